@@ -1,0 +1,124 @@
+"""Checks of user input: the only place where messages about shapes are written.
+
+Each check raises with the argument's name, what was expected, what came, and where
+there is one, what to do next. Public functions call them once; private code trusts.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from sbi.utils.sbiutils import within_support
+from torch import Tensor
+
+from sbi_rope.errors import InvalidInputError, InvalidTypeError
+
+__all__ = [
+    "check_batch",
+    "check_choice",
+    "check_finite",
+    "check_in_support",
+    "check_positive",
+    "check_positive_integer",
+    "check_same_length",
+    "check_tensor",
+    "check_unit_interval",
+]
+
+
+def check_tensor(name: str, value: Any) -> Tensor:
+    """Return ``value`` if it is a tensor of numbers; say how to convert if not."""
+    if not isinstance(value, Tensor):
+        raise InvalidTypeError(
+            f"Expected `{name}` to be a torch.Tensor; got {type(value).__name__}. "
+            f"Convert it with `torch.as_tensor({name}, dtype=torch.float32)`."
+        )
+    if value.is_complex() or value.dtype == torch.bool:
+        raise InvalidTypeError(
+            f"Expected `{name}` to hold real numbers; got dtype {value.dtype}."
+        )
+    return value
+
+
+def check_finite(name: str, value: Tensor) -> None:
+    """Raise if any entry is NaN or infinite, naming the first rows that are."""
+    bad = ~torch.isfinite(value)
+    if bad.any():
+        rows = bad.flatten(1).any(dim=1) if value.ndim > 1 else bad.reshape(-1)
+        first = rows.nonzero().flatten()[:5].tolist()
+        raise InvalidInputError(
+            f"Expected `{name}` to be finite; got NaN or Inf in {int(rows.sum())} of "
+            f"{rows.numel()} rows (first: {first}). Remove or repair these rows."
+        )
+
+
+def check_batch(
+    name: str, value: Any, event_shape: Sequence[int], *, finite: bool = True
+) -> Tensor:
+    """Check a non-empty batch of events, shape ``(n, *event_shape)``."""
+    value = check_tensor(name, value)
+    expected = "(n, " + ", ".join(str(size) for size in event_shape) + ")"
+    if tuple(value.shape[1:]) != tuple(event_shape) or value.ndim == 0:
+        raise InvalidInputError(
+            f"Expected `{name}` of shape {expected}; got {tuple(value.shape)}."
+        )
+    if value.shape[0] == 0:
+        raise InvalidInputError(
+            f"Expected `{name}` of shape {expected} with n >= 1; got an empty batch."
+        )
+    if finite:
+        check_finite(name, value)
+    return value
+
+
+def check_same_length(name_a: str, a: Tensor, name_b: str, b: Tensor) -> None:
+    """Raise if two batches have different numbers of rows."""
+    if a.shape[0] != b.shape[0]:
+        raise InvalidInputError(
+            f"Expected `{name_a}` and `{name_b}` to have the same number of rows; got "
+            f"{a.shape[0]} and {b.shape[0]}."
+        )
+
+
+def check_in_support(name: str, theta: Tensor, prior: Any) -> None:
+    """Raise if any row of ``theta`` lies outside the prior's support."""
+    outside = ~within_support(prior, theta)
+    if outside.any():
+        first = outside.nonzero().flatten()[:5].tolist()
+        raise InvalidInputError(
+            f"Expected `{name}` inside the support of the prior; {int(outside.sum())} "
+            f"of {theta.shape[0]} rows are outside (first: {first}). Check the units "
+            f"and the order of the parameters, or train NPE with a wider prior."
+        )
+
+
+def check_positive(name: str, value: Any) -> None:
+    """Raise unless ``value`` is a finite number above zero."""
+    if not _is_number(value) or not 0.0 < value < float("inf"):
+        raise InvalidInputError(f"Expected `{name}` to be positive; got {value!r}.")
+
+
+def check_positive_integer(name: str, value: Any) -> None:
+    """Raise unless ``value`` is an integer of at least one."""
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise InvalidInputError(
+            f"Expected `{name}` to be an integer of at least 1; got {value!r}."
+        )
+
+
+def check_unit_interval(name: str, value: Any) -> None:
+    """Raise unless ``value`` is a number in [0, 1]."""
+    if not _is_number(value) or not 0.0 <= value <= 1.0:
+        raise InvalidInputError(f"Expected `{name}` in [0, 1]; got {value!r}.")
+
+
+def check_choice(name: str, value: Any, choices: Sequence[str]) -> None:
+    """Raise unless ``value`` is one of the given strings."""
+    if value not in choices:
+        raise InvalidInputError(
+            f"Expected `{name}` to be one of {list(choices)}; got {value!r}."
+        )
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)

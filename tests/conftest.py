@@ -1,0 +1,41 @@
+"""Fixtures and guards shared by all tests."""
+
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+
+SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@pytest.fixture(autouse=True)
+def _seeded() -> Iterator[None]:
+    """Give every test the same random numbers, and leave no trace of it."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        yield
+
+
+@pytest.fixture(autouse=True)
+def _no_network(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Fail any test that opens a connection, unless it is marked ``network``."""
+    if request.node.get_closest_marker("network"):
+        return
+
+    def refuse(*args: object, **kwargs: object) -> None:
+        raise RuntimeError("This test opened a network connection.")
+
+    monkeypatch.setattr(socket.socket, "connect", refuse)
+
+
+@pytest.fixture(scope="session")
+def chamber_root() -> Path:
+    """Folder with the causal chamber data sets, or skip."""
+    root = SHARED_DATA / "causal_chamber"
+    if not root.is_dir():
+        pytest.skip("the causal chamber data are not on this machine")
+    return root
