@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from sbi.utils.sbiutils import within_support
+from sbi.utils import within_support
 from torch import Tensor
 
 from sbi_rope.errors import InvalidInputError, InvalidTypeError
