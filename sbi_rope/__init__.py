@@ -1,3 +1,16 @@
 """Robust posterior estimation for misspecified simulators, on top of sbi."""
 
+from sbi_rope.coupling import Coupling, SinkhornCoupler
+from sbi_rope.finetuning import CalibrationFinetuner
+from sbi_rope.mixture import MixturePosterior
+from sbi_rope.rope import RoPE
+
+__all__ = [
+    "CalibrationFinetuner",
+    "Coupling",
+    "MixturePosterior",
+    "RoPE",
+    "SinkhornCoupler",
+]
+
 __version__ = "0.1.0"

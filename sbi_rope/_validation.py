@@ -16,8 +16,10 @@ from sbi_rope.errors import InvalidInputError, InvalidTypeError
 __all__ = [
     "check_batch",
     "check_choice",
+    "check_device",
     "check_finite",
     "check_in_support",
+    "check_instance",
     "check_positive",
     "check_positive_integer",
     "check_same_length",
@@ -69,6 +71,26 @@ def check_batch(
     if finite:
         check_finite(name, value)
     return value
+
+
+def check_device(name: str, value: Tensor, device: torch.device) -> None:
+    """Raise unless a tensor lives on the device of the posterior."""
+    if value.device != device:
+        raise InvalidInputError(
+            f"Expected `{name}` on {device}, where the posterior is; got "
+            f"{value.device}. Move it with `{name}.to('{device}')`."
+        )
+
+
+def check_instance(
+    name: str, value: Any, expected: type, *, optional: bool = False
+) -> None:
+    """Raise unless ``value`` is an instance of a class, or None where allowed."""
+    if not isinstance(value, expected) and not (optional and value is None):
+        raise InvalidTypeError(
+            f"Expected `{name}` to be a {expected.__name__}; got "
+            f"{type(value).__name__}."
+        )
 
 
 def check_same_length(name_a: str, a: Tensor, name_b: str, b: Tensor) -> None:

@@ -1,0 +1,222 @@
+r"""Where this package touches the inside of sbi, and nowhere else.
+
+An NPE estimator is :math:`q(\theta \mid h(x))`. sbi keeps the embedding :math:`h` (its
+standardising layer followed by the user's network) as one submodule of the estimator,
+under a name that depends on the family. Everything here finds that submodule by
+identity with the public property ``embedding_net``, so that it holds for every family.
+"""
+
+import copy
+from typing import Any, Literal
+
+import torch
+from sbi.inference.posteriors.base_posterior import NeuralPosterior
+from sbi.inference.posteriors.direct_posterior import DirectPosterior
+from sbi.inference.posteriors.filtered_direct_posterior import FilteredDirectPosterior
+from sbi.inference.posteriors.npe_a_posterior import NPE_A_Posterior
+from sbi.inference.posteriors.vector_field_posterior import VectorFieldPosterior
+from sbi.neural_nets.estimators.base import (
+    ConditionalDensityEstimator,
+    ConditionalEstimator,
+    ConditionalVectorFieldEstimator,
+)
+from torch import Tensor, nn
+from torch.distributions import Distribution
+
+from sbi_rope.errors import LogProbUnavailableError, UnsupportedPosteriorError
+
+__all__ = [
+    "ConditionalDensityEstimator",
+    "ConditionalEstimator",
+    "DirectPosterior",
+    "NeuralPosterior",
+    "VectorFieldDensity",
+    "device_of",
+    "dtype_of",
+    "embed",
+    "embedding_of",
+    "estimator_of",
+    "headless",
+    "posterior_from",
+    "with_embedding",
+]
+
+
+def estimator_of(posterior: Any) -> ConditionalEstimator:
+    """Return the trained estimator inside an sbi posterior.
+
+    Raises:
+        UnsupportedPosteriorError: If the posterior is not a plain amortised posterior
+            of NPE, FMPE or NPSE.
+    """
+    if isinstance(posterior, VectorFieldPosterior):
+        return posterior.vector_field_estimator
+    plain = isinstance(posterior, DirectPosterior) and not isinstance(
+        posterior, FilteredDirectPosterior | NPE_A_Posterior
+    )
+    if not plain or getattr(posterior, "is_mixture", False):
+        raise UnsupportedPosteriorError(
+            "Expected `posterior` to be what `NPE(...).build_posterior()` returns "
+            "with sample_with='direct' (a DirectPosterior), or the posterior of FMPE "
+            f"or NPSE; got {type(posterior).__name__}. RoPE needs an amortised "
+            "posterior whose estimator has an embedding of x."
+        )
+    return posterior.posterior_estimator
+
+
+def embedding_of(estimator: ConditionalEstimator) -> nn.Module:
+    r"""Return :math:`h`, the embedding of x, of a trained estimator.
+
+    It includes sbi's standardising layer. Without a user-given network it is that
+    layer alone; with ``z_score_x="none"`` as well it is the identity.
+
+    Raises:
+        UnsupportedPosteriorError: If the estimator does not expose its embedding.
+    """
+    embedding = getattr(estimator, "embedding_net", None)
+    if not isinstance(embedding, nn.Module) or not _paths_to(estimator, embedding):
+        raise UnsupportedPosteriorError(
+            f"Cannot separate the embedding net of a {type(estimator).__name__} from "
+            "its density. Supported: the mixture density networks, nflows and zuko "
+            "flows, and vector fields of sbi."
+        )
+    return embedding
+
+
+def headless(estimator: ConditionalEstimator) -> Any:
+    r"""Return :math:`q(\theta \mid s)`: the estimator without its embedding.
+
+    The parameters are shared with ``estimator``, which is left as it was.
+    """
+    embedding = embedding_of(estimator)
+    blank = torch.zeros(
+        1,
+        *estimator.condition_shape,
+        dtype=dtype_of(estimator),
+        device=device_of(estimator),
+    )
+    statistic_shape = embed(embedding, blank).shape[1:]
+    if len(statistic_shape) != 1:
+        raise UnsupportedPosteriorError(
+            "Expected the embedding net to return one vector per observation, shape "
+            f"(n, l); got {('n', *statistic_shape)}."
+        )
+    clone = with_embedding(estimator, nn.Identity())
+    clone._condition_shape = torch.Size(statistic_shape)
+    return clone
+
+
+def with_embedding(estimator: ConditionalEstimator, embedding: nn.Module) -> Any:
+    r"""Return the estimator with another embedding in the place of :math:`h`.
+
+    The other parameters are shared with ``estimator``, which is left as it was.
+    """
+    clone: nn.Module = estimator
+    for path in _paths_to(estimator, embedding_of(estimator)):
+        clone = _replace(clone, path.split("."), embedding)
+    return clone
+
+
+def posterior_from(
+    posterior: Any, estimator: ConditionalEstimator
+) -> DirectPosterior | VectorFieldPosterior:
+    """Return an sbi posterior of the same kind as ``posterior`` around an estimator."""
+    prior = copy.deepcopy(posterior.prior)
+    device = device_of(estimator)
+    if isinstance(estimator, ConditionalVectorFieldEstimator):
+        return VectorFieldPosterior(
+            estimator,
+            prior,
+            device=device,
+            enable_transform=posterior.enable_transform,
+            sample_with=posterior.sample_with,
+        )
+    assert isinstance(estimator, ConditionalDensityEstimator)
+    return DirectPosterior(
+        estimator, prior, device=device, enable_transform=posterior.enable_transform
+    )
+
+
+class VectorFieldDensity(ConditionalDensityEstimator):
+    """A vector field (FMPE, NPSE) in the shape of a density that can only be sampled.
+
+    Its density would need one ODE solve per component and parameter, so ``log_prob``
+    raises instead of starting hours of work.
+    """
+
+    def __init__(
+        self,
+        estimator: ConditionalVectorFieldEstimator,
+        prior: Distribution,
+        sample_with: Literal["ode", "sde"],
+    ) -> None:
+        super().__init__(estimator, estimator.input_shape, estimator.condition_shape)
+        self.vector_field = estimator
+        self.prior = prior
+        self.sample_with = sample_with
+
+    def sample(
+        self, sample_shape: torch.Size, condition: Tensor, **kwargs: Any
+    ) -> Tensor:
+        """Solve the ODE or SDE for every condition; no prior support is enforced."""
+        posterior = VectorFieldPosterior(
+            self.vector_field,
+            self.prior,
+            device=condition.device,
+            sample_with=self.sample_with,
+        )
+        return posterior.sample_batched(
+            sample_shape,
+            condition,
+            show_progress_bars=False,
+            reject_outside_prior=False,
+        )
+
+    def log_prob(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
+        """Raise: the density of a vector field is not evaluated."""
+        raise LogProbUnavailableError(
+            "log_prob is not available for posteriors of FMPE and NPSE: every mixture "
+            "component would need its own ODE solve. Use samples, or train NPE."
+        )
+
+    def loss(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
+        """Return the loss of the vector field."""
+        return self.vector_field.loss(input, condition, **kwargs)
+
+
+def embed(net: nn.Module, x: Tensor, *, batch_size: int = 1000) -> Tensor:
+    """Apply an embedding net without gradients, in batches: ``(n, *)`` to ``(n, l)``.
+
+    The net is put into evaluation mode: no dropout, and batch normalisation with its
+    trained statistics, so that the result does not depend on the batch.
+    """
+    net.eval()
+    with torch.no_grad():
+        return torch.cat([net(part) for part in x.split(batch_size)])
+
+
+def dtype_of(module: nn.Module) -> torch.dtype:
+    """Return the floating dtype of a module's parameters."""
+    return next(p.dtype for p in module.parameters() if p.is_floating_point())
+
+
+def device_of(module: nn.Module) -> torch.device:
+    """Return the device of a module's parameters."""
+    return next(p.device for p in module.parameters())
+
+
+def _paths_to(root: nn.Module, target: nn.Module) -> list[str]:
+    named = root.named_modules(remove_duplicate=False)
+    return [name for name, module in named if module is target and name]
+
+
+def _replace(root: nn.Module, path: list[str], new: nn.Module) -> nn.Module:
+    # Only the modules along the path are copied, and those without their tensors.
+    clone = copy.copy(root)
+    clone._modules = dict(root._modules)
+    child = root._modules[path[0]]
+    if len(path) > 1:
+        assert child is not None
+        new = _replace(child, path[1:], new)
+    clone._modules[path[0]] = new
+    return clone

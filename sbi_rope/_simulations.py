@@ -1,0 +1,249 @@
+"""Where simulations come from: a simulator, or a stored set of them."""
+
+import warnings
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+from tqdm.auto import tqdm
+
+from sbi_rope._random import seeded
+from sbi_rope._validation import check_batch, check_same_length
+from sbi_rope.errors import (
+    InvalidInputError,
+    InvalidTypeError,
+    RoPEWarning,
+    SimulationError,
+)
+
+__all__ = ["SimulationSource", "Simulator", "StoredSimulations"]
+
+# Simulations held in memory before they are embedded.
+CHUNK = 1000
+
+Embedding = Callable[[Tensor], Tensor]
+
+
+class SimulationSource(Protocol):
+    """What RoPE needs of simulations, each already reduced to its embedding."""
+
+    def embeddings(
+        self, count: int | None, at_least: int, embed: Embedding, *, progress: bool
+    ) -> Tensor:
+        """Return embeddings of simulations from the prior, shape ``(n_s, l)``."""
+        ...
+
+    def targets(
+        self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
+    ) -> Tensor:
+        """Return the mean embedding of simulations at each theta, ``(n, l)``."""
+        ...
+
+
+class Simulator:
+    """A user's simulator, batched or not, checked on a few draws of the prior."""
+
+    def __init__(
+        self,
+        function: Callable[[Tensor], Tensor],
+        prior: Distribution,
+        *,
+        event_shape: torch.Size,
+        like: Tensor,
+    ) -> None:
+        if not callable(function):
+            raise InvalidTypeError(
+                "Expected `simulator` to be callable, from theta (n, d) to x (n, "
+                f"*event); got {type(function).__name__}."
+            )
+        self.function = function
+        self.prior = prior
+        self.event_shape = event_shape
+        self.like = like
+        # The probe has its own random numbers: seeded results do not depend on it.
+        with seeded(0):
+            self.is_batched = self._probe()
+
+    def embeddings(
+        self, count: int | None, at_least: int, embed: Embedding, *, progress: bool
+    ) -> Tensor:
+        """Simulate at parameters from the prior; drop rows that are not finite."""
+        count = at_least if count is None else count
+        theta = self.prior.sample(torch.Size((count,))).to(self.like)
+        statistics, valid = self._embed_at(theta, embed, progress=progress)
+        _warn_of_dropped(int((~valid).sum()), count, "simulations from the prior")
+        if not valid.any():
+            raise SimulationError(
+                f"All {count} simulations from the prior contain NaN or Inf."
+            )
+        return statistics[valid]
+
+    def targets(
+        self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
+    ) -> Tensor:
+        """Simulate ``count`` times at each theta and average the finite ones."""
+        repeated = theta.repeat_interleave(count, dim=0)
+        statistics, valid = self._embed_at(repeated, embed, progress=progress)
+        _warn_of_dropped(
+            int((~valid).sum()), len(repeated), "simulations at calibration parameters"
+        )
+        valid = valid.reshape(-1, count)
+        statistics = statistics.reshape(*valid.shape, -1)
+        empty = ~valid.any(dim=1)
+        if empty.any():
+            rows = empty.nonzero().flatten()[:5].tolist()
+            raise SimulationError(
+                f"All simulations at the calibration parameters of rows {rows} contain "
+                f"NaN or Inf ({int(empty.sum())} rows in all). Remove these pairs."
+            )
+        total = statistics.where(valid[..., None], 0.0).sum(dim=1)
+        return total / valid.sum(dim=1, keepdim=True)
+
+    def _embed_at(
+        self, theta: Tensor, embed: Embedding, *, progress: bool
+    ) -> tuple[Tensor, Tensor]:
+        statistics, valid = [], []
+        chunks = theta.split(CHUNK)
+        for part in tqdm(chunks, desc="Simulating", disable=not progress):
+            x = self(part)
+            ok = torch.isfinite(x).flatten(1).all(dim=1)
+            # Embedding nets may refuse NaN: give them zeros, which are dropped later.
+            ok_shape = (-1,) + (1,) * (x.ndim - 1)
+            statistics.append(embed(x.where(ok.reshape(ok_shape), 0.0)))
+            valid.append(ok)
+        return torch.cat(statistics), torch.cat(valid)
+
+    def __call__(self, theta: Tensor) -> Tensor:
+        """Simulate, theta ``(n, d)`` to x ``(n, *event)``; x may contain NaN."""
+        try:
+            if self.is_batched:
+                x = self.function(theta)
+            else:
+                rows = [self.function(row) for row in theta]
+                x = torch.stack([row.reshape(self.event_shape) for row in rows])
+        except Exception as error:
+            raise SimulationError(
+                f"The simulator raised {type(error).__name__} on theta of shape "
+                f"{tuple(theta.shape)}: {error}"
+            ) from error
+        expected = (theta.shape[0], *self.event_shape)
+        if not isinstance(x, Tensor) or tuple(x.shape) != expected:
+            raise SimulationError(
+                f"Expected the simulator to return a tensor of shape {expected}; got "
+                f"{_describe(x)}."
+            )
+        return x.to(self.like)
+
+    def _probe(self) -> bool:
+        """Find out whether the simulator takes a batch or a single theta."""
+        first = self.prior.sample(torch.Size((1,))).to(self.like)
+        sizes = {first.shape[1], *self.event_shape}
+        # A number of rows that cannot be mistaken for a number of parameters.
+        count = next(n for n in range(3, 3 + len(sizes) + 1) if n not in sizes)
+        theta = torch.cat(
+            [first, self.prior.sample(torch.Size((count - 1,))).to(first)]
+        )
+        as_batch = self._attempt(theta)
+        if isinstance(as_batch, Tensor) and as_batch.shape == (
+            count,
+            *self.event_shape,
+        ):
+            return True
+        single = self._attempt(theta[0])
+        if isinstance(single, Tensor) and single.numel() == self.event_shape.numel():
+            return False
+        hint = (
+            " Convert NumPy results with `torch.as_tensor(x, dtype=torch.float32)`."
+            if not isinstance(as_batch, Tensor | Exception)
+            else ""
+        )
+        raise SimulationError(
+            f"Expected `simulator` to map theta {tuple(theta.shape)} to x "
+            f"{(count, *self.event_shape)}, or theta {tuple(theta[0].shape)} to x "
+            f"{tuple(self.event_shape)}; got {_describe(as_batch)} and "
+            f"{_describe(single)}.{hint}"
+        ) from (as_batch if isinstance(as_batch, Exception) else None)
+
+    def _attempt(self, theta: Tensor) -> Any:
+        try:
+            return self.function(theta)
+        except Exception as error:  # any error of user code is an answer here
+            return error
+
+
+class StoredSimulations:
+    """Pairs (theta, x) simulated beforehand; pairs that are not finite are dropped."""
+
+    def __init__(
+        self,
+        simulations: tuple[Tensor, Tensor],
+        *,
+        theta_shape: torch.Size,
+        event_shape: torch.Size,
+        like: Tensor,
+    ) -> None:
+        if not isinstance(simulations, tuple | list) or len(simulations) != 2:
+            raise InvalidTypeError(
+                "Expected `simulations` to be a pair (theta, x) of tensors; got "
+                f"{type(simulations).__name__}."
+            )
+        theta, x = simulations
+        theta = check_batch("simulations[0]", theta, theta_shape, finite=False)
+        x = check_batch("simulations[1]", x, event_shape, finite=False)
+        check_same_length("simulations[0]", theta, "simulations[1]", x)
+        valid = torch.isfinite(theta).all(dim=1)
+        valid &= torch.isfinite(x).flatten(1).all(dim=1)
+        _warn_of_dropped(int((~valid).sum()), len(valid), "stored simulations")
+        if not valid.any():
+            raise SimulationError("All stored simulations contain NaN or Inf.")
+        self.theta = theta[valid].to(like)
+        self.x = x[valid].to(like)
+        # "Nearest" is measured in standard deviations of the stored parameters.
+        self.theta_std = self.theta.std(dim=0).clamp_min(1e-12)
+
+    def embeddings(
+        self, count: int | None, at_least: int, embed: Embedding, *, progress: bool
+    ) -> Tensor:
+        """Embed a random subset; without a count, up to ``at_least`` of them."""
+        available = len(self.x)
+        if count is not None and count > available:
+            raise InvalidInputError(
+                f"Expected `num_simulations` of at most {available}, the number of "
+                f"stored simulations; got {count}."
+            )
+        count = min(available, at_least) if count is None else count
+        chosen = torch.randperm(available)[:count].to(self.x.device)
+        return embed(self.x[chosen])
+
+    def targets(
+        self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
+    ) -> Tensor:
+        """Average over the ``count`` stored simulations with the nearest parameters."""
+        if count > len(self.x):
+            raise InvalidInputError(
+                f"Expected `num_neighbors` of at most {len(self.x)}, the number of "
+                f"stored simulations; got {count}."
+            )
+        distance = torch.cdist(theta / self.theta_std, self.theta / self.theta_std)
+        nearest = distance.topk(count, dim=1, largest=False).indices
+        statistics = embed(self.x[nearest.flatten()])
+        return statistics.reshape(*nearest.shape, -1).mean(dim=1)
+
+
+def _warn_of_dropped(dropped: int, total: int, what: str) -> None:
+    if dropped:
+        warnings.warn(
+            f"Dropped {dropped} of {total} {what} because they contain NaN or Inf.",
+            RoPEWarning,
+            stacklevel=4,
+        )
+
+
+def _describe(result: Any) -> str:
+    if isinstance(result, Exception):
+        return f"{type(result).__name__}: {result}"
+    if isinstance(result, Tensor):
+        return f"a tensor of shape {tuple(result.shape)}"
+    return f"an object of type {type(result).__name__}"

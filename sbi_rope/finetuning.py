@@ -1,0 +1,242 @@
+"""Fine-tuning the embedding net on real observations with known parameters."""
+
+import copy
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor, nn
+from tqdm.auto import tqdm
+
+from sbi_rope._random import seeded
+from sbi_rope._validation import (
+    check_finite,
+    check_positive,
+    check_positive_integer,
+    check_same_length,
+    check_tensor,
+)
+from sbi_rope.errors import InvalidInputError, RoPEWarning
+
+__all__ = ["CalibrationFinetuner", "FinetuneResult", "History"]
+
+# Fewer pairs than this leave nothing to hold out.
+MIN_PAIRS_FOR_HOLDOUT = 5
+# Without a hold-out nothing says when to stop, so little is risked.
+STEPS_WITHOUT_HOLDOUT = 50
+
+
+@dataclass(frozen=True)
+class History:
+    """The course of a fine-tuning, for plotting.
+
+    Attributes:
+        training_loss: Mean distance to the targets over the training pairs before each
+            step, and after the last; in units of the embedding.
+        validation_loss: The same over the held-out pairs; empty without a hold-out.
+        best_step: Number of steps after which the kept net was reached; 0 is the
+            starting point, the embedding net as NPE left it.
+    """
+
+    training_loss: list[float] = field(repr=False)
+    validation_loss: list[float] = field(repr=False)
+    best_step: int
+
+
+@dataclass(frozen=True, eq=False)
+class FinetuneResult:
+    """The fine-tuned embedding net and how it came about.
+
+    Attributes:
+        embedding_net: :math:`g`, in evaluation mode.
+        history: Losses and the step that was kept.
+    """
+
+    embedding_net: nn.Module
+    history: History
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrationFinetuner:
+    r"""Tunes a copy g of the embedding net h on calibration pairs.
+
+    It minimises, with the norm not squared,
+
+    .. math::
+        \mathcal{L}(g) = \sum_{i=1}^{n_c} \Bigl\lVert g(x_{o,i})
+        - \mathbb{E}_{\varepsilon}\bigl[h(S(\theta_i, \varepsilon))\bigr]
+        \Bigr\rVert_2,
+
+    starting from g = h, with Adam on all training pairs at once. A fifth of the pairs
+    is held out; the g that does best on them is kept, and the starting point competes,
+    so that tuning never returns something worse than it started from on the hold-out.
+
+    The net is tuned in evaluation mode (no dropout, fixed batch statistics). If h has
+    no trainable parameters, because NPE was trained without an embedding net, g is h
+    followed by an affine map that starts as the identity.
+
+    References:
+        | Addressing Misspecification in Simulation-based Inference through Data-driven
+          Calibration (Wehenkel et al., 2025), eq. 7 and Algorithm 1, step 2
+        | https://arxiv.org/abs/2405.08719
+
+    Args:
+        learning_rate: Step size of Adam.
+        num_steps: Gradient steps, each over all training pairs.
+        simulations_per_target: Simulations behind each expectation. One, as in the
+            paper, pulls g to the noise of single simulations.
+        resample_targets: Draw new simulations at every step, as in the paper, instead
+            of one bank before the first. Costs ``num_steps`` times the simulations.
+        num_neighbors: With stored simulations in the place of a simulator, the
+            expectation is the mean over so many simulations with the nearest
+            parameters.
+        validation_fraction: Share of the pairs that is held out.
+
+    Raises:
+        InvalidInputError: If an argument is outside its range.
+    """
+
+    learning_rate: float = 1e-3
+    num_steps: int = 1000
+    simulations_per_target: int = 100
+    resample_targets: bool = False
+    num_neighbors: int = 1
+    validation_fraction: float = 0.2
+
+    def __post_init__(self) -> None:
+        """Check the ranges of all fields."""
+        check_positive("learning_rate", self.learning_rate)
+        check_positive_integer("num_steps", self.num_steps)
+        check_positive_integer("simulations_per_target", self.simulations_per_target)
+        check_positive_integer("num_neighbors", self.num_neighbors)
+        check_positive("validation_fraction", self.validation_fraction)
+        if self.validation_fraction > 0.5:
+            raise InvalidInputError(
+                "Expected `validation_fraction` in (0, 0.5]; got "
+                f"{self.validation_fraction!r}."
+            )
+
+    def finetune(
+        self,
+        embedding_net: nn.Module,
+        x: Tensor,
+        draw_targets: Callable[[int], Tensor],
+        *,
+        seed: int | None = None,
+        show_progress_bars: bool = True,
+    ) -> FinetuneResult:
+        """Tune a copy of the embedding net; the net itself is left as it is.
+
+        Args:
+            embedding_net: h, a module from ``(n, *event)`` to ``(n, l)``.
+            x: Real observations of the calibration set, shape ``(n_c, *event)``.
+            draw_targets: Given a number of simulations k, returns the mean embedding
+                of k simulations for each pair, shape ``(n_c, l)``.
+            seed: Seed of the split and of the simulations; None uses torch's state.
+            show_progress_bars: Whether to show the course of the loss.
+
+        Returns:
+            The tuned net and its history.
+
+        Raises:
+            InvalidInputError: If shapes do not fit or a value is not finite.
+        """
+        x = check_tensor("x", x)
+        check_finite("x", x)
+        with seeded(seed):
+            targets = check_tensor("targets", draw_targets(self.simulations_per_target))
+            check_same_length("x", x, "targets", targets)
+            check_finite("targets", targets)
+            train, held_out = self._split(x.shape[0])
+            return self._optimise(
+                trainable_copy(embedding_net, targets),
+                x,
+                targets,
+                train.to(x.device),
+                held_out.to(x.device),
+                draw_targets=draw_targets if self.resample_targets else None,
+                show_progress_bars=show_progress_bars,
+            )
+
+    def _split(self, num_pairs: int) -> tuple[Tensor, Tensor]:
+        order = torch.randperm(num_pairs)
+        if num_pairs < MIN_PAIRS_FOR_HOLDOUT:
+            warnings.warn(
+                f"Only {num_pairs} calibration pair(s): none is held out, and tuning "
+                f"stops after at most {STEPS_WITHOUT_HOLDOUT} steps. Append at least "
+                f"{MIN_PAIRS_FOR_HOLDOUT} pairs to choose the best net on a hold-out.",
+                RoPEWarning,
+                stacklevel=4,
+            )
+            return order, order[:0]
+        num_held_out = max(1, round(self.validation_fraction * num_pairs))
+        return order[num_held_out:], order[:num_held_out]
+
+    def _optimise(
+        self,
+        net: nn.Module,
+        x: Tensor,
+        targets: Tensor,
+        train: Tensor,
+        held_out: Tensor,
+        *,
+        draw_targets: Callable[[int], Tensor] | None,
+        show_progress_bars: bool,
+    ) -> FinetuneResult:
+        has_holdout = held_out.numel() > 0
+        num_steps = self.num_steps
+        if not has_holdout:
+            num_steps = min(num_steps, STEPS_WITHOUT_HOLDOUT)
+        optimizer = torch.optim.Adam(net.parameters(), lr=self.learning_rate)
+        training_loss: list[float] = []
+        validation_loss: list[float] = []
+        best_state, best_step = copy.deepcopy(net.state_dict()), 0
+        held_out_targets = targets[held_out]
+
+        progress = tqdm(
+            range(num_steps + 1), desc="Fine-tuning", disable=not show_progress_bars
+        )
+        for step in progress:
+            if draw_targets is not None and step > 0:
+                targets = draw_targets(self.simulations_per_target)
+            loss = _mean_distance(net(x[train]), targets[train])
+            training_loss.append(float(loss.detach()))
+            if not torch.isfinite(loss):
+                break  # the steps were too large; what was kept before stands
+            if has_holdout:
+                with torch.no_grad():
+                    distance = _mean_distance(net(x[held_out]), held_out_targets)
+                validation_loss.append(float(distance))
+            if not has_holdout or validation_loss[-1] < validation_loss[best_step]:
+                best_state, best_step = copy.deepcopy(net.state_dict()), step
+            if step < num_steps:
+                optimizer.zero_grad()
+                loss.backward()
+                optimizer.step()
+
+        net.load_state_dict(best_state)
+        history = History(training_loss, validation_loss, best_step)
+        return FinetuneResult(net.requires_grad_(requires_grad=False), history)
+
+
+def trainable_copy(embedding_net: nn.Module, embeddings: Tensor) -> nn.Module:
+    """Copy a net so that all of it can be trained, in evaluation mode.
+
+    Args:
+        embedding_net: The net to copy.
+        embeddings: Any batch of its outputs, shape ``(n, l)``.
+    """
+    net = copy.deepcopy(embedding_net).requires_grad_()
+    if not any(True for _ in net.parameters()):
+        width = embeddings.shape[1]
+        affine = nn.Linear(width, width).to(embeddings)
+        with torch.no_grad():
+            affine.weight.copy_(torch.eye(width))
+            affine.bias.zero_()
+        net = nn.Sequential(net, affine)
+    return net.eval()
+
+
+def _mean_distance(embeddings: Tensor, targets: Tensor) -> Tensor:
+    return torch.linalg.vector_norm(embeddings - targets, dim=1).mean()

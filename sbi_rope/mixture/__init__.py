@@ -1,0 +1,6 @@
+"""The posterior of RoPE: a mixture of simulated posteriors."""
+
+from sbi_rope.mixture.estimator import MixtureEstimator
+from sbi_rope.mixture.posterior import Leakage, MixturePosterior
+
+__all__ = ["Leakage", "MixtureEstimator", "MixturePosterior"]

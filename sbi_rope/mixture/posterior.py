@@ -1,0 +1,321 @@
+"""The mixture as an sbi posterior: prior support, normalisation, the batch."""
+
+import copy
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from sbi.utils import within_support
+from torch import Tensor
+from torch.distributions import Distribution, constraints
+from tqdm.auto import tqdm
+
+from sbi_rope._random import seeded
+from sbi_rope._sbi import DirectPosterior
+from sbi_rope.coupling import Coupling
+from sbi_rope.errors import InvalidInputError, SamplingError
+from sbi_rope.mixture.estimator import MAX_EVALUATIONS, MixtureEstimator
+
+__all__ = ["Leakage", "MixturePosterior"]
+
+# Draws behind each component's mass inside the prior's support.
+LEAKAGE_DRAWS = 1024
+# Rounds of rejection sampling, each with more proposals the lower the acceptance.
+MAX_ROUNDS = 1000
+MAX_PROPOSALS_PER_DRAW = 1000
+
+
+@dataclass(frozen=True)
+class Leakage:
+    r"""The mass of each observation's mixture inside the prior's support.
+
+    Attributes:
+        mass: :math:`Z_i = \sum_j \alpha_{ij} Z_j`, shape ``(n,)``.
+        standard_error: Of ``mass``, from the draws behind each :math:`Z_j`.
+    """
+
+    mass: Tensor
+    standard_error: Tensor
+
+
+class MixturePosterior(DirectPosterior):
+    r"""The posteriors of a batch of real observations, as an sbi posterior.
+
+    For observation i of the batch x_o,
+
+    .. math::
+        p(\theta \mid x_{o,i})
+        = \frac{\mathbf{1}[\theta \in \operatorname{supp} p]}{Z_i}
+        \sum_j \alpha_{ij}\, q(\theta \mid h(x_{s,j})),
+        \qquad Z_i = \sum_j \alpha_{ij} Z_j,
+
+    with :math:`Z_j` the mass of component j inside the support of the prior. It has all
+    methods of sbi's :class:`DirectPosterior` and works with sbi's diagnostics. These
+    speak about the batch: simulation-based calibration, coverage and the like are
+    meaningful for the x_o of this posterior with their true parameters only.
+
+    Memory: the flow sees at most 100,000 pairs of parameter and component at a time.
+    Accuracy: ``log_prob`` leaves out the smallest weights of each row that sum to at
+    most ``tail_mass`` = t, so that the density is too small by at most t times the
+    largest density among the components left out.
+
+    References:
+        | Addressing Misspecification in Simulation-based Inference through Data-driven
+          Calibration (Wehenkel et al., 2025), eq. 6
+        | https://arxiv.org/abs/2405.08719
+
+    Args:
+        estimator: The mixture.
+        prior: The prior NPE was trained with.
+        enable_transform: As in sbi, for ``map()``.
+    """
+
+    # Read by `metrics`: this posterior normalises and rejects in bounded time.
+    bounded_rejection = True
+    # Read by `_sbi`: a repaired posterior cannot be repaired again.
+    is_mixture = True
+
+    def __init__(
+        self,
+        estimator: MixtureEstimator,
+        prior: Distribution,
+        *,
+        enable_transform: bool = True,
+    ) -> None:
+        super().__init__(
+            estimator,
+            prior,
+            device=estimator.contexts.device,
+            enable_transform=enable_transform,
+        )
+        self.posterior_estimator: MixtureEstimator = estimator
+        # Shared with the views of single observations, so that it is estimated once.
+        self._cache: dict[str, Tensor] = {}
+        self._purpose = (
+            f"It is the mixture of {len(estimator.contexts)} simulated posteriors for "
+            f"each of {len(estimator.x_o)} real observations."
+        )
+
+    # --- the batch ---
+
+    @property
+    def x_o(self) -> Tensor:
+        """The batch of real observations, shape ``(n_o, *event)``."""
+        return self.posterior_estimator.x_o
+
+    @property
+    def coupling(self) -> Coupling:
+        """The coupling of the batch with the simulations."""
+        return self.posterior_estimator.coupling
+
+    @property
+    def weights(self) -> Tensor:
+        """Mixture weights, shape ``(n_o, n_s)``; rows sum to one."""
+        return self.coupling.weights
+
+    def __len__(self) -> int:
+        return len(self.x_o)
+
+    def __getitem__(self, index: int) -> "MixturePosterior":
+        """Return the posterior of one observation, with it as the default x."""
+        view = copy.copy(self)
+        view.potential_fn = copy.copy(self.potential_fn)
+        view.set_default_x(self.x_o[int(index)][None])
+        return view
+
+    def __iter__(self) -> Iterator["MixturePosterior"]:
+        return (self[i] for i in range(len(self)))
+
+    def to(self, device: str | torch.device) -> None:
+        """Move the posterior, its coupling and its batch to a device."""
+        self.posterior_estimator.to_device(device)
+        self._cache = {name: value.to(device) for name, value in self._cache.items()}
+        super().to(device)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # sbi hands out its own __dict__, which a shallow copy would then share.
+        return dict(self.__dict__)
+
+    # --- sampling ---
+
+    def sample(  # type: ignore[override]
+        self,
+        sample_shape: Any = (),
+        x: Tensor | None = None,
+        max_sampling_batch_size: int = MAX_EVALUATIONS,
+        show_progress_bars: bool = True,  # noqa: FBT001, FBT002
+        reject_outside_prior: bool = True,  # noqa: FBT001, FBT002
+    ) -> Tensor:
+        r"""Draw from :math:`p(\theta \mid x)` of one observation.
+
+        Args:
+            sample_shape: Shape of the draws.
+            x: An observation of the batch; the default x if None.
+            max_sampling_batch_size: Most draws the flow makes at a time.
+            show_progress_bars: Whether to show the draws accepted so far.
+            reject_outside_prior: Whether to draw from the truncated mixture, or from
+                the mixture as it is.
+
+        Returns:
+            Shape ``(*sample_shape, d)``.
+
+        Raises:
+            UnseenObservationError: If x is not in the batch and ``unseen="raise"``.
+            SamplingError: If next to nothing lies inside the prior's support.
+        """
+        x = self._one_x(x)
+        samples = self.sample_batched(
+            sample_shape,
+            x,
+            max_sampling_batch_size,
+            show_progress_bars,
+            reject_outside_prior,
+        )
+        return samples.squeeze(-1 - len(self.posterior_estimator.input_shape))
+
+    @torch.no_grad()
+    def sample_batched(  # type: ignore[override]
+        self,
+        sample_shape: Any,
+        x: Tensor,
+        max_sampling_batch_size: int = MAX_EVALUATIONS,
+        show_progress_bars: bool = True,  # noqa: FBT001, FBT002
+        reject_outside_prior: bool = True,  # noqa: FBT001, FBT002
+    ) -> Tensor:
+        r"""Draw from :math:`p(\theta \mid x_b)` of every observation of a batch.
+
+        Args:
+            sample_shape: Shape of the draws of each observation.
+            x: Observations, shape ``(B, *event)``.
+            max_sampling_batch_size: Most draws the flow makes at a time.
+            show_progress_bars: Whether to show the draws accepted so far.
+            reject_outside_prior: Whether to draw from the truncated mixtures.
+
+        Returns:
+            Shape ``(*sample_shape, B, d)``.
+
+        Raises:
+            UnseenObservationError: If an x is not in the batch and ``unseen="raise"``.
+            SamplingError: If next to nothing lies inside the prior's support.
+        """
+        estimator = self.posterior_estimator
+        shape = torch.Size(sample_shape)
+        weights = estimator.rows(self._batch_of_x(x))
+        slots = torch.arange(len(weights), device=weights.device).repeat(shape.numel())
+        theta = torch.empty(len(slots), *estimator.input_shape, device=slots.device).to(
+            estimator.contexts
+        )
+        open_slots = torch.arange(len(slots), device=slots.device)
+        repeats = 1
+        with tqdm(
+            total=len(slots), desc="Sampling", disable=not show_progress_bars
+        ) as progress:
+            for _ in range(MAX_ROUNDS):
+                proposals = open_slots.repeat_interleave(repeats)
+                draws = estimator.draw(
+                    slots[proposals], weights, batch_size=max_sampling_batch_size
+                )
+                accepted = self._accept(draws, reject=reject_outside_prior)
+                # Later proposals overwrite earlier ones: any of them is a fair draw.
+                theta[proposals[accepted]] = draws[accepted]
+                hit = torch.zeros(len(slots), dtype=torch.bool, device=slots.device)
+                hit[proposals[accepted]] = True
+                still_open = open_slots[~hit[open_slots]]
+                progress.update(len(open_slots) - len(still_open))
+                if not len(still_open):
+                    return theta.reshape(*shape, len(weights), *estimator.input_shape)
+                open_slots = still_open
+                rate = float(accepted.double().mean())
+                repeats = int(1 / max(rate, 1 / MAX_PROPOSALS_PER_DRAW))
+                repeats = max(1, min(repeats, MAX_EVALUATIONS // len(open_slots)))
+        hopeless = slots[open_slots].unique()[:5].tolist()
+        raise SamplingError(
+            f"Less than about one in {MAX_ROUNDS} draws lies inside the support of the "
+            f"prior for observations {hopeless} of the batch: the posterior of the "
+            "simulations leaks. Train NPE longer, or with "
+            "z_score_theta='transform_to_unconstrained', or pass "
+            "reject_outside_prior=False."
+        )
+
+    def _accept(self, theta: Tensor, *, reject: bool) -> Tensor:
+        if not reject:
+            return torch.ones(len(theta), dtype=torch.bool, device=theta.device)
+        return within_support(self.prior, theta).reshape(len(theta))
+
+    def _one_x(self, x: Tensor | None) -> Tensor:
+        batch = self._batch_of_x(self._x_else_default_x(x))
+        if len(batch) > 1:
+            raise InvalidInputError(
+                f"Expected one observation; got {len(batch)}. Use the `_batched` "
+                "methods for several observations."
+            )
+        return batch
+
+    def _batch_of_x(self, x: Tensor) -> Tensor:
+        event_shape = self.posterior_estimator.condition_shape
+        x = torch.as_tensor(x)
+        if x.shape == event_shape:
+            x = x[None]
+        if x.shape[1:] != event_shape:
+            # process_x of sbi gives x without a batch dimension a leading one.
+            raise InvalidInputError(
+                f"Expected `x` of shape (n, {', '.join(map(str, event_shape))}); got "
+                f"{tuple(x.shape)}."
+            )
+        return x
+
+    # --- normalisation ---
+
+    def leakage(self, x: Tensor) -> Leakage:
+        r"""Return the mass of each mixture inside the prior's support, with its error.
+
+        Every component's mass :math:`Z_j` is estimated once from 1024 draws and kept.
+        The draws have random numbers of their own, so that log_prob is a function.
+
+        Args:
+            x: Observations, shape ``(B, *event)``.
+        """
+        if "component_mass" not in self._cache:
+            self._cache["component_mass"] = self._estimate_component_mass()
+        mass = self._cache["component_mass"]
+        weights = self.posterior_estimator.rows(self._batch_of_x(x))
+        variance = mass * (1.0 - mass) / LEAKAGE_DRAWS
+        return Leakage(weights @ mass, (weights.square() @ variance).sqrt())
+
+    @torch.no_grad()
+    def _estimate_component_mass(self) -> Tensor:
+        estimator = self.posterior_estimator
+        contexts = estimator.contexts
+        if _is_unbounded(self.prior):
+            return torch.ones(len(contexts), device=contexts.device).double()
+        mass = []
+        with seeded(0):
+            for part in contexts.split(max(1, MAX_EVALUATIONS // LEAKAGE_DRAWS)):
+                theta = estimator.components.sample(
+                    torch.Size((LEAKAGE_DRAWS,)), condition=part
+                )
+                inside = self._accept(
+                    theta.reshape(-1, *estimator.input_shape), reject=True
+                ).reshape(LEAKAGE_DRAWS, -1)
+                mass.append(inside.double().mean(dim=0))
+        return torch.cat(mass)
+
+    def leakage_correction(  # type: ignore[override]
+        self, x: Tensor, **kwargs: Any
+    ) -> Tensor:
+        r"""Return :math:`Z_i`, shape ``(B,)``; called by log_prob of the base class."""
+        mass = self.leakage(x).mass.to(self.posterior_estimator.contexts)
+        if not (mass > 0).all():
+            raise SamplingError(
+                "The mixture of at least one observation has no mass inside the "
+                "support of the prior. Train NPE longer, or pass norm_posterior=False."
+            )
+        return mass
+
+
+def _is_unbounded(prior: Distribution) -> bool:
+    support: Any = getattr(prior, "support", None)
+    while isinstance(support, constraints.independent):
+        support = support.base_constraint
+    return support in (constraints.real, constraints.real_vector)

@@ -1,0 +1,375 @@
+"""Robust posterior estimation: the conductor of its three steps."""
+
+import copy
+from collections.abc import Callable
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+
+from sbi_rope._random import seeded
+from sbi_rope._sbi import (
+    ConditionalDensityEstimator,
+    VectorFieldDensity,
+    device_of,
+    dtype_of,
+    embed,
+    embedding_of,
+    estimator_of,
+    headless,
+    posterior_from,
+    with_embedding,
+)
+from sbi_rope._simulations import SimulationSource, Simulator, StoredSimulations
+from sbi_rope._validation import (
+    check_batch,
+    check_choice,
+    check_device,
+    check_finite,
+    check_in_support,
+    check_instance,
+    check_positive_integer,
+    check_same_length,
+    check_unit_interval,
+)
+from sbi_rope.coupling import Coupling, SinkhornCoupler
+from sbi_rope.errors import CouplingError, InvalidInputError, NotReadyError
+from sbi_rope.finetuning import CalibrationFinetuner, History
+from sbi_rope.mixture import MixtureEstimator, MixturePosterior
+
+__all__ = ["RoPE"]
+
+# Simulations to couple with when the batch is smaller than this.
+MIN_SIMULATIONS = 1000
+
+
+class RoPE:
+    r"""Repairs a trained sbi posterior with a few labelled real observations.
+
+    An NPE posterior is :math:`q(\theta \mid h(x))`, trained on simulations. RoPE
+
+    1. tunes a copy g of h so that :math:`g(x_o)` lands where h puts simulations with
+       the same parameters (:meth:`train`; needs calibration pairs);
+    2. couples a batch of real observations with simulations by optimal transport
+       between :math:`g(x_o)` and :math:`h(x_s)`;
+    3. returns for each observation the mixture
+       :math:`\sum_j \alpha_{ij}\, q(\theta \mid h(x_{s,j}))` (:meth:`build_posterior`).
+
+    Without calibration pairs step 1 is skipped, g = h (the paper's "OT-only"). The
+    posterior passed in is copied and never changed.
+
+    References:
+        | Addressing Misspecification in Simulation-based Inference through Data-driven
+          Calibration (Wehenkel et al., 2025), Algorithm 1
+        | https://arxiv.org/abs/2405.08719
+
+    Args:
+        posterior: What ``NPE(...).build_posterior()`` returns, or the posterior of FMPE
+            or NPSE (these can be sampled, but have no ``log_prob``). A default x is
+            ignored. The posterior must be amortised: one trained over several rounds
+            fits one observation only, which cannot be recognised here.
+        simulator: Maps parameters ``(n, d)`` to simulations ``(n, *event)``, or one
+            ``(d,)`` to one ``(*event)``; simulations with NaN are dropped and counted.
+        simulations: Instead of a simulator, stored pairs (theta, x) drawn from the
+            prior. Fine-tuning then uses those with the nearest parameters.
+        finetuner: Settings of step 1; ``CalibrationFinetuner()`` if None.
+        coupler: Settings of step 2; ``SinkhornCoupler()`` if None.
+
+    Raises:
+        UnsupportedPosteriorError: If the posterior has no embedding to work with.
+        InvalidInputError: If both or none of simulator and simulations are given, or
+            their shapes do not fit the posterior.
+        SimulationError: If the simulator raises or returns something unusable.
+
+    Example:
+        >>> from sbi.inference import NPE
+        >>> from sbi.utils import BoxUniform
+        >>> _ = torch.manual_seed(0)
+        >>> prior = BoxUniform(torch.zeros(1), torch.ones(1))
+        >>> simulator = lambda theta: theta + 0.1 * torch.randn_like(theta)
+        >>> theta = prior.sample((200,))
+        >>> npe = NPE(prior, show_progress_bars=False)
+        >>> _ = npe.append_simulations(theta, simulator(theta)).train(max_num_epochs=2)
+
+        >>> theta_cal, theta_o = prior.sample((10,)), prior.sample((30,))
+        >>> x_cal, x_o = simulator(theta_cal) + 0.3, simulator(theta_o) + 0.3
+        >>> rope = RoPE(npe.build_posterior(), simulator=simulator)
+        >>> rope = rope.append_calibration(theta_cal, x_cal)
+        >>> rope = rope.train(show_progress_bars=False)
+        >>> posterior = rope.build_posterior(x_o)
+        >>> posterior.sample_batched((5,), x=x_o, show_progress_bars=False).shape
+        torch.Size([5, 30, 1])
+    """
+
+    def __init__(
+        self,
+        posterior: Any,
+        *,
+        simulator: Callable[[Tensor], Tensor] | None = None,
+        simulations: tuple[Tensor, Tensor] | None = None,
+        finetuner: CalibrationFinetuner | None = None,
+        coupler: SinkhornCoupler | None = None,
+    ) -> None:
+        check_instance("finetuner", finetuner, CalibrationFinetuner, optional=True)
+        check_instance("coupler", coupler, SinkhornCoupler, optional=True)
+        estimator = estimator_of(posterior)
+        embedding_of(estimator)
+        # Copies: neither training here nor moving our posterior to another device may
+        # touch what belongs to the user.
+        self._estimator = (
+            copy.deepcopy(estimator).eval().requires_grad_(requires_grad=False)
+        )
+        self._posterior = posterior
+        self._prior = copy.deepcopy(posterior.prior)
+        self._h = embedding_of(self._estimator)
+        self._q = headless(self._estimator)
+        self._g: nn.Module | None = None
+        self._history: History | None = None
+        self.finetuner = CalibrationFinetuner() if finetuner is None else finetuner
+        self.coupler = SinkhornCoupler() if coupler is None else coupler
+
+        self._theta_cal = self._as_theta(torch.empty(0, *estimator.input_shape))
+        self._x_cal = self._theta_cal.new_empty(0, *estimator.condition_shape)
+        self._source = self._make_source(simulator, simulations)
+
+    def _make_source(
+        self,
+        simulator: Callable[[Tensor], Tensor] | None,
+        simulations: tuple[Tensor, Tensor] | None,
+    ) -> SimulationSource:
+        if (simulator is None) == (simulations is None):
+            raise InvalidInputError(
+                "Expected exactly one of `simulator` and `simulations`; got "
+                f"{'none' if simulator is None else 'both'}."
+            )
+        event_shape = self._estimator.condition_shape
+        if simulations is not None:
+            return StoredSimulations(
+                simulations,
+                theta_shape=self._estimator.input_shape,
+                event_shape=event_shape,
+                like=self._theta_cal,
+            )
+        assert simulator is not None
+        return Simulator(
+            simulator, self._prior, event_shape=event_shape, like=self._theta_cal
+        )
+
+    def append_calibration(self, theta: Tensor, x: Tensor) -> "RoPE":
+        """Add real observations with known parameters; may be called repeatedly.
+
+        Args:
+            theta: Parameters, shape ``(n, d)``, inside the prior's support.
+            x: Real observations, shape ``(n, *event)``.
+
+        Returns:
+            Itself, so that calls can be chained.
+
+        Raises:
+            InvalidTypeError: If one of them is not a tensor.
+            InvalidInputError: If shapes, row counts or devices do not fit, a value is
+                not finite, or a theta is outside the prior's support. Nothing is added
+                then.
+        """
+        theta = self._as_theta(check_batch("theta", theta, self._estimator.input_shape))
+        x = self._as_x("x", x)
+        check_same_length("theta", theta, "x", x)
+        check_in_support("theta", theta, self._prior)
+        self._theta_cal = torch.cat([self._theta_cal, theta])
+        self._x_cal = torch.cat([self._x_cal, x])
+        self._g, self._history = None, None
+        return self
+
+    def train(
+        self, *, seed: int | None = None, show_progress_bars: bool = True
+    ) -> "RoPE":
+        """Tune the embedding net on all calibration pairs appended so far.
+
+        Training again starts anew from the embedding net of NPE.
+
+        Args:
+            seed: Seed of the simulations and of the hold-out split; None uses torch's
+                state.
+            show_progress_bars: Whether to show the course of the loss.
+
+        Returns:
+            Itself, so that calls can be chained.
+
+        Raises:
+            NotReadyError: If no calibration pairs were appended.
+            SimulationError: If the simulator fails at the calibration parameters.
+        """
+        if not len(self._x_cal):
+            raise NotReadyError(
+                "No calibration pairs to train on. Call `append_calibration(theta, "
+                "x)` first, or go on to `build_posterior(x_o)`, which then couples "
+                "with the embedding net as NPE left it (OT-only)."
+            )
+        stored = isinstance(self._source, StoredSimulations)
+
+        def draw_targets(count: int) -> Tensor:
+            return self._source.targets(
+                self._theta_cal,
+                self.finetuner.num_neighbors if stored else count,
+                self._embed_simulations,
+                progress=False,
+            )
+
+        result = self.finetuner.finetune(
+            self._h,
+            self._x_cal,
+            draw_targets,
+            seed=seed,
+            show_progress_bars=show_progress_bars,
+        )
+        self._g, self._history = result.embedding_net, result.history
+        return self
+
+    def build_posterior(
+        self,
+        x_o: Tensor,
+        *,
+        coupler: SinkhornCoupler | None = None,
+        num_simulations: int | None = None,
+        seed: int | None = None,
+        unseen: Literal["raise", "extend"] = "raise",
+        require_convergence: bool = True,
+        tail_mass: float = 1e-3,
+    ) -> MixturePosterior:
+        """Couple a batch of real observations with simulations.
+
+        The trained state is reused: call it for as many batches and couplers as needed.
+        With the same seed the simulations are the same.
+
+        Args:
+            x_o: The batch, shape ``(n_o, *event)``. Posteriors depend on the whole
+                batch, and a batch of fewer than 20 earns a warning.
+            coupler: Replaces the coupler of this object for this batch.
+            num_simulations: n_s; ``max(n_o, 1000)`` if None (or all stored ones, if
+                there are fewer).
+            seed: Seed of the simulations; None uses torch's state.
+            unseen: What the posterior does with an x outside the batch: ``"raise"``,
+                or ``"extend"`` the coupling by one row.
+            require_convergence: Whether a coupling that has not converged is an error.
+            tail_mass: Share of the weights ``log_prob`` may leave out, in [0, 1).
+
+        Returns:
+            The posteriors of the batch.
+
+        Raises:
+            NotReadyError: If calibration pairs were appended after the last training.
+            InvalidInputError: If x_o has the wrong shape or device, is empty, or not
+                finite.
+            CouplingError: If the coupling has not converged.
+            SimulationError: If the simulator fails.
+        """
+        if len(self._x_cal) and self._g is None:
+            raise NotReadyError(
+                f"{len(self._x_cal)} calibration pairs were appended but not trained "
+                "on. Call `train()` first."
+            )
+        check_instance("coupler", coupler, SinkhornCoupler, optional=True)
+        check_choice("unseen", unseen, ("raise", "extend"))
+        check_unit_interval("tail_mass", tail_mass)
+        if num_simulations is not None:
+            check_positive_integer("num_simulations", num_simulations)
+        x_o = self._as_x("x_o", x_o)
+        coupler = self.coupler if coupler is None else coupler
+
+        g = self._h if self._g is None else self._g
+        with seeded(seed):
+            contexts = self._source.embeddings(
+                num_simulations,
+                max(len(x_o), MIN_SIMULATIONS),
+                self._embed_simulations,
+                progress=False,
+            )
+        embedded = embed(g, x_o)
+        check_finite("g(x_o)", embedded)
+        coupling = coupler.couple(embedded, contexts)
+        if require_convergence:
+            _check_converged(coupling, coupler)
+        mixture = MixtureEstimator(
+            copy.deepcopy(self._components()),
+            contexts,
+            coupling,
+            x_o,
+            embedding_net=copy.deepcopy(g),
+            unseen=unseen,
+            tail_mass=tail_mass,
+        )
+        return MixturePosterior(
+            mixture,
+            copy.deepcopy(self._prior),
+            enable_transform=self._posterior.enable_transform,
+        )
+
+    def tuned_posterior(self) -> Any:
+        r"""Return the flow on the tuned embedding, :math:`q(\theta \mid g(x))`.
+
+        The paper's ablation without transport ("tuning-only"), an ordinary sbi
+        posterior for any x.
+
+        Raises:
+            NotReadyError: If ``train()`` was not called.
+        """
+        if self._g is None:
+            raise NotReadyError("No tuned embedding net yet. Call `train()` first.")
+        tuned = with_embedding(self._estimator, self._g)
+        return posterior_from(self._posterior, copy.deepcopy(tuned))
+
+    @property
+    def embedding_net(self) -> nn.Module:
+        """A copy of h, the embedding net of NPE with sbi's standardising layer."""
+        return copy.deepcopy(self._h)
+
+    @property
+    def tuned_embedding_net(self) -> nn.Module:
+        """A copy of g, the tuned embedding net."""
+        if self._g is None:
+            raise NotReadyError("No tuned embedding net yet. Call `train()` first.")
+        return copy.deepcopy(self._g)
+
+    @property
+    def history(self) -> History:
+        """The losses of the last training."""
+        if self._history is None:
+            raise NotReadyError("Nothing was trained yet. Call `train()` first.")
+        return self._history
+
+    def __repr__(self) -> str:
+        state = "trained" if self._g is not None else "not trained"
+        return (
+            f"RoPE({type(self._estimator).__name__}, {len(self._x_cal)} calibration "
+            f"pairs, {state}, {self.coupler})"
+        )
+
+    def _components(self) -> ConditionalDensityEstimator:
+        if isinstance(self._q, ConditionalDensityEstimator):
+            return self._q
+        return VectorFieldDensity(self._q, self._prior, self._posterior.sample_with)
+
+    def _embed_simulations(self, x: Tensor) -> Tensor:
+        return embed(self._h, x)
+
+    def _as_theta(self, theta: Tensor) -> Tensor:
+        return theta.to(
+            dtype=dtype_of(self._estimator), device=device_of(self._estimator)
+        )
+
+    def _as_x(self, name: str, x: Tensor) -> Tensor:
+        x = check_batch(name, x, self._estimator.condition_shape)
+        check_device(name, x, device_of(self._estimator))
+        return x.detach().to(dtype_of(self._estimator), copy=True)
+
+
+def _check_converged(coupling: Coupling, coupler: SinkhornCoupler) -> None:
+    if coupling.converged:
+        return
+    raise CouplingError(
+        f"The coupling has not converged: marginal error {coupling.marginal_error:.1e} "
+        f"after {coupling.num_iterations} iterations, tolerance "
+        f"{coupler.tolerance:.1e}. Use a larger gamma (now {coupler.gamma}), tau < 1 "
+        f"(now {coupler.tau}), more max_iterations, or accept it with "
+        "require_convergence=False."
+    )
