@@ -153,7 +153,7 @@ class VectorFieldDensity(ConditionalDensityEstimator):
         super().__init__(estimator, estimator.input_shape, estimator.condition_shape)
         self.vector_field = estimator
         self.prior = prior
-        self.sample_with = sample_with
+        self.sample_with: Literal["ode", "sde"] = sample_with
 
     def sample(
         self, sample_shape: torch.Size, condition: Tensor, **kwargs: Any

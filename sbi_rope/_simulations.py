@@ -73,11 +73,11 @@ class Simulator:
         count = at_least if count is None else count
         theta = self.prior.sample(torch.Size((count,))).to(self.like)
         statistics, valid = self._embed_at(theta, embed, progress=progress)
-        _warn_of_dropped(int((~valid).sum()), count, "simulations from the prior")
         if not valid.any():
             raise SimulationError(
                 f"All {count} simulations from the prior contain NaN or Inf."
             )
+        _warn_of_dropped(int((~valid).sum()), count, "simulations from the prior")
         return statistics[valid]
 
     def targets(
@@ -86,9 +86,7 @@ class Simulator:
         """Simulate ``count`` times at each theta and average the finite ones."""
         repeated = theta.repeat_interleave(count, dim=0)
         statistics, valid = self._embed_at(repeated, embed, progress=progress)
-        _warn_of_dropped(
-            int((~valid).sum()), len(repeated), "simulations at calibration parameters"
-        )
+        dropped = int((~valid).sum())
         valid = valid.reshape(-1, count)
         statistics = statistics.reshape(*valid.shape, -1)
         empty = ~valid.any(dim=1)
@@ -98,6 +96,9 @@ class Simulator:
                 f"All simulations at the calibration parameters of rows {rows} contain "
                 f"NaN or Inf ({int(empty.sum())} rows in all). Remove these pairs."
             )
+        _warn_of_dropped(
+            dropped, valid.numel(), "simulations at calibration parameters"
+        )
         total = statistics.where(valid[..., None], 0.0).sum(dim=1)
         return total / valid.sum(dim=1, keepdim=True)
 
@@ -195,9 +196,9 @@ class StoredSimulations:
         check_same_length("simulations[0]", theta, "simulations[1]", x)
         valid = torch.isfinite(theta).all(dim=1)
         valid &= torch.isfinite(x).flatten(1).all(dim=1)
-        _warn_of_dropped(int((~valid).sum()), len(valid), "stored simulations")
         if not valid.any():
             raise SimulationError("All stored simulations contain NaN or Inf.")
+        _warn_of_dropped(int((~valid).sum()), len(valid), "stored simulations")
         self.theta = theta[valid].to(like)
         self.x = x[valid].to(like)
         # "Nearest" is measured in standard deviations of the stored parameters.

@@ -185,18 +185,19 @@ class SinkhornCoupler:
             CouplingError: If ``cost_scale="simulated"`` and the median distance
                 between simulations is zero.
         """
+        real = check_tensor("real", real)
         simulated = check_tensor("simulated", simulated)
+        if real.device != simulated.device:
+            raise InvalidInputError(
+                "Expected `real` and `simulated` on the same device; got "
+                f"{real.device} and {simulated.device}."
+            )
         if simulated.ndim != 2:
             raise InvalidInputError(
                 f"Expected `simulated` of shape (n_s, l); got {tuple(simulated.shape)}."
             )
         simulated = check_batch("simulated", simulated, simulated.shape[1:])
         real = check_batch("real", real, simulated.shape[1:])
-        if real.device != simulated.device:
-            raise InvalidInputError(
-                "Expected `real` and `simulated` on the same device; got "
-                f"{real.device} and {simulated.device}."
-            )
         if real.shape[0] < SMALL_BATCH:
             self._warn_small_batch(real.shape[0])
 

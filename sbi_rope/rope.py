@@ -30,6 +30,7 @@ from sbi_rope._validation import (
     check_instance,
     check_positive_integer,
     check_same_length,
+    check_tensor,
     check_unit_interval,
 )
 from sbi_rope.coupling import Coupling, SinkhornCoupler
@@ -128,7 +129,12 @@ class RoPE:
         self.finetuner = CalibrationFinetuner() if finetuner is None else finetuner
         self.coupler = SinkhornCoupler() if coupler is None else coupler
 
-        self._theta_cal = self._as_theta(torch.empty(0, *estimator.input_shape))
+        self._theta_cal = torch.empty(
+            0,
+            *estimator.input_shape,
+            dtype=dtype_of(estimator),
+            device=device_of(estimator),
+        )
         self._x_cal = self._theta_cal.new_empty(0, *estimator.condition_shape)
         self._source = self._make_source(simulator, simulations)
 
@@ -171,8 +177,8 @@ class RoPE:
                 not finite, or a theta is outside the prior's support. Nothing is added
                 then.
         """
-        theta = self._as_theta(check_batch("theta", theta, self._estimator.input_shape))
-        x = self._as_x("x", x)
+        theta = self._checked("theta", theta, self._estimator.input_shape)
+        x = self._checked("x", x, self._estimator.condition_shape)
         check_same_length("theta", theta, "x", x)
         check_in_support("theta", theta, self._prior)
         self._theta_cal = torch.cat([self._theta_cal, theta])
@@ -273,7 +279,7 @@ class RoPE:
         check_unit_interval("tail_mass", tail_mass)
         if num_simulations is not None:
             check_positive_integer("num_simulations", num_simulations)
-        x_o = self._as_x("x_o", x_o)
+        x_o = self._checked("x_o", x_o, self._estimator.condition_shape)
         coupler = self.coupler if coupler is None else coupler
 
         g = self._h if self._g is None else self._g
@@ -352,15 +358,11 @@ class RoPE:
     def _embed_simulations(self, x: Tensor) -> Tensor:
         return embed(self._h, x)
 
-    def _as_theta(self, theta: Tensor) -> Tensor:
-        return theta.to(
-            dtype=dtype_of(self._estimator), device=device_of(self._estimator)
-        )
-
-    def _as_x(self, name: str, x: Tensor) -> Tensor:
-        x = check_batch(name, x, self._estimator.condition_shape)
-        check_device(name, x, device_of(self._estimator))
-        return x.detach().to(dtype_of(self._estimator), copy=True)
+    def _checked(self, name: str, value: Tensor, event_shape: torch.Size) -> Tensor:
+        """Check a batch of the user and return a copy in the estimator's dtype."""
+        check_device(name, check_tensor(name, value), device_of(self._estimator))
+        value = check_batch(name, value, event_shape)
+        return value.detach().to(dtype_of(self._estimator), copy=True)
 
 
 def _check_converged(coupling: Coupling, coupler: SinkhornCoupler) -> None:

@@ -83,12 +83,13 @@ class MixturePosterior(DirectPosterior):
         *,
         enable_transform: bool = True,
     ) -> None:
-        super().__init__(
-            estimator,
-            prior,
-            device=estimator.contexts.device,
-            enable_transform=enable_transform,
-        )
+        with seeded(0):  # sbi draws from the prior to look at it
+            super().__init__(
+                estimator,
+                prior,
+                device=estimator.contexts.device,
+                enable_transform=enable_transform,
+            )
         self.posterior_estimator: MixtureEstimator = estimator
         # Shared with the views of single observations, so that it is estimated once.
         self._cache: dict[str, Tensor] = {}

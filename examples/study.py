@@ -1,0 +1,200 @@
+"""One study of RoPE on a task: train NPE, repair it, score five methods, draw them.
+
+Used by the example scripts; a study is (seeds) x (calibration sizes).
+"""
+
+import argparse
+import csv
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sbi_rope import RoPE, SinkhornCoupler, plots
+from sbi_rope.baselines import PriorPosterior
+from sbi_rope.metrics import Evaluation, evaluate
+from sbi_rope.tasks import Task
+
+COLUMNS = (
+    "task",
+    "seed",
+    "method",
+    "n_calibration",
+    "lpp",
+    "lpp_z",
+    "lpp_median",
+    "neg_inf_fraction",
+    "acauc",
+    "expected_coverage_error",
+    "seconds",
+)
+# Draws per observation behind the calibration scores.
+NUM_SAMPLES = 500
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """What to run; the train function returns an sbi posterior of a task."""
+
+    task: Task
+    train_npe: Callable[[Task, int], Any]
+    coupler: SinkhornCoupler
+    seeds: list[int]
+    n_calibration: list[int]
+    n_test: int
+    out: Path
+
+    def run(self) -> list[dict[str, Any]]:
+        """Run all seeds and sizes; rows are written as they are finished."""
+        self.out.mkdir(parents=True, exist_ok=True)
+        results = ResultsFile(self.out / "results.csv")
+        for seed in self.seeds:
+            self._run_seed(seed, results)
+        print_table(results.rows)
+        print(f"\nWritten to {self.out}/: results.csv and pictures (*.png).")
+        return results.rows
+
+    def _run_seed(self, seed: int, results: "ResultsFile") -> None:
+        task = self.task
+        theta_o, x_o = task.get_test_set(self.n_test, seed=seed)
+        simulator = task.get_simulator()
+        curves: dict[str, Any] = {}
+
+        def score(method: str, posterior: Any, start: float, n: int = 0) -> None:
+            print(f"  scoring {method} ...", flush=True)
+            evaluation: Evaluation = evaluate(
+                posterior,
+                theta_o,
+                x_o,
+                theta_std=task.prior_std,
+                num_samples=NUM_SAMPLES,
+                seed=seed,
+            )
+            curves[method] = evaluation.coverage
+            results.append(
+                task=task.name,
+                seed=seed,
+                method=method,
+                n_calibration=n,
+                seconds=round(time.perf_counter() - start, 1),
+                **evaluation.as_row(),
+            )
+
+        print(f"Seed {seed}: {task.name}, {self.n_test} test observations", flush=True)
+        start = time.perf_counter()
+        score("prior", PriorPosterior(task.get_prior()), start)
+        start = time.perf_counter()
+        print("  training NPE on simulations ...", flush=True)
+        npe = self.train_npe(task, seed)
+        score("NPE", npe, start)
+
+        start = time.perf_counter()
+        ot_only = RoPE(npe, simulator=simulator, coupler=self.coupler)
+        score("OT-only", ot_only.build_posterior(x_o, seed=seed), start)
+        for n in self.n_calibration:
+            start = time.perf_counter()
+            theta_cal, x_cal = task.get_calibration_set(n, seed=seed)
+            rope = RoPE(npe, simulator=simulator, coupler=self.coupler)
+            rope.append_calibration(theta_cal, x_cal)
+            rope.train(seed=seed, show_progress_bars=False)
+            score("tuning-only", rope.tuned_posterior(), start, n)
+            start = time.perf_counter()
+            posterior = rope.build_posterior(x_o, seed=seed)
+            score("RoPE", posterior, start, n)
+            self._draw(f"seed{seed}_n{n}", npe, rope, posterior, theta_o, curves)
+
+    def _draw(
+        self,
+        name: str,
+        npe: Any,
+        rope: RoPE,
+        posterior: Any,
+        theta_o: Tensor,
+        curves: dict[str, Any],
+    ) -> None:
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            samples = {
+                "NPE": npe.sample(
+                    (2000,),
+                    x=posterior.x_o[:1],
+                    show_progress_bars=False,
+                    reject_outside_prior=False,
+                ),
+                "RoPE": posterior[0].sample((2000,), show_progress_bars=False),
+            }
+        names = self.task.parameter_names
+        figures = {
+            "posterior": plots.pair_plot(samples, theta_o[0], parameter_names=names),
+            "calibration": plots.calibration_curves(curves),
+            "finetuning": plots.finetuning_history(rope.history),
+            "coupling": plots.effective_sample_sizes(posterior.coupling),
+        }
+        for kind, figure in figures.items():
+            figure.savefig(
+                self.out / f"{kind}_{name}.png", dpi=120, bbox_inches="tight"
+            )
+
+
+class ResultsFile:
+    """A CSV file that is complete after every row; an older one is set aside."""
+
+    def __init__(self, path: Path) -> None:
+        if path.exists():
+            stamp = time.strftime("%Y%m%d-%H%M%S", time.localtime(path.stat().st_mtime))
+            path.rename(path.with_name(f"results_{stamp}.csv"))
+        self.path = path
+        self.rows: list[dict[str, Any]] = []
+        with path.open("w", newline="") as file:
+            csv.DictWriter(file, COLUMNS).writeheader()
+
+    def append(self, **row: Any) -> None:
+        """Add a row to the file."""
+        self.rows.append(row)
+        with self.path.open("a", newline="") as file:
+            csv.DictWriter(file, COLUMNS).writerow(row)
+
+
+def print_table(rows: list[dict[str, Any]]) -> None:
+    """Print the mean over seeds of each method and calibration size."""
+    print(
+        "\nLPP: mean log-probability of the true parameters, in standard deviations of "
+        "the prior (higher is\nbetter). ACAUC: 0 is calibrated, > 0 overconfident. ECE: "
+        "expected coverage error. -inf: share of test\nobservations with density zero. "
+        "NPE and tuning-only are scored without sbi's leakage correction.\n"
+    )
+    print(f"{'method':<12}{'pairs':>6}{'LPP':>10}{'ACAUC':>9}{'ECE':>8}{'-inf':>7}")
+    order = ("prior", "NPE", "tuning-only", "OT-only", "RoPE")
+    keys = dict.fromkeys((row["method"], row["n_calibration"]) for row in rows)
+    for method, n in sorted(keys, key=lambda key: (order.index(key[0]), key[1])):
+        group = [r for r in rows if (r["method"], r["n_calibration"]) == (method, n)]
+
+        def mean(column: str, group: list[dict[str, Any]] = group) -> float:
+            return sum(row[column] for row in group) / len(group)
+
+        print(
+            f"{method:<12}{n or '-':>6}{mean('lpp_z'):>10.2f}{mean('acauc'):>9.3f}"
+            f"{mean('expected_coverage_error'):>8.3f}{mean('neg_inf_fraction'):>7.2f}"
+        )
+
+
+def argument_parser(description: str, *, n_test: int, out: str) -> Any:
+    """Return the arguments that all examples share."""
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.ArgumentDefaultsHelpFormatter
+    )
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument(
+        "--n-calibration",
+        type=int,
+        nargs="+",
+        default=[50],
+        help="labelled real observations to repair with",
+    )
+    parser.add_argument("--n-test", type=int, default=n_test)
+    parser.add_argument("--out", type=Path, default=Path(out))
+    return parser

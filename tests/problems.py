@@ -1,0 +1,194 @@
+"""Small problems shared by the tests: trained estimators, and mixtures of Gaussians."""
+
+import functools
+import math
+import warnings
+from typing import Any
+
+import torch
+from sbi.inference import FMPE, NPE, NPSE
+from sbi.neural_nets import posterior_flow_nn, posterior_nn, posterior_score_nn
+from sbi.neural_nets.estimators import ConditionalDensityEstimator
+from sbi.utils import BoxUniform
+from torch import Size, Tensor, nn
+from torch.distributions import Distribution, MultivariateNormal
+
+from sbi_rope.coupling import Coupling
+from sbi_rope.mixture import MixtureEstimator, MixturePosterior
+
+FAMILIES = ["mdn", "maf", "nsf", "zuko_maf", "zuko_nsf", "zuko_unaf"]
+
+
+class SmallCNN(nn.Sequential):
+    """An embedding of (1, 8, 8) images."""
+
+    def __init__(self) -> None:
+        super().__init__(nn.Conv2d(1, 3, 3), nn.ReLU(), nn.Flatten(), nn.Linear(108, 4))
+
+
+def box(dim: int, low: float = -1.0, high: float = 1.0) -> BoxUniform:
+    return BoxUniform(torch.full((dim,), low), torch.full((dim,), high))
+
+
+def simulate(theta: Tensor) -> Tensor:
+    """Three noisy readings of theta, whatever its dimension."""
+    mixing = torch.tensor([[1.0, 0.5, -0.5], [0.2, -1.0, 0.7]])[: theta.shape[1]]
+    return theta @ mixing + 0.1 * torch.randn(len(theta), 3)
+
+
+def simulate_image(theta: Tensor) -> Tensor:
+    """An (1, 8, 8) image whose brightness and slope are theta."""
+    slope = torch.linspace(-1, 1, 8)
+    image = theta[:, 0, None, None] + theta[:, 1, None, None] * slope
+    return (image + 0.1 * torch.randn(len(theta), 8, 8))[:, None]
+
+
+@functools.cache
+def npe_posterior(
+    family: str = "maf",
+    embedding: str = "linear",
+    z_score_x: str = "independent",
+    dim: int = 2,
+    num_epochs: int = 2,
+) -> Any:
+    """Train a small NPE once a session; for reading only.
+
+    ``embedding`` is "none", "linear" (with dropout, so that evaluation mode matters),
+    or "cnn" for image-shaped x.
+    """
+    net: nn.Module = {
+        "none": nn.Identity,
+        "linear": lambda: nn.Sequential(nn.Linear(3, 4), nn.Tanh(), nn.Dropout(0.5)),
+        "cnn": SmallCNN,
+    }[embedding]()
+    with torch.random.fork_rng(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        torch.manual_seed(1)
+        prior = box(dim)
+        theta = prior.sample((200,))
+        x = (simulate_image if embedding == "cnn" else simulate)(theta)
+        builder = posterior_nn(
+            family,
+            z_score_x=z_score_x,
+            embedding_net=net,
+            hidden_features=16,
+            num_transforms=1 if family == "zuko_unaf" else 2,
+        )
+        npe = NPE(prior, density_estimator=builder, show_progress_bars=False)
+        npe.append_simulations(theta, x)
+        npe.train(max_num_epochs=num_epochs, training_batch_size=50)
+        return npe.build_posterior()
+
+
+@functools.cache
+def vector_field_posterior(method: str) -> Any:
+    """Train a small FMPE or NPSE once a session; for reading only."""
+    trainer, builder = {
+        "fmpe": (FMPE, posterior_flow_nn),
+        "npse": (NPSE, posterior_score_nn),
+    }[method]
+    net = nn.Linear(3, 4)
+    with torch.random.fork_rng(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        torch.manual_seed(1)
+        prior = box(2)
+        theta = prior.sample((200,))
+        estimator = builder("mlp", embedding_net=net, hidden_features=16)
+        inference = trainer(prior, estimator, show_progress_bars=False)
+        inference.append_simulations(theta, simulate(theta))
+        inference.train(max_num_epochs=2)
+        return inference.build_posterior()
+
+
+class Gaussians(ConditionalDensityEstimator):
+    """The analytic q(theta | s) = N(mean, diag(std^2)) with s = (mean, log std)."""
+
+    def __init__(self, dim: int) -> None:
+        super().__init__(nn.Identity(), Size((dim,)), Size((2 * dim,)))
+
+    def log_prob(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
+        mean, log_std = condition.chunk(2, dim=-1)
+        z = (input - mean) / log_std.exp()
+        return (-0.5 * z.square() - log_std - 0.5 * math.log(2 * math.pi)).sum(-1)
+
+    def sample(self, sample_shape: Size, condition: Tensor, **kwargs: Any) -> Tensor:
+        mean, log_std = condition.chunk(2, dim=-1)
+        noise = torch.randn(*sample_shape, *mean.shape).to(mean)
+        return mean + log_std.exp() * noise
+
+    def loss(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
+        return -self.log_prob(input[None], condition)[0]
+
+
+def coupling_of(weights: Tensor, simulated: Tensor) -> Coupling:
+    """A coupling with weights chosen by hand."""
+    return Coupling(
+        weights=weights.double(),
+        potential=torch.linspace(-1, 1, len(simulated), dtype=torch.float64),
+        marginal_error=0.0,
+        num_iterations=0,
+        converged=True,
+        solver="none",
+        gamma=0.5,
+        tau=1.0,
+        simulated=simulated.double(),
+    )
+
+
+def contexts_of(dim: int, n_s: int, *, std: float = 0.3) -> Tensor:
+    """Means over [-1, 1], standard deviations around ``std``."""
+    mean = 2 * torch.rand(n_s, dim) - 1
+    return torch.cat([mean, math.log(std) + 0.3 * torch.randn(n_s, dim)], dim=1)
+
+
+def gaussian_posterior(
+    *,
+    dim: int = 2,
+    n_o: int = 5,
+    n_s: int = 12,
+    prior: Distribution | None = None,
+    std: float = 0.3,
+    weights: Tensor | None = None,
+    contexts: Tensor | None = None,
+    x_o: Tensor | None = None,
+    unseen: Any = "raise",
+    tail_mass: float = 0.0,
+) -> MixturePosterior:
+    """A mixture of analytic Gaussians; x_o has three readings, g maps them linearly."""
+    if contexts is None:
+        contexts = contexts_of(dim, n_s, std=std)
+    if x_o is None:
+        x_o = torch.randn(n_o, 3)
+    if weights is None:
+        weights = torch.softmax(2 * torch.randn(len(x_o), len(contexts)), dim=1)
+    if prior is None:
+        prior = box(dim)
+    estimator = MixtureEstimator(
+        Gaussians(dim),
+        contexts,
+        coupling_of(weights, contexts),
+        x_o,
+        embedding_net=nn.Linear(x_o[0].numel(), 2 * dim),
+        unseen=unseen,
+        tail_mass=tail_mass,
+    )
+    return MixturePosterior(estimator, prior)
+
+
+def standard_normal(dim: int) -> MultivariateNormal:
+    return MultivariateNormal(torch.zeros(dim), torch.eye(dim))
+
+
+def brute_force_log_prob(posterior: MixturePosterior, theta: Tensor) -> Tensor:
+    """log sum_j alpha_ij q(theta | s_j) over all i and j, (S, n_o) from (S, n_o, d).
+
+    One component at a time, in float64; no support, no tail.
+    """
+    estimator = posterior.posterior_estimator
+    columns = []
+    for context in estimator.contexts:
+        flat = theta.reshape(-1, theta.shape[-1])
+        condition = context[None].expand(len(flat), -1)
+        log_q = estimator.components.log_prob(flat[None], condition)[0]
+        columns.append(log_q.double().reshape(theta.shape[:-1]))
+    return torch.logsumexp(torch.stack(columns, -1) + posterior.weights.log(), dim=-1)

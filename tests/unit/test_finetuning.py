@@ -1,0 +1,183 @@
+"""Fine-tuning: what it minimises, what it keeps, what it leaves alone."""
+
+import contextlib
+import copy
+import math
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from sbi_rope import CalibrationFinetuner
+from sbi_rope.errors import InvalidInputError, InvalidTypeError, RoPEWarning
+from sbi_rope.finetuning import STEPS_WITHOUT_HOLDOUT, trainable_copy
+from tests import gaussian
+
+
+def linear(dim: int = 2) -> nn.Linear:
+    return gaussian.GaussianEstimator(dim).net  # type: ignore[return-value]
+
+
+def finetune(
+    net: nn.Module, x: Tensor, targets: Tensor, **settings: float
+) -> tuple[nn.Module, list[float], list[float], int]:
+    result = CalibrationFinetuner(**settings).finetune(  # type: ignore[arg-type]
+        net, x, lambda count: targets, seed=0, show_progress_bars=False
+    )
+    history = result.history
+    return (
+        result.embedding_net,
+        history.training_loss,
+        history.validation_loss,
+        history.best_step,
+    )
+
+
+def test_the_first_losses_are_the_mean_unsquared_distances() -> None:
+    x, targets = torch.randn(10, 2), torch.randn(10, 2)
+    net = linear()
+    _, training, validation, _ = finetune(net, x, targets, num_steps=1)
+    distances = ((net(x).detach() - targets) ** 2).sum(dim=1).sqrt()
+    expected = (8 * training[0] + 2 * validation[0]) / 10
+    assert float(distances.mean()) == pytest.approx(expected, rel=1e-6)
+
+
+def test_many_pairs_lead_to_the_minimiser_known_in_closed_form() -> None:
+    """The conditional median of 0.8 theta given x_o: 0.64 (x_o - 0.7) / 1.4.
+
+    Not h of the simulation behind x_o, which has 0.8 in the place of 0.64: the targets
+    average over the simulator's noise, and so g shrinks.
+    """
+    theta, x_o = gaussian.labelled(5000)
+    g, *_ = finetune(
+        linear(), x_o, gaussian.GAIN * theta, learning_rate=3e-3, num_steps=600
+    )
+    slope = gaussian.GAIN**2 / gaussian.SCALE
+    weight, bias = g.weight.detach(), g.bias.detach()  # type: ignore[union-attr]
+    assert torch.allclose(weight, slope * torch.eye(2), atol=0.02)
+    assert torch.allclose(bias, torch.full((2,), -slope * gaussian.SHIFT), atol=0.02)
+
+
+def test_the_net_that_is_kept_is_the_best_on_the_held_out_pairs() -> None:
+    # Pure noise: any step away from the start overfits sooner or later.
+    x, targets = torch.randn(20, 2), torch.randn(20, 2)
+    net = nn.Sequential(nn.Linear(2, 64), nn.Tanh(), nn.Linear(64, 2))
+    g, _, validation, best = finetune(net, x, targets, learning_rate=1e-2)
+    assert len(validation) == 1001
+    assert validation[best] == min(validation)
+    torch.manual_seed(0)  # the seed of the split
+    held_out = torch.randperm(20)[:4]
+    distance = (g(x) - targets).norm(dim=1)[held_out].mean()
+    assert float(distance) == pytest.approx(validation[best], rel=1e-6)
+    assert validation[-1] > validation[best]
+
+
+def test_the_start_is_kept_if_nothing_is_better() -> None:
+    x = torch.randn(10, 2)
+    net = linear()
+    targets = net(x).detach()
+    g, _, validation, best = finetune(net, x, targets, learning_rate=0.1)
+    assert best == 0
+    assert validation[0] == 0.0  # the norm has a kink here, and no NaN gradient
+    assert torch.equal(g(x), net(x))
+
+
+def test_the_users_net_is_left_as_it_was() -> None:
+    x, targets = torch.randn(10, 2), torch.randn(10, 2)
+    net = nn.Sequential(nn.Linear(2, 2), nn.Dropout(0.5)).train()
+    net[0].requires_grad_(requires_grad=False)
+    before = copy.deepcopy(net.state_dict())
+    g, *_ = finetune(net, x, targets, num_steps=20)
+    assert all(torch.equal(before[k], v) for k, v in net.state_dict().items())
+    assert net.training
+    assert not net[0].weight.requires_grad
+    assert not g.training
+    assert not torch.equal(g[0].weight, net[0].weight)  # type: ignore[index]
+
+
+def test_a_net_without_parameters_gets_an_affine_map_that_starts_as_identity() -> None:
+    x = torch.randn(50, 3)
+    g = trainable_copy(nn.Identity(), x)
+    assert torch.equal(g(x), x)
+    tuned, *_ = finetune(nn.Identity(), x, 1.3 * x - 0.2, num_steps=1000)
+    assert (tuned(x) - (1.3 * x - 0.2)).norm(dim=1).mean() < 0.02
+
+
+@pytest.mark.parametrize("n", [1, 4])
+def test_few_pairs_are_not_held_out_and_get_few_steps(n: int) -> None:
+    x = torch.randn(n, 2)
+    with pytest.warns(RoPEWarning, match="at least 5 pairs"):
+        _, training, validation, best = finetune(linear(), x, x)
+    assert validation == []
+    assert best == STEPS_WITHOUT_HOLDOUT
+    assert training[-1] < training[0]
+
+
+def test_five_pairs_are_enough_to_hold_one_out() -> None:
+    x = torch.randn(5, 2)
+    *_, validation, _ = finetune(linear(), x, x, num_steps=3)
+    assert len(validation) == 4
+
+
+def test_targets_are_drawn_once_or_before_every_step() -> None:
+    x, calls = torch.randn(10, 2), []
+
+    def draw(count: int) -> Tensor:
+        calls.append(count)
+        return torch.randn(10, 2)
+
+    settings = {"num_steps": 7, "simulations_per_target": 3}
+    CalibrationFinetuner(**settings).finetune(  # type: ignore[arg-type]
+        linear(), x, draw, show_progress_bars=False
+    )
+    assert calls == [3]
+    CalibrationFinetuner(**settings, resample_targets=True).finetune(  # type: ignore[arg-type]
+        linear(), x, draw, show_progress_bars=False
+    )
+    assert calls == [3] * 9
+
+
+@pytest.mark.parametrize("n", [3, 20])
+def test_steps_that_are_too_large_never_leave_nan_behind(n: int) -> None:
+    x, targets = torch.randn(n, 2), torch.randn(n, 2)
+    with pytest.warns(RoPEWarning) if n < 5 else contextlib.nullcontext():
+        g, *_ = finetune(linear(), x, targets, learning_rate=1e30)
+    assert torch.isfinite(g(x)).all()
+
+
+def test_the_same_seed_gives_the_same_net_and_leaves_the_callers_state() -> None:
+    x, targets, net = torch.randn(30, 2), torch.randn(30, 2), linear()
+    state = torch.get_rng_state()
+    first, *_ = finetune(net, x, targets, num_steps=20)
+    assert torch.equal(torch.get_rng_state(), state)
+    second, *_ = finetune(net, x, targets, num_steps=20)
+    assert torch.equal(first(x), second(x))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"learning_rate": 0.0},
+        {"learning_rate": math.inf},
+        {"num_steps": 0},
+        {"num_steps": 10.0},
+        {"simulations_per_target": 0},
+        {"num_neighbors": 0},
+        {"validation_fraction": 0.0},
+        {"validation_fraction": 0.9},
+    ],
+    ids=str,
+)
+def test_settings_outside_their_range_are_refused(settings: dict) -> None:
+    with pytest.raises(InvalidInputError, match=next(iter(settings))):
+        CalibrationFinetuner(**settings)
+
+
+def test_unusable_pairs_are_refused() -> None:
+    x = torch.randn(10, 2)
+    with pytest.raises(InvalidInputError, match="same number of rows"):
+        finetune(linear(), x, x[:9])
+    with pytest.raises(InvalidInputError, match="`x` to be finite"):
+        finetune(linear(), x / 0, x)
+    with pytest.raises(InvalidTypeError, match="`x` to be a torch.Tensor"):
+        finetune(linear(), x.numpy(), x)  # type: ignore[arg-type]

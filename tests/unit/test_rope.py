@@ -1,0 +1,451 @@
+"""The conductor: order of the steps, reuse, what is refused and what is kept."""
+
+import copy
+import pickle
+import warnings
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from sbi_rope import CalibrationFinetuner, MixturePosterior, RoPE, SinkhornCoupler
+from sbi_rope.errors import (
+    CouplingError,
+    InvalidInputError,
+    InvalidTypeError,
+    NotReadyError,
+    RoPEError,
+    RoPEWarning,
+    SimulationError,
+)
+from tests import gaussian
+
+QUICK = CalibrationFinetuner(num_steps=20)
+
+
+def rope(**options: object) -> RoPE:
+    arguments = {"simulator": gaussian.simulator, "finetuner": QUICK, **options}
+    return RoPE(gaussian.posterior(), **arguments)  # type: ignore[arg-type]
+
+
+def trained(**options: object) -> RoPE:
+    conductor = rope(**options).append_calibration(*gaussian.labelled(20))
+    return conductor.train(seed=0, show_progress_bars=False)
+
+
+X_O = gaussian.real_process(torch.linspace(-1, 1, 60).reshape(30, 2))
+
+
+def test_calibration_may_be_appended_in_parts() -> None:
+    theta, x = gaussian.labelled(20)
+    once = rope().append_calibration(theta, x)
+    twice = rope().append_calibration(theta[:5], x[:5])
+    twice.append_calibration(theta[5:], x[5:])
+    nets = [
+        conductor.train(seed=0, show_progress_bars=False).tuned_embedding_net
+        for conductor in (once, twice)
+    ]
+    assert torch.equal(nets[0](x), nets[1](x))
+
+
+def test_without_calibration_g_is_h() -> None:
+    conductor = rope()
+    posterior = conductor.build_posterior(X_O, seed=3)
+    h = conductor.embedding_net
+    with torch.no_grad():
+        expected = SinkhornCoupler().couple(h(X_O), posterior.coupling.simulated)
+    assert torch.allclose(posterior.weights, expected.weights)
+
+
+def test_training_needs_calibration_and_building_needs_training() -> None:
+    conductor = rope()
+    with pytest.raises(NotReadyError, match="append_calibration"):
+        conductor.train()
+    for name in ("history", "tuned_embedding_net"):
+        with pytest.raises(NotReadyError, match=r"`train\(\)` first"):
+            getattr(conductor, name)
+    with pytest.raises(NotReadyError, match=r"`train\(\)` first"):
+        conductor.tuned_posterior()
+    conductor.append_calibration(*gaussian.labelled(10))
+    with pytest.raises(NotReadyError, match="10 calibration pairs were appended"):
+        conductor.build_posterior(X_O)
+    conductor.train(show_progress_bars=False)
+    conductor.build_posterior(X_O)
+    # New pairs make the training stale.
+    conductor.append_calibration(*gaussian.labelled(10))
+    with pytest.raises(NotReadyError, match="20 calibration pairs"):
+        conductor.build_posterior(X_O)
+
+
+def test_the_trained_state_serves_many_batches_and_couplers() -> None:
+    conductor = trained()
+    before = copy.deepcopy(conductor.tuned_embedding_net.state_dict())
+    first = conductor.build_posterior(X_O, seed=0)
+    sharp = conductor.build_posterior(X_O, seed=0, coupler=SinkhornCoupler(gamma=0.05))
+    other = conductor.build_posterior(X_O[:25] + 0.1, seed=0)
+    again = conductor.build_posterior(X_O, seed=0)
+    assert torch.equal(first.weights, again.weights)
+    assert torch.equal(first.coupling.simulated, sharp.coupling.simulated)
+    assert (
+        sharp.coupling.effective_sample_size < first.coupling.effective_sample_size
+    ).all()
+    assert other.weights.shape == (25, 1000)
+    after = conductor.tuned_embedding_net.state_dict()
+    assert all(torch.equal(before[k], after[k]) for k in before)
+
+
+def test_tuned_posterior_is_the_flow_on_g() -> None:
+    conductor = trained()
+    posterior = conductor.tuned_posterior()
+    theta = torch.randn(30, 2)
+    g = conductor.tuned_embedding_net
+    law = torch.distributions.Normal(g(X_O), gaussian.POSTERIOR_STD)
+    expected = law.log_prob(theta).sum(dim=1)
+    assert torch.allclose(
+        posterior.log_prob_batched(theta, X_O, norm_posterior=False)[0],
+        expected,
+        atol=1e-5,
+    )
+    assert not isinstance(posterior, MixturePosterior)
+
+
+def test_the_users_posterior_and_data_are_left_as_they_were() -> None:
+    npe = gaussian.posterior()
+    npe.posterior_estimator.train()
+    before = copy.deepcopy(npe.posterior_estimator.state_dict())
+    theta, x = gaussian.labelled(20)
+    theta_before, x_before = theta.clone(), x.clone()
+    conductor = RoPE(npe, simulator=gaussian.simulator, finetuner=QUICK)
+    conductor.append_calibration(theta, x).train(show_progress_bars=False)
+    posterior = conductor.build_posterior(X_O)
+    posterior.log_prob_batched(torch.zeros(30, 2), X_O)
+    after = npe.posterior_estimator.state_dict()
+    assert all(torch.equal(before[k], after[k]) for k in before)
+    assert all(p.requires_grad for p in npe.posterior_estimator.parameters())
+    assert npe.posterior_estimator.training
+    assert npe.default_x is None
+    assert torch.equal(theta, theta_before)
+    assert torch.equal(x, x_before)
+    # Nor does changing the data in place change the posterior.
+    batch = X_O.clone()
+    mine = conductor.build_posterior(batch)
+    batch.zero_()
+    assert torch.equal(mine.x_o, X_O)
+
+
+def test_seeds_make_results_repeatable_and_leave_the_callers_state() -> None:
+    conductor = rope().append_calibration(*gaussian.labelled(20))
+    state = torch.get_rng_state()
+    conductor.train(seed=3, show_progress_bars=False)
+    g = conductor.tuned_embedding_net(X_O)
+    conductor.train(seed=3, show_progress_bars=False)
+    assert torch.equal(conductor.tuned_embedding_net(X_O), g)
+    one = conductor.build_posterior(X_O, seed=7)
+    two = conductor.build_posterior(X_O, seed=7)
+    three = conductor.build_posterior(X_O, seed=8)
+    assert torch.equal(torch.get_rng_state(), state)
+    assert torch.equal(one.weights, two.weights)
+    assert not torch.equal(one.weights, three.weights)
+
+
+def test_a_simulator_that_draws_from_numpy_is_seeded_too() -> None:
+    def numpy_simulator(theta: Tensor) -> Tensor:
+        noise = np.random.standard_normal(theta.shape)  # noqa: NPY002
+        return theta + 0.5 * torch.as_tensor(noise, dtype=torch.float32)
+
+    conductor = rope(simulator=numpy_simulator)
+    one, two = (conductor.build_posterior(X_O, seed=1).weights for _ in range(2))
+    assert torch.equal(one, two)
+
+
+def test_number_of_simulations() -> None:
+    conductor = rope()
+    assert conductor.build_posterior(X_O).weights.shape == (30, 1000)
+    assert conductor.build_posterior(X_O, num_simulations=70).weights.shape == (30, 70)
+    many = gaussian.real_process(torch.randn(1100, 2))
+    assert conductor.build_posterior(many).weights.shape == (1100, 1100)
+
+
+def test_a_simulator_for_single_parameters_is_recognised() -> None:
+    calls = []
+
+    def single(theta: Tensor) -> Tensor:
+        first, second = theta  # fails on a batch
+        calls.append(theta.shape)
+        return gaussian.simulator(torch.stack([first, second]))
+
+    posterior = rope(simulator=single).build_posterior(X_O, num_simulations=40)
+    assert posterior.weights.shape == (30, 40)
+    assert set(calls) == {(2,)}
+
+
+def test_simulations_with_nan_are_dropped_and_counted() -> None:
+    def sometimes_nan(theta: Tensor) -> Tensor:
+        x = gaussian.simulator(theta)
+        return torch.where(x[:, :1] > 0.5, torch.nan, x)
+
+    conductor = rope(simulator=sometimes_nan)
+    with pytest.warns(RoPEWarning, match=r"Dropped \d+ of 200 simulations") as caught:
+        posterior = conductor.build_posterior(X_O, num_simulations=200)
+    dropped = int(str(caught[0].message).split()[1])
+    assert 0 < dropped < 200
+    assert posterior.weights.shape == (30, 200 - dropped)
+    # In training, the mean over the finite simulations is the target.
+    conductor.append_calibration(torch.zeros(10, 2), X_O[:10])
+    with pytest.warns(RoPEWarning, match="calibration parameters"):
+        conductor.train(show_progress_bars=False)
+    assert torch.isfinite(conductor.tuned_embedding_net(X_O)).all()
+
+
+def test_calibration_targets_are_the_mean_embedding_of_fresh_simulations() -> None:
+    theta, x = gaussian.labelled(12)
+    conductor = rope(finetuner=CalibrationFinetuner(num_steps=1))
+    conductor.append_calibration(theta, x).train(seed=0, show_progress_bars=False)
+    expected = gaussian.GAIN * (x - theta)  # h(x_o) minus E[h(S(theta))]
+    history = conductor.history
+    measured = (10 * history.training_loss[0] + 2 * history.validation_loss[0]) / 12
+    # 100 draws a target: the noise of the mean is 0.8 * 0.5 / 10.
+    assert measured == pytest.approx(float(expected.norm(dim=1).mean()), abs=0.03)
+
+
+def test_stored_simulations_in_the_place_of_a_simulator() -> None:
+    theta = gaussian.prior().sample((500,))
+    x = gaussian.simulator(theta)
+    x[:3] = torch.nan
+    with pytest.warns(RoPEWarning, match="Dropped 3 of 500 stored simulations"):
+        conductor = RoPE(gaussian.posterior(), simulations=(theta, x), finetuner=QUICK)
+    posterior = conductor.build_posterior(X_O)
+    assert posterior.weights.shape == (30, 497)
+    assert conductor.build_posterior(X_O, num_simulations=50).weights.shape == (30, 50)
+    with pytest.raises(InvalidInputError, match="at most 497"):
+        conductor.build_posterior(X_O, num_simulations=498)
+    # The targets are the simulations with the nearest parameters.
+    cal = theta[100:110]
+    conductor.append_calibration(cal, x[100:110]).train(show_progress_bars=False)
+    assert conductor.history.training_loss[0] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_nearest_parameters_are_nearest_in_standard_deviations() -> None:
+    wide = torch.tensor([[0.0, 0.0], [0.0, 50.0], [1.0, 0.0]]).repeat(5, 1)
+    x = wide.clone()
+    source = RoPE(
+        gaussian.posterior(), simulations=(wide, x)
+    )._source  # its neighbours are not public
+    # 40 of the wide second parameter is less than 0.9 of the narrow first one.
+    theta = torch.tensor([[0.9, 40.0]])
+    target = source.targets(theta, 1, lambda value: value, progress=False)
+    assert target.tolist() == [[1.0, 0.0]] or target.tolist() == [[0.0, 50.0]]
+    std = wide.std(dim=0)
+    nearest = ((theta - wide) / std).norm(dim=1).argmin()
+    assert torch.equal(target[0], x[nearest])
+
+
+def test_non_convergence_raises_unless_asked_not_to() -> None:
+    rough = SinkhornCoupler(gamma=0.01, max_iterations=1)
+    conductor = rope(coupler=rough)
+    with pytest.raises(CouplingError, match=r"not converged.*require_convergence"):
+        conductor.build_posterior(X_O)
+    posterior = conductor.build_posterior(X_O, require_convergence=False)
+    assert not posterior.coupling.converged
+
+
+def test_a_single_observation_gets_the_prior_and_a_warning() -> None:
+    with pytest.warns(RoPEWarning, match="the posterior is the prior"):
+        posterior = trained().build_posterior(X_O[:1], seed=0)
+    samples = posterior.sample((4000,), x=X_O[:1], show_progress_bars=False)
+    assert samples.mean(dim=0).abs().max() < 0.1
+    assert (samples.std(dim=0) - 1).abs().max() < 0.1
+
+
+def test_one_calibration_pair_is_enough_to_go_on() -> None:
+    with pytest.warns(RoPEWarning, match="Only 1 calibration pair"):
+        conductor = (
+            rope()
+            .append_calibration(*gaussian.labelled(1))
+            .train(show_progress_bars=False)
+        )
+    assert torch.isfinite(conductor.build_posterior(X_O).weights).all()
+
+
+def test_float64_observations_are_those_of_the_batch() -> None:
+    posterior = trained().build_posterior(X_O.double() / 3, seed=0)
+    assert posterior.x_o.dtype == torch.float32
+    theta = torch.zeros(30, 2)
+    log_prob = posterior.log_prob_batched(theta, (X_O.double() / 3))
+    assert torch.isfinite(log_prob).all()
+
+
+def test_the_whole_object_survives_pickling() -> None:
+    conductor = pickle.loads(pickle.dumps(trained()))
+    assert conductor.build_posterior(X_O, seed=0).weights.shape == (30, 1000)
+
+
+THETA, X = torch.zeros(10, 2), torch.zeros(10, 2)
+NAN = torch.full((10, 2), torch.nan)
+
+
+@pytest.mark.parametrize(
+    ("theta", "x", "error", "match"),
+    [
+        pytest.param(THETA, X[:9], InvalidInputError, "rows; got 10 and 9", id="rows"),
+        pytest.param(
+            THETA[:, :1], X, InvalidInputError, "`theta` of shape", id="theta"
+        ),
+        pytest.param(THETA, X[:, :1], InvalidInputError, "`x` of shape", id="x shape"),
+        pytest.param(THETA[0], X[0], InvalidInputError, "`theta` of shape", id="1-d"),
+        pytest.param(NAN, X, InvalidInputError, "`theta` to be finite", id="nan theta"),
+        pytest.param(THETA, NAN, InvalidInputError, "`x` to be finite", id="nan x"),
+        pytest.param(THETA, X / 0, InvalidInputError, "`x` to be finite", id="inf x"),
+        pytest.param(THETA[:0], X[:0], InvalidInputError, "empty", id="empty"),
+        pytest.param(THETA.numpy(), X, InvalidTypeError, "`theta` to be", id="numpy"),
+        pytest.param(THETA, X.tolist(), InvalidTypeError, "`x` to be a", id="list"),
+        pytest.param(
+            THETA, X.to("meta"), InvalidInputError, "where the posterior is", id="dev"
+        ),
+    ],
+)
+def test_unusable_calibration_sets_are_refused_and_nothing_is_added(
+    theta: Tensor, x: Tensor, error: type, match: str
+) -> None:
+    conductor = rope()
+    with pytest.raises(error, match=match):
+        conductor.append_calibration(theta, x)
+    conductor.build_posterior(X_O)  # still without calibration
+
+
+def test_calibration_parameters_outside_the_prior_are_refused() -> None:
+    from sbi.inference import DirectPosterior
+    from sbi.utils import BoxUniform
+
+    box = BoxUniform(-torch.ones(2), torch.ones(2))
+    npe = DirectPosterior(gaussian.GaussianEstimator(), box)
+    theta = torch.tensor([[0.0, 0.0], [0.0, 1.5], [0.5, 0.5]])
+    with pytest.raises(
+        InvalidInputError, match=r"1 of 3 rows are outside \(first: \[1\]"
+    ):
+        RoPE(npe, simulator=gaussian.simulator).append_calibration(theta, theta)
+
+
+@pytest.mark.parametrize(
+    ("x_o", "error", "match"),
+    [
+        pytest.param(X_O[:, :1], InvalidInputError, "`x_o` of shape", id="shape"),
+        pytest.param(X_O[0], InvalidInputError, "`x_o` of shape", id="1-d"),
+        pytest.param(X_O[:0], InvalidInputError, "empty batch", id="empty"),
+        pytest.param(X_O / 0, InvalidInputError, "finite; got NaN or Inf", id="inf"),
+        pytest.param(X_O.numpy(), InvalidTypeError, "`x_o`", id="numpy"),
+        pytest.param(X_O.to("meta"), InvalidInputError, "`x_o` on cpu", id="device"),
+    ],
+)
+def test_unusable_batches_are_refused(x_o: Tensor, error: type, match: str) -> None:
+    with pytest.raises(error, match=match):
+        trained().build_posterior(x_o)
+
+
+@pytest.mark.parametrize(
+    ("option", "match"),
+    [
+        ({"num_simulations": 0}, "num_simulations"),
+        ({"num_simulations": 10.5}, "num_simulations"),
+        ({"unseen": "guess"}, "unseen"),
+        ({"tail_mass": 1.5}, "tail_mass"),
+        ({"coupler": 0.5}, "coupler"),
+    ],
+    ids=str,
+)
+def test_unusable_options_are_refused(option: dict, match: str) -> None:
+    with pytest.raises(RoPEError, match=match):
+        rope().build_posterior(X_O, **option)
+
+
+def _returns(value: object) -> Callable[[Tensor], object]:
+    return lambda theta: value
+
+
+def _raises(theta: Tensor) -> Tensor:
+    raise KeyError("no such file")
+
+
+@pytest.mark.parametrize(
+    ("simulator", "error", "match"),
+    [
+        pytest.param(None, InvalidInputError, "exactly one", id="none"),
+        pytest.param(3, InvalidTypeError, "`simulator` to be callable", id="number"),
+        pytest.param(_raises, SimulationError, "KeyError: 'no such file'", id="raises"),
+        pytest.param(
+            lambda theta: theta[:, :1], SimulationError, r"\(2,\)", id="shape"
+        ),
+        pytest.param(
+            lambda theta: theta.numpy(), SimulationError, "torch.as_tensor", id="numpy"
+        ),
+        pytest.param(_returns(None), SimulationError, "NoneType", id="nothing"),
+        pytest.param(
+            _returns(torch.zeros(7)), SimulationError, r"shape \(7,\)", id="constant"
+        ),
+    ],
+)
+def test_unusable_simulators_are_refused_at_once(
+    simulator: object, error: type, match: str
+) -> None:
+    with pytest.raises(error, match=match):
+        rope(simulator=simulator)
+
+
+def test_a_simulator_that_returns_only_nan_is_refused() -> None:
+    conductor = rope(simulator=lambda theta: theta * torch.nan)
+    with pytest.raises(SimulationError, match="All 1000 simulations"):
+        conductor.build_posterior(X_O)
+    conductor.append_calibration(*gaussian.labelled(10))
+    with pytest.raises(SimulationError, match="calibration parameters of rows"):
+        conductor.train(show_progress_bars=False)
+
+
+def test_a_failure_in_training_loses_nothing() -> None:
+    broken = False
+
+    def simulator(theta: Tensor) -> Tensor:
+        if broken:
+            raise OSError("disk full")
+        return gaussian.simulator(theta)
+
+    conductor = rope(simulator=simulator).append_calibration(*gaussian.labelled(10))
+    conductor.train(seed=0, show_progress_bars=False)
+    before = conductor.tuned_embedding_net(X_O)
+    broken = True
+    with pytest.raises(SimulationError, match="OSError.*disk full"):
+        conductor.train(show_progress_bars=False)
+    assert torch.equal(conductor.tuned_embedding_net(X_O), before)
+    broken = False
+    conductor.build_posterior(X_O)
+
+
+@pytest.mark.parametrize(
+    ("simulations", "match"),
+    [
+        pytest.param(THETA, "pair", id="one tensor"),
+        pytest.param((THETA, X[:9]), "same number of rows", id="rows"),
+        pytest.param((THETA[:, :1], X), r"simulations\[0\]", id="theta"),
+        pytest.param((THETA, X.numpy()), r"simulations\[1\]", id="numpy"),
+        pytest.param((THETA, NAN), "All stored simulations", id="nan"),
+    ],
+)
+def test_unusable_stored_simulations_are_refused(
+    simulations: object, match: str
+) -> None:
+    with pytest.raises(RoPEError, match=match):
+        rope(simulator=None, simulations=simulations)
+
+
+def test_a_simulator_and_stored_simulations_exclude_each_other() -> None:
+    with pytest.raises(InvalidInputError, match="exactly one.*both"):
+        rope(simulations=(THETA, X))
+
+
+def test_the_default_x_of_the_users_posterior_is_ignored() -> None:
+    npe = gaussian.posterior().set_default_x(torch.zeros(1, 2))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        posterior = RoPE(npe, simulator=gaussian.simulator).build_posterior(X_O)
+    assert posterior.default_x is None
