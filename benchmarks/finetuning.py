@@ -51,6 +51,7 @@ SETTINGS = {
     "lr 3e-3, bank of 100": {"learning_rate": 3e-3},
     "lr 1e-3, bank of 100, 300 steps": {"learning_rate": 1e-3, "num_steps": 300},
     "lr 1e-4, bank of 100, 3000 steps": {"learning_rate": 1e-4, "num_steps": 3000},
+    "defaults (lr 1e-3, bank of 100, patience 200)": {"patience": 200},
     "stored, 1 neighbour": {"num_neighbors": 1},
     "stored, 10 neighbours": {"num_neighbors": 10},
 }
@@ -82,7 +83,7 @@ def run(task: Task, npe: Any, setting: str, n: int, seed: int) -> dict[str, Any]
             source = {"simulations": (stored, task.get_simulator()(stored))}
     rope = RoPE(
         npe,
-        finetuner=CalibrationFinetuner(**SETTINGS[setting]),
+        finetuner=CalibrationFinetuner(**{"patience": 10_000, **SETTINGS[setting]}),
         coupler=SinkhornCoupler(gamma=0.1, cost_scale="simulated"),
         **source,
     )

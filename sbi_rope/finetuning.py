@@ -83,7 +83,8 @@ class CalibrationFinetuner:
 
     Args:
         learning_rate: Step size of Adam.
-        num_steps: Gradient steps, each over all training pairs.
+        num_steps: Most gradient steps, each over all training pairs.
+        patience: Steps without a new best on the held-out pairs after which to stop.
         simulations_per_target: Simulations behind each expectation. One, as in the
             paper, pulls g to the noise of single simulations.
         resample_targets: Draw new simulations at every step, as in the paper, instead
@@ -99,6 +100,7 @@ class CalibrationFinetuner:
 
     learning_rate: float = 1e-3
     num_steps: int = 1000
+    patience: int = 200
     simulations_per_target: int = 100
     resample_targets: bool = False
     num_neighbors: int = 1
@@ -108,6 +110,7 @@ class CalibrationFinetuner:
         """Check the ranges of all fields."""
         check_positive("learning_rate", self.learning_rate)
         check_positive_integer("num_steps", self.num_steps)
+        check_positive_integer("patience", self.patience)
         check_positive_integer("simulations_per_target", self.simulations_per_target)
         check_positive_integer("num_neighbors", self.num_neighbors)
         check_positive("validation_fraction", self.validation_fraction)
@@ -210,6 +213,8 @@ class CalibrationFinetuner:
                 validation_loss.append(float(distance))
             if not has_holdout or validation_loss[-1] < validation_loss[best_step]:
                 best_state, best_step = copy.deepcopy(net.state_dict()), step
+            if step - best_step >= self.patience:
+                break
             if step < num_steps:
                 optimizer.zero_grad()
                 loss.backward()

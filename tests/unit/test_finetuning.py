@@ -63,7 +63,7 @@ def test_the_net_that_is_kept_is_the_best_on_the_held_out_pairs() -> None:
     x, targets = torch.randn(20, 2), torch.randn(20, 2)
     net = nn.Sequential(nn.Linear(2, 64), nn.Tanh(), nn.Linear(64, 2))
     g, _, validation, best = finetune(net, x, targets, learning_rate=1e-2)
-    assert len(validation) == 1001
+    assert len(validation) == best + 1 + 200  # stopped by its patience
     assert validation[best] == min(validation)
     torch.manual_seed(0)  # the seed of the split
     held_out = torch.randperm(20)[:4]
@@ -179,5 +179,5 @@ def test_unusable_pairs_are_refused() -> None:
         finetune(linear(), x, x[:9])
     with pytest.raises(InvalidInputError, match="`x` to be finite"):
         finetune(linear(), x / 0, x)
-    with pytest.raises(InvalidTypeError, match="`x` to be a torch.Tensor"):
+    with pytest.raises(InvalidTypeError, match="`x` to be a torch"):
         finetune(linear(), x.numpy(), x)  # type: ignore[arg-type]

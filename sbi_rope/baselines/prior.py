@@ -1,0 +1,142 @@
+r"""The prior as a posterior: what is known before any observation."""
+
+from typing import Any
+
+import torch
+from sbi.inference.posteriors.base_posterior import NeuralPosterior
+from sbi.inference.potentials.base_potential import BasePotential
+from sbi.utils import mcmc_transform, within_support
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_rope._validation import check_tensor
+from sbi_rope.errors import InvalidTypeError
+
+__all__ = ["PriorPosterior"]
+
+
+class PriorPosterior(NeuralPosterior):
+    r"""The prior :math:`p(\theta)`, in the form of an sbi posterior that ignores x.
+
+    It is calibrated whenever the prior is right, and its log posterior probability is
+    the bar that an estimate must clear to have learnt anything from x.
+
+    ``sample`` and ``log_prob`` need no observation; the batched methods take one sample
+    set or density for each row of ``x``, whose values are never read. ``potential``
+    follows sbi and asks for an ``x`` or a default. ``map`` is the mode of the prior
+    found by sbi's gradient ascent; of a uniform prior, any point.
+
+    References:
+        | Addressing Misspecification in Simulation-based Inference through Data-driven
+        | Calibration (Wehenkel et al., 2025), section 4, Baselines
+        | https://arxiv.org/abs/2405.08719
+
+    Args:
+        prior: A torch distribution over parameters of shape ``(k,)``.
+
+    Raises:
+        InvalidTypeError: If the prior is not a torch distribution.
+
+    Example:
+        >>> from sbi.utils import BoxUniform
+        >>> posterior = PriorPosterior(BoxUniform(torch.zeros(2), torch.ones(2)))
+        >>> posterior.sample_batched((5,), x=torch.zeros(3, 7)).shape
+        torch.Size([5, 3, 2])
+    """
+
+    def __init__(self, prior: Any) -> None:
+        if not isinstance(prior, Distribution):
+            raise InvalidTypeError(
+                f"Expected `prior` to be a torch distribution; got "
+                f"{type(prior).__name__}. Wrap it with "
+                f"`sbi.utils.process_prior(prior)[0]`."
+            )
+        device = prior.sample(torch.Size((1,))).device
+        super().__init__(
+            potential_fn=_PriorPotential(prior, device=device),
+            theta_transform=mcmc_transform(prior, device=str(device)),
+        )
+        self.prior = prior
+        self._purpose = "It is the prior and ignores x."
+
+    def sample(
+        self,
+        sample_shape: Any = (),
+        x: Tensor | None = None,
+        show_progress_bars: bool = True,  # noqa: FBT001, FBT002
+        **kwargs: Any,
+    ) -> Tensor:
+        """Draw from the prior, shape ``(*sample_shape, k)``; the rest is ignored."""
+        return self.prior.sample(torch.Size(sample_shape))
+
+    def sample_batched(
+        self,
+        sample_shape: Any,
+        x: Tensor,
+        show_progress_bars: bool = True,  # noqa: FBT001, FBT002
+        **kwargs: Any,
+    ) -> Tensor:
+        """Draw from the prior for each row of ``x``, ``(*sample_shape, n, k)``.
+
+        Options of other posteriors' samplers are taken and ignored, as sbi's base class
+        asks.
+        """
+        check_tensor("x", x)
+        return self.prior.sample(torch.Size((*sample_shape, x.shape[0])))
+
+    def log_prob(
+        self,
+        theta: Tensor,
+        x: Tensor | None = None,
+        track_gradients: bool = False,  # noqa: FBT001, FBT002
+    ) -> Tensor:
+        r"""Log density of the prior, :math:`-\infty` outside it, shape ``(n,)``."""
+        return self.potential_fn(
+            torch.atleast_2d(theta), track_gradients=track_gradients
+        )
+
+    def log_prob_batched(
+        self,
+        theta: Tensor,
+        x: Tensor,
+        track_gradients: bool = False,  # noqa: FBT001, FBT002
+    ) -> Tensor:
+        """Log density of the prior for each row of ``x``, as sbi shapes it.
+
+        Args:
+            theta: Parameters, one for each row of ``x``, shape ``(n, k)``, or several,
+                ``(num_samples, n, k)``.
+            x: Observations, shape ``(n, *event_shape)``; only their number counts.
+            track_gradients: Whether gradients with respect to theta are needed.
+
+        Returns:
+            The log density, shape ``(1, n)`` or ``(num_samples, n)``.
+        """
+        theta = theta if theta.ndim > 2 else theta.unsqueeze(0)
+        theta = theta.expand(-1, x.shape[0], -1)
+        return self.potential_fn(theta, track_gradients=track_gradients)
+
+    def to(self, device: str | torch.device) -> None:
+        """Move the prior and the default x to a device."""
+        self.potential_fn.to(device)
+        default_x = self._x
+        self.__init__(self.potential_fn.prior)
+        if default_x is not None:
+            self.set_default_x(default_x)
+
+
+class _PriorPotential(BasePotential):
+    """Log density of the prior, for any x; the support is checked first."""
+
+    prior: Distribution
+
+    def __call__(self, theta: Tensor, track_gradients: bool = True) -> Tensor:  # noqa: FBT001, FBT002
+        with torch.set_grad_enabled(track_gradients):
+            inside = within_support(self.prior, theta)
+            # torch's distributions raise outside their support: evaluate them at a
+            # prior draw there, and overwrite the result.
+            filler = self.prior.sample(torch.Size(())).to(theta)
+            safe = torch.where(inside.unsqueeze(-1), theta, filler)
+            # A flat density has no graph back to theta; sbi's map() needs one.
+            log_prob = self.prior.log_prob(safe) + 0.0 * safe.sum(dim=-1)
+            return torch.where(inside, log_prob, torch.full_like(log_prob, -torch.inf))

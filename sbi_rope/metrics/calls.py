@@ -1,0 +1,194 @@
+r"""How the metrics call a posterior: in chunks, and never in an unbounded loop.
+
+sbi's ``DirectPosterior`` rejects samples outside the prior, and normalises its density
+by the share it keeps. Both go on until enough samples are accepted, which is for ever
+once a misspecified observation has pushed the flow's mass out of the prior. The metrics
+therefore score such posteriors as the network states them: samples without rejection,
+``log_prob`` without renormalisation (but still :math:`-\infty` outside the prior).
+Leakage counts as an error of the posterior.
+
+A posterior whose own rejection is bounded says so by an attribute
+``bounded_rejection = True``, and is called without these arguments.
+"""
+
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from sbi.inference import DirectPosterior, EnsemblePosterior, VectorFieldPosterior
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from sbi_rope._validation import (
+    check_batch,
+    check_positive_integer,
+    check_same_length,
+    check_tensor,
+)
+from sbi_rope.errors import InvalidInputError, LogProbUnavailableError
+from sbi_rope.metrics.calibration import mid_ranks
+
+__all__ = [
+    "CHUNK_SIZE",
+    "check_test_set",
+    "draw_joint_levels",
+    "draw_ranks",
+    "evaluate_log_probs",
+]
+
+# Observations treated in one call unless the caller says otherwise.
+CHUNK_SIZE = 100
+
+# Draws whose density is evaluated in one call: some flows embed x once per draw.
+DRAWS_PER_CALL = 10
+
+# sbi warns about what is done on purpose here: no rejection, whole chunks at once.
+EXPECTED_WARNINGS = (
+    r".*lie outside the prior support",
+    r"Capping max_sampling_batch_size",
+    r"Note that for batched sampling",
+)
+
+
+def check_test_set(theta: Tensor, x: Tensor, chunk_size: int) -> None:
+    """Check that theta is (n, k), x is (n, ...), and both are finite."""
+    check_positive_integer("chunk_size", chunk_size)
+    check_batch("theta", theta, check_tensor("theta", theta).shape[-1:])
+    check_batch("x", x, check_tensor("x", x).shape[1:])
+    check_same_length("theta", theta, "x", x)
+
+
+def evaluate_log_probs(
+    posterior: Any, theta: Tensor, x: Tensor, *, chunk_size: int, show: bool
+) -> Tensor:
+    """Log density of each true parameter given its observation, float64, ``(n,)``."""
+    _require_log_prob(posterior)
+    arguments = {"norm_posterior": False} if _is_unbounded_direct(posterior) else {}
+    parts = []
+    for rows in _chunks(theta.shape[0], chunk_size, "Evaluating log_prob", show=show):
+        with torch.no_grad():
+            part = posterior.log_prob_batched(theta[rows], x=x[rows], **arguments)
+        if part.numel() != theta[rows].shape[0]:
+            raise InvalidInputError(
+                f"Expected `log_prob_batched` to return one value for each of "
+                f"{theta[rows].shape[0]} observations; got shape {tuple(part.shape)}."
+            )
+        parts.append(part.reshape(-1).double())
+    log_probs = torch.cat(parts)
+    bad = torch.isnan(log_probs) | torch.isposinf(log_probs)
+    _refuse("log-probabilities that are NaN or +Inf", bad)
+    return log_probs
+
+
+def draw_ranks(
+    posterior: Any,
+    theta: Tensor,
+    x: Tensor,
+    *,
+    num_samples: int,
+    chunk_size: int,
+    show: bool,
+) -> Tensor:
+    """Mid-rank of each true parameter among posterior samples, shape ``(n, k)``."""
+    parts = []
+    for rows in _chunks(theta.shape[0], chunk_size, "Drawing samples", show=show):
+        samples = _draw(posterior, theta, x, rows, num_samples)
+        parts.append(mid_ranks(samples, theta[rows]))
+    return torch.cat(parts)
+
+
+def draw_joint_levels(
+    posterior: Any,
+    theta: Tensor,
+    x: Tensor,
+    *,
+    num_samples: int,
+    chunk_size: int,
+    show: bool,
+) -> Tensor:
+    """Level of the smallest joint HPD region containing theta, shape ``(n, 1)``."""
+    _require_log_prob(posterior)
+    parts = []
+    for rows in _chunks(theta.shape[0], chunk_size, "Drawing samples", show=show):
+        samples = _draw(posterior, theta, x, rows, num_samples)
+        draws = torch.cat([theta[rows].unsqueeze(0).to(samples), samples])
+        densities = torch.cat(
+            [_density(posterior, part, x[rows]) for part in draws.split(DRAWS_PER_CALL)]
+        )
+        bad = torch.isnan(densities).any(dim=0)
+        _refuse("NaN log-probabilities", bad, start=rows.start)
+        # Ranking -log p ascending counts the draws that are denser than theta.
+        parts.append(mid_ranks(-densities[1:, :, None], -densities[0, :, None]))
+    return torch.cat(parts)
+
+
+def _draw(
+    posterior: Any, theta: Tensor, x: Tensor, rows: slice, num_samples: int
+) -> Tensor:
+    arguments = {"reject_outside_prior": False} if _is_unbounded(posterior) else {}
+    with torch.no_grad(), warnings.catch_warnings():
+        for message in EXPECTED_WARNINGS:
+            warnings.filterwarnings("ignore", message=message)
+        samples = posterior.sample_batched(
+            torch.Size((num_samples,)), x=x[rows], show_progress_bars=False, **arguments
+        )
+    expected = (num_samples, *theta[rows].shape)
+    if tuple(samples.shape) != expected:
+        raise InvalidInputError(
+            f"Expected samples of shape {expected}; `sample_batched` returned "
+            f"{tuple(samples.shape)}. Check that `theta` has one row for each"
+            f" observation and one column for each parameter."
+        )
+    bad = torch.isnan(samples).any(dim=0).any(dim=-1)
+    _refuse("NaN samples", bad, start=rows.start)
+    return samples
+
+
+def _density(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:
+    """Log density of draws, ``(draws, n)``, under the law they were drawn from."""
+    with torch.no_grad():
+        if _is_unbounded_direct(posterior):
+            # Unrejected draws can leave the prior, where `log_prob` is -Inf although
+            # the density they come from is not: a leaking posterior would look
+            # under-confident. The estimator states the density of its own draws.
+            return posterior.posterior_estimator.log_prob(theta, condition=x)
+        return posterior.log_prob_batched(theta, x=x)
+
+
+def _is_unbounded(posterior: Any) -> bool:
+    """Whether sbi would reject without a bound, and can be told not to."""
+    if isinstance(posterior, EnsemblePosterior):
+        return all(_is_unbounded(member) for member in posterior.posteriors)
+    return isinstance(
+        posterior, DirectPosterior | VectorFieldPosterior
+    ) and not getattr(posterior, "bounded_rejection", False)
+
+
+def _is_unbounded_direct(posterior: Any) -> bool:
+    return isinstance(posterior, DirectPosterior) and _is_unbounded(posterior)
+
+
+def _require_log_prob(posterior: Any) -> None:
+    if not hasattr(posterior, "log_prob_batched"):
+        raise LogProbUnavailableError(
+            f"Expected `posterior` with a method `log_prob_batched`; got "
+            f"{type(posterior).__name__}. Its calibration can still be scored with "
+            f"`acauc` (kinds 'central' and 'rank') and `coverage_curve`."
+        )
+
+
+def _refuse(what: str, bad: Tensor, *, start: int = 0) -> None:
+    """Raise if any observation is bad: a score must not hide a broken posterior."""
+    if bad.any():
+        first = (bad.nonzero().flatten()[:5] + start).tolist()
+        raise InvalidInputError(
+            f"The posterior returned {what} for at least {int(bad.sum())} observations "
+            f"(first: {first}). Remove these observations, or repair the posterior."
+        )
+
+
+def _chunks(length: int, size: int, text: str, *, show: bool) -> Iterator[slice]:
+    starts = range(0, length, size)
+    for start in tqdm(starts, desc=text, disable=not show):
+        yield slice(start, start + size)

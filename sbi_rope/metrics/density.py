@@ -1,0 +1,124 @@
+r"""How probable the posterior finds the true parameters."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sbi_rope._validation import check_batch, check_positive, check_same_length
+from sbi_rope.metrics.calibration import standard_error_of_mean
+from sbi_rope.metrics.calls import CHUNK_SIZE, check_test_set, evaluate_log_probs
+
+__all__ = ["LPPScore", "check_theta_std", "lpp"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LPPScore:
+    r"""Log-probabilities of the true parameters under the posterior; higher is better.
+
+    Attributes:
+        log_probs: One value for each observation, in nats, float64, shape ``(n,)``.
+            :math:`-\infty` (a true parameter the posterior excludes) is kept.
+    """
+
+    log_probs: Tensor
+
+    @property
+    def mean(self) -> float:
+        r"""The LPP: :math:`-\infty` as soon as one true parameter is excluded."""
+        return float(self.log_probs.mean())
+
+    @property
+    def standard_error(self) -> float:
+        """Of the mean, over observations; Inf if the mean is infinite."""
+        return standard_error_of_mean(self.log_probs)
+
+    @property
+    def median(self) -> float:
+        """Median over observations, which a few excluded parameters cannot move."""
+        return float(self.log_probs.quantile(0.5, interpolation="nearest"))
+
+    @property
+    def neg_inf_fraction(self) -> float:
+        r"""Share of true parameters with a log-probability of :math:`-\infty`."""
+        return float(torch.isneginf(self.log_probs).double().mean())
+
+    def standardised(self, theta_std: Tensor) -> "LPPScore":
+        r"""Return the same score for parameters measured in ``theta_std``.
+
+        The density of :math:`z_j = \theta_j / s_j` is
+        :math:`p(z \mid x) = p(\theta \mid x) \prod_j s_j`.
+
+        Args:
+            theta_std: The scales :math:`s`, positive, shape ``(k,)``.
+        """
+        shift = theta_std.to(self.log_probs).log().sum()
+        return LPPScore(log_probs=self.log_probs + shift)
+
+
+def lpp(
+    posterior: Any,
+    theta: Tensor,
+    x: Tensor,
+    *,
+    theta_std: Tensor | None = None,
+    chunk_size: int = CHUNK_SIZE,
+    show_progress_bars: bool = False,
+) -> LPPScore:
+    r"""Log posterior probability of the true parameters, averaged over observations.
+
+    .. math:: \text{LPP} = \frac{1}{n} \sum_{i=1}^{n}
+        \log \tilde p(\theta_i \mid x_i)
+
+    Natural units unless ``theta_std`` is given; for both units from one evaluation,
+    call :meth:`LPPScore.standardised` on the result in natural units. A value of
+    :math:`-\infty` stays in the mean and is counted; NaN raises.
+
+    References:
+        | Addressing Misspecification in Simulation-based Inference through Data-driven
+        | Calibration (Wehenkel et al., 2025), section 4, Metrics
+        | https://arxiv.org/abs/2405.08719
+
+    Args:
+        posterior: Any posterior with ``log_prob_batched``.
+        theta: True parameters, shape ``(n, k)``.
+        x: Their observations, shape ``(n, *event_shape)``.
+        theta_std: Units of theta, usually the prior's standard deviation, shape
+            ``(k,)``.
+        chunk_size: Observations evaluated at a time.
+        show_progress_bars: Whether to show progress.
+
+    Returns:
+        The log-probabilities, with mean, standard error, median, and share of
+        :math:`-\infty`.
+
+    Raises:
+        InvalidInputError: If an argument has the wrong shape or is not finite, or the
+            posterior returns NaN.
+        LogProbUnavailableError: If the posterior has no ``log_prob_batched``.
+
+    Example:
+        >>> from sbi.utils import BoxUniform
+        >>> from sbi_rope.baselines import PriorPosterior
+        >>> prior = BoxUniform(torch.zeros(1), torch.ones(1))
+        >>> score = lpp(PriorPosterior(prior), torch.rand(9, 1), torch.rand(9, 2))
+        >>> score.mean
+        0.0
+    """
+    check_test_set(theta, x, chunk_size)
+    check_theta_std(theta_std, theta)
+    score = LPPScore(
+        log_probs=evaluate_log_probs(
+            posterior, theta, x, chunk_size=chunk_size, show=show_progress_bars
+        )
+    )
+    return score if theta_std is None else score.standardised(theta_std)
+
+
+def check_theta_std(theta_std: Tensor | None, theta: Tensor) -> None:
+    """Check that the scales are None or positive, one for each parameter."""
+    if theta_std is not None:
+        check_batch("theta_std", theta_std, ())
+        check_same_length("theta_std", theta_std, "theta.T", theta.T)
+        check_positive("theta_std", float(theta_std.min()))

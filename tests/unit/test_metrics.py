@@ -1,0 +1,571 @@
+"""The scores against closed forms, and against posteriors that misbehave."""
+
+import contextlib
+import math
+import signal
+import warnings
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import torch
+from sbi.inference import NPE, DirectPosterior
+from sbi.inference.posteriors import EnsemblePosterior
+from sbi.neural_nets import posterior_nn
+from sbi.utils import BoxUniform
+from sbi.utils.tracking import TensorBoardTracker
+from torch import Tensor
+from torch.distributions import Gamma, Normal
+from torch.utils.tensorboard import SummaryWriter
+
+from sbi_rope import metrics
+from sbi_rope.errors import InvalidInputError, InvalidTypeError, LogProbUnavailableError
+
+NORMAL = Normal(torch.tensor(0.0, dtype=torch.float64), 1.0)
+
+
+class GaussianPosterior:
+    """N(x + bias, scale^2) in every dimension, in sbi's shapes."""
+
+    def __init__(self, bias: float = 0.0, scale: float | Tensor = 1.0) -> None:
+        self.bias, self.scale = bias, torch.as_tensor(scale)
+        self.batch_sizes: list[int] = []
+
+    def sample_batched(
+        self,
+        sample_shape: torch.Size,
+        x: Tensor,
+        show_progress_bars: bool = True,
+    ) -> Tensor:
+        self.batch_sizes.append(len(x))
+        noise = torch.randn(*sample_shape, *x.shape, dtype=x.dtype)
+        return x + self.bias + self.scale * noise
+
+    def log_prob_batched(self, theta: Tensor, x: Tensor) -> Tensor:
+        self.batch_sizes.append(len(x))
+        theta = theta if theta.ndim > 2 else theta.unsqueeze(0)
+        return Normal(x + self.bias, self.scale).log_prob(theta).sum(dim=-1)
+
+
+class NoDensity(GaussianPosterior):
+    """A posterior one can only sample."""
+
+    log_prob_batched = property()  # type: ignore[assignment]
+
+
+def gaussian_pairs(n: int, k: int = 1) -> tuple[Tensor, Tensor]:
+    """Theta given x is N(x, 1)."""
+    x = 3.0 * torch.randn(n, k)
+    return x + torch.randn(n, k), x
+
+
+def expected_acauc(bias: float, scale: float, kind: str, *, num_samples: int) -> float:
+    """Integrate the mean level over the law of the truth, N(0, 1).
+
+    The rank is normal around the distribution function for many samples, so the central
+    level is folded normal: it cannot come closer to 0 than about 1 / sqrt(M).
+    """
+    z = torch.linspace(-9, 9, 20001, dtype=torch.float64)
+    rank = NORMAL.cdf((z - bias) / scale)
+    level = rank if kind == "rank" else (2 * rank - 1).abs()
+    if kind == "central":
+        spread = 2 * (rank * (1 - rank) / num_samples).sqrt().clamp(min=1e-12)
+        fold = (2 / math.pi) ** 0.5 * spread * torch.exp(-0.5 * (level / spread) ** 2)
+        level = fold + level * torch.erf(level / spread / 2**0.5)
+    return float(torch.trapezoid(level * NORMAL.log_prob(z).exp(), z)) - 0.5
+
+
+@contextlib.contextmanager
+def at_most(seconds: float) -> Iterator[None]:
+    """Raise if the body has not ended in time, so that a hanging test fails."""
+
+    def stop(*_: Any) -> None:
+        raise TimeoutError(f"still running after {seconds} s")
+
+    previous = signal.signal(signal.SIGALRM, stop)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, previous)
+
+
+# --- pure functions -----------------------------------------------------------------
+
+
+def test_mid_ranks_split_ties() -> None:
+    samples = torch.tensor([0.0, 1.0, 1.0, 2.0]).reshape(4, 1, 1)
+    ranks = [float(metrics.mid_ranks(samples, torch.tensor([[t]]))) for t in (-1, 1, 3)]
+    assert ranks == pytest.approx([0.5 / 5, 2.5 / 5, 4.5 / 5])
+
+
+def test_a_posterior_made_of_ties_ranks_in_the_middle() -> None:
+    ranks = metrics.mid_ranks(torch.ones(8, 3, 2), torch.ones(3, 2))
+    assert torch.equal(ranks, torch.full((3, 2), 0.5, dtype=torch.float64))
+
+
+def test_acauc_equals_its_integral_over_levels() -> None:
+    levels = torch.rand(50, 3, dtype=torch.float64).mul(1000).floor() / 1000
+    alpha = (torch.arange(1000, dtype=torch.float64) + 0.5) / 1000
+    inside = (levels.unsqueeze(-1) <= alpha).double()
+    integral = float((alpha - inside).mean())
+    assert metrics.acauc_of(levels).value == pytest.approx(integral, abs=1e-5)
+
+
+def test_acauc_standard_error_is_that_of_uniform_levels() -> None:
+    score = metrics.acauc_of(torch.rand(2000, 1))
+    assert score.standard_error == pytest.approx((1 / 12 / 2000) ** 0.5, rel=0.05)
+
+
+def test_acauc_standard_error_does_not_count_copies_of_a_parameter() -> None:
+    levels = torch.rand(100, 1)
+    copies = metrics.acauc_of(levels.expand(-1, 5))
+    assert copies.standard_error == pytest.approx(
+        metrics.acauc_of(levels).standard_error
+    )
+
+
+def test_coverage_counts_levels_reached_including_equality() -> None:
+    levels = metrics.central_levels(torch.tensor([[0.785], [0.5]], dtype=torch.float64))
+    curve = metrics.coverage_curve_of(levels)
+    assert curve.levels[56] == pytest.approx(0.57)
+    assert curve.per_parameter[0, [0, 55, 56, 98]].tolist() == [0.5, 0.5, 1.0, 1.0]
+    assert curve.num_observations == 2
+
+
+def test_coverage_error_does_not_cancel_over_parameters() -> None:
+    levels = torch.stack([torch.zeros(10), torch.ones(10)], dim=1)
+    assert metrics.acauc_of(levels).value == 0.0
+    score = metrics.expected_coverage_error_of(levels)
+    assert score.per_parameter.tolist() == pytest.approx([0.5, 0.5])
+    assert score.value == pytest.approx(0.5)
+
+
+def test_coverage_error_of_calibrated_levels_is_its_expected_floor() -> None:
+    values = [
+        metrics.expected_coverage_error_of(torch.rand(400, 4)).value for _ in range(40)
+    ]
+    assert sum(values) / 40 == pytest.approx(0.313 / 20, rel=0.1)
+
+
+def test_coverage_error_standard_error_matches_its_spread() -> None:
+    # One parameter over-confident, one under-confident, by the same latent error.
+    scales = torch.tensor([0.5, 2.0], dtype=torch.float64)
+
+    def levels() -> Tensor:
+        return metrics.central_levels(NORMAL.cdf(torch.randn(400, 1) / scales))
+
+    scores = [metrics.expected_coverage_error_of(levels()) for _ in range(100)]
+    spread = float(torch.tensor([score.value for score in scores]).std())
+    assert scores[0].standard_error == pytest.approx(spread, rel=0.25)
+
+
+def test_one_observation_has_no_standard_error() -> None:
+    assert math.isnan(metrics.acauc_of(torch.rand(1, 2)).standard_error)
+
+
+# --- Gaussian posteriors with known scores ------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("bias", "scale", "central", "hpd", "rank"),
+    [
+        pytest.param(0.0, 1.0, 0.0015, 0.0013, -0.0001, id="calibrated"),
+        pytest.param(0.0, 0.3, 0.3127, 0.3135, -0.001, id="over-confident"),
+        pytest.param(0.0, 0.01, 0.492, 0.493, 0.0, id="very over-confident"),
+        pytest.param(0.0, 3.0, -0.298, -0.299, 0.001, id="under-confident"),
+        pytest.param(0.0, 100.0, -0.474, -0.494, 0.0, id="very under-confident"),
+        pytest.param(2.0, 1.0, 0.356, 0.357, -0.422, id="too high"),
+        pytest.param(-2.0, 1.0, 0.354, 0.355, 0.421, id="too low"),
+        pytest.param(50.0, 0.1, 0.499, 0.5, -0.5, id="far too high"),
+        pytest.param(-50.0, 0.1, 0.499, 0.5, 0.5, id="far too low"),
+    ],
+)
+def test_acauc_of_gaussian_posteriors(
+    bias: float, scale: float, central: float, hpd: float, rank: float
+) -> None:
+    theta, x = gaussian_pairs(1500)
+    posterior = GaussianPosterior(bias, scale)
+    for kind, table in (("central", central), ("hpd", hpd), ("rank", rank)):
+        score = metrics.acauc(
+            posterior, theta, x, kind=kind, num_samples=1000, num_observations=1500
+        )
+        exact = expected_acauc(bias, scale, kind, num_samples=1000)
+        # 0.001: finitely many samples; 0.002: the error of the published value.
+        assert abs(score.value - exact) < 4 * score.standard_error + 0.001
+        assert abs(score.value - table) < 4 * score.standard_error + 0.002
+
+
+@pytest.mark.parametrize("kind", ["central", "hpd", "rank"])
+def test_calibrated_posteriors_score_zero(kind: Any) -> None:
+    theta, x = gaussian_pairs(2000, k=3)
+    score = metrics.acauc(GaussianPosterior(), theta, x, kind=kind)
+    assert abs(score.value) < 4 * score.standard_error
+    assert score.per_parameter.shape == ((1,) if kind == "hpd" else (3,))
+
+
+@pytest.mark.parametrize("kind", ["central", "hpd", "rank"])
+def test_skewed_but_exact_posteriors_score_zero(kind: Any) -> None:
+    class GammaPosterior(GaussianPosterior):
+        law = Gamma(torch.tensor([1.2]), torch.tensor([1.0]))
+
+        def sample_batched(self, sample_shape: torch.Size, x: Tensor, **_: Any) -> Any:
+            return x + self.law.sample((*sample_shape, len(x)))
+
+        def log_prob_batched(self, theta: Tensor, x: Tensor) -> Tensor:
+            # The truth may lie at the edge of the support, up to rounding.
+            return self.law.log_prob((theta - x).clamp(min=1e-6)).sum(dim=-1)
+
+    x = torch.randn(1500, 1)
+    theta = x + GammaPosterior.law.sample((1500,))
+    score = metrics.acauc(GammaPosterior(), theta, x, kind=kind, num_samples=300)
+    assert abs(score.value) < 4 * score.standard_error
+
+
+def test_joint_regions_see_dependence_that_central_intervals_miss() -> None:
+    common = torch.randn(2000, 1)
+    score = metrics.acauc(
+        GaussianPosterior(), common.expand(-1, 2), torch.zeros(2000, 2), kind="hpd"
+    )
+    central = metrics.acauc(
+        GaussianPosterior(), common.expand(-1, 2), torch.zeros(2000, 2)
+    )
+    # |theta|^2 = 2 z^2 instead of chi^2 with two degrees: E exp(-z^2) = 1/sqrt(3).
+    expected = 0.5 - 3**-0.5
+    assert abs(central.value) < 4 * central.standard_error
+    assert abs(score.value - expected) < 4 * score.standard_error
+
+
+def test_coverage_of_gaussian_posteriors_follows_its_formula() -> None:
+    theta, x = gaussian_pairs(2000, k=2)
+    curve = metrics.coverage_curve(GaussianPosterior(scale=0.5), theta, x)
+    expected = 2 * NORMAL.cdf(0.5 * NORMAL.icdf((1 + curve.levels) / 2)) - 1
+    assert curve.per_parameter.shape == (2, 99)
+    assert ((curve.average - expected).abs() < 5 * curve.standard_error + 0.002).all()
+
+
+def test_coverage_error_of_gaussian_posteriors_follows_its_formula() -> None:
+    theta, x = gaussian_pairs(2000, k=2)
+    score = metrics.expected_coverage_error(GaussianPosterior(scale=0.5), theta, x)
+    levels = torch.arange(1, 100, dtype=torch.float64) / 100
+    covered = 2 * NORMAL.cdf(0.5 * NORMAL.icdf((1 + levels) / 2)) - 1
+    expected = float((levels - covered).mean())
+    assert abs(score.value - expected) < 4 * score.standard_error + 0.001
+
+
+def test_coverage_error_of_a_calibrated_posterior_is_small() -> None:
+    theta, x = gaussian_pairs(2000, k=2)
+    score = metrics.expected_coverage_error(GaussianPosterior(), theta, x)
+    assert score.value < 4 * 0.313 / 2000**0.5
+
+
+# --- log-probabilities --------------------------------------------------------------
+
+
+def test_lpp_of_a_gaussian_matches_its_closed_form() -> None:
+    theta, x = gaussian_pairs(4000, k=2)
+    score = metrics.lpp(GaussianPosterior(0.5, 2.0), theta, x)
+    # -log s - log(2 pi)/2 - (1 + b^2) / (2 s^2), and the variance of the last term.
+    expected = 2 * (-math.log(2.0) - 0.5 * math.log(2 * math.pi) - 1.25 / 8)
+    variance = 2 * (2 + 4 * 0.25) / (4 * 2.0**4)
+    assert score.standard_error == pytest.approx((variance / 4000) ** 0.5, rel=0.1)
+    assert abs(score.mean - expected) < 4 * score.standard_error
+
+
+def test_standardised_units_add_the_log_scales() -> None:
+    theta, x = gaussian_pairs(20, k=2)
+    theta_std = torch.tensor([3.0, 0.25])
+    natural = metrics.lpp(GaussianPosterior(), theta, x)
+    standardised = metrics.lpp(GaussianPosterior(), theta, x, theta_std=theta_std)
+    # The same Gaussian, written in z = theta / s.
+    scaled = Normal(x / theta_std, 1 / theta_std).log_prob(theta / theta_std).sum(1)
+    assert torch.allclose(standardised.log_probs, scaled.double(), atol=1e-4)
+    assert torch.equal(
+        standardised.log_probs, natural.standardised(theta_std).log_probs
+    )
+
+
+def test_minus_infinity_is_kept_and_counted() -> None:
+    log_probs = torch.tensor([-1.0, -2.0, -torch.inf, -3.0, -torch.inf])
+    score = metrics.LPPScore(log_probs=log_probs)
+    assert score.mean == -math.inf
+    assert score.standard_error == math.inf
+    assert score.median == -3.0
+    assert score.neg_inf_fraction == pytest.approx(0.4)
+
+
+def test_median_of_mostly_excluded_parameters_is_minus_infinity() -> None:
+    score = metrics.LPPScore(log_probs=torch.tensor([-1.0, -torch.inf, -torch.inf]))
+    assert score.median == -math.inf
+
+
+def test_chunks_change_no_log_prob_and_bound_the_batch() -> None:
+    theta, x = gaussian_pairs(57, k=2)
+    posterior = GaussianPosterior()
+    whole = metrics.lpp(posterior, theta, x, chunk_size=57)
+    posterior.batch_sizes.clear()
+    parts = metrics.lpp(posterior, theta, x, chunk_size=10)
+    assert torch.equal(whole.log_probs, parts.log_probs)
+    assert posterior.batch_sizes == [10, 10, 10, 10, 10, 7]
+
+
+# --- the whole evaluation -----------------------------------------------------------
+
+
+def test_evaluation_agrees_with_the_single_scores() -> None:
+    theta, x = gaussian_pairs(80, k=2)
+    posterior, std = GaussianPosterior(0.3, 0.7), torch.tensor([2.0, 5.0])
+    options = {"num_samples": 100, "seed": 3}
+    result = metrics.evaluate(posterior, theta, x, theta_std=std, **options)
+    assert result.as_row() == {
+        "lpp": metrics.lpp(posterior, theta, x).mean,
+        "lpp_z": metrics.lpp(posterior, theta, x, theta_std=std).mean,
+        "lpp_median": metrics.lpp(posterior, theta, x).median,
+        "neg_inf_fraction": 0.0,
+        "acauc": metrics.acauc(posterior, theta, x, **options).value,
+        "expected_coverage_error": metrics.expected_coverage_error(
+            posterior, theta, x, **options
+        ).value,
+    }
+    bias = metrics.acauc(posterior, theta, x, kind="rank", **options)
+    assert metrics.acauc_of(result.ranks).value == bias.value
+    curve = metrics.coverage_curve(posterior, theta, x, **options)
+    assert torch.equal(result.coverage.per_parameter, curve.per_parameter)
+
+
+def test_evaluation_without_scales_has_no_standardised_lpp() -> None:
+    theta, x = gaussian_pairs(5)
+    result = metrics.evaluate(GaussianPosterior(), theta, x, num_samples=10)
+    assert result.lpp_z is None
+    assert math.isnan(result.as_row()["lpp_z"])
+
+
+def test_a_seed_fixes_the_samples_and_leaves_no_trace() -> None:
+    theta, x = gaussian_pairs(30)
+    state = torch.get_rng_state()
+    first = metrics.evaluate(GaussianPosterior(), theta, x, num_samples=20, seed=1)
+    assert torch.equal(torch.get_rng_state(), state)
+    torch.randn(7)
+    again = metrics.evaluate(GaussianPosterior(), theta, x, num_samples=20, seed=1)
+    other = metrics.evaluate(GaussianPosterior(), theta, x, num_samples=20, seed=2)
+    assert torch.equal(first.ranks, again.ranks)
+    assert not torch.equal(first.ranks, other.ranks)
+
+
+def test_joint_acauc_uses_at_most_200_observations_spread_over_the_set() -> None:
+    posterior = GaussianPosterior()
+    theta, x = gaussian_pairs(1000)
+    theta[990:] = 1e3  # level 1, seen only if the last rows are sampled
+    score = metrics.acauc(posterior, theta, x, kind="hpd", num_samples=20, seed=0)
+    assert sum(posterior.batch_sizes[::4]) == 200
+    assert float(score.per_parameter) == score.value
+    theta, x = gaussian_pairs(1000)
+    theta[[0, -1]] = 1e3
+    two = metrics.acauc(posterior, theta, x, kind="hpd", num_observations=2)
+    assert two.value == pytest.approx(0.5, abs=0.01)
+
+
+# --- sbi's own posteriors -----------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def bounded_npe(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[tuple[DirectPosterior, Tensor, Tensor]]:
+    """An NPE with a bounded prior, and observations far outside its training data."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        prior = BoxUniform(torch.zeros(2), torch.ones(2))
+        theta = prior.sample((400,))
+        x = theta + 0.1 * torch.randn_like(theta)
+        # By default sbi logs into a folder of the working directory.
+        tracker = TensorBoardTracker(SummaryWriter(tmp_path_factory.mktemp("logs")))
+        npe = NPE(prior, density_estimator=posterior_nn("nsf"), tracker=tracker)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="Maximum number of epochs")
+            npe.append_simulations(theta, x).train(max_num_epochs=2)
+        yield npe.build_posterior(), theta[:20], x[:20] + 1e3
+
+
+@pytest.mark.parametrize("members", [0, 2], ids=["one posterior", "ensemble"])
+def test_calibration_does_not_hang_where_nothing_is_accepted(
+    bounded_npe: tuple[DirectPosterior, Tensor, Tensor], members: int
+) -> None:
+    posterior: Any
+    posterior, theta, x = bounded_npe
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        draws = posterior.sample_batched((50,), x, reject_outside_prior=False)
+    assert not posterior.prior.support.check(draws).any()
+    if members:
+        posterior = EnsemblePosterior([posterior] * members)
+    with at_most(10), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        score = metrics.acauc(posterior, theta, x, num_samples=100)
+    assert score.value > 0.4
+
+
+def test_evaluation_of_a_leaking_npe_is_what_its_network_states(
+    bounded_npe: tuple[DirectPosterior, Tensor, Tensor],
+) -> None:
+    posterior, theta, x = bounded_npe
+    with at_most(10):
+        result = metrics.evaluate(posterior, theta, x, num_samples=50)
+    raw = posterior.posterior_estimator.log_prob(theta.unsqueeze(0), x)[0]
+    assert torch.allclose(result.lpp.log_probs, raw.detach().double(), rtol=1e-5)
+
+
+def test_a_leaking_npe_is_over_confident_under_joint_regions_too(
+    bounded_npe: tuple[DirectPosterior, Tensor, Tensor],
+) -> None:
+    posterior, theta, x = bounded_npe
+    with at_most(10):
+        score = metrics.acauc(posterior, theta, x, kind="hpd", num_samples=50)
+    assert score.value > 0.4
+
+
+def test_truth_outside_the_prior_is_counted(
+    bounded_npe: tuple[DirectPosterior, Tensor, Tensor],
+) -> None:
+    posterior, theta, x = bounded_npe
+    score = metrics.lpp(posterior, torch.cat([theta, theta + 5]), x.repeat(2, 1))
+    assert score.neg_inf_fraction == 0.5
+
+
+def test_a_posterior_with_bounded_rejection_is_called_as_it_is(
+    bounded_npe: tuple[DirectPosterior, Tensor, Tensor],
+) -> None:
+    class Bounded(DirectPosterior):
+        bounded_rejection = True
+
+        def sample_batched(self, sample_shape: Any, x: Tensor, **options: Any) -> Any:
+            assert set(options) == {"show_progress_bars"}
+            return torch.rand(*sample_shape, len(x), 2)
+
+        def log_prob_batched(self, theta: Tensor, x: Tensor, **options: Any) -> Any:
+            assert options == {}
+            return torch.zeros(theta.shape[:-1]).reshape(-1, len(x))
+
+    npe, theta, x = bounded_npe
+    posterior = Bounded(npe.posterior_estimator, npe.prior)
+    assert metrics.evaluate(posterior, theta, x, num_samples=5).lpp.mean == 0.0
+    score = metrics.acauc(posterior, theta, x, kind="hpd", num_samples=5)
+    assert score.value == 0.0
+
+
+# --- errors -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "match"),
+    [
+        pytest.param(
+            lambda a: a.update(theta=a["theta"][1:]),
+            InvalidInputError,
+            "same number of rows",
+            id="rows",
+        ),
+        pytest.param(
+            lambda a: a.update(theta=a["theta"][:, 0]),
+            InvalidInputError,
+            "`theta` of shape",
+            id="theta is a vector",
+        ),
+        pytest.param(
+            lambda a: a.update(theta=a["theta"].log()),
+            InvalidInputError,
+            "`theta` to be finite",
+            id="theta is NaN",
+        ),
+        pytest.param(
+            lambda a: a.update(x=a["x"] * torch.inf),
+            InvalidInputError,
+            "`x` to be finite",
+            id="x is infinite",
+        ),
+        pytest.param(
+            lambda a: a.update(x=a["x"].tolist()), InvalidTypeError, "`x`", id="list"
+        ),
+        pytest.param(
+            lambda a: a.update(theta_std=torch.ones(3)),
+            InvalidInputError,
+            "theta_std",
+            id="scales of another length",
+        ),
+        pytest.param(
+            lambda a: a.update(theta_std=torch.tensor([1.0, 0.0])),
+            InvalidInputError,
+            "`theta_std` to be positive",
+            id="scale of zero",
+        ),
+        pytest.param(
+            lambda a: a.update(num_samples=0),
+            InvalidInputError,
+            "num_samples",
+            id="no samples",
+        ),
+        pytest.param(
+            lambda a: a.update(chunk_size=0),
+            InvalidInputError,
+            "chunk_size",
+            id="no chunk",
+        ),
+        pytest.param(
+            lambda a: a.update(theta=a["theta"].repeat(1, 2)),
+            InvalidInputError,
+            "one column for each parameter",
+            id="too many parameters",
+        ),
+    ],
+)
+def test_evaluate_refuses(
+    change: Callable[[dict[str, Any]], None], error: type[Exception], match: str
+) -> None:
+    theta, x = gaussian_pairs(12, k=2)
+    arguments: dict[str, Any] = {"theta": theta, "x": x, "num_samples": 5}
+    change(arguments)
+
+    class Wide(GaussianPosterior):
+        def log_prob_batched(self, theta: Tensor, x: Tensor) -> Tensor:
+            return torch.zeros(1, len(x))
+
+    with pytest.raises(error, match=match):
+        metrics.evaluate(Wide(), **arguments)
+
+
+def test_an_unknown_kind_is_refused() -> None:
+    theta, x = gaussian_pairs(5)
+    with pytest.raises(InvalidInputError, match="kind"):
+        metrics.acauc(GaussianPosterior(), theta, x, kind="joint")  # type: ignore[arg-type]
+
+
+def test_a_posterior_without_density_is_named() -> None:
+    theta, x = gaussian_pairs(30)
+    for score in (metrics.lpp, metrics.evaluate):
+        with pytest.raises(LogProbUnavailableError, match="NoDensity"):
+            score(NoDensity(), theta, x)
+    with pytest.raises(LogProbUnavailableError):
+        metrics.acauc(NoDensity(), theta, x, kind="hpd")
+    assert metrics.acauc(NoDensity(), theta, x).standard_error > 0
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_broken_log_probs_raise_and_say_where(value: float) -> None:
+    class Broken(GaussianPosterior):
+        def log_prob_batched(self, theta: Tensor, x: Tensor) -> Tensor:
+            return torch.where(x[:, 0] == 7.0, value, x[:, 0]).unsqueeze(0)
+
+    x = torch.arange(12.0).unsqueeze(1)
+    with pytest.raises(InvalidInputError, match=r"first: \[7\]"):
+        metrics.lpp(Broken(), x, x, chunk_size=5)
+
+
+def test_nan_samples_raise_and_say_where() -> None:
+    class Broken(GaussianPosterior):
+        def sample_batched(self, sample_shape: torch.Size, x: Tensor, **_: Any) -> Any:
+            return torch.where(x == 7.0, torch.nan, x).expand(*sample_shape, *x.shape)
+
+    x = torch.arange(12.0).unsqueeze(1)
+    with pytest.raises(InvalidInputError, match=r"NaN samples.*first: \[7\]"):
+        metrics.coverage_curve(Broken(), x, x, chunk_size=5)

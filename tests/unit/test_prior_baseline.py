@@ -1,0 +1,120 @@
+"""The prior is a posterior that ignores x."""
+
+import pickle
+
+import pytest
+import torch
+from sbi.diagnostics import run_sbc
+from sbi.utils import BoxUniform
+from torch.distributions import Distribution, Exponential, Independent, Normal
+
+from sbi_rope.baselines import PriorPosterior
+from sbi_rope.errors import InvalidTypeError
+from sbi_rope.metrics import acauc, evaluate
+
+
+def box() -> Distribution:
+    return BoxUniform(torch.tensor([0.0, -1.0]), torch.tensor([2.0, 1.0]))
+
+
+def normal() -> Distribution:
+    return Independent(Normal(torch.tensor([1.0, -2.0]), torch.tensor([0.5, 2.0])), 1)
+
+
+def positive() -> Distribution:
+    # Unlike sbi's own priors, this one raises outside its support.
+    law = Exponential(torch.ones(2), validate_args=True)
+    return Independent(law, 1, validate_args=True)
+
+
+@pytest.mark.parametrize("sample_shape", [(), (5,), (2, 3)])
+def test_samples_have_sbi_shapes(sample_shape: tuple[int, ...]) -> None:
+    posterior = PriorPosterior(box())
+    x = torch.zeros(4, 3, 7)
+    assert posterior.sample(sample_shape).shape == (*sample_shape, 2)
+    batched = posterior.sample_batched(sample_shape, x=x, show_progress_bars=False)
+    assert batched.shape == (*sample_shape, 4, 2)
+
+
+def test_samples_follow_the_prior_whatever_x() -> None:
+    samples = PriorPosterior(normal()).sample_batched((4000,), torch.full((2, 1), 1e6))
+    assert torch.allclose(samples.mean(dim=0), normal().mean.expand(2, 2), atol=0.2)
+    assert torch.allclose(samples.std(dim=0), normal().stddev.expand(2, 2), rtol=0.1)
+
+
+@pytest.mark.parametrize("prior", [box(), normal(), positive()])
+def test_log_prob_is_the_prior_density(prior: Distribution) -> None:
+    theta = prior.sample((6,))
+    posterior = PriorPosterior(prior)
+    expected = prior.log_prob(theta)
+    assert torch.equal(posterior.log_prob(theta), expected)
+    batched = posterior.log_prob_batched(theta, torch.zeros(6, 1))
+    assert torch.equal(batched, expected.unsqueeze(0))
+    assert torch.equal(posterior.potential(theta, x=torch.zeros(1, 1)), expected)
+
+
+def test_log_prob_batched_takes_several_draws_for_each_x() -> None:
+    theta = box().sample((5, 3))
+    values = PriorPosterior(box()).log_prob_batched(theta, torch.zeros(3, 1))
+    assert torch.equal(values, box().log_prob(theta))
+
+
+@pytest.mark.parametrize("prior", [box(), positive()])
+def test_log_prob_is_minus_infinity_outside_the_support(prior: Distribution) -> None:
+    values = PriorPosterior(prior).log_prob(torch.tensor([[-0.5, 0.5], [0.5, 0.5]]))
+    assert values[0] == -torch.inf
+    assert torch.isfinite(values[1])
+
+
+def test_map_is_the_mode_of_the_prior() -> None:
+    posterior = PriorPosterior(normal()).set_default_x(torch.zeros(1, 3))
+    mode = posterior.map(num_iter=500, show_progress_bars=False)
+    assert torch.allclose(mode, normal().mean, atol=0.02)
+
+
+def test_map_of_a_uniform_prior_lies_in_it() -> None:
+    posterior = PriorPosterior(box()).set_default_x(torch.zeros(1, 3))
+    mode = posterior.map(num_iter=20, show_progress_bars=False)
+    assert torch.isfinite(posterior.log_prob(mode)).all()
+
+
+def test_prior_survives_pickling_and_moving() -> None:
+    posterior = PriorPosterior(box()).set_default_x(torch.zeros(1, 3))
+    posterior = pickle.loads(pickle.dumps(posterior))
+    posterior.to("cpu")
+    assert posterior.default_x is not None
+    assert posterior.sample((3,)).shape == (3, 2)
+
+
+def test_sbc_accepts_the_prior() -> None:
+    theta = box().sample((120,))
+    ranks, _ = run_sbc(
+        theta,
+        torch.zeros(120, 1),
+        PriorPosterior(box()),
+        num_posterior_samples=100,
+        show_progress_bar=False,
+    )
+    assert ranks.shape == (120, 2)
+    assert abs(ranks.mean() / 100 - 0.5) < 4 * (1 / 12 / 120) ** 0.5
+
+
+def test_a_correct_prior_is_calibrated_under_every_kind() -> None:
+    theta, x = normal().sample((300,)), torch.zeros(300, 1)
+    posterior = PriorPosterior(normal())
+    for kind in ("central", "hpd", "rank"):
+        score = acauc(posterior, theta, x, kind=kind)
+        assert abs(score.value) < 4 * score.standard_error
+
+
+def test_lpp_of_the_prior_is_minus_its_entropy() -> None:
+    theta = normal().sample((2000,))
+    lpp = evaluate(
+        PriorPosterior(normal()), theta, torch.zeros(2000, 1), num_samples=2
+    ).lpp
+    assert abs(lpp.mean + float(normal().entropy())) < 4 * lpp.standard_error
+
+
+def test_a_prior_that_is_no_distribution_is_refused() -> None:
+    with pytest.raises(InvalidTypeError, match="process_prior"):
+        PriorPosterior([box()])
