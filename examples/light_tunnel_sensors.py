@@ -32,7 +32,7 @@ def train_npe(task: Task, seed: int, num_simulations: int = 20_000) -> Any:
         show_progress_bars=False,
     )
     npe.append_simulations(theta, simulator(theta))
-    npe.train(training_batch_size=500, learning_rate=1e-3, max_num_epochs=40)
+    npe.train(training_batch_size=200, learning_rate=1e-3, max_num_epochs=30)
     return npe.build_posterior()
 
 

@@ -164,9 +164,9 @@ def print_table(rows: list[dict[str, Any]]) -> None:
     print(
         "\nLPP: mean log-probability of the true parameters, in standard deviations\n"
         "of the prior (higher is better). ACAUC: 0 is calibrated, above 0 is\n"
-        "overconfident. ECE: expected coverage error. -inf: share of test observations\n"
-        "with density zero. NPE and tuning-only are scored without sbi's leakage\n"
-        "correction.\n"
+        "overconfident. ECE: expected coverage error. -inf: share of test\n"
+        "observations with density zero. NPE and tuning-only are scored without sbi's\n"
+        "leakage correction.\n"
     )
     print(f"{'method':<12}{'pairs':>6}{'LPP':>10}{'ACAUC':>9}{'ECE':>8}{'-inf':>7}")
     order = ("prior", "NPE", "tuning-only", "OT-only", "RoPE")

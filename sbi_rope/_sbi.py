@@ -7,6 +7,7 @@ identity with the public property ``embedding_net``, so that it holds for every 
 """
 
 import copy
+import warnings
 from typing import Any, Literal
 
 import torch
@@ -15,6 +16,7 @@ from sbi.inference.posteriors.direct_posterior import DirectPosterior
 from sbi.inference.posteriors.filtered_direct_posterior import FilteredDirectPosterior
 from sbi.inference.posteriors.npe_a_posterior import NPE_A_Posterior
 from sbi.inference.posteriors.vector_field_posterior import VectorFieldPosterior
+from sbi.inference.potentials.base_potential import BasePotential
 from sbi.neural_nets.estimators.base import (
     ConditionalDensityEstimator,
     ConditionalEstimator,
@@ -26,6 +28,7 @@ from torch.distributions import Distribution
 from sbi_rope.errors import LogProbUnavailableError, UnsupportedPosteriorError
 
 __all__ = [
+    "BasePotential",
     "ConditionalDensityEstimator",
     "ConditionalEstimator",
     "DirectPosterior",
@@ -165,12 +168,17 @@ class VectorFieldDensity(ConditionalDensityEstimator):
             device=condition.device,
             sample_with=self.sample_with,
         )
-        return posterior.sample_batched(
-            sample_shape,
-            condition,
-            show_progress_bars=False,
-            reject_outside_prior=False,
-        )
+        with warnings.catch_warnings():
+            # Draws outside the prior are rejected by the mixture; the batch is ours.
+            warnings.filterwarnings("ignore", message=".*outside the prior support")
+            warnings.filterwarnings("ignore", message="Capping max_sampling_batch")
+            warnings.filterwarnings("ignore", message="Note that for batched sampling")
+            return posterior.sample_batched(
+                sample_shape,
+                condition,
+                show_progress_bars=False,
+                reject_outside_prior=False,
+            )
 
     def log_prob(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
         """Raise: the density of a vector field is not evaluated."""
@@ -187,12 +195,17 @@ class VectorFieldDensity(ConditionalDensityEstimator):
 def embed(net: nn.Module, x: Tensor, *, batch_size: int = 1000) -> Tensor:
     """Apply an embedding net without gradients, in batches: ``(n, *)`` to ``(n, l)``.
 
-    The net is put into evaluation mode: no dropout, and batch normalisation with its
+    The net runs in evaluation mode: no dropout, and batch normalisation with its
     trained statistics, so that the result does not depend on the batch.
     """
+    modes = {module: module.training for module in net.modules()}
     net.eval()
-    with torch.no_grad():
-        return torch.cat([net(part) for part in x.split(batch_size)])
+    try:
+        with torch.no_grad():
+            return torch.cat([net(part) for part in x.split(batch_size)])
+    finally:
+        for module, training in modes.items():
+            module.training = training
 
 
 def dtype_of(module: nn.Module) -> torch.dtype:

@@ -37,11 +37,13 @@ class History:
         validation_loss: The same over the held-out pairs; empty without a hold-out.
         best_step: Number of steps after which the kept net was reached; 0 is the
             starting point, the embedding net as NPE left it.
+        learning_rate: The learning rate of this course, the best of those tried.
     """
 
     training_loss: list[float] = field(repr=False)
     validation_loss: list[float] = field(repr=False)
     best_step: int
+    learning_rate: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +84,10 @@ class CalibrationFinetuner:
         | https://arxiv.org/abs/2405.08719
 
     Args:
-        learning_rate: Step size of Adam.
+        learning_rate: Step size of Adam. Of several, each is tried from the start and
+            the best on the held-out pairs is kept (without a hold-out, the first):
+            a deep embedding net is best tuned with the smaller of the defaults, an
+            affine map with the larger.
         num_steps: Most gradient steps, each over all training pairs.
         patience: Steps without a new best on the held-out pairs after which to stop.
         simulations_per_target: Simulations behind each expectation. One, as in the
@@ -98,7 +103,7 @@ class CalibrationFinetuner:
         InvalidInputError: If an argument is outside its range.
     """
 
-    learning_rate: float = 1e-3
+    learning_rate: float | tuple[float, ...] = (1e-4, 1e-3)
     num_steps: int = 1000
     patience: int = 200
     simulations_per_target: int = 100
@@ -108,7 +113,10 @@ class CalibrationFinetuner:
 
     def __post_init__(self) -> None:
         """Check the ranges of all fields."""
-        check_positive("learning_rate", self.learning_rate)
+        if not self._learning_rates:
+            raise InvalidInputError("Expected at least one `learning_rate`; got ().")
+        for rate in self._learning_rates:
+            check_positive("learning_rate", rate)
         check_positive_integer("num_steps", self.num_steps)
         check_positive_integer("patience", self.patience)
         check_positive_integer("simulations_per_target", self.simulations_per_target)
@@ -119,6 +127,11 @@ class CalibrationFinetuner:
                 "Expected `validation_fraction` in (0, 0.5]; got "
                 f"{self.validation_fraction!r}."
             )
+
+    @property
+    def _learning_rates(self) -> tuple[float, ...]:
+        rates = self.learning_rate
+        return rates if isinstance(rates, tuple) else (rates,)
 
     def finetune(
         self,
@@ -152,15 +165,21 @@ class CalibrationFinetuner:
             check_same_length("x", x, "targets", targets)
             check_finite("targets", targets)
             train, held_out = self._split(x.shape[0])
-            return self._optimise(
-                trainable_copy(embedding_net, targets),
-                x,
-                targets,
-                train.to(x.device),
-                held_out.to(x.device),
-                draw_targets=draw_targets if self.resample_targets else None,
-                show_progress_bars=show_progress_bars,
-            )
+            rates = self._learning_rates if len(held_out) else self._learning_rates[:1]
+            results = [
+                self._optimise(
+                    trainable_copy(embedding_net, targets),
+                    x,
+                    targets,
+                    train.to(x.device),
+                    held_out.to(x.device),
+                    learning_rate=rate,
+                    draw_targets=draw_targets if self.resample_targets else None,
+                    show_progress_bars=show_progress_bars,
+                )
+                for rate in rates
+            ]
+        return min(results, key=_best_validation_loss)
 
     def _split(self, num_pairs: int) -> tuple[Tensor, Tensor]:
         order = torch.randperm(num_pairs)
@@ -184,6 +203,7 @@ class CalibrationFinetuner:
         train: Tensor,
         held_out: Tensor,
         *,
+        learning_rate: float,
         draw_targets: Callable[[int], Tensor] | None,
         show_progress_bars: bool,
     ) -> FinetuneResult:
@@ -191,14 +211,16 @@ class CalibrationFinetuner:
         num_steps = self.num_steps
         if not has_holdout:
             num_steps = min(num_steps, STEPS_WITHOUT_HOLDOUT)
-        optimizer = torch.optim.Adam(net.parameters(), lr=self.learning_rate)
+        optimizer = torch.optim.Adam(net.parameters(), lr=learning_rate)
         training_loss: list[float] = []
         validation_loss: list[float] = []
         best_state, best_step = copy.deepcopy(net.state_dict()), 0
         held_out_targets = targets[held_out]
 
         progress = tqdm(
-            range(num_steps + 1), desc="Fine-tuning", disable=not show_progress_bars
+            range(num_steps + 1),
+            desc=f"Fine-tuning (learning rate {learning_rate:g})",
+            disable=not show_progress_bars,
         )
         for step in progress:
             if draw_targets is not None and step > 0:
@@ -221,8 +243,13 @@ class CalibrationFinetuner:
                 optimizer.step()
 
         net.load_state_dict(best_state)
-        history = History(training_loss, validation_loss, best_step)
+        history = History(training_loss, validation_loss, best_step, learning_rate)
         return FinetuneResult(net.requires_grad_(requires_grad=False), history)
+
+
+def _best_validation_loss(result: FinetuneResult) -> float:
+    history = result.history
+    return min(history.validation_loss, default=0.0)
 
 
 def trainable_copy(embedding_net: nn.Module, embeddings: Tensor) -> nn.Module:

@@ -160,7 +160,7 @@ def gaussian_posterior(
     if x_o is None:
         x_o = torch.randn(n_o, 3)
     if weights is None:
-        weights = torch.softmax(2 * torch.randn(len(x_o), len(contexts)), dim=1)
+        weights = (2 * torch.randn(len(x_o), len(contexts))).double().softmax(dim=1)
     if prior is None:
         prior = box(dim)
     estimator = MixtureEstimator(

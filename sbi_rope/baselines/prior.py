@@ -3,12 +3,11 @@ r"""The prior as a posterior: what is known before any observation."""
 from typing import Any
 
 import torch
-from sbi.inference.posteriors.base_posterior import NeuralPosterior
-from sbi.inference.potentials.base_potential import BasePotential
 from sbi.utils import mcmc_transform, within_support
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_rope._sbi import BasePotential, NeuralPosterior
 from sbi_rope._validation import check_tensor
 from sbi_rope.errors import InvalidTypeError
 

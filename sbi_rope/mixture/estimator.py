@@ -59,6 +59,7 @@ class MixtureEstimator(ConditionalDensityEstimator):
         self._g = embedding_net
         self.register_buffer("contexts", contexts)
         self.register_buffer("x_o", x_o)
+        self._extended: tuple[list[bytes], Tensor] | None = None
         # The first row of equal observations stands for all of them.
         self._index: dict[bytes, int] = {}
         for i, key in enumerate(_keys(x_o)):
@@ -68,6 +69,7 @@ class MixtureEstimator(ConditionalDensityEstimator):
         """Move the networks, the batch and the coupling."""
         self.to(device)
         self.coupling = self.coupling.to(device)
+        self._extended = None
 
     def rows(self, x: Tensor) -> Tensor:
         """Return the mixture weights of observations, ``(n, *event)`` to ``(n, n_s)``.
@@ -81,8 +83,15 @@ class MixtureEstimator(ConditionalDensityEstimator):
         weights = self.coupling.weights[index.clamp_min(0)]
         new = index < 0
         if new.any():
-            weights[new] = self._extend(x[new])
+            weights[new] = self._extended_rows(x[new])
         return weights
+
+    def _extended_rows(self, x: Tensor) -> Tensor:
+        # log_prob and its normaliser, or the steps of map(), ask for the same rows.
+        keys = _keys(x)
+        if self._extended is None or self._extended[0] != keys:
+            self._extended = (keys, self._extend(x))
+        return self._extended[1]
 
     def _extend(self, x: Tensor) -> Tensor:
         if self.unseen == "raise":
@@ -100,7 +109,7 @@ class MixtureEstimator(ConditionalDensityEstimator):
             f"effective sample size {smallest:.1f} of {rows.shape[1]} simulations. "
             "Below about 50, couple the new batch instead.",
             RoPEWarning,
-            stacklevel=5,
+            stacklevel=6,
         )
         return rows
 
@@ -195,24 +204,24 @@ class MixtureEstimator(ConditionalDensityEstimator):
         self, rows: Tensor, weights: Tensor, *, batch_size: int = MAX_EVALUATIONS
     ) -> Tensor:
         """Draw one theta for each entry of ``rows``, an index into ``weights``."""
-        # Inverse transform: a component for every draw, in one search per row.
+        # Inverse transform: row i fills the interval [i, i + 1], so that one search
+        # serves all rows.
         cumulative = weights.cumsum(dim=1)
         cumulative = cumulative / cumulative[:, -1:]
-        theta = [self._draw_chunk(part, cumulative) for part in rows.split(batch_size)]
+        cumulative += torch.arange(len(weights), device=weights.device)[:, None]
+        # Rounding may carry a draw past the end of its row.
+        positive = (weights > 0).flip(1).to(torch.int8)
+        last = weights.shape[1] - 1 - positive.argmax(dim=1)
+        theta = []
+        for part in rows.split(batch_size):
+            uniform = torch.rand(len(part), dtype=weights.dtype, device=part.device)
+            # right=True passes over components of weight zero.
+            found = torch.searchsorted(cumulative.flatten(), uniform + part, right=True)
+            components = (found - part * weights.shape[1]).clamp_min(0)
+            condition = self.contexts[torch.minimum(components, last[part])]
+            draws = self.components.sample(torch.Size((1,)), condition=condition)
+            theta.append(draws[0])
         return torch.cat(theta)
-
-    def _draw_chunk(self, rows: Tensor, cumulative: Tensor) -> Tensor:
-        num_rows, num_components = cumulative.shape
-        # Row i fills the interval [i, i + 1]: one search serves all rows. right=True
-        # passes over components of weight zero.
-        offset = torch.arange(num_rows, device=rows.device)[:, None]
-        uniform = torch.rand(len(rows), dtype=cumulative.dtype, device=rows.device)
-        found = torch.searchsorted(
-            (cumulative + offset).flatten(), uniform + rows, right=True
-        )
-        components = (found - rows * num_components).clamp(0, num_components - 1)
-        condition = self.contexts[components]
-        return self.components.sample(torch.Size((1,)), condition=condition)[0]
 
     def loss(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
         """Return the negative log-probability, shape ``(B,)``."""

@@ -1,6 +1,7 @@
 """The mixture as an sbi posterior: prior support, normalisation, the batch."""
 
 import copy
+import operator
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -21,9 +22,9 @@ __all__ = ["Leakage", "MixturePosterior"]
 
 # Draws behind each component's mass inside the prior's support.
 LEAKAGE_DRAWS = 1024
-# Rounds of rejection sampling, each with more proposals the lower the acceptance.
-MAX_ROUNDS = 1000
-MAX_PROPOSALS_PER_DRAW = 1000
+# Rejection sampling gives an observation up if, after so many proposals, less than this
+# share of them lies inside the prior's support.
+MIN_PROPOSALS, MIN_ACCEPTANCE = 100_000, 1e-3
 
 
 @dataclass(frozen=True)
@@ -122,7 +123,7 @@ class MixturePosterior(DirectPosterior):
         """Return the posterior of one observation, with it as the default x."""
         view = copy.copy(self)
         view.potential_fn = copy.copy(self.potential_fn)
-        view.set_default_x(self.x_o[int(index)][None])
+        view.set_default_x(self.x_o[operator.index(index)][None])
         return view
 
     def __iter__(self) -> Iterator["MixturePosterior"]:
@@ -203,41 +204,41 @@ class MixturePosterior(DirectPosterior):
         estimator = self.posterior_estimator
         shape = torch.Size(sample_shape)
         weights = estimator.rows(self._batch_of_x(x))
-        slots = torch.arange(len(weights), device=weights.device).repeat(shape.numel())
-        theta = torch.empty(len(slots), *estimator.input_shape, device=slots.device).to(
-            estimator.contexts
-        )
-        open_slots = torch.arange(len(slots), device=slots.device)
+        num_rows = len(weights)
+        # One slot for every sample, open until a proposal for it is accepted.
+        slots = torch.arange(num_rows, device=weights.device).repeat(shape.numel())
+        theta = estimator.contexts.new_empty(len(slots), *estimator.input_shape)
+        still_open = torch.ones(len(slots), dtype=torch.bool, device=slots.device)
+        proposed = torch.zeros(num_rows, dtype=torch.long, device=slots.device)
+        inside = proposed.clone()
         repeats = 1
         with tqdm(
             total=len(slots), desc="Sampling", disable=not show_progress_bars
         ) as progress:
-            for _ in range(MAX_ROUNDS):
+            while (open_slots := still_open.nonzero().flatten()).numel():
                 proposals = open_slots.repeat_interleave(repeats)
+                rows = slots[proposals]
                 draws = estimator.draw(
-                    slots[proposals], weights, batch_size=max_sampling_batch_size
+                    rows, weights, batch_size=max_sampling_batch_size
                 )
                 accepted = self._accept(draws, reject=reject_outside_prior)
-                # Later proposals overwrite earlier ones: any of them is a fair draw.
-                theta[proposals[accepted]] = draws[accepted]
-                hit = torch.zeros(len(slots), dtype=torch.bool, device=slots.device)
-                hit[proposals[accepted]] = True
-                still_open = open_slots[~hit[open_slots]]
-                progress.update(len(open_slots) - len(still_open))
-                if not len(still_open):
-                    return theta.reshape(*shape, len(weights), *estimator.input_shape)
-                open_slots = still_open
-                rate = float(accepted.double().mean())
-                repeats = int(1 / max(rate, 1 / MAX_PROPOSALS_PER_DRAW))
-                repeats = max(1, min(repeats, MAX_EVALUATIONS // len(open_slots)))
-        hopeless = slots[open_slots].unique()[:5].tolist()
-        raise SamplingError(
-            f"Less than about one in {MAX_ROUNDS} draws lies inside the support of the "
-            f"prior for observations {hopeless} of the batch: the posterior of the "
-            "simulations leaks. Train NPE longer, or with "
-            "z_score_theta='transform_to_unconstrained', or pass "
-            "reject_outside_prior=False."
-        )
+                # Of several proposals for a slot the first accepted one is kept.
+                chosen = accepted.nonzero().flatten()
+                filled = proposals[chosen]
+                first = filled != filled.roll(1)
+                first[:1] = True
+                theta[filled[first]] = draws[chosen[first]]
+                still_open[filled] = False
+                progress.n = len(slots) - int(still_open.sum())
+                progress.refresh()
+                proposed += rows.bincount(minlength=num_rows)
+                inside += rows[accepted].bincount(minlength=num_rows)
+                _check_acceptance(proposed, inside)
+                # As many proposals as will fill most of the open slots.
+                rate = max(float(accepted.double().mean()), MIN_ACCEPTANCE)
+                room = MAX_EVALUATIONS // len(open_slots)
+                repeats = max(1, min(int(1 / rate), room))
+        return theta.reshape(*shape, num_rows, *estimator.input_shape)
 
     def _accept(self, theta: Tensor, *, reject: bool) -> Tensor:
         if not reject:
@@ -306,6 +307,11 @@ class MixturePosterior(DirectPosterior):
         self, x: Tensor, **kwargs: Any
     ) -> Tensor:
         r"""Return :math:`Z_i`, shape ``(B,)``; called by log_prob of the base class."""
+        if kwargs:
+            raise InvalidInputError(
+                f"Expected no `leakage_correction_params`; got {sorted(kwargs)}. The "
+                "mass of each component is estimated once, from 1024 draws."
+            )
         mass = self.leakage(x).mass.to(self.posterior_estimator.contexts)
         if not (mass > 0).all():
             raise SamplingError(
@@ -315,8 +321,24 @@ class MixturePosterior(DirectPosterior):
         return mass
 
 
+def _check_acceptance(proposed: Tensor, inside: Tensor) -> None:
+    hopeless = (proposed >= MIN_PROPOSALS) & (inside < MIN_ACCEPTANCE * proposed)
+    if hopeless.any():
+        rows = hopeless.nonzero().flatten()[:5].tolist()
+        raise SamplingError(
+            f"Less than one in {int(1 / MIN_ACCEPTANCE)} draws lies inside the support "
+            f"of the prior for the observations in rows {rows} of `x`: the posteriors "
+            "of the simulations leak. Train NPE longer, or with "
+            "z_score_theta='transform_to_unconstrained', or pass "
+            "reject_outside_prior=False."
+        )
+
+
 def _is_unbounded(prior: Distribution) -> bool:
-    support: Any = getattr(prior, "support", None)
+    try:
+        support: Any = getattr(prior, "support", None)
+    except NotImplementedError:  # torch's way of saying that a law states none
+        return False
     while isinstance(support, constraints.independent):
         support = support.base_constraint
     return support in (constraints.real, constraints.real_vector)

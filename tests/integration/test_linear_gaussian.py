@@ -66,7 +66,7 @@ def test_a_larger_gamma_moves_the_mixture_towards_the_prior() -> None:
 
 @pytest.mark.parametrize("tau", [1.0, 0.9])
 def test_without_misspecification_rope_hardly_moves_the_posterior(tau: float) -> None:
-    """Stated tolerance: 0.03 nats on average over the batch, at gamma 0.05, n = 1000."""
+    """Tolerance: 0.03 nats on average over the batch, at gamma 0.05 and n = 1000."""
     x_o = gaussian.simulator(gaussian.prior().sample((1000,)))
     rope = RoPE(
         gaussian.posterior(),

@@ -72,6 +72,20 @@ def test_the_net_that_is_kept_is_the_best_on_the_held_out_pairs() -> None:
     assert validation[-1] > validation[best]
 
 
+def test_of_several_learning_rates_the_best_on_the_hold_out_is_kept() -> None:
+    x = torch.randn(30, 2)
+    losses = {}
+    for rate in (1e-5, 1e-2, (1e-5, 1e-2), (1e-2, 1e-5)):
+        result = CalibrationFinetuner(learning_rate=rate).finetune(
+            linear(), x, lambda count: 2 * x + 1, seed=0, show_progress_bars=False
+        )
+        losses[rate] = min(result.history.validation_loss)
+        if isinstance(rate, tuple):
+            assert result.history.learning_rate == 1e-2
+    assert losses[1e-2] < losses[1e-5]
+    assert losses[1e-5, 1e-2] == losses[1e-2, 1e-5] == losses[1e-2]
+
+
 def test_the_start_is_kept_if_nothing_is_better() -> None:
     x = torch.randn(10, 2)
     net = linear()
@@ -126,7 +140,7 @@ def test_targets_are_drawn_once_or_before_every_step() -> None:
         calls.append(count)
         return torch.randn(10, 2)
 
-    settings = {"num_steps": 7, "simulations_per_target": 3}
+    settings = {"num_steps": 7, "simulations_per_target": 3, "learning_rate": 1e-3}
     CalibrationFinetuner(**settings).finetune(  # type: ignore[arg-type]
         linear(), x, draw, show_progress_bars=False
     )
@@ -159,6 +173,8 @@ def test_the_same_seed_gives_the_same_net_and_leaves_the_callers_state() -> None
     [
         {"learning_rate": 0.0},
         {"learning_rate": math.inf},
+        {"learning_rate": ()},
+        {"learning_rate": (1e-3, -1.0)},
         {"num_steps": 0},
         {"num_steps": 10.0},
         {"simulations_per_target": 0},

@@ -414,7 +414,7 @@ def test_a_failure_in_training_loses_nothing() -> None:
     conductor.train(seed=0, show_progress_bars=False)
     before = conductor.tuned_embedding_net(X_O)
     broken = True
-    with pytest.raises(SimulationError, match="OSError.*disk full"):
+    with pytest.raises(SimulationError, match=r"OSError.*disk full"):
         conductor.train(show_progress_bars=False)
     assert torch.equal(conductor.tuned_embedding_net(X_O), before)
     broken = False
@@ -439,7 +439,7 @@ def test_unusable_stored_simulations_are_refused(
 
 
 def test_a_simulator_and_stored_simulations_exclude_each_other() -> None:
-    with pytest.raises(InvalidInputError, match="exactly one.*both"):
+    with pytest.raises(InvalidInputError, match=r"exactly one.*both"):
         rope(simulations=(THETA, X))
 
 

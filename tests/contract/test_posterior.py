@@ -1,0 +1,399 @@
+"""MixturePosterior keeps the contract of sbi's posteriors, and adds a batch to it."""
+
+import copy
+import io
+import pickle
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from sbi.inference import DirectPosterior
+from torch import Tensor, nn
+
+from sbi_rope.errors import InvalidInputError
+from sbi_rope.mixture import MixturePosterior
+from tests import problems
+from tests.problems import gaussian_posterior
+
+QUIET = {"show_progress_bars": False}
+
+
+def through_pickle(posterior: MixturePosterior) -> MixturePosterior:
+    return pickle.loads(pickle.dumps(posterior))
+
+
+def through_torch(posterior: MixturePosterior) -> MixturePosterior:
+    buffer = io.BytesIO()
+    torch.save(posterior, buffer)
+    buffer.seek(0)
+    return torch.load(buffer, weights_only=False)
+
+
+def to_cpu(posterior: MixturePosterior) -> MixturePosterior:
+    moved = copy.deepcopy(posterior)
+    moved.to("cpu")
+    return moved
+
+
+COPIES = [
+    pytest.param(copy.copy, id="copy"),
+    pytest.param(copy.deepcopy, id="deepcopy"),
+    pytest.param(through_pickle, id="pickle"),
+    pytest.param(through_torch, id="torch.save"),
+    pytest.param(to_cpu, id="to"),
+    pytest.param(lambda posterior: through_pickle(copy.deepcopy(posterior)), id="both"),
+]
+
+
+def image_posterior() -> MixturePosterior:
+    return gaussian_posterior(x_o=torch.randn(5, 1, 8, 8))
+
+
+def one_reading_posterior() -> MixturePosterior:
+    return gaussian_posterior(x_o=torch.randn(5, 1), dim=1)
+
+
+POSTERIORS = [
+    pytest.param(gaussian_posterior, id="vector"),
+    pytest.param(image_posterior, id="image"),
+    pytest.param(one_reading_posterior, id="one reading, one parameter"),
+]
+
+
+def test_it_is_a_direct_posterior_of_sbi() -> None:
+    assert isinstance(gaussian_posterior(), DirectPosterior)
+
+
+@pytest.mark.parametrize("make", POSTERIORS)
+@pytest.mark.parametrize("sample_shape", [(), (1,), (4,), (2, 3)])
+def test_sample_has_the_shape_asked_for(
+    make: Callable[[], MixturePosterior], sample_shape: tuple[int, ...]
+) -> None:
+    posterior = make()
+    dim = posterior.posterior_estimator.input_shape[0]
+    x_o = posterior.x_o
+    for x in (x_o[1], x_o[1:2]):
+        samples = posterior.sample(sample_shape, x=x, **QUIET)
+        assert samples.shape == (*sample_shape, dim)
+    for size in (1, 3, 5):
+        samples = posterior.sample_batched(sample_shape, x_o[:size], **QUIET)
+        assert samples.shape == (*sample_shape, size, dim)
+    assert samples.dtype is torch.float32
+    assert not samples.requires_grad
+
+
+def test_sample_without_arguments_is_one_draw_at_the_default_x() -> None:
+    assert gaussian_posterior()[2].sample(**QUIET).shape == (2,)
+
+
+@pytest.mark.parametrize("make", POSTERIORS)
+def test_log_prob_has_the_shapes_of_sbi(make: Callable[[], MixturePosterior]) -> None:
+    posterior = make()
+    dim = posterior.posterior_estimator.input_shape[0]
+    x_o = posterior.x_o
+    theta = 2 * torch.rand(7, 5, dim) - 1
+    for x in (x_o[0], x_o[:1]):
+        assert posterior.log_prob(theta[:, 0], x=x).shape == (7,)
+        assert posterior.log_prob(theta[0, 0], x=x).shape == (1,)
+    assert posterior.log_prob_batched(theta[0], x_o).shape == (1, 5)
+    batched = posterior.log_prob_batched(theta, x_o)
+    assert batched.shape == (7, 5)
+    assert batched.dtype is torch.float32
+    for i in range(5):
+        single = posterior.log_prob(theta[:, i], x=x_o[i])
+        assert torch.allclose(single, batched[:, i], atol=1e-5)
+
+
+def test_several_observations_need_the_batched_methods() -> None:
+    posterior = gaussian_posterior()
+    x = posterior.x_o[:2]
+    with pytest.raises(ValueError, match="batched"):
+        posterior.sample((2,), x=x, **QUIET)
+    with pytest.raises(ValueError, match="batched"):
+        posterior.log_prob(torch.zeros(1, 2), x=x)
+
+
+def test_an_x_of_another_shape_is_refused() -> None:
+    posterior = gaussian_posterior()
+    for x in (torch.zeros(4), torch.zeros(2, 4), torch.zeros(2, 3, 1)):
+        with pytest.raises(InvalidInputError, match=r"`x` of shape \(n, 3\)"):
+            posterior.sample_batched((2,), x, **QUIET)
+
+
+def test_an_x_that_is_not_finite_is_refused_by_name() -> None:
+    posterior = gaussian_posterior()
+    bad = posterior.x_o[0].clone()
+    bad[0] = torch.nan
+    with pytest.raises(
+        (ValueError, AssertionError), match=r"[Nn]a[Nn]|not in the batch"
+    ):
+        posterior.sample((2,), x=bad, **QUIET)
+
+
+def test_without_a_default_x_an_x_is_needed() -> None:
+    with pytest.raises(ValueError, match="x"):
+        gaussian_posterior().sample((2,), **QUIET)
+
+
+def test_set_default_x_serves_all_methods_and_can_be_chained() -> None:
+    posterior = gaussian_posterior()
+    x, theta = posterior.x_o[3], torch.zeros(2, 2)
+    expected = posterior.log_prob(theta, x=x)
+    assert posterior.set_default_x(x) is posterior
+    assert torch.equal(posterior.log_prob(theta), expected)
+    torch.manual_seed(1)
+    samples = posterior.sample((4,), **QUIET)
+    torch.manual_seed(1)
+    assert torch.equal(posterior.sample((4,), x=x, **QUIET), samples)
+    posterior.set_default_x(posterior.x_o[0])
+    assert not torch.equal(posterior.log_prob(theta), expected)
+
+
+def test_the_potential_is_the_log_prob_without_normalisation() -> None:
+    posterior = gaussian_posterior()
+    theta = 3 * torch.rand(9, 2) - 1.5
+    x = posterior.x_o[1]
+    expected = posterior.log_prob(theta, x=x, norm_posterior=False)
+    assert torch.allclose(posterior.potential(theta, x=x), expected, atol=1e-6)
+    assert torch.allclose(posterior[1].potential(theta), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("tail_mass", [0.0, 1e-3])
+def test_gradients_of_potential_and_log_prob_are_those_of_finite_differences(
+    tail_mass: float,
+) -> None:
+    posterior = gaussian_posterior(tail_mass=tail_mass)
+    theta = (torch.rand(4, 2) - 0.5).requires_grad_()
+    x, step = posterior.x_o[2], 1e-2
+    for function in (
+        lambda t: posterior.potential(t, x=x, track_gradients=True),
+        lambda t: posterior.log_prob(t, x=x, track_gradients=True),
+        lambda t: posterior.log_prob_batched(t[:, None], x[None], track_gradients=True)[
+            :, 0
+        ],
+    ):
+        (gradient,) = torch.autograd.grad(function(theta).sum(), theta)
+        for k in range(2):
+            shift = step * torch.eye(2)[k]
+            change = (function(theta + shift) - function(theta - shift)) / (2 * step)
+            assert torch.allclose(gradient[:, k], change, atol=0.02, rtol=0.02)
+
+
+def test_gradients_are_not_tracked_unless_asked_for() -> None:
+    posterior = gaussian_posterior()
+    theta = torch.zeros(1, 2, requires_grad=True)
+    assert not posterior.log_prob(theta, x=posterior.x_o[0]).requires_grad
+    assert not posterior.potential(theta, x=posterior.x_o[0]).requires_grad
+
+
+def test_map_finds_the_mode() -> None:
+    posterior = gaussian_posterior()
+    axis = torch.linspace(-0.99, 0.99, 150)
+    grid = torch.cartesian_prod(axis, axis)
+    for i in (0, 3):
+        view = posterior[i]
+        best = view.log_prob(grid).max()
+        mode = view.map(num_iter=100, num_init_samples=200, show_progress_bars=False)
+        assert mode.shape == (1, 2)
+        assert view.log_prob(mode) > best - 0.02
+
+
+def test_map_needs_a_default_x() -> None:
+    posterior = gaussian_posterior()
+    with pytest.raises(ValueError, match=r"[Dd]efault"):
+        posterior.map()
+
+
+# --- the batch ---
+
+
+def test_length_indexing_and_iteration_follow_the_batch() -> None:
+    posterior = gaussian_posterior()
+    assert len(posterior) == 5
+    assert torch.equal(posterior[3].default_x, posterior.x_o[3:4])
+    assert torch.equal(posterior[-1].default_x, posterior.x_o[4:])
+    views = list(posterior)
+    assert len(views) == 5
+    assert all(
+        torch.equal(view.default_x[0], x)
+        for view, x in zip(views, posterior.x_o, strict=True)
+    )
+
+
+@pytest.mark.parametrize("index", [5, -6, 1000])
+def test_an_index_outside_the_batch_is_an_index_error(index: int) -> None:
+    with pytest.raises(IndexError):
+        gaussian_posterior()[index]
+
+
+@pytest.mark.parametrize("index", [1.5, "1", None, slice(0, 2)])
+def test_an_index_that_is_no_integer_is_a_type_error(index: Any) -> None:
+    with pytest.raises(TypeError):
+        gaussian_posterior()[index]
+
+
+def test_a_view_is_the_posterior_at_its_observation() -> None:
+    posterior = gaussian_posterior()
+    theta = 2 * torch.rand(6, 2) - 1
+    for i, view in enumerate(posterior):
+        assert isinstance(view, MixturePosterior)
+        expected = posterior.log_prob(theta, x=posterior.x_o[i])
+        assert torch.equal(view.log_prob(theta), expected)
+        torch.manual_seed(i)
+        samples = view.sample((3,), **QUIET)
+        torch.manual_seed(i)
+        again = posterior.sample((3,), x=posterior.x_o[i], **QUIET)
+        assert torch.equal(samples, again)
+    other = posterior[0].log_prob(theta, x=posterior.x_o[4])
+    assert torch.equal(other, posterior.log_prob(theta, x=posterior.x_o[4]))
+
+
+def test_views_of_image_batches_have_one_image_as_default_x() -> None:
+    posterior = image_posterior()
+    assert posterior[2].default_x.shape == (1, 1, 8, 8)
+    assert posterior[2].sample((3,), **QUIET).shape == (3, 2)
+    assert posterior[2].log_prob(torch.zeros(1, 2)).shape == (1,)
+
+
+def test_a_view_changes_neither_the_posterior_nor_other_views() -> None:
+    posterior = gaussian_posterior().set_default_x(torch.zeros(3))
+    first, second = posterior[0], posterior[1]
+    theta = torch.zeros(1, 2)
+    first.potential(theta)
+    second.potential(theta)
+    first.map(num_iter=2, num_init_samples=10, num_to_optimize=2)
+    first.set_default_x(posterior.x_o[4])
+    assert torch.equal(posterior.default_x, torch.zeros(1, 3))
+    assert torch.equal(second.default_x, posterior.x_o[1:2])
+    assert torch.equal(
+        second.potential_fn(theta), posterior.potential(theta, x=posterior.x_o[1])
+    )
+    assert posterior._map is None
+    assert second._map is None
+
+
+def test_the_evidence_of_the_coupling_is_at_hand() -> None:
+    posterior = gaussian_posterior()
+    assert posterior.weights is posterior.coupling.weights
+    assert posterior.weights.shape == (5, 12)
+    assert posterior.x_o.shape == (5, 3)
+    assert "12 simulated posteriors" in str(posterior)
+    assert "5 real observations" in str(posterior)
+    assert "MixturePosterior" in repr(posterior)
+
+
+# --- copies ---
+
+
+@pytest.mark.parametrize("make_copy", COPIES)
+@pytest.mark.parametrize("index", [None, 2])
+def test_a_copy_has_the_same_density_and_samples(
+    make_copy: Callable[[MixturePosterior], MixturePosterior], index: int | None
+) -> None:
+    posterior: Any = gaussian_posterior(std=0.8)
+    if index is not None:
+        posterior = posterior[index]
+    theta = 2 * torch.rand(4, 5, 2) - 1
+    expected = posterior.log_prob_batched(theta, posterior.x_o)
+    other = make_copy(posterior)
+    assert type(other) is MixturePosterior
+    assert torch.equal(other.log_prob_batched(theta, posterior.x_o), expected)
+    torch.manual_seed(1)
+    samples = posterior.sample_batched((3,), posterior.x_o, **QUIET)
+    torch.manual_seed(1)
+    assert torch.equal(other.sample_batched((3,), posterior.x_o, **QUIET), samples)
+    if index is not None:
+        assert torch.equal(other.default_x, posterior.default_x)
+        assert torch.equal(other.log_prob(theta[:, 0]), posterior.log_prob(theta[:, 0]))
+
+
+@pytest.mark.parametrize("make_copy", COPIES)
+def test_a_copy_made_before_the_first_log_prob_agrees_too(
+    make_copy: Callable[[MixturePosterior], MixturePosterior],
+) -> None:
+    posterior = gaussian_posterior(std=0.8)
+    other = make_copy(posterior)
+    theta = 2 * torch.rand(4, 5, 2) - 1
+    assert torch.equal(
+        other.log_prob_batched(theta, posterior.x_o),
+        posterior.log_prob_batched(theta, posterior.x_o),
+    )
+
+
+@pytest.mark.parametrize("make_copy", COPIES)
+def test_the_default_x_of_a_copy_is_its_own(
+    make_copy: Callable[[MixturePosterior], MixturePosterior],
+) -> None:
+    posterior = gaussian_posterior()
+    posterior.set_default_x(posterior.x_o[0])
+    make_copy(posterior).set_default_x(posterior.x_o[1])
+    assert torch.equal(posterior.default_x, posterior.x_o[:1])
+
+
+def test_a_copy_of_an_extending_posterior_extends() -> None:
+    posterior = gaussian_posterior(unseen="extend")
+    other = through_pickle(posterior)
+    new, theta = torch.randn(3), torch.zeros(1, 2)
+    with pytest.warns(UserWarning, match="Extended"):
+        expected = posterior.log_prob(theta, x=new)
+    with pytest.warns(UserWarning, match="Extended"):
+        assert torch.equal(other.log_prob(theta, x=new), expected)
+
+
+def test_several_unseen_observations_in_turn_each_get_their_own_row() -> None:
+    posterior = gaussian_posterior(unseen="extend")
+    new, theta = torch.randn(2, 3), torch.zeros(1, 2)
+    with pytest.warns(UserWarning, match="Extended"):
+        both = posterior.log_prob_batched(theta[None].expand(1, 2, 2), new)[0]
+    for i in (0, 1, 0):
+        with pytest.warns(UserWarning, match="Extended"):
+            one = posterior.log_prob(theta, x=new[i])
+        assert torch.allclose(one, both[i], atol=1e-5)
+
+
+def test_moving_keeps_the_default_x() -> None:
+    posterior = gaussian_posterior()[2]
+    posterior.to("cpu")
+    assert torch.equal(posterior.default_x, posterior.x_o[2:3])
+
+
+@pytest.mark.gpu
+def test_moving_to_a_gpu_and_back_changes_nothing() -> None:
+    posterior = gaussian_posterior(std=0.8)
+    theta = 2 * torch.rand(4, 5, 2) - 1
+    expected = posterior.log_prob_batched(theta, posterior.x_o)
+    x_o = posterior.x_o
+    posterior.to("cuda")
+    assert posterior.weights.device.type == "cuda"
+    moved = posterior.log_prob_batched(theta.cuda(), x_o.cuda())
+    assert torch.allclose(moved.cpu(), expected, atol=1e-4)
+    assert posterior.sample_batched((3,), x_o.cuda(), **QUIET).device.type == "cuda"
+    posterior.to("cpu")
+    assert torch.equal(posterior.log_prob_batched(theta, x_o), expected)
+
+
+def test_no_network_of_the_posterior_is_left_in_training_mode() -> None:
+    posterior = gaussian_posterior()
+    posterior.posterior_estimator.train()
+    posterior.log_prob(torch.zeros(1, 2), x=posterior.x_o[0])
+    assert not any(m.training for m in posterior.posterior_estimator.modules())
+
+
+def test_dropout_in_the_components_does_not_blur_the_density() -> None:
+    class Noisy(problems.Gaussians):
+        def __init__(self) -> None:
+            super().__init__(2)
+            self.dropout = nn.Dropout(0.5)
+
+        def log_prob(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
+            return super().log_prob(input, self.dropout(condition))
+
+    posterior = gaussian_posterior()
+    posterior.posterior_estimator.components = Noisy()
+    theta = torch.zeros(1, 2)
+    values = {
+        float(posterior.log_prob(theta, x=posterior.x_o[0], norm_posterior=False))
+        for _ in range(5)
+    }
+    assert len(values) == 1

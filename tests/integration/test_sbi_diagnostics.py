@@ -1,0 +1,268 @@
+"""sbi's own diagnostics and plots run unchanged on a MixturePosterior.
+
+True parameters drawn from the posteriors themselves are calibrated by construction, so
+that the diagnostics must find nothing; shifted ones must be found.
+"""
+
+import warnings
+from typing import Any
+
+import pytest
+import torch
+from sbi.diagnostics import (
+    LC2ST,
+    check_sbc,
+    check_tarp,
+    get_nltp,
+    run_sbc,
+    run_tarp,
+)
+from sbi.diagnostics.misspecification import calculate_p_misspecification
+from sbi.inference import EnsemblePosterior
+from torch import Tensor
+
+from sbi_rope import (
+    CalibrationFinetuner,
+    MixturePosterior,
+    RoPE,
+    SinkhornCoupler,
+)
+from sbi_rope._sbi import embed
+from tests import problems
+
+NUM_OBSERVATIONS = 60
+QUIET = {"show_progress_bars": False}
+
+
+@pytest.fixture
+def posterior() -> MixturePosterior:
+    """Gaussian components leaking out of the prior, so that all of it is exercised."""
+    return problems.gaussian_posterior(n_o=NUM_OBSERVATIONS, n_s=40, std=0.5)
+
+
+@pytest.fixture
+def theta(posterior: MixturePosterior) -> Tensor:
+    return posterior.sample_batched((), posterior.x_o, **QUIET)
+
+
+@pytest.fixture(scope="module")
+def repaired() -> tuple[RoPE, MixturePosterior, Tensor]:
+    """RoPE on a misspecified simulator, trained end to end."""
+    with torch.random.fork_rng():
+        torch.manual_seed(7)
+        npe = problems.npe_posterior("maf", "none", num_epochs=30)
+        theta = npe.prior.sample((NUM_OBSERVATIONS + 30,))
+        x = problems.simulate(theta) + 0.5
+        rope = RoPE(
+            npe,
+            simulator=problems.simulate,
+            finetuner=CalibrationFinetuner(num_steps=200, learning_rate=1e-2),
+            coupler=SinkhornCoupler(gamma=0.1),
+        )
+        rope.append_calibration(theta[:30], x[:30]).train(seed=0, **QUIET)
+        posterior = rope.build_posterior(x[30:], num_simulations=100, seed=0)
+    return rope, posterior, theta[30:]
+
+
+def test_sbc_finds_calibrated_posteriors_calibrated_and_shifted_ones_not(
+    posterior: MixturePosterior, theta: Tensor
+) -> None:
+    ranks, dap = run_sbc(
+        theta,
+        posterior.x_o,
+        posterior,
+        num_posterior_samples=200,
+        show_progress_bar=False,
+    )
+    assert ranks.shape == dap.shape == (NUM_OBSERVATIONS, 2)
+    checks = check_sbc(ranks, theta, dap, num_posterior_samples=200)
+    assert checks["ks_pvals"].min() > 0.01
+
+    shifted, dap = run_sbc(
+        (theta + 0.6).clamp(-1, 1),
+        posterior.x_o,
+        posterior,
+        num_posterior_samples=200,
+        show_progress_bar=False,
+    )
+    checks = check_sbc(shifted, theta, dap, num_posterior_samples=200)
+    assert checks["ks_pvals"].max() < 1e-3
+
+
+def test_sbc_needs_no_batched_sampling_and_may_use_workers(
+    posterior: MixturePosterior, theta: Tensor
+) -> None:
+    ranks, _ = run_sbc(
+        theta[:4],
+        posterior.x_o[:4],
+        posterior,
+        num_posterior_samples=50,
+        use_batched_sampling=False,
+        show_progress_bar=False,
+    )
+    assert ranks.shape == (4, 2)
+    assert (ranks >= 0).all()
+    assert (ranks <= 50).all()
+
+
+@pytest.mark.slow
+def test_sbc_runs_in_other_processes(
+    posterior: MixturePosterior, theta: Tensor
+) -> None:
+    ranks, _ = run_sbc(
+        theta[:4],
+        posterior.x_o[:4],
+        posterior,
+        num_posterior_samples=50,
+        num_workers=2,
+        use_batched_sampling=False,
+        show_progress_bar=False,
+    )
+    assert ranks.shape == (4, 2)
+
+
+def test_sbc_samples_in_batches_without_falling_back(
+    posterior: MixturePosterior, theta: Tensor
+) -> None:
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*[Bb]atched sampling.*")
+        run_sbc(
+            theta,
+            posterior.x_o,
+            posterior,
+            num_posterior_samples=20,
+            show_progress_bar=False,
+        )
+
+
+def test_expected_coverage_is_nominal_for_calibrated_posteriors(
+    posterior: MixturePosterior, theta: Tensor
+) -> None:
+    ranks, _ = run_sbc(
+        theta,
+        posterior.x_o,
+        posterior,
+        reduce_fns=posterior.log_prob,
+        num_posterior_samples=200,
+        show_progress_bar=False,
+    )
+    assert ranks.shape == (NUM_OBSERVATIONS, 1)
+    levels = ranks[:, 0].double() / 200
+    # Uniform, with four standard errors on mean and spread.
+    assert abs(float(levels.mean()) - 0.5) < 4 / (12 * NUM_OBSERVATIONS) ** 0.5
+    assert 0.2 < float(levels.std()) < 0.38
+
+
+def test_tarp_finds_calibrated_posteriors_calibrated(
+    posterior: MixturePosterior, theta: Tensor
+) -> None:
+    ecp, alpha = run_tarp(
+        theta,
+        posterior.x_o,
+        posterior,
+        num_posterior_samples=200,
+        show_progress_bar=False,
+    )
+    assert ecp.shape == alpha.shape
+    area, p_value = check_tarp(ecp, alpha)
+    assert abs(area) < 2
+    assert p_value > 0.05
+
+
+def test_nltp_is_the_normalised_negative_log_prob(
+    posterior: MixturePosterior, theta: Tensor
+) -> None:
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*not normalized.*")
+        nltp = get_nltp(theta, posterior.x_o, posterior)
+    expected = -posterior.log_prob_batched(theta, posterior.x_o)[0]
+    assert torch.allclose(nltp, expected, atol=1e-5)
+
+
+def test_lc2st_accepts_its_samples(posterior: MixturePosterior, theta: Tensor) -> None:
+    samples = posterior.sample_batched((), posterior.x_o, **QUIET)
+    lc2st = LC2ST(
+        theta,
+        posterior.x_o,
+        samples,
+        num_trials_null=4,
+        classifier_kwargs={"hidden_layer_sizes": (8,), "max_iter": 50},
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # fifty iterations do not converge
+        lc2st.train_on_observed_data(verbosity=0)
+        lc2st.train_under_null_hypothesis(verbosity=0)
+    draws = posterior[0].sample((100,), **QUIET)
+    p_value = lc2st.p_value(theta_o=draws, x_o=posterior.x_o[:1])
+    assert 0 <= p_value <= 1
+
+
+def test_misspecification_is_found_before_tuning_and_much_smaller_after(
+    repaired: tuple[RoPE, MixturePosterior, Tensor],
+) -> None:
+    rope, posterior, _ = repaired
+    x = problems.simulate(problems.box(2).sample((300,)))
+    simulated = embed(rope.embedding_net, x)
+    before, after = (
+        calculate_p_misspecification(embed(net, posterior.x_o), simulated, n_shuffle=99)
+        for net in (rope.embedding_net, rope.tuned_embedding_net)
+    )
+    assert before[0] < 0.02
+    assert after[1][1] < 0.3 * before[1][1]
+
+
+def test_the_diagnostics_run_on_what_rope_builds(
+    repaired: tuple[RoPE, MixturePosterior, Tensor],
+) -> None:
+    _, posterior, theta = repaired
+    settings: Any = {"num_posterior_samples": 50, "show_progress_bar": False}
+    ranks, _ = run_sbc(theta, posterior.x_o, posterior, **settings)
+    assert ranks.shape == (NUM_OBSERVATIONS, 2)
+    ecp, alpha = run_tarp(theta, posterior.x_o, posterior, **settings)
+    assert ecp.shape == alpha.shape
+    nltp = get_nltp(theta, posterior.x_o, posterior)
+    assert torch.isfinite(nltp).all()
+    # Better than the prior, log 4 on the box [-1, 1]^2, and than NPE.
+    assert nltp.mean() < 1.386
+    npe = problems.npe_posterior("maf", "none", num_epochs=30)
+    log_prob = npe.log_prob_batched(theta, posterior.x_o, norm_posterior=False)
+    assert nltp.mean() < -log_prob.mean()
+
+
+def test_an_ensemble_of_it_averages_the_densities(posterior: MixturePosterior) -> None:
+    other = problems.gaussian_posterior(n_s=7, x_o=posterior.x_o)
+    ensemble = EnsemblePosterior([posterior, other], weights=[0.25, 0.75])
+    x, theta = posterior.x_o[3], 2 * torch.rand(6, 2) - 1
+    ensemble.set_default_x(x)
+    expected = (
+        0.25 * posterior.log_prob(theta, x=x).exp()
+        + 0.75 * other.log_prob(theta, x=x).exp()
+    )
+    assert torch.allclose(ensemble.log_prob(theta).exp(), expected, atol=1e-5)
+    samples = ensemble.sample((500,), **QUIET)
+    assert samples.shape == (500, 2)
+    assert (samples.abs() <= 1).all()
+
+
+def test_pairplot_and_conditional_pairplot_draw_it(
+    posterior: MixturePosterior,
+) -> None:
+    matplotlib = pytest.importorskip("matplotlib")
+    pytest.importorskip("six")
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+    from sbi.analysis import conditional_pairplot, pairplot
+
+    view = posterior[2]
+    samples = view.sample((100,), **QUIET)
+    figure, axes = pairplot(samples)
+    assert axes.shape == (2, 2)
+    pyplot.close(figure)
+    figure, axes = conditional_pairplot(
+        view,
+        condition=samples[:1],
+        limits=torch.tensor([[-1.0, 1.0]] * 2),
+        resolution=10,
+    )
+    assert axes.shape == (2, 2)
+    pyplot.close(figure)

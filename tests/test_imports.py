@@ -1,0 +1,235 @@
+"""Importing the package has no side effects, and imports run one way."""
+
+import ast
+import json
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import pytest
+import sbi
+
+import sbi_rope
+
+PACKAGE = Path(sbi_rope.__file__).parent
+
+# What `import sbi_rope` uses of others; these may import what they like.
+DEPENDENCIES = "import ot, numpy, torch, tqdm.auto, sbi.inference, sbi.utils"
+
+# A module imports from layers below its own, and from its own package.
+LAYERS = [
+    {"errors"},
+    {"_validation", "_sbi", "_random"},
+    {"coupling", "finetuning", "metrics", "_simulations"},
+    {"mixture", "plots", "tasks"},
+    {"rope"},
+    {"baselines"},
+    {"stacking"},
+]
+NEVER_IMPORT_EACH_OTHER = [
+    ("tasks", "rope"),
+    ("tasks", "mixture"),
+    ("tasks", "coupling"),
+]
+# sbi keeps its promises for what a package's __init__ exports.
+PUBLIC_OF_SBI = {
+    "sbi.inference",
+    "sbi.neural_nets",
+    "sbi.utils",
+    "sbi.diagnostics",
+    "sbi.analysis",
+}
+
+
+def run(code: str) -> dict[str, Any]:
+    """Run code in a fresh interpreter; it prints one line of JSON at its end."""
+    result = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert result.returncode == 0, result.stderr
+    lines = result.stdout.splitlines()
+    return {"out": lines[:-1], "err": result.stderr, **json.loads(lines[-1])}
+
+
+def test_importing_prints_nothing_and_opens_no_socket() -> None:
+    result = run("""
+        import json, socket
+        def refuse(*args, **kwargs):
+            raise RuntimeError("a socket was used")
+        for name in ("connect", "connect_ex", "bind", "sendto"):
+            setattr(socket.socket, name, refuse)
+        socket.getaddrinfo = socket.create_connection = refuse
+        import sbi_rope, sbi_rope.metrics, sbi_rope.baselines, sbi_rope.tasks
+        print(json.dumps({}))
+    """)
+    assert result["out"] == []
+    assert result["err"] == ""
+
+
+def test_importing_loads_nothing_heavy_that_its_dependencies_do_not() -> None:
+    result = run(f"""
+        import json, sys
+        {DEPENDENCIES}
+        before = set(sys.modules)
+        import sbi_rope, sbi_rope.metrics, sbi_rope.baselines, sbi_rope.tasks
+        new = sorted(set(sys.modules) - before)
+        print(json.dumps({{"new": new, "all": sorted(sys.modules)}}))
+    """)
+    packages = {name.split(".")[0] for name in result["new"]}
+    assert packages.isdisjoint({"pandas", "matplotlib", "causalchamber", "six", "PIL"})
+    for name in ("sbi.analysis", "causalchamber", "six"):
+        assert name not in result["all"]
+    # Whatever the list above forgets.
+    assert packages - set(sys.stdlib_module_names) <= {"sbi_rope", "sbi"}
+
+
+def test_importing_changes_no_state_of_torch_beyond_what_sbi_changes() -> None:
+    code = """
+        import hashlib, json, random, warnings
+        import numpy, torch
+        torch.manual_seed(0); numpy.random.seed(0); random.seed(0)
+        filters = len(warnings.filters)
+        {imports}
+        digest = hashlib.sha256(torch.get_rng_state().numpy().tobytes()).hexdigest()
+        print(json.dumps(dict(
+            dtype=str(torch.get_default_dtype()),
+            rng=digest,
+            numpy=float(numpy.random.rand()),
+            random=random.random(),
+            validate=torch.distributions.Distribution._validate_args,
+            grad=torch.is_grad_enabled(),
+            threads=torch.get_num_threads(),
+            deterministic=torch.are_deterministic_algorithms_enabled(),
+            filters=[str(f) for f in warnings.filters],
+        )))
+    """
+    theirs = run(code.format(imports=DEPENDENCIES))
+    ours = run(code.format(imports=f"{DEPENDENCIES}; import sbi_rope, sbi_rope.tasks"))
+    assert ours == theirs
+
+
+def test_what_is_promised_is_there() -> None:
+    for name in sbi_rope.__all__:
+        assert getattr(sbi_rope, name).__name__ == name
+    assert sbi_rope.__version__.count(".") == 2
+
+
+# --- layers ---
+
+
+def modules() -> list[Path]:
+    return sorted(PACKAGE.rglob("*.py"))
+
+
+def module_name(path: Path) -> str:
+    parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def imports_of(path: Path, *, top_level: bool = False) -> set[str]:
+    """Absolute names of all that a file imports, ``from a import b`` as a and a.b."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    found: set[str] = set()
+    for node in tree.body if top_level else ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path.name} has a relative import"
+            assert node.module is not None
+            found.add(node.module)
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
+
+
+def part_of(module: str) -> str | None:
+    """The part of the package a module belongs to: sbi_rope.mixture.x to mixture."""
+    names = module.split(".")
+    return names[1] if names[0] == "sbi_rope" and len(names) > 1 else None
+
+
+def parts_imported(path: Path) -> set[str]:
+    known = set().union(*LAYERS)
+    return {part for name in imports_of(path) if (part := part_of(name)) in known}
+
+
+def layer(part: str) -> int:
+    return next(i for i, parts in enumerate(LAYERS) if part in parts)
+
+
+EACH_MODULE = pytest.mark.parametrize(
+    "path", [pytest.param(path, id=module_name(path)) for path in modules()]
+)
+
+
+@EACH_MODULE
+def test_every_module_has_a_layer(path: Path) -> None:
+    part = part_of(module_name(path))
+    assert part is None or part in set().union(*LAYERS), f"give {part} a place"
+
+
+@EACH_MODULE
+def test_no_module_imports_the_package_as_a_whole(path: Path) -> None:
+    # It would hide which layer is meant, and close a circle.
+    names = {name for name in imports_of(path) if name.startswith("sbi_rope.")}
+    parts = {part_of(name) for name in names}
+    assert parts <= set().union(*LAYERS)
+
+
+@EACH_MODULE
+def test_imports_run_from_upper_to_lower_layers(path: Path) -> None:
+    part = part_of(module_name(path))
+    if part is None:
+        return  # the package's own __init__ may import all
+    for other in parts_imported(path) - {part}:
+        # Metrics, for one, are below plots; equals do not know each other.
+        assert layer(other) < layer(part), f"{part} imports {other}"
+
+
+@pytest.mark.parametrize(("one", "other"), NEVER_IMPORT_EACH_OTHER)
+def test_tasks_and_methods_do_not_know_each_other(one: str, other: str) -> None:
+    for path in modules():
+        part = part_of(module_name(path))
+        if part in (one, other):
+            assert parts_imported(path).isdisjoint({one, other} - {part}), path
+
+
+def names_beyond_public(names: set[str]) -> set[str]:
+    """Paths into sbi deeper than its public packages, as ``sbi.utils.x`` modules."""
+    root = Path(sbi.__file__).parent.parent
+    beyond = set()
+    for name in names:
+        if name.split(".")[0] != "sbi" or name in PUBLIC_OF_SBI | {"sbi"}:
+            continue
+        # A name exported by a public package is no module of its own.
+        path = root.joinpath(*name.split("."))
+        if path.is_dir() or path.with_suffix(".py").is_file():
+            beyond.add(name)
+    return beyond
+
+
+@EACH_MODULE
+def test_only_one_module_reaches_into_sbi(path: Path) -> None:
+    if module_name(path) == "sbi_rope._sbi":
+        return
+    beyond = names_beyond_public(imports_of(path))
+    assert not beyond, f"take {sorted(beyond)} from sbi_rope._sbi"
+
+
+def test_the_check_for_reaching_into_sbi_tells_modules_from_names() -> None:
+    public = {"sbi.utils", "sbi.utils.BoxUniform", "sbi.inference.NPE", "torch.nn"}
+    assert names_beyond_public(public) == set()
+    deep = {"sbi.inference.posteriors.base_posterior", "sbi.utils.torchutils"}
+    assert names_beyond_public(deep) == deep
+
+
+@EACH_MODULE
+def test_plots_and_data_libraries_are_imported_where_they_are_used(path: Path) -> None:
+    packages = {name.split(".")[0] for name in imports_of(path, top_level=True)}
+    assert packages.isdisjoint({"matplotlib", "pandas", "causalchamber", "six"})
+    assert "sbi.analysis" not in imports_of(path, top_level=True)

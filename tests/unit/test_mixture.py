@@ -1,0 +1,752 @@
+"""The mixture against brute force: its density, its samples, its normalisation."""
+
+import copy
+import math
+import warnings
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from sbi.utils import BoxUniform, MultipleIndependent
+from sbi.utils.metrics import c2st
+from torch import Size, Tensor
+from torch.distributions import Distribution, Gamma, Normal
+
+from sbi_rope._sbi import embed, embedding_of, headless
+from sbi_rope.coupling import SinkhornCoupler
+from sbi_rope.errors import (
+    InvalidInputError,
+    RoPEWarning,
+    SamplingError,
+    UnseenObservationError,
+)
+from sbi_rope.mixture import MixtureEstimator, MixturePosterior
+from sbi_rope.mixture import estimator as estimator_module
+from sbi_rope.mixture import posterior as posterior_module
+from tests import problems
+from tests.problems import brute_force_log_prob, gaussian_posterior
+
+QUIET = {"show_progress_bars": False}
+
+
+def flow_posterior(
+    family: str = "maf", *, n_o: int = 6, tail_mass: float = 0.0
+) -> MixturePosterior:
+    """A mixture of trained flows, coupled by a sharp coupler."""
+    npe = problems.npe_posterior(family)
+    x_s = problems.simulate(npe.prior.sample((25,)))
+    x_o = problems.simulate(npe.prior.sample((n_o,))) + 0.2
+    h = embedding_of(npe.posterior_estimator)
+    contexts = embed(h, x_s)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RoPEWarning)
+        coupling = SinkhornCoupler(gamma=0.1, tau=0.9).couple(embed(h, x_o), contexts)
+    estimator = MixtureEstimator(
+        headless(copy.deepcopy(npe.posterior_estimator)),
+        contexts,
+        coupling,
+        x_o,
+        embedding_net=h,
+        tail_mass=tail_mass,
+    )
+    return MixturePosterior(estimator, copy.deepcopy(npe.prior))
+
+
+def log_prob_batched(posterior: MixturePosterior, theta: Tensor) -> Tensor:
+    return posterior.log_prob_batched(theta, posterior.x_o, norm_posterior=False)
+
+
+def inside_mass(posterior: MixturePosterior) -> Tensor:
+    """Z_j of Gaussian components inside the box [-1, 1], in closed form."""
+    mean, log_std = posterior.posterior_estimator.contexts.double().chunk(2, dim=1)
+    normal = Normal(mean, log_std.exp())
+    one = torch.ones_like(mean)
+    return (normal.cdf(one) - normal.cdf(-one)).prod(dim=1)
+
+
+def count_draws(posterior: MixturePosterior, monkeypatch: pytest.MonkeyPatch) -> list:
+    """Record the number of thetas of every call of the components' sample."""
+    components: Any = posterior.posterior_estimator.components
+    original, calls = components.sample, []
+
+    def sample(sample_shape: Size, condition: Tensor, **kwargs: Any) -> Tensor:
+        calls.append(Size(sample_shape).numel() * len(condition))
+        return original(sample_shape, condition, **kwargs)
+
+    monkeypatch.setattr(components, "sample", sample)
+    return calls
+
+
+# --- density ---
+
+
+def test_log_prob_is_the_log_sum_over_all_components() -> None:
+    posterior = gaussian_posterior(n_o=5, n_s=40)
+    theta = 2 * torch.rand(30, 5, 2) - 1
+    expected = brute_force_log_prob(posterior, theta).float()
+    batched = log_prob_batched(posterior, theta)
+    assert batched.shape == (30, 5)
+    assert torch.allclose(batched, expected, atol=1e-6, rtol=1e-6)
+    assert torch.allclose(
+        log_prob_batched(posterior, theta[0]), expected[:1], atol=1e-6, rtol=1e-6
+    )
+    for i, x in enumerate(posterior.x_o):
+        single = posterior.log_prob(theta[:, i], x=x, norm_posterior=False)
+        assert torch.allclose(single, expected[:, i], atol=1e-6, rtol=1e-6)
+
+
+@pytest.mark.parametrize("family", problems.FAMILIES)
+def test_log_prob_of_trained_flows_is_the_log_sum_over_all_components(
+    family: str,
+) -> None:
+    posterior = flow_posterior(family)
+    theta = 2 * torch.rand(10, 6, 2) - 1
+    with torch.no_grad():
+        expected = brute_force_log_prob(posterior, theta).float()
+    assert torch.allclose(
+        log_prob_batched(posterior, theta), expected, atol=1e-4, rtol=1e-5
+    )
+
+
+@pytest.mark.parametrize("limit", [1, 3, 7, 50, 1000])
+@pytest.mark.parametrize("tail_mass", [0.0, 0.05])
+def test_chunking_changes_nothing(
+    limit: int, tail_mass: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    posterior = gaussian_posterior(n_o=7, n_s=20, tail_mass=tail_mass)
+    theta = 2 * torch.rand(6, 7, 2) - 1
+    whole = log_prob_batched(posterior, theta)
+    monkeypatch.setattr(estimator_module, "MAX_EVALUATIONS", limit)
+    assert torch.allclose(log_prob_batched(posterior, theta), whole, atol=1e-6)
+
+
+def test_the_flow_never_sees_more_pairs_than_it_may(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    posterior = gaussian_posterior(n_o=7, n_s=20)
+    components: Any = posterior.posterior_estimator.components
+    original, pairs = components.log_prob, []
+
+    def log_prob(input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
+        pairs.append(input.shape[0] * input.shape[1])
+        return original(input, condition, **kwargs)
+
+    monkeypatch.setattr(components, "log_prob", log_prob)
+    monkeypatch.setattr(estimator_module, "MAX_EVALUATIONS", 60)
+    log_prob_batched(posterior, torch.zeros(10, 7, 2))
+    assert max(pairs) <= 60
+    assert sum(pairs) == 10 * 7 * 20
+
+
+@pytest.mark.parametrize("tail_mass", [1e-3, 0.05, 0.5, 0.99, 1.0])
+def test_the_tail_left_out_obeys_the_bound_of_the_docstring(tail_mass: float) -> None:
+    torch.manual_seed(5)
+    weights = torch.softmax(3 * torch.randn(8, 60), dim=1)
+    posterior = gaussian_posterior(n_o=8, weights=weights, contexts=contexts(60))
+    theta = 2 * torch.rand(50, 8, 2) - 1
+    full = log_prob_batched(posterior, theta).double().exp()
+    posterior.posterior_estimator.tail_mass = tail_mass
+    truncated = log_prob_batched(posterior, theta).double().exp()
+
+    # The largest density among the components left out, found independently.
+    estimator = posterior.posterior_estimator
+    bound = torch.zeros(50, 8, dtype=torch.float64)
+    num_dropped = 0
+    for i, row in enumerate(posterior.weights):
+        smallest_first = row.argsort()
+        dropped = smallest_first[row[smallest_first].cumsum(0) <= tail_mass][:59]
+        num_dropped += len(dropped)
+        for j in dropped:
+            condition = estimator.contexts[j].expand(50, -1)
+            density = estimator.components.log_prob(theta[None, :, i], condition)[0]
+            bound[:, i] = torch.maximum(bound[:, i], density.double().exp())
+    missing = full - truncated
+    rounding = 1e-6 * full
+    assert num_dropped > 8
+    assert (missing >= -rounding).all()
+    assert (missing <= tail_mass * bound + rounding).all()
+    assert (missing > 10 * rounding).any(), "no component was left out"
+
+
+def contexts(n_s: int, dim: int = 2) -> Tensor:
+    return problems.contexts_of(dim, n_s)
+
+
+def test_equal_weights_are_kept_even_where_each_is_small() -> None:
+    uniform = torch.full((2, 4000), 1 / 4000)
+    posterior = gaussian_posterior(
+        dim=1, n_o=2, weights=uniform, contexts=contexts(4000, 1), tail_mass=1e-3
+    )
+    theta = torch.linspace(-1, 1, 5)[:, None, None].expand(5, 2, 1)
+    expected = brute_force_log_prob(posterior, theta).float()
+    assert torch.allclose(log_prob_batched(posterior, theta), expected, atol=2e-3)
+
+
+def test_the_tails_of_the_density_do_not_underflow() -> None:
+    posterior = gaussian_posterior(dim=1, prior=problems.standard_normal(1), std=0.01)
+    theta = torch.full((1, 5, 1), 50.0)
+    expected = brute_force_log_prob(posterior, theta)
+    assert expected.max() < -1e5
+    assert torch.allclose(
+        log_prob_batched(posterior, theta).double(), expected, rtol=1e-5
+    )
+
+
+@pytest.mark.parametrize(
+    "prior",
+    [
+        pytest.param(problems.box(2), id="bounded"),
+        pytest.param(problems.standard_normal(2), id="unbounded"),
+    ],
+)
+def test_the_density_integrates_to_one(prior: Distribution) -> None:
+    posterior = gaussian_posterior(prior=prior, n_o=3, std=0.4)
+    bound = 1.0 if isinstance(prior, BoxUniform) else 4.0
+    size = 161
+    step = 2 * bound / size
+    axis = torch.arange(size) * step - bound + step / 2
+    grid = torch.cartesian_prod(axis, axis)
+    integral = (
+        posterior.log_prob_batched(grid[:, None].expand(-1, 3, -1), posterior.x_o)
+        .exp()
+        .sum(dim=0)
+        * step**2
+    )
+    error = posterior.leakage(posterior.x_o).standard_error
+    assert ((integral - 1).abs() < 4 * error + 2e-3).all()
+
+
+@pytest.mark.parametrize("tail_mass", [0.0, 1e-3])
+def test_weights_of_zero_contribute_nothing(tail_mass: float) -> None:
+    weights = torch.tensor([[0.0, 1.0, 0.0], [0.5, 0.0, 0.5]])
+    posterior = gaussian_posterior(
+        n_o=2, weights=weights, contexts=contexts(3), tail_mass=tail_mass
+    )
+    theta = 2 * torch.rand(4, 2, 2) - 1
+    expected = brute_force_log_prob(posterior, theta).float()
+    assert torch.allclose(log_prob_batched(posterior, theta), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("shape", "num_x"),
+    [((3, 2), 5), ((4, 3, 2), 5), ((2, 2), 3), ((1, 4, 2), 5)],
+)
+def test_rows_of_theta_and_x_must_match(shape: tuple, num_x: int) -> None:
+    posterior = gaussian_posterior(n_o=5)
+    with pytest.raises(InvalidInputError, match=r"as many rows of `theta`"):
+        posterior.log_prob_batched(torch.zeros(shape), posterior.x_o[:num_x])
+
+
+def test_one_row_of_theta_or_one_x_serves_all_of_the_other() -> None:
+    posterior = gaussian_posterior(n_o=5)
+    theta = 2 * torch.rand(4, 5, 2) - 1
+    many = posterior.log_prob_batched(theta[:, :1], posterior.x_o)
+    same = posterior.log_prob_batched(theta[:, :1].expand(-1, 5, -1), posterior.x_o)
+    assert torch.allclose(many, same, atol=1e-6)
+    one_x = posterior.log_prob_batched(theta, posterior.x_o[:1])
+    same = posterior.log_prob_batched(theta, posterior.x_o[:1].expand(5, -1))
+    assert torch.allclose(one_x, same, atol=1e-6)
+
+
+# --- samples ---
+
+
+@pytest.mark.parametrize("bounded", [True, False])
+def test_samples_follow_the_density(bounded: bool) -> None:
+    prior = problems.box(2) if bounded else problems.standard_normal(2)
+    posterior = gaussian_posterior(prior=prior, n_o=2, n_s=6)
+    size, bound = 400, 1.0 if bounded else 4.0
+    step = 2 * bound / size
+    axis = torch.arange(size) * step - bound + step / 2
+    grid = torch.cartesian_prod(axis, axis)
+    samples = posterior.sample_batched((1500,), posterior.x_o, **QUIET)
+    for i in range(2):
+        density = posterior.log_prob(grid, x=posterior.x_o[i]).exp().double()
+        chosen = torch.multinomial(density, 1500, replacement=True)
+        drawn = grid[chosen] + step * (torch.rand(1500, 2) - 0.5)
+        probability = density / density.sum()
+        mean = probability @ grid.double()
+        covariance = (grid - mean).T @ (probability[:, None] * (grid - mean))
+        se = (covariance.diagonal() / 1500).sqrt()
+        assert ((samples[:, i].mean(dim=0) - mean).abs() < 4 * se).all()
+        assert (samples[:, i].T.cov() - covariance).abs().max() < 0.15 * float(
+            covariance.diagonal().max()
+        )
+        score = float(c2st(samples[:, i], drawn, n_folds=2))
+        assert abs(score - 0.5) < 0.05
+
+
+def test_marginal_samples_have_the_distribution_of_the_density() -> None:
+    posterior = gaussian_posterior(dim=1, n_o=3, n_s=5)
+    size = 4000
+    axis = (torch.arange(size) + 0.5) * 2 / size - 1
+    samples = posterior.sample_batched((4000,), posterior.x_o, **QUIET)
+    for i in range(3):
+        density = posterior.log_prob(axis[:, None], x=posterior.x_o[i]).double().exp()
+        cdf = (density / density.sum()).cumsum(0)
+        u = cdf[((samples[:, i, 0] + 1) / 2 * size).long().clamp(0, size - 1)]
+        uniform = (torch.arange(4000) + 0.5) / 4000
+        distance = (u.sort().values - uniform).abs().max()
+        assert distance < 1.95 / math.sqrt(4000)  # Kolmogorov-Smirnov, level 0.001
+
+
+def test_components_are_drawn_with_their_weights_and_never_with_weight_zero() -> None:
+    # Components that cannot be confused: a spike at each integer.
+    spikes = torch.stack([torch.arange(6.0), torch.full((6,), -9.0)], dim=1)
+    weights = torch.tensor(
+        [[0.0, 0.5, 0.0, 0.3, 0.2, 0.0], [0.9, 0.0, 0.0, 0.0, 0.0, 0.1]]
+    )
+    posterior = gaussian_posterior(
+        dim=1,
+        n_o=2,
+        weights=weights,
+        contexts=spikes,
+        prior=problems.standard_normal(1),
+    )
+    n = 20_000
+    samples = posterior.sample_batched((n,), posterior.x_o, **QUIET)
+    for i in range(2):
+        found = samples[:, i, 0].round().long().bincount(minlength=6) / n
+        assert (found[weights[i] == 0] == 0).all()
+        se = (weights[i] * (1 - weights[i]) / n).sqrt()
+        assert ((found - weights[i]).abs() <= 4 * se).all()
+
+
+@pytest.mark.parametrize("uniform", [0.0, 1 - 2**-53])
+def test_no_random_number_draws_a_component_of_weight_zero(
+    uniform: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spikes = torch.stack([torch.arange(4.0), torch.full((4,), -9.0)], dim=1)
+    weights = torch.tensor([[0.0, 0.3, 0.7, 0.0]]).expand(200, -1)
+    posterior = gaussian_posterior(
+        dim=1,
+        n_o=200,
+        weights=weights,
+        contexts=spikes,
+        prior=problems.standard_normal(1),
+    )
+    # The ends of what torch.rand returns in double precision.
+    monkeypatch.setattr(
+        torch, "rand", lambda *size, **kwargs: torch.full(size, uniform, **kwargs)
+    )
+    samples = posterior.sample_batched((2,), posterior.x_o, **QUIET)
+    expected = 1.0 if uniform == 0.0 else 2.0
+    assert torch.equal(samples.round(), torch.full((2, 200, 1), expected))
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def test_an_accepted_draw_is_kept_whole(device: str) -> None:
+    # Equal coordinates in every draw: a mixture of two draws would show. Most of the
+    # mass is outside the prior, so that each slot gets several proposals at a time.
+    posterior = gaussian_posterior(dim=2, n_o=4, std=3.0)
+
+    class Diagonal(problems.Gaussians):
+        def sample(self, sample_shape: Size, condition: Tensor, **kw: Any) -> Tensor:
+            return (
+                super()
+                .sample(sample_shape, condition)[..., :1]
+                .expand(*sample_shape, len(condition), 2)
+            )
+
+    posterior.posterior_estimator.components = Diagonal(2)
+    posterior.to(device)
+    samples = posterior.sample_batched((5000,), posterior.x_o, **QUIET)
+    assert torch.equal(samples[..., 0], samples[..., 1])
+
+
+@pytest.mark.parametrize("batch_size", [1, 7, 100_000])
+def test_the_size_of_sampling_batches_does_not_show_in_the_samples(
+    batch_size: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    posterior = gaussian_posterior()
+    calls = count_draws(posterior, monkeypatch)
+    samples = posterior.sample_batched(
+        (10,), posterior.x_o, max_sampling_batch_size=batch_size, **QUIET
+    )
+    assert samples.shape == (10, 5, 2)
+    assert max(calls) <= batch_size
+    assert len(samples.flatten().unique()) == samples.numel()
+
+
+def test_samples_stay_inside_the_prior_unless_asked_otherwise() -> None:
+    posterior = gaussian_posterior(std=1.0)
+    inside = posterior.sample_batched((500,), posterior.x_o, **QUIET)
+    assert (inside.abs() <= 1).all()
+    free = posterior.sample_batched(
+        (500,), posterior.x_o, reject_outside_prior=False, **QUIET
+    )
+    share = (free.abs() <= 1).all(dim=-1).double().mean(dim=0)
+    expected = posterior.weights @ inside_mass(posterior)
+    assert ((share - expected).abs() < 4 * (0.25 / 500) ** 0.5).all()
+
+
+def test_a_posterior_far_outside_the_prior_is_still_sampled() -> None:
+    far = torch.tensor([[3.0, 0.0]])  # Z = P(N(3, 1) in [-1, 1]) = 0.023
+    posterior = gaussian_posterior(dim=1, n_o=1, weights=torch.ones(1, 1), contexts=far)
+    samples = posterior.sample((2000,), x=posterior.x_o[0], **QUIET)[:, 0].double()
+    normal = Normal(3.0, 1.0)
+    low, high = normal.cdf(torch.tensor(-1.0)), normal.cdf(torch.tensor(1.0))
+    u = (normal.cdf(samples) - low) / (high - low)
+    assert abs(float(u.mean()) - 0.5) < 4 * (1 / 12 / 2000) ** 0.5
+    assert abs(float(u.var()) - 1 / 12) < 0.01
+
+
+def hopeless_posterior(n_o: int = 2) -> MixturePosterior:
+    """All mass of the first observation lies far outside the prior."""
+    spikes = torch.tensor([[100.0, -3.0], [0.0, -3.0]])
+    weights = torch.eye(2)[[0] + [1] * (n_o - 1)]
+    return gaussian_posterior(dim=1, n_o=n_o, weights=weights, contexts=spikes)
+
+
+def test_no_mass_inside_the_prior_ends_in_an_error_that_names_the_observation(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(posterior_module, "MIN_PROPOSALS", 2000)
+    posterior = hopeless_posterior()
+    with pytest.raises(SamplingError, match=r"rows \[0\] of `x`.*reject_outside_prior"):
+        posterior.sample_batched((3,), posterior.x_o, **QUIET)
+    with pytest.raises(SamplingError):
+        posterior.sample((1,), x=posterior.x_o[0], **QUIET)
+    assert posterior.sample((3,), x=posterior.x_o[1], **QUIET).shape == (3, 1)
+    free = posterior.sample(
+        (3,), x=posterior.x_o[0], reject_outside_prior=False, **QUIET
+    )
+    assert (free > 90).all()
+
+
+def test_rejection_gives_up_after_a_bounded_number_of_draws(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    posterior = hopeless_posterior()
+    components: Any = posterior.posterior_estimator.components
+    original, drawn = components.sample, [0]
+
+    def sample(sample_shape: Size, condition: Tensor, **kwargs: Any) -> Tensor:
+        drawn[0] += len(condition)
+        # At a hundred thousand draws a second, which flows rarely reach, minutes.
+        assert drawn[0] < 2e7, "more than 20 million draws for 1000 samples"
+        return original(sample_shape, condition, **kwargs)
+
+    monkeypatch.setattr(components, "sample", sample)
+    with pytest.raises(SamplingError):
+        posterior.sample((1000,), x=posterior.x_o[0], **QUIET)
+
+
+def test_log_prob_without_mass_inside_the_prior_raises_unless_not_normalised() -> None:
+    posterior = hopeless_posterior()
+    theta = torch.zeros(1, 1)
+    with pytest.raises(SamplingError, match="norm_posterior=False"):
+        posterior.log_prob(theta, x=posterior.x_o[0])
+    value = posterior.log_prob(theta, x=posterior.x_o[0], norm_posterior=False)
+    assert value < -1e5
+
+
+# --- prior support and leakage ---
+
+
+def test_the_mass_inside_the_prior_is_that_of_the_components() -> None:
+    # With identity weights the mass of observation j is that of component j.
+    n = 200
+    posterior = gaussian_posterior(
+        n_o=n, weights=torch.eye(n), contexts=problems.contexts_of(2, n, std=0.5)
+    )
+    leakage, truth = posterior.leakage(posterior.x_o), inside_mass(posterior)
+    error = (truth * (1 - truth) / posterior_module.LEAKAGE_DRAWS).sqrt()
+    z = (leakage.mass - truth) / error
+    assert z.abs().max() < 4.5
+    assert 0.8 < z.std() < 1.2
+    assert abs(float(z.mean())) < 4 / n**0.5
+    assert torch.allclose(leakage.standard_error, error, rtol=0.5)
+
+
+def test_the_mass_of_a_mixture_and_its_error_follow_the_weights() -> None:
+    posterior = gaussian_posterior(std=0.6, n_o=10, n_s=30)
+    leakage, z_j = posterior.leakage(posterior.x_o), inside_mass(posterior)
+    truth = posterior.weights @ z_j
+    variance = posterior.weights.square() @ (z_j * (1 - z_j))
+    error = (variance / posterior_module.LEAKAGE_DRAWS).sqrt()
+    assert truth.min() < 0.9
+    assert ((leakage.mass - truth).abs() < 4 * error).all()
+    assert torch.allclose(leakage.standard_error, error, rtol=0.1)
+
+
+@pytest.mark.parametrize("family", ["maf", "zuko_nsf"])
+def test_the_mass_inside_the_prior_of_flows_is_that_of_their_density(
+    family: str,
+) -> None:
+    posterior = flow_posterior(family, n_o=4)
+    axis = (torch.arange(60) + 0.5) / 30 - 1
+    grid = torch.cartesian_prod(axis, axis)[:, None].expand(-1, 4, -1)
+    integral = log_prob_batched(posterior, grid).exp().sum(dim=0) / 30**2
+    leakage = posterior.leakage(posterior.x_o)
+    assert ((leakage.mass - integral).abs() < 4 * leakage.standard_error + 5e-3).all()
+
+
+@pytest.mark.parametrize(
+    "prior",
+    [
+        pytest.param(problems.standard_normal(2), id="multivariate"),
+        pytest.param(
+            torch.distributions.Independent(Normal(torch.zeros(2), torch.ones(2)), 1),
+            id="independent",
+        ),
+    ],
+)
+def test_an_unbounded_prior_has_mass_one_without_draws(
+    prior: Distribution, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    posterior = gaussian_posterior(prior=prior)
+    calls = count_draws(posterior, monkeypatch)
+    leakage = posterior.leakage(posterior.x_o)
+    assert torch.allclose(leakage.mass, torch.ones(5).double(), atol=1e-14)
+    assert torch.equal(leakage.standard_error, torch.zeros(5).double())
+    assert calls == []
+
+
+class WithoutSupport(Distribution):
+    """A user's prior that says only through its density where it ends."""
+
+    arg_constraints = {}  # noqa: RUF012
+
+    def __init__(self) -> None:
+        super().__init__(Size(), Size((2,)), validate_args=False)
+        self.box = problems.box(2)
+
+    def sample(self, sample_shape: Size = Size()) -> Tensor:  # noqa: B008
+        return self.box.sample(sample_shape)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        inside = (value.abs() <= 1).all(dim=-1)
+        return torch.where(inside, -math.log(4.0), -torch.inf)
+
+
+@pytest.mark.parametrize(
+    ("make_prior", "inside"),
+    [
+        pytest.param(
+            lambda: MultipleIndependent(
+                [problems.box(1), Normal(torch.zeros(1), torch.ones(1))]
+            ),
+            lambda theta: theta[..., 0].abs() <= 1,
+            id="half bounded",
+        ),
+        pytest.param(
+            lambda: torch.distributions.Independent(
+                Gamma(torch.ones(2), torch.ones(2)), 1
+            ),
+            lambda theta: (theta >= 0).all(dim=-1),
+            id="half line",
+        ),
+        pytest.param(
+            WithoutSupport,
+            lambda theta: (theta.abs() <= 1).all(dim=-1),
+            id="no support property",
+        ),
+    ],
+)
+def test_support_of_any_shape_bounds_samples_density_and_mass(
+    make_prior: Any, inside: Any
+) -> None:
+    posterior = gaussian_posterior(prior=make_prior(), std=0.8)
+    samples = posterior.sample_batched((200,), posterior.x_o, **QUIET)
+    assert inside(samples).all()
+    free = posterior.sample_batched(
+        (4000,), posterior.x_o, reject_outside_prior=False, **QUIET
+    )
+    log_prob = posterior.log_prob_batched(free[:50], posterior.x_o)
+    assert torch.equal(torch.isfinite(log_prob), inside(free[:50]))
+    share = inside(free).double().mean(dim=0)
+    leakage = posterior.leakage(posterior.x_o)
+    error = (leakage.standard_error.square() + 0.25 / 4000).sqrt()
+    assert ((leakage.mass - share).abs() < 4 * error).all()
+
+
+def test_log_prob_is_minus_infinity_outside_the_prior_alone() -> None:
+    posterior = gaussian_posterior(std=0.8)
+    theta = 3 * torch.rand(50, 5, 2) - 1.5
+    inside = (theta.abs() <= 1).all(dim=-1)
+    for norm in (True, False):
+        log_prob = posterior.log_prob_batched(theta, posterior.x_o, norm_posterior=norm)
+        assert torch.equal(torch.isfinite(log_prob), inside)
+        assert (log_prob[~inside] == -torch.inf).all()
+
+
+def test_normalising_subtracts_the_log_of_the_mass() -> None:
+    posterior = gaussian_posterior(std=0.8)
+    theta = 2 * torch.rand(3, 5, 2) - 1
+    difference = log_prob_batched(posterior, theta) - posterior.log_prob_batched(
+        theta, posterior.x_o
+    )
+    log_mass = posterior.leakage(posterior.x_o).mass.log().float()
+    assert log_mass.max() < -0.05
+    assert torch.allclose(difference, log_mass.expand(3, -1), atol=1e-5)
+    one = posterior.log_prob(theta[:, 2], x=posterior.x_o[2])
+    one_free = posterior.log_prob(theta[:, 2], posterior.x_o[2], norm_posterior=False)
+    assert torch.allclose(one_free - one, log_mass[2].expand(3), atol=1e-5)
+
+
+def test_the_mass_of_components_is_estimated_once_for_all_views(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    posterior = gaussian_posterior()
+    calls = count_draws(posterior, monkeypatch)
+    view, theta = posterior[1], torch.zeros(1, 2)
+    view.log_prob(theta)
+    assert sum(calls) == 12 * posterior_module.LEAKAGE_DRAWS
+    for _ in range(2):
+        posterior.log_prob_batched(theta, posterior.x_o)
+        posterior[3].log_prob(theta)
+        posterior.leakage(posterior.x_o)
+    assert sum(calls) == 12 * posterior_module.LEAKAGE_DRAWS
+
+
+def test_log_prob_is_a_function_and_leaves_the_random_state_alone() -> None:
+    posterior = gaussian_posterior(std=0.8)
+    again = copy.deepcopy(posterior)
+    theta = 2 * torch.rand(3, 5, 2) - 1
+    torch_state, numpy_state = torch.get_rng_state(), np.random.get_state()  # noqa: NPY002
+    first = posterior.log_prob_batched(theta, posterior.x_o)
+    assert torch.equal(torch.get_rng_state(), torch_state)
+    assert all(
+        np.array_equal(a, b)
+        for a, b in zip(np.random.get_state(), numpy_state, strict=True)  # noqa: NPY002
+    )
+    torch.rand(17)
+    assert torch.equal(again.log_prob_batched(theta, posterior.x_o), first)
+
+
+def test_samples_follow_the_seed_of_torch() -> None:
+    posterior = gaussian_posterior(std=0.8)
+    draws = []
+    for seed in (1, 1, 2):
+        torch.manual_seed(seed)
+        draws.append(posterior.sample_batched((4,), posterior.x_o, **QUIET))
+    assert torch.equal(draws[0], draws[1])
+    assert not torch.equal(draws[0], draws[2])
+
+
+# --- from x to its row ---
+
+
+def test_an_observation_is_found_by_its_value() -> None:
+    x_o = torch.randn(6, 3)
+    x_o[4] = x_o[1]
+    x_o[2, 0] = 0.0
+    posterior = gaussian_posterior(x_o=x_o)
+    estimator = posterior.posterior_estimator
+    rows = posterior.weights
+    assert torch.equal(estimator.rows(x_o)[[0, 1, 2, 3, 5]], rows[[0, 1, 2, 3, 5]])
+    assert torch.equal(estimator.rows(x_o[[5, 0, 0]]), rows[[5, 0, 0]])
+    assert torch.equal(estimator.rows(x_o[4:5]), estimator.rows(x_o[1:2]))
+    negative_zero = x_o[2:3].clone()
+    negative_zero[0, 0] = -0.0
+    assert torch.equal(estimator.rows(negative_zero), rows[2:3])
+
+
+def test_duplicates_in_the_batch_have_the_same_posterior() -> None:
+    x_o = torch.randn(4, 3)
+    x_o[3] = x_o[0]
+    weights = torch.softmax(torch.randn(4, 8), dim=1)
+    weights[3] = weights[0]
+    posterior = gaussian_posterior(x_o=x_o, weights=weights, contexts=contexts(8))
+    theta = 2 * torch.rand(9, 1, 2) - 1
+    log_prob = posterior.log_prob_batched(theta, posterior.x_o)
+    assert torch.equal(log_prob[:, 0], log_prob[:, 3])
+
+
+def test_double_precision_and_numpy_observations_are_recognised() -> None:
+    posterior = gaussian_posterior()
+    theta, x = torch.zeros(2, 2), posterior.x_o[3]
+    expected = posterior.log_prob(theta, x=x)
+    for same in (x.double(), x.numpy(), x.double().numpy(), x[None], x.tolist()):
+        assert torch.equal(posterior.log_prob(theta, x=same), expected)
+        assert posterior.sample((2,), x=same, **QUIET).shape == (2, 2)
+    batch = posterior.x_o.double()
+    assert torch.equal(
+        posterior.log_prob_batched(torch.zeros(5, 2), batch)[0, 3], expected[0]
+    )
+    assert posterior.sample_batched((2,), batch.numpy(), **QUIET).shape == (2, 5, 2)
+
+
+def test_rows_cannot_be_changed_through_what_was_returned() -> None:
+    posterior = gaussian_posterior()
+    before = posterior.weights.clone()
+    posterior.posterior_estimator.rows(posterior.x_o)[:] = 0
+    assert torch.equal(posterior.weights, before)
+
+
+def test_an_unseen_observation_raises_and_both_ways_on_are_named() -> None:
+    posterior = gaussian_posterior()
+    new = torch.randn(1, 3)
+    for call in (
+        lambda: posterior.sample((2,), x=new, **QUIET),
+        lambda: posterior.log_prob(torch.zeros(1, 2), x=new),
+        lambda: posterior.sample_batched(
+            (2,), torch.cat([posterior.x_o, new]), **QUIET
+        ),
+        lambda: posterior.log_prob_batched(torch.zeros(1, 2), new),
+        lambda: posterior.leakage(new),
+        lambda: posterior.potential(torch.zeros(1, 2), x=new),
+    ):
+        with pytest.raises(UnseenObservationError, match=r"1 observation") as caught:
+            call()
+        assert "rope.build_posterior(x_new)" in str(caught.value)
+        assert "unseen='extend'" in str(caught.value)
+        assert isinstance(caught.value, ValueError)
+
+
+def test_an_unseen_observation_may_extend_the_coupling_with_a_warning() -> None:
+    posterior = gaussian_posterior(unseen="extend")
+    estimator = posterior.posterior_estimator
+    new = torch.randn(2, 3)
+    expected = posterior.coupling.rows(embed(estimator._g, new))
+    smallest = float((1 / expected.square().sum(dim=1)).min())
+    mixed = torch.cat([new[:1], posterior.x_o[2:3], new[1:]])
+    with pytest.warns(RoPEWarning, match=rf"2 unseen.*size {smallest:.1f} of 12"):
+        rows = estimator.rows(mixed)
+    assert torch.allclose(rows[[0, 2]], expected, atol=1e-12)
+    assert torch.equal(rows[1], posterior.weights[2])
+
+    with pytest.warns(RoPEWarning):
+        log_prob = posterior.log_prob(torch.zeros(1, 2), x=new[0], norm_posterior=False)
+    extended = gaussian_posterior(
+        n_o=2, weights=expected, contexts=estimator.contexts, x_o=new
+    )
+    assert torch.allclose(
+        log_prob,
+        extended.log_prob(torch.zeros(1, 2), x=new[0], norm_posterior=False),
+        atol=1e-6,
+    )
+
+
+def test_observations_of_the_batch_do_not_warn_when_extending_is_allowed() -> None:
+    posterior = gaussian_posterior(unseen="extend")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        posterior.sample_batched((2,), posterior.x_o, **QUIET)
+        posterior.log_prob_batched(torch.zeros(5, 2), posterior.x_o)
+
+
+def test_the_warning_of_extending_points_at_the_callers_line() -> None:
+    posterior = gaussian_posterior(unseen="extend")
+    for call in (
+        lambda: posterior.sample_batched((2,), torch.randn(1, 3), **QUIET),
+        lambda: posterior.log_prob(
+            torch.zeros(1, 2), x=torch.randn(3), norm_posterior=False
+        ),
+        lambda: posterior.log_prob_batched(
+            torch.zeros(1, 2), torch.randn(1, 3), norm_posterior=False
+        ),
+    ):
+        with pytest.warns(RoPEWarning) as caught:
+            call()
+        assert caught[0].filename == __file__
+
+
+def test_one_call_extends_the_coupling_with_one_warning() -> None:
+    posterior = gaussian_posterior(unseen="extend")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        posterior.log_prob(torch.zeros(1, 2), x=torch.randn(3))
+    assert len(caught) == 1

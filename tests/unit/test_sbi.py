@@ -1,0 +1,204 @@
+"""What the package takes from sbi's estimators, and what it refuses."""
+
+import copy
+from typing import Any
+
+import pytest
+import torch
+from sbi.inference import (
+    NPE,
+    DirectPosterior,
+    EnsemblePosterior,
+    ImportanceSamplingPosterior,
+    MCMCPosterior,
+    RejectionPosterior,
+    VectorFieldPosterior,
+    VIPosterior,
+)
+from sbi.inference.posteriors import NPE_A_Posterior
+from torch import Tensor, nn
+
+from sbi_rope import RoPE
+from sbi_rope._sbi import (
+    dtype_of,
+    embed,
+    embedding_of,
+    estimator_of,
+    headless,
+    posterior_from,
+    with_embedding,
+)
+from sbi_rope.errors import RoPEError, UnsupportedPosteriorError
+from tests import problems
+
+
+def fresh_estimator(family: str = "maf") -> Any:
+    """A copy that a test may change."""
+    return copy.deepcopy(problems.npe_posterior(family).posterior_estimator)
+
+
+def bare(kind: type) -> Any:
+    """An instance without state: enough for a check that looks at the type."""
+    return kind.__new__(kind)
+
+
+def test_the_estimator_of_a_direct_posterior_is_the_trained_one() -> None:
+    posterior = problems.npe_posterior()
+    assert estimator_of(posterior) is posterior.posterior_estimator
+
+
+@pytest.mark.parametrize("method", ["fmpe", "npse"])
+def test_the_estimator_of_a_vector_field_posterior_is_the_trained_one(
+    method: str,
+) -> None:
+    posterior = problems.vector_field_posterior(method)
+    assert estimator_of(posterior) is posterior.vector_field_estimator
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        pytest.param(lambda: bare(MCMCPosterior), "MCMCPosterior", id="mcmc"),
+        pytest.param(lambda: bare(VIPosterior), "VIPosterior", id="vi"),
+        pytest.param(
+            lambda: bare(ImportanceSamplingPosterior),
+            "ImportanceSamplingPosterior",
+            id="importance",
+        ),
+        pytest.param(
+            lambda: bare(RejectionPosterior), "RejectionPosterior", id="rejection"
+        ),
+        pytest.param(lambda: bare(NPE_A_Posterior), "NPE_A_Posterior", id="npe-a"),
+        pytest.param(
+            lambda: EnsemblePosterior([problems.npe_posterior()] * 2),
+            "EnsemblePosterior",
+            id="ensemble",
+        ),
+        pytest.param(problems.gaussian_posterior, "MixturePosterior", id="mixture"),
+        pytest.param(
+            lambda: problems.gaussian_posterior()[0], "MixturePosterior", id="view"
+        ),
+        pytest.param(
+            lambda: NPE(problems.box(2), show_progress_bars=False), "NPE_C", id="npe"
+        ),
+        pytest.param(
+            lambda: problems.npe_posterior().posterior_estimator,
+            "NFlowsFlow",
+            id="estimator",
+        ),
+        pytest.param(lambda: problems.box(2), "BoxUniform", id="prior"),
+        pytest.param(lambda: None, "NoneType", id="none"),
+    ],
+)
+def test_what_has_no_amortised_estimator_is_refused_by_name(
+    make: Any, name: str
+) -> None:
+    posterior = make()
+    with pytest.raises(UnsupportedPosteriorError, match=f"got {name}") as caught:
+        RoPE(posterior, simulator=problems.simulate)
+    assert "NPE(...).build_posterior()" in str(caught.value)
+    assert isinstance(caught.value, RoPEError)
+    assert isinstance(caught.value, TypeError)
+
+
+@pytest.mark.parametrize("sample_with", ["mcmc", "rejection", "vi"])
+def test_an_npe_posterior_sampled_another_way_is_refused(sample_with: str) -> None:
+    theta = problems.box(2).sample((50,))
+    npe = NPE(problems.box(2), density_estimator="mdn", show_progress_bars=False)
+    npe.append_simulations(theta, problems.simulate(theta)).train(max_num_epochs=1)
+    posterior = npe.build_posterior(sample_with=sample_with)  # type: ignore[arg-type]
+    with pytest.raises(UnsupportedPosteriorError, match=type(posterior).__name__):
+        RoPE(posterior, simulator=problems.simulate)
+
+
+def test_an_estimator_without_embedding_net_is_refused_by_name() -> None:
+    with pytest.raises(UnsupportedPosteriorError, match="Gaussians"):
+        embedding_of(problems.Gaussians(2))
+
+
+class Mean(nn.Module):
+    def forward(self, x: Tensor) -> Tensor:
+        return x.mean(dim=1)
+
+
+@pytest.mark.parametrize(
+    "net",
+    [
+        pytest.param(Mean(), id="one number"),
+        pytest.param(nn.Unflatten(1, (1, 3)), id="matrix"),
+    ],
+)
+def test_an_embedding_that_is_not_a_vector_is_refused(net: nn.Module) -> None:
+    estimator = with_embedding(fresh_estimator(), net)
+    with pytest.raises(UnsupportedPosteriorError, match="one vector per observation"):
+        headless(estimator)
+
+
+def test_with_embedding_uses_the_new_net_and_leaves_the_estimator() -> None:
+    estimator = fresh_estimator()
+    old = embedding_of(estimator)
+    new = nn.Sequential(nn.Linear(3, 7), nn.Linear(7, 4))
+    theta, x = torch.rand(1, 5, 2), torch.randn(5, 3)
+    before = estimator.log_prob(theta, x)
+
+    swapped = with_embedding(estimator, new)
+    assert embedding_of(swapped) is new
+    expected = headless(estimator).log_prob(theta, embed(new, x))
+    assert torch.equal(swapped.log_prob(theta, x), expected)
+    assert embedding_of(estimator) is old
+    assert torch.equal(estimator.log_prob(theta, x), before)
+
+
+def test_with_embedding_shares_all_other_parameters() -> None:
+    estimator = fresh_estimator()
+    old = {id(p) for p in embedding_of(estimator).parameters()}
+    density = {id(p) for p in estimator.parameters()} - old
+    swapped = with_embedding(estimator, nn.Identity())
+    assert {id(p) for p in swapped.parameters()} == density
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_headless_leaves_the_mode_of_the_estimator(training: bool) -> None:
+    estimator = fresh_estimator().train(training)
+    headless(estimator)
+    assert {module.training for module in estimator.modules()} == {training}
+
+
+def test_headless_keeps_the_double_precision_of_an_estimator() -> None:
+    estimator = fresh_estimator("zuko_maf").double()
+    assert dtype_of(estimator) is torch.float64
+    context = embed(embedding_of(estimator), torch.randn(5, 3, dtype=torch.float64))
+    theta = torch.rand(1, 5, 2, dtype=torch.float64)
+    assert headless(estimator).log_prob(theta, context).dtype is torch.float64
+
+
+def test_embed_does_not_depend_on_the_batch() -> None:
+    net = nn.Sequential(nn.Linear(3, 4), nn.BatchNorm1d(4), nn.Dropout(0.5)).train()
+    x = torch.randn(10, 3)
+    whole = embed(net, x)
+    assert torch.allclose(embed(net, x, batch_size=3), whole, atol=1e-6)
+    assert torch.allclose(embed(net, x[4:5]), whole[4:5], atol=1e-6)
+    assert not whole.requires_grad
+
+
+def test_posterior_from_wraps_an_estimator_as_its_model_does() -> None:
+    original = problems.npe_posterior()
+    estimator = fresh_estimator()
+    posterior = posterior_from(original, estimator)
+    assert type(posterior) is DirectPosterior
+    assert posterior.posterior_estimator is estimator
+    theta, x = torch.rand(4, 2), torch.randn(3)
+    assert torch.equal(
+        posterior.log_prob(theta, x, norm_posterior=False),
+        original.log_prob(theta, x, norm_posterior=False),
+    )
+    assert posterior.prior is not original.prior
+
+
+@pytest.mark.parametrize("sample_with", ["ode", "sde"])
+def test_posterior_from_keeps_how_a_vector_field_is_sampled(sample_with: str) -> None:
+    original = copy.copy(problems.vector_field_posterior("npse"))
+    original.sample_with = sample_with
+    posterior = posterior_from(original, original.vector_field_estimator)
+    assert type(posterior) is VectorFieldPosterior
+    assert posterior.sample_with == sample_with
