@@ -1,7 +1,6 @@
 """The plots show what their labels say; looks are judged by eye."""
 
 import builtins
-import sys
 from types import SimpleNamespace
 from typing import Any
 
@@ -29,17 +28,16 @@ def two_posteriors() -> dict[str, Tensor]:
 
 
 @pytest.mark.parametrize("size", [1, 3])
-def test_pair_plot_has_a_diagonal_panel_for_each_parameter(size: int) -> None:
-    pytest.importorskip("six")
+def test_pair_plot_has_a_panel_for_each_parameter_and_pair(size: int) -> None:
     figure = plots.pair_plot(
         {"NPE": torch.randn(200, size)}, parameter_names=["a", "b", "c"][:size]
     )
-    labels = [axes.get_xlabel() for axes in figure.axes[:: size + 1]]
+    assert len(figure.axes) == size * (size + 1) // 2
+    labels = [axes.get_xlabel() for axes in figure.axes[-size:]]
     assert labels == ["a", "b", "c"][:size]
 
 
 def test_pair_plot_names_methods_and_marks_the_truth() -> None:
-    pytest.importorskip("six")
     figure = plots.pair_plot(two_posteriors(), torch.tensor([0.25, 0.5]))
     assert legend_texts(figure.legends[0]) == ["NPE", "RoPE", "truth"]
     marks = [line.get_xdata()[0] for line in figure.axes[0].lines]
@@ -47,7 +45,6 @@ def test_pair_plot_names_methods_and_marks_the_truth() -> None:
 
 
 def test_pair_plot_limits_ignore_extremes_but_hold_the_truth() -> None:
-    pytest.importorskip("six")
     samples = two_posteriors()
     samples["NPE"][0] = 1e6
     low, high = plots.pair_plot(samples, torch.tensor([-9.0, 0.0])).axes[0].get_xlim()
@@ -56,7 +53,6 @@ def test_pair_plot_limits_ignore_extremes_but_hold_the_truth() -> None:
 
 
 def test_pair_plot_leaves_no_open_figure() -> None:
-    pytest.importorskip("six")
     from matplotlib import pyplot
 
     before = pyplot.get_fignums()
@@ -81,6 +77,9 @@ def test_pair_plot_leaves_no_open_figure() -> None:
             {"a": torch.zeros(5, 2)}, {"theta": torch.zeros(3)}, "theta", id="theta"
         ),
         pytest.param({"a": torch.full((5, 2), torch.nan)}, {}, "finite", id="nan"),
+        pytest.param(
+            {"a": torch.zeros(5, 2)}, {"prior": torch.zeros(5, 3)}, "prior", id="prior"
+        ),
     ],
 )
 def test_pair_plot_refuses(
@@ -90,18 +89,98 @@ def test_pair_plot_refuses(
         plots.pair_plot(samples, **kwargs)
 
 
-def test_missing_six_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def outline(axes: Any) -> Any:
+    """All corners of the contours in a panel."""
+    paths = [path for drawn in axes.collections for path in drawn.get_paths()]
+    return torch.cat([torch.as_tensor(path.vertices) for path in paths])
+
+
+def test_pair_plot_leaves_a_posterior_far_from_the_truth_outside_and_says_so() -> None:
+    samples = {"NPE": torch.randn(400, 2) + 50.0, "RoPE": torch.randn(400, 2)}
+    figure = plots.pair_plot(samples, torch.zeros(2))
+    assert figure.axes[0].get_xlim()[1] < 10.0
+    texts = legend_texts(figure.legends[0])
+    assert texts == ["NPE (100 % outside)", "RoPE", "truth"]
+
+
+def test_pair_plot_shows_all_where_no_posterior_is_around_the_truth() -> None:
+    samples = {"NPE": torch.randn(400, 2) + 50.0, "RoPE": torch.randn(400, 2) + 9.0}
+    low, high = plots.pair_plot(samples, torch.zeros(2)).axes[0].get_xlim()
+    assert low < 0.0
+    assert high > 52.0
+
+
+def test_pair_plot_with_a_prior_reaches_no_further_than_its_width() -> None:
+    samples = {"NPE": 30.0 * torch.randn(400, 2), "RoPE": torch.rand(400, 2)}
+    figure = plots.pair_plot(
+        samples, torch.full((2,), 0.5), prior=torch.rand(500, 2), parameter_names="ab"
+    )
+    low, high = figure.axes[0].get_xlim()
+    assert -1.5 < low < -0.5
+    assert 1.5 < high < 2.5
+    assert legend_texts(figure.legends[0])[-1] == "prior"
+    shade = figure.axes[0].patches[0]
+    assert (shade.get_x(), shade.get_width()) == pytest.approx((0.0, 1.0), abs=0.05)
+
+
+@pytest.mark.parametrize("count", [1, 2, 200])
+def test_pair_plot_draws_identical_samples_as_a_point(count: int) -> None:
+    same = torch.tensor([[1.0, 2.0]]).repeat(count, 1)
+    figure = plots.pair_plot({"same": same, "RoPE": torch.randn(200, 2)})
+    point = figure.axes[1].lines[0]
+    assert (point.get_xdata()[0], point.get_ydata()[0]) == (1.0, 2.0)
+    figure.draw_without_rendering()
+
+
+def test_pair_plot_draws_samples_on_a_line_as_a_line() -> None:
+    x = torch.linspace(0, 1, 300)
+    line = plots.pair_plot({"a": torch.stack([x, 2 * x], dim=1)}).axes[1].lines[0]
+    assert sorted(line.get_ydata()) == pytest.approx([0.0, 2.0])
+
+
+def test_pair_plot_contours_enclose_their_share() -> None:
+    axes = plots.pair_plot({"a": torch.randn(5000, 2)}).axes[1]
+    radius = outline(axes).norm(dim=1)
+    # Of a normal in two dimensions; smoothing widens them a little.
+    for share in (0.5, 0.9):
+        expected = (-2 * torch.log(torch.tensor(1 - share))).sqrt()
+        assert (radius - expected).abs().min() < 0.1 * expected
+    assert radius.max() < 1.3 * expected
+    assert radius.min() > 0.9
+
+
+def test_pair_plot_histograms_have_an_area_of_the_samples_they_hold() -> None:
+    samples = torch.randn(1000, 1)
+    samples[:3] = 1e6
+    values, edges, _ = plots.pair_plot({"a": samples}).axes[0].patches[0].get_data()
+    area = float((values * (edges[1:] - edges[:-1])).sum())
+    assert area == pytest.approx(0.99, abs=0.005)
+
+
+def test_missing_matplotlib_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     original = builtins.__import__
 
-    def without_six(name: str, *args: Any, **kwargs: Any) -> Any:
-        if name == "sbi.analysis":
-            raise ModuleNotFoundError("No module named 'six'", name="six")
+    def without(name: str, *args: Any, **kwargs: Any) -> Any:
+        if name.startswith("matplotlib"):
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
         return original(name, *args, **kwargs)
 
-    monkeypatch.delitem(sys.modules, "sbi.analysis", raising=False)
-    monkeypatch.setattr(builtins, "__import__", without_six)
-    with pytest.raises(ImportError, match=r"`six`.*sbi-rope\[benchmarks\]"):
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(ImportError, match=r"matplotlib.*sbi-rope\[benchmarks\]"):
         plots.pair_plot(two_posteriors())
+
+
+def test_a_method_has_the_same_colour_in_every_picture() -> None:
+    pair = plots.pair_plot({"RoPE": torch.randn(50, 1), "NPE": torch.randn(50, 1)})
+    lines = plots.calibration_curves(
+        {name: curve() for name in ("prior", "NPE", "OT-only", "RoPE")}
+    )
+    drawn = {line.get_label(): line.get_color() for line in lines.axes[0].lines}
+    legend = {
+        line.get_label(): line.get_color() for line in pair.legends[0].get_lines()
+    }
+    assert legend == {name: drawn[name] for name in ("RoPE", "NPE")}
+    assert len({drawn[name] for name in ("prior", "NPE", "OT-only", "RoPE")}) == 4
 
 
 def test_calibration_curves_draw_each_average_against_its_level() -> None:
@@ -161,3 +240,160 @@ def test_effective_sample_sizes_count_every_row(num_simulations: int) -> None:
     assert axes.patches[0].get_x() < axes.patches[-1].get_x()
     assert axes.lines[1].get_xdata()[0] == num_simulations
     assert f"{num_simulations}" in legend_texts(axes.get_legend())[1]
+
+
+# --- overview ---
+
+
+def three_steps(**changes: Any) -> dict[str, Any]:
+    """Simulations around zero, and real observations far off until tuned."""
+    stretch = torch.tensor([3.0, 2.0, 0.1, 0.1])
+    after = torch.randn(60, 4) * stretch
+    weights = torch.full((200,), 0.05 / 198)
+    weights[[7, 11]] = torch.tensor([0.6, 0.35])
+    return {
+        "simulated": torch.randn(200, 4) * stretch,
+        "before": after + torch.tensor([20.0, 0.0, 0.0, 0.0]),
+        "after": after,
+        "weights": weights,
+        "samples": {"NPE": torch.randn(200, 3) + 1.0, "RoPE": torch.randn(200, 3)},
+        "theta": torch.tensor([0.25, 0.5, 0.75]),
+        "parameter_names": ["a", "b", "c"],
+        "index": 4,
+    } | changes
+
+
+def dots(axes: Any) -> list[Any]:
+    """The scatters of a panel, in the order they were drawn."""
+    return [c for c in axes.collections if type(c).__name__ == "PathCollection"]
+
+
+def stars(axes: Any) -> Any:
+    return [line.get_xydata()[0] for line in axes.lines if line.get_marker() == "*"]
+
+
+def test_overview_has_three_panels_with_their_legends() -> None:
+    figure = plots.overview(**three_steps())
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert [title.split()[1] for title in titles] == ["Tune:", "Couple:", "Mix:"]
+    tune, couple, mix = (legend_texts(axes.get_legend()) for axes in figure.axes)
+    assert tune == ["simulations", "real, before tuning", "real, after tuning"]
+    assert couple == ["one real observation", "its 2 or so simulations"]
+    assert mix == ["NPE", "RoPE", "truth"]
+    figure.draw_without_rendering()
+
+
+def test_overview_projects_the_simulations_to_their_principal_components() -> None:
+    data = three_steps()
+    tune = plots.overview(**data).axes[0]
+    simulated, before, after = (
+        torch.as_tensor(c.get_offsets().data) for c in dots(tune)
+    )
+    # The plane is that of the two wide coordinates, up to sign and a small turn.
+    spread = simulated.std(dim=0)
+    assert spread.tolist() == pytest.approx([3.0, 2.0], rel=0.2)
+    shift = (before - after).norm(dim=1)
+    assert shift.tolist() == pytest.approx([20.0] * 60, rel=0.05)
+    assert len(simulated) == 200
+
+
+def test_overview_follows_the_observation_of_the_index() -> None:
+    data = three_steps()
+    tune, couple, _ = plots.overview(**data).axes
+    after = dots(tune)[2].get_offsets()[4]
+    assert stars(tune)[0] == pytest.approx(after)
+    assert stars(couple)[0] == pytest.approx(after)
+    assert tune.texts[0].xy == pytest.approx(tuple(after))
+    assert tune.texts[0].xyann == pytest.approx(tuple(dots(tune)[1].get_offsets()[4]))
+
+
+def test_overview_draws_heavier_simulations_larger_and_darker() -> None:
+    couple = plots.overview(**three_steps()).axes[1]
+    faint, heavy = dots(couple)
+    expected = faint.get_offsets()[[11, 7]]
+    assert heavy.get_offsets().tolist() == expected.tolist()
+    assert heavy.get_sizes()[0] < heavy.get_sizes()[1]
+    assert heavy.get_alpha()[0] < heavy.get_alpha()[1]
+
+
+@pytest.mark.parametrize(
+    ("parameters", "labels"),
+    [(None, ("a", "b")), ((2, 0), ("c", "a")), ((1,), ("b", "density"))],
+)
+def test_overview_shows_the_parameters_asked_for(
+    parameters: Any, labels: tuple[str, str]
+) -> None:
+    mix = plots.overview(**three_steps(parameters=parameters)).axes[2]
+    assert (mix.get_xlabel(), mix.get_ylabel()) == labels
+    truth = {"a": 0.25, "b": 0.5, "c": 0.75}
+    assert mix.lines[-1].get_xdata()[0] == truth[labels[0]]
+    if labels[1] in truth:
+        assert mix.lines[-1].get_ydata()[0] == truth[labels[1]]
+
+
+@pytest.mark.parametrize("parameters", [(0,), (0, 1)])
+def test_overview_shades_the_prior(parameters: Any) -> None:
+    prior = 8.0 * torch.rand(2000, 3) - 4.0
+    mix = plots.overview(**three_steps(prior=prior, parameters=parameters)).axes[2]
+    shade = mix.patches[0] if len(parameters) == 1 else mix.collections[0]
+    box = shade.get_path() if len(parameters) == 1 else shade.get_paths()[0]
+    corners = box.vertices[:, 0]
+    if len(parameters) == 1:
+        corners = shade.get_patch_transform().transform(box.vertices)[:, 0]
+    assert (corners.min(), corners.max()) == pytest.approx((-4.0, 4.0), abs=0.15)
+    assert legend_texts(mix.get_legend())[0] == "prior"
+
+
+def test_overview_axes_ignore_extreme_embeddings_and_samples() -> None:
+    data = three_steps()
+    data["simulated"][0] = 1e6
+    data["before"][0] = -1e6
+    data["samples"]["NPE"][0] = 1e6
+    for axes in plots.overview(**data).axes:
+        assert max(abs(x) for x in (*axes.get_xlim(), *axes.get_ylim())) < 100.0
+
+
+def test_overview_holds_an_observation_far_from_the_simulations() -> None:
+    data = three_steps()
+    data["after"][4] = 100.0
+    couple = plots.overview(**data).axes[1]
+    low, high = couple.get_xlim()
+    assert low < stars(couple)[0][0] < high
+
+
+def test_overview_spreads_out_one_dimensional_embeddings() -> None:
+    data = three_steps()
+    for name in ("simulated", "before", "after"):
+        data[name] = data[name][:, :1]
+    tune = plots.overview(**data).axes[0]
+    assert tune.get_xlabel() == "embedding"
+    points = torch.as_tensor(dots(tune)[0].get_offsets().data)
+    assert torch.allclose(points[:, 0], data["simulated"][:, 0].double())
+    assert points[:, 1].std() > 0.2
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        pytest.param({"simulated": torch.zeros(200)}, "simulated", id="simulated"),
+        pytest.param({"before": torch.zeros(60, 3)}, "before", id="width"),
+        pytest.param({"after": torch.zeros(59, 4)}, "same number", id="rows"),
+        pytest.param({"after": torch.full((60, 4), torch.nan)}, "finite", id="nan"),
+        pytest.param({"weights": torch.ones(60, 200)}, "one row", id="all-weights"),
+        pytest.param({"weights": -torch.ones(200)}, "at least 0", id="negative"),
+        pytest.param({"weights": torch.zeros(200)}, "not all", id="no-weight"),
+        pytest.param({"samples": {}}, "at least one entry", id="nothing"),
+        pytest.param({"theta": torch.zeros(2)}, "theta", id="theta"),
+        pytest.param({"parameter_names": ["a"]}, "parameter_names", id="names"),
+        pytest.param({"prior": torch.zeros(9, 2)}, "prior", id="prior"),
+        pytest.param({"index": 60}, "from 0 to 59", id="index"),
+        pytest.param({"index": -1}, "from 0 to 59", id="negative-index"),
+        pytest.param({"parameters": (0, 3)}, "from 0 to 2", id="parameter"),
+        pytest.param({"parameters": (0, 0)}, "different", id="twice"),
+        pytest.param({"parameters": ()}, "one or two", id="none"),
+        pytest.param({"parameters": (0, 1, 2)}, "one or two", id="three"),
+    ],
+)
+def test_overview_refuses(changes: dict[str, Any], match: str) -> None:
+    with pytest.raises(InvalidInputError, match=match):
+        plots.overview(**three_steps(**changes))

@@ -1,11 +1,12 @@
 """The prior is a posterior that ignores x."""
 
+import math
 import pickle
 
 import pytest
 import torch
 from sbi.diagnostics import run_sbc
-from sbi.utils import BoxUniform
+from sbi.utils import BoxUniform, MultipleIndependent
 from torch.distributions import Distribution, Exponential, Independent, Normal
 
 from sbi_rope.baselines import PriorPosterior
@@ -118,3 +119,16 @@ def test_lpp_of_the_prior_is_minus_its_entropy() -> None:
 def test_a_prior_that_is_no_distribution_is_refused() -> None:
     with pytest.raises(InvalidTypeError, match="process_prior"):
         PriorPosterior([box()])
+
+
+def test_a_prior_of_independent_parts_can_be_drawn_and_evaluated_in_batches() -> None:
+    prior = MultipleIndependent(
+        [BoxUniform(torch.zeros(2), 2 * torch.ones(2)), Normal(torch.zeros(1), 1.0)]
+    )
+    posterior = PriorPosterior(prior)
+    x = torch.zeros(3, 5)
+    theta = posterior.sample_batched((2, 4), x)
+    assert theta.shape == (2, 4, 3, 3)
+    assert posterior.sample((2, 4)).shape == (2, 4, 3)
+    expected = Normal(0.0, 1.0).log_prob(theta[0, ..., 2]) - math.log(4)
+    assert torch.allclose(posterior.log_prob_batched(theta[0], x), expected)

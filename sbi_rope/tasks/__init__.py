@@ -1,0 +1,69 @@
+"""Benchmarks of inference under a misspecified simulator.
+
+Each task is a prior, a simulator, an embedding network, and real observations with
+known parameters; see :class:`Task`.
+"""
+
+import inspect
+from pathlib import Path
+from typing import Any
+
+from sbi_rope.errors import InvalidInputError
+from sbi_rope.tasks.base import Task
+from sbi_rope.tasks.light_tunnel_sensors import LightTunnelSensors
+from sbi_rope.tasks.pendulum import Pendulum
+
+__all__ = ["TASKS", "Task", "get_task", "list_tasks"]
+
+TASKS: dict[str, type[Task]] = {
+    "light_tunnel_sensors": LightTunnelSensors,
+    "pendulum": Pendulum,
+}
+
+
+def list_tasks() -> list[str]:
+    """Return the names of all tasks, in alphabetical order.
+
+    Example:
+        >>> "pendulum" in list_tasks()
+        True
+    """
+    return sorted(TASKS)
+
+
+def get_task(
+    name: str,
+    *,
+    variant: str | None = None,
+    root: str | Path | None = None,
+    **options: Any,
+) -> Task:
+    """Return a task by its name.
+
+    Args:
+        name: One of :func:`list_tasks`.
+        variant: A kind of real process, one of the task's ``variants``.
+        root: Folder that holds recorded data; synthetic tasks do not read it.
+        **options: The task's own options, see the documentation of its class.
+
+    Raises:
+        InvalidInputError: If the task, the variant or an option does not exist; the
+            message lists those that do.
+
+    Example:
+        >>> get_task("pendulum", variant="misspecified_prior").parameter_names
+        ('omega_0', 'A')
+    """
+    if name not in TASKS:
+        raise InvalidInputError(
+            f"Expected `name` to be one of {list_tasks()}; got {name!r}."
+        )
+    task = TASKS[name]
+    accepted = inspect.signature(task).parameters.keys() - {"variant", "root"}
+    unknown = sorted(options.keys() - accepted)
+    if unknown:
+        raise InvalidInputError(
+            f"Expected the options of {name!r} to be among {sorted(accepted)}; got "
+            f"{unknown}."
+        )
+    return task(variant=variant, root=root, **options)

@@ -1,0 +1,220 @@
+r"""The light tunnel's sensors: a published law, and what was measured."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from sbi.utils import BoxUniform, MultipleIndependent
+from torch import Tensor, nn
+
+from sbi_rope._validation import check_in_support, check_positive
+from sbi_rope.errors import InvalidInputError
+from sbi_rope.tasks.base import Task, check_theta
+from sbi_rope.tasks.chambers import read_columns
+from sbi_rope.tasks.distributions import UniformDistance
+from sbi_rope.tasks.networks import fully_connected
+from sbi_rope.tasks.splits import Part, select_rows
+
+__all__ = ["LightTunnelSensors", "LightTunnelSimulator"]
+
+DATASET = "lt_interventions_standard_v1"
+INPUTS = ("red", "green", "blue", "pol_1", "pol_2")
+OUTPUTS = ("ir_1", "vis_1", "ir_2", "vis_2", "ir_3", "vis_3", "current")
+
+# Constants of the law, as published with the package causalchamber.
+RESPONSE = (  # rows: infrared, visible; columns: red, green, blue
+    (4.34165202, 2.8594438, 1.91565691),
+    (0.89410569, 1.58679242, 2.68477163),
+)
+DISTANCES = (0.1, 0.17, 0.25)  # from the source to the three sensors
+FIRST_POLARISER = (0.42685688, 0.41231782, 0.46652526)
+ALIGNED = (0.2909342, 0.29624314, 0.30526271)
+CROSSED = (0.00431032, 0.01447611, 0.02041075)
+CURRENT_RESPONSE = (0.12834946, 0.12870338, 0.13078523)
+CURRENT_AT_REST = 58.13307318503893
+# Settings of the recorded experiment: photodiode sizes 2 and 1, exposure time 3 and
+# the current's reference voltage 5 V, at which it has no factor.
+GAIN = (2.0 ** (2 + 3), 2.0 ** (1 + 3))  # infrared, visible
+
+
+@dataclass(frozen=True, kw_only=True)
+class LightTunnelSimulator:
+    r"""Six light readings and a current, after the published law with noise.
+
+    With :math:`c` the colours of the source, :math:`S` the response of the two
+    photodiodes times their gain, :math:`d_i` the distances, :math:`T` transmissions
+    of the polarisers and :math:`\Delta` the angle between them, sensor :math:`i`
+    reads
+
+    .. math::
+        r_1 = S c, \quad
+        r_2 = \tfrac{d_1^2}{d_2^2} S (T_s \odot c), \quad
+        r_3 = \tfrac{d_1^2}{d_3^2} S (T(\Delta) \odot c), \quad
+        T(\Delta) = T_c + (T_p - T_c) \cos^2 \Delta,
+
+    and the light source draws :math:`q^\top c + C_0`. Noise is relative on the six
+    readings, which are then cut off at 0, and additive on the current. Readings are
+    returned as :math:`\log(r + 1)`.
+
+    References:
+        | Sanity Checking Causal Representation Learning on a Simple Real-World System
+          (Gamella, Bing and Runge, 2025), appendix C
+        | https://github.com/juangamella/causal-chamber-package, simulator
+          ``lt.Deterministic`` (MIT licence)
+
+    Args:
+        relative_noise: Standard deviation of the readings, as a fraction of them.
+        current_noise_std: Standard deviation of the current, in its raw units.
+
+    Example:
+        >>> law = LightTunnelSimulator().readings(torch.tensor([[80.0, 0, 0, 0]]))
+        >>> law.round()[0, :2]
+        tensor([11115.,  1144.])
+    """
+
+    relative_noise: float = 0.03
+    current_noise_std: float = 4.0
+
+    def __call__(self, theta: Tensor) -> Tensor:
+        """Simulate ``theta`` of shape ``(n, 4)``, to shape ``(n, 7)``."""
+        theta = check_theta(theta, 4)
+        readings = self.readings(theta)
+        light, current = readings[:, :6], readings[:, 6:]
+        light = light * (1 + self.relative_noise * torch.randn_like(light))
+        current = current + self.current_noise_std * torch.randn_like(current)
+        # Colours below 0, which the prior allows down to -0.5, read less than 0.
+        return torch.cat([light.clamp(min=0.0).log1p(), current], dim=1)
+
+    def readings(self, theta: Tensor) -> Tensor:
+        """Return raw readings without noise, in the order of ``OUTPUTS``.
+
+        Args:
+            theta: Red, green, blue and the angle in degrees, shape ``(n, 4)``.
+
+        Returns:
+            Readings, shape ``(n, 7)``, differentiable in ``theta``.
+        """
+        colour, angle = theta[:, :3], theta[:, 3:]
+        response = theta.new_tensor(RESPONSE).T * theta.new_tensor(GAIN)
+        aligned, crossed = theta.new_tensor(ALIGNED), theta.new_tensor(CROSSED)
+        malus = torch.cos(torch.deg2rad(angle)) ** 2
+        near, middle, far = DISTANCES
+        transmissions = (
+            torch.ones_like(crossed),
+            (near / middle) ** 2 * theta.new_tensor(FIRST_POLARISER),
+            (near / far) ** 2 * (crossed + (aligned - crossed) * malus),
+        )
+        light = [(transmission * colour) @ response for transmission in transmissions]
+        weights = theta.new_tensor(CURRENT_RESPONSE).unsqueeze(1)
+        return torch.cat([*light, colour @ weights + CURRENT_AT_REST], dim=1)
+
+
+class LightTunnelSensors(Task):
+    r"""Colours and polariser angle of a light tunnel, from measured sensor readings.
+
+    The observations are real: a light source shines through two polarisers onto three
+    light sensors, each with an infrared and a visible-light diode. The parameters are
+    the red, green and blue settings of the source and the absolute angle between the
+    polarisers (the law knows no other property of the two positions). The simulator
+    (:class:`LightTunnelSimulator`) over-predicts the measured light by 23 % to 34 %,
+    and knows nothing of six small lamps beside the sensors that change during the
+    experiment.
+
+    The prior follows the experiment's protocol: colours are uniform integers from 0 to
+    85, hence uniform on [-0.5, 85.5] here, and each polariser has independent uniform
+    positions on a range of 40 degrees, hence :class:`UniformDistance`. The recorded
+    angles are 5 % smaller on average (12.7 instead of 13.3 degrees), so that this
+    prior, too, is only nearly right.
+
+    An observation is :math:`\log(r + 1)` of ``ir_1, vis_1, ir_2, vis_2, ir_3, vis_3``,
+    and the raw ``current``. A fixed third of the recorded rows (2000 of 6000) is for
+    calibration, the rest for tests.
+
+    References:
+        | Causal chambers as a real-world physical testbed for AI methodology
+          (Gamella, Peters and Bühlmann, 2025)
+        | https://doi.org/10.1038/s42256-024-00964-x
+        | https://github.com/juangamella/causal-chamber, data set
+          ``lt_interventions_standard_v1`` (CC BY 4.0)
+
+    Args:
+        variant: ``None``; the task has no variants.
+        root: Folder that holds ``lt_interventions_standard_v1/``. Only the two data
+            sets need it.
+        download: Whether to download the data set into ``root`` if it is not there.
+        experiment: The recorded experiment that both sets come from. Others of the data
+            set change a lamp (``uniform_l_11_mid``) or a sensor's setting
+            (``uniform_t_ir_1_strong``) and so misspecify the simulator in another way;
+            those with parameters outside of the prior are refused.
+        relative_noise: Simulated standard deviation of a light reading, as a fraction.
+        current_noise_std: Simulated standard deviation of the current.
+    """
+
+    name = "light_tunnel_sensors"
+    parameter_names = ("red", "green", "blue", "polariser_angle")
+    parameter_units = ("1", "1", "1", "degree")
+    x_shape = (len(OUTPUTS),)
+
+    def __init__(
+        self,
+        *,
+        variant: str | None = None,
+        root: str | Path | None = None,
+        download: bool = False,
+        experiment: str = "uniform_reference",
+        relative_noise: float = 0.03,
+        current_noise_std: float = 4.0,
+    ) -> None:
+        super().__init__(variant=variant, root=root)
+        if download and root is None:
+            raise InvalidInputError(
+                "Expected `root` with `download=True`: the folder to download into; "
+                "got None."
+            )
+        check_positive("relative_noise", relative_noise)
+        check_positive("current_noise_std", current_noise_std)
+        self.download = download
+        self.experiment = experiment
+        self.relative_noise = relative_noise
+        self.current_noise_std = current_noise_std
+
+    def get_prior(self) -> MultipleIndependent:
+        """Return the prior: uniform colours, and the distance of two angles.
+
+        As with every ``MultipleIndependent`` of sbi, a sample shape of more than one
+        dimension is flattened, and ``log_prob`` takes at most two dimensions.
+        """
+        low = torch.full((3,), -0.5, dtype=torch.float32)
+        width = torch.tensor([40.0], dtype=torch.float32)
+        # Its constructor draws a sample to learn the shapes.
+        with torch.random.fork_rng(devices=[]):
+            return MultipleIndependent(
+                [BoxUniform(low, low + 86), UniformDistance(width)]
+            )
+
+    def get_simulator(self) -> LightTunnelSimulator:
+        """Return the published law with noise."""
+        return LightTunnelSimulator(
+            relative_noise=self.relative_noise,
+            current_noise_std=self.current_noise_std,
+        )
+
+    def get_embedding_net(self) -> nn.Module:
+        """Return a network with three hidden layers of 64 and eight outputs."""
+        return fully_connected(len(OUTPUTS), (64, 64, 64, 8))
+
+    def _labelled_set(self, n: int, *, seed: int, part: Part) -> tuple[Tensor, Tensor]:
+        theta, x = self._recorded()
+        rows = select_rows(theta.shape[0], n, seed=seed, part=part)
+        return theta[rows].float(), x[rows].float()
+
+    def _recorded(self) -> tuple[Tensor, Tensor]:
+        file = f"{DATASET}/{self.experiment}.csv"
+        values = read_columns(
+            file, INPUTS + OUTPUTS, root=self.root, download=self.download
+        )
+        colour, positions, readings = values.split([3, 2, len(OUTPUTS)], dim=1)
+        angle = (positions[:, :1] - positions[:, 1:]).abs()
+        theta = torch.cat([colour, angle], dim=1)
+        check_in_support(f"theta of {file}", theta.float(), self.get_prior())
+        return theta, torch.cat([readings[:, :6].log1p(), readings[:, 6:]], dim=1)

@@ -1,0 +1,108 @@
+r"""Embedding networks that several tasks share."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from sbi_rope._validation import check_batch, check_positive_integer
+from sbi_rope.errors import InvalidInputError
+
+__all__ = ["SeriesEmbedding", "fully_connected"]
+
+CHANNELS = (1, 16, 64, 128, 128, 128, 128, 128)
+STRIDES = (1, 2, 1, 2, 1, 2, 1)
+HEAD = (512, 128, 32)
+
+
+class SeriesEmbedding(nn.Module):
+    r"""One-dimensional convolutional network for a single time series.
+
+    Seven convolutions with kernel 3 and dilation 2, a mean over three neighbours
+    (stride 1) after the second, fourth and sixth, and four linear layers, all with
+    ReLU in between. A dummy pass finds the number of features between the two
+    halves, 2048 for a series of 200 steps.
+
+    References:
+        | Addressing Misspecification in Simulation-based Inference through
+          Data-driven Calibration (Wehenkel et al.), appendix on task C, algorithm
+          of the 1D CNN
+        | https://arxiv.org/abs/2405.08719
+
+    Args:
+        num_steps: Length of the series.
+        output_dim: Number of statistics to return.
+        padding: Zeros added at each end before every convolution. The paper's 1
+            shortens the series at every layer and needs at least 73 steps; 2 keeps
+            the length (up to the strides), for shorter series.
+
+    Raises:
+        InvalidInputError: If the series is too short for the layers.
+
+    Example:
+        >>> SeriesEmbedding(num_steps=200, output_dim=10)(torch.zeros(5, 200)).shape
+        torch.Size([5, 10])
+    """
+
+    def __init__(
+        self, *, num_steps: int = 200, output_dim: int = 10, padding: int = 1
+    ) -> None:
+        super().__init__()
+        check_positive_integer("num_steps", num_steps)
+        check_positive_integer("output_dim", output_dim)
+        check_positive_integer("padding", padding)
+        self.num_steps = num_steps
+        self.features = _convolutions(padding)
+        self.num_features = self._count_features(padding)
+        self.head = fully_connected(self.num_features, (*HEAD, output_dim))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Embed series of shape ``(n, num_steps)`` as ``(n, output_dim)``."""
+        x = check_batch("x", x, (self.num_steps,), finite=False)
+        return self.head(self.features(x.unsqueeze(1)))
+
+    def _count_features(self, padding: int) -> int:
+        try:
+            with torch.no_grad():
+                return self.features(torch.zeros(1, 1, self.num_steps)).shape[1]
+        except RuntimeError as error:
+            raise InvalidInputError(
+                f"Expected `num_steps` large enough for seven convolutions with "
+                f"padding {padding}; got {self.num_steps}. Increase `padding`: 2 "
+                f"keeps the length."
+            ) from error
+
+
+def fully_connected(input_dim: int, widths: Sequence[int]) -> nn.Sequential:
+    """Return linear layers with ReLU between them, and none after the last.
+
+    Args:
+        input_dim: Number of inputs.
+        widths: Number of outputs of each layer, the last one being the network's.
+
+    Example:
+        >>> fully_connected(7, (64, 8))
+        Sequential(
+          (0): Linear(in_features=7, out_features=64, bias=True)
+          (1): ReLU()
+          (2): Linear(in_features=64, out_features=8, bias=True)
+        )
+    """
+    layers: list[nn.Module] = []
+    for before, after in zip((input_dim, *widths), widths, strict=False):
+        layers += [nn.Linear(before, after), nn.ReLU()]
+    return nn.Sequential(*layers[:-1])
+
+
+def _convolutions(padding: int) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for i, stride in enumerate(STRIDES):
+        layers += [
+            nn.Conv1d(
+                CHANNELS[i], CHANNELS[i + 1], 3, stride, dilation=2, padding=padding
+            ),
+            nn.ReLU(),
+        ]
+        if stride == 2:
+            layers.append(nn.AvgPool1d(3, stride=1))
+    return nn.Sequential(*layers, nn.Flatten())

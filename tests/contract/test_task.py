@@ -1,0 +1,371 @@
+"""What every task promises, checked for all tasks and variants."""
+
+import copy
+import pickle
+import random
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from sbi.inference import DirectPosterior, simulate_for_sbi
+from sbi.neural_nets import posterior_nn
+from sbi.utils import within_support
+from sbi.utils.user_input_checks import process_prior
+from torch import Tensor
+
+from sbi_rope.errors import InvalidInputError, InvalidTypeError, RoPEError
+from sbi_rope.tasks import TASKS, Task, get_task
+
+# Fixtures that give the folder of a task's recorded data; other tasks are synthetic.
+ROOT_FIXTURES = {"light_tunnel_sensors": "chamber_root"}
+KINDS = [
+    pytest.param(name, variant, id=name if variant is None else f"{name}-{variant}")
+    for name, task in TASKS.items()
+    for variant in (None, *task.variants)
+]
+
+
+@pytest.fixture(params=sorted(TASKS))
+def task(request: pytest.FixtureRequest) -> Task:
+    return get_task(request.param)
+
+
+@pytest.fixture
+def labelled(request: pytest.FixtureRequest, name: str, variant: str | None) -> Task:
+    fixture = ROOT_FIXTURES.get(name)
+    root = None if fixture is None else request.getfixturevalue(fixture)
+    return get_task(name, variant=variant, root=root)
+
+
+def same_rows(a: Tensor, b: Tensor) -> int:
+    rows = {tuple(row) for row in a.flatten(1).tolist()}
+    return sum(tuple(row) in rows for row in b.flatten(1).tolist())
+
+
+def largest_z(a: Tensor, b: Tensor) -> float:
+    """Largest difference between means of x and x squared, in standard errors."""
+    a, b = (
+        torch.cat([x.flatten(1), x.flatten(1) ** 2], dim=1).double() for x in (a, b)
+    )
+    error = (a.var(dim=0) / len(a) + b.var(dim=0) / len(b)).sqrt()
+    return float(((a.mean(dim=0) - b.mean(dim=0)).abs() / error).max())
+
+
+# The prior ---------------------------------------------------------------------------
+
+
+def test_description_has_one_entry_per_parameter(task: Task) -> None:
+    assert task.name in TASKS
+    assert len(task.parameter_names) == len(task.parameter_units) == task.theta_dim
+    assert len(set(task.parameter_names)) == task.theta_dim
+    assert task.prior_std.shape == (task.theta_dim,)
+
+
+def test_prior_passes_the_checks_of_sbi_unchanged(task: Task) -> None:
+    prior = task.get_prior()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        processed, theta_dim, returns_numpy = process_prior(prior)
+    assert processed is prior
+    assert theta_dim == task.theta_dim
+    assert not returns_numpy
+    assert prior.event_shape == (task.theta_dim,)
+
+
+def test_prior_draws_are_float32_inside_its_support(task: Task) -> None:
+    prior = task.get_prior()
+    theta = prior.sample(torch.Size((1000,)))
+    assert theta.shape == (1000, task.theta_dim)
+    assert theta.dtype == torch.float32
+    assert within_support(prior, theta).all()
+    assert torch.isfinite(prior.log_prob(theta)).all()
+
+
+def test_prior_is_float32_whatever_the_default_dtype(task: Task) -> None:
+    default = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    try:
+        assert task.get_prior().sample().dtype == torch.float32
+        assert (
+            task.get_simulator()(task.get_prior().sample((2,))).dtype == torch.float32
+        )
+    finally:
+        torch.set_default_dtype(default)
+
+
+def test_prior_density_integrates_to_one(task: Task) -> None:
+    prior = process_prior(task.get_prior())[0]
+    draws = prior.sample((50_000,))
+    low, high = draws.min(dim=0).values, draws.max(dim=0).values
+    margin = 0.05 * (high - low)
+    low, high = low - margin, high + margin
+    box = low + (high - low) * torch.rand(200_000, task.theta_dim)
+    mass = prior.log_prob(box).double().exp().mean() * (high - low).double().prod()
+    assert mass == pytest.approx(1.0, abs=0.015)
+
+
+def test_prior_density_is_zero_outside_its_support(task: Task) -> None:
+    prior = process_prior(task.get_prior())[0]
+    draws = prior.sample((1000,))
+    width = draws.max(dim=0).values - draws.min(dim=0).values
+    for outside in (draws - 1.1 * width, draws + 1.1 * width):
+        assert not within_support(prior, outside).any()
+        assert (prior.log_prob(outside) == -torch.inf).all()
+
+
+def test_prior_std_is_that_of_draws_from_the_prior(task: Task) -> None:
+    draws = task.get_prior().sample((50_000,))
+    torch.testing.assert_close(draws.std(dim=0), task.prior_std, rtol=0.02, atol=0.0)
+
+
+def test_prior_can_be_copied_and_pickled(task: Task) -> None:
+    prior = task.get_prior()
+    theta = prior.sample((5,))
+    for copied in (copy.deepcopy(prior), pickle.loads(pickle.dumps(prior))):
+        torch.testing.assert_close(copied.log_prob(theta), prior.log_prob(theta))
+
+
+def test_making_the_parts_of_a_task_draws_nothing(task: Task) -> None:
+    before = torch.get_rng_state()
+    task.get_prior()
+    task.get_simulator()
+    assert task.prior_std is not None
+    assert torch.equal(before, torch.get_rng_state())
+
+
+def test_each_call_returns_a_new_prior(task: Task) -> None:
+    assert task.get_prior() is not task.get_prior()
+
+
+# The simulator and the network -------------------------------------------------------
+
+
+def test_simulator_returns_finite_batches(task: Task) -> None:
+    x = task.get_simulator()(task.get_prior().sample((500,)))
+    assert x.shape == (500, *task.x_shape)
+    assert x.dtype == torch.float32
+    assert torch.isfinite(x).all()
+
+
+def test_simulator_follows_the_global_seed(task: Task) -> None:
+    simulator, theta = task.get_simulator(), task.get_prior().sample((3,))
+    draws = []
+    for seed in (1, 1, 2):
+        torch.manual_seed(seed)
+        draws.append(simulator(theta))
+    assert torch.equal(draws[0], draws[1])
+    assert not torch.equal(draws[0], draws[2])
+
+
+def test_simulator_gives_equal_parameters_different_noise(task: Task) -> None:
+    theta = task.get_prior().sample((1,)).expand(2, -1)
+    first, second = task.get_simulator()(theta)
+    assert not torch.equal(first, second)
+
+
+def test_simulator_keeps_the_dtype_of_theta(task: Task) -> None:
+    theta = task.get_prior().sample((2,))
+    assert task.get_simulator()(theta.double()).dtype == torch.float64
+
+
+def test_simulator_can_be_pickled(task: Task) -> None:
+    theta = task.get_prior().sample((3,))
+    simulator = task.get_simulator()
+    copied = pickle.loads(pickle.dumps(simulator))
+    torch.manual_seed(0)
+    expected = simulator(theta)
+    torch.manual_seed(0)
+    assert torch.equal(copied(theta), expected)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "match"),
+    [
+        pytest.param(lambda t: t.tolist(), InvalidTypeError, "Tensor", id="list"),
+        pytest.param(lambda t: t[0], InvalidInputError, "shape", id="no-batch"),
+        pytest.param(lambda t: t[:, :1], InvalidInputError, "shape", id="width"),
+        pytest.param(lambda t: t[:0], InvalidInputError, "empty", id="empty"),
+        pytest.param(lambda t: t * torch.nan, InvalidInputError, "finite", id="nan"),
+        pytest.param(lambda t: t.long(), InvalidTypeError, "floating", id="integer"),
+    ],
+)
+def test_simulator_refuses_what_is_not_a_batch_of_parameters(
+    task: Task, change: object, error: type[RoPEError], match: str
+) -> None:
+    theta = task.get_prior().sample((3,))
+    with pytest.raises(error, match=match):
+        task.get_simulator()(change(theta))  # type: ignore[operator]
+
+
+def test_sbi_can_simulate_from_the_task(task: Task) -> None:
+    prior = process_prior(task.get_prior())[0]
+    theta, x = simulate_for_sbi(
+        task.get_simulator(), prior, 20, show_progress_bar=False
+    )
+    assert theta.shape == (20, task.theta_dim)
+    assert x.shape == (20, *task.x_shape)
+
+
+def test_embedding_net_returns_one_row_of_statistics_per_observation(
+    task: Task,
+) -> None:
+    x = task.get_simulator()(task.get_prior().sample((6,)))
+    statistics = task.get_embedding_net()(x)
+    assert statistics.ndim == 2
+    assert statistics.shape[0] == 6
+
+
+def test_gradients_reach_every_parameter_of_the_embedding_net(task: Task) -> None:
+    net = task.get_embedding_net()
+    x = task.get_simulator()(task.get_prior().sample((50,)))
+    net(x).square().sum().backward()
+    for name, parameter in net.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.abs().sum() > 0, name
+
+
+def test_each_call_returns_a_new_embedding_net(task: Task) -> None:
+    first, second = task.get_embedding_net(), task.get_embedding_net()
+    assert not {id(p) for p in first.parameters()} & {
+        id(p) for p in second.parameters()
+    }
+    different = (
+        not torch.equal(p, q)
+        for p, q in zip(first.parameters(), second.parameters(), strict=True)
+    )
+    assert any(different)
+
+
+def test_sbi_builds_a_posterior_on_the_task(task: Task) -> None:
+    prior = process_prior(task.get_prior())[0]
+    theta = prior.sample((200,))
+    x = task.get_simulator()(theta)
+    build = posterior_nn("mdn", embedding_net=task.get_embedding_net())
+    posterior = DirectPosterior(build(theta, x), prior).set_default_x(x[:1])
+    assert torch.isfinite(
+        posterior.log_prob(
+            theta, leakage_correction_params={"num_rejection_samples": 100}
+        )
+    ).any()
+    assert within_support(
+        prior, posterior.sample((20,), show_progress_bars=False)
+    ).all()
+    mode = posterior.map(
+        num_iter=2, num_init_samples=20, num_to_optimize=2, show_progress_bars=False
+    )
+    assert within_support(prior, mode).all()
+    restored = pickle.loads(pickle.dumps(posterior))
+    assert within_support(restored.prior, theta).all()
+
+
+# Labelled real observations ----------------------------------------------------------
+
+
+@pytest.mark.parametrize(("name", "variant"), KINDS)
+@pytest.mark.parametrize("part", ["calibration", "test"])
+class TestOneSet:
+    def test_has_the_shapes_asked_for(self, labelled: Task, part: str) -> None:
+        theta, x = draw(labelled, part, 130)
+        assert theta.shape == (130, labelled.theta_dim)
+        assert x.shape == (130, *labelled.x_shape)
+        assert theta.dtype == x.dtype == torch.float32
+        assert torch.isfinite(x).all()
+        assert within_support(labelled.get_prior(), theta).all()
+
+    def test_is_the_same_for_the_same_seed(self, labelled: Task, part: str) -> None:
+        first, second = (
+            draw(labelled, part, 20, seed=3),
+            draw(labelled, part, 20, seed=3),
+        )
+        assert torch.equal(first[0], second[0])
+        assert torch.equal(first[1], second[1])
+
+    def test_differs_between_seeds(self, labelled: Task, part: str) -> None:
+        first, second = (
+            draw(labelled, part, 20, seed=3),
+            draw(labelled, part, 20, seed=4),
+        )
+        assert not torch.equal(first[0], second[0])
+        assert not torch.equal(first[1], second[1])
+
+    def test_has_no_observation_twice(self, labelled: Task, part: str) -> None:
+        _, x = draw(labelled, part, 250)
+        assert len({tuple(row) for row in x.flatten(1).tolist()}) == 250
+
+    def test_begins_with_the_smaller_set(self, labelled: Task, part: str) -> None:
+        small, large = draw(labelled, part, 7), draw(labelled, part, 130)
+        assert torch.equal(small[0], large[0][:7])
+        assert torch.equal(small[1], large[1][:7])
+
+    def test_leaves_the_global_random_states_alone(
+        self, labelled: Task, part: str
+    ) -> None:
+        before = torch.get_rng_state(), random.getstate(), np.random.get_state()[1]  # noqa: NPY002
+        draw(labelled, part, 5)
+        after = torch.get_rng_state(), random.getstate(), np.random.get_state()[1]  # noqa: NPY002
+        assert torch.equal(before[0], after[0])
+        assert before[1] == after[1]
+        assert np.array_equal(before[2], after[2])
+
+    def test_does_not_depend_on_the_global_seed(
+        self, labelled: Task, part: str
+    ) -> None:
+        torch.manual_seed(1)
+        first = draw(labelled, part, 5)
+        torch.manual_seed(2)
+        assert torch.equal(first[1], draw(labelled, part, 5)[1])
+
+    @pytest.mark.parametrize("n", [0, -1, 2.0, True, "3"])
+    def test_refuses_a_bad_size(self, labelled: Task, part: str, n: object) -> None:
+        with pytest.raises(InvalidInputError, match="`n`"):
+            draw(labelled, part, n)
+
+    @pytest.mark.parametrize("seed", [-1, 2**31, 0.5, None, True])
+    def test_refuses_a_bad_seed(self, labelled: Task, part: str, seed: object) -> None:
+        with pytest.raises(InvalidInputError, match="`seed`"):
+            draw(labelled, part, 5, seed=seed)
+
+
+@pytest.mark.parametrize(("name", "variant"), KINDS)
+@pytest.mark.parametrize("seeds", [(0, 0), (0, 1), (1, 0)])
+def test_calibration_and_test_sets_share_no_observation(
+    labelled: Task, seeds: tuple[int, int]
+) -> None:
+    calibration = labelled.get_calibration_set(300, seed=seeds[0])
+    test = labelled.get_test_set(300, seed=seeds[1])
+    assert same_rows(calibration[1], test[1]) == 0
+    assert same_rows(calibration[0], test[0]) <= 0.01 * 300
+
+
+@pytest.mark.parametrize(("name", "variant"), KINDS)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_simulations_under_a_seed_share_no_parameter_with_its_sets(
+    labelled: Task, seed: int
+) -> None:
+    torch.manual_seed(seed)
+    theta = labelled.get_prior().sample((1000,))
+    assert same_rows(theta, labelled.get_calibration_set(100, seed=seed)[0]) == 0
+    assert same_rows(theta, labelled.get_test_set(100, seed=seed)[0]) == 0
+
+
+@pytest.mark.parametrize(("name", "variant"), KINDS)
+def test_calibration_and_test_sets_follow_one_law(labelled: Task) -> None:
+    calibration, test = labelled.get_calibration_set(1000), labelled.get_test_set(1000)
+    assert largest_z(calibration[0], test[0]) < 4.5
+    assert largest_z(calibration[1], test[1]) < 4.5
+
+
+@pytest.mark.parametrize(("name", "variant"), KINDS)
+def test_real_law_is_not_the_simulated_law(labelled: Task) -> None:
+    theta, x_o = labelled.get_test_set(1000)
+    simulator = labelled.get_simulator()
+    assert largest_z(simulator(theta), simulator(theta)) < 4.5
+    assert largest_z(simulator(theta), x_o) > 6.0
+
+
+def draw(
+    task: Task, part: str, n: object, *, seed: object = 0
+) -> tuple[Tensor, Tensor]:
+    get = task.get_calibration_set if part == "calibration" else task.get_test_set
+    return get(n, seed=seed)  # type: ignore[arg-type]

@@ -1,0 +1,91 @@
+"""The registry and what the base class of tasks does."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from sbi_rope.errors import InvalidInputError
+from sbi_rope.tasks import TASKS, Task, get_task, list_tasks
+
+
+def test_registered_names_are_those_of_the_classes() -> None:
+    assert {name: task.name for name, task in TASKS.items()} == {n: n for n in TASKS}
+
+
+def test_list_tasks_names_all_tasks_in_order() -> None:
+    assert list_tasks() == sorted(TASKS)
+
+
+def test_get_task_passes_everything_on() -> None:
+    task = get_task(
+        "pendulum",
+        variant="misspecified_prior",
+        root="~/data",
+        misspecification_weight=0.25,
+    )
+    assert task.name == "pendulum"
+    assert task.variant == "misspecified_prior"
+    assert task.root == Path("~/data").expanduser()
+    assert task.misspecification_weight == 0.25  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("call", "match"),
+    [
+        pytest.param(lambda: get_task("pendulu"), r"\['light_.*'pendulum'", id="name"),
+        pytest.param(
+            lambda: get_task("pendulum", variant="damped"),
+            r"`variant`.*\['misspecified_prior'\].*'damped'",
+            id="variant",
+        ),
+        pytest.param(
+            lambda: get_task("pendulum", noise=1.0),
+            r"options of 'pendulum'.*'noise_std'.*\['noise'\]",
+            id="option",
+        ),
+    ],
+)
+def test_what_does_not_exist_is_answered_with_what_does(
+    call: object, match: str
+) -> None:
+    with pytest.raises(InvalidInputError, match=match):
+        call()  # type: ignore[operator]
+
+
+def test_repr_names_the_variant() -> None:
+    assert repr(get_task("pendulum")) == "Pendulum()"
+    task = get_task("pendulum", variant="misspecified_prior")
+    assert repr(task) == "Pendulum(variant='misspecified_prior')"
+
+
+@pytest.mark.parametrize("method", ["get_prior", "get_simulator", "_labelled_set"])
+def test_a_task_without_an_abstract_method_cannot_be_made(method: str) -> None:
+    assert method in Task.__abstractmethods__
+
+
+def test_sets_do_not_depend_on_the_default_dtype() -> None:
+    theta, x = get_task("pendulum").get_test_set(3)
+    default = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    try:
+        again = get_task("pendulum").get_test_set(3)
+    finally:
+        torch.set_default_dtype(default)
+    assert torch.equal(theta, again[0])
+    assert torch.equal(x, again[1])
+
+
+def test_importing_tasks_is_quiet_and_loads_no_data_library() -> None:
+    code = (
+        "import sys, sbi_rope.tasks\n"
+        "heavy = {'causalchamber', 'sbi.analysis'}\n"
+        "assert not heavy & sys.modules.keys(), heavy & sys.modules.keys()\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == ""

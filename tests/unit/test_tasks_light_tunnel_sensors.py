@@ -1,0 +1,325 @@
+"""The light tunnel's sensors: law, prior and recorded data."""
+
+import math
+import sys
+import types
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from sbi_rope.errors import DataNotFoundError, InvalidInputError
+from sbi_rope.tasks.distributions import UniformDistance
+from sbi_rope.tasks.light_tunnel_sensors import (
+    DATASET,
+    INPUTS,
+    OUTPUTS,
+    LightTunnelSensors,
+    LightTunnelSimulator,
+)
+
+PAGE = (
+    "https://github.com/juangamella/causal-chamber/tree/main/datasets/"
+    "lt_interventions_standard_v1"
+)
+WriteTable = Callable[..., Path]
+
+
+@pytest.fixture
+def write_table(tmp_path: Path) -> WriteTable:
+    """Write a small file in the official layout, and return its root."""
+
+    def write(
+        num_rows: int = 9,
+        *,
+        experiment: str = "uniform_reference",
+        drop: tuple[str, ...] = (),
+        **changes: object,
+    ) -> Path:
+        columns = [c for c in ("timestamp", *INPUTS, *OUTPUTS) if c not in drop]
+        lines = [",".join(columns)]
+        for i in range(num_rows):
+            row = dict.fromkeys(columns, 100 + i) | {
+                "red": i,
+                "green": 2 * i,
+                "blue": 85,
+                "pol_1": -10.0,
+                "pol_2": 2.5 * i,
+            }
+            row |= changes if i == 1 else {}
+            lines.append(",".join(str(row[column]) for column in columns))
+        folder = tmp_path / DATASET
+        folder.mkdir(exist_ok=True)
+        (folder / f"{experiment}.csv").write_text("\n".join(lines) + "\n")
+        return tmp_path
+
+    return write
+
+
+# The law -----------------------------------------------------------------------------
+
+
+def test_law_is_that_of_causalchamber() -> None:
+    pandas = pytest.importorskip("pandas")
+    np = pytest.importorskip("numpy")
+    sensors = pytest.importorskip("causalchamber.simulators.lt")
+    law = sensors.Deterministic(
+        S=np.array(
+            [[4.34165202, 2.8594438, 1.91565691], [0.89410569, 1.58679242, 2.68477163]]
+        ),
+        d1=0.1,
+        d2=0.17,
+        d3=0.25,
+        Ts=np.array([0.42685688, 0.41231782, 0.46652526]),
+        Tp=np.array([0.2909342, 0.29624314, 0.30526271]),
+        Tc=np.array([0.00431032, 0.01447611, 0.02041075]),
+        Q=np.array([0.12834946, 0.12870338, 0.13078523]),
+        C0=58.13307318503893,
+        A=1.42261211,
+        a1=506.8049747171294,
+        a2=510.98343062774353,
+    )
+    colour = 85 * torch.rand(50, 3, dtype=torch.float64)
+    positions = 40 * torch.rand(50, 2, dtype=torch.float64) - 15
+    inputs = pandas.DataFrame(
+        torch.cat([colour, positions], dim=1).numpy(), columns=list(INPUTS)
+    )
+    for sensor in ("1", "2", "3"):
+        inputs[f"diode_ir_{sensor}"], inputs[f"diode_vis_{sensor}"] = 2, 1
+        inputs[f"t_ir_{sensor}"], inputs[f"t_vis_{sensor}"] = 3, 3
+    inputs["v_c"] = inputs["v_angle_1"] = inputs["v_angle_2"] = 5.0
+    outputs = law.simulate_from_inputs(inputs)[: len(OUTPUTS)]
+    expected = torch.stack([torch.as_tensor(output) for output in outputs], dim=1)
+    angle = (positions[:, :1] - positions[:, 1:]).abs()
+    readings = LightTunnelSimulator().readings(torch.cat([colour, angle], dim=1))
+    torch.testing.assert_close(readings, expected, rtol=1e-9, atol=0.0)
+
+
+def test_noise_is_relative_on_light_and_additive_on_the_current() -> None:
+    theta = torch.tensor([[50.0, 20.0, 70.0, 10.0]]).expand(20_000, -1)
+    x = LightTunnelSimulator(relative_noise=0.03, current_noise_std=4.0)(theta)
+    readings = LightTunnelSimulator().readings(theta[:1])
+    light, current = x[:, :6].expm1() / readings[:, :6], x[:, 6]
+    torch.testing.assert_close(light.mean(dim=0), torch.ones(6), atol=1e-3, rtol=0.0)
+    torch.testing.assert_close(
+        light.std(dim=0), torch.full((6,), 0.03), rtol=0.03, atol=0.0
+    )
+    assert current.mean() == pytest.approx(float(readings[0, 6]), abs=0.1)
+    assert current.std() == pytest.approx(4.0, rel=0.03)
+
+
+def test_options_reach_the_simulator_and_default_to_the_recorded_noise() -> None:
+    recorded = LightTunnelSimulator(relative_noise=0.03, current_noise_std=4.0)
+    assert LightTunnelSimulator() == recorded
+    assert LightTunnelSensors().get_simulator() == recorded
+    task = LightTunnelSensors(relative_noise=0.1, current_noise_std=7.0)
+    assert task.get_simulator() == LightTunnelSimulator(
+        relative_noise=0.1, current_noise_std=7.0
+    )
+
+
+def test_negative_readings_are_cut_off_at_zero() -> None:
+    theta = torch.tensor([[-0.5, -0.5, -0.5, 0.0]])
+    assert (LightTunnelSimulator().readings(theta)[:, :6] < 0).all()
+    assert (LightTunnelSimulator()(theta)[:, :6] == 0).all()
+
+
+def test_only_the_third_sensor_sees_the_angle() -> None:
+    theta = torch.tensor([[50.0, 20.0, 70.0, 0.0], [50.0, 20.0, 70.0, 40.0]])
+    aligned, turned = LightTunnelSimulator().readings(theta)
+    changed = (aligned != turned).tolist()
+    assert changed == [name in ("ir_3", "vis_3") for name in OUTPUTS]
+
+
+# The prior ---------------------------------------------------------------------------
+
+
+def test_prior_log_density_is_analytic() -> None:
+    prior = LightTunnelSensors().get_prior()
+    theta = torch.tensor([[0.0, 85.0, 42.0, 0.0], [0.0, 85.0, 42.0, 30.0]])
+    expected = [-3 * math.log(86) + math.log(2 * (40 - d) / 1600) for d in (0, 30)]
+    torch.testing.assert_close(prior.log_prob(theta), torch.tensor(expected))
+
+
+# Recorded data -----------------------------------------------------------------------
+
+
+def test_law_overpredicts_the_light_by_the_known_ratios(chamber_root: Path) -> None:
+    theta, x = all_recorded(LightTunnelSensors(root=chamber_root))
+    assert len(theta) == 6000
+    measured = x[:, :6].expm1().mean(dim=0)
+    ratios = LightTunnelSimulator().readings(theta)[:, :6].mean(dim=0) / measured
+    expected = torch.tensor([1.23, 1.24, 1.24, 1.26, 1.26, 1.34])
+    torch.testing.assert_close(ratios, expected, atol=0.02, rtol=0.0)
+
+
+def test_recorded_data_have_2000_rows_to_calibrate_and_4000_to_test(
+    chamber_root: Path,
+) -> None:
+    task = LightTunnelSensors(root=chamber_root)
+    with pytest.raises(InvalidInputError, match="at most 2000"):
+        task.get_calibration_set(2001)
+    with pytest.raises(InvalidInputError, match="at most 4000"):
+        task.get_test_set(4001)
+
+
+def test_recorded_parameters_follow_the_prior(chamber_root: Path) -> None:
+    theta, _ = all_recorded(LightTunnelSensors(root=chamber_root))
+    # Distribution functions of the prior, which are uniform where it is right.
+    colour = (theta[:, :3] + 0.5) / 86
+    angle = UniformDistance(torch.tensor([40.0])).cdf(theta[:, 3:])
+    levels = torch.cat([colour, angle], dim=1).sort(dim=0).values
+    distance = (levels - torch.linspace(0, 1, 6000).unsqueeze(1)).abs().amax(dim=0)
+    # Colours are integers (half a step is 0.006); angles come out a little small.
+    assert (distance < torch.tensor([0.02, 0.02, 0.02, 0.05])).all()
+
+
+@pytest.mark.parametrize("experiment", ["uniform_l_11_mid", "uniform_t_ir_1_strong"])
+def test_other_experiments_can_be_chosen(chamber_root: Path, experiment: str) -> None:
+    task = LightTunnelSensors(root=chamber_root, experiment=experiment)
+    reference = LightTunnelSensors(root=chamber_root)
+    assert task.get_test_set(600)[1].shape == (600, 7)
+    shift = task.get_test_set(600)[1].mean(dim=0) - reference.get_test_set(600)[1].mean(
+        dim=0
+    )
+    exposure_is_shorter = experiment == "uniform_t_ir_1_strong"
+    assert (shift[0] < -1.5) == exposure_is_shorter
+
+
+@pytest.mark.parametrize("experiment", ["uniform_red_strong", "uniform_pol_1_strong"])
+def test_experiments_outside_of_the_prior_are_refused(
+    chamber_root: Path, experiment: str
+) -> None:
+    task = LightTunnelSensors(root=chamber_root, experiment=experiment)
+    with pytest.raises(InvalidInputError, match=f"{experiment}.*support of the prior"):
+        task.get_test_set(5)
+
+
+def test_rows_become_parameters_and_logarithms(write_table: WriteTable) -> None:
+    theta, x = all_recorded(LightTunnelSensors(root=write_table()), num_rows=9)
+    order = theta[:, 0].argsort()
+    i = torch.arange(9.0)
+    expected = [i, 2 * i, torch.full((9,), 85.0), 10 + 2.5 * i]
+    assert torch.equal(theta[order], torch.stack(expected, dim=1))
+    torch.testing.assert_close(x[order, :6], (101 + i).log().unsqueeze(1).expand(9, 6))
+    assert torch.equal(x[order, 6], 100 + i)
+
+
+def test_order_of_the_readings_is_that_of_the_simulator(
+    write_table: WriteTable,
+) -> None:
+    changes = {name: 10**i for i, name in enumerate(OUTPUTS)}
+    theta, x = all_recorded(LightTunnelSensors(root=write_table(**changes)), num_rows=9)
+    row = x[theta[:, 0] == 1][0]
+    torch.testing.assert_close(row[:6].expm1(), 10.0 ** torch.arange(6))
+    assert row[6] == 1e6
+
+
+def test_without_a_root_only_the_data_are_missing() -> None:
+    task = LightTunnelSensors()
+    assert task.get_simulator()(task.get_prior().sample((2,))).shape == (2, 7)
+    with pytest.raises(DataNotFoundError, match=r"`root`.*`download=True`") as error:
+        task.get_test_set(1)
+    assert f"{DATASET}/uniform_reference.csv" in str(error.value)
+    assert PAGE in str(error.value)
+
+
+def test_a_missing_file_is_named_with_both_ways_to_get_it(tmp_path: Path) -> None:
+    with pytest.raises(DataNotFoundError) as error:
+        LightTunnelSensors(root=tmp_path).get_calibration_set(1)
+    message = str(error.value)
+    assert str(tmp_path / DATASET / "uniform_reference.csv") in message
+    assert "download=True" in message
+    assert PAGE in message
+
+
+@pytest.mark.parametrize(
+    ("table", "match"),
+    [
+        pytest.param({"drop": ("vis_2", "pol_1")}, "'pol_1', 'vis_2'", id="column"),
+        pytest.param(
+            {"ir_1": "nan"}, r"uniform_reference.csv.*finite.*\[1\]", id="nan"
+        ),
+        pytest.param({"ir_1": ""}, r"uniform_reference.csv.*finite.*\[1\]", id="blank"),
+        pytest.param({"ir_1": "dark"}, "finite", id="word"),
+        pytest.param({"red": 86}, "support of the prior", id="colour"),
+        pytest.param({"pol_2": 31}, "support of the prior", id="angle"),
+    ],
+)
+def test_broken_files_are_explained(
+    write_table: WriteTable, table: dict, match: str
+) -> None:
+    task = LightTunnelSensors(root=write_table(**table))
+    with pytest.raises(InvalidInputError, match=match):
+        task.get_test_set(1)
+
+
+def test_download_fetches_what_is_missing(
+    write_table: WriteTable, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    calls = stub_downloads(monkeypatch, lambda: write_table())
+    root = tmp_path / "new" / ".."
+    task = LightTunnelSensors(root=root, download=True)
+    assert calls == []
+    task.get_test_set(2)
+    task.get_test_set(2)
+    assert calls == [(DATASET, str(root), True)]
+
+
+def test_a_download_without_the_file_is_an_error(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    stub_downloads(monkeypatch, lambda: None)
+    task = LightTunnelSensors(root=tmp_path, download=True)
+    with pytest.raises(DataNotFoundError, match=r"uniform_reference\.csv"):
+        task.get_test_set(2)
+
+
+def test_a_missing_package_is_named(
+    monkeypatch: pytest.MonkeyPatch, write_table: WriteTable
+) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ImportError, match=r"need pandas.*sbi-rope\[benchmarks\]"):
+        LightTunnelSensors(root=write_table()).get_test_set(1)
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        pytest.param({"download": True}, "`root`", id="download"),
+        pytest.param({"relative_noise": 0.0}, "relative_noise", id="light"),
+        pytest.param({"current_noise_std": -1.0}, "current_noise_std", id="current"),
+        pytest.param({"variant": "shifted"}, "variant", id="variant"),
+    ],
+)
+def test_options_out_of_range_are_refused(options: dict, match: str) -> None:
+    with pytest.raises(InvalidInputError, match=match):
+        LightTunnelSensors(**options)
+
+
+def all_recorded(
+    task: LightTunnelSensors, *, num_rows: int = 6000
+) -> tuple[Tensor, Tensor]:
+    third = num_rows // 3
+    parts = (task.get_calibration_set(third), task.get_test_set(num_rows - third))
+    theta, x = zip(*parts, strict=True)
+    return torch.cat(theta), torch.cat(x)
+
+
+def stub_downloads(
+    monkeypatch: pytest.MonkeyPatch, action: Callable[[], object]
+) -> list[tuple[str, str, bool]]:
+    """Replace causalchamber's downloads by an action, and record the calls."""
+    calls: list[tuple[str, str, bool]] = []
+
+    def dataset(name: str, *, root: str, download: bool) -> None:
+        calls.append((name, root, download))
+        action()
+
+    module = types.ModuleType("causalchamber.datasets")
+    module.Dataset = dataset  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "causalchamber", types.ModuleType("causalchamber"))
+    monkeypatch.setitem(sys.modules, "causalchamber.datasets", module)
+    return calls

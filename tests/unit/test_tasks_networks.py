@@ -1,0 +1,79 @@
+"""The embedding networks of the tasks."""
+
+import pytest
+import torch
+from torch import nn
+
+from sbi_rope.errors import InvalidInputError
+from sbi_rope.tasks.networks import SeriesEmbedding, fully_connected
+
+
+@pytest.mark.parametrize(
+    ("num_steps", "padding", "num_features"),
+    [(200, 1, 2048), (193, 1, 2048), (201, 1, 2176), (100, 1, 512), (1000, 1, 14848)],
+)
+def test_flatten_size_follows_the_length(
+    num_steps: int, padding: int, num_features: int
+) -> None:
+    net = SeriesEmbedding(num_steps=num_steps, padding=padding)
+    assert net.num_features == num_features
+    assert net(torch.randn(2, num_steps)).shape == (2, 10)
+
+
+def test_layers_are_those_of_the_paper() -> None:
+    net = SeriesEmbedding()
+    convolutions = [
+        (m.in_channels, m.out_channels, m.kernel_size[0], m.stride[0], m.dilation[0])
+        for m in net.modules()
+        if isinstance(m, nn.Conv1d)
+    ]
+    assert convolutions == [
+        (1, 16, 3, 1, 2),
+        (16, 64, 3, 2, 2),
+        (64, 128, 3, 1, 2),
+        (128, 128, 3, 2, 2),
+        (128, 128, 3, 1, 2),
+        (128, 128, 3, 2, 2),
+        (128, 128, 3, 1, 2),
+    ]
+    linear = [
+        (m.in_features, m.out_features)
+        for m in net.modules()
+        if isinstance(m, nn.Linear)
+    ]
+    assert linear == [(2048, 512), (512, 128), (128, 32), (32, 10)]
+    once = [nn.Conv1d, nn.ReLU]
+    twice = [*once, *once, nn.AvgPool1d]
+    expected = [*twice, *twice, *twice, *once, nn.Flatten]
+    assert [type(layer) for layer in net.features] == expected
+
+
+def test_short_series_need_more_padding() -> None:
+    with pytest.raises(InvalidInputError, match=r"`num_steps`.*got 50.*`padding`"):
+        SeriesEmbedding(num_steps=50)
+    assert SeriesEmbedding(num_steps=50, padding=2)(torch.randn(2, 50)).shape == (2, 10)
+
+
+def test_the_shortest_series_with_the_padding_of_the_paper_has_73_steps() -> None:
+    SeriesEmbedding(num_steps=73)
+    with pytest.raises(InvalidInputError, match="got 72"):
+        SeriesEmbedding(num_steps=72)
+
+
+@pytest.mark.parametrize("shape", [(3, 100), (200,), (3, 1, 200)])
+def test_series_of_another_shape_are_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(InvalidInputError, match=r"`x` of shape \(n, 200\)"):
+        SeriesEmbedding()(torch.zeros(shape))
+
+
+@pytest.mark.parametrize("option", ["num_steps", "output_dim", "padding"])
+def test_sizes_are_positive(option: str) -> None:
+    with pytest.raises(InvalidInputError, match=option):
+        SeriesEmbedding(**{option: 0})
+
+
+def test_fully_connected_has_relu_between_layers_only() -> None:
+    net = fully_connected(3, (12, 48, 9))
+    kinds = [type(layer) for layer in net]
+    assert kinds == [nn.Linear, nn.ReLU, nn.Linear, nn.ReLU, nn.Linear]
+    assert net(torch.randn(5, 3)).shape == (5, 9)

@@ -1,0 +1,125 @@
+"""The pendulum."""
+
+import math
+
+import pytest
+import torch
+
+from sbi_rope.errors import InvalidInputError
+from sbi_rope.tasks.pendulum import Pendulum, PendulumSimulator
+
+
+def test_prior_log_density_is_analytic() -> None:
+    theta, _ = Pendulum().get_test_set(200)
+    log_prob = Pendulum().get_prior().log_prob(theta)
+    torch.testing.assert_close(log_prob, torch.full((200,), -math.log(28.5)))
+
+
+def test_positions_are_a_damped_cosine() -> None:
+    theta = torch.tensor([[0.0, 2.0], [math.pi, 3.0]], dtype=torch.float64)
+    x = PendulumSimulator().position(
+        theta,
+        phase=torch.tensor([[0.0], [0.0]]),
+        damping=torch.tensor([[0.0], [0.5]]),
+    )
+    torch.testing.assert_close(x[0], torch.full((200,), 2.0, dtype=torch.float64))
+    assert x[1, 0] == pytest.approx(3.0)
+    # pi rad/s for 10 s are five full turns.
+    assert x[1, -1] == pytest.approx(3.0 * math.exp(-5.0))
+
+
+def test_noise_is_that_of_the_sensor() -> None:
+    theta = torch.tensor([[0.0, 2.0]]).expand(1000, -1)
+    # At frequency 0 a series is constant but for the noise at every step.
+    for simulator in (Pendulum().get_simulator(), PendulumSimulator()):
+        x = simulator(theta)
+        noise = x - x.mean(dim=1, keepdim=True)
+        assert noise.std() == pytest.approx(0.1, rel=0.01)
+
+
+def test_phase_is_uniform_on_the_circle() -> None:
+    # The swing turns by a quarter in 10 s: first and last position give the phase.
+    theta = torch.tensor([[math.pi / 20, 1.0]]).expand(10_000, -1)
+    x = PendulumSimulator(noise_std=1e-3)(theta)
+    phase = torch.atan2(-x[:, -1], x[:, 0])
+    levels = torch.linspace(0.05, 0.95, 10)
+    expected = math.pi * (2 * levels - 1)
+    torch.testing.assert_close(phase.quantile(levels), expected, atol=0.1, rtol=0.0)
+
+
+def test_simulations_are_not_damped_and_real_series_are() -> None:
+    theta, x_o = Pendulum().get_test_set(2000)
+    x_s = Pendulum().get_simulator()(theta)
+    amplitude = theta[:, 1:]
+
+    def power(x: torch.Tensor, step: slice) -> float:
+        return float((x[:, step] / amplitude).square().mean())
+
+    assert power(x_s, slice(-20, None)) == pytest.approx(0.5, abs=0.05)
+    # The mean of exp(-2 alpha t) over alpha in (0, 1) is about 1 / (2 t).
+    assert power(x_o, slice(0, 3)) == pytest.approx(0.45, abs=0.05)
+    assert power(x_o, slice(-20, None)) == pytest.approx(0.5 / 19, rel=0.25)
+
+
+def test_without_friction_the_simulator_is_exact() -> None:
+    theta, x_o = Pendulum(max_damping=0.0).get_test_set(2000)
+    x_s = Pendulum().get_simulator()(theta)
+    torch.testing.assert_close(x_o.std(dim=0), x_s.std(dim=0), rtol=0.1, atol=0.0)
+
+
+def test_noise_std_reaches_both_sides() -> None:
+    task = Pendulum(noise_std=3.0, max_damping=0.0)
+    theta, x_o = task.get_test_set(300)
+    for x in (x_o, task.get_simulator()(theta)):
+        # Neighbouring positions are nearly equal, so their difference is noise.
+        assert x.diff(dim=1).std() / 2**0.5 == pytest.approx(3.0, rel=0.05)
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("part", ["calibration", "test"])
+def test_weight_is_the_share_of_the_tighter_distribution(
+    weight: float, part: str
+) -> None:
+    task = Pendulum(variant="misspecified_prior", misspecification_weight=weight)
+    draw = task.get_calibration_set if part == "calibration" else task.get_test_set
+    theta, _ = draw(2000)
+    low, high = torch.tensor([1.0, 3.0]), torch.tensor([2.0, 6.0])
+    inside = ((theta >= low) & (theta <= high)).all(dim=1).double().mean()
+    assert inside == pytest.approx(weight + (1 - weight) * 3 / 28.5, abs=0.04)
+
+
+def test_misspecified_prior_leaves_the_assumed_prior_alone() -> None:
+    task = Pendulum(variant="misspecified_prior", misspecification_weight=1.0)
+    draws = task.get_prior().sample((20_000,))
+    assert draws.min(dim=0).values.tolist() == pytest.approx([0.0, 0.5], abs=0.01)
+    assert draws.max(dim=0).values.tolist() == pytest.approx([3.0, 10.0], abs=0.01)
+
+
+def test_default_weight_of_the_variant_is_a_half() -> None:
+    assert Pendulum(variant="misspecified_prior").misspecification_weight == 0.5
+    assert Pendulum().misspecification_weight == 0.0
+
+
+def test_network_has_2048_features_and_ten_outputs() -> None:
+    net = Pendulum().get_embedding_net()
+    assert net.num_features == 2048
+    assert net(torch.randn(4, 200)).shape == (4, 10)
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        pytest.param({"misspecification_weight": 0.5}, "no effect", id="no-variant"),
+        pytest.param(
+            {"variant": "misspecified_prior", "misspecification_weight": 1.5},
+            r"\[0, 1\]",
+            id="weight",
+        ),
+        pytest.param({"noise_std": 0.0}, "noise_std", id="noise"),
+        pytest.param({"max_damping": -0.1}, "max_damping", id="damping"),
+        pytest.param({"max_damping": math.nan}, "max_damping", id="nan"),
+    ],
+)
+def test_options_out_of_range_are_refused(options: dict, match: str) -> None:
+    with pytest.raises(InvalidInputError, match=match):
+        Pendulum(**options)
