@@ -116,20 +116,42 @@ class Study:
         theta_o: Tensor,
         curves: dict[str, Any],
     ) -> None:
-        with torch.random.fork_rng():
+        task, x_o = self.task, posterior.x_o
+        with torch.random.fork_rng(), torch.no_grad():
             torch.manual_seed(0)
+            prior = task.get_prior().sample(torch.Size((2000,)))
+            h, g = rope.embedding_net, rope.tuned_embedding_net
+            before, after = h(x_o), g(x_o)
             samples = {
                 "NPE": npe.sample(
                     (2000,),
-                    x=posterior.x_o[:1],
+                    x=x_o[:1],
                     show_progress_bars=False,
                     reject_outside_prior=False,
                 ),
                 "RoPE": posterior[0].sample((2000,), show_progress_bars=False),
             }
-        names = self.task.parameter_names
+        names = [
+            name if unit == "1" else f"{name} [{unit}]"
+            for name, unit in zip(
+                task.parameter_names, task.parameter_units, strict=True
+            )
+        ]
         figures = {
-            "posterior": plots.pair_plot(samples, theta_o[0], parameter_names=names),
+            "overview": plots.overview(
+                simulated=posterior.coupling.simulated,
+                before=before,
+                after=after,
+                weights=posterior.weights[0],
+                samples=samples,
+                theta=theta_o[0],
+                parameter_names=names,
+                parameters=(0, task.theta_dim - 1),
+                prior=prior,
+            ),
+            "posterior": plots.pair_plot(
+                samples, theta_o[0], parameter_names=names, prior=prior
+            ),
             "calibration": plots.calibration_curves(curves),
             "finetuning": plots.finetuning_history(rope.history),
             "coupling": plots.effective_sample_sizes(posterior.coupling),

@@ -66,7 +66,7 @@ class PriorPosterior(NeuralPosterior):
         **kwargs: Any,
     ) -> Tensor:
         """Draw from the prior, shape ``(*sample_shape, k)``; the rest is ignored."""
-        return self.prior.sample(torch.Size(sample_shape))
+        return self._draw(torch.Size(sample_shape))
 
     def sample_batched(
         self,
@@ -81,7 +81,12 @@ class PriorPosterior(NeuralPosterior):
         asks.
         """
         check_tensor("x", x)
-        return self.prior.sample(torch.Size((*sample_shape, x.shape[0])))
+        return self._draw(torch.Size((*sample_shape, x.shape[0])))
+
+    def _draw(self, shape: torch.Size) -> Tensor:
+        # sbi's MultipleIndependent knows sample shapes of one dimension only.
+        samples = self.prior.sample(torch.Size((shape.numel(),)))
+        return samples.reshape(*shape, *samples.shape[1:])
 
     def log_prob(
         self,
@@ -130,12 +135,16 @@ class _PriorPotential(BasePotential):
     prior: Distribution
 
     def __call__(self, theta: Tensor, track_gradients: bool = True) -> Tensor:  # noqa: FBT001, FBT002
+        shape = theta.shape[:-1]
         with torch.set_grad_enabled(track_gradients):
+            # sbi's MultipleIndependent takes theta of two dimensions at most.
+            theta = theta.reshape(-1, theta.shape[-1])
             inside = within_support(self.prior, theta)
             # torch's distributions raise outside their support: evaluate them at a
             # prior draw there, and overwrite the result.
-            filler = self.prior.sample(torch.Size(())).to(theta)
+            filler = self.prior.sample(torch.Size((1,))).to(theta)
             safe = torch.where(inside.unsqueeze(-1), theta, filler)
             # A flat density has no graph back to theta; sbi's map() needs one.
             log_prob = self.prior.log_prob(safe) + 0.0 * safe.sum(dim=-1)
-            return torch.where(inside, log_prob, torch.full_like(log_prob, -torch.inf))
+            log_prob = log_prob.where(inside, -torch.inf)
+            return log_prob.reshape(shape)

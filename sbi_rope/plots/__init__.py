@@ -1,0 +1,25 @@
+r"""Pictures of posteriors, of their calibration, and of how RoPE got there.
+
+Every function returns a matplotlib figure and shows nothing. matplotlib is imported
+when a function is called: ``pip install sbi-rope[benchmarks]``.
+"""
+
+from sbi_rope.plots.diagnostics import (
+    CouplingLike,
+    FinetuningHistory,
+    calibration_curves,
+    effective_sample_sizes,
+    finetuning_history,
+)
+from sbi_rope.plots.posteriors import pair_plot
+from sbi_rope.plots.steps import overview
+
+__all__ = [
+    "CouplingLike",
+    "FinetuningHistory",
+    "calibration_curves",
+    "effective_sample_sizes",
+    "finetuning_history",
+    "overview",
+    "pair_plot",
+]

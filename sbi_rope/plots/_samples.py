@@ -1,0 +1,252 @@
+"""Posterior samples in a panel: their checks, the axes, histograms and contours."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from sbi_rope._validation import check_batch, check_tensor
+from sbi_rope.errors import InvalidInputError
+from sbi_rope.plots._figures import PRIOR
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+# How many times its own width the axes may be widened for posteriors far from it.
+REACH = 1.0
+# Shares of the samples that contours enclose.
+LEVELS = (0.9, 0.5)
+GRID = 100
+
+
+def check_not_empty(name: str, value: Mapping[str, Any]) -> None:
+    """Raise unless there is something to draw."""
+    if not value:
+        raise InvalidInputError(f"Expected `{name}` with at least one entry; got none.")
+
+
+def check_samples(
+    samples: Mapping[str, Tensor],
+    theta: Tensor | None,
+    parameter_names: Sequence[str] | None,
+) -> tuple[dict[str, Tensor], Tensor | None, list[str]]:
+    """Return samples and truth on the CPU in float64, and one name a parameter."""
+    check_not_empty("samples", samples)
+    width = check_tensor("samples", next(iter(samples.values()))).shape[-1:]
+    draws = {
+        name: check_batch(f"samples[{name!r}]", value, width).detach().cpu().double()
+        for name, value in samples.items()
+    }
+    names = list(parameter_names or [f"$\\theta_{j + 1}$" for j in range(width[0])])
+    if len(names) != width[0]:
+        raise InvalidInputError(
+            f"Expected `parameter_names` of length {width[0]}; got {len(names)}."
+        )
+    if theta is None:
+        return draws, None, names
+    check_batch("theta", check_tensor("theta", theta).reshape(1, -1), width)
+    return draws, theta.detach().cpu().double().reshape(-1), names
+
+
+def central_interval(values: Tensor) -> Tensor:
+    """Ends of the central 99 % of each column, shape ``(2, k)``.
+
+    Of five rows or more, at least the smallest and the largest are left out.
+    """
+    last = len(values) - 1
+    # Order statistics, not interpolated: a single extreme must not leak in.
+    low = min(math.ceil(0.005 * last), last // 4)
+    return values.sort(dim=0).values[[low, last - low]]
+
+
+def robust_limits(
+    draws: Sequence[Tensor], truth: Tensor | None, prior: Tensor | None = None
+) -> Tensor:
+    """Limits of the axes, shape ``(2, k)``.
+
+    They hold the core: the prior's interval if given, or else the central 99 % of each
+    posterior that is around the truth; and the truth. Of the other posteriors they hold
+    the central 99 % as far as it is within ``REACH`` times the width of the core.
+    """
+    spans = torch.stack([central_interval(value) for value in draws])
+    low, high = spans[:, 0], spans[:, 1]  # one row a posterior
+    core_low, core_high = low.amin(dim=0), high.amax(dim=0)
+    if prior is not None:
+        core_low, core_high = prior[0], prior[1]
+    elif truth is not None:
+        around = (low <= truth) & (truth <= high)
+        inf = torch.full_like(low, torch.inf)
+        # Where none is around the truth, none is favoured.
+        some = around.any(dim=0)
+        core_low = torch.where(
+            some, torch.where(around, low, inf).amin(dim=0), core_low
+        )
+        core_high = torch.where(
+            some, torch.where(around, high, -inf).amax(dim=0), core_high
+        )
+    if truth is not None:
+        core_low, core_high = core_low.minimum(truth), core_high.maximum(truth)
+    width = _width(core_low, core_high)
+    floor, ceiling = core_low - REACH * width, core_high + REACH * width
+    visible = (low <= ceiling) & (high >= floor)
+    low = torch.where(visible, low.maximum(floor), core_low).amin(dim=0)
+    high = torch.where(visible, high.minimum(ceiling), core_high).amax(dim=0)
+    return with_margin(low.minimum(core_low), high.maximum(core_high))
+
+
+def with_margin(low: Tensor, high: Tensor) -> Tensor:
+    """Limits of axes a little wider than what they hold, shape ``(2, k)``."""
+    margin = 0.06 * _width(low, high)
+    return torch.stack([low - margin, high + margin])
+
+
+def _width(low: Tensor, high: Tensor) -> Tensor:
+    """Return the width of an interval, or of a visible one if it is but a point."""
+    size = torch.maximum(low.abs(), high.abs())
+    visible = torch.where(size > 0, size, torch.ones_like(size))
+    return torch.where(high - low > 1e-9 * size, high - low, visible)
+
+
+def prior_interval(prior: Any, like: Tensor) -> Tensor:
+    """Check samples of the prior and return their central 99 %, shape ``(2, k)``."""
+    return central_interval(
+        check_batch("prior", prior, like.shape[1:]).detach().cpu().double()
+    )
+
+
+def shade_prior(axes: "Axes", interval: Tensor) -> None:
+    """Shade the prior's interval, shape ``(2, 1)`` or ``(2, 2)``."""
+    style: dict[str, Any] = {"color": PRIOR, "lw": 0, "zorder": 0}
+    low, high = interval.tolist()
+    if len(low) == 1:
+        axes.axvspan(low[0], high[0], **style)
+    else:
+        axes.fill_between([low[0], high[0]], low[1], high[1], **style)
+
+
+def share_outside(values: Tensor, limits: Tensor) -> float:
+    """Share of the samples outside the limits in any parameter."""
+    inside = ((values >= limits[0]) & (values <= limits[1])).all(dim=1)
+    return 1.0 - float(inside.double().mean())
+
+
+def label_with_share(name: str, values: Tensor, limits: Tensor) -> str:
+    """Return the name of a method, saying so if its samples do not fit the axes."""
+    outside = share_outside(values, limits)
+    # Of k parameters, one in a hundred of each is outside by construction.
+    if outside <= 0.05 + 0.01 * limits.shape[1]:
+        return name
+    return f"{name} ({100 * outside:.0f} % outside)"
+
+
+def draw_marginal(axes: "Axes", values: Tensor, style: Mapping[str, Any]) -> None:
+    """Draw a histogram of ``values``, shape ``(n,)``, with an area of one.
+
+    The limits of the axes must be set: what is outside sets no height.
+    """
+    low, high = central_interval(values.unsqueeze(1)).flatten().tolist()
+    left, right = axes.get_xlim()
+    if low > right or high < left:
+        return
+    if _is_point(low, high):
+        axes.axvline(low, **style)
+        return
+    # Bins of one width, also beyond: extremes must not widen them, and must count.
+    num_bins = min(max(round(len(values) ** 0.5), 5), 30)
+    counts, edges = torch.histogram(values, bins=num_bins, range=(low, high))
+    density = counts / (len(values) * (edges[1] - edges[0]))
+    # Dashed steps are hard to read.
+    axes.stairs(density.numpy(), edges.numpy(), color=style["color"], lw=1.6)
+
+
+def draw_contours(
+    axes: "Axes",
+    values: Tensor,
+    style: Mapping[str, Any],
+    *,
+    fill: bool = False,
+    bounded: bool = True,
+    shares: Sequence[float] = LEVELS,
+) -> None:
+    """Draw contours around shares of ``values``, shape ``(n, 2)``, largest first.
+
+    The limits of the axes must be set. If ``bounded``, nothing is drawn beyond the
+    outermost values: smoothing must not carry a posterior out of the prior's support.
+    """
+    from matplotlib.patches import Rectangle
+
+    low, high = central_interval(values)
+    margin = (high - low) / 2
+    core = values[((values >= low - margin) & (values <= high + margin)).all(dim=1)]
+    colour = style["color"]
+    # Principal axes, so that the smoothing does not widen a narrow ridge.
+    centre = core.mean(dim=0) if len(core) else values.mean(dim=0)
+    scale, directions = torch.linalg.eigh((core - centre).T.cov(correction=0))
+    scale = scale.clamp(min=0.0).sqrt()
+    flat = [_is_point(float(a), float(b)) for a, b in zip(low, high, strict=True)]
+    if all(flat):
+        axes.plot(*centre.tolist(), "o", color=colour, ms=5)
+        return
+    if any(flat) or scale[0] < 1e-6 * scale[1]:
+        ends = core[(core - centre).matmul(directions[:, 1]).argsort()[[0, -1]]]
+        axes.plot(ends[:, 0].numpy(), ends[:, 1].numpy(), **style)
+        return
+    density, grid = _smoothed((core - centre) @ directions / scale)
+    points = (grid * scale) @ directions.T + centre
+    x, y = points[..., 0].numpy(), points[..., 1].numpy()
+    levels = _levels(density, shares)
+    drawn = [axes.contour(x, y, density.numpy(), levels, colors=[colour])]
+    drawn[0].set_linestyle(style["linestyle"])
+    if fill:
+        top = 1.01 * float(density.max())
+        drawn += [
+            axes.contourf(x, y, density.numpy(), [a, top], colors=[colour], alpha=0.16)
+            for a in levels
+        ]
+    for contours in drawn:
+        contours.set_in_layout(False)
+    if not bounded:
+        return
+    left, right = _overlap(values[:, 0], axes.get_xlim())
+    bottom, top = _overlap(values[:, 1], axes.get_ylim())
+    frame = Rectangle(
+        (left, bottom), right - left, top - bottom, transform=axes.transData
+    )
+    for contours in drawn:
+        contours.set_clip_path(frame)
+
+
+def _overlap(values: Tensor, limits: tuple[float, float]) -> tuple[float, float]:
+    low, high = max(float(values.min()), limits[0]), min(float(values.max()), limits[1])
+    return low, max(low, high)
+
+
+def _is_point(low: float, high: float) -> bool:
+    return high - low <= 1e-9 * max(abs(low), abs(high), 1e-300)
+
+
+def _smoothed(values: Tensor) -> tuple[Tensor, Tensor]:
+    """Density of whitened ``values`` on a grid: both ``(GRID, GRID, ...)``."""
+    bandwidth = len(values) ** (-1 / 6)  # Scott's rule
+    low = values.amin(dim=0) - 3 * bandwidth
+    high = values.amax(dim=0) + 3 * bandwidth
+    ticks = [
+        torch.linspace(float(a), float(b), GRID, dtype=values.dtype)
+        for a, b in zip(low, high, strict=True)
+    ]
+    kernels = [
+        torch.exp(-((tick.unsqueeze(1) - column) ** 2) / (2 * bandwidth**2))
+        for tick, column in zip(ticks, values.T, strict=True)
+    ]
+    return kernels[0] @ kernels[1].T, torch.cartesian_prod(*ticks).reshape(
+        GRID, GRID, 2
+    )
+
+
+def _levels(density: Tensor, shares: Sequence[float]) -> list[float]:
+    """Return the densities whose contours enclose the shares, in increasing order."""
+    ordered = density.flatten().sort(descending=True).values
+    mass = ordered.cumsum(0) / ordered.sum()
+    return [float(ordered[(mass < share).sum()]) for share in shares]

@@ -1,0 +1,192 @@
+"""How well calibrated posteriors are, and how the steps of RoPE went."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Protocol
+
+import torch
+from torch import Tensor
+
+from sbi_rope.metrics import CoverageCurve
+from sbi_rope.plots._figures import (
+    BLUE,
+    GREY,
+    SKY,
+    VERMILLION,
+    line_styles,
+    new_figure,
+)
+from sbi_rope.plots._samples import check_not_empty
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = [
+    "CouplingLike",
+    "FinetuningHistory",
+    "calibration_curves",
+    "effective_sample_sizes",
+    "finetuning_history",
+]
+
+
+class FinetuningHistory(Protocol):
+    """What :func:`finetuning_history` reads; :class:`sbi_rope.finetuning.History`."""
+
+    @property
+    def training_loss(self) -> Sequence[float]:
+        """Loss before each step and after the last."""
+        ...
+
+    @property
+    def validation_loss(self) -> Sequence[float]:
+        """The same over held-out pairs; may be empty."""
+        ...
+
+    @property
+    def best_step(self) -> int:
+        """Step of the kept network; 0 is the starting point."""
+        ...
+
+
+class CouplingLike(Protocol):
+    """What :func:`effective_sample_sizes` reads of a coupling."""
+
+    @property
+    def weights(self) -> Tensor:
+        """Mixture weights, shape ``(n_o, n_s)``."""
+        ...
+
+    @property
+    def effective_sample_size(self) -> Tensor:
+        """Effective number of simulations behind each row, shape ``(n_o,)``."""
+        ...
+
+
+def calibration_curves(curves: Mapping[str, CoverageCurve]) -> "Figure":
+    r"""Empirical coverage of central credible intervals against their level.
+
+    Above the diagonal a posterior is under-confident, below it over-confident. The band
+    holds, level by level, 95 % of the curves of calibrated posteriors of one parameter
+    and the smallest test set shown: :math:`\alpha \pm 1.96
+    \sqrt{\alpha (1 - \alpha) / n}`. The average of several parameters varies no more.
+
+    Args:
+        curves: Coverage curves by method name, from
+            :func:`sbi_rope.metrics.coverage_curve`; the average over parameters is
+            drawn.
+
+    Returns:
+        The figure.
+
+    Raises:
+        InvalidInputError: If there is no curve.
+        ImportError: If matplotlib is not installed.
+    """
+    check_not_empty("curves", curves)
+    figure, axes = new_figure(7.4, 4.2)
+    count = min(curve.num_observations for curve in curves.values())
+    alpha = torch.linspace(0.0, 1.0, 201)
+    width = 1.96 * (alpha * (1.0 - alpha) / count).sqrt()
+    axes.fill_between(
+        alpha,
+        (alpha - width).clamp(min=0.0),
+        (alpha + width).clamp(max=1.0),
+        color="0.85",
+        label=f"calibrated, 95 % (n = {count})",
+    )
+    axes.plot([0, 1], [0, 1], color=GREY, lw=0.8)
+    styles = line_styles(curves)
+    for name, curve in curves.items():
+        axes.plot(curve.levels.cpu(), curve.average.cpu(), label=name, **styles[name])
+    axes.set(xlim=(0, 1), ylim=(0, 1), box_aspect=1)
+    axes.set_xlabel("credible level")
+    axes.set_ylabel("share of true parameters inside")
+    note = {"color": GREY, "size": "small", "transform": axes.transAxes}
+    axes.text(0.03, 0.97, "under-confident", va="top", **note)
+    axes.text(0.97, 0.03, "over-confident", ha="right", **note)
+    # Beside the axes: inside them every corner can hold a curve.
+    axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.02, 1.0))
+    return figure
+
+
+def finetuning_history(history: FinetuningHistory) -> "Figure":
+    """Losses of a fine-tuning, with the kept step marked.
+
+    Args:
+        history: Losses before each step and after the last, as
+            :class:`sbi_rope.finetuning.History` holds them. Without a hold-out only the
+            training loss is drawn.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ImportError: If matplotlib is not installed.
+    """
+    figure, axes = new_figure(6.0, 3.6)
+    from matplotlib.ticker import MaxNLocator
+
+    training = torch.as_tensor(history.training_loss).cpu()
+    validation = torch.as_tensor(history.validation_loss).cpu()
+    axes.plot(training, label="training pairs", color=BLUE, lw=1.2)
+    kept = training
+    if len(validation) > 0:
+        axes.plot(validation, label="held-out pairs", color=VERMILLION, lw=1.2)
+        kept = validation
+    step = history.best_step
+    suffix = " (the starting point)" if step == 0 else ""
+    axes.axvline(step, color=GREY, lw=0.8)
+    axes.plot(
+        [step],
+        [float(kept[step])],
+        "o",
+        color="black",
+        ms=5,
+        clip_on=False,
+        label=f"kept: step {step}{suffix}",
+    )
+    axes.set_xlim(left=0, right=max(len(training) - 1, 1))
+    axes.set_ylim(bottom=0)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_xlabel("step")
+    axes.set_ylabel("mean distance to the target\n(units of the embedding)")
+    axes.legend(frameon=False)
+    return figure
+
+
+def effective_sample_sizes(coupling: CouplingLike) -> "Figure":
+    r"""How many simulations stand behind each observation's posterior.
+
+    The effective sample size of a row is :math:`1 / \sum_j \alpha_{ij}^2`: 1 if a
+    single simulation carries all the weight, :math:`n_s` (marked) if all weigh the same
+    and the posterior is the average over all simulations.
+
+    Args:
+        coupling: A coupling of observations to simulations.
+
+    Returns:
+        The figure: a histogram on a logarithmic axis.
+
+    Raises:
+        ImportError: If matplotlib is not installed.
+    """
+    figure, axes = new_figure(6.0, 3.6)
+    sizes = coupling.effective_sample_size.detach().cpu().double()
+    num_simulations = coupling.weights.shape[1]
+    edges = torch.logspace(0, math.log10(max(num_simulations, 2)), 41).tolist()
+    median = float(sizes.median())
+    axes.hist(sizes.clamp(edges[0], edges[-1]), bins=edges, color=SKY)
+    axes.axvline(median, color=BLUE, lw=1.8, label=f"median: {median:.3g} simulations")
+    axes.axvline(
+        num_simulations,
+        color="black",
+        ls="--",
+        lw=1.2,
+        label=f"all equal: $n_s$ = {num_simulations}",
+    )
+    axes.set_xscale("log")
+    axes.set_xlabel("effective sample size (simulations)")
+    axes.set_ylabel(f"observations (of {len(sizes)})")
+    axes.legend(frameon=False, loc="upper left")
+    return figure

@@ -1,0 +1,120 @@
+"""Posteriors of one observation, side by side."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from torch import Tensor
+
+from sbi_rope.plots._figures import PRIOR, empty_figure, hide_frame, line_styles
+from sbi_rope.plots._samples import (
+    check_samples,
+    draw_contours,
+    draw_marginal,
+    label_with_share,
+    prior_interval,
+    robust_limits,
+    shade_prior,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["pair_plot"]
+
+
+def pair_plot(
+    samples: Mapping[str, Tensor],
+    theta: Tensor | None = None,
+    *,
+    parameter_names: Sequence[str] | None = None,
+    prior: Tensor | None = None,
+) -> "Figure":
+    """Marginals and pairs of several posteriors of one observation.
+
+    The axes hold the central 99 % of every posterior, and the true parameter: a few
+    extreme samples do not squeeze the picture. Neither does a posterior far from the
+    prior, or from the truth that another one holds: the legend says which share of its
+    samples is outside.
+    Contours enclose 50 % and 90 % of the samples.
+
+    Args:
+        samples: Posterior samples by method name, each of shape ``(num_samples, k)``.
+        theta: The true parameter, shape ``(k,)``, marked in black.
+        parameter_names: One label for each parameter, with its unit.
+        prior: Samples of the prior, shape ``(num_samples, k)``; their central 99 % is
+            shaded.
+
+    Returns:
+        The figure: k rows and columns, the marginals on the diagonal.
+
+    Raises:
+        InvalidInputError: If the shapes differ, or a sample is not finite.
+        ImportError: If matplotlib is not installed.
+    """
+    draws, truth, names = check_samples(samples, theta, parameter_names)
+    k = len(names)
+    figure = empty_figure(2.0 * k + 0.8, 2.0 * k + 1.0)
+    interval = (
+        None if prior is None else prior_interval(prior, draws[next(iter(draws))])
+    )
+    limits = robust_limits(list(draws.values()), truth, interval)
+    styles = line_styles(draws)
+    for row in range(k):
+        for column in range(row + 1):
+            axes = figure.add_subplot(k, k, row * k + column + 1)
+            hide_frame(axes)
+            axes.set_xlim(*limits[:, column].tolist())
+            if row != column:
+                axes.set_ylim(*limits[:, row].tolist())
+            pair = [column] if row == column else [column, row]
+            if interval is not None:
+                shade_prior(axes, interval[:, pair])
+            for name, value in draws.items():
+                if row == column:
+                    draw_marginal(axes, value[:, row], styles[name])
+                else:
+                    draw_contours(axes, value[:, pair], styles[name])
+            if row == column:
+                axes.spines["left"].set_visible(False)
+                axes.set_yticks([])
+                axes.set_ylim(bottom=0)
+            if truth is not None and row == column:
+                axes.axvline(float(truth[row]), color="black", lw=1.2)
+            elif truth is not None:
+                axes.plot(*truth[pair].tolist(), "o", color="black", ms=4, zorder=5)
+            axes.tick_params(labelbottom=row == k - 1, labelleft=column == 0)
+            if row == k - 1:
+                axes.set_xlabel(names[column])
+            if column == 0 and row > 0:
+                axes.set_ylabel(names[row])
+    _add_legend(figure, draws, truth, limits, shaded=interval is not None)
+    return figure
+
+
+def _add_legend(
+    figure: "Figure",
+    draws: Mapping[str, Tensor],
+    truth: Tensor | None,
+    limits: Tensor,
+    *,
+    shaded: bool,
+) -> None:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    styles = line_styles(draws)
+    handles: list[Any] = [
+        Line2D([], [], label=label_with_share(name, value, limits), **styles[name])
+        for name, value in draws.items()
+    ]
+    if truth is not None:
+        handles.append(
+            Line2D([], [], color="black", lw=1.2, marker="o", ms=4, label="truth")
+        )
+    if shaded:
+        handles.append(Patch(color=PRIOR, label="prior"))
+    # In the empty half of the figure, or above the only panel.
+    if limits.shape[1] > 1:
+        figure.legend(handles=handles, loc="upper right", frameon=False)
+    else:
+        figure.legend(handles=handles, loc="outside upper center", frameon=False)

@@ -1,0 +1,366 @@
+"""What RoPE does, in one row of three panels."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from sbi_rope._validation import (
+    check_batch,
+    check_finite,
+    check_same_length,
+    check_tensor,
+)
+from sbi_rope.errors import InvalidInputError
+from sbi_rope.plots._figures import (
+    BLUE,
+    PRIOR,
+    VERMILLION,
+    empty_figure,
+    hide_frame,
+    line_styles,
+)
+from sbi_rope.plots._samples import (
+    central_interval,
+    check_samples,
+    draw_contours,
+    draw_marginal,
+    label_with_share,
+    prior_interval,
+    robust_limits,
+    shade_prior,
+    with_margin,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+__all__ = ["overview"]
+
+SIMULATED = "0.72"
+STAR: dict[str, Any] = {
+    "marker": "*",
+    "ms": 17,
+    "mec": "white",
+    "mew": 1.0,
+    "color": "black",
+    "ls": "none",
+    "zorder": 6,
+}
+# More dots than these make a blot.
+MAX_SIMULATED, MAX_REAL = 1000, 250
+
+
+@dataclass(frozen=True)
+class _Plane:
+    """Embeddings in the plane of the simulations' first two principal components."""
+
+    simulated: Tensor
+    before: Tensor
+    after: Tensor
+    flat: bool
+
+
+def overview(
+    *,
+    simulated: Tensor,
+    before: Tensor,
+    after: Tensor,
+    weights: Tensor,
+    samples: Mapping[str, Tensor],
+    theta: Tensor,
+    parameter_names: Sequence[str],
+    index: int = 0,
+    parameters: Sequence[int] | None = None,
+    prior: Tensor | None = None,
+) -> "Figure":
+    r"""What RoPE does, for one observation: tune, couple, mix.
+
+    1. *Tune*: the embeddings of real observations before and after tuning, in the plane
+       of the first two principal components of the simulations' embeddings. Contours
+       enclose 90 % of the observations; the arrow follows observation ``index``.
+    2. *Couple*: the same plane. The larger and darker a simulation, the more it weighs
+       in the posterior of observation ``index``, the star.
+    3. *Mix*: the posterior of that observation. Contours enclose 50 % and 90 % of the
+       samples.
+
+    Axes hold the central 99 % of the embeddings; those of the posteriors are found as
+    in :func:`pair_plot`.
+
+    Args:
+        simulated: :math:`h(x_s)`, shape ``(n_s, l)``; ``posterior.coupling.simulated``.
+        before: :math:`h(x_o)`, shape ``(n_o, l)``.
+        after: :math:`g(x_o)`, shape ``(n_o, l)``.
+        weights: Weights of the simulations for the observation, shape ``(n_s,)``;
+            ``posterior.weights[index]``.
+        samples: Samples of the observation's posterior by method name, each of shape
+            ``(num_samples, k)``.
+        theta: The observation's true parameter, shape ``(k,)``.
+        parameter_names: One label for each parameter, with its unit.
+        index: Row of the observation in ``before`` and ``after``.
+        parameters: The one or two parameters to show; the first two if None.
+        prior: Samples of the prior, shape ``(num_samples, k)``; their central 99 % is
+            shown in grey.
+
+    Returns:
+        The figure, with three panels.
+
+    Raises:
+        InvalidInputError: If shapes do not fit, a value is not finite, or an index is
+            out of range.
+        ImportError: If matplotlib is not installed.
+    """
+    before, after, simulated, weights = _check_embeddings(
+        before, after, simulated, weights
+    )
+    if not 0 <= index < len(before):
+        raise InvalidInputError(
+            f"Expected `index` from 0 to {len(before) - 1}, a row of `before`; got "
+            f"{index}."
+        )
+    draws, truth, names = check_samples(samples, theta, parameter_names)
+    assert truth is not None
+    shown = _check_parameters(parameters, len(names))
+    interval = None
+    if prior is not None:
+        interval = prior_interval(prior, truth.unsqueeze(0))[:, shown]
+
+    figure = empty_figure(12.0, 4.0)
+    # Panels of one size, whatever the legends hold.
+    figure.set_layout_engine("none")
+    tune, couple, mix = figure.subplots(
+        1,
+        3,
+        gridspec_kw={
+            "left": 0.03,
+            "right": 0.99,
+            "bottom": 0.23,
+            "top": 0.92,
+            "wspace": 0.16,
+        },
+    )
+    for axes in (tune, couple, mix):
+        hide_frame(axes)
+    plane = _plane(simulated, before, after)
+    _draw_tuning(tune, plane, index)
+    _draw_coupling(couple, plane, weights, index)
+    _draw_posteriors(
+        mix,
+        {name: value[:, shown] for name, value in draws.items()},
+        truth[shown],
+        [names[j] for j in shown],
+        interval,
+    )
+    return figure
+
+
+def _draw_tuning(axes: "Axes", plane: _Plane, index: int) -> None:
+    _set_up_plane(
+        axes, plane, [plane.simulated, plane.before, plane.after], plane.after[index]
+    )
+    _scatter(axes, plane.simulated, s=9, color=SIMULATED)
+    for points, colour, line in (
+        (plane.before, VERMILLION, "--"),
+        (plane.after, BLUE, "-"),
+    ):
+        _scatter(axes, points, MAX_REAL, s=9, color=colour, alpha=0.7, zorder=2)
+        if not plane.flat:
+            style = {"color": colour, "linestyle": line, "linewidth": 1.8}
+            draw_contours(axes, points, style, bounded=False, shares=[0.9])
+    start, end = plane.before[index], plane.after[index]
+    axes.plot(*end.tolist(), **STAR)
+    axes.annotate(
+        "",
+        xy=(float(end[0]), float(end[1])),
+        xytext=(float(start[0]), float(start[1])),
+        arrowprops={"arrowstyle": "-|>", "color": "black", "lw": 1.6},
+        zorder=7,
+    )
+    handles = [
+        _dot(SIMULATED, "simulations"),
+        _dot(VERMILLION, "real, before tuning"),
+        _dot(BLUE, "real, after tuning"),
+    ]
+    _legend(axes, handles)
+    axes.set_title("1.  Tune: real data move onto simulations", loc="left")
+
+
+def _draw_coupling(axes: "Axes", plane: _Plane, weights: Tensor, index: int) -> None:
+    star = plane.after[index]
+    _set_up_plane(axes, plane, [plane.simulated], star)
+    relative = weights / weights.max()
+    _scatter(axes, plane.simulated, s=9, color=SIMULATED)
+    heaviest = relative.argsort()[-MAX_SIMULATED:]
+    heaviest = heaviest[relative[heaviest] > 0.01]  # lighter ones cannot be seen
+    size = relative[heaviest]
+    _scatter(
+        axes,
+        plane.simulated[heaviest],
+        s=(4 + 90 * size).numpy(),
+        color=BLUE,
+        alpha=(0.1 + 0.7 * size).numpy(),
+        zorder=3,
+    )
+    axes.plot(*star.tolist(), **STAR)
+    count = 1.0 / float((weights / weights.sum()).square().sum())
+    from matplotlib.lines import Line2D
+
+    small: dict[str, Any] = STAR | {"ms": 12}
+    handles = [
+        Line2D([], [], **small, label="one real observation"),
+        _dot(BLUE, f"its {count:.0f} or so simulations"),
+    ]
+    _legend(axes, handles)
+    axes.set_title("2.  Couple: weigh simulations for each", loc="left")
+
+
+def _draw_posteriors(
+    axes: "Axes",
+    draws: Mapping[str, Tensor],
+    truth: Tensor,
+    names: Sequence[str],
+    interval: Tensor | None,
+) -> None:
+    limits = robust_limits(list(draws.values()), truth, interval)
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    handles: list[Any] = []
+    axes.set_xlim(*limits[:, 0].tolist())
+    if len(names) > 1:
+        axes.set_ylim(*limits[:, 1].tolist())
+    if interval is not None:
+        shade_prior(axes, interval)
+        handles.append(Patch(color=PRIOR, label="prior"))
+    for name, style in line_styles(draws).items():
+        label = label_with_share(name, draws[name], limits)
+        handles.append(Line2D([], [], label=label, **style))
+        if len(names) == 1:
+            draw_marginal(axes, draws[name][:, 0], style)
+        else:
+            draw_contours(axes, draws[name], style, fill=True)
+    axes.set_xlabel(names[0])
+    if len(names) == 1:
+        axes.axvline(float(truth[0]), color="black", lw=1.4)
+        mark = Line2D([], [], color="black", lw=1.4)
+        axes.set_ylim(bottom=0)
+        axes.set_yticks([])
+        axes.set_ylabel("density")
+    else:
+        cross: dict[str, Any] = STAR | {"marker": "X", "ms": 10}
+        axes.plot(*truth.tolist(), **cross)
+        mark = Line2D([], [], **cross)
+        axes.set_ylabel(names[1])
+    mark.set_label("truth")
+    _legend(axes, [*handles, mark])
+    axes.set_title("3.  Mix: average their posteriors", loc="left")
+
+
+def _scatter(
+    axes: "Axes", points: Tensor, most: int = MAX_SIMULATED, **style: Any
+) -> None:
+    """Draw every m-th point, with m such that there are not too many."""
+    x, y = points[:: -(-len(points) // most)].T.numpy()
+    axes.scatter(x, y, linewidths=0, rasterized=True, **style)
+
+
+def _set_up_plane(
+    axes: "Axes", plane: _Plane, clouds: Sequence[Tensor], star: Tensor
+) -> None:
+    spans = [central_interval(points) for points in clouds]
+    points = torch.cat([*spans, star.unsqueeze(0)])
+    limits = with_margin(points.amin(dim=0), points.amax(dim=0))
+    axes.set_xlim(*limits[:, 0].tolist())
+    axes.set_ylim(*limits[:, 1].tolist())
+    axes.set_xticks([])
+    axes.set_yticks([])
+    axes.set_xlabel("embedding" if plane.flat else "1st principal component")
+    axes.set_ylabel("(spread out)" if plane.flat else "2nd principal component")
+
+
+def _dot(colour: str, label: str) -> "Line2D":
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], marker="o", ls="none", mew=0, color=colour, label=label)
+
+
+def _legend(axes: "Axes", handles: Sequence[Any]) -> None:
+    # Below the panel: inside it every corner can hold a cloud.
+    axes.legend(
+        handles=handles,
+        frameon=False,
+        loc="upper center",
+        bbox_to_anchor=(0.5, -0.16),
+        fontsize=9,
+        ncols=4,
+        handletextpad=0.3,
+        handlelength=1.4,
+        columnspacing=0.9,
+    )
+
+
+def _plane(simulated: Tensor, before: Tensor, after: Tensor) -> _Plane:
+    """Project embeddings to the two directions in which simulations vary most."""
+    flat = simulated.shape[1] == 1
+    if flat:
+        clouds = [_spread_out(points) for points in (simulated, before, after)]
+        return _Plane(*clouds, flat=True)
+    centre = simulated.median(dim=0).values
+    low, high = central_interval(simulated)
+    # A few extremes must not turn the plane.
+    core = torch.minimum(torch.maximum(simulated, low), high) - centre
+    basis = torch.linalg.eigh(core.T.cov(correction=0)).eigenvectors[:, [-1, -2]]
+    clouds = [(points - centre) @ basis for points in (simulated, before, after)]
+    return _Plane(*clouds, flat=False)
+
+
+def _spread_out(points: Tensor) -> Tensor:
+    """Give one-dimensional embeddings a second coordinate, the same for equal rows."""
+    golden = torch.arange(len(points), dtype=points.dtype) * 0.6180339887498949
+    return torch.cat([points, golden.frac().unsqueeze(1)], dim=1)
+
+
+def _check_embeddings(
+    before: Tensor, after: Tensor, simulated: Tensor, weights: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return all in float64 on the CPU."""
+    if check_tensor("simulated", simulated).ndim != 2:
+        raise InvalidInputError(
+            f"Expected `simulated` of shape (n_s, l); got {tuple(simulated.shape)}."
+        )
+    event = simulated.shape[1:]
+    check_batch("simulated", simulated, event)
+    check_batch("before", before, event)
+    check_batch("after", after, event)
+    check_same_length("before", before, "after", after)
+    if check_tensor("weights", weights).shape != simulated.shape[:1]:
+        raise InvalidInputError(
+            f"Expected `weights` of shape ({len(simulated)},), one for each row of "
+            f"`simulated`; got {tuple(weights.shape)}. Pass one row of the coupling, "
+            "`weights[index]`."
+        )
+    check_finite("weights", weights)
+    if (weights < 0).any() or not (weights > 0).any():
+        raise InvalidInputError(
+            "Expected `weights` of at least 0, not all of them 0; got "
+            f"{float(weights.min()):.3g} to {float(weights.max()):.3g}."
+        )
+    before, after, simulated, weights = (
+        value.detach().cpu().double() for value in (before, after, simulated, weights)
+    )
+    return before, after, simulated, weights
+
+
+def _check_parameters(parameters: Sequence[int] | None, k: int) -> list[int]:
+    shown = list(range(min(k, 2)) if parameters is None else parameters)
+    valid = all(0 <= j < k for j in shown) and len(set(shown)) == len(shown)
+    if not valid or len(shown) not in (1, 2):
+        raise InvalidInputError(
+            f"Expected `parameters` to be one or two different indices from 0 to "
+            f"{k - 1}; got {tuple(shown)}."
+        )
+    return shown
