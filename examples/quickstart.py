@@ -45,7 +45,7 @@ def main() -> None:
             task, seed, args.num_simulations, args.max_num_epochs
         ),
         # Fixed before any test data were looked at; see benchmarks/README.md.
-        coupler=SinkhornCoupler(gamma=0.1, tau=1.0, cost_scale="simulated"),
+        coupler=SinkhornCoupler(gamma=0.2, tau=1.0, cost_scale="simulated"),
         seeds=args.seeds,
         n_calibration=args.n_calibration,
         n_test=args.n_test,

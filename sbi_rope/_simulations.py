@@ -20,8 +20,11 @@ from sbi_rope.errors import (
 
 __all__ = ["SimulationSource", "Simulator", "StoredSimulations"]
 
-# Simulations held in memory before they are embedded.
-CHUNK = 1000
+# Simulations held in memory before they are embedded; few if they come one by one, so
+# that a slow simulator shows its progress.
+BATCHED_CHUNK, SINGLE_CHUNK = 1000, 10
+# Seconds of work before it deserves a progress bar.
+DELAY = 2.0
 
 Embedding = Callable[[Tensor], Tensor]
 
@@ -106,14 +109,18 @@ class Simulator:
         self, theta: Tensor, embed: Embedding, *, progress: bool
     ) -> tuple[Tensor, Tensor]:
         statistics, valid = [], []
-        chunks = theta.split(CHUNK)
-        for part in tqdm(chunks, desc="Simulating", disable=not progress):
+        bar = tqdm(
+            total=len(theta), desc="Simulating", disable=not progress, delay=DELAY
+        )
+        for part in theta.split(BATCHED_CHUNK if self.is_batched else SINGLE_CHUNK):
             x = self(part)
+            bar.update(len(part))
             ok = torch.isfinite(x).flatten(1).all(dim=1)
             # Embedding nets may refuse NaN: give them zeros, which are dropped later.
             ok_shape = (-1,) + (1,) * (x.ndim - 1)
             statistics.append(embed(x.where(ok.reshape(ok_shape), 0.0)))
             valid.append(ok)
+        bar.close()
         return torch.cat(statistics), torch.cat(valid)
 
     def __call__(self, theta: Tensor) -> Tensor:

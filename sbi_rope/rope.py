@@ -218,7 +218,7 @@ class RoPE:
                 self._theta_cal,
                 self.finetuner.num_neighbors if stored else count,
                 self._embed_simulations,
-                progress=False,
+                progress=show_progress_bars,
             )
 
         result = self.finetuner.finetune(
@@ -241,6 +241,7 @@ class RoPE:
         unseen: Literal["raise", "extend"] = "raise",
         require_convergence: bool = True,
         tail_mass: float = 1e-3,
+        show_progress_bars: bool = True,
     ) -> MixturePosterior:
         """Couple a batch of real observations with simulations.
 
@@ -257,7 +258,8 @@ class RoPE:
             unseen: What the posterior does with an x outside the batch: ``"raise"``,
                 or ``"extend"`` the coupling by one row.
             require_convergence: Whether a coupling that has not converged is an error.
-            tail_mass: Share of the weights ``log_prob`` may leave out, in [0, 1).
+            tail_mass: Share of the weights ``log_prob`` may leave out, in [0, 1].
+            show_progress_bars: Whether to show the progress of slow simulations.
 
         Returns:
             The posteriors of the batch.
@@ -288,7 +290,7 @@ class RoPE:
                 num_simulations,
                 max(len(x_o), MIN_SIMULATIONS),
                 self._embed_simulations,
-                progress=False,
+                progress=show_progress_bars,
             )
         embedded = embed(g, x_o)
         check_finite("g(x_o)", embedded)

@@ -293,7 +293,9 @@ class MixturePosterior(DirectPosterior):
             return torch.ones(len(contexts), device=contexts.device).double()
         mass = []
         with seeded(0):
-            for part in contexts.split(max(1, MAX_EVALUATIONS // LEAKAGE_DRAWS)):
+            chunks = contexts.split(max(1, MAX_EVALUATIONS // LEAKAGE_DRAWS))
+            # Some flows need minutes here, and log_prob has no switch for a bar.
+            for part in tqdm(chunks, desc="Normalising", delay=5.0, leave=False):
                 theta = estimator.components.sample(
                     torch.Size((LEAKAGE_DRAWS,)), condition=part
                 )
