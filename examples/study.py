@@ -167,8 +167,8 @@ class ResultsFile:
 
     def __init__(self, path: Path) -> None:
         if path.exists():
-            stamp = time.strftime("%Y%m%d-%H%M%S", time.localtime(path.stat().st_mtime))
-            path.rename(path.with_name(f"results_{stamp}.csv"))
+            older = sum(1 for _ in path.parent.glob("results_*.csv"))
+            path.rename(path.with_name(f"results_{older + 1}.csv"))
         self.path = path
         self.rows: list[dict[str, Any]] = []
         with path.open("w", newline="") as file:

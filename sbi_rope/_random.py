@@ -1,10 +1,14 @@
 """Seeds that leave no trace."""
 
+import random
 from collections.abc import Iterator
 from contextlib import contextmanager
+from numbers import Integral
 
 import numpy as np
 import torch
+
+from sbi_rope.errors import InvalidInputError
 
 __all__ = ["seeded"]
 
@@ -13,18 +17,27 @@ __all__ = ["seeded"]
 def seeded(seed: int | None) -> Iterator[None]:
     """Run a block with its own random numbers, or with the caller's if seed is None.
 
-    sbi's estimators and most simulators draw from the global generators of torch and
-    NumPy, so a generator object cannot be passed down. The states of both are put back
+    sbi's estimators and most simulators draw from the global generators of torch, NumPy
+    or Python, so a generator object cannot be passed down. Their states are put back
     afterwards.
     """
     if seed is None:
         yield
         return
-    numpy_state = np.random.get_state()  # noqa: NPY002
+    if isinstance(seed, bool) or not isinstance(seed, Integral) or seed < 0:
+        raise InvalidInputError(
+            f"Expected `seed` to be a non-negative integer or None; got {seed!r}."
+        )
+    # Away from the streams of small seeds: whoever trained NPE after manual_seed(0)
+    # would meet the same parameters again under seed 0.
+    stream = (int(seed) * 0x9E3779B1 + 0x7F4A7C15) % 2**32
+    numpy_state, python_state = np.random.get_state(), random.getstate()  # noqa: NPY002
     with torch.random.fork_rng(devices=list(range(torch.cuda.device_count()))):
-        torch.manual_seed(seed)
-        np.random.seed(seed % 2**32)  # noqa: NPY002
+        torch.manual_seed(stream)
+        np.random.seed(stream)  # noqa: NPY002
+        random.seed(stream)
         try:
             yield
         finally:
             np.random.set_state(numpy_state)  # noqa: NPY002
+            random.setstate(python_state)

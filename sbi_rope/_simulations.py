@@ -1,6 +1,5 @@
 """Where simulations come from: a simulator, or a stored set of them."""
 
-import warnings
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -10,12 +9,18 @@ from torch.distributions import Distribution
 from tqdm.auto import tqdm
 
 from sbi_rope._random import seeded
-from sbi_rope._validation import check_batch, check_same_length
+from sbi_rope._validation import (
+    check_batch,
+    check_device,
+    check_in_support,
+    check_same_length,
+    check_tensor,
+)
 from sbi_rope.errors import (
     InvalidInputError,
     InvalidTypeError,
-    RoPEWarning,
     SimulationError,
+    warn_user,
 )
 
 __all__ = ["SimulationSource", "Simulator", "StoredSimulations"]
@@ -31,6 +36,8 @@ Embedding = Callable[[Tensor], Tensor]
 
 class SimulationSource(Protocol):
     """What RoPE needs of simulations, each already reduced to its embedding."""
+
+    num_dropped: int
 
     def embeddings(
         self, count: int | None, at_least: int, embed: Embedding, *, progress: bool
@@ -65,6 +72,7 @@ class Simulator:
         self.prior = prior
         self.event_shape = event_shape
         self.like = like
+        self.num_dropped = 0
         # The probe has its own random numbers: seeded results do not depend on it.
         with seeded(0):
             self.is_batched = self._probe()
@@ -80,6 +88,7 @@ class Simulator:
             raise SimulationError(
                 f"All {count} simulations from the prior contain NaN or Inf."
             )
+        self.num_dropped += int((~valid).sum())
         _warn_of_dropped(int((~valid).sum()), count, "simulations from the prior")
         return statistics[valid]
 
@@ -92,6 +101,7 @@ class Simulator:
         dropped = int((~valid).sum())
         valid = valid.reshape(-1, count)
         statistics = statistics.reshape(*valid.shape, -1)
+        self.num_dropped += dropped
         empty = ~valid.any(dim=1)
         if empty.any():
             rows = empty.nonzero().flatten()[:5].tolist()
@@ -129,20 +139,36 @@ class Simulator:
             if self.is_batched:
                 x = self.function(theta)
             else:
-                rows = [self.function(row) for row in theta]
-                x = torch.stack([row.reshape(self.event_shape) for row in rows])
+                x = torch.cat([self._single(self.function(row)) for row in theta])
+        except SimulationError:
+            raise
         except Exception as error:
             raise SimulationError(
                 f"The simulator raised {type(error).__name__} on theta of shape "
                 f"{tuple(theta.shape)}: {error}"
             ) from error
         expected = (theta.shape[0], *self.event_shape)
-        if not isinstance(x, Tensor) or tuple(x.shape) != expected:
+        if not isinstance(x, Tensor) or tuple(x.shape) != expected or x.is_complex():
             raise SimulationError(
-                f"Expected the simulator to return a tensor of shape {expected}; got "
-                f"{_describe(x)}."
+                f"Expected the simulator to return a real tensor of shape {expected}; "
+                f"got {_describe(x)}."
             )
         return x.to(self.like)
+
+    def _single(self, x: Any) -> Tensor:
+        """Return one simulation with a leading dimension of one."""
+        if not self._is_single(x):
+            raise SimulationError(
+                f"Expected the simulator to return a tensor of shape "
+                f"{tuple(self.event_shape)} for one theta; got {_describe(x)}."
+            )
+        return x.reshape(1, *self.event_shape)
+
+    def _is_single(self, x: Any) -> bool:
+        shapes = {tuple(self.event_shape), (1, *self.event_shape)}
+        if self.event_shape == (1,):
+            shapes.add(())
+        return isinstance(x, Tensor) and tuple(x.shape) in shapes
 
     def _probe(self) -> bool:
         """Find out whether the simulator takes a batch or a single theta."""
@@ -150,17 +176,16 @@ class Simulator:
         sizes = {first.shape[1], *self.event_shape}
         # A number of rows that cannot be mistaken for a number of parameters.
         count = next(n for n in range(3, 3 + len(sizes) + 1) if n not in sizes)
-        theta = torch.cat(
-            [first, self.prior.sample(torch.Size((count - 1,))).to(first)]
-        )
+        theta = first.repeat(count, 1)
         as_batch = self._attempt(theta)
         if isinstance(as_batch, Tensor) and as_batch.shape == (
             count,
             *self.event_shape,
         ):
+            self._check_noise(theta, as_batch)
             return True
         single = self._attempt(theta[0])
-        if isinstance(single, Tensor) and single.numel() == self.event_shape.numel():
+        if self._is_single(single):
             return False
         hint = (
             " Convert NumPy results with `torch.as_tensor(x, dtype=torch.float32)`."
@@ -173,6 +198,15 @@ class Simulator:
             f"{tuple(self.event_shape)}; got {_describe(as_batch)} and "
             f"{_describe(single)}.{hint}"
         ) from (as_batch if isinstance(as_batch, Exception) else None)
+
+    def _check_noise(self, theta: Tensor, x: Tensor) -> None:
+        """Warn if all rows of a batch get the same noise."""
+        if bool((x == x[:1]).all()) and not torch.equal(self.function(theta), x):
+            warn_user(
+                "`simulator` adds the same noise to all simulations of a batch. Draw "
+                "noise of the shape of the batch, or simulate row by row with "
+                "`lambda theta: torch.stack([simulator(row) for row in theta])`."
+            )
 
     def _attempt(self, theta: Tensor) -> Any:
         try:
@@ -187,6 +221,7 @@ class StoredSimulations:
     def __init__(
         self,
         simulations: tuple[Tensor, Tensor],
+        prior: Distribution,
         *,
         theta_shape: torch.Size,
         event_shape: torch.Size,
@@ -198,6 +233,10 @@ class StoredSimulations:
                 f"{type(simulations).__name__}."
             )
         theta, x = simulations
+        check_device(
+            "simulations[0]", check_tensor("simulations[0]", theta), like.device
+        )
+        check_device("simulations[1]", check_tensor("simulations[1]", x), like.device)
         theta = check_batch("simulations[0]", theta, theta_shape, finite=False)
         x = check_batch("simulations[1]", x, event_shape, finite=False)
         check_same_length("simulations[0]", theta, "simulations[1]", x)
@@ -206,6 +245,8 @@ class StoredSimulations:
         if not valid.any():
             raise SimulationError("All stored simulations contain NaN or Inf.")
         _warn_of_dropped(int((~valid).sum()), len(valid), "stored simulations")
+        check_in_support("simulations[0]", theta[valid], prior)
+        self.num_dropped = int((~valid).sum())
         self.theta = theta[valid].to(like)
         self.x = x[valid].to(like)
         # "Nearest" is measured in standard deviations of the stored parameters.
@@ -242,10 +283,8 @@ class StoredSimulations:
 
 def _warn_of_dropped(dropped: int, total: int, what: str) -> None:
     if dropped:
-        warnings.warn(
-            f"Dropped {dropped} of {total} {what} because they contain NaN or Inf.",
-            RoPEWarning,
-            stacklevel=4,
+        warn_user(
+            f"Dropped {dropped} of {total} {what} because they contain NaN or Inf."
         )
 
 
@@ -253,5 +292,5 @@ def _describe(result: Any) -> str:
     if isinstance(result, Exception):
         return f"{type(result).__name__}: {result}"
     if isinstance(result, Tensor):
-        return f"a tensor of shape {tuple(result.shape)}"
+        return f"a tensor of shape {tuple(result.shape)} and dtype {result.dtype}"
     return f"an object of type {type(result).__name__}"

@@ -5,6 +5,7 @@ there is one, what to do next. Public functions call them once; private code tru
 """
 
 from collections.abc import Sequence
+from numbers import Integral, Real
 from typing import Any
 
 import torch
@@ -122,7 +123,7 @@ def check_positive(name: str, value: Any) -> None:
 
 def check_positive_integer(name: str, value: Any) -> None:
     """Raise unless ``value`` is an integer of at least one."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
         raise InvalidInputError(
             f"Expected `{name}` to be an integer of at least 1; got {value!r}."
         )
@@ -143,4 +144,4 @@ def check_choice(name: str, value: Any, choices: Sequence[str]) -> None:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    return isinstance(value, Real) and not isinstance(value, bool)

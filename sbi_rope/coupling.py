@@ -17,7 +17,7 @@ from sbi_rope._validation import (
     check_tensor,
     check_unit_interval,
 )
-from sbi_rope.errors import CouplingError, InvalidInputError, RoPEWarning
+from sbi_rope.errors import CouplingError, InvalidInputError, warn_user
 
 __all__ = ["Coupling", "SinkhornCoupler"]
 
@@ -50,7 +50,8 @@ class Coupling:
         converged: Whether ``marginal_error`` reached the tolerance.
         solver: The solver that had the last word: ``"pot"``, ``"log"``, or ``"none"``
             at tau = 0, which needs no iteration. A coupler set to ``"pot"`` that
-            reports ``"log"`` was rescued by the log-domain solver.
+            reports ``"log"`` was helped out by the log-domain solver, where POT over-
+            or underflowed or made no progress.
         gamma: The entropic regularisation in units of the embeddings, that is after
             ``cost_scale``.
         tau: The trust in the prior.
@@ -204,6 +205,11 @@ class SinkhornCoupler:
         simulated = simulated.detach().double()
         gamma = self.gamma * self._scale(simulated)
         cost = _distances(real.detach().double(), simulated)
+        if not torch.isfinite(cost).all():
+            raise CouplingError(
+                "The distances between embeddings overflow. Check the scale of the "
+                "observations and of the embedding net's outputs."
+            )
         # A constant added to a row of C changes no softmax of it. With the smallest
         # entry of every row at zero the kernel exp(-C / gamma) cannot vanish in a row.
         cost -= cost.min(dim=1, keepdim=True).values
@@ -229,13 +235,11 @@ class SinkhornCoupler:
             if n_o == 1 and self.tau == 1.0
             else "the coupling balances the prior over these few observations. "
         )
-        warnings.warn(
+        warn_user(
             f"Coupling a batch of {n_o} real observation(s), tau={self.tau}: "
             + consequence
             + f"Use a batch of at least {SMALL_BATCH}, a smaller tau, or the rows of a "
-            "posterior built for a larger batch (`unseen='extend'`).",
-            RoPEWarning,
-            stacklevel=3,
+            "posterior built for a larger batch (`unseen='extend'`)."
         )
 
     def _scale(self, simulated: Tensor) -> float:
@@ -309,9 +313,10 @@ class SinkhornCoupler:
             error = _weights_and_error(cost, potential, self.tau)[1]
             if error <= self.tolerance:
                 return potential, iterations, True
-            # Exact iterations never increase the error: if it stays, POT has lost
-            # entries of the kernel to underflow. If it made fewer iterations than
-            # asked, it met infinities.
+            # If the error stays, POT has lost entries of the kernel to underflow, or
+            # the problem is one where iterations hardly help; the log-domain solver
+            # is safe in both. If POT made fewer iterations than asked, it met
+            # infinities.
             if done < burst or error > 0.999 * best_error:
                 return best, iterations, False
             best, best_error = potential, error

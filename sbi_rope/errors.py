@@ -4,6 +4,9 @@ Every error derives from :class:`RoPEError` and from the builtin a caller would
 expect, so that both ``except RoPEError`` and ``except ValueError`` work.
 """
 
+import inspect
+import warnings
+
 __all__ = [
     "CouplingError",
     "DataNotFoundError",
@@ -17,6 +20,7 @@ __all__ = [
     "SimulationError",
     "UnseenObservationError",
     "UnsupportedPosteriorError",
+    "warn_user",
 ]
 
 
@@ -66,3 +70,17 @@ class DataNotFoundError(RoPEError, FileNotFoundError):
 
 class RoPEWarning(UserWarning):
     """Something works, but not as well as the caller may think."""
+
+
+def warn_user(message: str) -> None:
+    """Issue a :class:`RoPEWarning` that points at the caller's own line.
+
+    The line is the first one up the stack outside of this package, sbi and torch.
+    """
+    level, frame = 1, inspect.currentframe()
+    while frame is not None:
+        package = frame.f_globals.get("__name__", "").split(".")[0]
+        if package not in ("sbi_rope", "sbi", "torch", "contextlib"):
+            break
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, RoPEWarning, stacklevel=level)

@@ -1,7 +1,6 @@
 """Fine-tuning the embedding net on real observations with known parameters."""
 
 import copy
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -12,12 +11,13 @@ from tqdm.auto import tqdm
 from sbi_rope._random import seeded
 from sbi_rope._validation import (
     check_finite,
+    check_instance,
     check_positive,
     check_positive_integer,
     check_same_length,
     check_tensor,
 )
-from sbi_rope.errors import InvalidInputError, RoPEWarning
+from sbi_rope.errors import InvalidInputError, warn_user
 
 __all__ = ["CalibrationFinetuner", "FinetuneResult", "History"]
 
@@ -85,9 +85,9 @@ class CalibrationFinetuner:
 
     Args:
         learning_rate: Step size of Adam. Of several, each is tried from the start and
-            the best on the held-out pairs is kept (without a hold-out, the first):
-            a deep embedding net is best tuned with the smaller of the defaults, an
-            affine map with the larger.
+            the best on the held-out pairs is kept. A deep embedding net is best tuned
+            with the smaller of the defaults, an affine map with the larger, and so
+            they are without a hold-out.
         num_steps: Most gradient steps, each over all training pairs.
         patience: Steps without a new best on the held-out pairs after which to stop.
         simulations_per_target: Simulations behind each expectation. One, as in the
@@ -121,6 +121,7 @@ class CalibrationFinetuner:
         check_positive_integer("patience", self.patience)
         check_positive_integer("simulations_per_target", self.simulations_per_target)
         check_positive_integer("num_neighbors", self.num_neighbors)
+        check_instance("resample_targets", self.resample_targets, bool)
         check_positive("validation_fraction", self.validation_fraction)
         if self.validation_fraction > 0.5:
             raise InvalidInputError(
@@ -164,8 +165,8 @@ class CalibrationFinetuner:
             targets = check_tensor("targets", draw_targets(self.simulations_per_target))
             check_same_length("x", x, "targets", targets)
             check_finite("targets", targets)
+            _check_start(embedding_net, x, targets)
             train, held_out = self._split(x.shape[0])
-            rates = self._learning_rates if len(held_out) else self._learning_rates[:1]
             results = [
                 self._optimise(
                     trainable_copy(embedding_net, targets),
@@ -177,19 +178,27 @@ class CalibrationFinetuner:
                     draw_targets=draw_targets if self.resample_targets else None,
                     show_progress_bars=show_progress_bars,
                 )
-                for rate in rates
+                for rate in self._rates_to_try(embedding_net, held_out)
             ]
-        return min(results, key=_best_validation_loss)
+        return min(results, key=_kept_validation_loss)
+
+    def _rates_to_try(self, net: nn.Module, held_out: Tensor) -> tuple[float, ...]:
+        if len(held_out):
+            return self._learning_rates
+        # Nothing can choose: the careful rate for a net, the larger for an affine map.
+        has_parameters = any(True for _ in net.parameters())
+        rate = (
+            min(self._learning_rates) if has_parameters else max(self._learning_rates)
+        )
+        return (rate,)
 
     def _split(self, num_pairs: int) -> tuple[Tensor, Tensor]:
         order = torch.randperm(num_pairs)
         if num_pairs < MIN_PAIRS_FOR_HOLDOUT:
-            warnings.warn(
+            warn_user(
                 f"Only {num_pairs} calibration pair(s): none is held out, and tuning "
                 f"stops after at most {STEPS_WITHOUT_HOLDOUT} steps. Append at least "
-                f"{MIN_PAIRS_FOR_HOLDOUT} pairs to choose the best net on a hold-out.",
-                RoPEWarning,
-                stacklevel=4,
+                f"{MIN_PAIRS_FOR_HOLDOUT} pairs to choose the best net on a hold-out."
             )
             return order, order[:0]
         num_held_out = max(1, round(self.validation_fraction * num_pairs))
@@ -223,12 +232,17 @@ class CalibrationFinetuner:
             disable=not show_progress_bars,
         )
         for step in progress:
-            if draw_targets is not None and step > 0:
+            if draw_targets is not None and 0 < step < num_steps:
                 targets = draw_targets(self.simulations_per_target)
             loss = _mean_distance(net(x[train]), targets[train])
             training_loss.append(float(loss.detach()))
             if not torch.isfinite(loss):
-                break  # the steps were too large; what was kept before stands
+                warn_user(
+                    f"The loss of the fine-tuning is not finite after {step} steps "
+                    f"with learning rate {learning_rate:g}; the best net before is "
+                    "kept. Use a smaller learning rate."
+                )
+                break
             if has_holdout:
                 with torch.no_grad():
                     distance = _mean_distance(net(x[held_out]), held_out_targets)
@@ -247,9 +261,9 @@ class CalibrationFinetuner:
         return FinetuneResult(net.requires_grad_(requires_grad=False), history)
 
 
-def _best_validation_loss(result: FinetuneResult) -> float:
+def _kept_validation_loss(result: FinetuneResult) -> float:
     history = result.history
-    return min(history.validation_loss, default=0.0)
+    return history.validation_loss[history.best_step] if history.validation_loss else 0
 
 
 def trainable_copy(embedding_net: nn.Module, embeddings: Tensor) -> nn.Module:
@@ -268,6 +282,18 @@ def trainable_copy(embedding_net: nn.Module, embeddings: Tensor) -> nn.Module:
             affine.bias.zero_()
         net = nn.Sequential(net, affine)
     return net.eval()
+
+
+def _check_start(net: nn.Module, x: Tensor, targets: Tensor) -> None:
+    with torch.no_grad():
+        distance = torch.linalg.vector_norm(net(x) - targets, dim=1)
+    if not torch.isfinite(distance).all():
+        rows = (~torch.isfinite(distance)).nonzero().flatten()[:5].tolist()
+        raise InvalidInputError(
+            f"The embedding net returns NaN or Inf for the observations `x` of the "
+            f"calibration pairs {rows}, or values too large to compare. Remove or "
+            "repair these pairs."
+        )
 
 
 def _mean_distance(embeddings: Tensor, targets: Tensor) -> Tensor:

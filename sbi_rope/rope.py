@@ -34,7 +34,12 @@ from sbi_rope._validation import (
     check_unit_interval,
 )
 from sbi_rope.coupling import Coupling, SinkhornCoupler
-from sbi_rope.errors import CouplingError, InvalidInputError, NotReadyError
+from sbi_rope.errors import (
+    CouplingError,
+    InvalidInputError,
+    NotReadyError,
+    UnsupportedPosteriorError,
+)
 from sbi_rope.finetuning import CalibrationFinetuner, History
 from sbi_rope.mixture import MixtureEstimator, MixturePosterior
 
@@ -115,6 +120,11 @@ class RoPE:
         check_instance("coupler", coupler, SinkhornCoupler, optional=True)
         estimator = estimator_of(posterior)
         embedding_of(estimator)
+        if dtype_of(estimator) != torch.float32:
+            raise UnsupportedPosteriorError(
+                f"Expected an estimator in float32; got {dtype_of(estimator)}. sbi "
+                "converts every x to float32; convert the estimator with `.float()`."
+            )
         # Copies: neither training here nor moving our posterior to another device may
         # touch what belongs to the user.
         self._estimator = (
@@ -152,6 +162,7 @@ class RoPE:
         if simulations is not None:
             return StoredSimulations(
                 simulations,
+                self._prior,
                 theta_shape=self._estimator.input_shape,
                 event_shape=event_shape,
                 like=self._theta_cal,
@@ -194,8 +205,8 @@ class RoPE:
         Training again starts anew from the embedding net of NPE.
 
         Args:
-            seed: Seed of the simulations and of the hold-out split; None uses torch's
-                state.
+            seed: Seed of the simulations and of the hold-out split, for torch, NumPy
+                and Python; None uses their states.
             show_progress_bars: Whether to show the course of the loss.
 
         Returns:
@@ -254,7 +265,8 @@ class RoPE:
             coupler: Replaces the coupler of this object for this batch.
             num_simulations: n_s; ``max(n_o, 1000)`` if None (or all stored ones, if
                 there are fewer).
-            seed: Seed of the simulations; None uses torch's state.
+            seed: Seed of the simulations, for torch, NumPy and Python; None uses their
+                states.
             unseen: What the posterior does with an x outside the batch: ``"raise"``,
                 or ``"extend"`` the coupling by one row.
             require_convergence: Whether a coupling that has not converged is an error.
@@ -345,6 +357,11 @@ class RoPE:
             raise NotReadyError("Nothing was trained yet. Call `train()` first.")
         return self._history
 
+    @property
+    def num_dropped_simulations(self) -> int:
+        """Number of simulations dropped so far because of NaN or Inf."""
+        return self._source.num_dropped
+
     def __repr__(self) -> str:
         state = "trained" if self._g is not None else "not trained"
         return (
@@ -364,7 +381,9 @@ class RoPE:
         """Check a batch of the user and return a copy in the estimator's dtype."""
         check_device(name, check_tensor(name, value), device_of(self._estimator))
         value = check_batch(name, value, event_shape)
-        return value.detach().to(dtype_of(self._estimator), copy=True)
+        value = value.detach().to(dtype_of(self._estimator), copy=True)
+        check_finite(name, value)  # the estimator's dtype may hold less
+        return value
 
 
 def _check_converged(coupling: Coupling, coupler: SinkhornCoupler) -> None:

@@ -20,6 +20,7 @@ from sbi.inference import DirectPosterior, EnsemblePosterior, VectorFieldPosteri
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from sbi_rope._sbi import NeuralPosterior
 from sbi_rope._validation import (
     check_batch,
     check_positive_integer,
@@ -51,12 +52,17 @@ EXPECTED_WARNINGS = (
 )
 
 
-def check_test_set(theta: Tensor, x: Tensor, chunk_size: int) -> None:
-    """Check that theta is (n, k), x is (n, ...), and both are finite."""
+def check_test_set(
+    posterior: Any, theta: Tensor, x: Tensor, chunk_size: int
+) -> tuple[Tensor, Tensor]:
+    """Check theta (n, k) and x (n, ...), and return them in the posterior's dtype."""
     check_positive_integer("chunk_size", chunk_size)
     check_batch("theta", theta, check_tensor("theta", theta).shape[-1:])
     check_batch("x", x, check_tensor("x", x).shape[1:])
     check_same_length("theta", theta, "x", x)
+    if isinstance(posterior, NeuralPosterior):
+        return theta.float(), x.float()  # sbi's estimators know float32 only
+    return theta, x
 
 
 def evaluate_log_probs(
@@ -159,7 +165,7 @@ def _density(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:
 def _is_unbounded(posterior: Any) -> bool:
     """Whether sbi would reject without a bound, and can be told not to."""
     if isinstance(posterior, EnsemblePosterior):
-        return all(_is_unbounded(member) for member in posterior.posteriors)
+        return any(_is_unbounded(member) for member in posterior.posteriors)
     return isinstance(
         posterior, DirectPosterior | VectorFieldPosterior
     ) and not getattr(posterior, "bounded_rejection", False)

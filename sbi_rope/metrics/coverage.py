@@ -88,7 +88,7 @@ def acauc(
         LogProbUnavailableError: If ``"hpd"`` is asked of a posterior without density.
     """
     check_choice("kind", kind, list(DEFAULT_NUM_SAMPLES))
-    check_test_set(theta, x, chunk_size)
+    theta, x = check_test_set(posterior, theta, x, chunk_size)
     if num_samples is None:
         num_samples = DEFAULT_NUM_SAMPLES[kind]
     if num_observations is None:
@@ -204,7 +204,7 @@ def _central_levels(
     chunk_size: int,
     show: bool,
 ) -> Tensor:
-    check_test_set(theta, x, chunk_size)
+    theta, x = check_test_set(posterior, theta, x, chunk_size)
     check_positive_integer("num_samples", num_samples)
     with seeded(seed):
         ranks = draw_ranks(

@@ -106,7 +106,7 @@ def lpp(
         >>> score.mean
         0.0
     """
-    check_test_set(theta, x, chunk_size)
+    theta, x = check_test_set(posterior, theta, x, chunk_size)
     check_theta_std(theta_std, theta)
     score = LPPScore(
         log_probs=evaluate_log_probs(

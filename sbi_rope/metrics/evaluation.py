@@ -92,7 +92,7 @@ def evaluate(
             posterior returns NaN.
         LogProbUnavailableError: If the posterior has no ``log_prob_batched``.
     """
-    check_test_set(theta, x, chunk_size)
+    theta, x = check_test_set(posterior, theta, x, chunk_size)
     check_positive_integer("num_samples", num_samples)
     check_theta_std(theta_std, theta)
     with seeded(seed):

@@ -1,7 +1,6 @@
 """The density of the mixture, as an estimator in the sense of sbi."""
 
 import hashlib
-import warnings
 from typing import Any, Literal
 
 import torch
@@ -9,7 +8,7 @@ from torch import Tensor, nn
 
 from sbi_rope._sbi import ConditionalDensityEstimator, embed
 from sbi_rope.coupling import Coupling
-from sbi_rope.errors import InvalidInputError, RoPEWarning, UnseenObservationError
+from sbi_rope.errors import InvalidInputError, UnseenObservationError, warn_user
 
 __all__ = ["MAX_EVALUATIONS", "MixtureEstimator"]
 
@@ -79,7 +78,7 @@ class MixtureEstimator(ConditionalDensityEstimator):
         """
         x = x.to(self.x_o)
         found = [self._index.get(key, -1) for key in _keys(x)]
-        index = torch.tensor(found, device=self.x_o.device)
+        index = torch.tensor(found, dtype=torch.long, device=self.x_o.device)
         weights = self.coupling.weights[index.clamp_min(0)]
         new = index < 0
         if new.any():
@@ -104,12 +103,10 @@ class MixtureEstimator(ConditionalDensityEstimator):
             )
         rows = self.coupling.rows(embed(self._g, x))
         smallest = float((1.0 / rows.square().sum(dim=1)).min())
-        warnings.warn(
+        warn_user(
             f"Extended the coupling to {len(x)} unseen observation(s); smallest "
             f"effective sample size {smallest:.1f} of {rows.shape[1]} simulations. "
-            "Below about 50, couple the new batch instead.",
-            RoPEWarning,
-            stacklevel=6,
+            "Below about 50, couple the new batch instead."
         )
         return rows
 
@@ -125,6 +122,13 @@ class MixtureEstimator(ConditionalDensityEstimator):
             Shape ``(S, B)``. With ``tail_mass`` = t the density is too small by at most
             t times the largest density among the components left out.
         """
+        if input.shape[-len(self.input_shape) :] != self.input_shape:
+            raise InvalidInputError(
+                f"Expected `theta` of shape (..., {self.input_shape[0]}); got "
+                f"{tuple(input.shape)}."
+            )
+        if torch.isnan(input).any():
+            raise InvalidInputError("Expected `theta` without NaN.")
         if input.ndim == len(self.input_shape) + 1:
             input = input[None]
         weights = self.rows(condition)

@@ -14,8 +14,9 @@ from tqdm.auto import tqdm
 
 from sbi_rope._random import seeded
 from sbi_rope._sbi import DirectPosterior
+from sbi_rope._validation import check_batch
 from sbi_rope.coupling import Coupling
-from sbi_rope.errors import InvalidInputError, SamplingError
+from sbi_rope.errors import InvalidInputError, InvalidTypeError, SamplingError
 from sbi_rope.mixture.estimator import MAX_EVALUATIONS, MixtureEstimator
 
 __all__ = ["Leakage", "MixturePosterior"]
@@ -130,9 +131,22 @@ class MixturePosterior(DirectPosterior):
         return (self[i] for i in range(len(self)))
 
     def to(self, device: str | torch.device) -> None:
-        """Move the posterior, its coupling and its batch to a device."""
+        """Move the posterior, its coupling and its batch to a device.
+
+        Posteriors of single observations taken before share what is moved; take them
+        again afterwards.
+
+        Raises:
+            InvalidInputError: If the prior cannot be moved; nothing is moved then.
+        """
+        if not hasattr(self.prior, "to"):
+            raise InvalidInputError(
+                f"Cannot move a posterior whose prior has no method `to`: "
+                f"{type(self.prior).__name__}. Use a prior of sbi, such as BoxUniform."
+            )
         self.posterior_estimator.to_device(device)
-        self._cache = {name: value.to(device) for name, value in self._cache.items()}
+        for name, value in self._cache.items():
+            self._cache[name] = value.to(device)
         super().to(device)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -202,7 +216,7 @@ class MixturePosterior(DirectPosterior):
             SamplingError: If next to nothing lies inside the prior's support.
         """
         estimator = self.posterior_estimator
-        shape = torch.Size(sample_shape)
+        shape = _as_shape(sample_shape)
         weights = estimator.rows(self._batch_of_x(x))
         num_rows = len(weights)
         # One slot for every sample, open until a proposal for it is accepted.
@@ -256,7 +270,7 @@ class MixturePosterior(DirectPosterior):
 
     def _batch_of_x(self, x: Tensor) -> Tensor:
         event_shape = self.posterior_estimator.condition_shape
-        x = torch.as_tensor(x)
+        x = torch.as_tensor(x, dtype=torch.float32)
         if x.shape == event_shape:
             x = x[None]
         if x.shape[1:] != event_shape:
@@ -265,7 +279,40 @@ class MixturePosterior(DirectPosterior):
                 f"Expected `x` of shape (n, {', '.join(map(str, event_shape))}); got "
                 f"{tuple(x.shape)}."
             )
-        return x
+        return check_batch("x", x, event_shape)
+
+    def log_prob_batched(
+        self,
+        theta: Tensor,
+        x: Tensor,
+        norm_posterior: bool = True,  # noqa: FBT001, FBT002
+        track_gradients: bool = False,  # noqa: FBT001, FBT002
+        leakage_correction_params: dict | None = None,
+    ) -> Tensor:
+        r"""Return :math:`\log p(\theta_b \mid x_b)` for every observation of a batch.
+
+        Args:
+            theta: Parameters, shape ``(B, d)`` or ``(S, B, d)``.
+            x: Observations, shape ``(B, *event)``.
+            norm_posterior: Whether to divide by the mass inside the prior's support.
+            track_gradients: Whether gradients with respect to theta are needed.
+            leakage_correction_params: Not used here; must be None.
+
+        Returns:
+            Shape ``(1, B)`` or ``(S, B)``; minus infinity outside the prior's support.
+
+        Raises:
+            InvalidInputError: If shapes do not fit or theta is NaN.
+            UnseenObservationError: If an x is not in the batch and ``unseen="raise"``.
+            SamplingError: If a mixture has no mass inside the prior's support.
+        """
+        return super().log_prob_batched(
+            theta,
+            self._batch_of_x(x),
+            norm_posterior,
+            track_gradients,
+            leakage_correction_params,
+        )
 
     # --- normalisation ---
 
@@ -321,6 +368,21 @@ class MixturePosterior(DirectPosterior):
                 "support of the prior. Train NPE longer, or pass norm_posterior=False."
             )
         return mass
+
+
+def _as_shape(sample_shape: Any) -> torch.Size:
+    try:
+        shape = torch.Size(sample_shape)
+    except TypeError as error:
+        raise InvalidTypeError(
+            f"Expected `sample_shape` to be a tuple of integers, such as (1000,); got "
+            f"{sample_shape!r}."
+        ) from error
+    if any(size < 0 for size in shape):
+        raise InvalidInputError(
+            f"Expected `sample_shape` without negative sizes; got {tuple(shape)}."
+        )
+    return shape
 
 
 def _check_acceptance(proposed: Tensor, inside: Tensor) -> None:

@@ -552,13 +552,13 @@ def test_support_of_any_shape_bounds_samples_density_and_mass(
     samples = posterior.sample_batched((200,), posterior.x_o, **QUIET)
     assert inside(samples).all()
     free = posterior.sample_batched(
-        (4000,), posterior.x_o, reject_outside_prior=False, **QUIET
+        (8000,), posterior.x_o, reject_outside_prior=False, **QUIET
     )
     log_prob = posterior.log_prob_batched(free[:50], posterior.x_o)
     assert torch.equal(torch.isfinite(log_prob), inside(free[:50]))
     share = inside(free).double().mean(dim=0)
     leakage = posterior.leakage(posterior.x_o)
-    error = (leakage.standard_error.square() + 0.25 / 4000).sqrt()
+    error = (leakage.standard_error.square() + 0.25 / 8000).sqrt()
     assert ((leakage.mass - share).abs() < 4 * error).all()
 
 
