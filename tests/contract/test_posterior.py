@@ -11,7 +11,7 @@ import torch
 from sbi.inference import DirectPosterior
 from torch import Tensor, nn
 
-from sbi_rope.errors import InvalidInputError
+from sbi_rope.errors import InvalidInputError, RoPEError
 from sbi_rope.mixture import MixturePosterior
 from tests import problems
 from tests.problems import gaussian_posterior
@@ -397,3 +397,50 @@ def test_dropout_in_the_components_does_not_blur_the_density() -> None:
         for _ in range(5)
     }
     assert len(values) == 1
+
+
+@pytest.mark.parametrize(
+    ("call", "match"),
+    [
+        pytest.param(lambda p: p.sample(5, x=p.x_o[0]), "tuple", id="sample shape"),
+        pytest.param(lambda p: p.sample((-1,), x=p.x_o[0]), "negative", id="negative"),
+        pytest.param(
+            lambda p: p.log_prob(torch.zeros(1, 1), x=p.x_o[0]), "`theta`", id="narrow"
+        ),
+        pytest.param(
+            lambda p: p[0].potential(torch.zeros(3, 1)), "`theta`", id="potential"
+        ),
+        pytest.param(
+            lambda p: p.log_prob(torch.full((1, 2), torch.nan), x=p.x_o[0]),
+            "without NaN",
+            id="nan theta",
+        ),
+        pytest.param(
+            lambda p: p.sample_batched((2,), p.x_o[:0]), "empty", id="no observation"
+        ),
+        pytest.param(
+            lambda p: p.sample_batched((2,), p.x_o * torch.nan), "`x` to be fin", id="x"
+        ),
+        pytest.param(
+            lambda p: p.log_prob_batched(
+                torch.zeros(5, 2), p.x_o, leakage_correction_params={"force": True}
+            ),
+            "leakage_correction_params",
+            id="leakage",
+        ),
+    ],
+)
+def test_what_cannot_be_answered_is_refused_by_name(
+    call: Callable[[MixturePosterior], Tensor], match: str
+) -> None:
+    with pytest.raises(RoPEError, match=match):
+        call(gaussian_posterior())
+
+
+def test_numpy_observations_are_converted_as_in_sbi() -> None:
+    posterior = gaussian_posterior()
+    theta = torch.zeros(5, 2)
+    expected = posterior.log_prob_batched(theta, posterior.x_o)
+    x = posterior.x_o.numpy()
+    assert torch.equal(posterior.log_prob_batched(theta, x), expected)
+    assert posterior.sample_batched((3,), x, **QUIET).shape == (3, 5, 2)

@@ -308,3 +308,61 @@ def test_unusable_embeddings_are_refused(
 def test_simulations_without_spread_cannot_set_the_scale() -> None:
     with pytest.raises(CouplingError, match="median distance"):
         SinkhornCoupler(cost_scale="simulated").couple(X, X)
+
+
+def test_distances_that_overflow_are_refused() -> None:
+    with pytest.raises(CouplingError, match="overflow"):
+        SinkhornCoupler().couple(X.double() + 1e200, X.double())
+
+
+def balanced_overflow() -> tuple[Tensor, Tensor, float]:
+    """gamma / max(C) = 1e-3 at tau = 1, where POT's scalings overflow."""
+    real, simulated = clouds(250, 250, dim=10)
+    return real, simulated, 1e-3 * float(cost_of(real, simulated).max())
+
+
+def test_where_pots_scalings_overflow_the_rows_stay_exact_and_finite() -> None:
+    real, simulated, gamma = balanced_overflow()
+    coupling = SinkhornCoupler(gamma=gamma, tau=1.0, max_iterations=600).couple(
+        real, simulated
+    )
+    assert not coupling.converged  # and says so: 600 iterations are not enough
+    assert (coupling.weights.sum(dim=1) - 1).abs().max() < 1e-12
+    # A potential of the oracle after as many iterations is no better.
+    expected, _ = oracles.semi_balanced_plan(
+        cost_of(real, simulated), gamma=gamma, tau=1.0, iterations=600
+    )
+    assert coupling.marginal_error < 1.5 * float(
+        (expected.mean(dim=0) - 1 / 250).abs().sum()
+    )
+
+
+def test_iterations_of_all_solvers_count_together() -> None:
+    real, simulated, gamma = far_clouds()
+    coupling = SinkhornCoupler(gamma=gamma, tau=1.0, max_iterations=37).couple(
+        real, simulated
+    )
+    assert coupling.solver == "log"
+    assert coupling.num_iterations == 37
+
+
+def test_pot_goes_on_from_where_it_was() -> None:
+    # Starting each burst anew would never get past the longest burst.
+    real, simulated = clouds(250, 250, dim=10)
+    gamma = 1e-2 * float(cost_of(real, simulated).max())
+    coupling = SinkhornCoupler(gamma=gamma, tau=1.0, tolerance=1e-8).couple(
+        real, simulated
+    )
+    assert coupling.solver == "pot"
+    assert coupling.num_iterations > 1000
+    assert coupling.converged
+
+
+def test_the_default_tolerance_reports_its_distance_from_the_oracle() -> None:
+    real, simulated = clouds()
+    cost = cost_of(real, simulated)
+    gamma = 0.1 * float(cost.max())
+    coupling = SinkhornCoupler(gamma=gamma, tau=0.9).couple(real, simulated)
+    expected, _ = oracles.semi_balanced_plan(cost, gamma=gamma, tau=0.9)
+    assert coupling.marginal_error <= 1e-6
+    assert worst_total_variation(coupling.weights, expected) < 1e-4

@@ -1,6 +1,5 @@
 """Fine-tuning: what it minimises, what it keeps, what it leaves alone."""
 
-import contextlib
 import copy
 import math
 
@@ -134,6 +133,28 @@ def test_five_pairs_are_enough_to_hold_one_out() -> None:
     assert len(validation) == 4
 
 
+def test_held_out_targets_stay_when_the_others_are_drawn_anew() -> None:
+    x, net = torch.randn(20, 2), linear()
+    draws = iter([net(x).detach()] + [1e3 * torch.randn(20, 2) for _ in range(30)])
+    result = CalibrationFinetuner(
+        learning_rate=1e-9, num_steps=5, resample_targets=True
+    ).finetune(net, x, lambda count: next(draws), seed=0, show_progress_bars=False)
+    assert max(result.history.validation_loss) < 1e-4
+    assert min(result.history.training_loss[1:]) > 10
+
+
+def test_without_a_hold_out_an_affine_map_gets_the_largest_rate() -> None:
+    x = torch.randn(4, 2)
+    rates = {}
+    for net in (linear(), nn.Identity()):
+        with pytest.warns(RoPEWarning):
+            result = CalibrationFinetuner().finetune(
+                net, x, lambda count: 2 * x, seed=0, show_progress_bars=False
+            )
+        rates[type(net)] = result.history.learning_rate
+    assert rates == {nn.Linear: 1e-4, nn.Identity: 1e-3}
+
+
 def test_targets_are_drawn_once_or_before_every_step() -> None:
     x, calls = torch.randn(10, 2), []
 
@@ -155,7 +176,7 @@ def test_targets_are_drawn_once_or_before_every_step() -> None:
 @pytest.mark.parametrize("n", [3, 20])
 def test_steps_that_are_too_large_never_leave_nan_behind(n: int) -> None:
     x, targets = torch.randn(n, 2), torch.randn(n, 2)
-    with pytest.warns(RoPEWarning) if n < 5 else contextlib.nullcontext():
+    with pytest.warns(RoPEWarning, match="not finite after"):
         g, *_ = finetune(linear(), x, targets, learning_rate=1e30)
     assert torch.isfinite(g(x)).all()
 

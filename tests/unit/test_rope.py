@@ -449,3 +449,145 @@ def test_the_default_x_of_the_users_posterior_is_ignored() -> None:
         warnings.simplefilter("error")
         posterior = RoPE(npe, simulator=gaussian.simulator).build_posterior(X_O)
     assert posterior.default_x is None
+
+
+def test_unseen_observations_are_embedded_by_the_tuned_net() -> None:
+    conductor = trained()
+    posterior = conductor.build_posterior(X_O, seed=0, unseen="extend")
+    new = gaussian.real_process(torch.zeros(3, 2))
+    with pytest.warns(RoPEWarning, match="smallest effective sample size"):
+        rows = posterior.posterior_estimator.rows(new)
+    g, h = conductor.tuned_embedding_net, conductor.embedding_net
+    with torch.no_grad():
+        assert torch.allclose(rows, posterior.coupling.rows(g(new)))
+        assert not torch.allclose(rows, posterior.coupling.rows(h(new)))
+
+
+def test_targets_are_means_over_the_finite_simulations() -> None:
+    def simulator(theta: Tensor) -> Tensor:
+        # Half of the simulations fail; the others return theta itself.
+        fails = torch.rand(len(theta), 1) < 0.5
+        return torch.where(fails, torch.nan, theta)
+
+    theta = torch.tensor([[1.0, -1.0], [0.5, 2.0]])
+    source = rope(simulator=simulator)._source
+    with pytest.warns(RoPEWarning, match="Dropped"):
+        target = source.targets(theta, 50, lambda x: x, progress=False)
+    assert torch.allclose(target, theta)
+    assert 20 < source.num_dropped < 80
+
+
+def test_stored_simulations_are_chosen_at_random() -> None:
+    theta = gaussian.prior().sample((100,))
+    conductor = RoPE(
+        gaussian.posterior(), simulations=(theta, gaussian.simulator(theta))
+    )
+    chosen = [
+        conductor.build_posterior(X_O, num_simulations=30, seed=seed).coupling.simulated
+        for seed in (0, 0, 1)
+    ]
+    assert torch.equal(chosen[0], chosen[1])
+    assert not torch.equal(chosen[0], chosen[2])
+    first = (gaussian.GAIN * conductor._source.x[:30]).double()
+    assert not torch.allclose(chosen[0], first)
+
+
+def test_looking_at_a_simulator_leaves_the_callers_random_state() -> None:
+    npe = gaussian.posterior()
+    state = torch.get_rng_state()
+    RoPE(npe, simulator=gaussian.simulator)
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+@pytest.mark.parametrize("dim", [2, 3, 4, 5])
+def test_a_single_simulator_is_recognised_whatever_the_number_of_parameters(
+    dim: int,
+) -> None:
+    def single(theta: Tensor) -> Tensor:
+        assert theta.shape == (dim,)
+        return gaussian.simulator(theta)
+
+    conductor = RoPE(gaussian.posterior(dim), simulator=single)
+    x_o = torch.randn(20, dim)
+    assert conductor.build_posterior(x_o, num_simulations=30).weights.shape == (20, 30)
+
+
+def test_noise_that_a_whole_batch_shares_is_warned_about() -> None:
+    with pytest.warns(RoPEWarning, match="the same noise"):
+        rope(simulator=lambda theta: theta + torch.randn(2))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rope(simulator=lambda theta: 2 * theta)  # no noise at all is fine
+
+
+def test_moving_our_posterior_moves_nothing_else() -> None:
+    npe = gaussian.posterior()
+    conductor = RoPE(npe, simulator=gaussian.simulator, finetuner=QUICK)
+    posterior = conductor.build_posterior(X_O)
+    posterior.posterior_estimator.to_device("meta")
+    assert posterior.x_o.is_meta
+    assert posterior.weights.is_meta
+    assert not next(npe.posterior_estimator.parameters()).is_meta
+    # sbi moves a prior in place: ours is a copy.
+    assert posterior.prior is not npe.prior
+    assert posterior.prior is not conductor._prior
+    assert torch.isfinite(conductor.build_posterior(X_O).weights).all()
+
+
+def test_a_posterior_that_cannot_be_moved_stays_whole() -> None:
+    posterior = rope().build_posterior(X_O)
+    with pytest.raises(InvalidInputError, match="no method `to`"):
+        posterior.to("meta")
+    assert not posterior.x_o.is_meta
+
+
+def test_values_too_large_for_the_estimator_are_refused() -> None:
+    conductor = rope()
+    huge = X.double().clone()
+    huge[3] = 1e300
+    with pytest.raises(InvalidInputError, match=r"`x` to be finite.*\[3\]"):
+        conductor.append_calibration(THETA, huge)
+    x = X.clone()
+    x[4] = 3e38
+    conductor.append_calibration(THETA, x)
+    with pytest.raises(InvalidInputError, match=r"calibration pairs \[4\]"):
+        conductor.train(show_progress_bars=False)
+
+
+def test_estimators_in_float64_are_refused() -> None:
+    npe = gaussian.posterior()
+    npe.posterior_estimator.double()
+    with pytest.raises(RoPEError, match=r"convert the estimator with `.float\(\)`"):
+        RoPE(npe, simulator=gaussian.simulator)
+
+
+def test_stored_simulations_must_come_from_the_prior() -> None:
+    from sbi.inference import DirectPosterior
+    from sbi.utils import BoxUniform
+
+    npe = DirectPosterior(
+        gaussian.GaussianEstimator(), BoxUniform(-torch.ones(2), torch.ones(2))
+    )
+    with pytest.raises(InvalidInputError, match=r"`simulations\[0\]` inside the supp"):
+        RoPE(npe, simulations=(THETA + 5, X))
+    with pytest.raises(InvalidInputError, match="where the posterior is"):
+        RoPE(npe, simulations=(THETA, X.to("meta")))
+
+
+@pytest.mark.parametrize("seed", ["a", 1.5, -1, True])
+def test_seeds_that_are_no_seeds_are_refused(seed: object) -> None:
+    with pytest.raises(InvalidInputError, match="`seed` to be a non-negative integer"):
+        rope().build_posterior(X_O, seed=seed)  # type: ignore[arg-type]
+
+
+def test_a_seed_does_not_repeat_the_draws_of_its_user() -> None:
+    torch.manual_seed(3)
+    theta = gaussian.prior().sample((1000,))
+    drawn = []
+
+    def simulator(theta: Tensor) -> Tensor:
+        drawn.append(theta)
+        return gaussian.simulator(theta)
+
+    rope(simulator=simulator).build_posterior(X_O, seed=3)
+    assert not torch.isin(drawn[-1], theta).any()
