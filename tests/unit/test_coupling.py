@@ -55,6 +55,7 @@ def test_rows_equal_those_of_the_oracle(
     )
     if change < 1e-10:
         assert coupling.converged
+        assert coupling.solver == solver  # POT needs no help here
         assert worst_total_variation(coupling.weights, expected) < 1e-6
     else:
         # Plain Sinkhorn has not converged at tau = 1 and a small gamma; neither has
@@ -366,3 +367,21 @@ def test_the_default_tolerance_reports_its_distance_from_the_oracle() -> None:
     expected, _ = oracles.semi_balanced_plan(cost, gamma=gamma, tau=0.9)
     assert coupling.marginal_error <= 1e-6
     assert worst_total_variation(coupling.weights, expected) < 1e-4
+
+
+def test_a_rescue_in_the_middle_keeps_to_the_budget() -> None:
+    torch.manual_seed(4)  # clouds whose scalings overflow after some iterations
+    real, simulated = clouds()
+    gamma = 1.7e-4 * float(cost_of(real, simulated).max())
+    coupler = SinkhornCoupler(gamma=gamma, tau=1.0, max_iterations=300)
+    coupling = coupler.couple(real, simulated)
+    _, made_by_pot, healthy = coupler._solve_pot(
+        _in_units_of_gamma(cost_of(real, simulated), gamma)
+    )
+    assert not healthy
+    assert 0 < made_by_pot < 300
+    assert (coupling.solver, coupling.num_iterations) == ("log", 300)
+
+
+def _in_units_of_gamma(cost: Tensor, gamma: float) -> Tensor:
+    return (cost - cost.min(dim=1, keepdim=True).values) / gamma
