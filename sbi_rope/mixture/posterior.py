@@ -3,14 +3,12 @@
 import copy
 import operator
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 from sbi.utils import within_support
 from torch import Tensor
-from torch.distributions import Distribution, constraints
-from tqdm.auto import tqdm
+from torch.distributions import Distribution
 
 from sbi_rope._random import seeded
 from sbi_rope._sbi import DirectPosterior
@@ -18,27 +16,15 @@ from sbi_rope._validation import check_batch
 from sbi_rope.coupling import Coupling
 from sbi_rope.errors import InvalidInputError, InvalidTypeError, SamplingError
 from sbi_rope.mixture.estimator import MAX_EVALUATIONS, MixtureEstimator
+from sbi_rope.mixture.truncation import (
+    LEAKAGE_DRAWS,
+    Leakage,
+    component_mass,
+    draw_inside,
+    is_unbounded,
+)
 
-__all__ = ["Leakage", "MixturePosterior"]
-
-# Draws behind each component's mass inside the prior's support.
-LEAKAGE_DRAWS = 1024
-# Rejection sampling gives an observation up if, after so many proposals, less than this
-# share of them lies inside the prior's support.
-MIN_PROPOSALS, MIN_ACCEPTANCE = 100_000, 1e-3
-
-
-@dataclass(frozen=True)
-class Leakage:
-    r"""The mass of each observation's mixture inside the prior's support.
-
-    Attributes:
-        mass: :math:`Z_i = \sum_j \alpha_{ij} Z_j`, shape ``(n,)``.
-        standard_error: Of ``mass``, from the draws behind each :math:`Z_j`.
-    """
-
-    mass: Tensor
-    standard_error: Tensor
+__all__ = ["MixturePosterior"]
 
 
 class MixturePosterior(DirectPosterior):
@@ -218,45 +204,17 @@ class MixturePosterior(DirectPosterior):
         estimator = self.posterior_estimator
         shape = _as_shape(sample_shape)
         weights = estimator.rows(self._batch_of_x(x))
-        num_rows = len(weights)
-        # One slot for every sample, open until a proposal for it is accepted.
-        slots = torch.arange(num_rows, device=weights.device).repeat(shape.numel())
-        theta = estimator.contexts.new_empty(len(slots), *estimator.input_shape)
-        still_open = torch.ones(len(slots), dtype=torch.bool, device=slots.device)
-        proposed = torch.zeros(num_rows, dtype=torch.long, device=slots.device)
-        inside = proposed.clone()
-        repeats = 1
-        with tqdm(
-            total=len(slots), desc="Sampling", disable=not show_progress_bars
-        ) as progress:
-            while (open_slots := still_open.nonzero().flatten()).numel():
-                proposals = open_slots.repeat_interleave(repeats)
-                rows = slots[proposals]
-                draws = estimator.draw(
-                    rows, weights, batch_size=max_sampling_batch_size
-                )
-                accepted = self._accept(draws, reject=reject_outside_prior)
-                # Of several proposals for a slot the first accepted one is kept.
-                chosen = accepted.nonzero().flatten()
-                filled = proposals[chosen]
-                first = filled != filled.roll(1)
-                first[:1] = True
-                theta[filled[first]] = draws[chosen[first]]
-                still_open[filled] = False
-                progress.n = len(slots) - int(still_open.sum())
-                progress.refresh()
-                proposed += rows.bincount(minlength=num_rows)
-                inside += rows[accepted].bincount(minlength=num_rows)
-                _check_acceptance(proposed, inside)
-                # As many proposals as will fill most of the open slots.
-                rate = max(float(accepted.double().mean()), MIN_ACCEPTANCE)
-                room = MAX_EVALUATIONS // len(open_slots)
-                repeats = max(1, min(int(1 / rate), room))
-        return theta.reshape(*shape, num_rows, *estimator.input_shape)
+        theta = draw_inside(
+            estimator,
+            weights,
+            shape.numel(),
+            accept=self._inside if reject_outside_prior else None,
+            batch_size=max_sampling_batch_size,
+            show_progress_bars=show_progress_bars,
+        )
+        return theta.reshape(*shape, len(weights), *estimator.input_shape)
 
-    def _accept(self, theta: Tensor, *, reject: bool) -> Tensor:
-        if not reject:
-            return torch.ones(len(theta), dtype=torch.bool, device=theta.device)
+    def _inside(self, theta: Tensor) -> Tensor:
         return within_support(self.prior, theta).reshape(len(theta))
 
     def _one_x(self, x: Tensor | None) -> Tensor:
@@ -326,31 +284,16 @@ class MixturePosterior(DirectPosterior):
             x: Observations, shape ``(B, *event)``.
         """
         if "component_mass" not in self._cache:
-            self._cache["component_mass"] = self._estimate_component_mass()
+            estimator = self.posterior_estimator
+            self._cache["component_mass"] = component_mass(
+                estimator.components,
+                estimator.contexts,
+                accept=None if is_unbounded(self.prior) else self._inside,
+            )
         mass = self._cache["component_mass"]
         weights = self.posterior_estimator.rows(self._batch_of_x(x))
         variance = mass * (1.0 - mass) / LEAKAGE_DRAWS
         return Leakage(weights @ mass, (weights.square() @ variance).sqrt())
-
-    @torch.no_grad()
-    def _estimate_component_mass(self) -> Tensor:
-        estimator = self.posterior_estimator
-        contexts = estimator.contexts
-        if _is_unbounded(self.prior):
-            return torch.ones(len(contexts), device=contexts.device).double()
-        mass = []
-        with seeded(0):
-            chunks = contexts.split(max(1, MAX_EVALUATIONS // LEAKAGE_DRAWS))
-            # Some flows need minutes here, and log_prob has no switch for a bar.
-            for part in tqdm(chunks, desc="Normalising", delay=5.0, leave=False):
-                theta = estimator.components.sample(
-                    torch.Size((LEAKAGE_DRAWS,)), condition=part
-                )
-                inside = self._accept(
-                    theta.reshape(-1, *estimator.input_shape), reject=True
-                ).reshape(LEAKAGE_DRAWS, -1)
-                mass.append(inside.double().mean(dim=0))
-        return torch.cat(mass)
 
     def leakage_correction(  # type: ignore[override]
         self, x: Tensor, **kwargs: Any
@@ -383,26 +326,3 @@ def _as_shape(sample_shape: Any) -> torch.Size:
             f"Expected `sample_shape` without negative sizes; got {tuple(shape)}."
         )
     return shape
-
-
-def _check_acceptance(proposed: Tensor, inside: Tensor) -> None:
-    hopeless = (proposed >= MIN_PROPOSALS) & (inside < MIN_ACCEPTANCE * proposed)
-    if hopeless.any():
-        rows = hopeless.nonzero().flatten()[:5].tolist()
-        raise SamplingError(
-            f"Less than one in {int(1 / MIN_ACCEPTANCE)} draws lies inside the support "
-            f"of the prior for the observations in rows {rows} of `x`: the posteriors "
-            "of the simulations leak. Train NPE longer, or with "
-            "z_score_theta='transform_to_unconstrained', or pass "
-            "reject_outside_prior=False."
-        )
-
-
-def _is_unbounded(prior: Distribution) -> bool:
-    try:
-        support: Any = getattr(prior, "support", None)
-    except NotImplementedError:  # torch's way of saying that a law states none
-        return False
-    while isinstance(support, constraints.independent):
-        support = support.base_constraint
-    return support in (constraints.real, constraints.real_vector)

@@ -23,7 +23,7 @@ from sbi_rope.errors import (
 )
 from sbi_rope.mixture import MixtureEstimator, MixturePosterior
 from sbi_rope.mixture import estimator as estimator_module
-from sbi_rope.mixture import posterior as posterior_module
+from sbi_rope.mixture import truncation as truncation_module
 from tests import problems
 from tests.problems import brute_force_log_prob, gaussian_posterior
 
@@ -402,7 +402,7 @@ def hopeless_posterior(n_o: int = 2) -> MixturePosterior:
 def test_no_mass_inside_the_prior_ends_in_an_error_that_names_the_observation(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(posterior_module, "MIN_PROPOSALS", 2000)
+    monkeypatch.setattr(truncation_module, "MIN_PROPOSALS", 2000)
     posterior = hopeless_posterior()
     with pytest.raises(SamplingError, match=r"rows \[0\] of `x`.*reject_outside_prior"):
         posterior.sample_batched((3,), posterior.x_o, **QUIET)
@@ -452,7 +452,7 @@ def test_the_mass_inside_the_prior_is_that_of_the_components() -> None:
         n_o=n, weights=torch.eye(n), contexts=problems.contexts_of(2, n, std=0.5)
     )
     leakage, truth = posterior.leakage(posterior.x_o), inside_mass(posterior)
-    error = (truth * (1 - truth) / posterior_module.LEAKAGE_DRAWS).sqrt()
+    error = (truth * (1 - truth) / truncation_module.LEAKAGE_DRAWS).sqrt()
     z = (leakage.mass - truth) / error
     assert z.abs().max() < 4.5
     assert 0.8 < z.std() < 1.2
@@ -465,7 +465,7 @@ def test_the_mass_of_a_mixture_and_its_error_follow_the_weights() -> None:
     leakage, z_j = posterior.leakage(posterior.x_o), inside_mass(posterior)
     truth = posterior.weights @ z_j
     variance = posterior.weights.square() @ (z_j * (1 - z_j))
-    error = (variance / posterior_module.LEAKAGE_DRAWS).sqrt()
+    error = (variance / truncation_module.LEAKAGE_DRAWS).sqrt()
     assert truth.min() < 0.9
     assert ((leakage.mass - truth).abs() < 4 * error).all()
     assert torch.allclose(leakage.standard_error, error, rtol=0.1)
@@ -593,12 +593,12 @@ def test_the_mass_of_components_is_estimated_once_for_all_views(
     calls = count_draws(posterior, monkeypatch)
     view, theta = posterior[1], torch.zeros(1, 2)
     view.log_prob(theta)
-    assert sum(calls) == 12 * posterior_module.LEAKAGE_DRAWS
+    assert sum(calls) == 12 * truncation_module.LEAKAGE_DRAWS
     for _ in range(2):
         posterior.log_prob_batched(theta, posterior.x_o)
         posterior[3].log_prob(theta)
         posterior.leakage(posterior.x_o)
-    assert sum(calls) == 12 * posterior_module.LEAKAGE_DRAWS
+    assert sum(calls) == 12 * truncation_module.LEAKAGE_DRAWS
 
 
 def test_log_prob_is_a_function_and_leaves_the_random_state_alone() -> None:
