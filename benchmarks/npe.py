@@ -19,9 +19,9 @@ SETTINGS: dict[str, tuple[int, dict[str, Any], dict[str, Any]]] = {
         {"training_batch_size": 200, "learning_rate": 1e-3, "max_num_epochs": 40},
     ),
     "pendulum": (
-        20_000,
-        {"num_transforms": 3, "z_score_x": "structured"},
-        {"training_batch_size": 200, "learning_rate": 5e-4, "max_num_epochs": 20},
+        10_000,
+        {"num_transforms": 2, "z_score_x": "structured"},
+        {"training_batch_size": 100, "learning_rate": 1e-3, "max_num_epochs": 12},
     ),
 }
 
