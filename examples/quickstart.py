@@ -37,7 +37,7 @@ def main() -> None:
     """Run the study with the arguments of the command line."""
     parser = argument_parser(__doc__ or "", n_test=500, out="results/quickstart")
     parser.add_argument("--num-simulations", type=int, default=10_000)
-    parser.add_argument("--max-num-epochs", type=int, default=12)
+    parser.add_argument("--max-num-epochs", type=int, default=8)
     args = parser.parse_args()
     Study(
         task=get_task("pendulum"),
