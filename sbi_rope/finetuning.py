@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from sbi_rope._random import seeded
+from sbi_rope._sbi import embed
 from sbi_rope._validation import (
     check_finite,
     check_instance,
@@ -165,7 +166,7 @@ class CalibrationFinetuner:
             targets = check_tensor("targets", draw_targets(self.simulations_per_target))
             check_same_length("x", x, "targets", targets)
             check_finite("targets", targets)
-            _check_start(embedding_net, x, targets)
+            _check_start(embed(embedding_net, x), targets)
             train, held_out = self._split(x.shape[0])
             results = [
                 self._optimise(
@@ -284,9 +285,8 @@ def trainable_copy(embedding_net: nn.Module, embeddings: Tensor) -> nn.Module:
     return net.eval()
 
 
-def _check_start(net: nn.Module, x: Tensor, targets: Tensor) -> None:
-    with torch.no_grad():
-        distance = torch.linalg.vector_norm(net(x) - targets, dim=1)
+def _check_start(embedded: Tensor, targets: Tensor) -> None:
+    distance = torch.linalg.vector_norm(embedded - targets, dim=1)
     if not torch.isfinite(distance).all():
         rows = (~torch.isfinite(distance)).nonzero().flatten()[:5].tolist()
         raise InvalidInputError(

@@ -98,7 +98,7 @@ def test_the_start_is_kept_if_nothing_is_better() -> None:
 
 def test_the_users_net_is_left_as_it_was() -> None:
     x, targets = torch.randn(10, 2), torch.randn(10, 2)
-    net = nn.Sequential(nn.Linear(2, 2), nn.Dropout(0.5)).train()
+    net = nn.Sequential(nn.Linear(2, 2), nn.BatchNorm1d(2), nn.Dropout(0.5)).train()
     net[0].requires_grad_(requires_grad=False)
     before = copy.deepcopy(net.state_dict())
     g, *_ = finetune(net, x, targets, num_steps=20)
