@@ -46,6 +46,15 @@ class History:
     best_step: int
     learning_rate: float
 
+    def __repr__(self) -> str:
+        loss, what = self.validation_loss, "validation_loss"
+        if not loss:
+            loss, what = self.training_loss, "training_loss"
+        return (
+            f"History({what} {loss[0]:.3g} -> {loss[self.best_step]:.3g}, "
+            f"best_step={self.best_step}, learning_rate={self.learning_rate:g})"
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class FinetuneResult:

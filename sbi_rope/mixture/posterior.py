@@ -264,12 +264,50 @@ class MixturePosterior(DirectPosterior):
             UnseenObservationError: If an x is not in the batch and ``unseen="raise"``.
             SamplingError: If a mixture has no mass inside the prior's support.
         """
+        theta = torch.as_tensor(theta)
+        event_shape = self.posterior_estimator.input_shape
+        if theta.ndim < 2 or theta.shape[-len(event_shape) :] != event_shape:
+            raise InvalidInputError(
+                f"Expected `theta` of shape (B, {event_shape[0]}) or (S, B, "
+                f"{event_shape[0]}); got {tuple(theta.shape)}."
+            )
         return super().log_prob_batched(
             theta,
             self._batch_of_x(x),
             norm_posterior,
             track_gradients,
             leakage_correction_params,
+        )
+
+    def map(  # type: ignore[override]
+        self,
+        x: Tensor | None = None,
+        num_iter: int = 100,
+        num_to_optimize: int = 5,
+        num_init_samples: int = 100,
+        **options: Any,
+    ) -> Tensor:
+        """Return the maximum of the density given the default x, as in sbi.
+
+        Every step evaluates all components for all starting points, so that sbi's
+        defaults (1000 steps from the best 100 of 1000 samples) would take many minutes.
+
+        Args:
+            x: As in sbi not used; set the default x, or take ``posterior[i]``.
+            num_iter: Steps of gradient ascent.
+            num_to_optimize: Starting points, the densest of the samples.
+            num_init_samples: Samples to choose the starting points from.
+            **options: The other options of sbi's ``DirectPosterior.map``.
+
+        Returns:
+            Shape ``(1, d)``.
+        """
+        return super().map(
+            x=x,
+            num_iter=num_iter,
+            num_to_optimize=num_to_optimize,
+            num_init_samples=num_init_samples,
+            **options,
         )
 
     # --- normalisation ---

@@ -411,6 +411,9 @@ def test_dropout_in_the_components_does_not_blur_the_density() -> None:
             lambda p: p[0].potential(torch.zeros(3, 1)), "`theta`", id="potential"
         ),
         pytest.param(
+            lambda p: p.log_prob_batched(torch.zeros(5), p.x_o), "`theta`", id="flat"
+        ),
+        pytest.param(
             lambda p: p.log_prob(torch.full((1, 2), torch.nan), x=p.x_o[0]),
             "without NaN",
             id="nan theta",

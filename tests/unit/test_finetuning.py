@@ -86,6 +86,15 @@ def test_of_several_learning_rates_the_best_on_the_hold_out_is_kept() -> None:
     assert losses[1e-5, 1e-2] == losses[1e-2, 1e-5] == losses[1e-2]
 
 
+def test_the_history_says_at_a_glance_whether_tuning_helped() -> None:
+    x = torch.randn(10, 2)
+    result = CalibrationFinetuner(num_steps=1).finetune(
+        linear(), x, lambda count: x, seed=0, show_progress_bars=False
+    )
+    assert "validation_loss" in repr(result.history)
+    assert "->" in repr(result.history)
+
+
 def test_the_start_is_kept_if_nothing_is_better() -> None:
     x = torch.randn(10, 2)
     net = linear()
