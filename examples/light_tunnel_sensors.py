@@ -48,7 +48,7 @@ def main() -> None:
     Study(
         task=get_task("light_tunnel_sensors", root=args.root, download=args.download),
         train_npe=lambda task, seed: train_npe(task, seed, args.num_simulations),
-        # Fixed before any test data were looked at; see benchmarks/README.md.
+        # Chosen on calibration data, see benchmarks/README.md.
         coupler=SinkhornCoupler(gamma=0.1, tau=1.0, cost_scale="simulated"),
         seeds=args.seeds,
         n_calibration=args.n_calibration,
