@@ -151,6 +151,33 @@ def main() -> None:
                 with path.open("a", newline="") as file:
                     csv.DictWriter(file, COLUMNS).writerow(row)
                 print(*row.values(), sep=" | ", flush=True)
+    print_table(path)
+
+
+def print_table(path: Path) -> None:
+    """Print the means over seeds, in the form of benchmarks/README.md."""
+    groups: dict[tuple[int, str], list[dict[str, str]]] = {}
+    with path.open(newline="") as file:
+        for row in csv.DictReader(file):
+            key = (int(row["n_calibration"]), row["setting"])
+            groups.setdefault(key, []).append(row)
+    print(
+        "| pairs | setting | best step | distance | tuning-only LPP | RoPE LPP | "
+        "seconds | seeds |\n|---|---|---|---|---|---|---|---|"
+    )
+    digits = {
+        "best_step": 0,
+        "distance": 3,
+        "tuning_lpp_z": 2,
+        "rope_lpp_z": 2,
+        "seconds": 1,
+    }
+    for (n, setting), rows in sorted(groups.items(), key=lambda item: item[0][0]):
+        means = [
+            f"{sum(float(row[column]) for row in rows) / len(rows):.{places}f}"
+            for column, places in digits.items()
+        ]
+        print(f"| {n} | {setting} | {' | '.join(means)} | {len(rows)} |")
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ Used by the example scripts; a study is (seeds) x (calibration sizes).
 
 import argparse
 import csv
+import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -188,9 +189,13 @@ def print_table(rows: list[dict[str, Any]]) -> None:
         "of the prior (higher is better). ACAUC: 0 is calibrated, above 0 is\n"
         "overconfident. ECE: expected coverage error. -inf: share of test\n"
         "observations with density zero. NPE and tuning-only are scored without sbi's\n"
-        "leakage correction.\n"
+        "leakage correction. With several seeds: mean, and standard deviation of the\n"
+        "LPP over seeds (+-).\n"
     )
-    print(f"{'method':<12}{'pairs':>6}{'LPP':>10}{'ACAUC':>9}{'ECE':>8}{'-inf':>7}")
+    print(
+        f"{'method':<12}{'pairs':>6}{'LPP':>10}{'+-':>7}{'ACAUC':>9}{'ECE':>8}"
+        f"{'-inf':>7}"
+    )
     order = ("prior", "NPE", "tuning-only", "OT-only", "RoPE")
     keys = dict.fromkeys((row["method"], row["n_calibration"]) for row in rows)
     for method, n in sorted(keys, key=lambda key: (order.index(key[0]), key[1])):
@@ -199,9 +204,11 @@ def print_table(rows: list[dict[str, Any]]) -> None:
         def mean(column: str, group: list[dict[str, Any]] = group) -> float:
             return sum(row[column] for row in group) / len(group)
 
+        scores = [row["lpp_z"] for row in group]
+        spread = f"{statistics.stdev(scores):.2f}" if len(scores) > 1 else "-"
         print(
-            f"{method:<12}{n or '-':>6}{mean('lpp_z'):>10.2f}{mean('acauc'):>9.3f}"
-            f"{mean('expected_coverage_error'):>8.3f}{mean('neg_inf_fraction'):>7.2f}"
+            f"{method:<12}{n or '-':>6}{mean('lpp_z'):>10.2f}{spread:>7}"
+            f"{mean('acauc'):>9.3f}{mean('expected_coverage_error'):>8.3f}{mean('neg_inf_fraction'):>7.2f}"
         )
 
 

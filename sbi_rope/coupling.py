@@ -33,7 +33,7 @@ FIRST_BURST, LAST_BURST = 16, 256
 class Coupling:
     r"""How much of each simulation stands behind each real observation.
 
-    Row i holds the mixture weights of observation i (RoPE, eq. 6). They are a softmax
+    Row i holds the mixture weights of observation i (RoPE, eq. 5). They are a softmax
     of the simulation-side log-potential :math:`w`,
 
     .. math:: \alpha_{ij} = \operatorname{softmax}_j (w_j - C_{ij} / \gamma),
@@ -120,7 +120,7 @@ class SinkhornCoupler:
 
     References:
         | Addressing Misspecification in Simulation-based Inference through Data-driven
-          Calibration (Wehenkel et al., 2025), eqs. 4 and 6
+          Calibration (Wehenkel et al., 2025), eqs. 2 and 5
         | https://arxiv.org/abs/2405.08719
 
     Args:

@@ -90,7 +90,7 @@ class CalibrationFinetuner:
 
     References:
         | Addressing Misspecification in Simulation-based Inference through Data-driven
-          Calibration (Wehenkel et al., 2025), eq. 7 and Algorithm 1, step 2
+          Calibration (Wehenkel et al., 2025), eq. 6 and Algorithm 1, step 2
         | https://arxiv.org/abs/2405.08719
 
     Args:

@@ -33,7 +33,7 @@ def semi_balanced_plan(
 
 
 def objective(plan: Tensor, cost: Tensor, *, gamma: float, tau: float) -> float:
-    """Evaluate the paper's eq. 4 at P, rows summing to 1 / n_o."""
+    """Evaluate the paper's eq. 2 at P, rows summing to 1 / n_o."""
     q = plan.sum(dim=0)
     value = (plan * cost).sum() + gamma * torch.xlogy(plan, plan).sum()
     if tau < 1:

@@ -50,7 +50,7 @@ class MixturePosterior(DirectPosterior):
 
     References:
         | Addressing Misspecification in Simulation-based Inference through Data-driven
-          Calibration (Wehenkel et al., 2025), eq. 6
+          Calibration (Wehenkel et al., 2025), eq. 5
         | https://arxiv.org/abs/2405.08719
 
     Args:
