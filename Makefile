@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: quickstart test test-slow lint types format clean
+.PHONY: quickstart test test-slow test-latest-sbi lint types format clean
 
 quickstart: $(VENV)/.installed
 	$(BIN)/python examples/quickstart.py
@@ -13,6 +13,9 @@ test: $(VENV)/.installed
 
 test-slow: $(VENV)/.installed
 	$(BIN)/python -m pytest -q -m "slow and not gpu and not network"
+
+test-latest-sbi:
+	PYTHON=$(PYTHON) .ci/latest-sbi
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff check .
@@ -26,7 +29,7 @@ format: $(VENV)/.installed
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) results
+	rm -rf $(VENV) $(VENV)-latest results
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	test -d $(VENV) || $(PYTHON) -m venv $(VENV)

@@ -3,11 +3,13 @@ r"""Where this package touches the inside of sbi, and nowhere else.
 An NPE estimator is :math:`q(\theta \mid h(x))`. sbi keeps the embedding :math:`h` (its
 standardising layer followed by the user's network) as one submodule of the estimator,
 under a name that depends on the family. Everything here finds that submodule by
-identity with the public property ``embedding_net``, so that it holds for every family.
+identity with the public property ``embedding_net``, so that it holds for every family;
+the mixed estimator of MNPE, which has no such property, is the exception.
 """
 
 import copy
 import warnings
+from collections.abc import Iterator
 from typing import Any, Literal
 
 import torch
@@ -22,6 +24,8 @@ from sbi.neural_nets.estimators.base import (
     ConditionalEstimator,
     ConditionalVectorFieldEstimator,
 )
+from sbi.neural_nets.estimators.mixed_density_estimator import MixedDensityEstimator
+from sbi.neural_nets.estimators.tabpfn_flow import TabPFNFlow
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
@@ -32,6 +36,7 @@ __all__ = [
     "ConditionalDensityEstimator",
     "ConditionalEstimator",
     "DirectPosterior",
+    "MixedDensity",
     "NeuralPosterior",
     "VectorFieldDensity",
     "device_of",
@@ -76,12 +81,33 @@ def embedding_of(estimator: ConditionalEstimator) -> nn.Module:
     Raises:
         UnsupportedPosteriorError: If the estimator does not expose its embedding.
     """
+    if isinstance(estimator, TabPFNFlow):
+        raise UnsupportedPosteriorError(
+            "Expected an estimator whose embedding of x was trained; got TabPFNFlow "
+            "(NPE-PFN), which compares x with stored simulations instead and has "
+            "nothing to tune. Train NPE on the same simulations and pass its posterior."
+        )
+    if isinstance(estimator, MixedDensityEstimator):
+        return _embedding_of_mixed(estimator)
     embedding = getattr(estimator, "embedding_net", None)
     if not isinstance(embedding, nn.Module) or not _paths_to(estimator, embedding):
         raise UnsupportedPosteriorError(
             f"Cannot separate the embedding net of a {type(estimator).__name__} from "
             "its density. Supported: the mixture density networks, nflows and zuko "
-            "flows, and vector fields of sbi."
+            "flows, mixed estimators (MNPE), and vector fields of sbi."
+        )
+    return embedding
+
+
+def _embedding_of_mixed(estimator: MixedDensityEstimator) -> nn.Module:
+    # Its two halves see x through one net. Tuning a net that only one of them uses
+    # would leave the other with the embedding of the simulations.
+    embedding = estimator.condition_embedding
+    if estimator.discrete_net.net.embedding_net is not embedding:
+        raise UnsupportedPosteriorError(
+            "Expected a MixedDensityEstimator whose discrete and continuous parts "
+            "share one embedding net; got two. Build it with "
+            "`posterior_nn('mnpe', embedding_net=...)`."
         )
     return embedding
 
@@ -105,8 +131,11 @@ def headless(estimator: ConditionalEstimator) -> Any:
             f"(n, l); got {('n', *statistic_shape)}."
         )
     clone = with_embedding(estimator, nn.Identity())
-    clone._condition_shape = torch.Size(statistic_shape)
-    return clone
+    for path in _paths_to(estimator, embedding):
+        for module in _modules_along(clone, path):
+            if isinstance(module, ConditionalEstimator):
+                module._condition_shape = torch.Size(statistic_shape)
+    return MixedDensity(clone) if isinstance(clone, MixedDensityEstimator) else clone
 
 
 def with_embedding(estimator: ConditionalEstimator, embedding: nn.Module) -> Any:
@@ -138,6 +167,59 @@ def posterior_from(
     return DirectPosterior(
         estimator, prior, device=device, enable_transform=posterior.enable_transform
     )
+
+
+class MixedDensity(ConditionalDensityEstimator):
+    """The mixed estimator of MNPE, as a density over all of the prior's support.
+
+    Where sbi's own has no density it is zero: at a category that was not trained on,
+    which sbi gives the mass of the next larger one or refuses, and with
+    ``log_transform_x`` at zero and below, where sbi returns NaN.
+    """
+
+    def __init__(self, estimator: MixedDensityEstimator) -> None:
+        super().__init__(estimator, estimator.input_shape, estimator.condition_shape)
+        self.mixed = estimator
+
+    @property
+    def embedding_net(self) -> nn.Module:
+        """The embedding net of both parts."""
+        return self.mixed.condition_embedding
+
+    def log_prob(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
+        """Return the log of density times mass, ``(S, B)``."""
+        categories = self.mixed.discrete_net.net.categorical_values_per_var
+        continuous = input[..., : -len(categories)]
+        # Detached, so that gradient ascent does not move between categories.
+        discrete = input[..., -len(categories) :].detach()
+        trained = torch.stack(
+            [
+                torch.isin(column, values.to(column))
+                for column, values in zip(discrete.unbind(-1), categories, strict=True)
+            ],
+            dim=-1,
+        )
+        inside = torch.ones_like(continuous, dtype=torch.bool)
+        if self.mixed.log_transform_input:
+            inside = continuous > 0
+        # Anything that can be evaluated stands in for what cannot.
+        some = torch.stack([values[0] for values in categories]).to(discrete)
+        valid = torch.cat(
+            [continuous.where(inside, 1.0), discrete.where(trained, some)], dim=-1
+        )
+        log_prob = self.mixed.log_prob(valid, condition)
+        possible = trained.all(dim=-1) & inside.all(dim=-1)
+        return log_prob.where(possible, -torch.inf)
+
+    def sample(
+        self, sample_shape: torch.Size, condition: Tensor, **kwargs: Any
+    ) -> Tensor:
+        """Draw the discrete parameters, then the continuous ones given these."""
+        return self.mixed.sample(sample_shape, condition, **kwargs)
+
+    def loss(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
+        """Return the negative log-probability, shape ``(B,)``."""
+        return -self.log_prob(input[None], condition)[0]
 
 
 class VectorFieldDensity(ConditionalDensityEstimator):
@@ -221,6 +303,14 @@ def device_of(module: nn.Module) -> torch.device:
 def _paths_to(root: nn.Module, target: nn.Module) -> list[str]:
     named = root.named_modules(remove_duplicate=False)
     return [name for name, module in named if module is target and name]
+
+
+def _modules_along(root: nn.Module, path: str) -> Iterator[nn.Module]:
+    """Yield the modules from the root to the parent of a path's end."""
+    yield root
+    for name in path.split(".")[:-1]:
+        root = root.get_submodule(name)
+        yield root
 
 
 def _replace(root: nn.Module, path: list[str], new: nn.Module) -> nn.Module:

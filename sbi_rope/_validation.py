@@ -21,8 +21,8 @@ __all__ = [
     "check_finite",
     "check_in_support",
     "check_instance",
+    "check_integer",
     "check_positive",
-    "check_positive_integer",
     "check_same_length",
     "check_tensor",
     "check_unit_interval",
@@ -121,11 +121,11 @@ def check_positive(name: str, value: Any) -> None:
         raise InvalidInputError(f"Expected `{name}` to be positive; got {value!r}.")
 
 
-def check_positive_integer(name: str, value: Any) -> None:
-    """Raise unless ``value`` is an integer of at least one."""
-    if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
+def check_integer(name: str, value: Any, *, minimum: int = 1) -> None:
+    """Raise unless ``value`` is an integer of at least ``minimum``."""
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < minimum:
         raise InvalidInputError(
-            f"Expected `{name}` to be an integer of at least 1; got {value!r}."
+            f"Expected `{name}` to be an integer of at least {minimum}; got {value!r}."
         )
 
 
@@ -135,8 +135,8 @@ def check_unit_interval(name: str, value: Any) -> None:
         raise InvalidInputError(f"Expected `{name}` in [0, 1]; got {value!r}.")
 
 
-def check_choice(name: str, value: Any, choices: Sequence[str]) -> None:
-    """Raise unless ``value`` is one of the given strings."""
+def check_choice(name: str, value: Any, choices: Sequence[Any]) -> None:
+    """Raise unless ``value`` is one of the choices."""
     if value not in choices:
         raise InvalidInputError(
             f"Expected `{name}` to be one of {list(choices)}; got {value!r}."

@@ -13,8 +13,8 @@ from sbi_rope._sbi import embed
 from sbi_rope._validation import (
     check_finite,
     check_instance,
+    check_integer,
     check_positive,
-    check_positive_integer,
     check_same_length,
     check_tensor,
 )
@@ -127,10 +127,10 @@ class CalibrationFinetuner:
             raise InvalidInputError("Expected at least one `learning_rate`; got ().")
         for rate in self._learning_rates:
             check_positive("learning_rate", rate)
-        check_positive_integer("num_steps", self.num_steps)
-        check_positive_integer("patience", self.patience)
-        check_positive_integer("simulations_per_target", self.simulations_per_target)
-        check_positive_integer("num_neighbors", self.num_neighbors)
+        check_integer("num_steps", self.num_steps)
+        check_integer("patience", self.patience)
+        check_integer("simulations_per_target", self.simulations_per_target)
+        check_integer("num_neighbors", self.num_neighbors)
         check_instance("resample_targets", self.resample_targets, bool)
         check_positive("validation_fraction", self.validation_fraction)
         if self.validation_fraction > 0.5:

@@ -28,7 +28,7 @@ from sbi_rope._validation import (
     check_finite,
     check_in_support,
     check_instance,
-    check_positive_integer,
+    check_integer,
     check_same_length,
     check_tensor,
     check_unit_interval,
@@ -70,8 +70,8 @@ class RoPE:
         | https://arxiv.org/abs/2405.08719
 
     Args:
-        posterior: What ``NPE(...).build_posterior()`` returns, or the posterior of FMPE
-            or NPSE (these can be sampled, but have no ``log_prob``). A default x is
+        posterior: What ``NPE(...).build_posterior()`` returns, or the posterior of
+            MNPE, FMPE or NPSE (the last two have no ``log_prob``). A default x is
             ignored. The posterior must be amortised: one trained over several rounds
             fits one observation only, which cannot be recognised here.
         simulator: Maps parameters ``(n, d)`` to simulations ``(n, *event)``, or one
@@ -292,7 +292,7 @@ class RoPE:
         check_choice("unseen", unseen, ("raise", "extend"))
         check_unit_interval("tail_mass", tail_mass)
         if num_simulations is not None:
-            check_positive_integer("num_simulations", num_simulations)
+            check_integer("num_simulations", num_simulations)
         x_o = self._checked("x_o", x_o, self._estimator.condition_shape)
         coupler = self.coupler if coupler is None else coupler
 
@@ -306,7 +306,7 @@ class RoPE:
             )
         embedded = embed(g, x_o)
         check_finite("g(x_o)", embedded)
-        coupling = coupler.couple(embedded, contexts)
+        coupling = coupler.couple(embedded, contexts, seed=seed)
         if require_convergence:
             _check_converged(coupling, coupler)
         mixture = MixtureEstimator(

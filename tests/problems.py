@@ -3,20 +3,38 @@
 import functools
 import math
 import warnings
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
-from sbi.inference import FMPE, NPE, NPSE
+from sbi.inference import FMPE, MNPE, NPE, NPSE
 from sbi.neural_nets import posterior_flow_nn, posterior_nn, posterior_score_nn
 from sbi.neural_nets.estimators import ConditionalDensityEstimator
-from sbi.utils import BoxUniform
+from sbi.utils import BoxUniform, MultipleIndependent
 from torch import Size, Tensor, nn
-from torch.distributions import Distribution, MultivariateNormal
+from torch.distributions import Bernoulli, Binomial, Distribution, MultivariateNormal
 
 from sbi_rope.coupling import Coupling
 from sbi_rope.mixture import MixtureEstimator, MixturePosterior
 
-FAMILIES = ["mdn", "maf", "nsf", "zuko_maf", "zuko_nsf", "zuko_unaf"]
+# Names of `posterior_nn` for continuous parameters, and for mixed ones.
+FAMILIES = [
+    "mdn",
+    "made",
+    "maf",
+    "maf_rqs",
+    "nsf",
+    "zuko_nice",
+    "zuko_maf",
+    "zuko_nsf",
+    "zuko_ncsf",
+    "zuko_sospf",
+    "zuko_naf",
+    "zuko_unaf",
+    "zuko_gf",
+    "zuko_bpf",
+]
+MIXED_FAMILIES = ["mnpe", "mnle"]
 
 
 class SmallCNN(nn.Sequential):
@@ -30,10 +48,17 @@ def box(dim: int, low: float = -1.0, high: float = 1.0) -> BoxUniform:
     return BoxUniform(torch.full((dim,), low), torch.full((dim,), high))
 
 
+def mixed_prior(dim: int) -> MultipleIndependent:
+    """A box, a parameter with the values 0, 1, 2 and one with the values 0, 1."""
+    discrete = [Binomial(2, torch.tensor([0.5])), Bernoulli(torch.tensor([0.3]))]
+    return MultipleIndependent([box(dim), *discrete], validate_args=False)
+
+
 def simulate(theta: Tensor) -> Tensor:
-    """Three noisy readings of theta, whatever its dimension."""
-    mixing = torch.tensor([[1.0, 0.5, -0.5], [0.2, -1.0, 0.7]])[: theta.shape[1]]
-    return theta @ mixing + 0.1 * torch.randn(len(theta), 3)
+    """Three noisy readings of theta, whatever its dimension up to four."""
+    mixing = [[1.0, 0.5, -0.5], [0.2, -1.0, 0.7], [-0.6, 0.3, 0.9], [0.4, 0.8, 0.1]]
+    signal = theta @ torch.tensor(mixing[: theta.shape[1]])
+    return signal + 0.1 * torch.randn(len(theta), 3)
 
 
 def simulate_image(theta: Tensor) -> Tensor:
@@ -54,7 +79,8 @@ def npe_posterior(
     """Train a small NPE once a session; for reading only.
 
     ``embedding`` is "none", "linear" (with dropout, so that evaluation mode matters),
-    or "cnn" for image-shaped x.
+    or "cnn" for image-shaped x. ``dim`` is the number of continuous parameters, which a
+    mixed family has two discrete ones beside.
     """
     net: nn.Module = {
         "none": nn.Identity,
@@ -64,7 +90,7 @@ def npe_posterior(
     with torch.random.fork_rng(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         torch.manual_seed(1)
-        prior = box(dim)
+        prior = mixed_prior(dim) if family in MIXED_FAMILIES else box(dim)
         theta = prior.sample((200,))
         x = (simulate_image if embedding == "cnn" else simulate)(theta)
         builder = posterior_nn(
@@ -74,7 +100,8 @@ def npe_posterior(
             hidden_features=16,
             num_transforms=1 if family == "zuko_unaf" else 2,
         )
-        npe = NPE(prior, density_estimator=builder, show_progress_bars=False)
+        trainer = MNPE if family == "mnpe" else NPE
+        npe = trainer(prior, density_estimator=builder, show_progress_bars=False)
         npe.append_simulations(theta, x)
         npe.train(max_num_epochs=num_epochs, training_batch_size=50)
         return npe.build_posterior()
@@ -120,18 +147,48 @@ class Gaussians(ConditionalDensityEstimator):
         return -self.log_prob(input[None], condition)[0]
 
 
-def coupling_of(weights: Tensor, simulated: Tensor) -> Coupling:
-    """A coupling with weights chosen by hand."""
-    return Coupling(
-        weights=weights.double(),
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TableCoupling(Coupling):
+    """A coupling with weights chosen by hand, found by the number of the observation.
+
+    What is no row of ``real`` gets the row that any other coupling would give it.
+    """
+
+    table: Tensor = field(repr=False)
+
+    @property
+    def weights(self) -> Tensor:
+        return self.table
+
+    def rows(self, real: Tensor) -> Tensor:
+        rows = super().rows(real)
+        same = (real[:, None] == self.real).all(dim=-1)
+        known = same.any(dim=1)
+        rows[known] = self.table[same.int().argmax(dim=1)[known]]
+        return rows
+
+    def to(self, device: str | torch.device) -> "TableCoupling":
+        return replace(super().to(device), table=self.table.to(device))
+
+
+def coupling_of(
+    weights: Tensor, simulated: Tensor, *, dtype: torch.dtype = torch.float64
+) -> TableCoupling:
+    """A coupling with weights chosen by hand; the embedding of x_o is its number."""
+    numbers = torch.arange(len(weights), dtype=dtype, device=weights.device)
+    return TableCoupling(
+        table=weights.to(dtype),
         potential=torch.linspace(-1, 1, len(simulated), dtype=torch.float64),
+        real=numbers[:, None].repeat(1, simulated.shape[1]),
+        simulated=simulated.to(dtype),
+        gamma=0.5,
+        tau=1.0,
         marginal_error=0.0,
+        batch_error=0.0,
+        num_fitted=len(weights),
         num_iterations=0,
         converged=True,
         solver="none",
-        gamma=0.5,
-        tau=1.0,
-        simulated=simulated.double(),
     )
 
 
@@ -153,6 +210,7 @@ def gaussian_posterior(
     x_o: Tensor | None = None,
     unseen: Any = "raise",
     tail_mass: float = 0.0,
+    dtype: torch.dtype = torch.float64,
 ) -> MixturePosterior:
     """A mixture of analytic Gaussians; x_o has three readings, g maps them linearly."""
     if contexts is None:
@@ -166,7 +224,7 @@ def gaussian_posterior(
     estimator = MixtureEstimator(
         Gaussians(dim),
         contexts,
-        coupling_of(weights, contexts),
+        coupling_of(weights, contexts, dtype=dtype),
         x_o,
         embedding_net=nn.Linear(x_o[0].numel(), 2 * dim),
         unseen=unseen,

@@ -23,7 +23,7 @@ from tqdm.auto import tqdm
 from sbi_rope._sbi import NeuralPosterior
 from sbi_rope._validation import (
     check_batch,
-    check_positive_integer,
+    check_integer,
     check_same_length,
     check_tensor,
 )
@@ -56,7 +56,7 @@ def check_test_set(
     posterior: Any, theta: Tensor, x: Tensor, chunk_size: int
 ) -> tuple[Tensor, Tensor]:
     """Check theta (n, k) and x (n, ...), and return them in the posterior's dtype."""
-    check_positive_integer("chunk_size", chunk_size)
+    check_integer("chunk_size", chunk_size)
     check_batch("theta", theta, check_tensor("theta", theta).shape[-1:])
     check_batch("x", x, check_tensor("x", x).shape[1:])
     check_same_length("theta", theta, "x", x)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from sbi_rope._random import seeded
-from sbi_rope._validation import check_choice, check_positive_integer
+from sbi_rope._validation import check_choice, check_integer
 from sbi_rope.metrics.calibration import (
     ACAUCScore,
     CoverageCurve,
@@ -93,8 +93,8 @@ def acauc(
         num_samples = DEFAULT_NUM_SAMPLES[kind]
     if num_observations is None:
         num_observations = MAX_JOINT_OBSERVATIONS if kind == "hpd" else theta.shape[0]
-    check_positive_integer("num_samples", num_samples)
-    check_positive_integer("num_observations", num_observations)
+    check_integer("num_samples", num_samples)
+    check_integer("num_observations", num_observations)
     theta, x = _thin(theta, x, num_observations)
     draw = draw_joint_levels if kind == "hpd" else draw_ranks
     with seeded(seed):
@@ -205,7 +205,7 @@ def _central_levels(
     show: bool,
 ) -> Tensor:
     theta, x = check_test_set(posterior, theta, x, chunk_size)
-    check_positive_integer("num_samples", num_samples)
+    check_integer("num_samples", num_samples)
     with seeded(seed):
         ranks = draw_ranks(
             posterior,

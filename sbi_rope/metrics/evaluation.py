@@ -7,7 +7,7 @@ from typing import Any
 from torch import Tensor
 
 from sbi_rope._random import seeded
-from sbi_rope._validation import check_positive_integer
+from sbi_rope._validation import check_integer
 from sbi_rope.metrics.calibration import (
     ACAUCScore,
     CoverageCurve,
@@ -93,7 +93,7 @@ def evaluate(
         LogProbUnavailableError: If the posterior has no ``log_prob_batched``.
     """
     theta, x = check_test_set(posterior, theta, x, chunk_size)
-    check_positive_integer("num_samples", num_samples)
+    check_integer("num_samples", num_samples)
     check_theta_std(theta_std, theta)
     with seeded(seed):
         natural = LPPScore(

@@ -1,20 +1,25 @@
 """The density of the mixture, as an estimator in the sense of sbi."""
 
 import hashlib
+from collections.abc import Iterator
 from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
+from tqdm.auto import tqdm
 
 from sbi_rope._sbi import ConditionalDensityEstimator, embed
 from sbi_rope.coupling import Coupling
 from sbi_rope.errors import InvalidInputError, UnseenObservationError, warn_user
+from sbi_rope.mixture.chunks import (
+    blocks,
+    flow_batch,
+    keep_freed_memory,
+    num_fitting,
+)
+from sbi_rope.mixture.sampling import Accept, BlockSampler
 
-__all__ = ["MAX_EVALUATIONS", "MixtureEstimator"]
-
-# Most pairs of parameter and component that the flow sees at a time; this, and not the
-# numbers of observations and simulations, bounds its memory.
-MAX_EVALUATIONS = 100_000
+__all__ = ["MixtureEstimator"]
 
 
 class MixtureEstimator(ConditionalDensityEstimator):
@@ -26,8 +31,8 @@ class MixtureEstimator(ConditionalDensityEstimator):
     Args:
         components: :math:`q(\theta \mid s)`, an estimator conditioned on embeddings.
         contexts: :math:`h(x_s)`, shape ``(n_s, l)``.
-        coupling: Where the weights come from, ``coupling.weights`` of shape
-            ``(n_o, n_s)``.
+        coupling: Where the weights come from, ``coupling.rows`` of its features of the
+            observations, ``coupling.real`` of shape ``(n_o, l)``.
         x_o: The batch of real observations, shape ``(n_o, *event)``.
         embedding_net: :math:`g`, needed to extend to unseen observations only.
         unseen: What to do with an x outside the batch: ``"raise"``, or ``"extend"`` by
@@ -70,8 +75,8 @@ class MixtureEstimator(ConditionalDensityEstimator):
         self.coupling = self.coupling.to(device)
         self._extended = None
 
-    def rows(self, x: Tensor) -> Tensor:
-        """Return the mixture weights of observations, ``(n, *event)`` to ``(n, n_s)``.
+    def features(self, x: Tensor) -> Tensor:
+        """Return the embeddings of observations, ``(n, *event)`` to ``(n, l)``.
 
         Raises:
             UnseenObservationError: If an x is not in the batch and ``unseen="raise"``.
@@ -79,14 +84,28 @@ class MixtureEstimator(ConditionalDensityEstimator):
         x = x.to(self.x_o)
         found = [self._index.get(key, -1) for key in _keys(x)]
         index = torch.tensor(found, dtype=torch.long, device=self.x_o.device)
-        weights = self.coupling.weights[index.clamp_min(0)]
+        features = self.coupling.real[index.clamp_min(0)]
         new = index < 0
         if new.any():
-            weights[new] = self._extended_rows(x[new])
-        return weights
+            features[new] = self._unseen_features(x[new])
+        return features
 
-    def _extended_rows(self, x: Tensor) -> Tensor:
-        # log_prob and its normaliser, or the steps of map(), ask for the same rows.
+    def row_blocks(self, features: Tensor) -> Iterator[tuple[slice, Tensor]]:
+        """Yield the weights ``(b, n_s)`` of a block of observations after the other."""
+        for block in blocks(len(features), len(self.contexts)):
+            yield block, self.coupling.rows(features[block])
+
+    def rows(self, x: Tensor) -> Tensor:
+        """Return the mixture weights of observations, ``(n, *event)`` to ``(n, n_s)``.
+
+        Raises:
+            UnseenObservationError: If an x is not in the batch and ``unseen="raise"``.
+        """
+        return self.coupling.rows(self.features(x))
+
+    def _unseen_features(self, x: Tensor) -> Tensor:
+        # log_prob and its normaliser, or the steps of map(), ask for the same ones, and
+        # earn one warning.
         keys = _keys(x)
         if self._extended is None or self._extended[0] != keys:
             self._extended = (keys, self._extend(x))
@@ -101,131 +120,152 @@ class MixtureEstimator(ConditionalDensityEstimator):
                 "`rope.build_posterior(x_new)`, or allow rows under the old coupling "
                 "with `rope.build_posterior(x_o, unseen='extend')`."
             )
-        rows = self.coupling.rows(embed(self._g, x))
-        smallest = float((1.0 / rows.square().sum(dim=1)).min())
+        features = embed(self._g, x).to(self.coupling.real)
+        smallest = min(
+            float((1.0 / rows.square().sum(dim=1)).min())
+            for _, rows in self.row_blocks(features)
+        )
         warn_user(
             f"Extended the coupling to {len(x)} unseen observation(s); smallest "
-            f"effective sample size {smallest:.1f} of {rows.shape[1]} simulations. "
-            "Below about 50, couple the new batch instead."
+            f"effective sample size {smallest:.1f} of {len(self.contexts)} "
+            "simulations. Below about 50, couple the new batch instead."
         )
-        return rows
+        return features
+
+    # --- density ---
 
     def log_prob(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
         r"""Return :math:`\log \sum_j \alpha_{ij} q(\theta \mid h(x_{s,j}))`.
 
         Args:
             input: theta, shape ``(S, B, d)`` or ``(B, d)``; B or 1 of them.
-            condition: Real observations, shape ``(B, *event)``.
+            condition: Real observations, shape ``(B, *event)``; B or 1 of them.
             **kwargs: None; kept for sbi's signature.
 
         Returns:
             Shape ``(S, B)``. With ``tail_mass`` = t the density is too small by at most
             t times the largest density among the components left out.
         """
-        if input.shape[-len(self.input_shape) :] != self.input_shape:
-            raise InvalidInputError(
-                f"Expected `theta` of shape (..., {self.input_shape[0]}); got "
-                f"{tuple(input.shape)}."
-            )
-        if torch.isnan(input).any():
-            raise InvalidInputError("Expected `theta` without NaN.")
-        if input.ndim == len(self.input_shape) + 1:
-            input = input[None]
-        weights = self.rows(condition)
-        num_rows = max(input.shape[1], weights.shape[0])
-        if {input.shape[1], weights.shape[0]} - {1, num_rows}:
+        theta = self._checked(input)
+        features = self.features(condition)
+        num_rows = max(theta.shape[1], len(features))
+        if {theta.shape[1], len(features)} - {1, num_rows}:
             raise InvalidInputError(
                 "Expected as many rows of `theta` as observations, or one of them; "
-                f"got theta {tuple(input.shape)} and {weights.shape[0]} observations."
+                f"got theta {tuple(input.shape)} and {len(features)} observations."
             )
-        theta = input.expand(-1, num_rows, *self.input_shape)
-        weights = weights.expand(num_rows, -1)
-        theta = theta.to(self.contexts)
-
-        kept, counts, order = self._without_tail(weights)
-        # A block of rows times a chunk of theta fits into MAX_EVALUATIONS, unless a
-        # single theta and row have more components than that.
-        step = max(1, MAX_EVALUATIONS // int(counts.max()))
-        blocks = [
-            torch.cat(
-                [
-                    self._block_log_prob(part[:, block], order, kept, counts, block)
-                    for block in _blocks(counts, max(1, MAX_EVALUATIONS // len(part)))
-                ],
-                dim=1,
-            )
-            for part in theta.split(step)
+        keep_freed_memory(theta.device)
+        shape = (len(theta), num_rows)
+        # One observation serves all theta with one row of weights.
+        num_columns = len(features)
+        theta = theta.expand(-1, num_rows, *self.input_shape)
+        theta = theta.reshape(-1, num_columns, *self.input_shape)
+        parts = [
+            self._block_log_prob(theta[:, block], weights)
+            for block, weights in self.row_blocks(features)
         ]
-        return torch.cat(blocks)
+        return torch.cat(parts, dim=1).reshape(shape).to(theta)
+
+    def _checked(self, theta: Tensor) -> Tensor:
+        """Return theta as ``(S, B, d)``."""
+        if theta.shape[-len(self.input_shape) :] != self.input_shape:
+            raise InvalidInputError(
+                f"Expected `theta` of shape (..., {self.input_shape[0]}); got "
+                f"{tuple(theta.shape)}."
+            )
+        if torch.isnan(theta).any():
+            raise InvalidInputError("Expected `theta` without NaN.")
+        if theta.ndim == len(self.input_shape) + 1:
+            theta = theta[None]
+        return theta.to(self.contexts)
+
+    def _block_log_prob(self, theta: Tensor, weights: Tensor) -> Tensor:
+        """Return the log density of theta ``(S, b, d)`` for rows ``(b, n_s)``."""
+        row, component, log_weights = self._without_tail(weights)
+        parts = []
+        for part in theta.split(num_fitting(len(row))):
+            log_terms = self._log_q(part, row, component).double() + log_weights
+            parts.append(_log_sum_exp(log_terms, row, len(weights)))
+        return torch.cat(parts)
 
     def _without_tail(self, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Sort each row and count the components that carry 1 - tail_mass of it."""
-        sorted_weights, order = weights.sort(dim=1, descending=True)
+        """Return row, component and log weight of those that carry 1 - tail_mass."""
         # Summed from the small end, where the digits are.
-        tail = sorted_weights.flip(1).cumsum(dim=1).flip(1)
-        counts = ((tail > self.tail_mass) & (sorted_weights > 0)).sum(dim=1)
-        return sorted_weights, counts.clamp_min(1), order
+        ascending, order = weights.sort(dim=1)
+        tail = ascending.cumsum(dim=1, dtype=torch.float64)
+        kept = (tail > self.tail_mass) & (ascending > 0)
+        kept[:, -1] = True
+        row = kept.nonzero()[:, 0]
+        return row, order[kept], ascending[kept].double().log()
 
-    def _block_log_prob(
-        self,
-        theta: Tensor,
-        order: Tensor,
-        sorted_weights: Tensor,
-        counts: Tensor,
-        block: slice,
-    ) -> Tensor:
-        counts = counts[block]
-        rows = torch.arange(len(counts), device=theta.device).repeat_interleave(counts)
-        rank = torch.arange(len(rows), device=theta.device)
-        rank = rank - (counts.cumsum(0) - counts)[rows]
-        log_q = self.components.log_prob(
-            theta[:, rows], condition=self.contexts[order[block][rows, rank]]
-        )
-        log_terms = log_q.double() + sorted_weights[block][rows, rank].log()
+    def _log_q(self, theta: Tensor, row: Tensor, component: Tensor) -> Tensor:
+        """Evaluate K components at theta of their row, ``(S, b, d)`` to ``(S, K)``.
 
-        # A log-sum-exp over the components of each row.
-        shape = (len(theta), len(counts))
-        index = rows.expand_as(log_terms)
-        largest = log_terms.detach().new_full(shape, -torch.inf)
-        largest = largest.scatter_reduce(1, index, log_terms.detach(), "amax")
-        largest = largest.where(torch.isfinite(largest), 0.0)
-        terms = (log_terms - largest.gather(1, index)).exp()
-        total = torch.zeros_like(largest).index_add(1, rows, terms)
-        return (total.log() + largest).to(theta.dtype)
+        The flow sees batches of its own size, whatever rows and samples they mix.
+        """
+        shape = (len(theta), len(row))
+        pairs = torch.arange(len(theta) * len(row), device=theta.device)
+        log_q = []
+        for batch in pairs.split(flow_batch(theta.device)):
+            sample, k = batch // len(row), batch % len(row)
+            log_q.append(
+                self.components.log_prob(
+                    theta[sample, row[k]][None],
+                    condition=self.contexts[component[k]],
+                )[0]
+            )
+        return torch.cat(log_q).reshape(shape)
 
-    def sample(
-        self, sample_shape: torch.Size, condition: Tensor, **kwargs: Any
-    ) -> Tensor:
-        """Draw from the mixtures, ``(*sample_shape, B, d)``; no support is enforced."""
-        weights = self.rows(condition)
-        num_samples = torch.Size(sample_shape).numel()
-        rows = torch.arange(len(weights), device=weights.device).repeat(num_samples)
-        theta = self.draw(rows, weights)
-        return theta.reshape(*sample_shape, len(weights), *self.input_shape)
+    # --- samples ---
 
     @torch.no_grad()
-    def draw(
-        self, rows: Tensor, weights: Tensor, *, batch_size: int = MAX_EVALUATIONS
+    def sample(
+        self,
+        sample_shape: torch.Size,
+        condition: Tensor,
+        *,
+        accept: Accept | None = None,
+        batch_size: int | None = None,
+        show_progress_bars: bool = False,
+        **kwargs: Any,
     ) -> Tensor:
-        """Draw one theta for each entry of ``rows``, an index into ``weights``."""
-        # Inverse transform: row i fills the interval [i, i + 1], so that one search
-        # serves all rows.
-        cumulative = weights.cumsum(dim=1)
-        cumulative = cumulative / cumulative[:, -1:]
-        cumulative += torch.arange(len(weights), device=weights.device)[:, None]
-        # Rounding may carry a draw past the end of its row.
-        positive = (weights > 0).flip(1).to(torch.int8)
-        last = weights.shape[1] - 1 - positive.argmax(dim=1)
-        theta = []
-        for part in rows.split(batch_size):
-            uniform = torch.rand(len(part), dtype=weights.dtype, device=part.device)
-            # right=True passes over components of weight zero.
-            found = torch.searchsorted(cumulative.flatten(), uniform + part, right=True)
-            components = (found - part * weights.shape[1]).clamp_min(0)
-            condition = self.contexts[torch.minimum(components, last[part])]
-            draws = self.components.sample(torch.Size((1,)), condition=condition)
-            theta.append(draws[0])
-        return torch.cat(theta)
+        """Draw from the mixtures of a batch.
+
+        Args:
+            sample_shape: Shape of the draws of each observation.
+            condition: Real observations, shape ``(B, *event)``.
+            accept: Tells which draws ``(n, d)`` to keep; None keeps all.
+            batch_size: Most draws the flow makes at a time; if None what is fast on the
+                device.
+            show_progress_bars: Whether to show the draws accepted so far.
+            **kwargs: None; kept for sbi's signature.
+
+        Returns:
+            Shape ``(*sample_shape, B, d)``.
+
+        Raises:
+            SamplingError: If next to nothing is accepted for some observation.
+        """
+        keep_freed_memory(self.contexts.device)
+        features = self.features(condition)
+        num_samples = torch.Size(sample_shape).numel()
+        shape = (num_samples, len(features), *self.input_shape)
+        theta = self.contexts.new_empty(shape)
+        total = num_samples * len(features)
+        with tqdm(total=total, desc="Sampling", disable=not show_progress_bars) as bar:
+            for block, weights in self.row_blocks(features):
+                sampler = BlockSampler(
+                    self.components,
+                    self.contexts,
+                    weights,
+                    accept=accept,
+                    batch_size=batch_size or flow_batch(theta.device),
+                    first_row=block.start,
+                )
+                for part in blocks(num_samples, len(weights)):
+                    theta[part, block] = sampler.sample(part.stop - part.start)
+                    bar.update((part.stop - part.start) * len(weights))
+        return theta.reshape(*sample_shape, *shape[1:])
 
     def loss(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
         """Return the negative log-probability, shape ``(B,)``."""
@@ -239,12 +279,13 @@ def _keys(x: Tensor) -> list[bytes]:
     return [hashlib.blake2b(row.tobytes(), digest_size=16).digest() for row in rows]
 
 
-def _blocks(counts: Tensor, limit: int) -> list[slice]:
-    """Cut rows into blocks of at most ``limit`` components, or one row."""
-    blocks, start, filled = [], 0, 0
-    for i, count in enumerate(counts.tolist()):
-        if i > start and filled + count > limit:
-            blocks.append(slice(start, i))
-            start, filled = i, 0
-        filled += count
-    return [*blocks, slice(start, len(counts))]
+def _log_sum_exp(log_terms: Tensor, row: Tensor, num_rows: int) -> Tensor:
+    """Sum the terms ``(S, K)`` of each row, ``(S, num_rows)``."""
+    index = row.expand_as(log_terms)
+    shape = (len(log_terms), num_rows)
+    largest = log_terms.detach().new_full(shape, -torch.inf)
+    largest = largest.scatter_reduce(1, index, log_terms.detach(), "amax")
+    largest = largest.where(torch.isfinite(largest), 0.0)
+    terms = (log_terms - largest.gather(1, index)).exp()
+    total = torch.zeros_like(largest).index_add(1, row, terms)
+    return total.log() + largest

@@ -53,8 +53,8 @@ class CouplingLike(Protocol):
     """What :func:`effective_sample_sizes` reads of a coupling."""
 
     @property
-    def weights(self) -> Tensor:
-        """Mixture weights, shape ``(n_o, n_s)``."""
+    def potential(self) -> Tensor:
+        """One number for each simulation, shape ``(n_s,)``."""
         ...
 
     @property
@@ -173,7 +173,7 @@ def effective_sample_sizes(coupling: CouplingLike) -> "Figure":
     """
     figure, axes = new_figure(6.0, 3.6)
     sizes = coupling.effective_sample_size.detach().cpu().double()
-    num_simulations = coupling.weights.shape[1]
+    num_simulations = len(coupling.potential)
     edges = torch.logspace(0, math.log10(max(num_simulations, 2)), 41).tolist()
     median = float(sizes.median())
     axes.hist(sizes.clamp(edges[0], edges[-1]), bins=edges, color=SKY)

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
-from sbi_rope._validation import check_batch, check_choice, check_positive_integer
+from sbi_rope._validation import check_batch, check_choice, check_integer
 from sbi_rope.errors import InvalidInputError, InvalidTypeError
 from sbi_rope.tasks.splits import MAX_SEED, Part
 
@@ -132,7 +132,7 @@ class Task(ABC):
         return self._checked_set(n, seed=seed, part="test")
 
     def _checked_set(self, n: int, *, seed: int, part: Part) -> tuple[Tensor, Tensor]:
-        check_positive_integer("n", n)
+        check_integer("n", n)
         _check_seed(seed)
         return self._labelled_set(n, seed=seed, part=part)
 

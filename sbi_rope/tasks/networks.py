@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._validation import check_batch, check_positive_integer
+from sbi_rope._validation import check_batch, check_integer
 from sbi_rope.errors import InvalidInputError
 
 __all__ = ["SeriesEmbedding", "fully_connected"]
@@ -48,9 +48,9 @@ class SeriesEmbedding(nn.Module):
         self, *, num_steps: int = 200, output_dim: int = 10, padding: int = 1
     ) -> None:
         super().__init__()
-        check_positive_integer("num_steps", num_steps)
-        check_positive_integer("output_dim", output_dim)
-        check_positive_integer("padding", padding)
+        check_integer("num_steps", num_steps)
+        check_integer("output_dim", output_dim)
+        check_integer("padding", padding)
         self.num_steps = num_steps
         self.features = _convolutions(padding)
         self.num_features = self._count_features(padding)

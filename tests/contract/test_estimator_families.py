@@ -1,14 +1,22 @@
 """Every estimator of sbi that RoPE works with can be split, tuned and mixed."""
 
 import copy
+import functools
+import pickle
 import warnings
+from dataclasses import dataclass
 from typing import Any
 
 import pytest
 import torch
+from sbi.inference import MNPE, DirectPosterior
+from sbi.inference.posteriors import DirectPosteriorParameters
+from sbi.neural_nets import factory, posterior_nn
+from sbi.utils import MultipleIndependent, within_support
 from torch import Tensor, nn
+from torch.distributions import Bernoulli, Categorical, Distribution, Gamma
 
-from sbi_rope import CalibrationFinetuner, RoPE
+from sbi_rope import CalibrationFinetuner, MixturePosterior, RoPE, SinkhornCoupler
 from sbi_rope._sbi import (
     VectorFieldDensity,
     embed,
@@ -18,13 +26,15 @@ from sbi_rope._sbi import (
     posterior_from,
     with_embedding,
 )
-from sbi_rope.errors import LogProbUnavailableError
+from sbi_rope.errors import InvalidInputError, LogProbUnavailableError
 from sbi_rope.finetuning import trainable_copy
+from sbi_rope.mixture import MixtureEstimator
 from tests import problems
 
 IDENTITY = "identity"
+QUIET = {"show_progress_bars": False}
 
-# Family, embedding net, z_score_x, dimension of theta.
+# Family, embedding net, z_score_x, number of continuous parameters.
 CASES = [
     *[
         pytest.param(family, embedding, "independent", 2, id=f"{family}-{embedding}")
@@ -47,18 +57,35 @@ CASES = [
         pytest.param(family, "cnn", "independent", 2, id=f"{family}-image")
         for family in problems.FAMILIES
     ],
+    *[
+        pytest.param("mnpe", embedding, z_score_x, 1, id=f"mnpe-{name}")
+        for name, embedding, z_score_x in (
+            ("none", "none", "independent"),
+            ("linear", "linear", "independent"),
+            (IDENTITY, "none", "none"),
+            ("no z-score", "linear", "none"),
+            ("image", "cnn", "independent"),
+        )
+    ],
+    pytest.param("mnle", "linear", "independent", 1, id="mnle-linear"),
 ]
 
 
 @pytest.fixture
-def estimator(request: pytest.FixtureRequest) -> Any:
-    """The trained estimator itself, shared by the session: it must not change."""
-    return estimator_of(problems.npe_posterior(*request.param))
+def npe(request: pytest.FixtureRequest) -> Any:
+    """The posterior of an NPE, shared by the session: it must not change."""
+    return problems.npe_posterior(*request.param)
 
 
-def batch_for(estimator: Any, size: int = 6) -> tuple[Tensor, Tensor]:
-    theta = 2 * torch.rand(4, size, *estimator.input_shape) - 1
-    return theta, torch.randn(size, *estimator.condition_shape)
+@pytest.fixture
+def estimator(npe: Any) -> Any:
+    """The trained estimator itself."""
+    return estimator_of(npe)
+
+
+def batch_for(npe: Any, size: int = 6) -> tuple[Tensor, Tensor]:
+    theta = npe.prior.sample((4 * size,)).reshape(4, size, -1)
+    return theta, torch.randn(size, *estimator_of(npe).condition_shape)
 
 
 def with_cases(*, embedding: str | None = None) -> Any:
@@ -67,12 +94,20 @@ def with_cases(*, embedding: str | None = None) -> Any:
         for case in CASES
         if embedding is None or case.values[1] == embedding
     ]
-    return pytest.mark.parametrize("estimator", cases, indirect=True)
+    return pytest.mark.parametrize("npe", cases, indirect=True)
+
+
+def test_every_name_of_sbi_is_among_the_cases_or_refused() -> None:
+    refused = {"tabpfn"}  # tests/unit/test_sbi.py
+    tested = {case.values[0] for case in CASES}
+    assert set(factory.model_builders) == tested | refused
 
 
 @with_cases()
-def test_the_density_on_embeddings_is_that_of_the_estimator(estimator: Any) -> None:
-    theta, x = batch_for(estimator)
+def test_the_density_on_embeddings_is_that_of_the_estimator(
+    npe: Any, estimator: Any
+) -> None:
+    theta, x = batch_for(npe)
     q, contexts = headless(estimator), embed(embedding_of(estimator), x)
     assert contexts.shape == (6, *q.condition_shape)
     assert contexts.std(dim=0).min() > 0, "the embedding ignores x"
@@ -82,8 +117,10 @@ def test_the_density_on_embeddings_is_that_of_the_estimator(estimator: Any) -> N
 
 
 @with_cases()
-def test_the_samples_on_embeddings_are_those_of_the_estimator(estimator: Any) -> None:
-    _, x = batch_for(estimator)
+def test_the_samples_on_embeddings_are_those_of_the_estimator(
+    npe: Any, estimator: Any
+) -> None:
+    _, x = batch_for(npe)
     q, contexts = headless(estimator), embed(embedding_of(estimator), x)
     with torch.no_grad():
         torch.manual_seed(3)
@@ -95,7 +132,7 @@ def test_the_samples_on_embeddings_are_those_of_the_estimator(estimator: Any) ->
 
 
 @with_cases()
-def test_splitting_leaves_the_estimator_as_it_was(estimator: Any) -> None:
+def test_splitting_leaves_the_estimator_as_it_was(npe: Any, estimator: Any) -> None:
     state = copy.deepcopy(estimator.state_dict())
     modules = dict(estimator.named_modules(remove_duplicate=False))
     shape, embedding = estimator.condition_shape, embedding_of(estimator)
@@ -116,9 +153,9 @@ def test_splitting_leaves_the_estimator_as_it_was(estimator: Any) -> None:
 
 @with_cases()
 def test_a_tuned_embedding_in_its_place_changes_the_density_accordingly(
-    estimator: Any,
+    npe: Any, estimator: Any
 ) -> None:
-    theta, x = batch_for(estimator)
+    theta, x = batch_for(npe)
     h, q = embedding_of(estimator), headless(estimator)
     g = trainable_copy(h, embed(h, x))
     with torch.no_grad():
@@ -131,9 +168,9 @@ def test_a_tuned_embedding_in_its_place_changes_the_density_accordingly(
 
 @with_cases(embedding="none")
 def test_without_an_embedding_net_the_standardised_x_is_the_embedding(
-    estimator: Any,
+    npe: Any, estimator: Any
 ) -> None:
-    h, (_, x) = embedding_of(estimator), batch_for(estimator)
+    h, (_, x) = embedding_of(estimator), batch_for(npe)
     assert list(h.parameters()) == []
     # An affine map of each entry, the identity with z_score_x="none".
     shift = embed(h, torch.zeros(1, 3))
@@ -143,9 +180,9 @@ def test_without_an_embedding_net_the_standardised_x_is_the_embedding(
 
 @with_cases()
 def test_tuning_starts_at_the_embedding_and_follows_shifted_targets(
-    estimator: Any,
+    npe: Any, estimator: Any
 ) -> None:
-    h, (_, x) = embedding_of(estimator), batch_for(estimator, size=30)
+    h, (_, x) = embedding_of(estimator), batch_for(npe, size=30)
     before = embed(h, x)
     start = trainable_copy(h, before)
     assert all(p.requires_grad for p in start.parameters())
@@ -162,40 +199,145 @@ def test_tuning_starts_at_the_embedding_and_follows_shifted_targets(
     assert torch.equal(embed(h, x), before), "tuning changed the embedding net itself"
 
 
-@pytest.mark.parametrize(
+@dataclass(frozen=True)
+class Repaired:
+    """A posterior repaired by RoPE, with what it was made of."""
+
+    npe: Any
+    before: dict[str, Tensor]
+    rope: RoPE
+    posterior: MixturePosterior
+
+    @property
+    def x_o(self) -> Tensor:
+        return self.posterior.x_o
+
+
+@functools.cache
+def repaired(family: str, embedding: str = "linear", dim: int = 2) -> Repaired:
+    """Repair a posterior of the family once a session; for reading only."""
+    npe = problems.npe_posterior(family, embedding, "independent", dim)
+    before = copy.deepcopy(npe.posterior_estimator.state_dict())
+    simulate = problems.simulate_image if embedding == "cnn" else problems.simulate
+    with torch.random.fork_rng():
+        torch.manual_seed(2)
+        theta = npe.prior.sample((30,))
+        x = simulate(theta) + 0.2
+        finetuner = CalibrationFinetuner(num_steps=3)
+        rope = RoPE(npe, simulator=simulate, finetuner=finetuner)
+        rope.append_calibration(theta[:10], x[:10]).train(seed=0, **QUIET)
+        posterior = rope.build_posterior(x[10:], num_simulations=8, seed=0)
+    return Repaired(npe, before, rope, posterior)
+
+
+REPAIRED = pytest.mark.parametrize(
     ("family", "embedding", "dim"),
     [
         *[(family, "linear", 2) for family in problems.FAMILIES],
+        *[(family, "linear", 1) for family in problems.MIXED_FAMILIES],
         ("maf", "cnn", 2),
         ("zuko_nsf", "cnn", 2),
+        ("mnpe", "cnn", 1),
         ("maf", "none", 1),
+        ("mnpe", "none", 1),
         ("zuko_maf", "linear", 1),
     ],
 )
+
+
+@REPAIRED
 def test_rope_repairs_posteriors_of_the_family(
     family: str, embedding: str, dim: int
 ) -> None:
-    npe = problems.npe_posterior(family, embedding, "independent", dim)
-    simulate = problems.simulate_image if embedding == "cnn" else problems.simulate
-    theta = npe.prior.sample((30,))
-    x = simulate(theta) + 0.2
-    state = copy.deepcopy(npe.posterior_estimator.state_dict())
+    case = repaired(family, embedding, dim)
+    posterior, x_o = case.posterior, case.x_o
+    samples = posterior.sample_batched((3,), x_o, **QUIET)
+    assert samples.shape == (3, 20, *posterior.posterior_estimator.input_shape)
+    assert within_support(case.npe.prior, samples).all()
 
-    rope = RoPE(npe, simulator=simulate, finetuner=CalibrationFinetuner(num_steps=3))
-    rope.append_calibration(theta[:10], x[:10]).train(seed=0, show_progress_bars=False)
-    posterior = rope.build_posterior(x[10:], num_simulations=25, seed=0)
-
-    samples = posterior.sample_batched((3,), x[10:], show_progress_bars=False)
-    assert samples.shape == (3, 20, dim)
-    # The mass inside the prior takes draws, which this family makes one by one.
-    norm = family != "zuko_unaf"
-    log_prob = posterior.log_prob_batched(samples, x[10:], norm_posterior=norm)
+    log_prob = posterior.log_prob_batched(samples, x_o, norm_posterior=False)
     assert log_prob.shape == (3, 20)
     assert torch.isfinite(log_prob).all()
-    one = posterior.log_prob(samples[:, 4], x=x[14], norm_posterior=norm)
+    one = posterior.log_prob(samples[:, 4], x=x_o[4], norm_posterior=False)
     assert torch.allclose(one, log_prob[:, 4], atol=1e-4)
-    after = npe.posterior_estimator.state_dict()
-    assert all(torch.equal(after[key], value) for key, value in state.items())
+    # Parameters of other observations, far in the tails of most components.
+    other = case.npe.prior.sample((20,))
+    log_prob_of_other = posterior.log_prob_batched(other, x_o, norm_posterior=False)
+    assert not log_prob_of_other.isnan().any()
+
+    # The mass inside the prior takes draws, which this family makes one by one.
+    if family != "zuko_unaf":
+        normalised = posterior.log_prob_batched(samples, x_o)
+        assert (normalised >= log_prob - 1e-5).all()
+        assert torch.isfinite(normalised).all()
+
+
+@REPAIRED
+def test_rope_leaves_posteriors_of_the_family_as_they_were(
+    family: str, embedding: str, dim: int
+) -> None:
+    case = repaired(family, embedding, dim)
+    after = case.npe.posterior_estimator.state_dict()
+    assert after.keys() == case.before.keys()
+    assert all(torch.equal(after[key], value) for key, value in case.before.items())
+    assert all(p.requires_grad for p in case.npe.posterior_estimator.parameters())
+    ours = {id(p) for p in case.posterior.posterior_estimator.parameters()}
+    assert not ours & {id(p) for p in case.npe.posterior_estimator.parameters()}
+
+
+@REPAIRED
+def test_repaired_posteriors_of_the_family_can_be_pickled(
+    family: str, embedding: str, dim: int
+) -> None:
+    case = repaired(family, embedding, dim)
+    theta = case.npe.prior.sample((20,))
+    copied = pickle.loads(pickle.dumps(case.posterior))
+    assert torch.equal(
+        copied.log_prob_batched(theta, case.x_o, norm_posterior=False),
+        case.posterior.log_prob_batched(theta, case.x_o, norm_posterior=False),
+    )
+
+
+@REPAIRED
+def test_the_tuned_posterior_of_the_family_is_the_flow_on_the_tuned_embedding(
+    family: str, embedding: str, dim: int
+) -> None:
+    case = repaired(family, embedding, dim)
+    tuned = case.rope.tuned_posterior()
+    assert type(tuned) is DirectPosterior
+    theta = case.npe.prior.sample((20,))
+    g, h = case.rope.tuned_embedding_net, case.rope.embedding_net
+    assert not torch.equal(embed(g, case.x_o), embed(h, case.x_o))
+    q = headless(case.npe.posterior_estimator)
+    expected = q.log_prob(theta[None], embed(g, case.x_o))
+    log_prob = tuned.log_prob_batched(theta, case.x_o, norm_posterior=False)
+    assert torch.allclose(log_prob, expected, atol=1e-4)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of draws outside the prior's support
+        samples = tuned.sample_batched(
+            (2,), case.x_o, reject_outside_prior=False, **QUIET
+        )
+    assert samples.shape == (2, *theta.shape)
+    assert torch.isfinite(samples).all()
+
+
+@pytest.mark.parametrize(
+    "family",
+    [
+        # Its thousands of draws are made one by one.
+        pytest.param(family, marks=[pytest.mark.slow] if family == "zuko_unaf" else [])
+        for family in problems.FAMILIES
+    ],
+)
+def test_densities_of_the_family_integrate_to_one_inside_the_prior(
+    family: str,
+) -> None:
+    posterior = repaired(family, dim=1).posterior[0]
+    edges = torch.linspace(-1, 1, 101)
+    theta = (edges[1:] + edges[:-1])[:, None] / 2
+    density = posterior.log_prob(theta).exp()
+    # 1024 draws behind the mass of each component, and steps of 0.02.
+    assert float(density.sum() * 0.02) == pytest.approx(1.0, abs=0.02)
 
 
 @pytest.mark.parametrize("method", ["fmpe", "npse"])
@@ -243,3 +385,145 @@ def test_sampling_a_vector_field_does_not_warn_of_draws_it_will_reject() -> None
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message=".*outside the prior support")
         posterior.sample((50,), x=posterior.x_o[0], show_progress_bars=False)
+
+
+# --- discrete parameters ---
+
+
+def train_mnpe(prior: Distribution, theta: Tensor, **options: Any) -> MNPE:
+    builder = posterior_nn("mnpe", hidden_features=16, **options)
+    mnpe = MNPE(prior, density_estimator=builder, **QUIET)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        mnpe.append_simulations(theta, problems.simulate(theta))
+        mnpe.train(max_num_epochs=1)
+    return mnpe
+
+
+def mixed_mixture(npe: Any, *, n_o: int = 20) -> tuple[MixturePosterior, Tensor]:
+    """A mixture of mixed densities, and the simulations behind it."""
+    h = embedding_of(npe.posterior_estimator)
+    x_s, x_o = (problems.simulate(npe.prior.sample((n,))) for n in (10, n_o))
+    contexts = embed(h, x_s)
+    coupling = SinkhornCoupler(gamma=0.1, tau=0.9).couple(embed(h, x_o), contexts)
+    estimator = MixtureEstimator(
+        headless(copy.deepcopy(npe.posterior_estimator)),
+        contexts,
+        coupling,
+        x_o,
+        embedding_net=h,
+        tail_mass=0.0,
+    )
+    return MixturePosterior(estimator, copy.deepcopy(npe.prior)), x_s
+
+
+def with_categories(theta: Tensor, first: float, second: float) -> Tensor:
+    """Append two discrete parameters to continuous ones."""
+    return torch.cat([theta, torch.tensor([[first, second]]).expand(len(theta), 2)], 1)
+
+
+@pytest.mark.parametrize("dim", [1, 2])
+def test_the_mixed_density_is_the_sum_over_all_simulations(dim: int) -> None:
+    npe = problems.npe_posterior("mnpe", dim=dim)
+    posterior, x_s = mixed_mixture(npe)
+    theta = npe.prior.sample((100,)).reshape(5, 20, -1)
+    with torch.no_grad():
+        log_q = torch.stack(
+            [npe.posterior_estimator.log_prob(theta, x[None]) for x in x_s], dim=-1
+        )
+    expected = torch.logsumexp(log_q + posterior.weights.log(), dim=-1).float()
+    log_prob = posterior.log_prob_batched(theta, posterior.x_o, norm_posterior=False)
+    assert torch.allclose(log_prob, expected, atol=1e-4)
+
+
+def test_the_mixed_density_has_the_masses_of_its_samples() -> None:
+    # Trained for long enough that the parts depend on each other.
+    npe = problems.npe_posterior("mnpe", dim=1, num_epochs=60)
+    posterior = mixed_mixture(npe)[0][0]
+    samples = posterior.sample((20_000,), **QUIET)
+    edges = torch.linspace(-1, 1, 101)
+    grid = (edges[1:] + edges[:-1])[:, None] / 2
+    total = 0.0
+    for first in (0.0, 1.0, 2.0):
+        for second in (0.0, 1.0):
+            density = posterior.log_prob(with_categories(grid, first, second)).exp()
+            chosen = (samples[:, 1] == first) & (samples[:, 2] == second)
+            # Five standard errors of the frequency.
+            assert float(density.sum() * 0.02) == pytest.approx(
+                float(chosen.double().mean()), abs=0.018
+            )
+            mean = float((grid[:, 0] * density).sum() / density.sum())
+            assert mean == pytest.approx(float(samples[chosen, 0].mean()), abs=0.06)
+            total += float(density.sum() * 0.02)
+    assert total == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize("value", [-1.0, 0.5, 3.0])
+def test_mixed_densities_are_zero_between_and_beyond_the_categories(
+    value: float,
+) -> None:
+    posterior, _ = mixed_mixture(problems.npe_posterior("mnpe", dim=1))
+    theta = with_categories(torch.zeros(20, 1), value, 0.0)
+    for norm in (True, False):
+        log_prob = posterior.log_prob_batched(theta, posterior.x_o, norm_posterior=norm)
+        assert (log_prob == -torch.inf).all()
+
+
+def test_log_transformed_densities_are_zero_at_zero_and_below() -> None:
+    prior = MultipleIndependent(
+        [Gamma(torch.ones(1), torch.ones(1)), Bernoulli(torch.tensor([0.5]))],
+        validate_args=False,
+    )
+    npe = train_mnpe(prior, prior.sample((100,)), log_transform_x=True)
+    q = headless(npe.build_posterior().posterior_estimator)
+    theta = torch.tensor([[-1.0, 0.0], [0.0, 1.0], [1.0, 0.0]])
+    log_prob = q.log_prob(theta[:, None], torch.zeros(1, 3)).flatten()
+    assert (log_prob == -torch.inf).tolist() == [True, True, False]
+    assert torch.isfinite(log_prob[2])
+
+
+@pytest.mark.parametrize("missing", [0.0, 1.0, 2.0])
+def test_a_category_that_was_never_trained_on_has_no_mass(missing: float) -> None:
+    prior = problems.mixed_prior(1)
+    theta = prior.sample((200,))
+    theta = theta[theta[:, 1] != missing]
+    posterior, _ = mixed_mixture(train_mnpe(prior, theta).build_posterior())
+    for value in (0.0, 1.0, 2.0):
+        log_prob = posterior.log_prob_batched(
+            with_categories(torch.zeros(20, 1), value, 0.0), posterior.x_o
+        )
+        assert ((log_prob == -torch.inf) == (value == missing)).all()
+
+
+def test_calibration_parameters_between_categories_are_refused() -> None:
+    rope = RoPE(problems.npe_posterior("mnpe", dim=1), simulator=problems.simulate)
+    theta = with_categories(torch.zeros(10, 1), 1.0, 0.0)
+    x = problems.simulate(theta)
+    theta[3, 2] = 0.5
+    with pytest.raises(InvalidInputError, match=r"1 of 10 rows .*\[3\]"):
+        rope.append_calibration(theta, x)
+
+
+def test_a_prior_that_sbi_cannot_transform_works_without_the_transform() -> None:
+    # Categorical has no mean, which sbi's transform of discrete priors needs.
+    prior = MultipleIndependent(
+        [problems.box(2), Categorical(torch.ones(1, 3))], validate_args=False
+    )
+    npe = train_mnpe(prior, prior.sample((100,))).build_posterior(
+        posterior_parameters=DirectPosteriorParameters(enable_transform=False)
+    )
+    posterior = RoPE(npe, simulator=problems.simulate).build_posterior(
+        problems.simulate(prior.sample((20,))), num_simulations=8, seed=0
+    )
+    samples = posterior.sample_batched((2,), posterior.x_o, **QUIET)
+    assert within_support(prior, samples).all()
+    assert torch.isfinite(posterior.log_prob_batched(samples, posterior.x_o)).all()
+
+
+def test_the_maximum_of_a_mixed_density_has_categories() -> None:
+    posterior, _ = mixed_mixture(problems.npe_posterior("mnpe", dim=1))
+    view = posterior[0]
+    best = view.map(num_init_samples=20, num_iter=20, **QUIET)
+    assert within_support(view.prior, best).all()
+    samples = view.sample((200,), **QUIET)
+    assert view.potential(best) >= view.potential(samples).quantile(0.9)

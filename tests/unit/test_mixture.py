@@ -2,7 +2,11 @@
 
 import copy
 import math
+import subprocess
+import sys
 import warnings
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,17 +25,17 @@ from sbi_rope.errors import (
     SamplingError,
     UnseenObservationError,
 )
-from sbi_rope.mixture import MixtureEstimator, MixturePosterior
-from sbi_rope.mixture import estimator as estimator_module
+from sbi_rope.mixture import MixtureEstimator, MixturePosterior, chunks
+from sbi_rope.mixture import sampling as sampling_module
 from sbi_rope.mixture import truncation as truncation_module
 from tests import problems
-from tests.problems import brute_force_log_prob, gaussian_posterior
+from tests.problems import TableCoupling, brute_force_log_prob, gaussian_posterior
 
 QUIET = {"show_progress_bars": False}
 
 
 def flow_posterior(
-    family: str = "maf", *, n_o: int = 6, tail_mass: float = 0.0
+    family: str = "maf", *, n_o: int = 6, tail_mass: float = 0.0, **coupler: Any
 ) -> MixturePosterior:
     """A mixture of trained flows, coupled by a sharp coupler."""
     npe = problems.npe_posterior(family)
@@ -41,7 +45,9 @@ def flow_posterior(
     contexts = embed(h, x_s)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RoPEWarning)
-        coupling = SinkhornCoupler(gamma=0.1, tau=0.9).couple(embed(h, x_o), contexts)
+        coupling = SinkhornCoupler(gamma=0.1, tau=0.9, **coupler).couple(
+            embed(h, x_o), contexts
+        )
     estimator = MixtureEstimator(
         headless(copy.deepcopy(npe.posterior_estimator)),
         contexts,
@@ -109,19 +115,42 @@ def test_log_prob_of_trained_flows_is_the_log_sum_over_all_components(
     )
 
 
-@pytest.mark.parametrize("limit", [1, 3, 7, 50, 1000])
-@pytest.mark.parametrize("tail_mass", [0.0, 0.05])
-def test_chunking_changes_nothing(
-    limit: int, tail_mass: float, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("blocked", [False, True])
+def test_every_kind_of_coupling_gives_the_log_sum_of_its_own_weights(
+    dtype: torch.dtype, blocked: bool
 ) -> None:
-    posterior = gaussian_posterior(n_o=7, n_s=20, tail_mass=tail_mass)
+    posterior = flow_posterior(dtype=dtype, blocked=blocked)
+    assert posterior.coupling.real.dtype is dtype
+    rows = posterior.posterior_estimator.rows(posterior.x_o)
+    assert torch.equal(rows, posterior.weights)
+    theta = 2 * torch.rand(10, 6, 2) - 1
+    expected = brute_force_log_prob(posterior, theta).float()
+    log_prob = log_prob_batched(posterior, theta)
+    assert log_prob.dtype is torch.float32
+    assert torch.allclose(log_prob, expected, atol=1e-4, rtol=1e-5)
+
+
+@pytest.mark.parametrize("entries", [1, 13, 50, 2**19])
+@pytest.mark.parametrize("batch", [1, 7, 50, 2**14])
+@pytest.mark.parametrize("tail_mass", [0.0, 0.05])
+def test_chunking_changes_no_density(
+    entries: int, batch: int, tail_mass: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    posterior = gaussian_posterior(n_o=7, n_s=20, tail_mass=tail_mass, std=0.8)
     theta = 2 * torch.rand(6, 7, 2) - 1
-    whole = log_prob_batched(posterior, theta)
-    monkeypatch.setattr(estimator_module, "MAX_EVALUATIONS", limit)
-    assert torch.allclose(log_prob_batched(posterior, theta), whole, atol=1e-6)
+    whole = posterior.log_prob_batched(theta, posterior.x_o)
+    one = posterior.log_prob(theta[:, 2], x=posterior.x_o[2])
+    monkeypatch.setattr(chunks, "MAX_ENTRIES", entries)
+    monkeypatch.setattr(chunks, "CPU_BATCH", batch)
+    cut = posterior.log_prob_batched(theta, posterior.x_o)
+    assert torch.allclose(cut, whole, atol=1e-6)
+    assert torch.allclose(
+        posterior.log_prob(theta[:, 2], x=posterior.x_o[2]), one, atol=1e-6
+    )
 
 
-def test_the_flow_never_sees_more_pairs_than_it_may(
+def test_the_flow_sees_full_batches_of_pairs_and_never_more(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     posterior = gaussian_posterior(n_o=7, n_s=20)
@@ -133,10 +162,108 @@ def test_the_flow_never_sees_more_pairs_than_it_may(
         return original(input, condition, **kwargs)
 
     monkeypatch.setattr(components, "log_prob", log_prob)
-    monkeypatch.setattr(estimator_module, "MAX_EVALUATIONS", 60)
+    monkeypatch.setattr(chunks, "CPU_BATCH", 60)
     log_prob_batched(posterior, torch.zeros(10, 7, 2))
-    assert max(pairs) <= 60
-    assert sum(pairs) == 10 * 7 * 20
+    assert pairs == [60] * (10 * 7 * 20 // 60) + [10 * 7 * 20 % 60]
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        pytest.param(
+            lambda p: p.log_prob_batched(torch.zeros(9, 30, 2), p.x_o), id="log_prob"
+        ),
+        pytest.param(lambda p: p.sample_batched((20,), p.x_o, **QUIET), id="sample"),
+        pytest.param(lambda p: p.leakage(p.x_o), id="leakage"),
+        pytest.param(
+            lambda p: p.sample_batched((20,), torch.randn(30, 3), **QUIET), id="extend"
+        ),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:Extended")
+def test_weights_and_proposals_stay_within_the_number_of_the_docstring(
+    call: Callable[[MixturePosterior], Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    posterior = gaussian_posterior(n_o=30, n_s=12, std=2.0, unseen="extend")
+    original, inside, entries = TableCoupling.rows, posterior._inside, []
+
+    def rows(coupling: TableCoupling, real: Tensor) -> Tensor:
+        entries.append(len(real) * len(coupling.simulated))
+        return original(coupling, real)
+
+    def accept(theta: Tensor) -> Tensor:
+        entries.append(len(theta))
+        return inside(theta)
+
+    def refuse(coupling: TableCoupling) -> Tensor:
+        raise AssertionError("the matrix of all weights was asked for")
+
+    posterior.leakage(posterior.x_o)  # the draws behind it are cut by the flow's batch
+    monkeypatch.setattr(TableCoupling, "rows", rows)
+    monkeypatch.setattr(TableCoupling, "weights", property(refuse))
+    monkeypatch.setattr(posterior, "_inside", accept)
+    monkeypatch.setattr(chunks, "MAX_ENTRIES", 100)
+    call(posterior)
+    assert max(entries) <= 100
+    # 30 rows of 12 weights, eight at a time.
+    assert entries.count(8 * 12) >= 3
+
+
+MEMORY = """
+import re
+from pathlib import Path
+
+import torch
+
+from sbi_rope.coupling import Coupling
+from sbi_rope.mixture import MixtureEstimator, MixturePosterior
+from tests import problems
+
+
+
+def megabytes(name):
+    # Of this process alone: ru_maxrss starts at the peak of the parent.
+    status = Path("/proc/self/status").read_text()
+    return int(re.search(name + r":\\s+(\\d+)", status)[1]) / 1024
+
+
+n, dim = 6000, 2
+simulated = problems.contexts_of(dim, n)
+coupling = Coupling(
+    potential=torch.zeros(n, dtype=torch.float64), simulated=simulated.double(),
+    real=simulated.double() + 0.01, gamma=0.05, tau=1.0, marginal_error=0.0,
+    batch_error=0.0, num_fitted=n, num_iterations=0, converged=True, solver="none",
+    blocked=True,
+)
+estimator = MixtureEstimator(
+    problems.Gaussians(dim), simulated, coupling, torch.randn(n, 3),
+    embedding_net=torch.nn.Identity(),
+)
+posterior = MixturePosterior(estimator, problems.box(dim))
+before = megabytes("VmRSS")
+Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew
+posterior.log_prob_batched(torch.zeros(n, dim), posterior.x_o)
+posterior.sample_batched((10,), posterior.x_o, show_progress_bars=False)
+estimator.tail_mass = 0.0
+posterior.log_prob_batched(torch.zeros(500, dim), posterior.x_o[:500])
+posterior[0].log_prob(torch.zeros(500, dim))
+print(megabytes("VmHWM") - before)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_memory_stays_within_the_number_of_the_docstring() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", MEMORY],
+        cwd=Path(__file__).resolve().parents[2],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    # One matrix of all weights in double precision takes 288 MB.
+    assert float(done.stdout) < 100
 
 
 @pytest.mark.parametrize("tail_mass", [1e-3, 0.05, 0.5, 0.99, 1.0])
@@ -291,6 +418,29 @@ def test_marginal_samples_have_the_distribution_of_the_density() -> None:
         assert distance < 1.95 / math.sqrt(4000)  # Kolmogorov-Smirnov, level 0.001
 
 
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize(
+    ("entries", "batch"), [(2**19, 2**14), (1, 2**14), (2**19, 50), (70, 33)]
+)
+def test_samples_have_the_cdf_of_the_truncated_mixture_however_they_are_cut(
+    dtype: torch.dtype, entries: int, batch: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    posterior = gaussian_posterior(dim=1, n_o=3, n_s=5, std=0.6, dtype=dtype)
+    monkeypatch.setattr(chunks, "MAX_ENTRIES", entries)
+    monkeypatch.setattr(chunks, "CPU_BATCH", batch)
+    n = 2000
+    samples = posterior.sample_batched((n,), posterior.x_o, **QUIET)[..., 0].double()
+    one = posterior.sample((n,), x=posterior.x_o[1], **QUIET)[:, 0].double()
+    mean, log_std = posterior.posterior_estimator.contexts.double().T
+    components = Normal(mean, log_std.exp())
+    for i, draws in [*enumerate(samples.T), (1, one)]:
+        points = torch.cat([torch.tensor([-1.0, 1.0]), draws.sort().values])[:, None]
+        cdf = components.cdf(points) @ posterior.weights[i].double()
+        u = (cdf[2:] - cdf[0]) / (cdf[1] - cdf[0])
+        distance = (u - (torch.arange(n) + 0.5) / n).abs().max()
+        assert distance < 1.95 / math.sqrt(n)  # Kolmogorov-Smirnov, level 0.001
+
+
 def test_components_are_drawn_with_their_weights_and_never_with_weight_zero() -> None:
     # Components that cannot be confused: a spike at each integer.
     spikes = torch.stack([torch.arange(6.0), torch.full((6,), -9.0)], dim=1)
@@ -392,6 +542,21 @@ def test_a_posterior_far_outside_the_prior_is_still_sampled() -> None:
     assert abs(float(u.var()) - 1 / 12) < 0.01
 
 
+def test_the_last_few_samples_take_few_calls_of_the_flow(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # Half of the mass is inside the prior: one proposal at a time for each sample that
+    # is missing would take about log2(1000) = 10 calls.
+    edge = torch.tensor([[1.0, -3.0]])
+    posterior = gaussian_posterior(
+        dim=1, n_o=1, weights=torch.ones(1, 1), contexts=edge
+    )
+    calls = count_draws(posterior, monkeypatch)
+    posterior.sample((1000,), x=posterior.x_o[0], **QUIET)
+    assert len(calls) <= 5
+    assert sum(calls) < 4000
+
+
 def hopeless_posterior(n_o: int = 2) -> MixturePosterior:
     """All mass of the first observation lies far outside the prior."""
     spikes = torch.tensor([[100.0, -3.0], [0.0, -3.0]])
@@ -402,7 +567,7 @@ def hopeless_posterior(n_o: int = 2) -> MixturePosterior:
 def test_no_mass_inside_the_prior_ends_in_an_error_that_names_the_observation(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(truncation_module, "MIN_PROPOSALS", 2000)
+    monkeypatch.setattr(sampling_module, "MIN_PROPOSALS", 2000)
     posterior = hopeless_posterior()
     with pytest.raises(SamplingError, match=r"rows \[0\] of `x`.*reject_outside_prior"):
         posterior.sample_batched((3,), posterior.x_o, **QUIET)

@@ -16,6 +16,9 @@ from sbi.inference import (
     VIPosterior,
 )
 from sbi.inference.posteriors import NPE_A_Posterior
+from sbi.inference.posteriors.filtered_direct_posterior import FilteredDirectPosterior
+from sbi.neural_nets import posterior_nn
+from sbi.neural_nets.estimators.tabpfn_flow import TabPFNFlow
 from torch import Tensor, nn
 
 from sbi_rope import RoPE
@@ -70,6 +73,11 @@ def test_the_estimator_of_a_vector_field_posterior_is_the_trained_one(
         ),
         pytest.param(lambda: bare(NPE_A_Posterior), "NPE_A_Posterior", id="npe-a"),
         pytest.param(
+            lambda: bare(FilteredDirectPosterior),
+            "FilteredDirectPosterior",
+            id="npe-pfn",
+        ),
+        pytest.param(
             lambda: EnsemblePosterior([problems.npe_posterior()] * 2),
             "EnsemblePosterior",
             id="ensemble",
@@ -104,10 +112,27 @@ def test_what_has_no_amortised_estimator_is_refused_by_name(
 @pytest.mark.parametrize("sample_with", ["mcmc", "rejection", "vi"])
 def test_an_npe_posterior_sampled_another_way_is_refused(sample_with: str) -> None:
     theta = problems.box(2).sample((50,))
-    npe = NPE(problems.box(2), density_estimator="mdn", show_progress_bars=False)
+    builder = posterior_nn("mdn")
+    npe = NPE(problems.box(2), density_estimator=builder, show_progress_bars=False)
     npe.append_simulations(theta, problems.simulate(theta)).train(max_num_epochs=1)
     posterior = npe.build_posterior(sample_with=sample_with)  # type: ignore[arg-type]
     with pytest.raises(UnsupportedPosteriorError, match=type(posterior).__name__):
+        RoPE(posterior, simulator=problems.simulate)
+
+
+def test_an_estimator_that_was_not_trained_is_refused_by_name() -> None:
+    # `NPE_PFN(...).build_posterior(sample_with="direct")`, without its dependency.
+    posterior = bare(DirectPosterior)
+    posterior.posterior_estimator = bare(TabPFNFlow)
+    with pytest.raises(UnsupportedPosteriorError, match=r"got TabPFNFlow.*Train NPE"):
+        RoPE(posterior, simulator=problems.simulate)
+
+
+def test_a_mixed_estimator_with_two_embedding_nets_is_refused() -> None:
+    posterior = copy.deepcopy(problems.npe_posterior("mnpe", dim=1))
+    discrete = posterior.posterior_estimator.discrete_net.net
+    discrete.embedding_net = copy.deepcopy(discrete.embedding_net)
+    with pytest.raises(UnsupportedPosteriorError, match="share one embedding net"):
         RoPE(posterior, simulator=problems.simulate)
 
 
@@ -197,7 +222,8 @@ def test_posterior_from_wraps_an_estimator_as_its_model_does() -> None:
 
 @pytest.mark.parametrize("sample_with", ["ode", "sde"])
 def test_posterior_from_keeps_how_a_vector_field_is_sampled(sample_with: str) -> None:
-    original = copy.copy(problems.vector_field_posterior("npse"))
+    # Deeply, as shallow copies of sbi's posteriors share their attributes.
+    original = copy.deepcopy(problems.vector_field_posterior("npse"))
     original.sample_with = sample_with
     posterior = posterior_from(original, original.vector_field_estimator)
     assert type(posterior) is VectorFieldPosterior

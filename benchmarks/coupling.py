@@ -1,0 +1,476 @@
+"""How fast the coupling is solved, side by side with POT and OTT-JAX.
+
+Every section prints one Markdown table. Seconds are the smallest of several
+repetitions, in which the competitors of a cell take turns; compare within a cell, not
+across tables. Without an error there is no comparison: every row shows the marginal
+error of its potential, computed by one and the same function in float64.
+
+    python -m benchmarks.coupling
+    python -m benchmarks.coupling --sections solvers floor --n 500 2000 --repeats 7
+"""
+
+import argparse
+import itertools
+import math
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import ot
+import torch
+from torch import Tensor
+
+from benchmarks.machine import describe_machine, peak_memory
+from sbi_rope import SinkhornCoupler
+from sbi_rope.coupling import Coupling
+from sbi_rope.coupling.cost import Cost
+from sbi_rope.coupling.fixed_point import Solution, solve_fixed_point
+from sbi_rope.coupling.kernel import Kernel, marginal_error
+
+TOLERANCE = 1e-6
+SETTINGS = [(0.5, 0.9), (0.5, 1.0), (0.05, 0.9), (0.05, 1.0)]
+DTYPES = {"float64": torch.float64, "float32": torch.float32}
+
+
+class Outcome(NamedTuple):
+    """What a solver returned: rows of the plan, its column potential, iterations."""
+
+    rows: Any
+    potential: Tensor
+    num_iterations: int
+
+
+Solver = Callable[[], Outcome]
+
+
+def embeddings(n: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Return n misspecified observations and n simulations in ten dimensions."""
+    generator = torch.Generator().manual_seed(0)
+    simulated = torch.randn(n, 10, generator=generator, dtype=torch.float64)
+    real = 1.3 * torch.randn(n, 10, generator=generator, dtype=torch.float64)
+    real[:, 0] += 1.0
+    real[: n // 10] += 2.0
+    return real.to(dtype), simulated.to(dtype)
+
+
+def solved(cost: Cost, gamma: float, tau: float, *, memory: int = 5) -> Solution:
+    """Solve from stored distances to a potential with our own core."""
+    return solve_fixed_point(
+        Kernel(cost, gamma, stored=True),
+        torch.zeros(cost.shape[1], dtype=torch.float64),
+        tau=tau,
+        tolerance=TOLERANCE,
+        max_iterations=10_000,
+        memory=memory,
+        eps=torch.finfo(cost.real.dtype).eps,
+    )
+
+
+def own(cost: Cost, gamma: float, tau: float, *, memory: int = 5) -> Outcome:
+    """Solve from stored distances to rows with our own core."""
+    solution = solved(cost, gamma, tau, memory=memory)
+    rows = rows_of(solution.potential, cost, gamma)
+    return Outcome(rows, solution.potential, solution.num_iterations)
+
+
+def rows_of(potential: Tensor, cost: Cost, gamma: float) -> Tensor:
+    """Turn a potential into rows."""
+    distances = cost.block(slice(None))
+    return torch.add(potential.to(distances), distances, alpha=-1 / gamma).softmax(1)
+
+
+def pot(
+    cost: Cost,
+    gamma: float,
+    tau: float,
+    *,
+    method: str = "sinkhorn",
+    numpy: bool = True,
+    cut: int | None = None,
+) -> Outcome:
+    """Run POT with its own stopping rule, or cut after some iterations.
+
+    As shipped, its own plan is the result; cut, the rows come from its potential.
+    """
+    n_o, n_s = cost.shape
+    distances: Any = cost.block(slice(None))
+    a, b = distances.new_full((n_o,), 1 / n_o), distances.new_full((n_s,), 1 / n_s)
+    if numpy:
+        a, b, distances = a.numpy(), b.numpy(), distances.numpy()
+    stopping = {} if cut is None else {"numItermax": cut, "stopThr": 0.0}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        plan, log = ot.unbalanced.sinkhorn_unbalanced(
+            a,
+            b,
+            distances,
+            gamma,
+            (math.inf, math.inf if tau == 1.0 else gamma * tau / (1 - tau)),
+            method=method,
+            log=True,
+            **stopping,
+        )
+    potential = torch.as_tensor(log["logv"]).double()
+    if cut is not None:
+        plan = rows_of(potential, cost, gamma)
+    return Outcome(plan, potential, len(log["err"]))
+
+
+def ott(cost: Cost, gamma: float, tau: float) -> Solver | None:
+    """Return OTT-JAX's Sinkhorn solver, compiled, if it is installed."""
+    try:
+        import jax
+        from ott.geometry import geometry
+        from ott.problems.linear import linear_problem
+        from ott.solvers.linear import sinkhorn
+    except ImportError:
+        return None
+    if cost.real.dtype == torch.float64:
+        jax.config.update("jax_enable_x64", val=True)
+    distances = jax.numpy.asarray(cost.block(slice(None)).numpy())
+
+    @jax.jit
+    def solve(distances: Any) -> Any:
+        geom = geometry.Geometry(cost_matrix=distances, epsilon=gamma)
+        problem = linear_problem.LinearProblem(geom, tau_a=1.0, tau_b=tau)
+        out = sinkhorn.Sinkhorn(max_iterations=10_000)(problem)
+        return out.matrix, out.g, out.n_iters
+
+    def run() -> Outcome:
+        matrix, g, iterations = jax.block_until_ready(solve(distances))
+        potential = torch.tensor(g.tolist(), dtype=torch.float64) / gamma
+        return Outcome(matrix, potential - potential.mean(), int(iterations))
+
+    run()  # compilation is not measured
+    return run
+
+
+def error_of(
+    outcome: Outcome, real: Tensor, simulated: Tensor, gamma: float, tau: float
+) -> float:
+    """Return the marginal error of a potential, in float64 whatever the solver."""
+    if not torch.isfinite(outcome.potential).all():
+        return math.nan
+    cost = Cost(real.double(), simulated.double(), stored=False)
+    potential = outcome.potential - outcome.potential.mean()
+    log_q = Kernel(cost, gamma, stored=False)(potential)
+    return marginal_error(log_q, potential, tau)
+
+
+def race(
+    tasks: Mapping[str, Callable[[], Any]], repeats: int
+) -> dict[str, tuple[float, Any]]:
+    """Run tasks in turn; return the smallest seconds and the last result of each."""
+    seconds = dict.fromkeys(tasks, math.inf)
+    results: dict[str, Any] = {}
+    for _ in range(repeats):
+        for name, task in tasks.items():
+            results.pop(name, None)  # its memory, before the next one needs some
+            start = time.perf_counter()
+            results[name] = task()
+            seconds[name] = min(seconds[name], time.perf_counter() - start)
+    return {name: (seconds[name], results[name]) for name in tasks}
+
+
+def iterations_for_accuracy(cost: Cost, gamma: float, tau: float) -> int:
+    """Return how many of POT's iterations reach the tolerance, by our error."""
+    plain = own(cost, gamma, tau, memory=0).num_iterations
+    kernel = Kernel(cost, gamma, stored=True)
+    while plain < 10_000:
+        potential = pot(cost, gamma, tau, cut=plain).potential
+        potential = potential - potential.mean()
+        if not marginal_error(kernel(potential), potential, tau) > TOLERANCE:
+            break
+        plain += 1 + plain // 50
+    return plain
+
+
+def compare_solvers(args: argparse.Namespace) -> None:
+    """From stored distances to rows: our own core, POT, OTT-JAX."""
+    print(
+        "| n | dtype | gamma | tau | solver | iterations | error | ms | x own |\n"
+        "|---|---|---|---|---|---|---|---|---|"
+    )
+    for n, name, (gamma, tau) in itertools.product(args.n, args.dtypes, SETTINGS):
+        real, simulated = embeddings(n, DTYPES[name])
+        cost = Cost(real, simulated, stored=True)
+        by_pot = partial(pot, cost, gamma, tau)
+        solvers: dict[str, Solver] = {
+            "own": partial(own, cost, gamma, tau),
+            "own, not accelerated": partial(own, cost, gamma, tau, memory=0),
+            "POT sinkhorn as shipped (numpy)": by_pot,
+            "POT sinkhorn as shipped (torch)": partial(by_pot, numpy=False),
+            "POT translation_invariant as shipped (numpy)": partial(
+                by_pot, method="sinkhorn_translation_invariant"
+            ),
+        }
+        cut = iterations_for_accuracy(cost, gamma, tau)
+        if cut < 10_000:
+            solvers["POT sinkhorn cut at equal accuracy (numpy)"] = partial(
+                by_pot, cut=cut
+            )
+        by_ott = ott(cost, gamma, tau)
+        if by_ott is not None:
+            solvers["OTT-JAX as shipped"] = by_ott
+        results = race(solvers, repeats(args, n))
+        for key, (seconds, outcome) in results.items():
+            error = error_of(outcome, real, simulated, gamma, tau)
+            shown = "failed (NaN)" if math.isnan(error) else f"{error:.0e}"
+            print(
+                f"| {n} | {name} | {gamma} | {tau} | {key} | "
+                f"{outcome.num_iterations} | {shown} | {1e3 * seconds:.1f} | "
+                f"{seconds / results['own'][0]:.2f} |",
+                flush=True,
+            )
+
+
+def repeats(args: argparse.Namespace, n: int) -> int:
+    """Return how often to repeat: large problems are long enough to be steady."""
+    return args.repeats if n <= 2000 else min(args.repeats, 2)
+
+
+def from_embeddings(
+    real: Tensor, simulated: Tensor, gamma: float, tau: float
+) -> Tensor:
+    """Couple with the default solver."""
+    return SinkhornCoupler(gamma=gamma, tau=tau).couple(real, simulated).weights
+
+
+def from_embeddings_by_pot(
+    real: Tensor, simulated: Tensor, gamma: float, tau: float, *, numpy: bool
+) -> Tensor:
+    """Compute distances and hand them to POT."""
+    return pot(Cost(real, simulated, stored=True), gamma, tau, numpy=numpy).rows
+
+
+def compare_default(args: argparse.Namespace) -> None:
+    """From embeddings to rows: the coupler with its defaults, and POT as shipped."""
+    print(
+        "| n | gamma | tau | coupler ms | distances + POT as shipped ms (numpy) | "
+        "(torch) | coupler / faster POT |\n|---|---|---|---|---|---|---|"
+    )
+    for n, setting in itertools.product(args.n, SETTINGS):
+        problem = (*embeddings(n, torch.float64), *setting)
+        tasks = {
+            "coupler": partial(from_embeddings, *problem),
+            "numpy": partial(from_embeddings_by_pot, *problem, numpy=True),
+            "torch": partial(from_embeddings_by_pot, *problem, numpy=False),
+        }
+        results = race(tasks, repeats(args, n))
+        ms = {name: 1e3 * seconds for name, (seconds, _) in results.items()}
+        ratio = ms["coupler"] / min(ms["numpy"], ms["torch"])
+        print(
+            f"| {n} | {setting[0]} | {setting[1]} | {ms['coupler']:.1f} | "
+            f"{ms['numpy']:.1f} | {ms['torch']:.1f} | {ratio:.2f} |",
+            flush=True,
+        )
+
+
+def products(matrix: Tensor, ones: Tensor) -> None:
+    """Make the two matrix-vector products of an iteration, ten times."""
+    for _ in range(10):
+        matrix @ ones
+        matrix.T @ ones
+
+
+def compare_with_floor(args: argparse.Namespace) -> None:
+    """From stored distances to a potential: our own core, and the least it can cost."""
+    print(
+        "| n | dtype | gamma | tau | iterations | own ms | exp pass ms | 2 GEMVs ms | "
+        "floor ms | floor / own |\n|---|---|---|---|---|---|---|---|---|---|"
+    )
+    for n, name, (gamma, tau) in itertools.product(args.n, args.dtypes, SETTINGS):
+        cost = Cost(*embeddings(n, DTYPES[name]), stored=True)
+        distances = cost.block(slice(None))
+        tasks = {
+            "own": partial(solved, cost, gamma, tau),
+            # Into new memory, which the solver needs too.
+            "exp": partial(torch.exp, distances),
+            "gemv": partial(products, torch.exp(-distances), distances.new_ones(n)),
+        }
+        results = race(tasks, repeats(args, n) + 1)
+        ms = {key: 1e3 * seconds for key, (seconds, _) in results.items()}
+        iterations = results["own"][1].num_iterations
+        floor = ms["exp"] + iterations * ms["gemv"] / 10
+        print(
+            f"| {n} | {name} | {gamma} | {tau} | {iterations} | {ms['own']:.1f} | "
+            f"{ms['exp']:.1f} | {ms['gemv'] / 10:.2f} | {floor:.1f} | "
+            f"{floor / ms['own']:.2f} |",
+            flush=True,
+        )
+
+
+def one_by_one(
+    coupler: SinkhornCoupler, points: tuple[Tensor, Tensor], grid: list[list[float]]
+) -> list[Coupling]:
+    """Couple at every gamma and tau, each time from the start."""
+    return [
+        replace(coupler, gamma=gamma, tau=tau).couple(*points)
+        for gamma, tau in itertools.product(*grid)
+    ]
+
+
+def warm(
+    coupler: SinkhornCoupler, points: tuple[Tensor, Tensor], grid: list[list[float]]
+) -> list[Coupling]:
+    """Couple at every gamma and tau by a sweep."""
+    return list(coupler.sweep(*points, gammas=grid[0], taus=grid[1]))
+
+
+def compare_sweeps(args: argparse.Namespace) -> None:
+    """Ten gammas times five taus: warm starts, cold starts, and the plain iteration."""
+    gammas = torch.logspace(math.log10(5.0), math.log10(0.05), 10).tolist()
+    grid = [gammas, [0.5, 0.7, 0.9, 0.99, 1.0]]
+    print(
+        "| n | dtype | solver | iterations | not converged of 50 | s | x warm |\n"
+        "|---|---|---|---|---|---|---|"
+    )
+    for n, name in itertools.product(args.n, args.dtypes):
+        points = embeddings(n, DTYPES[name])
+        coupler = SinkhornCoupler(dtype=DTYPES[name])
+        plain = replace(coupler, memory=0)
+        tasks = {
+            "own, warm": partial(warm, coupler, points, grid),
+            "own, cold": partial(one_by_one, coupler, points, grid),
+            "own, cold, not accelerated": partial(one_by_one, plain, points, grid),
+        }
+        results = race(tasks, 1 if n > 500 else args.repeats)
+        for key, (seconds, couplings) in results.items():
+            failed = sum(not coupling.converged for coupling in couplings)
+            iterations = sum(coupling.num_iterations for coupling in couplings)
+            print(
+                f"| {n} | {name} | {key} | {iterations} | {failed} | {seconds:.2f} | "
+                f"{seconds / results['own, warm'][0]:.2f} |",
+                flush=True,
+            )
+
+
+def compare_memory(args: argparse.Namespace) -> None:
+    """Blocked and stored solutions, each in a process of its own."""
+    print(
+        "| n | dtype | mode | iterations | error | s | peak memory beyond the inputs, "
+        "MB |\n|---|---|---|---|---|---|---|"
+    )
+    for n, name in itertools.product([*args.n, 20_000], args.dtypes):
+        for mode in ("blocked", "stored"):
+            if mode == "stored" and n > 10_000:
+                print(f"| {n} | {name} | {mode} | not run | | | |", flush=True)
+                continue
+            command = [sys.executable, "-m", "benchmarks.coupling", "--threads"]
+            command += [str(args.threads), "--measure", str(n), name, mode]
+            run = subprocess.run(command, capture_output=True, text=True, check=True)
+            print(f"| {n} | {name} | {mode} | {run.stdout.strip()} |", flush=True)
+
+
+def measure(n: int, name: str, mode: str) -> None:
+    """Couple once and print iterations, error, seconds and peak memory."""
+    real, simulated = embeddings(n, DTYPES[name])
+    coupler = SinkhornCoupler(
+        gamma=0.5, tau=0.9, dtype=DTYPES[name], blocked=mode == "blocked"
+    )
+    coupler.couple(real[:100], simulated[:100])
+    before = peak_memory()
+    start = time.perf_counter()
+    coupling = coupler.couple(real, simulated)
+    seconds = time.perf_counter() - start
+    print(
+        f"{coupling.num_iterations} | {coupling.marginal_error:.0e} | {seconds:.2f} | "
+        f"{peak_memory() - before:.0f}"
+    )
+
+
+def compare_subsets(args: argparse.Namespace) -> None:
+    """Potentials fitted to some of 10,000 observations, 2000 simulations."""
+    print(
+        "| gamma | tau | fitted to | s | batch error | row TV to the full fit, mean | "
+        "max |\n|---|---|---|---|---|---|---|"
+    )
+    real, simulated = embeddings(10_000, torch.float64)
+    simulated = simulated[:2000]
+    for gamma, tau in [(0.5, 0.9), (0.1, 0.9)]:
+        coupler = SinkhornCoupler(gamma=gamma, tau=tau)
+        full = coupler.couple(real, simulated)
+        for count in (500, 1000, 2000, 5000, 10_000):
+            start = time.perf_counter()
+            part = replace(coupler, num_fitted=count).couple(real, simulated, seed=0)
+            seconds = time.perf_counter() - start
+            distance = (part.weights - full.weights).abs().sum(dim=1) / 2
+            print(
+                f"| {gamma} | {tau} | {count} | {seconds:.2f} | "
+                f"{part.batch_error:.1e} | "
+                f"{float(distance.mean()):.3f} | {float(distance.max()):.3f} |",
+                flush=True,
+            )
+
+
+def check_extremes(args: argparse.Namespace) -> None:
+    """NaN, and what converged, over gamma / max(C), tau, dtype, solver and mode."""
+    print(
+        "| gamma / max(C) | mode | converged of 4 taus | most iterations | "
+        "largest error | NaN |\n|---|---|---|---|---|---|"
+    )
+    real, simulated = embeddings(500, torch.float64)
+    largest = float(torch.cdist(real, simulated).max())
+    modes = [("own", False), ("own", True), ("pot", False)]
+    for ratio, (solver, blocked), name in itertools.product(
+        [1.0, 1e-1, 1e-2, 3e-3, 1e-3], modes, args.dtypes
+    ):
+        couplings = [
+            SinkhornCoupler(
+                gamma=ratio * largest,
+                tau=tau,
+                solver=solver,
+                blocked=blocked,
+                dtype=DTYPES[name],
+                max_iterations=3000,
+            ).couple(real, simulated)
+            for tau in (1.0, 0.99, 0.9, 0.5)
+        ]
+        nan = sum(not torch.isfinite(c.weights).all() for c in couplings)
+        print(
+            f"| {ratio} | {solver} {name}{' blocked' * blocked} | "
+            f"{sum(c.converged for c in couplings)} | "
+            f"{max(c.num_iterations for c in couplings)} | "
+            f"{max(c.marginal_error for c in couplings):.0e} | {nan} |",
+            flush=True,
+        )
+
+
+SECTIONS = {
+    "solvers": compare_solvers,
+    "default": compare_default,
+    "floor": compare_with_floor,
+    "sweeps": compare_sweeps,
+    "memory": compare_memory,
+    "subsets": compare_subsets,
+    "extremes": check_extremes,
+}
+
+
+def main() -> None:
+    """Print the sections asked for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sections", nargs="+", choices=SECTIONS, default=[*SECTIONS])
+    parser.add_argument("--n", type=int, nargs="+", default=[500, 2000])
+    parser.add_argument("--dtypes", nargs="+", choices=DTYPES, default=[*DTYPES])
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--measure", nargs=3, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    torch.set_num_threads(args.threads)
+    if args.measure:
+        measure(int(args.measure[0]), *args.measure[1:])
+        return
+    print(describe_machine(threads=args.threads), flush=True)
+    for section in args.sections:
+        print(f"\n{SECTIONS[section].__doc__}\n", flush=True)
+        SECTIONS[section](args)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,199 @@
+"""How long the mixture takes: densities, samples, and one observation at a time.
+
+Prints one Markdown table. Every row is a process of its own; its memory is that of the
+whole process, most of which is Python, torch and sbi. With ``--before`` each row is
+measured on another checkout of the package too, in turns; compare within a run.
+
+    python -m benchmarks.mixture
+    python -m benchmarks.mixture --before ../old-checkout --theta-dim 2 --repeats 2
+"""
+
+import argparse
+import json
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import torch
+from sbi.inference import NPE
+from sbi.neural_nets import posterior_nn
+from sbi.utils import BoxUniform
+from torch import Tensor
+
+X_DIM = 10
+COLUMNS = {
+    "version": "version",
+    "estimator": "estimator",
+    "d": "theta_dim",
+    "threads": "threads",
+    "median ESS": "ess",
+    "log_prob s": "log_prob",
+    "samples s": "samples",
+    "total s": "total",
+    "memory before MB": "memory_start",
+    "peak log_prob MB": "memory_log_prob",
+    "peak samples MB": "memory_samples",
+    "row ms": "row",
+    "row + log_prob ms": "row_log_prob",
+    "row + 1000 samples ms": "row_samples",
+}
+
+
+def simulate(theta: Tensor) -> Tensor:
+    """Return ten noisy nonlinear readings of theta."""
+    numbers = torch.arange(theta.shape[1] * X_DIM).reshape(-1, X_DIM)
+    return torch.tanh(theta @ torch.cos(numbers)) + 0.2 * torch.randn(len(theta), X_DIM)
+
+
+def prior_of(dim: int) -> BoxUniform:
+    """Return a bounded prior, so that normalising and rejecting take part."""
+    return BoxUniform(-torch.ones(dim), torch.ones(dim))
+
+
+def trained_npe(estimator: str, dim: int) -> object:
+    """Train for a few epochs: the cost does not depend on the weights."""
+    warnings.simplefilter("ignore")
+    torch.manual_seed(0)
+    theta = prior_of(dim).sample((5000,))
+    npe = NPE(
+        prior_of(dim),
+        density_estimator=posterior_nn(estimator),
+        show_progress_bars=False,
+    )
+    npe.append_simulations(theta, simulate(theta)).train(max_num_epochs=3)
+    return npe.build_posterior()
+
+
+def main() -> None:
+    """Print one row for each dimension, version and repetition."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--theta-dim", type=int, nargs="+", default=[2, 4])
+    parser.add_argument("--estimator", nargs="+", default=["nsf"])
+    parser.add_argument("--n-o", type=int, default=2000)
+    parser.add_argument("--n-s", type=int, default=2000)
+    parser.add_argument("--num-samples", type=int, default=5000)
+    parser.add_argument("--num-single", type=int, default=200)
+    parser.add_argument("--gamma", type=float, default=0.5)
+    parser.add_argument("--tau", type=float, default=0.9)
+    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument("--repeats", type=int, default=1)
+    parser.add_argument("--before", type=Path, help="another checkout to measure too")
+    args = parser.parse_args()
+    # Here, because a cell runs this file where the package is another checkout.
+    from benchmarks.machine import describe_machine
+
+    versions = {"now": Path(__file__).resolve().parents[1]}
+    if args.before is not None:
+        versions = {"before": args.before.resolve(), **versions}
+    print(describe_machine(threads=args.threads))
+    print(
+        f"{args.n_o} observations, {args.n_s} components, {args.num_samples} samples "
+        f"each, gamma {args.gamma}, tau {args.tau}\n"
+    )
+    print("| " + " | ".join(COLUMNS) + " |\n" + "|---" * len(COLUMNS) + "|", flush=True)
+    for estimator in args.estimator:
+        for dim in args.theta_dim:
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(folder) / "npe.pt"
+                torch.save(trained_npe(estimator, dim), path)
+                for _ in range(args.repeats):
+                    for name, root in versions.items():
+                        settings = vars(args) | {"npe": path, "theta_dim": dim}
+                        row = settings | measured(root, settings)
+                        row |= {"version": name, "estimator": estimator}
+                        cells = [str(row[key]) for key in COLUMNS.values()]
+                        print("| " + " | ".join(cells) + " |", flush=True)
+
+
+def measured(root: Path, settings: dict) -> dict:
+    """Measure a cell in a process whose package is the checkout at ``root``."""
+    done = subprocess.run(
+        [sys.executable, __file__, json.dumps(settings, default=str)],
+        env=os.environ | {"PYTHONPATH": str(root)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode:
+        raise RuntimeError(done.stderr)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def measure(settings: dict) -> None:
+    """Measure a cell and print it as JSON."""
+    from sbi_rope import RoPE, SinkhornCoupler
+
+    warnings.simplefilter("ignore")
+    torch.set_num_threads(settings["threads"])
+    npe = torch.load(settings["npe"], weights_only=False)
+    torch.manual_seed(1)
+    theta = npe.prior.sample((settings["n_o"],))
+    x_o = 1.1 * simulate(theta) + 0.1
+    rope = RoPE(npe, simulator=simulate)
+    posterior = rope.build_posterior(
+        x_o,
+        coupler=SinkhornCoupler(gamma=settings["gamma"], tau=settings["tau"]),
+        num_simulations=settings["n_s"],
+        seed=0,
+        unseen="extend",
+    )
+    ess = posterior.coupling.effective_sample_size.median()
+    cell = {"ess": round(float(ess)), "memory_start": memory("VmRSS")}
+    forget_peak()
+    cell["log_prob"] = round(seconds(posterior.log_prob_batched, theta, x_o), 2)
+    cell["memory_log_prob"] = memory("VmHWM")
+    forget_peak()
+    shape = (settings["num_samples"],)
+    draw = partial(posterior.sample_batched, show_progress_bars=False)
+    cell["samples"] = round(seconds(draw, shape, x_o), 2)
+    cell["memory_samples"] = memory("VmHWM")
+    cell["total"] = round(cell["log_prob"] + cell["samples"], 2)
+
+    new = iter(1.1 * simulate(npe.prior.sample((3 * settings["num_single"],))) + 0.1)
+    net = rope.embedding_net
+    calls: dict[str, Callable[[Tensor], Tensor]] = {
+        "row": lambda x: posterior.coupling.rows(net(x[None])),
+        "row_log_prob": lambda x: posterior.log_prob(theta[:1], x=x),
+        "row_samples": lambda x: posterior.sample((1000,), x, show_progress_bars=False),
+    }
+    for name, call in calls.items():
+        taken = [seconds(call, next(new)) for _ in range(settings["num_single"])]
+        cell[name] = round(1000 * sum(taken) / len(taken), 2)
+    print(json.dumps(cell))
+
+
+def seconds(call: Callable[..., object], *arguments: object) -> float:
+    """Return how long a call takes."""
+    start = time.perf_counter()
+    call(*arguments)
+    return time.perf_counter() - start
+
+
+def memory(name: str) -> int:
+    """Return the resident memory of this process in MB, "VmRSS" now or "VmHWM" at most.
+
+    Linux only. Not ``ru_maxrss``, which starts at the peak of the parent.
+    """
+    status = Path("/proc/self/status").read_text()
+    found = re.search(rf"{name}:\s+(\d+)", status)
+    assert found is not None
+    return round(int(found[1]) / 1024)
+
+
+def forget_peak() -> None:
+    """Let "VmHWM" start anew."""
+    Path("/proc/self/clear_refs").write_text("5")
+
+
+if __name__ == "__main__":
+    if len(sys.argv) == 2 and sys.argv[1].startswith("{"):
+        measure(json.loads(sys.argv[1]))
+    else:
+        main()

@@ -1,0 +1,92 @@
+"""Distances between two sets of embeddings, stored or computed block by block."""
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+__all__ = ["Cost", "Distances", "row_blocks"]
+
+# Entries of a block: few enough for the caches of a CPU core, many enough to occupy a
+# GPU. Blocks also bound the memory of everything that is not stored.
+CPU_BLOCK, GPU_BLOCK = 2**17, 2**24
+
+
+class Distances:
+    r"""Euclidean distances of any points from fixed ones, by one matrix product.
+
+    :math:`\lVert a - b \rVert^2 = \lVert a \rVert^2 + \lVert b \rVert^2 - 2 a^\top b`
+    about the centre of the fixed points, in float64. Points that coincide at a distance
+    R from the centre may be found some 1e-8 R apart, which is less than the rounding of
+    embeddings from a network in float32; other distances are right to the last digits.
+    Without the matrix product it takes 1.4 times as long for ten dimensions, and 7
+    times for 64.
+
+    Args:
+        points: The fixed points, shape ``(n_s, l)``; the distances have their dtype.
+    """
+
+    def __init__(self, points: Tensor) -> None:
+        # The median: a single far point must not move the centre away from the rest.
+        self.centre = points.double().median(dim=0).values
+        centred = points.double() - self.centre
+        squares = centred.square().sum(dim=1, keepdim=True)
+        self.largest_norm = squares.max().sqrt()
+        self._dtype = points.dtype
+        # With rows (-2a, |a|^2, 1), the product is the squared distance.
+        self._factor = torch.cat([centred, torch.ones_like(squares), squares], dim=1).T
+
+    def __call__(self, points: Tensor, columns: Tensor | None = None) -> Tensor:
+        """Return distances of points ``(n, l)`` from all or some of the fixed ones."""
+        centred = points.double() - self.centre
+        squares = centred.square().sum(dim=1, keepdim=True)
+        rows = torch.cat([-2 * centred, squares, torch.ones_like(squares)], dim=1)
+        factor = self._factor if columns is None else self._factor[:, columns]
+        return (rows @ factor).clamp_min_(0).to(self._dtype).sqrt_()
+
+
+class Cost:
+    r""":math:`C_{ij} = \lVert g(x_{o,i}) - h(x_{s,j}) \rVert_2`.
+
+    Args:
+        real: :math:`g(x_o)`, shape ``(n_o, l)``.
+        simulated: :math:`h(x_s)`, shape ``(n_s, l)``.
+        stored: Whether to keep the matrix, or compute its blocks whenever asked.
+    """
+
+    def __init__(self, real: Tensor, simulated: Tensor, *, stored: bool) -> None:
+        self.real = real
+        self.simulated = simulated
+        self._distances = Distances(simulated)
+        # No distance is longer than this.
+        largest_real = (real.double() - self._distances.centre).norm(dim=1).max()
+        self.bound = float(self._distances.largest_norm + largest_real)
+        self.matrix: Tensor | None = None
+        if stored:
+            self.matrix = real.new_empty(self.shape)
+            for rows in self.row_blocks():
+                self.matrix[rows] = self._distances(real[rows])
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """The numbers of observations and of simulations."""
+        return len(self.real), len(self.simulated)
+
+    def block(self, rows: slice, columns: Tensor | None = None) -> Tensor:
+        """Return some rows, and of these some columns; not to be written to."""
+        if self.matrix is None:
+            return self._distances(self.real[rows], columns)
+        return self.matrix[rows] if columns is None else self.matrix[rows, columns]
+
+    def row_blocks(
+        self, num_columns: int | None = None, *, scale: int = 1
+    ) -> Iterator[slice]:
+        """Cut the rows into blocks, ``scale`` times as large as usual."""
+        return row_blocks(self.real, num_columns or len(self.simulated), scale=scale)
+
+
+def row_blocks(real: Tensor, num_columns: int, *, scale: int = 1) -> Iterator[slice]:
+    """Cut rows into blocks of a bounded number of entries, at least one row each."""
+    limit = CPU_BLOCK if real.device.type == "cpu" else GPU_BLOCK
+    step = max(1, scale * limit // num_columns)
+    return (slice(i, i + step) for i in range(0, len(real), step))

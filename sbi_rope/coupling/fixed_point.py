@@ -1,0 +1,163 @@
+r"""Our own solver of the semi-balanced problem: an accelerated fixed point.
+
+With hard rows the whole state is the simulation-side log-potential w, and its optimum
+is the fixed point of
+
+.. math:: T(w) = \tau (w + \log b - \log q(w)),
+
+up to a constant, which changes no row. T is the Sinkhorn iteration of the problem; for
+tau < 1 it is a contraction in the supremum norm with factor tau.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from sbi_rope.coupling.kernel import marginal_error
+
+__all__ = ["Solution", "solve_fixed_point"]
+
+# An accelerated step is taken back if its error exceeds the last one by this factor.
+LARGEST_GROWTH = 2.0
+# Accelerated steps without a new best error before plain ones are made instead, and
+# how many of these the first time.
+PATIENCE, FIRST_PAUSE = 100, 50
+# Keeps the least-squares problem of nearly parallel differences solvable.
+RIDGE = 1e-10
+# So many iterations without a new best error, and an error of so many roundings, mean
+# that the digits are exhausted.
+STALLED, ROUNDINGS = 500, 100.0
+
+
+class Solution(NamedTuple):
+    """A potential with the evidence for it."""
+
+    potential: Tensor
+    marginal_error: float
+    num_iterations: int
+
+
+def solve_fixed_point(
+    kernel: Callable[[Tensor], Tensor],
+    start: Tensor,
+    *,
+    tau: float,
+    tolerance: float,
+    max_iterations: int,
+    memory: int,
+    eps: float,
+) -> Solution:
+    r"""Iterate w to the fixed point, accelerated by Anderson's method.
+
+    The next iterate is the combination of the images of the last ``memory`` + 1 ones
+    whose residuals T(w) - w, combined alike, are smallest. Where that makes the
+    marginal error grow, the plain step T(w) is made instead and the memory forgotten;
+    where it makes no progress for long, the plain iteration takes over for a while.
+
+    Args:
+        kernel: Returns log q of a potential.
+        start: The first potential, shape ``(n_s,)``, float64.
+        tau: In (0, 1].
+        tolerance: Marginal error to reach.
+        max_iterations: Most evaluations of the kernel.
+        memory: Differences to remember; 0 for the plain iteration.
+        eps: Relative rounding error of the kernel.
+
+    Returns:
+        The best potential seen, with mean zero, its error, and the evaluations made.
+    """
+    log_b = -math.log(len(start))
+    potential = start - start.mean()
+    best, best_at, iteration = Solution(potential, math.inf, 0), 0, 0
+    steps = _Steps(memory, potential) if memory else None
+    for iteration in range(1, max_iterations + 1):
+        log_q = kernel(potential)
+        error = marginal_error(log_q, potential, tau)
+        if error < best.marginal_error:
+            best, best_at = Solution(potential, error, iteration), iteration
+        exhausted = iteration - best_at > STALLED and error < ROUNDINGS * eps
+        if error <= tolerance or exhausted:
+            break
+        image = tau * (potential + log_b - log_q)
+        image = image - image.mean()
+        potential = image if steps is None else steps.next(potential, image, error)
+    return best._replace(num_iterations=iteration)
+
+
+class _Steps:
+    """Accelerated steps, with plain ones where acceleration does not help."""
+
+    def __init__(self, memory: int, start: Tensor) -> None:
+        self._history = _History(memory, start)
+        self._best_error = self._last_error = math.inf
+        self._without_progress = 0
+        self._plain_left, self._pause = 0, FIRST_PAUSE
+        # Where to go if the last step, accelerated, proves bad; None after a plain one.
+        self._instead: Tensor | None = None
+        # Where to go if acceleration makes no progress.
+        self._anchor = start
+
+    def next(self, potential: Tensor, image: Tensor, error: float) -> Tensor:
+        """Return the next potential after one with this image and error."""
+        self._without_progress += 1
+        # Plain steps may have to move the potential far before the error falls, so that
+        # the end of a plain phase counts as progress too.
+        if error < self._best_error or self._plain_left == 1:
+            self._best_error = min(error, self._best_error)
+            self._without_progress, self._anchor = 0, image
+        if self._plain_left:
+            self._plain_left -= 1
+            return image
+        if self._without_progress > PATIENCE:
+            self._plain_left, self._pause = self._pause, 2 * self._pause
+            return self._forget(self._anchor)
+        if self._instead is not None and not error <= LARGEST_GROWTH * self._last_error:
+            return self._forget(self._instead)
+        self._last_error = error
+        accelerated = self._history.combine(potential, image)
+        self._instead = None if accelerated is None else image
+        return image if accelerated is None else accelerated
+
+    def _forget(self, plain: Tensor) -> Tensor:
+        self._history.clear()
+        self._instead = None
+        return plain
+
+
+class _History:
+    """The last iterates and residuals, and Anderson's combination of them."""
+
+    def __init__(self, memory: int, like: Tensor) -> None:
+        # Differences of images and residuals, the oldest overwritten first.
+        self._image_steps = like.new_zeros(memory, len(like))
+        self._residual_steps = like.new_zeros(memory, len(like))
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._num_steps = 0
+        self._last: tuple[Tensor, Tensor] | None = None
+
+    def combine(self, potential: Tensor, image: Tensor) -> Tensor | None:
+        """Add an iterate and its image; return the next iterate, or None."""
+        memory = len(self._residual_steps)
+        residual = image - potential
+        if self._last is not None:
+            slot = self._num_steps % memory
+            torch.sub(image, self._last[0], out=self._image_steps[slot])
+            torch.sub(residual, self._last[1], out=self._residual_steps[slot])
+            self._num_steps += 1
+        self._last = (image, residual)
+        if not self._num_steps:
+            return None
+        steps = self._residual_steps[: self._num_steps]
+        gram = steps @ steps.T
+        gram.diagonal().add_(RIDGE * gram.trace())
+        coefficients, info = torch.linalg.solve_ex(gram, steps @ residual)
+        combination = image - coefficients @ self._image_steps[: self._num_steps]
+        if info.item() or not math.isfinite(float(combination.sum())):
+            return None
+        return combination

@@ -1,0 +1,149 @@
+r"""The column marginal of a potential, in scaling form.
+
+For a simulation-side log-potential :math:`w` the rows of the coupling are
+
+.. math:: \alpha_{ij} = \frac{\kappa_{ij}}{\sum_k \kappa_{ik}}, \qquad
+    \kappa_{ij} = e^{w_j - C_{ij} / \gamma - m_i},
+
+whatever :math:`m_i`, and their mean is :math:`q`.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from sbi_rope.coupling.cost import Cost
+
+__all__ = ["Kernel", "marginal_error"]
+
+
+class _Range(NamedTuple):
+    """What a dtype can carry."""
+
+    # Exponents are raised to this: denormal numbers make products ten times slower.
+    lowest: float
+    # Exponents that differ by no more than this need neither shift nor floor.
+    free: float
+    # Farthest that w may move from the potential inside of a stored kernel.
+    reach: float
+
+
+RANGE = {
+    torch.float32: _Range(lowest=-69.0, free=60.0, reach=20.0),
+    torch.float64: _Range(lowest=-660.0, free=450.0, reach=200.0),
+}
+
+# Products of stored blocks need no room for intermediate results: larger ones are best.
+STORED_BLOCK = 8
+
+
+class Kernel:
+    r"""The marginal of a potential by products with an exponentiated matrix.
+
+    The matrix is :math:`e^{w^0_j - C_{ij} / \gamma - m_i}` with :math:`w^0` the
+    potential absorbed last. Another potential multiplies its columns by
+    :math:`e^{w - w^0}`; when these factors leave the range of the dtype, w is absorbed
+    anew.
+
+    Args:
+        cost: The distances.
+        gamma: The entropic regularisation, in units of the cost.
+        stored: Whether to keep the matrix, or compute its blocks for every product.
+    """
+
+    def __init__(self, cost: Cost, gamma: float, *, stored: bool) -> None:
+        self.cost = cost
+        self.gamma = gamma
+        self.num_absorptions = 0
+        self._dtype = cost.real.dtype
+        self._matrix = cost.real.new_empty(cost.shape) if stored else None
+        self._shift = cost.real.new_zeros(len(cost.real))
+        self._absorbed: Tensor | None = None
+        self._exact = True
+
+    def __call__(self, potential: Tensor) -> Tensor:
+        """Return log q of a potential, both of shape ``(n_s,)`` and float64."""
+        absorbed = self._absorbed
+        reach = RANGE[self._dtype].reach
+        if absorbed is None or float((potential - absorbed).abs().max()) > reach:
+            absorbed = self._absorb(potential)
+        scaling = (potential - absorbed).exp()
+        row_sums, columns = self._products(scaling.to(self._dtype))
+        log_q = (scaling * columns / len(row_sums)).log()
+        if not self._exact:
+            lost = _lost(columns, row_sums)
+            row_log_sums = self._shift + row_sums.log()
+            self._restore(log_q, lost, potential, row_log_sums)
+        return log_q
+
+    def _absorb(self, potential: Tensor) -> Tensor:
+        self.num_absorptions += 1
+        # What is absorbed must be known to the last digit.
+        w = potential.to(self._dtype)
+        self._absorbed = w.double()
+        spread = float(w.abs().max()) + self.cost.bound / self.gamma
+        self._exact = spread <= RANGE[self._dtype].free
+        if self._matrix is not None:
+            for rows in self.cost.row_blocks():
+                self._exponentials(rows, w, out=self._matrix[rows])
+        return self._absorbed
+
+    def _exponentials(
+        self, rows: slice, w: Tensor, out: Tensor | None = None
+    ) -> Tensor:
+        """Compute some rows of the matrix, and their shifts."""
+        cost = self.cost.block(rows)
+        block = torch.add(w, cost, alpha=-1 / self.gamma, out=out)
+        if self._exact:
+            return block.exp_()
+        shift = self._shift[rows] = block.amax(dim=1)
+        lowest = RANGE[self._dtype].lowest
+        return block.sub_(shift[:, None]).clamp_min_(lowest).exp_()
+
+    def _products(self, scaling: Tensor) -> tuple[Tensor, Tensor]:
+        """Return K v and the product of K^T with its reciprocal, that in float64."""
+        assert self._absorbed is not None
+        w = self._absorbed.to(self._dtype)
+        row_sums = self._shift.new_empty(len(self._shift))
+        columns = torch.zeros_like(self._absorbed)
+        # A block is used twice while it is in the cache. Adding up blocks in float64
+        # keeps the rounding errors of float32 small, however many rows there are.
+        scale = 1 if self._matrix is None else STORED_BLOCK
+        for rows in self.cost.row_blocks(scale=scale):
+            matrix = self._matrix
+            block = self._exponentials(rows, w) if matrix is None else matrix[rows]
+            sums = torch.mv(block, scaling, out=row_sums[rows])
+            columns += block.T @ sums.reciprocal()
+        return row_sums, columns
+
+    def _restore(
+        self, log_q: Tensor, lost: Tensor, potential: Tensor, row_log_sums: Tensor
+    ) -> None:
+        """Put log-sum-exps in the place of columns that the matrix cannot hold."""
+        index = lost.nonzero().flatten()
+        if not len(index):
+            return
+        w = potential[index].to(self._dtype)
+        total = torch.full_like(w, -math.inf)
+        for rows in self.cost.row_blocks(len(index)):
+            exponents = w - self.cost.block(rows, index) / self.gamma
+            exponents -= row_log_sums[rows, None]
+            total = torch.logaddexp(total, torch.logsumexp(exponents, dim=0))
+        log_q[index] = total.double() - math.log(len(row_log_sums))
+
+
+def marginal_error(log_q: Tensor, potential: Tensor, tau: float) -> float:
+    r""":math:`\lVert q - q^*(w) \rVert_1`, blind to a constant added to w."""
+    if tau == 0.0:
+        return 0.0  # nothing is asked of the column marginal
+    target = torch.softmax(-potential * (1.0 - tau) / tau, dim=0)
+    return float((log_q.exp() - target).abs().sum())
+
+
+def _lost(columns: Tensor, row_sums: Tensor) -> Tensor:
+    """Tell in which columns the entries raised to the floor could matter."""
+    eps = torch.finfo(row_sums.dtype).eps
+    floor = math.exp(RANGE[row_sums.dtype].lowest)
+    return floor * float(row_sums.double().reciprocal().sum()) > eps * columns

@@ -1,0 +1,128 @@
+"""Two sets of embeddings, checked and ready to be coupled at any gamma and tau."""
+
+import torch
+from torch import Tensor
+
+from sbi_rope._validation import check_batch, check_tensor
+from sbi_rope.coupling.cost import Cost
+from sbi_rope.coupling.kernel import Kernel
+from sbi_rope.errors import CouplingError, InvalidInputError
+
+__all__ = ["Problem", "checked_embeddings", "median_distance"]
+
+# Pairwise distances of so many simulations are enough for their median.
+MAX_FOR_MEDIAN = 2000
+# Exponents C / gamma beyond this leave no digits for the differences between them.
+LARGEST_EXPONENT = {torch.float64: 1e12, torch.float32: 1e5}
+
+
+class Problem:
+    """The distances of some or all observations from all simulations.
+
+    Args:
+        real: Embeddings of the observations, shape ``(n_o, l)``.
+        simulated: Embeddings of the simulations, shape ``(n_s, l)``.
+        fitted: Indices of the observations to fit to; None for all.
+        blocked: Whether to hold nothing of size n_o x n_s.
+        stored: Whether to store the distances, for more than one use of them.
+    """
+
+    def __init__(
+        self,
+        real: Tensor,
+        simulated: Tensor,
+        *,
+        fitted: Tensor | None,
+        blocked: bool,
+        stored: bool,
+    ) -> None:
+        self.real = real
+        self.simulated = simulated
+        self.blocked = blocked
+        self.all_fitted = fitted is None
+        self.cost = Cost(
+            real if fitted is None else real[fitted], simulated, stored=stored
+        )
+        if not 4 * self.cost.bound**2 < torch.finfo(torch.float64).max:
+            raise CouplingError(
+                "The distances between embeddings overflow. Check the scale of the "
+                "observations and of the embedding net's outputs."
+            )
+        self._kernel: tuple[float, Kernel] | None = None
+
+    @property
+    def size(self) -> int:
+        """The number of distances, of all observations from all simulations."""
+        return len(self.real) * len(self.simulated)
+
+    def zero_potential(self) -> Tensor:
+        """Return the potential to start from when nothing is known."""
+        return self.simulated.new_zeros(len(self.simulated), dtype=torch.float64)
+
+    def check_gamma(self, gamma: float) -> None:
+        """Check that the dtype has digits left for distances / gamma.
+
+        Raises:
+            CouplingError: If gamma, in units of the embeddings, is too small.
+        """
+        smallest = self.cost.bound / LARGEST_EXPONENT[self.real.dtype]
+        if gamma < smallest:
+            raise CouplingError(
+                f"Expected a gamma of at least {smallest:.1e} in units of the "
+                f"embeddings, where {self.real.dtype} has digits left for distances / "
+                f"gamma; got {gamma:.1e}. Use a larger gamma, or dtype=torch.float64."
+            )
+
+    def kernel(self, gamma: float) -> Kernel:
+        """Return the kernel of a gamma in units of the embeddings; the last is kept."""
+        if self._kernel is None or self._kernel[0] != gamma:
+            self._kernel = None  # frees its memory before the next one is made
+            kernel = Kernel(self.cost, gamma, stored=not self.blocked)
+            self._kernel = (gamma, kernel)
+        return self._kernel[1]
+
+    def kernel_of_all(self, gamma: float) -> Kernel:
+        """Return a kernel over all observations, fitted to or not."""
+        cost = Cost(self.real, self.simulated, stored=False)
+        return Kernel(cost, gamma, stored=False)
+
+
+def checked_embeddings(real: Tensor, simulated: Tensor) -> tuple[Tensor, Tensor]:
+    """Check two sets of embeddings.
+
+    Raises:
+        InvalidTypeError: If one is not a tensor of numbers.
+        InvalidInputError: If shapes or devices do not fit, a set is empty, or a value
+            is not finite.
+    """
+    real = check_tensor("real", real)
+    simulated = check_tensor("simulated", simulated)
+    if real.device != simulated.device:
+        raise InvalidInputError(
+            "Expected `real` and `simulated` on the same device; got "
+            f"{real.device} and {simulated.device}."
+        )
+    if simulated.ndim != 2:
+        raise InvalidInputError(
+            f"Expected `simulated` of shape (n_s, l); got {tuple(simulated.shape)}."
+        )
+    simulated = check_batch("simulated", simulated, simulated.shape[1:])
+    real = check_batch("real", real, simulated.shape[1:])
+    return real.detach(), simulated.detach()
+
+
+def median_distance(simulated: Tensor) -> float:
+    """Return the median distance between simulations.
+
+    Raises:
+        CouplingError: If it is zero.
+    """
+    subset = simulated[:MAX_FOR_MEDIAN]
+    median = torch.nn.functional.pdist(subset).median() if len(subset) > 1 else 0.0
+    if float(median) == 0.0:
+        raise CouplingError(
+            "cost_scale='simulated' needs simulations whose embeddings differ, but "
+            f"the median distance between {len(subset)} of them is zero. Use more "
+            "simulations, cost_scale='none', or check the embedding net."
+        )
+    return float(median)

@@ -1,0 +1,132 @@
+"""Draws from a block of mixtures, and the rejection of those outside the prior."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from sbi_rope._sbi import ConditionalDensityEstimator
+from sbi_rope.errors import SamplingError
+from sbi_rope.mixture.chunks import num_fitting
+
+__all__ = ["Accept", "BlockSampler"]
+
+# Rejection sampling gives an observation up if, after so many proposals, less than this
+# share of them lies inside the prior's support.
+MIN_PROPOSALS, MIN_ACCEPTANCE = 100_000, 1e-3
+# Draws that take a flow about as long as a single one.
+SMALL_BATCH = 512
+
+Accept = Callable[[Tensor], Tensor]
+
+
+class BlockSampler:
+    """Draws from the mixtures of a block of observations.
+
+    Args:
+        components: The density of a component given its context.
+        contexts: Contexts of the components, shape ``(n_s, l)``.
+        weights: Rows of the mixture weights, shape ``(b, n_s)``.
+        accept: Tells which proposals ``(n, d)`` to keep; None keeps all.
+        batch_size: Most draws the flow makes at a time.
+        first_row: The number of the block's first observation, for messages.
+    """
+
+    def __init__(
+        self,
+        components: ConditionalDensityEstimator,
+        contexts: Tensor,
+        weights: Tensor,
+        *,
+        accept: Accept | None,
+        batch_size: int,
+        first_row: int = 0,
+    ) -> None:
+        self.components = components
+        self.contexts = contexts
+        self.accept = accept
+        self.batch_size = batch_size
+        self.first_row = first_row
+        self.num_rows, self.num_components = weights.shape
+        # Inverse transform: row i fills the interval [i, i + 1], so that one search
+        # serves all rows. The offset takes digits, hence in double precision.
+        cumulative = weights.cumsum(dim=1, dtype=torch.float64)
+        cumulative /= cumulative[:, -1:].clone()
+        cumulative += torch.arange(self.num_rows, device=weights.device)[:, None]
+        self._cumulative = cumulative.flatten()
+        # Rounding may carry a draw past the end of its row.
+        positive = (weights > 0).flip(1).to(torch.int8)
+        self._last = self.num_components - 1 - positive.argmax(dim=1)
+        self._proposed = torch.zeros_like(self._last)
+        self._inside = torch.zeros_like(self._last)
+
+    def sample(self, num_samples: int) -> Tensor:
+        """Draw from every mixture, ``(num_samples, b, d)``.
+
+        Raises:
+            SamplingError: If next to nothing is accepted for some observation.
+        """
+        slots = torch.arange(self.num_rows, device=self._last.device)
+        slots = slots.repeat_interleave(num_samples)
+        theta = self._propose(slots) if self.accept is None else self._fill(slots)
+        return theta.unflatten(0, (self.num_rows, num_samples)).transpose(0, 1)
+
+    def _propose(self, rows: Tensor) -> Tensor:
+        """Draw one theta from the mixture of each entry of ``rows``."""
+        uniform = torch.rand(len(rows), dtype=torch.float64, device=rows.device)
+        # right=True passes over components of weight zero.
+        found = torch.searchsorted(self._cumulative, uniform + rows, right=True)
+        found = (found - rows * self.num_components).clamp_min_(0)
+        chosen = torch.minimum(found, self._last[rows])
+        return torch.cat(
+            [
+                self.components.sample(torch.Size((1,)), self.contexts[part])[0]
+                for part in chosen.split(self.batch_size)
+            ]
+        )
+
+    def _fill(self, slots: Tensor) -> Tensor:
+        """Propose for every slot, an index of a row, until one is accepted for it."""
+        assert self.accept is not None
+        theta = self.contexts.new_empty(len(slots), *self.components.input_shape)
+        still_open = torch.ones(len(slots), dtype=torch.bool, device=slots.device)
+        rate = 1.0
+        while (open_slots := still_open.nonzero().flatten()).numel():
+            proposals = open_slots.repeat_interleave(_repeats(len(open_slots), rate))
+            rows = slots[proposals]
+            draws = self._propose(rows)
+            accepted = self.accept(draws)
+            # Of several proposals for a slot the first accepted one is kept.
+            chosen = accepted.nonzero().flatten()
+            filled = proposals[chosen]
+            first = filled != filled.roll(1)
+            first[:1] = True
+            theta[filled[first]] = draws[chosen[first]]
+            still_open[filled] = False
+            self._count(rows, accepted)
+            rate = float(accepted.double().mean())
+        return theta
+
+    def _count(self, rows: Tensor, accepted: Tensor) -> None:
+        self._proposed += rows.bincount(minlength=self.num_rows)
+        self._inside += rows[accepted].bincount(minlength=self.num_rows)
+        hopeless = (self._proposed >= MIN_PROPOSALS) & (
+            self._inside < MIN_ACCEPTANCE * self._proposed
+        )
+        if hopeless.any():
+            numbers = (hopeless.nonzero().flatten()[:5] + self.first_row).tolist()
+            raise SamplingError(
+                f"Less than one in {int(1 / MIN_ACCEPTANCE)} draws lies inside the "
+                f"support of the prior for the observations in rows {numbers} of `x`: "
+                "the posteriors of the simulations leak. Train NPE longer, or with "
+                "z_score_theta='transform_to_unconstrained', or pass "
+                "reject_outside_prior=False."
+            )
+
+
+def _repeats(num_open: int, rate: float) -> int:
+    """Return how many proposals to make for every open slot."""
+    # As many as will fill most of the slots, and for the last few slots as many as take
+    # no longer than one.
+    wanted = max(int(1 / max(rate, MIN_ACCEPTANCE)), SMALL_BATCH // num_open)
+    return max(1, min(wanted, num_fitting(num_open)))

@@ -1,0 +1,489 @@
+"""Blocks, sweeps and subsets: large couplings equal small ones done the long way."""
+
+import functools
+import itertools
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from sbi_rope import SinkhornCoupler
+from sbi_rope.coupling import cost as cost_module
+from sbi_rope.coupling import fixed_point
+from sbi_rope.coupling.cost import Cost, Distances
+from sbi_rope.coupling.fixed_point import solve_fixed_point
+from sbi_rope.coupling.kernel import Kernel, marginal_error
+from sbi_rope.errors import CouplingError, InvalidInputError, RoPEWarning
+from tests.memory import run_alone
+from tests.modes import MODES, digits
+
+
+def clouds(n_o: int = 300, n_s: int = 200) -> tuple[Tensor, Tensor]:
+    simulated = torch.randn(n_s, 5, dtype=torch.float64)
+    real = 1.3 * torch.randn(n_o, 5, dtype=torch.float64) + 0.5
+    return real, simulated
+
+
+def total_variation(a: Tensor, b: Tensor) -> Tensor:
+    return (a.double() - b.double()).abs().sum(dim=1) / 2
+
+
+# --- distances ---
+
+
+@pytest.mark.parametrize("width", [1, 3, 64])
+@pytest.mark.parametrize("offset", [0.0, 1e6])
+def test_distances_are_exact_to_the_stated_accuracy(width: int, offset: float) -> None:
+    fixed = torch.randn(50, width, dtype=torch.float64) + offset
+    points = torch.cat([fixed[:10], fixed[:10] + 1e-3, 3 * fixed[10:20] - 2 * offset])
+    expected = (points[:, None] - fixed).norm(dim=2)
+    centred = fixed - fixed.median(dim=0).values
+    radius = float(centred.norm(dim=1).max())
+    error = (Distances(fixed)(points) - expected).abs()
+    assert error.max() < 5e-8 * radius
+    apart = expected > 0.1 * radius
+    assert (error / expected)[apart].max() < 1e-12
+
+
+def test_float32_distances_are_rounded_float64_ones() -> None:
+    fixed = torch.randn(50, 3) + 100.0
+    points = torch.cat([fixed[:10], torch.randn(10, 3)])
+    expected = (points[:, None].double() - fixed.double()).norm(dim=2)
+    distances = Distances(fixed)(points)
+    assert distances.dtype == torch.float32
+    assert torch.allclose(distances.double(), expected, rtol=1e-7, atol=1e-7)
+
+
+def test_a_far_simulation_does_not_cost_the_others_their_digits() -> None:
+    fixed = torch.randn(50, 3, dtype=torch.float64)
+    fixed[0] = 1e8
+    points = fixed[1:] + 1e-2
+    expected = (points[:, None] - fixed).norm(dim=2)
+    assert ((Distances(fixed)(points) - expected) / expected).abs().max() < 1e-9
+
+
+# --- kernels ---
+
+
+def log_marginal(real: Tensor, simulated: Tensor, gamma: float, w: Tensor) -> Tensor:
+    """The log of the mean of the rows, in the log domain throughout."""
+    cost = (real[:, None].double() - simulated[None].double()).norm(dim=2)
+    rows = torch.log_softmax(w - cost / gamma, dim=1)
+    return torch.logsumexp(rows, dim=0) - math.log(len(real))
+
+
+def kernel_of(mode: str, real: Tensor, simulated: Tensor, gamma: float) -> Any:
+    cost = Cost(real, simulated, stored=mode == "stored cost")
+    return Kernel(cost, gamma, stored=mode != "streamed")
+
+
+KERNELS = pytest.mark.parametrize("mode", ["stored", "stored cost", "streamed"])
+DTYPES = pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+
+
+@KERNELS
+@DTYPES
+@pytest.mark.parametrize("gamma", [10.0, 0.5, 0.02])
+@pytest.mark.parametrize("spread", [0.0, 1.0, 300.0])
+def test_kernels_return_the_log_of_the_mean_row(
+    mode: str, dtype: torch.dtype, gamma: float, spread: float
+) -> None:
+    real, simulated = (part.to(dtype) for part in clouds(80, 60))
+    simulated[:5] += 30.0  # columns that underflow at the smaller gammas
+    kernel = kernel_of(mode, real, simulated, gamma)
+    for _ in range(3):  # another potential may need another absorption
+        w = spread * torch.randn(60, dtype=torch.float64)
+        expected = log_marginal(real, simulated, gamma, w)
+        # Exponents of up to 3000 are rounded to 6e-8 of themselves.
+        error = ((kernel(w) - expected) / (1 + expected.abs())).abs().max()
+        assert error < (1e-12 if dtype == torch.float64 else 3e-6)
+
+
+@DTYPES
+def test_potentials_are_absorbed_only_where_the_factors_leave_the_range(
+    dtype: torch.dtype,
+) -> None:
+    real, simulated = (part.to(dtype) for part in clouds(80, 60))
+    kernel = kernel_of("stored", real, simulated, 0.5)
+    w = torch.randn(60, dtype=torch.float64)
+    for scale in (0.0, 1.0, 2.0, -1.0):
+        kernel(scale * w)
+    assert kernel.num_absorptions == 1
+    kernel(1000.0 * w)
+    assert kernel.num_absorptions == 2
+
+
+@KERNELS
+def test_no_entry_of_the_kernel_is_a_denormal_number(
+    mode: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, simulated = (part.float() for part in clouds(80, 60))
+    smallest = []
+    exponentiate = torch.Tensor.exp_
+
+    def spy(self: Tensor) -> Tensor:
+        result = exponentiate(self)
+        smallest.append(float(result.min()))
+        return result
+
+    monkeypatch.setattr(torch.Tensor, "exp_", spy)
+    kernel_of(mode, real, simulated, 0.01)(torch.zeros(60, dtype=torch.float64))
+    assert smallest
+    assert min(smallest) > 1e-31
+
+
+@pytest.mark.parametrize("block", [1, 100, 10**9])
+@pytest.mark.parametrize("mode", MODES)
+def test_the_size_of_the_blocks_changes_nothing(
+    mode: dict[str, Any], block: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, simulated = clouds(60, 50)
+    coupler = SinkhornCoupler(
+        gamma=0.3, tau=0.9, tolerance=digits(mode, double=1e-10, single=1e-6), **mode
+    )
+    expected = coupler.couple(real, simulated)
+    monkeypatch.setattr(cost_module, "CPU_BLOCK", block)
+    coupling = coupler.couple(real, simulated)
+    bound = digits(mode, double=1e-9, single=1e-4)
+    assert (coupling.weights - expected.weights).abs().max() < bound
+    assert torch.allclose(
+        coupling.effective_sample_size, expected.effective_sample_size, rtol=1e-4
+    )
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_rows_are_read_in_any_portion(mode: dict[str, Any]) -> None:
+    real, simulated = clouds(60, 50)
+    coupling = SinkhornCoupler(gamma=0.3, tau=0.9, **mode).couple(real, simulated)
+    parts = [coupling.rows(part) for part in coupling.real.split([1, 20, 39])]
+    assert (torch.cat(parts) - coupling.weights).abs().max() < digits(
+        mode, double=1e-13, single=1e-6
+    )
+
+
+def test_blocked_weights_are_computed_but_not_kept() -> None:
+    real, simulated = clouds(60, 50)
+    blocked = SinkhornCoupler(blocked=True).couple(real, simulated)
+    assert blocked.weights is not blocked.weights
+    assert torch.equal(blocked.weights, blocked.weights)
+    kept = SinkhornCoupler(blocked=False).couple(real, simulated)
+    assert kept.weights is kept.weights
+
+
+def test_blocks_are_chosen_where_the_distances_would_be_too_many(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    real, simulated = clouds(60, 50)
+    monkeypatch.setattr("sbi_rope.coupling.coupler.MAX_STORED", 60 * 50)
+    assert not SinkhornCoupler().couple(real, simulated).blocked
+    monkeypatch.setattr("sbi_rope.coupling.coupler.MAX_STORED", 60 * 50 - 1)
+    assert SinkhornCoupler().couple(real, simulated).blocked
+    stored = SinkhornCoupler(blocked=False)
+    assert not stored._set_up(real, simulated, 0, reused=False)[0].blocked
+    pot = SinkhornCoupler(solver="pot")
+    assert not pot._set_up(real, simulated, 0, reused=True)[0].blocked
+    # A part may be stored where the whole may not, and its weights not kept.
+    part = SinkhornCoupler(num_fitted=59)
+    assert not part._set_up(real, simulated, 0, reused=False)[0].blocked
+    assert part.couple(real, simulated).blocked
+
+
+MEASURE = """
+import sys, torch
+from tests.memory import peak_memory
+from sbi_rope import SinkhornCoupler
+torch.manual_seed(0)
+real, simulated = torch.randn(6000, 4), torch.randn(6000, 4)
+SinkhornCoupler(blocked=True).couple(real[:200], simulated[:200])
+before = peak_memory()
+coupling = SinkhornCoupler(blocked=sys.argv[1] == "blocked").couple(real, simulated)
+coupling.effective_sample_size
+coupling.rows(real[:100])
+print(peak_memory() - before)
+"""
+
+
+@pytest.mark.parametrize(
+    ("mode", "least", "most"),
+    [("blocked", 0.0, 60.0), ("stored", 250.0, 400.0)],
+)
+def test_blocked_couplings_hold_no_matrix(mode: str, least: float, most: float) -> None:
+    # 6000 x 6000 numbers are 275 MB in float64.
+    assert least <= float(run_alone(MEASURE, mode)) <= most
+
+
+# --- the accelerated fixed point ---
+
+
+def solve(kernel: Any, n_s: int, **options: Any) -> Any:
+    settings = {
+        "tau": 1.0,
+        "tolerance": 1e-8,
+        "max_iterations": 3000,
+        "memory": 5,
+        "eps": 2e-16,
+    }
+    start = torch.zeros(n_s, dtype=torch.float64)
+    return solve_fixed_point(kernel, start, **(settings | options))
+
+
+def test_acceleration_needs_fewer_iterations_for_the_same_plan() -> None:
+    real, simulated = clouds()
+    kernel = kernel_of("stored", real, simulated, 0.15)
+    plain, accelerated = solve(kernel, 200, memory=0), solve(kernel, 200)
+    assert accelerated.num_iterations < 0.4 * plain.num_iterations
+    assert max(plain.marginal_error, accelerated.marginal_error) <= 1e-8
+    assert (plain.potential - accelerated.potential).abs().max() < 1e-4
+
+
+def test_the_solution_is_the_best_potential_seen() -> None:
+    real, simulated = clouds()
+    kernel = kernel_of("stored", real, simulated, 0.15)
+    last = math.inf
+    for budget in range(1, 30):
+        solution = solve(kernel, 200, max_iterations=budget)
+        assert solution.num_iterations == budget
+        error = marginal_error(kernel(solution.potential), solution.potential, 1.0)
+        assert error == pytest.approx(solution.marginal_error, rel=1e-6)
+        assert abs(float(solution.potential.mean())) < 1e-12
+        assert solution.marginal_error <= last
+        last = solution.marginal_error
+
+
+def unbalanced_clusters() -> tuple[Tensor, Tensor, float]:
+    """Clusters with other shares of observations than of simulations.
+
+    At tau = 1 whole clusters have to exchange mass across gaps of a hundred gammas: the
+    potential must move far before the error falls, which misleads acceleration.
+    """
+    torch.manual_seed(0)
+    simulated = 0.1 * torch.randn(300, 5) + 5.0 * torch.randint(0, 4, (300, 1))
+    real = 0.1 * torch.randn(300, 5) + 5.0 * torch.randint(0, 4, (300, 1)) + 0.5
+    gamma = 0.01 * float(torch.cdist(real, simulated).max())
+    return real.double(), simulated.double(), gamma
+
+
+def test_plain_iterations_take_over_where_acceleration_gets_lost(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    real, simulated, gamma = unbalanced_clusters()
+    kernel = kernel_of("stored", real, simulated, gamma)
+    plain = solve(kernel, 300, memory=0, tolerance=1e-6)
+    assert plain.marginal_error <= 1e-6
+    accelerated = solve(kernel, 300, tolerance=1e-6, max_iterations=1500)
+    assert accelerated.marginal_error <= 1e-6
+    # Without the takeover the same budget is not enough.
+    monkeypatch.setattr(fixed_point, "PATIENCE", 10**9)
+    lost = solve(kernel, 300, tolerance=1e-6, max_iterations=1500)
+    assert lost.marginal_error > 1e-4
+
+
+def test_a_step_that_makes_the_error_grow_is_taken_back() -> None:
+    real, simulated, gamma = unbalanced_clusters()
+    kernel = kernel_of("stored", real, simulated, gamma)
+    seen: list[tuple[Tensor, float]] = []
+
+    def watched(potential: Tensor) -> Tensor:
+        log_q = kernel(potential)
+        seen.append((potential, marginal_error(log_q, potential, 1.0)))
+        return log_q
+
+    solve(watched, 300, max_iterations=200)
+    grown = next(
+        i
+        for i in range(1, 199)
+        if seen[i][1] > fixed_point.LARGEST_GROWTH * seen[i - 1][1]
+    )
+    before = seen[grown - 1][0]
+    image = before - math.log(300) - kernel(before)
+    assert torch.allclose(seen[grown + 1][0], image - image.mean(), atol=1e-9)
+
+
+def test_exhausted_digits_end_the_iteration() -> None:
+    real, simulated = (part.float() for part in clouds())
+    kernel = kernel_of("stored", real, simulated, 0.5)
+    eps = torch.finfo(torch.float32).eps
+    solution = solve(kernel, 200, tolerance=1e-14, max_iterations=10_000, eps=eps)
+    assert fixed_point.STALLED < solution.num_iterations < 2000
+    assert 1e-14 < solution.marginal_error < 1e-5
+
+
+# --- sweeps ---
+
+GAMMAS, TAUS = [0.1, 1.0, 0.3], [0.5, 1.0, 0.0, 0.9]
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_sweep_yields_single_solutions_in_the_order_asked_for(
+    mode: dict[str, Any],
+) -> None:
+    real, simulated = clouds()
+    tolerance = digits(mode, double=1e-10, single=1e-6)
+    coupler = SinkhornCoupler(tolerance=tolerance, **mode)
+    sweep = list(coupler.sweep(real, simulated, gammas=GAMMAS, taus=TAUS))
+    assert [(c.gamma, c.tau) for c in sweep] == list(itertools.product(GAMMAS, TAUS))
+    for coupling in sweep:
+        single = replace(coupler, gamma=coupling.gamma, tau=coupling.tau)
+        expected = single.couple(real, simulated)
+        assert coupling.converged
+        assert coupling.solver == expected.solver
+        difference = total_variation(coupling.weights, expected.weights).max()
+        assert difference < digits(mode, double=1e-8, single=1e-4)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_warm_starts_save_iterations(mode: dict[str, Any]) -> None:
+    real, simulated = clouds()
+    gammas, taus = [1.0, 0.5, 0.3, 0.2, 0.15, 0.1], [0.9, 1.0]
+    coupler = SinkhornCoupler(**mode)
+    warm = sum(
+        c.num_iterations
+        for c in coupler.sweep(real, simulated, gammas=gammas, taus=taus)
+    )
+    cold = sum(
+        replace(coupler, gamma=gamma, tau=tau).couple(real, simulated).num_iterations
+        for gamma, tau in itertools.product(gammas, taus)
+    )
+    assert warm < 0.9 * cold
+
+
+def test_a_sweep_computes_only_what_was_asked_for_so_far(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    real, simulated = clouds()
+    solved = []
+    solve_one = SinkhornCoupler._solve
+
+    def spy(self: SinkhornCoupler, *arguments: Any) -> Any:
+        solved.append((self.gamma, self.tau))
+        return solve_one(self, *arguments)
+
+    monkeypatch.setattr(SinkhornCoupler, "_solve", spy)
+    sweep = SinkhornCoupler().sweep(real, simulated, gammas=[1.0, 0.5], taus=[1.0, 0.5])
+    assert solved == []
+    next(sweep)
+    assert solved == [(1.0, 1.0)]
+    list(sweep)
+    assert solved == [(1.0, 1.0), (1.0, 0.5), (0.5, 1.0), (0.5, 0.5)]
+
+
+def test_a_sweep_scales_gamma_like_a_single_coupling() -> None:
+    real, simulated = clouds()
+    coupler = SinkhornCoupler(gamma=0.2, cost_scale="simulated")
+    (swept,) = coupler.sweep(real, simulated, gammas=[0.2], taus=[1.0])
+    single = coupler.couple(real, simulated)
+    assert swept.gamma == single.gamma
+    assert torch.allclose(swept.weights, single.weights, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("gammas", "taus", "match"),
+    [
+        pytest.param([], [1.0], "at least one", id="no gamma"),
+        pytest.param([0.5], [], "at least one", id="no tau"),
+        pytest.param([0.5, -1.0], [1.0], "`gamma` to be positive", id="gamma"),
+        pytest.param([0.5], [1.0, 1.5], r"`tau` in \[0, 1\]", id="tau"),
+    ],
+)
+def test_settings_of_a_sweep_are_checked_before_anything_is_solved(
+    gammas: list[float], taus: list[float], match: str
+) -> None:
+    with pytest.raises(InvalidInputError, match=match):
+        SinkhornCoupler().sweep(*clouds(), gammas=gammas, taus=taus)
+
+
+# --- potentials fitted to some of the observations ---
+
+
+@functools.cache
+def fits_to_parts() -> tuple[Any, list[Any]]:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        real, simulated = clouds(3000, 200)
+    coupler = SinkhornCoupler(gamma=0.5, tau=0.9, tolerance=1e-9)
+    parts = [
+        replace(coupler, num_fitted=count).couple(real, simulated, seed=1)
+        for count in (100, 500, 2000)
+    ]
+    return coupler.couple(real, simulated), parts
+
+
+def test_potentials_fitted_to_more_observations_approach_the_full_fit() -> None:
+    full, parts = fits_to_parts()
+    errors = [
+        float(total_variation(part.weights, full.weights).mean()) for part in parts
+    ]
+    assert errors[0] > 1.5 * errors[1] > 1.5**2 * errors[2] > 0
+    assert errors[2] < 0.02
+    assert [part.num_fitted for part in parts] == [100, 500, 2000]
+
+
+def test_the_error_of_a_partial_fit_over_the_whole_batch_is_reported() -> None:
+    full, parts = fits_to_parts()
+    for part in parts:
+        assert part.converged
+        assert part.marginal_error <= 1e-9
+        q = part.weights.mean(dim=0)
+        target = torch.softmax(-part.potential * (1 - 0.9) / 0.9, dim=0)
+        assert part.batch_error == pytest.approx(float((q - target).abs().sum()))
+    errors = [part.batch_error for part in [*parts, full]]
+    assert errors == sorted(errors, reverse=True)
+
+
+def test_fitting_to_all_observations_is_the_full_fit() -> None:
+    real, simulated = clouds()
+    full = SinkhornCoupler().couple(real, simulated)
+    for count in (300, 301):
+        coupling = SinkhornCoupler(num_fitted=count).couple(real, simulated)
+        assert torch.equal(coupling.potential, full.potential)
+        assert (coupling.num_fitted, coupling.batch_error) == (300, full.marginal_error)
+
+
+def test_the_choice_of_observations_has_a_seed_of_its_own() -> None:
+    real, simulated = clouds()
+    coupler = SinkhornCoupler(num_fitted=50)
+    state = torch.get_rng_state()
+    first, again, other = (
+        coupler.couple(real, simulated, seed=seed).potential for seed in (1, 1, 2)
+    )
+    assert torch.equal(first, again)
+    assert not torch.allclose(first, other)
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_few_fitted_observations_are_warned_about_like_a_small_batch() -> None:
+    with pytest.warns(RoPEWarning, match="a batch of 10 real"):
+        SinkhornCoupler(num_fitted=10).couple(*clouds())
+
+
+# --- on a GPU ---
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(("gamma", "tau"), [(0.5, 0.9), (0.1, 1.0), (0.02, 0.5)])
+def test_a_gpu_gives_the_rows_of_the_cpu(
+    mode: dict[str, Any], gamma: float, tau: float
+) -> None:
+    real, simulated = clouds()
+    coupler = SinkhornCoupler(
+        gamma=gamma, tau=tau, tolerance=digits(mode, double=1e-9, single=1e-6), **mode
+    )
+    expected = coupler.couple(real, simulated)
+    coupling = coupler.couple(real.cuda(), simulated.cuda())
+    assert coupling.potential.is_cuda
+    assert coupling.converged
+    difference = total_variation(coupling.weights.cpu(), expected.weights).max()
+    assert difference < digits(mode, double=1e-6, single=1e-3)
+
+
+def test_an_impossible_gamma_in_a_sweep_is_a_named_error() -> None:
+    sweep = SinkhornCoupler(dtype=torch.float32).sweep(
+        *clouds(), gammas=[1.0, 1e-9], taus=[1.0]
+    )
+    assert next(sweep).converged
+    with pytest.raises(CouplingError, match="gamma of at least"):
+        next(sweep)
