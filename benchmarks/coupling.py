@@ -333,7 +333,7 @@ def compare_sweeps(args: argparse.Namespace) -> None:
     for n, name in itertools.product(args.n, args.dtypes):
         points = embeddings(n, DTYPES[name])
         coupler = SinkhornCoupler(dtype=DTYPES[name])
-        plain = replace(coupler, memory=0)
+        plain = replace(coupler, anderson_memory=0)
         tasks = {
             "own, warm": partial(warm, coupler, points, grid),
             "own, cold": partial(one_by_one, coupler, points, grid),

@@ -4,7 +4,7 @@ import platform
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-__all__ = ["describe_machine", "peak_memory"]
+__all__ = ["describe_machine", "forget_peak", "memory", "peak_memory"]
 
 PACKAGES = ("torch", "POT", "sbi", "ott-jax", "jax")
 
@@ -23,13 +23,27 @@ def describe_machine(*, threads: int) -> str:
     )
 
 
+def memory() -> float:
+    """Return the memory this process holds now, in MB (Linux only)."""
+    return _status("VmRSS")
+
+
 def peak_memory() -> float:
-    """Return the most memory this process has held so far, in MB (Linux only).
+    """Return the most memory this process has held, in MB (Linux only).
 
     Not by ``resource``, whose maximum starts at that of the parent process.
     """
+    return _status("VmHWM")
+
+
+def forget_peak() -> None:
+    """Let :func:`peak_memory` start anew."""
+    Path("/proc/self/clear_refs").write_text("5")
+
+
+def _status(name: str) -> float:
     lines = Path("/proc/self/status").read_text().splitlines()
-    line = next(line for line in lines if line.startswith("VmHWM"))
+    line = next(line for line in lines if line.startswith(name))
     return int(line.split()[1]) / 1024
 
 

@@ -72,11 +72,11 @@ class SinkhornCoupler:
         blocked: Whether to compute the distances anew, block by block, in every
             iteration, so that no matrix of size n_o x n_s is ever held: slower, but
             its memory does not grow with n_o n_s. None (the default) does so for more
-            than 50 million distances, that of 7,000 observations from 7,000
-            simulations.
+            than 50 million distances (7,000 observations and as many simulations).
         num_fitted: Fit the potential to so many observations, chosen at random; None
             (the default) fits it to all. ``batch_error`` tells what that costs.
-        memory: Differences that Anderson acceleration remembers; 0 switches it off.
+        anderson_memory: Last steps that Anderson acceleration combines; 0 switches it
+            off.
 
     Raises:
         InvalidInputError: If an argument is outside its range.
@@ -101,7 +101,7 @@ class SinkhornCoupler:
     dtype: torch.dtype = torch.float64
     blocked: bool | None = None
     num_fitted: int | None = None
-    memory: int = 5
+    anderson_memory: int = 5
 
     def __post_init__(self) -> None:
         """Check the ranges of all fields."""
@@ -115,7 +115,7 @@ class SinkhornCoupler:
         check_choice("blocked", self.blocked, (None, True, False))
         if self.num_fitted is not None:
             check_integer("num_fitted", self.num_fitted)
-        check_integer("memory", self.memory, minimum=0)
+        check_integer("anderson_memory", self.anderson_memory, minimum=0)
         if self.solver == "pot" and self.blocked:
             raise InvalidInputError(
                 "Expected `blocked` to be None or False with solver='pot', which needs "
@@ -295,7 +295,7 @@ class SinkhornCoupler:
             tau=self.tau,
             tolerance=self.tolerance,
             max_iterations=self.max_iterations - made,
-            memory=self.memory,
+            memory=self.anderson_memory,
             eps=torch.finfo(self.dtype).eps,
         )
         iterations = made + solution.num_iterations

@@ -184,8 +184,8 @@ class MixtureEstimator(ConditionalDensityEstimator):
         row, component, log_weights = self._without_tail(weights)
         parts = []
         for part in theta.split(num_fitting(len(row))):
-            log_terms = self._log_q(part, row, component).double() + log_weights
-            parts.append(_log_sum_exp(log_terms, row, len(weights)))
+            log_q = _without_nan(self._log_q(part, row, component).double())
+            parts.append(_log_sum_exp(log_q + log_weights, row, len(weights)))
         return torch.cat(parts)
 
     def _without_tail(self, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -277,6 +277,19 @@ def _keys(x: Tensor) -> list[bytes]:
     # Adding zero makes -0.0 and 0.0, which are equal, equal in their bytes too.
     rows = (x.detach().cpu().flatten(1) + 0.0).contiguous().numpy()
     return [hashlib.blake2b(row.tobytes(), digest_size=16).digest() for row in rows]
+
+
+def _without_nan(log_q: Tensor) -> Tensor:
+    """Let components without a density at some theta not take the others with them."""
+    undefined = torch.isnan(log_q)
+    if not undefined.any():
+        return log_q
+    warn_user(
+        f"{int(undefined.sum())} of {undefined.numel()} component densities are NaN "
+        "and counted as zero: the flow fails at these simulations or parameters. Train "
+        "NPE longer, or with another density estimator."
+    )
+    return log_q.where(~undefined, -torch.inf)
 
 
 def _log_sum_exp(log_terms: Tensor, row: Tensor, num_rows: int) -> Tensor:

@@ -369,7 +369,9 @@ def test_a_small_batch_is_warned_about_and_one_row_at_tau_one_is_uniform() -> No
         pytest.param({"dtype": torch.float16}, "`dtype` to be one of", id="dtype"),
         pytest.param({"blocked": "yes"}, "`blocked` to be one of", id="blocked"),
         pytest.param({"num_fitted": 0}, "`num_fitted`.*at least 1", id="fitted"),
-        pytest.param({"memory": -1}, "`memory`.*at least 0", id="memory"),
+        pytest.param(
+            {"anderson_memory": -1}, "`anderson_memory`.*at least 0", id="memory"
+        ),
         pytest.param(
             {"solver": "pot", "blocked": True}, "solver='own'", id="blocked POT"
         ),
@@ -420,7 +422,9 @@ def balanced_overflow() -> tuple[Tensor, Tensor, float]:
 
 def test_where_pots_scalings_overflow_the_rows_stay_exact_and_finite() -> None:
     real, simulated, gamma = balanced_overflow()
-    coupler = SinkhornCoupler(gamma=gamma, solver="pot", max_iterations=600, memory=0)
+    coupler = SinkhornCoupler(
+        gamma=gamma, solver="pot", max_iterations=600, anderson_memory=0
+    )
     coupling = coupler.couple(real, simulated)
     assert not coupling.converged  # and says so: 600 iterations are not enough
     assert (coupling.weights.sum(dim=1) - 1).abs().max() < 1e-12
@@ -436,7 +440,7 @@ def test_where_pots_scalings_overflow_the_rows_stay_exact_and_finite() -> None:
 def test_where_plain_iterations_do_not_get_there_accelerated_ones_do() -> None:
     real, simulated, gamma = balanced_overflow()
     coupler = SinkhornCoupler(gamma=gamma, max_iterations=3000)
-    plain = replace(coupler, memory=0).couple(real, simulated)
+    plain = replace(coupler, anderson_memory=0).couple(real, simulated)
     accelerated = coupler.couple(real, simulated)
     assert (plain.num_iterations, plain.converged) == (3000, False)
     assert accelerated.converged
@@ -498,6 +502,8 @@ def test_a_rescue_in_the_middle_keeps_to_the_budget() -> None:
     )
     assert not healthy
     assert 0 < solution.num_iterations < 300
-    coupler = SinkhornCoupler(gamma=gamma, solver="pot", max_iterations=300, memory=0)
+    coupler = SinkhornCoupler(
+        gamma=gamma, solver="pot", max_iterations=300, anderson_memory=0
+    )
     coupling = coupler.couple(real, simulated)
     assert (coupling.solver, coupling.num_iterations) == ("own", 300)

@@ -193,7 +193,7 @@ def test_blocks_are_chosen_where_the_distances_would_be_too_many(
 
 MEASURE = """
 import sys, torch
-from tests.memory import peak_memory
+from benchmarks.machine import peak_memory
 from sbi_rope import SinkhornCoupler
 torch.manual_seed(0)
 real, simulated = torch.randn(6000, 4), torch.randn(6000, 4)

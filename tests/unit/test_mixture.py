@@ -2,11 +2,8 @@
 
 import copy
 import math
-import subprocess
-import sys
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,6 +26,7 @@ from sbi_rope.mixture import MixtureEstimator, MixturePosterior, chunks
 from sbi_rope.mixture import sampling as sampling_module
 from sbi_rope.mixture import truncation as truncation_module
 from tests import problems
+from tests.memory import run_alone
 from tests.problems import TableCoupling, brute_force_log_prob, gaussian_posterior
 
 QUIET = {"show_progress_bars": False}
@@ -210,22 +208,12 @@ def test_weights_and_proposals_stay_within_the_number_of_the_docstring(
 
 
 MEMORY = """
-import re
-from pathlib import Path
-
 import torch
 
 from sbi_rope.coupling import Coupling
 from sbi_rope.mixture import MixtureEstimator, MixturePosterior
 from tests import problems
-
-
-
-def megabytes(name):
-    # Of this process alone: ru_maxrss starts at the peak of the parent.
-    status = Path("/proc/self/status").read_text()
-    return int(re.search(name + r":\\s+(\\d+)", status)[1]) / 1024
-
+from benchmarks.machine import forget_peak, memory, peak_memory
 
 n, dim = 6000, 2
 simulated = problems.contexts_of(dim, n)
@@ -240,30 +228,47 @@ estimator = MixtureEstimator(
     embedding_net=torch.nn.Identity(),
 )
 posterior = MixturePosterior(estimator, problems.box(dim))
-before = megabytes("VmRSS")
-Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew
+before = memory()
+forget_peak()
 posterior.log_prob_batched(torch.zeros(n, dim), posterior.x_o)
 posterior.sample_batched((10,), posterior.x_o, show_progress_bars=False)
 estimator.tail_mass = 0.0
 posterior.log_prob_batched(torch.zeros(500, dim), posterior.x_o[:500])
 posterior[0].log_prob(torch.zeros(500, dim))
-print(megabytes("VmHWM") - before)
+print(peak_memory() - before)
 """
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_memory_stays_within_the_number_of_the_docstring() -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", MEMORY],
-        cwd=Path(__file__).resolve().parents[2],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
     # One matrix of all weights in double precision takes 288 MB.
-    assert float(done.stdout) < 100
+    assert float(run_alone(MEMORY)) < 100
+
+
+def test_a_component_without_a_density_does_not_take_the_others_with_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    broken = gaussian_posterior(n_o=6, n_s=20)
+    estimator = broken.posterior_estimator
+    theta = 2 * torch.rand(6, 2) - 1
+    expected = brute_force_log_prob(broken, theta)
+    components: Any = estimator.components
+    original, first = components.log_prob, estimator.contexts[0]
+    share = (
+        broken.weights[:, 0]
+        * original(theta[None], condition=first.expand(6, -1)).double().exp().flatten()
+    )
+
+    def log_prob(input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
+        log_q = original(input, condition)
+        return log_q.where((condition != first).any(dim=1), math.nan)
+
+    monkeypatch.setattr(components, "log_prob", log_prob)
+    with pytest.warns(RoPEWarning, match=r"6 of 120 component densities are NaN"):
+        log_prob_now = log_prob_batched(broken, theta)[0]
+    assert torch.allclose(
+        log_prob_now.double(), (expected.exp() - share).log().flatten(), atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("tail_mass", [1e-3, 0.05, 0.5, 0.99, 1.0])
