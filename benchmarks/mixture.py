@@ -10,8 +10,6 @@ measured on another checkout of the package too, in turns; compare within a run.
 
 import argparse
 import json
-import os
-import re
 import subprocess
 import sys
 import tempfile
@@ -20,6 +18,7 @@ import warnings
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from sbi.inference import NPE
@@ -27,6 +26,9 @@ from sbi.neural_nets import posterior_nn
 from sbi.utils import BoxUniform
 from torch import Tensor
 
+from benchmarks.machine import describe_machine, forget_peak, memory, peak_memory
+
+ROOT = Path(__file__).resolve().parents[1]
 X_DIM = 10
 COLUMNS = {
     "version": "version",
@@ -57,7 +59,7 @@ def prior_of(dim: int) -> BoxUniform:
     return BoxUniform(-torch.ones(dim), torch.ones(dim))
 
 
-def trained_npe(estimator: str, dim: int) -> object:
+def trained_npe(estimator: str, dim: int) -> Any:
     """Train for a few epochs: the cost does not depend on the weights."""
     warnings.simplefilter("ignore")
     torch.manual_seed(0)
@@ -73,7 +75,7 @@ def trained_npe(estimator: str, dim: int) -> object:
 
 def main() -> None:
     """Print one row for each dimension, version and repetition."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--theta-dim", type=int, nargs="+", default=[2, 4])
     parser.add_argument("--estimator", nargs="+", default=["nsf"])
     parser.add_argument("--n-o", type=int, default=2000)
@@ -86,10 +88,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=1)
     parser.add_argument("--before", type=Path, help="another checkout to measure too")
     args = parser.parse_args()
-    # Here, because a cell runs this file where the package is another checkout.
-    from benchmarks.machine import describe_machine
-
-    versions = {"now": Path(__file__).resolve().parents[1]}
+    versions = {"now": ROOT}
     if args.before is not None:
         versions = {"before": args.before.resolve(), **versions}
     print(describe_machine(threads=args.threads))
@@ -106,17 +105,17 @@ def main() -> None:
                 for _ in range(args.repeats):
                     for name, root in versions.items():
                         settings = vars(args) | {"npe": path, "theta_dim": dim}
-                        row = settings | measured(root, settings)
+                        row = settings | measured(settings | {"root": root})
                         row |= {"version": name, "estimator": estimator}
                         cells = [str(row[key]) for key in COLUMNS.values()]
                         print("| " + " | ".join(cells) + " |", flush=True)
 
 
-def measured(root: Path, settings: dict) -> dict:
-    """Measure a cell in a process whose package is the checkout at ``root``."""
+def measured(settings: dict[str, Any]) -> dict[str, Any]:
+    """Measure a cell in a process of its own."""
     done = subprocess.run(
-        [sys.executable, __file__, json.dumps(settings, default=str)],
-        env=os.environ | {"PYTHONPATH": str(root)},
+        [sys.executable, "-m", "benchmarks.mixture", json.dumps(settings, default=str)],
+        cwd=ROOT,
         capture_output=True,
         text=True,
         check=False,
@@ -126,8 +125,9 @@ def measured(root: Path, settings: dict) -> dict:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def measure(settings: dict) -> None:
-    """Measure a cell and print it as JSON."""
+def measure(settings: dict[str, Any]) -> None:
+    """Measure a cell with the package of a checkout and print it as JSON."""
+    sys.path.insert(0, settings["root"])
     from sbi_rope import RoPE, SinkhornCoupler
 
     warnings.simplefilter("ignore")
@@ -145,15 +145,15 @@ def measure(settings: dict) -> None:
         unseen="extend",
     )
     ess = posterior.coupling.effective_sample_size.median()
-    cell = {"ess": round(float(ess)), "memory_start": memory("VmRSS")}
+    cell: dict[str, float] = {"ess": round(float(ess)), "memory_start": round(memory())}
     forget_peak()
     cell["log_prob"] = round(seconds(posterior.log_prob_batched, theta, x_o), 2)
-    cell["memory_log_prob"] = memory("VmHWM")
+    cell["memory_log_prob"] = round(peak_memory())
     forget_peak()
     shape = (settings["num_samples"],)
     draw = partial(posterior.sample_batched, show_progress_bars=False)
     cell["samples"] = round(seconds(draw, shape, x_o), 2)
-    cell["memory_samples"] = memory("VmHWM")
+    cell["memory_samples"] = round(peak_memory())
     cell["total"] = round(cell["log_prob"] + cell["samples"], 2)
 
     new = iter(1.1 * simulate(npe.prior.sample((3 * settings["num_single"],))) + 0.1)
@@ -174,22 +174,6 @@ def seconds(call: Callable[..., object], *arguments: object) -> float:
     start = time.perf_counter()
     call(*arguments)
     return time.perf_counter() - start
-
-
-def memory(name: str) -> int:
-    """Return the resident memory of this process in MB, "VmRSS" now or "VmHWM" at most.
-
-    Linux only. Not ``ru_maxrss``, which starts at the peak of the parent.
-    """
-    status = Path("/proc/self/status").read_text()
-    found = re.search(rf"{name}:\s+(\d+)", status)
-    assert found is not None
-    return round(int(found[1]) / 1024)
-
-
-def forget_peak() -> None:
-    """Let "VmHWM" start anew."""
-    Path("/proc/self/clear_refs").write_text("5")
 
 
 if __name__ == "__main__":

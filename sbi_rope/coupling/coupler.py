@@ -146,7 +146,7 @@ class SinkhornCoupler:
         """
         # A single solution of our own needs the distances hardly more than once.
         problem, scale = self._set_up(
-            real, simulated, seed, reused=self.solver == "pot"
+            real, simulated, seed, gamma=self.gamma, reused=self.solver == "pot"
         )
         return self._solve(problem, self.gamma * scale, problem.zero_potential())
 
@@ -190,7 +190,10 @@ class SinkhornCoupler:
             )
         for gamma, tau in settings:
             replace(self, gamma=gamma, tau=tau)
-        problem, scale = self._set_up(real, simulated, seed, reused=True)
+        smallest = min(gamma for gamma, _ in settings)
+        problem, scale = self._set_up(
+            real, simulated, seed, gamma=smallest, reused=True
+        )
         return self._sweep(problem, scale, settings)
 
     def _sweep(
@@ -198,18 +201,28 @@ class SinkhornCoupler:
     ) -> Iterator[Coupling]:
         # All taus of a gamma in a row: they share the kernel.
         path = iter(sorted(set(settings), reverse=True))
-        solved: dict[tuple[float, float], Coupling] = {}
         start = problem.zero_potential()
-        for setting in settings:
-            while setting not in solved:
+        potentials: dict[tuple[float, float], Tensor] = {}
+        waiting: dict[tuple[float, float], Coupling] = {}
+        for position, setting in enumerate(settings):
+            while setting not in waiting:
                 gamma, tau = next(path)
-                solved[gamma, tau] = replace(self, gamma=gamma, tau=tau)._solve(
-                    problem, gamma * scale, warm_start(solved, gamma, tau, start)
+                waiting[gamma, tau] = replace(self, gamma=gamma, tau=tau)._solve(
+                    problem, gamma * scale, warm_start(potentials, gamma, tau, start)
                 )
-            yield solved[setting]
+                potentials[gamma, tau] = waiting[gamma, tau].potential
+            # What was handed out is the caller's to keep, with the weights it may hold.
+            again = setting in settings[position + 1 :]
+            yield waiting[setting] if again else waiting.pop(setting)
 
     def _set_up(
-        self, real: Tensor, simulated: Tensor, seed: int | None, *, reused: bool
+        self,
+        real: Tensor,
+        simulated: Tensor,
+        seed: int | None,
+        *,
+        gamma: float,
+        reused: bool,
     ) -> tuple[Problem, float]:
         real, simulated = checked_embeddings(real, simulated)
         num_fitted = min(len(real), self.num_fitted or len(real))
@@ -230,6 +243,7 @@ class SinkhornCoupler:
             fitted=fitted,
             blocked=blocked,
             stored=reused and not blocked,
+            smallest_gamma=gamma * scale,
         )
         return problem, scale
 
@@ -266,6 +280,7 @@ class SinkhornCoupler:
             num_iterations=solution.num_iterations,
             converged=solution.marginal_error <= self.tolerance,
             solver=solver,
+            direct=problem.direct,
             blocked=problem.blocked or problem.size > MAX_STORED,
         )
 

@@ -24,14 +24,14 @@ class _Range(NamedTuple):
 
     # Exponents are raised to this: denormal numbers make products ten times slower.
     lowest: float
-    # Exponents that differ by no more than this need neither shift nor floor.
+    # Exponents no larger than this need neither shift nor floor, whatever the factors.
     free: float
     # Farthest that w may move from the potential inside of a stored kernel.
     reach: float
 
 
 RANGE = {
-    torch.float32: _Range(lowest=-69.0, free=60.0, reach=20.0),
+    torch.float32: _Range(lowest=-69.0, free=45.0, reach=20.0),
     torch.float64: _Range(lowest=-660.0, free=450.0, reach=200.0),
 }
 

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from sbi_rope._validation import check_batch, check_tensor
-from sbi_rope.coupling.cost import Cost
+from sbi_rope.coupling.cost import Cost, Distances
 from sbi_rope.coupling.kernel import Kernel
 from sbi_rope.errors import CouplingError, InvalidInputError
 
@@ -14,6 +14,8 @@ __all__ = ["Problem", "checked_embeddings", "median_distance"]
 MAX_FOR_MEDIAN = 2000
 # Exponents C / gamma beyond this leave no digits for the differences between them.
 LARGEST_EXPONENT = {torch.float64: 1e12, torch.float32: 1e5}
+# Above this the rounding of distances by a matrix product would show in the weights.
+LARGEST_BY_PRODUCT = 1e3
 
 
 class Problem:
@@ -25,6 +27,10 @@ class Problem:
         fitted: Indices of the observations to fit to; None for all.
         blocked: Whether to hold nothing of size n_o x n_s.
         stored: Whether to store the distances, for more than one use of them.
+        smallest_gamma: The smallest gamma to be asked for, in units of the embeddings.
+
+    Raises:
+        CouplingError: If the distances overflow.
     """
 
     def __init__(
@@ -35,19 +41,25 @@ class Problem:
         fitted: Tensor | None,
         blocked: bool,
         stored: bool,
+        smallest_gamma: float,
     ) -> None:
+        bound = Distances(simulated).bound(real)
+        if not bound < 0.1 * torch.finfo(real.dtype).max ** 0.5:
+            raise CouplingError(
+                "The distances between embeddings overflow. Check the scale of the "
+                "observations and of the embedding net's outputs."
+            )
+        self.direct = bound > LARGEST_BY_PRODUCT * smallest_gamma
         self.real = real
         self.simulated = simulated
         self.blocked = blocked
         self.all_fitted = fitted is None
         self.cost = Cost(
-            real if fitted is None else real[fitted], simulated, stored=stored
+            real if fitted is None else real[fitted],
+            simulated,
+            stored=stored,
+            direct=self.direct,
         )
-        if not 4 * self.cost.bound**2 < torch.finfo(torch.float64).max:
-            raise CouplingError(
-                "The distances between embeddings overflow. Check the scale of the "
-                "observations and of the embedding net's outputs."
-            )
         self._kernel: tuple[float, Kernel] | None = None
 
     @property
@@ -65,7 +77,10 @@ class Problem:
         Raises:
             CouplingError: If gamma, in units of the embeddings, is too small.
         """
-        smallest = self.cost.bound / LARGEST_EXPONENT[self.real.dtype]
+        smallest = max(
+            self.cost.bound / LARGEST_EXPONENT[self.real.dtype],
+            torch.finfo(self.real.dtype).tiny,
+        )
         if gamma < smallest:
             raise CouplingError(
                 f"Expected a gamma of at least {smallest:.1e} in units of the "
@@ -83,7 +98,7 @@ class Problem:
 
     def kernel_of_all(self, gamma: float) -> Kernel:
         """Return a kernel over all observations, fitted to or not."""
-        cost = Cost(self.real, self.simulated, stored=False)
+        cost = Cost(self.real, self.simulated, stored=False, direct=self.direct)
         return Kernel(cost, gamma, stored=False)
 
 
@@ -117,7 +132,7 @@ def median_distance(simulated: Tensor) -> float:
     Raises:
         CouplingError: If it is zero.
     """
-    subset = simulated[:MAX_FOR_MEDIAN]
+    subset = simulated[:MAX_FOR_MEDIAN].double()
     median = torch.nn.functional.pdist(subset).median() if len(subset) > 1 else 0.0
     if float(median) == 0.0:
         raise CouplingError(

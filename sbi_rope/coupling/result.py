@@ -9,6 +9,7 @@ from torch import Tensor
 
 from sbi_rope._validation import check_batch
 from sbi_rope.coupling.cost import Distances, row_blocks
+from sbi_rope.errors import InvalidInputError
 
 __all__ = ["Coupling"]
 
@@ -48,6 +49,8 @@ class Coupling:
         blocked: Whether no matrix of size n_o x n_s is held, so that ``weights`` is
             computed at every request: after a solution in blocks, and for more than 50
             million weights.
+        direct: Whether distances are computed without a matrix product, as a gamma
+            needs that is small against them.
     """
 
     potential: Tensor = field(repr=False)
@@ -62,6 +65,7 @@ class Coupling:
     converged: bool
     solver: Literal["own", "pot", "none"]
     blocked: bool = False
+    direct: bool = False
 
     @property
     def weights(self) -> Tensor:
@@ -99,10 +103,19 @@ class Coupling:
             Weights of shape ``(n, n_s)``; rows sum to one.
 
         Raises:
-            InvalidInputError: If the shape does not fit or a value is not finite.
+            InvalidInputError: If the shape does not fit, a value is not finite, or an
+                observation is so far away that all its distances are the same.
         """
-        real = check_batch("real", real, self.simulated.shape[1:])
-        return self._rows(real.to(self.simulated))
+        real = check_batch("real", real, self.simulated.shape[1:]).to(self.simulated)
+        farthest = self._distances.bound(real)
+        limit = 0.1 * self.gamma / torch.finfo(real.dtype).eps
+        if not farthest < limit:
+            raise InvalidInputError(
+                f"Expected `real` at most {limit:.1e} away from the simulations, where "
+                f"{real.dtype} still tells their distances apart; got {farthest:.1e}. "
+                "Such an observation is like no simulation: look at its values."
+            )
+        return self._rows(real)
 
     def to(self, device: str | torch.device) -> "Coupling":
         """Return the same coupling on another device."""
@@ -126,4 +139,4 @@ class Coupling:
 
     @cached_property
     def _distances(self) -> Distances:
-        return Distances(self.simulated)
+        return Distances(self.simulated, direct=self.direct)

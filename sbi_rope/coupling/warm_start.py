@@ -4,13 +4,11 @@ from collections.abc import Mapping
 
 from torch import Tensor
 
-from sbi_rope.coupling.result import Coupling
-
 __all__ = ["warm_start"]
 
 
 def warm_start(
-    solved: Mapping[tuple[float, float], Coupling],
+    solved: Mapping[tuple[float, float], Tensor],
     gamma: float,
     tau: float,
     cold: Tensor,
@@ -21,7 +19,7 @@ def warm_start(
     linearly from the two last, larger gammas at the same tau.
 
     Args:
-        solved: Couplings by (gamma, tau), all at this gamma or larger ones.
+        solved: Potentials by (gamma, tau), all at this gamma or larger ones.
         gamma: As in the keys of ``solved``.
         tau: As in the keys of ``solved``.
         cold: The potential to start from if nothing is solved yet.
@@ -30,7 +28,7 @@ def warm_start(
     keys = sorted(key for key in solved if key[1] == tau) or sorted(solved)[:1]
     if not keys:
         return cold
-    scaled = [key[0] * solved[key].potential for key in keys[:2]]
+    scaled = [key[0] * solved[key] for key in keys[:2]]
     if len(scaled) == 1:
         return scaled[0] / gamma
     (last, _), (before, _) = keys[:2]

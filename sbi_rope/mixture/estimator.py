@@ -11,12 +11,7 @@ from tqdm.auto import tqdm
 from sbi_rope._sbi import ConditionalDensityEstimator, embed
 from sbi_rope.coupling import Coupling
 from sbi_rope.errors import InvalidInputError, UnseenObservationError, warn_user
-from sbi_rope.mixture.chunks import (
-    blocks,
-    flow_batch,
-    keep_freed_memory,
-    num_fitting,
-)
+from sbi_rope.mixture.chunks import blocks, flow_batch, keep_freed_memory, num_fitting
 from sbi_rope.mixture.sampling import Accept, BlockSampler
 
 __all__ = ["MixtureEstimator"]

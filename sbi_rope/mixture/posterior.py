@@ -47,6 +47,7 @@ class MixturePosterior(DirectPosterior):
     end at most 2^19 weights, terms of the density or proposals are held at a time, or
     one row of weights where it is longer; no matrix of n_o x n_s ever is. Not counted
     is what tracking gradients keeps.
+
     Accuracy: ``log_prob`` leaves out the smallest weights of each row that sum to at
     most ``tail_mass`` = t, so that the density is too small by at most t times the
     largest density among the components left out.

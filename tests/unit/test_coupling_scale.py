@@ -3,6 +3,7 @@
 import functools
 import itertools
 import math
+import weakref
 from dataclasses import replace
 from typing import Any
 
@@ -55,6 +56,81 @@ def test_float32_distances_are_rounded_float64_ones() -> None:
     distances = Distances(fixed)(points)
     assert distances.dtype == torch.float32
     assert torch.allclose(distances.double(), expected, rtol=1e-7, atol=1e-7)
+
+
+def test_without_the_product_distances_are_exact() -> None:
+    fixed = torch.randn(50, 3, dtype=torch.float64) + 1e6
+    points = torch.cat([fixed[:10], fixed[:10] + 1e-6])
+    expected = (points[:, None] - fixed).norm(dim=2)
+    assert torch.allclose(
+        Distances(fixed, direct=True)(points), expected, rtol=1e-9, atol=0.0
+    )
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("scale", [1e-25, 1.0, 1e15])
+def test_the_unit_of_the_embeddings_does_not_matter(
+    dtype: torch.dtype, scale: float
+) -> None:
+    real, simulated = clouds(60, 50)
+    coupler = SinkhornCoupler(gamma=0.1, tau=0.9, dtype=dtype)
+    expected = coupler.couple(real, simulated)
+    scaled = replace(coupler, gamma=0.1 * scale).couple(scale * real, scale * simulated)
+    assert scaled.converged
+    assert total_variation(scaled.weights, expected.weights).max() < 1e-4
+    by_median = replace(coupler, cost_scale="simulated")
+    assert by_median.couple(scale * real, scale * simulated).gamma == pytest.approx(
+        by_median.couple(real, simulated).gamma * scale, rel=1e-5
+    )
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_distances_beyond_the_dtype_are_refused(dtype: torch.dtype) -> None:
+    real, simulated = clouds(60, 50)
+    scale = 1e20 if dtype == torch.float32 else 1.5e154
+    with pytest.raises(CouplingError, match="overflow"):
+        SinkhornCoupler(gamma=scale, dtype=dtype).couple(
+            scale * real, scale * simulated
+        )
+
+
+@pytest.mark.parametrize("blocked", [False, True])
+def test_a_gamma_small_against_the_distances_gets_exact_distances(
+    blocked: bool,
+) -> None:
+    # Two clusters a million apart, each a thousandth wide, and gamma as their width.
+    simulated = 1e-3 * torch.randn(60, 2, dtype=torch.float64)
+    simulated[:20] += 1e6
+    real = 1e-3 * torch.randn(60, 2, dtype=torch.float64)
+    real[:20] += 1e6
+    coupling = SinkhornCoupler(gamma=1e-3, tau=0.5, blocked=blocked).couple(
+        real, simulated
+    )
+    cost = (real[:, None] - simulated).norm(dim=2)
+    rows = torch.softmax(coupling.potential - cost / 1e-3, dim=1)
+    assert coupling.direct
+    assert total_variation(coupling.weights, rows).max() < 1e-6
+    log_q = rows.mean(dim=0).log()
+    assert marginal_error(log_q, coupling.potential, 0.5) < 2e-6
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_gamma_below_the_numbers_of_the_dtype_is_refused(dtype: torch.dtype) -> None:
+    with pytest.raises(CouplingError, match="gamma of at least"):
+        SinkhornCoupler(gamma=1e-310, dtype=dtype).couple(
+            torch.ones(30, 2), torch.ones(20, 2)
+        )
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("value", [1e20, 1e200, 1e300])
+def test_rows_of_an_observation_beyond_all_distances_are_refused(
+    dtype: torch.dtype, value: float
+) -> None:
+    coupling = SinkhornCoupler(dtype=dtype).couple(*clouds(60, 50))
+    far = torch.full((1, 5), value, dtype=torch.float64)
+    with pytest.raises(InvalidInputError, match="`real` at most"):
+        coupling.rows(far)
 
 
 def test_a_far_simulation_does_not_cost_the_others_their_digits() -> None:
@@ -182,12 +258,12 @@ def test_blocks_are_chosen_where_the_distances_would_be_too_many(
     monkeypatch.setattr("sbi_rope.coupling.coupler.MAX_STORED", 60 * 50 - 1)
     assert SinkhornCoupler().couple(real, simulated).blocked
     stored = SinkhornCoupler(blocked=False)
-    assert not stored._set_up(real, simulated, 0, reused=False)[0].blocked
+    assert not stored._set_up(real, simulated, 0, gamma=1.0, reused=False)[0].blocked
     pot = SinkhornCoupler(solver="pot")
-    assert not pot._set_up(real, simulated, 0, reused=True)[0].blocked
+    assert not pot._set_up(real, simulated, 0, gamma=1.0, reused=True)[0].blocked
     # A part may be stored where the whole may not, and its weights not kept.
     part = SinkhornCoupler(num_fitted=59)
-    assert not part._set_up(real, simulated, 0, reused=False)[0].blocked
+    assert not part._set_up(real, simulated, 0, gamma=1.0, reused=False)[0].blocked
     assert part.couple(real, simulated).blocked
 
 
@@ -368,6 +444,16 @@ def test_a_sweep_computes_only_what_was_asked_for_so_far(
     assert solved == [(1.0, 1.0)]
     list(sweep)
     assert solved == [(1.0, 1.0), (1.0, 0.5), (0.5, 1.0), (0.5, 0.5)]
+
+
+def test_a_sweep_keeps_no_coupling_that_it_has_handed_out() -> None:
+    sweep = SinkhornCoupler().sweep(*clouds(), gammas=[1.0, 0.5, 1.0], taus=[1.0])
+    first, second = next(sweep), next(sweep)
+    again = next(sweep)
+    assert again is first  # asked for twice
+    handed_out = [weakref.ref(coupling) for coupling in (first, second)]
+    del first, second, again
+    assert [reference() for reference in handed_out] == [None, None]
 
 
 def test_a_sweep_scales_gamma_like_a_single_coupling() -> None:

@@ -127,6 +127,11 @@ def test_every_kind_of_coupling_gives_the_log_sum_of_its_own_weights(
     log_prob = log_prob_batched(posterior, theta)
     assert log_prob.dtype is torch.float32
     assert torch.allclose(log_prob, expected, atol=1e-4, rtol=1e-5)
+    leakage = posterior.leakage(posterior.x_o)
+    mass = posterior._cache["component_mass"]
+    assert torch.allclose(leakage.mass, posterior.weights.double() @ mass, atol=1e-12)
+    normalised = posterior.log_prob_batched(theta, posterior.x_o)
+    assert torch.allclose(normalised, log_prob - leakage.mass.log().float(), atol=1e-4)
 
 
 @pytest.mark.parametrize("entries", [1, 13, 50, 2**19])
@@ -148,7 +153,9 @@ def test_chunking_changes_no_density(
     )
 
 
+@pytest.mark.parametrize("batch", [60, 500])
 def test_the_flow_sees_full_batches_of_pairs_and_never_more(
+    batch: int,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     posterior = gaussian_posterior(n_o=7, n_s=20)
@@ -160,9 +167,10 @@ def test_the_flow_sees_full_batches_of_pairs_and_never_more(
         return original(input, condition, **kwargs)
 
     monkeypatch.setattr(components, "log_prob", log_prob)
-    monkeypatch.setattr(chunks, "CPU_BATCH", 60)
+    monkeypatch.setattr(chunks, "CPU_BATCH", batch)
     log_prob_batched(posterior, torch.zeros(10, 7, 2))
-    assert pairs == [60] * (10 * 7 * 20 // 60) + [10 * 7 * 20 % 60]
+    full, rest = divmod(10 * 7 * 20, batch)
+    assert pairs == [batch] * full + [rest]
 
 
 @pytest.mark.parametrize(
@@ -183,7 +191,8 @@ def test_weights_and_proposals_stay_within_the_number_of_the_docstring(
     call: Callable[[MixturePosterior], Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     posterior = gaussian_posterior(n_o=30, n_s=12, std=2.0, unseen="extend")
-    original, inside, entries = TableCoupling.rows, posterior._inside, []
+    estimator, entries = posterior.posterior_estimator, []
+    original, inside, log_q = TableCoupling.rows, posterior._inside, estimator._log_q
 
     def rows(coupling: TableCoupling, real: Tensor) -> Tensor:
         entries.append(len(real) * len(coupling.simulated))
@@ -193,6 +202,11 @@ def test_weights_and_proposals_stay_within_the_number_of_the_docstring(
         entries.append(len(theta))
         return inside(theta)
 
+    def terms(*arguments: Tensor) -> Tensor:
+        log_terms = log_q(*arguments)
+        entries.append(log_terms.numel())
+        return log_terms
+
     def refuse(coupling: TableCoupling) -> Tensor:
         raise AssertionError("the matrix of all weights was asked for")
 
@@ -200,6 +214,7 @@ def test_weights_and_proposals_stay_within_the_number_of_the_docstring(
     monkeypatch.setattr(TableCoupling, "rows", rows)
     monkeypatch.setattr(TableCoupling, "weights", property(refuse))
     monkeypatch.setattr(posterior, "_inside", accept)
+    monkeypatch.setattr(estimator, "_log_q", terms)
     monkeypatch.setattr(chunks, "MAX_ENTRIES", 100)
     call(posterior)
     assert max(entries) <= 100
@@ -583,6 +598,17 @@ def test_no_mass_inside_the_prior_ends_in_an_error_that_names_the_observation(
         (3,), x=posterior.x_o[0], reject_outside_prior=False, **QUIET
     )
     assert (free > 90).all()
+
+
+def test_the_error_names_the_observation_however_the_batch_is_cut(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(chunks, "MAX_ENTRIES", 4)
+    monkeypatch.setattr(sampling_module, "MIN_PROPOSALS", 50)
+    posterior = hopeless_posterior(n_o=6)
+    order = [5, 4, 3, 0, 2, 1]
+    with pytest.raises(SamplingError, match=r"rows \[3\] of `x`"):
+        posterior.sample_batched((3,), posterior.x_o[order], **QUIET)
 
 
 def test_rejection_gives_up_after_a_bounded_number_of_draws(
