@@ -151,6 +151,8 @@ class MixtureEstimator(ConditionalDensityEstimator):
             )
         keep_freed_memory(theta.device)
         shape = (len(theta), num_rows)
+        if not theta.numel():
+            return theta.new_empty(shape)
         # One observation serves all theta with one row of weights.
         num_columns = len(features)
         theta = theta.expand(-1, num_rows, *self.input_shape)
@@ -203,12 +205,12 @@ class MixtureEstimator(ConditionalDensityEstimator):
         log_q = []
         for batch in pairs.split(flow_batch(theta.device)):
             sample, k = batch // len(row), batch % len(row)
-            log_q.append(
-                self.components.log_prob(
-                    theta[sample, row[k]][None],
-                    condition=self.contexts[component[k]],
-                )[0]
-            )
+            points = theta[sample, row[k]]
+            if points.requires_grad:
+                # A component without a density at its point has no gradient there.
+                points.register_hook(lambda grad: grad.nan_to_num(nan=0.0))
+            condition = self.contexts[component[k]]
+            log_q.append(self.components.log_prob(points[None], condition)[0])
         return torch.cat(log_q).reshape(shape)
 
     # --- samples ---

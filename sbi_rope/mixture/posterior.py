@@ -12,7 +12,7 @@ from torch.distributions import Distribution
 
 from sbi_rope._random import seeded
 from sbi_rope._sbi import DirectPosterior
-from sbi_rope._validation import check_batch
+from sbi_rope._validation import check_batch, check_integer
 from sbi_rope.coupling import Coupling
 from sbi_rope.errors import InvalidInputError, InvalidTypeError, SamplingError
 from sbi_rope.mixture.estimator import MixtureEstimator
@@ -207,6 +207,8 @@ class MixturePosterior(DirectPosterior):
             UnseenObservationError: If an x is not in the batch and ``unseen="raise"``.
             SamplingError: If next to nothing lies inside the prior's support.
         """
+        if max_sampling_batch_size is not None:
+            check_integer("max_sampling_batch_size", max_sampling_batch_size)
         return self.posterior_estimator.sample(
             _as_shape(sample_shape),
             self._batch_of_x(x),
@@ -272,6 +274,10 @@ class MixturePosterior(DirectPosterior):
                 f"Expected `theta` of shape (B, {event_shape[0]}) or (S, B, "
                 f"{event_shape[0]}); got {tuple(theta.shape)}."
             )
+        if not theta.numel():
+            raise InvalidInputError(
+                f"Expected at least one `theta`; got shape {tuple(theta.shape)}."
+            )
         return super().log_prob_batched(
             theta,
             self._batch_of_x(x),
@@ -324,14 +330,15 @@ class MixturePosterior(DirectPosterior):
         """
         estimator = self.posterior_estimator
         features = estimator.features(self._batch_of_x(x))
+        exact = is_unbounded(self.prior)
         if "component_mass" not in self._cache:
             self._cache["component_mass"] = component_mass(
                 estimator.components,
                 estimator.contexts,
-                accept=None if is_unbounded(self.prior) else self._inside,
+                accept=None if exact else self._inside,
             )
         rows = (weights for _, weights in estimator.row_blocks(features))
-        return mixture_mass(self._cache["component_mass"], rows)
+        return mixture_mass(self._cache["component_mass"], rows, exact=exact)
 
     def leakage_correction(  # type: ignore[override]
         self, x: Tensor, **kwargs: Any

@@ -58,14 +58,19 @@ def component_mass(
     return torch.cat(mass)
 
 
-def mixture_mass(mass: Tensor, row_blocks: Iterable[Tensor]) -> Leakage:
+def mixture_mass(
+    mass: Tensor, row_blocks: Iterable[Tensor], *, exact: bool = False
+) -> Leakage:
     """Return the mass of mixtures, given that of their components.
 
     Args:
         mass: Of each component, shape ``(n_s,)``.
         row_blocks: The mixture weights, shapes ``(b, n_s)``.
+        exact: Whether the masses are known, not estimated.
     """
-    variance = mass * (1.0 - mass) / LEAKAGE_DRAWS
+    # Without the half a draw, components with no or all draws inside had no error.
+    smoothed = (LEAKAGE_DRAWS * mass + 0.5) / (LEAKAGE_DRAWS + 1)
+    variance = smoothed * (1.0 - smoothed) / LEAKAGE_DRAWS * (0.0 if exact else 1.0)
     means, errors = [], []
     for rows in row_blocks:
         weights = rows.to(mass)

@@ -260,6 +260,33 @@ def test_memory_stays_within_the_number_of_the_docstring() -> None:
     assert float(run_alone(MEMORY)) < 100
 
 
+def test_components_without_a_draw_inside_still_have_an_error() -> None:
+    # Mixtures that lie outside but for a sliver, of 5e-4 or less.
+    contexts = torch.cat([torch.full((40, 1), 2.0), torch.full((40, 1), -1.1)], dim=1)
+    posterior = gaussian_posterior(dim=1, n_o=10, contexts=contexts)
+    exact = posterior.weights @ inside_mass(posterior)
+    leakage = posterior.leakage(posterior.x_o)
+    assert (exact < 2e-3).all()
+    assert ((leakage.mass - exact).abs() < 4 * leakage.standard_error).all()
+    none_inside = gaussian_posterior(dim=1, n_o=10, contexts=contexts - 1.2)
+    assert (none_inside.leakage(none_inside.x_o).standard_error > 0).all()
+
+
+@pytest.mark.parametrize("size", [-1, 0, 1.5])
+def test_impossible_batch_sizes_are_refused(size: float) -> None:
+    posterior = gaussian_posterior()
+    with pytest.raises(InvalidInputError, match="max_sampling_batch_size"):
+        posterior.sample_batched((3,), posterior.x_o, max_sampling_batch_size=size)
+
+
+def test_no_theta_has_no_density() -> None:
+    posterior = gaussian_posterior(n_o=5)
+    empty = torch.zeros(0, 5, 2)
+    with pytest.raises(InvalidInputError, match="at least one `theta`"):
+        log_prob_batched(posterior, empty)
+    assert posterior.posterior_estimator.log_prob(empty, posterior.x_o).shape == (0, 5)
+
+
 def test_a_component_without_a_density_does_not_take_the_others_with_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -276,11 +303,18 @@ def test_a_component_without_a_density_does_not_take_the_others_with_it(
 
     def log_prob(input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
         log_q = original(input, condition)
-        return log_q.where((condition != first).any(dim=1), math.nan)
+        broken_here = (condition == first).all(dim=1)
+        # NaN that reaches the gradients too.
+        return log_q + input.sum(dim=-1) * torch.where(broken_here, math.nan, 0.0)
 
     monkeypatch.setattr(components, "log_prob", log_prob)
     with pytest.warns(RoPEWarning, match=r"6 of 120 component densities are NaN"):
         log_prob_now = log_prob_batched(broken, theta)[0]
+    theta = theta.clone().requires_grad_()
+    with pytest.warns(RoPEWarning):
+        estimator.log_prob(theta, broken.x_o).sum().backward()
+    assert torch.isfinite(theta.grad).all()
+    assert (theta.grad != 0).all()
     assert torch.allclose(
         log_prob_now.double(), (expected.exp() - share).log().flatten(), atol=1e-5
     )
