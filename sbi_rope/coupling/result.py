@@ -72,7 +72,7 @@ class Coupling:
         r""":math:`\alpha`, shape ``(n_o, n_s)``, in the dtype of the coupling.
 
         Computed at the first request and kept; a blocked coupling computes it
-        at every request. Rows sum to one.
+        at every request. Rows sum to one. Not to be written to.
         """
         return self._rows(self.real) if self.blocked else self._kept_weights
 
