@@ -77,9 +77,9 @@ def test_rows_equal_those_of_the_oracle(
         assert coupling.converged
     if coupling.converged and change < 1e-10:
         distance = worst_total_variation(coupling.weights, expected)
-        # In float32 the exponents C / gamma are rounded to 6e-8 of themselves; and at
-        # tau = 1 a marginal error of 1e-6 leaves some room where few points matter.
-        assert distance < digits(mode, double=1e-6, single=1e-4 + 3e-6 / ratio)
+        # At tau = 1 and the smallest gamma, a marginal error of 1e-6 leaves some room.
+        single = 1e-3 if (tau, ratio) == (1.0, 1e-3) else 1e-5
+        assert distance < digits(mode, double=1e-6, single=single)
     else:
         # Plain Sinkhorn has not converged at tau = 1 and a small gamma.
         assert tau == 1.0
@@ -275,7 +275,7 @@ def test_columns_that_underflow_are_solved_in_the_log_domain(
     expected, _ = oracles.semi_balanced_plan(cost, gamma=0.05, tau=0.5)
     assert coupling.converged
     assert worst_total_variation(coupling.weights, expected) < digits(
-        mode, double=1e-9, single=2e-3
+        mode, double=1e-9, single=2e-5
     )
     # w = tau (w + log b - log q) in the far columns, whatever their size.
     log_q = torch.logsumexp(
@@ -283,7 +283,7 @@ def test_columns_that_underflow_are_solved_in_the_log_domain(
     )
     fixed = 0.5 * (coupling.potential - log_q)
     difference = (fixed - fixed.mean()) - coupling.potential
-    assert difference.abs().max() < digits(mode, double=1e-6, single=0.5)
+    assert difference.abs().max() < digits(mode, double=1e-6, single=1e-3)
 
 
 @pytest.mark.parametrize("mode", MODES)
