@@ -182,16 +182,19 @@ class ResultsFile:
             csv.DictWriter(file, COLUMNS).writerow(row)
 
 
-def print_table(rows: list[dict[str, Any]]) -> None:
+EXPLANATION = """
+LPP: mean log-probability of the true parameters, in standard deviations of the prior
+(higher is better). ACAUC: 0 is calibrated, above 0 is overconfident. ECE: expected
+coverage error. -inf: share of test observations with density zero. NPE and tuning-only
+are scored without sbi's leakage correction. With several seeds: mean, and standard
+deviation of the LPP over seeds (+-).
+"""
+
+
+def print_table(rows: list[dict[str, Any]], *, explain: bool = True) -> None:
     """Print the mean over seeds of each method and calibration size."""
-    print(
-        "\nLPP: mean log-probability of the true parameters, in standard deviations\n"
-        "of the prior (higher is better). ACAUC: 0 is calibrated, above 0 is\n"
-        "overconfident. ECE: expected coverage error. -inf: share of test\n"
-        "observations with density zero. NPE and tuning-only are scored without sbi's\n"
-        "leakage correction. With several seeds: mean, and standard deviation of the\n"
-        "LPP over seeds (+-).\n"
-    )
+    if explain:
+        print(EXPLANATION)
     print(
         f"{'method':<12}{'pairs':>6}{'LPP':>10}{'+-':>7}{'ACAUC':>9}{'ECE':>8}"
         f"{'-inf':>7}"

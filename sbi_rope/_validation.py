@@ -56,16 +56,21 @@ def check_finite(name: str, value: Tensor) -> None:
 
 
 def check_batch(
-    name: str, value: Any, event_shape: Sequence[int], *, finite: bool = True
+    name: str,
+    value: Any,
+    event_shape: Sequence[int],
+    *,
+    finite: bool = True,
+    allow_empty: bool = False,
 ) -> Tensor:
-    """Check a non-empty batch of events, shape ``(n, *event_shape)``."""
+    """Check a batch of events, shape ``(n, *event_shape)``, not empty by default."""
     value = check_tensor(name, value)
     expected = "(n, " + ", ".join(str(size) for size in event_shape) + ")"
     if tuple(value.shape[1:]) != tuple(event_shape) or value.ndim == 0:
         raise InvalidInputError(
             f"Expected `{name}` of shape {expected}; got {tuple(value.shape)}."
         )
-    if value.shape[0] == 0:
+    if value.shape[0] == 0 and not allow_empty:
         raise InvalidInputError(
             f"Expected `{name}` of shape {expected} with n >= 1; got an empty batch."
         )

@@ -23,8 +23,8 @@ LAYERS = [
     {"errors"},
     {"_validation", "_sbi", "_random"},
     {"coupling", "finetuning", "metrics", "_simulations"},
-    {"mixture", "plots", "tasks"},
-    {"rope"},
+    {"mixture", "plots"},
+    {"rope", "tasks"},
     {"baselines"},
     {"stacking"},
 ]

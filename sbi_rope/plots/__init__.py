@@ -11,6 +11,7 @@ from sbi_rope.plots.diagnostics import (
     effective_sample_sizes,
     finetuning_history,
 )
+from sbi_rope.plots.observations import real_and_simulated
 from sbi_rope.plots.posteriors import pair_plot
 from sbi_rope.plots.steps import overview
 
@@ -22,4 +23,5 @@ __all__ = [
     "finetuning_history",
     "overview",
     "pair_plot",
+    "real_and_simulated",
 ]

@@ -11,12 +11,14 @@ from typing import Any
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.base import Task
 from sbi_rope.tasks.light_tunnel_sensors import LightTunnelSensors
+from sbi_rope.tasks.linear_gaussian import LinearGaussian
 from sbi_rope.tasks.pendulum import Pendulum
 
 __all__ = ["TASKS", "Task", "get_task", "list_tasks"]
 
 TASKS: dict[str, type[Task]] = {
     "light_tunnel_sensors": LightTunnelSensors,
+    "linear_gaussian": LinearGaussian,
     "pendulum": Pendulum,
 }
 

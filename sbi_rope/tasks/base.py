@@ -3,18 +3,33 @@ r"""What a task is: a prior, a simulator, and labelled real observations."""
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
-from sbi_rope._validation import check_batch, check_choice, check_integer
+from sbi_rope._validation import (
+    check_batch,
+    check_choice,
+    check_integer,
+    check_positive,
+)
 from sbi_rope.errors import InvalidInputError, InvalidTypeError
-from sbi_rope.tasks.splits import MAX_SEED, Part
+from sbi_rope.tasks.settings import PaperSettings
+from sbi_rope.tasks.splits import MAX_SEED, DrawnPairs, Part, RecordedPairs
+from sbi_rope.tasks.variants import (
+    COMMON_VARIANTS,
+    beta_shaped,
+    inside_region,
+    with_label_noise,
+)
 
 __all__ = ["Task", "check_theta"]
 
 Simulator = Callable[[Tensor], Tensor]
+T = TypeVar("T")
+
+LABEL_NOISE = 0.2
 
 
 class Task(ABC):
@@ -26,56 +41,82 @@ class Task(ABC):
 
     To write a task, subclass this class in a file of its own and
 
-    1. set the class attributes ``name``, ``parameter_names``, ``parameter_units``
-       (one string a parameter, ``"1"`` if it has no unit) and ``x_shape``, and
-       ``variants`` if the real process comes in several kinds;
+    1. set the class attributes listed below; those of one instance, such as a shape
+       that an option changes, may be set by the constructor;
     2. implement :meth:`get_prior`: a new float32 distribution with event shape
        ``(theta_dim,)``, a ``support``, a ``mean`` and a ``variance``. Build tensors
-       with an explicit dtype, so that torch's default does not matter;
+       with an explicit dtype, so that torch's default does not matter. Implement
+       :meth:`prior_quantiles` too;
     3. implement :meth:`get_simulator`: an instance of a class defined at the top of
        a module (so that it can be pickled) whose ``__call__`` passes its input
        through :func:`check_theta`, draws from torch's global generator, and keeps
        the dtype and device of ``theta``;
     4. implement :meth:`get_embedding_net`: a new, untrained network;
-    5. implement :meth:`_labelled_set`. A synthetic real process passes its draw
-       to :func:`~sbi_rope.tasks.splits.draw_rows`, recorded data go through
-       :func:`~sbi_rope.tasks.splits.select_rows`. Both keep the two parts apart,
-       leave all global random states alone, and make a small set the beginning of a
-       larger one with the same seed;
+    5. implement :meth:`_real_process`: the pairs of the real process, drawn or
+       recorded. Read its options with :meth:`_option`, which refuses those that have
+       no effect. The variants common to all tasks need nothing else;
     6. add the class to ``TASKS`` in ``sbi_rope/tasks/__init__.py``. The tests in
        ``tests/contract/test_task.py`` then apply to it.
 
-    Options of a task are keyword arguments of its constructor, next to ``variant``
-    and ``root``.
+    Options of a task are keyword arguments of its constructor, next to ``variant``,
+    ``root`` and ``label_noise``.
 
     Attributes:
         name: The name under which :func:`~sbi_rope.tasks.get_task` finds the task.
         parameter_names: One name a parameter, in the order of ``theta``.
-        parameter_units: One unit a parameter.
+        parameter_units: One unit a parameter, ``"1"`` if it has none.
         x_shape: Shape of one observation.
-        variants: The kinds of real process besides the standard one.
+        x_names: One name an entry if an observation is a list of statistics; empty
+            for series and images.
+        misspecification: In a sentence, what the simulator gets wrong.
+        variants: The kinds of real process besides the standard one, with a sentence
+            each. :data:`~sbi_rope.tasks.variants.COMMON_VARIANTS` belong to all
+            tasks.
+        shifted_region: The intervals that parameters come from in the variant
+            ``"prior_shift"``.
+        paper_settings: The hyper-parameters the paper states, ``None`` for tasks that
+            are not in it.
         variant: The chosen kind, or ``None`` for the standard one.
         root: Folder with recorded data, or ``None``.
+        label_noise: Standard deviation of the noise on calibration labels, as a
+            fraction of the prior's; 0 except in the variant ``"noisy_labels"``.
 
     Args:
         variant: One of ``variants``, or ``None`` for the standard real process.
         root: Folder that holds recorded data. Synthetic tasks do not read it, so
             that one ``root`` can be passed to all tasks.
+        label_noise: Only for ``"noisy_labels"``; 0.2 unless given.
     """
 
     name: ClassVar[str]
-    parameter_names: ClassVar[tuple[str, ...]]
-    parameter_units: ClassVar[tuple[str, ...]]
-    x_shape: ClassVar[tuple[int, ...]]
-    variants: ClassVar[tuple[str, ...]] = ()
+    parameter_names: tuple[str, ...]
+    parameter_units: tuple[str, ...]
+    x_shape: tuple[int, ...]
+    x_names: tuple[str, ...] = ()
+    misspecification: ClassVar[str]
+    variants: ClassVar[dict[str, str]] = COMMON_VARIANTS
+    shifted_region: ClassVar[dict[str, tuple[float, float]]]
+    paper_settings: ClassVar[PaperSettings | None] = None
 
     def __init__(
-        self, *, variant: str | None = None, root: str | Path | None = None
+        self,
+        *,
+        variant: str | None = None,
+        root: str | Path | None = None,
+        label_noise: float | None = None,
     ) -> None:
         if variant is not None:
-            check_choice("variant", variant, self.variants)
+            check_choice("variant", variant, list(self.variants))
         self.variant = variant
         self.root = None if root is None else Path(root).expanduser()
+        self.label_noise = self._option(
+            "label_noise",
+            label_noise,
+            LABEL_NOISE if variant == "noisy_labels" else 0.0,
+            variant="noisy_labels",
+        )
+        if label_noise is not None:
+            check_positive("label_noise", label_noise)
 
     @property
     def theta_dim(self) -> int:
@@ -90,9 +131,28 @@ class Task(ABC):
         """
         return self.get_prior().stddev
 
+    @property
+    def required_files(self) -> tuple[Path, ...]:
+        """Recorded files the sets are read from, below ``root``; none if drawn."""
+        if self.variant == "well_specified":
+            return ()
+        return self._recorded_files()
+
+    @property
+    def has_data(self) -> bool:
+        """Whether the two labelled sets can be had without a download."""
+        files = self.required_files
+        if not files:
+            return True
+        return self.root is not None and all((self.root / f).is_file() for f in files)
+
     @abstractmethod
     def get_prior(self) -> Distribution:
         """Return a new prior over theta, event shape ``(theta_dim,)``."""
+
+    @abstractmethod
+    def prior_quantiles(self, theta: Tensor) -> Tensor:
+        """Return the prior's marginal distribution functions at theta ``(n, d)``."""
 
     @abstractmethod
     def get_simulator(self) -> Simulator:
@@ -102,8 +162,20 @@ class Task(ABC):
         """
 
     @abstractmethod
-    def get_embedding_net(self) -> nn.Module:
-        """Return a new network from x ``(n, *x_shape)`` to statistics ``(n, l)``."""
+    def get_embedding_net(self, *, light: bool = False) -> nn.Module:
+        """Return a new network from x ``(n, *x_shape)`` to statistics ``(n, l)``.
+
+        Args:
+            light: Whether to return a small network for a CPU instead of the paper's.
+        """
+
+    @abstractmethod
+    def _real_process(self, part: Part) -> DrawnPairs | RecordedPairs:
+        """Return the labelled pairs of the real process for one part."""
+
+    def _recorded_files(self) -> tuple[Path, ...]:
+        """Return the files behind :meth:`_real_process`, relative to ``root``."""
+        return ()
 
     def get_calibration_set(self, n: int, *, seed: int = 0) -> tuple[Tensor, Tensor]:
         """Return ``n`` labelled real observations to calibrate with.
@@ -122,23 +194,82 @@ class Task(ABC):
                 have fewer than ``n`` observations to calibrate with.
             DataNotFoundError: If the task needs files that are not there.
         """
-        return self._checked_set(n, seed=seed, part="calibration")
+        theta, x = self._labelled_set(n, seed=seed, part="calibration")
+        if self.variant == "noisy_labels":
+            std = self.label_noise * self.prior_std
+            theta = with_label_noise(theta, std, self.get_prior(), seed=seed)
+        return theta, x
 
     def get_test_set(self, n: int, *, seed: int = 0) -> tuple[Tensor, Tensor]:
         """Return ``n`` labelled real observations to test on.
 
         Arguments, result and errors are those of :meth:`get_calibration_set`.
         """
-        return self._checked_set(n, seed=seed, part="test")
+        return self._labelled_set(n, seed=seed, part="test")
 
-    def _checked_set(self, n: int, *, seed: int, part: Part) -> tuple[Tensor, Tensor]:
+    def get_simulations(self, n: int, *, seed: int = 0) -> tuple[Tensor, Tensor]:
+        """Return ``n`` draws of the prior and a simulation of each, to train on.
+
+        Simulations with NaN are replaced together with their parameters, and counted
+        in a warning. Arguments and result are those of :meth:`get_calibration_set`;
+        no parameter is shared with the two sets.
+        """
         check_integer("n", n)
         _check_seed(seed)
-        return self._labelled_set(n, seed=seed, part=part)
+        return self._simulated_process().take(n, seed=seed, part="simulation")
 
-    @abstractmethod
+    def _simulated_process(self) -> DrawnPairs:
+        prior = self.get_prior()
+        return DrawnPairs(
+            draw_theta=lambda n: prior.sample((n,)),  # type: ignore[arg-type]
+            observe=self.get_simulator(),
+        )
+
     def _labelled_set(self, n: int, *, seed: int, part: Part) -> tuple[Tensor, Tensor]:
-        """Return ``n`` pairs of one part; ``n`` and ``seed`` have been checked."""
+        check_integer("n", n)
+        _check_seed(seed)
+        if self.variant == "well_specified":
+            process = self._simulated_process()
+        else:
+            process = self._real_process(part)
+        keep = None
+        if self.variant == "prior_shift":
+            keep = self._inside_shifted_region
+        elif self.variant == "biased_calibration" and part == "calibration":
+            keep = self._beta_shaped
+        return process.take(n, seed=seed, part=part, keep=keep)
+
+    def _inside_shifted_region(self, theta: Tensor) -> Tensor:
+        return inside_region(theta, self.parameter_names, self.shifted_region)
+
+    def _beta_shaped(self, theta: Tensor) -> Tensor:
+        return beta_shaped(self.prior_quantiles(theta))
+
+    def _option(
+        self, name: str, value: T | None, default: T, *, variant: str | None = None
+    ) -> T:
+        """Return an option of the real process, or raise where it has no effect.
+
+        Args:
+            name: Name of the option.
+            value: What the user gave, ``None`` for the default.
+            default: The value otherwise.
+            variant: The only variant with an effect; by default that is all of them
+                but ``"well_specified"``.
+        """
+        if value is None:
+            return default
+        if variant is not None and self.variant != variant:
+            raise InvalidInputError(
+                f"`{name}` has no effect without `variant={variant!r}`; got both "
+                f"`{name}={value!r}` and `variant={self.variant!r}`."
+            )
+        if variant is None and self.variant == "well_specified":
+            raise InvalidInputError(
+                f"`{name}` has no effect with `variant='well_specified'`, where the "
+                f"real process is the simulator; got `{name}={value!r}`."
+            )
+        return value
 
     def __repr__(self) -> str:
         variant = "" if self.variant is None else f"variant={self.variant!r}"
@@ -149,14 +280,14 @@ def check_theta(theta: Any, theta_dim: int) -> Tensor:
     """Return ``theta`` if it is a batch of floating-point parameter vectors.
 
     Args:
-        theta: What a simulator was called with.
+        theta: What a simulator was called with; an empty batch is one too.
         theta_dim: Number of parameters.
 
     Raises:
         InvalidTypeError: If ``theta`` is not a tensor of floating-point numbers.
         InvalidInputError: If its shape is not ``(n, theta_dim)``, or it is not finite.
     """
-    theta = check_batch("theta", theta, (theta_dim,))
+    theta = check_batch("theta", theta, (theta_dim,), allow_empty=True)
     if not theta.is_floating_point():
         raise InvalidTypeError(
             f"Expected `theta` to hold floating-point numbers; got {theta.dtype}. "

@@ -7,86 +7,274 @@ References:
     | https://github.com/juangamella/causal-chamber (data under CC BY 4.0)
 """
 
+import tempfile
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from sbi_rope._validation import check_finite
-from sbi_rope.errors import DataNotFoundError, InvalidInputError
+from sbi_rope.errors import DataNotFoundError, InvalidInputError, warn_user
 
-__all__ = ["read_columns"]
+__all__ = [
+    "check_download",
+    "find_file",
+    "find_images",
+    "read_columns",
+    "read_images",
+    "read_names",
+    "read_table",
+    "require",
+]
 
 DATASETS_PAGE = "https://github.com/juangamella/causal-chamber/tree/main/datasets"
+# MD5 sums of the archives that the tasks were written for.
+KNOWN_ARCHIVES = {
+    "lt_camera_v1": "1f35abfc03676d61e9b49083eb466edc",
+    "lt_interventions_standard_v1": "476664d024f88e8b7640998bb5e9ee33",
+    "wt_intake_impulse_v1": "8b7a0e587d3e9a804b380d96f14a1b12",
+}
+CUT_FILE = (
+    "The file is not the published one, or has been cut: remove the data set's folder "
+    "and get it again."
+)
 
 
-def read_columns(
-    file: str,
-    columns: Sequence[str],
-    *,
-    root: Path | None,
-    download: bool = False,
-) -> Tensor:
-    """Read columns of a CSV file of a causal chamber data set.
+def check_download(root: Path | None, *, download: bool) -> None:
+    """Raise if data are to be downloaded to nowhere."""
+    if download and root is None:
+        raise InvalidInputError(
+            "Expected `root` with `download=True`: the folder to download into; got "
+            "None."
+        )
+
+
+def find_file(file: Path, *, root: Path | None, download: bool = False) -> Path:
+    """Return the full path of a recorded file.
 
     Args:
         file: The file's path below ``root``, beginning with the name of the data set:
-            ``"lt_interventions_standard_v1/uniform_reference.csv"``.
-        columns: Names of the columns to read.
+            ``lt_interventions_standard_v1/uniform_reference.csv``.
         root: Folder that holds the data sets.
-        download: Whether to download the data set into ``root`` if the file is not
-            there.
+        download: Whether to download the data set into ``root`` if it is not there.
+
+    Raises:
+        DataNotFoundError: If the file is not there, after the download if asked for;
+            the message says what is there instead.
+    """
+    dataset = file.parts[0]
+    if root is None:
+        raise DataNotFoundError(
+            f"Needs the recorded file {file}, and no `root` was given. Pass the "
+            f"folder that holds it as `root`. {_how_to_get(dataset)}"
+        )
+    if download and not (root / dataset).exists():
+        _download(dataset, root)
+    path = root / file
+    if not path.is_file():
+        raise DataNotFoundError(
+            f"No file {path}. {_what_is_there(root / dataset)} {_how_to_get(dataset)}"
+        )
+    return path
+
+
+def read_table(path: Path, columns: Sequence[str]) -> Any:
+    """Read columns of a CSV file as a pandas table.
+
+    Raises:
+        InvalidInputError: If columns are missing, or the file is no table.
+    """
+    pandas = require("pandas")
+    try:
+        frame = pandas.read_csv(path)
+    except ValueError as error:  # pandas' own errors of parsing are ValueErrors
+        raise InvalidInputError(
+            f"Expected {path} to be a CSV table; {error}. {CUT_FILE}"
+        ) from error
+    missing = [column for column in columns if column not in frame.columns]
+    if missing:
+        raise InvalidInputError(
+            f"Expected {path} to have the columns {list(columns)}; {missing} are "
+            f"missing. {CUT_FILE}"
+        )
+    return frame[list(columns)]
+
+
+def read_columns(path: Path, columns: Sequence[str]) -> Tensor:
+    """Read columns of numbers of a CSV file.
+
+    Args:
+        path: The file.
+        columns: Names of the columns to read.
 
     Returns:
         The values, shape ``(rows, len(columns))``, float64.
 
     Raises:
-        DataNotFoundError: If the file is not there, after the download if asked for.
-        InvalidInputError: If columns are missing, or a value is not a finite number.
+        InvalidInputError: If columns are missing, there are no rows, or a value is not
+            a finite number.
     """
-    if root is None:
-        raise DataNotFoundError(
-            f"Needs the recorded file {file}, and no `root` was given. Pass the "
-            f"folder that holds it as `root`. {_how_to_get(file)}"
-        )
-    path = root / file
-    if download and not path.is_file():
-        _download(file.split("/")[0], root)
-    if not path.is_file():
-        raise DataNotFoundError(f"No file {path}. {_how_to_get(file)}")
-    pandas = _require("pandas")
-    frame = pandas.read_csv(path)
-    missing = [column for column in columns if column not in frame.columns]
-    if missing:
-        raise InvalidInputError(
-            f"Expected {path} to have the columns {list(columns)}; {missing} are "
-            f"missing. The file is not the published one, or has been cut."
-        )
-    numbers = frame[list(columns)].apply(pandas.to_numeric, errors="coerce")
+    frame = read_table(path, columns)
+    if frame.empty:
+        raise InvalidInputError(f"Expected {path} to have rows. {CUT_FILE}")
+    numbers = frame.apply(require("pandas").to_numeric, errors="coerce")
     values = torch.tensor(numbers.to_numpy(dtype="float64"))
     check_finite(str(path), values)
     return values
 
 
-def _how_to_get(file: str) -> str:
-    page = f"{DATASETS_PAGE}/{file.split('/')[0]}"
+def read_names(path: Path, column: str) -> list[str]:
+    """Read a column of file names of a CSV file.
+
+    Raises:
+        InvalidInputError: If the column is missing, or a row has no name.
+    """
+    names = read_table(path, [column])[column]
+    unnamed = names.isna().to_numpy().nonzero()[0].tolist()
+    if unnamed:
+        raise InvalidInputError(
+            f"Expected every row of {path} to have a name in the column {column!r}; "
+            f"the rows {unnamed[:5]} have none. {CUT_FILE}"
+        )
+    return [str(name) for name in names]
+
+
+def find_images(experiment: Path, size: int) -> Path:
+    """Return the folder with an experiment's images of one size.
+
+    Args:
+        experiment: Folder of the experiment, in which ``images_<size>`` lies.
+        size: Height and width of the images, in pixels.
+
+    Raises:
+        DataNotFoundError: If there is no such folder; the message lists the sizes
+            there are.
+    """
+    folder = experiment / f"images_{size}"
+    if not folder.is_dir():
+        sizes = sorted(path.name[7:] for path in experiment.glob("images_*"))
+        dataset = experiment.parent.name
+        raise DataNotFoundError(
+            f"No folder {folder}. The sizes of the images there are {sizes}: choose "
+            f"one of them as `image_size`, or get the newest version of the data set. "
+            f"{_how_to_get(dataset)}"
+        )
+    return folder
+
+
+def read_images(folder: Path, names: Sequence[str], size: int) -> Tensor:
+    """Read square RGB images with 8 bit a channel.
+
+    Args:
+        folder: Folder of the images.
+        names: File names, in any format that PIL reads.
+        size: Height and width that the images have, in pixels.
+
+    Returns:
+        The images, shape ``(len(names), 3, size, size)``, uint8.
+
+    Raises:
+        DataNotFoundError: If a file is not there.
+        InvalidInputError: If a file cannot be read to its end, or is no RGB image of
+            this size.
+    """
+    images = torch.empty(
+        len(names), size, size, 3, dtype=torch.uint8, device=torch.device("cpu")
+    )
+    for i, name in enumerate(names):
+        path = folder / name
+        if not path.is_file():
+            raise DataNotFoundError(
+                f"No image {path}, which the experiment's table names. The data set is "
+                f"not whole: remove its folder and get it again."
+            )
+        content = _read_image(path, size)
+        images[i] = torch.frombuffer(content, dtype=torch.uint8).reshape(size, size, 3)
+    return images.permute(0, 3, 1, 2).contiguous()
+
+
+def _read_image(path: Path, size: int) -> bytearray:
+    """Return the bytes of an image, pixel by pixel."""
+    image_module = require("PIL.Image")
+    try:
+        with image_module.open(path) as image:
+            found = f"{image.width} x {image.height} pixels in mode {image.mode}"
+            fits = image.size == (size, size) and image.mode == "RGB"
+            content = bytearray(image.tobytes() if fits else b"")
+    except (OSError, SyntaxError, ValueError) as error:  # what PIL's decoders raise
+        raise InvalidInputError(
+            f"Expected {path} to be an image; {error}. {CUT_FILE}"
+        ) from error
+    if not fits:
+        raise InvalidInputError(
+            f"Expected {path} to have {size} x {size} pixels in mode RGB; got {found}. "
+            f"{CUT_FILE}"
+        )
+    return content
+
+
+def _what_is_there(folder: Path) -> str:
+    if not folder.parent.is_dir():
+        return f"There is no folder {folder.parent}."
+    if not folder.is_dir():
+        return f"There is no folder {folder}."
+    names = sorted(
+        path.name.removesuffix(".csv")
+        for path in folder.iterdir()
+        if path.is_dir() or path.suffix == ".csv"
+    )
+    return f"The data set has {names or 'no experiments'}."
+
+
+def _how_to_get(dataset: str) -> str:
     return (
-        f"Either pass `download=True` along with `root` (needs the package "
-        f"causalchamber), or download and unpack the data set from {page}."
+        f"Either pass `download=True` along with a `root` without a folder {dataset} "
+        f"(needs the package causalchamber), or download and unpack the data set from "
+        f"{DATASETS_PAGE}/{dataset}."
     )
 
 
 def _download(dataset: str, root: Path) -> None:
-    # This import asks the internet for the list of data sets, so it comes last.
-    datasets = _require("causalchamber.datasets")
-    root.mkdir(parents=True, exist_ok=True)
-    datasets.Dataset(dataset, root=str(root), download=True)
+    try:
+        # This import asks the internet for the list of data sets, so it comes last.
+        datasets = require("causalchamber.datasets")
+        _warn_if_changed(dataset, datasets)
+        root.mkdir(parents=True, exist_ok=True)
+        # Downloaded, checked against its MD5 sum and unpacked beside its place, and
+        # moved there whole: what a download cut off half-way leaves is never taken
+        # for data.
+        with tempfile.TemporaryDirectory(prefix=".download_", dir=root) as folder:
+            datasets.Dataset(dataset, root=folder, download=True)
+            (Path(folder) / dataset).rename(root / dataset)
+    except ImportError:
+        raise
+    except Exception as error:  # of the network, the archive or the disk
+        raise DataNotFoundError(
+            f"Could not download {dataset}: {type(error).__name__}: {error}. Nothing "
+            f"of it was kept. Try again, or download and unpack it into {root} from "
+            f"{DATASETS_PAGE}/{dataset}."
+        ) from error
 
 
-def _require(module: str) -> ModuleType:
+def _warn_if_changed(dataset: str, datasets: ModuleType) -> None:
+    # The package checks an archive against the sum in its own, current list only.
+    listed = getattr(datasets, "directory", {}).get("datasets", {})
+    published = listed.get(dataset, {}).get("md5")
+    known = KNOWN_ARCHIVES.get(dataset)
+    if known and published and published != known:
+        warn_user(
+            f"The published data set {dataset} has changed since this task was written "
+            f"(MD5 sum {published}; {known} was known): results may differ from those "
+            "of other users."
+        )
+
+
+def require(module: str) -> ModuleType:
+    """Import an optional package, or say how to install it."""
     try:
         return import_module(module)
     except ModuleNotFoundError as error:

@@ -10,10 +10,11 @@ from torch import Tensor, nn
 from sbi_rope._validation import check_in_support, check_positive
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.base import Task, check_theta
-from sbi_rope.tasks.chambers import read_columns
+from sbi_rope.tasks.chambers import check_download, find_file, read_columns
 from sbi_rope.tasks.distributions import UniformDistance
 from sbi_rope.tasks.networks import fully_connected
-from sbi_rope.tasks.splits import Part, select_rows
+from sbi_rope.tasks.splits import Part, RecordedPairs
+from sbi_rope.tasks.variants import COMMON_VARIANTS
 
 __all__ = ["LightTunnelSensors", "LightTunnelSimulator"]
 
@@ -35,6 +36,26 @@ CURRENT_AT_REST = 58.13307318503893
 # Settings of the recorded experiment: photodiode sizes 2 and 1, exposure time 3 and
 # the current's reference voltage 5 V, at which it has no factor.
 GAIN = (2.0 ** (2 + 3), 2.0 ** (1 + 3))  # infrared, visible
+
+REFERENCE = "uniform_reference"
+# Experiments whose colours, angles or sensor settings are not those of the reference.
+STRONG_COLOURS = tuple(f"uniform_{c}_strong" for c in ("red", "green", "blue"))
+STRONG_ANGLES = ("uniform_pol_1_strong", "uniform_pol_2_strong")
+SETTINGS = tuple(
+    f"uniform_{setting}_strong"
+    for setting in (
+        *(f"t_{diode}_{sensor}" for sensor in (1, 2, 3) for diode in ("ir", "vis")),
+        "v_c",
+        "v_angle_1",
+        "v_angle_2",
+    )
+)
+# The experiments of the variants that choose their own, calibration and test.
+OWN_EXPERIMENTS = {
+    "strong_colours": (STRONG_COLOURS, STRONG_COLOURS),
+    "strong_angles": (STRONG_ANGLES, STRONG_ANGLES),
+    "sensor_settings": ((REFERENCE,), SETTINGS),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,15 +158,27 @@ class LightTunnelSensors(Task):
         | https://github.com/juangamella/causal-chamber, data set
           ``lt_interventions_standard_v1`` (CC BY 4.0)
 
+    Three variants use other experiments of the data set. In ``"strong_colours"`` one
+    colour comes from 171 to 255, and the prior of the colours reaches to 255.5. In
+    ``"strong_angles"`` one polariser is turned away, to differences of 42 to 118
+    degrees, and the angle is uniform on [0, 120] in the prior; the light does not tell
+    an angle from its supplement, so that posteriors have two modes. In
+    ``"sensor_settings"`` the calibration set is the standard one, but the test set
+    pools nine experiments with another exposure time of one diode (``t_*``) or another
+    reference voltage (``v_*``) that the simulator knows nothing of.
+
     Args:
-        variant: ``None``; the task has no variants.
+        variant: ``None`` or one of ``variants``.
         root: Folder that holds ``lt_interventions_standard_v1/``. Only the two data
             sets need it.
+        label_noise: Noise on the calibration labels, in standard deviations of the
+            prior; 0.2 unless given. Only for ``"noisy_labels"``.
         download: Whether to download the data set into ``root`` if it is not there.
-        experiment: The recorded experiment that both sets come from. Others of the data
-            set change a lamp (``uniform_l_11_mid``) or a sensor's setting
-            (``uniform_t_ir_1_strong``) and so misspecify the simulator in another way;
-            those with parameters outside of the prior are refused.
+        experiment: The recorded experiment that both sets come from,
+            ``"uniform_reference"`` unless given; not for the variants that choose it
+            themselves. Others of the data set change a lamp (``uniform_l_11_mid``) or a
+            sensor's setting (``uniform_t_ir_1_strong``) and so misspecify the simulator
+            in another way; those with parameters outside of the prior are refused.
         relative_noise: Simulated standard deviation of a light reading, as a fraction.
         current_noise_std: Simulated standard deviation of the current.
     """
@@ -154,27 +187,43 @@ class LightTunnelSensors(Task):
     parameter_names = ("red", "green", "blue", "polariser_angle")
     parameter_units = ("1", "1", "1", "degree")
     x_shape = (len(OUTPUTS),)
+    x_names = (*(f"log_{output}" for output in OUTPUTS[:6]), "current")
+    misspecification = (
+        "the published law over-predicts the light by a quarter to a third, and six "
+        "lamps beside the sensors change unknown to it"
+    )
+    variants = COMMON_VARIANTS | {
+        "strong_colours": "one colour of the source is from 171 to 255, with a prior "
+        "widened to 255.5",
+        "strong_angles": "one polariser is turned away by 42 to 118 degrees, with a "
+        "prior widened to [0, 120]",
+        "sensor_settings": "test observations have another exposure time or reference "
+        "voltage at one sensor",
+    }
+    shifted_region = {"red": (45.0, 85.5), "polariser_angle": (0.0, 15.0)}  # noqa: RUF012
 
     def __init__(
         self,
         *,
         variant: str | None = None,
         root: str | Path | None = None,
+        label_noise: float | None = None,
         download: bool = False,
-        experiment: str = "uniform_reference",
+        experiment: str | None = None,
         relative_noise: float = 0.03,
         current_noise_std: float = 4.0,
     ) -> None:
-        super().__init__(variant=variant, root=root)
-        if download and root is None:
-            raise InvalidInputError(
-                "Expected `root` with `download=True`: the folder to download into; "
-                "got None."
-            )
+        super().__init__(variant=variant, root=root, label_noise=label_noise)
+        check_download(self.root, download=download)
         check_positive("relative_noise", relative_noise)
         check_positive("current_noise_std", current_noise_std)
+        if experiment is not None and variant in OWN_EXPERIMENTS:
+            raise InvalidInputError(
+                f"`experiment` has no effect with `variant={variant!r}`, which chooses "
+                f"its own; got `experiment={experiment!r}`."
+            )
         self.download = download
-        self.experiment = experiment
+        self.experiment = self._option("experiment", experiment, REFERENCE)
         self.relative_noise = relative_noise
         self.current_noise_std = current_noise_std
 
@@ -184,13 +233,26 @@ class LightTunnelSensors(Task):
         As with every ``MultipleIndependent`` of sbi, a sample shape of more than one
         dimension is flattened, and ``log_prob`` takes at most two dimensions.
         """
-        low = torch.full((3,), -0.5, dtype=torch.float32)
-        width = torch.tensor([40.0], dtype=torch.float32)
         # Its constructor draws a sample to learn the shapes.
         with torch.random.fork_rng(devices=[]):
-            return MultipleIndependent(
-                [BoxUniform(low, low + 86), UniformDistance(width)]
-            )
+            return MultipleIndependent([self._colour_prior(), self._angle_prior()])
+
+    def prior_quantiles(self, theta: Tensor) -> Tensor:
+        """Return the distribution functions of colours and angle, ``(n, 4)``."""
+        colours = self._colour_prior().base_dist.cdf(theta[:, :3])
+        prior = self._angle_prior()
+        angle = prior if isinstance(prior, UniformDistance) else prior.base_dist
+        return torch.cat([colours, angle.cdf(theta[:, 3:])], dim=1)
+
+    def _colour_prior(self) -> BoxUniform:
+        low = torch.full((3,), -0.5, dtype=torch.float32)
+        return BoxUniform(low, low + (256 if self.variant == "strong_colours" else 86))
+
+    def _angle_prior(self) -> UniformDistance | BoxUniform:
+        if self.variant == "strong_angles":
+            zero = torch.zeros(1, dtype=torch.float32)
+            return BoxUniform(zero, zero + 120)
+        return UniformDistance(torch.tensor([40.0], dtype=torch.float32))
 
     def get_simulator(self) -> LightTunnelSimulator:
         """Return the published law with noise."""
@@ -199,20 +261,30 @@ class LightTunnelSensors(Task):
             current_noise_std=self.current_noise_std,
         )
 
-    def get_embedding_net(self) -> nn.Module:
+    def get_embedding_net(self, *, light: bool = False) -> nn.Module:
         """Return a network with three hidden layers of 64 and eight outputs."""
         return fully_connected(len(OUTPUTS), (64, 64, 64, 8))
 
-    def _labelled_set(self, n: int, *, seed: int, part: Part) -> tuple[Tensor, Tensor]:
-        theta, x = self._recorded()
-        rows = select_rows(theta.shape[0], n, seed=seed, part=part)
-        return theta[rows].float(), x[rows].float()
-
-    def _recorded(self) -> tuple[Tensor, Tensor]:
-        file = f"{DATASET}/{self.experiment}.csv"
-        values = read_columns(
-            file, INPUTS + OUTPUTS, root=self.root, download=self.download
+    def _recorded_files(self) -> tuple[Path, ...]:
+        experiments = dict.fromkeys(
+            (*self._experiments("calibration"), *self._experiments("test"))
         )
+        return tuple(Path(DATASET, f"{name}.csv") for name in experiments)
+
+    def _experiments(self, part: Part) -> tuple[str, ...]:
+        standard = (self.experiment,)
+        pair = OWN_EXPERIMENTS.get(self.variant or "", (standard, standard))
+        return pair[part == "test"]
+
+    def _real_process(self, part: Part) -> RecordedPairs:
+        recorded = [self._recorded(name) for name in self._experiments(part)]
+        theta, x = (torch.cat(parts) for parts in zip(*recorded, strict=True))
+        return RecordedPairs(theta=theta.float(), read_x=x.float().__getitem__)
+
+    def _recorded(self, experiment: str) -> tuple[Tensor, Tensor]:
+        file = Path(DATASET, f"{experiment}.csv")
+        path = find_file(file, root=self.root, download=self.download)
+        values = read_columns(path, INPUTS + OUTPUTS)
         colour, positions, readings = values.split([3, 2, len(OUTPUTS)], dim=1)
         angle = (positions[:, :1] - positions[:, 1:]).abs()
         theta = torch.cat([colour, angle], dim=1)

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from sbi_rope._validation import check_batch, check_integer
 from sbi_rope.errors import InvalidInputError
 
-__all__ = ["SeriesEmbedding", "fully_connected"]
+__all__ = ["SeriesEmbedding", "fully_connected", "light_series_embedding"]
 
 CHANNELS = (1, 16, 64, 128, 128, 128, 128, 128)
 STRIDES = (1, 2, 1, 2, 1, 2, 1)
@@ -92,6 +92,33 @@ def fully_connected(input_dim: int, widths: Sequence[int]) -> nn.Sequential:
     for before, after in zip((input_dim, *widths), widths, strict=False):
         layers += [nn.Linear(before, after), nn.ReLU()]
     return nn.Sequential(*layers[:-1])
+
+
+def light_series_embedding(*, num_steps: int, output_dim: int) -> nn.Sequential:
+    """Return a small convolutional network for a single time series, for CPUs.
+
+    Three convolutions with kernel 5 and stride 2, to 32 channels, and two linear
+    layers: about a thirtieth of the work of :class:`SeriesEmbedding` at 200 steps.
+
+    Args:
+        num_steps: Length of the series, at least 1.
+        output_dim: Number of statistics to return.
+
+    Example:
+        >>> net = light_series_embedding(num_steps=50, output_dim=10)
+        >>> net(torch.zeros(5, 50)).shape
+        torch.Size([5, 10])
+    """
+    check_integer("num_steps", num_steps)
+    check_integer("output_dim", output_dim)
+    layers: list[nn.Module] = [nn.Unflatten(1, (1, num_steps))]
+    length = num_steps
+    for before, after in ((1, 16), (16, 32), (32, 32)):
+        layers += [nn.Conv1d(before, after, 5, stride=2, padding=2), nn.ReLU()]
+        length = (length + 1) // 2
+    return nn.Sequential(
+        *layers, nn.Flatten(), fully_connected(32 * length, (64, output_dim))
+    )
 
 
 def _convolutions(padding: int) -> nn.Sequential:

@@ -11,8 +11,10 @@ from torch import Tensor, nn
 from sbi_rope._validation import check_positive, check_unit_interval
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.base import Task, check_theta
-from sbi_rope.tasks.networks import SeriesEmbedding
-from sbi_rope.tasks.splits import Part, draw_rows
+from sbi_rope.tasks.networks import SeriesEmbedding, light_series_embedding
+from sbi_rope.tasks.settings import PaperSettings
+from sbi_rope.tasks.splits import DrawnPairs, Part
+from sbi_rope.tasks.variants import COMMON_VARIANTS
 
 __all__ = ["Pendulum", "PendulumSimulator"]
 
@@ -93,14 +95,16 @@ class Pendulum(Task):
         | https://arxiv.org/abs/2405.08719
 
     Args:
-        variant: ``None`` or ``"misspecified_prior"``.
+        variant: ``None`` or one of ``variants``.
         root: Not used, the task is synthetic.
+        label_noise: Noise on the calibration labels, in standard deviations of the
+            prior; 0.2 unless given. Only for ``"noisy_labels"``.
         misspecification_weight: Weight of the tighter distribution in the mixture, in
             [0, 1]; 0.5 unless given. Only for ``"misspecified_prior"``.
         noise_std: Standard deviation of the noise on simulated and real positions, in
             units of A.
-        max_damping: Largest damping rate of the real process, in 1/s. At 0 the
-            simulator is exact.
+        max_damping: Largest damping rate of the real process, in 1/s; 1 unless given.
+            At 0 the simulator is exact.
 
     Example:
         >>> theta, x_o = Pendulum().get_calibration_set(50)
@@ -112,62 +116,76 @@ class Pendulum(Task):
     parameter_names = ("omega_0", "A")
     parameter_units = ("rad/s", "1")
     x_shape = (NUM_STEPS,)
-    variants = ("misspecified_prior",)
+    misspecification = "the real swing is damped by friction"
+    variants = COMMON_VARIANTS | {
+        "misspecified_prior": "the real parameters come from a mixture of the prior "
+        "and a tighter box, with `misspecification_weight`",
+    }
+    shifted_region = {"omega_0": (1.5, 3.0), "A": (0.5, 5.25)}  # noqa: RUF012
+    paper_settings = PaperSettings(
+        learning_rate=1e-4,
+        finetuning_learning_rate=1e-5,
+        finetuning_steps=5000,
+        joint_epoch_size=50_000,
+    )
 
     def __init__(
         self,
         *,
         variant: str | None = None,
         root: str | Path | None = None,
+        label_noise: float | None = None,
         misspecification_weight: float | None = None,
         noise_std: float = 0.1,
-        max_damping: float = 1.0,
+        max_damping: float | None = None,
     ) -> None:
-        super().__init__(variant=variant, root=root)
+        super().__init__(variant=variant, root=root, label_noise=label_noise)
         check_positive("noise_std", noise_std)
-        if not 0.0 <= max_damping < math.inf:
+        self.noise_std = noise_std
+        self.max_damping = self._option("max_damping", max_damping, 1.0)
+        if not 0.0 <= self.max_damping < math.inf:
             raise InvalidInputError(
                 f"Expected `max_damping` to be at least 0; got {max_damping!r}."
             )
-        self.noise_std = noise_std
-        self.max_damping = max_damping
-        self.misspecification_weight = self._checked_weight(misspecification_weight)
+        self.misspecification_weight = self._option(
+            "misspecification_weight",
+            misspecification_weight,
+            0.5 if variant == "misspecified_prior" else 0.0,
+            variant="misspecified_prior",
+        )
+        check_unit_interval("misspecification_weight", self.misspecification_weight)
 
     def get_prior(self) -> BoxUniform:
         """Return the uniform prior on [0, 3] x [0.5, 10], log density -log 28.5."""
         return _box((0.0, 0.5), (3.0, 10.0))
 
+    def prior_quantiles(self, theta: Tensor) -> Tensor:
+        """Return relative positions in the box, shape ``(n, 2)``."""
+        return self.get_prior().base_dist.cdf(theta)
+
     def get_simulator(self) -> PendulumSimulator:
         """Return the simulator without friction."""
         return PendulumSimulator(noise_std=self.noise_std)
 
-    def get_embedding_net(self) -> nn.Module:
-        """Return the paper's convolutional network with ten outputs."""
+    def get_embedding_net(self, *, light: bool = False) -> nn.Module:
+        """Return the paper's convolutional network, or a light one; ten outputs."""
+        if light:
+            return light_series_embedding(num_steps=NUM_STEPS, output_dim=10)
         return SeriesEmbedding(num_steps=NUM_STEPS, output_dim=10)
 
-    def _labelled_set(self, n: int, *, seed: int, part: Part) -> tuple[Tensor, Tensor]:
-        return draw_rows(self._draw, n, seed=seed, part=part)
+    def _real_process(self, part: Part) -> DrawnPairs:
+        return DrawnPairs(
+            draw_theta=self._draw_theta,
+            observe=PendulumSimulator(
+                noise_std=self.noise_std, max_damping=self.max_damping
+            ),
+        )
 
-    def _draw(self, n: int) -> tuple[Tensor, Tensor]:
+    def _draw_theta(self, n: int) -> Tensor:
         theta = self.get_prior().sample((n,))
         tight = _box((1.0, 3.0), (2.0, 6.0)).sample((n,))
         chance = torch.rand(n, 1, dtype=theta.dtype)
-        theta = torch.where(chance < self.misspecification_weight, tight, theta)
-        real = PendulumSimulator(noise_std=self.noise_std, max_damping=self.max_damping)
-        return theta, real(theta)
-
-    def _checked_weight(self, weight: float | None) -> float:
-        if self.variant is None:
-            if weight is not None:
-                raise InvalidInputError(
-                    "`misspecification_weight` has no effect without "
-                    "`variant='misspecified_prior'`; got both "
-                    f"`misspecification_weight={weight!r}` and `variant=None`."
-                )
-            return 0.0
-        weight = 0.5 if weight is None else weight
-        check_unit_interval("misspecification_weight", weight)
-        return weight
+        return torch.where(chance < self.misspecification_weight, tight, theta)
 
 
 def _box(low: tuple[float, ...], high: tuple[float, ...]) -> BoxUniform:

@@ -1,109 +1,198 @@
-r"""Calibration and test sets that never share an observation.
+r"""Labelled pairs that never appear in two sets.
 
-Synthetic tasks give each part random streams of its own (:func:`draw_rows`),
-recorded data are split once and for all (:func:`select_rows`).
+A task's pairs come from a process that can be drawn from (:class:`DrawnPairs`), each
+part on random streams of its own, or from recorded data (:class:`RecordedPairs`),
+split once and for all.
 """
 
 import hashlib
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from torch import Tensor
 
-from sbi_rope.errors import InvalidInputError
+from sbi_rope.errors import InvalidInputError, SimulationError, warn_user
 
-__all__ = ["MAX_SEED", "Part", "draw_rows", "select_rows"]
+__all__ = ["MAX_SEED", "DrawnPairs", "Keep", "Part", "RecordedPairs", "stream_of"]
 
-Part = Literal["calibration", "test"]
+Part = Literal["calibration", "test", "simulation"]
+# The chance, in [0, 1], of parameters (n, d) to stay in a set; one number a row.
+Keep = Callable[[Tensor], Tensor]
 
 # torch's CPU generator keeps the lower 32 bits of a seed, and each seed of a task
-# needs two of those streams.
-MAX_SEED = 2**31
+# needs four of those streams.
+MAX_SEED = 2**30
 BLOCK_SIZE = 100
+# Blocks without a single pair after which there is no hope for one.
+MAX_EMPTY_BLOCKS = 1000
 
 
-def draw_rows(
-    draw: Callable[[int], tuple[Tensor, Tensor]], n: int, *, seed: int, part: Part
-) -> tuple[Tensor, Tensor]:
-    r"""Draw labelled observations from the random stream of one seed and part.
+@dataclass(frozen=True, kw_only=True)
+class DrawnPairs:
+    r"""Labelled observations of a process that is drawn on request.
 
-    Stream :math:`2s` belongs to the calibration set of seed :math:`s` and stream
-    :math:`2s + 1` to its test set, so no two sets share one. An odd multiplier
-    modulo :math:`2^{32}` (a bijection) then moves the streams away from the small
-    seeds with which callers draw their simulations.
-
-    The rows are drawn on the CPU in blocks of fixed size, of which the first ``n``
-    rows are kept: a smaller set is the beginning of a larger one. The caller's
-    generators, those of all devices included, are left as they were.
+    Parameters are drawn on the CPU in blocks of fixed size, and the first rows are
+    kept: a smaller set is the beginning of a larger one. The caller's generators,
+    those of all devices included, are left as they were. Pairs whose observation is
+    not finite are dropped with their parameters, drawn again, and counted in a
+    warning.
 
     Args:
-        draw: Draws a given number of pairs ``(theta, x_o)`` from torch's global
-            generator.
-        n: Number of rows to return.
-        seed: Integer from 0 to ``MAX_SEED - 1``.
-        part: The part of the task's data that is drawn.
-
-    Returns:
-        Parameters and observations, ``n`` rows each.
+        draw_theta: Draws a number of parameters, shape ``(n, d)``, from torch's
+            global generator.
+        observe: Draws one observation for each of them, shape ``(n, *event)``.
 
     Example:
-        >>> def draw(n):
-        ...     theta = torch.rand(n, 1)
-        ...     return theta, theta + torch.randn(n, 3)
-        >>> few, _ = draw_rows(draw, 2, seed=0, part="test")
-        >>> many, _ = draw_rows(draw, 5, seed=0, part="test")
+        >>> pairs = DrawnPairs(
+        ...     draw_theta=lambda n: torch.rand(n, 1),
+        ...     observe=lambda theta: theta + torch.randn(len(theta), 3),
+        ... )
+        >>> few, _ = pairs.take(2, seed=0, part="test")
+        >>> many, _ = pairs.take(5, seed=0, part="test")
         >>> torch.equal(few, many[:2])
         True
     """
-    stream = (2 * seed + (part == "test")) * 0x9E3779B1 + 0x85EBCA6B
-    with torch.random.fork_rng(devices=[]), torch.device("cpu"):
-        # `torch.manual_seed` would reseed the accelerators as well.
-        torch.default_generator.manual_seed(stream % 2**32)
-        blocks = [draw(BLOCK_SIZE) for _ in range(-(-n // BLOCK_SIZE))]
-    theta, x = (torch.cat(rows)[:n] for rows in zip(*blocks, strict=True))
-    return theta, x
+
+    draw_theta: Callable[[int], Tensor]
+    observe: Callable[[Tensor], Tensor]
+
+    def take(
+        self, n: int, *, seed: int, part: Part, keep: Keep | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Return the first ``n`` pairs of the stream of one seed and part.
+
+        Args:
+            n: Number of pairs.
+            seed: Integer from 0 to ``MAX_SEED - 1``.
+            part: The part of the task's data that is drawn.
+            keep: Which parameters may stay; all, if it is not given.
+
+        Raises:
+            SimulationError: If the process gives no valid pair in many attempts.
+        """
+        thetas, xs = [], []
+        found = dropped = empty = 0
+        with torch.random.fork_rng(devices=[]), torch.device("cpu"):
+            # `torch.manual_seed` would reseed the accelerators as well.
+            torch.default_generator.manual_seed(stream_of(seed, part))
+            while found < n:
+                theta, x, invalid = self._block(keep)
+                thetas.append(theta)
+                xs.append(x)
+                found, dropped = found + len(theta), dropped + invalid
+                empty = 0 if len(theta) else empty + 1
+                if empty == MAX_EMPTY_BLOCKS:
+                    raise SimulationError(
+                        f"Only {found} of {n} pairs were found before "
+                        f"{empty * BLOCK_SIZE} draws in a row gave none "
+                        f"({dropped} had an observation with NaN or Inf)."
+                    )
+        if dropped:
+            warn_user(
+                f"Replaced {dropped} of {found + dropped} drawn pairs because their "
+                "observations contain NaN or Inf."
+            )
+        return torch.cat(thetas)[:n], torch.cat(xs)[:n]
+
+    def _block(self, keep: Keep | None) -> tuple[Tensor, Tensor, int]:
+        theta = self.draw_theta(BLOCK_SIZE)
+        if keep is not None:
+            theta = theta[torch.rand(BLOCK_SIZE, dtype=torch.float64) < keep(theta)]
+        if not len(theta):
+            return theta, torch.empty(0), 0
+        x = self.observe(theta)
+        valid = torch.isfinite(x).flatten(1).all(dim=1)
+        return theta[valid], x[valid], int((~valid).sum())
 
 
-def select_rows(num_rows: int, n: int, *, seed: int, part: Part) -> list[int]:
-    """Choose rows of a recorded data set.
+@dataclass(frozen=True, kw_only=True)
+class RecordedPairs:
+    """Labelled observations that were recorded once.
 
-    The rows are put in a fixed random order that does not depend on ``seed``. Its
+    The rows are put in a fixed random order that does not depend on the seed. Its
     first third belongs to the calibration part and the rest to the test part; the
     seed picks the rows within the part. Orders come from a hash of the row number,
     so that they are the same with every version of every library.
 
     Args:
-        num_rows: Number of rows of the data set.
-        n: Number of rows to choose.
-        seed: Which rows to choose; a smaller choice is the beginning of a larger one.
-        part: The part to choose from.
-
-    Returns:
-        Row numbers, ``n`` of them, all different.
-
-    Raises:
-        InvalidInputError: If the part has fewer than ``n`` rows.
+        theta: Parameters of all rows, shape ``(rows, d)``.
+        read_x: Returns the observations of chosen rows, in their order.
 
     Example:
-        >>> select_rows(6, 2, seed=0, part="calibration")
-        [3, 2]
-        >>> sorted(select_rows(6, 4, seed=0, part="test"))
-        [0, 1, 4, 5]
+        >>> theta = torch.arange(6.0).reshape(6, 1)
+        >>> pairs = RecordedPairs(theta=theta, read_x=lambda rows: 10 * theta[rows])
+        >>> pairs.take(2, seed=0, part="calibration")[1].flatten()
+        tensor([30., 20.])
     """
-    order = _shuffled(range(num_rows), key="split")
-    third = num_rows // 3
-    rows = order[:third] if part == "calibration" else order[third:]
-    if n > len(rows):
-        raise InvalidInputError(
-            f"Expected `n` to be at most {len(rows)}, the number of recorded "
-            f"observations in the {part} part; got {n}."
-        )
-    return _shuffled(rows, key=f"seed {seed}")[:n]
+
+    theta: Tensor
+    read_x: Callable[[list[int]], Tensor]
+
+    def take(
+        self, n: int, *, seed: int, part: Part, keep: Keep | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Return ``n`` pairs of one part; a smaller choice begins a larger one.
+
+        Args:
+            n: Number of pairs.
+            seed: Which rows to choose.
+            part: The part to choose from.
+            keep: Which parameters may stay; all, if it is not given.
+
+        Raises:
+            InvalidInputError: If the part has fewer than ``n`` such rows.
+        """
+        rows = self.rows_of(part)
+        rows = _shuffled(rows, key=f"seed {seed}")
+        if keep is not None:
+            chances = keep(self.theta[rows]).tolist()
+            rows = [
+                row
+                for row, chance in zip(rows, chances, strict=True)
+                if _uniform(row, key=f"keep {seed}") < chance
+            ]
+        if n > len(rows):
+            raise InvalidInputError(
+                f"Expected `n` to be at most {len(rows)}, the number of recorded "
+                f"observations in the {part} part; got {n}."
+            )
+        rows = rows[:n]
+        return self.theta[rows], self.read_x(rows)
+
+    def rows_of(self, part: Part) -> list[int]:
+        """Return the numbers of all rows of a part, whatever the seed."""
+        order = _shuffled(range(len(self.theta)), key="split")
+        third = len(order) // 3
+        return order[:third] if part == "calibration" else order[third:]
+
+
+def stream_of(seed: int, use: Part | Literal["labels"]) -> int:
+    r"""Return the 32-bit random stream that a seed has for one use.
+
+    Streams :math:`2s` and :math:`2s + 1` belong to the calibration and the test set
+    of seed :math:`s`, those of simulations and label noise lie above all of them, so
+    that no two uses share one. An odd multiplier modulo :math:`2^{32}` (a bijection)
+    then moves the streams away from the small seeds with which callers draw their
+    own simulations.
+    """
+    index = {
+        "calibration": 2 * seed,
+        "test": 2 * seed + 1,
+        "simulation": 2 * MAX_SEED + seed,
+        "labels": 3 * MAX_SEED + seed,
+    }[use]
+    return (index * 0x9E3779B1 + 0x85EBCA6B) % 2**32
 
 
 def _shuffled(rows: list[int] | range, *, key: str) -> list[int]:
-    def digest(row: int) -> bytes:
-        return hashlib.sha256(f"{key}: {row}".encode()).digest()
+    return sorted(rows, key=lambda row: _digest(row, key=key))
 
-    return sorted(rows, key=digest)
+
+def _uniform(row: int, *, key: str) -> float:
+    return int.from_bytes(_digest(row, key=key)[:7], "big") / 2**56
+
+
+def _digest(row: int, *, key: str) -> bytes:
+    return hashlib.sha256(f"{key}: {row}".encode()).digest()

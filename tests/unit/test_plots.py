@@ -397,3 +397,60 @@ def test_overview_spreads_out_one_dimensional_embeddings() -> None:
 def test_overview_refuses(changes: dict[str, Any], match: str) -> None:
     with pytest.raises(InvalidInputError, match=match):
         plots.overview(**three_steps(**changes))
+
+
+# Observations ------------------------------------------------------------------------
+
+
+def test_statistics_are_drawn_as_a_histogram_each() -> None:
+    figure = plots.real_and_simulated(
+        torch.randn(100, 5), torch.randn(100, 5) + 1, names=list("abcde")
+    )
+    assert [axes.get_xlabel() for axes in figure.axes] == list("abcde")
+    assert legend_texts(figure.legends[0]) == ["simulated", "real"]
+
+
+def test_series_are_drawn_in_pairs() -> None:
+    x_o, x_s = torch.randn(3, 50), torch.randn(3, 50)
+    figure = plots.real_and_simulated(x_o, x_s)
+    assert len(figure.axes) == 3
+    for i, axes in enumerate(figure.axes):
+        lines = {line.get_label(): line.get_ydata() for line in axes.lines}
+        assert lines["real"] == pytest.approx(x_o[i].numpy())
+        assert lines["simulated"] == pytest.approx(x_s[i].numpy())
+
+
+def test_images_are_drawn_real_above_simulated() -> None:
+    x_o, x_s = torch.rand(9, 3, 8, 8), torch.rand(9, 3, 8, 8)
+    figure = plots.real_and_simulated(x_o, x_s)
+    assert len(figure.axes) == 12
+    shown = [torch.tensor(axes.images[0].get_array()) for axes in figure.axes]
+    for i in range(6):
+        assert torch.equal(shown[i], x_o[i].permute(1, 2, 0))
+        assert torch.equal(shown[6 + i], x_s[i].permute(1, 2, 0))
+
+
+def test_constant_statistics_are_drawn_too() -> None:
+    plots.real_and_simulated(torch.ones(5, 1), torch.ones(5, 1), names=["a"])
+
+
+@pytest.mark.parametrize(
+    ("x_o", "x_s", "names", "match"),
+    [
+        pytest.param(torch.rand(5, 2), torch.rand(5, 3), "ab", "x_s", id="shape"),
+        pytest.param(torch.rand(5, 2), torch.rand(4, 2), "ab", "same number", id="n"),
+        pytest.param(torch.rand(5, 2), torch.rand(5, 2), "a", "names", id="names"),
+        pytest.param(torch.rand(5), torch.rand(5), "", r"\(n, d\)", id="no-batch"),
+        pytest.param(
+            torch.rand(5, 1, 4, 4), torch.rand(5, 1, 4, 4), "", "height", id="grey"
+        ),
+        pytest.param(
+            torch.rand(5, 2) * torch.nan, torch.rand(5, 2), "ab", "finite", id="nan"
+        ),
+    ],
+)
+def test_observations_that_cannot_be_drawn_are_refused(
+    x_o: Tensor, x_s: Tensor, names: str, match: str
+) -> None:
+    with pytest.raises(InvalidInputError, match=match):
+        plots.real_and_simulated(x_o, x_s, names=list(names))

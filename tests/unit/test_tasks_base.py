@@ -6,9 +6,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from sbi.utils import within_support
 
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks import TASKS, Task, get_task, list_tasks
+from sbi_rope.tasks.variants import beta_shaped, with_label_noise
 
 
 def test_registered_names_are_those_of_the_classes() -> None:
@@ -38,7 +40,7 @@ def test_get_task_passes_everything_on() -> None:
         pytest.param(lambda: get_task("pendulu"), r"\['light_.*'pendulum'", id="name"),
         pytest.param(
             lambda: get_task("pendulum", variant="damped"),
-            r"`variant`.*\['misspecified_prior'\].*'damped'",
+            r"`variant`.*'misspecified_prior'.*'damped'",
             id="variant",
         ),
         pytest.param(
@@ -61,7 +63,7 @@ def test_repr_names_the_variant() -> None:
     assert repr(task) == "Pendulum(variant='misspecified_prior')"
 
 
-@pytest.mark.parametrize("method", ["get_prior", "get_simulator", "_labelled_set"])
+@pytest.mark.parametrize("method", ["get_prior", "prior_quantiles", "_real_process"])
 def test_a_task_without_an_abstract_method_cannot_be_made(method: str) -> None:
     assert method in Task.__abstractmethods__
 
@@ -89,3 +91,43 @@ def test_importing_tasks_is_quiet_and_loads_no_data_library() -> None:
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout == ""
+
+
+def test_options_without_effect_are_refused() -> None:
+    with pytest.raises(InvalidInputError, match=r"`max_damping` has no effect"):
+        get_task("pendulum", variant="well_specified", max_damping=0.5)
+
+
+def test_the_beta_shape_is_a_density_over_its_maximum() -> None:
+    u = torch.rand(1000, 2, dtype=torch.float64)
+    law = torch.distributions.Beta(
+        torch.tensor(3.0, dtype=torch.float64), torch.tensor(3.0, dtype=torch.float64)
+    )
+    highest = law.log_prob(torch.tensor(0.5, dtype=torch.float64))
+    expected = (law.log_prob(u) - highest).sum(dim=1).exp()
+    torch.testing.assert_close(beta_shaped(u), expected)
+
+
+def test_the_beta_shape_is_that_of_the_first_three_parameters() -> None:
+    u = torch.rand(10, 25)
+    assert torch.equal(beta_shaped(u), beta_shaped(u[:, :3]))
+
+
+def test_label_noise_stays_in_the_support_and_begins_like_that_of_more_labels() -> None:
+    prior = get_task("pendulum").get_prior()
+    theta = prior.sample(torch.Size((250,)))
+    std = torch.tensor([1.0, 3.0])
+    noisy = with_label_noise(theta, std, prior, seed=3)
+    assert within_support(prior, noisy).all()
+    assert torch.equal(with_label_noise(theta[:130], std, prior, seed=3), noisy[:130])
+    assert not torch.equal(with_label_noise(theta, std, prior, seed=4), noisy)
+
+
+def test_label_noise_is_gaussian_where_the_support_is_wide() -> None:
+    prior = get_task("linear_gaussian").get_prior()
+    theta = prior.sample(torch.Size((4000,)))
+    std = torch.tensor([0.5, 2.0])
+    noise = (with_label_noise(theta, std, prior, seed=0) - theta) / std
+    levels = torch.distributions.Normal(0.0, 1.0).cdf(noise).sort(dim=0).values
+    steps = torch.arange(1, 4001).unsqueeze(1) / 4000
+    assert (levels - steps).abs().max() < 2.2 / 4000**0.5

@@ -1,6 +1,7 @@
 """The light tunnel's sensors: law, prior and recorded data."""
 
 import math
+import shutil
 import sys
 import types
 from collections.abc import Callable
@@ -8,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from sbi.utils import within_support
 from torch import Tensor
 
 from sbi_rope.errors import DataNotFoundError, InvalidInputError
@@ -16,6 +18,7 @@ from sbi_rope.tasks.light_tunnel_sensors import (
     DATASET,
     INPUTS,
     OUTPUTS,
+    OWN_EXPERIMENTS,
     LightTunnelSensors,
     LightTunnelSimulator,
 )
@@ -256,25 +259,94 @@ def test_broken_files_are_explained(
         task.get_test_set(1)
 
 
-def test_download_fetches_what_is_missing(
+def test_download_fetches_what_is_missing_once(
     write_table: WriteTable, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    calls = stub_downloads(monkeypatch, lambda: write_table())
-    root = tmp_path / "new" / ".."
-    task = LightTunnelSensors(root=root, download=True)
+    published = write_table() / DATASET
+    calls: list[tuple[str, bool]] = []
+
+    def dataset(name: str, *, root: str, download: bool) -> None:
+        calls.append((name, download))
+        shutil.copytree(published, Path(root) / name)
+
+    module = types.ModuleType("causalchamber.datasets")
+    module.Dataset = dataset  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "causalchamber", types.ModuleType("causalchamber"))
+    monkeypatch.setitem(sys.modules, "causalchamber.datasets", module)
+    task = LightTunnelSensors(root=tmp_path / "new", download=True)
     assert calls == []
     task.get_test_set(2)
     task.get_test_set(2)
-    assert calls == [(DATASET, str(root), True)]
+    assert calls == [(DATASET, True)]
 
 
-def test_a_download_without_the_file_is_an_error(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_a_task_knows_whether_its_files_are_there(
+    write_table: WriteTable, tmp_path: Path
 ) -> None:
-    stub_downloads(monkeypatch, lambda: None)
-    task = LightTunnelSensors(root=tmp_path, download=True)
-    with pytest.raises(DataNotFoundError, match=r"uniform_reference\.csv"):
-        task.get_test_set(2)
+    assert not LightTunnelSensors().has_data
+    assert not LightTunnelSensors(root=tmp_path).has_data
+    root = write_table()
+    assert LightTunnelSensors(root=root).has_data
+    assert not LightTunnelSensors(root=root, variant="sensor_settings").has_data
+
+
+def test_an_unknown_experiment_is_answered_with_those_there(
+    write_table: WriteTable,
+) -> None:
+    task = LightTunnelSensors(root=write_table(), experiment="uniform_dark")
+    with pytest.raises(DataNotFoundError, match=r"\['uniform_reference'\]"):
+        task.get_test_set(1)
+
+
+# Variants ----------------------------------------------------------------------------
+
+
+def test_strong_colours_have_one_colour_above_170(chamber_root: Path) -> None:
+    task = LightTunnelSensors(root=chamber_root, variant="strong_colours")
+    for theta, _ in (task.get_calibration_set(900), task.get_test_set(1900)):
+        assert ((theta[:, :3] >= 171).sum(dim=1) == 1).all()
+        assert (theta[:, :3] >= 171).any(dim=0).all()
+    assert not within_support(LightTunnelSensors().get_prior(), theta).any()
+
+
+def test_strong_angles_are_42_to_118_degrees(chamber_root: Path) -> None:
+    task = LightTunnelSensors(root=chamber_root, variant="strong_angles")
+    theta, _ = task.get_test_set(1300)
+    assert theta[:, 3].min() == pytest.approx(42, abs=1.0)
+    assert theta[:, 3].max() == pytest.approx(118, abs=1.0)
+
+
+def test_light_does_not_tell_an_angle_from_its_supplement() -> None:
+    theta = torch.tensor([[40.0, 50.0, 60.0, 70.0], [40.0, 50.0, 60.0, 110.0]])
+    x = LightTunnelSimulator().readings(theta)
+    torch.testing.assert_close(x[0], x[1])
+
+
+def test_sensor_settings_change_the_test_set_alone(chamber_root: Path) -> None:
+    task = LightTunnelSensors(root=chamber_root, variant="sensor_settings")
+    standard = LightTunnelSensors(root=chamber_root)
+    theta, x = standard.get_calibration_set(100)
+    assert torch.equal(task.get_calibration_set(100)[0], theta)
+    assert torch.equal(task.get_calibration_set(100)[1], x)
+    simulator = standard.get_simulator()
+
+    def log_ratios(theta: Tensor, x: Tensor) -> Tensor:
+        return x[:, :6] - simulator.readings(theta)[:, :6].log1p()
+
+    # An exposure time of 0 instead of 3 is an eighth of the light, at one diode of
+    # six in six of the nine experiments.
+    darker = log_ratios(*task.get_test_set(3000)) < -1.5
+    assert not (log_ratios(theta, x) < -1.5).double().mean() > 0.05
+    share = darker.double().mean(dim=0)
+    torch.testing.assert_close(
+        share, torch.full_like(share, 1 / 9), atol=0.04, rtol=0.0
+    )
+
+
+@pytest.mark.parametrize("variant", sorted(OWN_EXPERIMENTS))
+def test_variants_with_experiments_of_their_own_take_no_other(variant: str) -> None:
+    with pytest.raises(InvalidInputError, match="no effect"):
+        LightTunnelSensors(variant=variant, experiment="uniform_l_11_mid")
 
 
 def test_a_missing_package_is_named(
@@ -306,20 +378,3 @@ def all_recorded(
     parts = (task.get_calibration_set(third), task.get_test_set(num_rows - third))
     theta, x = zip(*parts, strict=True)
     return torch.cat(theta), torch.cat(x)
-
-
-def stub_downloads(
-    monkeypatch: pytest.MonkeyPatch, action: Callable[[], object]
-) -> list[tuple[str, str, bool]]:
-    """Replace causalchamber's downloads by an action, and record the calls."""
-    calls: list[tuple[str, str, bool]] = []
-
-    def dataset(name: str, *, root: str, download: bool) -> None:
-        calls.append((name, root, download))
-        action()
-
-    module = types.ModuleType("causalchamber.datasets")
-    module.Dataset = dataset  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "causalchamber", types.ModuleType("causalchamber"))
-    monkeypatch.setitem(sys.modules, "causalchamber.datasets", module)
-    return calls

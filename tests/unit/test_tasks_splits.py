@@ -1,4 +1,4 @@
-"""Sets that share no observation."""
+"""Pairs that share no observation."""
 
 from typing import get_args
 
@@ -6,72 +6,190 @@ import pytest
 import torch
 from torch import Tensor
 
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.tasks.splits import BLOCK_SIZE, MAX_SEED, Part, draw_rows, select_rows
+from sbi_rope.errors import InvalidInputError, RoPEWarning, SimulationError
+from sbi_rope.tasks.splits import (
+    BLOCK_SIZE,
+    MAX_SEED,
+    DrawnPairs,
+    Part,
+    RecordedPairs,
+    stream_of,
+)
+
+SEEDS = [0, 1, 2, 3, 100, MAX_SEED - 2, MAX_SEED - 1]
 
 
-def draw(n: int) -> tuple[Tensor, Tensor]:
-    theta = torch.rand(n, 2)
-    return theta, torch.randn(n, 3)
+def drawn() -> DrawnPairs:
+    return DrawnPairs(
+        draw_theta=lambda n: torch.rand(n, 2),
+        observe=lambda theta: theta[:, :1] + torch.zeros(len(theta), 3),
+    )
 
 
-def test_streams_of_all_seeds_and_parts_differ() -> None:
-    seeds = [0, 1, 2, 3, 100, MAX_SEED - 2, MAX_SEED - 1]
+def recorded(num_rows: int) -> RecordedPairs:
+    theta = torch.arange(float(num_rows)).unsqueeze(1)
+    return RecordedPairs(theta=theta, read_x=lambda rows: theta[rows] * 10)
+
+
+def first_half(theta: Tensor) -> Tensor:
+    return (theta[:, 0] < 0.5).double()
+
+
+# Drawn pairs -------------------------------------------------------------------------
+
+
+def test_streams_of_all_seeds_and_uses_differ() -> None:
+    uses = ("calibration", "test", "simulation", "labels")
+    streams = {stream_of(seed, use) for seed in SEEDS for use in uses}
+    assert len(streams) == 4 * len(SEEDS)
+    assert all(0 <= stream < 2**32 for stream in streams)
+
+
+def test_sets_of_all_seeds_and_parts_differ() -> None:
     first = [
-        tuple(draw_rows(draw, 1, seed=seed, part=part)[0].flatten().tolist())
-        for seed in seeds
+        tuple(drawn().take(1, seed=seed, part=part)[0].flatten().tolist())
+        for seed in SEEDS
         for part in get_args(Part)
     ]
-    assert len(set(first)) == 2 * len(seeds)
+    assert len(set(first)) == 3 * len(SEEDS)
 
 
 @pytest.mark.parametrize("n", [1, BLOCK_SIZE, BLOCK_SIZE + 1])
-def test_drawn_rows_are_as_many_as_asked(n: int) -> None:
-    theta, x = draw_rows(draw, n, seed=0, part="test")
+def test_drawn_pairs_are_as_many_as_asked(n: int) -> None:
+    theta, x = drawn().take(n, seed=0, part="test")
     assert theta.shape == (n, 2)
     assert x.shape == (n, 3)
 
 
 def test_blocks_differ() -> None:
-    theta, _ = draw_rows(draw, 2 * BLOCK_SIZE, seed=0, part="test")
+    theta, _ = drawn().take(2 * BLOCK_SIZE, seed=0, part="test")
     assert not torch.equal(theta[:BLOCK_SIZE], theta[BLOCK_SIZE:])
 
 
-def test_rows_are_drawn_on_the_cpu_whatever_the_default_device() -> None:
+def test_pairs_are_drawn_on_the_cpu_whatever_the_default_device() -> None:
     with torch.device("meta"):
-        theta, _ = draw_rows(draw, 3, seed=0, part="test")
+        theta, _ = drawn().take(3, seed=0, part="test")
     assert theta.device.type == "cpu"
 
 
 def test_the_random_state_survives_an_error() -> None:
-    def fail(n: int) -> tuple[Tensor, Tensor]:
-        torch.rand(n)
+    def fail(theta: Tensor) -> Tensor:
+        torch.rand(len(theta))
         raise ZeroDivisionError
 
     before = torch.get_rng_state()
+    pairs = DrawnPairs(draw_theta=lambda n: torch.rand(n, 1), observe=fail)
     with pytest.raises(ZeroDivisionError):
-        draw_rows(fail, 3, seed=0, part="test")
+        pairs.take(3, seed=0, part="test")
     assert torch.equal(before, torch.get_rng_state())
 
 
+@pytest.mark.parametrize("n", [10, 250])
+def test_kept_pairs_follow_the_chances_and_stay_together(n: int) -> None:
+    theta, x = drawn().take(n, seed=0, part="test", keep=first_half)
+    assert len(theta) == n
+    assert (theta[:, 0] < 0.5).all()
+    assert torch.equal(theta[:, 0], x[:, 0])
+
+
+def test_a_small_kept_set_begins_a_larger_one() -> None:
+    few, _ = drawn().take(10, seed=0, part="test", keep=first_half)
+    many, _ = drawn().take(250, seed=0, part="test", keep=first_half)
+    assert torch.equal(few, many[:10])
+
+
+def test_a_chance_between_0_and_1_thins_out() -> None:
+    theta, _ = drawn().take(
+        2000, seed=0, part="test", keep=lambda theta: theta[:, 0].double()
+    )
+    # The density 2 t has mean 2/3 and variance 1/18.
+    assert theta[:, 0].mean() == pytest.approx(2 / 3, abs=4 * (1 / 18 / 2000) ** 0.5)
+
+
+def test_pairs_with_nan_are_replaced_jointly_and_counted() -> None:
+    pairs = DrawnPairs(
+        draw_theta=lambda n: torch.rand(n, 2),
+        observe=lambda theta: torch.where(theta[:, :1] < 0.1, torch.nan, theta),
+    )
+    with pytest.warns(RoPEWarning, match=r"Replaced \d+ of \d+ drawn pairs"):
+        theta, x = pairs.take(500, seed=0, part="test")
+    assert theta.shape == (500, 2)
+    assert torch.equal(theta, x)
+    assert (theta[:, 0] >= 0.1).all()
+
+
+def test_a_process_without_valid_pairs_does_not_run_for_ever() -> None:
+    pairs = DrawnPairs(
+        draw_theta=lambda n: torch.rand(n, 2),
+        observe=lambda theta: theta * torch.nan,
+    )
+    with pytest.raises(SimulationError, match="0 of 3 pairs"):
+        pairs.take(3, seed=0, part="test")
+
+
+# Recorded pairs ----------------------------------------------------------------------
+
+
+def test_recorded_pairs_stay_together() -> None:
+    theta, x = recorded(100).take(20, seed=0, part="test")
+    assert torch.equal(x, 10 * theta)
+    assert len(theta.unique()) == 20
+
+
 def test_parts_are_a_partition_that_does_not_depend_on_the_seed() -> None:
-    calibration = set(select_rows(20, 6, seed=0, part="calibration"))
-    test = set(select_rows(20, 14, seed=1, part="test"))
-    assert calibration | test == set(range(20))
-    assert calibration == set(select_rows(20, 6, seed=2, part="calibration"))
+    def rows(n: int, seed: int, part: Part) -> set[float]:
+        theta, _ = recorded(20).take(n, seed=seed, part=part)
+        return set(theta.flatten().tolist())
+
+    calibration = rows(6, 0, "calibration")
+    assert calibration | rows(14, 1, "test") == set(range(20))
+    assert calibration == rows(6, 2, "calibration")
 
 
 def test_the_seed_picks_rows_within_a_part() -> None:
     first, second = (
-        select_rows(300, 10, seed=seed, part="calibration") for seed in (0, 1)
+        recorded(300).take(10, seed=seed, part="calibration")[0] for seed in (0, 1)
     )
-    assert set(first) != set(second)
+    assert set(first.flatten().tolist()) != set(second.flatten().tolist())
 
 
 def test_the_split_is_not_that_of_the_file_order() -> None:
-    rows = torch.tensor(select_rows(3000, 1000, seed=0, part="calibration"))
+    rows = torch.tensor(recorded(3000).rows_of("calibration"))
     assert rows.double().mean() == pytest.approx(1500, abs=100)
     assert rows.double().std() == pytest.approx(3000 / 12**0.5, rel=0.05)
+
+
+def test_only_the_chosen_rows_are_read() -> None:
+    read: list[int] = []
+
+    def read_x(rows: list[int]) -> Tensor:
+        read.extend(rows)
+        return torch.zeros(len(rows), 1)
+
+    pairs = RecordedPairs(theta=torch.rand(90, 1), read_x=read_x)
+    pairs.take(5, seed=0, part="test")
+    assert len(read) == 5
+
+
+def test_recorded_rows_are_kept_by_their_chances() -> None:
+    pairs = recorded(3000)
+    theta, _ = pairs.take(
+        300, seed=0, part="calibration", keep=lambda t: (t[:, 0] < 1500).double()
+    )
+    assert (theta < 1500).all()
+    few, _ = pairs.take(
+        7, seed=0, part="calibration", keep=lambda t: (t[:, 0] < 1500).double()
+    )
+    assert torch.equal(few, theta[:7])
+
+
+def test_chances_of_recorded_rows_thin_them_out() -> None:
+    with pytest.raises(InvalidInputError) as raised:
+        recorded(3000).take(
+            1000, seed=0, part="calibration", keep=lambda t: 0.3 * torch.ones(len(t))
+        )
+    available = int(str(raised.value).split("at most ")[1].split(",")[0])
+    assert available == pytest.approx(300, abs=5 * (1000 * 0.3 * 0.7) ** 0.5)
 
 
 @pytest.mark.parametrize(("part", "size"), [("calibration", 3), ("test", 7)])
@@ -79,4 +197,4 @@ def test_asking_for_more_rows_than_there_are_names_their_number(
     part: Part, size: int
 ) -> None:
     with pytest.raises(InvalidInputError, match=f"at most {size}, .*got {size + 1}"):
-        select_rows(10, size + 1, seed=0, part=part)
+        recorded(10).take(size + 1, seed=0, part=part)

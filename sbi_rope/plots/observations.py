@@ -1,0 +1,132 @@
+"""What is observed: real beside simulated."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from sbi_rope._validation import check_batch, check_same_length, check_tensor
+from sbi_rope.errors import InvalidInputError
+from sbi_rope.plots._figures import BLUE, VERMILLION, empty_figure, hide_frame
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["real_and_simulated"]
+
+NUM_SHOWN = 6
+NUM_COLUMNS = 4
+# Beyond this share of the draws at either end, histograms are cut.
+TAIL = 0.005
+
+
+def real_and_simulated(
+    x_o: Tensor, x_s: Tensor, *, names: Sequence[str] = ()
+) -> "Figure":
+    """Real observations beside simulations at the same parameters.
+
+    Statistics are drawn as a histogram each, over all rows; of series and images the
+    first six pairs are drawn.
+
+    Args:
+        x_o: Real observations: statistics ``(n, d)``, series ``(n, length)`` or
+            images ``(n, 3, height, width)`` with values in [0, 1].
+        x_s: Simulations at the parameters of the real observations, same shape.
+        names: Names of the d statistics. Without them ``(n, length)`` is taken for
+            series.
+
+    Returns:
+        The figure.
+
+    Raises:
+        InvalidInputError: If the shapes differ or are none of these, or the number of
+            names is not that of the statistics.
+    """
+    x_o = check_tensor("x_o", x_o)
+    x_o = check_batch("x_o", x_o, x_o.shape[1:]).detach().cpu()
+    x_s = check_batch("x_s", x_s, x_o.shape[1:]).detach().cpu()
+    check_same_length("x_o", x_o, "x_s", x_s)
+    if x_o.ndim == 2 and names:
+        if len(names) != x_o.shape[1]:
+            raise InvalidInputError(
+                f"Expected {x_o.shape[1]} `names`, one a statistic; got {len(names)}."
+            )
+        return _histograms(x_o, x_s, names)
+    if x_o.ndim == 2:
+        return _series(x_o, x_s)
+    if x_o.ndim == 4 and x_o.shape[1] == 3:
+        return _images(x_o, x_s)
+    raise InvalidInputError(
+        "Expected `x_o` of shape (n, d), (n, length) or (n, 3, height, width); got "
+        f"{tuple(x_o.shape)}."
+    )
+
+
+def _histograms(x_o: Tensor, x_s: Tensor, names: Sequence[str]) -> "Figure":
+    columns = min(len(names), NUM_COLUMNS)
+    panels = _panels(len(names), columns, width=2.6, height=2.2)
+    for k, (axes, name) in enumerate(zip(panels, names, strict=True)):
+        values = torch.cat([x_o[:, k], x_s[:, k]]).double()
+        low, high = (torch.quantile(values, q).item() for q in (TAIL, 1 - TAIL))
+        if low == high:
+            low, high = low - 0.5, high + 0.5
+        for x, colour, label in (
+            (x_s, VERMILLION, "simulated"),
+            (x_o, BLUE, "real"),
+        ):
+            axes.hist(
+                x[:, k].numpy(),
+                bins=40,
+                range=(low, high),
+                density=True,
+                histtype="stepfilled",
+                alpha=0.45,
+                color=colour,
+                label=label,
+            )
+        axes.set_xlabel(name)
+        axes.set_yticks([])
+    figure = panels[0].figure
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=2, frameon=False)
+    return figure  # type: ignore[return-value]
+
+
+def _series(x_o: Tensor, x_s: Tensor) -> "Figure":
+    count = min(len(x_o), NUM_SHOWN)
+    panels = _panels(count, min(count, 3), width=3.2, height=2.0)
+    for i, axes in enumerate(panels):
+        axes.plot(x_s[i].numpy(), color=VERMILLION, linewidth=1.2, label="simulated")
+        axes.plot(x_o[i].numpy(), color=BLUE, linewidth=1.2, label="real")
+    for axes in panels[-min(count, 3) :]:
+        axes.set_xlabel("step")
+    figure = panels[0].figure
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=2, frameon=False)
+    return figure  # type: ignore[return-value]
+
+
+def _images(x_o: Tensor, x_s: Tensor) -> "Figure":
+    count = min(len(x_o), NUM_SHOWN)
+    figure = empty_figure(1.5 * count + 0.3, 3.2)
+    grid = figure.subplots(2, count, squeeze=False)
+    for row, (label, x) in enumerate((("real", x_o), ("simulated", x_s))):
+        for axes, image in zip(grid[row], x, strict=False):
+            axes.imshow(image.clamp(0, 1).permute(1, 2, 0).numpy())
+            axes.set_xticks([])
+            axes.set_yticks([])
+        grid[row][0].set_ylabel(label)
+    return figure
+
+
+def _panels(count: int, columns: int, *, width: float, height: float) -> "list[Axes]":
+    rows = -(-count // columns)
+    figure = empty_figure(width * columns, height * rows + 0.3)
+    grid = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for axes in grid[count:]:
+        axes.remove()
+    for axes in grid[:count]:
+        hide_frame(axes)
+    return grid[:count]

@@ -1,0 +1,113 @@
+"""The task whose posteriors are known."""
+
+import math
+
+import pytest
+import torch
+from torch.distributions import MultivariateNormal
+
+from sbi_rope.errors import InvalidInputError
+from sbi_rope.tasks.linear_gaussian import LinearGaussian, LinearGaussianSimulator
+
+
+def test_matrix_couples_neighbours() -> None:
+    matrix = LinearGaussianSimulator(dim=3).matrix(torch.zeros(1))
+    assert matrix.tolist() == [[1, 0, 0], [0.5, 1, 0], [0, 0.5, 1]]
+
+
+def test_real_observations_are_scaled_and_shifted_simulations() -> None:
+    theta, noise = torch.randn(20, 4), torch.randn(20, 4)
+    x_s = LinearGaussianSimulator(dim=4).observe(theta, noise)
+    real = LinearGaussianSimulator(dim=4, scale=-2.0, shift=3.0)
+    torch.testing.assert_close(real.observe(theta, noise), -2.0 * x_s + 3.0)
+
+
+@pytest.mark.parametrize("dim", [1, 2, 25])
+def test_true_posterior_is_that_of_the_joint_gaussian(dim: int) -> None:
+    """Conditioning the joint law of (theta, x), by Schur complements."""
+    real = LinearGaussianSimulator(dim=dim, scale=1.7, shift=-0.4, noise_std=0.3)
+    x = torch.randn(5, dim, dtype=torch.float64)
+    matrix = real.scale * real.matrix(x)
+    cov_x = matrix @ matrix.T + (real.scale * real.noise_std) ** 2 * torch.eye(dim)
+    gain = torch.linalg.solve(cov_x, matrix).T
+    expected = MultivariateNormal(
+        (x - real.shift) @ gain.T,
+        torch.eye(dim, dtype=torch.float64) - gain @ matrix,
+    )
+    posterior = real.posterior(x)
+    torch.testing.assert_close(posterior.mean, expected.mean)
+    torch.testing.assert_close(
+        posterior.covariance_matrix, expected.covariance_matrix.expand(5, -1, -1)
+    )
+
+
+def test_true_posterior_is_proportional_to_prior_times_likelihood() -> None:
+    task = LinearGaussian(dim=2)
+    _, x_o = task.get_test_set(1)
+    grid = torch.cartesian_prod(*[torch.linspace(-4, 4, 161)] * 2).double()
+    real = LinearGaussianSimulator(scale=task.scale, shift=task.shift)
+    clean = real.observe(grid, torch.zeros_like(grid))
+    log_joint = -0.5 * (grid**2).sum(dim=1)
+    deviation = (x_o - clean) / (task.scale * task.noise_std)
+    log_joint = log_joint - 0.5 * (deviation**2).sum(dim=1)
+    density = log_joint.softmax(dim=0) / 0.05**2
+    torch.testing.assert_close(
+        task.get_true_posterior(x_o).log_prob(grid).exp(), density, atol=1e-6, rtol=1e-3
+    )
+
+
+def test_true_posterior_is_calibrated_on_the_real_process() -> None:
+    task = LinearGaussian(dim=3)
+    theta, x_o = task.get_test_set(4000)
+    posterior = task.get_true_posterior(x_o)
+    std = posterior.covariance_matrix.diagonal(dim1=-2, dim2=-1).sqrt()
+    levels = torch.special.ndtr((theta - posterior.mean) / std)
+    steps = torch.arange(1, 4001).unsqueeze(1) / 4000
+    # Kolmogorov's distance of uniform draws.
+    assert (levels.sort(dim=0).values - steps).abs().max() < 2.2 / 4000**0.5
+
+
+def test_simulators_posterior_is_wrong_on_the_real_process() -> None:
+    task = LinearGaussian()
+    theta, x_o = task.get_test_set(1000)
+    wrong = task.get_simulator().posterior(x_o).log_prob(theta).mean()
+    right = task.get_true_posterior(x_o).log_prob(theta).mean()
+    assert wrong < right - 1.0
+
+
+def test_gain_1_and_offset_0_make_the_simulator_exact() -> None:
+    task = LinearGaussian(scale=1.0, shift=0.0)
+    assert task._real_simulator() == task.get_simulator()
+    assert LinearGaussian(variant="well_specified")._real_simulator() == (
+        task.get_simulator()
+    )
+
+
+def test_dimension_shapes_everything() -> None:
+    task = LinearGaussian(dim=25)
+    assert task.theta_dim == len(task.parameter_units) == len(task.x_names) == 25
+    theta, x_o = task.get_calibration_set(3)
+    assert theta.shape == x_o.shape == (3, 25)
+    assert task.get_embedding_net()(x_o).shape == (3, 50)
+    biased = LinearGaussian(dim=25, variant="biased_calibration")
+    assert biased.get_calibration_set(20)[0].shape == (20, 25)
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        pytest.param({"dim": 0}, "dim", id="no-dimension"),
+        pytest.param({"dim": 26}, "at most 25", id="large"),
+        pytest.param({"dim": 2.0}, "dim", id="float"),
+        pytest.param({"scale": 0.0}, "scale", id="zero"),
+        pytest.param({"scale": math.nan}, "scale", id="nan"),
+        pytest.param({"shift": math.inf}, "shift", id="inf"),
+        pytest.param({"noise_std": 0.0}, "noise_std", id="noise"),
+        pytest.param(
+            {"variant": "well_specified", "scale": 2.0}, "no effect", id="no-effect"
+        ),
+    ],
+)
+def test_options_out_of_range_are_refused(options: dict, match: str) -> None:
+    with pytest.raises(InvalidInputError, match=match):
+        LinearGaussian(**options)
