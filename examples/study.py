@@ -147,7 +147,7 @@ class Study:
                 samples=samples,
                 theta=theta_o[0],
                 parameter_names=names,
-                parameters=(0, task.theta_dim - 1),
+                parameters=tuple({0, task.theta_dim - 1}),
                 prior=prior,
             ),
             "posterior": plots.pair_plot(

@@ -23,7 +23,11 @@ TAIL = 0.005
 
 
 def real_and_simulated(
-    x_o: Tensor, x_s: Tensor, *, names: Sequence[str] = ()
+    x_o: Tensor,
+    x_s: Tensor,
+    *,
+    names: Sequence[str] = (),
+    labels: tuple[str, str] = ("real", "simulated"),
 ) -> "Figure":
     """Real observations beside simulations at the same parameters.
 
@@ -36,6 +40,7 @@ def real_and_simulated(
         x_s: Simulations at the parameters of the real observations, same shape.
         names: Names of the d statistics. Without them ``(n, length)`` is taken for
             series.
+        labels: What the legend calls the two.
 
     Returns:
         The figure.
@@ -53,18 +58,20 @@ def real_and_simulated(
             raise InvalidInputError(
                 f"Expected {x_o.shape[1]} `names`, one a statistic; got {len(names)}."
             )
-        return _histograms(x_o, x_s, names)
+        return _histograms(x_o, x_s, names, labels)
     if x_o.ndim == 2:
-        return _series(x_o, x_s)
+        return _series(x_o, x_s, labels)
     if x_o.ndim == 4 and x_o.shape[1] == 3:
-        return _images(x_o, x_s)
+        return _images(x_o, x_s, labels)
     raise InvalidInputError(
         "Expected `x_o` of shape (n, d), (n, length) or (n, 3, height, width); got "
         f"{tuple(x_o.shape)}."
     )
 
 
-def _histograms(x_o: Tensor, x_s: Tensor, names: Sequence[str]) -> "Figure":
+def _histograms(
+    x_o: Tensor, x_s: Tensor, names: Sequence[str], labels: tuple[str, str]
+) -> "Figure":
     columns = min(len(names), NUM_COLUMNS)
     panels = _panels(len(names), columns, width=2.6, height=2.2)
     for k, (axes, name) in enumerate(zip(panels, names, strict=True)):
@@ -73,8 +80,8 @@ def _histograms(x_o: Tensor, x_s: Tensor, names: Sequence[str]) -> "Figure":
         if low == high:
             low, high = low - 0.5, high + 0.5
         for x, colour, label in (
-            (x_s, VERMILLION, "simulated"),
-            (x_o, BLUE, "real"),
+            (x_s, VERMILLION, labels[1]),
+            (x_o, BLUE, labels[0]),
         ):
             axes.hist(
                 x[:, k].numpy(),
@@ -94,12 +101,12 @@ def _histograms(x_o: Tensor, x_s: Tensor, names: Sequence[str]) -> "Figure":
     return figure  # type: ignore[return-value]
 
 
-def _series(x_o: Tensor, x_s: Tensor) -> "Figure":
+def _series(x_o: Tensor, x_s: Tensor, labels: tuple[str, str]) -> "Figure":
     count = min(len(x_o), NUM_SHOWN)
     panels = _panels(count, min(count, 3), width=3.2, height=2.0)
     for i, axes in enumerate(panels):
-        axes.plot(x_s[i].numpy(), color=VERMILLION, linewidth=1.2, label="simulated")
-        axes.plot(x_o[i].numpy(), color=BLUE, linewidth=1.2, label="real")
+        axes.plot(x_s[i].numpy(), color=VERMILLION, linewidth=1.2, label=labels[1])
+        axes.plot(x_o[i].numpy(), color=BLUE, linewidth=1.2, label=labels[0])
     for axes in panels[-min(count, 3) :]:
         axes.set_xlabel("step")
     figure = panels[0].figure
@@ -108,11 +115,11 @@ def _series(x_o: Tensor, x_s: Tensor) -> "Figure":
     return figure  # type: ignore[return-value]
 
 
-def _images(x_o: Tensor, x_s: Tensor) -> "Figure":
+def _images(x_o: Tensor, x_s: Tensor, labels: tuple[str, str]) -> "Figure":
     count = min(len(x_o), NUM_SHOWN)
     figure = empty_figure(1.5 * count + 0.3, 3.2)
     grid = figure.subplots(2, count, squeeze=False)
-    for row, (label, x) in enumerate((("real", x_o), ("simulated", x_s))):
+    for row, (label, x) in enumerate(zip(labels, (x_o, x_s), strict=True)):
         for axes, image in zip(grid[row], x, strict=False):
             axes.imshow(image.clamp(0, 1).permute(1, 2, 0).numpy())
             axes.set_xticks([])

@@ -10,16 +10,24 @@ from typing import Any
 
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.base import Task
+from sbi_rope.tasks.cs import CancerStroma
+from sbi_rope.tasks.light_tunnel import LightTunnel
 from sbi_rope.tasks.light_tunnel_sensors import LightTunnelSensors
 from sbi_rope.tasks.linear_gaussian import LinearGaussian
 from sbi_rope.tasks.pendulum import Pendulum
+from sbi_rope.tasks.sir import SIR
+from sbi_rope.tasks.wind_tunnel import WindTunnel
 
 __all__ = ["TASKS", "Task", "get_task", "list_tasks"]
 
 TASKS: dict[str, type[Task]] = {
+    "cs": CancerStroma,
+    "light_tunnel": LightTunnel,
     "light_tunnel_sensors": LightTunnelSensors,
     "linear_gaussian": LinearGaussian,
     "pendulum": Pendulum,
+    "sir": SIR,
+    "wind_tunnel": WindTunnel,
 }
 
 

@@ -6,6 +6,7 @@ them, with prior-predictive summaries; ``--plot FILE`` draws real beside simulat
 
 import argparse
 import dataclasses
+import os
 import sys
 import time
 from collections.abc import Sequence
@@ -111,7 +112,7 @@ def _describe(task: Task, n: int, seed: int) -> None:
     _print_table(f"simulated x ({n} draws)", _summaries(task, x_s))
     if task.has_data:
         _, x_o = task.get_test_set(n, seed=seed)
-        _print_table(f"real x ({n} test observations)", _summaries(task, x_o))
+        _print_table(f"{_kind(task)} x ({n} test observations)", _summaries(task, x_o))
     else:
         files = ", ".join(map(str, task.required_files))
         print(f"No real x: {files} not found; give its folder as --root.\n")
@@ -127,6 +128,10 @@ def _describe(task: Task, n: int, seed: int) -> None:
         print("\nHyper-parameters in the paper (None: not stated):")
         for name, value in dataclasses.asdict(task.paper_settings).items():
             print(f"  {name}: {value}")
+
+
+def _kind(task: Task) -> str:
+    return "stand-in" if task.variant == "synthetic" else "real"
 
 
 def _summaries(task: Task, x: Tensor) -> dict[str, Tensor]:
@@ -159,15 +164,25 @@ def _draw(task: Task, n: int, seed: int, path: Path) -> None:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         x_s = task.get_simulator()(theta)
-    figure = real_and_simulated(x_o, x_s, names=task.x_names)
+    figure = real_and_simulated(
+        x_o, x_s, names=task.x_names, labels=(_kind(task), "simulated")
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         figure.savefig(path, dpi=120)
     except ValueError as error:  # of matplotlib, for a file name without a format
         raise InvalidInputError(f"Cannot write {path}: {error}") from error
-    print(f"\nWritten to {path}: real test observations, and simulations at the same")
-    print("parameters.")
+    print(
+        f"\nWritten to {path}: {_kind(task)} test observations, and simulations at "
+        "the same parameters."
+    )
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        status = main()
+        sys.stdout.flush()
+    except BrokenPipeError:  # the reader, `head` for one, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        status = 1
+    sys.exit(status)

@@ -3,7 +3,7 @@ r"""What a task is: a prior, a simulator, and labelled real observations."""
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
 
 from torch import Tensor, nn
 from torch.distributions import Distribution
@@ -16,7 +16,7 @@ from sbi_rope._validation import (
 )
 from sbi_rope.errors import InvalidInputError, InvalidTypeError
 from sbi_rope.tasks.settings import PaperSettings
-from sbi_rope.tasks.splits import MAX_SEED, DrawnPairs, Part, RecordedPairs
+from sbi_rope.tasks.splits import MAX_SEED, DrawnPairs, Keep, Part, RecordedPairs
 from sbi_rope.tasks.variants import (
     COMMON_VARIANTS,
     beta_shaped,
@@ -68,6 +68,8 @@ class Task(ABC):
         x_shape: Shape of one observation.
         x_names: One name an entry if an observation is a list of statistics; empty
             for series and images.
+        z_score_x: How sbi's ``posterior_nn`` should standardise x: ``"independent"``
+            for every entry, ``"structured"`` for all entries together, ``"none"``.
         misspecification: In a sentence, what the simulator gets wrong.
         variants: The kinds of real process besides the standard one, with a sentence
             each. :data:`~sbi_rope.tasks.variants.COMMON_VARIANTS` belong to all
@@ -93,6 +95,7 @@ class Task(ABC):
     parameter_units: tuple[str, ...]
     x_shape: tuple[int, ...]
     x_names: tuple[str, ...] = ()
+    z_score_x: ClassVar[Literal["independent", "structured", "none"]] = "independent"
     misspecification: ClassVar[str]
     variants: ClassVar[dict[str, str]] = COMMON_VARIANTS
     shifted_region: ClassVar[dict[str, tuple[float, float]]]
@@ -232,18 +235,16 @@ class Task(ABC):
             process = self._simulated_process()
         else:
             process = self._real_process(part)
-        keep = None
+        return process.take(n, seed=seed, part=part, keep=self._keep(part))
+
+    def _keep(self, part: Part) -> Keep | None:
+        """Return which parameters of the real process a part may have."""
         if self.variant == "prior_shift":
-            keep = self._inside_shifted_region
-        elif self.variant == "biased_calibration" and part == "calibration":
-            keep = self._beta_shaped
-        return process.take(n, seed=seed, part=part, keep=keep)
-
-    def _inside_shifted_region(self, theta: Tensor) -> Tensor:
-        return inside_region(theta, self.parameter_names, self.shifted_region)
-
-    def _beta_shaped(self, theta: Tensor) -> Tensor:
-        return beta_shaped(self.prior_quantiles(theta))
+            names, region = self.parameter_names, self.shifted_region
+            return lambda theta: inside_region(theta, names, region)
+        if self.variant == "biased_calibration" and part == "calibration":
+            return lambda theta: beta_shaped(self.prior_quantiles(theta))
+        return None
 
     def _option(
         self, name: str, value: T | None, default: T, *, variant: str | None = None

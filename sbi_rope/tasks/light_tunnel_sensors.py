@@ -11,7 +11,7 @@ from sbi_rope._validation import check_in_support, check_positive
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.base import Task, check_theta
 from sbi_rope.tasks.chambers import check_download, find_file, read_columns
-from sbi_rope.tasks.distributions import UniformDistance
+from sbi_rope.tasks.distributions import UniformDistance, box
 from sbi_rope.tasks.networks import fully_connected
 from sbi_rope.tasks.splits import Part, RecordedPairs
 from sbi_rope.tasks.variants import COMMON_VARIANTS
@@ -245,13 +245,12 @@ class LightTunnelSensors(Task):
         return torch.cat([colours, angle.cdf(theta[:, 3:])], dim=1)
 
     def _colour_prior(self) -> BoxUniform:
-        low = torch.full((3,), -0.5, dtype=torch.float32)
-        return BoxUniform(low, low + (256 if self.variant == "strong_colours" else 86))
+        high = 255.5 if self.variant == "strong_colours" else 85.5
+        return box((-0.5,) * 3, (high,) * 3)
 
     def _angle_prior(self) -> UniformDistance | BoxUniform:
         if self.variant == "strong_angles":
-            zero = torch.zeros(1, dtype=torch.float32)
-            return BoxUniform(zero, zero + 120)
+            return box((0.0,), (120.0,))
         return UniformDistance(torch.tensor([40.0], dtype=torch.float32))
 
     def get_simulator(self) -> LightTunnelSimulator:

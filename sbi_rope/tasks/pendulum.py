@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from sbi_rope._validation import check_positive, check_unit_interval
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.base import Task, check_theta
+from sbi_rope.tasks.distributions import box
 from sbi_rope.tasks.networks import SeriesEmbedding, light_series_embedding
 from sbi_rope.tasks.settings import PaperSettings
 from sbi_rope.tasks.splits import DrawnPairs, Part
@@ -116,6 +117,7 @@ class Pendulum(Task):
     parameter_names = ("omega_0", "A")
     parameter_units = ("rad/s", "1")
     x_shape = (NUM_STEPS,)
+    z_score_x = "structured"
     misspecification = "the real swing is damped by friction"
     variants = COMMON_VARIANTS | {
         "misspecified_prior": "the real parameters come from a mixture of the prior "
@@ -157,7 +159,7 @@ class Pendulum(Task):
 
     def get_prior(self) -> BoxUniform:
         """Return the uniform prior on [0, 3] x [0.5, 10], log density -log 28.5."""
-        return _box((0.0, 0.5), (3.0, 10.0))
+        return box((0.0, 0.5), (3.0, 10.0))
 
     def prior_quantiles(self, theta: Tensor) -> Tensor:
         """Return relative positions in the box, shape ``(n, 2)``."""
@@ -183,12 +185,6 @@ class Pendulum(Task):
 
     def _draw_theta(self, n: int) -> Tensor:
         theta = self.get_prior().sample((n,))
-        tight = _box((1.0, 3.0), (2.0, 6.0)).sample((n,))
+        tight = box((1.0, 3.0), (2.0, 6.0)).sample((n,))
         chance = torch.rand(n, 1, dtype=theta.dtype)
         return torch.where(chance < self.misspecification_weight, tight, theta)
-
-
-def _box(low: tuple[float, ...], high: tuple[float, ...]) -> BoxUniform:
-    return BoxUniform(
-        torch.tensor(low, dtype=torch.float32), torch.tensor(high, dtype=torch.float32)
-    )

@@ -71,9 +71,12 @@ def with_label_noise(
     Returns:
         Noisy parameters, shape ``(n, d)``.
     """
-    generator = torch.Generator().manual_seed(stream_of(seed, "labels"))
+    seeds = torch.Generator().manual_seed(stream_of(seed, "labels"))
     noisy = theta.clone()
     for rows in torch.arange(len(theta)).split(BLOCK_SIZE):
+        # One generator a block: rows drawn anew in one leave the next as they are.
+        block_seed = int(torch.randint(2**32, (), generator=seeds))
+        generator = torch.Generator().manual_seed(block_seed)
         left = rows
         while len(left):
             # Whole blocks, so that a small set is the beginning of a larger one.

@@ -37,7 +37,11 @@ def test_get_task_passes_everything_on() -> None:
 @pytest.mark.parametrize(
     ("call", "match"),
     [
-        pytest.param(lambda: get_task("pendulu"), r"\['light_.*'pendulum'", id="name"),
+        pytest.param(
+            lambda: get_task("pendulu"),
+            r"'light_tunnel_sensors'.*'pendulum'",
+            id="name",
+        ),
         pytest.param(
             lambda: get_task("pendulum", variant="damped"),
             r"`variant`.*'misspecified_prior'.*'damped'",

@@ -1,10 +1,10 @@
-"""The distance of two uniform draws."""
+"""Distributions that priors need."""
 
 import pytest
 import torch
 from torch.distributions import Beta, biject_to
 
-from sbi_rope.tasks.distributions import UniformDistance
+from sbi_rope.tasks.distributions import Arcsine, UniformDistance, box
 
 
 @pytest.fixture
@@ -87,3 +87,114 @@ def test_expanding_repeats_the_width(distance: UniformDistance) -> None:
     expanded = distance.expand((3,))
     assert expanded.batch_shape == (3,)
     assert expanded.sample((2,)).shape == (2, 3)
+
+
+# Arcsine -----------------------------------------------------------------------------
+
+
+@pytest.fixture
+def malus() -> Arcsine:
+    return Arcsine(torch.tensor([1.0]), validate_args=False)
+
+
+def test_arcsine_is_a_beta_of_one_half() -> None:
+    alpha = torch.linspace(0.001, 0.999, 99, dtype=torch.float64)
+    half = torch.tensor(0.5, dtype=torch.float64)
+    beta, malus = Beta(half, half), Arcsine(torch.ones(1, dtype=torch.float64))
+    torch.testing.assert_close(malus.log_prob(alpha), beta.log_prob(alpha))
+    torch.testing.assert_close(malus.mean, beta.mean.reshape(1))
+    torch.testing.assert_close(malus.variance, beta.variance.reshape(1))
+
+
+def test_arcsine_density_scales_with_the_width() -> None:
+    alpha = torch.linspace(0.01, 0.99, 20)
+    wide, unit = Arcsine(torch.tensor([40.0])), Arcsine(torch.tensor([1.0]))
+    expected = unit.log_prob(alpha) - torch.tensor(40.0).log()
+    torch.testing.assert_close(wide.log_prob(40 * alpha), expected)
+
+
+def test_arcsine_density_is_the_derivative_of_the_distribution_function() -> None:
+    malus = Arcsine(torch.tensor([3.0], dtype=torch.float64))
+    alpha = torch.linspace(0.01, 2.99, 20, dtype=torch.float64, requires_grad=True)
+    (density,) = torch.autograd.grad(malus.cdf(alpha).sum(), alpha)
+    torch.testing.assert_close(density, malus.log_prob(alpha).exp())
+
+
+def test_arcsine_quantile_function_inverts_the_distribution_function(
+    malus: Arcsine,
+) -> None:
+    level = torch.tensor([0.0, 1e-3, 0.3, 0.5, 0.9, 1.0])
+    torch.testing.assert_close(malus.cdf(malus.icdf(level)), level)
+    torch.testing.assert_close(malus.icdf(level[[0, 3, 5]]), torch.tensor([0, 0.5, 1]))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_arcsine_density_is_finite_at_its_ends_and_zero_beyond(
+    dtype: torch.dtype,
+) -> None:
+    malus = Arcsine(torch.ones(1, dtype=dtype), validate_args=False)
+    ends = torch.tensor([0.0, 1e-40, 1.0, 1 - 6e-8], dtype=dtype)
+    torch.testing.assert_close(
+        malus.log_prob(ends), malus.log_prob(torch.tensor(2.0**-23)).expand(4).to(dtype)
+    )
+    beyond = torch.tensor([-1e-6, 1 + 2e-7, 2.0], dtype=dtype)
+    assert (malus.log_prob(beyond) == -torch.inf).all()
+    assert malus.support.check(ends).all()
+    assert not malus.support.check(beyond).any()
+
+
+def test_arcsine_draws_are_squared_cosines_of_uniform_angles(malus: Arcsine) -> None:
+    draws = malus.sample((20_000,)).flatten()
+    angles = 360 * torch.rand(2, 20_000) - 180
+    squares = torch.deg2rad(angles[0] - angles[1]).cos() ** 2
+    levels = torch.linspace(0.01, 0.99, 50)
+    torch.testing.assert_close(
+        draws.quantile(levels), squares.quantile(levels), atol=0.03, rtol=0.0
+    )
+    assert torch.isfinite(malus.log_prob(draws)).all()
+
+
+def test_arcsine_draws_are_differentiable_in_the_width() -> None:
+    width = torch.tensor([2.0], requires_grad=True)
+    draws = Arcsine(width).rsample((100,))
+    draws.sum().backward()
+    assert width.grad is not None
+    torch.testing.assert_close(width.grad, draws.detach().sum(dim=0) / 2)
+
+
+def test_arcsine_refuses_values_outside_when_arguments_are_validated() -> None:
+    malus = Arcsine(torch.tensor([1.0]), validate_args=True)
+    with pytest.raises(ValueError, match="support"):
+        malus.log_prob(torch.tensor([1.5]))
+    with pytest.raises(ValueError, match="width"):
+        Arcsine(torch.tensor([0.0]), validate_args=True)
+
+
+def test_expanding_an_arcsine_repeats_the_width(malus: Arcsine) -> None:
+    expanded = malus.expand((3,))
+    assert expanded.batch_shape == (3,)
+    assert expanded.sample((2,)).shape == (2, 3)
+
+
+# Boxes -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_box_is_uniform_and_float32_whatever_the_default_dtype(closed: bool) -> None:
+    default = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    try:
+        law = box((0.0, -1.0), (2.0, 3.0), closed=closed)
+    finally:
+        torch.set_default_dtype(default)
+    draws = law.sample(torch.Size((4000,)))
+    assert draws.dtype == torch.float32
+    assert law.log_prob(draws).exp().tolist() == pytest.approx([1 / 8] * 4000)
+
+
+def test_closed_box_has_a_density_at_its_upper_end_and_not_beyond() -> None:
+    ends = torch.tensor([[45.0], [45.001]])
+    log_prob = box((0.0,), (45.0,), closed=True).log_prob(ends)
+    assert log_prob[0].exp() == pytest.approx(1 / 45)
+    assert log_prob[1] == -torch.inf
+    assert box((0.0,), (45.0,)).log_prob(ends)[0] == -torch.inf

@@ -1,0 +1,356 @@
+"""Reading the causal chambers' tables and images, and getting them whole."""
+
+import sys
+import types
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from sbi_rope.errors import DataNotFoundError, InvalidInputError, RoPEWarning
+from sbi_rope.tasks import chambers
+from sbi_rope.tasks.chambers import (
+    KNOWN_ARCHIVES,
+    check_download,
+    find_file,
+    find_images,
+    read_columns,
+    read_images,
+    read_names,
+    read_table,
+)
+
+DATASET = "lt_camera_v1"
+FILE = Path(DATASET, "first_1.8", "first_1.8.csv")
+Unpack = Callable[[Path], None]
+
+
+def unpack(folder: Path) -> None:
+    """Write what a whole download unpacks."""
+    path = folder / FILE
+    path.parent.mkdir(parents=True)
+    path.write_text("a,b\n1,2\n")
+
+
+def write_image(path: Path, pixels: Tensor, *, mode: str = "RGB") -> None:
+    """Write pixels (3, height, width) in the format of the file's extension."""
+    image_module = pytest.importorskip("PIL.Image")
+    _, height, width = pixels.shape
+    content = pixels.permute(1, 2, 0).contiguous().numpy().tobytes()
+    image = image_module.frombytes("RGB", (width, height), content)
+    image.convert(mode).save(path, quality=95)
+
+
+def random_image(size: int = 16) -> Tensor:
+    return torch.randint(256, (3, size, size), dtype=torch.uint8)
+
+
+# Files and tables --------------------------------------------------------------------
+
+
+def test_a_file_that_is_there_is_found(tmp_path: Path) -> None:
+    unpack(tmp_path)
+    assert find_file(FILE, root=tmp_path) == tmp_path / FILE
+
+
+def test_without_a_root_the_file_and_the_ways_to_get_it_are_named() -> None:
+    with pytest.raises(DataNotFoundError, match=r"no `root`.*download=True") as error:
+        find_file(FILE, root=None)
+    assert str(FILE) in str(error.value)
+    assert f"causal-chamber/tree/main/datasets/{DATASET}" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("root", "file", "match"),
+    [
+        pytest.param("gone", FILE, r"There is no folder .*gone\.", id="root"),
+        pytest.param("", Path("x_v1/x.csv"), r"no folder .*x_v1\.", id="data-set"),
+        pytest.param(
+            "",
+            Path(DATASET, "b", "b.csv"),
+            r"The data set has \['first_1.8', 'table_0.5'\]",
+            id="experiment",
+        ),
+    ],
+)
+def test_of_a_missing_file_it_is_said_what_is_there_instead(
+    tmp_path: Path, root: str, file: Path, match: str
+) -> None:
+    unpack(tmp_path)
+    (tmp_path / DATASET / "table_0.5.csv").write_text("")
+    (tmp_path / DATASET / "LICENSE.txt").write_text("")
+    with pytest.raises(DataNotFoundError, match=match):
+        find_file(file, root=tmp_path / root)
+
+
+def test_columns_come_in_the_order_asked_for(tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text("a,b,c\n1,2,x\n3,4,y\n")
+    values = read_columns(tmp_path / "t.csv", ["b", "a"])
+    assert torch.equal(
+        values, torch.tensor([[2.0, 1.0], [4.0, 3.0]], dtype=torch.float64)
+    )
+    assert read_names(tmp_path / "t.csv", "c") == ["x", "y"]
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        pytest.param("a\n1\n", r"\['b'\] are missing.*get it again", id="column"),
+        pytest.param("a,b\n", "to have rows.*get it again", id="empty"),
+        pytest.param("", "CSV table.*get it again", id="nothing"),
+        pytest.param("a,b\n1,2\n3\n", r"finite.*\[1\]", id="cut"),
+        pytest.param("a,b\n1,dark\n", "finite", id="word"),
+    ],
+)
+def test_tables_that_are_cut_are_refused(tmp_path: Path, text: str, match: str) -> None:
+    (tmp_path / "t.csv").write_text(text)
+    with pytest.raises(InvalidInputError, match=rf"t\.csv.*{match}"):
+        read_columns(tmp_path / "t.csv", ["a", "b"])
+
+
+def test_a_table_without_pandas_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ImportError, match=r"need pandas.*sbi-rope\[benchmarks\]"):
+        read_table(tmp_path / "t.csv", ["a"])
+
+
+def test_rows_without_a_name_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text("a,b\n1,one.png\n2,\n")
+    with pytest.raises(InvalidInputError, match=r"column 'b'; the rows \[1\]"):
+        read_names(tmp_path / "t.csv", "b")
+
+
+# Images ------------------------------------------------------------------------------
+
+
+def test_images_are_read_channels_first_in_the_order_asked_for(tmp_path: Path) -> None:
+    written = {f"{i}.png": random_image() for i in range(3)}
+    for name, pixels in written.items():
+        write_image(tmp_path / name, pixels)
+    images = read_images(tmp_path, ["2.png", "0.png"], 16)
+    assert images.dtype == torch.uint8
+    assert torch.equal(images, torch.stack([written["2.png"], written["0.png"]]))
+
+
+def test_no_names_are_no_images(tmp_path: Path) -> None:
+    assert read_images(tmp_path, [], 16).shape == (0, 3, 16, 16)
+
+
+def test_compressed_photographs_can_be_read(tmp_path: Path) -> None:
+    pixels = torch.tensor([200, 100, 50], dtype=torch.uint8)[:, None, None]
+    write_image(tmp_path / "0.jpg", pixels.expand(3, 16, 16))
+    image = read_images(tmp_path, ["0.jpg"], 16)[0]
+    assert (image.int() - pixels.int()).abs().max() <= 3
+
+
+def test_a_missing_image_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DataNotFoundError, match=r"7\.png.*get it again"):
+        read_images(tmp_path, ["7.png"], 16)
+
+
+@pytest.mark.parametrize("extension", ["png", "jpg"])
+def test_an_image_cut_anywhere_is_refused_or_read_as_the_whole(
+    tmp_path: Path, extension: str
+) -> None:
+    path = tmp_path / f"0.{extension}"
+    write_image(path, random_image())
+    content, whole = path.read_bytes(), read_images(tmp_path, [path.name], 16)
+    refused = 0
+    for length in range(len(content)):
+        path.write_bytes(content[:length])
+        try:
+            image = read_images(tmp_path, [path.name], 16)
+        except InvalidInputError as error:
+            assert str(path) in str(error)  # noqa: PT017
+            assert "get it again" in str(error)  # noqa: PT017
+            refused += 1
+        else:
+            assert torch.equal(image, whole), length
+    assert refused > 0.9 * len(content)
+
+
+@pytest.mark.parametrize("size", [8, 17])
+def test_an_image_of_another_size_is_refused(tmp_path: Path, size: int) -> None:
+    write_image(tmp_path / "0.png", random_image())
+    match = rf"0\.png.*{size} x {size} pixels in mode RGB; got 16 x 16"
+    with pytest.raises(InvalidInputError, match=match):
+        read_images(tmp_path, ["0.png"], size)
+
+
+@pytest.mark.parametrize("mode", ["L", "RGBA", "P", "1"])
+def test_an_image_that_is_not_rgb_is_refused(tmp_path: Path, mode: str) -> None:
+    write_image(tmp_path / "0.png", random_image(), mode=mode)
+    with pytest.raises(InvalidInputError, match=rf"0\.png.*RGB; got .*mode {mode}\."):
+        read_images(tmp_path, ["0.png"], 16)
+
+
+def test_sizes_that_are_there_are_listed(tmp_path: Path) -> None:
+    for name in ("images_100", "images_full", "other"):
+        (tmp_path / DATASET / "first" / name).mkdir(parents=True)
+    experiment = tmp_path / DATASET / "first"
+    assert find_images(experiment, 100) == experiment / "images_100"
+    with pytest.raises(DataNotFoundError, match=r"images_64.*\['100', 'full'\]"):
+        find_images(experiment, 64)
+
+
+# Downloads ---------------------------------------------------------------------------
+
+
+def test_a_download_needs_a_root() -> None:
+    with pytest.raises(InvalidInputError, match=r"`root` with `download=True`"):
+        check_download(None, download=True)
+    check_download(None, download=False)
+
+
+def test_a_download_puts_the_whole_data_set_in_its_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = stub_downloads(monkeypatch, unpack)
+    root = tmp_path / "new" / "root"
+    assert find_file(FILE, root=root, download=True) == root / FILE
+    assert find_file(FILE, root=root, download=True).read_text() == "a,b\n1,2\n"
+    assert calls == [DATASET]
+    assert [path.name for path in root.iterdir()] == [DATASET]
+
+
+def test_without_being_asked_for_nothing_is_downloaded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = stub_downloads(monkeypatch, unpack)
+    with pytest.raises(DataNotFoundError):
+        find_file(FILE, root=tmp_path)
+    assert calls == []
+
+
+@pytest.mark.parametrize(
+    ("failure", "seen"),
+    [
+        pytest.param(OSError("disk full"), DataNotFoundError, id="disk"),
+        pytest.param(
+            Exception("Checksum does not match!"), DataNotFoundError, id="md5"
+        ),
+        pytest.param(KeyboardInterrupt(), KeyboardInterrupt, id="interrupt"),
+        pytest.param(SystemExit(), SystemExit, id="exit"),
+    ],
+)
+def test_a_download_cut_off_half_way_leaves_nothing(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    failure: BaseException,
+    seen: type[BaseException],
+) -> None:
+    def break_off(folder: Path) -> None:
+        unpack(folder)
+        raise failure
+
+    stub_downloads(monkeypatch, break_off)
+    with pytest.raises(seen) as error:
+        find_file(FILE, root=tmp_path, download=True)
+    if seen is DataNotFoundError:
+        assert str(failure) in str(error.value)
+        assert "Nothing of it was kept" in str(error.value)
+    assert list(tmp_path.iterdir()) == []
+    # The next attempt starts anew.
+    stub_downloads(monkeypatch, unpack)
+    assert find_file(FILE, root=tmp_path, download=True).is_file()
+
+
+def test_what_an_earlier_process_left_is_not_taken_for_data(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    unpack(tmp_path / ".download_killed")
+    with pytest.raises(DataNotFoundError, match="no folder"):
+        find_file(FILE, root=tmp_path)
+    calls = stub_downloads(monkeypatch, unpack)
+    assert find_file(FILE, root=tmp_path, download=True).is_file()
+    assert calls == [DATASET]
+
+
+def test_a_data_set_that_exists_is_neither_overwritten_nor_completed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = stub_downloads(monkeypatch, unpack)
+    other = tmp_path / DATASET / "own" / "own.csv"
+    other.parent.mkdir(parents=True)
+    other.write_text("mine")
+    with pytest.raises(
+        DataNotFoundError, match=rf"\['own'\].*without a folder {DATASET}"
+    ):
+        find_file(FILE, root=tmp_path, download=True)
+    assert calls == []
+    assert other.read_text() == "mine"
+    assert not (tmp_path / FILE).exists()
+
+
+def test_a_download_without_the_data_set_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stub_downloads(monkeypatch, lambda folder: None)
+    with pytest.raises(DataNotFoundError, match=f"Could not download {DATASET}"):
+        find_file(FILE, root=tmp_path, download=True)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_the_internet_the_other_way_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def offline(module: str) -> None:
+        raise ConnectionError(f"{module}: no route to host")
+
+    monkeypatch.setattr(chambers, "import_module", offline)
+    with pytest.raises(DataNotFoundError, match=r"no route.*causal-chamber/tree/main"):
+        find_file(FILE, root=tmp_path, download=True)
+
+
+def test_a_download_without_the_package_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "causalchamber", None)
+    monkeypatch.setitem(sys.modules, "causalchamber.datasets", None)
+    with pytest.raises(ImportError, match=r"need causalchamber\.datasets.*pip install"):
+        find_file(FILE, root=tmp_path, download=True)
+
+
+def test_a_data_set_published_anew_earns_a_warning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stub_downloads(monkeypatch, unpack, published="0123")
+    with pytest.warns(RoPEWarning, match=rf"{DATASET} has changed since.*0123") as seen:
+        find_file(FILE, root=tmp_path, download=True)
+    assert seen[0].filename == __file__
+
+
+@pytest.mark.parametrize("published", [None, KNOWN_ARCHIVES[DATASET]])
+def test_the_known_data_set_earns_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, published: str | None
+) -> None:
+    stub_downloads(monkeypatch, unpack, published=published)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        find_file(FILE, root=tmp_path, download=True)
+
+
+def stub_downloads(
+    monkeypatch: pytest.MonkeyPatch, action: Unpack, *, published: str | None = None
+) -> list[str]:
+    """Replace causalchamber's downloads by an action, and record the calls."""
+    calls: list[str] = []
+
+    class Dataset:
+        def __init__(self, name: str, root: str, download: bool = True) -> None:
+            assert download
+            calls.append(name)
+            action(Path(root))
+
+    module = types.ModuleType("causalchamber.datasets")
+    module.Dataset = Dataset  # type: ignore[attr-defined]
+    if published is not None:
+        module.directory = {"datasets": {DATASET: {"md5": published}}}  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "causalchamber", types.ModuleType("causalchamber"))
+    monkeypatch.setitem(sys.modules, "causalchamber.datasets", module)
+    return calls

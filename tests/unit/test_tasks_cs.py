@@ -1,0 +1,354 @@
+"""Cancer and stromal cells."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import ks_2samp
+from torch import Tensor
+
+from sbi_rope.errors import InvalidInputError
+from sbi_rope.tasks.cs import (
+    CancerStroma,
+    CancerStromaSimulator,
+    batched_statistics,
+    tissue_statistics,
+)
+from sbi_rope.tasks.splits import DrawnPairs
+
+NECROSIS = CancerStromaSimulator(necrosis_probability=0.75)
+# Means and standard deviations of 1500 draws of an independent implementation, under
+# the prior: stromal cells, cancer cells, mean and maximum distance.
+SIMULATED = ((677.0, 177.0, 0.1351, 0.349), (364.0, 84.0, 0.0590, 0.141))
+REAL = ((679.0, 87.0, 0.1405, 0.358), (365.0, 42.0, 0.0590, 0.142))
+
+
+def random_tissue(seed: int, *, num_cells: int | None = None) -> dict:
+    rng = np.random.default_rng(seed)
+    num_parents = int(rng.integers(1, 8))
+    num_cells = int(rng.integers(30, 300)) if num_cells is None else num_cells
+    return {
+        "cells": rng.random((2, num_cells)),
+        "parents": rng.random((2, num_parents)),
+        "num_daughters": rng.poisson(12.0, num_parents) + 1,
+        "necrotic": rng.random(num_parents) < 0.75,
+    }
+
+
+def naive_statistics(
+    cells: np.ndarray,
+    parents: np.ndarray,
+    num_daughters: np.ndarray,
+    necrotic: np.ndarray,
+    radius: float,
+) -> list[float]:
+    """Follow the description cell by cell, with full sorting."""
+
+    def squared(a: np.ndarray, b: np.ndarray) -> float:
+        return (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2
+
+    cancer, lost = set(), set()
+    for j, parent in enumerate(parents.T):
+        distances = [squared(parent, cell) for cell in cells.T]
+        limit = sorted(distances)[num_daughters[j]]
+        for i, distance in enumerate(distances):
+            if distance <= limit:
+                cancer.add(i)
+            if necrotic[j] and distance < radius**2 * limit:
+                lost.add(i)
+    stromal = [i for i in range(cells.shape[1]) if i not in cancer]
+    nearest = [
+        math.sqrt(min(squared(cells[:, i], cells[:, k]) for k in cancer - lost))
+        for i in stromal[:50]
+    ]
+    return [len(stromal), len(cancer - lost), np.mean(nearest), max(nearest)]
+
+
+def pad(tissues: list[dict]) -> dict:
+    """Stack tissues, with numbers in the padding that must not matter."""
+    num_cells = torch.tensor([t["cells"].shape[1] for t in tissues])
+    num_parents = torch.tensor([t["parents"].shape[1] for t in tissues])
+    size, n, p = len(tissues), int(num_cells.max()), int(num_parents.max())
+    batch = {
+        "cells": torch.rand(size, 2, n, dtype=torch.float64),
+        "parents": torch.rand(size, 2, p, dtype=torch.float64),
+        "num_daughters": torch.randint(1, 500, (size, p)),
+        "necrotic": torch.ones(size, p, dtype=torch.bool),
+    }
+    for name, values in batch.items():
+        for row, tissue in enumerate(tissues):
+            values[row, ..., : tissue[name].shape[-1]] = torch.as_tensor(tissue[name])
+    return batch | {"num_cells": num_cells, "num_parents": num_parents}
+
+
+# The statistics ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("radius", [0.0, 0.8, 1.0])
+@pytest.mark.parametrize("seed", range(5))
+def test_statistics_are_those_of_a_naive_implementation(
+    seed: int, radius: float
+) -> None:
+    tissue = random_tissue(seed)
+    x = tissue_statistics(**tissue, necrosis_radius=radius)
+    assert list(x) == pytest.approx(
+        naive_statistics(**tissue, radius=radius), rel=1e-12
+    )
+
+
+def test_padded_statistics_are_those_of_each_tissue() -> None:
+    tissues = [random_tissue(seed) for seed in range(60)]
+    # Too few cells for a parent, no stromal cell, no cell at all.
+    tissues += [random_tissue(0, num_cells=n) for n in (0, 1, 5, 14, 40)]
+    expected = [tissue_statistics(**t, necrosis_radius=0.8) for t in tissues]
+    x = batched_statistics(**pad(tissues), necrosis_radius=0.8)
+    assert 0 < np.isnan(expected).any(axis=1).sum() < 10
+    np.testing.assert_allclose(x.numpy(), expected, rtol=1e-12)
+
+
+def test_a_parent_owns_one_cell_more_than_its_daughters() -> None:
+    rng = np.random.default_rng(0)
+    x = tissue_statistics(
+        cells=rng.random((2, 100)),
+        parents=rng.random((2, 1)),
+        num_daughters=np.array([7]),
+        necrotic=np.array([False]),
+        necrosis_radius=0.8,
+    )
+    assert x[:2] == (92, 8)
+
+
+@pytest.mark.parametrize(
+    ("radius", "num_cancer"),
+    [
+        pytest.param(0.5, 3, id="strictly-inside"),
+        pytest.param(0.75, 2, id="one-inside"),
+        pytest.param(1.0, 2, id="boundary-stays"),
+    ],
+)
+def test_discs_are_closed_and_necrosis_is_open(radius: float, num_cancer: int) -> None:
+    # Distances 0.25, 0.5, 0.5 and 1 from the parent, whose disc has radius 0.5.
+    tissue = {
+        "cells": np.array([[0.25, 0.5, 0.0, 1.0], [0.0, 0.0, 0.5, 0.0]]),
+        "parents": np.zeros((2, 1)),
+        "num_daughters": np.array([1]),
+        "necrotic": np.array([True]),
+    }
+    expected = (1, num_cancer, 0.5, 0.5)
+    assert tissue_statistics(**tissue, necrosis_radius=radius) == expected
+    batch = batched_statistics(**pad([tissue]), necrosis_radius=radius)
+    assert tuple(batch[0].tolist()) == expected
+
+
+@pytest.mark.parametrize(
+    ("num_cells", "defined"),
+    [
+        pytest.param(0, False, id="no-cell"),
+        pytest.param(7, False, id="too-few"),
+        pytest.param(8, False, id="no-stromal-cell"),
+        pytest.param(9, True, id="one-stromal-cell"),
+    ],
+)
+def test_a_tissue_without_a_stromal_cell_has_no_statistics(
+    num_cells: int, defined: bool
+) -> None:
+    tissue = random_tissue(0, num_cells=num_cells) | {
+        "parents": np.full((2, 1), 0.5),
+        "num_daughters": np.array([7]),
+        "necrotic": np.array([False]),
+    }
+    x = np.array(tissue_statistics(**tissue, necrosis_radius=0.8))
+    assert np.isfinite(x).tolist() == [defined] * 4
+    # Next to a larger tissue.
+    batch = pad([tissue, random_tissue(1)])
+    together = batched_statistics(**batch, necrosis_radius=0.8)
+    np.testing.assert_allclose(together[0].numpy(), x, rtol=1e-12)
+
+
+def test_a_tissue_without_a_cancer_cell_has_no_statistics() -> None:
+    # Each of the two cancer cells is inside of the necrosis of one parent.
+    tissue = {
+        "cells": np.array([[0.4, 0.6, 0.5], [0.0, 0.0, 0.9]]),
+        "parents": np.array([[0.0, 1.0], [0.0, 0.0]]),
+        "num_daughters": np.array([1, 1]),
+        "necrotic": np.array([True, True]),
+    }
+    assert np.isnan(tissue_statistics(**tissue, necrosis_radius=0.8)).all()
+    assert batched_statistics(**pad([tissue]), necrosis_radius=0.8).isnan().all()
+    tissue["necrotic"][0] = False
+    assert tissue_statistics(**tissue, necrosis_radius=0.8)[:2] == (1, 1)
+
+
+# The simulator -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("table", "task"),
+    [
+        pytest.param(SIMULATED, CancerStroma(variant="well_specified"), id="simulated"),
+        pytest.param(REAL, CancerStroma(), id="real"),
+    ],
+)
+def test_means_under_the_prior_are_the_known_ones(
+    table: tuple[tuple[float, ...], tuple[float, ...]], task: CancerStroma
+) -> None:
+    _, x = task.get_test_set(1500)
+    mean, std = torch.tensor(table)
+    error = ((std**2 + x.var(dim=0)) / 1500).sqrt()
+    assert ((x.mean(dim=0) - mean).abs() < 4 * error).all()
+
+
+@pytest.mark.parametrize("simulator", [CancerStromaSimulator(), NECROSIS])
+def test_one_after_the_other_and_together_follow_one_law(
+    simulator: CancerStromaSimulator,
+) -> None:
+    # Few parents, of which one more or less would show.
+    theta = torch.tensor([[300.0, 3.0, 10.0]]).expand(1500, -1)
+    each = replace(simulator, batched=False)(theta)
+    together = replace(simulator, batched=True)(theta)
+    for a, b in zip(each.T, together.T, strict=True):
+        assert ks_2samp(a, b).pvalue > 1e-3
+
+
+def test_rows_of_a_batch_belong_to_their_parameters() -> None:
+    theta = torch.tensor([[1400.0, 5.0, 15.0], [250.0, 5.0, 15.0]]).repeat(300, 1)
+    num_cells = CancerStromaSimulator(batched=True)(theta)[:, :2].sum(dim=1)
+    assert (num_cells[::2] > 1000).all()
+    assert (num_cells[1::2] < 500).all()
+
+
+def test_numbers_of_cells_have_the_rate_of_theta() -> None:
+    theta = torch.tensor([[500.0, 5.0, 15.0]]).expand(1000, -1)
+    num_cells = CancerStromaSimulator()(theta)[:, :2].sum(dim=1)
+    assert num_cells.mean() == pytest.approx(500.0, abs=4 * (500 / 1000) ** 0.5)
+    assert num_cells.var() == pytest.approx(500.0, rel=0.2)
+
+
+def test_necrosis_takes_half_of_the_cancer_cells_and_no_stromal_cell() -> None:
+    theta = CancerStroma().get_prior().sample((500,))
+    simulated, real = seeded(CancerStromaSimulator(), theta), seeded(NECROSIS, theta)
+    assert torch.equal(simulated[:, 0], real[:, 0])
+    assert (real[:, 1] <= simulated[:, 1]).all()
+    # Without overlaps, 0.75 * 0.8**2 = 0.48 of them die.
+    ratio = real[:, 1].sum() / simulated[:, 1].sum()
+    assert ratio == pytest.approx(0.49, abs=0.02)
+    assert (real[:, 2:] >= simulated[:, 2:]).all()
+
+
+@pytest.mark.parametrize("batched", [False, True])
+@pytest.mark.parametrize(
+    "without",
+    [{"necrosis_probability": 0.0}, {"necrosis_radius": 0.0}],
+    ids=["probability", "radius"],
+)
+def test_without_necrosis_the_simulator_is_exact(
+    batched: bool, without: dict[str, float]
+) -> None:
+    theta = CancerStroma().get_prior().sample((50,))
+    simulated = seeded(CancerStromaSimulator(batched=batched), theta)
+    changed = replace(NECROSIS, batched=batched, **without)
+    assert torch.equal(seeded(changed, theta), simulated)
+    assert not torch.equal(seeded(replace(NECROSIS, batched=batched), theta), simulated)
+
+
+@pytest.mark.parametrize("batched", [False, True])
+def test_statistics_that_are_not_defined_are_nan(batched: bool) -> None:
+    theta = torch.tensor([[0.0, 5.0, 15.0], [3.0, 5.0, 15.0], [1000.0, 5.0, 15.0]])
+    x = CancerStromaSimulator(batched=batched)(theta)
+    assert x.isnan().all(dim=1).tolist() == [True, True, False]
+    assert x[2].isfinite().all()
+    assert CancerStromaSimulator(batched=batched)(theta[:1]).isnan().all()
+
+
+def test_pairs_that_are_not_defined_are_replaced_together() -> None:
+    def draw_theta(n: int) -> Tensor:
+        rate = torch.where(torch.rand(n) < 0.3, 2.0, 200.0 + 1300.0 * torch.rand(n))
+        return torch.stack([rate, 10 + 0 * rate, 15 + 0 * rate], dim=1)
+
+    pairs = DrawnPairs(draw_theta=draw_theta, observe=CancerStromaSimulator())
+    with pytest.warns(UserWarning, match="Replaced"):
+        theta, x = pairs.take(150, seed=0, part="test")
+    assert theta[:, 0].min() >= 200.0
+    z = (x[:, :2].sum(dim=1) - theta[:, 0]) / theta[:, 0].sqrt()
+    assert z.abs().max() < 5.0
+
+
+@pytest.mark.parametrize("batched", [False, True])
+@pytest.mark.parametrize("n", [0, 1, 300])
+def test_simulator_takes_batches_of_any_size(n: int, batched: bool) -> None:
+    theta = torch.tensor([[200.0, 3.0, 10.0]], dtype=torch.float64).expand(n, -1)
+    x = CancerStromaSimulator(batched=batched)(theta)
+    assert x.shape == (n, 4)
+    assert x.dtype == torch.float64
+    assert x.isfinite().all()
+
+
+def test_negative_rates_are_refused() -> None:
+    with pytest.raises(InvalidInputError, match=r"at least 0.*-1\.0"):
+        CancerStromaSimulator()(torch.tensor([[500.0, -1.0, 15.0]]))
+
+
+# The task ----------------------------------------------------------------------------
+
+
+def test_prior_log_density_is_analytic() -> None:
+    theta, _ = CancerStroma().get_test_set(20)
+    log_prob = CancerStroma().get_prior().log_prob(theta)
+    torch.testing.assert_close(log_prob, torch.full((20,), -math.log(1300 * 17 * 10)))
+
+
+def test_prior_quantiles_are_relative_positions() -> None:
+    theta = torch.tensor([[200.0, 20.0, 12.5], [850.0, 11.5, 20.0]])
+    expected = torch.tensor([[0.0, 1.0, 0.25], [0.5, 0.5, 1.0]])
+    torch.testing.assert_close(CancerStroma().prior_quantiles(theta), expected)
+
+
+def test_without_necrosis_the_task_is_well_specified() -> None:
+    exact = CancerStroma(necrosis_probability=0.0).get_test_set(50)
+    expected = CancerStroma(variant="well_specified").get_test_set(50)
+    assert torch.equal(exact[0], expected[0])
+    assert torch.equal(exact[1], expected[1])
+
+
+def test_options_reach_the_real_process_only() -> None:
+    strong = CancerStroma(necrosis_probability=1.0, necrosis_radius=1.0)
+    _, x = strong.get_test_set(200)
+    _, default = CancerStroma().get_test_set(200)
+    assert x[:, 1].mean() < 0.5 * default[:, 1].mean()
+    assert strong.get_simulator() == CancerStroma().get_simulator()
+    assert (CancerStroma().necrosis_probability, CancerStroma().necrosis_radius) == (
+        0.75,
+        0.8,
+    )
+
+
+def test_network_has_the_widths_of_the_paper() -> None:
+    for light in (False, True):
+        net = CancerStroma().get_embedding_net(light=light)
+        widths = [layer.out_features for layer in net if hasattr(layer, "out_features")]
+        assert widths == [12, 48, 48, 36, 9]
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        pytest.param({"necrosis_probability": 1.1}, "necrosis_probability", id="p"),
+        pytest.param({"necrosis_radius": -0.1}, "necrosis_radius", id="radius"),
+        pytest.param({"necrosis_radius": math.nan}, "necrosis_radius", id="nan"),
+        pytest.param(
+            {"variant": "well_specified", "necrosis_radius": 0.5},
+            "no effect",
+            id="well-specified",
+        ),
+    ],
+)
+def test_options_out_of_range_are_refused(options: dict, match: str) -> None:
+    with pytest.raises(InvalidInputError, match=match):
+        CancerStroma(**options)
+
+
+def seeded(simulator: CancerStromaSimulator, theta: Tensor) -> Tensor:
+    torch.manual_seed(0)
+    return simulator(theta)

@@ -1,0 +1,728 @@
+"""The light tunnel's images: two models, recorded images, and a posterior from them."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from sbi.inference import NPE
+from sbi.neural_nets import posterior_nn
+from torch import Tensor, nn
+from torch.distributions import Beta
+
+from sbi_rope import RoPE, SinkhornCoupler
+from sbi_rope.errors import DataNotFoundError, InvalidInputError
+from sbi_rope.tasks.light_tunnel import (
+    BETA_BINOMIAL,
+    DATASET,
+    INPUTS,
+    UNIFORM,
+    LightTunnel,
+)
+from sbi_rope.tasks.light_tunnel_models import (
+    CameraSimulator,
+    HexagonSimulator,
+    draw_crowded,
+    hexagon_mask,
+    malus,
+)
+from sbi_rope.tasks.light_tunnel_network import ImageEmbedding
+
+SIZE = 64
+WriteData = Callable[..., Path]
+
+
+def draw_inputs(n: int) -> Tensor:
+    """Draw colours and angles as the protocol of the uniform experiment does."""
+    colours = torch.randint(0, 255, (n, 3)).double()
+    angles = torch.randint(-1800, 1800, (n, 2)).double() / 10
+    return torch.cat([colours, angles], dim=1)
+
+
+def pixels_of(row: int, size: int = SIZE) -> Tensor:
+    """Return the recorded image of a row of the fixture, (3, size, size)."""
+    generator = torch.Generator().manual_seed(row)
+    return torch.randint(256, (3, size, size), generator=generator, dtype=torch.uint8)
+
+
+@pytest.fixture
+def write_data(tmp_path: Path) -> WriteData:
+    """Write a small experiment in the official layout, and return the root."""
+    image_module = pytest.importorskip("PIL.Image")
+
+    def write(
+        num_rows: int = 12,
+        *,
+        experiment: str = UNIFORM,
+        size: int = SIZE,
+        offset: int = 0,
+        drop: tuple[str, ...] = (),
+        **changes: object,
+    ) -> Path:
+        folder = tmp_path / DATASET / experiment
+        images = folder / f"images_{size}"
+        images.mkdir(parents=True)
+        columns = ["timestamp", *INPUTS, "image_file"]
+        columns = [column for column in columns if column not in drop]
+        lines = [",".join(columns)]
+        for i in range(offset, offset + num_rows):
+            row = {
+                "timestamp": i,
+                "red": i,
+                "green": 2 * i,
+                "blue": 254,
+                "pol_1": -10.0,
+                "pol_2": 2.5 * i,
+                "image_file": f"img_{i}.png",
+            }
+            row |= changes if i == 1 else {}
+            lines.append(",".join(str(row[column]) for column in columns))
+            content = pixels_of(i, size).permute(1, 2, 0).contiguous().numpy()
+            image = image_module.frombytes("RGB", (size, size), content.tobytes())
+            image.save(images / f"img_{i}.png")
+        (folder / f"{experiment}.csv").write_text("\n".join(lines) + "\n")
+        return tmp_path
+
+    return write
+
+
+def all_recorded(task: LightTunnel, num_rows: int = 12) -> tuple[Tensor, Tensor]:
+    third = num_rows // 3
+    parts = (task.get_calibration_set(third), task.get_test_set(num_rows - third))
+    theta, x = zip(*parts, strict=True)
+    return torch.cat(theta), torch.cat(x)
+
+
+# The models --------------------------------------------------------------------------
+
+
+def package() -> object:
+    """Return causalchamber's models, or skip."""
+    return pytest.importorskip("causalchamber.models.image_capture")
+
+
+@pytest.mark.filterwarnings("ignore:Arrays of 2-dimensional:DeprecationWarning")
+@pytest.mark.parametrize("size", [10, 63, 64, 100, 500])
+def test_mask_is_that_of_causalchamber(size: int) -> None:
+    expected = package().hexagon_mask(0.5, 0.5, 0.22, 0, size)  # type: ignore[attr-defined]
+    assert torch.equal(hexagon_mask(size).bool(), torch.as_tensor(expected))
+
+
+@pytest.mark.parametrize(("size", "num_pixels"), [(64, 525), (100, 1277), (500, 31489)])
+def test_mask_has_the_known_number_of_pixels(size: int, num_pixels: int) -> None:
+    assert hexagon_mask(size).sum() == num_pixels
+
+
+def test_mask_has_the_area_of_a_hexagon_below_the_middle() -> None:
+    mask = hexagon_mask(1000)
+    area = 1.5 * 3**0.5 * 220**2
+    assert mask.sum() == pytest.approx(area, rel=1e-3)
+    rows = mask.any(dim=1).nonzero().flatten()
+    columns = mask.any(dim=0).nonzero().flatten()
+    # A corner on each side, an edge above and below; rows are counted from below.
+    assert (columns[-1] - columns[0]).item() == pytest.approx(440, abs=2)
+    assert (rows[-1] - rows[0]).item() == pytest.approx(220 * 3**0.5, abs=2)
+    assert (rows[0] + rows[-1]).item() == 2 * 499
+    assert (columns[0] + columns[-1]).item() == 2 * 500
+
+
+@pytest.mark.filterwarnings("ignore:Arrays of 2-dimensional:DeprecationWarning")
+@pytest.mark.parametrize("size", [64, 100])
+def test_simulator_is_model_f1_of_causalchamber(size: int) -> None:
+    np = pytest.importorskip("numpy")
+    inputs = draw_inputs(30)
+    inputs[0, 3:], inputs[1, 3:] = 0.0, torch.tensor([45.0, -45.0])
+    first, second = np.deg2rad(inputs[:, 3].numpy()), np.deg2rad(inputs[:, 4].numpy())
+    # NumPy's cosine, as its last bit decides at which integer a level is cut off.
+    alpha = torch.as_tensor(np.cos(first - second) ** 2).unsqueeze(1)
+    theta = torch.cat([inputs[:, :3], alpha], dim=1)
+    images = HexagonSimulator(image_size=size)(theta)
+    for row, image in zip(inputs.tolist(), images, strict=True):
+        expected = package().model_f1(*row, 0.5, 0.5, 0.22, 0, size)  # type: ignore[attr-defined]
+        assert torch.equal(
+            image * 255, torch.as_tensor(expected).permute(2, 0, 1) * 1.0
+        )
+
+
+@pytest.mark.filterwarnings("ignore:Arrays of 2-dimensional:DeprecationWarning")
+def test_stand_in_without_noise_is_model_f3_of_causalchamber() -> None:
+    np = pytest.importorskip("numpy")
+    response = np.array(
+        [
+            [0.29958, 0.06920, 0.02816],
+            [0.04017, 0.92099, 0.31265],
+            [0.00217, 0.20716, 0.75763],
+        ]
+    )
+    constants = {
+        "S": response,
+        "w_r": 2.65625,
+        "w_g": 1.0,
+        "w_b": 1.77344,
+        "exposure": 2.5,
+        "Tp": np.array([[0.29, 0.35, 0.33]]).T,
+        "Tc": np.array([[0.02, 0.08, 0.18]]).T,
+        "center_x": 0.5,
+        "center_y": 0.5,
+        "radius": 0.22,
+        "offset": 0,
+        "image_size": SIZE,
+    }
+    inputs = draw_inputs(30)
+    theta = torch.cat([inputs[:, :3], malus(inputs[:, 3:])], dim=1)
+    images = CameraSimulator(image_size=SIZE).image(theta)
+    assert (images == 1).any()
+    for row, image in zip(inputs.tolist(), images, strict=True):
+        expected = package().model_f3(*row, **constants)  # type: ignore[attr-defined]
+        torch.testing.assert_close(image, torch.as_tensor(expected).permute(2, 0, 1))
+
+
+def test_image_without_truncation_is_within_a_level_of_the_simulation() -> None:
+    theta = LightTunnel().get_prior().sample((100,))
+    simulator = HexagonSimulator()
+    image = simulator.image(theta)
+    rest = 255 * (image - simulator(theta))
+    assert rest.min() >= -1e-4
+    assert 0.9 < rest.max() < 1.0
+    assert image.min() >= 0.0
+    assert image.max() <= 1.0
+
+
+def test_image_has_the_gradients_of_the_product() -> None:
+    theta = torch.tensor([[200.0, 100.0, 50.0, 0.25]], dtype=torch.float64)
+    theta.requires_grad_()
+    image = HexagonSimulator(image_size=10).image
+    assert torch.autograd.gradcheck(image, theta)
+    (gradient,) = torch.autograd.grad(image(theta)[0, 1].sum(), theta)
+    pixels = float(hexagon_mask(10).sum())
+    expected = pixels / 255 * torch.tensor([[0.0, 0.25, 0.0, 100.0]])
+    torch.testing.assert_close(gradient, expected.double())
+
+
+def test_images_can_be_differentiated_by_torch_func() -> None:
+    theta = torch.tensor([[200.0, 100.0, 50.0, 0.25], [20.0, 10.0, 5.0, 0.5]])
+    image = HexagonSimulator(image_size=10).image
+
+    def single(row: Tensor) -> Tensor:
+        return image(row.unsqueeze(0)).squeeze(0)
+
+    jacobian = torch.func.vmap(torch.func.jacrev(single))(theta)
+    expected = torch.func.vmap(torch.func.jacfwd(single))(theta)
+    assert jacobian.shape == (2, 3, 10, 10, 4)
+    torch.testing.assert_close(jacobian, expected)
+    assert (
+        (jacobian != 0)
+        .any(dim=-1)
+        .any(dim=1)
+        .equal(hexagon_mask(10).bool().expand(2, -1, -1))
+    )
+
+
+def test_simulations_are_8_bit_images_without_noise() -> None:
+    theta = LightTunnel().get_prior().sample((50,))
+    x = HexagonSimulator(image_size=SIZE)(theta)
+    levels = 255 * x
+    torch.testing.assert_close(levels, levels.round(), rtol=0.0, atol=1e-4)
+    assert torch.equal(x, HexagonSimulator(image_size=SIZE)(theta))
+
+
+def test_dequantised_simulations_are_uniform_within_their_levels() -> None:
+    theta = torch.tensor([[200.0, 101.0, 255.0, 1.0]]).expand(20, -1)
+    plain = 255 * HexagonSimulator(image_size=SIZE)(theta)
+    spread = 256 * HexagonSimulator(image_size=SIZE, dequantise=True)(theta)
+    share = (spread - plain.round()).flatten()
+    assert share.min() >= 0.0
+    assert share.max() <= 1.0
+    levels = torch.linspace(0.05, 0.95, 10)
+    torch.testing.assert_close(
+        share[:200_000].quantile(levels), levels, atol=0.01, rtol=0.0
+    )
+    assert spread[0].ne(spread[1]).all()
+
+
+@pytest.mark.parametrize(
+    "simulator",
+    [
+        HexagonSimulator(image_size=SIZE),
+        HexagonSimulator(image_size=SIZE, dequantise=True),
+        CameraSimulator(image_size=SIZE),
+    ],
+)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("n", [0, 1, 1000])
+def test_batches_of_any_size_keep_their_dtype(
+    simulator: HexagonSimulator | CameraSimulator, dtype: torch.dtype, n: int
+) -> None:
+    x = simulator(LightTunnel().get_prior().sample((n,)).to(dtype))
+    assert x.shape == (n, 3, SIZE, SIZE)
+    assert x.dtype == dtype
+    assert ((x >= 0) & (x <= 1)).all()
+
+
+def test_simulations_stay_on_the_device_of_theta() -> None:
+    theta = torch.empty(2, 4, device="meta")
+    assert HexagonSimulator().image(theta).device.type == "meta"
+    assert CameraSimulator().image(theta).device.type == "meta"
+
+
+def test_camera_adds_noise_before_it_rounds_to_8_bit() -> None:
+    theta = torch.tensor([[120.0, 60.0, 60.0, 0.5]]).expand(100, -1)
+    camera = CameraSimulator(image_size=SIZE, sensor_noise=5 / 255)
+    levels = 255 * camera(theta)
+    torch.testing.assert_close(levels, levels.round(), rtol=0.0, atol=1e-4)
+    inside = hexagon_mask(SIZE).bool()
+    noise = (levels - 255 * camera.image(theta))[:, :, inside]
+    assert noise.mean() == pytest.approx(0.0, abs=0.05)
+    # Rounding adds the variance of a uniform error.
+    assert noise.std() == pytest.approx(math.sqrt(25 + 1 / 12), rel=0.01)
+    # Half of the noise on black is cut off.
+    assert (levels[:, :, ~inside] == 0).float().mean() == pytest.approx(0.54, abs=0.01)
+
+
+def test_default_noise_of_the_camera_is_two_levels() -> None:
+    assert CameraSimulator().sensor_noise == 2 / 255
+    camera = LightTunnel(variant="synthetic", sensor_noise=0.1)._camera()
+    assert camera.sensor_noise == 0.1
+
+
+@pytest.mark.parametrize("noise", [-0.1, 1.0, math.nan])
+def test_noise_of_the_camera_out_of_range_is_refused(noise: float) -> None:
+    with pytest.raises(InvalidInputError, match="`sensor_noise`"):
+        LightTunnel(variant="synthetic", sensor_noise=noise)
+
+
+# The prior and the protocols ---------------------------------------------------------
+
+
+def test_prior_log_density_is_analytic() -> None:
+    theta = torch.tensor([[0.0, 254.0, 100.0, 0.5], [1.0, 2.0, 3.0, 0.1]])
+    alpha = theta[:, 3]
+    expected = -3 * math.log(255) - (math.pi * (alpha * (1 - alpha)).sqrt()).log()
+    torch.testing.assert_close(LightTunnel().get_prior().log_prob(theta), expected)
+
+
+def test_parallel_and_crossed_polarisers_have_a_finite_density() -> None:
+    alpha = malus(torch.tensor([[30.0, 30.0], [45.0, -45.0], [10.0, -170.0]]).double())
+    theta = torch.cat([torch.full((3, 3), 100.0), alpha.float()], dim=1)
+    assert alpha[0] == 1.0
+    assert torch.isfinite(LightTunnel().get_prior().log_prob(theta)).all()
+
+
+def test_quantiles_of_recorded_parameters_are_uniform() -> None:
+    inputs = draw_inputs(20_000)
+    theta = torch.cat([inputs[:, :3], malus(inputs[:, 3:])], dim=1).float()
+    levels = LightTunnel().prior_quantiles(theta).sort(dim=0).values
+    distance = levels - torch.linspace(0, 1, 20_000).unsqueeze(1)
+    assert distance.abs().max() < 0.015
+
+
+def test_crowded_parameters_are_beta_binomial() -> None:
+    stats = pytest.importorskip("scipy.stats")
+    theta = draw_crowded(20_000)
+    colours = stats.betabinom(255, 5, 5)
+    assert torch.equal(theta[:, :3], theta[:, :3].round())
+    for colour in theta[:, :3].T:
+        grid = torch.arange(0, 256, 16)
+        shares = (colour.unsqueeze(1) <= grid).float().mean(dim=0)
+        expected = torch.as_tensor(colours.cdf(grid)).float()
+        torch.testing.assert_close(shares, expected, atol=0.015, rtol=0.0)
+    angles = stats.betabinom(360, 5, 5).rvs((2, 20_000), random_state=0) - 180.0
+    alpha = malus(torch.as_tensor(angles).T).flatten()
+    levels = torch.linspace(0.05, 0.95, 10)
+    torch.testing.assert_close(
+        theta[:, 3].quantile(levels),
+        alpha.quantile(levels.double()).float(),
+        atol=0.02,
+        rtol=0.0,
+    )
+    assert theta.dtype == torch.float32
+
+
+def test_paper_settings_are_those_of_the_appendix() -> None:
+    settings = LightTunnel.paper_settings
+    assert settings is not None
+    assert settings.conditioner == (500,) * 3
+    assert settings.integrand == (150,) * 4
+    assert (settings.learning_rate, settings.batch_size) == (5e-4, 100)
+    assert settings.num_validation == 10_000
+    assert settings.finetuning_learning_rate == 1e-4
+    assert settings.finetuning_steps == 2000
+    assert (settings.joint_epochs, settings.joint_epoch_size) == (50, 1000)
+
+
+# The networks ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("size", "num_features"), [(64, 12), (87, 27), (100, 27)])
+def test_flatten_size_of_the_network_follows_the_image(
+    size: int, num_features: int
+) -> None:
+    net = ImageEmbedding(image_size=size)
+    assert net.num_features == num_features
+    assert net(torch.rand(2, 3, size, size)).shape == (2, 20)
+
+
+def test_layers_of_the_network_are_those_of_the_paper() -> None:
+    net = ImageEmbedding()
+    convolutions = [
+        (m.in_channels, m.out_channels, m.kernel_size[0], m.stride[0], m.dilation[0])
+        for m in net.modules()
+        if isinstance(m, nn.Conv2d)
+    ]
+    assert convolutions == [
+        (3, 64, 3, 2, 1),
+        (64, 128, 3, 2, 1),
+        (128, 128, 3, 2, 1),
+        (128, 64, 1, 1, 1),
+        (64, 3, 1, 1, 1),
+    ]
+    once = [nn.Conv2d, nn.ReLU]
+    expected = [*once, *once, nn.MaxPool2d, *once, *once, *once, nn.Flatten]
+    assert [type(layer) for layer in net.features] == expected
+    assert net.features[4].kernel_size == 3
+    linear = [
+        (m.in_features, m.out_features)
+        for m in net.modules()
+        if isinstance(m, nn.Linear)
+    ]
+    assert linear == [(27, 100), (100, 20)]
+
+
+def test_no_channel_of_an_untrained_network_is_dead() -> None:
+    task = LightTunnel(image_size=SIZE)
+    x = task.get_simulator()(task.get_prior().sample((20,)))
+    for _ in range(30):
+        features = task.get_embedding_net().features(x).reshape(20, 3, -1)
+        assert (features.std(dim=0) > 0).any(dim=1).all()
+
+
+@pytest.mark.parametrize("light", [False, True])
+@pytest.mark.parametrize("size", [64, 100])
+def test_networks_of_the_task_refuse_images_of_another_shape(
+    size: int, light: bool
+) -> None:
+    task = LightTunnel(image_size=size)
+    net = task.get_embedding_net(light=light)
+    assert net(torch.rand(2, *task.x_shape)).shape == (2, 20)
+    for shape in [(2, 3, 80, 80), (3, size, size), (2, size, size, 3)]:
+        with pytest.raises(InvalidInputError, match=rf"`x` of shape \(n, 3, {size}"):
+            net(torch.rand(*shape))
+
+
+def test_light_network_sees_means_over_squares() -> None:
+    net = ImageEmbedding(light=True)
+    means = net.features(HexagonSimulator()(torch.tensor([[255.0, 0.0, 51.0, 1.0]])))
+    red, green, blue = means.reshape(3, 10, 10)
+    expected = hexagon_mask(100).reshape(10, 10, 10, 10).mean(dim=(1, 3)).float()
+    torch.testing.assert_close(red, expected)
+    torch.testing.assert_close(blue, 0.2 * expected)
+    assert not green.any()
+    parameters = [sum(p.numel() for p in n.parameters()) for n in (net.head, net)]
+    assert parameters[0] == parameters[1]
+
+
+@pytest.mark.parametrize(("light", "smallest"), [(False, 39), (True, 10)])
+def test_images_too_small_for_the_layers_are_refused(
+    light: bool, smallest: int
+) -> None:
+    ImageEmbedding(image_size=smallest, light=light)
+    with pytest.raises(InvalidInputError, match=rf"`image_size`.*{smallest}; got"):
+        ImageEmbedding(image_size=smallest - 1, light=light)
+
+
+# Recorded images ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [64, 100])
+def test_rows_become_parameters_and_images(write_data: WriteData, size: int) -> None:
+    task = LightTunnel(root=write_data(size=size), image_size=size)
+    theta, x = all_recorded(task)
+    assert sorted(theta[:, 0].tolist()) == list(range(12))
+    i = theta[:, 0]
+    alpha = torch.deg2rad(10 + 2.5 * i).cos() ** 2
+    expected = torch.stack([i, 2 * i, torch.full((12,), 254.0), alpha], dim=1)
+    torch.testing.assert_close(theta, expected)
+    assert x.dtype == torch.float32
+    for row, image in zip(i.tolist(), x, strict=True):
+        assert torch.equal(image, pixels_of(int(row), size) / 255)
+
+
+def test_only_images_of_chosen_rows_are_read(write_data: WriteData) -> None:
+    root = write_data()
+    task = LightTunnel(root=root, image_size=SIZE)
+    chosen = task.get_test_set(3)[0][:, 0].int().tolist()
+    for i in set(range(12)) - set(chosen):
+        (root / DATASET / UNIFORM / f"images_{SIZE}" / f"img_{i}.png").unlink()
+    assert task.get_test_set(3)[0][:, 0].int().tolist() == chosen
+    with pytest.raises(DataNotFoundError, match=r"No image .*img_"):
+        task.get_test_set(4)
+
+
+def test_dequantised_images_get_the_same_noise_whenever_they_are_read(
+    write_data: WriteData,
+) -> None:
+    root = write_data()
+    task = LightTunnel(root=root, image_size=SIZE, dequantise=True)
+    theta, x = task.get_test_set(6)
+    plain = LightTunnel(root=root, image_size=SIZE).get_test_set(6)[1]
+    noise = 256 * x - 255 * plain
+    assert noise.min() >= -1e-3
+    assert noise.max() <= 1.001
+    assert noise.mean() == pytest.approx(0.5, abs=0.01)
+    assert (noise[0] - noise[1]).abs().mean() > 0.3
+    other = task.get_test_set(6, seed=1)
+    row = int((other[0][:, 0] == theta[0, 0]).nonzero()[0])
+    assert torch.equal(other[1][row], x[0])
+
+
+def test_flipped_turns_test_images_only(write_data: WriteData) -> None:
+    root = write_data()
+    task = LightTunnel(root=root, image_size=SIZE, variant="flipped")
+    for part, flipped in (("calibration", False), ("test", True)):
+        theta, x = getattr(task, f"get_{part}_set")(4)
+        for row, image in zip(theta[:, 0].tolist(), x, strict=True):
+            expected = pixels_of(int(row)) / 255
+            assert torch.equal(image, expected.flip(1) if flipped else expected)
+
+
+@pytest.mark.parametrize(
+    ("variant", "calibration", "test"),
+    [
+        (None, UNIFORM, UNIFORM),
+        ("biased_calibration", BETA_BINOMIAL, UNIFORM),
+        ("misspecified_prior", BETA_BINOMIAL, BETA_BINOMIAL),
+    ],
+)
+def test_each_variant_takes_its_sets_from_its_experiments(
+    write_data: WriteData, variant: str | None, calibration: str, test: str
+) -> None:
+    write_data()
+    # The second experiment has other rows, and parameters far from the middle.
+    root = write_data(24, experiment=BETA_BINOMIAL, offset=50)
+    task = LightTunnel(root=root, image_size=SIZE, variant=variant)
+    assert task.required_files == tuple(
+        Path(DATASET, name, f"{name}.csv")
+        for name in dict.fromkeys((calibration, test))
+    )
+    assert task.has_data
+    for experiment, draw, num_rows in (
+        (calibration, task.get_calibration_set, {UNIFORM: 4, BETA_BINOMIAL: 8}),
+        (test, task.get_test_set, {UNIFORM: 8, BETA_BINOMIAL: 16}),
+    ):
+        # All rows of the part are there: nothing is rejected.
+        theta, _ = draw(num_rows[experiment])
+        assert ((theta[:, 0] >= 50) == (experiment == BETA_BINOMIAL)).all()
+
+
+def test_another_experiment_can_be_chosen(write_data: WriteData) -> None:
+    write_data()
+    root = write_data(experiment="scm_1_reference", offset=50)
+    task = LightTunnel(root=root, image_size=SIZE, experiment="scm_1_reference")
+    assert (all_recorded(task)[0][:, 0] >= 50).all()
+
+
+def test_without_a_root_only_the_data_are_missing() -> None:
+    task = LightTunnel()
+    assert not task.has_data
+    assert task.get_simulator()(task.get_prior().sample((2,))).shape == (
+        2,
+        *task.x_shape,
+    )
+    with pytest.raises(DataNotFoundError, match=r"`root`.*`download=True`") as error:
+        task.get_test_set(1)
+    assert f"{DATASET}/{UNIFORM}/{UNIFORM}.csv" in str(error.value)
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DataNotFoundError, match=r"There is no folder .*gone"):
+        LightTunnel(root=tmp_path / "gone").get_test_set(1)
+    with pytest.raises(DataNotFoundError, match=rf"There is no folder .*{DATASET}"):
+        LightTunnel(root=tmp_path).get_test_set(1)
+
+
+def test_of_an_unknown_experiment_the_known_ones_are_listed(
+    write_data: WriteData,
+) -> None:
+    task = LightTunnel(root=write_data(), image_size=SIZE, experiment="uniform")
+    assert not task.has_data
+    with pytest.raises(DataNotFoundError) as error:
+        task.get_test_set(1)
+    assert f"The data set has ['{UNIFORM}']" in str(error.value)
+
+
+def test_of_a_size_that_is_not_there_the_others_are_listed(
+    write_data: WriteData,
+) -> None:
+    task = LightTunnel(root=write_data(), image_size=100)
+    assert not task.has_data
+    with pytest.raises(DataNotFoundError, match=r"images_100.*\['64'\].*`image_size`"):
+        task.get_test_set(1)
+
+
+@pytest.mark.parametrize(
+    ("table", "match"),
+    [
+        pytest.param({"drop": ("pol_2", "green")}, "'green', 'pol_2'", id="column"),
+        pytest.param({"drop": ("image_file",)}, "'image_file'", id="image-file"),
+        pytest.param({"num_rows": 0}, "to have rows", id="empty"),
+        pytest.param({"red": "nan"}, r"finite.*\[1\]", id="nan"),
+        pytest.param({"red": 256}, "support of the prior", id="colour"),
+        pytest.param({"image_file": ""}, r"column 'image_file'.*\[1\]", id="unnamed"),
+    ],
+)
+def test_broken_tables_are_explained(
+    write_data: WriteData, table: dict, match: str
+) -> None:
+    task = LightTunnel(root=write_data(**table), image_size=SIZE)
+    with pytest.raises(InvalidInputError, match=rf"(?s){UNIFORM}\.csv.*{match}"):
+        task.get_test_set(1)
+
+
+def test_a_missing_image_is_named(write_data: WriteData) -> None:
+    task = LightTunnel(root=write_data(image_file="gone.png"), image_size=SIZE)
+    with pytest.raises(DataNotFoundError, match=r"gone\.png.*get it again"):
+        all_recorded(task)
+
+
+def test_a_truncated_image_is_named(write_data: WriteData) -> None:
+    root = write_data()
+    path = root / DATASET / UNIFORM / f"images_{SIZE}" / "img_7.png"
+    path.write_bytes(path.read_bytes()[:2000])
+    task = LightTunnel(root=root, image_size=SIZE)
+    with pytest.raises(InvalidInputError, match=r"img_7\.png.*get it again"):
+        all_recorded(task)
+
+
+def test_an_image_of_another_size_is_named(write_data: WriteData) -> None:
+    root = write_data()
+    folder = root / DATASET / UNIFORM
+    (folder / f"images_{SIZE}").rename(folder / "images_100")
+    task = LightTunnel(root=root, image_size=100)
+    with pytest.raises(
+        InvalidInputError, match=r"img_\d+\.png.*100 x 100.*got 64 x 64"
+    ):
+        task.get_test_set(1)
+
+
+# The stand-in ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("variant", [None, *LightTunnel.variants])
+def test_with_a_stand_in_no_files_are_needed(variant: str | None) -> None:
+    task = LightTunnel(variant=variant, stand_in=True, image_size=SIZE)
+    assert task.required_files == ()
+    assert task.has_data
+    theta, x = task.get_test_set(5)
+    assert theta.shape == (5, 4)
+    assert x.shape == (5, 3, SIZE, SIZE)
+    assert theta.dtype == x.dtype == torch.float32
+
+
+def test_synthetic_is_the_standard_process_with_a_stand_in() -> None:
+    first = LightTunnel(variant="synthetic", image_size=SIZE).get_test_set(5)
+    second = LightTunnel(stand_in=True, image_size=SIZE).get_test_set(5)
+    assert torch.equal(first[0], second[0])
+    assert torch.equal(first[1], second[1])
+
+
+@pytest.mark.parametrize(
+    ("variant", "crowded"),
+    [
+        ("synthetic", (False, False)),
+        ("flipped", (False, False)),
+        ("biased_calibration", (True, False)),
+        ("misspecified_prior", (True, True)),
+    ],
+)
+def test_stand_in_draws_parameters_as_the_experiments_did(
+    variant: str, crowded: tuple[bool, bool]
+) -> None:
+    task = LightTunnel(variant=variant, stand_in=True, image_size=SIZE)
+    sets = task.get_calibration_set(400)[0], task.get_test_set(400)[0]
+    beta = Beta(torch.tensor(5.0), torch.tensor(5.0)).stddev * 255
+    for theta, in_the_middle in zip(sets, crowded, strict=True):
+        std = float(beta) if in_the_middle else 255 / 12**0.5
+        colours = theta[:, :3]
+        assert colours.std() == pytest.approx(std, rel=0.1)
+        assert torch.equal(colours, colours.round()) == in_the_middle
+
+
+def test_stand_in_flips_test_images_only() -> None:
+    tasks = [
+        LightTunnel(variant=variant, stand_in=True, image_size=SIZE, sensor_noise=0.0)
+        for variant in (None, "flipped")
+    ]
+    calibration = [task.get_calibration_set(3)[1] for task in tasks]
+    test = [task.get_test_set(3)[1] for task in tasks]
+    assert torch.equal(calibration[0], calibration[1])
+    assert torch.equal(test[0].flip(2), test[1])
+    assert not torch.equal(test[0], test[1])
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        pytest.param({"image_size": 50}, r"`image_size`.*\[64, 100\]", id="size"),
+        pytest.param({"image_size": (64, 100)}, "`image_size`", id="tuple"),
+        pytest.param({"download": True}, "`root`", id="download"),
+        pytest.param({"sensor_noise": 0.1}, "no effect on recorded", id="noise"),
+        pytest.param(
+            {"sensor_noise": 0.1, "stand_in": True, "variant": "well_specified"},
+            "no effect",
+            id="well-specified-noise",
+        ),
+        pytest.param(
+            {"experiment": "scm_1_reference", "variant": "well_specified"},
+            "no effect",
+            id="well-specified-experiment",
+        ),
+        pytest.param(
+            {"experiment": "scm_1_reference", "variant": "biased_calibration"},
+            "`experiment` has no effect",
+            id="own-experiment",
+        ),
+        pytest.param(
+            {"experiment": "scm_1_reference", "stand_in": True},
+            "`experiment` has no effect",
+            id="stand-in-experiment",
+        ),
+    ],
+)
+def test_options_without_a_meaning_are_refused(options: dict, match: str) -> None:
+    with pytest.raises(InvalidInputError, match=match):
+        LightTunnel(**options)
+
+
+# All of it ---------------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("ignore:Data has constant values:UserWarning")
+@pytest.mark.filterwarnings("ignore:Maximum number of epochs:UserWarning")
+@pytest.mark.parametrize("light", [True, False])
+def test_image_files_lead_to_a_posterior(write_data: WriteData, light: bool) -> None:
+    task = LightTunnel(root=write_data(60), image_size=SIZE)
+    prior, simulator = task.get_prior(), task.get_simulator()
+    theta = prior.sample((200,))
+    build = posterior_nn(
+        "mdn", embedding_net=task.get_embedding_net(light=light), z_score_x="none"
+    )
+    npe = NPE(prior, density_estimator=build, show_progress_bars=False)
+    npe.append_simulations(theta, simulator(theta)).train(max_num_epochs=2)
+    rope = RoPE(
+        npe.build_posterior(),
+        simulator=simulator,
+        coupler=SinkhornCoupler(gamma=0.5, tau=0.9, cost_scale="simulated"),
+    )
+    rope.append_calibration(*task.get_calibration_set(6))
+    rope.train(seed=0, show_progress_bars=False)
+    theta_o, x_o = task.get_test_set(25)
+    posterior = rope.build_posterior(
+        x_o, num_simulations=200, seed=0, show_progress_bars=False
+    )
+    samples = posterior.sample_batched((10,), x=x_o, show_progress_bars=False)
+    assert samples.shape == (10, 25, 4)
+    assert torch.isfinite(samples).all()
+    assert prior.support.check(samples).all()
+    log_prob = posterior.log_prob_batched(theta_o.unsqueeze(0), x=x_o)
+    assert torch.isfinite(log_prob).all()

@@ -1,0 +1,291 @@
+"""The epidemic."""
+
+import datetime
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+from scipy.stats import kstest
+from torch import Tensor
+
+from sbi_rope.errors import InvalidInputError
+from sbi_rope.tasks.sir import (
+    MONDAYS,
+    SATURDAYS,
+    SIR,
+    SUNDAYS,
+    SIRSimulator,
+    delay_weekend_reports,
+    integrate,
+    summarise,
+)
+
+# Means and standard deviations of 20 000 draws of an independent implementation,
+# under the prior, with steps of 0.1 days.
+MEAN = (7.27, 0.17, 9.38, 3.91, 4.05, 0.9980)
+STD = (1.51, 6.38, 1.52, 0.68, 0.60, 0.0014)
+
+
+def naive_statistics(series: np.ndarray) -> list[float]:
+    half, total = 0, 0.0
+    for day, number in enumerate(series):
+        total += number
+        if total / series.sum() > 0.5:
+            half = day
+            break
+    return [
+        math.log(np.mean(series)),
+        math.log(np.median(series)),
+        math.log(np.max(series)),
+        math.log(np.argmax(series) + 1),
+        math.log(half),
+        np.corrcoef(series[:-1], series[1:])[0, 1],
+    ]
+
+
+# The equations -----------------------------------------------------------------------
+
+
+def test_without_noise_the_numbers_solve_the_ordinary_equations() -> None:
+    theta = torch.tensor([[0.45, 0.1], [0.3, 0.25], [0.1, 0.02], [0.2, 0.0]])
+
+    def derivative(_: float, state: np.ndarray, beta: float, gamma: float) -> list:
+        s, log_i = state
+        return [-beta * s * math.exp(log_i), beta * s - gamma]
+
+    expected = np.stack(
+        [
+            solve_ivp(
+                derivative,
+                (0, 364),
+                (0.999, math.log(0.001)),
+                t_eval=np.arange(365),
+                args=rates,
+                rtol=1e-10,
+                atol=1e-12,
+            ).y[1]
+            for rates in theta.double().tolist()
+        ]
+    )
+    coarse, fine = (
+        SIRSimulator(volatility=0.0, time_step=step).infections(theta).numpy()
+        for step in (0.1, 0.05)
+    )
+    error, half = (np.abs(np.log(x / 1e5) - expected).max() for x in (coarse, fine))
+    assert error < 0.5
+    # A scheme of first order.
+    assert half == pytest.approx(error / 2, rel=0.1)
+    extrapolated = 2 * np.log(fine / 1e5) - np.log(coarse / 1e5)
+    np.testing.assert_allclose(extrapolated, expected, atol=0.01)
+
+
+def test_noise_has_the_variance_of_a_square_root_process() -> None:
+    # While nearly all are susceptible, log i moves by the integral of b - gamma, where
+    # b has the mean beta and the covariance of an Ornstein-Uhlenbeck process that
+    # starts at its mean, with variance sigma^2 gamma beta a day.
+    rate, eta, days = 0.02, 0.05, 30
+    theta = torch.tensor([[rate, rate]]).expand(5000, -1)
+    x = SIRSimulator().infections(theta)
+    growth = (x[:, days] / x[:, 0]).log()
+    short, long = math.exp(-eta * days), math.exp(-2 * eta * days)
+    factor = days - 2 * (1 - short) / eta + (1 - long) / (2 * eta)
+    expected = (0.05 * rate / eta) ** 2 * factor
+    assert growth.var() == pytest.approx(expected, rel=0.1)
+    assert growth.mean() == pytest.approx(0.0, abs=0.005)
+
+
+def test_finer_steps_on_one_brownian_path_converge() -> None:
+    theta = SIR().get_prior().sample((200,)).double().T
+    fine = torch.randn(364, 40, 200, dtype=torch.float64)
+
+    def log_numbers(steps: int) -> Tensor:
+        # Sums of increments are those of a coarser grid.
+        noise = fine.reshape(364, steps, 40 // steps, 200).sum(dim=2)
+        noise /= (40 / steps) ** 0.5
+        days = integrate(theta, noise, volatility=0.05)
+        return torch.stack(list(days)).log()
+
+    finest = log_numbers(40)
+    errors = [float((log_numbers(n) - finest).square().mean()) for n in (1, 4, 10)]
+    # First order: the squared error falls like the square of the step.
+    assert errors[1] < errors[0] / 10
+    assert errors[2] < errors[1] / 4
+    assert errors[2] < 0.05
+
+
+def test_numpy_and_torch_integrate_alike() -> None:
+    theta = SIR().get_prior().sample((20,)).double().T
+    noise = torch.randn(50, 10, 20, dtype=torch.float64)
+    days = torch.stack(list(integrate(theta, noise, volatility=0.05)))
+    arrays = list(integrate(theta.numpy(), noise.numpy(), volatility=0.05))
+    np.testing.assert_allclose(days.numpy(), arrays, rtol=1e-10)
+
+
+def test_epidemic_starts_with_one_in_a_thousand() -> None:
+    x = SIRSimulator().infections(SIR().get_prior().sample((10,)))
+    assert x.shape == (10, 365)
+    assert x.dtype == torch.float64
+    torch.testing.assert_close(x[:, 0], torch.full((10,), 100.0, dtype=torch.float64))
+
+
+def test_rows_of_a_large_batch_are_those_of_small_ones() -> None:
+    theta = SIR().get_prior().sample((1003,))
+    simulator = SIRSimulator(volatility=0.0, time_step=1.0)
+    expected = torch.cat([simulator.infections(part) for part in theta.split(101)])
+    torch.testing.assert_close(simulator.infections(theta), expected)
+
+
+# The delay of reports ----------------------------------------------------------------
+
+
+def test_days_of_the_week_are_those_of_a_year_that_starts_on_a_friday() -> None:
+    start = datetime.date(2021, 1, 1)
+    weekday = [(start + datetime.timedelta(days=i)).weekday() for i in range(365)]
+    for days, number, first, last in (
+        (SATURDAYS, 5, 1, 358),
+        (SUNDAYS, 6, 2, 359),
+        (MONDAYS, 0, 3, 360),
+    ):
+        chosen = list(range(365))[days]
+        assert chosen == [i for i in range(365) if weekday[i] == number]
+        assert (chosen[0], chosen[-1], len(chosen)) == (first, last, 52)
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.95, 1.0])
+def test_delay_is_that_of_a_loop_over_the_weeks(fraction: float) -> None:
+    infections = torch.rand(7, 365, dtype=torch.float64)
+    before = infections.clone()
+    expected = infections.clone()
+    for saturday in range(1, 359, 7):
+        for day in (saturday, saturday + 1):
+            late = (1 - fraction) * infections[:, day]
+            expected[:, day] -= late
+            expected[:, saturday + 2] += late
+    reported = delay_weekend_reports(infections, fraction)
+    torch.testing.assert_close(reported, expected)
+    torch.testing.assert_close(reported.sum(dim=1), infections.sum(dim=1))
+    assert torch.equal(infections, before)
+
+
+# The statistics ----------------------------------------------------------------------
+
+
+def test_statistics_are_those_of_a_naive_implementation() -> None:
+    epidemics = SIRSimulator().infections(SIR().get_prior().sample((50,)))
+    noise = torch.rand(50, 365, dtype=torch.float64)
+    for series in (epidemics, noise, delay_weekend_reports(epidemics, 0.5)):
+        expected = [naive_statistics(row) for row in series.numpy()]
+        np.testing.assert_allclose(summarise(series).numpy(), expected, rtol=1e-9)
+
+
+def test_means_under_the_prior_are_the_known_ones() -> None:
+    _, x = SIR().get_simulations(3000)
+    mean, std = torch.tensor(MEAN), torch.tensor(STD)
+    error = (std**2 / 20_000 + x.var(dim=0) / 3000).sqrt()
+    rounding = torch.tensor([0.005] * 5 + [5e-5])
+    assert ((x.mean(dim=0) - mean).abs() < 4 * error + rounding).all()
+    torch.testing.assert_close(x.std(dim=0), std, rtol=0.1, atol=0.0)
+
+
+def test_delay_shifts_the_autocorrelation_alone() -> None:
+    theta = SIR().get_prior().sample((3000,))
+    simulated = seeded(SIRSimulator(), theta)
+    real = seeded(SIRSimulator(reported_fraction=0.95), theta)
+    shift = (real - simulated).mean(dim=0) / simulated.std(dim=0)
+    assert shift[5] == pytest.approx(-2.97, abs=0.3)
+    assert (shift[:5].abs() < 0.1).all()
+
+
+# The simulator -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n", [0, 1, 1500])
+def test_simulator_takes_batches_of_any_size(n: int) -> None:
+    theta = SIR().get_prior().sample((n,)).double().requires_grad_()
+    x = SIRSimulator(time_step=1.0)(theta)
+    assert x.shape == (n, 6)
+    assert x.dtype == torch.float64
+    assert x.isfinite().all()
+
+
+def test_corners_of_the_prior_have_finite_statistics() -> None:
+    corners = [[0.5, 0.0], [0.5, 0.5], [1e-6, 1e-6], [0.0, 0.0], [0.5, 1e-30]]
+    x = SIRSimulator()(torch.tensor(corners))
+    # With both rates at 0 the series is constant and has no correlation.
+    assert x.isfinite().all(dim=1).tolist() == [True, True, True, False, True]
+
+
+@pytest.mark.parametrize("time_step", [0.3, 2.0, 0.0, -0.1, math.nan, "day"])
+def test_time_steps_that_do_not_divide_a_day_are_refused(time_step: object) -> None:
+    with pytest.raises(InvalidInputError, match="time_step"):
+        SIRSimulator(time_step=time_step)  # type: ignore[arg-type]
+
+
+def test_negative_rates_are_refused() -> None:
+    with pytest.raises(InvalidInputError, match="at least 0"):
+        SIRSimulator()(torch.tensor([[0.2, -0.1]]))
+
+
+# The task ----------------------------------------------------------------------------
+
+
+def test_prior_log_density_is_analytic() -> None:
+    theta = SIR().get_prior().sample((4, 20))
+    log_prob = SIR().get_prior().log_prob(theta)
+    torch.testing.assert_close(log_prob, torch.full((4, 20), math.log(8)))
+
+
+def test_prior_quantiles_are_uniform_under_the_prior() -> None:
+    u = SIR().prior_quantiles(SIR().get_prior().sample((5000,)))
+    for column in u.T:
+        assert kstest(column.numpy(), "uniform").pvalue > 1e-3
+    edges = torch.tensor([[0.0, 0.0], [0.5, 0.5], [0.25, 0.25]])
+    expected = torch.tensor([[0.0, 0.0], [1.0, 1.0], [0.25, 0.75]])
+    torch.testing.assert_close(SIR().prior_quantiles(edges), expected)
+
+
+def test_without_delay_the_task_is_well_specified() -> None:
+    exact = SIR(reported_fraction=1.0).get_test_set(50)
+    expected = SIR(variant="well_specified").get_test_set(50)
+    assert torch.equal(exact[0], expected[0])
+    assert torch.equal(exact[1], expected[1])
+
+
+def test_reported_fraction_is_the_strength_of_the_misspecification() -> None:
+    correlations = [
+        SIR(reported_fraction=fraction).get_test_set(100)[1][:, 5]
+        for fraction in (0.0, 0.5, 0.95, 1.0)
+    ]
+    assert (torch.stack(correlations).diff(dim=0) > 0).all()
+    assert torch.equal(correlations[2], SIR().get_test_set(100)[1][:, 5])
+
+
+def test_network_has_the_widths_of_the_paper() -> None:
+    for light in (False, True):
+        net = SIR().get_embedding_net(light=light)
+        widths = [layer.out_features for layer in net if hasattr(layer, "out_features")]
+        assert widths == [8, 32, 32, 24, 6]
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        pytest.param({"reported_fraction": 1.1}, "reported_fraction", id="above"),
+        pytest.param({"reported_fraction": -0.1}, "reported_fraction", id="below"),
+        pytest.param(
+            {"variant": "well_specified", "reported_fraction": 0.9},
+            "no effect",
+            id="well-specified",
+        ),
+    ],
+)
+def test_options_out_of_range_are_refused(options: dict, match: str) -> None:
+    with pytest.raises(InvalidInputError, match=match):
+        SIR(**options)
+
+
+def seeded(simulator: SIRSimulator, theta: Tensor) -> Tensor:
+    torch.manual_seed(0)
+    return simulator(theta)

@@ -1,0 +1,666 @@
+"""The wind tunnel: model, closed-form posterior, recorded data and stand-in."""
+
+import math
+import sys
+import types
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from sbi.inference import NPE
+from sbi.neural_nets import posterior_nn
+from torch import Tensor, nn
+from torch.distributions import Normal
+
+from sbi_rope import CalibrationFinetuner, RoPE
+from sbi_rope.errors import DataNotFoundError, InvalidInputError, InvalidTypeError
+from sbi_rope.tasks.splits import RecordedPairs
+from sbi_rope.tasks.wind_tunnel import DATASET, EXPERIMENT, WindTunnel
+from sbi_rope.tasks.wind_tunnel_model import (
+    SAMPLE_TIMES,
+    WindTunnelSimulator,
+    pressure_ratio,
+)
+
+PAGE = (
+    "https://github.com/juangamella/causal-chamber/tree/main/datasets/"
+    "wt_intake_impulse_v1"
+)
+# The published columns around those that are read.
+HEADER = (
+    "timestamp,counter,flag,intervention,hatch,load_in,load_out,osr_downwind,"
+    "pressure_downwind,pressure_upwind,pressure_ambient"
+)
+AMBIENT = 95_742.9
+WriteImpulses = Callable[..., Path]
+Schedule = tuple[tuple[float, int, int], ...]  # learning rate, batch, epochs
+
+
+def known_timing() -> Tensor:
+    """The shift of an impulse at its usual time."""
+    return torch.zeros(1, dtype=torch.float64)
+
+
+class Oracle:
+    """The exact posterior at known timing, from k(H) s(t) + N(0, 0.2^2)."""
+
+    def __init__(self) -> None:
+        self.ratio = pressure_ratio(known_timing())[0]
+        self.at_zero = 74.82473949999999 * (1 - 0.75)
+        self.per_degree = -74.82473949999999 * 0.15 / 45
+        self.std = 0.2 / abs(self.per_degree) / float(self.ratio.norm())
+
+    def estimate(self, x: Tensor) -> Tensor:
+        """The hatch of least squares, shape (n,)."""
+        scale = x.double() @ self.ratio / self.ratio.square().sum()
+        return (scale - self.at_zero) / self.per_degree
+
+    def quantile(self, theta: Tensor, x: Tensor) -> Tensor:
+        """Distribution function of the posterior, truncated to [0, 45]."""
+        law = Normal(self.estimate(x), self.std)
+        low, high = law.cdf(torch.tensor(0.0)), law.cdf(torch.tensor(45.0))
+        return (law.cdf(theta[:, 0].double()) - low) / (high - low)
+
+    def log_prob(self, theta: Tensor, x: Tensor) -> Tensor:
+        law = Normal(self.estimate(x), self.std)
+        mass = law.cdf(torch.tensor(45.0)) - law.cdf(torch.tensor(0.0))
+        return law.log_prob(theta[:, 0].double()) - mass.log()
+
+
+@pytest.fixture
+def write_impulses(tmp_path: Path) -> WriteImpulses:
+    """Write a small file in the official layout, and return its root."""
+
+    def write(
+        hatches: tuple[float, ...] = (0.0, 12.5, 45.0),
+        *,
+        pressures: Tensor | None = None,
+        experiment: str = EXPERIMENT,
+        edit: Callable[[list[str]], list[str]] = list,
+    ) -> Path:
+        if pressures is None:
+            pressures = torch.arange(50 * len(hatches)).reshape(-1, 50) / 97
+        rows = []
+        for impulse, hatch in enumerate(hatches):
+            for i, pressure in enumerate(pressures[impulse].tolist()):
+                load = 1.0 if 5 <= i < 25 else 0.01
+                rows.append(
+                    f"{1.7e9 + 8 * impulse + SAMPLE_TIMES[i]},{len(rows)},{impulse},0,"
+                    f"{hatch},{load},0.5,4,{AMBIENT + pressure!r},95740.0,{AMBIENT}"
+                )
+        folder = tmp_path / DATASET
+        folder.mkdir(exist_ok=True)
+        path = folder / f"{experiment}.csv"
+        path.write_text("\n".join(edit([HEADER, *rows])) + "\n")
+        return tmp_path
+
+    return write
+
+
+# The model ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("hatch", [0.0, 0.1, 17.3, 45.0])
+def test_pressure_at_known_timing_is_that_of_causalchamber(hatch: float) -> None:
+    np = pytest.importorskip("numpy")
+    models = pytest.importorskip("causalchamber.models")
+    max_speed = 3000 * np.pi / 30
+    full_torque = 0.05 * (0.27 - 0.166)
+    pressure, *_ = models.simulator_a2_c3(
+        load_in=[0.01] * 5 + [1.0] * 20 + [0.01] * 25,
+        load_out=[0.5] * 50,
+        hatch=hatch,
+        P_amb=0.0,
+        I=0.5 * 0.059**2 * 0.02,
+        tau=lambda load: full_torque * np.maximum(load, 0.1) ** 3,
+        C=full_torque / max_speed**2,
+        timestamps=SAMPLE_TIMES,
+        omega_in_0=0.1 * max_speed,
+        omega_out_0=0.5 * max_speed,
+        S_max=74.82473949999999,
+        omega_max=max_speed,
+        Q_max=186.7 / 3600,
+        r_0=0.75,
+        beta=0.15,
+        barometer_error=0.0,
+        barometer_precision=0.0,
+    )
+    theta = torch.tensor([[hatch]], dtype=torch.float64)
+    for jitter in (0.0, 0.3):
+        simulator = WindTunnelSimulator(onset_jitter=jitter)
+        x = simulator.pressure(theta, onset_shift=known_timing())
+        torch.testing.assert_close(x[0], torch.as_tensor(pressure), rtol=0, atol=1e-9)
+
+
+def test_samples_are_taken_at_the_recorded_times() -> None:
+    times = torch.tensor(SAMPLE_TIMES, dtype=torch.float64)
+    assert times.shape == (50,)
+    assert times[[5, 24, 25, 49]].tolist() == [0.78639, 3.66501, 3.94014, 7.58541]
+    # About seven a second, and a break when the load changes.
+    steps = times.diff()
+    assert steps[24] == pytest.approx(0.27513)
+    assert ((steps > 0.15) & (steps < 0.18)).sum() == 48
+
+
+def test_pressure_is_linear_in_the_hatch_with_the_published_factor() -> None:
+    theta = torch.linspace(0, 45, 10, dtype=torch.float64).unsqueeze(1)
+    shift = torch.full((10,), 0.123, dtype=torch.float64)
+    x = WindTunnelSimulator().pressure(theta, onset_shift=shift)
+    s = pressure_ratio(shift)
+    expected = (18.706184875 - 0.249415798333 * theta) * s
+    torch.testing.assert_close(x, expected, rtol=0.0, atol=2e-5)
+    # Exactly linear, whatever the error of interpolation.
+    middle = (x[0] + x[-1]) / 2
+    torch.testing.assert_close((x[4] + x[5]) / 2, middle, rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("jitter", [0.05, 0.3, 0.6])
+def test_interpolated_shifts_are_exact_to_a_hundred_thousandth(jitter: float) -> None:
+    shift = jitter * (2 * torch.rand(2000, dtype=torch.float64) - 1)
+    theta = torch.zeros(2000, 1, dtype=torch.float64)
+    x = WindTunnelSimulator(onset_jitter=jitter).pressure(theta, onset_shift=shift)
+    direct = 74.82473949999999 * 0.25 * pressure_ratio(shift)
+    torch.testing.assert_close(x, direct, rtol=0.0, atol=2e-5)
+
+
+def test_an_impulse_begins_and_ends_with_its_shift() -> None:
+    shift = torch.tensor([-0.2, 0.0, 0.2], dtype=torch.float64)
+    steps = pressure_ratio(shift).diff(dim=1)
+    times = torch.tensor(SAMPLE_TIMES, dtype=torch.float64)[1:]
+    for row, delta in zip(steps, shift, strict=True):
+        begun = times > 0.61425 + delta
+        ended = times > 3.66501 + delta + 0.16
+        # Faster by the load's torque at once, and slower at its end.
+        assert row[begun][0] > row[~begun][-1]
+        assert (row[begun & ~ended][1:-2] > 0.01).all()
+        assert (row[ended] < 0).all()
+
+
+def test_at_a_later_time_the_ratio_follows_the_equation_of_motion() -> None:
+    # Riccati's equation with constant torque: w = w_c tanh(w_c K t / I + c).
+    max_speed, inertia = 3000 * math.pi / 30, 0.5 * 0.059**2 * 0.02
+    drag = 0.05 * (0.27 - 0.166) / max_speed**2
+    ratio = pressure_ratio(known_timing())[0]
+    # The fan at the back slows down from 0.5 to 0.5^1.5 of its highest speed.
+    final = 0.5**1.5
+    times = torch.tensor(SAMPLE_TIMES, dtype=torch.float64)
+    rate = max_speed * drag / inertia * final
+    exhaust = final / torch.tanh(rate * times + math.atanh(final / 0.5))
+    # Before the impulse the front fan slows down from 0.1 to 0.1^1.5.
+    rest = 0.1**1.5
+    rate = max_speed * drag / inertia * rest
+    intake = rest / torch.tanh(rate * times + math.atanh(rest / 0.1))
+    expected = (intake**2 - exhaust**2)[:5]
+    torch.testing.assert_close(ratio[:5], expected, rtol=0.0, atol=1e-4)
+
+
+def test_noise_has_the_deviation_and_correlation_asked_for() -> None:
+    theta = torch.full((20_000, 1), 20.0, dtype=torch.float64)
+    for correlation in (0.0, 0.6):
+        simulator = WindTunnelSimulator(
+            noise_std=0.5, onset_jitter=0.0, noise_correlation=correlation
+        )
+        noise = simulator(theta) - simulator.pressure(
+            theta[:1], onset_shift=known_timing()
+        )
+        lag = (torch.arange(50) - torch.arange(50).unsqueeze(1)).abs()
+        expected = 0.25 * torch.tensor(correlation, dtype=torch.float64) ** lag
+        torch.testing.assert_close(noise.T.cov(), expected, rtol=0.0, atol=0.012)
+
+
+def test_shifts_are_uniform_up_to_the_jitter() -> None:
+    simulator = WindTunnelSimulator(noise_std=1e-9, onset_jitter=0.3)
+    x = simulator(torch.zeros(5000, 1, dtype=torch.float64))
+    # After the impulse, the pressure at a fixed time grows with its shift.
+    levels = torch.linspace(0.05, 0.95, 10, dtype=torch.float64)
+    grid = torch.linspace(-0.3, 0.3, 601, dtype=torch.float64)
+    fading = simulator.pressure(
+        torch.zeros(601, 1, dtype=torch.float64), onset_shift=grid
+    )[:, 30].contiguous()
+    assert (fading.diff() > 0).all()
+    shift = grid[torch.searchsorted(fading, x[:, 30].contiguous()).clamp(max=600)]
+    torch.testing.assert_close(
+        shift.quantile(levels), 0.6 * levels - 0.3, rtol=0.0, atol=0.02
+    )
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.3])
+@pytest.mark.parametrize("num", [0, 1, 1000])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_batches_of_any_size_keep_their_dtype(
+    num: int, dtype: torch.dtype, jitter: float
+) -> None:
+    theta = 45 * torch.rand(num, 1, dtype=dtype)
+    x = WindTunnelSimulator(onset_jitter=jitter)(theta)
+    assert x.shape == (num, 50)
+    assert x.dtype == dtype
+    assert torch.isfinite(x).all()
+
+
+def test_single_and_double_precision_give_the_same_draws() -> None:
+    theta = 45 * torch.rand(5, 1)
+    torch.manual_seed(1)
+    single = WindTunnelSimulator()(theta)
+    torch.manual_seed(1)
+    assert torch.equal(single, WindTunnelSimulator()(theta.double()).float())
+
+
+def test_gradients_exist_even_if_the_first_call_was_in_inference_mode() -> None:
+    simulator = WindTunnelSimulator(onset_jitter=0.0, exhaust_offset=0.0125)
+    with torch.inference_mode():
+        simulator(torch.zeros(2, 1))
+    theta = torch.full((2, 1), 10.0, requires_grad=True)
+    simulator(theta).sum().backward()
+    slope = -0.249415798333 * float(pressure_ratio(known_timing()).sum())
+    assert theta.grad is not None
+    assert theta.grad[0, 0] == pytest.approx(slope, abs=0.05)
+
+
+def test_a_shift_beyond_the_jitter_is_refused() -> None:
+    shift = torch.tensor([0.1, -0.31], dtype=torch.float64)
+    with pytest.raises(InvalidInputError, match=r"onset_jitter=0\.3.*0\.31"):
+        WindTunnelSimulator().pressure(torch.zeros(2, 1), onset_shift=shift)
+
+
+# The posterior at known timing -------------------------------------------------------
+
+
+def test_closed_form_posterior_has_the_known_width_and_score() -> None:
+    oracle = Oracle()
+    assert float(oracle.ratio.norm()) == pytest.approx(2.125, abs=1e-3)
+    assert oracle.std == pytest.approx(0.377, abs=1e-3)
+    score = -0.5 * math.log(2 * math.pi * math.e) - math.log(oracle.std)
+    assert score == pytest.approx(-0.444, abs=1e-3)
+
+
+def test_simulations_follow_the_closed_form_posterior() -> None:
+    theta, x = WindTunnel(onset_jitter=0.0).get_simulations(20_000)
+    oracle = Oracle()
+    levels = oracle.quantile(theta, x).sort().values
+    distance = (levels - torch.linspace(0, 1, 20_000)).abs().max()
+    assert distance < 1.63 / 20_000**0.5  # the 1 % point of Kolmogorov's test
+    assert float(oracle.log_prob(theta, x).mean()) == pytest.approx(-0.444, abs=0.03)
+
+
+def train_npe(task: WindTunnel, num: int, build: Callable, schedule: Schedule) -> NPE:
+    theta, x = task.get_simulations(num)
+    npe = NPE(task.get_prior(), density_estimator=build, show_progress_bars=False)
+    npe.append_simulations(theta, x)
+    for learning_rate, batch, epochs in schedule:
+        npe.train(
+            learning_rate=learning_rate,
+            training_batch_size=batch,
+            max_num_epochs=epochs,
+            force_first_round_loss=True,
+        )
+    return npe
+
+
+def distance_from_the_oracle(npe: NPE, task: WindTunnel) -> float:
+    """Difference of the scores on the same simulations, in nats."""
+    theta, x = task.get_test_set(2000)
+    log_prob = npe.build_posterior().log_prob_batched(
+        theta.unsqueeze(0), x=x, norm_posterior=False
+    )
+    return float(Oracle().log_prob(theta, x).mean() - log_prob.double().mean())
+
+
+@pytest.mark.filterwarnings("ignore:Maximum number of epochs")
+def test_npe_on_the_estimate_of_least_squares_reaches_the_closed_form() -> None:
+    task = WindTunnel(variant="well_specified", onset_jitter=0.0)
+    oracle = Oracle()
+    net = nn.Linear(50, 1).requires_grad_(requires_grad=False)
+    weight = oracle.ratio / oracle.ratio.square().sum() / oracle.per_degree / 13
+    net.weight.copy_(weight.unsqueeze(0))
+    net.bias.fill_((-oracle.at_zero / oracle.per_degree - 22.5) / 13)
+    build = posterior_nn(
+        "nsf", embedding_net=net, num_transforms=1, hidden_features=30, z_score_x="none"
+    )
+    npe = train_npe(task, 4000, build, ((5e-3, 100, 10), (5e-4, 200, 5)))
+    assert distance_from_the_oracle(npe, task) == pytest.approx(0.0, abs=0.1)
+
+
+@pytest.mark.filterwarnings("ignore:Maximum number of epochs")
+@pytest.mark.slow
+def test_npe_with_the_light_network_reaches_the_closed_form() -> None:
+    task = WindTunnel(variant="well_specified", onset_jitter=0.0)
+    # Each time is scaled by itself: with one scale for the whole curve, the mean curve
+    # is four times as large as what the hatch changes, and training takes longer.
+    build = posterior_nn(
+        "nsf",
+        embedding_net=task.get_embedding_net(light=True),
+        num_transforms=1,
+        hidden_features=30,
+        z_score_x="independent",
+    )
+    schedule = ((2e-3, 100, 10), (3e-4, 200, 8), (5e-5, 500, 4))
+    npe = train_npe(task, 20_000, build, schedule)
+    assert distance_from_the_oracle(npe, task) == pytest.approx(0.0, abs=0.1)
+
+
+# The task ----------------------------------------------------------------------------
+
+
+def test_prior_log_density_is_analytic() -> None:
+    theta = torch.tensor([[0.0], [22.5], [44.9]])
+    log_prob = WindTunnel().get_prior().log_prob(theta)
+    torch.testing.assert_close(log_prob, torch.full((3,), -math.log(45)))
+    quantiles = WindTunnel().prior_quantiles(theta)
+    torch.testing.assert_close(quantiles, theta / 45)
+
+
+def test_options_reach_the_simulator_and_default_to_the_published_noise() -> None:
+    published = WindTunnelSimulator(noise_std=0.2, onset_jitter=0.3)
+    assert WindTunnelSimulator() == published
+    assert WindTunnel().get_simulator() == published
+    task = WindTunnel(noise_std=0.5, onset_jitter=0.0)
+    assert task.get_simulator() == WindTunnelSimulator(noise_std=0.5, onset_jitter=0.0)
+
+
+@pytest.mark.parametrize("light", [True, False])
+def test_networks_return_ten_statistics(light: bool) -> None:
+    net = WindTunnel().get_embedding_net(light=light)
+    assert net(torch.randn(4, 50)).shape == (4, 10)
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        pytest.param({"download": True}, "`root`", id="download"),
+        pytest.param({"noise_std": 0.0}, "noise_std", id="noise"),
+        pytest.param({"onset_jitter": -0.1}, "onset_jitter", id="negative"),
+        pytest.param({"onset_jitter": 0.61}, "onset_jitter", id="early"),
+        pytest.param({"onset_jitter": math.nan}, "onset_jitter", id="nan"),
+        pytest.param({"onset_jitter": "0.1"}, "onset_jitter", id="text"),
+        pytest.param({"variant": "shifted"}, "variant", id="variant"),
+        pytest.param(
+            {"misspecification_strength": 0.5}, "no effect without", id="no-stand-in"
+        ),
+        pytest.param(
+            {"misspecification_strength": 1.1, "stand_in": True},
+            r"\[0, 1\]",
+            id="strength",
+        ),
+        pytest.param(
+            {"experiment": EXPERIMENT, "stand_in": True}, "read no data", id="both"
+        ),
+        pytest.param(
+            {"experiment": EXPERIMENT, "variant": "synthetic"},
+            "read no data",
+            id="both-by-variant",
+        ),
+        pytest.param(
+            {
+                "misspecification_strength": 0.5,
+                "stand_in": True,
+                "variant": "well_specified",
+            },
+            "no effect",
+            id="exact",
+        ),
+        pytest.param(
+            {"experiment": EXPERIMENT, "variant": "well_specified"},
+            "no effect",
+            id="exact-experiment",
+        ),
+    ],
+)
+def test_options_without_effect_or_out_of_range_are_refused(
+    options: dict, match: str
+) -> None:
+    with pytest.raises(InvalidInputError, match=match):
+        WindTunnel(**options)
+
+
+def test_a_stand_in_that_is_not_a_boolean_is_refused() -> None:
+    with pytest.raises(InvalidTypeError, match="stand_in"):
+        WindTunnel(stand_in="yes")  # type: ignore[arg-type]
+
+
+# The stand-in ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"variant": "synthetic"}]
+    + [{"variant": v, "stand_in": True} for v in (None, *WindTunnel.variants)],
+)
+def test_the_stand_in_needs_no_files(options: dict) -> None:
+    task = WindTunnel(**options)
+    assert task.required_files == ()
+    assert task.has_data
+    for theta, x in (task.get_calibration_set(5), task.get_test_set(5)):
+        assert theta.shape == (5, 1)
+        assert x.shape == (5, 50)
+
+
+def test_without_the_stand_in_one_file_is_needed() -> None:
+    assert WindTunnel().required_files == (Path(DATASET, f"{EXPERIMENT}.csv"),)
+    assert not WindTunnel().has_data
+    assert WindTunnel(variant="well_specified").required_files == ()
+
+
+def test_the_stand_in_looks_like_a_hatch_open_wider() -> None:
+    theta, x = WindTunnel(variant="synthetic", onset_jitter=0.0).get_test_set(2000)
+    error = Oracle().estimate(x) - theta[:, 0]
+    # Far more than the posterior's 0.38 degrees, far less than the prior's width.
+    closed, half_open = theta[:, 0] < 10, (theta[:, 0] > 18) & (theta[:, 0] < 27)
+    assert float(error[closed].mean()) == pytest.approx(10.0, abs=1.5)
+    assert float(error[half_open].mean()) == pytest.approx(7.5, abs=1.5)
+
+
+def test_the_stand_in_has_correlated_noise() -> None:
+    theta, x = WindTunnel(variant="synthetic", onset_jitter=0.0).get_test_set(2000)
+    # At known timing a pressure is a straight line in the hatch, plus noise.
+    line = torch.cat([torch.ones_like(theta), theta], dim=1).double()
+    noise = x.double() - line @ torch.linalg.lstsq(line, x.double()).solution
+    assert float(noise.std()) == pytest.approx(0.2, rel=0.02)
+    products = noise[:, 1:] * noise[:, :-1]
+    assert float(products.mean()) / 0.04 == pytest.approx(0.6, abs=0.02)
+
+
+def test_strength_zero_makes_the_simulator_exact() -> None:
+    task = WindTunnel(
+        variant="synthetic", misspecification_strength=0.0, onset_jitter=0.0
+    )
+    theta, x = task.get_test_set(2000)
+    error = Oracle().estimate(x) - theta[:, 0]
+    assert float(error.mean()) == pytest.approx(0.0, abs=0.04)
+    assert float(error.std()) == pytest.approx(Oracle().std, rel=0.06)
+
+
+def test_prior_shift_opens_the_hatch_by_half_and_more() -> None:
+    theta, _ = WindTunnel(variant="prior_shift", stand_in=True).get_test_set(500)
+    assert theta.min() > 22.5
+
+
+# Recorded data -----------------------------------------------------------------------
+
+
+def test_each_impulse_becomes_a_hatch_and_a_curve(
+    write_impulses: WriteImpulses,
+) -> None:
+    hatches = (0.0, 12.5, 45.0, 3.1, 7.7, 20.0)
+    theta, x = all_recorded(WindTunnel(root=write_impulses(hatches)), 6)
+    order = [theta.flatten().tolist().index(torch.tensor(h)) for h in hatches]
+    expected = torch.arange(300).reshape(6, 50) / 97
+    torch.testing.assert_close(x[order], expected, rtol=0.0, atol=1e-6)
+
+
+def test_rows_are_split_once_and_for_all(write_impulses: WriteImpulses) -> None:
+    task = WindTunnel(root=write_impulses(tuple(range(9))))
+    assert isinstance(task._real_process("test"), RecordedPairs)
+    with pytest.raises(InvalidInputError, match="at most 3"):
+        task.get_calibration_set(4)
+    with pytest.raises(InvalidInputError, match="at most 6"):
+        task.get_test_set(7)
+    parts = (task.get_calibration_set(3)[0], task.get_test_set(6)[0])
+    assert sorted(torch.cat(parts).flatten().tolist()) == list(range(9))
+
+
+def test_another_experiment_can_be_chosen(write_impulses: WriteImpulses) -> None:
+    write_impulses((1.0,) * 3)
+    root = write_impulses((2.0,) * 3, experiment="load_out_1_osr_downwind_4")
+    task = WindTunnel(root=root, experiment="load_out_1_osr_downwind_4")
+    assert task.get_test_set(2)[0].flatten().tolist() == [2.0, 2.0]
+
+
+def test_without_a_root_the_message_offers_data_download_and_stand_in() -> None:
+    task = WindTunnel()
+    assert task.get_simulations(3)[1].shape == (3, 50)
+    with pytest.raises(DataNotFoundError, match=r"`root`.*`download=True`") as error:
+        task.get_test_set(1)
+    message = str(error.value)
+    assert f"{DATASET}/{EXPERIMENT}.csv" in message
+    assert PAGE in message
+    assert "stand_in=True" in message
+
+
+def test_a_missing_data_set_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DataNotFoundError) as error:
+        WindTunnel(root=tmp_path).get_calibration_set(1)
+    message = str(error.value)
+    assert str(tmp_path / DATASET / f"{EXPERIMENT}.csv") in message
+    assert PAGE in message
+
+
+def test_an_unknown_experiment_lists_those_there(
+    write_impulses: WriteImpulses,
+) -> None:
+    task = WindTunnel(root=write_impulses(), experiment="load_out_2")
+    with pytest.raises(DataNotFoundError, match=rf"load_out_2.*\['{EXPERIMENT}'\]"):
+        task.get_test_set(1)
+
+
+@pytest.mark.parametrize(
+    ("edit", "match"),
+    [
+        pytest.param(
+            lambda rows: [rows[0].replace("hatch", "door"), *rows[1:]],
+            r"\['hatch'\] are missing.*again",
+            id="column",
+        ),
+        pytest.param(lambda rows: rows[:1], "to have rows", id="no-rows"),
+        pytest.param(
+            lambda rows: rows[:-1],
+            r"impulse 2 has a block of 49 rows from row 100\..*again",
+            id="cut-at-the-end",
+        ),
+        pytest.param(
+            lambda rows: rows[:60] + rows[61:-3],
+            "impulse 1 has a block of 49 rows from row 50",
+            id="first-of-two",
+        ),
+        pytest.param(
+            lambda rows: rows[:1] + rows[2:51] + rows[1:2] + rows[51:],
+            None,
+            id="order-within-an-impulse",
+        ),
+        pytest.param(
+            lambda rows: rows + rows[1:51],
+            "impulse 0 has a block of 50 rows from row 150 and one before",
+            id="twice",
+        ),
+        pytest.param(
+            lambda rows: rows[:51] + rows[51:52] + rows[51:],
+            "impulse 1 has a block of 51 rows",
+            id="one-too-many",
+        ),
+        pytest.param(
+            lambda rows: change(rows, 60, 4, "13.0"),
+            r"constant `hatch`.*during 1 of 3 \(first: impulse 1\).*again",
+            id="hatch-moves",
+        ),
+        pytest.param(
+            lambda rows: (
+                rows[:101] + [r.replace(",45.0,", ",45.5,") for r in rows[101:]]
+            ),
+            rf"{EXPERIMENT}.*support of the prior",
+            id="hatch-too-wide",
+        ),
+        pytest.param(
+            lambda rows: change(rows, 7, 8, "nan"), r"finite.*\[6\]", id="nan"
+        ),
+        pytest.param(
+            lambda rows: change(rows, 7, 10, ""), r"finite.*\[6\]", id="blank"
+        ),
+        pytest.param(
+            lambda rows: change(rows, 7, 2, "six"), r"finite.*\[6\]", id="word"
+        ),
+        pytest.param(lambda rows: change(rows, 7, 9, "nan"), None, id="unread-column"),
+    ],
+)
+def test_broken_files_are_explained(
+    write_impulses: WriteImpulses,
+    edit: Callable[[list[str]], list[str]],
+    match: str | None,
+) -> None:
+    task = WindTunnel(root=write_impulses(edit=edit))
+    if match is None:
+        assert task.get_test_set(2)[1].shape == (2, 50)
+    else:
+        with pytest.raises(InvalidInputError, match=match):
+            task.get_test_set(1)
+
+
+def test_download_fetches_what_is_missing(
+    write_impulses: WriteImpulses, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def dataset(name: str, *, root: object, download: bool) -> None:
+        folder = Path(str(root), name)
+        write_impulses()
+        (tmp_path / DATASET).rename(folder)
+
+    module = types.ModuleType("causalchamber.datasets")
+    module.Dataset = dataset  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "causalchamber", types.ModuleType("causalchamber"))
+    monkeypatch.setitem(sys.modules, "causalchamber.datasets", module)
+    task = WindTunnel(root=tmp_path / "new", download=True)
+    assert task.get_test_set(2)[1].shape == (2, 50)
+    assert task.has_data
+
+
+# From a file to a repaired posterior -------------------------------------------------
+
+
+@pytest.mark.filterwarnings("ignore:Maximum number of epochs")
+def test_rope_repairs_a_posterior_with_recorded_pairs(
+    write_impulses: WriteImpulses,
+) -> None:
+    # Eighteen impulses: six to calibrate with, twelve to test on.
+    theta, x = WindTunnel(variant="synthetic").get_test_set(18)
+    hatches = tuple(theta.flatten().tolist())
+    task = WindTunnel(root=write_impulses(hatches, pressures=x))
+    build = posterior_nn("nsf", embedding_net=task.get_embedding_net(light=True))
+    npe = train_npe(task, 500, build, ((1e-3, 50, 3),))
+
+    rope = RoPE(
+        npe.build_posterior(),
+        simulator=task.get_simulator(),
+        finetuner=CalibrationFinetuner(num_steps=50),
+    )
+    rope.append_calibration(*task.get_calibration_set(6))
+    rope.train(seed=0, show_progress_bars=False)
+    theta_o, x_o = task.get_test_set(12)
+    with pytest.warns(match="batch of 12"):
+        posterior = rope.build_posterior(x_o, seed=0)
+    samples = posterior.sample_batched((100,), x=x_o, show_progress_bars=False)
+    assert samples.shape == (100, 12, 1)
+    assert ((samples >= 0) & (samples <= 45)).all()
+    log_prob = posterior.log_prob_batched(theta_o.unsqueeze(0), x=x_o)
+    assert torch.isfinite(log_prob).all()
+
+
+def all_recorded(task: WindTunnel, num: int) -> tuple[Tensor, Tensor]:
+    third = num // 3
+    parts = (task.get_calibration_set(third), task.get_test_set(num - third))
+    theta, x = zip(*parts, strict=True)
+    return torch.cat(theta), torch.cat(x)
+
+
+def change(rows: list[str], row: int, column: int, value: str) -> list[str]:
+    """Replace one value of a file; row 0 is the header."""
+    values = rows[row].split(",")
+    values[column] = value
+    return [*rows[:row], ",".join(values), *rows[row + 1 :]]
