@@ -22,6 +22,7 @@ from sbi_rope.tasks import Task
 
 COLUMNS = (
     "task",
+    "variant",
     "seed",
     "method",
     "n_calibration",
@@ -78,6 +79,7 @@ class Study:
             curves[method] = evaluation.coverage
             results.append(
                 task=task.name,
+                variant=task.variant,
                 seed=seed,
                 method=method,
                 n_calibration=n,

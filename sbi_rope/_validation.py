@@ -22,6 +22,7 @@ __all__ = [
     "check_in_support",
     "check_instance",
     "check_integer",
+    "check_not_negative",
     "check_positive",
     "check_same_length",
     "check_tensor",
@@ -124,6 +125,14 @@ def check_positive(name: str, value: Any) -> None:
     """Raise unless ``value`` is a finite number above zero."""
     if not _is_number(value) or not 0.0 < value < float("inf"):
         raise InvalidInputError(f"Expected `{name}` to be positive; got {value!r}.")
+
+
+def check_not_negative(name: str, value: Any) -> None:
+    """Raise unless ``value`` is a finite number of at least zero."""
+    if not _is_number(value) or not 0.0 <= value < float("inf"):
+        raise InvalidInputError(
+            f"Expected `{name}` to be a finite number of at least 0; got {value!r}."
+        )
 
 
 def check_integer(name: str, value: Any, *, minimum: int = 1) -> None:

@@ -76,7 +76,8 @@ def _histograms(
     panels = _panels(len(names), columns, width=2.6, height=2.2)
     for k, (axes, name) in enumerate(zip(panels, names, strict=True)):
         values = torch.cat([x_o[:, k], x_s[:, k]]).double()
-        low, high = (torch.quantile(values, q).item() for q in (TAIL, 1 - TAIL))
+        tail = TAIL if len(values) * TAIL > 1 else 0.0
+        low, high = (torch.quantile(values, q).item() for q in (tail, 1 - tail))
         if low == high:
             low, high = low - 0.5, high + 0.5
         for x, colour, label in (

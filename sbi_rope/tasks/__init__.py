@@ -8,6 +8,7 @@ import inspect
 from pathlib import Path
 from typing import Any
 
+from sbi_rope._validation import check_choice
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.base import Task
 from sbi_rope.tasks.cs import CancerStroma
@@ -64,10 +65,7 @@ def get_task(
         >>> get_task("pendulum", variant="misspecified_prior").parameter_names
         ('omega_0', 'A')
     """
-    if name not in TASKS:
-        raise InvalidInputError(
-            f"Expected `name` to be one of {list_tasks()}; got {name!r}."
-        )
+    check_choice("name", name, list_tasks())
     task = TASKS[name]
     accepted = inspect.signature(task).parameters.keys() - {"variant", "root"}
     unknown = sorted(options.keys() - accepted)

@@ -37,22 +37,33 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--variant", help="a kind of real process")
     parser.add_argument("--root", type=Path, help="folder with recorded data")
     parser.add_argument(
+        "--stand-in",
+        action="store_true",
+        help="put a model in the place of recorded data, where the task has one",
+    )
+    parser.add_argument(
         "-n", type=int, default=NUM_ROWS, help="draws behind a summary (%(default)s)"
     )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--plot", type=Path, metavar="FILE", help="picture to write")
     args = parser.parse_args(arguments)
-    if args.name is None and (args.plot or args.variant):
-        parser.error("--plot and --variant need the name of a task")
+    if args.name is None and (args.plot or args.variant or args.stand_in):
+        parser.error("--plot, --variant and --stand-in need the name of a task")
     try:
         if args.name is None:
             _print_list(args.root)
         else:
-            task = get_task(args.name, variant=args.variant, root=args.root)
-            _describe(task, args.n, args.seed)
-            if args.plot:
-                _draw(task, args.n, args.seed, args.plot)
-    except RoPEError as error:
+            options = {"stand_in": True} if args.stand_in else {}
+            task = get_task(args.name, variant=args.variant, root=args.root, **options)
+            # Draws first: what cannot be done is said before anything is printed.
+            theta, x_s = task.get_simulations(args.n, seed=args.seed)
+            real = None
+            if task.has_data or args.plot:
+                real = task.get_test_set(args.n, seed=args.seed)
+            _describe(task, theta, x_s, real)
+            if args.plot and real:
+                _draw(task, *real, path=args.plot, seed=args.seed)
+    except (RoPEError, ImportError, OSError) as error:
         print(f"{parser.prog}: {error}", file=sys.stderr)
         return 2
     return 0
@@ -100,19 +111,22 @@ def _simulations_per_second(task: Task) -> float:
 # One task ----------------------------------------------------------------------------
 
 
-def _describe(task: Task, n: int, seed: int) -> None:
-    print(f"{task!r}: {task.misspecification}.\n")
+def _describe(
+    task: Task, theta: Tensor, x_s: Tensor, real: tuple[Tensor, Tensor] | None
+) -> None:
+    n = len(theta)
+    wrong = "nothing" if task.variant == "well_specified" else task.misspecification
+    print(f"{task!r}\nWhat the simulator gets wrong: {wrong}.\n")
     units = dict(zip(task.parameter_names, task.parameter_units, strict=True))
-    theta, x_s = task.get_simulations(n, seed=seed)
     columns = {
         name if unit == "1" else f"{name} [{unit}]": theta[:, k]
         for k, (name, unit) in enumerate(units.items())
     }
     _print_table(f"prior ({n} draws)", columns)
     _print_table(f"simulated x ({n} draws)", _summaries(task, x_s))
-    if task.has_data:
-        _, x_o = task.get_test_set(n, seed=seed)
-        _print_table(f"{_kind(task)} x ({n} test observations)", _summaries(task, x_o))
+    if real:
+        title = f"{_kind(task)} x ({n} test observations)"
+        _print_table(title, _summaries(task, real[1]))
     else:
         files = ", ".join(map(str, task.required_files))
         print(f"No real x: {files} not found; give its folder as --root.\n")
@@ -131,7 +145,9 @@ def _describe(task: Task, n: int, seed: int) -> None:
 
 
 def _kind(task: Task) -> str:
-    return "stand-in" if task.variant == "synthetic" else "real"
+    if task.variant == "well_specified":
+        return "well-specified"
+    return "stand-in" if task.stand_in else "real"
 
 
 def _summaries(task: Task, x: Tensor) -> dict[str, Tensor]:
@@ -157,10 +173,13 @@ def _print_table(title: str, columns: dict[str, Tensor]) -> None:
     print()
 
 
-def _draw(task: Task, n: int, seed: int, path: Path) -> None:
+def _draw(task: Task, theta: Tensor, x_o: Tensor, *, path: Path, seed: int) -> None:
     from sbi_rope.plots import real_and_simulated
 
-    theta, x_o = task.get_test_set(n, seed=seed)
+    if not path.suffix:
+        raise InvalidInputError(
+            f"Expected a file name with a format, such as {path}.png; got {path}."
+        )
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         x_s = task.get_simulator()(theta)

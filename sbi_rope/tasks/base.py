@@ -2,9 +2,11 @@ r"""What a task is: a prior, a simulator, and labelled real observations."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from numbers import Integral
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar
 
+import torch
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
@@ -13,6 +15,7 @@ from sbi_rope._validation import (
     check_choice,
     check_integer,
     check_positive,
+    check_unit_interval,
 )
 from sbi_rope.errors import InvalidInputError, InvalidTypeError
 from sbi_rope.tasks.settings import PaperSettings
@@ -78,6 +81,7 @@ class Task(ABC):
             ``"prior_shift"``.
         paper_settings: The hyper-parameters the paper states, ``None`` for tasks that
             are not in it.
+        stand_in: Whether a model stands in for recorded observations.
         variant: The chosen kind, or ``None`` for the standard one.
         root: Folder with recorded data, or ``None``.
         label_noise: Standard deviation of the noise on calibration labels, as a
@@ -87,7 +91,8 @@ class Task(ABC):
         variant: One of ``variants``, or ``None`` for the standard real process.
         root: Folder that holds recorded data. Synthetic tasks do not read it, so
             that one ``root`` can be passed to all tasks.
-        label_noise: Only for ``"noisy_labels"``; 0.2 unless given.
+        label_noise: Above 0 and at most 1, and only for ``"noisy_labels"``; 0.2
+            unless given.
     """
 
     name: ClassVar[str]
@@ -100,6 +105,7 @@ class Task(ABC):
     variants: ClassVar[dict[str, str]] = COMMON_VARIANTS
     shifted_region: ClassVar[dict[str, tuple[float, float]]]
     paper_settings: ClassVar[PaperSettings | None] = None
+    stand_in: bool = False
 
     def __init__(
         self,
@@ -111,13 +117,14 @@ class Task(ABC):
         if variant is not None:
             check_choice("variant", variant, list(self.variants))
         self.variant = variant
-        self.root = None if root is None else Path(root).expanduser()
+        self.root = _checked_root(root)
         self.label_noise = self._option(
             "label_noise",
             label_noise,
             LABEL_NOISE if variant == "noisy_labels" else 0.0,
             variant="noisy_labels",
         )
+        check_unit_interval("label_noise", self.label_noise)
         if label_noise is not None:
             check_positive("label_noise", label_noise)
 
@@ -199,8 +206,9 @@ class Task(ABC):
         """
         theta, x = self._labelled_set(n, seed=seed, part="calibration")
         if self.variant == "noisy_labels":
-            std = self.label_noise * self.prior_std
-            theta = with_label_noise(theta, std, self.get_prior(), seed=seed)
+            with torch.device("cpu"):
+                std = self.label_noise * self.prior_std
+                theta = with_label_noise(theta, std, self.get_prior(), seed=seed)
         return theta, x
 
     def get_test_set(self, n: int, *, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -219,7 +227,9 @@ class Task(ABC):
         """
         check_integer("n", n)
         _check_seed(seed)
-        return self._simulated_process().take(n, seed=seed, part="simulation")
+        # Whatever torch's default device: every machine has the same sets.
+        with torch.device("cpu"):
+            return self._simulated_process().take(n, seed=seed, part="simulation")
 
     def _simulated_process(self) -> DrawnPairs:
         prior = self.get_prior()
@@ -231,11 +241,12 @@ class Task(ABC):
     def _labelled_set(self, n: int, *, seed: int, part: Part) -> tuple[Tensor, Tensor]:
         check_integer("n", n)
         _check_seed(seed)
-        if self.variant == "well_specified":
-            process = self._simulated_process()
-        else:
-            process = self._real_process(part)
-        return process.take(n, seed=seed, part=part, keep=self._keep(part))
+        with torch.device("cpu"):
+            if self.variant == "well_specified":
+                process = self._simulated_process()
+            else:
+                process = self._real_process(part)
+            return process.take(n, seed=seed, part=part, keep=self._keep(part))
 
     def _keep(self, part: Part) -> Keep | None:
         """Return which parameters of the real process a part may have."""
@@ -273,8 +284,10 @@ class Task(ABC):
         return value
 
     def __repr__(self) -> str:
-        variant = "" if self.variant is None else f"variant={self.variant!r}"
-        return f"{type(self).__name__}({variant})"
+        options = [] if self.variant is None else [f"variant={self.variant!r}"]
+        if self.stand_in and self.variant != "synthetic":
+            options.append("stand_in=True")
+        return f"{type(self).__name__}({', '.join(options)})"
 
 
 def check_theta(theta: Any, theta_dim: int) -> Tensor:
@@ -297,8 +310,22 @@ def check_theta(theta: Any, theta_dim: int) -> Tensor:
     return theta
 
 
+def _checked_root(root: Any) -> Path | None:
+    if root is None:
+        return None
+    if not isinstance(root, str | Path):
+        raise InvalidTypeError(
+            f"Expected `root` to be a path or None; got {type(root).__name__}."
+        )
+    try:
+        return Path(root).expanduser()
+    except RuntimeError as error:  # no such user
+        raise InvalidInputError(f"Expected `root` to be a path; {error}") from error
+
+
 def _check_seed(seed: Any) -> None:
-    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < MAX_SEED:
+    is_integer = isinstance(seed, Integral) and not isinstance(seed, bool)
+    if not is_integer or not 0 <= int(seed) < MAX_SEED:
         raise InvalidInputError(
             f"Expected `seed` to be an integer from 0 to {MAX_SEED - 1}; got {seed!r}."
         )

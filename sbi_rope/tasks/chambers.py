@@ -17,10 +17,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import check_finite
+from sbi_rope._validation import check_finite, check_instance
 from sbi_rope.errors import DataNotFoundError, InvalidInputError, warn_user
 
 __all__ = [
+    "CUT_FILE",
     "check_download",
     "find_file",
     "find_images",
@@ -29,6 +30,7 @@ __all__ = [
     "read_names",
     "read_table",
     "require",
+    "warn_if_incomplete",
 ]
 
 DATASETS_PAGE = "https://github.com/juangamella/causal-chamber/tree/main/datasets"
@@ -44,9 +46,12 @@ CUT_FILE = (
 )
 
 
-def check_download(root: Path | None, *, download: bool) -> None:
-    """Raise if data are to be downloaded to nowhere."""
-    if download and root is None:
+def check_download(
+    root: Path | None, required: Sequence[Path], *, download: bool
+) -> None:
+    """Raise if files are required and to be downloaded to nowhere."""
+    check_instance("download", download, bool)
+    if download and required and root is None:
         raise InvalidInputError(
             "Expected `root` with `download=True`: the folder to download into; got "
             "None."
@@ -90,7 +95,8 @@ def read_table(path: Path, columns: Sequence[str]) -> Any:
     """
     pandas = require("pandas")
     try:
-        frame = pandas.read_csv(path)
+        # The first column is data, even if rows end with one comma too many.
+        frame = pandas.read_csv(path, index_col=False)
     except ValueError as error:  # pandas' own errors of parsing are ValueErrors
         raise InvalidInputError(
             f"Expected {path} to be a CSV table; {error}. {CUT_FILE}"
@@ -125,6 +131,22 @@ def read_columns(path: Path, columns: Sequence[str]) -> Tensor:
     values = torch.tensor(numbers.to_numpy(dtype="float64"))
     check_finite(str(path), values)
     return values
+
+
+def warn_if_incomplete(path: Path, found: int, published: int, *, what: str) -> None:
+    """Warn of a recording with another number of observations than the published one.
+
+    Args:
+        path: The file that was read.
+        found: Number of observations in it.
+        published: Number of observations that were published.
+        what: What one of them is called, in the plural.
+    """
+    if found != published:
+        warn_user(
+            f"{path} holds {found} {what}, the published file has {published}. Sets "
+            f"differ from those of other users. If this is not on purpose: {CUT_FILE}"
+        )
 
 
 def read_names(path: Path, column: str) -> list[str]:
@@ -205,7 +227,12 @@ def _read_image(path: Path, size: int) -> bytearray:
             found = f"{image.width} x {image.height} pixels in mode {image.mode}"
             fits = image.size == (size, size) and image.mode == "RGB"
             content = bytearray(image.tobytes() if fits else b"")
-    except (OSError, SyntaxError, ValueError) as error:  # what PIL's decoders raise
+    except (
+        OSError,  # these are what PIL's decoders raise
+        SyntaxError,
+        ValueError,
+        image_module.DecompressionBombError,
+    ) as error:
         raise InvalidInputError(
             f"Expected {path} to be an image; {error}. {CUT_FILE}"
         ) from error

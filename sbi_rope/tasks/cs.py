@@ -23,6 +23,7 @@ __all__ = ["CancerStroma", "CancerStromaSimulator"]
 Array = TypeVar("Array", np.ndarray, Tensor)
 
 STATISTICS = ("n_stromal", "n_cancer", "mean_distance", "max_distance")
+MAX_RATE = 1e6  # a tissue of that many cells takes seconds and a gigabyte
 NUM_DISTANCES = 50  # the first stromal cells enter the two distances, others do not
 # Tissues that the batched path handles at once; 0.1 GB an array under the prior.
 CHUNK_SIZE = 256
@@ -73,9 +74,10 @@ class CancerStromaSimulator:
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, 3)``, to shape ``(n, 4)``."""
         theta = check_theta(theta, 3).detach()
-        if (theta < 0).any():
+        if ((theta < 0) | (theta > MAX_RATE)).any():
             raise InvalidInputError(
-                f"Expected rates `theta` of at least 0; got {float(theta.min())!r}."
+                f"Expected rates `theta` from 0 to {MAX_RATE:g}; got "
+                f"{float(theta.min())!r} to {float(theta.max())!r}."
             )
         if not len(theta):
             return theta.new_empty(0, len(STATISTICS))
@@ -264,8 +266,9 @@ class CancerStroma(Task):
         necrosis_radius: float | None = None,
     ) -> None:
         super().__init__(variant=variant, root=root, label_noise=label_noise)
+        exact = variant == "well_specified"
         self.necrosis_probability = self._option(
-            "necrosis_probability", necrosis_probability, 0.75
+            "necrosis_probability", necrosis_probability, 0.0 if exact else 0.75
         )
         self.necrosis_radius = self._option("necrosis_radius", necrosis_radius, 0.8)
         self._real = CancerStromaSimulator(

@@ -8,7 +8,7 @@ import torch
 from sbi.utils import BoxUniform, MultipleIndependent
 from torch import Tensor
 
-from sbi_rope._validation import check_choice, check_in_support
+from sbi_rope._validation import check_choice, check_in_support, check_instance
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.base import Task
 from sbi_rope.tasks.chambers import (
@@ -18,6 +18,7 @@ from sbi_rope.tasks.chambers import (
     read_columns,
     read_images,
     read_names,
+    warn_if_incomplete,
 )
 from sbi_rope.tasks.distributions import Arcsine, box
 from sbi_rope.tasks.light_tunnel_models import (
@@ -41,6 +42,7 @@ INPUTS = ("red", "green", "blue", "pol_1", "pol_2")
 IMAGE_SIZES = (64, 100)
 UNIFORM = "uniform_ap_1.8_iso_500.0_ss_0.005"
 BETA_BINOMIAL = "betab_ap_1.8_iso_500.0_ss_0.005"
+NUM_IMAGES = 10_000  # of the uniform experiment
 # The experiments of the variants that choose their own, calibration and test.
 OWN_EXPERIMENTS = {
     "misspecified_prior": (BETA_BINOMIAL, BETA_BINOMIAL),
@@ -132,6 +134,8 @@ class LightTunnel(Task):
         "the camera, or polarisers that treat colours differently"
     )
     variants = COMMON_VARIANTS | {
+        "biased_calibration": "colours and polariser angles of the calibration set "
+        "crowd in the middle of their ranges, those of the test set do not",
         "misspecified_prior": "colours and polariser angles of both sets crowd in the "
         "middle of their ranges",
         "flipped": "test images are flipped vertically, calibration images are not",
@@ -162,7 +166,7 @@ class LightTunnel(Task):
     ) -> None:
         super().__init__(variant=variant, root=root, label_noise=label_noise)
         check_choice("image_size", image_size, IMAGE_SIZES)
-        check_download(self.root, download=download)
+        check_instance("stand_in", stand_in, bool)
         self.stand_in = stand_in or variant == "synthetic"
         if experiment is not None and (self.stand_in or variant in OWN_EXPERIMENTS):
             raise InvalidInputError(
@@ -179,6 +183,7 @@ class LightTunnel(Task):
         self.dequantise = dequantise
         self.download = download
         self.experiment = self._option("experiment", experiment, UNIFORM)
+        check_download(self.root, self.required_files, download=download)
         self.sensor_noise = self._option("sensor_noise", sensor_noise, CAMERA_NOISE)
         self._camera()  # refuses a bad `sensor_noise` now
 
@@ -254,6 +259,8 @@ class LightTunnel(Task):
         theta = torch.cat([colour, malus(angles)], dim=1).float()
         check_in_support(f"theta of {table}", theta, self.get_prior())
         names = read_names(path, "image_file")
+        if path.stem == UNIFORM:
+            warn_if_incomplete(path, len(names), NUM_IMAGES, what="images")
         return RecordedPairs(
             theta=theta, read_x=partial(self._read_x, folder, names, part)
         )
@@ -267,7 +274,8 @@ class LightTunnel(Task):
             return self._oriented(as_brightness(levels, dequantise=False), part)
         for image, name in zip(levels, chosen, strict=True):
             # The same noise on an image whenever it is read.
-            digest = hashlib.sha256(f"dequantise: {name}".encode()).digest()
+            key = f"dequantise: {folder.parent.name}/{name}"
+            digest = hashlib.sha256(key.encode()).digest()
             noise = torch.Generator().manual_seed(int.from_bytes(digest[:4], "big"))
             image.copy_(as_brightness(image, dequantise=True, generator=noise))
         return self._oriented(levels, part)

@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Beta, Binomial
 
-from sbi_rope._validation import check_integer
-from sbi_rope.errors import InvalidInputError
+from sbi_rope._validation import check_integer, check_unit_interval
 from sbi_rope.tasks.base import check_theta
 
 __all__ = [
@@ -133,11 +132,7 @@ class CameraSimulator:
 
     def __post_init__(self) -> None:
         check_integer("image_size", self.image_size)
-        if not 0.0 <= self.sensor_noise < 1.0:
-            raise InvalidInputError(
-                f"Expected `sensor_noise` in [0, 1), as a share of full brightness; "
-                f"got {self.sensor_noise!r}."
-            )
+        check_unit_interval("sensor_noise", self.sensor_noise)
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, 4)``, to ``(n, 3, size, size)``."""

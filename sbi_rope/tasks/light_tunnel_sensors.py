@@ -7,10 +7,19 @@ import torch
 from sbi.utils import BoxUniform, MultipleIndependent
 from torch import Tensor, nn
 
-from sbi_rope._validation import check_in_support, check_positive
+from sbi_rope._validation import (
+    check_in_support,
+    check_not_negative,
+    check_positive,
+)
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.base import Task, check_theta
-from sbi_rope.tasks.chambers import check_download, find_file, read_columns
+from sbi_rope.tasks.chambers import (
+    CUT_FILE,
+    check_download,
+    find_file,
+    read_columns,
+)
 from sbi_rope.tasks.distributions import UniformDistance, box
 from sbi_rope.tasks.networks import fully_connected
 from sbi_rope.tasks.splits import Part, RecordedPairs
@@ -46,8 +55,6 @@ SETTINGS = tuple(
     for setting in (
         *(f"t_{diode}_{sensor}" for sensor in (1, 2, 3) for diode in ("ir", "vis")),
         "v_c",
-        "v_angle_1",
-        "v_angle_2",
     )
 )
 # The experiments of the variants that choose their own, calibration and test.
@@ -95,6 +102,10 @@ class LightTunnelSimulator:
 
     relative_noise: float = 0.03
     current_noise_std: float = 4.0
+
+    def __post_init__(self) -> None:
+        check_not_negative("relative_noise", self.relative_noise)
+        check_not_negative("current_noise_std", self.current_noise_std)
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, 4)``, to shape ``(n, 7)``."""
@@ -164,8 +175,10 @@ class LightTunnelSensors(Task):
     degrees, and the angle is uniform on [0, 120] in the prior; the light does not tell
     an angle from its supplement, so that posteriors have two modes. In
     ``"sensor_settings"`` the calibration set is the standard one, but the test set
-    pools nine experiments with another exposure time of one diode (``t_*``) or another
-    reference voltage (``v_*``) that the simulator knows nothing of.
+    pools seven experiments with another exposure time of one diode (``t_*``) or another
+    reference voltage of the current (``v_c``) that the simulator knows nothing of. The
+    reference voltages of the angle sensors, which are no part of an observation, change
+    nothing and are left out.
 
     Args:
         variant: ``None`` or one of ``variants``.
@@ -197,8 +210,8 @@ class LightTunnelSensors(Task):
         "widened to 255.5",
         "strong_angles": "one polariser is turned away by 42 to 118 degrees, with a "
         "prior widened to [0, 120]",
-        "sensor_settings": "test observations have another exposure time or reference "
-        "voltage at one sensor",
+        "sensor_settings": "test observations have another exposure time at one diode, "
+        "or another reference voltage of the current",
     }
     shifted_region = {"red": (45.0, 85.5), "polariser_angle": (0.0, 15.0)}  # noqa: RUF012
 
@@ -214,7 +227,6 @@ class LightTunnelSensors(Task):
         current_noise_std: float = 4.0,
     ) -> None:
         super().__init__(variant=variant, root=root, label_noise=label_noise)
-        check_download(self.root, download=download)
         check_positive("relative_noise", relative_noise)
         check_positive("current_noise_std", current_noise_std)
         if experiment is not None and variant in OWN_EXPERIMENTS:
@@ -224,6 +236,7 @@ class LightTunnelSensors(Task):
             )
         self.download = download
         self.experiment = self._option("experiment", experiment, REFERENCE)
+        check_download(self.root, self.required_files, download=download)
         self.relative_noise = relative_noise
         self.current_noise_std = current_noise_std
 
@@ -285,6 +298,11 @@ class LightTunnelSensors(Task):
         path = find_file(file, root=self.root, download=self.download)
         values = read_columns(path, INPUTS + OUTPUTS)
         colour, positions, readings = values.split([3, 2, len(OUTPUTS)], dim=1)
+        if (readings < 0).any():
+            raise InvalidInputError(
+                f"Expected readings of at least 0 in {path}; got {readings.min()}. "
+                f"{CUT_FILE}"
+            )
         angle = (positions[:, :1] - positions[:, 1:]).abs()
         theta = torch.cat([colour, angle], dim=1)
         check_in_support(f"theta of {file}", theta.float(), self.get_prior())

@@ -49,6 +49,10 @@ class LinearGaussianSimulator:
     scale: float = 1.0
     shift: float = 0.0
 
+    def __post_init__(self) -> None:
+        check_integer("dim", self.dim)
+        check_positive("noise_std", self.noise_std)
+
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, d)``, to the same shape."""
         theta = check_theta(theta, self.dim)

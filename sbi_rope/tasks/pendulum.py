@@ -8,8 +8,11 @@ import torch
 from sbi.utils import BoxUniform
 from torch import Tensor, nn
 
-from sbi_rope._validation import check_positive, check_unit_interval
-from sbi_rope.errors import InvalidInputError
+from sbi_rope._validation import (
+    check_not_negative,
+    check_positive,
+    check_unit_interval,
+)
 from sbi_rope.tasks.base import Task, check_theta
 from sbi_rope.tasks.distributions import box
 from sbi_rope.tasks.networks import SeriesEmbedding, light_series_embedding
@@ -45,6 +48,10 @@ class PendulumSimulator:
 
     noise_std: float = 0.1
     max_damping: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_not_negative("noise_std", self.noise_std)
+        check_not_negative("max_damping", self.max_damping)
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, 2)``, to shape ``(n, 200)``."""
@@ -144,11 +151,8 @@ class Pendulum(Task):
         super().__init__(variant=variant, root=root, label_noise=label_noise)
         check_positive("noise_std", noise_std)
         self.noise_std = noise_std
-        self.max_damping = self._option("max_damping", max_damping, 1.0)
-        if not 0.0 <= self.max_damping < math.inf:
-            raise InvalidInputError(
-                f"Expected `max_damping` to be at least 0; got {max_damping!r}."
-            )
+        damping = 0.0 if variant == "well_specified" else 1.0
+        self.max_damping = self._option("max_damping", max_damping, damping)
         self.misspecification_weight = self._option(
             "misspecification_weight",
             misspecification_weight,
@@ -156,6 +160,9 @@ class Pendulum(Task):
             variant="misspecified_prior",
         )
         check_unit_interval("misspecification_weight", self.misspecification_weight)
+        self._real = PendulumSimulator(
+            noise_std=self.noise_std, max_damping=self.max_damping
+        )
 
     def get_prior(self) -> BoxUniform:
         """Return the uniform prior on [0, 3] x [0.5, 10], log density -log 28.5."""
@@ -176,12 +183,7 @@ class Pendulum(Task):
         return SeriesEmbedding(num_steps=NUM_STEPS, output_dim=10)
 
     def _real_process(self, part: Part) -> DrawnPairs:
-        return DrawnPairs(
-            draw_theta=self._draw_theta,
-            observe=PendulumSimulator(
-                noise_std=self.noise_std, max_damping=self.max_damping
-            ),
-        )
+        return DrawnPairs(draw_theta=self._draw_theta, observe=self._real)
 
     def _draw_theta(self, n: int) -> Tensor:
         theta = self.get_prior().sample((n,))

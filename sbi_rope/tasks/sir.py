@@ -272,8 +272,9 @@ class SIR(Task):
         reported_fraction: float | None = None,
     ) -> None:
         super().__init__(variant=variant, root=root, label_noise=label_noise)
+        exact = variant == "well_specified"
         self.reported_fraction = self._option(
-            "reported_fraction", reported_fraction, 0.95
+            "reported_fraction", reported_fraction, 1.0 if exact else 0.95
         )
         self._real = SIRSimulator(reported_fraction=self.reported_fraction)
 

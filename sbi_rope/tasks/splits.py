@@ -6,6 +6,7 @@ split once and for all.
 """
 
 import hashlib
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -27,6 +28,8 @@ MAX_SEED = 2**30
 BLOCK_SIZE = 100
 # Blocks without a single pair after which there is no hope for one.
 MAX_EMPTY_BLOCKS = 1000
+# Sets are drawn one after the other: all threads share torch's generator.
+LOCK = threading.RLock()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +38,8 @@ class DrawnPairs:
 
     Parameters are drawn on the CPU in blocks of fixed size, and the first rows are
     kept: a smaller set is the beginning of a larger one. The caller's generators,
-    those of all devices included, are left as they were. Pairs whose observation is
+    those of all devices included, are left as they were; other threads must not draw
+    from them meanwhile. Pairs whose observation is
     not finite are dropped with their parameters, drawn again, and counted in a
     warning.
 
@@ -74,7 +78,7 @@ class DrawnPairs:
         """
         thetas, xs = [], []
         found = dropped = empty = 0
-        with torch.random.fork_rng(devices=[]), torch.device("cpu"):
+        with LOCK, torch.random.fork_rng(devices=[]), torch.device("cpu"):
             # `torch.manual_seed` would reseed the accelerators as well.
             torch.default_generator.manual_seed(stream_of(seed, part))
             while found < n:
@@ -154,9 +158,10 @@ class RecordedPairs:
                 if _uniform(row, key=f"keep {seed}") < chance
             ]
         if n > len(rows):
+            filtered = "" if keep is None else " that the variant keeps under this seed"
             raise InvalidInputError(
                 f"Expected `n` to be at most {len(rows)}, the number of recorded "
-                f"observations in the {part} part; got {n}."
+                f"observations in the {part} part{filtered}; got {n}."
             )
         rows = rows[:n]
         return self.theta[rows], self.read_x(rows)

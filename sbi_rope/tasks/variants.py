@@ -21,10 +21,10 @@ __all__ = [
 COMMON_VARIANTS = {
     "prior_shift": "all real parameters come from a part of the prior's support, "
     "`shifted_region`",
-    "biased_calibration": "the parameters of the calibration set crowd in the middle "
-    "of the prior, those of the test set do not",
+    "biased_calibration": "the first parameters of the calibration set, three at "
+    "most, crowd in the middle of the prior, those of the test set do not",
     "noisy_labels": "the parameters of the calibration set are known up to Gaussian "
-    "noise of `label_noise` prior standard deviations",
+    "noise of `label_noise` prior standard deviations, cut at the prior's support",
     "well_specified": "the real process is the simulator",
 }
 # The rejection behind a biased set would accept next to nothing with more.
@@ -39,16 +39,18 @@ def inside_region(
     inside = torch.ones(len(theta), dtype=torch.bool)
     for name, (low, high) in region.items():
         value = theta[:, names.index(name)]
-        inside &= (value > low) & (value < high)
+        inside &= (value >= low) & (value <= high)
     return inside.double()
 
 
 def beta_shaped(quantiles: Tensor) -> Tensor:
-    r"""Return a chance that gives kept quantiles a symmetric Beta(3, 3) law.
+    r"""Return a chance that lets parameters near the middle of the prior stay.
 
     .. math:: \prod_{k \le 3} \left( 4 u_k (1 - u_k) \right)^2,
 
-    the density of Beta(3, 3) over its maximum, in the first three parameters.
+    the density of Beta(3, 3) over its maximum, in the first three parameters. Where
+    parameters are independent in the prior, Beta(3, 3) is the law of the quantiles
+    that stay.
 
     Args:
         quantiles: Values of the prior's distribution functions, shape ``(n, d)``.
@@ -75,12 +77,14 @@ def with_label_noise(
     noisy = theta.clone()
     for rows in torch.arange(len(theta)).split(BLOCK_SIZE):
         # One generator a block: rows drawn anew in one leave the next as they are.
-        block_seed = int(torch.randint(2**32, (), generator=seeds))
+        block_seed = int(torch.randint(2**32, (), generator=seeds, device="cpu"))
         generator = torch.Generator().manual_seed(block_seed)
         left = rows
         while len(left):
             # Whole blocks, so that a small set is the beginning of a larger one.
-            noise = torch.randn(BLOCK_SIZE, theta.shape[1], generator=generator)
+            noise = torch.randn(
+                (BLOCK_SIZE, theta.shape[1]), dtype=theta.dtype, generator=generator
+            )
             drawn = theta[left] + std * noise[left - rows[0]]
             inside = within_support(prior, drawn)
             noisy[left[inside]] = drawn[inside]

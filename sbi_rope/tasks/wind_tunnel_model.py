@@ -8,6 +8,11 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
+from sbi_rope._validation import (
+    check_not_negative,
+    check_positive,
+    check_unit_interval,
+)
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.base import check_theta
 
@@ -102,6 +107,13 @@ class WindTunnelSimulator:
     max_pressure: float = MAX_PRESSURE
     inertia: float = INERTIA
     exhaust_offset: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("noise_std", "onset_jitter", "noise_correlation"):
+            check_not_negative(name, getattr(self, name))
+        check_unit_interval("noise_correlation", self.noise_correlation)
+        check_positive("max_pressure", self.max_pressure)
+        check_positive("inertia", self.inertia)
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, 1)``, to shape ``(n, 50)``."""

@@ -21,6 +21,7 @@ from sbi_rope.tasks.chambers import (
     read_images,
     read_names,
     read_table,
+    warn_if_incomplete,
 )
 
 DATASET = "lt_camera_v1"
@@ -203,8 +204,24 @@ def test_sizes_that_are_there_are_listed(tmp_path: Path) -> None:
 
 def test_a_download_needs_a_root() -> None:
     with pytest.raises(InvalidInputError, match=r"`root` with `download=True`"):
-        check_download(None, download=True)
-    check_download(None, download=False)
+        check_download(None, [Path("a/b.csv")], download=True)
+    check_download(None, [Path("a/b.csv")], download=False)
+    check_download(None, [], download=True)
+    check_download(Path("root"), [Path("a/b.csv")], download=True)
+
+
+def test_a_recording_of_another_length_earns_a_warning() -> None:
+    with pytest.warns(RoPEWarning, match="holds 20 impulses, .* has 5000"):
+        warn_if_incomplete(Path("a.csv"), 20, 5000, what="impulses")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_if_incomplete(Path("a.csv"), 5000, 5000, what="impulses")
+
+
+def test_rows_that_end_with_a_comma_are_not_shifted(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text("a,b\n1,2,\n3,4,\n")
+    assert read_columns(path, ["a", "b"]).tolist() == [[1.0, 2.0], [3.0, 4.0]]
 
 
 def test_a_download_puts_the_whole_data_set_in_its_place(

@@ -45,7 +45,7 @@ def test_a_task_is_described(name: str, capsys: pytest.CaptureFixture[str]) -> N
     out = capsys.readouterr().out
     assert "prior (50 draws)" in out
     assert "simulated x (50 draws)" in out
-    assert "real x (50 test observations)" in out
+    assert "well-specified x (50 test observations)" in out
     assert "prior_shift: " in out
 
 
@@ -122,3 +122,22 @@ def test_the_module_runs_as_a_command() -> None:
     assert done.returncode == 0, done.stderr
     assert "linear_gaussian" in done.stdout or "LinearGaussian" in done.stdout
     assert done.stderr == ""
+
+
+@pytest.mark.parametrize("name", ["light_tunnel", "wind_tunnel"])
+def test_a_stand_in_is_called_one(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([name, "-n", "20", "--stand-in", "--variant", "prior_shift"]) == 0
+    out = capsys.readouterr().out
+    assert "stand-in x (20 test observations)" in out
+    assert "stand_in=True" in out
+
+
+@pytest.mark.parametrize("plot", ["noformat", "file/x.png"])
+def test_a_picture_that_cannot_be_written_is_explained(
+    plot: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("")
+    assert main(["pendulum", "-n", "9", "--plot", str(tmp_path / plot)]) == 2
+    assert "Traceback" not in capsys.readouterr().err

@@ -1,5 +1,6 @@
 """Pairs that share no observation."""
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import get_args
 
 import pytest
@@ -125,6 +126,15 @@ def test_a_process_without_valid_pairs_does_not_run_for_ever() -> None:
     )
     with pytest.raises(SimulationError, match="0 of 3 pairs"):
         pairs.take(3, seed=0, part="test")
+
+
+def test_threads_get_the_set_of_one_thread() -> None:
+    expected, _ = drawn().take(2000, seed=0, part="test")
+    with ThreadPoolExecutor(4) as threads:
+        sets = threads.map(
+            lambda _: drawn().take(2000, seed=0, part="test")[0], range(8)
+        )
+    assert all(torch.equal(theta, expected) for theta in sets)
 
 
 # Recorded pairs ----------------------------------------------------------------------
