@@ -232,18 +232,22 @@ class Task(ABC):
             return self._simulated_process().take(n, seed=seed, part="simulation")
 
     def _simulated_process(self) -> DrawnPairs:
+        """Return the pairs to train on."""
         prior = self.get_prior()
         return DrawnPairs(
             draw_theta=lambda n: prior.sample((n,)),  # type: ignore[arg-type]
             observe=self.get_simulator(),
         )
 
+    def _well_specified_process(self, part: Part) -> DrawnPairs | RecordedPairs:
+        return self._simulated_process()
+
     def _labelled_set(self, n: int, *, seed: int, part: Part) -> tuple[Tensor, Tensor]:
         check_integer("n", n)
         _check_seed(seed)
         with torch.device("cpu"):
             if self.variant == "well_specified":
-                process = self._simulated_process()
+                process = self._well_specified_process(part)
             else:
                 process = self._real_process(part)
             return process.take(n, seed=seed, part=part, keep=self._keep(part))

@@ -1,6 +1,5 @@
 r"""The light tunnel: a coloured hexagon for the images of a camera."""
 
-import hashlib
 from functools import partial
 from pathlib import Path
 
@@ -32,7 +31,7 @@ from sbi_rope.tasks.light_tunnel_models import (
 )
 from sbi_rope.tasks.light_tunnel_network import ImageEmbedding
 from sbi_rope.tasks.settings import PaperSettings
-from sbi_rope.tasks.splits import DrawnPairs, Keep, Part, RecordedPairs
+from sbi_rope.tasks.splits import DrawnPairs, Keep, Part, RecordedPairs, generator_of
 from sbi_rope.tasks.variants import COMMON_VARIANTS
 
 __all__ = ["LightTunnel"]
@@ -274,9 +273,7 @@ class LightTunnel(Task):
             return self._oriented(as_brightness(levels, dequantise=False), part)
         for image, name in zip(levels, chosen, strict=True):
             # The same noise on an image whenever it is read.
-            key = f"dequantise: {folder.parent.name}/{name}"
-            digest = hashlib.sha256(key.encode()).digest()
-            noise = torch.Generator().manual_seed(int.from_bytes(digest[:4], "big"))
+            noise = generator_of(f"dequantise {folder.parent.name}/{name}")
             image.copy_(as_brightness(image, dequantise=True, generator=noise))
         return self._oriented(levels, part)
 

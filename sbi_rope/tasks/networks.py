@@ -12,21 +12,22 @@ __all__ = ["SeriesEmbedding", "fully_connected", "light_series_embedding"]
 
 CHANNELS = (1, 16, 64, 128, 128, 128, 128, 128)
 STRIDES = (1, 2, 1, 2, 1, 2, 1)
+POOLS = ((3, 1), (3, 1), (3, 1))
 HEAD = (512, 128, 32)
 
 
 class SeriesEmbedding(nn.Module):
     r"""One-dimensional convolutional network for a single time series.
 
-    Seven convolutions with kernel 3 and dilation 2, a mean over three neighbours
-    (stride 1) after the second, fourth and sixth, and four linear layers, all with
-    ReLU in between. A dummy pass finds the number of features between the two
-    halves, 2048 for a series of 200 steps.
+    Seven convolutions with kernel 3 and dilation 2, means over neighbours after the
+    second, fourth and sixth, and four linear layers, all with ReLU in between. A dummy
+    pass finds the number of features between the two halves, 2048 for a series of 200
+    steps.
 
     References:
         | Addressing Misspecification in Simulation-based Inference through
-          Data-driven Calibration (Wehenkel et al.), appendix on task C, algorithm
-          of the 1D CNN
+          Data-driven Calibration (Wehenkel et al.), appendices on tasks C and D,
+          algorithms of the 1D CNNs
         | https://arxiv.org/abs/2405.08719
 
     Args:
@@ -35,6 +36,8 @@ class SeriesEmbedding(nn.Module):
         padding: Zeros added at each end before every convolution. The paper's 1
             shortens the series at every layer and needs at least 73 steps; 2 keeps
             the length (up to the strides), for shorter series.
+        pools: Number of neighbours and stride of each of the three means.
+        decimation: Every how many steps one is taken, the others are not looked at.
 
     Raises:
         InvalidInputError: If the series is too short for the layers.
@@ -45,26 +48,35 @@ class SeriesEmbedding(nn.Module):
     """
 
     def __init__(
-        self, *, num_steps: int = 200, output_dim: int = 10, padding: int = 1
+        self,
+        *,
+        num_steps: int = 200,
+        output_dim: int = 10,
+        padding: int = 1,
+        pools: Sequence[tuple[int, int]] = POOLS,
+        decimation: int = 1,
     ) -> None:
         super().__init__()
         check_integer("num_steps", num_steps)
         check_integer("output_dim", output_dim)
         check_integer("padding", padding)
+        check_integer("decimation", decimation)
         self.num_steps = num_steps
-        self.features = _convolutions(padding)
+        self.decimation = decimation
+        self.features = _convolutions(padding, pools)
         self.num_features = self._count_features(padding)
         self.head = fully_connected(self.num_features, (*HEAD, output_dim))
 
     def forward(self, x: Tensor) -> Tensor:
         """Embed series of shape ``(n, num_steps)`` as ``(n, output_dim)``."""
         x = check_batch("x", x, (self.num_steps,), finite=False)
-        return self.head(self.features(x.unsqueeze(1)))
+        return self.head(self.features(x[:, :: self.decimation].unsqueeze(1)))
 
     def _count_features(self, padding: int) -> int:
         try:
             with torch.no_grad():
-                return self.features(torch.zeros(1, 1, self.num_steps)).shape[1]
+                series = torch.zeros(1, 1, self.num_steps)[..., :: self.decimation]
+                return self.features(series).shape[1]
         except RuntimeError as error:
             raise InvalidInputError(
                 f"Expected `num_steps` large enough for seven convolutions with "
@@ -121,8 +133,9 @@ def light_series_embedding(*, num_steps: int, output_dim: int) -> nn.Sequential:
     )
 
 
-def _convolutions(padding: int) -> nn.Sequential:
+def _convolutions(padding: int, pools: Sequence[tuple[int, int]]) -> nn.Sequential:
     layers: list[nn.Module] = []
+    means = iter(pools)
     for i, stride in enumerate(STRIDES):
         layers += [
             nn.Conv1d(
@@ -131,5 +144,6 @@ def _convolutions(padding: int) -> nn.Sequential:
             nn.ReLU(),
         ]
         if stride == 2:
-            layers.append(nn.AvgPool1d(3, stride=1))
+            size, step = next(means)
+            layers.append(nn.AvgPool1d(size, stride=step))
     return nn.Sequential(*layers, nn.Flatten())

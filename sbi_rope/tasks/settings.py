@@ -10,7 +10,8 @@ class PaperSettings:
     """What the paper trained a task's models with; ``None`` where it does not say.
 
     The estimator is a flow of one unconstrained monotonic autoregressive
-    transformation (sbi's ``"zuko_unaf"``), trained with Adam. RoPE couples as many
+    transformation (sbi's ``"zuko_unaf"``) or, in task D, of five affine ones
+    (``"maf"``), trained with Adam. RoPE couples as many
     simulations as there are test observations at ``gamma`` and ``tau``, RoPE* at
     ``tau_relaxed``; a fifth of every calibration set is held out.
 
@@ -22,7 +23,8 @@ class PaperSettings:
     Attributes:
         density_estimator: Name of the flow for sbi's ``posterior_nn``.
         conditioner: Widths of the hidden layers of the flow's conditioner.
-        integrand: Widths of the hidden layers of the monotonic transformation.
+        integrand: Widths of the hidden layers of the monotonic transformation; empty
+            for affine ones.
         learning_rate: Of NPE.
         batch_size: Of NPE.
         num_steps: Gradient steps of NPE; ``None`` is "until convergence".

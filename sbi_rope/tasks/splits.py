@@ -16,7 +16,15 @@ from torch import Tensor
 
 from sbi_rope.errors import InvalidInputError, SimulationError, warn_user
 
-__all__ = ["MAX_SEED", "DrawnPairs", "Keep", "Part", "RecordedPairs", "stream_of"]
+__all__ = [
+    "MAX_SEED",
+    "DrawnPairs",
+    "Keep",
+    "Part",
+    "RecordedPairs",
+    "generator_of",
+    "stream_of",
+]
 
 Part = Literal["calibration", "test", "simulation"]
 # The chance, in [0, 1], of parameters (n, d) to stay in a set; one number a row.
@@ -189,6 +197,12 @@ def stream_of(seed: int, use: Part | Literal["labels"]) -> int:
         "labels": 3 * MAX_SEED + seed,
     }[use]
     return (index * 0x9E3779B1 + 0x85EBCA6B) % 2**32
+
+
+def generator_of(key: str) -> torch.Generator:
+    """Return random numbers on the CPU that belong to a name, the same everywhere."""
+    digest = hashlib.sha256(key.encode()).digest()
+    return torch.Generator().manual_seed(int.from_bytes(digest[:4], "big"))
 
 
 def _shuffled(rows: list[int] | range, *, key: str) -> list[int]:
