@@ -40,7 +40,11 @@ NUM_SAMPLES = 500
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """What to run; the train function returns an sbi posterior of a task."""
+    """What to run; the train function returns an sbi posterior of a task.
+
+    With ``stored``, RoPE uses these simulations instead of the task's simulator. With
+    ``held_out``, NPE is also scored on simulations it has not seen: the row "SBI".
+    """
 
     task: Task
     train_npe: Callable[[Task, int], Any]
@@ -49,6 +53,8 @@ class Study:
     n_calibration: list[int]
     n_test: int
     out: Path
+    stored: Callable[[Task, int], tuple[Tensor, Tensor]] | None = None
+    held_out: Callable[[Task, int], tuple[Tensor, Tensor]] | None = None
 
     def run(self) -> list[dict[str, Any]]:
         """Run all seeds and sizes; rows are written as they are finished."""
@@ -63,15 +69,23 @@ class Study:
     def _run_seed(self, seed: int, results: "ResultsFile") -> None:
         task = self.task
         theta_o, x_o = task.get_test_set(self.n_test, seed=seed)
-        simulator = task.get_simulator()
+        if self.stored is None:
+            source = {"simulator": task.get_simulator()}
+        else:
+            source = {"simulations": self.stored(task, seed)}
         curves: dict[str, Any] = {}
 
-        def score(method: str, posterior: Any, start: float, n: int = 0) -> None:
+        def score(
+            method: str,
+            posterior: Any,
+            start: float,
+            n: int = 0,
+            pairs: tuple[Tensor, Tensor] = (theta_o, x_o),
+        ) -> None:
             print(f"  scoring {method} ...", flush=True)
             evaluation: Evaluation = evaluate(
                 posterior,
-                theta_o,
-                x_o,
+                *pairs,
                 theta_std=task.prior_std,
                 num_samples=NUM_SAMPLES,
                 seed=seed,
@@ -94,14 +108,17 @@ class Study:
         print("  training NPE on simulations ...", flush=True)
         npe = self.train_npe(task, seed)
         score("NPE", npe, start)
+        if self.held_out is not None:
+            start = time.perf_counter()
+            score("SBI", npe, start, pairs=self.held_out(task, seed))
 
         start = time.perf_counter()
-        ot_only = RoPE(npe, simulator=simulator, coupler=self.coupler)
+        ot_only = RoPE(npe, coupler=self.coupler, **source)
         score("OT-only", ot_only.build_posterior(x_o, seed=seed), start)
         for n in self.n_calibration:
             start = time.perf_counter()
             theta_cal, x_cal = task.get_calibration_set(n, seed=seed)
-            rope = RoPE(npe, simulator=simulator, coupler=self.coupler)
+            rope = RoPE(npe, coupler=self.coupler, **source)
             rope.append_calibration(theta_cal, x_cal)
             rope.train(seed=seed, show_progress_bars=False)
             score("tuning-only", rope.tuned_posterior(), start, n)
@@ -188,8 +205,8 @@ EXPLANATION = """
 LPP: mean log-probability of the true parameters, in standard deviations of the prior
 (higher is better). ACAUC: 0 is calibrated, above 0 is overconfident. ECE: expected
 coverage error. -inf: share of test observations with density zero. NPE and tuning-only
-are scored without sbi's leakage correction. With several seeds: mean, and standard
-deviation of the LPP over seeds (+-).
+are scored without sbi's leakage correction. SBI is NPE on simulations it has not seen.
+With several seeds: mean, and standard deviation of the LPP over seeds (+-).
 """
 
 
@@ -201,7 +218,7 @@ def print_table(rows: list[dict[str, Any]], *, explain: bool = True) -> None:
         f"{'method':<12}{'pairs':>6}{'LPP':>10}{'+-':>7}{'ACAUC':>9}{'ECE':>8}"
         f"{'-inf':>7}"
     )
-    order = ("prior", "NPE", "tuning-only", "OT-only", "RoPE")
+    order = ("prior", "SBI", "NPE", "tuning-only", "OT-only", "RoPE")
     keys = dict.fromkeys((row["method"], row["n_calibration"]) for row in rows)
     for method, n in sorted(keys, key=lambda key: (order.index(key[0]), key[1])):
         group = [r for r in rows if (r["method"], r["n_calibration"]) == (method, n)]

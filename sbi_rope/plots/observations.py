@@ -97,8 +97,12 @@ def _histograms(
         axes.set_xlabel(name)
         axes.set_yticks([])
     figure = panels[0].figure
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=2, frameon=False)
+    figure.legend(
+        *panels[0].get_legend_handles_labels(),
+        loc="outside upper center",
+        ncols=2,
+        frameon=False,
+    )
     return figure  # type: ignore[return-value]
 
 
@@ -111,8 +115,12 @@ def _series(x_o: Tensor, x_s: Tensor, labels: tuple[str, str]) -> "Figure":
     for axes in panels[-min(count, 3) :]:
         axes.set_xlabel("step")
     figure = panels[0].figure
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=2, frameon=False)
+    figure.legend(
+        *panels[0].get_legend_handles_labels(),
+        loc="outside upper center",
+        ncols=2,
+        frameon=False,
+    )
     return figure  # type: ignore[return-value]
 
 
