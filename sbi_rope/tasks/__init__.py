@@ -12,6 +12,7 @@ from sbi_rope._validation import check_choice
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.base import Task
 from sbi_rope.tasks.cs import CancerStroma
+from sbi_rope.tasks.hemodynamics.task import Hemodynamics
 from sbi_rope.tasks.light_tunnel import LightTunnel
 from sbi_rope.tasks.light_tunnel_sensors import LightTunnelSensors
 from sbi_rope.tasks.linear_gaussian import LinearGaussian
@@ -23,6 +24,7 @@ __all__ = ["TASKS", "Task", "get_task", "list_tasks"]
 
 TASKS: dict[str, type[Task]] = {
     "cs": CancerStroma,
+    "hemodynamics": Hemodynamics,
     "light_tunnel": LightTunnel,
     "light_tunnel_sensors": LightTunnelSensors,
     "linear_gaussian": LinearGaussian,

@@ -63,6 +63,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _describe(task, theta, x_s, real)
             if args.plot and real:
                 _draw(task, *real, path=args.plot, seed=args.seed)
+    except BrokenPipeError:
+        raise
     except (RoPEError, ImportError, OSError) as error:
         print(f"{parser.prog}: {error}", file=sys.stderr)
         return 2

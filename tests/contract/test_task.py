@@ -29,6 +29,10 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "light_tunnel": {"image_size": 64, "stand_in": True, "dequantise": True},
     "wind_tunnel": {"stand_in": True},
 }
+# Tasks with few stored observations, and how many these tests may take at once.
+LARGEST = {"hemodynamics": 60}
+# Tasks whose misspecification takes more than means and variances of x to see.
+SUBTLE = {"hemodynamics"}
 # Priors that reach everywhere.
 UNBOUNDED = {"linear_gaussian"}
 # Variants whose calibration set follows another law than the test set.
@@ -74,6 +78,10 @@ def root(request: pytest.FixtureRequest, name: str) -> Path | None:
 @pytest.fixture
 def labelled(name: str, variant: str | None, root: Path | None) -> Task:
     return make(name, variant=variant, root=root)
+
+
+def at_most(n: int, name: str) -> int:
+    return min(n, LARGEST.get(name, n))
 
 
 def rows_of(x: Tensor) -> list[bytes]:
@@ -336,9 +344,10 @@ def test_simulations_to_train_on_are_a_prefix_of_more_and_of_no_set(
     assert torch.equal(few[0], theta[:7])
     assert torch.equal(few[1], x[:7])
     if task.has_data:
-        assert same_rows(theta, task.get_calibration_set(100, seed=1)[0]) == 0
-        assert same_rows(theta, task.get_test_set(100, seed=1)[0]) == 0
-    assert same_rows(theta, task.get_simulations(150, seed=2)[0]) == 0
+        n = at_most(100, task.name)
+        assert same_rows(theta, task.get_calibration_set(n, seed=1)[0]) == 0
+        assert same_rows(theta, task.get_test_set(n, seed=1)[0]) == 0
+    assert same_rows(x, task.get_simulations(150, seed=2)[1]) == 0
 
 
 def test_sbi_builds_a_posterior_on_the_task(task: Task) -> None:
@@ -372,9 +381,10 @@ def test_sbi_builds_a_posterior_on_the_task(task: Task) -> None:
 @pytest.mark.parametrize("part", ["calibration", "test"])
 class TestOneSet:
     def test_has_the_shapes_asked_for(self, labelled: Task, part: str) -> None:
-        theta, x = draw(labelled, part, 130)
-        assert theta.shape == (130, labelled.theta_dim)
-        assert x.shape == (130, *labelled.x_shape)
+        n = at_most(130, labelled.name)
+        theta, x = draw(labelled, part, n)
+        assert theta.shape == (n, labelled.theta_dim)
+        assert x.shape == (n, *labelled.x_shape)
         assert theta.dtype == x.dtype == torch.float32
         assert torch.isfinite(x).all()
         assert within_support(labelled.get_prior(), theta).all()
@@ -396,11 +406,13 @@ class TestOneSet:
         assert not torch.equal(first[1], second[1])
 
     def test_has_no_observation_twice(self, labelled: Task, part: str) -> None:
-        _, x = draw(labelled, part, 250)
-        assert len(set(rows_of(x))) == 250
+        n = at_most(250, labelled.name)
+        _, x = draw(labelled, part, n)
+        assert len(set(rows_of(x))) == n
 
     def test_begins_with_the_smaller_set(self, labelled: Task, part: str) -> None:
-        small, large = draw(labelled, part, 7), draw(labelled, part, 130)
+        n = at_most(130, labelled.name)
+        small, large = draw(labelled, part, 7), draw(labelled, part, n)
         assert torch.equal(small[0], large[0][:7])
         assert torch.equal(small[1], large[1][:7])
 
@@ -451,10 +463,11 @@ class TestOneSet:
 def test_calibration_and_test_sets_share_no_observation(
     labelled: Task, seeds: tuple[int, int]
 ) -> None:
-    calibration = labelled.get_calibration_set(250, seed=seeds[0])
-    test = labelled.get_test_set(250, seed=seeds[1])
+    n = at_most(250, labelled.name)
+    calibration = labelled.get_calibration_set(n, seed=seeds[0])
+    test = labelled.get_test_set(n, seed=seeds[1])
     assert same_rows(calibration[1], test[1]) == 0
-    assert same_rows(calibration[0], test[0]) <= 0.01 * 250
+    assert same_rows(calibration[0], test[0]) <= 0.01 * n
 
 
 @pytest.mark.parametrize(("name", "variant"), KINDS)
@@ -464,8 +477,9 @@ def test_simulations_under_a_seed_share_no_parameter_with_its_sets(
 ) -> None:
     torch.manual_seed(seed)
     theta = labelled.get_prior().sample((1000,))
-    assert same_rows(theta, labelled.get_calibration_set(100, seed=seed)[0]) == 0
-    assert same_rows(theta, labelled.get_test_set(100, seed=seed)[0]) == 0
+    n = at_most(100, labelled.name)
+    assert same_rows(theta, labelled.get_calibration_set(n, seed=seed)[0]) == 0
+    assert same_rows(theta, labelled.get_test_set(n, seed=seed)[0]) == 0
 
 
 @pytest.mark.parametrize(("name", "variant"), KINDS)
@@ -480,13 +494,14 @@ def test_nothing_is_printed(labelled: Task, capfd: pytest.CaptureFixture[str]) -
 def test_calibration_and_test_sets_follow_one_law(
     labelled: Task, variant: str | None
 ) -> None:
-    calibration, test = labelled.get_calibration_set(250), labelled.get_test_set(1000)
+    calibration = labelled.get_calibration_set(at_most(250, labelled.name))
+    test = labelled.get_test_set(at_most(1000, labelled.name))
     same_theta = largest_z(calibration[0], test[0]) < 4.5
     same_x = largest_z(calibration[1], test[1]) < 4.5
     if variant not in ANOTHER_CALIBRATION_LAW:
         assert same_theta
         assert same_x
-    elif variant != "noisy_labels":
+    elif variant != "noisy_labels" and labelled.name not in LARGEST:
         assert not (same_theta and same_x)
 
 
@@ -494,14 +509,14 @@ def test_calibration_and_test_sets_follow_one_law(
 def test_real_law_is_the_simulated_law_only_where_the_task_says_so(
     labelled: Task, variant: str | None
 ) -> None:
-    theta, x_o = labelled.get_test_set(1000)
+    theta, x_o = labelled.get_test_set(at_most(1000, labelled.name))
     simulator = labelled.get_simulator()
     x_s = simulator(theta)
     assert largest_z(x_s, simulator(theta)) < 4.5
     if variant == "well_specified":
         assert labelled.has_data
         assert largest_z(x_s, x_o) < 4.5
-    else:
+    elif labelled.name not in SUBTLE:
         assert largest_z(x_s, x_o) > 6.0
 
 
@@ -511,7 +526,8 @@ class TestCommonVariants:
         self, name: str, root: Path | None
     ) -> None:
         task = make(name, variant="prior_shift", root=root)
-        for theta, _ in (task.get_calibration_set(100), task.get_test_set(100)):
+        n = at_most(100, name) // 3
+        for theta, _ in (task.get_calibration_set(n), task.get_test_set(n)):
             for parameter, (low, high) in task.shifted_region.items():
                 values = theta[:, task.parameter_names.index(parameter)]
                 assert (values >= low).all()
@@ -521,13 +537,16 @@ class TestCommonVariants:
         self, name: str, root: Path | None
     ) -> None:
         task = make(name, variant="biased_calibration", root=root)
+        n = at_most(200, name)
         calibration, test = (
             task.prior_quantiles(theta)[:, :3].std(dim=0)
-            for theta, _ in (task.get_calibration_set(200), task.get_test_set(200))
+            for theta, _ in (task.get_calibration_set(n), task.get_test_set(n))
         )
-        # Standard deviations of Beta(3, 3) and of the uniform law, and a margin.
-        assert (calibration < 0.189 + 0.035).all()
-        assert (test > 0.289 - 0.04).all()
+        # Standard deviations of Beta(3, 3) and of the uniform law, and a margin of
+        # three standard errors or more.
+        margin = 0.5 / n**0.5
+        assert (calibration < 0.189 + margin).all()
+        assert (test > 0.289 - margin).all()
 
     def test_noisy_labels_belong_to_the_observations_of_the_standard_task(
         self, name: str, root: Path | None
@@ -535,8 +554,9 @@ class TestCommonVariants:
         clean, noisy = (
             make(name, variant=variant, root=root) for variant in (None, "noisy_labels")
         )
-        theta, x = clean.get_calibration_set(200)
-        noisy_theta, same_x = noisy.get_calibration_set(200)
+        n = at_most(200, name)
+        theta, x = clean.get_calibration_set(n)
+        noisy_theta, same_x = noisy.get_calibration_set(n)
         assert torch.equal(x, same_x)
         assert all(
             torch.equal(a, b)
@@ -545,8 +565,8 @@ class TestCommonVariants:
         scaled = (noisy_theta - theta) / clean.prior_std
         assert (scaled != 0).all()
         # Less than .2 where the prior's support cuts the noise.
-        assert scaled.std(dim=0).max() < 0.2 * 1.15
-        assert scaled.std(dim=0).min() > 0.2 * 0.7
+        assert scaled.std(dim=0).max() < 0.2 * (1 + 2.2 / n**0.5)
+        assert scaled.std(dim=0).min() > 0.2 * (0.85 - 2.2 / n**0.5)
 
     def test_label_noise_is_as_large_as_asked(
         self, name: str, root: Path | None
@@ -555,13 +575,14 @@ class TestCommonVariants:
             make(name, variant="noisy_labels", label_noise=noise, root=root)
             for noise in (0.001, 0.002)
         )
-        truth, _ = make(name, root=root).get_calibration_set(200)
+        n = at_most(200, name)
+        truth, _ = make(name, root=root).get_calibration_set(n)
         ratio = [
-            (task.get_calibration_set(200)[0] - truth).std(dim=0) / task.prior_std
+            (task.get_calibration_set(n)[0] - truth).std(dim=0) / task.prior_std
             for task in (small, large)
         ]
         torch.testing.assert_close(
-            ratio[0], torch.full_like(ratio[0], 0.001), rtol=0.2, atol=0
+            ratio[0], torch.full_like(ratio[0], 0.001), rtol=2.8 / n**0.5, atol=0
         )
         torch.testing.assert_close(ratio[1], 2 * ratio[0], rtol=0.1, atol=0)
 

@@ -1,0 +1,1 @@
+"""Task D: stroke volume and ejection time from the pulse at the wrist."""

@@ -1,0 +1,68 @@
+"""Arrays in files that are whole or not there, with the same bytes every time."""
+
+import json
+import os
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+__all__ = ["read_arrays", "read_json", "write_arrays", "write_json"]
+
+# What numpy and zipfile raise for files that are no archives of arrays, or cut.
+BROKEN = (OSError, ValueError, KeyError, EOFError, AttributeError, zipfile.BadZipFile)
+FIXED_DATE = (1980, 1, 1, 0, 0, 0)  # equal arrays make equal files
+
+
+def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write arrays to an uncompressed npz file that is there once it is whole."""
+    temporary = _temporary(path)
+    try:
+        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
+            for name, array in arrays.items():
+                member = zipfile.ZipInfo(f"{name}.npy", FIXED_DATE)
+                with archive.open(member, "w", force_zip64=True) as file:
+                    np.lib.format.write_array(
+                        file, np.asarray(array, order="C"), allow_pickle=False
+                    )
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Read all arrays of an npz file, up to its last byte.
+
+    Raises:
+        ValueError: If the file is none, or is broken.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except BROKEN as error:  # AttributeError: a single array
+        raise ValueError(f"{type(error).__name__}: {error}") from error
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write settings to a file that is there once it is whole."""
+    temporary = _temporary(path)
+    try:
+        temporary.write_text(json.dumps(content, indent=1), encoding="utf-8")
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def read_json(path: Path) -> Any:
+    """Read settings.
+
+    Raises:
+        ValueError: If the file does not hold any.
+    """
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def _temporary(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{os.getpid()}.tmp")

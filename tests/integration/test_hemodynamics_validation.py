@@ -1,0 +1,207 @@
+"""Simulated blood flow against openBF, exact solutions and what is physiological."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sbi_rope.tasks.hemodynamics import validation
+from sbi_rope.tasks.hemodynamics.network import build_network
+from sbi_rope.tasks.hemodynamics.openbf import openbf_error
+from sbi_rope.tasks.hemodynamics.subject import Beat, Physics
+from sbi_rope.tasks.hemodynamics.validation import (
+    BASELINE,
+    linear_error,
+    mass_error,
+    refinement_error,
+    reflection,
+    validation_table,
+    velocity_error,
+)
+from sbi_rope.tasks.hemodynamics.waveforms import (
+    SITES,
+    simulate_beat,
+    simulate_sites,
+)
+from tests.conftest import SHARED_DATA
+
+pytest.importorskip("numba")
+
+
+@pytest.fixture(scope="module")
+def openbf_folder() -> Path:
+    folder = SHARED_DATA / "hemodynamics" / "reference_openbf"
+    if not folder.is_dir():
+        pytest.skip("the stored waves of openBF are not on this machine")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def beat() -> Beat:
+    return simulate_beat(BASELINE)
+
+
+# Other solutions ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("case", "goal"), [("cca", 1.0), ("ibif", 1.5), ("adan56", 3)])
+def test_pressures_agree_with_those_of_openbf(
+    openbf_folder: Path, case: str, goal: float
+) -> None:
+    assert openbf_error(openbf_folder, case) < goal
+
+
+def test_finer_cells_come_closer_to_openbf(openbf_folder: Path) -> None:
+    coarse = openbf_error(openbf_folder, "adan56", cell_length=0.02)
+    fine = openbf_error(openbf_folder, "adan56", cell_length=0.005)
+    assert fine < 0.75 * coarse
+
+
+@pytest.mark.parametrize("viscoelastic", [False, True])
+def test_small_waves_are_those_of_the_linear_equations(viscoelastic: bool) -> None:
+    assert linear_error(viscoelastic=viscoelastic) < 3.0
+
+
+@pytest.mark.parametrize("viscoelastic", [False, True])
+def test_small_waves_come_closer_to_the_linear_ones_with_finer_cells(
+    viscoelastic: bool,
+) -> None:
+    errors = [
+        linear_error(viscoelastic=viscoelastic, cell_length=length)
+        for length in (0.02, 0.005)
+    ]
+    assert errors[1] < 0.6 * errors[0]
+
+
+def test_a_bifurcation_reflects_what_its_admittances_say() -> None:
+    measured, exact = reflection()
+    assert exact > 0.25
+    assert measured == pytest.approx(exact, abs=0.01)
+
+
+# The solution itself -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("viscoelastic", [False, True])
+def test_no_blood_is_lost(viscoelastic: bool) -> None:
+    physics = Physics(viscoelastic=viscoelastic)
+    network = build_network(BASELINE, physics)
+    flow = simulate_sites(network, BASELINE, physics, list(SITES.values()))
+    assert mass_error(flow) < 1e-10
+
+
+def test_as_much_leaves_as_enters_once_beats_repeat() -> None:
+    assert simulate_beat(BASELINE, Physics(num_cycles=20)).mass_error < 1e-4
+
+
+def test_beats_repeat(beat: Beat) -> None:
+    assert beat.period_error < 0.3
+
+
+def test_coarse_and_fine_cells_give_the_same_wave() -> None:
+    assert refinement_error() < 1.0
+
+
+def test_shorter_steps_give_the_same_wave(beat: Beat) -> None:
+    shorter = simulate_beat(BASELINE, Physics(courant=0.3))
+    difference = shorter.pressure["radial"] - beat.pressure["radial"]
+    assert np.abs(difference).max() < 0.3
+
+
+# Physiology --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("velocity", [5.5, 6.1, 8.0, 11.0])
+def test_waves_in_elastic_arteries_travel_at_the_velocity_asked_for(
+    velocity: float,
+) -> None:
+    assert velocity_error(velocity, viscoelastic=False) < 8.0
+
+
+@pytest.mark.parametrize(
+    "velocity",
+    [
+        pytest.param(
+            5.5,
+            marks=pytest.mark.xfail(
+                reason="Viscous walls spread the wave on its way to the leg, so that "
+                "its foot is 9 % early in arteries this soft."
+            ),
+        ),
+        6.1,
+        8.0,
+        11.0,
+    ],
+)
+def test_waves_in_viscoelastic_arteries_travel_at_the_velocity_asked_for(
+    velocity: float,
+) -> None:
+    assert velocity_error(velocity, viscoelastic=True) < 8.0
+
+
+def test_the_mean_pressure_is_near_its_target(beat: Beat) -> None:
+    for target in (75.0, 89.0, 110.0):
+        wave = simulate_beat(replace(BASELINE, mean_pressure=target)).pressure["aortic"]
+        assert wave.mean() == pytest.approx(target, abs=3.0)
+
+
+@pytest.mark.parametrize(
+    ("site", "systolic", "diastolic"),
+    [("aortic", 102, 76), ("brachial", 110, 75), ("radial", 118, 73)],
+)
+def test_a_man_of_25_has_the_pressures_of_one(
+    beat: Beat, site: str, systolic: float, diastolic: float
+) -> None:
+    wave = beat.pressure[site]
+    assert wave.max() == pytest.approx(systolic, abs=5.0)
+    assert wave.min() == pytest.approx(diastolic, abs=4.0)
+
+
+def test_the_pulse_grows_on_its_way_to_the_wrist(beat: Beat) -> None:
+    pulse = {site: np.ptp(wave) for site, wave in beat.pressure.items()}
+    assert pulse["aortic"] < pulse["brachial"] < pulse["radial"]
+    assert 1.5 < pulse["radial"] / pulse["aortic"] < 1.9
+
+
+def test_closure_of_the_valve_leaves_a_notch_in_the_aortic_pressure(
+    beat: Beat,
+) -> None:
+    wave = beat.pressure["aortic"]
+    time = np.arange(256) / 256 * beat.period * 1000
+    near = (time > 0.9 * BASELINE.ejection_time) & (
+        time < 1.25 * BASELINE.ejection_time
+    )
+    notch = np.flatnonzero(near)[wave[near].argmin()]
+    after = wave[notch : notch + 40].max()
+    assert time[notch] == pytest.approx(BASELINE.ejection_time, abs=30.0)
+    assert after > wave[notch] + 0.5
+
+
+def test_stiffer_arteries_have_a_larger_pulse(beat: Beat) -> None:
+    stiff = simulate_beat(replace(BASELINE, pulse_wave_velocity=10.0))
+    assert np.ptp(stiff.pressure["aortic"]) > 1.3 * np.ptp(beat.pressure["aortic"])
+
+
+# The table ---------------------------------------------------------------------------
+
+
+def test_without_the_waves_of_openbf_these_rows_are_not_run(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(validation, "_exact_rows", lambda: ())
+    monkeypatch.setattr(validation, "_baseline_rows", lambda: ())
+    rows = validation_table(None)
+    assert [row.measured for row in rows] == [None] * 3
+    assert [row.passed for row in rows] == [None] * 3
+    assert "adan56" in rows[2].name
+
+
+@pytest.mark.slow
+def test_all_rows_pass_but_the_velocity_in_the_softest_viscous_arteries(
+    openbf_folder: Path,
+) -> None:
+    rows = validation_table(openbf_folder)
+    failed = {row.name for row in rows if not row.passed}
+    assert failed <= {"wave velocity 5.5 m/s, viscoelastic"}
+    assert len(rows) == 23

@@ -1,0 +1,228 @@
+"""The command that generates, validates and describes pressure waves."""
+
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sbi_rope.errors import SimulationError
+from sbi_rope.tasks.hemodynamics import waveforms
+from sbi_rope.tasks.hemodynamics.__main__ import main
+from sbi_rope.tasks.hemodynamics.dataset import load
+from sbi_rope.tasks.hemodynamics.population import Population
+from sbi_rope.tasks.hemodynamics.subject import Beat, Physics, Subject
+
+PNG = b"\x89PNG"
+PHASE = 2 * np.pi * np.arange(256) / 256
+
+
+def hum(subject: Subject, physics: Physics) -> Beat:
+    """Stand in for the solver."""
+    if subject.age > 70.0:
+        raise SimulationError(f"Unstable at {subject.age:g} years.")
+    wave = subject.mean_pressure + 20.0 * np.cos(PHASE)
+    return Beat(
+        period=subject.period,
+        pressure=dict.fromkeys(("radial", "brachial", "aortic"), wave),
+        period_error=0.01,
+        mass_error=1e-5,
+        courant=0.4 if subject.age < 30.0 else physics.courant,
+    )
+
+
+@pytest.fixture(autouse=True)
+def _no_solver(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(waveforms, "simulate_beat", hum)
+
+
+def _generate(file: Path, *options: str) -> int:
+    process = () if "--process" in options else ("--process", "real")
+    return main(["generate", "--n", "50", *process, *options, "--out", str(file)])
+
+
+def test_generate_writes_the_file_and_counts_the_rejected(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert _generate(tmp_path / "x.npz", "--seed", "3") == 0
+    captured = capsys.readouterr()
+    beats = load(tmp_path / "x.npz", process="real", population=Population())
+    assert (len(beats), beats.settings["seed"]) == (50, 3)
+    rejected = sum(beats.rejected.values())
+    assert rejected > 0
+    assert f"50 people, {rejected} rejected" in captured.out
+    assert f"{rejected}: Unstable at # years" in captured.out
+    assert "50/50" in captured.err  # of the progress bar
+
+
+def test_options_of_generate_reach_population_and_physics(tmp_path: Path) -> None:
+    path = tmp_path / "folder" / "x.npz"
+    options = "--prior independent --height-sd 0.05 --segment-sd 0.2 --fixed-aorta"
+    physics = "--cell-length 0.02 --num-cycles 8 --elastic"
+    assert _generate(path, *options.split(), *physics.split()) == 0
+    load(
+        path,
+        population=Population(
+            prior="independent", height_sd=0.05, segment_sd=0.2, proximal_aorta=False
+        ),
+        physics=Physics(cell_length=0.02, num_cycles=8, viscoelastic=False),
+    )
+
+
+def test_an_interrupt_says_how_to_go_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(subject: Subject, physics: Physics) -> Beat:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(waveforms, "simulate_beat", stop)
+    assert _generate(tmp_path / "x.npz") == 130
+    assert "The same command goes on" in capsys.readouterr().err
+    monkeypatch.setattr(waveforms, "simulate_beat", hum)
+    assert _generate(tmp_path / "x.npz") == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        (["--n", "0"], "`n`"),
+        (["--height-sd", "-1"], "height_sd"),
+        (["--cell-length", "0"], "cell_length"),
+        (["--seed", "-1"], "seed"),
+        (["--jobs", "0"], "jobs"),
+    ],
+)
+def test_errors_of_generate_are_one_line(
+    options: list[str],
+    word: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert _generate(tmp_path / "x.npz", *options) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert word in lines[0]
+    assert not list(tmp_path.iterdir())
+
+
+def test_generate_keeps_a_file_that_is_there(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "x.npz"
+    file.write_text("mine")
+    assert _generate(file) == 2
+    assert "Expected no file" in capsys.readouterr().err
+    assert file.read_text() == "mine"
+
+
+def test_a_place_that_cannot_be_written_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("")
+    assert _generate(tmp_path / "file" / "x.npz") == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_info_summarises_a_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "x.npz"
+    _generate(file)
+    capsys.readouterr()
+    assert main(["info", str(file)]) == 0
+    out = capsys.readouterr().out
+    rows = {line[:32].strip(): line[32:].split() for line in out.splitlines()}
+    beats = load(file)
+    systolic = beats.beat.amax(dim=1)
+    assert float(rows["systolic pressure [mmHg]"][0]) == pytest.approx(
+        float(systolic.mean()), rel=1e-3
+    )
+    assert float(rows["pulse pressure [mmHg]"][0]) == pytest.approx(40.0, abs=0.1)
+    assert "process: real" in out
+    young = int((beats.nuisance[:, 0] < 30.0).sum())
+    assert f"smaller time step: {young}\n" in out
+
+
+def test_info_about_no_data_set_is_an_error_of_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["info", str(tmp_path / "none.npz")]) == 2
+    assert "No file" in capsys.readouterr().err
+    (tmp_path / "text.npz").write_text("hello")
+    assert main(["info", str(tmp_path / "text.npz")]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def _table(passed: bool | None) -> Any:
+    measured: Any = SimpleNamespace(name="mass", measured=2e-5, goal="< 1e-4")
+    open_row: Any = SimpleNamespace(name="cca", measured=None, goal="< 1")
+    measured.unit, measured.passed = "1", True
+    open_row.unit, open_row.passed = "%", passed
+    rows = [measured, open_row]
+    return lambda reference: rows
+
+
+@pytest.mark.parametrize(("passed", "status"), [(True, 0), (None, 0), (False, 1)])
+def test_validate_prints_the_table_and_tells_whether_all_is_well(
+    passed: bool | None,
+    status: int,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    validation = pytest.importorskip("sbi_rope.tasks.hemodynamics.validation")
+    monkeypatch.setattr(validation, "validation_table", _table(passed))
+    assert main(["validate"]) == status
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1].split() == ["mass", "2e-05", "<", "1e-4", "1", "yes"]
+    assert lines[2].split()[:3] == ["cca", "not", "run"]
+
+
+def test_validate_draws_beats_of_both_processes(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pytest.importorskip("matplotlib")
+    validation = pytest.importorskip("sbi_rope.tasks.hemodynamics.validation")
+    monkeypatch.setattr(validation, "validation_table", _table(passed=True))
+    monkeypatch.setattr(Population, "draw", _anyone(Population.draw))
+    picture = tmp_path / "folder" / "waves.png"
+    assert main(["validate", "--plot", str(picture)]) == 0
+    assert picture.read_bytes().startswith(PNG)
+    assert main(["validate", "--plot", str(tmp_path / "waves.what")]) == 2
+    assert "Cannot write" in capsys.readouterr().err
+
+
+def _anyone(draw: Any) -> Any:
+    """Return a draw of people whom the stand-in accepts."""
+
+    def young(self: Population, process: Any, seed: int, index: int) -> Subject:
+        subjects = (draw(self, process, seed, index + 1000 * i) for i in range(100))
+        return next(subject for subject in subjects if subject.age <= 70.0)
+
+    return young
+
+
+def test_generate_without_numba_says_how_to_install_it(tmp_path: Path) -> None:
+    code = f"""
+        import sys
+        sys.modules["numba"] = None
+        from sbi_rope.tasks.hemodynamics.__main__ import main
+        file = {str(tmp_path / "x.npz")!r}
+        sys.exit(main(["generate", "--n", "2", "--process", "real", "--out", file]))
+    """
+    result = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 2
+    assert result.stderr.splitlines()[-1].endswith(
+        'needs numba. Install it with `pip install "sbi-rope[hemodynamics]"`.'
+    )
+    assert not (tmp_path / "x.npz").exists()

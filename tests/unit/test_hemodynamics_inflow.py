@@ -1,0 +1,99 @@
+"""Flow out of the heart."""
+
+import numpy as np
+import pytest
+
+from sbi_rope.errors import InvalidInputError
+from sbi_rope.tasks.hemodynamics import inflow
+from sbi_rope.tasks.hemodynamics.inflow import aortic_inflow
+from sbi_rope.tasks.hemodynamics.subject import NUM_SEGMENTS, Subject
+from tests.conftest import SHARED_DATA
+
+
+def _subject(**changes: float) -> Subject:
+    person = {
+        "age": 25.0,
+        "heart_rate": 75.0,
+        "stroke_volume": 66.0,
+        "ejection_time": 290.0,
+        "peak_flow_time": 70.0,
+        "regurgitant_volume": 0.8,
+        "mean_pressure": 90.0,
+        "diastolic_pressure": 75.0,
+        "outflow_pressure": 33.0,
+        "pulse_wave_velocity": 6.0,
+        "diameter_factor": 1.0,
+        "compliance_factor": 1.0,
+    }
+    return Subject(**(person | changes), length_factors=(1.0,) * NUM_SEGMENTS)
+
+
+SUBJECTS = [
+    _subject(),
+    _subject(heart_rate=48.0, stroke_volume=95.0, ejection_time=345.0),
+    _subject(heart_rate=120.0, stroke_volume=25.0, ejection_time=220.0),
+    _subject(peak_flow_time=110.0, regurgitant_volume=2.5),
+    _subject(regurgitant_volume=0.0),
+]
+
+
+@pytest.mark.parametrize("subject", SUBJECTS)
+def test_a_beat_ejects_the_stroke_volume(subject: Subject) -> None:
+    flow = aortic_inflow(subject, 4000)
+    assert flow.mean() * subject.period == pytest.approx(
+        subject.stroke_volume, rel=1e-5
+    )
+
+
+@pytest.mark.parametrize("subject", SUBJECTS)
+def test_the_regurgitant_volume_flows_back(subject: Subject) -> None:
+    flow = aortic_inflow(subject, 4000)
+    returned = -flow.clip(max=0.0).mean() * subject.period
+    assert returned == pytest.approx(subject.regurgitant_volume, rel=1e-3, abs=1e-12)
+
+
+@pytest.mark.parametrize("subject", SUBJECTS)
+def test_flow_peaks_turns_and_ends_when_it_should(subject: Subject) -> None:
+    flow = aortic_inflow(subject, 20_000)
+    time = 1000 * subject.period * np.arange(20_000) / 20_000
+    step = time[1]
+    assert time[flow.argmax()] == pytest.approx(subject.peak_flow_time, abs=2 * step)
+    ejected = time[flow > 0]
+    assert ejected[0] == pytest.approx(0.0, abs=2 * step)
+    assert ejected[-1] == pytest.approx(subject.ejection_time, abs=2 * step)
+    assert len(ejected) * step == pytest.approx(subject.ejection_time, abs=2 * step)
+    end = 309 / 282 * subject.ejection_time
+    assert (flow[(time > subject.ejection_time) & (time < end)] <= 0).all()
+    assert (flow[time >= end] == 0).all()
+
+
+def test_finer_sampling_of_the_flow_passes_through_the_coarser_one() -> None:
+    subject = _subject()
+    np.testing.assert_allclose(
+        aortic_inflow(subject, 3000)[::6], aortic_inflow(subject, 500), rtol=1e-9
+    )
+    assert aortic_inflow(subject, 1).tolist() == [0.0]
+
+
+def test_reverse_flow_is_shortened_to_fit_the_beat() -> None:
+    subject = _subject(heart_rate=120.0, ejection_time=480.0)
+    flow = aortic_inflow(subject, 8000)
+    assert flow.mean() * subject.period == pytest.approx(66.0, rel=1e-5)
+    assert (flow[: int(0.96 * 8000)] >= 0).all()
+    assert (flow[int(0.961 * 8000) :] < 0).all()
+
+
+def test_inflow_needs_a_positive_number_of_samples() -> None:
+    with pytest.raises(InvalidInputError, match="num_samples"):
+        aortic_inflow(_subject(), 0)
+
+
+def test_the_table_reproduces_the_published_waveform() -> None:
+    path = SHARED_DATA / "hemodynamics" / "inflow_template_mynard2015.csv"
+    if not path.is_file():
+        pytest.skip("the published waveform is not on this machine")
+    time, published = np.loadtxt(path, delimiter=",", skiprows=2, unpack=True)
+    ours = inflow._template().spline(time)
+    np.testing.assert_allclose(ours, published, rtol=0, atol=0.002 * published.max())
+    forward = published.clip(min=0.0).sum()
+    assert ours.clip(min=0.0).sum() == pytest.approx(forward, rel=1e-4)

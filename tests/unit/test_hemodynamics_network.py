@@ -1,0 +1,336 @@
+"""The arteries of a person, and small waves in them."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sbi_rope.errors import DataNotFoundError, InvalidInputError, SimulationError
+from sbi_rope.tasks.hemodynamics import arteries
+from sbi_rope.tasks.hemodynamics.arteries import MMHG
+from sbi_rope.tasks.hemodynamics.grid import build_grid
+from sbi_rope.tasks.hemodynamics.linear import linear_pressure
+from sbi_rope.tasks.hemodynamics.network import (
+    Network,
+    Outlets,
+    build_network,
+    carotid_femoral_velocity,
+)
+from sbi_rope.tasks.hemodynamics.openbf import read_case
+from sbi_rope.tasks.hemodynamics.subject import NUM_SEGMENTS, Physics
+from sbi_rope.tasks.hemodynamics.validation import BASELINE
+from tests.conftest import SHARED_DATA
+
+OPENBF_TEXT = """project_name: tube
+blood:
+  rho: 1050.0
+  mu: 4.0e-3
+network:
+  - label: tube
+    sn: 1
+    tn: 2
+    L: 0.1
+    E: 500.0e3
+    R0: 0.01
+    h0: 1e-3
+    R1: 1e8
+    R2: 1e9
+    Cc: 1e-10
+"""
+
+
+def tube(radius: float = 0.01, resistance: float = 1e8) -> Network:
+    """Return a cylinder of 1 m that ends in a resistance."""
+    return Network(
+        inlet_node=np.array([0]),
+        outlet_node=np.array([1]),
+        length=np.array([1.0]),
+        inlet_radius=np.array([radius]),
+        outlet_radius=np.array([radius]),
+        stiffness=np.array([[0.0], [0.0], [6e4]]),
+        wall_viscosity=np.zeros((2, 1)),
+        reference_pressure=np.array([1e4]),
+        friction=np.zeros(1),
+        density=1060.0,
+        source_node=0,
+        outlets=Outlets(
+            segment=np.array([0]),
+            proximal_resistance=np.array([resistance]),
+            distal_resistance=np.array([1e-3]),
+            compliance=np.array([1e-10]),
+            pressure=1e4,
+        ),
+    )
+
+
+def mean_radius(network: Network) -> np.ndarray:
+    return (network.inlet_radius + network.outlet_radius) / 2
+
+
+# The tables --------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(not SHARED_DATA.is_dir(), reason="the published table is not here")
+def test_the_geometry_is_the_published_one() -> None:
+    path = SHARED_DATA / "hemodynamics" / "pwdb_116_arteries.csv"
+    lines = path.read_text().splitlines()
+    lines = [line for line in lines if not line.startswith("#")][1:]
+    expected = np.array([[float(x) for x in line.split(",")[1:6]] for line in lines])
+    table = np.array([segment[1:] for segment in arteries.SEGMENTS], dtype=float)
+    np.testing.assert_allclose(table, expected * [1, 1, 1e3, 1e3, 1e3])
+
+
+def test_all_segments_hang_together() -> None:
+    reached = {arteries.SEGMENTS[0][1]}
+    for _ in range(NUM_SEGMENTS):
+        for segment in arteries.SEGMENTS:
+            if reached & set(segment[1:3]):
+                reached |= set(segment[1:3])
+    assert reached == set(range(1, 110))
+
+
+def test_every_blind_end_has_a_vascular_bed_and_nothing_else_has() -> None:
+    ends = [node for segment in arteries.SEGMENTS for node in segment[1:3]]
+    blind = {
+        i
+        for i, segment in enumerate(arteries.SEGMENTS, start=1)
+        if ends.count(segment[2]) == 1
+    }
+    in_beds = [segment for bed in arteries.BEDS for segment in bed[0]]
+    assert sorted(in_beds) == sorted(blind)
+
+
+# Stiffness ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("velocity", [4.0, 6.1, 11.0])
+@pytest.mark.parametrize("diameter", [0.8, 1.2])
+def test_the_walls_give_the_wave_velocity_asked_for(
+    velocity: float, diameter: float
+) -> None:
+    factors = tuple(1 + 0.2 * np.sin(np.arange(NUM_SEGMENTS)))
+    subject = replace(
+        BASELINE,
+        pulse_wave_velocity=velocity,
+        diameter_factor=diameter,
+        length_factors=factors,
+    )
+    network = build_network(subject, Physics())
+    measured = carotid_femoral_velocity(
+        network.length,
+        network.inlet_radius,
+        network.outlet_radius,
+        network.stiffness[2, 0],
+    )
+    assert measured == pytest.approx(velocity, rel=1e-6)
+
+
+def test_in_equal_tubes_the_wave_velocity_is_that_of_each() -> None:
+    radius = np.full(NUM_SEGMENTS, 0.004)
+    stiffness = 0.004 * (3e5 * np.exp(-1350 * 0.004) + 4e4)
+    speed = np.sqrt(2 / 3 * stiffness / (1060 * 0.004))
+    length = np.linspace(0.1, 0.2, NUM_SEGMENTS)
+    measured = carotid_femoral_velocity(length, radius, radius, 4e4)
+    assert measured == pytest.approx(speed, rel=1e-12)
+
+
+def test_the_ways_end_in_the_middle_of_the_carotid_and_of_the_femoral_artery() -> None:
+    radius = np.full((2, NUM_SEGMENTS), 0.004)
+    radius[:, 15 - 1] = 0.003, 0.005  # 0.0035 in the middle of its first half
+    length = np.full(NUM_SEGMENTS, 0.1)
+
+    def speed(radius: float) -> float:
+        return float(np.sqrt(2 / 3 * (3e5 * np.exp(-1350 * radius) + 4e4) / 1060))
+
+    # Two segments and a half to the carotid, twelve and a half to the femoral artery.
+    carotid = 0.2 / speed(0.004) + 0.05 / speed(0.0035)
+    expected = (1.25 - 0.25) / (1.25 / speed(0.004) - carotid)
+    measured = carotid_femoral_velocity(length, *radius, 4e4)
+    assert measured == pytest.approx(expected, rel=1e-12)
+
+
+def test_a_carotid_longer_than_the_way_to_the_leg_is_refused() -> None:
+    factors = [1.0] * NUM_SEGMENTS
+    factors[15 - 1] = 20.0
+    subject = replace(BASELINE, length_factors=tuple(factors))
+    with pytest.raises(SimulationError, match="`length_factors`"):
+        build_network(subject, Physics())
+
+
+def test_a_wave_velocity_follows_from_the_tube_law() -> None:
+    network = build_network(BASELINE, Physics())
+    radius = np.array([0.01, 0.012])
+    # c^2 = A / rho dp/dA = sqrt(A) (beta / A_d) / (2 rho)
+    slope = network.tube_law(0, radius)
+    expected = np.sqrt(np.sqrt(np.pi) * radius * slope / (2 * network.density))
+    np.testing.assert_allclose(network.wave_speed(0, radius), expected)
+
+
+def test_only_walls_of_segments_longer_than_11_mm_are_viscous() -> None:
+    network = build_network(BASELINE, Physics())
+    long = np.array([segment[3] > 11.0 for segment in arteries.SEGMENTS])
+    np.testing.assert_array_equal(network.wall_viscosity[0] > 0, long)
+    assert float(network.viscosity(21, np.array(0.0015))) == pytest.approx(
+        0.6 + 1.5e-3 / 0.003
+    )
+
+
+def test_walls_can_be_elastic() -> None:
+    network = build_network(BASELINE, Physics(viscoelastic=False))
+    assert not network.wall_viscosity.any()
+
+
+# Geometry ----------------------------------------------------------------------------
+
+
+def test_short_segments_are_stretched_and_no_others() -> None:
+    factors = tuple(np.linspace(0.5, 1.5, NUM_SEGMENTS))
+    subject = replace(BASELINE, length_factors=factors)
+    network = build_network(subject, Physics(min_segment_length=0.02))
+    table = 1e-3 * np.array([segment[3] for segment in arteries.SEGMENTS])
+    np.testing.assert_allclose(network.length, np.maximum(table * factors, 0.02))
+
+
+def test_the_diameter_factor_is_that_of_large_arteries() -> None:
+    wide = build_network(replace(BASELINE, diameter_factor=1.1), Physics())
+    usual = build_network(BASELINE, Physics())
+    ratio = wide.outlet_radius / usual.outlet_radius
+    np.testing.assert_allclose(ratio[mean_radius(usual) > 4.25e-3], 1.1)
+    np.testing.assert_allclose(ratio[mean_radius(usual) < 4.23e-3], 1.0)
+
+
+def test_branches_of_large_arteries_begin_as_wide_as_these() -> None:
+    wide = build_network(replace(BASELINE, diameter_factor=1.1), Physics())
+    usual = build_network(BASELINE, Physics())
+    ratio = wide.inlet_radius / usual.inlet_radius
+    left_external_iliac, left_femoral = 44 - 1, 46 - 1
+    assert ratio[left_external_iliac] == pytest.approx(1.1)
+    assert ratio[left_femoral] == 1.0
+
+
+def test_cells_are_about_as_long_as_asked_for() -> None:
+    network = build_network(BASELINE, Physics())
+    grid = build_grid(network, 0.01)
+    np.testing.assert_allclose(grid.num_cells * grid.cell_length, network.length)
+    assert grid.cell_length.max() < 0.015
+    assert grid.cell_length.min() > 0.0066
+
+
+# Vascular beds -----------------------------------------------------------------------
+
+
+def test_all_outlets_together_have_the_resistance_of_the_target_pressure() -> None:
+    network = build_network(BASELINE, Physics())
+    outlets = network.outlets
+    total = outlets.proximal_resistance + outlets.distal_resistance
+    flow = BASELINE.stroke_volume * 1e-6 / BASELINE.period
+    pressure = outlets.pressure + flow / (1 / total).sum()
+    assert pressure / MMHG == pytest.approx(BASELINE.mean_pressure)
+
+
+def test_compliances_add_up_to_those_of_the_beds() -> None:
+    subject = replace(BASELINE, compliance_factor=0.7)
+    outlets = build_network(subject, Physics()).outlets
+    expected = 0.7 * sum(bed[2] for bed in arteries.BEDS)
+    assert outlets.compliance.sum() / 1e-6 * MMHG == pytest.approx(expected)
+
+
+def test_most_outlets_reflect_nothing_at_once() -> None:
+    network = build_network(BASELINE, Physics())
+    segment, radius = network.outlets.segment, network.outlet_radius
+    impedance = [
+        1060 * network.wave_speed(k, radius[k]) / (np.pi * radius[k] ** 2)
+        for k in segment
+    ]
+    matched = np.isclose(network.outlets.proximal_resistance, impedance)
+    assert set(segment[~matched] + 1) <= {26}
+
+
+def test_a_strong_heart_leaves_every_bed_a_resistance() -> None:
+    subject = replace(BASELINE, stroke_volume=110.0, pulse_wave_velocity=9.0)
+    outlets = build_network(subject, Physics()).outlets
+    assert (outlets.distal_resistance > 0).all()
+
+
+# Small waves -------------------------------------------------------------------------
+
+
+def test_a_matched_tube_only_delays_a_wave() -> None:
+    matched = tube()
+    speed = float(matched.wave_speed(0, np.array(0.01)))
+    impedance = 1060 * speed / (np.pi * 0.01**2)
+    matched = tube(resistance=impedance)
+    period = 1.0
+    time = np.arange(1000) / 1000
+    inflow = 1e-6 * np.sin(2 * np.pi * time / period)
+    wave = linear_pressure(
+        *(matched, inflow, period),
+        pressure=1e4,
+        sites=[(0, 0.0), (0, 0.5)],
+        num_harmonics=20,
+    )
+    delayed = np.sin(2 * np.pi * (time - np.array([[0.0], [0.5 / speed]])))
+    np.testing.assert_allclose(wave, 1e-6 * impedance * delayed, atol=1e-4)
+
+
+def test_two_halves_of_a_tube_carry_waves_as_the_whole_does() -> None:
+    whole = tube()
+    halves = replace(
+        whole,
+        inlet_node=np.array([0, 2]),
+        outlet_node=np.array([2, 1]),
+        length=np.full(2, 0.5),
+        inlet_radius=np.full(2, 0.01),
+        outlet_radius=np.full(2, 0.01),
+        stiffness=np.repeat(whole.stiffness, 2, axis=1),
+        wall_viscosity=np.zeros((2, 2)),
+        reference_pressure=np.full(2, 1e4),
+        friction=np.zeros(2),
+        outlets=replace(whole.outlets, segment=np.array([1])),
+    )
+    inflow = 1e-6 * np.maximum(np.sin(np.linspace(0, 2 * np.pi, 200)), 0)
+    first, second = (
+        linear_pressure(
+            network, inflow, 1.0, pressure=1.1e4, sites=sites, num_harmonics=30
+        )
+        for network, sites in ((whole, [(0, 0.5)]), (halves, [(1, 0.0)]))
+    )
+    np.testing.assert_allclose(first, second, atol=1e-9 * np.abs(first).max())
+
+
+# openBF ------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def openbf_folder(tmp_path: Path) -> Path:
+    (tmp_path / "tube.yaml").write_text(OPENBF_TEXT)
+    np.savetxt(tmp_path / "tube_inlet.dat", [[0.0, 0.0], [0.5, 1e-6], [1.0, 0.0]])
+    wave = np.column_stack([np.linspace(3, 4, 5), *np.full((5, 5), 1e4)])
+    np.savez(tmp_path / "ref_tube.npz", tube__P=wave)
+    return tmp_path
+
+
+def test_a_wall_of_openbf_has_its_tube_law(openbf_folder: Path) -> None:
+    network = read_case(openbf_folder, "tube").network
+    # p = beta (sqrt(A / A0) - 1), beta = sqrt(pi / A0) h0 E / (1 - 0.25)
+    expected = 1e-3 * 500e3 / (0.01 * 0.75) / (np.sqrt(np.pi) * 0.01)
+    assert float(network.tube_law(0, np.array(0.01))) == pytest.approx(expected)
+    assert network.friction[0] == pytest.approx(8 * np.pi * 4e-3 / 1050)
+
+
+def test_the_beats_that_openbf_simulated_are_counted(openbf_folder: Path) -> None:
+    case = read_case(openbf_folder, "tube")
+    assert case.num_cycles == 4
+    assert case.time[0] == pytest.approx(0.0)
+
+
+def test_a_missing_case_of_openbf_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DataNotFoundError, match=r"cca\.yaml"):
+        read_case(tmp_path, "cca")
+
+
+def test_a_network_of_openbf_without_vessels_is_refused(openbf_folder: Path) -> None:
+    (openbf_folder / "tube.yaml").write_text(OPENBF_TEXT.split("network:")[0])
+    with pytest.raises(InvalidInputError, match="vessels"):
+        read_case(openbf_folder, "tube")

@@ -1,0 +1,238 @@
+"""Who is drawn: hearts and arteries of people."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.stats import kstest, truncnorm
+
+from sbi_rope.errors import InvalidInputError
+from sbi_rope.tasks.hemodynamics import population
+from sbi_rope.tasks.hemodynamics import population_tables as tables
+from sbi_rope.tasks.hemodynamics.population import (
+    NUISANCES,
+    TRUNCATED_SD,
+    Population,
+    Process,
+    ejection_time_slopes,
+    truncated_normal,
+)
+from sbi_rope.tasks.hemodynamics.subject import NUM_SEGMENTS, Subject
+from tests.conftest import SHARED_DATA
+
+N = 3000
+
+
+def _draw(
+    process: Process, n: int = N, **settings: float | str | bool
+) -> list[Subject]:
+    law = Population(**settings)  # type: ignore[arg-type]
+    return [law.draw(process, seed=3, index=i) for i in range(n)]
+
+
+@pytest.fixture(scope="module")
+def people() -> dict[str, np.ndarray]:
+    subjects = _draw("simulator")
+    names = (*NUISANCES, "stroke_volume", "ejection_time", "period")
+    return {name: np.array([getattr(s, name) for s in subjects]) for name in names}
+
+
+def test_a_person_only_depends_on_settings_process_seed_and_index() -> None:
+    law = Population()
+    person = law.draw("real", seed=1, index=7)
+    assert law.draw("real", seed=1, index=7) == person
+    others = [
+        law.draw("simulator", seed=1, index=7),
+        law.draw("real", seed=2, index=7),
+        law.draw("real", seed=7, index=1),
+        law.draw("real", seed=1, index=8),
+    ]
+    assert len({person.age, *(other.age for other in others)}) == 5
+
+
+def test_cut_normal_numbers_follow_scipys_law() -> None:
+    rng = np.random.default_rng(0)
+    draws = [truncated_normal(rng, 79.0, 11.0, highest=90.0) for _ in range(4000)]
+    law = truncnorm(-2.0, 1.0, loc=79.0, scale=11.0)
+    assert kstest(draws, law.cdf).pvalue > 1e-3
+    assert truncnorm(-2, 2).std() == pytest.approx(TRUNCATED_SD)
+
+
+def test_age_and_heart_follow_their_laws(people: dict[str, np.ndarray]) -> None:
+    age = people["age"]
+    assert kstest((age - 25) / 50, "uniform").pvalue > 1e-3
+    mean, sd = tables.stroke_volume_law(age)
+    volume = (people["stroke_volume"] - mean) / sd
+    rate = (people["heart_rate"] - tables.heart_rate_mean(age)) / 11.0
+    time, slope, noise_sd = ejection_time_slopes()
+    weissler = tables.weissler_time(people["stroke_volume"], people["heart_rate"])
+    noise = (people["ejection_time"] - time - slope * weissler) / noise_sd
+    law = truncnorm(-2.0, 2.0)
+    for values in (volume, rate, noise):
+        assert kstest(values, law.cdf).pvalue > 1e-3
+        assert abs(np.corrcoef(values, age)[0, 1]) < 4 / N**0.5
+    assert abs(np.corrcoef([volume, rate, noise])[np.triu_indices(3, 1)]).max() < 0.08
+
+
+def test_ejection_time_is_explained_to_half_by_weissler(
+    people: dict[str, np.ndarray],
+) -> None:
+    time = people["ejection_time"]
+    assert time.mean() == pytest.approx(282.0, abs=1.5)
+    # 23.3 ms before the unexplained half is cut.
+    sd = 23.3 * np.hypot(0.7, np.sqrt(0.51) * TRUNCATED_SD)
+    assert time.std() == pytest.approx(sd, rel=0.04)
+    correlation = np.corrcoef(time, people["stroke_volume"])[0, 1]
+    assert correlation == pytest.approx(0.63, abs=0.03)
+    assert np.corrcoef(time, people["heart_rate"])[0, 1] < -0.3
+
+
+@pytest.mark.parametrize("prior", ["population", "independent"])
+def test_timings_leave_room_in_the_beat(prior: str) -> None:
+    subjects = _draw("simulator", prior=prior)
+    time = np.array([s.ejection_time for s in subjects])
+    period = np.array([s.period for s in subjects])
+    peak = np.array([s.peak_flow_time for s in subjects])
+    assert (time <= 0.55 * 1000 * period).all()
+    assert (peak <= 0.45 * time).all()
+    assert min(s.regurgitant_volume for s in subjects) >= 0.0
+
+
+def test_independent_parameters_follow_the_laws_asked_for() -> None:
+    subjects = _draw("simulator", prior="independent")
+    volume = np.array([s.stroke_volume for s in subjects])
+    time = np.array([s.ejection_time for s in subjects])
+    law = truncnorm(-2.0, 2.0)
+    assert kstest((volume - 65) / 15, law.cdf).pvalue > 1e-3
+    assert kstest((time - 282) / (282 * 24.43 / 295.29), law.cdf).pvalue > 1e-3
+    assert abs(np.corrcoef(volume, time)[0, 1]) < 4 / N**0.5
+
+
+def test_pulse_wave_velocity_has_the_published_quantiles() -> None:
+    rng = np.random.default_rng(0)
+    arteries = [population._draw_arteries(rng, 55.0) for _ in range(8000)]
+    pressure = np.array([a["mean_pressure"] for a in arteries])
+    usual = tables.velocity_trend(55.0, tables.pressure_law(55.0)[0])
+    trend = [tables.velocity_trend(55.0, value) / usual for value in pressure]
+    velocity = np.array([a["pulse_wave_velocity"] for a in arteries])
+    # Of the cut law, other shares lie below the quantiles 0.1 and 0.9 of the whole.
+    shares = truncnorm(-2, 2).cdf([-1.28155, 0.0, 1.28155])
+    found = np.quantile(velocity / trend, shares)
+    assert found == pytest.approx([6.2, 7.5, 9.2], rel=0.02)
+    assert np.corrcoef(velocity, pressure)[0, 1] > 0.2
+
+
+def test_velocity_follows_the_published_pressure_classes() -> None:
+    # At 50 years: 0.00083 * 2500 + 5.55 at 92.5 mmHg, 8.165 at 99.5, 8.535 at 106.5.
+    assert tables.velocity_trend(50.0, 92.5) == pytest.approx(7.625)
+    assert tables.velocity_trend(50.0, 103.0) == pytest.approx((8.165 + 8.535) / 2)
+    assert tables.velocity_trend(50.0, 85.5) == pytest.approx(7.625 - 0.54)
+
+
+def test_the_peak_of_the_flow_is_early_in_a_short_ejection(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(population, "MAX_PEAK_SHARE", 0.3)
+    for subject in _draw("simulator", 300):
+        assert subject.peak_flow_time <= 0.3 * subject.ejection_time
+
+
+def test_arteries_age(people: dict[str, np.ndarray]) -> None:
+    old, young = people["age"] > 65, people["age"] < 35
+    ratio = {
+        name: values[old].mean() / values[young].mean()
+        for name, values in people.items()
+    }
+    assert ratio["pulse_wave_velocity"] == pytest.approx(9.4 / 6.3, rel=0.08)
+    assert ratio["diameter_factor"] == pytest.approx(1.18 / 1.035, rel=0.03)
+    assert ratio["compliance_factor"] == pytest.approx(0.043 / 0.083, rel=0.08)
+    spread = people["mean_pressure"] - np.interp(
+        people["age"], tables.PRESSURE_AGES, tables.MEAN_PRESSURES
+    )
+    assert spread.std() == pytest.approx(7.3 * TRUNCATED_SD, rel=0.05)
+    assert people["outflow_pressure"].mean() == pytest.approx(33.2, abs=0.4)
+
+
+def test_the_simulator_gives_everyone_the_same_lengths() -> None:
+    assert {s.length_factors for s in _draw("simulator", 20)} == {(1.0,) * NUM_SEGMENTS}
+
+
+def test_real_lengths_vary_with_height_and_by_segment() -> None:
+    subjects = _draw("real", 1500)
+    logs = np.log([s.length_factors for s in subjects])
+    others = logs[:, 2:]
+    height = others.mean(axis=1)
+    assert (others - height[:, None]).std() == pytest.approx(0.15, rel=0.02)
+    # The mean over segments has some of their scatter left.
+    expected = np.hypot(0.1 / 1.7 * TRUNCATED_SD, 0.15 / 114**0.5)
+    assert height.std() == pytest.approx(expected, rel=0.08)
+    assert np.exp(height).mean() == pytest.approx(1.0, abs=0.01)
+    aorta = (logs[:, :2] - height[:, None]).mean(axis=1)
+    ages = np.array([s.age for s in subjects])
+    growth = np.array([tables.aorta_growth(age) for age in ages])
+    spread = np.hypot(0.134 * TRUNCATED_SD, 0.15 / 2**0.5)
+    assert (aorta - np.log(growth)).std() == pytest.approx(spread, rel=0.08)
+    assert np.exp(aorta[ages > 70]).mean() > 1.25
+
+
+def test_without_scatter_the_simulator_is_exact() -> None:
+    exact = _draw("real", 5, height_sd=0.0, segment_sd=0.0, proximal_aorta=False)
+    for subject in exact:
+        assert subject.length_factors == (1.0,) * NUM_SEGMENTS
+    aorta = _draw("real", 5, height_sd=0.0, segment_sd=0.0)
+    for subject in aorta:
+        assert subject.length_factors[0] == subject.length_factors[1] != 1.0
+        assert set(subject.length_factors[2:]) == {1.0}
+
+
+def test_one_scatter_does_not_change_what_else_is_drawn() -> None:
+    both = Population().draw("real", seed=0, index=0)
+    segments = Population(height_sd=0.0).draw("real", seed=0, index=0)
+    ratio = np.divide(both.length_factors, segments.length_factors)
+    assert ratio == pytest.approx(np.full(NUM_SEGMENTS, ratio[0]))
+    assert both.pulse_wave_velocity == segments.pulse_wave_velocity
+
+
+@pytest.mark.parametrize(
+    "settings", [{"height_sd": -0.1}, {"segment_sd": float("nan")}, {"prior": "flat"}]
+)
+def test_population_refuses_settings_out_of_range(settings: dict[str, float]) -> None:
+    with pytest.raises(InvalidInputError, match=next(iter(settings))):
+        Population(**settings)  # type: ignore[arg-type]
+
+
+def test_draw_refuses_what_is_no_person() -> None:
+    with pytest.raises(InvalidInputError, match="process"):
+        Population().draw("patient", seed=0, index=0)  # type: ignore[arg-type]
+    with pytest.raises(InvalidInputError, match="seed"):
+        Population().draw("real", seed=-1, index=0)
+    with pytest.raises(InvalidInputError, match="index"):
+        Population().draw("real", seed=0, index=-1)
+
+
+def test_tables_are_the_published_ones() -> None:
+    path = SHARED_DATA / "hemodynamics" / "pwdb_population_and_model_facts.json"
+    if not path.is_file():
+        pytest.skip("the published numbers are not on this machine")
+    facts = json.loads(path.read_text())["population"]
+    mean, sd = tables.stroke_volume_law(np.array([25.0, 75.0]))
+    assert mean[0] == pytest.approx(facts["SV_ml"]["at_25"][0], abs=0.1)
+    assert sd[1] == pytest.approx(facts["SV_ml"]["at_75"][1], abs=0.1)
+    assert list(facts["HR_bpm"]["age"]) == tables.HR_AGES.tolist()
+    pressure = facts["MBP_mmHg"]
+    assert pressure["age"] == tables.PRESSURE_AGES.tolist()
+    assert pressure["mean"] == tables.MEAN_PRESSURES.tolist()
+    assert pressure["sd"] == tables.MEAN_PRESSURE_SDS.tolist()
+    assert facts["DBP_mmHg"]["mean"] == tables.DIASTOLIC_PRESSURES.tolist()
+    velocity = facts["aortic_PWV_m_s"]
+    quantiles = velocity["p10_p50_p90_by_decade_optimalBP"].values()
+    assert np.array(list(quantiles)).T.tolist() == tables.VELOCITY_QUANTILES.tolist()
+    assert [velocity[k] for k in "ABC"] == tables.CLASS_TRENDS.tolist()
+    assert velocity["sbp"] == tables.CLASS_SYSTOLIC.tolist()
+    assert velocity["dbp"] == tables.CLASS_DIASTOLIC.tolist()
+    assert facts["proximal_aorta_length"]["mm"] == tables.AORTA_LENGTHS.tolist()
+    data = facts["LVET_ms"]["weissler_data"]
+    design = np.stack([data["sv"], data["hr"], np.ones(22)], axis=1)
+    fitted = 1000 * design @ np.linalg.lstsq(design, data["lvet_s"], rcond=None)[0]
+    ours = tables.weissler_time(data["sv"], data["hr"])
+    assert np.corrcoef(fitted, ours)[0, 1] > 0.97

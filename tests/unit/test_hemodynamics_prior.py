@@ -1,0 +1,240 @@
+"""The density of stroke volume and ejection time."""
+
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from sbi.utils import mcmc_transform, within_support
+from sbi.utils.user_input_checks import process_prior
+from scipy.integrate import quad
+from scipy.stats import kstest, norm
+from torch import Tensor
+from torch.autograd.functional import jacobian
+from torch.distributions import biject_to
+
+from sbi_rope.errors import InvalidTypeError
+from sbi_rope.tasks.hemodynamics import population_tables as tables
+from sbi_rope.tasks.hemodynamics.population import Population, ejection_time_slopes
+from sbi_rope.tasks.hemodynamics.prior import PopulationPrior, _linear_quantile
+
+KINDS = ("population", "independent")
+N = 8000
+
+
+@pytest.fixture(params=KINDS)
+def kind(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+@pytest.fixture
+def prior(kind: str) -> PopulationPrior:
+    return PopulationPrior(Population(prior=kind))  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def people() -> dict[str, Tensor]:
+    def draw(kind: str) -> Tensor:
+        population = Population(prior=kind)  # type: ignore[arg-type]
+        hearts = [population.draw("simulator", 5, i) for i in range(N)]
+        return torch.tensor([(s.stroke_volume, s.ejection_time) for s in hearts])
+
+    return {kind: draw(kind) for kind in KINDS}
+
+
+def _grid(prior: PopulationPrior, points: int = 801) -> tuple[Tensor, float]:
+    """Return midpoints of a grid over all parameters, and the area of a cell."""
+    low, high = torch.tensor([25.0, 150.0]), torch.tensor([105.0, 400.0])
+    places = (torch.arange(points, dtype=torch.float64) + 0.5) / points
+    axes = [a + (b - a) * places for a, b in zip(low, high, strict=True)]
+    area = float((high - low).prod()) / points**2
+    return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1), area
+
+
+def test_density_integrates_to_one(prior: PopulationPrior) -> None:
+    theta, area = _grid(prior)
+    assert float(prior.log_prob(theta).exp().sum()) * area == pytest.approx(1, abs=2e-3)
+
+
+def test_people_follow_the_density(
+    prior: PopulationPrior, kind: str, people: dict[str, Tensor]
+) -> None:
+    theta = people[kind]
+    assert prior.support.check(theta).all()
+    assert prior.log_prob(theta).isfinite().all()
+    for probabilities in prior.marginal_cdf(theta).T:
+        assert kstest(probabilities, "uniform").pvalue > 1e-3
+    # Two dimensions: cells of a histogram, against sums of the density over them.
+    edges = [np.linspace(25, 105, 13), np.linspace(200, 365, 13)]
+    counts = np.histogram2d(*theta.numpy().T, bins=edges)[0].ravel()
+    grid, area = _grid(prior)
+    mass = prior.log_prob(grid).exp().flatten() * area
+    points = grid.reshape(-1, 2).numpy()
+    expected = N * np.histogram2d(*points.T, bins=edges, weights=mass)[0].ravel()
+    large = expected > 8
+    chi_squared = ((counts - expected)[large] ** 2 / expected[large]).sum()
+    assert chi_squared < large.sum() + 4 * (2 * large.sum()) ** 0.5
+    assert large.sum() > 30
+
+
+def test_draws_follow_the_density(prior: PopulationPrior) -> None:
+    draws = prior.sample((50_000,))
+    assert draws.dtype == torch.float32
+    assert prior.support.check(draws).all()
+    assert prior.log_prob(draws).isfinite().all()
+    for probabilities in prior.marginal_cdf(draws).T:
+        assert kstest(probabilities, "uniform").pvalue > 1e-3
+    grid, area = _grid(prior)
+    density = prior.log_prob(grid).exp()
+    mean = (density.unsqueeze(-1) * grid).sum(dim=(0, 1)) * area
+    centred = grid - mean
+    covariance = float((density * centred.prod(dim=-1)).sum() * area)
+    found = float(torch.cov(draws.double().T)[0, 1])
+    assert found == pytest.approx(covariance, abs=5.0)
+    assert float(draws[:, 0].mean()) == pytest.approx(float(mean[0]), abs=0.25)
+
+
+@pytest.mark.parametrize(("start", "end"), [(1.0, 1.0), (0.0, 2.0), (3.0, 0.5)])
+def test_draws_within_a_cell_follow_a_linear_density(start: float, end: float) -> None:
+    uniform = torch.linspace(0.0, 1.0, 21, dtype=torch.float64)
+    place = _linear_quantile(uniform, torch.tensor(start), torch.tensor(end))
+    below = start * place + (end - start) * place**2 / 2
+    torch.testing.assert_close(below / ((start + end) / 2), uniform)
+
+
+def test_moments_are_those_of_people(
+    prior: PopulationPrior, kind: str, people: dict[str, Tensor]
+) -> None:
+    theta = people[kind]
+    torch.testing.assert_close(prior.mean, theta.mean(dim=0), rtol=0.01, atol=0.0)
+    torch.testing.assert_close(prior.stddev, theta.std(dim=0), rtol=0.03, atol=0.0)
+    assert prior.mean.dtype == prior.variance.dtype == torch.float32
+
+
+def test_stroke_volume_and_ejection_time_are_correlated() -> None:
+    draws = PopulationPrior().sample((20_000,))
+    assert float(torch.corrcoef(draws.T)[0, 1]) == pytest.approx(0.63, abs=0.02)
+
+
+def _cut_normal(
+    value: np.ndarray | float, mean: np.ndarray | float, sd: np.ndarray | float
+) -> np.ndarray:
+    inside = np.abs(value - np.asarray(mean)) <= 2 * np.asarray(sd)
+    return np.where(inside, norm.pdf(value, mean, sd) / 0.9544997361, 0.0)
+
+
+@pytest.mark.parametrize("theta", [(60.0, 280.0), (75.0, 310.0), (40.0, 262.0)])
+def test_density_is_the_integral_over_age_and_heart_rate(
+    theta: tuple[float, float],
+) -> None:
+    volume, time = theta
+    start, slope, noise_sd = ejection_time_slopes()
+    age = 25 + 50 * (np.arange(2000) + 0.5) / 2000
+    rate = (50 + 52 * (np.arange(2000) + 0.5) / 2000)[:, None]
+    mean, sd = tables.stroke_volume_law(age)
+    predicted = start + slope * tables.weissler_time(volume, rate)
+    joint = (
+        _cut_normal(volume, mean, sd)
+        * _cut_normal(rate, tables.heart_rate_mean(age), tables.HEART_RATE_SD)
+        * _cut_normal(time, predicted, noise_sd)
+    )
+    expected = joint.mean() * 52  # ages have the density 1 / 50
+    found = float(PopulationPrior().log_prob(torch.tensor(theta)).exp())
+    assert found == pytest.approx(expected, rel=5e-3)
+
+
+def test_marginal_cdf_is_the_integral_of_the_density(prior: PopulationPrior) -> None:
+    grid, area = _grid(prior)
+    mass = prior.log_prob(grid).exp() * area
+    for row in (150, 350, 500):
+        theta = grid[row, row].float().unsqueeze(0)
+        below = [mass[:row].sum() + mass[row].sum() / 2]
+        below.append(mass[:, :row].sum() + mass[:, row].sum() / 2)
+        expected = torch.tensor([below]).float()
+        found = prior.marginal_cdf(theta)
+        torch.testing.assert_close(found, expected, rtol=0.0, atol=2e-3)
+    far = torch.tensor([[0.0, 0.0], [1000.0, 1000.0]])
+    assert prior.marginal_cdf(far).tolist() == [[0.0, 0.0], [1.0, 1.0]]
+
+
+def test_independent_density_is_a_product() -> None:
+    prior = PopulationPrior(Population(prior="independent"))
+    whole = norm.cdf(2) - norm.cdf(-2)
+    sd = tables.EJECTION_TIME[1]
+    expected = norm.pdf(72, 65, 15) * norm.pdf(270, 282, sd) / whole**2
+    found = float(prior.log_prob(torch.tensor([72.0, 270.0])).exp())
+    assert found == pytest.approx(expected, rel=1e-3)
+    total = quad(lambda t: norm.pdf(t, 282, sd), 282 - 2 * sd, 282 + 2 * sd)[0]
+    assert total == pytest.approx(whole)
+
+
+def test_there_is_no_density_outside(prior: PopulationPrior) -> None:
+    outside = torch.tensor([[20.0, 280.0], [60.0, 400.0], [200.0, 280.0], [60.0, 0.0]])
+    assert prior.log_prob(outside).tolist() == [-torch.inf] * 4
+    assert not within_support(prior, outside).any()
+    batches = torch.stack([prior.sample((5,)), outside[:1].expand(5, 2)])
+    log_prob = prior.log_prob(batches)
+    assert log_prob.shape == (2, 5)
+    torch.testing.assert_close(log_prob[0], prior.log_prob(batches[0]))
+    assert prior.log_prob(batches[0, 0]).shape == ()
+
+
+def test_bijection_has_the_log_determinant_of_its_jacobian(
+    prior: PopulationPrior,
+) -> None:
+    transform = biject_to(prior.support)
+    z = 2 * torch.randn(10, 2, dtype=torch.float64)
+    theta = transform(z)
+    assert prior.support.check(theta).all()
+    expected = torch.stack([jacobian(transform, row) for row in z]).det().abs().log()
+    torch.testing.assert_close(transform.log_abs_det_jacobian(z, theta), expected)
+    torch.testing.assert_close(transform.inv(theta), z)
+    far = transform(torch.tensor([[200.0, -200.0], [-200.0, 200.0], [200.0, 200.0]]))
+    assert prior.support.check(far).all()
+    assert transform.inv(far).isfinite().all()
+
+
+def test_sbi_takes_the_prior_as_it_is(prior: PopulationPrior) -> None:
+    processed, theta_dim, _ = process_prior(prior)
+    assert processed is prior
+    assert theta_dim == 2
+    theta = prior.sample((7,))
+    to_unconstrained = mcmc_transform(prior)
+    z = to_unconstrained(theta)
+    assert to_unconstrained.log_abs_det_jacobian(theta, z).shape == (7,)
+    torch.testing.assert_close(to_unconstrained.inv(z), theta, rtol=1e-4, atol=1e-3)
+
+
+def test_prior_can_be_copied_expanded_and_moved(prior: PopulationPrior) -> None:
+    copied = pickle.loads(pickle.dumps(prior))
+    draws = copied.sample((5,))
+    torch.testing.assert_close(copied.log_prob(draws), prior.log_prob(draws))
+    assert pickle.loads(pickle.dumps(prior.support)).check(draws).all()
+    expanded = prior.expand((3,))
+    assert (expanded.batch_shape, expanded.event_shape) == ((3,), (2,))
+    assert expanded.sample((4,)).shape == (4, 3, 2)
+    assert expanded.mean.shape == expanded.variance.shape == (3, 2)
+    assert expanded.log_prob(draws[:3]).shape == (3,)
+    copied.to("meta")
+    assert copied.mean.device.type == "meta"
+    assert PopulationPrior(Population()).mean.device.type == "cpu"
+
+
+def test_density_has_gradients_made_in_inference_mode_or_not() -> None:
+    with torch.inference_mode():
+        prior = PopulationPrior()
+    theta = torch.tensor([60.0, 280.0], requires_grad=True)
+    prior.log_prob(theta).backward()
+    assert theta.grad is not None
+    step = torch.tensor([[0.0, 0.05], [0.0, -0.05]]).double()
+    ends = prior.log_prob(theta.detach().double() + step)
+    slope = float(ends[0] - ends[1]) / 0.1
+    assert float(theta.grad[1]) == pytest.approx(slope, rel=0.05)
+
+
+def test_prior_validates_values_if_asked() -> None:
+    prior = PopulationPrior(validate_args=True)
+    with pytest.raises(ValueError, match="support"):
+        prior.log_prob(torch.tensor([60.0, 400.0]))
+    with pytest.raises(InvalidTypeError, match="population"):
+        PopulationPrior("population")  # type: ignore[arg-type]

@@ -1,0 +1,311 @@
+"""The solver of blood flow, on small networks, and the beats made with it."""
+
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sbi_rope.errors import SimulationError
+from sbi_rope.tasks import hemodynamics
+from sbi_rope.tasks.hemodynamics import waveforms
+from sbi_rope.tasks.hemodynamics.linear import linear_pressure
+from sbi_rope.tasks.hemodynamics.network import Network, Outlets
+from sbi_rope.tasks.hemodynamics.solver import Flow, solve
+from sbi_rope.tasks.hemodynamics.subject import Physics
+from sbi_rope.tasks.hemodynamics.validation import BASELINE
+
+pytest.importorskip("numba")
+
+REST = 1e4  # Pa
+PERIOD = 0.8  # s
+HALF_SINE = np.maximum(np.sin(np.linspace(0, 2 * np.pi, 400, endpoint=False)), 0)
+
+
+def make_network(
+    nodes: list[tuple[int, int]],
+    *,
+    length: list[float],
+    radius: list[tuple[float, float]],
+    outlets: list[int],
+    viscosity: float = 0.0,
+    friction: float = 0.0,
+    resistance: tuple[float, float] = (1e8, 1e9),
+    outflow_pressure: float = REST,
+) -> Network:
+    num = len(nodes)
+    return Network(
+        inlet_node=np.array([node[0] for node in nodes]),
+        outlet_node=np.array([node[1] for node in nodes]),
+        length=np.array(length),
+        inlet_radius=np.array([pair[0] for pair in radius]),
+        outlet_radius=np.array([pair[1] for pair in radius]),
+        stiffness=np.array([[0.0] * num, [0.0] * num, [6e4] * num]),
+        wall_viscosity=np.array([[viscosity] * num, [0.0] * num]),
+        reference_pressure=np.full(num, REST),
+        friction=np.full(num, friction),
+        density=1060.0,
+        source_node=0,
+        outlets=Outlets(
+            segment=np.array(outlets),
+            proximal_resistance=np.full(len(outlets), resistance[0]),
+            distal_resistance=np.full(len(outlets), resistance[1]),
+            compliance=np.full(len(outlets), 1e-9),
+            pressure=outflow_pressure,
+        ),
+    )
+
+
+def run(network: Network, inflow: np.ndarray, **changes: Any) -> Flow:
+    options: dict[str, Any] = {
+        "sites": [(0, 0.5)],
+        "start_pressure": REST,
+        "stored_pressure": np.full(len(network.outlets.segment), REST),
+        "cell_length": 0.01,
+        "courant": 0.6,
+        "num_cycles": 3,
+        "convection": 4 / 3,
+    }
+    return solve(network, inflow, PERIOD, **{**options, **changes})
+
+
+def loop(*, viscosity: float = 0.0) -> Network:
+    """Return a tube that divides, whose branches meet again, with an outlet on one."""
+    return make_network(
+        [(0, 1), (1, 2), (1, 3), (2, 3), (3, 4), (2, 5)],
+        length=[0.1, 0.05, 0.12, 0.03, 0.2, 0.1],
+        radius=[(0.01, 0.009), *[(0.006, 0.005)] * 4, (0.004, 0.004)],
+        outlets=[4, 5],
+        viscosity=viscosity,
+        friction=6e-5,
+    )
+
+
+# Rest and steady flow ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("viscosity", [0.0, 0.6])
+def test_tapered_arteries_at_rest_stay_at_rest(viscosity: float) -> None:
+    flow = run(loop(viscosity=viscosity), np.zeros(10), num_cycles=5)
+    np.testing.assert_allclose(flow.pressure, REST, rtol=1e-9)
+
+
+@pytest.mark.parametrize("viscosity", [0.0, 0.6])
+def test_a_steady_flow_loses_pressure_by_friction_only(viscosity: float) -> None:
+    friction, current = 6e-5, 2e-5
+    tube = make_network(
+        [(0, 1)],
+        length=[0.3],
+        radius=[(0.008, 0.005)],
+        outlets=[0],
+        viscosity=viscosity,
+        friction=friction,
+        resistance=(5e7, 5e7),
+    )
+    flow = run(
+        tube,
+        np.full(10, current),
+        sites=[(0, 0.0), (0, 1.0)],
+        num_cycles=60,
+        cell_length=0.005,
+        convection=0.0,
+    )
+    start, end = flow.pressure.mean(axis=1)
+    assert end - REST == pytest.approx(1e8 * current, rel=1e-5)
+    # dp/dx = -rho f Q / A^2, where the tube is as wide as its pressure makes it.
+    position = (np.arange(1000) + 0.5) / 1000
+    radius = tube.radius(0, position)
+    pressure = start + (end - start) * position - REST
+    root = np.sqrt(np.pi) * radius + pressure / tube.tube_law(0, radius)
+    expected = 0.3 * (1060 * friction * current / root**4).mean()
+    assert start - end == pytest.approx(expected, rel=2e-3)
+
+
+def test_a_windkessel_empties_exponentially() -> None:
+    # A short tube that is stiff compared with the compliance behind it.
+    tube = make_network(
+        [(0, 1)], length=[0.01], radius=[(1e-3, 1e-3)], outlets=[0], resistance=(1, 3e8)
+    )
+    flow = run(tube, np.zeros(10), start_pressure=2 * REST, stored_pressure=[2 * REST])
+    time = np.arange(flow.pressure.shape[1]) / flow.pressure.shape[1] * PERIOD
+    decay = np.exp(-(time + 2 * PERIOD) / (3e8 * 1e-9))
+    np.testing.assert_allclose(flow.pressure[0] / REST, 1 + decay, rtol=2e-3)
+
+
+# Conservation and symmetry -----------------------------------------------------------
+
+
+@pytest.mark.parametrize("viscosity", [0.0, 0.6])
+def test_no_volume_is_lost_in_branches_and_loops(viscosity: float) -> None:
+    flow = run(loop(viscosity=viscosity), 1e-4 * HALF_SINE)
+    change = flow.volume_in - flow.volume_out
+    assert abs(change) > 1e-8
+    assert flow.volume_change == pytest.approx(change, abs=1e-12 * flow.volume_in)
+
+
+@pytest.mark.parametrize("viscosity", [0.0, 0.6])
+def test_it_does_not_matter_which_end_of_a_segment_is_its_inlet(
+    viscosity: float,
+) -> None:
+    network = loop(viscosity=viscosity)
+    turned = np.array([False, True, True, True, False, False])
+    mirrored = replace(
+        network,
+        inlet_node=np.where(turned, network.outlet_node, network.inlet_node),
+        outlet_node=np.where(turned, network.inlet_node, network.outlet_node),
+        inlet_radius=np.where(turned, network.outlet_radius, network.inlet_radius),
+        outlet_radius=np.where(turned, network.inlet_radius, network.outlet_radius),
+    )
+    # With coarse cells, some segments have no point but their ends.
+    first, second = (
+        run(some, 1e-4 * HALF_SINE, sites=[(2, position), (4, 0.5)], cell_length=0.04)
+        for some, position in ((network, 0.25), (mirrored, 0.75))
+    )
+    np.testing.assert_allclose(first.pressure, second.pressure, rtol=1e-9)
+
+
+@pytest.mark.parametrize("viscosity", [0.0, 0.6])
+def test_a_joint_within_a_tube_changes_nothing(viscosity: float) -> None:
+    whole = make_network(
+        [(0, 1)],
+        length=[0.4],
+        radius=[(0.01, 0.006)],
+        outlets=[0],
+        viscosity=viscosity,
+    )
+    halves = make_network(
+        [(0, 1), (1, 2)],
+        length=[0.2, 0.2],
+        radius=[(0.01, 0.008), (0.008, 0.006)],
+        outlets=[1],
+        viscosity=viscosity,
+    )
+    first = run(whole, 1e-4 * HALF_SINE, sites=[(0, 0.4), (0, 0.75)])
+    second = run(halves, 1e-4 * HALF_SINE, sites=[(0, 0.8), (1, 0.5)])
+    error = np.abs(first.pressure - second.pressure).max()
+    assert error < 5e-5 * np.ptp(first.pressure)
+
+
+# Waves -------------------------------------------------------------------------------
+
+
+def test_a_wave_arrives_when_its_velocity_says() -> None:
+    tube = make_network([(0, 1)], length=[2.0], radius=[(0.01, 0.01)], outlets=[0])
+    pulse = np.zeros(400)
+    pulse[:20] = np.sin(np.linspace(0, np.pi, 20)) ** 2
+    flow = run(
+        tube,
+        1e-7 * pulse,
+        sites=[(0, 0.1), (0, 0.6)],
+        num_cycles=2,
+        convection=0.0,
+    )
+    first, second = flow.previous.argmax(axis=1) / flow.previous.shape[1] * PERIOD
+    speed = float(tube.wave_speed(0, np.array(0.01)))
+    assert second - first == pytest.approx(1.0 / speed, rel=5e-3)
+
+
+@pytest.mark.parametrize("viscosity", [0.0, 0.3, 3.0])
+@pytest.mark.parametrize("cell_length", [0.01, 0.025])
+def test_small_waves_in_a_loop_are_those_of_the_linear_equations(
+    viscosity: float, cell_length: float
+) -> None:
+    network, sites = loop(viscosity=viscosity), [(0, 0.0), (2, 0.5), (4, 0.5), (5, 1.0)]
+    inflow = 1e-8 * (HALF_SINE - HALF_SINE.mean())
+    flow = run(
+        network,
+        inflow,
+        sites=sites,
+        num_cycles=12,
+        convection=0.0,
+        cell_length=cell_length,
+    )
+    exact = linear_pressure(
+        network, inflow, PERIOD, pressure=REST, sites=sites, num_harmonics=80
+    )
+    waves = flow.at(np.arange(400) / 400)
+    waves -= waves.mean(axis=1, keepdims=True)
+    error = np.sqrt(((waves - exact) ** 2).mean(axis=1)) / exact.std(axis=1)
+    assert error.max() < 0.015
+
+
+# Failure -----------------------------------------------------------------------------
+
+
+def test_a_flow_that_is_too_strong_is_reported() -> None:
+    with pytest.raises(SimulationError, match="not finite"):
+        run(loop(), 1.0 * HALF_SINE)
+
+
+def test_without_numba_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "numba", None)
+    monkeypatch.delitem(
+        sys.modules, "sbi_rope.tasks.hemodynamics.kernels", raising=False
+    )
+    monkeypatch.delattr(hemodynamics, "kernels", raising=False)
+    with pytest.raises(ImportError, match=r"sbi-rope\[hemodynamics\]"):
+        run(loop(), HALF_SINE)
+
+
+# Beats -------------------------------------------------------------------------------
+
+
+def failing_first(
+    error: bool,
+) -> Callable[..., Flow]:
+    """Return a simulation that fails, or does not repeat, with the first number."""
+    simulate = waveforms.simulate_sites
+
+    def simulate_sites(*arguments: Any, courant: float, **options: Any) -> Flow:
+        flow = simulate(*arguments, courant=courant, **options)
+        if courant < 0.6:
+            return flow
+        if error:
+            raise SimulationError("not finite")
+        return replace(flow, previous=flow.previous + 1e3)
+
+    return simulate_sites
+
+
+@pytest.mark.parametrize("error", [True, False])
+def test_a_failed_run_is_tried_again_with_smaller_steps(
+    monkeypatch: pytest.MonkeyPatch, error: bool
+) -> None:
+    monkeypatch.setattr(waveforms, "simulate_sites", failing_first(error))
+    beat = waveforms.simulate_beat(BASELINE, Physics(cell_length=0.02))
+    assert beat.courant == 0.4
+
+
+def test_beats_that_do_not_repeat_are_an_error() -> None:
+    physics = Physics(cell_length=0.02, num_cycles=2, max_period_error=1e-3)
+    with pytest.raises(SimulationError, match="`num_cycles`"):
+        waveforms.simulate_beat(BASELINE, physics)
+
+
+def test_a_beat_has_its_pressures_at_256_phases_in_mmhg() -> None:
+    beat = waveforms.simulate_beat(BASELINE, Physics(cell_length=0.02))
+    assert set(beat.pressure) == {"radial", "brachial", "aortic"}
+    for wave in beat.pressure.values():
+        assert wave.shape == (256,)
+        assert 60 < wave.min() < wave.max() < 140
+    assert beat.period == BASELINE.period
+
+
+def test_a_beat_begins_with_the_opening_of_the_valve() -> None:
+    wave = waveforms.simulate_beat(BASELINE).pressure["aortic"]
+    assert wave.argmin() in (*range(250, 256), *range(6))
+
+
+def test_the_wave_reaches_the_wrist_after_the_elbow_and_the_heart() -> None:
+    pressure = waveforms.simulate_beat(BASELINE).pressure
+    rise = {name: np.diff(wave).argmax() for name, wave in pressure.items()}
+    assert rise["aortic"] < rise["brachial"] < rise["radial"]
+
+
+def test_the_same_subject_has_the_same_beat_to_the_bit() -> None:
+    first, second = (
+        waveforms.simulate_beat(BASELINE, Physics(cell_length=0.02)) for _ in range(2)
+    )
+    np.testing.assert_array_equal(first.pressure["radial"], second.pressure["radial"])

@@ -1,0 +1,205 @@
+"""Recordings of stored beats, and the task made of them."""
+
+import math
+import pickle
+from pathlib import Path
+
+import pytest
+import torch
+
+from sbi_rope.errors import DataNotFoundError, InvalidInputError
+from sbi_rope.tasks.hemodynamics.records import NUM_STEPS, Recorder, play
+from sbi_rope.tasks.hemodynamics.task import Hemodynamics
+
+
+def sine(num_phases: int = 256) -> torch.Tensor:
+    phase = torch.arange(num_phases, dtype=torch.float64) / num_phases
+    return (2 * math.pi * phase).sin().unsqueeze(0)
+
+
+# Recordings --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("period", [0.4, 0.8123, 1.5])
+@pytest.mark.parametrize("start", [0.0, 0.3, 0.999])
+def test_a_beat_is_repeated_at_125_hz(period: float, start: float) -> None:
+    played = play(sine(), torch.tensor([period]), start=torch.tensor([start]))
+    time = torch.arange(NUM_STEPS, dtype=torch.float64) / 125
+    expected = (2 * math.pi * (start + time / period)).sin()
+    # Linear interpolation of a sine between 256 points is off by at most (pi/256)^2/2.
+    torch.testing.assert_close(played[0], expected, atol=1e-4, rtol=0.0)
+
+
+def test_records_have_mean_0_and_deviation_1_before_the_noise() -> None:
+    beat = 90 + 20 * sine().expand(5, -1)
+    x = Recorder(noise_std=0.0)(beat, torch.linspace(0.5, 1.2, 5))
+    torch.testing.assert_close(
+        x.mean(dim=1), torch.zeros(5).double(), atol=1e-9, rtol=0
+    )
+    torch.testing.assert_close(x.std(dim=1, correction=0), torch.ones(5).double())
+
+
+def test_global_normalisation_keeps_level_and_height() -> None:
+    beat = torch.stack([90 + 20 * sine()[0], 100 + 30 * sine()[0]])
+    recorder = Recorder(noise_std=0.0, normalisation="global")
+    x = recorder(beat, torch.full((2,), 0.8))
+    highest, lowest = torch.tensor([15.0, 35.0]) / 25, torch.tensor([-25.0, -25.0]) / 25
+    torch.testing.assert_close(x.amax(dim=1).float(), highest, atol=1e-3, rtol=0)
+    torch.testing.assert_close(x.amin(dim=1).float(), lowest, atol=1e-3, rtol=0)
+
+
+def test_noise_is_added_after_the_normalisation() -> None:
+    beat = sine().expand(200, -1)
+    period = torch.full((200,), 0.8)
+    noisy, clean = (
+        Recorder(noise_std=std)(
+            beat, period, generator=torch.Generator().manual_seed(0)
+        )
+        for std in (0.1, 0.0)
+    )
+    assert (noisy - clean).std() == pytest.approx(0.1, rel=0.01)
+
+
+def test_starts_are_uniform_over_the_beat() -> None:
+    # The first sample of a straight ramp tells where it began.
+    ramp = torch.arange(256, dtype=torch.float64).expand(4000, -1)
+    recorder = Recorder(noise_std=0.0, normalisation="global")
+    first = recorder(ramp, torch.full((4000,), 0.8))[:, 0] * 25 + 95
+    levels = (first / 256).sort().values
+    assert (levels - torch.arange(1, 4001) / 4000).abs().max() < 2 / 4000**0.5
+
+
+# The task ----------------------------------------------------------------------------
+
+
+def test_simulations_at_stored_parameters_are_of_that_person() -> None:
+    simulator = Hemodynamics(noise_std=1e-6).get_simulator()
+    rows = torch.randint(len(simulator.theta), (50,))
+    x = simulator(simulator.theta[rows])
+    torch.manual_seed(0)
+    x = simulator(simulator.theta[rows])
+    torch.manual_seed(0)
+    expected = simulator.recorder(simulator.beat[rows], simulator.period[rows])
+    assert torch.equal(x, expected)
+
+
+def test_simulations_in_between_are_of_the_nearest_person() -> None:
+    simulator = Hemodynamics().get_simulator()
+    theta = Hemodynamics().get_prior().sample(torch.Size((100,)))
+    scaled = (theta.unsqueeze(1) - simulator.theta) / simulator.theta_std
+    nearest = scaled.square().sum(dim=2).argmin(dim=1)
+    torch.manual_seed(0)
+    x = simulator(theta)
+    torch.manual_seed(0)
+    assert torch.equal(
+        x, simulator.recorder(simulator.beat[nearest], simulator.period[nearest])
+    )
+
+
+def test_every_stored_person_is_simulated_before_one_comes_again() -> None:
+    task = Hemodynamics()
+    stored = task.get_simulator().theta
+    theta, _ = task.get_simulations(len(stored))
+    assert len(theta.unique(dim=0)) == len(stored)
+    more, _ = task.get_simulations(len(stored) + 50)
+    assert torch.equal(more[: len(stored)], theta)
+
+
+def test_a_real_person_has_one_recording() -> None:
+    task = Hemodynamics()
+    first, second = (task.get_calibration_set(40, seed=seed) for seed in (0, 1))
+    same = (first[0].unsqueeze(1) == second[0]).all(dim=2).nonzero()
+    assert len(same) > 0
+    for i, j in same.tolist():
+        assert torch.equal(first[1][i], second[1][j])
+
+
+def test_well_specified_people_are_not_those_to_train_on() -> None:
+    task = Hemodynamics(variant="well_specified")
+    trained = {tuple(row) for row in task.get_simulator().theta.tolist()}
+    people = [task.get_calibration_set(50)[0], task.get_test_set(100)[0]]
+    assert not trained & {tuple(row) for row in torch.cat(people).tolist()}
+    half = len(Hemodynamics().get_simulator().theta) / 2
+    assert len(trained) == pytest.approx(half, abs=1)
+
+
+def test_parameters_lie_in_the_prior_and_follow_it() -> None:
+    task = Hemodynamics()
+    theta = task.get_simulator().theta
+    assert torch.isfinite(task.get_prior().log_prob(theta)).all()
+    levels = task.prior_quantiles(theta).sort(dim=0).values
+    steps = torch.arange(1, len(theta) + 1).unsqueeze(1) / len(theta)
+    assert (levels - steps).abs().max() < 2 / len(theta) ** 0.5
+
+
+def test_shipped_sets_are_small_and_of_known_seeds() -> None:
+    task = Hemodynamics()
+    for process in ("simulator", "real"):
+        people = task._load(None, process)
+        assert people.settings["seed"] == 0
+        assert len(people) >= 300
+        assert people.period_error.max() < 0.3
+    folder = Path(__file__).parents[2] / "sbi_rope/tasks/hemodynamics/data"
+    assert sum(path.stat().st_size for path in folder.glob("*.npz")) < 3_000_000
+
+
+def test_the_simulator_can_be_pickled() -> None:
+    simulator = Hemodynamics().get_simulator()
+    theta = simulator.theta[:3]
+    torch.manual_seed(0)
+    expected = simulator(theta)
+    torch.manual_seed(0)
+    assert torch.equal(pickle.loads(pickle.dumps(simulator))(theta), expected)
+
+
+def test_networks_are_the_papers_and_a_light_one() -> None:
+    task = Hemodynamics()
+    net = task.get_embedding_net()
+    assert net.num_features == 1024
+    assert net(torch.zeros(2, NUM_STEPS)).shape == (2, 5)
+    assert task.get_embedding_net(light=True)(torch.zeros(2, NUM_STEPS)).shape == (2, 5)
+
+
+def test_paper_settings_are_those_of_the_appendix() -> None:
+    settings = Hemodynamics.paper_settings
+    assert settings is not None
+    assert settings.density_estimator == "maf"
+    assert settings.conditioner == (300,) * 4
+    assert (settings.learning_rate, settings.batch_size) == (5e-4, 100)
+    assert settings.num_validation == 2000
+    assert (settings.finetuning_learning_rate, settings.finetuning_steps) == (
+        1e-5,
+        2000,
+    )
+    assert (settings.joint_epochs, settings.joint_epoch_size) == (50, 6000)
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
+    missing = tmp_path / "people.npz"
+    with pytest.raises(DataNotFoundError, match="generate"):
+        Hemodynamics(simulations=missing).get_simulator()
+    with pytest.raises(DataNotFoundError, match="generate"):
+        Hemodynamics(observations=missing).get_test_set(1)
+
+
+def test_files_of_the_other_process_are_refused() -> None:
+    folder = Path(__file__).parents[2] / "sbi_rope/tasks/hemodynamics/data"
+    with pytest.raises(InvalidInputError, match="process"):
+        Hemodynamics(simulations=folder / "real.npz").get_simulator()
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        pytest.param({"noise_std": 0.0}, "noise_std", id="noise"),
+        pytest.param({"normalisation": "none"}, "normalisation", id="normalisation"),
+        pytest.param(
+            {"variant": "well_specified", "observations": "x.npz"},
+            "no effect",
+            id="observations",
+        ),
+    ],
+)
+def test_options_out_of_range_are_refused(options: dict, match: str) -> None:
+    with pytest.raises(InvalidInputError, match=match):
+        Hemodynamics(**options)
