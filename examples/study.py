@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sbi_rope import RoPE, SinkhornCoupler, plots
+from sbi_rope import CalibrationFinetuner, RoPE, SinkhornCoupler, plots
 from sbi_rope.baselines import PriorPosterior
 from sbi_rope.metrics import Evaluation, evaluate
 from sbi_rope.tasks import Task
@@ -53,6 +53,7 @@ class Study:
     n_calibration: list[int]
     n_test: int
     out: Path
+    finetuner: CalibrationFinetuner | None = None
     stored: Callable[[Task, int], tuple[Tensor, Tensor]] | None = None
     held_out: Callable[[Task, int], tuple[Tensor, Tensor]] | None = None
 
@@ -118,7 +119,7 @@ class Study:
         for n in self.n_calibration:
             start = time.perf_counter()
             theta_cal, x_cal = task.get_calibration_set(n, seed=seed)
-            rope = RoPE(npe, coupler=self.coupler, **source)
+            rope = RoPE(npe, coupler=self.coupler, finetuner=self.finetuner, **source)
             rope.append_calibration(theta_cal, x_cal)
             rope.train(seed=seed, show_progress_bars=False)
             score("tuning-only", rope.tuned_posterior(), start, n)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from sbi_rope.tasks.hemodynamics import validation
 from sbi_rope.tasks.hemodynamics.network import build_network
 from sbi_rope.tasks.hemodynamics.openbf import openbf_error
+from sbi_rope.tasks.hemodynamics.population import Population, Process
 from sbi_rope.tasks.hemodynamics.subject import Beat, Physics
 from sbi_rope.tasks.hemodynamics.validation import (
     BASELINE,
@@ -205,3 +207,23 @@ def test_all_rows_pass_but_the_velocity_in_the_softest_viscous_arteries(
     failed = {row.name for row in rows if not row.passed}
     assert failed <= {"wave velocity 5.5 m/s, viscoelastic"}
     assert len(rows) == 23
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("process", ["simulator", "real"])
+def test_a_population_has_the_pressures_of_the_literature(process: Process) -> None:
+    people = [Population().draw(process, seed=7, index=i) for i in range(100)]
+    beats = [simulate_beat(person, Physics(cell_length=0.02)) for person in people]
+
+    def mean(site: str, extreme: Any) -> float:
+        return float(np.mean([extreme(beat.pressure[site]) for beat in beats]))
+
+    # Standard errors of these means are 1.1 and .9 mmHg.
+    assert mean("aortic", np.max) == pytest.approx(111, abs=5)
+    assert mean("aortic", np.min) == pytest.approx(77, abs=4)
+    assert mean("brachial", np.max) == pytest.approx(116, abs=5)
+    assert mean("brachial", np.min) == pytest.approx(75, abs=4)
+    assert mean("radial", np.max) == pytest.approx(124, abs=5)
+    assert mean("radial", np.min) == pytest.approx(74, abs=4)
+    assert all(np.isfinite(beat.pressure["radial"]).all() for beat in beats)
+    assert max(beat.period_error for beat in beats) < 0.3

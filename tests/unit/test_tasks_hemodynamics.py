@@ -1,9 +1,12 @@
 """Recordings of stored beats, and the task made of them."""
 
+import json
 import math
 import pickle
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -141,6 +144,54 @@ def test_shipped_sets_are_small_and_of_known_seeds() -> None:
         assert people.period_error.max() < 0.3
     folder = Path(__file__).parents[2] / "sbi_rope/tasks/hemodynamics/data"
     assert sum(path.stat().st_size for path in folder.glob("*.npz")) < 3_000_000
+
+
+@pytest.mark.parametrize("process", ["simulator", "real"])
+def test_shipped_people_have_pressures_of_people(process: str) -> None:
+    beat = Hemodynamics()._load(None, process).beat  # type: ignore[arg-type]
+    systolic, diastolic = beat.amax(dim=1), beat.amin(dim=1)
+    # Means over the population as in the study that the design follows.
+    assert systolic.mean() == pytest.approx(124, abs=4)
+    assert diastolic.mean() == pytest.approx(74, abs=3)
+    assert (systolic - diastolic).mean() == pytest.approx(50, abs=5)
+    assert beat.mean() == pytest.approx(95, abs=3)
+    assert 30 < beat.min() < beat.max() < 220
+
+
+def test_people_of_another_prior_or_physics_are_refused(tmp_path: Path) -> None:
+    source = Path(__file__).parents[2] / "sbi_rope/tasks/hemodynamics/data"
+
+    def changed(process: str, **changes: Any) -> Path:
+        arrays = dict(np.load(source / f"{process}.npz"))
+        header = json.loads(str(arrays["settings"]))
+        for part, values in changes.items():
+            header["settings"][part] |= values
+        arrays["settings"] = np.array(json.dumps(header))
+        path = tmp_path / f"{process}_{len(list(tmp_path.iterdir()))}.npz"
+        np.savez(path, **arrays)
+        return path
+
+    other = changed("simulator", population={"prior": "independent"})
+    with pytest.raises(InvalidInputError, match="prior='independent'"):
+        Hemodynamics(simulations=other).get_simulator()
+    assert Hemodynamics(simulations=other, prior="independent").get_simulator()
+    elastic = changed("real", physics={"viscoelastic": False})
+    with pytest.raises(InvalidInputError, match="viscoelastic is False"):
+        Hemodynamics(observations=elastic).get_test_set(1)
+
+
+def test_the_simulator_does_not_depend_on_the_default_device() -> None:
+    expected = Hemodynamics().get_simulator()
+    with torch.device("meta"):
+        assert torch.equal(Hemodynamics().get_simulator().theta, expected.theta)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16])
+def test_simulations_keep_the_dtype(dtype: torch.dtype) -> None:
+    simulator = Hemodynamics().get_simulator()
+    x = simulator(simulator.theta[:3].to(dtype))
+    assert x.dtype == dtype
+    assert torch.isfinite(x).all()
 
 
 def test_the_simulator_can_be_pickled() -> None:

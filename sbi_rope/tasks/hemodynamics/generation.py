@@ -4,6 +4,7 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -77,9 +78,10 @@ def generate(
         InvalidInputError: If the file is there, work in progress has other settings,
             or an argument is out of range.
         SimulationError: If nearly nobody can be simulated.
-        ImportError: If numba is not installed.
+        ImportError: If numba or joblib is not installed.
     """
     path = Path(path)
+    _check_free(path)
     check_integer("n", n)
     check_integer("seed", seed, minimum=0)
     check_choice("process", process, PROCESSES)
@@ -87,7 +89,7 @@ def generate(
         check_integer("jobs", jobs)
     work = Work(
         process=process,
-        seed=seed,
+        seed=int(seed),
         population=population or Population(),
         physics=physics or Physics(),
         simulate=simulate or _default_simulate(),
@@ -98,12 +100,11 @@ def generate(
         # Imported long ago; at the top of this module it would close a circle.
         "version": import_module("sbi_rope").__version__,
         "process": process,
-        "n": n,
-        "seed": seed,
+        "n": int(n),
+        "seed": int(seed),
         "population": describe_population(work.population, process),
         "physics": work.physics.as_dict(),
     }
-    _check_free(path)
     _claim(work.folder, settings)
     parts = _simulate_all(work, n, jobs, progress=progress)
     _check_free(path)
@@ -116,6 +117,12 @@ def generate(
 
 
 def _default_simulate() -> Simulate:
+    for module in ("numba", "joblib"):  # before any work begins
+        if find_spec(module) is None:
+            raise ImportError(
+                f"Simulating blood flow needs {module}. Install it with "
+                '`pip install "sbi-rope[hemodynamics]"`.'
+            )
     from sbi_rope.tasks.hemodynamics.waveforms import simulate_beat
 
     return simulate_beat

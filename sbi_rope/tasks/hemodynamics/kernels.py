@@ -4,6 +4,9 @@ A step takes flows from :math:`t - \Delta t / 2` to :math:`t + \Delta t / 2`, th
 and pressures from :math:`t` to :math:`t + \Delta t`.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 from numba import njit
 
@@ -17,7 +20,12 @@ IMPLICIT = 0.55
 OLD = (1 - IMPLICIT) / IMPLICIT  # that of the old flow, relative to it
 
 
-_compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _compiled(function: Callable[..., Any]) -> Any:
+    options = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
+    try:
+        return njit(cache=True, **options)(function)
+    except RuntimeError:  # no folder to keep compiled code in can be written to
+        return njit(**options)(function)
 
 
 @_compiled

@@ -7,7 +7,12 @@ from typing import Literal
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from sbi_rope._validation import check_choice, check_integer
+from sbi_rope._validation import (
+    check_choice,
+    check_instance,
+    check_integer,
+    check_not_negative,
+)
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.hemodynamics import population_tables as tables
 from sbi_rope.tasks.hemodynamics.subject import NUM_SEGMENTS, Subject
@@ -112,15 +117,20 @@ class Population:
         # At larger scatters, some arteries are all but gone and others metres long.
         for name, largest in (("height_sd", 0.4), ("segment_sd", 0.5)):
             value = getattr(self, name)
-            if not 0.0 <= value <= largest:
+            check_not_negative(name, value)
+            if value > largest:
                 raise InvalidInputError(
                     f"Expected `{name}` from 0 to {largest}; got {value!r}."
                 )
+        check_instance("proximal_aorta", self.proximal_aorta, bool)
         check_choice("prior", self.prior, ("population", "independent"))
 
     def as_dict(self) -> dict[str, float | bool | str]:
         """Return all settings by name, as stored with a data set."""
-        return asdict(self)
+        scatters = {
+            name: float(getattr(self, name)) for name in ("height_sd", "segment_sd")
+        }
+        return asdict(self) | scatters
 
     def draw(self, process: Process, seed: int, index: int) -> Subject:
         """Return one person, always the same for the same arguments.

@@ -131,7 +131,10 @@ class PopulationPrior(Distribution):
         near = torch.lerp(self._density[i, j], self._density[i + 1, j], u - i)
         far = torch.lerp(self._density[i, j + 1], self._density[i + 1, j + 1], u - i)
         density = torch.lerp(near, far, v - j) / self._band.area
-        log_density = density.log().where(inside & (density > 0), -torch.inf)
+        # Clamped, so that gradients are zero and not NaN where there is no density.
+        tiny = torch.finfo(density.dtype).tiny
+        log_density = density.clamp(min=tiny).log()
+        log_density = log_density.where(inside & (density > 0), -torch.inf)
         return log_density.to(value.dtype)
 
     def marginal_cdf(self, theta: Tensor) -> Tensor:

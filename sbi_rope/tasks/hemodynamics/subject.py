@@ -132,7 +132,8 @@ class Physics:
     max_period_error: float = 0.3
 
     def __post_init__(self) -> None:
-        for name in ("cell_length", "min_segment_length", "max_period_error"):
+        lengths = ("cell_length", "min_segment_length", "max_period_error")
+        for name in (*lengths, "convection"):
             check_positive(name, getattr(self, name))
         for name in ("courant", "fallback_courant"):
             check_positive(name, getattr(self, name))
@@ -141,7 +142,12 @@ class Physics:
 
     def as_dict(self) -> dict[str, float | int | bool]:
         """Return all settings by name, as stored with a data set."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        # Plain numbers, whatever kind they were given as.
+        kinds = {"num_cycles": int, "viscoelastic": bool}
+        return {
+            field.name: kinds.get(field.name, float)(getattr(self, field.name))
+            for field in fields(self)
+        }
 
 
 @dataclass(frozen=True, kw_only=True)

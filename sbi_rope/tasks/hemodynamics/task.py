@@ -4,14 +4,16 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._validation import check_positive
+from sbi_rope._validation import check_choice, check_positive
+from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.base import Task, check_theta
-from sbi_rope.tasks.hemodynamics.dataset import BeatSet, load
-from sbi_rope.tasks.hemodynamics.population import Process
+from sbi_rope.tasks.hemodynamics.dataset import BeatSet, differences, load
+from sbi_rope.tasks.hemodynamics.population import Population, Process
 from sbi_rope.tasks.hemodynamics.prior import PopulationPrior
 from sbi_rope.tasks.hemodynamics.records import NUM_STEPS, Normalisation, Recorder
 from sbi_rope.tasks.networks import SeriesEmbedding, light_series_embedding
@@ -21,6 +23,7 @@ from sbi_rope.tasks.splits import DrawnPairs, Part, RecordedPairs, generator_of
 __all__ = ["Hemodynamics", "NearestBeatSimulator"]
 
 SHIPPED = "sbi_rope.tasks.hemodynamics.data"
+CHUNK_SIZE = 1000  # parameters that are looked up together
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -55,16 +58,21 @@ class NearestBeatSimulator:
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, 2)``, to shape ``(n, 1000)``."""
         theta = check_theta(theta, 2)
-        scale = self.theta_std.to(theta)
+        device = theta.device
+        scale = self.theta_std.to(device)
+        stored = self.theta.to(device) / scale
+        chunks = (theta.float() / scale).split(CHUNK_SIZE)
         # Plain differences: a matrix product would not find an exact match at 0.
-        distance = torch.cdist(
-            theta / scale,
-            self.theta.to(theta) / scale,
-            compute_mode="donot_use_mm_for_euclid_dist",
+        nearest = torch.cat(
+            [
+                torch.cdist(
+                    chunk, stored, compute_mode="donot_use_mm_for_euclid_dist"
+                ).argmin(dim=1)
+                for chunk in chunks
+            ]
         )
-        nearest = distance.argmin(dim=1)
-        beat, period = self.beat.to(theta)[nearest], self.period.to(theta)[nearest]
-        return self.recorder(beat, period)
+        beat, period = self.beat.to(device)[nearest], self.period.to(device)[nearest]
+        return self.recorder(beat.to(theta.dtype), period.to(theta.dtype))
 
 
 class Hemodynamics(Task):
@@ -113,6 +121,8 @@ class Hemodynamics(Task):
         simulations: File of simulated people; the small one of the package unless
             given.
         observations: File of real people; the small one of the package unless given.
+        prior: The law of the parameters that both files were made with, see
+            :class:`Population`; those of the package have ``"population"``.
         noise_std: Standard deviation of the noise, after normalisation.
         normalisation: ``"per_record"``, to mean 0 and standard deviation 1, or
             ``"global"``, which keeps the level and the height of the pulse.
@@ -150,18 +160,21 @@ class Hemodynamics(Task):
         label_noise: float | None = None,
         simulations: str | Path | None = None,
         observations: str | Path | None = None,
+        prior: Literal["population", "independent"] = "population",
         noise_std: float = 0.05,
         normalisation: Normalisation = "per_record",
     ) -> None:
         super().__init__(variant=variant, root=root, label_noise=label_noise)
         check_positive("noise_std", noise_std)
+        check_choice("prior", prior, ("population", "independent"))
+        self.prior: Literal["population", "independent"] = prior
         self.simulations = simulations
         self.observations = self._option("observations", observations, None)
         self.recorder = Recorder(noise_std=noise_std, normalisation=normalisation)
 
     def get_prior(self) -> PopulationPrior:
         """Return the law of both parameters in the population."""
-        return PopulationPrior()
+        return PopulationPrior(Population(prior=self.prior))
 
     def prior_quantiles(self, theta: Tensor) -> Tensor:
         """Return the distribution functions of both parameters, ``(n, 2)``."""
@@ -170,13 +183,11 @@ class Hemodynamics(Task):
     def get_simulator(self) -> NearestBeatSimulator:
         """Return the simulator that looks simulated people up."""
         people = self._load(self.simulations, "simulator")
-        rows = torch.arange(len(people))
-        if self.variant == "well_specified":
-            rows = rows[::2]
+        step = 2 if self.variant == "well_specified" else 1
         return NearestBeatSimulator(
-            theta=people.theta[rows],
-            beat=people.beat[rows],
-            period=people.period[rows],
+            theta=people.theta[::step],
+            beat=people.beat[::step],
+            period=people.period[::step],
             theta_std=self.prior_std,
             recorder=self.recorder,
         )
@@ -195,7 +206,15 @@ class Hemodynamics(Task):
         return DrawnPairs(draw_theta=_Rounds(simulator.theta), observe=simulator)
 
     def _real_process(self, part: Part) -> RecordedPairs:
-        return self._recorded(self._load(self.observations, "real"))
+        people = self._load(self.observations, "real")
+        simulated = self._load(self.simulations, "simulator")
+        wrong = differences(people.settings["physics"], simulated.settings["physics"])
+        if wrong:
+            raise InvalidInputError(
+                f"Expected `observations` made with the physics of `simulations`; "
+                f"{wrong}. Make one of them again with the other's settings."
+            )
+        return self._recorded(people)
 
     def _well_specified_process(self, part: Part) -> RecordedPairs:
         people = self._load(self.simulations, "simulator")
@@ -211,11 +230,17 @@ class Hemodynamics(Task):
         read_x = partial(_record_once, self.recorder, beat, period, keys)
         return RecordedPairs(theta=people.theta[chosen], read_x=read_x)
 
-    @staticmethod
-    def _load(path: str | Path | None, process: Process) -> BeatSet:
+    def _load(self, path: str | Path | None, process: Process) -> BeatSet:
         if path is None:
             path = Path(str(files(SHIPPED) / f"{process}.npz"))
-        return load(path, process=process)
+        people = load(Path(path).expanduser(), process=process)
+        made_with = people.settings["population"]["prior"]
+        if made_with != self.prior:
+            raise InvalidInputError(
+                f"Expected people of the prior {self.prior!r} in {path}; got those of "
+                f"{made_with!r}. Pass `prior={made_with!r}`, or other files."
+            )
+        return people
 
 
 class _Rounds:
