@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sbi_rope.errors import SimulationError
-from sbi_rope.tasks.hemodynamics import waveforms
+from sbi_rope.tasks.hemodynamics import generation, waveforms
 from sbi_rope.tasks.hemodynamics.__main__ import main
 from sbi_rope.tasks.hemodynamics.dataset import load
 from sbi_rope.tasks.hemodynamics.population import Population
@@ -37,7 +37,8 @@ def hum(subject: Subject, physics: Physics) -> Beat:
 
 @pytest.fixture(autouse=True)
 def _no_solver(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(waveforms, "simulate_beat", hum)
+    monkeypatch.setattr(generation, "_default_simulate", lambda: hum)
+    monkeypatch.setattr(waveforms, "simulate_beat", hum)  # for the picture
 
 
 def _generate(file: Path, *options: str) -> int:
@@ -79,10 +80,10 @@ def test_an_interrupt_says_how_to_go_on(
     def stop(subject: Subject, physics: Physics) -> Beat:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(waveforms, "simulate_beat", stop)
+    monkeypatch.setattr(generation, "_default_simulate", lambda: stop)
     assert _generate(tmp_path / "x.npz") == 130
     assert "The same command goes on" in capsys.readouterr().err
-    monkeypatch.setattr(waveforms, "simulate_beat", hum)
+    monkeypatch.setattr(generation, "_default_simulate", lambda: hum)
     assert _generate(tmp_path / "x.npz") == 0
 
 
