@@ -9,10 +9,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-import torch
-from sbi.inference import NPE
-from sbi.neural_nets import posterior_nn
-from study import Study, argument_parser, print_table
+from study import Study, argument_parser, print_table, train_small_npe
 
 from sbi_rope import SinkhornCoupler
 from sbi_rope.tasks import Task, get_task, list_tasks
@@ -26,22 +23,13 @@ warnings.filterwarnings("ignore", "Data has constant values")
 def train_npe(task: Task, seed: int, num_simulations: int, max_num_epochs: int) -> Any:
     """Train plain sbi on simulations; nothing here knows of RoPE."""
     theta, x = task.get_simulations(num_simulations, seed=seed)
-    torch.manual_seed(seed)
-    npe = NPE(
-        task.get_prior(),
-        density_estimator=posterior_nn(
-            "nsf",
-            embedding_net=task.get_embedding_net(light=True),
-            z_score_x=task.z_score_x,
-            num_transforms=2,
-        ),
-        show_progress_bars=False,
+    return train_small_npe(
+        task,
+        (theta, x),
+        seed=seed,
+        learning_rate=1e-3,
+        max_num_epochs=max_num_epochs,
     )
-    npe.append_simulations(theta, x)
-    npe.train(
-        training_batch_size=100, learning_rate=1e-3, max_num_epochs=max_num_epochs
-    )
-    return npe.build_posterior()
 
 
 def find_task(name: str, root: Path | None) -> Task | None:

@@ -8,9 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from sbi.inference import NPE
-from sbi.neural_nets import posterior_nn
-from study import Study, argument_parser
+from study import Study, argument_parser, train_small_npe
 from torch import Tensor
 
 from sbi_rope import CalibrationFinetuner, SinkhornCoupler
@@ -45,22 +43,13 @@ def split_people(task: Task, seed: int, rounds: int) -> dict[str, Pairs]:
 def train_npe(task: Task, seed: int, rounds: int, max_num_epochs: int) -> Any:
     """Train plain sbi on simulations; nothing here knows of RoPE."""
     theta, x = split_people(task, seed, rounds)["to_train"]
-    torch.manual_seed(seed)
-    npe = NPE(
-        task.get_prior(),
-        density_estimator=posterior_nn(
-            "nsf",
-            embedding_net=task.get_embedding_net(light=True),
-            z_score_x=task.z_score_x,
-            num_transforms=2,
-        ),
-        show_progress_bars=False,
+    return train_small_npe(
+        task,
+        (theta, x),
+        seed=seed,
+        learning_rate=5e-4,
+        max_num_epochs=max_num_epochs,
     )
-    npe.append_simulations(theta, x)
-    npe.train(
-        training_batch_size=100, learning_rate=5e-4, max_num_epochs=max_num_epochs
-    )
-    return npe.build_posterior()
 
 
 def main() -> None:

@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from sbi.inference import NPE
+from sbi.neural_nets import posterior_nn
 from torch import Tensor
 
 from sbi_rope import CalibrationFinetuner, RoPE, SinkhornCoupler, plots
@@ -181,6 +183,35 @@ class Study:
             figure.savefig(
                 self.out / f"{kind}_{name}.png", dpi=120, bbox_inches="tight"
             )
+
+
+def train_small_npe(
+    task: Task,
+    simulations: tuple[Tensor, Tensor],
+    *,
+    seed: int,
+    learning_rate: float,
+    max_num_epochs: int,
+) -> Any:
+    """Train plain sbi with the task's light network; nothing here knows of RoPE."""
+    torch.manual_seed(seed)
+    npe = NPE(
+        task.get_prior(),
+        density_estimator=posterior_nn(
+            "nsf",
+            embedding_net=task.get_embedding_net(light=True),
+            z_score_x=task.z_score_x,
+            num_transforms=2,
+        ),
+        show_progress_bars=False,
+    )
+    npe.append_simulations(*simulations)
+    npe.train(
+        training_batch_size=100,
+        learning_rate=learning_rate,
+        max_num_epochs=max_num_epochs,
+    )
+    return npe.build_posterior()
 
 
 class ResultsFile:

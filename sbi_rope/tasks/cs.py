@@ -15,7 +15,7 @@ from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.base import Task, check_theta
 from sbi_rope.tasks.distributions import box
 from sbi_rope.tasks.networks import fully_connected
-from sbi_rope.tasks.settings import PaperSettings
+from sbi_rope.tasks.settings import STATISTICS_SETTINGS
 from sbi_rope.tasks.splits import DrawnPairs, Part
 
 __all__ = ["CancerStroma", "CancerStromaSimulator"]
@@ -246,15 +246,7 @@ class CancerStroma(Task):
     x_names = STATISTICS
     misspecification = "in real tissue the cancer cells near most parents are dead"
     shifted_region = {"cell_rate": (850.0, 1500.0), "parent_rate": (3.0, 11.5)}  # noqa: RUF012
-    paper_settings = PaperSettings(
-        batch_size=None,
-        num_steps=1_000_000,
-        num_validation=100_000,
-        finetuning_learning_rate=None,
-        finetuning_steps=None,
-        joint_epochs=None,
-        joint_epoch_size=None,
-    )
+    paper_settings = STATISTICS_SETTINGS
 
     def __init__(
         self,

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-__all__ = ["PaperSettings"]
+__all__ = ["STATISTICS_SETTINGS", "PaperSettings"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,3 +54,15 @@ class PaperSettings:
     gamma: float = 0.5
     tau: float = 1.0
     tau_relaxed: float = 0.9
+
+
+# The paper describes tasks A and B, whose observations are statistics, together.
+STATISTICS_SETTINGS = PaperSettings(
+    batch_size=None,
+    num_steps=1_000_000,
+    num_validation=100_000,
+    finetuning_learning_rate=None,
+    finetuning_steps=None,
+    joint_epochs=None,
+    joint_epoch_size=None,
+)

@@ -13,7 +13,7 @@ from sbi_rope._validation import check_positive, check_unit_interval
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.base import Task, check_theta
 from sbi_rope.tasks.networks import fully_connected
-from sbi_rope.tasks.settings import PaperSettings
+from sbi_rope.tasks.settings import STATISTICS_SETTINGS
 from sbi_rope.tasks.splits import DrawnPairs, Part
 from sbi_rope.tasks.triangle import UniformTriangle
 
@@ -253,15 +253,7 @@ class SIR(Task):
     x_names = STATISTICS
     misspecification = "a part of the real infections of a weekend is reported late"
     shifted_region = {"infection_rate": (0.25, 0.5), "recovery_rate": (0.0, 0.125)}  # noqa: RUF012
-    paper_settings = PaperSettings(
-        batch_size=None,
-        num_steps=1_000_000,
-        num_validation=100_000,
-        finetuning_learning_rate=None,
-        finetuning_steps=None,
-        joint_epochs=None,
-        joint_epoch_size=None,
-    )
+    paper_settings = STATISTICS_SETTINGS
 
     def __init__(
         self,
