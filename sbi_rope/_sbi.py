@@ -23,9 +23,12 @@ from sbi.neural_nets.estimators.base import (
     ConditionalDensityEstimator,
     ConditionalEstimator,
     ConditionalVectorFieldEstimator,
+    UnconditionalDensityEstimator,
 )
 from sbi.neural_nets.estimators.mixed_density_estimator import MixedDensityEstimator
 from sbi.neural_nets.estimators.tabpfn_flow import TabPFNFlow
+from sbi.neural_nets.net_builders.flow import build_zuko_unconditional_flow
+from sbi.samplers.mcmc import SliceSamplerVectorized
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
@@ -38,7 +41,10 @@ __all__ = [
     "DirectPosterior",
     "MixedDensity",
     "NeuralPosterior",
+    "SliceSamplerVectorized",
+    "UnconditionalDensityEstimator",
     "VectorFieldDensity",
+    "build_zuko_unconditional_flow",
     "device_of",
     "dtype_of",
     "embed",

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from sbi.utils import within_support
 from torch import Tensor
+from torch.distributions import Distribution
 
 from sbi_rope.errors import InvalidInputError, InvalidTypeError
 
@@ -24,6 +25,7 @@ __all__ = [
     "check_integer",
     "check_not_negative",
     "check_positive",
+    "check_prior",
     "check_same_length",
     "check_tensor",
     "check_unit_interval",
@@ -97,6 +99,16 @@ def check_instance(
         raise InvalidTypeError(
             f"Expected `{name}` to be a {expected.__name__}; got "
             f"{type(value).__name__}."
+        )
+
+
+def check_prior(prior: Any) -> None:
+    """Raise unless the prior is a torch distribution."""
+    if not isinstance(prior, Distribution):
+        raise InvalidTypeError(
+            f"Expected `prior` to be a torch distribution; got "
+            f"{type(prior).__name__}. Wrap it with "
+            f"`sbi.utils.process_prior(prior)[0]`."
         )
 
 

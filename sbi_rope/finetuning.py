@@ -2,14 +2,20 @@
 
 import copy
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
-from tqdm.auto import tqdm
 
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed
+from sbi_rope._training import (
+    STEPS_WITHOUT_HOLDOUT,
+    History,
+    fit,
+    split_pairs,
+    warn_without_holdout,
+)
 from sbi_rope._validation import (
     check_finite,
     check_instance,
@@ -18,42 +24,9 @@ from sbi_rope._validation import (
     check_same_length,
     check_tensor,
 )
-from sbi_rope.errors import InvalidInputError, warn_user
+from sbi_rope.errors import InvalidInputError
 
 __all__ = ["CalibrationFinetuner", "FinetuneResult", "History"]
-
-# Fewer pairs than this leave nothing to hold out.
-MIN_PAIRS_FOR_HOLDOUT = 5
-# Without a hold-out nothing says when to stop, so little is risked.
-STEPS_WITHOUT_HOLDOUT = 50
-
-
-@dataclass(frozen=True)
-class History:
-    """The course of a fine-tuning, for plotting.
-
-    Attributes:
-        training_loss: Mean distance to the targets over the training pairs before each
-            step, and after the last; in units of the embedding.
-        validation_loss: The same over the held-out pairs; empty without a hold-out.
-        best_step: Number of steps after which the kept net was reached; 0 is the
-            starting point, the embedding net as NPE left it.
-        learning_rate: The learning rate of this course, the best of those tried.
-    """
-
-    training_loss: list[float] = field(repr=False)
-    validation_loss: list[float] = field(repr=False)
-    best_step: int
-    learning_rate: float
-
-    def __repr__(self) -> str:
-        loss, what = self.validation_loss, "validation_loss"
-        if not loss:
-            loss, what = self.training_loss, "training_loss"
-        return (
-            f"History({what} {loss[0]:.3g} -> {loss[self.best_step]:.3g}, "
-            f"best_step={self.best_step}, learning_rate={self.learning_rate:g})"
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +163,7 @@ class CalibrationFinetuner:
                 )
                 for rate in self._rates_to_try(embedding_net, held_out)
             ]
-        return min(results, key=_kept_validation_loss)
+        return min(results, key=lambda result: result.history.kept_validation_loss)
 
     def _rates_to_try(self, net: nn.Module, held_out: Tensor) -> tuple[float, ...]:
         if len(held_out):
@@ -203,16 +176,10 @@ class CalibrationFinetuner:
         return (rate,)
 
     def _split(self, num_pairs: int) -> tuple[Tensor, Tensor]:
-        order = torch.randperm(num_pairs)
-        if num_pairs < MIN_PAIRS_FOR_HOLDOUT:
-            warn_user(
-                f"Only {num_pairs} calibration pair(s): none is held out, and tuning "
-                f"stops after at most {STEPS_WITHOUT_HOLDOUT} steps. Append at least "
-                f"{MIN_PAIRS_FOR_HOLDOUT} pairs to choose the best net on a hold-out."
-            )
-            return order, order[:0]
-        num_held_out = max(1, round(self.validation_fraction * num_pairs))
-        return order[num_held_out:], order[:num_held_out]
+        train, held_out = split_pairs(num_pairs, self.validation_fraction)
+        if not len(held_out):
+            warn_without_holdout(num_pairs)
+        return train, held_out
 
     def _optimise(
         self,
@@ -230,50 +197,34 @@ class CalibrationFinetuner:
         num_steps = self.num_steps
         if not has_holdout:
             num_steps = min(num_steps, STEPS_WITHOUT_HOLDOUT)
-        optimizer = torch.optim.Adam(net.parameters(), lr=learning_rate)
-        training_loss: list[float] = []
-        validation_loss: list[float] = []
-        best_state, best_step = copy.deepcopy(net.state_dict()), 0
-        held_out_targets = targets[held_out]
+        newest = targets
 
-        progress = tqdm(
-            range(num_steps + 1),
-            desc=f"Fine-tuning (learning rate {learning_rate:g})",
-            disable=not show_progress_bars,
-        )
-        for step in progress:
+        def all_pairs(step: int) -> list[tuple[Tensor, Tensor]]:
+            nonlocal newest
             if draw_targets is not None and 0 < step < num_steps:
-                targets = draw_targets(self.simulations_per_target)
-            loss = _mean_distance(net(x[train]), targets[train])
-            training_loss.append(float(loss.detach()))
-            if not torch.isfinite(loss):
-                warn_user(
-                    f"The loss of the fine-tuning is not finite after {step} steps "
-                    f"with learning rate {learning_rate:g}; the best net before is "
-                    "kept. Use a smaller learning rate."
-                )
-                break
-            if has_holdout:
-                with torch.no_grad():
-                    distance = _mean_distance(net(x[held_out]), held_out_targets)
-                validation_loss.append(float(distance))
-            if not has_holdout or validation_loss[-1] < validation_loss[best_step]:
-                best_state, best_step = copy.deepcopy(net.state_dict()), step
-            if step - best_step >= self.patience:
-                break
-            if step < num_steps:
-                optimizer.zero_grad()
-                loss.backward()
-                optimizer.step()
+                newest = draw_targets(self.simulations_per_target)
+            return [(x[train], newest[train])]
 
-        net.load_state_dict(best_state)
-        history = History(training_loss, validation_loss, best_step, learning_rate)
+        def distance(x: Tensor, targets: Tensor) -> Tensor:
+            return _mean_distance(net(x), targets)
+
+        history = fit(
+            net,
+            all_pairs,
+            distance,
+            validation_loss=(
+                (lambda: distance(x[held_out], targets[held_out]))
+                if has_holdout
+                else None
+            ),
+            learning_rate=learning_rate,
+            max_num_steps=num_steps,
+            patience=self.patience,
+            in_training_mode=False,
+            label="Fine-tuning",
+            show_progress_bars=show_progress_bars,
+        )
         return FinetuneResult(net.requires_grad_(requires_grad=False), history)
-
-
-def _kept_validation_loss(result: FinetuneResult) -> float:
-    history = result.history
-    return history.validation_loss[history.best_step] if history.validation_loss else 0
 
 
 def trainable_copy(embedding_net: nn.Module, embeddings: Tensor) -> nn.Module:

@@ -1,7 +1,9 @@
 """Robust posterior estimation: the conductor of its three steps."""
 
 import copy
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
@@ -283,38 +285,130 @@ class RoPE:
             CouplingError: If the coupling has not converged.
             SimulationError: If the simulator fails.
         """
+        check_instance("coupler", coupler, SinkhornCoupler, optional=True)
+        check_choice("unseen", unseen, ("raise", "extend"))
+        check_unit_interval("tail_mass", tail_mass)
+        batch = self._embed_batch(
+            x_o,
+            num_simulations=num_simulations,
+            seed=seed,
+            show_progress_bars=show_progress_bars,
+        )
+        coupler = self.coupler if coupler is None else coupler
+        coupling = coupler.couple(batch.real, batch.simulated, seed=seed)
+        if require_convergence:
+            _check_converged(coupling, coupler)
+        return self._mixture(batch, coupling, unseen=unseen, tail_mass=tail_mass)
+
+    def sweep(
+        self,
+        x_o: Tensor,
+        *,
+        gammas: Sequence[float],
+        taus: Sequence[float],
+        coupler: SinkhornCoupler | None = None,
+        num_simulations: int | None = None,
+        seed: int | None = None,
+        unseen: Literal["raise", "extend"] = "raise",
+        require_convergence: bool = True,
+        tail_mass: float = 1e-3,
+        show_progress_bars: bool = True,
+    ) -> Iterator[MixturePosterior]:
+        """Couple a batch at every gamma and every tau, with the same simulations.
+
+        The same as :meth:`build_posterior` at each, up to the tolerance of the coupler,
+        in less time: the simulations are drawn and embedded once, and each coupling
+        starts from its neighbour (:meth:`SinkhornCoupler.sweep
+        <sbi_rope.SinkhornCoupler.sweep>`).
+
+        Args:
+            x_o: As in :meth:`build_posterior`, and so are the arguments not listed.
+            gammas: Values of gamma; descending ones are handed out soonest.
+            taus: Values of tau.
+            coupler: Settings other than gamma and tau.
+            num_simulations: As in :meth:`build_posterior`.
+            seed: As in :meth:`build_posterior`.
+            unseen: As in :meth:`build_posterior`.
+            require_convergence: As in :meth:`build_posterior`.
+            tail_mass: As in :meth:`build_posterior`.
+            show_progress_bars: As in :meth:`build_posterior`.
+
+        Returns:
+            An iterator over the posteriors: all taus of the first gamma, then of the
+            second, and so on.
+
+        Raises:
+            InvalidInputError: If there is no gamma or tau or one is outside its range,
+                or as in :meth:`build_posterior`.
+            NotReadyError: As in :meth:`build_posterior`.
+            CouplingError: When the iteration reaches a coupling that has not converged.
+            SimulationError: If the simulator fails.
+        """
+        check_instance("coupler", coupler, SinkhornCoupler, optional=True)
+        check_choice("unseen", unseen, ("raise", "extend"))
+        check_unit_interval("tail_mass", tail_mass)
+        batch = self._embed_batch(
+            x_o,
+            num_simulations=num_simulations,
+            seed=seed,
+            show_progress_bars=show_progress_bars,
+        )
+        coupler = self.coupler if coupler is None else coupler
+        couplings = coupler.sweep(
+            batch.real, batch.simulated, gammas=gammas, taus=taus, seed=seed
+        )
+
+        def posteriors() -> Iterator[MixturePosterior]:
+            settings = itertools.product(gammas, taus)
+            for coupling, (gamma, tau) in zip(couplings, settings, strict=True):
+                if require_convergence:
+                    _check_converged(coupling, replace(coupler, gamma=gamma, tau=tau))
+                yield self._mixture(batch, coupling, unseen=unseen, tail_mass=tail_mass)
+
+        return posteriors()
+
+    def _embed_batch(
+        self,
+        x_o: Tensor,
+        *,
+        num_simulations: int | None,
+        seed: int | None,
+        show_progress_bars: bool,
+    ) -> "_Batch":
         if len(self._x_cal) and self._g is None:
             raise NotReadyError(
                 f"{len(self._x_cal)} calibration pairs were appended but not trained "
                 "on. Call `train()` first."
             )
-        check_instance("coupler", coupler, SinkhornCoupler, optional=True)
-        check_choice("unseen", unseen, ("raise", "extend"))
-        check_unit_interval("tail_mass", tail_mass)
         if num_simulations is not None:
             check_integer("num_simulations", num_simulations)
         x_o = self._checked("x_o", x_o, self._estimator.condition_shape)
-        coupler = self.coupler if coupler is None else coupler
-
         g = self._h if self._g is None else self._g
         with seeded(seed):
-            contexts = self._source.embeddings(
+            simulated = self._source.embeddings(
                 num_simulations,
                 max(len(x_o), MIN_SIMULATIONS),
                 self._embed_simulations,
                 progress=show_progress_bars,
             )
-        embedded = embed(g, x_o)
-        check_finite("g(x_o)", embedded)
-        coupling = coupler.couple(embedded, contexts, seed=seed)
-        if require_convergence:
-            _check_converged(coupling, coupler)
+        real = embed(g, x_o)
+        check_finite("g(x_o)", real)
+        return _Batch(x_o, real, simulated, copy.deepcopy(g))
+
+    def _mixture(
+        self,
+        batch: "_Batch",
+        coupling: Coupling,
+        *,
+        unseen: Literal["raise", "extend"],
+        tail_mass: float,
+    ) -> MixturePosterior:
         mixture = MixtureEstimator(
             copy.deepcopy(self._components()),
-            contexts,
+            batch.simulated,
             coupling,
-            x_o,
-            embedding_net=copy.deepcopy(g),
+            batch.x_o,
+            embedding_net=batch.embedding_net,
             unseen=unseen,
             tail_mass=tail_mass,
         )
@@ -384,6 +478,16 @@ class RoPE:
         value = value.detach().to(dtype_of(self._estimator), copy=True)
         check_finite(name, value)  # the estimator's dtype may hold less
         return value
+
+
+@dataclass(frozen=True, eq=False)
+class _Batch:
+    """A batch of real observations and the simulations it is coupled with."""
+
+    x_o: Tensor
+    real: Tensor
+    simulated: Tensor
+    embedding_net: nn.Module
 
 
 def _check_converged(coupling: Coupling, coupler: SinkhornCoupler) -> None:

@@ -1,10 +1,10 @@
 """Importing the package has no side effects, and imports run one way."""
 
 import ast
+import functools
 import json
 import subprocess
 import sys
-import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ DEPENDENCIES = "import ot, numpy, torch, tqdm.auto, sbi.inference, sbi.utils"
 # A module imports from layers below its own, and from its own package.
 LAYERS = [
     {"errors"},
-    {"_validation", "_sbi", "_random"},
+    {"_validation", "_sbi", "_random", "_training"},
     {"coupling", "finetuning", "metrics", "_simulations"},
     {"mixture", "plots"},
     {"rope", "tasks"},
@@ -43,75 +43,76 @@ PUBLIC_OF_SBI = {
 }
 
 
-def run(code: str) -> dict[str, Any]:
-    """Run code in a fresh interpreter; it prints one line of JSON at its end."""
+IMPORT = f"""
+import hashlib, json, random, socket, sys, warnings
+
+def refuse(*args, **kwargs):
+    raise RuntimeError("a socket was used")
+
+for name in ("connect", "connect_ex", "bind", "sendto"):
+    setattr(socket.socket, name, refuse)
+socket.getaddrinfo = socket.create_connection = refuse
+
+import numpy, torch
+
+def state():
+    generators = torch.get_rng_state(), numpy.random.get_state(), random.getstate()
+    return dict(
+        dtype=str(torch.get_default_dtype()),
+        rng=hashlib.sha256(generators[0].numpy().tobytes()).hexdigest(),
+        numpy=repr(generators[1][2:]) + str(generators[1][1].tolist()),
+        random=repr(generators[2]),
+        validate=torch.distributions.Distribution._validate_args,
+        grad=torch.is_grad_enabled(),
+        threads=torch.get_num_threads(),
+        deterministic=torch.are_deterministic_algorithms_enabled(),
+        filters=[str(f) for f in warnings.filters],
+    )
+
+{DEPENDENCIES}
+torch.manual_seed(0); numpy.random.seed(0); random.seed(0)
+theirs, before = state(), set(sys.modules)
+import sbi_rope, sbi_rope.metrics, sbi_rope.baselines, sbi_rope.tasks
+new, ours = sorted(set(sys.modules) - before), state()
+print(json.dumps(dict(new=new, all=sorted(sys.modules), theirs=theirs, ours=ours)))
+"""
+
+
+@pytest.fixture(scope="module")
+def fresh() -> dict[str, Any]:
+    """What a fresh interpreter reports of importing the package, once for all tests."""
     result = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(code)],
+        [sys.executable, "-c", IMPORT],
         capture_output=True,
         text=True,
         check=False,
         timeout=120,
     )
     assert result.returncode == 0, result.stderr
-    lines = result.stdout.splitlines()
-    return {"out": lines[:-1], "err": result.stderr, **json.loads(lines[-1])}
+    *out, report = result.stdout.splitlines()
+    return {"out": out, "err": result.stderr, **json.loads(report)}
 
 
-def test_importing_prints_nothing_and_opens_no_socket() -> None:
-    result = run("""
-        import json, socket
-        def refuse(*args, **kwargs):
-            raise RuntimeError("a socket was used")
-        for name in ("connect", "connect_ex", "bind", "sendto"):
-            setattr(socket.socket, name, refuse)
-        socket.getaddrinfo = socket.create_connection = refuse
-        import sbi_rope, sbi_rope.metrics, sbi_rope.baselines, sbi_rope.tasks
-        print(json.dumps({}))
-    """)
-    assert result["out"] == []
-    assert result["err"] == ""
+def test_importing_prints_nothing_and_opens_no_socket(fresh: dict[str, Any]) -> None:
+    assert fresh["out"] == []
+    assert fresh["err"] == ""
 
 
-def test_importing_loads_nothing_heavy_that_its_dependencies_do_not() -> None:
-    result = run(f"""
-        import json, sys
-        {DEPENDENCIES}
-        before = set(sys.modules)
-        import sbi_rope, sbi_rope.metrics, sbi_rope.baselines, sbi_rope.tasks
-        new = sorted(set(sys.modules) - before)
-        print(json.dumps({{"new": new, "all": sorted(sys.modules)}}))
-    """)
-    packages = {name.split(".")[0] for name in result["new"]}
+def test_importing_loads_nothing_heavy_that_its_dependencies_do_not(
+    fresh: dict[str, Any],
+) -> None:
+    packages = {name.split(".")[0] for name in fresh["new"]}
     assert packages.isdisjoint({"pandas", "matplotlib", "causalchamber", "six", "PIL"})
     for name in ("sbi.analysis", "causalchamber", "six"):
-        assert name not in result["all"]
+        assert name not in fresh["all"]
     # Whatever the list above forgets.
     assert packages - set(sys.stdlib_module_names) <= {"sbi_rope", "sbi"}
 
 
-def test_importing_changes_no_state_of_torch_beyond_what_sbi_changes() -> None:
-    code = """
-        import hashlib, json, random, warnings
-        import numpy, torch
-        torch.manual_seed(0); numpy.random.seed(0); random.seed(0)
-        filters = len(warnings.filters)
-        {imports}
-        digest = hashlib.sha256(torch.get_rng_state().numpy().tobytes()).hexdigest()
-        print(json.dumps(dict(
-            dtype=str(torch.get_default_dtype()),
-            rng=digest,
-            numpy=float(numpy.random.rand()),
-            random=random.random(),
-            validate=torch.distributions.Distribution._validate_args,
-            grad=torch.is_grad_enabled(),
-            threads=torch.get_num_threads(),
-            deterministic=torch.are_deterministic_algorithms_enabled(),
-            filters=[str(f) for f in warnings.filters],
-        )))
-    """
-    theirs = run(code.format(imports=DEPENDENCIES))
-    ours = run(code.format(imports=f"{DEPENDENCIES}; import sbi_rope, sbi_rope.tasks"))
-    assert ours == theirs
+def test_importing_changes_no_state_of_torch_beyond_what_sbi_changes(
+    fresh: dict[str, Any],
+) -> None:
+    assert fresh["ours"] == fresh["theirs"]
 
 
 def test_what_is_promised_is_there() -> None:
@@ -132,7 +133,8 @@ def module_name(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def imports_of(path: Path, *, top_level: bool = False) -> set[str]:
+@functools.cache
+def imports_of(path: Path, *, top_level: bool = False) -> frozenset[str]:
     """Absolute names of all that a file imports, ``from a import b`` as a and a.b."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     found: set[str] = set()
@@ -144,7 +146,7 @@ def imports_of(path: Path, *, top_level: bool = False) -> set[str]:
             assert node.module is not None
             found.add(node.module)
             found |= {f"{node.module}.{alias.name}" for alias in node.names}
-    return found
+    return frozenset(found)
 
 
 def part_of(module: str) -> str | None:

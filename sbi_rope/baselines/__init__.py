@@ -1,5 +1,39 @@
 """The methods RoPE is compared with, each used like an sbi trainer or posterior."""
 
-from sbi_rope.baselines.prior import PriorPosterior
+from sbi_rope.baselines.base import (
+    Method,
+    UsesCalibration,
+    UsesObservations,
+    UsesSimulations,
+)
+from sbi_rope.baselines.calibration_mlp import CalibrationMLP
+from sbi_rope.baselines.finetuned_npe import FinetunedNPE
+from sbi_rope.baselines.joint_npe import JointNPE
+from sbi_rope.baselines.nnpe import NNPE
+from sbi_rope.baselines.npe import NPE, SBI
+from sbi_rope.baselines.npe_rs import NPERS
+from sbi_rope.baselines.ot_only import OTOnly
+from sbi_rope.baselines.prior import PriorBaseline, PriorPosterior
+from sbi_rope.baselines.rnpe import RNPE
+from sbi_rope.baselines.training import Training
+from sbi_rope.baselines.tuning_only import TuningOnly
 
-__all__ = ["PriorPosterior"]
+__all__ = [
+    "NNPE",
+    "NPE",
+    "NPERS",
+    "RNPE",
+    "SBI",
+    "CalibrationMLP",
+    "FinetunedNPE",
+    "JointNPE",
+    "Method",
+    "OTOnly",
+    "PriorBaseline",
+    "PriorPosterior",
+    "Training",
+    "TuningOnly",
+    "UsesCalibration",
+    "UsesObservations",
+    "UsesSimulations",
+]

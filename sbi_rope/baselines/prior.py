@@ -8,10 +8,10 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_rope._sbi import BasePotential, NeuralPosterior
-from sbi_rope._validation import check_tensor
-from sbi_rope.errors import InvalidTypeError
+from sbi_rope._validation import check_prior, check_tensor
+from sbi_rope.baselines.base import Method
 
-__all__ = ["PriorPosterior"]
+__all__ = ["PriorBaseline", "PriorPosterior"]
 
 
 class PriorPosterior(NeuralPosterior):
@@ -44,12 +44,7 @@ class PriorPosterior(NeuralPosterior):
     """
 
     def __init__(self, prior: Any) -> None:
-        if not isinstance(prior, Distribution):
-            raise InvalidTypeError(
-                f"Expected `prior` to be a torch distribution; got "
-                f"{type(prior).__name__}. Wrap it with "
-                f"`sbi.utils.process_prior(prior)[0]`."
-            )
+        check_prior(prior)
         device = prior.sample(torch.Size((1,))).device
         super().__init__(
             potential_fn=_PriorPotential(prior, device=device),
@@ -127,6 +122,35 @@ class PriorPosterior(NeuralPosterior):
         self.__init__(self.potential_fn.prior)
         if default_x is not None:
             self.set_default_x(default_x)
+
+
+class PriorBaseline(Method):
+    """The prior in the place of a posterior: a method that sees no data at all.
+
+    Assumes that the prior is right, then it is calibrated. Whatever has a lower log
+    posterior probability has learnt less than nothing.
+
+    References:
+        | Addressing Misspecification in Simulation-based Inference through Data-driven
+        | Calibration (Wehenkel et al., 2025), section 4, Baselines
+        | https://arxiv.org/abs/2405.08719
+
+    Args:
+        prior: A torch distribution over parameters of shape ``(k,)``.
+        device: Where the prior lives.
+
+    Raises:
+        InvalidTypeError: If the prior is not a torch distribution.
+
+    Example:
+        >>> from sbi.utils import BoxUniform
+        >>> method = PriorBaseline(BoxUniform(torch.zeros(2), torch.ones(2)))
+        >>> method.train().build_posterior().log_prob(torch.zeros(1, 2))
+        tensor([0.])
+    """
+
+    def _fit(self, *, show_progress_bars: bool) -> tuple[PriorPosterior, None]:
+        return PriorPosterior(self._prior), None
 
 
 class _PriorPotential(BasePotential):

@@ -22,6 +22,7 @@ from sbi_rope.metrics.calibration import (
     expected_coverage_error_of,
     mid_ranks,
 )
+from sbi_rope.metrics.calls import draw_samples
 from sbi_rope.metrics.coverage import acauc, coverage_curve, expected_coverage_error
 from sbi_rope.metrics.density import LPPScore, lpp
 from sbi_rope.metrics.evaluation import Evaluation, evaluate
@@ -37,6 +38,7 @@ __all__ = [
     "central_levels",
     "coverage_curve",
     "coverage_curve_of",
+    "draw_samples",
     "evaluate",
     "expected_coverage_error",
     "expected_coverage_error_of",

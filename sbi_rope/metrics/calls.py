@@ -35,6 +35,7 @@ __all__ = [
     "check_test_set",
     "draw_joint_levels",
     "draw_ranks",
+    "draw_samples",
     "evaluate_log_probs",
 ]
 
@@ -129,16 +130,31 @@ def draw_joint_levels(
     return torch.cat(parts)
 
 
-def _draw(
-    posterior: Any, theta: Tensor, x: Tensor, rows: slice, num_samples: int
-) -> Tensor:
+def draw_samples(posterior: Any, x: Tensor, *, num_samples: int) -> Tensor:
+    """Draw as the scores see a posterior, without sbi's unbounded rejection.
+
+    Args:
+        posterior: Any posterior with ``sample_batched``.
+        x: Observations, shape ``(n, *event_shape)``.
+        num_samples: Draws for each.
+
+    Returns:
+        Samples, shape ``(num_samples, n, k)``; those of a leaking posterior of sbi may
+        lie outside the prior.
+    """
     arguments = {"reject_outside_prior": False} if _is_unbounded(posterior) else {}
     with torch.no_grad(), warnings.catch_warnings():
         for message in EXPECTED_WARNINGS:
             warnings.filterwarnings("ignore", message=message)
-        samples = posterior.sample_batched(
-            torch.Size((num_samples,)), x=x[rows], show_progress_bars=False, **arguments
+        return posterior.sample_batched(
+            torch.Size((num_samples,)), x=x, show_progress_bars=False, **arguments
         )
+
+
+def _draw(
+    posterior: Any, theta: Tensor, x: Tensor, rows: slice, num_samples: int
+) -> Tensor:
+    samples = draw_samples(posterior, x[rows], num_samples=num_samples)
     expected = (num_samples, *theta[rows].shape)
     if tuple(samples.shape) != expected:
         raise InvalidInputError(

@@ -1,6 +1,7 @@
 """The conductor: order of the steps, reuse, what is refused and what is kept."""
 
 import copy
+import itertools
 import pickle
 import warnings
 from collections.abc import Callable
@@ -589,3 +590,33 @@ def test_a_seed_does_not_repeat_the_draws_of_its_user() -> None:
 
     rope(simulator=simulator).build_posterior(X_O, seed=3)
     assert not torch.isin(drawn[-1], theta).any()
+
+
+def test_a_sweep_gives_the_posteriors_of_single_couplings() -> None:
+    conductor = trained()
+    theta = torch.randn(30, 2)
+    gammas, taus = (0.5, 0.1), (1.0, 0.8)
+    swept = list(conductor.sweep(X_O, gammas=gammas, taus=taus, seed=3))
+    settings = itertools.product(gammas, taus)
+    for posterior, (gamma, tau) in zip(swept, settings, strict=True):
+        single = conductor.build_posterior(
+            X_O, coupler=SinkhornCoupler(gamma=gamma, tau=tau), seed=3
+        )
+        assert torch.allclose(posterior.weights, single.weights, atol=1e-5)
+        ours, theirs = (p.log_prob_batched(theta, X_O) for p in (posterior, single))
+        assert torch.allclose(ours, theirs, atol=1e-3)
+    assert not torch.allclose(swept[0].weights, swept[2].weights, atol=1e-3)
+
+
+def test_a_sweep_refuses_what_a_single_coupling_refuses() -> None:
+    conductor = rope()
+    with pytest.raises(InvalidInputError, match="at least one value"):
+        conductor.sweep(X_O, gammas=(), taus=(1.0,))
+    with pytest.raises(InvalidInputError, match="`tau`"):
+        conductor.sweep(X_O, gammas=(0.5,), taus=(1.5,))
+    with pytest.raises(InvalidInputError, match="`x_o`"):
+        conductor.sweep(X_O[:, :1], gammas=(0.5,), taus=(1.0,))
+    coupler = SinkhornCoupler(max_iterations=1)
+    posteriors = conductor.sweep(X_O, gammas=(0.01,), taus=(1.0,), coupler=coupler)
+    with pytest.raises(CouplingError, match=r"now 0\.01"):
+        next(posteriors)

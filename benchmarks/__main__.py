@@ -1,0 +1,149 @@
+"""The benchmark as one command, which can be killed and resumed.
+
+    python -m benchmarks run smoke
+    python -m benchmarks run main --task pendulum --jobs 2 --root FOLDER
+    python -m benchmarks status
+    python -m benchmarks report
+
+Cells that are finished are kept, whichever suite asked for them, and are not computed
+again. Cells that failed are kept with their error; `--retry` computes them again.
+"""
+
+import argparse
+import contextlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from benchmarks.cases import Sources
+from benchmarks.cells import Suite, list_suites, load_suite
+from benchmarks.report import write_report
+from benchmarks.runner import Workplace, run_cells
+from benchmarks.tables import read_table, write_table
+
+DEFAULT_OUT = Path("results/benchmark")
+PUBLISHED = Path(__file__).parent / "results"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command and return its exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    run = commands.add_parser("run", help="run the cells of a suite")
+    run.set_defaults(command=_run)
+    run.add_argument("suite", help=f"one of {', '.join(list_suites())}, or a TOML file")
+    run.add_argument("--task", nargs="+", dest="tasks", help="these tasks only")
+    run.add_argument("--method", nargs="+", dest="methods", help="these methods only")
+    run.add_argument("--jobs", type=int, default=1, help="at a time; -1: all cores")
+    run.add_argument(
+        "--backend", default="loky", help="backend of joblib (%(default)s)"
+    )
+    run.add_argument("--scheduler", help="address of a dask scheduler")
+    run.add_argument("--device", default="cpu", help="%(default)s, or cuda")
+    run.add_argument("--root", type=Path, help="folder of recorded data")
+    run.add_argument(
+        "--hemodynamics", type=Path, help="folder with simulator.npz and real.npz"
+    )
+    run.add_argument("--again", action="store_true", help="also what is finished")
+    run.add_argument("--retry", action="store_true", help="also what failed")
+    _add_out(run, DEFAULT_OUT)
+
+    status = commands.add_parser("status", help="count the cells of all suites")
+    status.set_defaults(command=_status)
+    _add_out(status, DEFAULT_OUT)
+
+    report = commands.add_parser("report", help="write tables and figures again")
+    report.set_defaults(command=_report)
+    report.add_argument("suites", nargs="*", help="all that have results if none")
+    _add_out(report, PUBLISHED)
+    args = parser.parse_args(arguments)
+    return args.command(args)
+
+
+def _add_out(parser: argparse.ArgumentParser, default: Path) -> None:
+    parser.add_argument("--out", type=Path, default=default, help="(%(default)s)")
+
+
+def _run(args: argparse.Namespace) -> int:
+    suite = load_suite(args.suite)
+    cells = suite.select(tasks=args.tasks, methods=args.methods)
+    workplace = Workplace(
+        folder=args.out,
+        sources=Sources(root=args.root, hemodynamics=args.hemodynamics),
+        device=args.device,
+    )
+    with _scheduler(args):
+        counts = run_cells(
+            cells,
+            workplace,
+            jobs=args.jobs,
+            backend=args.backend,
+            again=args.again,
+            retry=args.retry,
+        )
+    print(", ".join(f"{count} {what}" for what, count in counts.items()))
+    folder = args.out / suite.name
+    table = write_table(suite, workplace.results, folder)
+    path = write_report(suite, table, folder)
+    print(f"Written: {path}")
+    for cell in cells:
+        row = table.rows.get(cell)
+        if row is not None and row["status"] == "failed":
+            print(f"failed: {cell}: {row['error'].splitlines()[0][:150]}")
+    return 0
+
+
+@contextlib.contextmanager
+def _scheduler(args: argparse.Namespace) -> Iterator[None]:
+    """Connect to a dask cluster, or start one on this machine, if dask is asked for."""
+    if args.backend != "dask":
+        yield
+        return
+    from distributed import Client
+
+    options = (
+        {"address": args.scheduler}
+        if args.scheduler
+        else {"n_workers": args.jobs, "threads_per_worker": 1}
+    )
+    with Client(**options):
+        yield
+
+
+def _status(args: argparse.Namespace) -> int:
+    results = Workplace(folder=args.out, sources=Sources()).results
+    print(f"{'suite':<14}{'cells':>7}{'finished':>10}{'failed':>8}{'not run':>9}")
+    for name in list_suites():
+        suite = load_suite(name)
+        rows = [results.read(cell) for cell in suite.cells]
+        finished = sum(1 for row in rows if row and row["status"] == "finished")
+        failed = sum(1 for row in rows if row and row["status"] == "failed")
+        print(
+            f"{name:<14}{len(rows):>7}{finished:>10}{failed:>8}"
+            f"{len(rows) - finished - failed:>9}"
+        )
+    return 0
+
+
+def _report(args: argparse.Namespace) -> int:
+    names = args.suites or [
+        name for name in list_suites() if (args.out / name / "results.csv").exists()
+    ]
+    if not names:
+        raise SystemExit(
+            f"No results in {args.out}. Use `run` first, or another --out."
+        )
+    for name in names:
+        suite: Suite = load_suite(name)
+        folder = args.out / suite.name
+        if not (folder / "results.csv").exists():
+            raise SystemExit(f"No results of {suite.name} in {args.out}.")
+        print(f"Written: {write_report(suite, read_table(folder), folder)}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,177 @@
+"""One loop for all networks that sbi's trainers cannot train."""
+
+import copy
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from tqdm.auto import tqdm
+
+from sbi_rope.errors import warn_user
+
+__all__ = [
+    "STEPS_WITHOUT_HOLDOUT",
+    "History",
+    "fit",
+    "split_pairs",
+    "warn_without_holdout",
+]
+
+# Fewer pairs than this leave nothing to hold out.
+MIN_PAIRS_FOR_HOLDOUT = 5
+# Without a hold-out nothing says when to stop, so little is risked.
+STEPS_WITHOUT_HOLDOUT = 50
+
+
+@dataclass(frozen=True)
+class History:
+    """The course of a training, for plotting.
+
+    A step is a gradient step over all pairs for ``CalibrationFinetuner``, and a pass
+    over the data for the baselines.
+
+    Attributes:
+        training_loss: Mean loss over the training data during each step, and after the
+            last; of a fine-tuning, the distance in units of the embedding.
+        validation_loss: Loss over the held-out data before each step and after the
+            last; empty without a hold-out.
+        best_step: Number of steps after which the kept net was reached; 0 is the
+            starting point.
+        learning_rate: The learning rate of this course, the best of those tried.
+    """
+
+    training_loss: list[float] = field(repr=False)
+    validation_loss: list[float] = field(repr=False)
+    best_step: int
+    learning_rate: float
+
+    @property
+    def kept_validation_loss(self) -> float:
+        """The validation loss of the kept net; 0 without a hold-out."""
+        return self.validation_loss[self.best_step] if self.validation_loss else 0.0
+
+    def __repr__(self) -> str:
+        loss, what = self.validation_loss, "validation_loss"
+        if not loss:
+            loss, what = self.training_loss, "training_loss"
+        return (
+            f"History({what} {loss[0]:.3g} -> {loss[self.best_step]:.3g}, "
+            f"best_step={self.best_step}, learning_rate={self.learning_rate:g})"
+        )
+
+
+def split_pairs(num_pairs: int, validation_fraction: float) -> tuple[Tensor, Tensor]:
+    """Return the rows to train on and those held out, at random.
+
+    Of fewer than five pairs none is held out.
+    """
+    order = torch.randperm(num_pairs)
+    if num_pairs < MIN_PAIRS_FOR_HOLDOUT:
+        return order, order[:0]
+    num_held_out = max(1, round(validation_fraction * num_pairs))
+    return order[num_held_out:], order[:num_held_out]
+
+
+def warn_without_holdout(num_pairs: int) -> None:
+    """Warn that there are too few pairs to choose a net by."""
+    warn_user(
+        f"Only {num_pairs} calibration pair(s): none is held out, and tuning stops "
+        f"after at most {STEPS_WITHOUT_HOLDOUT} steps. Append at least "
+        f"{MIN_PAIRS_FOR_HOLDOUT} pairs to choose the best net on a hold-out."
+    )
+
+
+def fit(
+    module: nn.Module,
+    batches: Callable[[int], Iterable[tuple[Any, ...]]],
+    loss: Callable[..., Tensor],
+    *,
+    validation_loss: Callable[[], Tensor] | None,
+    learning_rate: float,
+    max_num_steps: int,
+    patience: int,
+    clip_max_norm: float | None = None,
+    in_training_mode: bool = True,
+    label: str,
+    show_progress_bars: bool,
+) -> History:
+    """Train a module with Adam and leave it at its best on the held-out data.
+
+    The starting point competes, so that training never returns something worse than it
+    started from on the held-out data. Without a hold-out the last state is kept.
+
+    Args:
+        module: What to train, in place.
+        batches: Given the number of the step, the batches to pass over.
+        loss: Of a batch, its mean loss.
+        validation_loss: The loss over the held-out data, if there are any.
+        learning_rate: Step size of Adam.
+        max_num_steps: Most passes over the batches.
+        patience: Steps without a new best after which to stop.
+        clip_max_norm: Largest norm of a gradient; None does not clip.
+        in_training_mode: Whether dropout and batch statistics are active in training.
+        label: What the progress bar and warnings call it.
+        show_progress_bars: Whether to show the course of the loss.
+
+    Returns:
+        The losses and the step that was kept.
+    """
+    optimizer = torch.optim.Adam(module.parameters(), lr=learning_rate)
+    training_loss: list[float] = []
+    held_out_loss: list[float] = []
+    best_state, best_step = copy.deepcopy(module.state_dict()), 0
+
+    def one_pass(step: int, *, update: bool) -> float:
+        module.train(in_training_mode and update)
+        values = []
+        for batch in batches(step):
+            value = loss(*batch)
+            values.append(float(value.detach()))
+            if not update or not torch.isfinite(value):
+                continue
+            optimizer.zero_grad()
+            value.backward()
+            if clip_max_norm is not None:
+                nn.utils.clip_grad_norm_(module.parameters(), clip_max_norm)
+            optimizer.step()
+        module.eval()
+        return sum(values) / len(values)
+
+    progress = tqdm(
+        range(max_num_steps + 1),
+        desc=f"{label} (learning rate {learning_rate:g})",
+        disable=not show_progress_bars,
+    )
+    for step in progress:
+        if validation_loss is not None:
+            module.eval()
+            with torch.no_grad():
+                held_out_loss.append(float(validation_loss()))
+        improved = (
+            validation_loss is None or held_out_loss[-1] < held_out_loss[best_step]
+        )
+        state = copy.deepcopy(module.state_dict()) if improved else best_state
+        newest = step if improved else best_step
+        is_last = step == max_num_steps or step - newest >= patience
+        with torch.set_grad_enabled(not is_last):
+            training_loss.append(one_pass(step, update=not is_last))
+        if not math.isfinite(training_loss[-1]):
+            warn_user(
+                f"{label}: the loss is not finite after {step} steps with learning "
+                f"rate {learning_rate:g}; the best net before is kept. Use a smaller "
+                "learning rate."
+            )
+            break
+        best_state, best_step = state, newest
+        progress.set_postfix(
+            loss=(held_out_loss or training_loss)[-1], best_step=best_step
+        )
+        if is_last:
+            break
+    progress.close()
+    module.load_state_dict(best_state)
+    module.eval()
+    return History(training_loss, held_out_loss, best_step, learning_rate)

@@ -1,0 +1,119 @@
+"""NPE on simulations and calibration pairs together (J-NPE)."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sbi_rope._training import History, fit, split_pairs
+from sbi_rope._validation import check_instance
+from sbi_rope.baselines.base import UsesCalibration, UsesSimulations
+from sbi_rope.baselines.training import EstimatorBuilder, Training, estimator_builder
+
+__all__ = ["JointNPE"]
+
+DEFAULT_TRAINING = Training(validation_fraction=0.2)
+
+
+class JointNPE(UsesSimulations, UsesCalibration):
+    r"""NPE whose batches are half simulations, half calibration pairs (J-NPE).
+
+    .. math::
+        \min_q\; \tfrac12 \mathbb{E}_{p(\theta, x_s)}\bigl[-\log q(\theta \mid
+        h(x_s))\bigr] + \tfrac12 \tfrac1{n_c} \sum_i -\log q(\theta_i \mid h(x_{o,i}))
+
+    An epoch is one pass over the simulations; the calibration pairs beside them are
+    drawn with replacement. A part of the calibration pairs is held out and the network
+    that does best on it is kept; below five pairs the held-out data are simulations.
+
+    Sees simulations and the calibration set. Assumes nothing about the misspecification
+    and so has to learn it from the pairs alone: to be preferred from a few hundred
+    pairs on.
+
+    Where this differs from the paper: it states both that the best model on the
+    training set is kept and that all methods are selected on a fifth of the calibration
+    set; the latter is done. It does not say whether a batch of 100 holds 50 or 100
+    simulations; here it holds 50.
+
+    References:
+        | Addressing Misspecification in Simulation-based Inference through Data-driven
+          Calibration (Wehenkel et al., 2025), section 4, Baselines
+        | https://arxiv.org/abs/2405.08719
+
+    Args:
+        prior: A torch distribution over parameters of shape ``(k,)``.
+        density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns. An
+            embedding net inside it is copied, never trained in place.
+        training: How it is trained; the held-out share is that of the calibration
+            pairs. ``Training(validation_fraction=0.2)`` if None.
+        device: Where to train; data on other devices is moved there.
+
+    Raises:
+        InvalidTypeError: If an argument has the wrong type.
+        InvalidInputError: If sbi knows no estimator of that name.
+
+    Example:
+        >>> from sbi.utils import BoxUniform
+        >>> prior = BoxUniform(torch.zeros(1), torch.ones(1))
+        >>> theta, theta_cal = prior.sample((200,)), prior.sample((10,))
+        >>> method = JointNPE(prior, "mdn", training=Training(max_num_epochs=1))
+        >>> method = method.append_simulations(theta, theta)
+        >>> method = method.append_calibration(theta_cal, theta_cal + 0.3)
+        >>> posterior = method.train(show_progress_bars=False).build_posterior()
+        >>> posterior.sample((5,), x=torch.ones(1), show_progress_bars=False).shape
+        torch.Size([5, 1])
+    """
+
+    def __init__(
+        self,
+        prior: Any,
+        density_estimator: str | EstimatorBuilder = "nsf",
+        *,
+        training: Training | None = None,
+        device: str | torch.device = "cpu",
+    ) -> None:
+        check_instance("training", training, Training, optional=True)
+        super().__init__(prior, device=device)
+        self._build = estimator_builder(density_estimator)
+        self.training = DEFAULT_TRAINING if training is None else training
+
+    def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
+        theta, x = self._simulations
+        theta_cal, x_cal = self._calibration
+        train, held_out = split_pairs(len(x_cal), self.training.validation_fraction)
+        theta_held, x_held = theta_cal[held_out], x_cal[held_out]
+        if not len(held_out):
+            # Nothing real to choose by; simulations at least say when to stop.
+            rows, held_out = split_pairs(len(x), self.training.validation_fraction)
+            theta_held, x_held = theta[held_out], x[held_out]
+            theta, x = theta[rows], x[rows]
+        # As in NPE, the simulations alone say how x and theta are standardised.
+        estimator = self._build(theta.cpu(), x.cpu()).to(self._device)
+        half = max(1, min(self.training.training_batch_size // 2, len(x)))
+
+        def batches(step: int) -> Iterator[tuple[Tensor, Tensor]]:
+            order = torch.randperm(len(x))
+            for chosen in order[: len(x) - len(x) % half].split(half):
+                pairs = train[torch.randint(len(train), (half,))]
+                yield (
+                    torch.cat([theta[chosen], theta_cal[pairs]]),
+                    torch.cat([x[chosen], x_cal[pairs]]),
+                )
+
+        def loss(theta: Tensor, x: Tensor) -> Tensor:
+            return estimator.loss(theta, condition=x).mean()
+
+        history = fit(
+            estimator,
+            batches,
+            loss,
+            validation_loss=lambda: loss(theta_held, x_held),
+            learning_rate=self.training.learning_rate,
+            max_num_steps=self.training.max_num_epochs,
+            patience=self.training.stop_after_epochs,
+            clip_max_norm=self.training.clip_max_norm,
+            label="J-NPE",
+            show_progress_bars=show_progress_bars,
+        )
+        return self._direct_posterior(estimator), history

@@ -1,0 +1,99 @@
+"""Neural posterior estimation, as it is, and where its simulator is right."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sbi_rope._random import seeded
+from sbi_rope._simulations import Simulator
+from sbi_rope._training import History
+from sbi_rope.baselines.base import BuildsOnNPE
+from sbi_rope.errors import NotReadyError
+
+__all__ = ["NPE", "SBI"]
+
+
+class NPE(BuildsOnNPE):
+    r"""Neural posterior estimation, trained on simulations and trusted on real data.
+
+    .. math::
+        \min_q\; \mathbb{E}_{p(\theta)\, p(x_s \mid \theta)}
+        \bigl[-\log q(\theta \mid h(x_s))\bigr]
+
+    A thin cover of ``sbi.inference.NPE``, so that it is used like the other baselines.
+
+    Sees simulations. Assumes that the simulator is right. The method to prefer if it
+    is: nothing else here is as sharp then, and none is as wrong if it is not.
+
+    References:
+        | Automatic Posterior Transformation for Likelihood-free Inference
+          (Greenberg et al., 2019)
+        | https://arxiv.org/abs/1905.07488
+
+    Example:
+        >>> from sbi.utils import BoxUniform
+        >>> from sbi_rope.baselines import Training
+        >>> prior = BoxUniform(torch.zeros(1), torch.ones(1))
+        >>> theta = prior.sample((200,))
+        >>> method = NPE(prior, "mdn", npe_training=Training(max_num_epochs=1))
+        >>> method = method.append_simulations(theta, theta + 0.1)
+        >>> posterior = method.train(show_progress_bars=False).build_posterior()
+        >>> posterior.sample((5,), x=torch.ones(1), show_progress_bars=False).shape
+        torch.Size([5, 1])
+    """
+
+    def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History | None]:
+        return self._trained_npe(show_progress_bars=show_progress_bars)
+
+
+class SBI(NPE):
+    """NPE on simulations in the place of real observations: the reference.
+
+    Not a method for real data, but what inference would give if the simulator were
+    right: the posterior is that of :class:`NPE`, and is scored on fresh simulations of
+    the test parameters, :meth:`simulated_test_set`.
+
+    Sees simulations. Training sees no labels; the test parameters are only simulated
+    from, after the training.
+
+    References:
+        | Addressing Misspecification in Simulation-based Inference through Data-driven
+          Calibration (Wehenkel et al., 2025), section 4, Baselines
+        | https://arxiv.org/abs/2405.08719
+    """
+
+    def simulated_test_set(
+        self,
+        theta: Tensor,
+        simulator: Callable[[Tensor], Tensor],
+        *,
+        seed: int | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Return the test parameters, each with one simulation.
+
+        Args:
+            theta: Test parameters, shape ``(n, k)``.
+            simulator: Maps parameters to simulations, batched or not.
+            seed: Seed of the simulations; None uses the states of torch, NumPy and
+                Python.
+
+        Returns:
+            Parameters and simulations, without those that are not finite.
+
+        Raises:
+            SimulationError: If the simulator fails.
+        """
+        theta = self._checked_theta("theta", theta)
+        if self._event_shape is None:
+            raise NotReadyError(
+                "The shape of a simulation is not known yet. Call "
+                "`append_simulations(theta, x)` first."
+            )
+        with seeded(seed):
+            x = Simulator(
+                simulator, self._prior, event_shape=self._event_shape, like=theta
+            )(theta)
+        valid = torch.isfinite(x).flatten(1).all(dim=1)
+        return theta[valid], x[valid]

@@ -1,0 +1,81 @@
+"""RoPE's fine-tuned embedding without its optimal transport."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sbi_rope._training import History
+from sbi_rope._validation import check_instance
+from sbi_rope.baselines.base import BuildsOnNPE, UsesCalibration
+from sbi_rope.baselines.training import EstimatorBuilder, Training
+from sbi_rope.finetuning import CalibrationFinetuner
+from sbi_rope.rope import RoPE
+
+__all__ = ["TuningOnly"]
+
+
+class TuningOnly(BuildsOnNPE, UsesCalibration):
+    r"""The flow on the tuned embedding, :math:`q(\theta \mid g(x_o))`.
+
+    Step 2 of RoPE without step 3: :meth:`RoPE.tuned_posterior
+    <sbi_rope.RoPE.tuned_posterior>`.
+
+    Sees simulations and the calibration set, and simulates at the calibration
+    parameters. Assumes that :math:`g(x_o)` lands on the embeddings of simulations.
+    To be preferred where a few pairs suffice to tune the embedding; it is sharp and
+    has nothing to temper it where they do not.
+
+    References:
+        | Addressing Misspecification in Simulation-based Inference through Data-driven
+          Calibration (Wehenkel et al., 2025), section 4, Baselines
+        | https://arxiv.org/abs/2405.08719
+
+    Args:
+        prior: A torch distribution over parameters of shape ``(k,)``.
+        density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns. An
+            embedding net inside it is copied, never trained in place.
+        simulator: Maps parameters to simulations, batched or not. Without one, the
+            targets come from the appended simulations with the nearest parameters.
+        finetuner: Settings of the fine-tuning; ``CalibrationFinetuner()`` if None.
+        npe_training: How NPE is trained; ``Training()`` if None.
+        device: Where to train; data on other devices is moved there.
+
+    Raises:
+        InvalidTypeError: If an argument has the wrong type.
+        InvalidInputError: If sbi knows no estimator of that name.
+    """
+
+    def __init__(
+        self,
+        prior: Any,
+        density_estimator: str | EstimatorBuilder = "nsf",
+        *,
+        simulator: Callable[[Tensor], Tensor] | None = None,
+        finetuner: CalibrationFinetuner | None = None,
+        npe_training: Training | None = None,
+        device: str | torch.device = "cpu",
+    ) -> None:
+        check_instance("finetuner", finetuner, CalibrationFinetuner, optional=True)
+        super().__init__(
+            prior, density_estimator, npe_training=npe_training, device=device
+        )
+        self._simulator = simulator
+        self.finetuner = finetuner
+
+    @property
+    def _can_do_without_simulations(self) -> bool:
+        return self._npe is not None and self._simulator is not None
+
+    def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
+        npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
+        rope = RoPE(
+            npe,
+            simulator=self._simulator,
+            simulations=None if self._simulator is not None else self._simulations,
+            finetuner=self.finetuner,
+        )
+        rope.append_calibration(*self._calibration)
+        rope.train(show_progress_bars=show_progress_bars)
+        return rope.tuned_posterior(), rope.history

@@ -1,0 +1,181 @@
+"""The benchmark's runner on real cells, interrupted, in parallel, and with failures."""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from benchmarks.__main__ import main
+from benchmarks.cases import Case, Sources
+from benchmarks.cells import Cell, load_suite
+from benchmarks.runner import Workplace, run_cells
+from benchmarks.store import Cache
+
+ROOT = Path(__file__).parents[2]
+SUITE = """
+title = "Tiny"
+question = "Nothing."
+preset = "smoke"
+repetitions = 1
+
+[[cells]]
+tasks = ["pendulum"]
+methods = ["prior", "NPE", "tuning-only", "OT-only", "RoPE"]
+n_calibration = [10]
+gammas = { simulated = [0.1, 0.2] }
+"""
+# What may differ between two runs of the same cell.
+CHANGING = ("seconds_", "peak_memory", "finished_at", "git_commit", "suite")
+
+
+@pytest.fixture(scope="module")
+def suite_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("suite") / "tiny.toml"
+    path.write_text(SUITE)
+    return path
+
+
+def rows_of(folder: Path) -> list[dict[str, str]]:
+    with (folder / "tiny" / "results.csv").open(newline="") as file:
+        return [
+            {k: v for k, v in row.items() if not k.startswith(CHANGING)}
+            for row in csv.DictReader(file)
+        ]
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(
+    suite_file: Path, tmp_path_factory: pytest.TempPathFactory
+) -> list[dict[str, str]]:
+    folder = tmp_path_factory.mktemp("uninterrupted")
+    main(["run", str(suite_file), "--out", str(folder)])
+    return rows_of(folder)
+
+
+def test_a_suite_runs_to_its_end(uninterrupted: list[dict[str, str]]) -> None:
+    assert len(uninterrupted) == 7
+    assert {row["status"] for row in uninterrupted} == {"finished"}
+
+
+def test_a_run_in_parts_gives_the_same_table(
+    suite_file: Path, uninterrupted: list[dict[str, str]], tmp_path: Path
+) -> None:
+    for methods in (["RoPE", "prior"], ["NPE"]):
+        main(["run", str(suite_file), "--out", str(tmp_path), "--method", *methods])
+    main(["run", str(suite_file), "--out", str(tmp_path)])
+    assert rows_of(tmp_path) == uninterrupted
+
+
+def test_what_is_finished_is_not_computed_again(
+    suite_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["run", str(suite_file), "--out", str(tmp_path), "--method", "prior"]
+    main(command)
+    (before,) = (tmp_path / "cells").glob("*.json")
+    modified = before.stat().st_mtime_ns
+    capsys.readouterr()
+    main(command)
+    assert "1 kept, 0 finished, 0 failed" in capsys.readouterr().out
+    assert before.stat().st_mtime_ns == modified
+    main([*command, "--again"])
+    assert before.stat().st_mtime_ns > modified
+
+
+@pytest.mark.slow
+def test_a_killed_run_resumes_to_the_same_table(
+    suite_file: Path, uninterrupted: list[dict[str, str]], tmp_path: Path
+) -> None:
+    command = [sys.executable, "-m", "benchmarks", "run", str(suite_file)]
+    command += ["--out", str(tmp_path)]
+    process = subprocess.Popen(
+        command,
+        cwd=ROOT,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    while len(list((tmp_path / "cells").glob("*.json"))) < 2:
+        assert process.poll() is None, "it ended before it could be killed"
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    assert len(list((tmp_path / "cells").glob("*.json"))) < 7
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+    assert rows_of(tmp_path) == uninterrupted
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", ["loky", "dask"])
+def test_two_workers_give_the_same_table(
+    backend: str,
+    suite_file: Path,
+    uninterrupted: list[dict[str, str]],
+    tmp_path: Path,
+) -> None:
+    if backend == "dask":
+        pytest.importorskip("distributed")
+    command = [sys.executable, "-m", "benchmarks", "run", str(suite_file)]
+    command += ["--out", str(tmp_path), "--jobs", "2", "--backend", backend]
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+    assert rows_of(tmp_path) == uninterrupted
+
+
+def test_a_failing_method_does_not_stop_the_others(tmp_path: Path) -> None:
+    cells = [
+        Cell(task="sir", preset="smoke", method=method, n_calibration=n)
+        # HVAE needs a differentiable simulator, which this task has not.
+        for method, n in (("HVAE", 10), ("prior", 0))
+    ]
+    place = Workplace(folder=tmp_path, sources=Sources())
+    counts = run_cells(cells, place)
+    assert counts == {"kept": 0, "finished": 1, "failed": 1}
+    failed = place.results.read(cells[0])
+    assert failed is not None
+    assert "only for" in failed["error"]
+    assert run_cells(cells, place)["kept"] == 2
+    assert run_cells(cells, place, retry=True) == {
+        "kept": 1,
+        "finished": 0,
+        "failed": 1,
+    }
+
+
+def test_methods_see_the_same_data_and_repetitions_do_not(tmp_path: Path) -> None:
+    cell = Cell(task="linear_gaussian", preset="smoke", method="NPE", n_calibration=10)
+    cases = [
+        Case.of(other, Sources(), Cache(tmp_path), "cpu")
+        for other in (
+            cell,
+            replace(cell, method="RoPE", gamma=0.1, tau=1.0),
+            replace(cell, repetition=1),
+            replace(cell, variant="prior_shift"),
+        )
+    ]
+    first, same, other, shifted = cases
+    for name in ("simulations", "calibration", "test_set"):
+        ours, theirs, others = (
+            torch.cat([part.flatten() for part in getattr(case, name)])
+            for case in (first, same, other)
+        )
+        assert torch.equal(ours, theirs)
+        assert not torch.equal(ours, others)
+    # A variant of the real process has the same simulations, and shares the NPE.
+    assert torch.equal(first.simulations[1], shifted.simulations[1])
+    assert not torch.equal(first.test_set[1], shifted.test_set[1])
+    assert first.npe is not None
+    assert shifted.npe is not None
+    assert len(list(tmp_path.glob("npe-*"))) == 1
+
+
+def test_the_smoke_suite_knows_all_methods_that_run_everywhere() -> None:
+    from benchmarks.methods import EXTRAS, ORDER
+
+    methods = {cell.method for cell in load_suite("smoke").cells}
+    assert methods == set(ORDER) - set(EXTRAS)

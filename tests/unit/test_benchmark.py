@@ -1,0 +1,320 @@
+"""The benchmark's cells, files and reports, without training anything."""
+
+import json
+import math
+import multiprocessing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.cells import Cell, Suite, list_suites, load_suite
+from benchmarks.figures import LPPAxis
+from benchmarks.report import worse, write_report
+from benchmarks.store import Cache, Results, write_atomically
+from benchmarks.tables import Table, mean_and_spread, read_table, write_table
+
+SUITE = """
+title = "Tiny"
+question = "Nothing."
+preset = "smoke"
+repetitions = 2
+
+[[cells]]
+tasks = ["linear_gaussian"]
+methods = ["prior", "MLP", "OT-only", "RoPE"]
+n_calibration = [10, 50]
+gammas = { simulated = [0.1, 0.2], none = [0.5] }
+taus = [1.0, 0.9]
+options = { dim = [2, 3] }
+"""
+
+
+@pytest.fixture
+def suite(tmp_path: Path) -> Suite:
+    path = tmp_path / "tiny.toml"
+    path.write_text(SUITE)
+    return load_suite(str(path))
+
+
+def row_of(cell: Cell, **scores: Any) -> dict[str, Any]:
+    row = {
+        "task": cell.task,
+        "status": "finished",
+        "lpp": -3.0,
+        "lpp_z": -2.0,
+        "lpp_median": -1.9,
+        "lpp_standard_error": 0.1,
+        "neg_inf_fraction": 0.0,
+        "acauc": 0.01,
+        "acauc_standard_error": 0.01,
+        "acauc_per_parameter": "a=0.0100",
+        "expected_coverage_error": 0.02,
+        "c2st": None,
+        "converged": True,
+        "n_test": 4,
+        "stand_in": False,
+        "num_simulations": 100,
+    }
+    fields = {name: getattr(cell, name) for name in cell.__dataclass_fields__}
+    return {**row, **fields, **scores}
+
+
+def arrays_of(log_probs: list[float]) -> dict[str, np.ndarray]:
+    generator = np.random.default_rng(0)
+    return {
+        "log_probs": np.array(log_probs, dtype=np.float32),
+        "coverage": np.linspace(0.01, 0.99, 99, dtype=np.float32),
+        "samples": generator.normal(size=(50, 2)).astype(np.float32),
+        "theta": np.zeros(2, dtype=np.float32),
+    }
+
+
+# Cells and suites -------------------------------------------------------------------
+
+
+def test_a_suite_lists_every_combination_once(suite: Suite) -> None:
+    assert len(set(suite.cells)) == len(suite.cells)
+    counts = {
+        method: sum(cell.method == method for cell in suite.cells)
+        for method in ("prior", "MLP", "OT-only", "RoPE")
+    }
+    # Two repetitions and two dimensions; sizes and couplings only where they matter.
+    assert counts == {"prior": 4, "MLP": 8, "OT-only": 24, "RoPE": 48}
+
+
+def test_a_cell_has_a_name_of_its_own(suite: Suite) -> None:
+    assert len({cell.key for cell in suite.cells}) == len(suite.cells)
+    cell = suite.cells[0]
+    assert replace(cell).key == cell.key
+
+
+def test_cells_that_differ_in_gamma_and_tau_only_are_computed_together(
+    suite: Suite,
+) -> None:
+    groups = {cell.group for cell in suite.cells if cell.method == "RoPE"}
+    assert len(groups) == 2 * 2 * 2 * 2  # repetition, dimension, size, cost scale
+
+
+@pytest.mark.parametrize("name", list_suites())
+def test_the_suites_that_come_along_can_be_read(name: str) -> None:
+    suite = load_suite(name)
+    assert suite.cells
+    assert suite.title
+    for cell in suite.cells:
+        assert cell.preset in ("smoke", "standard", "paper")
+
+
+def test_unknown_names_are_refused_with_the_known_ones(
+    suite: Suite, tmp_path: Path
+) -> None:
+    with pytest.raises(SystemExit, match=r"No suite 'nonsense'; there are .*smoke"):
+        load_suite("nonsense")
+    with pytest.raises(SystemExit, match=r"No task 'sir' .*linear_gaussian"):
+        suite.select(tasks=["sir"])
+    with pytest.raises(SystemExit, match=r"No method 'magic' .*RoPE"):
+        suite.select(methods=["magic"])
+    path = tmp_path / "wrong.toml"
+    path.write_text(SUITE.replace("taus", "tau"))
+    with pytest.raises(SystemExit, match=r"Unknown key.*'tau'"):
+        load_suite(str(path))
+
+
+def test_a_selection_keeps_what_it_names(suite: Suite) -> None:
+    cells = suite.select(methods=["prior", "MLP"])
+    assert {cell.method for cell in cells} == {"prior", "MLP"}
+
+
+# Files ------------------------------------------------------------------------------
+
+
+def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "file.txt"
+    path.write_text("old")
+
+    def interrupted() -> None:
+        with write_atomically(path) as temporary:
+            temporary.write_text("ne")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_cache_computes_once_and_again_if_the_entry_is_damaged(
+    tmp_path: Path,
+) -> None:
+    cache, calls = Cache(tmp_path), []
+
+    def compute() -> list[int]:
+        calls.append(1)
+        return [1, 2]
+
+    for _ in range(2):
+        assert cache.get("thing", {"seed": 0}, compute) == [1, 2]
+    assert len(calls) == 1
+    cache.get("thing", {"seed": 1}, compute)
+    assert len(calls) == 2
+    for path in tmp_path.glob("thing-*"):
+        data = bytearray(path.read_bytes())
+        data[-10] ^= 1
+        path.write_bytes(bytes(data))
+    with pytest.warns(UserWarning, match="damaged"):
+        assert cache.get("thing", {"seed": 0}, compute) == [1, 2]
+    assert len(calls) == 3
+    assert cache.get("thing", {"seed": 0}, compute) == [1, 2]
+    assert len(calls) == 3
+
+
+def write_many(folder: Path, number: int) -> None:
+    results = Results(folder)
+    for _ in range(30):
+        for repetition in range(3):
+            cell = Cell(task="a", method="prior", repetition=repetition)
+            results.write(cell, {"value": [number] * 1000}, {"x": np.full(9, number)})
+
+
+def test_two_processes_on_one_folder_leave_whole_files(tmp_path: Path) -> None:
+    context = multiprocessing.get_context("fork")
+    processes = [
+        context.Process(target=write_many, args=(tmp_path, number)) for number in (1, 2)
+    ]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join()
+        assert process.exitcode == 0
+    results = Results(tmp_path)
+    for repetition in range(3):
+        cell = Cell(task="a", method="prior", repetition=repetition)
+        row = results.read(cell)
+        assert row is not None
+        assert len(set(row["value"])) == 1
+        assert len(set(results.read_arrays(cell)["x"])) == 1
+    assert len(list(tmp_path.iterdir())) == 6
+
+
+def test_a_damaged_result_counts_as_not_run(tmp_path: Path) -> None:
+    results = Results(tmp_path)
+    cell = Cell(task="a", method="prior")
+    results.write(cell, {"status": "finished"}, {})
+    path = tmp_path / f"{cell.key}.json"
+    path.write_text(path.read_text()[:-3])
+    assert results.read(cell) is None
+
+
+# Tables and reports -----------------------------------------------------------------
+
+
+@pytest.fixture
+def results(suite: Suite, tmp_path: Path) -> Results:
+    """All cells but those of the second repetition; the prior has one -inf."""
+    results = Results(tmp_path / "cells")
+    for cell in suite.cells:
+        if cell.repetition:
+            continue
+        if cell.method == "MLP":
+            row = row_of(cell) | {"status": "failed", "error": "ValueError: no"}
+            results.write(cell, row, {})
+            continue
+        if cell.method == "prior":
+            scores = {"lpp_z": -math.inf, "neg_inf_fraction": 0.25}
+            log_probs = [-math.inf, -1.0, -1.0, -1.0]
+        else:
+            value = {"OT-only": -2.0, "RoPE": -1.0}[cell.method]
+            scores = {"lpp_z": value}
+            log_probs = [value + 0.1 * i for i in (-1, 0, 0, 1)]
+        results.write(cell, row_of(cell, **scores), arrays_of(log_probs))
+    return results
+
+
+def test_a_table_survives_being_written_and_read(
+    suite: Suite, results: Results, tmp_path: Path
+) -> None:
+    written = write_table(suite, results, tmp_path / "out")
+    read = read_table(tmp_path / "out")
+    assert list(read.rows) == list(written.rows)
+    for cell, row in written.rows.items():
+        for name in ("lpp_z", "acauc", "status", "converged", "n_test", "error"):
+            assert read.rows[cell][name] == row.get(name, ""), name
+        for name, values in written.arrays.get(cell, {}).items():
+            assert np.array_equal(read.arrays[cell][name], values)
+    manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
+    assert manifest["not run"] == 42
+    assert manifest["failed"] == 4
+    assert manifest["finished"] == 38
+
+
+def test_the_same_table_gives_the_same_bytes(
+    suite: Suite, results: Results, tmp_path: Path
+) -> None:
+    table = write_table(suite, results, tmp_path / "out")
+    contents = []
+    for name in ("first", "second"):
+        write_report(suite, table, tmp_path / name)
+        # What is read from the CSV is what was in memory.
+        table = read_table(tmp_path / "out")
+        files = sorted((tmp_path / name).iterdir())
+        contents.append({path.name: path.read_bytes() for path in files})
+    assert contents[0].keys() == contents[1].keys()
+    assert len(contents[0]) > 2
+    assert contents[0] == contents[1]
+
+
+def test_a_report_shows_infinite_scores_failures_and_what_was_not_run(
+    suite: Suite, results: Results, tmp_path: Path
+) -> None:
+    table = write_table(suite, results, tmp_path / "out")
+    text = write_report(suite, table, tmp_path / "out").read_text()
+    assert "| prior | -inf |" in text
+    assert "**-1.00**" in text
+    assert "42 of 84 cells were not run" in text
+    assert "4 cells failed" in text
+    assert "ValueError: no" in text
+
+
+def test_a_mean_with_one_infinity_is_infinite_and_has_no_spread() -> None:
+    mean, spread = mean_and_spread([-1.0, -math.inf])
+    assert mean == -math.inf
+    assert math.isnan(spread)
+    assert mean_and_spread([1.0, 3.0]) == (2.0, math.sqrt(2.0))
+    assert math.isnan(mean_and_spread([1.0])[1])
+
+
+def test_the_paired_test_sees_what_an_unpaired_one_does_not() -> None:
+    generator = np.random.default_rng(0)
+    difficulty = 5 * generator.normal(size=200)
+    best = difficulty + 0.1 * generator.normal(size=200)
+    assert worse(best - 0.1, best)
+    assert not worse(best, best)
+    assert not worse(difficulty + 0.1 * generator.normal(size=200), best)
+    lost = best.copy()
+    lost[0] = -np.inf
+    assert worse(lost, best)
+    assert not worse(lost, lost)
+
+
+def test_the_axis_of_the_figures_is_linear_above_the_prior_and_logarithmic_below() -> (
+    None
+):
+    axis = LPPAxis(prior=-4.0, top=2.0)
+    values = np.array([-1000.0, -40.0, -4.0, -1.0, 2.0])
+    heights = axis.forward(values)
+    assert np.allclose(axis.inverse(heights), values)
+    assert heights[2:].tolist() == [0.0, 0.5, 1.0]
+    assert axis.forward(-4.0 - 6 * 11) == pytest.approx(-2.0)
+    assert axis.forward(-4.0 - 6 * 111) == pytest.approx(-3.0)
+
+
+def test_a_report_without_arrays_marks_nothing(
+    suite: Suite, results: Results, tmp_path: Path
+) -> None:
+    table = write_table(suite, results, tmp_path / "out")
+    bare = Table(table.rows, {cell: {} for cell in table.rows})
+    text = write_report(suite, bare, tmp_path / "bare").read_text()
+    assert "**-1.00**" not in text
+    assert "-1.00" in text
