@@ -317,9 +317,9 @@ class RoPE:
         """Couple a batch at every gamma and every tau, with the same simulations.
 
         The same as :meth:`build_posterior` at each, up to the tolerance of the coupler,
-        in less time: the simulations are drawn and embedded once, and each coupling
-        starts from its neighbour (:meth:`SinkhornCoupler.sweep
-        <sbi_rope.SinkhornCoupler.sweep>`).
+        in less time: the simulations are drawn and embedded once, their posteriors are
+        normalised once, and each coupling starts from its neighbour
+        (:meth:`SinkhornCoupler.sweep <sbi_rope.SinkhornCoupler.sweep>`).
 
         Args:
             x_o: As in :meth:`build_posterior`, and so are the arguments not listed.
@@ -360,10 +360,16 @@ class RoPE:
 
         def posteriors() -> Iterator[MixturePosterior]:
             settings = itertools.product(gammas, taus)
+            first = None
             for coupling, (gamma, tau) in zip(couplings, settings, strict=True):
                 if require_convergence:
                     _check_converged(coupling, replace(coupler, gamma=gamma, tau=tau))
-                yield self._mixture(batch, coupling, unseen=unseen, tail_mass=tail_mass)
+                posterior = self._mixture(
+                    batch, coupling, unseen=unseen, tail_mass=tail_mass
+                )
+                first = posterior if first is None else first
+                posterior.share_component_mass(first)
+                yield posterior
 
         return posteriors()
 

@@ -135,8 +135,8 @@ class MixturePosterior(DirectPosterior):
                 f"{type(self.prior).__name__}. Use a prior of sbi, such as BoxUniform."
             )
         self.posterior_estimator.to_device(device)
-        for name, value in self._cache.items():
-            self._cache[name] = value.to(device)
+        # A new one: posteriors of a sweep share it and stay where they are.
+        self._cache = {name: value.to(device) for name, value in self._cache.items()}
         super().to(device)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -339,6 +339,15 @@ class MixturePosterior(DirectPosterior):
             )
         rows = (weights for _, weights in estimator.row_blocks(features))
         return mixture_mass(self._cache["component_mass"], rows, exact=exact)
+
+    def share_component_mass(self, other: "MixturePosterior") -> None:
+        """Estimate the masses :math:`Z_j` once for two posteriors.
+
+        Args:
+            other: A posterior with the same components, simulations and prior, and
+                another coupling.
+        """
+        self._cache = other._cache
 
     def leakage_correction(  # type: ignore[override]
         self, x: Tensor, **kwargs: Any

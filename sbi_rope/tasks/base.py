@@ -59,7 +59,7 @@ class Task(ABC):
        recorded. Read its options with :meth:`_option`, which refuses those that have
        no effect. The variants common to all tasks need nothing else;
     6. add the class to ``TASKS`` in ``sbi_rope/tasks/__init__.py``. The tests in
-       ``tests/contract/test_task.py`` then apply to it.
+       ``tests/contract/test_task*.py`` then apply to it.
 
     Options of a task are keyword arguments of its constructor, next to ``variant``,
     ``root`` and ``label_noise``.
