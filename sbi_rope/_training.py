@@ -130,7 +130,7 @@ def fit(
         for batch in batches(step):
             value = loss(*batch)
             values.append(float(value.detach()))
-            if not update or not torch.isfinite(value):
+            if not update:
                 continue
             optimizer.zero_grad()
             value.backward()

@@ -24,6 +24,7 @@ from sbi_rope._sbi import (
 from sbi_rope._training import History
 from sbi_rope._validation import (
     check_batch,
+    check_finite,
     check_in_support,
     check_instance,
     check_prior,
@@ -68,6 +69,8 @@ class Method(ABC):
         check_prior(prior)
         self._prior: Distribution = copy.deepcopy(prior)
         self._device = torch.device(device)
+        if hasattr(self._prior, "to"):
+            self._prior.to(self._device)  # type: ignore[attr-defined]
         self._event_shape: torch.Size | None = None
         self._posterior: Any = None
         self._history: History | None = None
@@ -132,13 +135,22 @@ class Method(ABC):
 
     def _checked_x(self, name: str, x: Any, *, finite: bool = True) -> Tensor:
         x = check_tensor(name, x)
+        if self._event_shape is None and x.ndim < 2:
+            raise InvalidInputError(
+                f"Expected `{name}` of shape (n, *event); got {tuple(x.shape)}."
+            )
         shape = x.shape[1:] if self._event_shape is None else self._event_shape
-        x = check_batch(name, x, shape, finite=finite)
-        return x.to(self._device, torch.float32)
+        x = check_batch(name, x, shape, finite=False)
+        x = x.detach().to(self._device, torch.float32, copy=True)
+        if finite:
+            check_finite(name, x)  # float32 may hold less
+        return x
 
     def _checked_theta(self, name: str, theta: Any) -> Tensor:
         theta = check_batch(name, theta, self._prior.event_shape)
-        return theta.to(self._device, torch.float32)
+        theta = theta.detach().to(self._device, torch.float32, copy=True)
+        check_finite(name, theta)
+        return theta
 
     def _append(self, old: Tensor | None, new: Tensor) -> Tensor:
         self._event_shape = new.shape[1:]
@@ -179,8 +191,8 @@ class UsesSimulations(Method):
         """
         theta = self._checked_theta("theta", theta)
         check_in_support("theta", theta, self._prior)
-        check_same_length("theta", theta, "x", check_tensor("x", x))
         x = self._checked_x("x", x, finite=False)
+        check_same_length("theta", theta, "x", x)
         valid = torch.isfinite(x).flatten(1).all(dim=1)
         if not valid.any():
             raise InvalidInputError(
@@ -236,8 +248,8 @@ class UsesCalibration(Method):
         """
         theta = self._checked_theta("theta", theta)
         check_in_support("theta", theta, self._prior)
-        check_same_length("theta", theta, "x", check_tensor("x", x))
         x = self._checked_x("x", x)
+        check_same_length("theta", theta, "x", x)
         self._theta_cal = torch.cat([self._theta_cal, theta])
         self._x_cal = self._append(self._x_cal, x)
         return self

@@ -18,6 +18,7 @@ from sbi_rope.baselines.training import (
     estimator_builder,
     train_on_pairs,
 )
+from sbi_rope.errors import InvalidInputError
 
 __all__ = ["CalibrationMLP", "DiagonalGaussian"]
 
@@ -121,7 +122,8 @@ class CalibrationMLP(UsesCalibration):
 
     Raises:
         InvalidTypeError: If an argument has the wrong type.
-        InvalidInputError: If sbi knows no estimator of that name.
+        InvalidInputError: If sbi knows no estimator of that name; in ``train``, if
+            there is one pair only.
     """
 
     def __init__(
@@ -139,6 +141,11 @@ class CalibrationMLP(UsesCalibration):
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         theta, x = self._calibration
+        if len(x) < 2:
+            raise InvalidInputError(
+                "Expected at least 2 calibration pairs, by which x is standardised; "
+                "got 1. Append more, or use a method that also sees simulations."
+            )
         train, held_out = split_pairs(len(x), self.training.validation_fraction)
         estimator = self._gaussian(theta[train], x[train]).to(self._device)
         history = train_on_pairs(

@@ -48,8 +48,8 @@ class SpikeAndSlab:
         InvalidInputError: If an argument is outside its range.
 
     Example:
-        >>> SpikeAndSlab().log_prob(torch.zeros(3)).exp()
-        tensor([20.5838, 20.5838, 20.5838])
+        >>> SpikeAndSlab().log_prob(torch.zeros(2)).exp().round(decimals=1)
+        tensor([20.6000, 20.6000])
     """
 
     spike_std: float = 0.01

@@ -10,6 +10,7 @@ from sbi_rope._training import History, fit, split_pairs
 from sbi_rope._validation import check_instance
 from sbi_rope.baselines.base import UsesCalibration, UsesSimulations
 from sbi_rope.baselines.training import EstimatorBuilder, Training, estimator_builder
+from sbi_rope.errors import warn_user
 
 __all__ = ["JointNPE"]
 
@@ -85,6 +86,10 @@ class JointNPE(UsesSimulations, UsesCalibration):
         theta_held, x_held = theta_cal[held_out], x_cal[held_out]
         if not len(held_out):
             # Nothing real to choose by; simulations at least say when to stop.
+            warn_user(
+                f"Only {len(x_cal)} calibration pair(s): none is held out, and the "
+                "best network is chosen on simulations."
+            )
             rows, held_out = split_pairs(len(x), self.training.validation_fraction)
             theta_held, x_held = theta[held_out], x[held_out]
             theta, x = theta[rows], x[rows]

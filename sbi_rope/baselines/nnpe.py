@@ -6,14 +6,20 @@ from typing import Any
 
 import sbi.inference
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from sbi_rope._sbi import embed, estimator_of, posterior_from
+from sbi_rope._sbi import (
+    embed,
+    embedding_of,
+    estimator_of,
+    posterior_from,
+    with_embedding,
+)
 from sbi_rope._training import History
 from sbi_rope._validation import check_choice, check_instance
 from sbi_rope.baselines.base import BuildsOnNPE
 from sbi_rope.baselines.error_model import SpikeAndSlab
-from sbi_rope.baselines.statistics import NoiseOn, split_at_statistics
+from sbi_rope.baselines.statistics import NoiseOn, SoftClip, split_at_statistics
 from sbi_rope.baselines.training import EstimatorBuilder, Training, train_with_sbi
 
 __all__ = ["NNPE"]
@@ -44,7 +50,9 @@ class NNPE(BuildsOnNPE):
     Where this differs from the paper and the original code: the paper adds the errors
     to statistics and does not say what is done with series and images; here it is the
     embedding. The original code draws the noise once for all epochs. Draws of the
-    Cauchy law beyond 1000 standard deviations are put at 1000.
+    Cauchy law beyond 1000 standard deviations are put at 1000, and the network sees
+    statistics beyond three on a logarithmic scale, without which mixture density
+    networks diverge.
 
     References:
         | Robust Neural Posterior Estimation and Statistical Model Criticism
@@ -107,15 +115,21 @@ class NNPE(BuildsOnNPE):
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
         estimator = copy.deepcopy(estimator_of(npe)).requires_grad_()
-        # Shares its parameters with the estimator, whose embedding is out of reach.
+        # The density shares its parameters with the estimator.
         net, density = split_at_statistics(estimator, self.noise_on)
         theta, x = self._simulations
         statistics = embed(net, x)
+        clip = SoftClip(statistics)
+        density = with_embedding(density, nn.Sequential(clip, embedding_of(density)))
+        if self.noise_on == "embedding":
+            estimator = with_embedding(estimator, nn.Sequential(net, clip))
+        else:
+            estimator = density
         trained, history = train_with_sbi(
             partial(
                 _TrainerWithNoise,
                 noise=self.error_model,
-                scale=statistics.std(dim=0),
+                scale=clip.std,
             ),
             self._prior,
             lambda theta, x: density,

@@ -182,14 +182,15 @@ class RNPE(BuildsOnNPE):
     q(s) of simulated statistics is a neural spline flow. For every observation,
     statistics are drawn by sbi's slice sampler, with the choice between spike and slab
     summed out, and kept with the posterior: the first call about an observation takes
-    some half a second for eight statistics, later ones little. Chains that disagree
+    about a second for eight statistics, later ones little. Chains that disagree
     are warned of, and ``posterior.posterior_estimator.r_hat(x)`` tells by how much.
 
     Sees simulations. Assumes that statistics err independently of each other, any of
-    them, and that simulated statistics have a density: an embedding with more outputs
-    than x has informative entries makes chains slow. To be preferred to NNPE with few
-    statistics, each with a meaning; for series and images NNPE is faster and rarely
-    worse.
+    them, and that simulated ones are not tied to each other: a sweep moves one at a
+    time, so that chains are slow on strongly correlated statistics and slower on an
+    embedding with more outputs than x has informative entries. To be preferred to NNPE
+    with a few statistics, each with a meaning, and ``noise_on="input"``; elsewhere
+    NNPE has no chains that could fail.
 
     Where this differs from the original code: it samples the choices between spike and
     slab too, for 100,000 steps of mixed Hamiltonian Monte Carlo an observation, and

@@ -16,12 +16,22 @@ from sbi_rope._training import History, fit, split_pairs
 from sbi_rope.baselines.training import Training
 from sbi_rope.errors import UnsupportedPosteriorError
 
-__all__ = ["NoiseOn", "Standardisation", "fit_marginal", "split_at_statistics"]
+__all__ = [
+    "NoiseOn",
+    "SoftClip",
+    "Standardisation",
+    "fit_marginal",
+    "split_at_statistics",
+]
 
 NoiseOn = Literal["embedding", "input"]
 # Hidden units and transforms of the marginal density. A single spline transform is
 # evaluated in half the time of two, and the denoising does little else.
 HIDDEN, NUM_TRANSFORMS = 64, 1
+# Of the networks' outputs at the start.
+SHRINKAGE = 0.01
+# Where the logarithmic scale begins, in standard deviations, and the smallest of those.
+CLIP, SMALLEST = 3.0, 1e-20
 # A standard deviation smaller than this share of the mean is rounding.
 ROUNDING = 1e-6
 
@@ -81,10 +91,47 @@ class Standardisation(nn.Module):
         return statistics
 
 
+class SoftClip(nn.Module):
+    r"""Statistics on a logarithmic scale beyond three standard deviations.
+
+    .. math::
+        z \mapsto \begin{cases} z & |z| \le c \\
+        \operatorname{sign}(z)\, c\, (1 + \log (|z| / c)) & |z| > c \end{cases}
+
+    with z a statistic in standard deviations from its mean over simulations and c = 3.
+    It loses nothing and changes nothing where simulations are, but keeps networks from
+    inputs that are hundreds of times larger than those. Statistics that are the same
+    in all simulations stay at that value.
+
+    Args:
+        simulated: Statistics of simulations, shape ``(n, *)``.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, simulated: Tensor) -> None:
+        super().__init__()
+        std, mean = torch.std_mean(simulated, dim=0)
+        self.register_buffer("mean", mean)
+        self.register_buffer("std", std)
+
+    def forward(self, statistics: Tensor) -> Tensor:
+        """Return statistics in their own units, of the same shape."""
+        z = (statistics - self.mean) / self.std.clamp_min(SMALLEST)
+        outside = z.abs().clamp_min(CLIP)
+        clipped = z.sign() * CLIP * (1 + (outside / CLIP).log())
+        # Where nothing is clipped, not even the rounding of NPE's input changes.
+        return statistics.where(z.abs() <= CLIP, self.mean + self.std * clipped)
+
+
 def fit_marginal(
     s: Tensor, *, jitter: float, training: Training, show_progress_bars: bool
 ) -> tuple[UnconditionalDensityEstimator, History]:
     r"""Fit a neural spline flow :math:`q(s)` to standardised simulated statistics.
+
+    It starts as a standard normal density and stays like it where there are no
+    simulations, which is where misspecified statistics are.
 
     Args:
         s: Shape ``(n, l)``.
@@ -102,7 +149,9 @@ def fit_marginal(
         z_score_x="none",
         hidden_features=[HIDDEN, HIDDEN],
         num_transforms=NUM_TRANSFORMS,
-    ).to(s.device)
+    )
+    _start_as_standard_normal(flow)
+    flow = flow.to(s.device)
     train, held_out = split_pairs(len(s), training.validation_fraction)
 
     def batches(step: int) -> Any:
@@ -125,3 +174,17 @@ def fit_marginal(
         show_progress_bars=show_progress_bars,
     )
     return flow, history
+
+
+@torch.no_grad()
+def _start_as_standard_normal(flow: nn.Module) -> None:
+    """Shrink the outputs of the networks, at zero of which splines are the identity."""
+    for module in flow.modules():
+        outputs: nn.Module | None = None
+        if isinstance(module, nn.Sequential) and isinstance(module[-1], nn.Linear):
+            outputs = module[-1]
+        elif isinstance(module, nn.ParameterList):
+            outputs = module  # a single statistic, with no network
+        if outputs is not None:
+            for parameter in outputs.parameters():
+                parameter.mul_(SHRINKAGE)

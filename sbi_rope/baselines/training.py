@@ -125,7 +125,23 @@ def estimator_builder(density_estimator: Any) -> EstimatorBuilder:
         )
 
     def build(theta: Tensor, x: Tensor) -> Any:
-        return copy.deepcopy(density_estimator(theta, x))
+        modes: dict[Any, bool] = {}
+
+        def in_evaluation_mode(module: Any, inputs: Any) -> None:
+            modes.setdefault(module, module.training)
+            module.training = False
+
+        # sbi tries the net on one observation, which moves batch statistics.
+        hook = torch.nn.modules.module.register_module_forward_pre_hook(
+            in_evaluation_mode
+        )
+        try:
+            built = density_estimator(theta, x)
+        finally:
+            hook.remove()
+            for module, training in modes.items():
+                module.training = training
+        return copy.deepcopy(built)
 
     return build
 

@@ -143,7 +143,7 @@ def test_waves_in_viscoelastic_arteries_travel_at_the_velocity_asked_for(
 
 
 def test_the_mean_pressure_is_near_its_target(beat: Beat) -> None:
-    for target in (75.0, 89.0, 110.0):
+    for target in (75.0, 110.0):
         wave = simulate_beat(replace(BASELINE, mean_pressure=target)).pressure["aortic"]
         assert wave.mean() == pytest.approx(target, abs=3.0)
 

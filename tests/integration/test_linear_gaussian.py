@@ -39,14 +39,14 @@ def divergence(x_s: Tensor, posterior: MixturePosterior, draws: int = 30) -> flo
 
 def test_with_the_exact_g_the_mixture_approaches_the_exact_posterior() -> None:
     errors = []
-    for n in (30, 180, 1000):
+    for n in (30, 150, 600):
         _, x_o = gaussian.labelled(n)
         coupler = SinkhornCoupler(gamma=0.02, tau=0.9)
         posterior = with_exact_g(x_o, n, coupler)
         errors.append(divergence(gaussian.undo(x_o), posterior))
     assert errors[0] > 1.5 * errors[1]
     assert errors[1] > 1.5 * errors[2]
-    assert errors[2] < 0.03
+    assert errors[2] < 0.05
 
 
 def test_a_larger_gamma_moves_the_mixture_towards_the_prior() -> None:

@@ -18,6 +18,7 @@ from sbi.diagnostics import (
     run_tarp,
 )
 from sbi.diagnostics.misspecification import calculate_p_misspecification
+from sbi.diagnostics.sbc import check_uniformity_frequentist
 from sbi.inference import EnsemblePosterior
 from torch import Tensor
 
@@ -78,15 +79,15 @@ def test_sbc_finds_calibrated_posteriors_calibrated_and_shifted_ones_not(
     checks = check_sbc(ranks, theta, dap, num_posterior_samples=200)
     assert checks["ks_pvals"].min() > 0.01
 
-    shifted, dap = run_sbc(
+    shifted, _ = run_sbc(
         (theta + 0.6).clamp(-1, 1),
         posterior.x_o,
         posterior,
         num_posterior_samples=200,
         show_progress_bar=False,
     )
-    checks = check_sbc(shifted, theta, dap, num_posterior_samples=200)
-    assert checks["ks_pvals"].max() < 1e-3
+    # The first of the checks alone: the others train classifiers.
+    assert check_uniformity_frequentist(shifted, 200).max() < 1e-3
 
 
 def test_sbc_needs_no_batched_sampling_and_may_use_workers(

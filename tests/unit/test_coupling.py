@@ -49,7 +49,8 @@ def solved_by_the_oracle(
         real, simulated = clouds()
     cost = cost_of(real, simulated)
     gamma = ratio * float(cost.max())
-    plan = oracles.semi_balanced_plan(cost, gamma=gamma, tau=tau, iterations=20_000)
+    # It converges within 1500, or not at all in time.
+    plan = oracles.semi_balanced_plan(cost, gamma=gamma, tau=tau, iterations=1500)
     return real, simulated, gamma, *plan
 
 
@@ -64,7 +65,7 @@ def test_rows_equal_those_of_the_oracle(
         gamma=gamma,
         tau=tau,
         tolerance=digits(mode, double=1e-10, single=1e-6),
-        max_iterations=3000,
+        max_iterations=600,
         **mode,
     )
     coupling = coupler.couple(real, simulated)

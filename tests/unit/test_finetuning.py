@@ -76,7 +76,8 @@ def test_of_several_learning_rates_the_best_on_the_hold_out_is_kept() -> None:
     x = torch.randn(30, 2)
     losses = {}
     for rate in (1e-5, 1e-2, (1e-5, 1e-2), (1e-2, 1e-5)):
-        result = CalibrationFinetuner(learning_rate=rate).finetune(
+        finetuner = CalibrationFinetuner(learning_rate=rate, num_steps=300)
+        result = finetuner.finetune(
             linear(), x, lambda count: 2 * x + 1, seed=0, show_progress_bars=False
         )
         losses[rate] = min(result.history.validation_loss)

@@ -1,8 +1,6 @@
 """The command that generates, validates and describes pressure waves."""
 
-import subprocess
-import sys
-import textwrap
+import importlib
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,6 +14,7 @@ from sbi_rope.tasks.hemodynamics.__main__ import main
 from sbi_rope.tasks.hemodynamics.dataset import load
 from sbi_rope.tasks.hemodynamics.population import Population
 from sbi_rope.tasks.hemodynamics.subject import Beat, Physics, Subject
+from tests.fresh import imported_anew
 
 PNG = b"\x89PNG"
 PHASE = 2 * np.pi * np.arange(256) / 256
@@ -208,22 +207,20 @@ def _anyone(draw: Any) -> Any:
     return young
 
 
-def test_generate_without_numba_says_how_to_install_it(tmp_path: Path) -> None:
-    code = f"""
-        import sys
-        sys.modules["numba"] = None
-        from sbi_rope.tasks.hemodynamics.__main__ import main
-        file = {str(tmp_path / "x.npz")!r}
-        sys.exit(main(["generate", "--n", "2", "--process", "real", "--out", file]))
-    """
-    result = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(code)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert result.returncode == 2
-    assert result.stderr.splitlines()[-1].endswith(
-        'needs numba. Install it with `pip install "sbi-rope[hemodynamics]"`.'
+def test_generate_without_numba_says_how_to_install_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with imported_anew(without=("numba",)):
+        anew = importlib.import_module("sbi_rope.tasks.hemodynamics.__main__")
+        assert anew.main is not main
+        file = str(tmp_path / "x.npz")
+        arguments = ["generate", "--n", "2", "--process", "real", "--out", file]
+        assert anew.main(arguments) == 2
+    assert (
+        capsys.readouterr()
+        .err.splitlines()[-1]
+        .endswith(
+            'needs numba. Install it with `pip install "sbi-rope[hemodynamics]"`.'
+        )
     )
     assert not (tmp_path / "x.npz").exists()

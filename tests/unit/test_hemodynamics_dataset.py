@@ -1,9 +1,7 @@
 """Stored beats: made in parallel, resumed after an interrupt, and read."""
 
+import importlib
 import json
-import subprocess
-import sys
-import textwrap
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +18,7 @@ from sbi_rope.tasks.hemodynamics.generation import CHUNK_SIZE, generate
 from sbi_rope.tasks.hemodynamics.population import NUISANCES, Population
 from sbi_rope.tasks.hemodynamics.store import read_arrays, write_arrays
 from sbi_rope.tasks.hemodynamics.subject import Beat, Physics, Subject
+from tests.fresh import imported_anew
 
 N = 3 * CHUNK_SIZE + 5
 
@@ -144,7 +143,16 @@ def test_the_simulator_needs_no_lengths(tmp_path: Path) -> None:
 # The same bytes ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("backend", ["sequential", "threading", "loky"])
+@pytest.mark.parametrize(
+    "backend",
+    [
+        "sequential",
+        "threading",
+        # Its processes import everything anew. Those of "multiprocessing", below, do
+        # not.
+        pytest.param("loky", marks=pytest.mark.slow),
+    ],
+)
 def test_bytes_do_not_depend_on_jobs_and_backend(
     backend: str, made: Path, tmp_path: Path
 ) -> None:
@@ -355,19 +363,9 @@ def test_a_file_with_other_settings_than_asked_for_is_refused(made: Path) -> Non
 
 
 def test_stored_beats_load_without_numba_and_joblib(made: Path) -> None:
-    code = f"""
-        import sys
-        import sbi.inference  # which itself uses joblib
-        sys.modules["numba"] = sys.modules["joblib"] = None
-        from sbi_rope.tasks.hemodynamics.dataset import load
-        from sbi_rope.tasks.hemodynamics.__main__ import main
-        assert len(load({str(made)!r})) == {N}
-        sys.exit(main(["info", {str(made)!r}]))
-    """
-    result = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(code)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert result.returncode == 0, result.stderr
+    with imported_anew(without=("numba", "joblib")):
+        dataset = importlib.import_module("sbi_rope.tasks.hemodynamics.dataset")
+        command = importlib.import_module("sbi_rope.tasks.hemodynamics.__main__")
+        assert dataset.load is not load
+        assert len(dataset.load(made)) == N
+        assert command.main(["info", str(made)]) == 0

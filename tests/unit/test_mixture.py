@@ -454,8 +454,9 @@ def test_samples_follow_the_density(bounded: bool) -> None:
         assert (samples[:, i].T.cov() - covariance).abs().max() < 0.15 * float(
             covariance.diagonal().max()
         )
-        score = float(c2st(samples[:, i], drawn, n_folds=2))
-        assert abs(score - 0.5) < 0.05
+        if i == 0:  # training the classifier takes half a second
+            score = float(c2st(samples[:, i], drawn, n_folds=2))
+            assert abs(score - 0.5) < 0.05
 
 
 def test_marginal_samples_have_the_distribution_of_the_density() -> None:
@@ -482,7 +483,7 @@ def test_samples_have_the_cdf_of_the_truncated_mixture_however_they_are_cut(
     posterior = gaussian_posterior(dim=1, n_o=3, n_s=5, std=0.6, dtype=dtype)
     monkeypatch.setattr(chunks, "MAX_ENTRIES", entries)
     monkeypatch.setattr(chunks, "CPU_BATCH", batch)
-    n = 2000
+    n = 2000 if entries > 1 else 500  # one at a time takes its time
     samples = posterior.sample_batched((n,), posterior.x_o, **QUIET)[..., 0].double()
     one = posterior.sample((n,), x=posterior.x_o[1], **QUIET)[:, 0].double()
     mean, log_std = posterior.posterior_estimator.contexts.double().T

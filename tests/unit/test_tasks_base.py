@@ -1,7 +1,5 @@
 """The registry and what the base class of tasks does."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -82,19 +80,6 @@ def test_sets_do_not_depend_on_the_default_dtype() -> None:
         torch.set_default_dtype(default)
     assert torch.equal(theta, again[0])
     assert torch.equal(x, again[1])
-
-
-def test_importing_tasks_is_quiet_and_loads_no_data_library() -> None:
-    code = (
-        "import sys, sbi_rope.tasks\n"
-        "heavy = {'causalchamber', 'sbi.analysis'}\n"
-        "assert not heavy & sys.modules.keys(), heavy & sys.modules.keys()\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout == ""
 
 
 def test_options_without_effect_are_refused() -> None:

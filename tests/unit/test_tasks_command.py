@@ -1,5 +1,6 @@
 """The command that lists, describes and draws tasks."""
 
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +10,7 @@ import torch
 
 from sbi_rope.tasks import list_tasks
 from sbi_rope.tasks.__main__ import main
+from tests.fresh import imported_anew
 
 PNG = b"\x89PNG"
 
@@ -112,7 +114,21 @@ def test_a_picture_without_a_task_is_refused(tmp_path: Path) -> None:
         main(["--plot", str(tmp_path / "x.png")])
 
 
-def test_the_module_runs_as_a_command() -> None:
+def test_the_module_runs_as_a_command(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["tasks", "linear_gaussian", "-n", "20"])
+    # As by `python -m`, in this process.
+    with imported_anew(), pytest.raises(SystemExit) as end:
+        runpy.run_module("sbi_rope.tasks", run_name="__main__", alter_sys=True)
+    assert end.value.code in (None, 0)
+    out, err = capfd.readouterr()
+    assert "linear_gaussian" in out or "LinearGaussian" in out
+    assert err == ""
+
+
+@pytest.mark.slow
+def test_the_module_runs_as_a_command_of_its_own() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "sbi_rope.tasks", "linear_gaussian", "-n", "20"],
         capture_output=True,

@@ -213,7 +213,7 @@ def test_one_after_the_other_and_together_follow_one_law(
 
 
 def test_rows_of_a_batch_belong_to_their_parameters() -> None:
-    theta = torch.tensor([[1400.0, 5.0, 15.0], [250.0, 5.0, 15.0]]).repeat(300, 1)
+    theta = torch.tensor([[1400.0, 5.0, 15.0], [250.0, 5.0, 15.0]]).repeat(100, 1)
     num_cells = CancerStromaSimulator(batched=True)(theta)[:, :2].sum(dim=1)
     assert (num_cells[::2] > 1000).all()
     assert (num_cells[1::2] < 500).all()

@@ -647,7 +647,7 @@ def test_rope_repairs_a_posterior_with_recorded_pairs(
     rope.train(seed=0, show_progress_bars=False)
     theta_o, x_o = task.get_test_set(12)
     with pytest.warns(match="batch of 12"):
-        posterior = rope.build_posterior(x_o, seed=0)
+        posterior = rope.build_posterior(x_o, num_simulations=200, seed=0)
     samples = posterior.sample_batched((100,), x=x_o, show_progress_bars=False)
     assert samples.shape == (100, 12, 1)
     assert ((samples >= 0) & (samples <= 45)).all()

@@ -1,0 +1,702 @@
+"""Every baseline keeps one contract: data goes in, a posterior of sbi comes out."""
+
+import copy
+import functools
+import inspect
+import pickle
+import random
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from sbi.utils import within_support
+from torch import Tensor, nn
+
+import sbi_rope.baselines
+from sbi_rope._random import seeded
+from sbi_rope.baselines import (
+    NPE,
+    CalibrationMLP,
+    Method,
+    UsesCalibration,
+    UsesObservations,
+    UsesSimulations,
+)
+from sbi_rope.baselines.base import BuildsOnNPE
+from sbi_rope.errors import (
+    InvalidInputError,
+    InvalidTypeError,
+    NotReadyError,
+    RoPEWarning,
+)
+from tests import baselines
+from tests.baselines import (
+    CASES,
+    METHODS,
+    SHORT,
+    data_of,
+    feed,
+    first_task,
+    log_prob,
+    log_prob_batched,
+    make,
+    names_that_see,
+    sample,
+    sample_batched,
+    task_of,
+    train,
+    trained,
+)
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:.*mixed neural density estimator"),
+    pytest.mark.filterwarnings("ignore:Inferring num_categories"),
+    pytest.mark.filterwarnings("ignore:Maximum number of epochs"),
+    pytest.mark.filterwarnings("ignore:.*lie outside the prior support"),
+    pytest.mark.filterwarnings("ignore:RNPE. the chains of"),
+    pytest.mark.filterwarnings("ignore:Capping max_sampling_batch_size"),
+]
+
+CALLS = {
+    UsesSimulations: "append_simulations",
+    UsesCalibration: "append_calibration",
+    UsesObservations: "append_observations",
+}
+PARTS = [
+    pytest.param(name, part, id=f"{name}-{call}")
+    for part, call in CALLS.items()
+    for name in names_that_see(part)
+]
+LABELLED = [
+    pytest.param(name, call, id=f"{name}-{call}")
+    for part, call in CALLS.items()
+    for name in names_that_see(part)
+    if part is not UsesObservations
+]
+LEARNERS = [name for name in METHODS if name != "prior"]
+GAUSSIAN = [name for name, task in CASES if task == "linear_gaussian"]
+
+
+@pytest.fixture(params=CASES, ids="-".join)
+def case(request: pytest.FixtureRequest) -> tuple[str, str]:
+    """A method and a task whose data are there."""
+    name, task = request.param
+    if not task_of(task).has_data:
+        pytest.skip(f"the data of {task} are not on this machine")
+    return name, task
+
+
+@pytest.fixture(params=METHODS)
+def name(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+def result(name: str, task: str | None = None) -> Any:
+    """The posterior of the cached training."""
+    return trained(name, task or first_task(name)).build_posterior()
+
+
+def densities(posterior: Any, name: str, task: str | None = None) -> Tensor:
+    """Log densities that two equal posteriors share and two others do not."""
+    data = data_of(task or first_task(name))
+    return log_prob_batched(
+        posterior, data.theta[:5, None].repeat(1, 4, 1), data.x_o[:4]
+    )
+
+
+@functools.cache
+def expected_densities(name: str, task: str | None = None) -> Tensor:
+    """Those of the cached training."""
+    return densities(result(name, task), name, task)
+
+
+def retrained(name: str, data: baselines.Data | None = None, **options: Any) -> Any:
+    """The posterior of a new training with the seed of the cached one."""
+    data = data_of(first_task(name)) if data is None else data
+    return train(feed(make(name, first_task(name), **options), data)).build_posterior()
+
+
+# What comes out.
+
+
+def test_samples_have_the_shapes_of_sbi(case: tuple[str, str]) -> None:
+    posterior, data = result(*case), data_of(case[1])
+    dim = data.theta.shape[1]
+    assert sample(posterior, (4,), data.x_o[0]).shape == (4, dim)
+    assert sample(posterior, (), data.x_o[:1]).shape[-1] == dim
+    samples = sample_batched(posterior, (4,), data.x_o[:3])
+    assert samples.shape == (4, 3, dim)
+    assert samples.dtype is torch.float32
+    assert samples.isfinite().all()
+
+
+def test_log_probs_have_the_shapes_of_sbi(case: tuple[str, str]) -> None:
+    posterior, data = result(*case), data_of(case[1])
+    theta = data.theta[:6].reshape(2, 3, -1)
+    assert log_prob(posterior, data.theta[:5], data.x_o[0]).shape == (5,)
+    assert log_prob_batched(posterior, theta[0], data.x_o[:3]).shape == (1, 3)
+    values = log_prob_batched(posterior, theta, data.x_o[:3])
+    assert values.shape == (2, 3)
+    assert values.dtype is torch.float32
+    assert not values.requires_grad
+    for i in range(3):
+        single = log_prob(posterior, theta[:, i], data.x_o[i])
+        assert torch.allclose(single, values[:, i], atol=1e-4)
+
+
+@pytest.mark.parametrize("name", GAUSSIAN)
+def test_where_nothing_leaks_sbis_defaults_do_as_well(name: str) -> None:
+    posterior, data = result(name, "linear_gaussian"), data_of("linear_gaussian")
+    x = data.x_o[0]
+    samples = posterior.sample((6,), x=x, show_progress_bars=False)
+    assert samples.shape == (6, 2)
+    assert not samples.requires_grad
+    expected = log_prob(posterior, data.theta[:5], x)
+    assert torch.allclose(posterior.log_prob(data.theta[:5], x=x), expected, atol=1e-4)
+
+
+def test_the_posterior_knows_the_shape_of_an_observation(case: tuple[str, str]) -> None:
+    posterior, (name, task) = result(*case), case
+    if not isinstance(trained(name, task), UsesSimulations | UsesCalibration):
+        pytest.skip("it has no estimator")
+    estimator = posterior.posterior_estimator
+    assert estimator.condition_shape == data_of(task).x_o.shape[1:]
+    assert estimator.input_shape == data_of(task).theta.shape[1:]
+    assert not estimator.training
+
+
+@pytest.fixture(scope="module")
+def grid() -> Tensor:
+    """Points of two dimensions that hold all mass of short trainings."""
+    axis = torch.linspace(-9, 9, 181)
+    return torch.cartesian_prod(axis, axis)
+
+
+@pytest.mark.parametrize("name", GAUSSIAN)
+def test_the_density_integrates_to_one_and_is_that_of_the_samples(
+    name: str, grid: Tensor
+) -> None:
+    """By the rectangle rule, to 1 %; marginals by Kolmogorov and Smirnov, at 0.1 %."""
+    posterior, x = result(name, "linear_gaussian"), data_of("linear_gaussian").x_o[1]
+    with torch.no_grad():
+        mass = 0.1**2 * log_prob(posterior, grid, x).double().exp()
+    assert float(mass.sum()) == pytest.approx(1, abs=0.01)
+    samples = sample(posterior, (2000,), x).double()
+    for k in range(2):
+        marginal = mass.reshape(181, 181).sum(dim=1 - k)
+        edges = torch.linspace(-9, 9, 181).double() + 0.05
+        below = (samples[:, k, None] <= edges).double().mean(dim=0)
+        assert float((below - marginal.cumsum(0)).abs().max()) < 1.95 / 2000**0.5
+
+
+@pytest.mark.parametrize(
+    "name", [name for name, task in CASES if task == "light_tunnel_sensors"]
+)
+def test_inside_a_bounded_prior_is_the_mass_that_the_samples_have_there(
+    name: str,
+) -> None:
+    """By importance sampling from the prior, to five standard errors."""
+    task = "light_tunnel_sensors"
+    if not task_of(task).has_data:
+        pytest.skip(f"the data of {task} are not on this machine")
+    posterior, x, prior = (
+        result(name, task),
+        data_of(task).x_o[0],
+        task_of(task).get_prior(),
+    )
+    theta = prior.sample(torch.Size((20_000,)))
+    with torch.no_grad():
+        log_weights = log_prob(posterior, theta, x) - prior.log_prob(theta)
+    weights = log_weights.double().exp()
+    inside = within_support(prior, sample(posterior, (4000,), x)).double()
+    error = (weights.var() / 20_000 + inside.var() / 4000).sqrt()
+    assert float(error) < 0.1
+    assert abs(float(weights.mean() - inside.mean())) < 5 * float(error) + 1e-6
+    outside = theta.clone()
+    outside[:, 0] += 1e4
+    assert torch.isneginf(log_prob(posterior, outside[:5], x)).all()
+
+
+COPIES: list[Any] = [
+    pytest.param(copy.deepcopy, id="deepcopy"),
+    pytest.param(lambda p: pickle.loads(pickle.dumps(p)), id="pickle"),
+]
+
+
+@pytest.mark.parametrize("duplicate", COPIES)
+def test_a_copy_of_the_posterior_has_the_same_density(
+    case: tuple[str, str], duplicate: Callable[[Any], Any]
+) -> None:
+    posterior = result(*case)
+    expected = expected_densities(*case)
+    assert torch.equal(densities(duplicate(posterior), *case), expected)
+
+
+def test_the_posterior_can_be_moved(name: str) -> None:
+    # Not on the first task: sbi moves no posterior whose prior is torch's own.
+    task = METHODS[name].tasks[-1]
+    if not task_of(task).has_data:
+        pytest.skip(f"the data of {task} are not on this machine")
+    posterior = result(name, task)
+    expected = densities(posterior, name, task)
+    posterior.to("cpu")
+    assert torch.equal(densities(posterior, name, task), expected)
+    assert sample(posterior, (3,), data_of(task).x_o[0]).isfinite().all()
+
+
+def test_each_posterior_that_is_built_is_ones_own(name: str) -> None:
+    first, second = result(name), result(name)
+    assert first is not second
+    x = data_of(first_task(name)).x_o[:1]
+    first.set_default_x(x)
+    assert second.default_x is None
+
+
+# Training.
+
+
+def states() -> tuple[bytes, str, Any]:
+    numpy_state = np.random.get_state()  # noqa: NPY002
+    return (
+        torch.get_rng_state().numpy().tobytes(),
+        str(numpy_state),
+        random.getstate(),
+    )
+
+
+def test_the_same_seed_gives_the_same_posterior_and_leaves_no_trace(name: str) -> None:
+    method = feed(make(name, first_task(name)), data_of(first_task(name)))
+    before = states()
+    train(method, seed=0)
+    assert states() == before
+    expected = expected_densities(name)
+    assert torch.equal(densities(method.build_posterior(), name), expected)
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_another_seed_gives_another_posterior(name: str) -> None:
+    method = feed(make(name, first_task(name)), data_of(first_task(name)))
+    posterior = train(method, seed=1).build_posterior()
+    expected = expected_densities(name)
+    assert not torch.allclose(densities(posterior, name), expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_training_again_starts_anew(name: str) -> None:
+    method = copy.deepcopy(trained(name, first_task(name)))
+    again = train(method, seed=0).build_posterior()
+    assert torch.equal(densities(again, name), expected_densities(name))
+
+
+def test_training_can_be_chained_and_says_nothing(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    method = feed(make(name, first_task(name)), data_of(first_task(name)))
+    capsys.readouterr()
+    assert method.train(seed=0, show_progress_bars=False) is method
+    printed = capsys.readouterr()
+    assert printed.out == printed.err == ""
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, "0"])
+def test_a_seed_that_is_none_is_refused(name: str, seed: Any) -> None:
+    method = feed(make(name, first_task(name)), data_of(first_task(name)))
+    with pytest.raises(InvalidInputError, match="seed"):
+        method.train(seed=seed, show_progress_bars=False)
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_an_untrained_method_has_no_posterior(name: str) -> None:
+    method = feed(make(name, first_task(name)), data_of(first_task(name)))
+    with pytest.raises(NotReadyError, match=r"train\(\)"):
+        method.build_posterior()
+
+
+@pytest.mark.parametrize(("name", "part"), PARTS)
+def test_data_appended_after_the_training_ask_for_another(
+    name: str, part: type[Method]
+) -> None:
+    method = copy.deepcopy(trained(name, first_task(name)))
+    data = data_of(first_task(name))
+    append(method, CALLS[part], data)
+    with pytest.raises(NotReadyError, match=r"train\(\)"):
+        method.build_posterior()
+    with pytest.raises(NotReadyError):
+        _ = method.history
+
+
+def append(method: Any, call: str, data: baselines.Data) -> Any:
+    arguments = {
+        "append_simulations": (data.theta, data.x),
+        "append_calibration": (data.theta_cal, data.x_cal),
+        "append_observations": (data.x_o,),
+    }[call]
+    return getattr(method, call)(*arguments)
+
+
+@pytest.mark.parametrize(("name", "part"), PARTS)
+def test_missing_data_are_asked_for_by_the_call_that_takes_them(
+    name: str, part: type[Method]
+) -> None:
+    method = make(name, first_task(name))
+    feed(method, data_of(first_task(name)), without=part)
+    with pytest.raises(NotReadyError, match=rf"{CALLS[part]}\("):
+        method.train(seed=0, show_progress_bars=False)
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_data_in_two_parts_are_those_in_one(name: str) -> None:
+    data, method = data_of(first_task(name)), make(name, first_task(name))
+    feed(method, data.map(lambda value: value[:12]))
+    feed(method, data.map(lambda value: value[12:]))
+    posterior = train(method).build_posterior()
+    assert torch.equal(densities(posterior, name), expected_densities(name))
+
+
+def test_double_precision_is_taken_and_single_comes_out(name: str) -> None:
+    data = data_of(first_task(name)).map(lambda value: value.double())
+    posterior = retrained(name, data)
+    assert torch.equal(densities(posterior, name), expected_densities(name))
+    assert sample(posterior, (2,), data.x_o[0].float()).dtype is torch.float32
+
+
+# What goes in stays as it was.
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_nothing_that_is_passed_in_is_changed(name: str) -> None:
+    task = first_task(name)
+    data = data_of(task).map(torch.clone)
+    net = baselines.flat_net(data.x[0].numel())
+    density_estimator = baselines.builder(task, net=net)
+    prior = task_of(task).get_prior()
+    weights, law = copy.deepcopy(net.state_dict()), pickle.dumps(prior)
+    method = make(name, task, prior=prior, density_estimator=density_estimator)
+    train(feed(method, data)).build_posterior()
+    assert all(torch.equal(weights[k], v) for k, v in net.state_dict().items())
+    assert net.training
+    assert all(p.requires_grad and p.grad is None for p in net.parameters())
+    assert pickle.dumps(prior) == law
+    for field, value in vars(data).items():
+        assert torch.equal(value, getattr(data_of(task), field))
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_data_that_change_after_they_were_appended_change_nothing(name: str) -> None:
+    data = data_of(first_task(name)).map(torch.clone)
+    method = feed(make(name, first_task(name)), data)
+    for value in vars(data).values():
+        value.fill_(0.25)
+    expected = expected_densities(name)
+    assert torch.equal(densities(train(method).build_posterior(), name), expected)
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_data_with_gradients_get_none(name: str) -> None:
+    data = data_of(first_task(name)).map(lambda v: v.clone().requires_grad_())
+    posterior = retrained(name, data)
+    assert all(value.grad is None for value in vars(data).values())
+    assert torch.equal(densities(posterior, name), expected_densities(name))
+
+
+@pytest.mark.parametrize(("name", "call"), LABELLED)
+@pytest.mark.parametrize(
+    ("error", "message", "spoil"),
+    [
+        (InvalidTypeError, "`theta`", lambda t, x: (t.numpy(), x)),
+        (InvalidTypeError, "`x`", lambda t, x: (t, x.tolist())),
+        (InvalidTypeError, "`x`", lambda t, x: (t, x > 0)),
+        (InvalidInputError, "`theta` of shape", lambda t, x: (t[:, :1], x)),
+        (InvalidInputError, "`theta` of shape", lambda t, x: (t[0], x)),
+        (InvalidInputError, "`theta` of shape", lambda t, x: (t[:0], x[:0])),
+        (InvalidInputError, "`theta` and `x`", lambda t, x: (t[:3], x)),
+        (InvalidInputError, "`theta` to be finite", lambda t, x: (t * torch.nan, x)),
+        (InvalidInputError, "`x`", lambda t, x: (t, x[0, ..., 0].mean())),
+        (InvalidInputError, "`x`", lambda t, x: (t, x.flatten(1)[:, 0])),
+    ],
+    ids=[
+        "theta is an array",
+        "x is a list",
+        "x is boolean",
+        "theta too narrow",
+        "one theta",
+        "empty",
+        "rows",
+        "NaN in theta",
+        "x is a number",
+        "x is a row of numbers",
+    ],
+)
+def test_bad_pairs_are_refused_by_name(
+    name: str,
+    call: str,
+    error: type[Exception],
+    message: str,
+    spoil: Callable[[Tensor, Tensor], tuple[Any, Any]],
+) -> None:
+    data = data_of(first_task(name))
+    method = make(name, first_task(name))
+    with pytest.raises(error, match=message):
+        getattr(method, call)(*spoil(data.theta_cal, data.x_cal))
+
+
+@pytest.mark.parametrize(("name", "call"), LABELLED)
+def test_parameters_outside_the_prior_are_refused(name: str, call: str) -> None:
+    task = METHODS[name].tasks[-1]
+    if not task_of(task).has_data:
+        pytest.skip(f"the data of {task} are not on this machine")
+    data = data_of(task)
+    with pytest.raises(InvalidInputError, match="`theta` inside the support"):
+        getattr(make(name, task), call)(data.theta_cal + 1e4, data.x_cal)
+
+
+@pytest.mark.parametrize("name", names_that_see(UsesCalibration))
+def test_calibration_pairs_with_nan_are_refused(name: str) -> None:
+    data = data_of(first_task(name))
+    x = data.x_cal.clone()
+    x[3] = torch.nan
+    with pytest.raises(InvalidInputError, match=r"`x` to be finite.*\[3\]"):
+        make(name, first_task(name)).append_calibration(data.theta_cal, x)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("name", names_that_see(UsesObservations))
+@pytest.mark.parametrize(
+    ("error", "spoil"),
+    [
+        (InvalidTypeError, lambda x: x.numpy()),
+        (InvalidInputError, lambda x: x[:0]),
+        (InvalidInputError, lambda x: x * torch.nan),
+        (InvalidInputError, lambda x: x[0, ..., 0].mean()),
+        (InvalidInputError, lambda x: x.flatten(1)[:, 0]),
+    ],
+    ids=["array", "empty", "NaN", "number", "row of numbers"],
+)
+def test_bad_observations_are_refused_by_name(
+    name: str, error: type[Exception], spoil: Callable[[Tensor], Any]
+) -> None:
+    method: Any = make(name, first_task(name))
+    with pytest.raises(error, match="`x_o`"):
+        method.append_observations(spoil(data_of(first_task(name)).x_o))
+
+
+@pytest.mark.parametrize(("name", "part"), PARTS)
+def test_an_x_of_another_shape_than_the_first_is_refused(
+    name: str, part: type[Method]
+) -> None:
+    data = data_of(first_task(name))
+    method = feed(make(name, first_task(name)), data)
+    longer = data.map(lambda v: torch.cat([v, v], dim=-1))
+    mixed = baselines.Data(
+        data.theta, longer.x, data.theta_cal, longer.x_cal, data.theta_o, longer.x_o
+    )
+    with pytest.raises(InvalidInputError, match=r"`x(_o)?` of shape"):
+        append(method, CALLS[part], mixed)
+
+
+@pytest.mark.parametrize(("name", "part"), PARTS)
+def test_what_is_refused_is_not_appended(name: str, part: type[Method]) -> None:
+    data = data_of(first_task(name))
+    method = feed(make(name, first_task(name)), data)
+    bad = data.map(lambda v: v.clone().index_fill_(0, torch.tensor(1), torch.nan))
+    with pytest.raises(InvalidInputError):
+        append(method, CALLS[part], bad)
+    posterior = train(method).build_posterior()
+    assert torch.equal(densities(posterior, name), expected_densities(name))
+
+
+@pytest.mark.parametrize(("name", "part"), PARTS)
+def test_an_x_beyond_single_precision_is_not_finite(
+    name: str, part: type[Method]
+) -> None:
+    data, method = data_of(first_task(name)), make(name, first_task(name))
+    big = replace(data, x=huge(data.x), x_cal=huge(data.x_cal), x_o=huge(data.x_o))
+    with pytest.raises(InvalidInputError, match=r"`x(_o)?` .* finite"):
+        append(method, CALLS[part], big)
+
+
+def huge(value: Tensor) -> Tensor:
+    return torch.full_like(value, 1e300, dtype=torch.float64)
+
+
+@pytest.mark.parametrize(("name", "call"), LABELLED)
+def test_a_theta_beyond_single_precision_is_refused(name: str, call: str) -> None:
+    data, method = data_of(first_task(name)), make(name, first_task(name))
+    with pytest.raises(InvalidInputError, match="`theta`"):
+        getattr(method, call)(huge(data.theta_cal), data.x_cal)
+
+
+def test_what_is_no_prior_is_refused(name: str) -> None:
+    with pytest.raises(InvalidTypeError, match="`prior`"):
+        make(name, first_task(name), prior="uniform")
+
+
+@pytest.mark.parametrize(
+    "name", [name for name in METHODS if baselines.takes_estimator(name)]
+)
+class TestTheDensityEstimator:
+    @pytest.mark.parametrize("family", ["fancy", "mnpe"])
+    def test_of_an_unknown_name_is_refused(self, name: str, family: str) -> None:
+        with pytest.raises(InvalidInputError, match=f"`density_estimator`.*{family}"):
+            make(name, first_task(name), density_estimator=family)
+
+    def test_of_another_type_is_refused(self, name: str) -> None:
+        with pytest.raises(InvalidTypeError, match=r"`density_estimator`.*int"):
+            make(name, first_task(name), density_estimator=3)
+
+    def test_can_do_without_an_embedding_net(self, name: str) -> None:
+        task = first_task(name)
+        if len(data_of(task).x[0].shape) > 1:
+            pytest.skip("series and images need an embedding net")
+        density_estimator = baselines.builder(task, net=nn.Identity())
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RoPEWarning)
+            posterior = retrained(name, density_estimator=density_estimator)
+        assert densities(posterior, name).isfinite().all()
+
+
+def options_that_are_objects() -> list[Any]:
+    return [
+        pytest.param(name, option, id=f"{name}-{option}")
+        for name, entry in METHODS.items()
+        for option in ("training", "npe_training", "finetuner", "coupler")
+        if option in inspect.signature(entry.kind).parameters
+    ]
+
+
+@pytest.mark.parametrize(("name", "option"), options_that_are_objects())
+def test_an_option_of_another_type_is_refused(name: str, option: str) -> None:
+    with pytest.raises(InvalidTypeError, match=f"`{option}`"):
+        make(name, first_task(name), **{option: {"max_num_epochs": 3}})
+
+
+# Data that are few or broken.
+
+
+@pytest.mark.parametrize("name", names_that_see(UsesSimulations))
+def test_simulations_with_nan_are_dropped_with_a_warning(name: str) -> None:
+    data, method = data_of(first_task(name)), make(name, first_task(name))
+    x = torch.cat([data.x[:7], data.x[:2] * torch.nan, data.x[7:]])
+    x[8].flatten()[0] = torch.inf
+    theta = torch.cat([data.theta[:7], data.theta[:2], data.theta[7:]])
+    feed(method, data, without=UsesSimulations)
+    with pytest.warns(RoPEWarning, match="Dropped 2 of 202 simulations"):
+        method.append_simulations(theta, x)  # type: ignore[attr-defined]
+    posterior = train(method).build_posterior()
+    assert torch.equal(densities(posterior, name), expected_densities(name))
+
+
+@pytest.mark.parametrize("name", names_that_see(UsesSimulations))
+def test_simulations_that_all_have_nan_are_refused(name: str) -> None:
+    data, method = data_of(first_task(name)), make(name, first_task(name))
+    with pytest.raises(InvalidInputError, match="`x` that are finite"):
+        method.append_simulations(data.theta, data.x * torch.nan)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("name", names_that_see(UsesCalibration))
+def test_one_calibration_pair_is_enough_with_a_warning(name: str) -> None:
+    data, method = data_of(first_task(name)), make(name, first_task(name))
+    feed(method, data, without=UsesCalibration)
+    method.append_calibration(data.theta_cal[:1], data.x_cal[:1])  # type: ignore[attr-defined]
+    if isinstance(method, CalibrationMLP):  # which has nothing else to standardise by
+        with pytest.raises(InvalidInputError, match="at least 2 calibration pairs"):
+            train(method)
+        return
+    with pytest.warns(RoPEWarning, match="1 calibration pair"):
+        train(method)
+    assert densities(method.build_posterior(), name).isfinite().all()
+
+
+@pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
+@pytest.mark.parametrize("name", names_that_see(UsesObservations))
+def test_one_observation_is_enough(name: str) -> None:
+    data, method = data_of(first_task(name)), make(name, first_task(name))
+    feed(method, data, without=UsesObservations)
+    method.append_observations(data.x_o[:1])  # type: ignore[attr-defined]
+    posterior = train(method).build_posterior()
+    assert log_prob(posterior, data.theta[:5], data.x_o[0]).isfinite().all()
+
+
+# Which data a method sees.
+
+
+def public_methods() -> list[type[Method]]:
+    public = [getattr(sbi_rope.baselines, name) for name in sbi_rope.baselines.__all__]
+    kinds = {kind for kind in public if inspect.isclass(kind)}
+    kinds |= {entry.kind for entry in METHODS.values()}
+    return sorted(
+        (kind for kind in kinds if issubclass(kind, Method)),
+        key=lambda kind: kind.__name__,
+    )
+
+
+@pytest.mark.parametrize("kind", public_methods())
+def test_no_method_takes_labels_of_observations(kind: type[Method]) -> None:
+    calls = {name for name, _ in inspect.getmembers(kind) if name.startswith("append_")}
+    expected = {call for part, call in CALLS.items() if issubclass(kind, part)}
+    assert calls == expected
+    if "append_observations" in calls:
+        signature = inspect.signature(kind.append_observations)  # type: ignore[attr-defined]
+        assert list(signature.parameters) == ["self", "x_o"]
+    assert list(inspect.signature(kind.train).parameters) == [
+        "self",
+        "seed",
+        "show_progress_bars",
+    ]
+
+
+# NPE trained beforehand.
+
+BUILDERS = names_that_see(BuildsOnNPE)
+
+
+def given(name: str, posterior: Any) -> Any:
+    """A method that starts from a trained posterior."""
+    task = first_task(name)
+    options = METHODS[name].options(task_of(task))
+    return METHODS[name].kind.from_posterior(posterior, **options)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("name", BUILDERS)
+def test_a_posterior_trained_beforehand_does_as_well(name: str) -> None:
+    task = first_task(name)
+    data = data_of(task)
+    expected = expected_densities(name)
+    npe = NPE(task_of(task).get_prior(), baselines.builder(task), npe_training=SHORT)
+    npe.append_simulations(data.theta, data.x)
+    with seeded(0):
+        train(npe, seed=None)
+        state = torch.get_rng_state()
+        method = feed(given(name, npe.build_posterior()), data)
+        torch.set_rng_state(state)
+        posterior = train(method, seed=None).build_posterior()
+    assert torch.equal(densities(posterior, name), expected)
+
+
+@pytest.mark.parametrize("name", BUILDERS)
+def test_the_posterior_trained_beforehand_is_not_changed(name: str) -> None:
+    data, posterior = data_of(first_task(name)), result("npe", first_task(name))
+    weights = copy.deepcopy(posterior.posterior_estimator.state_dict())
+    train(feed(given(name, posterior), data)).build_posterior()
+    after = posterior.posterior_estimator.state_dict()
+    assert all(torch.equal(weights[key], value) for key, value in after.items())
+    assert all(p.grad is None for p in posterior.posterior_estimator.parameters())
+
+
+@pytest.mark.parametrize("name", BUILDERS)
+def test_a_posterior_trained_beforehand_fixes_the_shape_of_x(name: str) -> None:
+    data, method = (
+        data_of(first_task(name)),
+        given(name, result("npe", first_task(name))),
+    )
+    with pytest.raises(InvalidInputError, match=r"`x` of shape"):
+        method.append_simulations(data.theta, torch.cat([data.x, data.x], dim=-1))
+
+
+@pytest.mark.parametrize("name", BUILDERS)
+def test_what_is_no_posterior_of_npe_is_refused(name: str) -> None:
+    with pytest.raises(TypeError, match="`posterior`"):
+        given(name, result("prior", first_task(name)))

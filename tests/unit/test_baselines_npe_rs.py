@@ -1,0 +1,330 @@
+"""NPE-RS: the discrepancy is right, and pulls embeddings together in training only."""
+
+import copy
+import math
+from typing import Any
+
+import pytest
+import torch
+from sbi.neural_nets import posterior_nn
+from torch import Tensor, nn
+
+from sbi_rope._sbi import embed, embedding_of
+from sbi_rope.baselines import NPE, NPERS, Training
+from sbi_rope.baselines.npe_rs import squared_mmd
+from sbi_rope.errors import InvalidInputError, RoPEWarning
+from tests.problems import standard_normal
+
+pytestmark = pytest.mark.filterwarnings("ignore:Maximum number of epochs")
+
+SHORT = Training(training_batch_size=50, max_num_epochs=2)
+NOISE_STD = 0.5
+# A second reading of the same parameter, off by this much in reality.
+SHIFT = 3.0
+
+
+def brute_force(simulated: Tensor, observed: Tensor) -> float:
+    """The double sums, one pair at a time."""
+
+    def squared_distance(a: Tensor, b: Tensor) -> float:
+        return sum(float(u - v) ** 2 for u, v in zip(a, b, strict=True))
+
+    distances = sorted(squared_distance(a, b) for a in simulated for b in simulated)
+    median = distances[(len(distances) - 1) // 2]
+
+    def mean(xs: Tensor, ys: Tensor) -> float:
+        values = [math.exp(-squared_distance(x, y) / median) for x in xs for y in ys]
+        return sum(values) / len(values)
+
+    return (
+        mean(simulated, simulated)
+        + mean(observed, observed)
+        - 2 * mean(simulated, observed)
+    )
+
+
+def sets(m: int, n: int, dim: int = 3, **options: Any) -> tuple[Tensor, Tensor]:
+    simulated = torch.randn(m, dim, dtype=torch.float64)
+    observed = 0.5 + 1.5 * torch.randn(n, dim, dtype=torch.float64)
+    for value in (simulated, observed):
+        value.requires_grad_(**options)
+    return simulated, observed
+
+
+class TestSquaredMMD:
+    @pytest.mark.parametrize(("m", "n"), [(7, 5), (6, 6), (8, 1)])
+    def test_it_is_the_double_sum(self, m: int, n: int) -> None:
+        simulated, observed = sets(m, n, requires_grad=False)
+        expected = brute_force(simulated, observed)
+        assert float(squared_mmd(simulated, observed)) == pytest.approx(expected)
+
+    @pytest.mark.parametrize(("m", "n"), [(7, 5), (6, 6), (8, 1)])
+    def test_its_gradient_is_that_of_finite_differences(self, m: int, n: int) -> None:
+        """The bandwidth included, which depends on the simulations."""
+        assert torch.autograd.gradcheck(squared_mmd, sets(m, n, requires_grad=True))
+
+    def test_it_is_never_negative(self) -> None:
+        for _ in range(50):
+            simulated = torch.randn(20, 2)
+            assert squared_mmd(simulated, torch.randn(30, 2)) > 0
+
+    def test_of_a_set_and_itself_it_is_zero(self) -> None:
+        simulated, _ = sets(9, 1, requires_grad=False)
+        shuffled = simulated[torch.randperm(9)]
+        assert float(squared_mmd(simulated, shuffled)) == pytest.approx(0, abs=1e-12)
+
+    @pytest.mark.parametrize("factor", [1e-6, 1e6])
+    def test_the_unit_of_the_embedding_does_not_matter(self, factor: float) -> None:
+        simulated, observed = (
+            value.float() for value in sets(9, 6, requires_grad=False)
+        )
+        expected = float(squared_mmd(simulated, observed))
+        scaled = float(squared_mmd(factor * simulated, factor * observed))
+        assert scaled == pytest.approx(expected, rel=1e-4)
+
+    def test_of_sets_far_apart_it_is_the_sum_of_their_own_kernels(self) -> None:
+        simulated = torch.randn(20, 2)
+        value = squared_mmd(simulated, torch.full((5, 2), 1e3))
+        own = (
+            squared_mmd(simulated, simulated[:1])
+            + 2
+            * torch.exp(
+                -(simulated - simulated[0]).square().sum(1)
+                / torch.cdist(simulated, simulated).square().median()
+            ).mean()
+        )
+        assert float(value) == pytest.approx(float(own), rel=1e-5)
+
+    @pytest.mark.parametrize(
+        ("simulated", "observed", "expected"),
+        [
+            (torch.ones(6, 2), torch.ones(4, 2), 0.0),
+            (torch.ones(6, 2), torch.zeros(4, 2), 2.0),
+            (1e-12 * torch.randn(6, 2), torch.ones(4, 2), 2.0),
+            (1e-30 * torch.randn(6, 2), torch.ones(4, 2), 2.0),
+            (torch.zeros(6, 2), torch.full((4, 2), 1e-30), None),
+            (torch.tensor([[0.0], [0], [0], [0], [1]]), torch.ones(4, 1), None),
+        ],
+        ids=[
+            "all equal",
+            "two points",
+            "nearly",
+            "collapsed",
+            "smallest",
+            "median zero",
+        ],
+    )
+    def test_embeddings_that_have_collapsed_give_no_nan(
+        self, simulated: Tensor, observed: Tensor, expected: float | None
+    ) -> None:
+        simulated.requires_grad_()
+        observed.requires_grad_()
+        value = squared_mmd(simulated, observed)
+        assert torch.isfinite(value)
+        if expected is not None:
+            assert value.item() == pytest.approx(expected, abs=1e-6)
+        for gradient in torch.autograd.grad(value, (simulated, observed)):
+            assert torch.isfinite(gradient).all()
+
+
+def net() -> nn.Module:
+    return nn.Sequential(nn.Linear(2, 16), nn.ReLU(), nn.Linear(16, 2))
+
+
+def builder(embedding_net: nn.Module) -> Any:
+    return posterior_nn(
+        "mdn", embedding_net=embedding_net, hidden_features=16, num_components=1
+    )
+
+
+def simulate(theta: Tensor, shift: float = 0.0) -> Tensor:
+    """Two noisy readings of a parameter; the second can be off."""
+    offset = torch.tensor([0.0, shift])
+    return theta + offset + NOISE_STD * torch.randn(len(theta), 2)
+
+
+def method(
+    n: int,
+    *,
+    embedding_net: nn.Module | None = None,
+    shift: float = 0.0,
+    kind: type = NPERS,
+    training: Training = SHORT,
+    **options: Any,
+) -> Any:
+    """A method that has seen n simulations and 200 observations."""
+    torch.manual_seed(1)
+    prior = standard_normal(1)
+    theta, theta_o = prior.sample((n,)), prior.sample((200,))
+    x, x_o = simulate(theta), simulate(theta_o, shift)
+    density = builder(net() if embedding_net is None else embedding_net)
+    if kind is NPE:
+        method = NPE(prior, density, npe_training=training)
+        return method.append_simulations(theta, x)
+    method = NPERS(prior, density, training=training, **options)
+    return method.append_simulations(theta, x).append_observations(x_o)
+
+
+def trained(n: int = 100, **options: Any) -> Any:
+    return method(n, **options).train(seed=0, show_progress_bars=False)
+
+
+def densities(method: Any) -> Tensor:
+    torch.manual_seed(2)
+    theta = standard_normal(1).sample((50,))
+    return method.build_posterior().log_prob_batched(
+        theta[None], simulate(theta), norm_posterior=False
+    )
+
+
+CONVERGED = Training(
+    training_batch_size=100, learning_rate=1e-2, max_num_epochs=30, stop_after_epochs=30
+)
+
+
+class TestWhatItLearns:
+    def scores(self, method: Any, shift: float) -> tuple[float, float, float]:
+        """Mean log density of 2000 fresh pairs, the exact one, and the gap of h.
+
+        The gap is the largest distance between the means of real and simulated
+        embeddings, in standard deviations of the latter.
+        """
+        torch.manual_seed(3)
+        theta = standard_normal(1).sample((2000,))
+        x, x_o = simulate(theta), simulate(theta, shift)
+        posterior = method.build_posterior()
+        log_prob = posterior.log_prob_batched(theta[None], x_o, norm_posterior=False)
+        variance = 1 / (1 + 2 / NOISE_STD**2)
+        undone = x_o - torch.tensor([0.0, shift])
+        mean = undone.sum(dim=1, keepdim=True) * variance / NOISE_STD**2
+        exact = torch.distributions.Normal(mean, variance**0.5).log_prob(theta)
+        embedding = embedding_of(posterior.posterior_estimator)
+        real, simulated = embed(embedding, x_o), embed(embedding, x)
+        gap = (real.mean(0) - simulated.mean(0)).abs() / simulated.std(0)
+        return float(log_prob.mean()), float(exact.mean()), float(gap.max())
+
+    def test_where_the_simulator_is_right_it_stays_near_npe(self) -> None:
+        """Within 0.1 nats of NPE and of the exact posterior; of the prior it is 1."""
+        npe = trained(1000, kind=NPE, training=CONVERGED)
+        robust = trained(1000, training=CONVERGED)
+        npe_score, exact, _ = self.scores(npe, 0.0)
+        score, _, _ = self.scores(robust, 0.0)
+        assert abs(score - npe_score) < 0.1
+        assert abs(score - exact) < 0.1
+
+    def test_where_a_statistic_is_wrong_real_and_simulated_embeddings_meet(
+        self,
+    ) -> None:
+        """At less than a fifth of the distance of NPE, which is 15 nats off.
+
+        The posterior loses at most 1.5 nats of the exact one.
+        """
+        npe = trained(1000, kind=NPE, training=CONVERGED)
+        robust = trained(1000, shift=SHIFT, training=CONVERGED)
+        npe_score, exact, npe_gap = self.scores(npe, SHIFT)
+        score, _, gap = self.scores(robust, SHIFT)
+        assert gap < npe_gap / 5
+        assert npe_score < exact - 10
+        assert score > exact - 1.5
+
+
+def test_without_regularisation_it_is_npe() -> None:
+    expected = densities(trained(kind=NPE))
+    assert torch.equal(densities(trained(regularisation=0)), expected)
+    assert not torch.equal(densities(trained()), expected)
+
+
+@pytest.mark.parametrize("frozen", [True, False])
+def test_without_a_net_to_regularise_it_is_npe_and_says_so(frozen: bool) -> None:
+    embedding_net = nn.Linear(2, 2) if frozen else nn.Identity()
+    embedding_net.requires_grad_(requires_grad=False)
+    expected = densities(trained(kind=NPE, embedding_net=embedding_net))
+    with pytest.warns(RoPEWarning, match="nothing to regularise"):
+        robust = trained(embedding_net=embedding_net)
+    assert torch.equal(densities(robust), expected)
+
+
+def test_the_validation_loss_has_no_discrepancy_in_it() -> None:
+    history = trained(regularisation=1e4, shift=100.0).history
+    assert min(history.training_loss) > 1000
+    assert max(history.validation_loss) < 100
+
+
+def test_the_estimator_comes_back_in_evaluation_mode() -> None:
+    estimator = trained().build_posterior().posterior_estimator
+    assert not any(module.training for module in estimator.modules())
+
+
+def test_the_users_net_is_left_as_it_was() -> None:
+    embedding_net = net()
+    before = copy.deepcopy(embedding_net.state_dict())
+    trained(embedding_net=embedding_net)
+    after = embedding_net.state_dict()
+    assert all(torch.equal(before[key], after[key]) for key in before)
+    assert embedding_net.training
+
+
+def test_batch_statistics_are_those_of_the_simulations() -> None:
+    """In front of the net, where standardised simulations have mean 0."""
+    # In evaluation mode, as sbi asks: it tries the net on one observation first.
+    embedding_net = nn.Sequential(nn.BatchNorm1d(2), nn.Linear(2, 2)).eval()
+    robust = trained(400, embedding_net=embedding_net, shift=100.0)
+    embedding: Any = embedding_of(robust.build_posterior().posterior_estimator)
+    (norm,) = [m for m in embedding.modules() if isinstance(m, nn.BatchNorm1d)]
+    assert norm.running_mean.abs().max() < 0.3
+    assert norm.num_batches_tracked >= 14
+
+
+class Recorder(nn.Module):
+    """A linear embedding that remembers what passes through it for the penalty."""
+
+    seen: list[Tensor] = []  # noqa: RUF012
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.linear = nn.Linear(2, 2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        # One row at a time comes only from sbi, which tries the net when it builds.
+        if torch.is_grad_enabled() and not self.training and len(x) > 1:
+            self.seen.append(x.detach())
+        return self.linear(x)
+
+
+def test_each_step_draws_anew_from_all_simulations_and_observations() -> None:
+    Recorder.seen.clear()
+    training = Training(training_batch_size=10, max_num_epochs=10)
+    trained(
+        embedding_net=Recorder(),
+        training=training,
+        num_mmd_simulations=30,
+        num_mmd_observations=40,
+    )
+    num_steps = 11 * 9  # sbi runs one epoch more than it is told
+    assert len(Recorder.seen) == 2 * num_steps
+    for seen, size, total in [(0, 30, 100), (1, 40, 200)]:
+        steps = Recorder.seen[seen::2]
+        assert all(len(step.unique(dim=0)) == len(step) == size for step in steps)
+        assert len(torch.cat(steps).unique(dim=0)) == total
+        assert not torch.equal(steps[0], steps[1])
+
+
+def test_there_may_be_fewer_data_than_asked_for() -> None:
+    Recorder.seen.clear()
+    trained(40, embedding_net=Recorder(), num_mmd_observations=1000)
+    sizes = {len(seen) for seen in Recorder.seen}
+    assert sizes == {40, 200}
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("regularisation", -1.0),
+        ("regularisation", math.nan),
+        ("num_mmd_simulations", 0),
+        ("num_mmd_observations", 1.5),
+    ],
+)
+def test_options_outside_their_range_are_refused(option: str, value: Any) -> None:
+    with pytest.raises(InvalidInputError, match=f"`{option}`"):
+        NPERS(standard_normal(1), **{option: value})

@@ -1,0 +1,539 @@
+"""The simple baselines: what they become with plenty of data, and what they refuse."""
+
+import copy
+import functools
+import math
+from typing import Any
+
+import pytest
+import torch
+from sbi.neural_nets import posterior_nn
+from sbi.utils import BoxUniform
+from torch import Tensor, nn
+from torch.distributions import (
+    AffineTransform,
+    Distribution,
+    Independent,
+    Normal,
+    TransformedDistribution,
+)
+
+from sbi_rope import CalibrationFinetuner, RoPE, SinkhornCoupler
+from sbi_rope._random import seeded
+from sbi_rope._sbi import embedding_of, posterior_from
+from sbi_rope.baselines import (
+    NPE,
+    SBI,
+    CalibrationMLP,
+    FinetunedNPE,
+    JointNPE,
+    Method,
+    OTOnly,
+    PriorBaseline,
+    PriorPosterior,
+    Training,
+    TuningOnly,
+)
+from sbi_rope.baselines.calibration_mlp import DiagonalGaussian
+from sbi_rope.errors import (
+    InvalidInputError,
+    InvalidTypeError,
+    NotReadyError,
+    RoPEWarning,
+    SimulationError,
+    UnsupportedPosteriorError,
+)
+from sbi_rope.tasks import get_task
+from tests import gaussian, problems
+
+pytestmark = pytest.mark.filterwarnings("ignore:Maximum number of epochs")
+
+TASK: Any = get_task("linear_gaussian")
+SHORT = Training(training_batch_size=50, max_num_epochs=2)
+LONG = Training(
+    training_batch_size=100,
+    learning_rate=5e-3,
+    validation_fraction=0.2,
+    stop_after_epochs=15,
+    max_num_epochs=40,
+)
+QUIET: dict[str, Any] = {"seed": 0, "show_progress_bars": False}
+
+
+def builder(net: nn.Module | None = None) -> Any:
+    """One Gaussian with a full covariance, at a linear function of x unless given."""
+    net = nn.Linear(2, 4) if net is None else net
+    return posterior_nn("mdn", embedding_net=net, hidden_features=16, num_components=1)
+
+
+def simulations(n: int = 100) -> tuple[Tensor, Tensor]:
+    return TASK.get_simulations(n)
+
+
+def real(n: int = 20) -> tuple[Tensor, Tensor]:
+    return TASK.get_calibration_set(n)
+
+
+@functools.cache
+def npe() -> Any:
+    """A well-trained NPE, for reading only."""
+    method = NPE(TASK.get_prior(), builder(), npe_training=LONG)
+    return method.append_simulations(*simulations(2000)).train(**QUIET)
+
+
+def log_probs(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:
+    return posterior.log_prob_batched(theta[None], x, norm_posterior=False)[0]
+
+
+class TestWithPlentyOfPairs:
+    """Trained on 2400 pairs of the real process, scored on 1000 others."""
+
+    NUM_PAIRS = 2400
+
+    def loss_of(self, method: Method) -> float:
+        """Nats between the mean log density and that of the exact posterior."""
+        theta, x = real(self.NUM_PAIRS + 1000)
+        theta, x = theta[self.NUM_PAIRS :], x[self.NUM_PAIRS :]
+        exact = TASK.get_true_posterior(x).log_prob(theta.double()).mean()
+        return float(exact - log_probs(method.build_posterior(), theta, x).mean())
+
+    @pytest.mark.filterwarnings("error::sbi_rope.errors.RoPEWarning")
+    def test_npe_stays_wrong(self) -> None:
+        assert self.loss_of(npe()) > 2
+
+    def test_npe_is_right_where_its_simulator_is(self) -> None:
+        theta, x = SBI.simulated_test_set(npe(), *self.fresh())
+        exact = TASK.get_simulator().posterior(x).log_prob(theta.double()).mean()
+        scored = log_probs(npe().build_posterior(), theta, x).mean()
+        assert abs(float(exact - scored)) < 0.05
+
+    def fresh(self) -> tuple[Tensor, Any]:
+        return TASK.get_test_set(1000)[0], TASK.get_simulator()
+
+    def test_finetuned_npe_comes_within_three_hundredths_of_a_nat(self) -> None:
+        method = FinetunedNPE.from_posterior(
+            npe().build_posterior(), training=LONG, learning_rates=(5e-3,)
+        )
+        method.append_calibration(*real(self.NUM_PAIRS)).train(**QUIET)
+        assert abs(self.loss_of(method)) < 0.03
+
+    def test_joint_npe_comes_within_a_quarter_of_a_nat(self) -> None:
+        """Its posterior is shared between real observations and simulations.
+
+        With a linear embedding they cannot be told apart; the mixture of both is what
+        even many pairs lead to.
+        """
+        net = nn.Sequential(nn.Linear(2, 32), nn.ReLU(), nn.Linear(32, 8))
+        method = JointNPE(TASK.get_prior(), builder(net), training=LONG)
+        method.append_simulations(*simulations(1000))
+        method.append_calibration(*real(self.NUM_PAIRS)).train(**QUIET)
+        assert abs(self.loss_of(method)) < 0.25
+
+    def test_the_mlp_comes_as_close_as_a_diagonal_gaussian_can(self) -> None:
+        """To 0.03 nats; the best one has the marginal variances of the exact one."""
+        method = CalibrationMLP(TASK.get_prior(), builder(), training=LONG)
+        method.append_calibration(*real(self.NUM_PAIRS)).train(**QUIET)
+        covariance = TASK.get_true_posterior(torch.zeros(1, 2)).covariance_matrix[0]
+        best = covariance.diag().prod().log() - covariance.logdet()
+        assert self.loss_of(method) == pytest.approx(0.5 * float(best), abs=0.03)
+
+
+class TestDiagonalGaussian:
+    def estimator(self) -> tuple[DiagonalGaussian, Any]:
+        net = nn.Linear(3, 4)
+        mean, std = torch.tensor([1.0, -2.0]), torch.tensor([0.5, 3.0])
+        estimator = DiagonalGaussian(net, mean, std, torch.Size((3,)))
+
+        def law(x: Tensor) -> Distribution:
+            mu, log_variance = net(x).split(2, dim=1)
+            scale = std * torch.exp(log_variance).sqrt()
+            return Independent(Normal(mean + std * mu, scale), 1)
+
+        return estimator, law
+
+    def test_its_density_is_that_of_torch(self) -> None:
+        estimator, law = self.estimator()
+        x, theta = torch.randn(5, 3), torch.randn(7, 5, 2)
+        expected = law(x).log_prob(theta)
+        assert torch.allclose(estimator.log_prob(theta, x), expected, atol=1e-5)
+        assert torch.allclose(-estimator.loss(theta[0], x), expected[0], atol=1e-5)
+
+    def test_its_samples_are_those_of_torch(self) -> None:
+        estimator, law = self.estimator()
+        x = torch.randn(4, 3)
+        samples = estimator.sample(torch.Size((20_000,)), x).detach()
+        assert samples.shape == (20_000, 4, 2)
+        expected = law(x)
+        error = 5 * expected.stddev / 20_000**0.5
+        assert ((samples.mean(dim=0) - expected.mean).abs() < error).all()
+        assert torch.allclose(samples.std(dim=0), expected.stddev, rtol=0.03)
+        assert estimator.sample(torch.Size((2, 3)), x).shape == (2, 3, 4, 2)
+
+
+class TestCalibrationMLP:
+    def trained(self, prior: Any, density_estimator: Any = None) -> Any:
+        density_estimator = (
+            builder() if density_estimator is None else density_estimator
+        )
+        method = CalibrationMLP(prior, density_estimator, training=SHORT)
+        theta = prior.sample((20,))
+        method.append_calibration(theta, torch.cat([theta, theta], 1)[:, :2])
+        return method.train(**QUIET).build_posterior().posterior_estimator
+
+    def test_its_network_is_that_of_the_estimator_with_linear_outputs(self) -> None:
+        net = nn.Sequential(nn.Linear(2, 7), nn.Tanh())
+        estimator = self.trained(TASK.get_prior(), builder(net))
+        shapes = [tuple(p.shape) for p in estimator.parameters()]
+        assert shapes == [(7, 2), (7,), (4, 7), (4,)]
+
+    def test_without_an_embedding_net_it_has_two_hidden_layers(self) -> None:
+        estimator = self.trained(TASK.get_prior(), builder(nn.Identity()))
+        shapes = [tuple(p.shape) for p in estimator.parameters() if p.ndim == 2]
+        assert shapes == [(64, 2), (64, 64), (4, 64)]
+
+    def test_parameters_are_standardised_by_the_prior(self) -> None:
+        prior = BoxUniform(torch.tensor([10.0, 0.0]), torch.tensor([20.0, 1e-3]))
+        estimator = self.trained(prior)
+        assert torch.allclose(estimator.mean, torch.tensor([15.0, 5e-4]))
+        widths = torch.tensor([10.0, 1e-3])
+        assert torch.allclose(estimator.std, widths / 12**0.5)
+
+    @pytest.mark.filterwarnings("ignore:The passed discrete prior has no mean")
+    def test_a_prior_that_does_not_know_its_moments_is_sampled(self) -> None:
+        base = Independent(Normal(torch.zeros(2), torch.ones(2)), 1)
+        shift = AffineTransform(torch.tensor([3.0, -1.0]), torch.tensor([2.0, 0.1]), 1)
+        prior = TransformedDistribution(base, [shift])
+        estimator = self.trained(prior)
+        assert torch.allclose(estimator.mean, shift.loc, atol=0.1)  # type: ignore[arg-type]
+        assert torch.allclose(estimator.std, shift.scale, rtol=0.05)  # type: ignore[arg-type]
+
+    def test_it_makes_no_use_of_simulations(self) -> None:
+        method: Any = CalibrationMLP(TASK.get_prior(), builder())
+        assert not hasattr(method, "append_simulations")
+
+
+class TestJointNPE:
+    def method(self, n_cal: int, **options: Any) -> JointNPE:
+        training = Training(
+            training_batch_size=20, learning_rate=1e-2, max_num_epochs=10, **options
+        )
+        method = JointNPE(TASK.get_prior(), builder(), training=training)
+        method.append_simulations(*simulations(60))
+        return method.append_calibration(*real(n_cal))
+
+    def test_it_is_chosen_by_a_part_of_the_calibration_pairs(self) -> None:
+        method = self.method(20, validation_fraction=0.2).train(**QUIET)
+        theta, x = real(20)
+        with seeded(0):
+            held_out = torch.randperm(20)[:4]
+        scores = log_probs(method.build_posterior(), theta[held_out], x[held_out])
+        history = method.history
+        assert history.kept_validation_loss == min(history.validation_loss)
+        kept = history.kept_validation_loss
+        assert -float(scores.mean()) == pytest.approx(kept, rel=1e-5)
+
+    def test_each_batch_is_half_simulations_and_half_pairs(self) -> None:
+        """Seen by a net that counts: real observations are marked by their size."""
+        seen: list[tuple[int, int]] = []
+
+        class Counter(nn.Linear):
+            def forward(self, x: Tensor) -> Tensor:
+                if self.training and torch.is_grad_enabled() and len(x) > 1:
+                    seen.append((len(x), int((x.abs() > 50).all(dim=1).sum())))
+                return super().forward(x)
+
+        method = JointNPE(
+            TASK.get_prior(),
+            builder(Counter(2, 2)),
+            training=Training(training_batch_size=20, max_num_epochs=2),
+        )
+        method.append_simulations(*simulations(60))
+        theta, x = real(20)
+        method.append_calibration(theta, x + 1000).train(**QUIET)
+        assert set(seen) == {(20, 10)}
+        assert len(seen) == 2 * 6
+
+
+class TestFinetunedNPE:
+    def test_of_several_learning_rates_the_best_is_kept(self) -> None:
+        kept = {}
+        for rates in [(1e-6,), (1e-2,), (1e-6, 1e-2), (1e-2, 1e-6)]:
+            method = FinetunedNPE.from_posterior(
+                npe().build_posterior(),
+                training=Training(max_num_epochs=10, validation_fraction=0.2),
+                learning_rates=rates,
+            )
+            method.append_calibration(*real(50)).train(**QUIET)
+            kept[rates] = method.history.kept_validation_loss
+            if 1e-2 in rates:
+                assert method.history.learning_rate == 1e-2
+        assert kept[1e-2,] < kept[1e-6,]
+
+    def test_with_too_few_pairs_to_choose_the_smallest_is_taken(self) -> None:
+        method = FinetunedNPE.from_posterior(
+            npe().build_posterior(), training=SHORT, learning_rates=(1e-2, 1e-4)
+        )
+        with pytest.warns(RoPEWarning, match="Only 3 calibration pair"):
+            method.append_calibration(*real(3)).train(**QUIET)
+        assert method.history.learning_rate == 1e-4
+
+    def test_all_parameters_are_tuned(self) -> None:
+        posterior = npe().build_posterior()
+        posterior.posterior_estimator.requires_grad_(requires_grad=False)
+        method = FinetunedNPE.from_posterior(
+            posterior, training=SHORT, learning_rates=(1e-3,)
+        )
+        method.append_calibration(*real(50)).train(**QUIET)
+        tuned = method.build_posterior().posterior_estimator
+        start = dict(posterior.posterior_estimator.named_parameters())
+        for name, parameter in tuned.named_parameters():
+            # One Gaussian has one weight, and nothing to learn about it.
+            if "logit" not in name:
+                assert not torch.equal(parameter, start[name]), name
+
+    @pytest.mark.filterwarnings("ignore:Fine-tuning NPE. the loss is not finite")
+    def test_the_start_is_kept_where_tuning_makes_it_worse(self) -> None:
+        method = FinetunedNPE.from_posterior(
+            npe().build_posterior(), training=LONG, learning_rates=(100.0,)
+        )
+        theta, x = simulations(2050)
+        method.append_calibration(theta[2000:], x[2000:]).train(**QUIET)
+        assert method.history.best_step == 0
+        expected = log_probs(npe().build_posterior(), theta[:9], x[:9])
+        posterior = method.build_posterior()
+        assert torch.equal(log_probs(posterior, theta[:9], x[:9]), expected)
+
+    @pytest.mark.parametrize(
+        ("rates", "error"),
+        [
+            ((), InvalidInputError),
+            ((0.0,), InvalidInputError),
+            ((1e-3, -1.0), InvalidInputError),
+            ((math.nan,), InvalidInputError),
+            ([1e-3], InvalidTypeError),
+            (1e-3, InvalidTypeError),
+        ],
+    )
+    def test_learning_rates_that_are_none_are_refused(
+        self, rates: Any, error: type[Exception]
+    ) -> None:
+        with pytest.raises(error, match="`learning_rates`"):
+            FinetunedNPE(TASK.get_prior(), learning_rates=rates)
+
+    def test_an_estimator_without_a_density_is_refused(self) -> None:
+        method = FinetunedNPE.from_posterior(problems.vector_field_posterior("fmpe"))
+        method.append_calibration(torch.zeros(5, 2), torch.zeros(5, 3))
+        with pytest.raises(UnsupportedPosteriorError, match="density"):
+            method.train(**QUIET)
+
+
+class TestRoPEsParts:
+    """The two ablations are RoPE itself."""
+
+    THETA, X = torch.randn(7, 2), torch.randn(7, 2)
+
+    @pytest.mark.parametrize("stored", [True, False])
+    def test_tuning_only_is_ropes_tuned_posterior(self, stored: bool) -> None:
+        source: Any = (
+            {"simulations": simulations()}
+            if stored
+            else {"simulator": TASK.get_simulator()}
+        )
+        finetuner = CalibrationFinetuner(learning_rate=1e-2, num_steps=10)
+        posterior = npe().build_posterior()
+        rope = RoPE(posterior, finetuner=finetuner, **source)
+        rope.append_calibration(*real()).train(**QUIET)
+        method = TuningOnly.from_posterior(
+            posterior, finetuner=finetuner, simulator=source.get("simulator")
+        )
+        if stored:
+            method.append_simulations(*simulations())
+        method.append_calibration(*real()).train(**QUIET)
+        expected = log_probs(rope.tuned_posterior(), self.THETA, self.X)
+        scored = log_probs(method.build_posterior(), self.THETA, self.X)
+        assert torch.equal(scored, expected)
+        assert method.history == rope.history
+
+    @pytest.mark.parametrize("stored", [True, False])
+    def test_ot_only_is_rope_without_calibration(self, stored: bool) -> None:
+        source: Any = (
+            {"simulations": simulations()}
+            if stored
+            else {"simulator": TASK.get_simulator()}
+        )
+        coupler = SinkhornCoupler(gamma=0.8, tau=0.9)
+        posterior, (_, x_o) = npe().build_posterior(), TASK.get_test_set(30)
+        expected = RoPE(posterior, coupler=coupler, **source).build_posterior(
+            x_o, num_simulations=50, seed=0
+        )
+        method = OTOnly.from_posterior(
+            posterior,
+            coupler=coupler,
+            num_simulations=50,
+            simulator=source.get("simulator"),
+        )
+        if stored:
+            method.append_simulations(*simulations())
+        mixture = method.append_observations(x_o).train(**QUIET).build_posterior()
+        assert torch.equal(mixture.weights, expected.weights)
+        assert torch.equal(
+            mixture.log_prob_batched(self.THETA[None], x_o[:7]),
+            expected.log_prob_batched(self.THETA[None], x_o[:7]),
+        )
+
+    @pytest.mark.parametrize("kind", [TuningOnly, OTOnly])
+    def test_simulations_or_a_simulator_are_needed_beside_npe(self, kind: Any) -> None:
+        method = kind.from_posterior(npe().build_posterior())
+        if kind is TuningOnly:
+            method.append_calibration(*real())
+        else:
+            method.append_observations(TASK.get_test_set(30)[1])
+        with pytest.raises(NotReadyError, match=r"append_simulations\(theta, x\)"):
+            method.train(**QUIET)
+
+    def test_ot_only_refuses_numbers_of_simulations_that_are_none(self) -> None:
+        with pytest.raises(InvalidInputError, match="`num_simulations`"):
+            OTOnly(TASK.get_prior(), num_simulations=0)
+
+    def test_the_tuned_net_is_not_that_of_npe(self) -> None:
+        method = TuningOnly.from_posterior(
+            npe().build_posterior(), simulator=TASK.get_simulator()
+        )
+        method.finetuner = CalibrationFinetuner(learning_rate=1e-2, num_steps=10)
+        method.append_calibration(*real()).train(**QUIET)
+        tuned = method.build_posterior().posterior_estimator
+        start = npe().build_posterior().posterior_estimator
+        x = torch.randn(5, 2)
+        assert not torch.equal(embedding_of(tuned)(x), embedding_of(start)(x))
+
+
+class TestSBI:
+    def method(self) -> SBI:
+        return SBI(TASK.get_prior(), builder()).append_simulations(*simulations())
+
+    def test_each_test_parameter_has_a_simulation_of_its_own(self) -> None:
+        theta = TASK.get_test_set(2000)[0]
+        simulator = TASK.get_simulator()
+        kept, x = self.method().simulated_test_set(theta, simulator)
+        assert torch.equal(kept, theta)
+        noise = x - theta @ simulator.matrix(theta).T
+        assert float(noise.mean()) == pytest.approx(0, abs=0.05)
+        assert float(noise.std()) == pytest.approx(TASK.noise_std, rel=0.05)
+
+    def test_its_seed_decides_the_simulations_and_leaves_no_trace(self) -> None:
+        theta, simulator = TASK.get_test_set(5)[0], TASK.get_simulator()
+        method = self.method()
+        before = torch.get_rng_state()
+        first, again, other = (
+            method.simulated_test_set(theta, simulator, seed=seed)[1]
+            for seed in (0, 0, 1)
+        )
+        assert torch.equal(first, again)
+        assert not torch.equal(first, other)
+        assert torch.equal(torch.get_rng_state(), before)
+
+    def test_simulations_that_fail_are_left_out_with_their_parameters(self) -> None:
+        theta = TASK.get_test_set(50)[0]
+
+        def fragile(theta: Tensor) -> Tensor:
+            x = theta.clone()
+            x[theta[:, 0] > 1, 1] = torch.nan
+            x[theta[:, 0] < -1, 0] = torch.inf
+            return x
+
+        kept, x = self.method().simulated_test_set(theta, fragile)
+        assert torch.equal(kept, theta[theta[:, 0].abs() <= 1])
+        assert torch.equal(x, kept)
+        assert 0 < len(kept) < 50
+
+    def test_the_shape_of_a_simulation_has_to_be_known(self) -> None:
+        method = SBI(TASK.get_prior(), builder())
+        with pytest.raises(NotReadyError, match=r"append_simulations\(theta, x\)"):
+            method.simulated_test_set(torch.zeros(2, 2), TASK.get_simulator())
+
+    def test_it_knows_the_shape_of_a_posterior_trained_beforehand(self) -> None:
+        method = SBI.from_posterior(npe().build_posterior())
+        _, x = method.simulated_test_set(torch.zeros(3, 2), TASK.get_simulator())
+        assert x.shape == (3, 2)
+
+    def test_bad_parameters_are_refused(self) -> None:
+        with pytest.raises(InvalidInputError, match="`theta` of shape"):
+            self.method().simulated_test_set(torch.zeros(3, 1), TASK.get_simulator())
+
+    def test_a_simulator_of_another_shape_is_refused(self) -> None:
+        with pytest.raises(SimulationError):
+            self.method().simulated_test_set(torch.zeros(3, 2), lambda t: t[:, :1])
+
+
+class TestBase:
+    def test_the_prior_baseline_is_the_prior(self) -> None:
+        posterior = PriorBaseline(TASK.get_prior()).train().build_posterior()
+        assert isinstance(posterior, PriorPosterior)
+        theta = torch.randn(5, 2)
+        assert torch.equal(posterior.log_prob(theta), TASK.get_prior().log_prob(theta))
+
+    def test_npe_given_beforehand_comes_back_as_it_was(self) -> None:
+        posterior = gaussian.posterior()
+        method = NPE.from_posterior(posterior).train(**QUIET)
+        theta, x = gaussian.labelled(6)
+        scored = log_probs(method.build_posterior(), theta, x)
+        assert torch.equal(scored, log_probs(posterior, theta, x))
+
+    @pytest.mark.parametrize("family", ["fmpe", "npse"])
+    def test_npe_given_beforehand_may_be_a_vector_field(self, family: str) -> None:
+        posterior = problems.vector_field_posterior(family)
+        method = NPE.from_posterior(posterior).train(**QUIET)
+        built = method.build_posterior()
+        assert type(built) is type(posterior)
+        assert built is not posterior
+
+    def test_methods_without_losses_say_so(self) -> None:
+        method = PriorBaseline(TASK.get_prior()).train()
+        with pytest.raises(NotReadyError, match="PriorBaseline"):
+            _ = method.history
+        ready = NPE.from_posterior(npe().build_posterior()).train(**QUIET)
+        with pytest.raises(NotReadyError, match="NPE"):
+            _ = ready.history
+
+    def test_the_losses_are_those_of_the_last_training(self) -> None:
+        method = NPE(TASK.get_prior(), builder(), npe_training=SHORT)
+        method.append_simulations(*simulations())
+        first = method.train(**QUIET).history
+        assert method.train(seed=1, show_progress_bars=False).history != first
+        assert method.train(**QUIET).history == first
+
+    def test_options_given_to_from_posterior_are_those_of_the_constructor(self) -> None:
+        method = FinetunedNPE.from_posterior(
+            npe().build_posterior(), learning_rates=(0.25,)
+        )
+        assert method.learning_rates == (0.25,)
+        with pytest.raises(TypeError, match="learning_rate_of_mine"):
+            FinetunedNPE.from_posterior(
+                npe().build_posterior(), learning_rate_of_mine=1
+            )
+
+    def test_a_posterior_in_training_mode_gives_one_in_evaluation_mode(self) -> None:
+        source = problems.npe_posterior()  # its embedding net has a dropout layer
+        posterior = posterior_from(source, copy.deepcopy(source.posterior_estimator))
+        posterior.posterior_estimator.train()
+        method = NPE.from_posterior(posterior)
+        assert posterior.posterior_estimator.training
+        built = method.train(**QUIET).build_posterior()
+        assert not built.posterior_estimator.training
+
+    def test_a_posterior_that_changes_after_it_was_given_changes_nothing(self) -> None:
+        posterior = gaussian.posterior()
+        method = NPE.from_posterior(posterior)
+        theta, x = gaussian.labelled(6)
+        expected = log_probs(posterior, theta, x)
+        with torch.no_grad():
+            posterior.posterior_estimator.log_std.fill_(3.0)
+        scored = log_probs(method.train(**QUIET).build_posterior(), theta, x)
+        assert torch.equal(scored, expected)
+
+    def test_the_prior_is_copied(self) -> None:
+        prior = BoxUniform(torch.zeros(2), torch.ones(2))
+        method = PriorBaseline(prior)
+        prior.base_dist.high.fill_(9.0)
+        posterior = method.train().build_posterior()
+        assert posterior.sample((100,)).max() <= 1
