@@ -37,6 +37,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     run.add_argument("suite", help=f"one of {', '.join(list_suites())}, or a TOML file")
     run.add_argument("--task", nargs="+", dest="tasks", help="these tasks only")
     run.add_argument("--method", nargs="+", dest="methods", help="these methods only")
+    run.add_argument(
+        "--repetition", nargs="+", type=int, dest="repetitions", help="these only"
+    )
     run.add_argument("--jobs", type=int, default=1, help="at a time; -1: all cores")
     run.add_argument(
         "--backend", default="loky", help="backend of joblib (%(default)s)"
@@ -69,7 +72,9 @@ def _add_out(parser: argparse.ArgumentParser, default: Path) -> None:
 
 def _run(args: argparse.Namespace) -> int:
     suite = load_suite(args.suite)
-    cells = suite.select(tasks=args.tasks, methods=args.methods)
+    cells = suite.select(
+        tasks=args.tasks, methods=args.methods, repetitions=args.repetitions
+    )
     workplace = Workplace(
         folder=args.out,
         sources=Sources(root=args.root, hemodynamics=args.hemodynamics),

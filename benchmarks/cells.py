@@ -109,14 +109,19 @@ class Suite:
     cells: tuple[Cell, ...]
 
     def select(
-        self, *, tasks: list[str] | None = None, methods: list[str] | None = None
+        self,
+        *,
+        tasks: list[str] | None = None,
+        methods: list[str] | None = None,
+        repetitions: list[int] | None = None,
     ) -> list[Cell]:
-        """Return the cells of some tasks and methods.
+        """Return the cells of some tasks, methods and repetitions.
 
         Raises:
             SystemExit: If a name is not in the suite or nothing is left.
         """
-        for what, chosen in (("task", tasks), ("method", methods)):
+        wanted = {"task": tasks, "method": methods, "repetition": repetitions}
+        for what, chosen in wanted.items():
             known = sorted({getattr(cell, what) for cell in self.cells})
             for name in chosen or ():
                 if name not in known:
@@ -126,8 +131,10 @@ class Suite:
         cells = [
             cell
             for cell in self.cells
-            if (not tasks or cell.task in tasks)
-            and (not methods or cell.method in methods)
+            if all(
+                not chosen or getattr(cell, what) in chosen
+                for what, chosen in wanted.items()
+            )
         ]
         if not cells:
             raise SystemExit(f"Nothing of the suite {self.name} is selected.")

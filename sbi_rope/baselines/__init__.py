@@ -7,6 +7,7 @@ from sbi_rope.baselines.base import (
     UsesSimulations,
 )
 from sbi_rope.baselines.calibration_mlp import CalibrationMLP
+from sbi_rope.baselines.error_model import SpikeAndSlab
 from sbi_rope.baselines.finetuned_npe import FinetunedNPE
 from sbi_rope.baselines.joint_npe import JointNPE
 from sbi_rope.baselines.nnpe import NNPE
@@ -31,6 +32,7 @@ __all__ = [
     "OTOnly",
     "PriorBaseline",
     "PriorPosterior",
+    "SpikeAndSlab",
     "Training",
     "TuningOnly",
     "UsesCalibration",

@@ -42,9 +42,8 @@ class DenoisedEstimator(ConditionalDensityEstimator):
         \tfrac1M \sum_m q(\theta \mid s_m), \qquad s_m \sim p(s \mid y)
 
     An observation is denoised when it is first asked for and known by its values from
-    then on, so that its draws, density and samples belong together. Its draws of s
-    depend on the observations it is denoised together with, through the random numbers
-    alone.
+    then on, so that density and samples belong together. Its draws of s depend on those
+    it is denoised together with, through the random numbers alone.
 
     Args:
         density: :math:`q(\theta \mid s)`.
@@ -182,7 +181,7 @@ class RNPE(BuildsOnNPE):
     q(s) of simulated statistics is a neural spline flow. For every observation,
     statistics are drawn by sbi's slice sampler, with the choice between spike and slab
     summed out, and kept with the posterior: the first call about an observation takes
-    about a second for eight statistics, later ones little. Chains that disagree
+    half a second for eight statistics, later ones little. Chains that disagree
     are warned of, and ``posterior.posterior_estimator.r_hat(x)`` tells by how much.
 
     Sees simulations. Assumes that statistics err independently of each other, any of

@@ -1,0 +1,229 @@
+"""Spike and slab: its moments, its density, and what is left after denoising."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.distributions import Cauchy, MultivariateNormal, Normal
+
+from sbi_rope._random import seeded
+from sbi_rope.baselines.error_model import (
+    ChainSettings,
+    SpikeAndSlab,
+    denoise,
+    split_r_hat,
+)
+from sbi_rope.errors import InvalidInputError
+
+MODEL = SpikeAndSlab()
+
+
+def standard_normal(s: Tensor) -> Tensor:
+    return Normal(0.0, 1.0).log_prob(s).sum(dim=-1)
+
+
+def run(y: Tensor, seed: int = 0, **options: int) -> tuple[Tensor, Tensor]:
+    settings = {"num_draws": 1000, "num_chains": 20, "warmup": 30, "thin": 2, **options}
+    with seeded(seed):
+        return denoise(
+            y,
+            log_density=standard_normal,
+            simulated=torch.randn(500, y.shape[1]),
+            error_model=MODEL,
+            settings=ChainSettings(**settings),
+        )
+
+
+# --- the noise ---
+
+
+def test_the_share_of_large_errors_is_that_of_the_slab_beyond() -> None:
+    noise = MODEL.sample_like(torch.empty(200_000))
+    for size in (0.1, 1.0, 10.0):
+        expected = 0.5 * (1 - 2 / math.pi * math.atan(size / 0.25))
+        share = float((noise.abs() > size).float().mean())
+        assert abs(share - expected) < 4 * (expected / len(noise)) ** 0.5
+
+
+def test_a_slab_alone_has_the_quartiles_of_a_cauchy_law() -> None:
+    noise = SpikeAndSlab(slab_probability=1.0).sample_like(torch.empty(100_000))
+    quartiles = noise.quantile(torch.tensor([0.25, 0.5, 0.75]))
+    expected = torch.tensor([-0.25, 0.0, 0.25])
+    assert torch.allclose(quartiles, expected, atol=0.01)
+
+
+def test_a_spike_alone_has_the_moments_of_a_gaussian() -> None:
+    noise = SpikeAndSlab(slab_probability=0.0).sample_like(torch.empty(100_000))
+    assert abs(float(noise.mean())) < 4 * 0.01 / len(noise) ** 0.5
+    assert float(noise.std()) == pytest.approx(0.01, rel=0.01)
+    assert float((noise / 0.01).pow(4).mean()) == pytest.approx(3.0, rel=0.05)
+
+
+def test_every_entry_has_its_own_error() -> None:
+    noise = MODEL.sample_like(torch.empty(50_000, 2))
+    large = (noise.abs() > 0.1).float()
+    assert abs(float(torch.corrcoef(large.T)[0, 1])) < 4 / len(noise) ** 0.5
+
+
+def test_noise_never_exceeds_the_bound_and_reaches_it() -> None:
+    noise = SpikeAndSlab(bound=2.0).sample_like(torch.empty(10_000))
+    assert float(noise.max()) == 2.0
+    assert float(noise.min()) == -2.0
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_noise_has_shape_and_dtype_of_what_it_is_for(dtype: torch.dtype) -> None:
+    x = torch.full((3, 4, 5), torch.nan, dtype=dtype)
+    noise = MODEL.sample_like(x)
+    assert noise.shape == x.shape
+    assert noise.dtype == dtype
+    assert torch.isfinite(noise).all()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_the_density_is_the_mixture_of_both_laws(share: float) -> None:
+    model = SpikeAndSlab(spike_std=0.1, slab_scale=0.5, slab_probability=share)
+    noise = torch.linspace(-3, 3, 101, dtype=torch.float64)
+    zero = torch.zeros((), dtype=torch.float64)
+    spike = Normal(zero, zero + 0.1).log_prob(noise).exp()
+    slab = Cauchy(zero, zero + 0.5).log_prob(noise).exp()
+    expected = (1 - share) * spike + share * slab
+    assert torch.allclose(model.log_prob(noise).exp(), expected, rtol=1e-6)
+
+
+def test_the_density_integrates_to_one() -> None:
+    grid = torch.linspace(-25, 25, 200_001, dtype=torch.float64)
+    noise = 0.01 * torch.sinh(grid)
+    density = MODEL.log_prob(noise).exp() * 0.01 * torch.cosh(grid)
+    assert float(torch.trapezoid(density, grid)) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_the_density_far_out_is_finite() -> None:
+    assert torch.isfinite(MODEL.log_prob(torch.tensor([1e3, -1e10]))).all()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"spike_std": 0.0},
+        {"slab_scale": -1.0},
+        {"slab_probability": 1.5},
+        {"bound": math.inf},
+    ],
+)
+def test_options_out_of_range_are_refused(options: dict[str, float]) -> None:
+    with pytest.raises(InvalidInputError, match=next(iter(options))):
+        SpikeAndSlab(**options)
+
+
+# --- denoising ---
+
+
+def quadrature(y: float) -> tuple[float, float, float]:
+    """Mean, sd and the mass of the spike of p(s | y) with a standard normal q(s)."""
+    s = torch.cat(
+        [torch.linspace(-9, 9, 100_001), torch.linspace(y - 0.1, y + 0.1, 9999)]
+    )
+    s = s.double().sort().values
+    density = (standard_normal(s[:, None]) + MODEL.log_prob(y - s)).double()
+    density = (density - density.max()).exp()
+    density = density / torch.trapezoid(density, s)
+    mean = torch.trapezoid(density * s, s)
+    variance = torch.trapezoid(density * (s - mean) ** 2, s)
+    spike = torch.trapezoid(density * ((s - y).abs() < 0.05), s)
+    return float(mean), float(variance) ** 0.5, float(spike)
+
+
+def test_denoised_draws_have_the_moments_found_by_quadrature() -> None:
+    # At 3 spike and slab compete; at 1000 q(s) alone is left.
+    values = [0.0, 1.0, 3.0, 5.0, 1000.0]
+    draws, r_hat = run(torch.tensor(values)[:, None])
+    assert draws.shape == (5, 1000, 1)
+    assert (r_hat < 1.1).all()
+    for y, s in zip(values, draws[..., 0], strict=True):
+        mean, std, spike = quadrature(y)
+        assert float(s.mean()) == pytest.approx(mean, abs=0.12)
+        assert float(s.std()) == pytest.approx(std, abs=0.08)
+        assert float(((s - y).abs() < 0.05).float().mean()) == pytest.approx(
+            spike, abs=0.05
+        )
+
+
+def test_with_gaussian_errors_denoising_is_the_kalman_update() -> None:
+    covariance = torch.tensor([[1.0, 0.8], [0.8, 1.0]])
+    q = MultivariateNormal(torch.zeros(2), covariance)
+    y = torch.tensor([[1.0, -1.0], [2.0, 0.5]])
+    with seeded(0):
+        draws, _ = denoise(
+            y,
+            log_density=q.log_prob,
+            simulated=q.sample(torch.Size((500,))),
+            error_model=SpikeAndSlab(spike_std=0.5, slab_probability=0.0),
+            settings=ChainSettings(num_draws=1000, num_chains=20, warmup=30, thin=2),
+        )
+    gain = covariance @ torch.linalg.inv(covariance + 0.25 * torch.eye(2))
+    posterior = covariance - gain @ covariance
+    for observation, s in zip(y, draws, strict=True):
+        assert torch.allclose(s.mean(dim=0), gain @ observation, atol=0.06)
+        assert torch.allclose(torch.cov(s.T), posterior, atol=0.04)
+
+
+def test_draws_are_as_many_as_asked_and_repeat_under_a_seed() -> None:
+    options = {"num_draws": 18, "num_chains": 4, "warmup": 5, "thin": 1}
+    y = torch.tensor([[0.0, 2.0]])
+    draws, _ = run(y, **options)
+    assert draws.shape == (1, 18, 2)
+    assert torch.equal(draws, run(y, **options)[0])
+    assert not torch.equal(draws, run(y, seed=1, **options)[0])
+
+
+def test_a_density_that_is_nan_somewhere_is_never_drawn_from_there() -> None:
+    with seeded(0):
+        draws, _ = denoise(
+            torch.tensor([[0.5]]),
+            log_density=lambda s: standard_normal(s).where(s[:, 0] > 0, torch.nan),
+            simulated=torch.rand(20, 1),
+            error_model=MODEL,
+            settings=ChainSettings(num_draws=400, num_chains=4, warmup=20, thin=1),
+        )
+    assert (draws > 0).all()
+
+
+# --- convergence ---
+
+
+def test_r_hat_is_the_textbook_ratio_of_variances() -> None:
+    draws = torch.randn(3, 4, 10, 2, dtype=torch.float64)
+    result = split_r_hat(draws)
+    for i in range(3):
+        for d in range(2):
+            chains = [
+                part
+                for chain in draws[i, :, :, d].numpy()
+                for part in (chain[:5], chain[5:])
+            ]
+            within = np.mean([part.var(ddof=1) for part in chains])
+            between = 5 * np.var([part.mean() for part in chains], ddof=1)
+            expected = np.sqrt((4 / 5 * within + between / 5) / within)
+            assert float(result[i, d]) == pytest.approx(expected)
+
+
+def test_r_hat_is_one_for_independent_draws_and_large_for_parted_chains() -> None:
+    draws = torch.randn(4, 1000, 1)
+    assert float(split_r_hat(draws)) == pytest.approx(1.0, abs=0.01)
+    parted = draws + torch.tensor([0.0, 0.0, 0.0, 3.0])[:, None, None]
+    assert float(split_r_hat(parted)) > 1.5
+
+
+def test_r_hat_sees_chains_that_drift_together() -> None:
+    draws = torch.randn(4, 1000, 1) + torch.linspace(0, 5, 1000)[:, None]
+    assert float(split_r_hat(draws)) > 1.3
+
+
+def test_r_hat_of_chains_that_never_move_tells_whether_they_differ() -> None:
+    same = torch.ones(4, 10, 1)
+    assert float(split_r_hat(same)) == 1.0
+    differing = same * torch.arange(4.0)[:, None, None]
+    assert float(split_r_hat(differing)) == math.inf
