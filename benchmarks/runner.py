@@ -1,5 +1,6 @@
 """Runs cells, in parallel, and keeps what is finished."""
 
+import functools
 import itertools
 import subprocess
 import time
@@ -137,6 +138,7 @@ def prepare(cell: Cell, workplace: Workplace) -> None:
 def run_group(cells: list[Cell], workplace: Workplace) -> list[str]:
     """Run cells that share all but gamma and tau; write each when it is finished."""
     _use_one_thread()
+    git_commit()  # now, not when a cell is finished hours later
     statuses = []
     left = list(cells)
     try:
@@ -233,6 +235,7 @@ def _arrays(score: Score) -> dict[str, np.ndarray]:
     }
 
 
+@functools.cache
 def git_commit() -> str:
     """Return the commit the code is at, with a plus if it was changed since."""
     folder = Path(__file__).parent
