@@ -42,7 +42,7 @@ from sbi_rope.baselines import (
 )
 from sbi_rope.metrics import Evaluation, evaluate
 
-__all__ = ["EXTRAS", "METHODS", "ONLY_FOR", "Score", "scores"]
+__all__ = ["EXTRAS", "METHODS", "ONLY_FOR", "Failure", "Score", "scores"]
 
 # Tasks whose observations are statistics: NNPE's noise is on them, not on h(x).
 STATISTICS = ("cs", "sir", "linear_gaussian")
@@ -136,8 +136,22 @@ class Score:
     converged: bool = True
 
 
-def scores(case: Case, cells: Sequence[Cell]) -> Iterator[Score]:
-    """Score cells that differ in gamma and tau only, each when it is asked for."""
+@dataclass(frozen=True, kw_only=True)
+class Failure:
+    """A cell that could not be scored, and why."""
+
+    cell: Cell
+    error: Exception
+
+
+def scores(case: Case, cells: Sequence[Cell]) -> Iterator[Score | Failure]:
+    """Score cells that differ in gamma and tau only, each when it is asked for.
+
+    A posterior that cannot be scored is a failure of its cell alone.
+
+    Raises:
+        Exception: Whatever stops all cells, such as a failing training.
+    """
     if case.cell.method in NEEDS_COUPLING:
         yield from _coupled_scores(case, cells)
     else:
@@ -182,7 +196,7 @@ def _score(case: Case, cell: Cell) -> Score:
     )
 
 
-def _coupled_scores(case: Case, cells: Sequence[Cell]) -> Iterator[Score]:
+def _coupled_scores(case: Case, cells: Sequence[Cell]) -> Iterator[Score | Failure]:
     count = _Count(case)
     rope = RoPE(
         case.npe,
@@ -210,7 +224,12 @@ def _coupled_scores(case: Case, cells: Sequence[Cell]) -> Iterator[Score]:
         )
         for cell, posterior in zip(of_tau, posteriors, strict=True):
             couple_seconds = time.perf_counter() - start
-            evaluation, test_seconds = _evaluate(case, posterior, case.test_set)
+            try:
+                evaluation, test_seconds = _evaluate(case, posterior, case.test_set)
+            except Exception as error:
+                yield Failure(cell=cell, error=error)
+                start = time.perf_counter()
+                continue
             yield Score(
                 cell=cell,
                 posterior=posterior,
@@ -335,6 +354,8 @@ def main() -> None:
             cost_scale="simulated" if name in NEEDS_COUPLING else "",
         )
         for score in scores(replace(case, cell=cell), [cell]):
+            if isinstance(score, Failure):
+                raise score.error
             print(as_line(score), flush=True)
 
 

@@ -20,7 +20,7 @@ from tqdm.auto import tqdm
 from benchmarks.cases import Case, Sources
 from benchmarks.cells import Cell
 from benchmarks.machine import forget_peak, peak_memory
-from benchmarks.methods import ONLY_FOR, Score, scores
+from benchmarks.methods import ONLY_FOR, Failure, Score, scores
 from benchmarks.store import Cache, Results
 from sbi_rope.metrics import draw_samples
 
@@ -141,25 +141,32 @@ def run_group(cells: list[Cell], workplace: Workplace) -> list[str]:
     git_commit()  # now, not when a cell is finished hours later
     statuses = []
     left = list(cells)
+
+    def fail(cell: Cell, error: Exception) -> None:
+        row = {
+            **asdict(cell),
+            "status": "failed",
+            "error": f"{type(error).__name__}: {error}",
+            "traceback": "".join(traceback.format_exception(error)),
+        }
+        workplace.results.write(cell, row, {})
+        statuses.append("failed")
+
     try:
         case = Case.of(cells[0], workplace.sources, workplace.cache, workplace.device)
         _check_data(case)
         forget_peak()
         for score in scores(case, cells):
-            workplace.results.write(score.cell, _row(case, score), _arrays(score))
-            statuses.append("finished")
+            if isinstance(score, Failure):
+                fail(score.cell, score.error)
+            else:
+                workplace.results.write(score.cell, _row(case, score), _arrays(score))
+                statuses.append("finished")
             left.remove(score.cell)
             forget_peak()
     except Exception as error:
         for cell in left:
-            row = {
-                **asdict(cell),
-                "status": "failed",
-                "error": f"{type(error).__name__}: {error}",
-                "traceback": traceback.format_exc(),
-            }
-            workplace.results.write(cell, row, {})
-            statuses.append("failed")
+            fail(cell, error)
     return statuses
 
 
