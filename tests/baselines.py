@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from sbi_rope import CalibrationFinetuner
 from sbi_rope.baselines import (
+    HVAE,
     NNPE,
     NPE,
     NPERS,
@@ -58,6 +59,13 @@ class Entry:
     tasks: tuple[str, ...] = VECTOR_TASKS
 
 
+def swing(theta: Tensor) -> Tensor:
+    """The pendulum without noise, phase and friction, differentiable in theta."""
+    none = 0.0 * theta[:, :1]
+    simulator: Any = task_of("pendulum").get_simulator()
+    return simulator.position(theta, phase=none, damping=none)
+
+
 METHODS: dict[str, Entry] = {
     "prior": Entry(PriorBaseline),
     "npe": Entry(NPE, lambda task: {"npe_training": SHORT}),
@@ -80,6 +88,17 @@ METHODS: dict[str, Entry] = {
     ),
     "npe_rs": Entry(NPERS, lambda task: {"training": SHORT}),
     "nnpe": Entry(NNPE, lambda task: {"npe_training": SHORT, "training": SHORT}),
+    "hvae": Entry(
+        HVAE,
+        lambda task: {
+            "physics": swing,
+            "npe_training": SHORT,
+            "training": SHORT,
+            "width": 2,
+            "num_latents": 8,
+        },
+        ("pendulum",),
+    ),
     "rnpe": Entry(RNPE, lambda task: {"npe_training": SHORT, **CHAINS}),
 }
 CASES = [(name, task) for name, entry in METHODS.items() for task in entry.tasks]

@@ -9,6 +9,7 @@ from sbi_rope.baselines.base import (
 from sbi_rope.baselines.calibration_mlp import CalibrationMLP
 from sbi_rope.baselines.error_model import SpikeAndSlab
 from sbi_rope.baselines.finetuned_npe import FinetunedNPE
+from sbi_rope.baselines.hvae import HVAE
 from sbi_rope.baselines.joint_npe import JointNPE
 from sbi_rope.baselines.nnpe import NNPE
 from sbi_rope.baselines.npe import NPE, SBI
@@ -20,6 +21,7 @@ from sbi_rope.baselines.training import Training
 from sbi_rope.baselines.tuning_only import TuningOnly
 
 __all__ = [
+    "HVAE",
     "NNPE",
     "NPE",
     "NPERS",

@@ -1,0 +1,257 @@
+"""The hybrid VAE (HVAE): a deterministic simulator inside of an auto-encoder."""
+
+import copy
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sbi_rope._random import seeded
+from sbi_rope._sbi import (
+    embed,
+    embedding_of,
+    estimator_of,
+    headless,
+    posterior_from,
+)
+from sbi_rope._training import History
+from sbi_rope._validation import (
+    check_batch,
+    check_instance,
+    check_integer,
+    check_not_negative,
+    check_tensor,
+)
+from sbi_rope.baselines.base import BuildsOnNPE, UsesCalibration, UsesObservations
+from sbi_rope.baselines.hvae.estimator import LatentMixture
+from sbi_rope.baselines.hvae.model import FrozenNPE, HybridVAE
+from sbi_rope.baselines.hvae.networks import (
+    ConditionalUNet,
+    LatentEncoder,
+    check_event_shape,
+)
+from sbi_rope.baselines.hvae.prior import ContinuedPrior
+from sbi_rope.baselines.hvae.reparametrisation import check_differentiable
+from sbi_rope.baselines.hvae.training import train_hybrid
+from sbi_rope.baselines.training import EstimatorBuilder, Training
+from sbi_rope.errors import InvalidInputError, InvalidTypeError
+
+__all__ = ["HVAE"]
+
+DEFAULT_TRAINING = Training(
+    training_batch_size=100,
+    learning_rate=1e-3,
+    validation_fraction=0.2,
+    stop_after_epochs=30,
+    max_num_epochs=100,
+)
+# Log-variance at which R2P starts, in units of the standardised data.
+START_LOG_VARIANCE = -9.0
+# Draws of the prior on which the physics is tried.
+NUM_DRAWS_CHECKED = 3
+
+
+class HVAE(BuildsOnNPE, UsesCalibration, UsesObservations):
+    r"""An auto-encoder of real data with the simulator in its middle and NPE before it.
+
+    .. math::
+        \max \; \frac1n \sum_i \mathrm{ELBO}(x_{o,i}) + w \, \frac1{n_c} \sum_j
+        \mathbb{E} \log q\bigl(\theta_j \mid h(\tilde x_j)\bigr)
+
+    .. math::
+        \mathrm{ELBO}(x_o) = \mathbb{E} \log \mathcal{N}\bigl(x_o;
+        \mathrm{P2R}(f(\theta), z)\bigr)
+        - \mathrm{KL}\bigl(q(z \mid x_o) \,\|\, \mathcal{N}(0, I)\bigr)
+        - \mathbb{E} \log \frac{q(\theta \mid h(\tilde x))}{p(\theta)}
+
+    Inference: :math:`z \sim q(z \mid x_o)`, a simulation like the observation,
+    :math:`\tilde x = \mathrm{R2P}(x_o, z)`, and :math:`\theta \sim q(\theta \mid
+    h(\tilde x))` by NPE, which stays as it is. Explanation: the deterministic physics
+    :math:`f(\theta)`, to which P2R adds with z what it lacks. P2R and R2P are U-Nets
+    that predict mean and log-variance; :math:`q(z \mid x_o)` is an embedding net like
+    that of NPE, untrained, with a linear layer. The posterior mixes
+    :math:`q(\theta \mid h(\tilde x))` over ``num_latents`` draws of z whose noise is
+    fixed.
+
+    Sees simulations, the calibration set and observations without parameters. Their
+    means and standard deviations scale the data; a part of the pairs is held out, and
+    the epoch with the largest log-probability on them is kept, the start included. Of
+    fewer than 5 pairs none is held out, and the objective on held-out observations
+    decides; of fewer than 5 observations the last epoch is kept. Assumes series or
+    images, a simulator that can be differentiated once its noise is left out, and a
+    prior on a box. To be preferred where the physics lacks an effect that is the same
+    in kind for all observations and many of these are at hand. On the pendulum with 50
+    pairs it does far better than NPE and worse than :class:`FinetunedNPE`: the
+    densities stay as narrow as those of NPE.
+
+    Where this differs from the paper, and from the original code:
+
+    - The printed U-Nets cannot be run; ours have four up-convolutions, and outputs for
+      the log-variance. Their means are their inputs plus what they learn, so that
+      training starts at NPE.
+    - w is not stated. At 1 the ELBO, a sum over all entries of x, drowns the pairs, and
+      on the pendulum the result is no better than NPE; the default weighs them like all
+      entries together.
+    - The mean of R2P is taken. Draws from it (``noisy=True``) leave a valid bound, but
+      did not help.
+    - Draws of theta outside of the prior's support are brought to its edge for the
+      physics, and the density falls off exponentially there instead of ending. The
+      gradient of a draw is that of implicit functions, for all flows.
+    - There are none of the regularisers of the original code, as in the paper, and NPE
+      takes the place of its physics encoder.
+
+    References:
+        | Physics-Integrated Variational Autoencoders for Robust and Interpretable
+          Generative Modeling (Takeishi and Kalousis, 2021)
+        | https://arxiv.org/abs/2102.13156
+        | Addressing Misspecification in Simulation-based Inference through Data-driven
+          Calibration (Wehenkel et al., 2025), appendices on tasks C and E
+        | https://arxiv.org/abs/2405.08719
+
+    Args:
+        prior: A torch distribution over parameters of shape ``(k,)``, its support a
+            box, whose sides may be infinite.
+        density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns; a
+            normalizing flow. An embedding net inside it is copied, never trained in
+            place.
+        physics: f, from theta ``(n, k)`` to ``(n, *event)``: the simulator without
+            noise and nuisances, differentiable by torch.
+        npe_training: How NPE is trained; ``Training()`` if None.
+        training: How the networks are trained; at most 100 passes over the observations
+            in batches of 100 at a learning rate of 1e-3, and 30 without improvement, if
+            None.
+        width: Channels of the first block of the U-Nets. The paper has 64; on a CPU 8
+            takes a twentieth of the time.
+        latent_dim: Length of z.
+        num_latents: Components of the posterior.
+        calibration_weight: w; the number of entries of an observation if None. The
+            paper's objective has 1.
+        residual: Whether U-Nets start as the identity.
+        noisy: Whether simulations are drawn from R2P; otherwise its mean is taken.
+        device: Where to train; data on other devices is moved there.
+
+    Raises:
+        InvalidTypeError: If an argument has the wrong type.
+        InvalidInputError: If an argument is outside its range, sbi knows no estimator
+            of that name, or the prior's support is not a box. In ``train``, if
+            observations are neither series nor images with sides of 16 or more, or if
+            the physics does not return differentiable ones.
+        UnsupportedPosteriorError: In ``train``, if the estimator is not a flow.
+    """
+
+    def __init__(
+        self,
+        prior: Any,
+        density_estimator: str | EstimatorBuilder = "nsf",
+        *,
+        physics: Callable[[Tensor], Tensor],
+        npe_training: Training | None = None,
+        training: Training | None = None,
+        width: int = 64,
+        latent_dim: int = 5,
+        num_latents: int = 64,
+        calibration_weight: float | None = None,
+        residual: bool = True,
+        noisy: bool = False,
+        device: str | torch.device = "cpu",
+    ) -> None:
+        check_instance("training", training, Training, optional=True)
+        if not callable(physics):
+            raise InvalidTypeError(
+                "Expected `physics` to be callable, a differentiable function from "
+                f"theta (n, k) to (n, *event); got {type(physics).__name__}."
+            )
+        check_integer("width", width)
+        check_integer("latent_dim", latent_dim)
+        check_integer("num_latents", num_latents)
+        if calibration_weight is not None:
+            check_not_negative("calibration_weight", calibration_weight)
+        super().__init__(
+            prior, density_estimator, npe_training=npe_training, device=device
+        )
+        ContinuedPrior(self._prior)  # early, for its error
+        self.training = DEFAULT_TRAINING if training is None else training
+        self.physics = physics
+        self.width = width
+        self.latent_dim = latent_dim
+        self.num_latents = num_latents
+        self.calibration_weight = calibration_weight
+        self.residual = residual
+        self.noisy = noisy
+
+    def _check_data(self) -> None:
+        # Before NPE is trained, which takes a while.
+        super()._check_data()
+        assert self._event_shape is not None
+        check_event_shape(tuple(self._event_shape))
+        with seeded(0):
+            theta = self._prior.sample(torch.Size((NUM_DRAWS_CHECKED,)))
+        theta = theta.to(self._device, torch.float32).requires_grad_()
+        x = check_tensor("physics(theta)", self.physics(theta))
+        check_batch("physics(theta)", x, self._event_shape)
+        if len(x) != len(theta) or not x.requires_grad:
+            raise InvalidInputError(
+                "Expected `physics` to be differentiable, with one result for each "
+                f"row of theta; got {len(x)} for {len(theta)} rows, with "
+                f"requires_grad={x.requires_grad}. Write it in torch, without "
+                "`detach`, `torch.no_grad` and conversions to NumPy."
+            )
+
+    def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
+        npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
+        estimator = (
+            copy.deepcopy(estimator_of(npe)).eval().requires_grad_(requires_grad=False)
+        )
+        model = self._model(estimator)
+        event_shape = self._observations.shape[1:]
+        # On the CPU, so that a seed means the same on every device.
+        noise = torch.randn(self.num_latents, self.latent_dim, device="cpu")
+        x_noise = (
+            torch.randn(self.num_latents, *event_shape, device="cpu")
+            if self.noisy
+            else None
+        )
+        mixture = LatentMixture(
+            model, noise, x_noise, self._prior.event_shape, event_shape
+        )
+        mixture.to(self._device)
+        weight = self.calibration_weight
+        history = train_hybrid(
+            model,
+            mixture,
+            self._observations,
+            *self._calibration,
+            weight=event_shape.numel() if weight is None else weight,
+            training=self.training,
+            show_progress_bars=show_progress_bars,
+        )
+        return posterior_from(npe, mixture.eval()), history
+
+    def _model(self, estimator: Any) -> HybridVAE:
+        x = torch.cat([self._observations, self._calibration[1]])
+        npe = FrozenNPE(embedding_of(estimator), headless(estimator))
+        check_differentiable(npe.flow, embed(npe.embedding, x[:2]))
+        # One number a channel: pixels that never change have no standard deviation.
+        channels = x.transpose(0, 1).flatten(1) if x.ndim == 4 else x.reshape(1, -1)
+        std = channels.std(dim=1)
+        unet = partial(
+            ConditionalUNet,
+            tuple(x.shape[1:]),
+            self.latent_dim,
+            width=self.width,
+            mean=channels.mean(dim=1),
+            std=std.where(std > 0, 1.0),
+            residual=self.residual,
+        )
+        model = HybridVAE(
+            LatentEncoder(npe.embedding, self.latent_dim, x),
+            unet(log_variance=START_LOG_VARIANCE),
+            unet(),
+            npe=npe,
+            physics=self.physics,
+            prior=ContinuedPrior(self._prior, device=self._device),
+            noisy=self.noisy,
+        )
+        return model.to(self._device)

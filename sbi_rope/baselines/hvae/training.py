@@ -1,0 +1,99 @@
+"""How the networks of the HVAE are trained, and by what their best state is chosen."""
+
+from collections.abc import Callable, Iterator
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from sbi_rope._random import seeded
+from sbi_rope._training import History, fit, split_pairs
+from sbi_rope.baselines.hvae.estimator import LatentMixture
+from sbi_rope.baselines.hvae.model import HybridVAE
+from sbi_rope.baselines.training import Training
+from sbi_rope.errors import warn_user
+
+__all__ = ["train_hybrid"]
+
+# Draws of z behind the loss on the held-out pairs.
+NUM_LATENTS_HELD_OUT = 8
+
+
+def train_hybrid(
+    model: HybridVAE,
+    mixture: LatentMixture,
+    x_o: Tensor,
+    theta: Tensor,
+    x: Tensor,
+    *,
+    weight: float,
+    training: Training,
+    show_progress_bars: bool,
+) -> History:
+    """Train a model in place and leave it at its best on what is held out.
+
+    Held out are pairs, or if there are fewer than five, observations.
+
+    Args:
+        model: What is trained.
+        mixture: Its posterior, which shares its networks.
+        x_o: Observations without parameters, shape ``(n, *event)``.
+        theta: Parameters of the calibration pairs, shape ``(m, k)``.
+        x: Their observations, shape ``(m, *event)``.
+        weight: Of the pairs' mean log-probability in the objective.
+        training: Batch size, learning rate and so on.
+        show_progress_bars: Whether to show the course of the loss.
+
+    Returns:
+        The losses and the epoch that was kept.
+    """
+    train, held_out = split_pairs(len(x), training.validation_fraction)
+    pairs = theta[train], x[train]
+    objective = partial(model.objective, weight=weight)
+    validation_loss: Callable[[], Tensor] | None = None
+    if len(held_out):
+        validation_loss = partial(_held_out_loss, mixture, theta[held_out], x[held_out])
+    else:
+        warn_user(
+            f"Only {len(x)} calibration pair(s): none is held out, and the networks "
+            "are chosen by the objective on held-out observations. Append at least 5 "
+            "pairs to choose them by what matters."
+        )
+        rows, held_out = split_pairs(len(x_o), training.validation_fraction)
+        if len(held_out):
+            validation_loss = partial(
+                _with_same_draws, objective, x_o[held_out], *pairs
+            )
+        x_o = x_o[rows]
+    return fit(
+        model,
+        partial(_batches, torch.cat([x_o, pairs[1]]), *pairs, training),
+        objective,
+        validation_loss=validation_loss,
+        learning_rate=training.learning_rate,
+        max_num_steps=training.max_num_epochs,
+        patience=training.stop_after_epochs,
+        clip_max_norm=training.clip_max_norm,
+        label="HVAE",
+        show_progress_bars=show_progress_bars,
+    )
+
+
+def _batches(
+    unlabelled: Tensor, theta: Tensor, x: Tensor, training: Training, epoch: int
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Pass over all observations, each batch together with one of pairs."""
+    size = training.training_batch_size
+    for rows in torch.randperm(len(unlabelled)).split(size):
+        pairs = torch.randperm(len(x))[:size]
+        yield unlabelled[rows], theta[pairs], x[pairs]
+
+
+def _held_out_loss(mixture: LatentMixture, theta: Tensor, x: Tensor) -> Tensor:
+    return -mixture.log_prob(theta, x, num_latents=NUM_LATENTS_HELD_OUT).mean()
+
+
+def _with_same_draws(objective: Callable[..., Tensor], *data: Tensor) -> Tensor:
+    # Or the luckiest epoch would be kept.
+    with seeded(0):
+        return objective(*data)

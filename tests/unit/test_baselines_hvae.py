@@ -1,0 +1,698 @@
+"""The HVAE: bound, gradients, mixture and training."""
+
+import copy
+import math
+import pickle
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import torch
+from sbi.inference import NPE, DirectPosterior
+from sbi.neural_nets import posterior_nn
+from sbi.utils import BoxUniform, MultipleIndependent
+from torch import Tensor, nn
+from torch.distributions import (
+    Beta,
+    Dirichlet,
+    Independent,
+    MultivariateNormal,
+    Normal,
+    kl_divergence,
+)
+
+from sbi_rope._sbi import headless
+from sbi_rope.baselines.hvae import HVAE
+from sbi_rope.baselines.hvae.estimator import LatentMixture
+from sbi_rope.baselines.hvae.model import (
+    FrozenNPE,
+    HybridVAE,
+    latent_kl,
+    normal_log_prob,
+)
+from sbi_rope.baselines.hvae.prior import ContinuedPrior
+from sbi_rope.baselines.hvae.reparametrisation import (
+    check_differentiable,
+    reparametrised_sample,
+)
+from sbi_rope.baselines.training import Training
+from sbi_rope.errors import (
+    InvalidInputError,
+    InvalidTypeError,
+    NotReadyError,
+    RoPEWarning,
+    UnsupportedPosteriorError,
+)
+from sbi_rope.tasks.pendulum import PendulumSimulator
+
+# --- a linear-Gaussian model whose evidence is known ---
+# theta ~ N(0, I_2), z ~ N(0, 1), x = A theta + B z + noise of standard deviation 0.5.
+
+A = torch.tensor([[1.0, 0.0], [0.5, 1.0], [0.0, -1.0], [1.0, 1.0]])
+B = torch.tensor([[0.5], [-1.0], [1.0], [0.3]])
+NOISE_STD = 0.5
+COVARIANCE = A @ A.T + B @ B.T + NOISE_STD**2 * torch.eye(4)
+EVIDENCE = MultivariateNormal(torch.zeros(4), COVARIANCE)
+PRECISION = torch.eye(2) + A.T @ A / NOISE_STD**2
+
+
+class LinearFlow(nn.Module):
+    """The exact q(theta | s) of simulations s = A theta + noise, as a flow."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.law = MultivariateNormal(torch.zeros(2), precision_matrix=PRECISION)
+
+    def _mean(self, s: Tensor) -> Tensor:
+        return s @ A @ self.law.covariance_matrix / NOISE_STD**2
+
+    def sample(self, shape: torch.Size, s: Tensor) -> Tensor:
+        return self._mean(s) + self.law.sample((*shape, len(s)))
+
+    def log_prob(self, theta: Tensor, s: Tensor) -> Tensor:
+        return self.law.log_prob(theta - self._mean(s))
+
+    def inverse_transform(self, theta: Tensor, s: Tensor) -> Tensor:
+        factor = torch.linalg.cholesky(PRECISION)
+        return (theta - self._mean(s)) @ factor
+
+
+class Encoder(nn.Module):
+    """The exact q(z | x), moved by ``shift`` standard deviations."""
+
+    def __init__(self, shift: float = 0.0) -> None:
+        super().__init__()
+        gain = torch.linalg.solve(COVARIANCE, B)
+        self.variance = 1 - (B.T @ gain).squeeze()
+        self.gain, self.shift = gain, shift
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        mean = x @ self.gain + self.shift * self.variance.sqrt()
+        return mean, self.variance.log().expand_as(mean)
+
+
+class Shift(nn.Module):
+    """x plus a multiple of B z, with a given standard deviation."""
+
+    def __init__(self, factor: float, std: float) -> None:
+        super().__init__()
+        self.factor, self.std = factor, std
+
+    def forward(self, x: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+        mean = x.repeat_interleave(len(z) // len(x), dim=0) + self.factor * z @ B.T
+        return mean, torch.full_like(mean, 2 * math.log(self.std))
+
+
+def linear_model(
+    *, shift: float = 0.0, noisy: bool = False, r2p_std: float = 0.1
+) -> HybridVAE:
+    return HybridVAE(
+        Encoder(shift),
+        Shift(-1.0, r2p_std),
+        Shift(1.0, NOISE_STD),
+        npe=FrozenNPE(nn.Identity(), LinearFlow()),
+        physics=lambda theta: theta @ A.T,
+        prior=ContinuedPrior(MultivariateNormal(torch.zeros(2), torch.eye(2))),
+        noisy=noisy,
+    )
+
+
+def test_elbo_of_the_exact_posterior_is_the_evidence_for_every_draw() -> None:
+    torch.manual_seed(0)
+    x = EVIDENCE.sample((200,))
+    elbo = linear_model().elbo(x)
+    # The KL term is in closed form, so that single draws scatter about it.
+    model = linear_model()
+    repeated = model.elbo(x.repeat(500, 1)).reshape(500, 200)
+    assert elbo.shape == (200,)
+    error = repeated.mean(dim=0) - EVIDENCE.log_prob(x)
+    standard_error = repeated.std(dim=0) / math.sqrt(500)
+    assert (error.abs() < 5 * standard_error + 1e-4).all()
+    assert error.mean().abs() < 0.01
+
+
+def test_elbo_of_a_shifted_encoder_is_lower_by_the_divergence() -> None:
+    torch.manual_seed(0)
+    x = EVIDENCE.sample((20_000,))
+    gap = (EVIDENCE.log_prob(x) - linear_model(shift=1.5).elbo(x)).detach()
+    # KL of two Gaussians of the same variance, 1.5 standard deviations apart. But theta
+    # is then inferred at the wrong z, exactly, which costs nothing more.
+    standard_error = float(gap.std()) / math.sqrt(len(gap))
+    assert standard_error < 0.03
+    assert float(gap.mean()) == pytest.approx(1.5**2 / 2, abs=4 * standard_error)
+
+
+def test_elbo_with_drawn_simulations_is_lower_by_what_the_noise_costs() -> None:
+    torch.manual_seed(0)
+    x, std = EVIDENCE.sample((20_000,)), 0.3
+    elbo = linear_model(noisy=True, r2p_std=std).elbo(x).detach()
+    gap = EVIDENCE.log_prob(x) - elbo
+    # E KL(q(theta | s + noise) || q(theta | s)), two Gaussians of the same precision.
+    gain = torch.linalg.solve(PRECISION, A.T) / NOISE_STD**2
+    expected = 0.5 * std**2 * torch.trace(gain.T @ PRECISION @ gain)
+    standard_error = float(gap.std()) / math.sqrt(len(gap))
+    assert standard_error < 0.03
+    assert float(gap.mean()) == pytest.approx(float(expected), abs=4 * standard_error)
+
+
+def test_objective_adds_the_weighted_log_probability_of_the_pairs() -> None:
+    x = EVIDENCE.sample((10,))
+    pairs = torch.randn(4, 2), EVIDENCE.sample((4,))
+    model = linear_model()
+    torch.manual_seed(1)
+    log_prob = model.calibration_log_prob(*pairs)
+    elbo = model.elbo(x)
+    for weight in (0.0, 1.0, 3.0):
+        torch.manual_seed(1)
+        value = model.objective(x, *pairs, weight=weight)
+        torch.testing.assert_close(value, -elbo.mean() - weight * log_prob.mean())
+
+
+def test_log_probability_of_a_pair_averages_to_the_posterior_over_latents() -> None:
+    torch.manual_seed(0)
+    theta, x = torch.randn(5, 2), EVIDENCE.sample((5,))
+    gain = A.T @ torch.linalg.inv(COVARIANCE)
+    exact = MultivariateNormal(x @ gain.T, torch.eye(2) - gain @ A)
+    log_prob = linear_model().calibration_log_prob(
+        theta.repeat(20_000, 1), x.repeat(20_000, 1)
+    )
+    mixed = log_prob.reshape(20_000, 5).logsumexp(dim=0) - math.log(20_000)
+    torch.testing.assert_close(mixed, exact.log_prob(theta), atol=0.1, rtol=0)
+
+
+def test_latent_divergence_is_that_of_torch() -> None:
+    mean, log_variance = torch.randn(7, 5), torch.randn(7, 5)
+    law = Independent(Normal(mean, (0.5 * log_variance).exp()), 1)
+    standard = Independent(Normal(torch.zeros(7, 5), torch.ones(7, 5)), 1)
+    torch.testing.assert_close(
+        latent_kl(mean, log_variance), kl_divergence(law, standard)
+    )
+
+
+def test_likelihood_of_events_is_that_of_torch() -> None:
+    x, mean, log_variance = torch.randn(3, 6, 2, 5, 4).unbind()
+    expected = Independent(Normal(mean, (0.5 * log_variance).exp()), 3).log_prob(x)
+    torch.testing.assert_close(normal_log_prob(x, mean, log_variance), expected)
+
+
+# --- draws with a gradient ---
+
+
+@pytest.fixture
+def double() -> Iterator[None]:
+    """Make float64 the default, which nflows asks for where it makes tensors."""
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(torch.float32)
+
+
+def flow(name: str) -> Any:
+    torch.manual_seed(0)
+    theta = torch.randn(100, 2)
+    x = torch.cat([theta, theta.sin()], dim=1) + 0.3 * torch.randn(100, 4)
+    options = {} if name in ("mdn", "made") else {"num_transforms": 2}
+    return headless(posterior_nn(name, **options)(theta, x).eval())
+
+
+@pytest.mark.usefixtures("double")
+@pytest.mark.parametrize("name", ["maf", "nsf", "zuko_nsf", "zuko_unaf"])
+def test_gradient_of_a_draw_is_that_of_finite_differences_at_fixed_noise(
+    name: str,
+) -> None:
+    q = flow(name)
+    s = torch.randn(10, 4).requires_grad_()
+    theta = reparametrised_sample(q, s)
+    direction, weights = torch.randn(10, 4), torch.randn(10, 2)
+    (gradient,) = torch.autograd.grad((theta * weights).sum(), s)
+    noise = q.inverse_transform(theta, s).detach()
+
+    def at_same_noise(s: Tensor) -> Tensor:
+        # By Newton's method, as some flows are inverted too coarsely for differences.
+        point = theta.detach()
+        for _ in range(10):
+            point = point.clone().requires_grad_()
+            u = q.inverse_transform(point, s)
+            rows = [
+                torch.autograd.grad(u[:, k].sum(), point, retain_graph=True)[0]
+                for k in range(2)
+            ]
+            step = torch.linalg.solve(torch.stack(rows, 1), (u - noise)[..., None])
+            point = (point - step[..., 0]).detach()
+        return point
+
+    s = s.detach()
+    h = 1e-5
+    difference = at_same_noise(s + h * direction) - at_same_noise(s - h * direction)
+    expected = (difference / (2 * h) * weights).sum(dim=1)
+    torch.testing.assert_close(
+        (gradient * direction).sum(dim=1), expected, atol=1e-5, rtol=1e-4
+    )
+
+
+def test_draw_is_that_of_the_flow() -> None:
+    q, s = flow("nsf"), torch.randn(10, 4)
+    torch.manual_seed(3)
+    theta = reparametrised_sample(q, s.clone().requires_grad_())
+    torch.manual_seed(3)
+    torch.testing.assert_close(theta.detach(), q.sample(torch.Size((1,)), s)[0])
+
+
+@pytest.mark.parametrize("name", ["mdn", "made"])
+def test_estimators_whose_draws_have_no_gradient_are_refused(name: str) -> None:
+    with pytest.raises(UnsupportedPosteriorError, match="'nsf'"):
+        check_differentiable(flow(name), torch.zeros(2, 4))
+
+
+# --- the prior, continued ---
+
+
+def test_continued_prior_is_the_prior_inside_and_falls_off_outside() -> None:
+    prior = BoxUniform(torch.tensor([0.0, -1.0]), torch.tensor([2.0, 3.0]))
+    continued = ContinuedPrior(prior)
+    inside = torch.tensor([[0.5, 0.0], [1.9, 2.9]])
+    torch.testing.assert_close(continued.log_prob(inside), prior.log_prob(inside))
+    outside = torch.tensor([[2.0, 1.0], [3.0, 1.0], [4.0, 1.0]]).requires_grad_()
+    values = continued.log_prob(outside)
+    # exp(-d / (0.1 std)), the standard deviation being 2 / sqrt(12).
+    slope = math.sqrt(12) / 2 / 0.1
+    torch.testing.assert_close(
+        values.diff(), torch.tensor([-slope, -slope]), rtol=0.02, atol=0
+    )
+    values.sum().backward()
+    assert outside.grad is not None
+    assert (outside.grad[:, 0] < 0).all()
+    assert (outside.grad[:, 1] == 0).all()
+
+
+def test_continued_prior_is_finite_where_the_density_is_not() -> None:
+    half = torch.tensor([0.5])
+    prior = MultipleIndependent(
+        [BoxUniform(torch.zeros(2), torch.ones(2)), Beta(half, half)]
+    )
+    theta = torch.tensor([[0.5, 0.5, 0.0], [0.5, 0.5, 1.0], [0.5, 2.0, -1.0]])
+    continued = ContinuedPrior(prior)
+    assert torch.isfinite(continued.log_prob(theta)).all()
+    nearest = continued.nearest(theta)
+    assert torch.isfinite(prior.log_prob(nearest)).all()
+    torch.testing.assert_close(nearest, theta.clamp(0, 1), atol=1e-3, rtol=0)
+
+
+def test_continued_prior_of_an_unbounded_prior_is_the_prior() -> None:
+    prior = MultivariateNormal(torch.zeros(2), torch.eye(2))
+    theta = 10 * torch.randn(5, 2)
+    torch.testing.assert_close(
+        ContinuedPrior(prior).log_prob(theta), prior.log_prob(theta)
+    )
+
+
+def test_prior_whose_support_is_no_box_is_refused() -> None:
+    with pytest.raises(InvalidInputError, match="support is a box"):
+        ContinuedPrior(Dirichlet(torch.ones(3)))
+
+
+def test_physics_sees_parameters_inside_the_support_alone() -> None:
+    prior = BoxUniform(-0.1 * torch.ones(2), 0.1 * torch.ones(2))
+    seen = []
+
+    def recorded(theta: Tensor) -> Tensor:
+        seen.append(theta.detach())
+        return theta @ A.T
+
+    model = linear_model()
+    model.prior, model.physics = ContinuedPrior(prior), recorded
+    assert torch.isfinite(model.elbo(EVIDENCE.sample((100,)))).all()
+    assert torch.isfinite(prior.log_prob(seen[0])).all()
+    assert (seen[0].abs() > 0.099).any()
+
+
+# --- the posterior ---
+
+
+def mixture(num_latents: int = 7) -> LatentMixture:
+    torch.manual_seed(0)
+    return LatentMixture(
+        linear_model(shift=1.0, noisy=True, r2p_std=0.3),
+        torch.randn(num_latents, 1),
+        torch.randn(num_latents, 4),
+        torch.Size((2,)),
+        torch.Size((4,)),
+    )
+
+
+def test_density_is_the_mean_over_all_draws_of_the_latent() -> None:
+    estimator = mixture()
+    x, theta = EVIDENCE.sample((3,)), torch.randn(5, 3, 2)
+    mean, log_variance = Encoder(1.0)(x)
+    expected = torch.zeros(5, 3)
+    for epsilon, eta in zip(estimator.z_noise, estimator.x_noise, strict=True):
+        z = mean + (0.5 * log_variance).exp() * epsilon
+        s = x - z @ B.T + 0.3 * eta
+        expected += LinearFlow().log_prob(theta, s).exp() / 7
+    torch.testing.assert_close(estimator.log_prob(theta, x), expected.log())
+    torch.testing.assert_close(estimator.log_prob(theta[0], x), expected[:1].log())
+    torch.testing.assert_close(estimator.loss(theta[0], x), -expected[0].log())
+
+
+def test_density_does_not_depend_on_how_it_is_cut(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    estimator = mixture()
+    x, theta = EVIDENCE.sample((11,)), torch.randn(5, 11, 2)
+    expected = estimator.log_prob(theta, x)
+    for entries, pairs in ((4, 1), (8, 10), (56, 20), (100, 100)):
+        module = "sbi_rope.baselines.hvae.estimator"
+        monkeypatch.setattr(f"{module}.MAX_ENTRIES", entries)
+        monkeypatch.setattr(f"{module}.flow_batch", lambda device, n=pairs: n)
+        torch.testing.assert_close(estimator.log_prob(theta, x), expected)
+        assert estimator.sample(torch.Size((3,)), x).shape == (3, 11, 2)
+
+
+def test_one_observation_serves_all_theta_and_one_theta_all_observations() -> None:
+    estimator = mixture()
+    x, theta = EVIDENCE.sample((3,)), torch.randn(5, 3, 2)
+    first = estimator.log_prob(theta, x[:1])
+    for i in range(3):
+        torch.testing.assert_close(
+            first[:, i], estimator.log_prob(theta[:, i : i + 1], x[:1])[:, 0]
+        )
+    torch.testing.assert_close(
+        estimator.log_prob(theta[:, :1], x),
+        estimator.log_prob(theta[:, :1].expand(-1, 3, -1), x),
+    )
+
+
+def test_density_integrates_to_one() -> None:
+    axis = torch.linspace(-6, 6, 241)
+    grid = torch.cartesian_prod(axis, axis)
+    x = EVIDENCE.sample((2,))
+    density = mixture().log_prob(grid[:, None].expand(-1, 2, -1), x).exp()
+    total = density.sum(dim=0) * (axis[1] - axis[0]) ** 2
+    torch.testing.assert_close(total, torch.ones(2), atol=1e-3, rtol=0)
+
+
+def test_samples_have_the_moments_and_the_mean_log_density_of_the_density() -> None:
+    estimator = mixture()
+    x = EVIDENCE.sample((2,))
+    torch.manual_seed(1)
+    samples = estimator.sample(torch.Size((20_000,)), x)
+    axis = torch.linspace(-6, 6, 241)
+    grid = torch.cartesian_prod(axis, axis)
+    log_density = estimator.log_prob(grid[:, None].expand(-1, 2, -1), x)
+    weights = log_density.exp() * (axis[1] - axis[0]) ** 2
+    mean = weights.T @ grid
+    torch.testing.assert_close(samples.mean(dim=0), mean, atol=0.02, rtol=0)
+    second = weights.T @ grid**2
+    torch.testing.assert_close((samples**2).mean(dim=0), second, atol=0.05, rtol=0)
+    entropy = -(weights * log_density).sum(dim=0)
+    estimate = -estimator.log_prob(samples, x).mean(dim=0)
+    torch.testing.assert_close(estimate, entropy, atol=0.03, rtol=0)
+
+
+# --- the method ---
+
+
+def physics(theta: Tensor) -> Tensor:
+    zero = torch.zeros_like(theta[:, :1])
+    return PendulumSimulator().position(theta, phase=zero, damping=zero)
+
+
+PRIOR = BoxUniform(torch.tensor([0.0, 0.5]), torch.tensor([3.0, 10.0]))
+SMALL = Training(
+    training_batch_size=50,
+    learning_rate=1e-3,
+    validation_fraction=0.2,
+    max_num_epochs=2,
+)
+
+
+def embedding_net(num_steps: int = 200) -> nn.Module:
+    return nn.Sequential(
+        nn.Linear(num_steps, 32), nn.ReLU(), nn.Linear(32, 32), nn.ReLU()
+    )
+
+
+def real(n: int, *, seed: int) -> tuple[Tensor, Tensor]:
+    torch.manual_seed(seed)
+    theta = PRIOR.sample((n,))
+    return theta, PendulumSimulator(max_damping=1.0)(theta)
+
+
+@pytest.fixture(scope="module")
+def npe() -> DirectPosterior:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        theta = PRIOR.sample((2000,))
+        builder = posterior_nn(
+            "maf",
+            embedding_net=embedding_net(),
+            z_score_x="structured",
+            num_transforms=2,
+        )
+        trainer = NPE(PRIOR, density_estimator=builder, show_progress_bars=False)
+        trainer.append_simulations(theta, PendulumSimulator()(theta))
+        trainer.train(max_num_epochs=10, training_batch_size=100, learning_rate=2e-3)
+        return trainer.build_posterior()
+
+
+def small(npe: Any, **options: Any) -> HVAE:
+    options = {
+        "physics": physics,
+        "width": 2,
+        "num_latents": 4,
+        "training": SMALL,
+        **options,
+    }
+    return HVAE.from_posterior(npe, **options)
+
+
+def trained(npe: Any, *, num_pairs: int = 20, seed: int = 0, **options: Any) -> HVAE:
+    method = small(npe, **options)
+    method.append_calibration(*real(num_pairs, seed=1))
+    method.append_observations(real(60, seed=2)[1])
+    return method.train(seed=seed, show_progress_bars=False)
+
+
+def scores(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:
+    return posterior.log_prob_batched(theta[None], x=x, norm_posterior=False)[0]
+
+
+def test_training_improves_on_npe_for_held_out_real_data(npe: Any) -> None:
+    training = Training(
+        training_batch_size=50,
+        learning_rate=3e-3,
+        validation_fraction=0.2,
+        max_num_epochs=10,
+    )
+    method = trained(npe, num_pairs=200, training=training)
+    theta, x = real(300, seed=3)
+    gain = scores(method.build_posterior(), theta, x) - scores(npe, theta, x)
+    standard_error = float(gain.std()) / math.sqrt(len(gain))
+    assert float(gain.mean()) > 3 * standard_error
+    history = method.history
+    assert history.kept_validation_loss < history.validation_loss[0]
+
+
+@pytest.fixture(scope="module")
+def posterior(npe: Any) -> Any:
+    return trained(npe).build_posterior()
+
+
+@pytest.mark.filterwarnings("ignore:Only 3 calibration")
+def test_npe_is_left_as_it_was_and_is_not_trained_inside_either(npe: Any) -> None:
+    before = copy.deepcopy(npe.posterior_estimator.state_dict())
+    # Chosen by the bound, which improves within an epoch.
+    method = trained(npe, num_pairs=3)
+    assert method.history.best_step > 0
+    estimator = method.build_posterior().posterior_estimator
+    for name, value in npe.posterior_estimator.state_dict().items():
+        torch.testing.assert_close(value, before[name], rtol=0, atol=0)
+    inside = headless(npe.posterior_estimator).state_dict()
+    for name, value in estimator.flow.state_dict().items():
+        torch.testing.assert_close(value, inside[name], rtol=0, atol=0)
+    for own, given in zip(
+        estimator.embedding.parameters(),
+        npe.posterior_estimator.embedding_net.parameters(),
+        strict=True,
+    ):
+        torch.testing.assert_close(own, given, rtol=0, atol=0)
+
+
+def test_posterior_is_one_of_sbi_with_the_shapes_of_the_data(posterior: Any) -> None:
+    theta, x = real(3, seed=3)
+    assert isinstance(posterior, DirectPosterior)
+    assert posterior.posterior_estimator.condition_shape == (200,)
+    log_prob = posterior.log_prob_batched(theta[None], x=x, norm_posterior=False)
+    assert log_prob.shape == (1, 3)
+    one = posterior.log_prob(theta[:1], x=x[:1], norm_posterior=False)
+    torch.testing.assert_close(one, log_prob[0, :1])
+    quiet = {"show_progress_bars": False, "reject_outside_prior": False}
+    assert posterior.sample((5,), x=x[:1], **quiet).shape == (5, 2)
+    assert posterior.sample_batched((5,), x=x, **quiet).shape == (5, 3, 2)
+
+
+@pytest.mark.filterwarnings("ignore:Only 3 calibration")
+def test_same_seed_gives_the_same_posterior_and_another_seed_another(npe: Any) -> None:
+    theta, x = real(5, seed=3)
+    # Chosen by the bound, which improves within an epoch.
+    methods = [trained(npe, num_pairs=3, seed=seed) for seed in (0, 0, 1)]
+    assert all(method.history.best_step > 0 for method in methods)
+    one, same, other = (scores(m.build_posterior(), theta, x) for m in methods)
+    torch.testing.assert_close(one, same, rtol=0, atol=0)
+    assert (one != other).any()
+
+
+def test_posterior_survives_pickling(posterior: Any) -> None:
+    theta, x = real(5, seed=3)
+    restored = pickle.loads(pickle.dumps(posterior))
+    torch.testing.assert_close(scores(restored, theta, x), scores(posterior, theta, x))
+
+
+def test_npe_is_trained_on_simulations_if_none_is_given() -> None:
+    method = HVAE(
+        PRIOR,
+        posterior_nn("maf", embedding_net=embedding_net(), num_transforms=1),
+        physics=physics,
+        npe_training=Training(max_num_epochs=1),
+        training=SMALL,
+        width=2,
+        num_latents=4,
+    )
+    method.append_calibration(*real(10, seed=1))
+    method.append_observations(real(20, seed=2)[1])
+    with pytest.raises(NotReadyError, match="append_simulations"):
+        method.train(seed=0)
+    theta = PRIOR.sample((100,))
+    method.append_simulations(theta, PendulumSimulator()(theta))
+    posterior = method.train(seed=0, show_progress_bars=False).build_posterior()
+    assert torch.isfinite(scores(posterior, *real(5, seed=3))).all()
+
+
+def test_few_pairs_are_all_trained_on_and_observations_are_held_out(npe: Any) -> None:
+    with pytest.warns(RoPEWarning, match="3 calibration pair"):
+        method = trained(npe, num_pairs=3)
+    assert len(method.history.validation_loss) == SMALL.max_num_epochs + 1
+
+
+@pytest.mark.parametrize("name", ["zuko_unaf", "zuko_nsf"])
+def test_training_runs_on_flows_of_zuko(name: str) -> None:
+    method = HVAE(
+        PRIOR,
+        posterior_nn(name, embedding_net=embedding_net(), num_transforms=1),
+        physics=physics,
+        npe_training=Training(max_num_epochs=1),
+        training=SMALL,
+        width=2,
+        num_latents=4,
+    )
+    theta = PRIOR.sample((50,))
+    method.append_simulations(theta, PendulumSimulator()(theta))
+    method.append_calibration(*real(10, seed=1))
+    method.append_observations(real(20, seed=2)[1])
+    posterior = method.train(seed=0, show_progress_bars=False).build_posterior()
+    assert torch.isfinite(scores(posterior, *real(5, seed=3))).all()
+
+
+def test_images_are_supported() -> None:
+    prior = BoxUniform(torch.zeros(3), torch.ones(3))
+
+    def picture(theta: Tensor) -> Tensor:
+        square = torch.zeros(20, 17)
+        square[5:12, 3:9] = 1.0
+        return theta[:, :, None, None] * square
+
+    net = nn.Sequential(nn.AvgPool2d(4), nn.Flatten(), nn.LazyLinear(8))
+    net(torch.zeros(1, 3, 20, 17))
+    method = HVAE(
+        prior,
+        posterior_nn("maf", embedding_net=net, num_transforms=1, z_score_x="none"),
+        physics=picture,
+        npe_training=Training(max_num_epochs=1),
+        training=SMALL,
+        width=2,
+        num_latents=4,
+    )
+    theta = prior.sample((60,))
+    noise = 0.1 * torch.randn(60, 3, 20, 17)
+    method.append_simulations(theta, picture(theta) + noise)
+    method.append_calibration(theta[:10], 0.5 * picture(theta[:10]))
+    method.append_observations(0.5 * picture(theta[10:]))
+    posterior = method.train(seed=0, show_progress_bars=False).build_posterior()
+    x = 0.5 * picture(theta[:5])
+    assert torch.isfinite(scores(posterior, theta[:5], x)).all()
+    assert posterior.posterior_estimator.condition_shape == (3, 20, 17)
+
+
+# --- errors ---
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"physics": None}, "`physics` to be callable"),
+        ({"width": 0}, "width"),
+        ({"latent_dim": 0}, "latent_dim"),
+        ({"num_latents": 0}, "num_latents"),
+        ({"calibration_weight": -1.0}, "calibration_weight"),
+        ({"training": 3}, "training"),
+    ],
+)
+def test_bad_options_are_refused(
+    npe: Any, options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises((InvalidInputError, InvalidTypeError), match=message):
+        small(npe, **options)
+
+
+@pytest.mark.parametrize(
+    ("broken", "message"),
+    [
+        (lambda theta: physics(theta)[:, :100], r"shape \(n, 200\)"),
+        (lambda theta: physics(theta).detach(), "differentiable"),
+        (lambda theta: physics(theta).log(), "finite"),
+        (lambda theta: None, "torch.Tensor"),
+    ],
+)
+def test_physics_that_is_of_no_use_is_refused_before_training(
+    npe: Any, broken: Callable[[Tensor], Any], message: str
+) -> None:
+    method = small(npe, physics=broken)
+    method.append_calibration(*real(10, seed=1))
+    method.append_observations(real(10, seed=2)[1])
+    with pytest.raises((InvalidInputError, InvalidTypeError), match=message):
+        method.train(seed=0)
+
+
+def test_statistics_instead_of_series_are_refused_before_training() -> None:
+    method = HVAE(PRIOR, physics=physics)
+    x, theta = torch.randn(30, 6), PRIOR.sample((30,))
+    method.append_simulations(theta, x)
+    method.append_calibration(theta, x).append_observations(x)
+    with pytest.raises(InvalidInputError, match="at least 16 steps"):
+        method.train(seed=0)
+
+
+@pytest.mark.parametrize("missing", ["calibration", "observations"])
+def test_both_kinds_of_real_data_are_needed(npe: Any, missing: str) -> None:
+    method = small(npe)
+    if missing == "calibration":
+        method.append_observations(real(10, seed=2)[1])
+    else:
+        method.append_calibration(*real(10, seed=1))
+    with pytest.raises(NotReadyError, match=f"append_{missing}"):
+        method.train(seed=0)
+
+
+def test_mixture_density_networks_are_refused() -> None:
+    method = HVAE(
+        PRIOR,
+        "mdn",
+        physics=physics,
+        npe_training=Training(max_num_epochs=1),
+        training=SMALL,
+    )
+    theta = PRIOR.sample((50,))
+    method.append_simulations(theta, PendulumSimulator()(theta))
+    method.append_calibration(*real(10, seed=1))
+    method.append_observations(real(20, seed=2)[1])
+    with pytest.raises(UnsupportedPosteriorError, match="'nsf'"):
+        method.train(seed=0, show_progress_bars=False)

@@ -1,0 +1,165 @@
+"""The U-Net and the encoder of the HVAE."""
+
+import pytest
+import torch
+from torch import nn
+
+from sbi_rope.baselines.hvae.networks import (
+    ConditionalUNet,
+    LatentEncoder,
+    bounded,
+    check_event_shape,
+)
+from sbi_rope.errors import InvalidInputError
+
+EVENTS = [(200,), (100,), (50,), (16,), (3, 100, 100), (3, 64, 64), (1, 17, 40)]
+
+
+def trained_like(net: nn.Module) -> nn.Module:
+    """Give every parameter a value, also those that start at zero."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        for parameter in net.parameters():
+            if not parameter.any():
+                nn.init.normal_(parameter, std=0.3)
+    return net.eval()
+
+
+@pytest.mark.parametrize("event", EVENTS)
+def test_mean_and_log_variance_have_the_shape_of_the_data(
+    event: tuple[int, ...],
+) -> None:
+    net = ConditionalUNet(event, 5, width=2)
+    mean, log_variance = net(torch.randn(3, *event), torch.randn(3, 5))
+    assert mean.shape == log_variance.shape == (3, *event)
+
+
+@pytest.mark.parametrize("event", [(50,), (3, 20, 33)])
+@pytest.mark.parametrize("output", [0, 1])
+def test_every_latent_reaches_nearly_every_entry_of_both_outputs(
+    event: tuple[int, ...], output: int
+) -> None:
+    torch.manual_seed(0)
+    net = trained_like(ConditionalUNet(event, 5, width=4)).double()
+    x, z = torch.randn(1, *event).double(), torch.randn(1, 5).double()
+    before = net(x, z)[output]
+    for k in range(5):
+        moved = z + torch.eye(5)[k]
+        # Some ReLUs are shut.
+        assert (net(x, moved)[output] != before).double().mean() > 0.95
+
+
+def test_several_latents_of_one_x_are_the_same_as_one_at_a_time() -> None:
+    torch.manual_seed(0)
+    net = trained_like(ConditionalUNet((50,), 5, width=4))
+    x, z = torch.randn(3, 50), torch.randn(3 * 4, 5)
+    together = net(x, z)
+    for i in range(12):
+        alone = net(x[i // 4 : i // 4 + 1], z[i : i + 1])
+        torch.testing.assert_close(together[0][i], alone[0][0])
+        torch.testing.assert_close(together[1][i], alone[1][0])
+
+
+def test_residual_net_starts_as_the_identity_at_the_given_variance() -> None:
+    std = torch.tensor([2.0, 3.0])
+    net = ConditionalUNet(
+        (2, 20, 20), 5, width=4, mean=torch.ones(2), std=std, log_variance=-4.0
+    )
+    x = torch.randn(3, 2, 20, 20)
+    mean, log_variance = net(x, torch.randn(3, 5))
+    torch.testing.assert_close(mean, x)
+    expected = bounded(torch.tensor(-4.0)) + 2 * std.log()
+    torch.testing.assert_close(log_variance[0, :, 0, 0], expected)
+
+
+@pytest.mark.parametrize("residual", [True, False])
+def test_outputs_follow_the_units_of_the_data(residual: bool) -> None:
+    nets = []
+    for mean, std in ((0.0, 1.0), (5.0, 10.0)):
+        torch.manual_seed(0)
+        moments = {"mean": torch.tensor([mean]), "std": torch.tensor([std])}
+        net = ConditionalUNet((40,), 2, width=4, residual=residual, **moments)
+        nets.append(trained_like(net))
+    x, z = torch.randn(3, 40), torch.randn(3, 2)
+    mean, log_variance = nets[0](x, z)
+    scaled_mean, scaled_log_variance = nets[1](5.0 + 10.0 * x, z)
+    torch.testing.assert_close(scaled_mean, 5.0 + 10.0 * mean)
+    expected = log_variance + 2 * torch.tensor(10.0).log()
+    torch.testing.assert_close(scaled_log_variance, expected)
+
+
+def test_padding_repeats_the_last_value() -> None:
+    torch.manual_seed(0)
+    short = trained_like(ConditionalUNet((50,), 2, width=4))
+    long = ConditionalUNet((64,), 2, width=4)
+    long.load_state_dict(short.state_dict())
+    long.eval()
+    x, z = torch.randn(3, 50), torch.randn(3, 2)
+    extended = torch.cat([x, x[:, -1:].expand(-1, 14)], dim=1)
+    torch.testing.assert_close(short(x, z)[0], long(extended, z)[0][:, :50])
+
+
+def test_channels_double_four_times_from_the_width() -> None:
+    net = ConditionalUNet((3, 32, 32), 5, width=64)
+    state = net.state_dict()
+    sizes = [state[f"down.{i}.0.weight"].shape[0] for i in range(5)]
+    assert sizes == [64, 128, 256, 512, 1024]
+    assert [state[f"enlarge.{i}.weight"].shape[:2] for i in range(4)] == [
+        (1029, 512),
+        (512, 256),
+        (256, 128),
+        (128, 64),
+    ]
+
+
+@pytest.mark.parametrize("event", [(15,), (3, 15, 100), (20, 20), ()])
+def test_events_that_are_too_short_or_no_series_or_image_are_refused(
+    event: tuple[int, ...],
+) -> None:
+    with pytest.raises(InvalidInputError, match="series of at least 16 steps"):
+        check_event_shape(event)
+
+
+def test_log_variances_are_bounded_and_nearly_unchanged_about_zero() -> None:
+    values = torch.tensor([-1e6, -1.0, 0.0, 1.0, 1e6])
+    result = bounded(values)
+    torch.testing.assert_close(result[[0, -1]], torch.tensor([-10.0, 10.0]))
+    torch.testing.assert_close(result[1:-1], values[1:-1], atol=4e-3, rtol=0)
+
+
+@pytest.mark.parametrize(
+    "embedding", [nn.Flatten(), nn.Sequential(nn.Flatten(), nn.Linear(48, 7))]
+)
+def test_encoder_is_trainable_and_leaves_the_embedding_net_alone(
+    embedding: nn.Module,
+) -> None:
+    embedding.requires_grad_(False)
+    before = [p.clone() for p in embedding.parameters()]
+    x = torch.randn(6, 3, 16)
+    encoder = LatentEncoder(embedding, 5, x)
+    mean, log_variance = encoder(x)
+    assert mean.shape == log_variance.shape == (6, 5)
+    optimizer = torch.optim.Adam(encoder.parameters(), lr=0.1)
+    (mean.square().sum() + log_variance.sum()).backward()
+    assert all(p.grad is not None and p.grad.any() for p in encoder.parameters())
+    optimizer.step()
+    for old, new in zip(before, embedding.parameters(), strict=True):
+        torch.testing.assert_close(old, new, rtol=0, atol=0)
+
+
+def test_encoder_starts_anew_but_keeps_what_is_not_learnt() -> None:
+    class Own(nn.Linear):
+        def reset_parameters(self) -> None:
+            nn.init.constant_(self.weight, 7.0)
+            nn.init.zeros_(self.bias)
+
+    fixed = nn.Identity()
+    fixed.register_buffer("scale", torch.full((4,), 3.0))
+    embedding = nn.Sequential(nn.Linear(48, 4), fixed, Own(4, 4))
+    given = embedding[0].weight.clone()
+    nn.init.zeros_(embedding[2].weight)
+    torch.manual_seed(0)
+    start = LatentEncoder(embedding, 5, torch.randn(6, 48)).embedding
+    assert (start[0].weight != given).all()
+    assert (start[2].weight == 7.0).all()
+    assert (start[1].scale == 3.0).all()
