@@ -31,7 +31,8 @@ class History:
     """The course of a training, for plotting.
 
     A step is a gradient step over all pairs for ``CalibrationFinetuner``, and a pass
-    over the data for the baselines.
+    over the data for the baselines. What sbi's trainers report starts after the first
+    pass, which is step 0 then.
 
     Attributes:
         training_loss: Mean loss over the training data during each step, and after the
@@ -50,8 +51,9 @@ class History:
 
     @property
     def kept_validation_loss(self) -> float:
-        """The validation loss of the kept net; 0 without a hold-out."""
-        return self.validation_loss[self.best_step] if self.validation_loss else 0.0
+        """The validation loss of the kept net; 0 without a hold-out, inf for NaN."""
+        loss = self.validation_loss[self.best_step] if self.validation_loss else 0.0
+        return math.inf if math.isnan(loss) else loss
 
     def __repr__(self) -> str:
         loss, what = self.validation_loss, "validation_loss"
@@ -150,8 +152,8 @@ def fit(
             module.eval()
             with torch.no_grad():
                 held_out_loss.append(float(validation_loss()))
-        improved = (
-            validation_loss is None or held_out_loss[-1] < held_out_loss[best_step]
+        improved = validation_loss is None or _is_below(
+            held_out_loss[-1], held_out_loss[best_step]
         )
         state = copy.deepcopy(module.state_dict()) if improved else best_state
         newest = step if improved else best_step
@@ -175,3 +177,8 @@ def fit(
     module.load_state_dict(best_state)
     module.eval()
     return History(training_loss, held_out_loss, best_step, learning_rate)
+
+
+def _is_below(loss: float, best: float) -> bool:
+    """Whether a loss is an improvement; any number improves on NaN."""
+    return not math.isnan(loss) and not best <= loss

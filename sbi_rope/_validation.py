@@ -103,12 +103,19 @@ def check_instance(
 
 
 def check_prior(prior: Any) -> None:
-    """Raise unless the prior is a torch distribution."""
+    """Raise unless the prior is a torch distribution over vectors."""
     if not isinstance(prior, Distribution):
         raise InvalidTypeError(
             f"Expected `prior` to be a torch distribution; got "
             f"{type(prior).__name__}. Wrap it with "
             f"`sbi.utils.process_prior(prior)[0]`."
+        )
+    if len(prior.event_shape) != 1:
+        raise InvalidInputError(
+            "Expected a `prior` over vectors, event shape (k,); got event shape "
+            f"{tuple(prior.event_shape)}. Wrap several in "
+            "`sbi.utils.MultipleIndependent`, or torch's own in "
+            "`torch.distributions.Independent(prior, 1)`."
         )
 
 

@@ -354,22 +354,21 @@ class RoPE:
             show_progress_bars=show_progress_bars,
         )
         coupler = self.coupler if coupler is None else coupler
+        gammas, taus = list(gammas), list(taus)
         couplings = coupler.sweep(
             batch.real, batch.simulated, gammas=gammas, taus=taus, seed=seed
         )
 
         def posteriors() -> Iterator[MixturePosterior]:
             settings = itertools.product(gammas, taus)
-            first = None
+            # In our hands: moving a posterior to a device gives it another.
+            shared: dict[str, Tensor] = {}
             for coupling, (gamma, tau) in zip(couplings, settings, strict=True):
                 if require_convergence:
                     _check_converged(coupling, replace(coupler, gamma=gamma, tau=tau))
-                posterior = self._mixture(
-                    batch, coupling, unseen=unseen, tail_mass=tail_mass
+                yield self._mixture(
+                    batch, coupling, unseen=unseen, tail_mass=tail_mass, shared=shared
                 )
-                first = posterior if first is None else first
-                posterior.share_component_mass(first)
-                yield posterior
 
         return posteriors()
 
@@ -408,6 +407,7 @@ class RoPE:
         *,
         unseen: Literal["raise", "extend"],
         tail_mass: float,
+        shared: dict[str, Tensor] | None = None,
     ) -> MixturePosterior:
         mixture = MixtureEstimator(
             copy.deepcopy(self._components()),
@@ -422,6 +422,7 @@ class RoPE:
             mixture,
             copy.deepcopy(self._prior),
             enable_transform=self._posterior.enable_transform,
+            shared=shared,
         )
 
     def tuned_posterior(self) -> Any:

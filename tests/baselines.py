@@ -188,8 +188,9 @@ def first_task(name: str) -> str:
 
 def feed(method: Method, data: Data, *, without: type[Method] | None = None) -> Method:
     """Append all that a method may see, leaving out one part."""
-    if isinstance(method, UsesSimulations) and without is not UsesSimulations:
-        method.append_simulations(data.theta, data.x)
+    wants = isinstance(method, UsesSimulations) and method.needs_simulations
+    if wants and without is not UsesSimulations:
+        method.append_simulations(data.theta, data.x)  # type: ignore[attr-defined]
     if isinstance(method, UsesCalibration) and without is not UsesCalibration:
         method.append_calibration(data.theta_cal, data.x_cal)
     if isinstance(method, UsesObservations) and without is not UsesObservations:

@@ -71,6 +71,11 @@ class Method(ABC):
         self._device = torch.device(device)
         if hasattr(self._prior, "to"):
             self._prior.to(self._device)  # type: ignore[attr-defined]
+        elif self._device.type != "cpu":
+            raise InvalidInputError(
+                f"Cannot move the prior to {device}: a {type(prior).__name__} has no "
+                "method `to`. Use a prior of sbi, such as BoxUniform."
+            )
         self._event_shape: torch.Size | None = None
         self._posterior: Any = None
         self._history: History | None = None
@@ -189,6 +194,11 @@ class UsesSimulations(Method):
             InvalidInputError: If shapes or row counts do not fit, or a theta is not in
                 the support of the prior. Nothing is added then.
         """
+        if not self.needs_simulations:
+            warn_user(
+                f"{type(self).__name__} starts from a trained posterior and makes no "
+                "use of simulations."
+            )
         theta = self._checked_theta("theta", theta)
         check_in_support("theta", theta, self._prior)
         x = self._checked_x("x", x, finite=False)
@@ -213,12 +223,13 @@ class UsesSimulations(Method):
         return self._theta, self._x
 
     @property
-    def _can_do_without_simulations(self) -> bool:
-        return False
+    def needs_simulations(self) -> bool:
+        """Whether simulations must be appended before the training."""
+        return True
 
     def _check_data(self) -> None:
         super()._check_data()
-        if not self._can_do_without_simulations:
+        if self.needs_simulations:
             self._needs("simulations", len(self._theta), "append_simulations(theta, x)")
 
 
@@ -336,14 +347,23 @@ class BuildsOnNPE(UsesSimulations):
         Args:
             posterior: What ``NPE(...).build_posterior()`` of sbi returns. It is copied
                 and never changed.
-            **options: Keyword arguments of the constructor, except for ``device``.
+            **options: Keyword arguments of the constructor, except for ``device`` and
+                what concerns the training of NPE.
 
         Returns:
-            The method, which needs no simulations then unless it says otherwise.
+            The method. If its ``needs_simulations`` is False, simulations that are
+            appended have no effect, and earn a warning.
 
         Raises:
             UnsupportedPosteriorError: If it is not a plain amortised posterior.
+            InvalidInputError: If an option would have no effect.
         """
+        for name in ("density_estimator", "npe_training"):
+            if name in options:
+                raise InvalidInputError(
+                    f"Expected no `{name}` beside a trained posterior; it would have "
+                    "no effect."
+                )
         estimator = estimator_of(posterior)
         method = cls(posterior.prior, device=device_of(estimator), **options)
         method._npe = posterior_from(posterior, copy.deepcopy(estimator))
@@ -351,8 +371,9 @@ class BuildsOnNPE(UsesSimulations):
         return method
 
     @property
-    def _can_do_without_simulations(self) -> bool:
-        return self._npe is not None
+    def needs_simulations(self) -> bool:
+        """Whether there is something to train or to look up on simulations."""
+        return self._npe is None
 
     def _trained_npe(self, *, show_progress_bars: bool) -> tuple[Any, History | None]:
         if self._npe is not None:

@@ -1,6 +1,5 @@
 """A network from real observations to a Gaussian over parameters, without simulator."""
 
-import copy
 import math
 from typing import Any
 
@@ -8,10 +7,11 @@ import torch
 from torch import Tensor, nn
 
 from sbi_rope._random import seeded
-from sbi_rope._sbi import ConditionalDensityEstimator, embed, embedding_of
+from sbi_rope._sbi import ConditionalDensityEstimator, embedding_of
 from sbi_rope._training import History, split_pairs
 from sbi_rope._validation import check_instance
 from sbi_rope.baselines.base import UsesCalibration
+from sbi_rope.baselines.networks import embedding_with_head
 from sbi_rope.baselines.training import (
     EstimatorBuilder,
     Training,
@@ -29,8 +29,6 @@ DEFAULT_TRAINING = Training(
     stop_after_epochs=200,
     max_num_epochs=2000,
 )
-# Hidden layers where the estimator has no embedding net of its own.
-HIDDEN = 64
 # Draws that stand in for the moments of a prior that does not know them.
 NUM_DRAWS = 10_000
 
@@ -95,14 +93,16 @@ class CalibrationMLP(UsesCalibration):
         \min_{\mu, \sigma}\; \sum_i -\log \mathcal{N}\bigl(\theta_i;\, \mu(x_{o,i}),\,
         \operatorname{diag} \sigma^2(x_{o,i})\bigr)
 
-    The network is the embedding net of the density estimator, untrained, with linear
-    outputs for mean and log-variance; where the estimator has no embedding net, one
-    with two hidden layers of 64 units. Parameters are standardised by the prior.
-    A part of the pairs is held out and the best network on them is kept.
+    The network is the embedding net of the density estimator, its parameters drawn
+    anew, with linear outputs for mean and log-variance; where the estimator has no
+    embedding net, one with two hidden layers of 64 units. Parameters are standardised
+    by the prior. A part of the pairs is held out and the best network on them is kept.
 
     Sees the calibration set alone. Assumes nothing of the simulator and that the
     posterior is about Gaussian. Says what the labels are worth without a simulator: a
-    method that uses one and does worse is not worth its simulations.
+    method that uses one and does worse is not worth its simulations. With few pairs its
+    mean log-probability can hang on one observation unlike all of them, where the
+    network is sure of something wrong; the median tells more then.
 
     Where this differs from the paper: neither number of steps, batch size nor scaling
     of the parameters is stated there.
@@ -162,21 +162,9 @@ class CalibrationMLP(UsesCalibration):
 
     def _gaussian(self, theta: Tensor, x: Tensor) -> DiagonalGaussian:
         theta, x = theta.cpu(), x.cpu()
-        embedding = copy.deepcopy(embedding_of(self._build(theta, x)))
-        width = embed(embedding, x[:1]).flatten(1).shape[1]
-        outputs = 2 * theta.shape[1]
-        if any(True for _ in embedding.parameters()):
-            head: nn.Module = nn.Linear(width, outputs)
-        else:
-            head = nn.Sequential(
-                nn.Linear(width, HIDDEN),
-                nn.ReLU(),
-                nn.Linear(HIDDEN, HIDDEN),
-                nn.ReLU(),
-                nn.Linear(HIDDEN, outputs),
-            )
+        embedding = embedding_of(self._build(theta, x))
+        net = embedding_with_head(embedding, 2 * theta.shape[1], x)
         mean, std = self._prior_moments()
-        net = nn.Sequential(embedding, nn.Flatten(), head)
         return DiagonalGaussian(net, mean, std, x.shape[1:])
 
     def _prior_moments(self) -> tuple[Tensor, Tensor]:

@@ -109,8 +109,9 @@ class NNPE(BuildsOnNPE):
         self.training = Training() if training is None else training
 
     @property
-    def _can_do_without_simulations(self) -> bool:
-        return False
+    def needs_simulations(self) -> bool:
+        """Always: it trains on their statistics."""
+        return True
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
@@ -132,13 +133,16 @@ class NNPE(BuildsOnNPE):
                 scale=clip.std,
             ),
             self._prior,
-            lambda theta, x: density,
+            # sbi tries it on the CPU, and moves it to the data's device.
+            lambda theta, x: density.cpu(),
             theta,
             statistics,
             training=self.training,
             show_progress_bars=show_progress_bars,
         )
+        # It shares its parameters with the estimator, on whatever device.
         density.load_state_dict(trained.state_dict())
+        estimator = estimator.to(self._device)
         return posterior_from(npe, estimator.eval()), history
 
 

@@ -71,8 +71,9 @@ class OTOnly(BuildsOnNPE, UsesObservations):
         self.num_simulations = num_simulations
 
     @property
-    def _can_do_without_simulations(self) -> bool:
-        return self._npe is not None and self._simulator is not None
+    def needs_simulations(self) -> bool:
+        """Whether there is something to train or to look up on simulations."""
+        return self._npe is None or self._simulator is None
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[MixturePosterior, Any]:
         npe, history = self._trained_npe(show_progress_bars=show_progress_bars)

@@ -256,8 +256,9 @@ class RNPE(BuildsOnNPE):
         self.training = Training() if training is None else training
 
     @property
-    def _can_do_without_simulations(self) -> bool:
-        return False
+    def needs_simulations(self) -> bool:
+        """Always: it trains on their statistics."""
+        return True
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)

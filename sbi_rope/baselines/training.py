@@ -46,7 +46,8 @@ class Training:
         validation_fraction: Share of the data that is held out.
         stop_after_epochs: Epochs without improvement on the held-out data after which
             to stop.
-        max_num_epochs: Most passes over the training data.
+        max_num_epochs: Most passes over the training data; sbi's trainers make two at
+            least.
         clip_max_norm: Largest norm of a gradient; None does not clip.
 
     Raises:
@@ -194,7 +195,10 @@ def train_with_sbi(
     )
     with quiet:
         trainer.append_simulations(theta, x)
-        estimator = trainer.train(**asdict(training))
+        # sbi trains one epoch more than it is told, and at least two.
+        options: dict[str, Any] = asdict(training)
+        options["max_num_epochs"] = max(1, training.max_num_epochs - 1)
+        estimator = trainer.train(**options)
     losses = trainer.summary["validation_loss"]
     best = min(range(len(losses)), key=losses.__getitem__)
     history = History(

@@ -61,6 +61,8 @@ class MixturePosterior(DirectPosterior):
         estimator: The mixture.
         prior: The prior NPE was trained with.
         enable_transform: As in sbi, for ``map()``.
+        shared: What posteriors of the same components, simulations and prior, with
+            other couplings, share: each leaves there what it has estimated of them.
     """
 
     # Read by `metrics`: this posterior normalises and rejects in bounded time.
@@ -74,6 +76,7 @@ class MixturePosterior(DirectPosterior):
         prior: Distribution,
         *,
         enable_transform: bool = True,
+        shared: dict[str, Tensor] | None = None,
     ) -> None:
         with seeded(0):  # sbi draws from the prior to look at it
             super().__init__(
@@ -84,7 +87,7 @@ class MixturePosterior(DirectPosterior):
             )
         self.posterior_estimator: MixtureEstimator = estimator
         # Shared with the views of single observations, so that it is estimated once.
-        self._cache: dict[str, Tensor] = {}
+        self._cache: dict[str, Tensor] = {} if shared is None else shared
         self._purpose = (
             f"It is the mixture of {len(estimator.contexts)} simulated posteriors for "
             f"each of {len(estimator.x_o)} real observations."
@@ -339,15 +342,6 @@ class MixturePosterior(DirectPosterior):
             )
         rows = (weights for _, weights in estimator.row_blocks(features))
         return mixture_mass(self._cache["component_mass"], rows, exact=exact)
-
-    def share_component_mass(self, other: "MixturePosterior") -> None:
-        """Estimate the masses :math:`Z_j` once for two posteriors.
-
-        Args:
-            other: A posterior with the same components, simulations and prior, and
-                another coupling.
-        """
-        self._cache = other._cache
 
     def leakage_correction(  # type: ignore[override]
         self, x: Tensor, **kwargs: Any

@@ -69,9 +69,16 @@ class ImageEmbedding(nn.Module):
         return self.head(self.features(check_batch("x", x, shape, finite=False)))
 
 
+class _LastConvolution(nn.Conv2d):
+    """A convolution whose biases start, and start again, above zero."""
+
+    def reset_parameters(self) -> None:
+        """Draw the weights; set the biases."""
+        super().reset_parameters()
+        nn.init.constant_(self.bias, LAST_BIAS)  # type: ignore[arg-type]
+
+
 def _convolutions() -> nn.Sequential:
-    last = nn.Conv2d(64, 3, 1)
-    nn.init.constant_(last.bias, LAST_BIAS)  # type: ignore[arg-type]
     return nn.Sequential(
         nn.Conv2d(3, 64, 3, stride=2),
         nn.ReLU(),
@@ -82,7 +89,7 @@ def _convolutions() -> nn.Sequential:
         nn.ReLU(),
         nn.Conv2d(128, 64, 1),
         nn.ReLU(),
-        last,
+        _LastConvolution(64, 3, 1),
         nn.ReLU(),
         nn.Flatten(),
     )

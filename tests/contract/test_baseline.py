@@ -656,7 +656,8 @@ BUILDERS = names_that_see(BuildsOnNPE)
 def given(name: str, posterior: Any) -> Any:
     """A method that starts from a trained posterior."""
     task = first_task(name)
-    options = METHODS[name].options(task_of(task))
+    options = dict(METHODS[name].options(task_of(task)))
+    options.pop("npe_training")
     return METHODS[name].kind.from_posterior(posterior, **options)  # type: ignore[attr-defined]
 
 
@@ -694,6 +695,29 @@ def test_a_posterior_trained_beforehand_fixes_the_shape_of_x(name: str) -> None:
     )
     with pytest.raises(InvalidInputError, match=r"`x` of shape"):
         method.append_simulations(data.theta, torch.cat([data.x, data.x], dim=-1))
+
+
+@pytest.mark.parametrize("name", BUILDERS)
+@pytest.mark.parametrize("option", ["density_estimator", "npe_training"])
+def test_options_without_effect_beside_a_trained_posterior_are_refused(
+    name: str, option: str
+) -> None:
+    posterior = result("npe", first_task(name))
+    with pytest.raises(InvalidInputError, match=f"`{option}`"):
+        METHODS[name].kind.from_posterior(posterior, **{option: None})  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("name", BUILDERS)
+def test_simulations_that_are_not_needed_earn_a_warning(name: str) -> None:
+    data, method = (
+        data_of(first_task(name)),
+        given(name, result("npe", first_task(name))),
+    )
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        method.append_simulations(data.theta, data.x)
+    warned = any("makes no use of simulations" in str(w.message) for w in caught)
+    assert warned is not method.needs_simulations
 
 
 @pytest.mark.parametrize("name", BUILDERS)

@@ -159,7 +159,7 @@ def test_encoder_starts_anew_but_keeps_what_is_not_learnt() -> None:
     given = embedding[0].weight.clone()
     nn.init.zeros_(embedding[2].weight)
     torch.manual_seed(0)
-    start = LatentEncoder(embedding, 5, torch.randn(6, 48)).embedding
+    start = LatentEncoder(embedding, 5, torch.randn(6, 48)).net[0]
     assert (start[0].weight != given).all()
     assert (start[2].weight == 7.0).all()
     assert (start[1].scale == 3.0).all()

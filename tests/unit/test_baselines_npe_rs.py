@@ -300,7 +300,7 @@ def test_each_step_draws_anew_from_all_simulations_and_observations() -> None:
         num_mmd_simulations=30,
         num_mmd_observations=40,
     )
-    num_steps = 11 * 9  # sbi runs one epoch more than it is told
+    num_steps = 10 * 9
     assert len(Recorder.seen) == 2 * num_steps
     for seen, size, total in [(0, 30, 100), (1, 40, 200)]:
         steps = Recorder.seen[seen::2]

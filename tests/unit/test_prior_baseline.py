@@ -10,7 +10,7 @@ from sbi.utils import BoxUniform, MultipleIndependent
 from torch.distributions import Distribution, Exponential, Independent, Normal
 
 from sbi_rope.baselines import PriorPosterior
-from sbi_rope.errors import InvalidTypeError
+from sbi_rope.errors import InvalidInputError, InvalidTypeError
 from sbi_rope.metrics import acauc, evaluate
 
 
@@ -132,3 +132,9 @@ def test_a_prior_of_independent_parts_can_be_drawn_and_evaluated_in_batches() ->
     assert posterior.sample((2, 4)).shape == (2, 4, 3)
     expected = Normal(0.0, 1.0).log_prob(theta[0, ..., 2]) - math.log(4)
     assert torch.allclose(posterior.log_prob_batched(theta[0], x), expected)
+
+
+def test_a_prior_over_numbers_instead_of_vectors_is_refused() -> None:
+    prior = torch.distributions.Uniform(torch.zeros(2), torch.ones(2))
+    with pytest.raises(InvalidInputError, match=r"event shape \(k,\)"):
+        PriorPosterior(prior)

@@ -21,7 +21,7 @@ from sbi_rope.errors import (
     RoPEWarning,
     SimulationError,
 )
-from tests import gaussian
+from tests import gaussian, problems
 
 QUICK = CalibrationFinetuner(num_steps=20)
 
@@ -620,3 +620,20 @@ def test_a_sweep_refuses_what_a_single_coupling_refuses() -> None:
     posteriors = conductor.sweep(X_O, gammas=(0.01,), taus=(1.0,), coupler=coupler)
     with pytest.raises(CouplingError, match=r"now 0\.01"):
         next(posteriors)
+
+
+def test_a_posterior_of_a_sweep_can_be_moved_without_the_others() -> None:
+    conductor = RoPE(problems.npe_posterior(), simulator=problems.simulate)
+    x_o, theta = 0.3 * torch.randn(30, 3), torch.rand(30, 2) - 0.5
+    settings = {"gammas": iter((0.5, 0.1)), "taus": (1.0,), "seed": 3}
+    posteriors = conductor.sweep(x_o, **settings)  # type: ignore[arg-type]
+    first = next(posteriors)
+    first.log_prob_batched(theta, x_o)
+    first.to("cpu")
+    second = next(posteriors)
+    # What was moved belongs to the first alone.
+    first._cache["component_mass"] = 0.5 * first._cache["component_mass"]
+    coupler = SinkhornCoupler(gamma=0.1)
+    expected = conductor.build_posterior(x_o, coupler=coupler, seed=3)
+    ours, theirs = (p.log_prob_batched(theta, x_o) for p in (second, expected))
+    assert torch.allclose(ours, theirs, atol=1e-3)

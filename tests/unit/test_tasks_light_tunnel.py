@@ -382,7 +382,9 @@ def test_layers_of_the_network_are_those_of_the_paper() -> None:
     ]
     once = [nn.Conv2d, nn.ReLU]
     expected = [*once, *once, nn.MaxPool2d, *once, *once, *once, nn.Flatten]
-    assert [type(layer) for layer in net.features] == expected
+    assert len(net.features) == len(expected)
+    for layer, kind in zip(net.features, expected, strict=True):
+        assert isinstance(layer, kind)
     assert net.features[4].kernel_size == 3
     linear = [
         (m.in_features, m.out_features)

@@ -1,14 +1,13 @@
 r"""The networks of the HVAE: a conditional U-Net and an encoder of latents."""
 
-import copy
 from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from sbi_rope._sbi import embed
 from sbi_rope._validation import check_integer
+from sbi_rope.baselines.networks import embedding_with_head
 from sbi_rope.errors import InvalidInputError
 
 __all__ = ["ConditionalUNet", "LatentEncoder", "bounded", "check_event_shape"]
@@ -165,24 +164,11 @@ class LatentEncoder(nn.Module):
 
     def __init__(self, embedding: nn.Module, latent_dim: int, x: Tensor) -> None:
         super().__init__()
-        self.embedding = copy.deepcopy(embedding).requires_grad_()
-        # The outer ones last, whose own way to start overrules that of their parts.
-        for module in reversed(list(self.embedding.modules())):
-            if callable(getattr(module, "reset_parameters", None)):
-                module.reset_parameters()  # type: ignore[operator]
-        width = embed(self.embedding, x[:1]).flatten(1).shape[1]
-        layers: list[nn.Module] = []
-        if not list(self.embedding.parameters()):
-            for before in (width, HIDDEN):
-                layers += [nn.Linear(before, HIDDEN), nn.ReLU()]
-            width = HIDDEN
-        self.head = nn.Sequential(
-            nn.Flatten(), *layers, nn.Linear(width, 2 * latent_dim)
-        )
+        self.net = embedding_with_head(embedding, 2 * latent_dim, x)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and log-variance, each ``(n, latent_dim)``."""
-        mean, log_variance = self.head(self.embedding(x)).chunk(2, dim=1)
+        mean, log_variance = self.net(x).chunk(2, dim=1)
         return mean, bounded(log_variance)
 
 
