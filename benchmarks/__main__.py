@@ -112,7 +112,7 @@ def _scheduler(args: argparse.Namespace) -> Iterator[None]:
     options = (
         {"address": args.scheduler}
         if args.scheduler
-        else {"n_workers": args.jobs, "threads_per_worker": 1}
+        else {"n_workers": max(args.jobs, 1), "threads_per_worker": 1}
     )
     with Client(**options):
         yield

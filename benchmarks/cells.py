@@ -204,8 +204,8 @@ def _cells_of(
                     yield Cell(
                         **shared,
                         n_calibration=n,
-                        gamma=gamma,
-                        tau=tau,
+                        gamma=float(gamma),
+                        tau=float(tau),
                         cost_scale=scale,
                     )
 

@@ -1,5 +1,7 @@
 """What a timing was measured on."""
 
+import contextlib
+import math
 import platform
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -29,7 +31,7 @@ def memory() -> float:
 
 
 def peak_memory() -> float:
-    """Return the most memory this process has held, in MB (Linux only).
+    """Return the most memory this process has held, in MB; NaN if not on Linux.
 
     Not by ``resource``, whose maximum starts at that of the parent process.
     """
@@ -37,12 +39,16 @@ def peak_memory() -> float:
 
 
 def forget_peak() -> None:
-    """Let :func:`peak_memory` start anew."""
-    Path("/proc/self/clear_refs").write_text("5")
+    """Let :func:`peak_memory` start anew, where the system allows it."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
 
 
 def _status(name: str) -> float:
-    lines = Path("/proc/self/status").read_text().splitlines()
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+    except OSError:
+        return math.nan
     line = next(line for line in lines if line.startswith(name))
     return int(line.split()[1]) / 1024
 

@@ -41,12 +41,15 @@ from sbi_rope.baselines import (
     UsesObservations,
     UsesSimulations,
 )
+from sbi_rope.baselines.base import BuildsOnNPE
 from sbi_rope.metrics import Evaluation, evaluate
 
 __all__ = ["EXTRAS", "METHODS", "ONLY_FOR", "Failure", "Score", "scores"]
 
 # Tasks whose observations are statistics: NNPE's noise is on them, not on h(x).
 STATISTICS = ("cs", "sir", "linear_gaussian")
+# More entries are no list of statistics that RNPE's chains could go through.
+MAX_STATISTICS = 10
 # A method that takes a differentiable simulator, and the tasks that have one.
 ONLY_FOR = {"HVAE": ("pendulum", "light_tunnel")}
 # Channels of its first layer: an eighth of the paper's, for CPUs.
@@ -73,7 +76,7 @@ def _noise_on(case: Case) -> Any:
 
 
 def _is_short(case: Case) -> bool:
-    return math.prod(case.task.x_shape) <= 10
+    return math.prod(case.task.x_shape) <= MAX_STATISTICS
 
 
 def _from_scratch(case: Case) -> tuple[Any, Any]:
@@ -95,7 +98,11 @@ METHODS: dict[str, Callable[[Case], Method]] = {
     "NPE-RS": lambda case: NPERS(
         *_from_scratch(case), training=case.settings.training, device=case.device
     ),
-    "J-NPE": lambda case: JointNPE(*_from_scratch(case), device=case.device),
+    "J-NPE": lambda case: JointNPE(
+        *_from_scratch(case),
+        training=replace(case.settings.training, validation_fraction=0.2),
+        device=case.device,
+    ),
     "MLP": lambda case: CalibrationMLP(*_from_scratch(case), device=case.device),
     "fine-tuned NPE": lambda case: FinetunedNPE.from_posterior(case.npe),
     "HVAE": lambda case: HVAE.from_posterior(
@@ -120,7 +127,9 @@ class Score:
             fine-tuning, which the couplings of a sweep share.
         couple_seconds: Simulating and coupling.
         test_seconds: Sampling and evaluating the posteriors of the test set.
-        num_simulations: Simulations behind it, those of the shared NPE included.
+        num_simulations: Simulations behind the posterior, those of the shared NPE
+            included.
+        shares_npe: Whether it starts from the NPE that methods share.
         converged: Whether the coupling has converged; True without one.
     """
 
@@ -132,6 +141,7 @@ class Score:
     couple_seconds: float
     test_seconds: float
     num_simulations: int
+    shares_npe: bool
     converged: bool = True
 
 
@@ -164,9 +174,9 @@ def _score(case: Case, cell: Cell) -> Score:
     count = _Count(case)
     method = METHODS[cell.method](case)
     start = time.perf_counter()
-    if isinstance(method, UsesSimulations):
-        # Methods without a simulator use these as they use stored simulations.
-        stored = case.simulator is None and cell.method == "tuning-only"
+    if isinstance(method, UsesSimulations) and method.needs_simulations:
+        # Without a simulator, tuning-only looks targets up among stored simulations.
+        stored = cell.method == "tuning-only"
         method.append_simulations(*(case.stored if stored else case.simulations))
     if isinstance(method, UsesCalibration):
         method.append_calibration(*case.calibration)
@@ -175,6 +185,8 @@ def _score(case: Case, cell: Cell) -> Score:
     method.train(seed=case.seed, show_progress_bars=False)
     posterior = method.build_posterior()
     seconds = time.perf_counter() - start
+    used = len(case.simulations[0]) if isinstance(method, UsesSimulations) else 0
+    used += count.new
     if isinstance(method, SBI):
         if case.simulator is None:
             assert case.held_out is not None
@@ -182,7 +194,6 @@ def _score(case: Case, cell: Cell) -> Score:
         else:
             pairs = method.simulated_test_set(theta, case.simulator, seed=case.seed)
     evaluation, test_seconds = _evaluate(case, posterior, pairs)
-    used = len(case.simulations[0]) if isinstance(method, UsesSimulations) else 0
     return Score(
         cell=cell,
         posterior=posterior,
@@ -191,7 +202,8 @@ def _score(case: Case, cell: Cell) -> Score:
         train_seconds=seconds,
         couple_seconds=0.0,
         test_seconds=test_seconds,
-        num_simulations=used + count.new,
+        num_simulations=used,
+        shares_npe=isinstance(method, BuildsOnNPE),
     )
 
 
@@ -208,39 +220,44 @@ def _coupled_scores(case: Case, cells: Sequence[Cell]) -> Iterator[Score | Failu
         rope.append_calibration(*case.calibration)
         rope.train(seed=case.seed, show_progress_bars=False)
     train_seconds = time.perf_counter() - start
-    ordered = sorted(cells, key=lambda cell: (cell.tau, cell.gamma), reverse=True)
-    for tau, group in itertools.groupby(ordered, key=lambda cell: cell.tau):
-        of_tau = list(group)
-        start = time.perf_counter()
-        posteriors = rope.sweep(
-            case.test_set[1],
-            gammas=[cell.gamma for cell in of_tau],  # type: ignore[misc]
-            taus=[tau],  # type: ignore[list-item]
-            coupler=SinkhornCoupler(cost_scale=of_tau[0].cost_scale),  # type: ignore[arg-type]
-            seed=case.seed,
-            require_convergence=False,
-            show_progress_bars=False,
-        )
-        for cell, posterior in zip(of_tau, posteriors, strict=True):
-            couple_seconds = time.perf_counter() - start
+    wanted = {(cell.gamma, cell.tau): cell for cell in cells}
+    # One sweep over all, from large gammas to small: it simulates and normalises once.
+    gammas = sorted({gamma for gamma, _ in wanted if gamma is not None}, reverse=True)
+    taus = sorted({tau for _, tau in wanted if tau is not None}, reverse=True)
+    start = time.perf_counter()
+    posteriors = rope.sweep(
+        case.test_set[1],
+        gammas=gammas,
+        taus=taus,
+        coupler=SinkhornCoupler(cost_scale=case.cell.cost_scale),  # type: ignore[arg-type]
+        seed=case.seed,
+        require_convergence=False,
+        show_progress_bars=False,
+    )
+    used = len(case.simulations[0]) + count.new
+    settings = itertools.product(gammas, taus)
+    for setting, posterior in zip(settings, posteriors, strict=True):
+        couple_seconds = time.perf_counter() - start
+        cell = wanted.get(setting)
+        if cell is not None:
             try:
                 evaluation, test_seconds = _evaluate(case, posterior, case.test_set)
-            except Exception as error:
+            except Exception as error:  # such as no mass inside the prior's support
                 yield Failure(cell=cell, error=error)
-                start = time.perf_counter()
-                continue
-            yield Score(
-                cell=cell,
-                posterior=posterior,
-                test_set=case.test_set,
-                evaluation=evaluation,
-                train_seconds=train_seconds,
-                couple_seconds=couple_seconds,
-                test_seconds=test_seconds,
-                num_simulations=len(case.simulations[0]) + count.new,
-                converged=posterior.coupling.converged,
-            )
-            start = time.perf_counter()
+            else:
+                yield Score(
+                    cell=cell,
+                    posterior=posterior,
+                    test_set=case.test_set,
+                    evaluation=evaluation,
+                    train_seconds=train_seconds,
+                    couple_seconds=couple_seconds,
+                    test_seconds=test_seconds,
+                    num_simulations=used,
+                    converged=posterior.coupling.converged,
+                    shares_npe=True,
+                )
+        start = time.perf_counter()
 
 
 class _Count:
@@ -292,8 +309,8 @@ def methods_for(task: str, names: list[str] | None) -> list[str]:
 
 
 HEADER = (
-    "| method | LPP | LPP (z) | -inf | ACAUC | ECE | training [s] | test [s] | "
-    "simulations |\n|---|---|---|---|---|---|---|---|---|"
+    "| method | LPP | LPP (z) | median LPP | -inf | ACAUC | ECE | training [s] | test [s] | "
+    "simulations |\n|---|---|---|---|---|---|---|---|---|---|"
 )
 
 
@@ -305,7 +322,8 @@ def as_line(score: Score) -> str:
     seconds = score.train_seconds + score.couple_seconds
     return (
         f"| {score.cell.method} | {lpp} | {row['lpp_z']:.2f} | "
-        f"{row['neg_inf_fraction']:.3f} | {row['acauc']:+.3f} | "
+        f"{row['lpp_median']:.2f} | {row['neg_inf_fraction']:.3f} | "
+        f"{row['acauc']:+.3f} | "
         f"{row['expected_coverage_error']:.3f} | {seconds:.1f} | "
         f"{score.test_seconds:.1f} | {score.num_simulations:,} |"
     )

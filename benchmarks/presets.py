@@ -88,6 +88,8 @@ def standard(task: Task) -> Settings:
 def paper(task: Task) -> Settings:
     """Return the paper's networks, flows and steps, for a GPU."""
     stated = task.paper_settings
+    if stated is None:
+        raise ValueError(f"{task.name} is not in the paper; use another preset.")
     batch_size = stated.batch_size or 100
     num_simulations = 100_000
     steps_per_epoch = num_simulations // batch_size
@@ -102,10 +104,20 @@ def paper(task: Task) -> Settings:
         num_samples=5000,
         light_net=False,
         flow=stated.density_estimator,
-        flow_options={
-            "num_transforms": 1 if stated.density_estimator == "zuko_unaf" else 5,
-            "hidden_features": stated.conditioner[0],
-        },
+        flow_options=(
+            {
+                "num_transforms": 1,
+                "hidden_features": list(stated.conditioner),
+                "network": {"hidden_features": list(stated.integrand)},
+            }
+            if stated.density_estimator == "zuko_unaf"
+            # sbi's affine flow has one width for all hidden layers.
+            else {
+                "num_transforms": 5,
+                "hidden_features": stated.conditioner[0],
+                "num_blocks": len(stated.conditioner),
+            }
+        ),
         finetuner=CalibrationFinetuner(
             learning_rate=stated.finetuning_learning_rate or 1e-4,
             num_steps=stated.finetuning_steps or 5000,

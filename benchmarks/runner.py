@@ -1,7 +1,9 @@
 """Runs cells, in parallel, and keeps what is finished."""
 
 import functools
+import hashlib
 import itertools
+import json
 import subprocess
 import time
 import traceback
@@ -21,11 +23,13 @@ from benchmarks.cases import Case, Sources
 from benchmarks.cells import Cell
 from benchmarks.machine import forget_peak, peak_memory
 from benchmarks.methods import ONLY_FOR, Failure, Score, scores
-from benchmarks.store import Cache, Results
+from benchmarks.store import Cache, Results, write_atomically
 from sbi_rope.metrics import draw_samples
 
 __all__ = ["Workplace", "run_cells"]
 
+# Raised when the same cell gives another result than before.
+FORMAT = 1
 PACKAGES = ("torch", "sbi", "POT", "numpy")
 # Observations and samples behind the comparison with a posterior in closed form.
 C2ST_OBSERVATIONS, C2ST_SAMPLES = 5, 500
@@ -46,6 +50,35 @@ class Workplace:
     folder: Path
     sources: Sources
     device: str = "cpu"
+
+    def claim(self) -> None:
+        """Make sure that all in this folder was made in the same way.
+
+        Raises:
+            SystemExit: If it holds results of other data, devices or settings.
+        """
+        place = {
+            "format": FORMAT,
+            "root": str(self.sources.root and self.sources.root.resolve()),
+            "hemodynamics": str(
+                self.sources.hemodynamics and self.sources.hemodynamics.resolve()
+            ),
+            "device": self.device,
+            "presets": hashlib.sha256(
+                (Path(__file__).parent / "presets.py").read_bytes()
+            ).hexdigest(),
+        }
+        path = self.folder / "place.json"
+        if not path.exists():
+            with write_atomically(path) as temporary:
+                temporary.write_text(json.dumps(place, indent=1))
+        before = json.loads(path.read_text())
+        other = [name for name, value in place.items() if before.get(name) != value]
+        if other:
+            raise SystemExit(
+                f"{self.folder} holds results of another {', '.join(other)} "
+                f"({[before.get(name) for name in other]}). Use another --out."
+            )
 
     @property
     def results(self) -> Results:
@@ -86,6 +119,9 @@ def run_cells(
         if again or _is_missing(workplace.results.read(cell), retry=retry)
     ]
     counts = {"kept": len(cells) - len(waiting), "finished": 0, "failed": 0}
+    if backend == "threading":
+        raise SystemExit("Threads share random numbers; use loky or another backend.")
+    workplace.claim()
     groups = _grouped(waiting)
     # What methods share is made first, so that no two jobs make it at the same time.
     shared = {group[0].group[:5]: group[0] for group in groups}
@@ -185,7 +221,6 @@ def _row(case: Case, score: Score) -> dict[str, Any]:
     evaluation = score.evaluation
     names = case.task.parameter_names
     per_parameter = zip(names, evaluation.acauc.per_parameter.tolist(), strict=True)
-    uses_npe = score.num_simulations > 0
     return {
         **asdict(score.cell),
         "status": "finished",
@@ -197,12 +232,12 @@ def _row(case: Case, score: Score) -> dict[str, Any]:
         "converged": score.converged,
         "n_test": len(score.test_set[0]),
         "stand_in": case.task.stand_in,
-        "seconds_npe": round(case.npe_seconds, 1) if uses_npe else 0.0,
+        "seconds_npe": round(case.npe_seconds, 1) if score.shares_npe else 0.0,
         "seconds_train": round(score.train_seconds, 2),
         "seconds_couple": round(score.couple_seconds, 2),
         "seconds_test": round(score.test_seconds, 2),
         "num_simulations": score.num_simulations,
-        "peak_memory_mb": round(peak_memory()),
+        "peak_memory_mb": peak_memory(),
         "device": case.device,
         "versions": "; ".join(f"{name} {version(name)}" for name in PACKAGES),
         "git_commit": git_commit(),
