@@ -164,7 +164,9 @@ class Case:
     @cached_property
     def test_set(self) -> Pairs:
         """Real observations to infer, with their parameters."""
-        theta, x = self.task.get_test_set(self.settings.n_test, seed=self.seed)
+        recorded = self.task.num_recorded("test", seed=self.seed)
+        n = self.settings.n_test if recorded is None else recorded
+        theta, x = self.task.get_test_set(min(n, self.settings.n_test), seed=self.seed)
         return theta.to(self.device), x.to(self.device)
 
     @property

@@ -62,7 +62,7 @@ class LPPAxis:
 def draw_all(suite: Suite, table: Table, folder: Path) -> list[tuple[str, str]]:
     """Draw the figures of a suite; return their files and what they show."""
     rows = {c: r for c, r in table.rows.items() if r["status"] == "finished"}
-    if not rows or suite.x_axis == "none":
+    if not rows:
         return []
     drawn = []
     for name, what, figure in (
@@ -122,21 +122,23 @@ def _panel(
     if not values or not positions:
         return
     if score == "lpp_z":
-        by_method = {
-            c.method: rows[c][score] for c in cells if math.isfinite(rows[c][score])
-        }
-        prior = by_method.get("prior", min(values))
-        scale = LPPAxis(prior, max(by_method.get("SBI", prior), max(values)))
+        prior = _mean_of("prior", cells, rows, default=min(values))
+        top = _mean_of("SBI", cells, rows, default=prior)
+        scale = LPPAxis(prior, max(top, max(values)))
         axes.set_yscale("function", functions=(scale.forward, scale.inverse))
         bottom = scale.inverse(scale.forward(min(values)) - 0.1)
         axes.set_ylim(bottom, scale.inverse(scale.forward(max(values)) + 0.1))
         _set_ticks(axes, scale, min(values), max(values))
     for label, group in lines.items():
         colour, line, marker = _style(group[0])
-        points = group_by(group, "method") and _points(axis, group, rows, score)
+        points = _points(axis, group, rows, score)
         if not points:
             mean, _ = mean_and_spread([rows[c][score] for c in group])
             if not math.isfinite(mean):
+                (handle,) = axes.plot(
+                    positions, [axes.get_ylim()[0]] * len(positions), "v", color=colour
+                )
+                seen.setdefault(label, handle)
                 continue
             handle = axes.axhline(mean, color=colour, ls=line, lw=1.3)
         else:
@@ -151,6 +153,14 @@ def _panel(
         axes.set_xscale("log")
     axes.set_xticks(positions, [f"{p:g}" for p in positions], minor=False)
     axes.minorticks_off()
+
+
+def _mean_of(
+    method: str, cells: list[Cell], rows: dict[Cell, dict[str, Any]], default: float
+) -> float:
+    values = [rows[c]["lpp_z"] for c in cells if c.method == method]
+    values = [value for value in values if math.isfinite(value)]
+    return sum(values) / len(values) if values else default
 
 
 def _set_ticks(axes: Any, scale: LPPAxis, low: float, high: float) -> None:

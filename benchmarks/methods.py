@@ -153,8 +153,13 @@ class Failure:
     error: Exception
 
 
-def scores(case: Case, cells: Sequence[Cell]) -> Iterator[Score | Failure]:
+def scores(
+    case: Case, cells: Sequence[Cell], group: Sequence[Cell]
+) -> Iterator[Score | Failure]:
     """Score cells that differ in gamma and tau only, each when it is asked for.
+
+    The sweep over gamma and tau passes by all of ``group``, of which ``cells`` are a
+    part.
 
     A posterior that cannot be scored is a failure of its cell alone.
 
@@ -162,7 +167,7 @@ def scores(case: Case, cells: Sequence[Cell]) -> Iterator[Score | Failure]:
         Exception: Whatever stops all cells, such as a failing training.
     """
     if case.cell.method in NEEDS_COUPLING:
-        yield from _coupled_scores(case, cells)
+        yield from _coupled_scores(case, cells, group)
     else:
         for cell in cells:
             yield _score(case, cell)
@@ -207,7 +212,9 @@ def _score(case: Case, cell: Cell) -> Score:
     )
 
 
-def _coupled_scores(case: Case, cells: Sequence[Cell]) -> Iterator[Score | Failure]:
+def _coupled_scores(
+    case: Case, cells: Sequence[Cell], group: Sequence[Cell]
+) -> Iterator[Score | Failure]:
     count = _Count(case)
     rope = RoPE(
         case.npe,
@@ -222,8 +229,8 @@ def _coupled_scores(case: Case, cells: Sequence[Cell]) -> Iterator[Score | Failu
     train_seconds = time.perf_counter() - start
     wanted = {(cell.gamma, cell.tau): cell for cell in cells}
     # One sweep over all, from large gammas to small: it simulates and normalises once.
-    gammas = sorted({gamma for gamma, _ in wanted if gamma is not None}, reverse=True)
-    taus = sorted({tau for _, tau in wanted if tau is not None}, reverse=True)
+    gammas = sorted({cell.gamma for cell in group if cell.gamma}, reverse=True)
+    taus = sorted({cell.tau for cell in group if cell.tau is not None}, reverse=True)
     start = time.perf_counter()
     posteriors = rope.sweep(
         case.test_set[1],
@@ -309,8 +316,8 @@ def methods_for(task: str, names: list[str] | None) -> list[str]:
 
 
 HEADER = (
-    "| method | LPP | LPP (z) | median LPP | -inf | ACAUC | ECE | training [s] | test [s] | "
-    "simulations |\n|---|---|---|---|---|---|---|---|---|---|"
+    "| method | LPP | LPP (z) | median LPP | -inf | ACAUC | ECE | training [s] | "
+    "test [s] | simulations |\n|---|---|---|---|---|---|---|---|---|---|"
 )
 
 
@@ -370,7 +377,7 @@ def main() -> None:
             tau=args.tau if name in NEEDS_COUPLING else None,
             cost_scale="simulated" if name in NEEDS_COUPLING else "",
         )
-        for score in scores(replace(case, cell=cell), [cell]):
+        for score in scores(replace(case, cell=cell), [cell], [cell]):
             if isinstance(score, Failure):
                 raise score.error
             print(as_line(score), flush=True)

@@ -122,14 +122,19 @@ def run_cells(
     if backend == "threading":
         raise SystemExit("Threads share random numbers; use loky or another backend.")
     workplace.claim()
-    groups = _grouped(waiting)
+    missing = set(waiting)
+    # Whole groups, also where only some of their cells are missing: a sweep starts each
+    # coupling from its neighbour, and a resumed run must pass by the same ones.
+    groups = [group for group in _grouped(cells) if missing & set(group)]
     # What methods share is made first, so that no two jobs make it at the same time.
     shared = {group[0].group[:5]: group[0] for group in groups}
     _parallel(jobs, backend, [(prepare, cell, workplace) for cell in shared.values()])
     bar = tqdm(total=len(waiting), desc="Cells", smoothing=0.1)
-    for ended in _parallel(
-        jobs, backend, [(run_group, group, workplace) for group in groups], bar=bar
-    ):
+    calls = [
+        (run_group, group, [cell for cell in group if cell in missing], workplace)
+        for group in groups
+    ]
+    for ended in _parallel(jobs, backend, calls, bar=bar):
         for status in ended:
             counts[status] += 1
     bar.close()
@@ -171,8 +176,14 @@ def prepare(cell: Cell, workplace: Workplace) -> None:
         return
 
 
-def run_group(cells: list[Cell], workplace: Workplace) -> list[str]:
-    """Run cells that share all but gamma and tau; write each when it is finished."""
+def run_group(group: list[Cell], cells: list[Cell], workplace: Workplace) -> list[str]:
+    """Run cells that share all but gamma and tau; write each when it is finished.
+
+    Args:
+        group: All of them, for the way the couplings of a sweep follow each other.
+        cells: Those to run.
+        workplace: Where results are kept.
+    """
     _use_one_thread()
     git_commit()  # now, not when a cell is finished hours later
     statuses = []
@@ -192,7 +203,7 @@ def run_group(cells: list[Cell], workplace: Workplace) -> list[str]:
         case = Case.of(cells[0], workplace.sources, workplace.cache, workplace.device)
         _check_data(case)
         forget_peak()
-        for score in scores(case, cells):
+        for score in scores(case, cells, group):
             if isinstance(score, Failure):
                 fail(score.cell, score.error)
             else:

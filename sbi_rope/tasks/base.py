@@ -242,15 +242,31 @@ class Task(ABC):
     def _well_specified_process(self, part: Part) -> DrawnPairs | RecordedPairs:
         return self._simulated_process()
 
+    def num_recorded(self, part: Part, *, seed: int = 0) -> int | None:
+        """Return how many pairs a set can have; None if any number can be drawn.
+
+        Args:
+            part: ``"calibration"`` or ``"test"``.
+            seed: Seed of the set; variants keep other pairs under other seeds.
+        """
+        _check_seed(seed)
+        with torch.device("cpu"):
+            process = self._process_of(part)
+            if isinstance(process, DrawnPairs):
+                return None
+            return len(process.rows_kept(seed=seed, part=part, keep=self._keep(part)))
+
     def _labelled_set(self, n: int, *, seed: int, part: Part) -> tuple[Tensor, Tensor]:
         check_integer("n", n)
         _check_seed(seed)
         with torch.device("cpu"):
-            if self.variant == "well_specified":
-                process = self._well_specified_process(part)
-            else:
-                process = self._real_process(part)
+            process = self._process_of(part)
             return process.take(n, seed=seed, part=part, keep=self._keep(part))
+
+    def _process_of(self, part: Part) -> DrawnPairs | RecordedPairs:
+        if self.variant == "well_specified":
+            return self._well_specified_process(part)
+        return self._real_process(part)
 
     def _keep(self, part: Part) -> Keep | None:
         """Return which parameters of the real process a part may have."""

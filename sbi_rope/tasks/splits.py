@@ -156,15 +156,7 @@ class RecordedPairs:
         Raises:
             InvalidInputError: If the part has fewer than ``n`` such rows.
         """
-        rows = self.rows_of(part)
-        rows = _shuffled(rows, key=f"seed {seed}")
-        if keep is not None:
-            chances = keep(self.theta[rows]).tolist()
-            rows = [
-                row
-                for row, chance in zip(rows, chances, strict=True)
-                if _uniform(row, key=f"keep {seed}") < chance
-            ]
+        rows = self.rows_kept(seed=seed, part=part, keep=keep)
         if n > len(rows):
             filtered = "" if keep is None else " that the variant keeps under this seed"
             raise InvalidInputError(
@@ -173,6 +165,20 @@ class RecordedPairs:
             )
         rows = rows[:n]
         return self.theta[rows], self.read_x(rows)
+
+    def rows_kept(
+        self, *, seed: int, part: Part, keep: Keep | None = None
+    ) -> list[int]:
+        """Return the numbers of the rows a set is taken from, in their order."""
+        rows = _shuffled(self.rows_of(part), key=f"seed {seed}")
+        if keep is None:
+            return rows
+        chances = keep(self.theta[rows]).tolist()
+        return [
+            row
+            for row, chance in zip(rows, chances, strict=True)
+            if _uniform(row, key=f"keep {seed}") < chance
+        ]
 
     def rows_of(self, part: Part) -> list[int]:
         """Return the numbers of all rows of a part, whatever the seed."""

@@ -29,7 +29,8 @@ repetitions = 1
 tasks = ["pendulum"]
 methods = ["prior", "NPE", "tuning-only", "OT-only", "RoPE"]
 n_calibration = [10]
-gammas = { simulated = [0.1, 0.2] }
+gammas = { simulated = [0.1] }
+taus = [1.0, 0.9]
 """
 # What may differ between two runs of the same cell.
 CHANGING = ("seconds_", "peak_memory", "finished_at", "git_commit", "suite")
@@ -71,6 +72,52 @@ def test_a_run_in_parts_gives_the_same_table(
         main(["run", str(suite_file), "--out", str(tmp_path), "--method", *methods])
     main(["run", str(suite_file), "--out", str(tmp_path)])
     assert rows_of(tmp_path) == uninterrupted
+
+
+def test_a_cell_missing_from_a_sweep_comes_back_the_same(
+    suite_file: Path, uninterrupted: list[dict[str, str]], tmp_path: Path
+) -> None:
+    command = ["run", str(suite_file), "--out", str(tmp_path), "--method", "RoPE"]
+    main(command)
+    last = max(
+        (cell for cell in load_suite(str(suite_file)).cells if cell.method == "RoPE"),
+        key=lambda cell: -(cell.tau or 0),
+    )
+    path = tmp_path / "cells" / f"{last.key}.json"
+    path.write_text("{")  # as if killed while writing in place
+    main(command)
+    expected = [row for row in uninterrupted if row["method"] == "RoPE"]
+    assert rows_of(tmp_path) == expected
+
+
+def test_a_folder_refuses_results_of_other_data(
+    suite_file: Path, tmp_path: Path
+) -> None:
+    command = ["run", str(suite_file), "--out", str(tmp_path), "--method", "prior"]
+    main(command)
+    with pytest.raises(SystemExit, match="another root"):
+        main([*command, "--again", "--root", str(tmp_path)])
+
+
+def test_stored_people_are_shared_out_without_overlap(tmp_path: Path) -> None:
+    cell = Cell(task="hemodynamics", preset="smoke", method="SBI")
+    place = Workplace(folder=tmp_path, sources=Sources())
+    case = Case.of(cell, place.sources, place.cache, "cpu")
+    assert case.held_out is not None
+    held_out = set(case.held_out[0][:, 0].tolist())
+    for pairs in (case.simulations, case.stored):
+        assert held_out.isdisjoint(pairs[0][:, 0].tolist())
+    cells = [replace(cell, method=method) for method in ("prior", "SBI")]
+    assert run_cells(cells, place)["finished"] == 2
+
+
+def test_the_test_set_is_as_large_as_what_is_recorded(tmp_path: Path) -> None:
+    cell = Cell(task="hemodynamics", preset="standard", method="prior")
+    case = Case.of(cell, Sources(), Cache(tmp_path), "cpu")
+    recorded = case.task.num_recorded("test")
+    assert recorded is not None
+    assert recorded < case.settings.n_test
+    assert len(case.test_set[0]) == recorded
 
 
 def test_what_is_finished_is_not_computed_again(

@@ -292,10 +292,71 @@ def test_the_paired_test_sees_what_an_unpaired_one_does_not() -> None:
     assert worse(best - 0.1, best)
     assert not worse(best, best)
     assert not worse(difficulty + 0.1 * generator.normal(size=200), best)
+
+
+def test_the_paired_test_is_not_blinded_by_one_observation() -> None:
+    generator = np.random.default_rng(0)
+    best = generator.normal(size=1000)
+    values = best - 0.3 + 0.5 * generator.normal(size=1000)
+    assert worse(values, best)
+    values[0] = -30_800.0
+    assert worse(values, best)
     lost = best.copy()
     lost[0] = -np.inf
     assert worse(lost, best)
     assert not worse(lost, lost)
+    assert not worse(best, lost)
+
+
+def test_a_method_with_a_missing_repetition_still_competes(
+    suite: Suite, tmp_path: Path
+) -> None:
+    results = Results(tmp_path / "cells")
+    for cell in suite.cells:
+        if cell.method in ("prior", "RoPE") and cell.options == '{"dim": 2}':
+            if cell.method == "RoPE" and cell.repetition:
+                continue
+            value = {"prior": -3.0, "RoPE": -1.0}[cell.method]
+            noise = np.random.default_rng(cell.repetition).normal(size=50)
+            results.write(
+                cell, row_of(cell, lpp_z=value), arrays_of(list(value + 0.1 * noise))
+            )
+    table = write_table(suite, results, tmp_path / "out")
+    text = write_report(suite, table, tmp_path / "out").read_text()
+    assert "**-1.00**" in text
+    assert "**-3.00" not in text
+
+
+def test_a_method_without_labels_can_be_best_at_one_size_only(
+    suite: Suite, tmp_path: Path
+) -> None:
+    results = Results(tmp_path / "cells")
+    for cell in suite.cells:
+        if cell.repetition or cell.options != '{"dim": 2}':
+            continue
+        if cell.method in ("prior", "MLP"):
+            value = {0: -2.0, 10: -3.0, 50: -1.0}[cell.n_calibration]
+            results.write(
+                cell,
+                row_of(cell, lpp_z=value),
+                arrays_of([value + 0.1 * i for i in range(9)]),
+            )
+    table = write_table(suite, results, tmp_path / "out")
+    text = write_report(suite, table, tmp_path / "out").read_text()
+    assert "| prior | **-2.00** | -2.00 |" in text
+    assert "| MLP | -3.00 | **-1.00** |" in text
+
+
+def test_losses_are_listed_against_every_method(suite: Suite, tmp_path: Path) -> None:
+    results = Results(tmp_path / "cells")
+    for cell in suite.cells:
+        if cell.repetition == 0 and cell.method in ("RoPE", "MLP"):
+            value = {"RoPE": -2.0, "MLP": -1.0}[cell.method]
+            log_probs = [value + 0.1 * i for i in range(9)]
+            results.write(cell, row_of(cell, lpp_z=value), arrays_of(log_probs))
+    table = write_table(suite, results, tmp_path / "out")
+    text = write_report(suite, table, tmp_path / "out").read_text()
+    assert "gamma=0.1 tau=1 #0: -2.00; MLP -1.00\n" in text
 
 
 def test_the_axis_of_the_figures_is_linear_above_the_prior_and_logarithmic_below() -> (
