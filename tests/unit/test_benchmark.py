@@ -9,12 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from benchmarks.cells import Cell, Suite, list_suites, load_suite
 from benchmarks.figures import LPPAxis
+from benchmarks.presets import PRESETS
 from benchmarks.report import worse, write_report
 from benchmarks.store import Cache, Results, write_atomically
 from benchmarks.tables import Table, mean_and_spread, read_table, write_table
+from sbi_rope.tasks import get_task, list_tasks
 
 SUITE = """
 title = "Tiny"
@@ -379,3 +382,36 @@ def test_a_report_without_arrays_marks_nothing(
     text = write_report(suite, bare, tmp_path / "bare").read_text()
     assert "**-1.00**" not in text
     assert "-1.00" in text
+
+
+# Presets ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("preset", list(PRESETS))
+@pytest.mark.parametrize("name", list_tasks())
+def test_every_preset_builds_an_estimator_for_every_task(
+    name: str, preset: str
+) -> None:
+    task = get_task(name)
+    if preset == "paper" and task.paper_settings is None:
+        with pytest.raises(ValueError, match="not in the paper"):
+            PRESETS[preset](task)
+        return
+    settings = PRESETS[preset](task)
+    theta, x = task.get_prior().sample((8,)), torch.randn(8, *task.x_shape)
+    estimator = settings.builder(task)(theta, x)
+    assert estimator.log_prob(theta[None], condition=x).shape == (1, 8)
+
+
+def test_the_papers_flow_has_the_papers_layers() -> None:
+    task = get_task("pendulum")
+    settings = PRESETS["paper"](task)
+    theta, x = task.get_prior().sample((8,)), torch.randn(8, *task.x_shape)
+    estimator = settings.builder(task)(theta, x)
+    widths = [
+        tuple(weight.shape[-2:])
+        for name, weight in estimator.net.named_parameters()
+        if name.endswith("weight")
+    ]
+    # Conditioner and integrand: three hidden layers of 100 each.
+    assert sum(shape == (100, 100) for shape in widths) == 4
