@@ -29,6 +29,8 @@ DEFAULT_TRAINING = Training(
     stop_after_epochs=200,
     max_num_epochs=2000,
 )
+# In standard deviations of the prior; a share of the held-out error; pairs.
+FARTHEST, FLOOR, PSEUDO_PAIRS = 5.0, 0.1, 2
 # Draws that stand in for the moments of a prior that does not know them.
 NUM_DRAWS = 10_000
 
@@ -38,7 +40,11 @@ class DiagonalGaussian(ConditionalDensityEstimator):
 
     .. math::
         q(\theta \mid x) = \prod_k \mathcal{N}\bigl(\theta_k;\;
-        m_k + s_k \mu_k(x),\; s_k^2 e^{v_k(x)}\bigr)
+        m_k + 5 s_k \tanh(\mu_k(x) / 5),\; s_k^2 (w_k(x) + f_k^2)\bigr),
+        \qquad w = \frac{25 e^v}{25 + e^v}
+
+    Mean and standard deviation stay within five standard deviations of the prior. The
+    floor f starts at zero, see :meth:`set_floor`.
 
     Args:
         net: Maps observations ``(n, *event)`` to means and log-variances ``(n, 2 k)``
@@ -50,6 +56,7 @@ class DiagonalGaussian(ConditionalDensityEstimator):
 
     mean: Tensor
     std: Tensor
+    floor: Tensor
 
     def __init__(
         self,
@@ -61,10 +68,33 @@ class DiagonalGaussian(ConditionalDensityEstimator):
         super().__init__(net, mean.shape, condition_shape)
         self.register_buffer("mean", mean)
         self.register_buffer("std", std)
+        self.register_buffer("floor", torch.zeros_like(std))
+
+    @torch.no_grad()
+    def set_floor(self, theta: Tensor, x: Tensor) -> None:
+        """Let no standard deviation fall below a tenth of the root mean square error.
+
+        Far from what it was trained on, a network can be sure of something wrong
+        without bound, and one such observation then decides any mean of log densities.
+
+        Args:
+            theta: Parameters it was not trained on, shape ``(n, k)``.
+            x: Their observations, shape ``(n, *event)``.
+        """
+        error = (theta - self._moments(x)[0]) / self.std
+        # As if two more pairs were off by a standard deviation of the prior: a few
+        # pairs can be met by chance.
+        total = error.square().sum(dim=0) + PSEUDO_PAIRS
+        self.floor = FLOOR * (total / (len(x) + PSEUDO_PAIRS)).sqrt()
 
     def _moments(self, condition: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and log standard deviation of theta, each ``(B, k)``."""
         mean, log_variance = self.net(condition).chunk(2, dim=-1)
+        mean = FARTHEST * torch.tanh(mean / FARTHEST)
+        log_variance = -torch.logaddexp(
+            -log_variance, torch.full_like(log_variance, -2 * math.log(FARTHEST))
+        )
+        log_variance = torch.logaddexp(log_variance, 2 * self.floor.log())
         return self.mean + self.std * mean, self.std.log() + 0.5 * log_variance
 
     def log_prob(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
@@ -97,15 +127,15 @@ class CalibrationMLP(UsesCalibration):
     anew, with linear outputs for mean and log-variance; where the estimator has no
     embedding net, one with two hidden layers of 64 units. Parameters are standardised
     by the prior. A part of the pairs is held out and the best network on them is kept.
+    No standard deviation is below a tenth of the root mean square error on them.
 
     Sees the calibration set alone. Assumes nothing of the simulator and that the
     posterior is about Gaussian. Says what the labels are worth without a simulator: a
-    method that uses one and does worse is not worth its simulations. With few pairs its
-    mean log-probability can hang on one observation unlike all of them, where the
-    network is sure of something wrong; the median tells more then.
+    method that uses one and does worse is not worth its simulations.
 
     Where this differs from the paper: neither number of steps, batch size nor scaling
-    of the parameters is stated there.
+    of the parameters is stated there, nor a bound on the standard deviations. Without
+    one, a single observation unlike the pairs can cost more than all others together.
 
     References:
         | Addressing Misspecification in Simulation-based Inference through Data-driven
@@ -158,6 +188,8 @@ class CalibrationMLP(UsesCalibration):
             label="MLP",
             show_progress_bars=show_progress_bars,
         )
+        unseen = held_out if len(held_out) else train
+        estimator.set_floor(theta[unseen], x[unseen])
         return self._direct_posterior(estimator), history
 
     def _gaussian(self, theta: Tensor, x: Tensor) -> DiagonalGaussian:

@@ -146,8 +146,9 @@ class TestDiagonalGaussian:
 
         def law(x: Tensor) -> Distribution:
             mu, log_variance = net(x).split(2, dim=1)
-            scale = std * torch.exp(log_variance).sqrt()
-            return Independent(Normal(mean + std * mu, scale), 1)
+            variance = log_variance.exp()
+            scale = std * (25 * variance / (25 + variance)).sqrt()
+            return Independent(Normal(mean + std * 5 * torch.tanh(mu / 5), scale), 1)
 
         return estimator, law
 
@@ -157,6 +158,26 @@ class TestDiagonalGaussian:
         expected = law(x).log_prob(theta)
         assert torch.allclose(estimator.log_prob(theta, x), expected, atol=1e-5)
         assert torch.allclose(-estimator.loss(theta[0], x), expected[0], atol=1e-5)
+
+    def test_it_is_never_surer_than_a_tenth_of_its_error(self) -> None:
+        estimator, law = self.estimator()
+        x = torch.randn(2000, 3)
+        # Off by 20, that is by 40 and by 20 / 3 standard deviations of the prior.
+        theta = law(x).mean + 20 * torch.randn(2000, 2)
+        before = law(x).stddev
+        estimator.set_floor(theta, x)
+        expected = (before.square() + 2.0**2).sqrt()
+        mean, log_std = estimator._moments(x)
+        assert torch.allclose(mean, law(x).mean)
+        assert torch.allclose(log_std.exp(), expected, rtol=0.05)
+
+    def test_far_from_everything_it_stays_within_bounds(self) -> None:
+        estimator, _ = self.estimator()
+        estimator.set_floor(torch.randn(100, 2), torch.randn(100, 3))
+        x = 1e6 * torch.randn(50, 3)
+        theta = torch.tensor([1.0, -2.0])
+        log_prob = estimator.log_prob(theta.expand(1, 50, 2), x)
+        assert (log_prob > -1e4).all()
 
     def test_its_samples_are_those_of_torch(self) -> None:
         estimator, law = self.estimator()
