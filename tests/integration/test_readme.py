@@ -17,9 +17,9 @@ class TrainedNPE:
         return gaussian.posterior()
 
 
-def test_the_four_lines_repair_a_posterior() -> None:
+def test_the_lines_repair_a_posterior() -> None:
     code = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
-    assert len(code) == 1
+    assert len(code) == 2
     theta_cal, x_cal = gaussian.labelled(10)
     names = {
         "npe": TrainedNPE(),
@@ -31,3 +31,7 @@ def test_the_four_lines_repair_a_posterior() -> None:
     exec(code[0], names)
     assert names["samples"].shape == (1000, 30, 2)
     assert torch.isfinite(names["samples"]).all()
+    # The other block is about another method with the same names.
+    exec(code[1], names)
+    samples = names["posterior"].sample_batched((10,), x=names["x_o"])
+    assert torch.isfinite(samples).all()
