@@ -30,6 +30,10 @@ STYLES = {
 }
 # With the distances as they are, as in the paper.
 UNSCALED = {"RoPE": "#003050", "OT-only": "#2A6F97"}
+# Lines that differ in calibration pairs only.
+MARKERS = {10: "o", 50: "s", 200: "^", 1000: "D"}
+# More labels than these run into each other.
+MAX_TICKS = 6
 REFERENCES = {"prior": ("0.6", "prior"), "SBI": ("black", "SBI")}
 # Calibration pairs behind calibration curves and corner plots, where there is a choice.
 SHOWN_PAIRS = 50
@@ -131,6 +135,8 @@ def _panel(
         _set_ticks(axes, scale, min(values), max(values))
     for label, group in lines.items():
         colour, line, marker = _style(group[0])
+        if axis != "n_calibration" and group[0].n_calibration:
+            marker = MARKERS.get(group[0].n_calibration, marker)
         points = _points(axis, group, rows, score)
         if not points:
             mean, _ = mean_and_spread([rows[c][score] for c in group])
@@ -151,7 +157,8 @@ def _panel(
         seen.setdefault(label, handle)
     if positions[0] > 0 and positions[-1] / positions[0] >= 8:
         axes.set_xscale("log")
-    axes.set_xticks(positions, [f"{p:g}" for p in positions], minor=False)
+    turned = 90 if len(positions) > MAX_TICKS else 0
+    axes.set_xticks(positions, [f"{p:g}" for p in positions], rotation=turned)
     axes.minorticks_off()
 
 

@@ -31,6 +31,7 @@ from sbi_rope.baselines import (
     NPERS,
     RNPE,
     SBI,
+    BuildsOnNPE,
     CalibrationMLP,
     FinetunedNPE,
     JointNPE,
@@ -41,7 +42,6 @@ from sbi_rope.baselines import (
     UsesObservations,
     UsesSimulations,
 )
-from sbi_rope.baselines.base import BuildsOnNPE
 from sbi_rope.metrics import Evaluation, evaluate
 
 __all__ = ["EXTRAS", "METHODS", "ONLY_FOR", "Failure", "Score", "scores"]

@@ -1,6 +1,7 @@
 """The methods RoPE is compared with, each used like an sbi trainer or posterior."""
 
 from sbi_rope.baselines.base import (
+    BuildsOnNPE,
     Method,
     UsesCalibration,
     UsesObservations,
@@ -27,6 +28,7 @@ __all__ = [
     "NPERS",
     "RNPE",
     "SBI",
+    "BuildsOnNPE",
     "CalibrationMLP",
     "FinetunedNPE",
     "JointNPE",
