@@ -144,14 +144,14 @@ def run_cells(
 def _parallel(
     jobs: int, backend: str, calls: list[tuple[Any, ...]], bar: Any = None
 ) -> list[Any]:
-    parallel = joblib.Parallel(
-        n_jobs=jobs, backend=backend, return_as="generator_unordered", batch_size=1
-    )
     results = []
-    for result in parallel(joblib.delayed(f)(*args) for f, *args in calls):
-        results.append(result)
-        if bar is not None:
-            bar.update(len(result))
+    # The way that knows external backends, dask's among them.
+    with joblib.parallel_config(backend=backend, n_jobs=jobs):
+        parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1)
+        for result in parallel(joblib.delayed(f)(*args) for f, *args in calls):
+            results.append(result)
+            if bar is not None:
+                bar.update(len(result))
     return results
 
 
