@@ -633,6 +633,11 @@ def public_methods() -> list[type[Method]]:
     )
 
 
+def test_every_method_is_held_to_this_contract() -> None:
+    concrete = {kind for kind in public_methods() if not inspect.isabstract(kind)}
+    assert concrete == {entry.kind for entry in METHODS.values()}
+
+
 @pytest.mark.parametrize("kind", public_methods())
 def test_no_method_takes_labels_of_observations(kind: type[Method]) -> None:
     calls = {name for name, _ in inspect.getmembers(kind) if name.startswith("append_")}
