@@ -7,16 +7,16 @@ import torch
 from torch import Tensor
 
 from sbi_rope._validation import check_instance, check_integer
-from sbi_rope.baselines.base import BuildsOnNPE, UsesObservations
+from sbi_rope.baselines.base import UsesObservations
+from sbi_rope.baselines.stage import StageOfRoPE
 from sbi_rope.baselines.training import EstimatorBuilder, Training
 from sbi_rope.coupling import SinkhornCoupler
 from sbi_rope.mixture import MixturePosterior
-from sbi_rope.rope import RoPE
 
 __all__ = ["OTOnly"]
 
 
-class OTOnly(BuildsOnNPE, UsesObservations):
+class OTOnly(StageOfRoPE, UsesObservations):
     r"""Transport between :math:`h(x_o)` and :math:`h(x_s)`: RoPE without calibration.
 
     Step 3 of RoPE without step 2, g = h.
@@ -64,24 +64,18 @@ class OTOnly(BuildsOnNPE, UsesObservations):
         if num_simulations is not None:
             check_integer("num_simulations", num_simulations)
         super().__init__(
-            prior, density_estimator, npe_training=npe_training, device=device
+            prior,
+            density_estimator,
+            simulator=simulator,
+            npe_training=npe_training,
+            device=device,
         )
-        self._simulator = simulator
         self.coupler = coupler
         self.num_simulations = num_simulations
 
-    @property
-    def needs_simulations(self) -> bool:
-        """Whether there is something to train or to look up on simulations."""
-        return self._npe is None or self._simulator is None
-
     def _fit(self, *, show_progress_bars: bool) -> tuple[MixturePosterior, Any]:
-        npe, history = self._trained_npe(show_progress_bars=show_progress_bars)
-        rope = RoPE(
-            npe,
-            simulator=self._simulator,
-            simulations=None if self._simulator is not None else self._simulations,
-            coupler=self.coupler,
+        rope, history = self._rope(
+            coupler=self.coupler, show_progress_bars=show_progress_bars
         )
         posterior = rope.build_posterior(
             self._observations,

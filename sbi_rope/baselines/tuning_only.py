@@ -8,15 +8,15 @@ from torch import Tensor
 
 from sbi_rope._training import History
 from sbi_rope._validation import check_instance
-from sbi_rope.baselines.base import BuildsOnNPE, UsesCalibration
+from sbi_rope.baselines.base import UsesCalibration
+from sbi_rope.baselines.stage import StageOfRoPE
 from sbi_rope.baselines.training import EstimatorBuilder, Training
 from sbi_rope.finetuning import CalibrationFinetuner
-from sbi_rope.rope import RoPE
 
 __all__ = ["TuningOnly"]
 
 
-class TuningOnly(BuildsOnNPE, UsesCalibration):
+class TuningOnly(StageOfRoPE, UsesCalibration):
     r"""The flow on the tuned embedding, :math:`q(\theta \mid g(x_o))`.
 
     Step 2 of RoPE without step 3: :meth:`RoPE.tuned_posterior
@@ -59,23 +59,17 @@ class TuningOnly(BuildsOnNPE, UsesCalibration):
     ) -> None:
         check_instance("finetuner", finetuner, CalibrationFinetuner, optional=True)
         super().__init__(
-            prior, density_estimator, npe_training=npe_training, device=device
+            prior,
+            density_estimator,
+            simulator=simulator,
+            npe_training=npe_training,
+            device=device,
         )
-        self._simulator = simulator
         self.finetuner = finetuner
 
-    @property
-    def needs_simulations(self) -> bool:
-        """Whether there is something to train or to look up on simulations."""
-        return self._npe is None or self._simulator is None
-
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
-        npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
-        rope = RoPE(
-            npe,
-            simulator=self._simulator,
-            simulations=None if self._simulator is not None else self._simulations,
-            finetuner=self.finetuner,
+        rope, _ = self._rope(
+            finetuner=self.finetuner, show_progress_bars=show_progress_bars
         )
         rope.append_calibration(*self._calibration)
         rope.train(show_progress_bars=show_progress_bars)
