@@ -313,5 +313,11 @@ def _corners(
         theta = torch.from_numpy(arrays["RoPE"]["theta"])
         name = "-".join(str(w) for w in where if w not in ("", "{}"))
         name = "".join(c if c.isalnum() or c in "-_." else "_" for c in name)
-        figure = plots.pair_plot(samples, theta, prior=prior)
+        scores = rows[cells["RoPE"]]["acauc_per_parameter"].split("; ")
+        figure = plots.pair_plot(
+            samples,
+            theta,
+            prior=prior,
+            parameter_names=[score.split("=")[0] for score in scores],
+        )
         yield f"corner-{name}.png", f"Posteriors of one observation, {name}", figure

@@ -53,7 +53,7 @@ def row_of(cell: Cell, **scores: Any) -> dict[str, Any]:
         "neg_inf_fraction": 0.0,
         "acauc": 0.01,
         "acauc_standard_error": 0.01,
-        "acauc_per_parameter": "a=0.0100",
+        "acauc_per_parameter": "a=0.0100; b=0.0200",
         "expected_coverage_error": 0.02,
         "c2st": None,
         "converged": True,
