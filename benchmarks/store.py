@@ -5,7 +5,7 @@ import hashlib
 import io
 import json
 import os
-import tempfile
+import secrets
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -27,13 +27,13 @@ def write_atomically(path: Path) -> Iterator[Path]:
     see half a file.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=path.suffix)
-    os.close(handle)
+    # Not by `mkstemp`, whose files only their owner may read.
+    name = path.with_name(f".{secrets.token_hex(8)}{path.suffix}")
     try:
-        yield Path(name)
+        yield name
         os.replace(name, path)
     finally:
-        Path(name).unlink(missing_ok=True)
+        name.unlink(missing_ok=True)
 
 
 class Cache:

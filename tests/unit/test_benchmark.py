@@ -148,6 +148,14 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_files_can_be_read_by_whoever_can_read_others(tmp_path: Path) -> None:
+    plain, path = tmp_path / "plain.txt", tmp_path / "file.txt"
+    plain.write_text("text")
+    with write_atomically(path) as temporary:
+        temporary.write_text("text")
+    assert path.stat().st_mode == plain.stat().st_mode
+
+
 def test_the_cache_computes_once_and_again_if_the_entry_is_damaged(
     tmp_path: Path,
 ) -> None:
