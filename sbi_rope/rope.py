@@ -285,20 +285,19 @@ class RoPE:
             CouplingError: If the coupling has not converged.
             SimulationError: If the simulator fails.
         """
-        check_instance("coupler", coupler, SinkhornCoupler, optional=True)
-        check_choice("unseen", unseen, ("raise", "extend"))
-        check_unit_interval("tail_mass", tail_mass)
+        coupler = self._coupler_or(coupler)
         batch = self._embed_batch(
             x_o,
             num_simulations=num_simulations,
             seed=seed,
+            unseen=unseen,
+            tail_mass=tail_mass,
             show_progress_bars=show_progress_bars,
         )
-        coupler = self.coupler if coupler is None else coupler
         coupling = coupler.couple(batch.real, batch.simulated, seed=seed)
         if require_convergence:
             _check_converged(coupling, coupler)
-        return self._mixture(batch, coupling, unseen=unseen, tail_mass=tail_mass)
+        return self._mixture(batch, coupling)
 
     def sweep(
         self,
@@ -344,16 +343,15 @@ class RoPE:
             CouplingError: When the iteration reaches a coupling that has not converged.
             SimulationError: If the simulator fails.
         """
-        check_instance("coupler", coupler, SinkhornCoupler, optional=True)
-        check_choice("unseen", unseen, ("raise", "extend"))
-        check_unit_interval("tail_mass", tail_mass)
+        coupler = self._coupler_or(coupler)
         batch = self._embed_batch(
             x_o,
             num_simulations=num_simulations,
             seed=seed,
+            unseen=unseen,
+            tail_mass=tail_mass,
             show_progress_bars=show_progress_bars,
         )
-        coupler = self.coupler if coupler is None else coupler
         gammas, taus = list(gammas), list(taus)
         couplings = coupler.sweep(
             batch.real, batch.simulated, gammas=gammas, taus=taus, seed=seed
@@ -366,11 +364,13 @@ class RoPE:
             for coupling, (gamma, tau) in zip(couplings, settings, strict=True):
                 if require_convergence:
                     _check_converged(coupling, replace(coupler, gamma=gamma, tau=tau))
-                yield self._mixture(
-                    batch, coupling, unseen=unseen, tail_mass=tail_mass, shared=shared
-                )
+                yield self._mixture(batch, coupling, shared=shared)
 
         return posteriors()
+
+    def _coupler_or(self, coupler: SinkhornCoupler | None) -> SinkhornCoupler:
+        check_instance("coupler", coupler, SinkhornCoupler, optional=True)
+        return self.coupler if coupler is None else coupler
 
     def _embed_batch(
         self,
@@ -378,8 +378,12 @@ class RoPE:
         *,
         num_simulations: int | None,
         seed: int | None,
+        unseen: Literal["raise", "extend"],
+        tail_mass: float,
         show_progress_bars: bool,
     ) -> "_Batch":
+        check_choice("unseen", unseen, ("raise", "extend"))
+        check_unit_interval("tail_mass", tail_mass)
         if len(self._x_cal) and self._g is None:
             raise NotReadyError(
                 f"{len(self._x_cal)} calibration pairs were appended but not trained "
@@ -398,15 +402,20 @@ class RoPE:
             )
         real = embed(g, x_o)
         check_finite("g(x_o)", real)
-        return _Batch(x_o, real, simulated, copy.deepcopy(g))
+        return _Batch(
+            x_o=x_o,
+            real=real,
+            simulated=simulated,
+            embedding_net=g,
+            unseen=unseen,
+            tail_mass=tail_mass,
+        )
 
     def _mixture(
         self,
         batch: "_Batch",
         coupling: Coupling,
         *,
-        unseen: Literal["raise", "extend"],
-        tail_mass: float,
         shared: dict[str, Tensor] | None = None,
     ) -> MixturePosterior:
         mixture = MixtureEstimator(
@@ -414,9 +423,10 @@ class RoPE:
             batch.simulated,
             coupling,
             batch.x_o,
-            embedding_net=batch.embedding_net,
-            unseen=unseen,
-            tail_mass=tail_mass,
+            # Each posterior its own: moving one to a device leaves the others.
+            embedding_net=copy.deepcopy(batch.embedding_net),
+            unseen=batch.unseen,
+            tail_mass=batch.tail_mass,
         )
         return MixturePosterior(
             mixture,
@@ -487,14 +497,16 @@ class RoPE:
         return value
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class _Batch:
-    """A batch of real observations and the simulations it is coupled with."""
+    """Real observations, what they are coupled with, and how they are looked up."""
 
     x_o: Tensor
     real: Tensor
     simulated: Tensor
     embedding_net: nn.Module
+    unseen: Literal["raise", "extend"]
+    tail_mass: float
 
 
 def _check_converged(coupling: Coupling, coupler: SinkhornCoupler) -> None:

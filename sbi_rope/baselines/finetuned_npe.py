@@ -40,8 +40,8 @@ class FinetunedNPE(BuildsOnNPE, UsesCalibration):
     point included.
 
     Sees simulations and the calibration set. Assumes that what NPE has learnt is a good
-    start. To be preferred from some 200 pairs on, where it is the strongest of the
-    cheap methods; with 10 it is often worse than the prior.
+    start. To be preferred from some 200 pairs on, where it is among the
+    strongest of the cheap methods; with 10 it can be worse than the prior.
 
     References:
         | Multifidelity Simulation-based Inference for Computationally Expensive

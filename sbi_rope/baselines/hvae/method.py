@@ -83,19 +83,17 @@ class HVAE(BuildsOnNPE, UsesCalibration, UsesObservations):
     images, a simulator that can be differentiated once its noise is left out, and a
     prior on a box. To be preferred where the physics lacks an effect that is the same
     in kind for all observations and many of these are at hand. On the pendulum with 50
-    pairs it does far better than NPE and worse than :class:`FinetunedNPE`: the
-    densities stay as narrow as those of NPE.
+    pairs it does better than NPE and worse than :class:`FinetunedNPE`: the densities
+    stay as narrow as those of NPE.
 
     Where this differs from the paper, and from the original code:
 
     - The printed U-Nets cannot be run; ours have four up-convolutions, and outputs for
       the log-variance. Their means are their inputs plus what they learn, so that
       training starts at NPE.
-    - w is not stated. At 1 the ELBO, a sum over all entries of x, drowns the pairs, and
-      on the pendulum the result is no better than NPE; the default weighs them like all
-      entries together.
-    - The mean of R2P is taken. Draws from it (``noisy=True``) leave a valid bound, but
-      did not help.
+    - w is not stated. At 1 the ELBO, a sum over all entries of x, outweighs the pairs;
+      the default weighs them like all entries together.
+    - The mean of R2P is taken. Draws from it (``noisy=True``) leave a valid bound.
     - Draws of theta outside of the prior's support are brought to its edge for the
       physics, and the density falls off exponentially there instead of ending. The
       gradient of a draw is that of implicit functions, for all flows.
@@ -122,8 +120,8 @@ class HVAE(BuildsOnNPE, UsesCalibration, UsesObservations):
         training: How the networks are trained; at most 100 passes over the observations
             in batches of 100 at a learning rate of 1e-3, and 30 without improvement, if
             None.
-        width: Channels of the first block of the U-Nets. The paper has 64; on a CPU 8
-            takes a twentieth of the time.
+        width: Channels of the first block of the U-Nets. The paper has 64; 8 takes a
+            fraction of the time on a CPU.
         latent_dim: Length of z.
         num_latents: Components of the posterior.
         calibration_weight: w; the number of entries of an observation if None. The
