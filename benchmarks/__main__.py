@@ -35,10 +35,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     run = commands.add_parser("run", help="run the cells of a suite")
     run.set_defaults(command=_run)
     run.add_argument("suite", help=f"one of {', '.join(list_suites())}, or a TOML file")
-    run.add_argument("--task", nargs="+", dest="tasks", help="these tasks only")
-    run.add_argument("--method", nargs="+", dest="methods", help="these methods only")
     run.add_argument(
-        "--repetition", nargs="+", type=int, dest="repetitions", help="these only"
+        "--task", nargs="+", action="extend", dest="tasks", help="these tasks only"
+    )
+    run.add_argument(
+        "--method",
+        nargs="+",
+        action="extend",
+        dest="methods",
+        help="these methods only",
+    )
+    run.add_argument(
+        "--repetition",
+        nargs="+",
+        action="extend",
+        type=int,
+        dest="repetitions",
+        help="these only",
     )
     run.add_argument("--jobs", type=int, default=1, help="at a time; -1: all cores")
     run.add_argument(

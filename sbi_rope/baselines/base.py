@@ -9,7 +9,6 @@ from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any
 
 import torch
-from sbi.inference import NPE
 from torch import Tensor
 from torch.distributions import Distribution
 
@@ -33,6 +32,7 @@ from sbi_rope._validation import (
 )
 from sbi_rope.baselines.training import (
     EstimatorBuilder,
+    SimulationTrainer,
     Training,
     estimator_builder,
     train_with_sbi,
@@ -380,7 +380,7 @@ class BuildsOnNPE(UsesSimulations):
             return self._npe, None
         theta, x = self._simulations
         estimator, history = train_with_sbi(
-            NPE,
+            SimulationTrainer,
             self._prior,
             self._build,
             theta,

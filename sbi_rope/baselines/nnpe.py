@@ -4,7 +4,6 @@ import copy
 from functools import partial
 from typing import Any
 
-import sbi.inference
 import torch
 from torch import Tensor, nn
 
@@ -20,7 +19,12 @@ from sbi_rope._validation import check_choice, check_instance
 from sbi_rope.baselines.base import BuildsOnNPE
 from sbi_rope.baselines.error_model import SpikeAndSlab
 from sbi_rope.baselines.statistics import NoiseOn, SoftClip, split_at_statistics
-from sbi_rope.baselines.training import EstimatorBuilder, Training, train_with_sbi
+from sbi_rope.baselines.training import (
+    EstimatorBuilder,
+    SimulationTrainer,
+    Training,
+    train_with_sbi,
+)
 
 __all__ = ["NNPE"]
 
@@ -146,7 +150,7 @@ class NNPE(BuildsOnNPE):
         return posterior_from(npe, estimator.eval()), history
 
 
-class _TrainerWithNoise(sbi.inference.NPE):
+class _TrainerWithNoise(SimulationTrainer):
     """sbi's trainer, with fresh noise on x in every batch it takes a loss of."""
 
     def __init__(self, *, noise: SpikeAndSlab, scale: Tensor, **options: Any) -> None:

@@ -3,7 +3,6 @@
 from typing import Any
 
 import torch
-from sbi.inference import NPE
 from torch import Tensor
 
 from sbi_rope._sbi import embedding_of
@@ -12,6 +11,7 @@ from sbi_rope._validation import check_instance, check_integer, check_not_negati
 from sbi_rope.baselines.base import UsesObservations, UsesSimulations
 from sbi_rope.baselines.training import (
     EstimatorBuilder,
+    SimulationTrainer,
     Training,
     estimator_builder,
     train_with_sbi,
@@ -166,7 +166,7 @@ class NPERS(UsesSimulations, UsesObservations):
         def penalty(estimator: Any) -> Tensor | None:
             return self._penalty(estimator, x)
 
-        def make_trainer(**options: Any) -> NPE:
+        def make_trainer(**options: Any) -> SimulationTrainer:
             return _PenalisedNPE(penalty, **options)
 
         estimator, history = train_with_sbi(
@@ -201,7 +201,7 @@ class NPERS(UsesSimulations, UsesObservations):
         return self.regularisation * squared_mmd(simulated, observed)
 
 
-class _PenalisedNPE(NPE):
+class _PenalisedNPE(SimulationTrainer):
     """sbi's NPE with a penalty in the training loss that depends on the estimator."""
 
     def __init__(self, penalty: Any, **options: Any) -> None:

@@ -25,6 +25,7 @@ from sbi_rope.errors import InvalidInputError, InvalidTypeError
 
 __all__ = [
     "EstimatorBuilder",
+    "SimulationTrainer",
     "Training",
     "estimator_builder",
     "train_on_pairs",
@@ -147,8 +148,54 @@ def estimator_builder(density_estimator: Any) -> EstimatorBuilder:
     return build
 
 
+class SimulationTrainer(NPE):
+    """sbi's NPE, which holds simulations of the same parameters out together.
+
+    Where a few stored people are recorded many times, a network can learn them by
+    heart; only people it has not met say when to stop.
+    """
+
+    def get_dataloaders(  # noqa: D102
+        self,
+        starting_round: int = 0,
+        training_batch_size: int = 200,
+        validation_fraction: float = 0.1,
+        resume_training: bool = False,  # noqa: FBT001, FBT002
+        dataloader_kwargs: dict[str, Any] | None = None,
+    ) -> tuple[Any, Any]:
+        theta = self.get_simulations(starting_round)[0]
+        split = None if resume_training else _split_by(theta, validation_fraction)
+        # sbi takes the rows of a training it resumes as they are.
+        if split is not None and len(split[0]) >= training_batch_size:
+            self.train_indices, self.val_indices = split
+            resume_training = True
+        return super().get_dataloaders(
+            starting_round,
+            training_batch_size,
+            validation_fraction,
+            resume_training,
+            dataloader_kwargs,
+        )
+
+
+def _split_by(
+    theta: Tensor, validation_fraction: float
+) -> tuple[Tensor, Tensor] | None:
+    """Split rows by their parameters; None if no two rows share theirs."""
+    groups, of_row = theta.unique(dim=0, return_inverse=True)
+    if len(groups) == len(theta):
+        return None
+    num_held_out = len(theta) - int((1 - validation_fraction) * len(theta))
+    order = torch.randperm(len(groups), device=theta.device)
+    rows = torch.bincount(of_row)[order].cumsum(0)
+    # As many groups as it takes to fill what sbi makes room for.
+    held_out_groups = order[: int((rows < num_held_out).sum()) + 1]
+    held_out = torch.isin(of_row, held_out_groups)
+    return (~held_out).nonzero()[:, 0], held_out.nonzero()[:, 0]
+
+
 def train_with_sbi(
-    make_trainer: Callable[..., NPE],
+    make_trainer: Callable[..., SimulationTrainer],
     prior: Any,
     build: EstimatorBuilder,
     theta: Tensor,
@@ -160,7 +207,7 @@ def train_with_sbi(
     """Train an estimator on simulations with one of sbi's trainers.
 
     Args:
-        make_trainer: ``sbi.inference.NPE`` or a subclass of it, called with the words
+        make_trainer: ``SimulationTrainer`` or a subclass of it, called with the words
             of its constructor.
         prior: The prior.
         build: Returns the untrained estimator.

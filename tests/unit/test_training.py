@@ -25,6 +25,7 @@ from sbi_rope._training import (
 from sbi_rope.baselines import Training
 from sbi_rope.baselines.training import (
     MIN_SIMULATIONS,
+    SimulationTrainer,
     estimator_builder,
     train_on_pairs,
     train_with_sbi,
@@ -374,7 +375,7 @@ def with_sbi(n: int = 60, **options: Any) -> tuple[Any, History]:
     settings: dict[str, Any] = {"max_num_epochs": 5, "training_batch_size": 20}
     settings.update(options)
     return train_with_sbi(
-        NPE,
+        SimulationTrainer,
         box(2),
         estimator_builder(small()),
         *pairs(n),
@@ -417,6 +418,38 @@ class TestTrainWithSBI:
         with_sbi(MIN_SIMULATIONS, max_num_epochs=1)
         with pytest.raises(InvalidInputError, match=f"at least {MIN_SIMULATIONS}"):
             with_sbi(MIN_SIMULATIONS - 1)
+
+
+def split_of(make_trainer: Any, theta: Tensor) -> tuple[Tensor, Tensor]:
+    trainer = make_trainer(prior=box(2), show_progress_bars=False)
+    trainer.append_simulations(theta, simulate(theta))
+    torch.manual_seed(0)
+    trainer.get_dataloaders(training_batch_size=10, validation_fraction=0.2)
+    return trainer.train_indices, trainer.val_indices
+
+
+class TestSimulationTrainer:
+    def test_recordings_of_a_person_are_held_out_together(self) -> None:
+        people = box(2).sample((12,))
+        theta = people.repeat(6, 1)
+        train, held_out = split_of(SimulationTrainer, theta)
+        assert sorted(torch.cat([train, held_out]).tolist()) == list(range(72))
+        assert not set(train.remainder(12).tolist()) & set(
+            held_out.remainder(12).tolist()
+        )
+        assert 72 * 0.2 <= len(held_out) < 72 * 0.2 + 6
+
+    def test_without_recordings_of_the_same_it_is_the_split_of_sbi(self) -> None:
+        theta = box(2).sample((50,))
+        for ours, sbis in zip(
+            split_of(SimulationTrainer, theta), split_of(NPE, theta), strict=True
+        ):
+            assert torch.equal(ours, sbis)
+
+    def test_too_few_people_are_split_by_recording(self) -> None:
+        theta = box(2).sample((1,)).repeat(30, 1)
+        train, held_out = split_of(SimulationTrainer, theta)
+        assert (len(train), len(held_out)) == (24, 6)
 
 
 def on_pairs(n: int, **options: Any) -> tuple[Any, Any, History]:
