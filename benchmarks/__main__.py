@@ -4,6 +4,7 @@
     python -m benchmarks run main --task pendulum --jobs 2 --root FOLDER
     python -m benchmarks status
     python -m benchmarks report
+    python -m benchmarks summary
 
 Cells that are finished are kept, whichever suite asked for them, and are not computed
 again. Cells that failed are kept with their error; `--retry` computes them again.
@@ -18,10 +19,12 @@ from benchmarks.cases import Sources
 from benchmarks.cells import Suite, list_suites, load_suite
 from benchmarks.report import write_report
 from benchmarks.runner import Workplace, run_cells
+from benchmarks.summary import write_summary
 from benchmarks.tables import read_table, write_table
 
 DEFAULT_OUT = Path("results/benchmark")
 PUBLISHED = Path(__file__).parent / "results"
+README = Path(__file__).parents[1] / "README.md"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -75,6 +78,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     report.set_defaults(command=_report)
     report.add_argument("suites", nargs="*", help="all that have results if none")
     _add_out(report, PUBLISHED)
+
+    summary = commands.add_parser("summary", help="write what all suites say together")
+    summary.set_defaults(command=_summary)
+    summary.add_argument(
+        "--readme",
+        type=Path,
+        default=README,
+        help="file with a place for a block of results (%(default)s)",
+    )
+    _add_out(summary, PUBLISHED)
     args = parser.parse_args(arguments)
     return args.command(args)
 
@@ -160,6 +173,11 @@ def _report(args: argparse.Namespace) -> int:
         if not (folder / "results.csv").exists():
             raise SystemExit(f"No results of {suite.name} in {args.out}.")
         print(f"Written: {write_report(suite, read_table(folder), folder)}")
+    return 0
+
+
+def _summary(args: argparse.Namespace) -> int:
+    print(f"Written: {write_summary(args.out, args.readme)}, {args.readme}")
     return 0
 
 

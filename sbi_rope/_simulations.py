@@ -39,10 +39,13 @@ class SimulationSource(Protocol):
 
     num_dropped: int
 
-    def embeddings(
+    def from_prior(
         self, count: int | None, at_least: int, embed: Embedding, *, progress: bool
-    ) -> Tensor:
-        """Return embeddings of simulations from the prior, shape ``(n_s, l)``."""
+    ) -> tuple[Tensor, Tensor]:
+        """Return parameters from the prior and the embedding of a simulation of each.
+
+        Shapes ``(n_s, d)`` and ``(n_s, l)``.
+        """
         ...
 
     def targets(
@@ -77,9 +80,9 @@ class Simulator:
         with seeded(0):
             self.is_batched = self._probe()
 
-    def embeddings(
+    def from_prior(
         self, count: int | None, at_least: int, embed: Embedding, *, progress: bool
-    ) -> Tensor:
+    ) -> tuple[Tensor, Tensor]:
         """Simulate at parameters from the prior; drop rows that are not finite."""
         count = at_least if count is None else count
         theta = self.prior.sample(torch.Size((count,))).to(self.like)
@@ -90,7 +93,7 @@ class Simulator:
             )
         self.num_dropped += int((~valid).sum())
         _warn_of_dropped(int((~valid).sum()), count, "simulations from the prior")
-        return statistics[valid]
+        return theta[valid], statistics[valid]
 
     def targets(
         self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
@@ -252,9 +255,9 @@ class StoredSimulations:
         # "Nearest" is measured in standard deviations of the stored parameters.
         self.theta_std = self.theta.std(dim=0).clamp_min(1e-12)
 
-    def embeddings(
+    def from_prior(
         self, count: int | None, at_least: int, embed: Embedding, *, progress: bool
-    ) -> Tensor:
+    ) -> tuple[Tensor, Tensor]:
         """Embed a random subset; without a count, up to ``at_least`` of them."""
         available = len(self.x)
         if count is not None and count > available:
@@ -264,7 +267,7 @@ class StoredSimulations:
             )
         count = min(available, at_least) if count is None else count
         chosen = torch.randperm(available)[:count].to(self.x.device)
-        return embed(self.x[chosen])
+        return self.theta[chosen], embed(self.x[chosen])
 
     def targets(
         self, theta: Tensor, count: int, embed: Embedding, *, progress: bool

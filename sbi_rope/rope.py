@@ -148,6 +148,7 @@ class RoPE:
             device=device_of(estimator),
         )
         self._x_cal = self._theta_cal.new_empty(0, *estimator.condition_shape)
+        self._targets: Tensor | None = None
         self._source = self._make_source(simulator, simulations)
 
     def _make_source(
@@ -196,7 +197,7 @@ class RoPE:
         check_in_support("theta", theta, self._prior)
         self._theta_cal = torch.cat([self._theta_cal, theta])
         self._x_cal = torch.cat([self._x_cal, x])
-        self._g, self._history = None, None
+        self._g, self._history, self._targets = None, None, None
         return self
 
     def train(
@@ -224,15 +225,12 @@ class RoPE:
                 "x)` first, or go on to `build_posterior(x_o)`, which then couples "
                 "with the embedding net as NPE left it (OT-only)."
             )
-        stored = isinstance(self._source, StoredSimulations)
+        known = None if self.finetuner.resample_targets else self._targets
 
         def draw_targets(count: int) -> Tensor:
-            return self._source.targets(
-                self._theta_cal,
-                self.finetuner.num_neighbors if stored else count,
-                self._embed_simulations,
-                progress=show_progress_bars,
-            )
+            if known is not None:
+                return known
+            return self._draw_targets(self._theta_cal, count, show_progress_bars)
 
         result = self.finetuner.finetune(
             self._h,
@@ -243,6 +241,115 @@ class RoPE:
         )
         self._g, self._history = result.embedding_net, result.history
         return self
+
+    def draw_targets(
+        self,
+        rows: Tensor,
+        *,
+        seed: int | None = None,
+        show_progress_bars: bool = True,
+    ) -> Tensor:
+        r"""Return where tuning moves some pairs, :math:`E_\varepsilon[h(S(\theta_i))]`.
+
+        Args:
+            rows: Numbers of calibration pairs, shape ``(m,)``.
+            seed: Seed of the simulations; None uses the states of torch, NumPy and
+                Python.
+            show_progress_bars: Whether to show the progress of slow simulations.
+
+        Returns:
+            Shape ``(m, l)``. They depend on the parameters of these pairs only.
+
+        Raises:
+            SimulationError: If the simulator fails.
+        """
+        count = self.finetuner.simulations_per_target
+        with seeded(seed):
+            return self._draw_targets(self._theta_cal[rows], count, show_progress_bars)
+
+    def _draw_targets(self, theta: Tensor, count: int, progress: bool) -> Tensor:  # noqa: FBT001
+        stored = isinstance(self._source, StoredSimulations)
+        return self._source.targets(
+            theta,
+            self.finetuner.num_neighbors if stored else count,
+            self._embed_simulations,
+            progress=progress,
+        )
+
+    def draw_simulations(
+        self,
+        num_simulations: int | None = None,
+        *,
+        at_least: int = MIN_SIMULATIONS,
+        seed: int | None = None,
+        show_progress_bars: bool = True,
+    ) -> tuple[Tensor, Tensor]:
+        r"""Return parameters from the prior and embeddings :math:`h(x_s)`.
+
+        With the same number and seed these are the simulations that
+        :meth:`build_posterior` couples with.
+
+        Args:
+            num_simulations: n_s; ``at_least`` if None (or all stored ones, if there
+                are fewer).
+            at_least: The number without ``num_simulations``.
+            seed: Seed of the simulations; None uses the states of torch, NumPy and
+                Python.
+            show_progress_bars: Whether to show the progress of slow simulations.
+
+        Returns:
+            Parameters, shape ``(n_s, d)``, and the embedding of a simulation of each,
+            shape ``(n_s, l)``; without simulations that are not finite.
+
+        Raises:
+            InvalidInputError: If there are fewer stored simulations than asked for.
+            SimulationError: If the simulator fails.
+        """
+        if num_simulations is not None:
+            check_integer("num_simulations", num_simulations)
+        with seeded(seed):
+            return self._source.from_prior(
+                num_simulations,
+                at_least,
+                self._embed_simulations,
+                progress=show_progress_bars,
+            )
+
+    def embed_observations(self, x_o: Tensor) -> Tensor:
+        r"""Return :math:`g(x_o)`, shape ``(n_o, l)``; g = h without calibration pairs.
+
+        Args:
+            x_o: Real observations, shape ``(n_o, *event)``.
+
+        Raises:
+            NotReadyError: If calibration pairs were appended after the last training.
+            InvalidInputError: If x_o has the wrong shape or device, is empty, or it or
+                its embedding is not finite.
+        """
+        if len(self._x_cal) and self._g is None:
+            raise NotReadyError(
+                f"{len(self._x_cal)} calibration pairs were appended but not trained "
+                "on. Call `train()` first."
+            )
+        x_o = self._checked("x_o", x_o, self._estimator.condition_shape)
+        real = embed(self._h if self._g is None else self._g, x_o)
+        check_finite("g(x_o)", real)
+        return real
+
+    def with_pairs(self, rows: Tensor, *, targets: Tensor | None = None) -> "RoPE":
+        """Return an untrained RoPE of the same NPE and simulator, with some pairs only.
+
+        Args:
+            rows: Numbers of the calibration pairs to keep, shape ``(m,)``.
+            targets: What :meth:`draw_targets` returned for these rows, so that
+                :meth:`train` does not simulate again; of no effect if the finetuner
+                draws new ones in every step.
+        """
+        part = copy.copy(self)
+        part._theta_cal, part._x_cal = self._theta_cal[rows], self._x_cal[rows]
+        part._targets = targets
+        part._g, part._history = None, None
+        return part
 
     def build_posterior(
         self,
@@ -384,29 +491,18 @@ class RoPE:
     ) -> "_Batch":
         check_choice("unseen", unseen, ("raise", "extend"))
         check_unit_interval("tail_mass", tail_mass)
-        if len(self._x_cal) and self._g is None:
-            raise NotReadyError(
-                f"{len(self._x_cal)} calibration pairs were appended but not trained "
-                "on. Call `train()` first."
-            )
-        if num_simulations is not None:
-            check_integer("num_simulations", num_simulations)
-        x_o = self._checked("x_o", x_o, self._estimator.condition_shape)
-        g = self._h if self._g is None else self._g
-        with seeded(seed):
-            simulated = self._source.embeddings(
-                num_simulations,
-                max(len(x_o), MIN_SIMULATIONS),
-                self._embed_simulations,
-                progress=show_progress_bars,
-            )
-        real = embed(g, x_o)
-        check_finite("g(x_o)", real)
+        real = self.embed_observations(x_o)
+        _, simulated = self.draw_simulations(
+            num_simulations,
+            at_least=max(len(real), MIN_SIMULATIONS),
+            seed=seed,
+            show_progress_bars=show_progress_bars,
+        )
         return _Batch(
-            x_o=x_o,
+            x_o=self._checked("x_o", x_o, self._estimator.condition_shape),
             real=real,
             simulated=simulated,
-            embedding_net=g,
+            embedding_net=self._h if self._g is None else self._g,
             unseen=unseen,
             tail_mass=tail_mass,
         )
@@ -448,6 +544,16 @@ class RoPE:
             raise NotReadyError("No tuned embedding net yet. Call `train()` first.")
         tuned = with_embedding(self._estimator, self._g)
         return posterior_from(self._posterior, copy.deepcopy(tuned))
+
+    @property
+    def npe(self) -> Any:
+        """A copy of the NPE posterior that is repaired."""
+        return posterior_from(self._posterior, copy.deepcopy(self._estimator))
+
+    @property
+    def calibration(self) -> tuple[Tensor, Tensor]:
+        """The calibration pairs appended so far, theta and x."""
+        return self._theta_cal.clone(), self._x_cal.clone()
 
     @property
     def embedding_net(self) -> nn.Module:

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import torch
 
-__all__ = ["blocks", "flow_batch", "keep_freed_memory", "num_fitting"]
+__all__ = ["blocks", "flow_batch", "flow_slices", "keep_freed_memory", "num_fitting"]
 
 # Most weights, terms of the density, or proposals held at a time: a block of
 # observations times all simulations, or times some of its samples. With all that is
@@ -19,6 +19,12 @@ CPU_BATCH, GPU_BATCH = 2**14, 2**17
 def flow_batch(device: torch.device) -> int:
     """Return how many pairs of parameter and component the flow sees in one call."""
     return CPU_BATCH if device.type == "cpu" else GPU_BATCH
+
+
+def flow_slices(count: int, device: torch.device) -> list[slice]:
+    """Cut so many pairs of parameter and component into batches of the flow."""
+    size = flow_batch(device)
+    return [slice(start, start + size) for start in range(0, count, size)]
 
 
 def num_fitting(num_columns: int) -> int:

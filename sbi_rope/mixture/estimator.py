@@ -1,7 +1,7 @@
 """The density of the mixture, as an estimator in the sense of sbi."""
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, Literal
 
 import torch
@@ -13,8 +13,9 @@ from sbi_rope.coupling import Coupling
 from sbi_rope.errors import InvalidInputError, UnseenObservationError, warn_user
 from sbi_rope.mixture.chunks import blocks, flow_batch, keep_freed_memory, num_fitting
 from sbi_rope.mixture.sampling import Accept, BlockSampler
+from sbi_rope.mixture.truncation import Leakage, component_mass, mixture_mass
 
-__all__ = ["MixtureEstimator"]
+__all__ = ["MixtureEstimator", "without_nan"]
 
 
 class MixtureEstimator(ConditionalDensityEstimator):
@@ -181,7 +182,7 @@ class MixtureEstimator(ConditionalDensityEstimator):
         row, component, log_weights = self._without_tail(weights)
         parts = []
         for part in theta.split(num_fitting(len(row))):
-            log_q = _without_nan(self._log_q(part, row, component).double())
+            log_q = without_nan(self._log_q(part, row, component).double())
             parts.append(_log_sum_exp(log_q + log_weights, row, len(weights)))
         return torch.cat(parts)
 
@@ -224,6 +225,7 @@ class MixtureEstimator(ConditionalDensityEstimator):
         accept: Accept | None = None,
         batch_size: int | None = None,
         show_progress_bars: bool = False,
+        make_sampler: Callable[..., BlockSampler] | None = None,
         **kwargs: Any,
     ) -> Tensor:
         """Draw from the mixtures of a batch.
@@ -235,6 +237,8 @@ class MixtureEstimator(ConditionalDensityEstimator):
             batch_size: Most draws the flow makes at a time; if None what is fast on the
                 device.
             show_progress_bars: Whether to show the draws accepted so far.
+            make_sampler: What draws from a block of observations, given the block, its
+                weights, and the options of :class:`BlockSampler`; that class if None.
             **kwargs: None; kept for sbi's signature.
 
         Returns:
@@ -251,9 +255,8 @@ class MixtureEstimator(ConditionalDensityEstimator):
         total = num_samples * len(features)
         with tqdm(total=total, desc="Sampling", disable=not show_progress_bars) as bar:
             for block, weights in self.row_blocks(features):
-                sampler = BlockSampler(
-                    self.components,
-                    self.contexts,
+                sampler = (make_sampler or self._sampler)(
+                    block,
                     weights,
                     accept=accept,
                     batch_size=batch_size or flow_batch(theta.device),
@@ -263,6 +266,26 @@ class MixtureEstimator(ConditionalDensityEstimator):
                     theta[part, block] = sampler.sample(part.stop - part.start)
                     bar.update((part.stop - part.start) * len(weights))
         return theta.reshape(*sample_shape, *shape[1:])
+
+    def _sampler(self, block: slice, weights: Tensor, **options: Any) -> BlockSampler:
+        return BlockSampler(self.components, self.contexts, weights, **options)
+
+    def mass(
+        self, x: Tensor, *, accept: Accept | None, cache: dict[str, Tensor]
+    ) -> Leakage:
+        r"""Return :math:`Z_i = \sum_j \alpha_{ij} Z_j`, the mass that is accepted.
+
+        Args:
+            x: Observations, shape ``(n, *event)``.
+            accept: Tells which parameters ``(n, d)`` count; None counts all.
+            cache: Keeps :math:`Z_j`, which is estimated once.
+        """
+        if "component_mass" not in cache:
+            cache["component_mass"] = component_mass(
+                self.components, self.contexts, accept=accept
+            )
+        rows = (weights for _, weights in self.row_blocks(self.features(x)))
+        return mixture_mass(cache["component_mass"], rows, exact=accept is None)
 
     def loss(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
         """Return the negative log-probability, shape ``(B,)``."""
@@ -276,7 +299,7 @@ def _keys(x: Tensor) -> list[bytes]:
     return [hashlib.blake2b(row.tobytes(), digest_size=16).digest() for row in rows]
 
 
-def _without_nan(log_q: Tensor) -> Tensor:
+def without_nan(log_q: Tensor) -> Tensor:
     """Let components without a density at some theta not take the others with them."""
     undefined = torch.isnan(log_q)
     if not undefined.any():

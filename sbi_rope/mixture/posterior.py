@@ -16,12 +16,7 @@ from sbi_rope._validation import check_batch, check_integer
 from sbi_rope.coupling import Coupling
 from sbi_rope.errors import InvalidInputError, InvalidTypeError, SamplingError
 from sbi_rope.mixture.estimator import MixtureEstimator
-from sbi_rope.mixture.truncation import (
-    Leakage,
-    component_mass,
-    is_unbounded,
-    mixture_mass,
-)
+from sbi_rope.mixture.truncation import Leakage, is_unbounded
 
 __all__ = ["MixturePosterior"]
 
@@ -331,17 +326,11 @@ class MixturePosterior(DirectPosterior):
         Args:
             x: Observations, shape ``(B, *event)``.
         """
-        estimator = self.posterior_estimator
-        features = estimator.features(self._batch_of_x(x))
-        exact = is_unbounded(self.prior)
-        if "component_mass" not in self._cache:
-            self._cache["component_mass"] = component_mass(
-                estimator.components,
-                estimator.contexts,
-                accept=None if exact else self._inside,
-            )
-        rows = (weights for _, weights in estimator.row_blocks(features))
-        return mixture_mass(self._cache["component_mass"], rows, exact=exact)
+        return self.posterior_estimator.mass(
+            self._batch_of_x(x),
+            accept=None if is_unbounded(self.prior) else self._inside,
+            cache=self._cache,
+        )
 
     def leakage_correction(  # type: ignore[override]
         self, x: Tensor, **kwargs: Any

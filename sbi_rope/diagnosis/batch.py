@@ -1,0 +1,187 @@
+"""The diagnosis of a batch."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from sbi_rope._random import seeded
+from sbi_rope._validation import check_instance, check_integer
+from sbi_rope.coupling import SinkhornCoupler
+from sbi_rope.diagnosis.misspecification import misspecification_findings
+from sbi_rope.diagnosis.prior_shift import prior_shift
+from sbi_rope.diagnosis.report import Diagnosis, Finding
+from sbi_rope.diagnosis.residuals import (
+    cross_fitted_residuals,
+    num_features,
+    residual_finding,
+)
+from sbi_rope.diagnosis.simulations import Simulations
+from sbi_rope.diagnosis.support import support_of
+from sbi_rope.errors import InvalidInputError
+from sbi_rope.rope import MIN_SIMULATIONS, RoPE
+
+__all__ = ["diagnose"]
+
+# Fewer do not tell what is usual.
+FEWEST_SIMULATIONS = 100
+
+
+def diagnose(
+    rope: RoPE,
+    x_o: Tensor,
+    *,
+    num_simulations: int | None = None,
+    coupler: SinkhornCoupler | None = None,
+    num_folds: int | None = 5,
+    parameter_names: Sequence[str] | None = None,
+    seed: int | None = None,
+    show_progress_bars: bool = True,
+) -> Diagnosis:
+    r"""Tell whether a batch is one that RoPE can be trusted with.
+
+    1. Is it unlike simulations, before tuning and after? sbi's MMD test on
+       :math:`h(x_o)` and :math:`g(x_o)` against :math:`h(x_s)`.
+    2. Which observations does no simulation match, and on how many simulations does
+       each posterior rest?
+    3. Does it have other parameters than the prior? The parameters of the simulations,
+       weighted by the coupling at tau = 0, against the prior.
+    4. Does :math:`g(x) - E[h(S(\theta))]` of calibration pairs depend on
+       :math:`\theta`? On residuals of pairs that g was not trained on.
+
+    Without calibration pairs, g = h, and the second test of 1 and all of 4 are left
+    out. Thresholds are what simulations in the place of the batch exceed; single
+    findings are alarming by chance in about one batch of a hundred.
+
+    Args:
+        rope: A trained RoPE, or one without calibration pairs; it is left as it is.
+        x_o: The batch, shape ``(n_o, *event)``.
+        num_simulations: n_s; ``max(n_o, 1000)`` if None (or all stored ones, if there
+            are fewer). At least 100.
+        coupler: What effective sample sizes are those of; that of ``rope`` if None.
+        num_folds: Trainings behind the residuals of 4, each as long as ``rope.train``;
+            None leaves 4 out.
+        parameter_names: One name for each parameter; "theta_1" and so on if None.
+        seed: Seed of everything random; None uses the states of torch, NumPy and
+            Python. The simulations are those of ``rope.build_posterior`` under the
+            same seed and number.
+        show_progress_bars: Whether to show the progress of slow simulations and the
+            folds done.
+
+    Returns:
+        The findings; ``print`` it, or draw it with ``plot()``.
+
+    Raises:
+        NotReadyError: If calibration pairs were appended after the last training.
+        InvalidTypeError: If an argument has the wrong type.
+        InvalidInputError: If x_o has the wrong shape or device, is empty, or not
+            finite; if an argument is out of range; or if there are fewer than 100
+            simulations.
+        CouplingError: If the embeddings cannot be coupled.
+        SimulationError: If the simulator fails.
+    """
+    check_instance("rope", rope, RoPE)
+    check_instance("coupler", coupler, SinkhornCoupler, optional=True)
+    if num_simulations is not None:
+        check_integer("num_simulations", num_simulations, minimum=FEWEST_SIMULATIONS)
+    if num_folds is not None:
+        check_integer("num_folds", num_folds, minimum=2)
+    real = rope.embed_observations(x_o)
+    tuned = len(rope.calibration[0]) > 0
+    with seeded(seed):
+        # First, so that they are those of a posterior under the same seed.
+        theta, simulated = rope.draw_simulations(
+            num_simulations,
+            at_least=max(len(real), MIN_SIMULATIONS),
+            show_progress_bars=show_progress_bars,
+        )
+        names = _names(parameter_names, theta.shape[1])
+        _check_enough(theta)
+        coupling = (coupler or rope.coupler).couple(real, simulated)
+        before = rope.with_pairs(torch.arange(0)).embed_observations(x_o)
+        simulations = Simulations(
+            theta=_moved(theta), embedded=_moved(simulated), tuned=tuned
+        )
+        real, sizes = _moved(real), _moved(coupling.effective_sample_size)
+        findings = misspecification_findings(
+            _moved(before), real if tuned else None, simulations
+        )
+        support = support_of(real, simulations)
+        findings += support.findings(sizes, len(simulations))
+        shift = prior_shift(real, simulations)
+        findings += shift.findings(simulations, names)
+        residuals, residual_findings, notes = _residuals(
+            rope, simulations, num_folds, show_progress_bars=show_progress_bars
+        )
+    if not coupling.converged:
+        notes.append("The coupling has not converged; its sample sizes are rough.")
+    return Diagnosis(
+        findings=(*findings, *residual_findings),
+        notes=tuple(notes),
+        flags=support.flags,
+        effective_sample_size=sizes,
+        distance=support.distance,
+        theta=simulations.theta,
+        implied=shift.implied,
+        unshifted=shift.unshifted,
+        residuals=residuals,
+        parameter_names=names,
+    )
+
+
+def _residuals(
+    rope: RoPE,
+    simulations: Simulations,
+    num_folds: int | None,
+    *,
+    show_progress_bars: bool,
+) -> tuple[Tensor | None, list[Finding], list[str]]:
+    """Return residuals and what they say, or why there are none."""
+    theta = _moved(rope.calibration[0])
+    if not len(theta):
+        return (
+            None,
+            [],
+            [
+                "There are no calibration pairs: nothing was tuned, and what needs "
+                "labels was left out (misspecification after tuning, residuals)."
+            ],
+        )
+    if num_folds is None:
+        return None, [], ["Residuals of calibration pairs were left out, as asked."]
+    if not num_features(*theta.shape):
+        return (
+            None,
+            [],
+            [
+                f"Residuals were left out: {len(theta)} calibration pairs are too few "
+                f"for a regression on {theta.shape[1]} parameters."
+            ],
+        )
+    residuals = cross_fitted_residuals(
+        rope, num_folds=num_folds, show_progress_bars=show_progress_bars
+    )
+    return residuals, [residual_finding(residuals, theta, simulations)], []
+
+
+def _moved(values: Tensor) -> Tensor:
+    return values.detach().cpu().double()
+
+
+def _names(names: Sequence[str] | None, dim: int) -> tuple[str, ...]:
+    if names is None:
+        return tuple(f"theta_{k + 1}" for k in range(dim))
+    if isinstance(names, str) or len(names) != dim or len(set(names)) != dim:
+        raise InvalidInputError(
+            f"Expected `parameter_names` to be {dim} different names, one for each "
+            f"parameter; got {names!r}."
+        )
+    return tuple(names)
+
+
+def _check_enough(theta: Tensor) -> None:
+    if len(theta) < FEWEST_SIMULATIONS:
+        raise InvalidInputError(
+            f"Expected at least {FEWEST_SIMULATIONS} simulations to tell what is "
+            f"usual; got {len(theta)}. Give RoPE a simulator, or more `simulations`."
+        )

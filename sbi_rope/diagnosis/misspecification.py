@@ -1,0 +1,138 @@
+"""Is the batch unlike simulations, before tuning and after?"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from sbi_rope.diagnosis.report import Finding
+from sbi_rope.diagnosis.simulations import Simulations
+
+__all__ = ["MMDTest", "misspecification_findings", "mmd_test"]
+
+# Observations and simulations in one MMD: its cost is quadratic.
+MAX_OBSERVATIONS, MAX_SIMULATIONS = 300, 600
+NUM_DRAWS = 300
+LEVEL = 0.01
+
+
+@dataclass(frozen=True, kw_only=True)
+class MMDTest:
+    """The outcome of a test.
+
+    Attributes:
+        mmd: Squared MMD of the batch and simulations.
+        usual: Its median for a batch of simulations.
+        p_value: Chance of one as large for a batch of simulations.
+    """
+
+    mmd: float
+    usual: float
+    p_value: float
+
+
+def mmd_test(batch: Tensor, simulated: Tensor, *, null: Tensor) -> MMDTest:
+    r"""Test whether a batch is like simulations, with sbi's MMD.
+
+    The p-value of sbi compares an MMD of n against m points with MMDs of n against
+    m - n, which are larger on average; here both are of the same numbers.
+
+    References:
+        | Detecting Model Misspecification in Amortized Bayesian Inference with Neural
+          Networks (Schmitt et al., 2023)
+        | https://arxiv.org/abs/2112.08866
+
+    Args:
+        batch: Embeddings, shape ``(n_o, l)``; a random 300 of them are used.
+        simulated: Embeddings of simulations, shape ``(n_s, l)``.
+        null: What the batch would be drawn from if all were well, row by row another
+            view of ``simulated``, shape ``(n_s, l)``.
+    """
+    num_real = min(len(batch), MAX_OBSERVATIONS, len(simulated) // 3)
+    num_simulated = min(MAX_SIMULATIONS, len(simulated) - num_real)
+    chosen = batch[torch.randperm(len(batch))[:num_real]]
+    usual = torch.empty(NUM_DRAWS, dtype=torch.float64)
+    for i in range(NUM_DRAWS):
+        order = torch.randperm(len(simulated))[: num_real + num_simulated]
+        real, other = order[:num_real], order[num_real:]
+        usual[i] = _mmd(null[real], simulated[other])
+    value = _mmd(chosen, simulated[torch.randperm(len(simulated))[:num_simulated]])
+    return MMDTest(
+        mmd=value,
+        usual=float(usual.median()),
+        # The batch itself is one of the draws, so that p is never 0.
+        p_value=(1 + int((usual >= value).sum())) / (1 + NUM_DRAWS),
+    )
+
+
+def _mmd(a: Tensor, b: Tensor) -> float:
+    # Imported late: it brings packages that nothing else here needs.
+    from sbi.diagnostics import calc_misspecification_mmd
+
+    _, (_, mmd) = calc_misspecification_mmd(
+        a, b, mode="x_space", n_shuffle=1, max_samples=len(b)
+    )
+    return float(mmd)
+
+
+def misspecification_findings(
+    before: Tensor, after: Tensor | None, simulations: Simulations
+) -> list[Finding]:
+    """Test h(x_o), and g(x_o) if there is a tuned g, against h(x_s)."""
+    simulated = simulations.embedded
+    first = mmd_test(before, simulated, null=simulated)
+    findings = [_before(first)]
+    if after is not None:
+        second = mmd_test(after, simulated, null=simulations.averaged)
+        findings.append(_after(first, second))
+    return findings
+
+
+def _before(test: MMDTest) -> Finding:
+    alarming = test.p_value < LEVEL
+    size = f"its MMD is {_ratio(test)} that of a batch of simulations"
+    if alarming:
+        sentence = (
+            f"As NPE sees it, the batch is unlike simulations: {size}. The simulator "
+            "is misspecified, or the batch has other parameters than the prior; this "
+            "test cannot tell which."
+        )
+    else:
+        sentence = f"As NPE sees it, the batch is like simulations: {size}."
+    return _finding("misspecification before tuning", test, alarming, sentence)
+
+
+def _after(before: MMDTest, after: MMDTest) -> Finding:
+    alarming = after.p_value < LEVEL
+    size = f"its MMD is {_ratio(after)} what is usual"
+    course = f"{before.mmd:.2g} before tuning, {after.mmd:.2g} after"
+    if alarming:
+        sentence = (
+            f"After tuning the batch is unlike simulations: {size} ({course}). If a "
+            "prior shift is found as well, that may be all; otherwise there are too "
+            "few calibration pairs, or they are unlike the batch."
+        )
+    else:
+        sentence = (
+            f"After tuning the batch is no less like simulations than averaging over "
+            f"the simulator's noise explains: {size} ({course})."
+        )
+    return _finding("misspecification after tuning", after, alarming, sentence)
+
+
+def _ratio(test: MMDTest) -> str:
+    return f"{test.mmd / max(test.usual, 1e-300):.2g} times"
+
+
+def _finding(name: str, test: MMDTest, alarming: bool, sentence: str) -> Finding:  # noqa: FBT001
+    return Finding(
+        name=name,
+        value=test.p_value,
+        threshold=LEVEL,
+        alarming=alarming,
+        sentence=sentence,
+        reason=(
+            "Alarming below the threshold (a p-value): one batch of simulations in a "
+            "hundred falls there."
+        ),
+    )

@@ -1,0 +1,186 @@
+"""Which parameters the batch implies, against the prior."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from sbi_rope.coupling import Coupling, SinkhornCoupler
+from sbi_rope.diagnosis.report import Finding
+from sbi_rope.diagnosis.simulations import Simulations
+
+__all__ = ["PriorShift", "prior_shift"]
+
+# Without a potential each observation chooses its simulations alone: no trust in the
+# prior. The smaller gamma, the less the implied distribution is blurred.
+COUPLER = SinkhornCoupler(gamma=0.1, tau=0.0, cost_scale="simulated")
+# Simulations that play the batch, and the number of batches they play.
+MAX_PLAYERS, NUM_DRAWS = 1000, 2000
+# Points at which distribution functions are compared.
+NUM_POINTS = 100
+CHUNK = 500
+LEVEL = 0.01
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PriorShift:
+    """The parameters a batch implies.
+
+    Attributes:
+        implied: Weights of the simulations, sum one, ``(n_s,)``.
+        unshifted: The same for a batch that follows the prior.
+        distance: Kolmogorov-Smirnov distance between the two, ``(d,)``.
+        threshold: What a batch of the prior exceeds in one parameter or more in one
+            of a hundred batches, ``(d,)``.
+    """
+
+    implied: Tensor
+    unshifted: Tensor
+    distance: Tensor
+    threshold: Tensor
+
+    def findings(self, simulations: Simulations, names: Sequence[str]) -> list[Finding]:
+        """Judge each parameter."""
+        theta = simulations.theta
+        std = theta.std(dim=0).clamp_min(1e-12)
+        mean, spread = _moments(theta, self.implied)
+        usual_mean, usual_spread = _moments(theta, self.unshifted)
+        move = ((mean - usual_mean) / std).tolist()
+        ratio = (spread / usual_spread.clamp_min(1e-12)).tolist()
+        return [
+            Finding(
+                name=f"prior shift: {name}",
+                value=float(self.distance[k]),
+                threshold=float(self.threshold[k]),
+                alarming=bool(self.distance[k] > self.threshold[k]),
+                sentence=_sentence(
+                    name,
+                    shifted=bool(self.distance[k] > self.threshold[k]),
+                    move=move[k],
+                    ratio=ratio[k],
+                    tuned=simulations.tuned,
+                ),
+                reason=(
+                    "Alarming above the threshold (a Kolmogorov-Smirnov distance): "
+                    "one batch of the prior in a hundred gets there in any parameter, "
+                    "blurred by the coupling as this one is."
+                ),
+            )
+            for k, name in enumerate(names)
+        ]
+
+
+def prior_shift(real: Tensor, simulations: Simulations) -> PriorShift:
+    r"""Compare the parameters behind a batch with those behind simulations.
+
+    Every observation weighs simulations by
+    :math:`\operatorname{softmax}_j(-C_{ij} / \gamma)`; the mean over the batch, as
+    weights of the simulations' parameters, stands for the batch's. It is blurred: by
+    gamma, by the posterior of each observation, which is drawn to the prior, and by
+    tuning. So it understates a shift. It is compared with what simulations give that
+    play the batch, each without itself, as they are and as tuning would leave them.
+
+    Args:
+        real: :math:`g(x_o)`, shape ``(n_o, l)``.
+        simulations: What the batch is compared with.
+    """
+    embedded = simulations.embedded
+    coupling = COUPLER.couple(real[:1], embedded)
+    points = _points(simulations.theta)
+    implied, batch = _rows(coupling, real, simulations, points)
+    players = torch.arange(min(len(simulations), MAX_PLAYERS))
+    averaged = simulations.averaged[players]
+    unshifted, expected = _rows(coupling, averaged, simulations, points, own=players)
+    # A g that was trained little averages less: in between is as good as either end.
+    ends = [expected]
+    if simulations.tuned:
+        ends.append(
+            _rows(coupling, embedded[players], simulations, points, own=players)[1]
+        )
+    level = 1.0 - LEVEL / simulations.theta.shape[1]
+    thresholds = [
+        _draws(end, expected, size=len(real)).quantile(level, dim=0) for end in ends
+    ]
+    return PriorShift(
+        implied=implied,
+        unshifted=unshifted,
+        distance=_largest_gap(batch.mean(dim=0), expected.mean(dim=0)),
+        threshold=torch.stack(thresholds).amax(dim=0),
+    )
+
+
+def _points(theta: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the order of each parameter, and where in it to compare."""
+    last = len(theta) - 1
+    where = torch.linspace(0, last, min(NUM_POINTS, len(theta))).round().long()
+    return theta.argsort(dim=0), where
+
+
+def _rows(
+    coupling: Coupling,
+    real: Tensor,
+    simulations: Simulations,
+    points: tuple[Tensor, Tensor],
+    own: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Return mean weights ``(n_s,)``, and distribution functions ``(n, d, points)``."""
+    order, where = points
+    total = torch.zeros(len(simulations), dtype=torch.float64)
+    functions = []
+    for start in range(0, len(real), CHUNK):
+        weights = coupling.rows(real[start : start + CHUNK])
+        if own is not None:
+            rows = torch.arange(len(weights))
+            weights[rows, own[start : start + CHUNK]] = 0.0
+            weights = weights / weights.sum(dim=1, keepdim=True).clamp_min(1e-300)
+        total += weights.sum(dim=0)
+        functions.append(
+            torch.stack(
+                [weights[:, column].cumsum(dim=1)[:, where] for column in order.T],
+                dim=1,
+            )
+        )
+    return total / len(real), torch.cat(functions)
+
+
+def _draws(functions: Tensor, expected: Tensor, *, size: int) -> Tensor:
+    """Return distances for batches of simulations, shape ``(draws, d)``."""
+    # The expectation is a mean over simulations too, and as uncertain as that.
+    batch = _resampled(functions, size)
+    reference = _resampled(expected, len(expected))
+    return _largest_gap(batch, reference)
+
+
+def _resampled(functions: Tensor, size: int) -> Tensor:
+    """Return means over rows drawn with replacement, ``(draws, d, points)``."""
+    count = len(functions)
+    shares = torch.full((count,), 1.0 / count, dtype=torch.float64)
+    draws = torch.distributions.Multinomial(size, shares).sample((NUM_DRAWS,))
+    mean = draws @ functions.reshape(count, -1) / size
+    return mean.reshape(NUM_DRAWS, *functions.shape[1:])
+
+
+def _largest_gap(a: Tensor, b: Tensor) -> Tensor:
+    return (a - b).abs().amax(dim=-1)
+
+
+def _moments(theta: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    mean = weights @ theta
+    return mean, (weights @ (theta - mean).square()).sqrt()
+
+
+def _sentence(
+    name: str, *, shifted: bool, move: float, ratio: float, tuned: bool
+) -> str:
+    where = (
+        f"the mean of {name} is {abs(move):.2f} prior standard deviations "
+        f"{'higher' if move > 0 else 'lower'} and its spread {ratio:.2f} times what a "
+        "batch of the prior would give"
+    )
+    if not shifted:
+        return f"No sign that the batch has other values of {name}: {where}."
+    sentence = f"The batch seems to have other values of {name} than the prior: {where}"
+    if not tuned:
+        return f"{sentence}. But g was not tuned, and misspecification looks the same."
+    return f"{sentence} (understated). A smaller tau trusts the prior less."

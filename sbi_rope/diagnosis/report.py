@@ -1,0 +1,117 @@
+"""What a diagnosis says: findings in words and numbers, and the arrays behind them."""
+
+import textwrap
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["Diagnosis", "Finding"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """One number, where it becomes alarming, and what it means.
+
+    Attributes:
+        name: What was looked at.
+        value: The number.
+        threshold: Where it becomes alarming.
+        alarming: Whether it is beyond the threshold.
+        sentence: What was found, in plain words.
+        reason: On which side of the threshold it is alarming, and why there.
+    """
+
+    name: str
+    value: float
+    threshold: float
+    alarming: bool
+    sentence: str
+    reason: str
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Diagnosis:
+    r"""Findings about a batch of real observations, and the arrays behind them.
+
+    All tensors are float64 on the CPU unless said otherwise.
+
+    Attributes:
+        findings: All that was tested.
+        notes: What was left out, and what else to know.
+        flags: Indices of the observations that no simulation matches, int64.
+        effective_sample_size: Of each observation's row of the coupling, ``(n_o,)``.
+        distance: From :math:`g(x_o)` to the nearest simulation, in units of the median
+            distance from a simulation to its nearest other, ``(n_o,)``.
+        theta: The parameters of the simulations, ``(n_s, d)``.
+        implied: Weights of ``theta`` that stand for the parameters of the batch, sum
+            one, ``(n_s,)``.
+        unshifted: The same for a batch that follows the prior: the prior, blurred as
+            ``implied`` is.
+        residuals: :math:`g(x) - E[h(S(\theta))]` of each calibration pair, with g
+            trained on others, ``(n_c, l)``; None if they were left out.
+        parameter_names: One name for each parameter.
+    """
+
+    findings: tuple[Finding, ...]
+    notes: tuple[str, ...]
+    flags: Tensor
+    effective_sample_size: Tensor = field(repr=False)
+    distance: Tensor = field(repr=False)
+    theta: Tensor = field(repr=False)
+    implied: Tensor = field(repr=False)
+    unshifted: Tensor = field(repr=False)
+    residuals: Tensor | None = field(repr=False)
+    parameter_names: tuple[str, ...]
+
+    @property
+    def alarming(self) -> tuple[Finding, ...]:
+        """The findings beyond their thresholds."""
+        return tuple(finding for finding in self.findings if finding.alarming)
+
+    def __getitem__(self, name: str) -> Finding:
+        """Return the finding of a name."""
+        return {finding.name: finding for finding in self.findings}[name]
+
+    def as_rows(self) -> list[dict[str, Any]]:
+        """Return a row for each finding, ready for a dataframe."""
+        return [asdict(finding) for finding in self.findings]
+
+    def plot(self) -> "Figure":
+        """Draw the prior and the distribution the batch implies, for each parameter.
+
+        Raises:
+            ImportError: If matplotlib is not installed.
+        """
+        from sbi_rope.plots.diagnosis import implied_parameters
+
+        return implied_parameters(
+            self.theta,
+            implied=self.implied,
+            unshifted=self.unshifted,
+            parameter_names=self.parameter_names,
+        )
+
+    def __str__(self) -> str:
+        count = len(self.alarming)
+        lines = [
+            f"Diagnosis of {len(self.distance)} observations against {len(self.theta)} "
+            f"simulations: {count} of {len(self.findings)} findings "
+            f"{'is' if count == 1 else 'are'} alarming."
+        ]
+        for finding in self.findings:
+            mark = "!" if finding.alarming else "-"
+            lines.append(
+                f"{mark} {finding.name}: {finding.value:.3g} "
+                f"(threshold {finding.threshold:.3g})"
+            )
+            lines.append(_indented(f"{finding.sentence} {finding.reason}"))
+        lines += [_indented(note, first="* ") for note in self.notes]
+        return "\n".join(lines)
+
+
+def _indented(text: str, *, first: str = "  ") -> str:
+    return textwrap.fill(text, 88, initial_indent=first, subsequent_indent="  ")

@@ -1,0 +1,153 @@
+"""Whether what tuning leaves of a calibration pair depends on its parameters."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from sbi_rope.diagnosis.report import Finding
+from sbi_rope.diagnosis.simulations import Simulations
+from sbi_rope.rope import RoPE
+
+__all__ = ["Dependence", "cross_fitted_residuals", "dependence", "residual_finding"]
+
+NUM_PERMUTATIONS = 1000
+LEVEL = 0.01
+# The most that averaging over the simulator's noise explains; see `dependence`.
+LARGEST_RATIO = 0.5
+# Bias below this share of the embeddings' spread is nothing, if there is no noise.
+SMALLEST_SHARE = 0.05
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dependence:
+    """How much residuals depend on parameters.
+
+    Attributes:
+        p_value: Of a permutation test.
+        bias: Root mean square of the part that follows the parameters.
+    """
+
+    p_value: float
+    bias: float
+
+
+def num_features(num_pairs: int, dim: int) -> int:
+    """Return how many features of the parameters so many pairs can carry; 0 is none."""
+    for count in (2 * dim, dim):
+        if num_pairs >= 2 * (count + 1) + 2:
+            return count
+    return 0
+
+
+def cross_fitted_residuals(
+    rope: RoPE, *, num_folds: int, show_progress_bars: bool
+) -> Tensor:
+    r"""Return :math:`g(x) - E[h(S(\theta))]` of each pair, g trained on other folds.
+
+    On the pairs g was trained on they would be too small. Costs as many trainings as
+    there are folds.
+
+    Args:
+        rope: RoPE with its calibration pairs; it is left as it is.
+        num_folds: Folds; as many as there are pairs, if these are fewer.
+        show_progress_bars: Whether to show the folds done.
+
+    Returns:
+        Shape ``(n_c, l)``.
+    """
+    theta, x = rope.calibration
+    targets = rope.draw_targets(torch.arange(len(theta)), show_progress_bars=False)
+    residuals = torch.empty_like(targets)
+    order = torch.randperm(len(theta)).to(theta.device)
+    folds = order.tensor_split(min(num_folds, len(theta)))
+    bar = tqdm(range(len(folds)), desc="Folds", disable=not show_progress_bars)
+    for number in bar:
+        held_out = folds[number]
+        others = torch.cat([rows for rows in folds if rows is not held_out])
+        part = rope.with_pairs(others, targets=targets[others])
+        part.train(show_progress_bars=False)
+        residuals[held_out] = part.embed_observations(x[held_out]) - targets[held_out]
+    return residuals.cpu().double()
+
+
+def dependence(residuals: Tensor, theta: Tensor) -> Dependence:
+    r"""Regress residuals on parameters and their squares, and permute.
+
+    The statistic is the sum of squares that the regression explains. The bias
+    :math:`b` is its unbiased estimate: with p features and residual variance
+    :math:`s^2`, :math:`b^2 = (\text{explained} - p\, s^2) / n`. With few pairs there
+    are no squares.
+
+    Args:
+        residuals: Shape ``(n, l)``.
+        theta: Parameters, shape ``(n, d)``.
+    """
+    count = num_features(*theta.shape)
+    standard = (theta - theta.mean(dim=0)) / theta.std(dim=0).clamp_min(1e-12)
+    features = torch.cat([standard, standard.square()], dim=1)[:, :count]
+    features = features - features.mean(dim=0)
+    vectors, values, _ = torch.linalg.svd(features, full_matrices=False)
+    basis = vectors[:, values > 1e-9 * values.max()]
+    centred = residuals - residuals.mean(dim=0)
+    explained = float((basis.T @ centred).square().sum())
+    permuted = torch.stack(
+        [
+            (basis.T @ centred[torch.randperm(len(centred))]).square().sum()
+            for _ in range(NUM_PERMUTATIONS)
+        ]
+    )
+    # Equal up to rounding counts as reached.
+    reached = int((permuted >= explained * (1 - 1e-12)).sum())
+    n, p = len(centred), basis.shape[1]
+    variance = (float(centred.square().sum()) - explained) / (n - 1 - p)
+    return Dependence(
+        p_value=(1 + reached) / (1 + NUM_PERMUTATIONS),
+        bias=(max(explained - p * variance, 0.0) / n) ** 0.5,
+    )
+
+
+def residual_finding(
+    residuals: Tensor, theta: Tensor, simulations: Simulations
+) -> Finding:
+    r"""Judge the bias in units of the simulator's own noise.
+
+    Residuals depend on parameters even where all is well. With :math:`h` the posterior
+    mean of a linear-Gaussian problem that explains a share R of the variance, the best
+    g leaves :math:`-R (1 - R)\, \theta`, and a simulation has noise of variance
+    :math:`R (1 - R)`: the ratio is :math:`\sqrt{R (1 - R)} \le 1/2`.
+    """
+    found = dependence(residuals, theta)
+    spread = float(simulations.embedded.var(dim=0).sum())
+    noise = float(simulations.noise.trace())
+    unit = max(noise, SMALLEST_SHARE**2 * spread) ** 0.5
+    value = found.bias / unit if unit else float(found.bias > 0)
+    significant = found.p_value < LEVEL
+    alarming = significant and value > LARGEST_RATIO
+    if alarming:
+        sentence = (
+            "What tuning leaves of the calibration pairs depends on their parameters: "
+            f"a bias of {value:.2f} times the simulator's noise (p = "
+            f"{found.p_value:.3f}). Tuning has not generalised, for want of pairs or of "
+            "training, or real observations do not follow the parameters as "
+            "simulations do, and the conditional independence RoPE rests on fails."
+        )
+    else:
+        sentence = (
+            "What tuning leaves of the calibration pairs depends on their parameters "
+            f"by {value:.2f} times the simulator's noise (p = {found.p_value:.3f}), "
+            + ("as it does where all is well." if significant else "if at all.")
+        )
+    return Finding(
+        name="residual depends on parameters",
+        value=value,
+        threshold=LARGEST_RATIO,
+        alarming=alarming,
+        sentence=sentence,
+        reason=(
+            "Alarming above the threshold, if p is below 0.01: averaging over the "
+            "simulator's noise alone leaves up to half of it in a linear-Gaussian "
+            "problem."
+        ),
+    )

@@ -1,0 +1,160 @@
+"""Fits all candidates of a stack to a batch."""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_rope._sbi import embed
+from sbi_rope.coupling import Coupling, SinkhornCoupler
+from sbi_rope.mixture import MixtureEstimator
+from sbi_rope.rope import RoPE
+from sbi_rope.stacking.candidates import (
+    Candidate,
+    CouplingCandidate,
+    DensityCandidate,
+    as_part,
+)
+from sbi_rope.stacking.coupling import StackedCoupling, StackedEmbedding
+from sbi_rope.stacking.estimator import StackedEstimator
+from sbi_rope.stacking.parts import Part
+
+__all__ = ["Components", "fit_candidates"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Components:
+    """What all fits of a stack share.
+
+    Attributes:
+        x_o: The batch of real observations, shape ``(n_o, *event)``.
+        prior: The prior NPE was trained with.
+        density: The density of a component given its context.
+        contexts: The embeddings of the simulations, shape ``(n_s, l)``.
+        fixed: The candidates that are the same whatever the pairs are.
+    """
+
+    x_o: Tensor
+    prior: Distribution
+    density: Any
+    contexts: Tensor
+    fixed: dict[str, Part]
+
+    @classmethod
+    def of(
+        cls,
+        rope: RoPE,
+        x_o: Tensor,
+        candidates: Sequence[Candidate],
+        *,
+        num_simulations: int | None,
+        seed: int,
+        show_progress_bars: bool,
+    ) -> "Components":
+        """Simulate what the batch is coupled with, and build the fixed candidates."""
+        # Only what is simulated is needed: h embeds it, and at tau = 0 there is
+        # nothing to solve.
+        posterior = rope.with_pairs(torch.arange(0)).build_posterior(
+            x_o,
+            coupler=replace(rope.coupler, tau=0.0),
+            num_simulations=num_simulations,
+            seed=seed,
+            show_progress_bars=show_progress_bars,
+        )
+        estimator = posterior.posterior_estimator
+        return cls(
+            x_o=posterior.x_o,
+            prior=posterior.prior,
+            density=estimator.components,
+            contexts=estimator.contexts,
+            fixed={
+                c.name: as_part(c.name, c.build(rope, seed), rope)
+                for c in candidates
+                if isinstance(c, DensityCandidate) and c.fixed
+            },
+        )
+
+
+def fit_candidates(
+    candidates: Sequence[Candidate],
+    rope: RoPE,
+    x: Tensor,
+    components: Components,
+    *,
+    seed: int,
+    unseen: Literal["raise", "extend"] = "raise",
+    tail_mass: float = 1e-3,
+) -> StackedEstimator:
+    """Couple a batch at all settings, and build the other candidates.
+
+    Args:
+        candidates: Couplings first.
+        rope: RoPE, tuned on the pairs that may be used.
+        x: The batch, shape ``(n, *event)``.
+        components: What all fits share.
+        seed: Seed of what is trained.
+        unseen: As in :meth:`~sbi_rope.RoPE.build_posterior`.
+        tail_mass: As in :meth:`~sbi_rope.RoPE.build_posterior`.
+
+    Returns:
+        The stack, with equal weights.
+    """
+    settings = [c for c in candidates if isinstance(c, CouplingCandidate)]
+    nets = {False: rope.embedding_net, True: rope.tuned_embedding_net}
+    used = [tuned for tuned in nets if any(c.tuned == tuned for c in settings)]
+    real, columns, start = [], {}, 0
+    for tuned in used:
+        real.append(embed(nets[tuned], x))
+        columns[tuned] = slice(start, start + real[-1].shape[1])
+        start += real[-1].shape[1]
+    couplings = _couple(settings, dict(zip(used, real, strict=True)), rope, components)
+    mixture = MixtureEstimator(
+        components.density,
+        components.contexts,
+        StackedCoupling(  # type: ignore[arg-type]
+            couplings=tuple(couplings[c] for c in settings),
+            shares=_equal(len(settings), x),
+            real=torch.cat(real, dim=1),
+            columns=tuple(columns[c.tuned] for c in settings),
+        ),
+        x,
+        embedding_net=StackedEmbedding([nets[tuned] for tuned in used]),
+        unseen=unseen,
+        tail_mass=tail_mass,
+    )
+    parts = [
+        components.fixed.get(c.name) or as_part(c.name, c.build(rope, seed), rope)
+        for c in candidates
+        if isinstance(c, DensityCandidate)
+    ]
+    return StackedEstimator(mixture, parts, _equal(len(candidates), x))
+
+
+def _equal(count: int, like: Tensor) -> Tensor:
+    return torch.full((count,), 1.0 / count, dtype=torch.double, device=like.device)
+
+
+def _couple(
+    settings: Sequence[CouplingCandidate],
+    real: dict[bool, Tensor],
+    rope: RoPE,
+    components: Components,
+) -> dict[CouplingCandidate, Coupling]:
+    """Couple at every setting; along gamma and tau each starts from its neighbour."""
+    couplings: dict[CouplingCandidate, Coupling] = {}
+    groups = dict.fromkeys((c.tuned, c.cost_scale) for c in settings)
+    for tuned, cost_scale in groups:
+        group = [c for c in settings if (c.tuned, c.cost_scale) == (tuned, cost_scale)]
+        gammas = sorted({c.gamma for c in group}, reverse=True)
+        taus = sorted({c.tau for c in group}, reverse=True)
+        coupler: SinkhornCoupler = replace(rope.coupler, cost_scale=cost_scale)
+        found = coupler.sweep(
+            real[tuned], components.contexts, gammas=gammas, taus=taus, seed=0
+        )
+        by_setting = dict(zip(itertools.product(gammas, taus), found, strict=True))
+        couplings.update({c: by_setting[c.gamma, c.tau] for c in group})
+    return couplings

@@ -1,0 +1,216 @@
+"""What the calibration pairs say about a stack: did calibration help?"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sbi_rope.metrics import (
+    CoverageCurve,
+    acauc_of,
+    coverage_curve_of,
+    expected_coverage_error_of,
+)
+from sbi_rope.stacking.cross_validation import CrossValidation, Difference
+
+__all__ = ["LearningCurve", "StackingReport"]
+
+# A family with half of the weight is what the stack mostly is.
+MOSTLY = 0.5
+# Of the intervals whose coverage the text states.
+LEVEL = 0.9
+
+IN_WORDS = {
+    "prior": "your labels do not support anything sharper than the prior",
+    "NPE": "the simulator serves these data as it is, and calibration changes little",
+    "OT-only": "transport without tuning does the work, and labels add little to it",
+    "tuning-only": "the tuned embedding is trusted without transport",
+    "RoPE": "tuning and transport repair the simulator, as RoPE is meant to",
+    "fine-tuned NPE": "with so many labels the simulator adds little beyond a start",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearningCurve:
+    """The held-out score of the stack when it is trained on fewer pairs.
+
+    Attributes:
+        num_pairs: Pairs that the candidates were trained on.
+        scores: Mean held-out log score of the stack.
+        standard_errors: Of the scores, from pair to pair. All scores are of the same
+            pairs, so that their differences are surer than that.
+    """
+
+    num_pairs: tuple[int, ...]
+    scores: tuple[float, ...]
+    standard_errors: tuple[float, ...]
+
+    @classmethod
+    def of(cls, parts: Sequence[CrossValidation]) -> "LearningCurve":
+        """Return the curve of cross-validations that trained on more and more pairs."""
+        scores = [part.stack_scores for part in parts]
+        return cls(
+            num_pairs=tuple(part.num_trained_on for part in parts),
+            scores=tuple(float(s.mean()) for s in scores),
+            standard_errors=tuple(float(s.std() / len(s) ** 0.5) for s in scores),
+        )
+
+    def gain_of_doubling(self) -> float:
+        r"""Return what twice as many pairs would add, if the curve goes on as it did.
+
+        By the line :math:`s(n) = a - b / n`, fitted to all points; of the largest n,
+        the gain is :math:`b / (2 n)`, or 0 if the curve falls.
+        """
+        inverse = 1.0 / torch.tensor(self.num_pairs, dtype=torch.double)
+        scores = torch.tensor(self.scores, dtype=torch.double)
+        if len(scores) < 2 or not torch.isfinite(scores).all():
+            return float("nan")
+        centred = inverse - inverse.mean()
+        slope = float((centred * scores).sum() / centred.square().sum())
+        return max(0.0, -slope) / (2 * self.num_pairs[-1])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StackingReport:
+    """Did calibration help, by what, and how far can the stack be trusted?
+
+    All numbers are of held-out pairs: neither the candidates nor the weights of what is
+    scored have seen them.
+
+    Attributes:
+        cross_validation: The scores behind it.
+        learning_curve: Of the stack, if it was asked for.
+    """
+
+    cross_validation: CrossValidation
+    learning_curve: LearningCurve | None = field(default=None)
+
+    def gain_over(self, name: str) -> Difference | None:
+        """Return the gain of the stack over a candidate; None if there is none such."""
+        if name not in self.cross_validation.names:
+            return None
+        return self.cross_validation.difference("stack", name)
+
+    @cached_property
+    def family_weights(self) -> dict[str, float]:
+        """The weight of each method, summed over its settings, from large to small."""
+        totals: dict[str, float] = {}
+        rows = self.cross_validation
+        for family, weight in zip(
+            rows.families, rows.weights.weights.tolist(), strict=True
+        ):
+            totals[family] = totals.get(family, 0.0) + weight
+        return dict(sorted(totals.items(), key=lambda item: -item[1]))
+
+    @cached_property
+    def levels(self) -> Tensor:
+        """Levels of held-out pairs; see :meth:`CrossValidation.levels`."""
+        return self.cross_validation.levels()
+
+    @property
+    def coverage(self) -> CoverageCurve:
+        """Coverage of the stack's central intervals on held-out pairs."""
+        return coverage_curve_of(self.levels)
+
+    def as_rows(self) -> list[dict[str, Any]]:
+        """Return a row for each candidate, the best held-out score first."""
+        rows = self.cross_validation.as_rows()
+        return sorted(rows, key=lambda row: -row["score"])
+
+    def to_dataframe(self) -> Any:
+        """Return :meth:`as_rows` as a pandas table.
+
+        Raises:
+            ImportError: If pandas is not installed.
+        """
+        try:
+            import pandas
+        except ModuleNotFoundError as error:
+            raise ImportError(
+                "pandas is not installed. Run `pip install pandas`, or use `as_rows()`."
+            ) from error
+        return pandas.DataFrame(self.as_rows())
+
+    def __str__(self) -> str:
+        n = len(self.cross_validation)
+        scores = self.cross_validation.stack_scores
+        lines = [
+            f"Stack of {len(self.cross_validation.names)} candidates, scored on {n} "
+            "held-out calibration pairs",
+            f"  log score of the stack: {_mean(scores)} a pair",
+            *self._gains(),
+            *self._weights(),
+            *self._calibration(),
+            *self._more_labels(),
+        ]
+        return "\n".join(lines)
+
+    def _gains(self) -> list[str]:
+        lines = []
+        for name in ("prior", "NPE"):
+            gain = self.gain_over(name)
+            if gain is None:
+                continue
+            if gain.low > 0:
+                verdict = f"better than {_called(name)}"
+            elif gain.high < 0:
+                verdict = f"WORSE than {_called(name)}"
+            else:
+                verdict = f"not shown to differ from {_called(name)}"
+            lines.append(
+                f"  {verdict}: {gain.mean:+.2f} nats a pair, 95 % interval "
+                f"{gain.low:+.2f} to {gain.high:+.2f}"
+            )
+        return lines
+
+    def _weights(self) -> list[str]:
+        (family, weight), *_ = self.family_weights.items()
+        shares = ", ".join(
+            f"{name} {share:.0%}" for name, share in self.family_weights.items()
+        )
+        if weight < MOSTLY:
+            return [f"  no method has half of the weight: {shares}"]
+        line = f"  mostly {family}"
+        if family in IN_WORDS:
+            line += f": {IN_WORDS[family]}"
+        return [line, f"  weights: {shares}"]
+
+    def _calibration(self) -> list[str]:
+        levels = self.levels
+        acauc, error = acauc_of(levels), expected_coverage_error_of(levels)
+        inside = (levels <= LEVEL).double().mean()
+        if abs(acauc.value) <= 2 * acauc.standard_error:
+            verdict = "calibrated as far as these pairs can tell"
+        else:
+            verdict = "over-confident" if acauc.value > 0 else "under-confident"
+        return [
+            f"  {verdict}: ACAUC {acauc.value:+.3f} +- {acauc.standard_error:.3f}, "
+            f"coverage error {error.value:.3f}; {LEVEL:.0%} intervals hold "
+            f"{float(inside):.0%} of the parameters"
+        ]
+
+    def _more_labels(self) -> list[str]:
+        curve = self.learning_curve
+        if curve is None:
+            return []
+        points = ", ".join(
+            f"{n}: {score:.2f}"
+            for n, score in zip(curve.num_pairs, curve.scores, strict=True)
+        )
+        return [
+            f"  score when trained on so many pairs: {points}",
+            f"  twice as many labels might add {curve.gain_of_doubling():.2f} nats",
+        ]
+
+
+def _called(name: str) -> str:
+    return {"prior": "the prior", "NPE": "NPE as it was"}[name]
+
+
+def _mean(scores: Tensor) -> str:
+    mean = float(scores.mean())
+    error = float(scores.std() / len(scores) ** 0.5) if len(scores) > 1 else 0.0
+    return f"{mean:.2f} +- {error:.2f}"

@@ -1,0 +1,138 @@
+"""Weights of candidates from the log scores of held-out pairs."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from sbi_rope._validation import check_integer, check_positive, check_tensor
+from sbi_rope.errors import InvalidInputError, warn_user
+
+__all__ = ["StackingWeights", "stacking_weights"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StackingWeights:
+    """The weights of candidates, with the evidence that they are the best.
+
+    Attributes:
+        weights: On the simplex, shape ``(K,)``, float64.
+        score: The mean log score of the stack over the pairs it was fitted to. It is
+            optimistic: the weights have seen these pairs.
+        gap: The objective is at most this far below its maximum, in nats of the sum
+            over pairs.
+        num_iterations: Iterations of EM.
+        converged: Whether the gap is at most the tolerance.
+    """
+
+    weights: Tensor
+    score: float
+    gap: float
+    num_iterations: int
+    converged: bool
+
+
+def stacking_weights(
+    log_scores: Tensor,
+    *,
+    pseudo_count: float = 1.0,
+    tolerance: float = 1e-3,
+    max_iterations: int = 20_000,
+) -> StackingWeights:
+    r"""Return the weights whose mixture of candidates scores best on held-out pairs.
+
+    With the log score :math:`\ell_{ik}` of candidate k at pair i,
+
+    .. math::
+        \max_{w \in \Delta} \; \sum_{i=1}^{n} \log \sum_{k=1}^{K} w_k e^{\ell_{ik}}
+        + \frac{c}{K} \sum_{k=1}^{K} \log w_k ,
+
+    the mode under a Dirichlet prior with all parameters :math:`1 + c / K`. c is worth
+    so many pairs that know nothing: with few pairs it keeps the weights apart from a
+    single candidate, with many it is forgotten. The problem is concave, and for c > 0
+    its answer unique. It is solved by EM,
+    :math:`w_k \leftarrow (\sum_i r_{ik} + c / K) / (n + c)` with the responsibilities
+    :math:`r_{ik} = w_k e^{\ell_{ik}} / \sum_m w_m e^{\ell_{im}}`, which starts from
+    equal weights and is then, for c = 0, within :math:`\log(K) / t` of the best sum
+    after t iterations.
+
+    References:
+        | Using Stacking to Average Bayesian Predictive Distributions (Yao et al., 2018)
+        | https://arxiv.org/abs/1704.02030
+
+    Args:
+        log_scores: :math:`\ell`, shape ``(n, K)``; minus infinity is allowed, NaN and
+            plus infinity are not. A pair that no candidate gives a density says nothing
+            about the weights; it earns a warning.
+        pseudo_count: c, at least 0.
+        tolerance: Largest ``gap`` called converged.
+        max_iterations: Iterations after which to stop and say so.
+
+    Returns:
+        The weights.
+
+    Raises:
+        InvalidTypeError: If the scores are not a tensor.
+        InvalidInputError: If the shape does not fit, a score is NaN or plus infinity,
+            or an argument is outside its range.
+
+    Example:
+        >>> log_scores = torch.tensor([[0.0, -9.0], [0.0, -9.0], [-9.0, 0.0]])
+        >>> stacking_weights(log_scores, pseudo_count=0.0).weights.round(decimals=3)
+        tensor([0.6670, 0.3330], dtype=torch.float64)
+    """
+    scores = _checked_scores(log_scores)
+    if not (math.isfinite(pseudo_count) and pseudo_count >= 0):
+        raise InvalidInputError(
+            f"Expected `pseudo_count` to be a finite number >= 0; got {pseudo_count!r}."
+        )
+    check_positive("tolerance", tolerance)
+    check_integer("max_iterations", max_iterations)
+    # Relative to the best candidate of each pair, so that nothing over- or underflows.
+    density = (scores - scores.max(dim=1, keepdim=True).values).exp()
+    n, num_candidates = density.shape
+    share = pseudo_count / num_candidates
+    weights = torch.full_like(density[0], 1.0 / num_candidates)
+    gap, iteration = math.inf, 0
+    for iteration in range(max_iterations + 1):
+        # What a candidate adds to the sum of log scores, for each unit of weight.
+        gradient = (density / (density @ weights)[:, None]).sum(dim=0)
+        if share:
+            gradient = gradient + share / weights
+        # The objective is concave: it lies below its tangent.
+        gap = float(gradient.max()) - (n + pseudo_count)
+        if gap <= tolerance or iteration == max_iterations:
+            break
+        weights = weights * gradient
+        weights = weights / weights.sum()
+    mixed = torch.logsumexp(scores + weights.log(), dim=1)
+    return StackingWeights(
+        weights=weights,
+        score=float(mixed.mean()) if n else math.nan,
+        gap=max(gap, 0.0),
+        num_iterations=iteration,
+        converged=gap <= tolerance,
+    )
+
+
+def _checked_scores(log_scores: Tensor) -> Tensor:
+    scores = check_tensor("log_scores", log_scores).detach().double()
+    if scores.ndim != 2 or not scores.shape[1]:
+        raise InvalidInputError(
+            "Expected `log_scores` of shape (pairs, candidates), with one candidate at "
+            f"least; got {tuple(scores.shape)}."
+        )
+    if bool(torch.isnan(scores).any()) or bool(torch.isposinf(scores).any()):
+        raise InvalidInputError(
+            "Expected `log_scores` without NaN and plus infinity. Leave out the "
+            "candidate that returns them."
+        )
+    known = ~torch.isneginf(scores).all(dim=1)
+    if not known.all():
+        warn_user(
+            f"{int((~known).sum())} of {len(scores)} held-out pairs have density zero "
+            "under every candidate and say nothing about their weights. Add the prior "
+            "as a candidate."
+        )
+    return scores[known]

@@ -1,0 +1,375 @@
+"""The page of all suites and the README's block, from tables that are made up."""
+
+import csv
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks.__main__ import main
+from benchmarks.cells import Cell, load_suite
+from benchmarks.statements import FIXED, STATEMENTS, Published, gap, verdict
+from benchmarks.summary import write_summary
+from benchmarks.tables import COLUMNS
+
+# A cell to its LPP and ACAUC, or None if it was not run, or "failed".
+Scores = Callable[[Cell], tuple[float, float] | str | None]
+
+LINES, FEW, TRANSPORT, TUNING, NPE_BEST, CATCH_UP, GAMMA, TAU = range(8)
+PRIORS = {"cs": -3.8, "sir": -2.3, "pendulum": -2.5, "hemodynamics": -2.3}
+SBI = {"cs": -0.67, "sir": 2.4, "pendulum": 3.1, "hemodynamics": 0.22}
+
+
+def publish(folder: Path, suite: str, scores: Scores) -> None:
+    """Write the table of a suite."""
+    path = folder / suite / "results.csv"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, restval="")
+        writer.writeheader()
+        for cell in load_suite(suite).cells:
+            score = scores(cell)
+            if score is None:
+                continue
+            row: dict[str, Any] = {
+                name: getattr(cell, name) for name in cell.__dataclass_fields__
+            }
+            row |= {name: "" for name, value in row.items() if value is None}
+            row |= {"suite": suite, "status": "failed", "error": "ValueError: no"}
+            if not isinstance(score, str):
+                row |= {"status": "finished", "error": "", "converged": True}
+                row |= {"lpp_z": repr(score[0]), "acauc": repr(score[1])}
+                row["stand_in"] = cell.variant == "synthetic"
+            writer.writerow(row)
+
+
+def first(scores: Scores) -> Scores:
+    """Leave out all repetitions but the first."""
+    return lambda cell: None if cell.repetition else scores(cell)
+
+
+def by_method(**others: float) -> Scores:
+    """Score by method on a few tasks; -5 if nothing is said."""
+
+    def scores(cell: Cell) -> tuple[float, float] | None:
+        if cell.task not in ("cs", "sir"):
+            return None
+        setting = (cell.gamma, cell.tau, cell.cost_scale)
+        name = cell.method.replace("-", "_").replace(" ", "_")
+        if cell.gamma is not None and setting != FIXED:
+            name += "_other"
+        return others.get(name, -5.0), 0.01
+
+    return first(scores)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return tmp_path / "results"
+
+
+@pytest.fixture
+def readme(tmp_path: Path) -> Path:
+    path = tmp_path / "README.md"
+    path.write_text("before\n<!-- results -->\nreplaced\n<!-- /results -->\nafter\n")
+    return path
+
+
+def write(folder: Path, readme: Path) -> str:
+    return write_summary(folder, readme).read_text()
+
+
+def line(text: str, start: str, *, after: str = "") -> list[str]:
+    """Return the entries of the first line of a table that starts like this."""
+    text = text[text.index(after) :]
+    found = next(part for part in text.splitlines() if part.startswith(f"| {start} |"))
+    return [entry.strip() for entry in found.strip("|").split("|")][1:]
+
+
+# The README -------------------------------------------------------------------------
+
+
+def test_the_block_replaces_what_is_between_the_markers_and_nothing_else(
+    folder: Path, readme: Path
+) -> None:
+    publish(folder, "main", by_method(RoPE=0.0))
+    write(folder, readme)
+    text = readme.read_text()
+    assert text.startswith("before\n<!-- results -->\n")
+    assert text.endswith("\n<!-- /results -->\nafter\n")
+    assert "replaced" not in text
+    assert "(results/README.md)" in text
+    assert len(text.splitlines()) < 45
+
+
+def test_the_same_tables_give_the_same_bytes(folder: Path, readme: Path) -> None:
+    publish(folder, "main", by_method(RoPE=0.0))
+    contents = []
+    for _ in range(2):
+        page = write_summary(folder, readme)
+        contents.append((page.read_bytes(), readme.read_bytes()))
+    assert contents[0] == contents[1]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "nothing",
+        "<!-- results -->",
+        "<!-- /results --> <!-- results -->",
+        "<!-- results --><!-- results --><!-- /results -->",
+    ],
+)
+def test_a_readme_without_a_place_for_the_block_is_refused_and_nothing_written(
+    folder: Path, readme: Path, text: str
+) -> None:
+    publish(folder, "main", by_method())
+    readme.write_text(text)
+    with pytest.raises(SystemExit, match=r"README\.md needs one line <!-- results -->"):
+        write(folder, readme)
+    assert readme.read_text() == text
+    assert not (folder / "README.md").exists()
+
+
+def test_a_folder_without_results_is_refused(folder: Path, readme: Path) -> None:
+    with pytest.raises(SystemExit, match="No results in"):
+        write(folder, readme)
+
+
+def test_the_command_writes_both(folder: Path, readme: Path) -> None:
+    publish(folder, "main", by_method())
+    assert main(["summary", "--out", str(folder), "--readme", str(readme)]) == 0
+    assert (folder / "README.md").exists()
+    assert "replaced" not in readme.read_text()
+
+
+# The suite main ---------------------------------------------------------------------
+
+
+def test_neither_sbi_nor_another_setting_of_rope_competes(
+    folder: Path, readme: Path
+) -> None:
+    publish(
+        folder, "main", by_method(SBI=3.0, RoPE_other=2.0, OT_only_other=2.0, NPE=1.0)
+    )
+    text = write(folder, readme)
+    assert line(text, "NPE") == ["**1.00**", "**1.00**"]
+    assert line(text, "SBI") == ["3.00", "3.00"]
+    assert line(text, "RoPE (gamma 0.1, tau 0.9)") == ["2.00", "2.00"]
+
+
+def test_of_several_complete_repetitions_mean_and_spread_are_shown(
+    folder: Path, readme: Path
+) -> None:
+    def scores(cell: Cell) -> tuple[float, float] | None:
+        return (float(cell.repetition), 0.0) if cell.task == "cs" else None
+
+    publish(folder, "main", scores)
+    text = write(folder, readme)
+    # Of 0, 1 and 2.
+    assert line(text, "NPE") == ["1.00 ± 1.00"]
+    assert "cs 3/3" in text
+
+
+def test_an_incomplete_repetition_does_not_enter_the_means(
+    folder: Path, readme: Path
+) -> None:
+    def scores(cell: Cell) -> tuple[float, float] | None:
+        late = cell.repetition == 1 and cell.method == "RoPE"
+        if cell.task != "cs" or (cell.repetition and not late):
+            return None
+        return (9.0 if late else 1.0 + (cell.method == "NPE")), 0.0
+
+    publish(folder, "main", scores)
+    text = write(folder, readme)
+    assert line(text, "RoPE") == ["1.00"]
+    assert line(text, "repetitions") == ["1"]
+    assert "cs 1/3" in text
+
+
+def test_what_failed_what_is_infinite_and_what_was_not_run_is_shown(
+    folder: Path, readme: Path
+) -> None:
+    def scores(cell: Cell) -> tuple[float, float] | str | None:
+        if cell.task != "cs" or cell.repetition:
+            return None
+        special = {"MLP": "failed", "NPE": (-math.inf, 0.0), "J-NPE": None}
+        return special.get(cell.method, (-1.0, 0.0))
+
+    publish(folder, "main", scores)
+    text = write(folder, readme)
+    assert line(text, "MLP") == ["failed"]
+    assert line(text, "NPE") == ["-inf"]
+    assert "| J-NPE |" not in text
+    assert "Not run: B sir, C pendulum, D hemodynamics" in text
+    assert line(text, "noniid")[:3] == ["0", "0", "48"]
+
+
+def test_stand_ins_are_named_wherever_their_numbers_are(
+    folder: Path, readme: Path
+) -> None:
+    def scores(cell: Cell) -> tuple[float, float] | None:
+        return (0.0, 0.0) if cell.task == "wind_tunnel" else None
+
+    publish(folder, "main", first(scores))
+    text = write(folder, readme)
+    assert line(text, "[main](main/report.md)")[-1] == "wind_tunnel synthetic"
+    assert "F wind_tunnel (stand-in)" in text
+    assert "F wind_tunnel (stand-in)" in readme.read_text()
+    assert "reproduced so far (stand-in: F)" in text
+
+
+# Where RoPE loses -------------------------------------------------------------------
+
+
+def test_losses_of_rope_are_counted_and_listed_with_their_gap(
+    folder: Path, readme: Path
+) -> None:
+    def scores(cell: Cell) -> tuple[float, float] | None:
+        if cell.task != "cs":
+            return None
+        # Above all others with 10 pairs, then 0.1 and 1 below OT-only, -2 at the end.
+        rope = {10: 1.0, 50: -0.1, 200: -1.0, 1000: -2.0}
+        fixed = {"RoPE": rope.get(cell.n_calibration), "OT-only": 0.0, "prior": -1.5}
+        return fixed.get(cell.method) or -3.0 * (cell.method != "OT-only"), 0.0
+
+    publish(folder, "main", first(scores))
+    text = write(folder, readme)
+    assert "best LPP in 1 of 4 cells" in text
+    assert "below OT-only in 3 of 4 (in 2 by more than 0.3 nat)" in text
+    assert "below the prior in 1 of 4 (in 1 by more than 0.3 nat)" in text
+    assert "best LPP in 1 of 4 cells" in readme.read_text()
+    losses = text[text.index("## Where RoPE loses") :]
+    assert "| A cs | 10 |" not in losses
+    assert "| A cs | 200 | -1.00 |  | -1.00 | -1.00 OT-only |" in losses
+    assert "| A cs | 1000 | -2.00 | -0.50 | -2.00 | -2.00 OT-only |" in losses
+
+
+def test_an_infinite_loss_is_a_loss_and_two_of_them_are_equal() -> None:
+    def rows(*values: float) -> list[dict[str, Any]]:
+        return [
+            {"repetition": number, "lpp_z": value, "status": "finished"}
+            for number, value in enumerate(values)
+        ]
+
+    assert gap(rows(-math.inf), rows(-1.0)) == -math.inf
+    assert gap(rows(-1.0), rows(-math.inf)) == math.inf
+    assert gap(rows(-math.inf), rows(-math.inf)) == 0.0
+    # Only of repetitions that both have.
+    assert gap(rows(1.0, 2.0), rows(0.5)) == 0.5
+    assert gap(rows(1.0), []) is None
+
+
+# Statements -------------------------------------------------------------------------
+
+
+def as_in_the_paper(cell: Cell) -> tuple[float, float]:
+    """Return scores of which every statement of the paper is true."""
+    if cell.method == "RoPE":
+        wide = cell.variant == "prior_shift" or cell.options.endswith(("0.5}", "1.0}"))
+        if wide and cell.tau is not None:
+            return 1.0 - cell.tau, 0.0
+        uniform = cell.cost_scale == "none" and (cell.gamma or 0.0) >= 5.0
+        return (-2.2 if uniform else 0.0), -0.05
+    if cell.method in ("J-NPE", "MLP"):
+        return {10: -4.0, 50: -1.0}.get(cell.n_calibration, 0.1), 0.05
+    clearly = -1.0 if cell.task in ("pendulum", "light_tunnel") else -0.1
+    lpps = {
+        "prior": PRIORS.get(cell.task, -2.0),
+        "SBI": SBI.get(cell.task, 2.0),
+        "NPE": 1.0 if cell.task == "sir" else -4.0,
+        "OT-only": clearly,
+        "tuning-only": 0.0 if cell.task == "sir" else -2.0,
+    }
+    return lpps.get(cell.method, -3.0), 0.0
+
+
+def judge(folder: Path, scores: Scores) -> list[str]:
+    for suite in ("main", "gamma", "tau"):
+        publish(folder, suite, first(scores))
+    published = Published.read(folder)
+    return [verdict(statement.check(published)) for statement in STATEMENTS]
+
+
+def test_all_statements_are_reproduced_where_all_are_true(folder: Path) -> None:
+    assert judge(folder, as_in_the_paper) == ["reproduced"] * len(STATEMENTS)
+
+
+@pytest.mark.parametrize(
+    ("statement", "chosen", "score"),
+    [
+        (LINES, {"task": "cs", "method": "SBI"}, (-0.67 + 0.35, 0.0)),
+        (FEW, {"task": "cs", "method": "RoPE", "n_calibration": 10}, (0.0, 0.03)),
+        (FEW, {"task": "cs", "method": "RoPE", "n_calibration": 10}, (0.0, -0.11)),
+        (TRANSPORT, {"task": "cs", "method": "OT-only"}, (-0.4, 0.0)),
+        (TRANSPORT, {"task": "pendulum", "method": "OT-only"}, (-0.2, 0.0)),
+        (TUNING, {"task": "cs", "method": "tuning-only"}, (-0.2, 0.0)),
+        (TUNING, {"task": "sir", "method": "tuning-only"}, (-0.4, 0.0)),
+        (NPE_BEST, {"task": "sir", "method": "NNPE"}, (1.1, 0.0)),
+        (NPE_BEST, {"task": "sir", "method": "fine-tuned NPE"}, (1.1, 0.0)),
+        (CATCH_UP, {"task": "cs", "method": "MLP", "n_calibration": 1000}, (-0.4, 0.0)),
+        (CATCH_UP, {"task": "cs", "method": "MLP", "n_calibration": 10}, (0.2, 0.0)),
+        (GAMMA, {"cost_scale": "none", "gamma": 10.0, "n_calibration": 200}, (-2.9, 0)),
+        (TAU, {"task": "pendulum", "variant": "prior_shift", "tau": 0.5}, (0.0, 0.0)),
+        (TAU, {"options": '{"misspecification_weight": 0.0}', "tau": 0.5}, (0.2, 0.0)),
+    ],
+)
+def test_one_number_beyond_its_tolerance_unmakes_its_statement_alone(
+    folder: Path,
+    statement: int,
+    chosen: dict[str, Any],
+    score: tuple[float, float],
+) -> None:
+    def scores(cell: Cell) -> tuple[float, float]:
+        if all(getattr(cell, name) == value for name, value in chosen.items()):
+            return score
+        return as_in_the_paper(cell)
+
+    verdicts = judge(folder, scores)
+    unmade = [i for i, what in enumerate(verdicts) if what != "reproduced"]
+    assert unmade == [statement]
+    assert verdicts[statement] in ("partly", "not reproduced")
+
+
+def test_what_was_not_run_is_neither_reproduced_nor_not(folder: Path) -> None:
+    def scores(cell: Cell) -> tuple[float, float] | None:
+        return as_in_the_paper(cell) if cell.task in ("cs", "sir") else None
+
+    verdicts = judge(folder, scores)
+    assert verdicts[LINES] == "reproduced so far"
+    assert verdicts[NPE_BEST] == "reproduced"
+    assert verdicts[GAMMA] == verdicts[TAU] == "not run"
+
+
+def test_a_statement_on_all_sizes_waits_for_the_last(folder: Path) -> None:
+    def scores(cell: Cell) -> tuple[float, float] | None:
+        return None if cell.n_calibration == 1000 else as_in_the_paper(cell)
+
+    publish(folder, "main", first(scores))
+    checks = STATEMENTS[FEW].check(Published.read(folder))
+    assert {c.name for c in checks if c.agrees is not None} == {"D"}
+
+
+# The other suites -------------------------------------------------------------------
+
+
+def test_the_other_suites_have_a_column_for_each_value_that_was_run(
+    folder: Path, readme: Path
+) -> None:
+    def scores(cell: Cell) -> tuple[float, float] | None:
+        noise = cell.options != "{}" and cell.variant == "noisy_labels"
+        shift = {"NPE": -1.5, "prior": -3.0}.get(cell.method, 0.0)
+        return (shift + cell.n_calibration / 1000 - noise, 0.0)
+
+    for suite in ("labels", "wellspecified"):
+        publish(folder, suite, first(scores))
+    text = write(folder, readme)
+    assert line(text, "", after="### Noisy labels") == ["0", "1", "5", "10"]
+    name = "G light_tunnel_sensors, MLP"
+    assert line(text, name) == ["0.05", "-0.95", "-0.95", "-0.95"]
+    # 0.01, 0.05 and 0.2 against -1.5.
+    name = "C pendulum, tau 0.9 (prior -3.00, NPE -1.50)"
+    assert line(text, name) == ["+1.51", "+1.55", "+1.70"]
+    assert "### gamma\n\nNot run." in text
