@@ -26,6 +26,7 @@ NEEDS_CALIBRATION = (
     "HVAE",
     "tuning-only",
     "RoPE",
+    "stack",
 )
 NEEDS_COUPLING = ("OT-only", "RoPE")
 KEYS = {"tasks", "variants", "methods", "n_calibration", "gammas", "taus", "options"}

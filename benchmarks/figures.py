@@ -16,6 +16,7 @@ from sbi_rope import plots
 __all__ = ["LPPAxis", "draw_all"]
 
 STYLES = {
+    "stack": ("black", "-", "*"),
     "RoPE": ("#0072B2", "-", "o"),
     "OT-only": ("#56B4E9", "--", "s"),
     "tuning-only": ("#009E73", "--", "^"),

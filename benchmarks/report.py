@@ -11,6 +11,7 @@ from scipy.stats import wilcoxon
 from benchmarks import figures
 from benchmarks.cells import Cell, Suite
 from benchmarks.methods import ORDER
+from benchmarks.stacking import stacking_lines
 from benchmarks.store import write_atomically
 from benchmarks.tables import Table, group_by, mean_and_spread
 
@@ -55,7 +56,10 @@ def write_report(suite: Suite, table: Table, folder: Path) -> Path:
         lines += _section(rows, table) if rows else ["Not run."]
     for name, what in figures.draw_all(suite, table, folder):
         lines += ["", f"![{what}]({name})"]
-    lines += ["", "## Where RoPE loses", "", *_losses(finished, table)]
+    if stacked := stacking_lines(table):
+        lines += ["", *stacked]
+    if any(cell.method == "RoPE" for cell in suite.cells):
+        lines += ["", "## Where RoPE loses", "", *_losses(finished, table)]
     lines += ["", "## What was not run", "", *_missing(suite, table)]
     path = folder / "report.md"
     with write_atomically(path) as temporary:

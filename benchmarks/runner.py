@@ -22,7 +22,8 @@ from tqdm.auto import tqdm
 from benchmarks.cases import Case, Sources
 from benchmarks.cells import Cell
 from benchmarks.machine import forget_peak, peak_memory
-from benchmarks.methods import ONLY_FOR, Failure, Score, scores
+from benchmarks.methods import ONLY_FOR
+from benchmarks.scoring import Failure, Score, scores
 from benchmarks.store import Cache, Results, write_atomically
 from sbi_rope.metrics import draw_samples
 
@@ -283,6 +284,7 @@ def _arrays(score: Score) -> dict[str, np.ndarray]:
     return {
         "log_probs": evaluation.lpp.log_probs.cpu().numpy().astype(np.float32),
         "coverage": evaluation.coverage.average.cpu().numpy().astype(np.float32),
+        **score.arrays,
         "samples": samples[:, 0].cpu().numpy().astype(np.float32),
         "theta": score.test_set[0][0].cpu().numpy().astype(np.float32),
     }

@@ -4,6 +4,7 @@ from sbi_rope.coupling import Coupling, SinkhornCoupler
 from sbi_rope.finetuning import CalibrationFinetuner
 from sbi_rope.mixture import MixturePosterior
 from sbi_rope.rope import RoPE
+from sbi_rope.stacking import StackedPosterior, stack
 
 __all__ = [
     "CalibrationFinetuner",
@@ -11,6 +12,8 @@ __all__ = [
     "MixturePosterior",
     "RoPE",
     "SinkhornCoupler",
+    "StackedPosterior",
+    "stack",
 ]
 
 __version__ = "0.1.0"

@@ -90,7 +90,7 @@ def misspecification_findings(
 
 def _before(test: MMDTest) -> Finding:
     alarming = test.p_value < LEVEL
-    size = f"its MMD is {_ratio(test)} that of a batch of simulations"
+    size = f"its squared MMD is {_ratio(test)} that of a batch of simulations"
     if alarming:
         sentence = (
             f"As NPE sees it, the batch is unlike simulations: {size}. The simulator "
@@ -104,7 +104,7 @@ def _before(test: MMDTest) -> Finding:
 
 def _after(before: MMDTest, after: MMDTest) -> Finding:
     alarming = after.p_value < LEVEL
-    size = f"its MMD is {_ratio(after)} what is usual"
+    size = f"its squared MMD is {_ratio(after)} what is usual"
     course = f"{before.mmd:.2g} before tuning, {after.mmd:.2g} after"
     if alarming:
         sentence = (
@@ -121,7 +121,8 @@ def _after(before: MMDTest, after: MMDTest) -> Finding:
 
 
 def _ratio(test: MMDTest) -> str:
-    return f"{test.mmd / max(test.usual, 1e-300):.2g} times"
+    ratio = test.mmd / max(test.usual, 1e-300)
+    return f"{ratio:.0f} times" if ratio >= 10 else f"{ratio:.1f} times"
 
 
 def _finding(name: str, test: MMDTest, alarming: bool, sentence: str) -> Finding:  # noqa: FBT001

@@ -102,13 +102,17 @@ class Diagnosis:
             f"simulations: {count} of {len(self.findings)} findings "
             f"{'is' if count == 1 else 'are'} alarming."
         ]
+        given = ""
         for finding in self.findings:
             mark = "!" if finding.alarming else "-"
             lines.append(
                 f"{mark} {finding.name}: {finding.value:.3g} "
                 f"(threshold {finding.threshold:.3g})"
             )
-            lines.append(_indented(f"{finding.sentence} {finding.reason}"))
+            # The same for all parameters: once is enough.
+            reason = "" if finding.reason == given else finding.reason
+            lines.append(_indented(f"{finding.sentence} {reason}"))
+            given = finding.reason
         lines += [_indented(note, first="* ") for note in self.notes]
         return "\n".join(lines)
 

@@ -129,8 +129,8 @@ def residual_finding(
         sentence = (
             "What tuning leaves of the calibration pairs depends on their parameters: "
             f"a bias of {value:.2f} times the simulator's noise (p = "
-            f"{found.p_value:.3f}). Tuning has not generalised, for want of pairs or of "
-            "training, or real observations do not follow the parameters as "
+            f"{found.p_value:.3f}). Tuning has not generalised, for want of pairs or "
+            "of training, or real observations do not follow the parameters as "
             "simulations do, and the conditional independence RoPE rests on fails."
         )
     else:

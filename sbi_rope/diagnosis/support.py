@@ -63,8 +63,8 @@ class Support:
             sentence=f"{sentence}.",
             reason=(
                 "Observations are flagged that are farther from their nearest "
-                f"simulation than all but {self.chance:.2g} of the simulations are "
-                "from theirs; alarming above the threshold, the number that is "
+                f"simulation than all but {self.chance:.2%} of the simulations are "
+                "from their nearest other; alarming above the threshold, the number "
                 "flagged by chance in one batch of simulations in a hundred."
             ),
         )

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = ["implied_parameters"]
 
-NUM_BINS = 30
+NUM_BINS = 20
 MAX_COLUMNS = 4
 
 

@@ -1,0 +1,147 @@
+"""The stack against each of its candidates, from committed results."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from benchmarks.cells import Cell
+from benchmarks.methods import STACK
+from benchmarks.tables import Table
+
+__all__ = ["Comparison", "comparisons", "stacking_lines"]
+
+# The goals, fixed beforehand, in nats and ACAUC.
+NEAR, CALIBRATED = 0.1, 0.05
+BASICS = ("prior", "NPE", "tuning-only", "fine-tuned NPE")
+EXPLANATION = """\
+LPP on the test set, in standard deviations of the prior. "Best" is the best single
+candidate *chosen on the test set*, which no user can do; "picked" is the one with the
+highest score on the held-out calibration pairs. "Held out" is what these pairs say of
+the stack, with its standard error: neither its candidates nor its weights have seen the
+pair that is scored. Candidates are not corrected for leakage, the stack is. Seconds are
+those of fine-tuning, cross-validation and coupling on one thread, with other work
+beside it.
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """A stack and its candidates on one set of data.
+
+    Attributes:
+        cell: The cell of the stack.
+        row: Its row.
+        test: Scores of the candidates on the test set, by name.
+        held_out: Scores on held-out pairs, by name; the stack's too.
+        held_out_error: Standard error of the stack's.
+    """
+
+    cell: Cell
+    row: dict[str, Any]
+    test: dict[str, float]
+    held_out: dict[str, float]
+    held_out_error: float
+
+    @property
+    def stacked(self) -> float:
+        """The score of the stack on the test set."""
+        return self.row["lpp_z"]
+
+    @property
+    def best(self) -> str:
+        """The candidate with the best score on the test set."""
+        return max(self.test, key=self.test.__getitem__)
+
+    @property
+    def picked(self) -> str:
+        """The candidate with the best score on held-out pairs."""
+        return max(self.test, key=self.held_out.__getitem__)
+
+    @property
+    def gap(self) -> float:
+        """By how much the stack is above the best candidate."""
+        return self.stacked - self.test[self.best]
+
+
+def comparisons(table: Table) -> list[Comparison]:
+    """Return all stacks of a table that were finished."""
+    found = []
+    for cell, row in table.rows.items():
+        arrays = table.arrays[cell]
+        if cell.method != STACK or "candidates" not in arrays:
+            continue
+        names = [str(name) for name in arrays["candidates"]]
+        found.append(
+            Comparison(
+                cell=cell,
+                row=row,
+                test=dict(zip(names, arrays["test"].tolist(), strict=False)),
+                held_out=dict(zip(names, arrays["held_out"].tolist(), strict=True)),
+                held_out_error=float(arrays["held_out_error"][-1]),
+            )
+        )
+    return found
+
+
+def stacking_lines(table: Table) -> list[str]:
+    """Return the comparison of all stacks in Markdown; nothing if there is none."""
+    found = comparisons(table)
+    if not found:
+        return []
+    heads = ("task", "variant", "pairs", *BASICS, "best", "", "picked", "**stack**")
+    heads += ("stack - best", "held out", "ACAUC", "ECE", "s")
+    lines = ["## The stack against its candidates", "", EXPLANATION]
+    lines += [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
+    lines += [f"| {' | '.join(_entries(one))} |" for one in found]
+    return [*lines, "", *_goals(found)]
+
+
+def _entries(one: Comparison) -> list[str]:
+    row = one.row
+    seconds = row["seconds_train"] + row["seconds_couple"]
+    return [
+        one.cell.task,
+        one.cell.variant,
+        str(one.cell.n_calibration),
+        *(f"{one.test[name]:.2f}" if name in one.test else "" for name in BASICS),
+        f"{one.test[one.best]:.2f}",
+        one.best,
+        f"{one.test[one.picked]:.2f}",
+        f"**{one.stacked:.2f}**",
+        f"{one.gap:+.2f}",
+        f"{one.held_out[STACK]:.2f} ± {one.held_out_error:.2f}",
+        f"{row['acauc']:+.3f}",
+        f"{row['expected_coverage_error']:.3f}",
+        f"{seconds:.0f}",
+    ]
+
+
+def _goals(found: list[Comparison]) -> list[str]:
+    """Say how often each goal was met, and where it was not."""
+    honest = [
+        abs(one.held_out[STACK] - one.stacked) <= 2 * one.held_out_error
+        for one in found
+    ]
+    goals = {
+        "better than the best candidate chosen on the test set": [
+            one.gap > 0 for one in found
+        ],
+        f"within {NEAR} nats of it, or better": [one.gap >= -NEAR for one in found],
+        f"not more than {NEAR} nats below the prior or NPE": [
+            one.stacked
+            >= max(one.test.get(name, -np.inf) for name in ("prior", "NPE")) - NEAR
+            for one in found
+        ],
+        f"ACAUC within {CALIBRATED}": [
+            abs(one.row["acauc"]) <= CALIBRATED for one in found
+        ],
+        "test score within two standard errors of the held-out score": honest,
+    }
+    lines = []
+    for goal, met in goals.items():
+        lines.append(f"- {goal}: {sum(met)} of {len(met)}")
+        missed = [str(one.cell) for one, ok in zip(found, met, strict=True) if not ok]
+        if missed and len(missed) <= len(met) / 2:
+            lines[-1] += f"; not {', '.join(missed)}"
+    return lines
