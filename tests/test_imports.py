@@ -26,7 +26,7 @@ LAYERS = [
     {"mixture", "plots"},
     {"rope", "tasks"},
     {"baselines"},
-    {"stacking"},
+    {"stacking", "diagnosis"},
 ]
 NEVER_IMPORT_EACH_OTHER = [
     ("tasks", "rope"),

@@ -12,7 +12,8 @@ from sbi_rope.diagnosis.misspecification import misspecification_findings
 from sbi_rope.diagnosis.prior_shift import prior_shift
 from sbi_rope.diagnosis.report import Diagnosis, Finding
 from sbi_rope.diagnosis.residuals import (
-    cross_fitted_residuals,
+    CrossFitted,
+    cross_fit,
     num_features,
     residual_finding,
 )
@@ -60,7 +61,8 @@ def diagnose(
             are fewer). At least 100.
         coupler: What effective sample sizes are those of; that of ``rope`` if None.
         num_folds: Trainings behind the residuals of 4, each as long as ``rope.train``;
-            None leaves 4 out.
+            None leaves 4 out,
+            and with it the errors of g that 3 allows for.
         parameter_names: One name for each parameter; "theta_1" and so on if None.
         seed: Seed of everything random; None uses the states of torch, NumPy and
             Python. The simulations are those of ``rope.build_posterior`` under the
@@ -108,15 +110,17 @@ def diagnose(
         )
         support = support_of(real, simulations)
         findings += support.findings(sizes, len(simulations))
-        shift = prior_shift(real, simulations)
-        findings += shift.findings(simulations, names)
-        residuals, residual_findings, notes = _residuals(
-            rope, simulations, num_folds, show_progress_bars=show_progress_bars
+        held_out, notes = _held_out(
+            rope, num_folds, show_progress_bars=show_progress_bars
         )
+        shift = prior_shift(real, simulations, held_out=held_out)
+        findings += shift.findings(simulations, names)
+        if held_out is not None:
+            findings += _residual_findings(rope, held_out, simulations, notes)
     if not coupling.converged:
         notes.append("The coupling has not converged; its sample sizes are rough.")
     return Diagnosis(
-        findings=(*findings, *residual_findings),
+        findings=tuple(findings),
         notes=tuple(notes),
         flags=support.flags,
         effective_sample_size=sizes,
@@ -124,44 +128,46 @@ def diagnose(
         theta=simulations.theta,
         implied=shift.implied,
         unshifted=shift.unshifted,
-        residuals=residuals,
+        residuals=None if held_out is None else held_out.residuals,
         parameter_names=names,
     )
 
 
-def _residuals(
-    rope: RoPE,
-    simulations: Simulations,
-    num_folds: int | None,
-    *,
-    show_progress_bars: bool,
-) -> tuple[Tensor | None, list[Finding], list[str]]:
-    """Return residuals and what they say, or why there are none."""
+def _held_out(
+    rope: RoPE, num_folds: int | None, *, show_progress_bars: bool
+) -> tuple[CrossFitted | None, list[str]]:
+    """Return held-out calibration pairs, or why there are none."""
+    num_pairs = len(rope.calibration[0])
+    if not num_pairs:
+        note = (
+            "There are no calibration pairs: nothing was tuned, and what needs labels "
+            "was left out (misspecification after tuning, residuals)."
+        )
+    elif num_folds is None:
+        note = (
+            "Residuals of calibration pairs were left out, as asked. Errors of g are "
+            "not told from a prior shift."
+        )
+    elif num_pairs < 2:
+        note = "Residuals were left out: there is but one calibration pair."
+    else:
+        return cross_fit(
+            rope, num_folds=num_folds, show_progress_bars=show_progress_bars
+        ), []
+    return None, [note]
+
+
+def _residual_findings(
+    rope: RoPE, held_out: CrossFitted, simulations: Simulations, notes: list[str]
+) -> list[Finding]:
     theta = _moved(rope.calibration[0])
-    if not len(theta):
-        return (
-            None,
-            [],
-            [
-                "There are no calibration pairs: nothing was tuned, and what needs "
-                "labels was left out (misspecification after tuning, residuals)."
-            ],
-        )
-    if num_folds is None:
-        return None, [], ["Residuals of calibration pairs were left out, as asked."]
-    if not num_features(*theta.shape):
-        return (
-            None,
-            [],
-            [
-                f"Residuals were left out: {len(theta)} calibration pairs are too few "
-                f"for a regression on {theta.shape[1]} parameters."
-            ],
-        )
-    residuals = cross_fitted_residuals(
-        rope, num_folds=num_folds, show_progress_bars=show_progress_bars
+    if num_features(*theta.shape):
+        return [residual_finding(held_out.residuals, theta, simulations)]
+    notes.append(
+        f"Whether residuals depend on parameters was not tested: {len(theta)} "
+        f"calibration pairs are too few for {theta.shape[1]} parameters."
     )
-    return residuals, [residual_finding(residuals, theta, simulations)], []
+    return []
 
 
 def _moved(values: Tensor) -> Tensor:

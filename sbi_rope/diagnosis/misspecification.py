@@ -11,8 +11,8 @@ from sbi_rope.diagnosis.simulations import Simulations
 __all__ = ["MMDTest", "misspecification_findings", "mmd_test"]
 
 # Observations and simulations in one MMD: its cost is quadratic.
-MAX_OBSERVATIONS, MAX_SIMULATIONS = 300, 600
-NUM_DRAWS = 300
+MAX_OBSERVATIONS, MAX_SIMULATIONS = 200, 400
+NUM_DRAWS = 200
 LEVEL = 0.01
 
 
@@ -43,7 +43,7 @@ def mmd_test(batch: Tensor, simulated: Tensor, *, null: Tensor) -> MMDTest:
         | https://arxiv.org/abs/2112.08866
 
     Args:
-        batch: Embeddings, shape ``(n_o, l)``; a random 300 of them are used.
+        batch: Embeddings, shape ``(n_o, l)``; a random 200 of them are used.
         simulated: Embeddings of simulations, shape ``(n_s, l)``.
         null: What the batch would be drawn from if all were well, row by row another
             view of ``simulated``, shape ``(n_s, l)``.

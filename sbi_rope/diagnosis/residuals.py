@@ -10,7 +10,14 @@ from sbi_rope.diagnosis.report import Finding
 from sbi_rope.diagnosis.simulations import Simulations
 from sbi_rope.rope import RoPE
 
-__all__ = ["Dependence", "cross_fitted_residuals", "dependence", "residual_finding"]
+__all__ = [
+    "CrossFitted",
+    "Dependence",
+    "cross_fit",
+    "dependence",
+    "num_features",
+    "residual_finding",
+]
 
 NUM_PERMUTATIONS = 1000
 LEVEL = 0.01
@@ -18,6 +25,24 @@ LEVEL = 0.01
 LARGEST_RATIO = 0.5
 # Bias below this share of the embeddings' spread is nothing, if there is no noise.
 SMALLEST_SHARE = 0.05
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CrossFitted:
+    r"""Calibration pairs as a g sees them that was not trained on them.
+
+    Attributes:
+        embedded: :math:`g(x)`, ``(n_c, l)``.
+        targets: :math:`E[h(S(\theta))]`, ``(n_c, l)``.
+    """
+
+    embedded: Tensor
+    targets: Tensor
+
+    @property
+    def residuals(self) -> Tensor:
+        """What is between the two, ``(n_c, l)``."""
+        return self.embedded - self.targets
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,35 +66,29 @@ def num_features(num_pairs: int, dim: int) -> int:
     return 0
 
 
-def cross_fitted_residuals(
-    rope: RoPE, *, num_folds: int, show_progress_bars: bool
-) -> Tensor:
-    r"""Return :math:`g(x) - E[h(S(\theta))]` of each pair, g trained on other folds.
+def cross_fit(rope: RoPE, *, num_folds: int, show_progress_bars: bool) -> CrossFitted:
+    r"""Embed each calibration pair by a g that was trained on the other folds.
 
-    On the pairs g was trained on they would be too small. Costs as many trainings as
-    there are folds.
+    On the pairs g was trained on, residuals would be too small. Costs as many
+    trainings as there are folds.
 
     Args:
         rope: RoPE with its calibration pairs; it is left as it is.
         num_folds: Folds; as many as there are pairs, if these are fewer.
         show_progress_bars: Whether to show the folds done.
-
-    Returns:
-        Shape ``(n_c, l)``.
     """
     theta, x = rope.calibration
-    targets = rope.draw_targets(torch.arange(len(theta)), show_progress_bars=False)
-    residuals = torch.empty_like(targets)
+    rows = torch.arange(len(theta), device=theta.device)
+    targets = rope.draw_targets(rows, show_progress_bars=False)
+    embedded = torch.empty_like(targets)
     order = torch.randperm(len(theta)).to(theta.device)
     folds = order.tensor_split(min(num_folds, len(theta)))
-    bar = tqdm(range(len(folds)), desc="Folds", disable=not show_progress_bars)
-    for number in bar:
-        held_out = folds[number]
-        others = torch.cat([rows for rows in folds if rows is not held_out])
+    for held_out in tqdm(folds, desc="Folds", disable=not show_progress_bars):
+        others = torch.cat([fold for fold in folds if fold is not held_out])
         part = rope.with_pairs(others, targets=targets[others])
         part.train(show_progress_bars=False)
-        residuals[held_out] = part.embed_observations(x[held_out]) - targets[held_out]
-    return residuals.cpu().double()
+        embedded[held_out] = part.embed_observations(x[held_out])
+    return CrossFitted(embedded=embedded.cpu().double(), targets=targets.cpu().double())
 
 
 def dependence(residuals: Tensor, theta: Tensor) -> Dependence:

@@ -49,27 +49,33 @@ class Simulations:
 
     @cached_property
     def averaged(self) -> Tensor:
-        r"""Embeddings as g would give them if simulations were real, ``(n_s, l)``.
+        """Embeddings as g would give them if simulations were real, ``(n_s, l)``."""
+        return self.average(self.embedded)
+
+    def average(self, points: Tensor) -> Tensor:
+        r"""Move embeddings ``(n, l)`` as tuning would if all were well.
 
         Tuning moves :math:`g(x)` to :math:`E[h \mid \theta]`, of which an observation
         tells no more than its mean given x: the noise of single simulations is
         averaged out, and what is left is drawn to the centre. To first order that is
-        :math:`\mu + (I - W V^{-1})(h - \mu)`, V the covariance of h. Without tuning it
-        is h itself.
+        :math:`\mu + (I - W V^{-1})(h - \mu)`, V the covariance of h. Without tuning h
+        stays as it is.
         """
         if not self.tuned:
-            return self.embedded
+            return points
         mean = self.embedded.mean(dim=0)
-        values, vectors = torch.linalg.eigh(
-            self.embedded.T.cov(correction=0).reshape(self.noise.shape)
-        )
+        return mean + (points - mean) @ self._averaging
+
+    @cached_property
+    def _averaging(self) -> Tensor:
+        centred = self.embedded - self.embedded.mean(dim=0)
+        values, vectors = torch.linalg.eigh(centred.T @ centred / len(centred))
         kept = values > 1e-10 * values.max()
         root = vectors[:, kept] * values[kept].sqrt()
         inverse = vectors[:, kept] / values[kept].sqrt()
         share, basis = torch.linalg.eigh(inverse.T @ self.noise @ inverse)
         left = (1.0 - share).clamp(0.0, 1.0)
-        change = inverse @ (basis * left) @ basis.T @ root.T
-        return mean + (self.embedded - mean) @ change
+        return inverse @ (basis * left) @ basis.T @ root.T
 
     @cached_property
     def nearest(self) -> Tensor:

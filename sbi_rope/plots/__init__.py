@@ -13,6 +13,7 @@ from sbi_rope.plots.diagnostics import (
 )
 from sbi_rope.plots.observations import real_and_simulated
 from sbi_rope.plots.posteriors import pair_plot
+from sbi_rope.plots.stacking import stacking_report
 from sbi_rope.plots.steps import overview
 
 __all__ = [
@@ -24,4 +25,5 @@ __all__ = [
     "overview",
     "pair_plot",
     "real_and_simulated",
+    "stacking_report",
 ]

@@ -94,6 +94,12 @@ class StackingReport:
             return None
         return self.cross_validation.difference("stack", name)
 
+    @property
+    def score(self) -> tuple[float, float]:
+        """The mean held-out log score of the stack, and its standard error."""
+        scores = self.cross_validation.stack_scores
+        return float(scores.mean()), float(scores.std() / len(scores) ** 0.5)
+
     @cached_property
     def family_weights(self) -> dict[str, float]:
         """The weight of each method, summed over its settings, from large to small."""
@@ -136,11 +142,11 @@ class StackingReport:
 
     def __str__(self) -> str:
         n = len(self.cross_validation)
-        scores = self.cross_validation.stack_scores
+        score, error = self.score
         lines = [
             f"Stack of {len(self.cross_validation.names)} candidates, scored on {n} "
             "held-out calibration pairs",
-            f"  log score of the stack: {_mean(scores)} a pair",
+            f"  log score of the stack: {score:.2f} +- {error:.2f} a pair",
             *self._gains(),
             *self._weights(),
             *self._calibration(),
@@ -208,9 +214,3 @@ class StackingReport:
 
 def _called(name: str) -> str:
     return {"prior": "the prior", "NPE": "NPE as it was"}[name]
-
-
-def _mean(scores: Tensor) -> str:
-    mean = float(scores.mean())
-    error = float(scores.std() / len(scores) ** 0.5) if len(scores) > 1 else 0.0
-    return f"{mean:.2f} +- {error:.2f}"

@@ -1,0 +1,154 @@
+"""What the calibration pairs say about a stack, in one picture."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Protocol
+
+import torch
+
+from sbi_rope.metrics import CoverageCurve
+from sbi_rope.plots._figures import BLUE, GREY, ORANGE, SKY, empty_figure, hide_frame
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["LearningCurveLike", "StackingReportLike", "stacking_report"]
+
+# Most candidates that are named.
+MAX_CANDIDATES = 12
+
+
+class LearningCurveLike(Protocol):
+    """What :func:`stacking_report` reads of a learning curve."""
+
+    @property
+    def num_pairs(self) -> Sequence[int]:
+        """Pairs trained on."""
+        ...
+
+    @property
+    def scores(self) -> Sequence[float]:
+        """Mean held-out scores."""
+        ...
+
+    @property
+    def standard_errors(self) -> Sequence[float]:
+        """Of the scores."""
+        ...
+
+
+class StackingReportLike(Protocol):
+    """What :func:`stacking_report` reads; :class:`sbi_rope.stacking.StackingReport`."""
+
+    @property
+    def learning_curve(self) -> LearningCurveLike | None:
+        """The held-out score by the number of pairs trained on."""
+        ...
+
+    @property
+    def family_weights(self) -> Mapping[str, float]:
+        """The weight of each method."""
+        ...
+
+    @property
+    def coverage(self) -> CoverageCurve:
+        """Coverage on held-out pairs."""
+        ...
+
+    @property
+    def score(self) -> tuple[float, float]:
+        """Mean held-out score of the stack, and its standard error."""
+        ...
+
+    def as_rows(self) -> list[dict[str, Any]]:
+        """Candidates with their weights and scores, the best first."""
+        ...
+
+
+def stacking_report(report: StackingReportLike) -> "Figure":
+    """Held-out scores of the candidates, weights, coverage, and the learning curve.
+
+    Left, the mean log score of the best candidates on pairs they were not trained on,
+    one standard error to each side, and that of the stack. Middle, the weight of each
+    method. Right, the coverage of the stack on held-out pairs, with the band that holds
+    95 % of the curves of calibrated posteriors; and, if it was computed, the score of
+    the stack against the number of pairs it was trained on.
+
+    Args:
+        report: The report of a stack.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ImportError: If matplotlib is not installed.
+    """
+    curve = report.learning_curve
+    widths = [1.7, 1.2, 1.0] if curve is None else [1.7, 1.2, 1.0, 1.0]
+    figure = empty_figure(11.0 if curve is None else 14.0, 3.8)
+    panels = figure.subplots(1, len(widths), width_ratios=widths)
+    _scores(panels[0], report)
+    _weights(panels[1], report.family_weights)
+    _coverage(panels[2], report.coverage)
+    if curve is not None:
+        _learning_curve(panels[3], curve)
+    for axes in panels:
+        hide_frame(axes)
+    return figure
+
+
+def _scores(axes: "Axes", report: StackingReportLike) -> None:
+    finite = [row for row in report.as_rows() if row["score"] > -float("inf")]
+    rows = finite[:MAX_CANDIDATES][::-1]
+    for position, row in enumerate(rows):
+        axes.errorbar(
+            row["score"],
+            position,
+            xerr=row["standard_error"],
+            fmt="o",
+            color=SKY,
+            markersize=4,
+        )
+    score, error = report.score
+    axes.errorbar(
+        score, len(rows), xerr=error, fmt="*", color=BLUE, markersize=10, capsize=3
+    )
+    axes.set_yticks(
+        range(len(rows) + 1), [*(row["candidate"] for row in rows), "stack"], fontsize=8
+    )
+    left_out = len(report.as_rows()) - len(rows)
+    note = f" ({left_out} lower ones not shown)" if left_out else ""
+    axes.set_xlabel(f"log score of held-out pairs{note}", fontsize=9)
+
+
+def _weights(axes: "Axes", weights: Mapping[str, float]) -> None:
+    names = list(weights)[::-1]
+    bars = axes.barh(range(len(names)), [weights[name] for name in names], color=ORANGE)
+    axes.bar_label(bars, [f"{weights[name]:.0%}" for name in names], padding=3)
+    axes.set_yticks(range(len(names)), names, fontsize=8)
+    axes.set(xlim=(0, 1.15 * max(weights.values())), xlabel="weight in the stack")
+
+
+def _coverage(axes: "Axes", curve: CoverageCurve) -> None:
+    alpha = torch.linspace(0.0, 1.0, 201)
+    width = 1.96 * (alpha * (1.0 - alpha) / curve.num_observations).sqrt()
+    low, high = (alpha - width).clamp(min=0.0), (alpha + width).clamp(max=1.0)
+    axes.fill_between(alpha, low, high, color="0.85")
+    axes.plot([0, 1], [0, 1], color=GREY, lw=0.8)
+    axes.plot(curve.levels.cpu(), curve.average.cpu(), color=BLUE)
+    axes.set(xlim=(0, 1), ylim=(0, 1), box_aspect=1)
+    axes.set(xlabel="credible level", ylabel="share of held-out pairs inside")
+
+
+def _learning_curve(axes: "Axes", curve: LearningCurveLike) -> None:
+    axes.errorbar(
+        curve.num_pairs,
+        curve.scores,
+        yerr=curve.standard_errors,
+        fmt="o-",
+        color=BLUE,
+        capsize=3,
+    )
+    axes.set(xscale="log", xlabel="pairs trained on", ylabel="held-out score")
+    axes.set_xticks(curve.num_pairs, [str(n) for n in curve.num_pairs])
+    axes.minorticks_off()

@@ -1,0 +1,528 @@
+"""Each finding of a diagnosis fires where it should, and is quiet where it should."""
+
+import warnings
+
+import pytest
+import torch
+from scipy.stats import kstest
+from torch import Tensor, nn
+
+from sbi_rope import CalibrationFinetuner, RoPE, SinkhornCoupler
+from sbi_rope.diagnosis import Diagnosis, diagnose
+from sbi_rope.diagnosis.misspecification import mmd_test
+from sbi_rope.diagnosis.prior_shift import prior_shift
+from sbi_rope.diagnosis.residuals import (
+    CrossFitted,
+    cross_fit,
+    dependence,
+    num_features,
+    residual_finding,
+)
+from sbi_rope.diagnosis.simulations import Simulations
+from sbi_rope.diagnosis.support import support_of
+from sbi_rope.errors import InvalidInputError, InvalidTypeError, NotReadyError
+from sbi_rope.plots.diagnosis import implied_parameters
+from tests import gaussian
+
+FINETUNER = CalibrationFinetuner(learning_rate=1e-2, num_steps=150)
+SHIFTS = ("prior shift: theta_1", "prior shift: theta_2")
+
+
+def conductor(**options: object) -> RoPE:
+    arguments = {"simulator": gaussian.simulator, "finetuner": FINETUNER, **options}
+    return RoPE(gaussian.posterior(), **arguments)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def tuned() -> RoPE:
+    torch.manual_seed(0)
+    rope = conductor().append_calibration(*gaussian.labelled(100))
+    return rope.train(seed=0, show_progress_bars=False)
+
+
+def look(rope: RoPE, x_o: Tensor, **options: object) -> Diagnosis:
+    return diagnose(rope, x_o, seed=0, show_progress_bars=False, **options)  # type: ignore[arg-type]
+
+
+def alarms(diagnosis: Diagnosis) -> set[str]:
+    return {finding.name for finding in diagnosis.alarming}
+
+
+def parameters(n: int, *, shifted: bool = False) -> Tensor:
+    theta = gaussian.prior().sample((8 * n,))
+    return theta[theta[:, 0] > 0.5][:n] if shifted else theta[:n]
+
+
+def simulations(n: int = 600, *, is_tuned: bool = False, dim: int = 2) -> Simulations:
+    """Parameters, and the posterior means of simulations."""
+    theta = gaussian.prior(dim).sample((n,))
+    embedded = gaussian.GAIN * gaussian.simulator(theta)
+    return Simulations(theta=theta.double(), embedded=embedded.double(), tuned=is_tuned)
+
+
+@pytest.fixture(scope="module")
+def misspecified(tuned: RoPE) -> Diagnosis:
+    torch.manual_seed(1)
+    return look(tuned, gaussian.real_process(parameters(200)))
+
+
+# --- the whole ---
+
+
+def test_nothing_alarms_where_the_simulator_is_right() -> None:
+    torch.manual_seed(2)
+    diagnosis = look(conductor(), gaussian.simulator(parameters(200)))
+    assert alarms(diagnosis) == set()
+    assert len(diagnosis.findings) == 7
+
+
+def test_misspecification_that_tuning_repairs_is_found_before_tuning_only(
+    misspecified: Diagnosis,
+) -> None:
+    assert alarms(misspecified) == {"misspecification before tuning"}
+
+
+def test_misspecification_that_was_not_tuned_is_found() -> None:
+    torch.manual_seed(3)
+    diagnosis = look(conductor(), gaussian.real_process(parameters(200)))
+    assert "misspecification before tuning" in alarms(diagnosis)
+    assert "observations no simulation matches" in alarms(diagnosis)
+    assert "g was not tuned" in diagnosis[SHIFTS[0]].sentence
+
+
+def test_a_prior_shift_is_found_in_the_parameter_that_shifts(tuned: RoPE) -> None:
+    torch.manual_seed(4)
+    x_o = gaussian.real_process(parameters(200, shifted=True))
+    diagnosis = look(tuned, x_o, num_folds=None)
+    assert diagnosis[SHIFTS[0]].alarming
+    assert "higher" in diagnosis[SHIFTS[0]].sentence
+    assert not diagnosis[SHIFTS[1]].alarming
+
+
+def test_a_single_outlier_is_flagged(tuned: RoPE) -> None:
+    torch.manual_seed(5)
+    x_o = gaussian.real_process(parameters(100))
+    x_o[7] = 25.0
+    diagnosis = look(tuned, x_o, num_folds=None)
+    assert 7 in diagnosis.flags.tolist()
+    assert diagnosis["farthest observation"].alarming
+    assert "Observation 7" in diagnosis["farthest observation"].sentence
+
+
+def test_without_pairs_what_needs_labels_is_left_out_and_said_so() -> None:
+    torch.manual_seed(6)
+    diagnosis = look(conductor(), gaussian.simulator(parameters(40)))
+    assert diagnosis.residuals is None
+    names = {finding.name for finding in diagnosis.findings}
+    assert names.isdisjoint(
+        {"misspecification after tuning", "residual depends on parameters"}
+    )
+    assert "no calibration pairs" in str(diagnosis)
+
+
+def test_too_few_pairs_leave_the_regression_out() -> None:
+    torch.manual_seed(7)
+    rope = conductor().append_calibration(*gaussian.labelled(5))
+    rope.train(seed=0, show_progress_bars=False)
+    diagnosis = look(rope, gaussian.real_process(parameters(40)))
+    assert "residual depends on parameters" not in {
+        finding.name for finding in diagnosis.findings
+    }
+    assert "too few" in diagnosis.notes[0]
+
+
+def test_its_simulations_and_sizes_are_those_of_a_posterior(tuned: RoPE) -> None:
+    torch.manual_seed(8)
+    x_o = gaussian.real_process(parameters(60))
+    sharp = SinkhornCoupler(gamma=0.1)
+    diagnosis = look(tuned, x_o, num_simulations=300, num_folds=None, coupler=sharp)
+    posterior = tuned.build_posterior(x_o, coupler=sharp, num_simulations=300, seed=0)
+    expected = posterior.coupling.effective_sample_size
+    assert torch.allclose(diagnosis.effective_sample_size, expected)
+    theta, embedded = tuned.draw_simulations(300, seed=0, show_progress_bars=False)
+    assert torch.equal(embedded, posterior.coupling.simulated.to(embedded))
+    assert torch.equal(diagnosis.theta, theta.double())
+
+
+def test_simulated_parameters_belong_to_their_embeddings() -> None:
+    noiseless = conductor(simulator=lambda theta: theta + 0.0)
+    theta, embedded = noiseless.draw_simulations(50, show_progress_bars=False)
+    assert torch.allclose(embedded, gaussian.GAIN * theta)
+    pairs = (theta, 2.0 * theta)
+    stored = conductor(simulator=None, simulations=pairs)
+    theta, embedded = stored.draw_simulations(20, show_progress_bars=False)
+    assert theta.shape == (20, 2)
+    assert torch.allclose(embedded, 2.0 * gaussian.GAIN * theta)
+
+
+def test_parameters_of_simulations_with_nan_are_dropped_with_them() -> None:
+    def simulator(theta: Tensor) -> Tensor:
+        return torch.where(theta[:, :1] > 0, theta, torch.nan)
+
+    rope = conductor(simulator=simulator)
+    with pytest.warns(UserWarning, match="Dropped"):
+        theta, embedded = rope.draw_simulations(50, show_progress_bars=False)
+    assert (theta[:, 0] > 0).all()
+    assert torch.allclose(embedded, gaussian.GAIN * theta)
+
+
+def test_the_same_seed_gives_the_same_diagnosis_and_leaves_the_callers_state(
+    tuned: RoPE,
+) -> None:
+    x_o = gaussian.real_process(parameters(30))
+    first = look(tuned, x_o, num_simulations=200)
+    state = torch.get_rng_state()
+    second = look(tuned, x_o, num_simulations=200)
+    assert torch.equal(state, torch.get_rng_state())
+    assert first.as_rows() == second.as_rows()
+
+
+def test_the_text_holds_every_finding_and_rows_their_numbers(
+    misspecified: Diagnosis,
+) -> None:
+    text = str(misspecified)
+    for finding, row in zip(misspecified.findings, misspecified.as_rows(), strict=True):
+        assert f"{finding.name}: {finding.value:.3g}" in text
+        assert row["value"] == finding.value
+    assert "1 of 9 findings is alarming" in text
+    assert text.count("\n! ") == 1
+
+
+def test_stored_simulations_will_do() -> None:
+    torch.manual_seed(9)
+    theta = gaussian.prior().sample((400,))
+    stored = (theta, gaussian.simulator(theta))
+    rope = conductor(simulator=None, simulations=stored)
+    rope.append_calibration(*gaussian.labelled(30)).train(show_progress_bars=False)
+    diagnosis = look(rope, gaussian.real_process(parameters(50)))
+    assert diagnosis.residuals is not None
+    assert diagnosis.theta.shape == (400, 2)
+
+
+# --- misspecification ---
+
+
+def squared_mmd(a: Tensor, b: Tensor) -> float:
+    """By the definition, with the median distance across as bandwidth."""
+    width = torch.cdist(a, b).flatten().median()
+
+    def kernel(x: Tensor, y: Tensor) -> Tensor:
+        return torch.exp(-((x[:, None] - y[None]) ** 2).sum(dim=2) / (2 * width**2))
+
+    return float(kernel(a, a).mean() + kernel(b, b).mean() - 2 * kernel(a, b).mean())
+
+
+def test_mmd_is_that_of_the_definition() -> None:
+    torch.manual_seed(10)
+    batch, simulated = torch.randn(40, 3).double() + 0.3, torch.randn(120, 3).double()
+    test = mmd_test(batch, simulated, null=simulated)
+    # All 120 - 40 simulations are used, whichever they are.
+    torch.manual_seed(10)
+    torch.randn(40, 3), torch.randn(120, 3)
+    chosen = batch[torch.randperm(40)]
+    for _ in range(200):
+        order = torch.randperm(120)
+        squared_mmd_draw = (simulated[order[:40]], simulated[order[40:]])
+        torch.randperm(80)  # sbi draws a baseline of its own
+    assert squared_mmd(*squared_mmd_draw) > 0
+    other = simulated[torch.randperm(120)[:80]]
+    assert test.mmd == pytest.approx(squared_mmd(chosen, other), rel=1e-6)
+
+
+def test_p_values_of_the_mmd_test_are_uniform_for_simulations() -> None:
+    torch.manual_seed(11)
+    values = []
+    for _ in range(25):
+        simulated = torch.randn(150, 2).double()
+        batch = torch.randn(30, 2).double()
+        values.append(mmd_test(batch, simulated, null=simulated).p_value)
+    assert kstest(values, "uniform").pvalue > 0.01
+
+
+def test_averaging_over_noise_is_not_taken_for_misspecification() -> None:
+    torch.manual_seed(12)
+    known = simulations(1000, is_tuned=True)
+    # What the best g gives: the posterior mean of the target.
+    x = gaussian.simulator(parameters(300)).double()
+    best = gaussian.GAIN**2 * x
+    assert mmd_test(best, known.embedded, null=known.averaged).p_value > 0.01
+    assert mmd_test(best, known.embedded, null=known.embedded).p_value < 0.05
+
+
+# --- the simulations ---
+
+
+def test_noise_and_averaged_embeddings_are_those_of_the_gaussian_problem() -> None:
+    torch.manual_seed(13)
+    known = simulations(2000, is_tuned=True)
+    noise = (gaussian.GAIN * gaussian.NOISE_STD) ** 2
+    assert torch.allclose(known.noise, noise * torch.eye(2).double(), atol=0.02)
+    best = gaussian.GAIN * known.embedded
+    assert torch.allclose(known.averaged, best, atol=0.15)
+    untuned = simulations()
+    assert torch.equal(untuned.averaged, untuned.embedded)
+
+
+def test_averaging_survives_embeddings_in_a_plane() -> None:
+    known = simulations(300, is_tuned=True)
+    flat = torch.cat([known.embedded, known.embedded[:, :1], 0 * known.theta], dim=1)
+    wide = Simulations(theta=known.theta, embedded=flat, tuned=True)
+    assert torch.isfinite(wide.averaged).all()
+    assert torch.allclose(wide.averaged[:, :2], known.averaged, atol=1e-6)
+
+
+# --- support ---
+
+
+def test_distances_are_those_by_brute_force() -> None:
+    torch.manual_seed(14)
+    known = simulations(700)
+    real = torch.randn(30, 2).double()
+    every = (known.embedded[:, None] - known.embedded[None]).norm(dim=2)
+    own = torch.stack(
+        [torch.cat([row[:i], row[i + 1 :]]).min() for i, row in enumerate(every)]
+    )
+    nearest = (real[:, None] - known.embedded[None]).norm(dim=2).amin(dim=1)
+    support = support_of(real, known)
+    assert torch.allclose(support.distance, nearest / own.median(), rtol=1e-6)
+    assert support.limit == pytest.approx(float(own.max() / own.median()), rel=1e-6)
+    assert support.chance == pytest.approx(1 / 701)
+
+
+def test_simulations_are_flagged_as_often_as_stated() -> None:
+    torch.manual_seed(15)
+    counts = 0
+    for _ in range(20):
+        known = simulations(1000)
+        support = support_of(simulations(500).embedded, known)
+        counts += len(support.flags)
+    # 20 expected; flags of one set of simulations come together.
+    assert 5 <= counts <= 45
+
+
+def test_many_observations_that_rest_on_few_simulations_alarm(tuned: RoPE) -> None:
+    x_o = gaussian.real_process(parameters(60))
+    for gamma, name in ((0.003, "observations with few simulations"), (9.0, None)):
+        diagnosis = look(
+            tuned,
+            x_o,
+            num_simulations=200,
+            num_folds=None,
+            coupler=SinkhornCoupler(gamma=gamma, tau=0.5),
+        )
+        name = name or "posteriors like the prior"
+        assert diagnosis[name].alarming
+
+
+# --- prior shift ---
+
+
+def test_implied_weights_are_the_mean_row_of_the_coupling() -> None:
+    torch.manual_seed(16)
+    known = simulations(200)
+    real = torch.randn(30, 2).double()
+    coupler = SinkhornCoupler(gamma=0.1, tau=0.0, cost_scale="simulated")
+    expected = coupler.couple(real, known.embedded).weights.mean(dim=0)
+    shift = prior_shift(real, known)
+    assert torch.allclose(shift.implied, expected)
+    # Simulations that play the batch do not choose themselves.
+    cost = torch.cdist(known.embedded, known.embedded)
+    gamma = coupler.couple(real, known.embedded).gamma
+    rows = (-cost.fill_diagonal_(torch.inf) / gamma).softmax(dim=1)
+    assert torch.allclose(shift.unshifted, rows.mean(dim=0), atol=1e-6)
+
+
+def test_the_distance_is_kolmogorov_and_smirnovs() -> None:
+    torch.manual_seed(17)
+    # As many simulations as points of comparison: none lies in between.
+    known = simulations(100)
+    shift = prior_shift(torch.randn(20, 2).double() + 0.5, known)
+    for k in range(2):
+        order = known.theta[:, k].argsort()
+        gap = (shift.implied - shift.unshifted)[order].cumsum(dim=0).abs().max()
+        assert float(shift.distance[k]) == pytest.approx(float(gap), abs=1e-9)
+
+
+def test_a_batch_of_the_prior_is_quiet_and_a_shift_is_not() -> None:
+    torch.manual_seed(18)
+    quiet, loud = 0, 0
+    for _ in range(10):
+        known = simulations(500)
+        for shifted in (False, True):
+            x = gaussian.simulator(parameters(100, shifted=shifted)).double()
+            shift = prior_shift(gaussian.GAIN * x, known)
+            alarming = shift.distance > shift.threshold
+            loud += int(alarming[0]) if shifted else 0
+            quiet += 0 if shifted else int(alarming.any())
+    assert loud == 10
+    assert quiet <= 1
+
+
+def test_errors_of_g_are_allowed_for_as_calibration_pairs_show_them() -> None:
+    torch.manual_seed(24)
+    known = simulations(800, is_tuned=True)
+    targets = gaussian.GAIN * parameters(200).double()
+    exact = CrossFitted(embedded=known.average(targets), targets=targets)
+    real = gaussian.GAIN**2 * gaussian.simulator(parameters(200)).double()
+    shift = prior_shift(real, known, held_out=exact)
+    assert shift.error is not None
+    assert torch.equal(shift.error, torch.zeros(2).double())
+    assert not (shift.distance > shift.threshold).any()
+    # A g that puts everything half a unit too high in one entry.
+    wrong = torch.tensor([0.5, 0.0]).double()
+    blind = prior_shift(real + wrong, known)
+    assert (blind.distance > blind.threshold).tolist() == [True, False]
+    off = CrossFitted(embedded=exact.embedded + wrong, targets=targets)
+    told = prior_shift(real + wrong, known, held_out=off)
+    assert not (told.distance > told.threshold).any()
+
+
+# --- residuals ---
+
+
+def test_p_values_of_the_residual_test_are_uniform_without_dependence() -> None:
+    torch.manual_seed(19)
+    values = [
+        dependence(torch.randn(20, 3).double(), torch.randn(20, 2).double()).p_value
+        for _ in range(60)
+    ]
+    assert kstest(values, "uniform").pvalue > 0.01
+
+
+def test_bias_is_recovered_whatever_the_noise() -> None:
+    torch.manual_seed(20)
+    theta = torch.randn(4000, 2).double()
+    noise = torch.randn(4000, 3).double()
+    curved = 0.3 * theta[:, :1] + 0.2 * (theta[:, 1:] ** 2 - 1)
+    found = dependence(noise + curved * torch.tensor([1.0, 0.0, -1.0]), theta)
+    # Twice the variance of 0.3 u + 0.2 (v^2 - 1).
+    assert found.bias == pytest.approx((2 * (0.09 + 0.08)) ** 0.5, rel=0.1)
+    assert found.p_value < 0.01
+    assert dependence(noise, theta).bias < 0.1
+
+
+def test_few_pairs_carry_no_squares() -> None:
+    assert num_features(5, 2) == 0
+    assert num_features(8, 2) == 2
+    assert num_features(12, 2) == 4
+
+
+def test_averaging_is_within_the_threshold_and_a_lost_parameter_is_not() -> None:
+    torch.manual_seed(21)
+    known = simulations(1000)
+    theta = parameters(300)
+    target = gaussian.GAIN * theta
+    best = gaussian.GAIN**2 * gaussian.simulator(theta)
+    finding = residual_finding((best - target).double(), theta.double(), known)
+    # sqrt(R (1 - R)) with R = 0.8.
+    assert finding.value == pytest.approx(0.4, abs=0.05)
+    assert not finding.alarming
+    # Real observations that do not see the second parameter.
+    best[:, 1] = 0.0
+    assert residual_finding((best - target).double(), theta.double(), known).alarming
+
+
+class Blind(nn.Module):
+    """A real process that simulations know nothing of: it folds one parameter."""
+
+    def forward(self, theta: Tensor) -> Tensor:
+        folded = torch.stack([theta[:, 0], theta[:, 1].abs()], dim=1)
+        return folded + gaussian.NOISE_STD * torch.randn_like(folded)
+
+
+def test_a_real_process_that_folds_a_parameter_alarms() -> None:
+    torch.manual_seed(22)
+    theta = parameters(80)
+    rope = conductor().append_calibration(theta, Blind()(theta))
+    rope.train(seed=0, show_progress_bars=False)
+    diagnosis = look(rope, Blind()(parameters(100)))
+    assert diagnosis["residual depends on parameters"].alarming
+
+
+def test_residuals_are_of_pairs_that_g_was_not_trained_on() -> None:
+    torch.manual_seed(23)
+    theta, x = gaussian.labelled(10)
+    rope = conductor(finetuner=CalibrationFinetuner(num_steps=50))
+    rope.append_calibration(theta, x).train(seed=0, show_progress_bars=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        torch.manual_seed(0)
+        before = cross_fit(rope, num_folds=10, show_progress_bars=False)
+        # Another label for the first pair: its own g has not seen it.
+        theta = theta.clone()
+        theta[0] = -theta[0]
+        other = conductor(simulator=lambda t: t + 0.0, finetuner=rope.finetuner)
+        same = conductor(simulator=lambda t: t + 0.0, finetuner=rope.finetuner)
+        nets = []
+        for part, labels in ((other, theta), (same, rope.calibration[0])):
+            part.append_calibration(labels, x)
+            torch.manual_seed(0)
+            held_out = cross_fit(part, num_folds=10, show_progress_bars=False)
+            nets.append(held_out.embedded)
+            assert torch.allclose(
+                held_out.targets, gaussian.GAIN * labels.double(), atol=1e-6
+            )
+    assert before.residuals.shape == (10, 2)
+    assert torch.allclose(nets[0][0], nets[1][0], atol=1e-5)
+    assert not torch.allclose(nets[0][1:], nets[1][1:], atol=1e-5)
+
+
+# --- bad input, and the picture ---
+
+
+def test_bad_input_is_refused(tuned: RoPE) -> None:
+    x_o = torch.zeros(30, 2)
+    with pytest.raises(InvalidTypeError, match="rope"):
+        diagnose(gaussian.posterior(), x_o)  # type: ignore[arg-type]
+    with pytest.raises(InvalidTypeError, match="coupler"):
+        diagnose(tuned, x_o, coupler="ot")  # type: ignore[arg-type]
+    with pytest.raises(InvalidTypeError, match="x_o"):
+        diagnose(tuned, [1.0])  # type: ignore[arg-type]
+    bad = [
+        (torch.zeros(30, 3), {}, r"\(n, 2\)"),
+        (torch.zeros(0, 2), {}, "empty"),
+        (torch.full((30, 2), torch.nan), {}, "finite"),
+        (x_o, {"num_simulations": 99}, "at least 100"),
+        (x_o, {"num_folds": 1}, "num_folds"),
+        (x_o, {"seed": -1}, "seed"),
+        (x_o, {"parameter_names": ["a"]}, "parameter_names"),
+        (x_o, {"parameter_names": "ab"}, "parameter_names"),
+    ]
+    for value, options, match in bad:
+        with pytest.raises(InvalidInputError, match=match):
+            diagnose(tuned, value, **options)
+
+
+def test_too_few_stored_simulations_are_refused() -> None:
+    theta = gaussian.prior().sample((50,))
+    rope = conductor(simulator=None, simulations=(theta, gaussian.simulator(theta)))
+    with pytest.raises(InvalidInputError, match="at least 100 simulations"):
+        look(rope, torch.zeros(30, 2))
+
+
+def test_pairs_that_were_not_trained_on_are_refused() -> None:
+    rope = conductor().append_calibration(*gaussian.labelled(10))
+    with pytest.raises(NotReadyError, match=r"`train\(\)` first"):
+        diagnose(rope, torch.zeros(30, 2))
+
+
+def test_the_picture_has_a_panel_for_each_parameter(misspecified: Diagnosis) -> None:
+    pytest.importorskip("matplotlib")
+    figure = misspecified.plot()
+    assert [axes.get_xlabel() for axes in figure.axes] == ["theta_1", "theta_2"]
+    figure.draw_without_rendering()
+    texts = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert "prior" in texts
+    assert "implied by this batch" in texts
+
+
+def test_the_picture_shows_the_weights() -> None:
+    pytest.importorskip("matplotlib")
+    theta = torch.linspace(0.0, 1.0, 200).unsqueeze(1)
+    figure = implied_parameters(theta, implied=(theta[:, 0] > 0.5).double())
+    outline = figure.axes[0].patches[-1].get_xy()
+    assert outline[outline[:, 0] < 0.4, 1].max() == 0.0
+    assert outline[outline[:, 0] > 0.6, 1].max() > 1.5
+    for bad in (torch.ones(3), -torch.ones(200), torch.full((200,), torch.nan)):
+        with pytest.raises(InvalidInputError, match="implied"):
+            implied_parameters(theta, implied=bad)
