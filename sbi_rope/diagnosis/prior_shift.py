@@ -108,7 +108,8 @@ def prior_shift(
         held_out: Calibration pairs, to measure the errors of g.
     """
     embedded = simulations.embedded
-    coupling = COUPLER.couple(real[:1], embedded)
+    # At tau = 0 the potential is zero, whatever is coupled.
+    coupling = COUPLER.couple(embedded[:100], embedded)
     points = _points(simulations.theta)
     implied, batch = _rows(coupling, real, simulations, points)
     players = torch.arange(min(len(simulations), MAX_PLAYERS))

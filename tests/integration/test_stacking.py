@@ -61,6 +61,8 @@ def quick_finetuned(rope: RoPE, seed: int) -> Any:
     return method.train(seed=seed, **QUIET).build_posterior()
 
 
+# Moves the net far enough to tell g from h.
+QUICK = CalibrationFinetuner(num_steps=15, simulations_per_target=3, learning_rate=0.03)
 PRIOR = DensityCandidate(
     name="prior", build=lambda rope, seed: PriorPosterior(rope.npe.prior), fixed=True
 )
@@ -96,9 +98,7 @@ def untrained(
 ) -> RoPE:
     if "simulations" not in options:
         options["simulator"] = uneven
-    options.setdefault(
-        "finetuner", CalibrationFinetuner(num_steps=15, simulations_per_target=3)
-    )
+    options.setdefault("finetuner", QUICK)
     rope = RoPE(problems.npe_posterior(family, embedding, dim=dim), **options)
     if pairs is None:
         pairs = problem(dim, num_pairs, seed=1)
@@ -190,6 +190,8 @@ def unnormalised(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:
 
 def test_couplings_of_a_stack_are_the_couplings_of_rope_at_their_settings() -> None:
     rope, posterior = the_rope(), the_stack()
+    g, h = rope.tuned_embedding_net, rope.embedding_net
+    assert (g(posterior.x_o) - h(posterior.x_o)).abs().max() > 0.1
     theta = problems.box(2).sample((NUM_OBSERVED,))
     estimator: Any = posterior.posterior_estimator
     found = estimator.candidate_log_probs(theta, posterior.x_o)
@@ -606,6 +608,16 @@ def test_too_few_pairs_are_refused(num_pairs: int) -> None:
 def test_a_stack_needs_a_trained_rope() -> None:
     with pytest.raises(NotReadyError, match=r"`train\(\)` first"):
         stacked(untrained())
+
+
+def test_a_trainer_that_ignores_its_seed_is_reproduced_all_the_same() -> None:
+    def build(rope: RoPE, seed: int) -> Any:
+        return quick_finetuned(rope, int(torch.randint(1000, ())))
+
+    candidate = DensityCandidate(name="careless", build=build)
+    options: dict[str, Any] = {"candidates": [OT_ONLY, candidate], "num_folds": 2}
+    first, second = (validate(the_rope(), **options).log_scores for _ in range(2))
+    assert torch.equal(first, second)
 
 
 def test_stored_simulations_serve_as_well() -> None:

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from benchmarks.cases import Case, CountingSimulator, Sources
 from benchmarks.cells import NEEDS_COUPLING, Cell
 from benchmarks.losses import Loss, as_line, losses, target_distances
-from benchmarks.methods import Score, scores
+from benchmarks.scoring import Score, scores
 from benchmarks.store import Cache
 
 PAIRS = 20
