@@ -68,7 +68,7 @@ def comparisons(table: Table) -> list[Comparison]:
     """Return all stacks of a table that were finished."""
     found = []
     for cell, row in table.rows.items():
-        arrays = table.arrays[cell]
+        arrays = table.arrays.get(cell, {})
         if cell.method != STACK or "candidates" not in arrays:
             continue
         names = [str(name) for name in arrays["candidates"]]

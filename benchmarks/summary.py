@@ -1,39 +1,42 @@
 """What all suites say together: a page beside the tables, a block for the README."""
 
-import json
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from benchmarks.cells import NEEDS_CALIBRATION
 from benchmarks.methods import ORDER
-from benchmarks.statements import (
+from benchmarks.other_suites import other_suites
+from benchmarks.published import (
     FIXED,
     LETTERS,
     PAPER,
     SIZE,
+    Published,
+    Row,
+    acauc_text,
+    both_texts,
+    entry,
+    lpp_text,
+    mean,
+    name_of,
+    table,
+)
+from benchmarks.statements import (
     STATEMENTS,
     TOLERANCE,
     VERDICTS,
-    Published,
-    Row,
-    finished,
-    gap,
-    mean,
-    table,
     verdict,
     write_statements,
 )
 from benchmarks.store import write_atomically
-from benchmarks.tables import group_by, mean_and_spread
+from benchmarks.tables import group_by
 
 __all__ = ["write_summary"]
 
 BEGIN, END = "<!-- results -->", "<!-- /results -->"
-MISSING = "-"
 # Its numbers mean nothing.
 LEFT_OUT = ("smoke",)
 # Shown beside FIXED; they do not compete, or one of four settings would be chosen by
@@ -91,13 +94,13 @@ def _page(published: Published) -> list[str]:
         *("`python -m benchmarks summary` writes this page from the tables.", ""),
         *("## What was run", "", *_overview(published), ""),
         *(f"## All tasks, {SIZE} calibration pairs", "", SETTINGS),
-        *("LPP:", "", *_main(published, _lpp, with_settings=both), ""),
-        *("ACAUC:", "", *_main(published, _acauc, with_settings=both), ""),
+        *("LPP:", "", *_main(published, lpp_text, with_settings=both), ""),
+        *("ACAUC:", "", *_main(published, acauc_text, with_settings=both), ""),
         *("## RoPE with fewer and more calibration pairs", ""),
         *(f"LPP (ACAUC), {FIXED}.", "", *_by_size(published), ""),
         *("## What the paper states", "", *write_statements(published), ""),
         *("## Where RoPE loses", "", *_losses(published), ""),
-        *("## What the other suites say", *_others(published)),
+        *("## What the other suites say", *other_suites(published)),
     ]
 
 
@@ -108,47 +111,11 @@ def _block(published: Published, link: str) -> list[str]:
         f"LPP with {SIZE} calibration pairs, in standard deviations of the prior. Bold",
         "is the best; RoPE and OT-only compete in one setting, fixed beforehand (gamma",
         f"{FIXED.gamma:g} in units of the median distance, tau {FIXED.tau:g}).",
-        *("", *_main(published, _lpp, with_settings=("RoPE",)), ""),
+        *("", *_main(published, lpp_text, with_settings=("RoPE",)), ""),
         *(_in_words(_compared(published)), ""),
         f"Of {len(STATEMENTS)} statements of the paper: {verdicts}.",
         f"All results, and the rules behind these counts: [{link}]({link}).",
     ]
-
-
-def _name(published: Published, task: str, *, suite: str = "main") -> str:
-    letter, *mark = published.name(task, suite=suite).split(" ", 1)
-    return " ".join([letter, task, *mark])
-
-
-def _entry(rows: Sequence[Row], text: Callable[[Sequence[Row]], str]) -> str:
-    """Return scores as text, with what failed."""
-    scored = finished(rows)
-    if not scored:
-        return "failed" if rows else MISSING
-    failed = len(rows) - len(scored)
-    return text(scored) + (f" ({failed} of {len(rows)} failed)" if failed else "")
-
-
-def _lpp(rows: Sequence[Row]) -> str:
-    text = _number([row["lpp_z"] for row in rows], ".2f")
-    return text + ("" if all(r["converged"] for r in rows) else " (not converged)")
-
-
-def _acauc(rows: Sequence[Row]) -> str:
-    return _number([row["acauc"] for row in rows], "+.3f")
-
-
-def _number(values: list[float], form: str) -> str:
-    value, spread = mean_and_spread(values)
-    text = f"{value:{form}}"
-    return text if math.isnan(spread) else f"{text} ± {spread:{form.lstrip('+')}}"
-
-
-def _both(rows: Sequence[Row]) -> str:
-    return f"{mean(rows):.2f} ({mean(rows, 'acauc'):+.2f})"
-
-
-# What was run -----------------------------------------------------------------------
 
 
 def _overview(published: Published) -> list[str]:
@@ -196,14 +163,14 @@ def _main(
     columns = [
         {name: published.select(name, task=task) for name in ORDER} for task in tasks
     ]
-    bold = [_best(column) if text is _lpp else None for column in columns]
+    bold = [_best(column) if text is lpp_text else None for column in columns]
     counts = [
         len({row["repetition"] for rows in column.values() for row in rows})
         for column in columns
     ]
     lines = [["repetitions", *map(str, counts)]]
     for name in ORDER:
-        entries = [_entry(column[name], text) for column in columns]
+        entries = [entry(column[name], text) for column in columns]
         if any(column[name] for column in columns):
             marked = [
                 f"**{entry}**" if name == best else entry
@@ -213,10 +180,10 @@ def _main(
     for name in with_settings:
         for setting in OTHER_SETTINGS:
             parts = [published.select(name, task=t, setting=setting) for t in tasks]
-            lines.append([f"{name} ({setting})", *(_entry(p, text) for p in parts)])
+            lines.append([f"{name} ({setting})", *(entry(p, text) for p in parts)])
     missing = [f"{LETTERS[task]} {task}" for task in LETTERS if task not in tasks]
     return [
-        *table(("", *(_name(published, task) for task in tasks)), lines),
+        *table(("", *(name_of(published, task) for task in tasks)), lines),
         *(["", f"Not run: {', '.join(missing)}."] if missing else []),
     ]
 
@@ -233,13 +200,13 @@ def _by_size(published: Published) -> list[str]:
     lines = []
     for task in _tasks(published):
         entries = {
-            name: _entry(published.select(name, task=task), _both)
+            name: entry(published.select(name, task=task), both_texts)
             for name in ("prior", "OT-only", "SBI")
         }
         parts = [published.select("RoPE", task=task, size=size) for size in sizes]
-        rope = [_entry(part, _both) for part in parts]
+        rope = [entry(part, both_texts) for part in parts]
         ends = entries["prior"], entries["OT-only"]
-        lines.append([_name(published, task), *ends, *rope, entries["SBI"]])
+        lines.append([name_of(published, task), *ends, *rope, entries["SBI"]])
     return table(("", "prior", "OT-only", *(f"{n} pairs" for n in sizes), "SBI"), lines)
 
 
@@ -298,7 +265,7 @@ def _losses(published: Published) -> list[str]:
         losses = [gaps.get(name, 0.0) for name in ("prior", "OT-only")]
         lines.append(
             [
-                *(_name(published, task), str(size), f"{lpp:.2f}"),
+                *(name_of(published, task), str(size), f"{lpp:.2f}"),
                 *(f"{value:.2f}" if value < 0 else "" for value in losses),
                 f"{gaps[best]:.2f} {best}",
             ]
@@ -313,90 +280,3 @@ def _losses(published: Published) -> list[str]:
 
 
 # The other suites -------------------------------------------------------------------
-
-
-def _others(published: Published) -> list[str]:
-    """Return a small table of each suite that one is defined for, and that has rows."""
-    tables = {
-        "gamma": (_gamma, f"RoPE, {SIZE} pairs, by gamma: LPP (ACAUC)."),
-        "tau": (_tau, f"RoPE, {SIZE} pairs, by tau: LPP (ACAUC)."),
-        "wellspecified": (_well_specified, "RoPE above NPE, by calibration pairs."),
-        "labels": (_labels, f"LPP with {SIZE} pairs, by noise on their labels in %."),
-    }
-    lines = []
-    for name, (of_suite, what) in tables.items():
-        rows = published.rows[name]
-        lines += ["", f"### {published.suites[name].title}", ""]
-        lines += [what, "", *of_suite(published, rows)] if rows else ["Not run."]
-    return lines
-
-
-def _grid(
-    rows: Iterable[Row],
-    *,
-    line: Callable[[Row], str],
-    column: Callable[[Row], float],
-    text: Callable[[Sequence[Row]], str] = _both,
-) -> list[str]:
-    grid: dict[str, dict[float, list[Row]]] = {}
-    for row in rows:
-        grid.setdefault(line(row), {}).setdefault(column(row), []).append(row)
-    columns = sorted({value for entries in grid.values() for value in entries})
-    lines = [
-        [name, *(_entry(entries.get(value, []), text) for value in columns)]
-        for name, entries in grid.items()
-    ]
-    return table(("", *(f"{value:g}" for value in columns)), lines)
-
-
-def _label(published: Published, row: Row, what: str, *methods: str) -> str:
-    """Name a line, with the LPP of other methods on the same data."""
-    same = {name: row[name] for name in ("task", "variant", "options")}
-    lpps = [
-        f"{name} {_entry(published.select(name, suite=row['suite'], **same), _lpp)}"
-        for name in methods
-    ]
-    name = _name(published, row["task"], suite=row["suite"])
-    return f"{name}, {what}" + (f" ({', '.join(lpps)})" if lpps else "")
-
-
-def _gamma(published: Published, rows: list[Row]) -> list[str]:
-    def line(row: Row) -> str:
-        unit = "embedding" if row["cost_scale"] == "none" else "median distance"
-        return _label(published, row, f"in units of the {unit}", "prior", "SBI")
-
-    chosen = [r for r in rows if r["method"] == "RoPE" and r["n_calibration"] == SIZE]
-    return _grid(chosen, line=line, column=lambda row: row["gamma"])
-
-
-def _tau(published: Published, rows: list[Row]) -> list[str]:
-    def line(row: Row) -> str:
-        weight = json.loads(row["options"]).get("misspecification_weight")
-        what = "prior shifted" if weight is None else f"weight {weight:g}"
-        return _label(published, row, what, "prior", "NPE")
-
-    chosen = [row for row in rows if row["method"] == "RoPE"]
-    return _grid(chosen, line=line, column=lambda row: row["tau"])
-
-
-def _well_specified(published: Published, rows: list[Row]) -> list[str]:
-    def line(row: Row) -> str:
-        return _label(published, row, f"tau {row['tau']:g}", "prior", "NPE")
-
-    def text(part: Sequence[Row]) -> str:
-        task = part[0]["task"]
-        npe = published.select("NPE", suite="wellspecified", task=task)
-        difference = gap(part, npe)
-        return MISSING if difference is None else f"{difference:+.2f}"
-
-    chosen = [row for row in rows if row["method"] == "RoPE"]
-    return _grid(chosen, line=line, column=lambda r: r["n_calibration"], text=text)
-
-
-def _labels(published: Published, rows: list[Row]) -> list[str]:
-    return _grid(
-        [row for row in rows if row["method"] in NEEDS_CALIBRATION],
-        line=lambda row: _label(published, row, row["method"]),
-        column=lambda row: 100 * json.loads(row["options"]).get("label_noise", 0.0),
-        text=_lpp,
-    )
