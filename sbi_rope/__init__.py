@@ -1,6 +1,7 @@
 """Robust posterior estimation for misspecified simulators, on top of sbi."""
 
 from sbi_rope.coupling import Coupling, SinkhornCoupler
+from sbi_rope.diagnosis import Diagnosis, diagnose
 from sbi_rope.finetuning import CalibrationFinetuner
 from sbi_rope.mixture import MixturePosterior
 from sbi_rope.rope import RoPE
@@ -9,10 +10,12 @@ from sbi_rope.stacking import StackedPosterior, stack
 __all__ = [
     "CalibrationFinetuner",
     "Coupling",
+    "Diagnosis",
     "MixturePosterior",
     "RoPE",
     "SinkhornCoupler",
     "StackedPosterior",
+    "diagnose",
     "stack",
 ]
 

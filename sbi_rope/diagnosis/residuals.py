@@ -52,10 +52,12 @@ class Dependence:
     Attributes:
         p_value: Of a permutation test.
         bias: Root mean square of the part that follows the parameters.
+        error: Standard error of ``bias``.
     """
 
     p_value: float
     bias: float
+    error: float
 
 
 def num_features(num_pairs: int, dim: int) -> int:
@@ -97,7 +99,8 @@ def dependence(residuals: Tensor, theta: Tensor) -> Dependence:
     The statistic is the sum of squares that the regression explains. The bias
     :math:`b` is its unbiased estimate: with p features and residual variance
     :math:`s^2`, :math:`b^2 = (\text{explained} - p\, s^2) / n`. With few pairs there
-    are no squares.
+    are no squares. Its standard error is about
+    :math:`\sqrt{(s^2 + b^2 / 2) / n}`, were all residual variance along the bias.
 
     Args:
         residuals: Shape ``(n, l)``.
@@ -121,16 +124,18 @@ def dependence(residuals: Tensor, theta: Tensor) -> Dependence:
     reached = int((permuted >= explained * (1 - 1e-12)).sum())
     n, p = len(centred), basis.shape[1]
     variance = (float(centred.square().sum()) - explained) / (n - 1 - p)
+    square = max(explained - p * variance, 0.0) / n
     return Dependence(
         p_value=(1 + reached) / (1 + NUM_PERMUTATIONS),
-        bias=(max(explained - p * variance, 0.0) / n) ** 0.5,
+        bias=square**0.5,
+        error=((variance + square / 2) / n) ** 0.5,
     )
 
 
 def residual_finding(
     residuals: Tensor, theta: Tensor, simulations: Simulations
 ) -> Finding:
-    r"""Judge the bias in units of the simulator's own noise.
+    r"""Judge the bias, its lower 95 % limit, in units of the simulator's noise.
 
     Residuals depend on parameters even where all is well. With :math:`h` the posterior
     mean of a linear-Gaussian problem that explains a share R of the variance, the best
@@ -141,13 +146,14 @@ def residual_finding(
     spread = float(simulations.embedded.var(dim=0).sum())
     noise = float(simulations.noise.trace())
     unit = max(noise, SMALLEST_SHARE**2 * spread) ** 0.5
-    value = found.bias / unit if unit else float(found.bias > 0)
+    lower = max(found.bias - 1.645 * found.error, 0.0)
+    value = lower / unit if unit else float(lower > 0)
     significant = found.p_value < LEVEL
     alarming = significant and value > LARGEST_RATIO
     if alarming:
         sentence = (
             "What tuning leaves of the calibration pairs depends on their parameters: "
-            f"a bias of {value:.2f} times the simulator's noise (p = "
+            f"a bias of at least {value:.2f} times the simulator's noise (p = "
             f"{found.p_value:.3f}). Tuning has not generalised, for want of pairs or "
             "of training, or real observations do not follow the parameters as "
             "simulations do, and the conditional independence RoPE rests on fails."
@@ -155,7 +161,8 @@ def residual_finding(
     else:
         sentence = (
             "What tuning leaves of the calibration pairs depends on their parameters "
-            f"by {value:.2f} times the simulator's noise (p = {found.p_value:.3f}), "
+            f"by {found.bias / unit if unit else 0.0:.2f} times the simulator's noise "
+            f"(p = {found.p_value:.3f}), "
             + ("as it does where all is well." if significant else "if at all.")
         )
     return Finding(
@@ -165,7 +172,8 @@ def residual_finding(
         alarming=alarming,
         sentence=sentence,
         reason=(
-            "Alarming above the threshold, if p is below 0.01: averaging over the "
+            "Alarming above the threshold (the lower 95 % limit of the ratio), if p is "
+            "below 0.01: averaging over the "
             "simulator's noise alone leaves up to half of it in a linear-Gaussian "
             "problem."
         ),

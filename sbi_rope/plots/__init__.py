@@ -4,6 +4,7 @@ Every function returns a matplotlib figure and shows nothing. matplotlib is impo
 when a function is called: ``pip install sbi-rope[benchmarks]``.
 """
 
+from sbi_rope.plots.diagnosis import implied_parameters
 from sbi_rope.plots.diagnostics import (
     CouplingLike,
     FinetuningHistory,
@@ -22,6 +23,7 @@ __all__ = [
     "calibration_curves",
     "effective_sample_sizes",
     "finetuning_history",
+    "implied_parameters",
     "overview",
     "pair_plot",
     "real_and_simulated",

@@ -1,5 +1,6 @@
 """What a stack is made of: couplings at several settings, and other posteriors."""
 
+import copy
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -83,7 +84,7 @@ class DensityCandidate:
             sbi posterior of NPE. The pairs are ``rope.calibration``, the trained NPE is
             ``rope.npe``.
         fixed: Whether the posterior is the same whatever the pairs are, so that it is
-            built once.
+            built once, with a RoPE that has no pairs.
 
     Example:
         Another trained posterior:
@@ -150,6 +151,11 @@ def check_candidates(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
         InvalidTypeError: If one is something else.
         InvalidInputError: If there is no coupling among them, or two have one name.
     """
+    if not isinstance(candidates, Sequence):
+        raise InvalidTypeError(
+            "Expected `candidates` to be a list of candidates; got "
+            f"{type(candidates).__name__}."
+        )
     for candidate in candidates:
         if not isinstance(candidate, CouplingCandidate | DensityCandidate):
             raise InvalidTypeError(
@@ -192,4 +198,5 @@ def as_part(name: str, posterior: Any, rope: RoPE) -> Part:
             f"{tuple(theta.shape[1:])}; got x {tuple(shapes[1])} and theta "
             f"{tuple(shapes[0])}."
         )
-    return Direct(estimator)
+    # A copy: the user may train it on, or put it into training mode.
+    return Direct(copy.deepcopy(estimator).eval())

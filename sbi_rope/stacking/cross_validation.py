@@ -11,7 +11,12 @@ from torch.distributions import Distribution
 from tqdm.auto import tqdm
 
 from sbi_rope._random import seeded
-from sbi_rope._validation import check_choice, check_instance, check_integer
+from sbi_rope._validation import (
+    check_choice,
+    check_instance,
+    check_integer,
+    check_not_negative,
+)
 from sbi_rope.errors import InvalidInputError, NotReadyError
 from sbi_rope.metrics.calibration import central_levels
 from sbi_rope.metrics.calls import draw_ranks
@@ -103,9 +108,11 @@ class CrossValidation:
         return stacking_weights(self.log_scores, pseudo_count=self.pseudo_count)
 
     def posteriors(self) -> Iterator[tuple[Tensor, StackedPosterior]]:
-        """Yield the rows of each fold, and the stack that has not seen their labels.
+        """Yield the rows of each fold, and the stack that was made without it.
 
-        Neither the candidates nor the weights of the stack have.
+        Its candidates have not seen the labels of the fold. Its weights are fitted to
+        the scores of the other folds; these come from candidates that have, which
+        moves the weights in the fourth digit.
         """
         for number, estimator in enumerate(self.estimators):
             held_out = self.fold == number
@@ -124,7 +131,10 @@ class CrossValidation:
 
     @cached_property
     def stack_scores(self) -> Tensor:
-        """Log density of each pair under the stack without its fold, shape ``(n,)``."""
+        """Log density of each pair under the stack without its fold, shape ``(n,)``.
+
+        As the stack's ``log_prob``: normalised inside the support of the prior.
+        """
         scores = self.log_scores.new_empty(len(self))
         for rows, posterior in self.posteriors():
             theta, x = self.theta[rows], self.x[rows]
@@ -158,13 +168,21 @@ class CrossValidation:
         return levels
 
     def scores_of(self, name: str) -> Tensor:
-        """Return the log scores of a candidate, shape ``(n,)``; "stack" is the stack.
+        """Return the log scores of a candidate, or of "stack", shape ``(n,)``.
+
+        None is corrected for leakage, so that they can be compared.
 
         Raises:
             InvalidInputError: If there is no candidate of that name.
         """
         if name == "stack":
-            return self.stack_scores
+            scores = self.log_scores.new_empty(len(self))
+            for rows, posterior in self.posteriors():
+                weights = scores.new_tensor(list(posterior.candidate_weights.values()))
+                scores[rows] = torch.logsumexp(
+                    self.log_scores[rows] + weights.log(), dim=1
+                )
+            return scores
         check_choice("name", name, (*self.names, "stack"))
         return self.log_scores[:, self.names.index(name)]
 
@@ -255,7 +273,7 @@ def cross_validate(
         UnsupportedPosteriorError: If a candidate has no density.
         SimulationError: If the simulator fails.
     """
-    chosen, seeds = check_setup(rope, candidates, num_folds, seed)
+    chosen, seeds = check_setup(rope, candidates, num_folds, pseudo_count, seed)
     components = Components.of(
         rope,
         x_o,
@@ -280,11 +298,13 @@ def check_setup(
     rope: RoPE,
     candidates: Sequence[Candidate] | None,
     num_folds: int,
+    pseudo_count: float,
     seed: int | None,
 ) -> tuple[tuple[Candidate, ...], list[int]]:
     """Return the candidates, couplings first, and seeds for all that is random."""
     check_instance("rope", rope, RoPE)
     check_integer("num_folds", num_folds, minimum=2)
+    check_not_negative("pseudo_count", pseudo_count)
     num_pairs = len(rope.calibration[0])
     if num_pairs < MIN_PAIRS:
         raise NotReadyError(
@@ -320,7 +340,8 @@ def score_folds(
     """
     theta, x = rope.calibration
     num_folds = min(num_folds, len(theta))
-    num_training_folds = num_training_folds or num_folds - 1
+    if num_training_folds is None:
+        num_training_folds = num_folds - 1
     check_integer("num_training_folds", num_training_folds)
     if num_training_folds >= num_folds:
         raise InvalidInputError(

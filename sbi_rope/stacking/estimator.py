@@ -56,10 +56,10 @@ class StackedEstimator(ConditionalDensityEstimator):
     def with_weights(self, weights: Tensor) -> "StackedEstimator":
         """Return a stack of the same candidates with other weights."""
         mixture = copy.copy(self.mixture)
-        of_couplings = weights[: len(self.coupling.couplings)]
-        mixture.coupling = replace(
-            self.coupling, shares=of_couplings / of_couplings.sum()
-        )
+        shares = weights[: len(self.coupling.couplings)]
+        # Without any weight their shares do not matter, but must be numbers.
+        total = shares.sum().clamp_min(torch.finfo(shares.dtype).tiny)
+        mixture.coupling = replace(self.coupling, shares=shares / total)
         return StackedEstimator(mixture, self.parts, weights)
 
     @property
@@ -188,7 +188,9 @@ class StackedEstimator(ConditionalDensityEstimator):
         mass = shares[0] * own.mass
         variance = (shares[0] * own.standard_error).square()
         for part, weight in zip(self.parts, shares[1:], strict=True):
-            if accept is None or isinstance(part, PriorDensity):
+            # What weighs no more than log_prob may leave out counts as inside.
+            negligible = bool(weight <= self.mixture.tail_mass)
+            if accept is None or negligible or isinstance(part, PriorDensity):
                 mass = mass + weight
                 continue
             # As many draws as its share of the stack: what counts is the error of

@@ -1,5 +1,6 @@
 """Fits all candidates of a stack to a batch."""
 
+import copy
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_rope._random import seeded
 from sbi_rope._sbi import embed
 from sbi_rope.coupling import Coupling, SinkhornCoupler
 from sbi_rope.mixture import MixtureEstimator
@@ -56,9 +58,10 @@ class Components:
         show_progress_bars: bool,
     ) -> "Components":
         """Simulate what the batch is coupled with, and build the fixed candidates."""
-        # Only what is simulated is needed: h embeds it, and at tau = 0 there is
-        # nothing to solve.
-        posterior = rope.with_pairs(torch.arange(0)).build_posterior(
+        # Without pairs, which nothing here may depend on: h embeds what is simulated,
+        # and at tau = 0 there is nothing to solve.
+        untuned = rope.with_pairs(torch.arange(0))
+        posterior = untuned.build_posterior(
             x_o,
             coupler=replace(rope.coupler, tau=0.0),
             num_simulations=num_simulations,
@@ -72,7 +75,7 @@ class Components:
             density=estimator.components,
             contexts=estimator.contexts,
             fixed={
-                c.name: as_part(c.name, c.build(rope, seed), rope)
+                c.name: _built(c, untuned, seed)
                 for c in candidates
                 if isinstance(c, DensityCandidate) and c.fixed
             },
@@ -103,6 +106,8 @@ def fit_candidates(
     Returns:
         The stack, with equal weights.
     """
+    # Copies: a stack can be moved to a device without the others.
+    components = copy.deepcopy(components)
     settings = [c for c in candidates if isinstance(c, CouplingCandidate)]
     nets = {False: rope.embedding_net, True: rope.tuned_embedding_net}
     used = [tuned for tuned in nets if any(c.tuned == tuned for c in settings)]
@@ -127,11 +132,17 @@ def fit_candidates(
         tail_mass=tail_mass,
     )
     parts = [
-        components.fixed.get(c.name) or as_part(c.name, c.build(rope, seed), rope)
+        components.fixed.get(c.name) or _built(c, rope, seed)
         for c in candidates
         if isinstance(c, DensityCandidate)
     ]
     return StackedEstimator(mixture, parts, _equal(len(candidates), x))
+
+
+def _built(candidate: DensityCandidate, rope: RoPE, seed: int) -> Part:
+    # Whoever forgets the seed, or looks at a prior by drawing from it, leaves no trace.
+    with seeded(seed):
+        return as_part(candidate.name, candidate.build(rope, seed), rope)
 
 
 def _equal(count: int, like: Tensor) -> Tensor:

@@ -63,7 +63,10 @@ class PriorDensity(nn.Module):
 
     def log_prob(self, theta: Tensor, features: Tensor) -> Tensor:
         """Return the log densities, ``(n, d)`` to ``(n,)``."""
-        return self.posterior.log_prob(theta, track_gradients=torch.is_grad_enabled())
+        with seeded(0):  # it draws what it evaluates outside the support
+            return self.posterior.log_prob(
+                theta, track_gradients=torch.is_grad_enabled()
+            )
 
     def sample(self, features: Tensor) -> Tensor:
         """Draw once for each row, ``(n, d)``."""
@@ -91,10 +94,9 @@ def log_prob_of_pairs(
 @torch.no_grad()
 def share_inside(part: Part, features: Tensor, accept: Accept, draws: int) -> Tensor:
     """Return the share of draws that is accepted, for each row of features."""
-    row = torch.arange(len(features), device=features.device).repeat_interleave(draws)
-    with seeded(0):
-        inside = [
-            accept(part.sample(features[row[block]]))
-            for block in flow_slices(len(row), features.device)
-        ]
-    return torch.cat(inside).reshape(len(features), draws).double().mean(dim=1)
+    inside = []
+    for row in features:
+        # The same random numbers for each, whatever is asked for beside it.
+        with seeded(0):
+            inside.append(accept(part.sample(row.expand(draws, -1))).double().mean())
+    return torch.stack(inside)

@@ -6,9 +6,11 @@ from typing import Any, Literal
 from torch import Tensor
 
 from sbi_rope._validation import check_choice, check_unit_interval
+from sbi_rope.errors import warn_user
 from sbi_rope.rope import RoPE
 from sbi_rope.stacking.candidates import Candidate
 from sbi_rope.stacking.cross_validation import check_setup, score_folds
+from sbi_rope.stacking.estimator import StackedEstimator
 from sbi_rope.stacking.fitting import Components, fit_candidates
 from sbi_rope.stacking.posterior import StackedPosterior
 from sbi_rope.stacking.report import LearningCurve, StackingReport
@@ -69,7 +71,7 @@ def stack(
     """
     check_choice("unseen", unseen, ("raise", "extend"))
     check_unit_interval("tail_mass", tail_mass)
-    chosen, seeds = check_setup(rope, candidates, num_folds, seed)
+    chosen, seeds = check_setup(rope, candidates, num_folds, pseudo_count, seed)
     _ = rope.tuned_embedding_net  # says so if it is not trained
     components = Components.of(
         rope,
@@ -103,6 +105,7 @@ def stack(
         unseen=unseen,
         tail_mass=tail_mass,
     )
+    _warn_unless_converged(estimator)
     weights = scores.weights.weights
     return StackedPosterior(
         estimator.with_weights(weights),
@@ -111,3 +114,16 @@ def stack(
         report=StackingReport(cross_validation=scores, learning_curve=curve),
         shared=scores.shared,
     )
+
+
+def _warn_unless_converged(estimator: StackedEstimator) -> None:
+    couplings = estimator.coupling.couplings
+    open_ones = [c for c in couplings if not c.converged]
+    if open_ones:
+        worst = max(coupling.marginal_error for coupling in open_ones)
+        warn_user(
+            f"{len(open_ones)} of {len(couplings)} couplings have not converged "
+            f"(marginal error up to {worst:.1e}). They are weighed by their scores as "
+            "they are. Give RoPE a coupler with more `max_iterations`, or leave the "
+            "smallest gammas out."
+        )

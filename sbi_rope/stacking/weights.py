@@ -6,7 +6,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import check_integer, check_positive, check_tensor
+from sbi_rope._validation import (
+    check_integer,
+    check_not_negative,
+    check_positive,
+    check_tensor,
+)
 from sbi_rope.errors import InvalidInputError, warn_user
 
 __all__ = ["StackingWeights", "stacking_weights"]
@@ -54,8 +59,7 @@ def stacking_weights(
     its answer unique. It is solved by EM,
     :math:`w_k \leftarrow (\sum_i r_{ik} + c / K) / (n + c)` with the responsibilities
     :math:`r_{ik} = w_k e^{\ell_{ik}} / \sum_m w_m e^{\ell_{im}}`, which starts from
-    equal weights and is then, for c = 0, within :math:`\log(K) / t` of the best sum
-    after t iterations.
+    equal weights.
 
     References:
         | Using Stacking to Average Bayesian Predictive Distributions (Yao et al., 2018)
@@ -83,17 +87,14 @@ def stacking_weights(
         tensor([0.6670, 0.3330], dtype=torch.float64)
     """
     scores = _checked_scores(log_scores)
-    if not (math.isfinite(pseudo_count) and pseudo_count >= 0):
-        raise InvalidInputError(
-            f"Expected `pseudo_count` to be a finite number >= 0; got {pseudo_count!r}."
-        )
+    check_not_negative("pseudo_count", pseudo_count)
     check_positive("tolerance", tolerance)
     check_integer("max_iterations", max_iterations)
     # Relative to the best candidate of each pair, so that nothing over- or underflows.
     density = (scores - scores.max(dim=1, keepdim=True).values).exp()
     n, num_candidates = density.shape
     share = pseudo_count / num_candidates
-    weights = torch.full_like(density[0], 1.0 / num_candidates)
+    weights = density.new_full((num_candidates,), 1.0 / num_candidates)
     gap, iteration = math.inf, 0
     for iteration in range(max_iterations + 1):
         # What a candidate adds to the sum of log scores, for each unit of weight.

@@ -5,7 +5,7 @@ import warnings
 import pytest
 import torch
 from scipy.stats import kstest
-from torch import Tensor, nn
+from torch import Tensor
 
 from sbi_rope import CalibrationFinetuner, RoPE, SinkhornCoupler
 from sbi_rope.diagnosis import Diagnosis, diagnose
@@ -82,6 +82,15 @@ def test_misspecification_that_tuning_repairs_is_found_before_tuning_only(
     assert alarms(misspecified) == {"misspecification before tuning"}
 
 
+def test_a_batch_unlike_the_calibration_pairs_is_found_after_tuning(
+    tuned: RoPE,
+) -> None:
+    torch.manual_seed(26)
+    x_o = gaussian.real_process(parameters(200)) + 0.7
+    diagnosis = look(tuned, x_o, num_folds=None)
+    assert diagnosis["misspecification after tuning"].alarming
+
+
 def test_misspecification_that_was_not_tuned_is_found() -> None:
     torch.manual_seed(3)
     diagnosis = look(conductor(), gaussian.real_process(parameters(200)))
@@ -120,6 +129,7 @@ def test_without_pairs_what_needs_labels_is_left_out_and_said_so() -> None:
     assert "no calibration pairs" in str(diagnosis)
 
 
+@pytest.mark.filterwarnings("ignore:Only 4 calibration")
 def test_too_few_pairs_leave_the_regression_out() -> None:
     torch.manual_seed(7)
     rope = conductor().append_calibration(*gaussian.labelled(5))
@@ -212,21 +222,16 @@ def squared_mmd(a: Tensor, b: Tensor) -> float:
     return float(kernel(a, a).mean() + kernel(b, b).mean() - 2 * kernel(a, b).mean())
 
 
-def test_mmd_is_that_of_the_definition() -> None:
+def test_mmd_is_that_of_the_definition(monkeypatch: pytest.MonkeyPatch) -> None:
     torch.manual_seed(10)
     batch, simulated = torch.randn(40, 3).double() + 0.3, torch.randn(120, 3).double()
+    # No order but the one they come in: the first 80 simulations are used.
+    monkeypatch.setattr(torch, "randperm", torch.arange)
     test = mmd_test(batch, simulated, null=simulated)
-    # All 120 - 40 simulations are used, whichever they are.
-    torch.manual_seed(10)
-    torch.randn(40, 3), torch.randn(120, 3)
-    chosen = batch[torch.randperm(40)]
-    for _ in range(200):
-        order = torch.randperm(120)
-        squared_mmd_draw = (simulated[order[:40]], simulated[order[40:]])
-        torch.randperm(80)  # sbi draws a baseline of its own
-    assert squared_mmd(*squared_mmd_draw) > 0
-    other = simulated[torch.randperm(120)[:80]]
-    assert test.mmd == pytest.approx(squared_mmd(chosen, other), rel=1e-6)
+    assert test.mmd == pytest.approx(squared_mmd(batch, simulated[:80]), rel=1e-6)
+    usual = squared_mmd(simulated[:40], simulated[40:])
+    assert test.usual == pytest.approx(usual, rel=1e-6)
+    assert test.p_value == pytest.approx(1 / 201 if test.mmd > usual else 1.0)
 
 
 def test_p_values_of_the_mmd_test_are_uniform_for_simulations() -> None:
@@ -404,6 +409,21 @@ def test_bias_is_recovered_whatever_the_noise() -> None:
     assert dependence(noise, theta).bias < 0.1
 
 
+def test_bias_is_not_inflated_by_few_pairs() -> None:
+    torch.manual_seed(25)
+    squares, errors = [], []
+    for _ in range(40):
+        theta = torch.randn(30, 2).double()
+        residuals = torch.randn(30, 3).double()
+        residuals[:, 0] += theta[:, 0]
+        found = dependence(residuals, theta)
+        squares.append(found.bias**2)
+        errors.append(found.error)
+    assert sum(squares) / len(squares) == pytest.approx(1.0, abs=0.2)
+    # The standard error is one that bounds.
+    assert sum(errors) / len(errors) > torch.tensor(squares).sqrt().std()
+
+
 def test_few_pairs_carry_no_squares() -> None:
     assert num_features(5, 2) == 0
     assert num_features(8, 2) == 2
@@ -417,28 +437,29 @@ def test_averaging_is_within_the_threshold_and_a_lost_parameter_is_not() -> None
     target = gaussian.GAIN * theta
     best = gaussian.GAIN**2 * gaussian.simulator(theta)
     finding = residual_finding((best - target).double(), theta.double(), known)
-    # sqrt(R (1 - R)) with R = 0.8.
-    assert finding.value == pytest.approx(0.4, abs=0.05)
+    # sqrt(R (1 - R)) with R = 0.8, and noise of this standard deviation.
+    found = dependence((best - target).double(), theta.double())
+    noise = 2**0.5 * gaussian.GAIN * gaussian.NOISE_STD
+    assert found.bias / noise == pytest.approx(0.4, abs=0.05)
+    lower = found.bias - 1.645 * found.error
+    assert finding.value == pytest.approx(lower / noise, rel=0.1)
     assert not finding.alarming
     # Real observations that do not see the second parameter.
     best[:, 1] = 0.0
     assert residual_finding((best - target).double(), theta.double(), known).alarming
 
 
-class Blind(nn.Module):
-    """A real process that simulations know nothing of: it folds one parameter."""
-
-    def forward(self, theta: Tensor) -> Tensor:
-        folded = torch.stack([theta[:, 0], theta[:, 1].abs()], dim=1)
-        return folded + gaussian.NOISE_STD * torch.randn_like(folded)
+def folding_process(theta: Tensor) -> Tensor:
+    """Does not tell the sign of the second parameter."""
+    return gaussian.simulator(torch.stack([theta[:, 0], theta[:, 1].abs()], dim=1))
 
 
 def test_a_real_process_that_folds_a_parameter_alarms() -> None:
     torch.manual_seed(22)
     theta = parameters(80)
-    rope = conductor().append_calibration(theta, Blind()(theta))
+    rope = conductor().append_calibration(theta, folding_process(theta))
     rope.train(seed=0, show_progress_bars=False)
-    diagnosis = look(rope, Blind()(parameters(100)))
+    diagnosis = look(rope, folding_process(parameters(100)))
     assert diagnosis["residual depends on parameters"].alarming
 
 
