@@ -18,10 +18,9 @@ EXPLANATION = """\
 LPP on the test set, in standard deviations of the prior. "Best" is the best single
 candidate *chosen on the test set*, which no user can do; "picked" is the one with the
 highest score on the held-out calibration pairs. "Held out" is what these pairs say of
-the stack, with its standard error: neither its candidates nor its weights have seen the
-pair that is scored. Candidates are not corrected for leakage, the stack is. Seconds are
-those of fine-tuning, cross-validation and coupling on one thread, with other work
-beside it.
+the stack, made without the pair that is scored, with its standard error. Candidates are
+not corrected for leakage, the stack is. Seconds are those of fine-tuning,
+cross-validation and coupling on one thread, with other work beside it.
 """
 
 

@@ -53,8 +53,8 @@ class CouplingLike(Protocol):
     """What :func:`effective_sample_sizes` reads of a coupling."""
 
     @property
-    def potential(self) -> Tensor:
-        """One number for each simulation, shape ``(n_s,)``."""
+    def simulated(self) -> Tensor:
+        """The embeddings of the simulations, shape ``(n_s, l)``."""
         ...
 
     @property
@@ -173,7 +173,7 @@ def effective_sample_sizes(coupling: CouplingLike) -> "Figure":
     """
     figure, axes = new_figure(6.0, 3.6)
     sizes = coupling.effective_sample_size.detach().cpu().double()
-    num_simulations = len(coupling.potential)
+    num_simulations = len(coupling.simulated)
     edges = torch.logspace(0, math.log10(max(num_simulations, 2)), 41).tolist()
     median = float(sizes.median())
     axes.hist(sizes.clamp(edges[0], edges[-1]), bins=edges, color=SKY)

@@ -50,11 +50,16 @@ class StackedCoupling:
         return self.rows(self.real)
 
     @property
+    def simulated(self) -> Tensor:
+        """The embeddings of the simulations, shape ``(n_s, l)``."""
+        return self.couplings[0].simulated
+
+    @property
     def effective_sample_size(self) -> Tensor:
         r""":math:`1 / \sum_j \alpha_{ij}^2` of each row, shape ``(n_o,)``."""
         sizes = [
             1 / self.rows(self.real[block]).square().sum(dim=1)
-            for block in blocks(len(self.real), len(self.couplings[0].simulated))
+            for block in blocks(len(self.real), len(self.simulated))
         ]
         return torch.cat(sizes)
 

@@ -19,7 +19,7 @@ class TrainedNPE:
 
 def test_the_lines_repair_a_posterior() -> None:
     code = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
-    assert len(code) == 2
+    assert len(code) == 3
     theta_cal, x_cal = gaussian.labelled(10)
     names = {
         "npe": TrainedNPE(),
@@ -31,7 +31,8 @@ def test_the_lines_repair_a_posterior() -> None:
     exec(code[0], names)
     assert names["samples"].shape == (1000, 30, 2)
     assert torch.isfinite(names["samples"]).all()
-    # The other block is about another method with the same names.
-    exec(code[1], names)
-    samples = names["posterior"].sample_batched((10,), x=names["x_o"])
-    assert torch.isfinite(samples).all()
+    # The other blocks are about a fixed setting and another method, by the same names.
+    for block in code[1:]:
+        exec(block, names)
+        samples = names["posterior"].sample_batched((10,), x=names["x_o"])
+        assert torch.isfinite(samples).all()

@@ -233,7 +233,7 @@ def test_effective_sample_sizes_count_every_row(num_simulations: int) -> None:
     weights[0] = 0.0
     weights[0, 0] = 1.0
     coupling = SimpleNamespace(
-        potential=weights[0], effective_sample_size=1.0 / weights.square().sum(dim=1)
+        simulated=weights[0], effective_sample_size=1.0 / weights.square().sum(dim=1)
     )
     axes = plots.effective_sample_sizes(coupling).axes[0]
     assert sum(bar.get_height() for bar in axes.patches) == 30
