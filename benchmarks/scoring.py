@@ -210,6 +210,7 @@ def _stack_score(case: Case, cell: Cell) -> Score:
         test_seconds=test_seconds,
         num_simulations=len(case.simulations[0]) + count.new,
         shares_npe=True,
+        converged=posterior.coupling.converged,
         arrays=_candidates(case, posterior),
     )
 
@@ -221,7 +222,7 @@ def _candidates(case: Case, posterior: StackedPosterior) -> dict[str, np.ndarray
     """
     held_out = posterior.report.cross_validation
     unit = float(case.task.prior_std.log().sum())
-    test = posterior.posterior_estimator.candidate_log_probs(*case.test_set)
+    test = posterior.candidate_log_probs(*case.test_set)
     scores = torch.cat([held_out.log_scores, held_out.stack_scores[:, None]], dim=1)
     return {
         "candidates": np.array([*held_out.names, STACK]),

@@ -18,9 +18,10 @@ EXPLANATION = """\
 LPP on the test set, in standard deviations of the prior. "Best" is the best single
 candidate *chosen on the test set*, which no user can do; "picked" is the one with the
 highest score on the held-out calibration pairs. "Held out" is what these pairs say of
-the stack, made without the pair that is scored, with its standard error. Candidates are
-not corrected for leakage, the stack is. Seconds are those of fine-tuning,
-cross-validation and coupling on one thread, with other work beside it.
+the stack, made without the pair that is scored, with its standard error. The stack,
+RoPE and OT-only are normalised inside the support of the prior, NPE and its relatives
+are scored as they are. Seconds are those of fine-tuning, cross-validation and coupling
+on one thread, with other work beside it.
 """
 
 

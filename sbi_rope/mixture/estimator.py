@@ -112,9 +112,9 @@ class MixtureEstimator(ConditionalDensityEstimator):
             raise UnseenObservationError(
                 f"{len(x)} observation(s) are not in the batch of "
                 f"{len(self.x_o)} this posterior was built for, and a posterior of "
-                "RoPE belongs to its batch. Either couple the new batch with "
-                "`rope.build_posterior(x_new)`, or allow rows under the old coupling "
-                "with `rope.build_posterior(x_o, unseen='extend')`."
+                "RoPE belongs to its batch. Either couple the new batch, with "
+                "`rope.build_posterior(x_new)` or `stack(rope, x_new)`, or allow rows "
+                "under the old coupling: both take `unseen='extend'`."
             )
         features = embed(self._g, x).to(self.coupling.real)
         smallest = min(

@@ -56,8 +56,8 @@ class StackingReportLike(Protocol):
         ...
 
     @property
-    def score(self) -> tuple[float, float]:
-        """Mean held-out score of the stack, and its standard error."""
+    def comparable_score(self) -> tuple[float, float]:
+        """Mean score of the stack as those of candidates, and its standard error."""
         ...
 
     def as_rows(self) -> list[dict[str, Any]]:
@@ -69,10 +69,11 @@ def stacking_report(report: StackingReportLike) -> "Figure":
     """Held-out scores of the candidates, weights, coverage, and the learning curve.
 
     Left, the mean log score of the best candidates on pairs they were not trained on,
-    one standard error to each side, and that of the stack. Middle, the weight of each
-    method. Right, the coverage of the stack on held-out pairs, with the band that holds
-    95 % of the curves of calibrated posteriors; and, if it was computed, the score of
-    the stack against the number of pairs it was trained on.
+    one standard error to each side, and that of the stack, none of them corrected for
+    leakage. Middle, the weight of each method. Right, the coverage of the stack on
+    held-out pairs, with the band that holds 95 % of the curves of calibrated
+    posteriors, level by level; and, if it was computed, the score of the stack against
+    the number of pairs it was trained on.
 
     Args:
         report: The report of a stack.
@@ -109,7 +110,7 @@ def _scores(axes: "Axes", report: StackingReportLike) -> None:
             color=SKY,
             markersize=4,
         )
-    score, error = report.score
+    score, error = report.comparable_score
     axes.errorbar(
         score, len(rows), xerr=error, fmt="*", color=BLUE, markersize=10, capsize=3
     )

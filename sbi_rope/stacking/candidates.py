@@ -79,12 +79,13 @@ class DensityCandidate:
     """A posterior with a density of its own, trained on calibration pairs or not.
 
     Args:
-        name: What the report calls it.
+        name: What the report calls it; any but "stack".
         build: Given RoPE, tuned on the pairs that may be used, and a seed, returns an
             sbi posterior of NPE. The pairs are ``rope.calibration``, the trained NPE is
             ``rope.npe``.
         fixed: Whether the posterior is the same whatever the pairs are, so that it is
-            built once, with a RoPE that has no pairs.
+            built once, with a RoPE that has no pairs. Never for one that was trained on
+            the calibration pairs: it has seen the labels that it would be scored by.
 
     Example:
         Another trained posterior:
@@ -98,6 +99,21 @@ class DensityCandidate:
     name: str
     build: Callable[[RoPE, int], Any]
     fixed: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the types of all fields."""
+        check_instance("name", self.name, str)
+        check_instance("fixed", self.fixed, bool)
+        if self.name == "stack":
+            raise InvalidInputError(
+                "Expected another name; 'stack' is that of them all."
+            )
+        if not callable(self.build):
+            raise InvalidTypeError(
+                "Expected `build` to be a function of (rope, seed) that returns a "
+                f"posterior; got {type(self.build).__name__}. Wrap a posterior: `lambda "
+                "rope, seed: posterior`."
+            )
 
     @property
     def family(self) -> str:
@@ -160,8 +176,9 @@ def check_candidates(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
         if not isinstance(candidate, CouplingCandidate | DensityCandidate):
             raise InvalidTypeError(
                 "Expected `candidates` to be CouplingCandidates and DensityCandidates; "
-                f"got {type(candidate).__name__}. Wrap a posterior: DensityCandidate("
-                "name=..., build=lambda rope, seed: posterior, fixed=True)."
+                f"got {type(candidate).__name__}. Wrap a posterior that was not trained "
+                "on the calibration pairs: DensityCandidate(name=..., build=lambda rope, "
+                "seed: posterior, fixed=True)."
             )
     if not any(isinstance(c, CouplingCandidate) for c in candidates):
         raise InvalidInputError(
@@ -183,6 +200,12 @@ def as_part(name: str, posterior: Any, rope: RoPE) -> Part:
             observations than those of RoPE.
     """
     if isinstance(posterior, PriorPosterior):
+        shape = rope.calibration[0].shape[1:]
+        if posterior.prior.event_shape != shape:
+            raise UnsupportedPosteriorError(
+                f"Expected the candidate {name!r} to be of theta {tuple(shape)}; got "
+                f"{tuple(posterior.prior.event_shape)}."
+            )
         return PriorDensity(posterior.prior)
     estimator = estimator_of(posterior)
     if not isinstance(estimator, ConditionalDensityEstimator):

@@ -55,6 +55,11 @@ class StackedCoupling:
         return self.couplings[0].simulated
 
     @property
+    def converged(self) -> bool:
+        """Whether all couplings have converged."""
+        return all(coupling.converged for coupling in self.couplings)
+
+    @property
     def effective_sample_size(self) -> Tensor:
         r""":math:`1 / \sum_j \alpha_{ij}^2` of each row, shape ``(n_o,)``."""
         sizes = [

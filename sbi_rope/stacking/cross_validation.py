@@ -1,5 +1,6 @@
 """Scores of candidates on calibration pairs that they were not trained on."""
 
+import copy
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -75,8 +76,8 @@ class CrossValidation:
         fold: The fold of each pair, shape ``(n,)``.
         theta: The parameters of the pairs, shape ``(n, d)``.
         x: Their observations.
-        num_trained_on: Pairs that the candidates were trained on, fold by fold, or one
-            more.
+        num_trained_on: Pairs that the candidates were trained on, on average, rounded
+            down.
         estimators: For each fold, all candidates trained without it, with equal
             weights.
         pseudo_count: As in :func:`stacking_weights`.
@@ -111,8 +112,8 @@ class CrossValidation:
         """Yield the rows of each fold, and the stack that was made without it.
 
         Its candidates have not seen the labels of the fold. Its weights are fitted to
-        the scores of the other folds; these come from candidates that have, which
-        moves the weights in the fourth digit.
+        the scores of the other folds; these come from candidates that have. With few
+        pairs the weights depend on the labels of the fold by that.
         """
         for number, estimator in enumerate(self.estimators):
             held_out = self.fold == number
@@ -122,8 +123,8 @@ class CrossValidation:
             yield (
                 held_out.nonzero().flatten(),
                 StackedPosterior(
-                    estimator.with_weights(weights),
-                    self.prior,
+                    copy.deepcopy(estimator).with_weights(weights),
+                    copy.deepcopy(self.prior),
                     weights=dict(zip(self.names, weights.tolist(), strict=True)),
                     shared=self.shared,
                 ),
@@ -248,8 +249,9 @@ def cross_validate(
     """Score candidates on calibration pairs that they were not trained on.
 
     For each fold everything is trained on the pairs of other folds. The held-out
-    observations, without their labels, are coupled together with the batch, as the
-    observations to be inferred are.
+    observations, without their labels, are coupled together with the batch (of more
+    than 2000 observations with a random part of it), as the observations to be inferred
+    are.
 
     Args:
         rope: RoPE with its calibration pairs; it is left as it is.

@@ -109,20 +109,26 @@ class StackedEstimator(ConditionalDensityEstimator):
         mixed = self.mixture.log_prob(input, condition).double()
         shares = self._shares
         terms = [mixed + shares[0].log()]
-        theta = input if input.ndim == 3 else input[None]
+        theta = (input if input.ndim == 3 else input[None]).to(self.contexts)
+        condition = condition.to(self.x_o)
         shape = torch.Size((len(theta), mixed.shape[1]))
         pairs = theta.expand(*shape, -1).reshape(-1, *self.input_shape)
         row = torch.arange(shape[1], device=theta.device).expand(shape).flatten()
         row = row.clamp_max(len(condition) - 1)
         for part, share in zip(self.parts, shares[1:], strict=True):
             features = part.features(condition)
-            log_q = log_prob_of_pairs(part, pairs.to(self.contexts), features, row)
+            log_q = log_prob_of_pairs(part, pairs, features, row)
             terms.append(log_q.reshape(shape).double() + share.log())
         return torch.logsumexp(torch.stack(terms), dim=0).to(theta)
 
     @torch.no_grad()
     def candidate_log_probs(
-        self, theta: Tensor, x: Tensor, *, log_q: Tensor | None = None
+        self,
+        theta: Tensor,
+        x: Tensor,
+        *,
+        log_q: Tensor | None = None,
+        component_mass: Tensor | None = None,
     ) -> Tensor:
         """Return the log density of each candidate by itself at pairs.
 
@@ -130,19 +136,23 @@ class StackedEstimator(ConditionalDensityEstimator):
             theta: Parameters, shape ``(n, d)``.
             x: Their observations, shape ``(n, *event)``.
             log_q: What :meth:`component_log_probs` returns for theta, if it is known.
+            component_mass: The mass of each component inside the support of the prior,
+                shape ``(n_s,)``; without it couplings are not normalised either.
 
         Returns:
-            Shape ``(n, K)``, float64: couplings first, then the parts. Not corrected
-            for leakage.
+            Shape ``(n, K)``, float64: couplings first, then the parts, which are not
+            corrected for leakage.
         """
         if log_q is None:
             log_q = self.component_log_probs(theta)
         features = self.mixture.features(x)
         coupling: StackedCoupling = self.coupling
-        scores = [
-            torch.logsumexp(rows.log() + log_q, dim=1)
-            for rows in coupling.rows_of_each(features)
-        ]
+        scores = []
+        for rows in coupling.rows_of_each(features):
+            score = torch.logsumexp(rows.log() + log_q, dim=1)
+            if component_mass is not None:
+                score = score - (rows.to(component_mass) @ component_mass).log()
+            scores.append(score)
         row = torch.arange(len(x), device=theta.device)
         scores += [
             log_prob_of_pairs(part, theta, part.features(x), row) for part in self.parts
@@ -183,6 +193,7 @@ class StackedEstimator(ConditionalDensityEstimator):
             accept: Tells which parameters ``(n, d)`` count; None counts all.
             cache: Keeps what is estimated once.
         """
+        x = x.to(self.x_o)
         own = self.mixture.mass(x, accept=accept, cache=cache)
         shares = self._shares
         mass = shares[0] * own.mass
@@ -190,7 +201,7 @@ class StackedEstimator(ConditionalDensityEstimator):
         for part, weight in zip(self.parts, shares[1:], strict=True):
             # What weighs no more than log_prob may leave out counts as inside.
             negligible = bool(weight <= self.mixture.tail_mass)
-            if accept is None or negligible or isinstance(part, PriorDensity):
+            if accept is None or negligible:
                 mass = mass + weight
                 continue
             # As many draws as its share of the stack: what counts is the error of
@@ -216,6 +227,7 @@ class StackedEstimator(ConditionalDensityEstimator):
         **kwargs: Any,
     ) -> Tensor:
         """Draw from the stacks of a batch; see :meth:`MixtureEstimator.sample`."""
+        condition = condition.to(self.x_o)
         extra = [part.features(condition) for part in self.parts]
 
         def make_sampler(block: slice, weights: Tensor, **options: Any) -> BlockSampler:

@@ -35,6 +35,7 @@ class Components:
     Attributes:
         x_o: The batch of real observations, shape ``(n_o, *event)``.
         prior: The prior NPE was trained with.
+        enable_transform: As in sbi, of the posterior of NPE.
         density: The density of a component given its context.
         contexts: The embeddings of the simulations, shape ``(n_s, l)``.
         fixed: The candidates that are the same whatever the pairs are.
@@ -42,6 +43,7 @@ class Components:
 
     x_o: Tensor
     prior: Distribution
+    enable_transform: bool
     density: Any
     contexts: Tensor
     fixed: dict[str, Part]
@@ -72,6 +74,7 @@ class Components:
         return cls(
             x_o=posterior.x_o,
             prior=posterior.prior,
+            enable_transform=posterior.enable_transform,
             density=estimator.components,
             contexts=estimator.contexts,
             fixed={

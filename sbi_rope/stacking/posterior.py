@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
+import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
@@ -66,6 +67,27 @@ class StackedPosterior(MixturePosterior):
         self._purpose = (
             f"It is the stack of {len(weights)} candidate posteriors for each of "
             f"{len(estimator.x_o)} real observations."
+        )
+
+    @torch.no_grad()
+    def candidate_log_probs(self, theta: Tensor, x: Tensor) -> Tensor:
+        """Return the log density of each candidate by itself at pairs.
+
+        Couplings are normalised inside the support of the prior, as RoPE's posteriors
+        are; the other densities are as they are.
+
+        Args:
+            theta: Parameters, shape ``(n, d)``.
+            x: Their observations, shape ``(n, *event)``.
+
+        Returns:
+            Shape ``(n, K)``, float64, in the order of ``candidate_weights``.
+        """
+        x = self._batch_of_x(x)
+        self.leakage(x)  # leaves the masses of the components in the cache
+        stacked: Any = self.posterior_estimator
+        return stacked.candidate_log_probs(
+            theta, x, component_mass=self._cache["component_mass"]
         )
 
     @property

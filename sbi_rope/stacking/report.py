@@ -1,5 +1,6 @@
 """What the calibration pairs say about a stack: did calibration help?"""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -77,8 +78,10 @@ class LearningCurve:
 class StackingReport:
     """Did calibration help, by what, and how far can the stack be trusted?
 
-    All numbers are of held-out pairs: neither the candidates nor the weights of what is
-    scored have seen them.
+    All numbers are of pairs that the candidates were not trained on; the weights of the
+    stack that scores a pair come from the scores of the other folds. The score of the
+    stack is that of its normalised density; gains compare densities that are not
+    corrected for leakage.
 
     Attributes:
         cross_validation: The scores behind it.
@@ -98,6 +101,12 @@ class StackingReport:
     def score(self) -> tuple[float, float]:
         """The mean held-out log score of the stack, and its standard error."""
         scores = self.cross_validation.stack_scores
+        return float(scores.mean()), float(scores.std() / len(scores) ** 0.5)
+
+    @property
+    def comparable_score(self) -> tuple[float, float]:
+        """The same, not corrected for leakage, as the scores of the candidates are."""
+        scores = self.cross_validation.scores_of("stack")
         return float(scores.mean()), float(scores.std() / len(scores) ** 0.5)
 
     @cached_property
@@ -206,10 +215,11 @@ class StackingReport:
             f"{n}: {score:.2f}"
             for n, score in zip(curve.num_pairs, curve.scores, strict=True)
         )
-        return [
-            f"  score when trained on so many pairs: {points}",
-            f"  twice as many labels might add {curve.gain_of_doubling():.2f} nats",
-        ]
+        lines = [f"  score when trained on so many pairs: {points}"]
+        gain = curve.gain_of_doubling()
+        if math.isfinite(gain):
+            lines.append(f"  twice as many labels might add {gain:.2f} nats")
+        return lines
 
 
 def _called(name: str) -> str:

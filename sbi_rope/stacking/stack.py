@@ -1,5 +1,6 @@
 """From a trained RoPE to a stack, in one call."""
 
+import copy
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -109,7 +110,8 @@ def stack(
     weights = scores.weights.weights
     return StackedPosterior(
         estimator.with_weights(weights),
-        components.prior,
+        copy.deepcopy(components.prior),  # moving the stack leaves the report
+        enable_transform=components.enable_transform,
         weights=dict(zip(scores.names, weights.tolist(), strict=True)),
         report=StackingReport(cross_validation=scores, learning_curve=curve),
         shared=scores.shared,
@@ -118,8 +120,8 @@ def stack(
 
 def _warn_unless_converged(estimator: StackedEstimator) -> None:
     couplings = estimator.coupling.couplings
-    open_ones = [c for c in couplings if not c.converged]
-    if open_ones:
+    if not estimator.coupling.converged:
+        open_ones = [c for c in couplings if not c.converged]
         worst = max(coupling.marginal_error for coupling in open_ones)
         warn_user(
             f"{len(open_ones)} of {len(couplings)} couplings have not converged "
