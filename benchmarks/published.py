@@ -159,7 +159,7 @@ def gap(ours: Iterable[Row], theirs: Iterable[Row]) -> float | None:
     return sum(differences) / len(pairs) if pairs else None
 
 
-# Judging ----------------------------------------------------------------------------
+# Texts ------------------------------------------------------------------------------
 
 
 def table(head: Sequence[str], lines: Iterable[Sequence[str]]) -> list[str]:
@@ -203,6 +203,3 @@ def number_text(values: list[float], form: str) -> str:
 def both_texts(rows: Sequence[Row]) -> str:
     """Return the mean LPP with the mean ACAUC in brackets."""
     return f"{mean(rows):.2f} ({mean(rows, 'acauc'):+.2f})"
-
-
-# What was run -----------------------------------------------------------------------

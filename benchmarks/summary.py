@@ -298,6 +298,3 @@ def _losses(published: Published) -> list[str]:
         _in_words(compared) + (f" Best where RoPE is not: {others}." if others else ""),
         *(["", *table(head, lines)] if lines else []),
     ]
-
-
-# The other suites -------------------------------------------------------------------

@@ -177,7 +177,12 @@ def _moved(values: Tensor) -> Tensor:
 def _names(names: Sequence[str] | None, dim: int) -> tuple[str, ...]:
     if names is None:
         return tuple(f"theta_{k + 1}" for k in range(dim))
-    if isinstance(names, str) or len(names) != dim or len(set(names)) != dim:
+    if (
+        not isinstance(names, Sequence)
+        or isinstance(names, str)
+        or len(names) != dim
+        or len(set(names)) != dim
+    ):
         raise InvalidInputError(
             f"Expected `parameter_names` to be {dim} different names, one for each "
             f"parameter; got {names!r}."

@@ -111,8 +111,8 @@ class DensityCandidate:
         if not callable(self.build):
             raise InvalidTypeError(
                 "Expected `build` to be a function of (rope, seed) that returns a "
-                f"posterior; got {type(self.build).__name__}. Wrap a posterior: `lambda "
-                "rope, seed: posterior`."
+                f"posterior; got {type(self.build).__name__}. Wrap a posterior: "
+                "`lambda rope, seed: posterior`."
             )
 
     @property
@@ -176,9 +176,9 @@ def check_candidates(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
         if not isinstance(candidate, CouplingCandidate | DensityCandidate):
             raise InvalidTypeError(
                 "Expected `candidates` to be CouplingCandidates and DensityCandidates; "
-                f"got {type(candidate).__name__}. Wrap a posterior that was not trained "
-                "on the calibration pairs: DensityCandidate(name=..., build=lambda rope, "
-                "seed: posterior, fixed=True)."
+                f"got {type(candidate).__name__}. Wrap a posterior that was not "
+                "trained on the calibration pairs: DensityCandidate(name=..., "
+                "build=lambda rope, seed: posterior, fixed=True)."
             )
     if not any(isinstance(c, CouplingCandidate) for c in candidates):
         raise InvalidInputError(

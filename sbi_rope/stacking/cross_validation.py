@@ -396,9 +396,7 @@ def score_folds(
         fold=fold,
         theta=theta,
         x=x,
-        num_trained_on=sum(
-            len(folds[(1 + j) % num_folds]) for j in range(num_training_folds)
-        ),
+        num_trained_on=len(theta) * num_training_folds // num_folds,
         estimators=tuple(estimators),
         prior=components.prior,
         pseudo_count=pseudo_count,

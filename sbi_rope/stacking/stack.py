@@ -43,7 +43,8 @@ def stack(
     weights that score best (:func:`stacking_weights`).
 
     Args:
-        rope: A trained RoPE; it is left as it is.
+        rope: A trained RoPE; it is left as it is, but counts the simulations
+            that were dropped.
         x_o: The batch of real observations, shape ``(n_o, *event)``.
         candidates: What to stack; ``default_candidates()`` if None: RoPE and OT-only at
             four gammas and four taus, the prior, NPE, tuning-only and fine-tuned NPE.
