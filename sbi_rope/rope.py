@@ -261,8 +261,10 @@ class RoPE:
             Shape ``(m, l)``. They depend on the parameters of these pairs only.
 
         Raises:
+            InvalidInputError: If a row is not the number of a pair.
             SimulationError: If the simulator fails.
         """
+        self._check_rows(rows)
         count = self.finetuner.simulations_per_target
         with seeded(seed):
             return self._draw_targets(self._theta_cal[rows], count, show_progress_bars)
@@ -344,12 +346,28 @@ class RoPE:
             targets: What :meth:`draw_targets` returned for these rows, so that
                 :meth:`train` does not simulate again; of no effect if the finetuner
                 draws new ones in every step.
+
+        Raises:
+            InvalidInputError: If a row is not the number of a pair, or there are not as
+                many targets as rows.
         """
+        self._check_rows(rows)
+        if targets is not None:
+            check_same_length("rows", rows, "targets", targets)
         part = copy.copy(self)
         part._theta_cal, part._x_cal = self._theta_cal[rows], self._x_cal[rows]
         part._targets = targets
         part._g, part._history = None, None
         return part
+
+    def _check_rows(self, rows: Tensor) -> None:
+        rows, count = check_tensor("rows", rows), len(self._x_cal)
+        whole = rows.ndim == 1 and rows.dtype == torch.long
+        if not whole or bool(((rows < 0) | (rows >= count)).any()):
+            raise InvalidInputError(
+                "Expected `rows` to be whole numbers of calibration pairs, shape (m,), "
+                f"from 0 to {count - 1}; got {rows.dtype} of shape {tuple(rows.shape)}."
+            )
 
     def build_posterior(
         self,

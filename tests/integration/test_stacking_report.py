@@ -234,3 +234,14 @@ def test_a_prior_of_other_parameters_is_no_candidate() -> None:
             seed=0,
             show_progress_bars=False,
         )
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [torch.tensor([12]), torch.tensor([-1]), torch.tensor([0.0]), torch.ones(())],
+)
+def test_rows_that_are_no_pairs_are_refused(rows: torch.Tensor) -> None:
+    rope = the_rope()
+    for call in (rope.with_pairs, rope.draw_targets):
+        with pytest.raises(InvalidInputError, match="rows"):
+            call(rows)
