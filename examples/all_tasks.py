@@ -70,6 +70,8 @@ def main() -> None:
             n_calibration=args.n_calibration,
             n_test=args.n_test,
             out=args.out / name,
+            with_stack=args.stack,
+            with_diagnosis=args.diagnose,
         ).run()
     print("\n\n==== all tasks ====")
     for title, rows in tables.items():

@@ -82,6 +82,8 @@ def main() -> None:
         n_calibration=args.n_calibration,
         n_test=args.n_test,
         out=args.out,
+        with_stack=args.stack,
+        with_diagnosis=args.diagnose,
     ).run()
 
 

@@ -39,7 +39,10 @@ def train_npe(task: Task, seed: int, num_simulations: int = 20_000) -> Any:
 def main() -> None:
     """Run the study with the arguments of the command line."""
     parser = argument_parser(
-        __doc__ or "", n_test=1000, out="results/light_tunnel_sensors"
+        __doc__ or "",
+        n_test=1000,
+        out="results/light_tunnel_sensors",
+        with_stack=True,
     )
     parser.add_argument("--root", type=Path, required=True, help="folder of the data")
     parser.add_argument("--download", action="store_true", help="fetch the data set")
@@ -54,6 +57,8 @@ def main() -> None:
         n_calibration=args.n_calibration,
         n_test=args.n_test,
         out=args.out,
+        with_stack=args.stack,
+        with_diagnosis=args.diagnose,
     ).run()
 
 

@@ -1,4 +1,4 @@
-"""One study of RoPE on a task: train NPE, repair it, score five methods, draw them.
+"""One study of RoPE on a task: train NPE, repair it, score all methods, draw them.
 
 Used by the example scripts; a study is (seeds) x (calibration sizes).
 """
@@ -17,7 +17,14 @@ from sbi.inference import NPE
 from sbi.neural_nets import posterior_nn
 from torch import Tensor
 
-from sbi_rope import CalibrationFinetuner, RoPE, SinkhornCoupler, plots
+from sbi_rope import (
+    CalibrationFinetuner,
+    RoPE,
+    SinkhornCoupler,
+    diagnose,
+    plots,
+    stack,
+)
 from sbi_rope.baselines import PriorPosterior
 from sbi_rope.metrics import Evaluation, evaluate
 from sbi_rope.tasks import Task
@@ -46,6 +53,8 @@ class Study:
 
     With ``stored``, RoPE uses these simulations instead of the task's simulator. With
     ``held_out``, NPE is also scored on simulations it has not seen: the row "SBI".
+    ``with_stack`` weighs all settings of RoPE and its rivals and prints the report of
+    the stack; ``with_diagnosis`` prints whether the test observations are fit for RoPE.
     """
 
     task: Task
@@ -58,6 +67,8 @@ class Study:
     finetuner: CalibrationFinetuner | None = None
     stored: Callable[[Task, int], tuple[Tensor, Tensor]] | None = None
     held_out: Callable[[Task, int], tuple[Tensor, Tensor]] | None = None
+    with_stack: bool = False
+    with_diagnosis: bool = False
 
     def run(self) -> list[dict[str, Any]]:
         """Run all seeds and sizes; rows are written as they are finished."""
@@ -128,7 +139,25 @@ class Study:
             start = time.perf_counter()
             posterior = rope.build_posterior(x_o, seed=seed)
             score("RoPE", posterior, start, n)
-            self._draw(f"seed{seed}_n{n}", npe, rope, posterior, theta_o, curves)
+            name = f"seed{seed}_n{n}"
+            if self.with_stack:
+                start = time.perf_counter()
+                print("  stacking ...", flush=True)
+                stacked = stack(rope, x_o, seed=seed, show_progress_bars=False)
+                score("stack", stacked, start, n)
+                print(stacked.report, flush=True)
+                self._save(plots.stacking_report(stacked.report), f"stack_{name}")
+            if self.with_diagnosis:
+                diagnosis = diagnose(
+                    rope,
+                    x_o,
+                    parameter_names=task.parameter_names,
+                    seed=seed,
+                    show_progress_bars=False,
+                )
+                print(diagnosis, flush=True)
+                self._save(diagnosis.plot(), f"diagnosis_{name}")
+            self._draw(name, npe, rope, posterior, theta_o, curves)
 
     def _draw(
         self,
@@ -180,9 +209,10 @@ class Study:
             "coupling": plots.effective_sample_sizes(posterior.coupling),
         }
         for kind, figure in figures.items():
-            figure.savefig(
-                self.out / f"{kind}_{name}.png", dpi=120, bbox_inches="tight"
-            )
+            self._save(figure, f"{kind}_{name}")
+
+    def _save(self, figure: Any, name: str) -> None:
+        figure.savefig(self.out / f"{name}.png", dpi=120, bbox_inches="tight")
 
 
 def train_small_npe(
@@ -238,6 +268,7 @@ LPP: mean log-probability of the true parameters, in standard deviations of the 
 (higher is better). ACAUC: 0 is calibrated, above 0 is overconfident. ECE: expected
 coverage error. -inf: share of test observations with density zero. NPE and tuning-only
 are scored without sbi's leakage correction. SBI is NPE on simulations it has not seen.
+RoPE has one setting, fixed beforehand; stack weighs many, and its rivals too.
 With several seeds: mean, and standard deviation of the LPP over seeds (+-).
 """
 
@@ -250,7 +281,7 @@ def print_table(rows: list[dict[str, Any]], *, explain: bool = True) -> None:
         f"{'method':<12}{'pairs':>6}{'LPP':>10}{'+-':>7}{'ACAUC':>9}{'ECE':>8}"
         f"{'-inf':>7}"
     )
-    order = ("prior", "SBI", "NPE", "tuning-only", "OT-only", "RoPE")
+    order = ("prior", "SBI", "NPE", "tuning-only", "OT-only", "RoPE", "stack")
     keys = dict.fromkeys((row["method"], row["n_calibration"]) for row in rows)
     for method, n in sorted(keys, key=lambda key: (order.index(key[0]), key[1])):
         group = [r for r in rows if (r["method"], r["n_calibration"]) == (method, n)]
@@ -266,7 +297,9 @@ def print_table(rows: list[dict[str, Any]], *, explain: bool = True) -> None:
         )
 
 
-def argument_parser(description: str, *, n_test: int, out: str) -> Any:
+def argument_parser(
+    description: str, *, n_test: int, out: str, with_stack: bool = False
+) -> Any:
     """Return the arguments that all examples share."""
     parser = argparse.ArgumentParser(
         description=description, formatter_class=argparse.ArgumentDefaultsHelpFormatter
@@ -280,5 +313,16 @@ def argument_parser(description: str, *, n_test: int, out: str) -> Any:
         help="labelled real observations to repair with",
     )
     parser.add_argument("--n-test", type=int, default=n_test)
+    parser.add_argument(
+        "--stack",
+        action=argparse.BooleanOptionalAction,
+        default=with_stack,
+        help="weigh all settings and rivals by held-out pairs; a minute or more each",
+    )
+    parser.add_argument(
+        "--diagnose",
+        action="store_true",
+        help="say whether the test observations are fit for RoPE",
+    )
     parser.add_argument("--out", type=Path, default=Path(out))
     return parser

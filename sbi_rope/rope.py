@@ -149,6 +149,7 @@ class RoPE:
         )
         self._x_cal = self._theta_cal.new_empty(0, *estimator.condition_shape)
         self._targets: Tensor | None = None
+        self._rehearsed: dict[int, Tensor] = {}
         self._source = self._make_source(simulator, simulations)
 
     def _make_source(
@@ -236,6 +237,9 @@ class RoPE:
             self._h,
             self._x_cal,
             draw_targets,
+            draw_simulations=lambda count: self._draw_rehearsal(
+                count, progress=show_progress_bars
+            ),
             seed=seed,
             show_progress_bars=show_progress_bars,
         )
@@ -277,6 +281,17 @@ class RoPE:
             self._embed_simulations,
             progress=progress,
         )
+
+    def _draw_rehearsal(self, count: int, *, progress: bool) -> Tensor:
+        # Drawn once for all that share these simulations, such as the folds of a
+        # stack; under a seed of its own, so that nothing depends on who came first.
+        if count not in self._rehearsed:
+            with seeded(0):
+                _, x = self._source.from_prior(
+                    None, count, lambda x: x, progress=progress
+                )
+            self._rehearsed[count] = x
+        return self._rehearsed[count]
 
     def draw_simulations(
         self,
@@ -359,6 +374,21 @@ class RoPE:
         part._targets = targets
         part._g, part._history = None, None
         return part
+
+    def with_finetuner(self, finetuner: CalibrationFinetuner) -> "RoPE":
+        """Return a RoPE with the same pairs and another finetuner, not trained yet.
+
+        Args:
+            finetuner: Settings of the tuning.
+
+        Raises:
+            InvalidTypeError: If it is something else.
+        """
+        check_instance("finetuner", finetuner, CalibrationFinetuner)
+        other = copy.copy(self)
+        other.finetuner = finetuner
+        other._g, other._history = None, None
+        return other
 
     def _check_rows(self, rows: Tensor) -> None:
         rows, count = check_tensor("rows", rows), len(self._x_cal)

@@ -10,6 +10,7 @@ from sbi_rope._sbi import ConditionalDensityEstimator, estimator_of
 from sbi_rope._validation import (
     check_choice,
     check_instance,
+    check_not_negative,
     check_positive,
     check_unit_interval,
 )
@@ -43,6 +44,8 @@ class CouplingCandidate:
         gamma: As in :class:`~sbi_rope.SinkhornCoupler`.
         tau: As in :class:`~sbi_rope.SinkhornCoupler`.
         tuned: Whether observations are embedded by the tuned net g, or by h.
+        rehearsal: None for RoPE's own g; a number for one tuned with so much of it, see
+            :class:`~sbi_rope.CalibrationFinetuner`.
         cost_scale: As in :class:`~sbi_rope.SinkhornCoupler`, but in units of the median
             distance between simulated embeddings by default.
 
@@ -53,6 +56,7 @@ class CouplingCandidate:
     gamma: float
     tau: float
     tuned: bool = True
+    rehearsal: float | None = None
     cost_scale: Literal["none", "simulated"] = "simulated"
 
     def __post_init__(self) -> None:
@@ -60,6 +64,13 @@ class CouplingCandidate:
         check_positive("gamma", self.gamma)
         check_unit_interval("tau", self.tau)
         check_instance("tuned", self.tuned, bool)
+        if self.rehearsal is not None:
+            check_not_negative("rehearsal", self.rehearsal)
+            if not self.tuned:
+                raise InvalidInputError(
+                    "Expected `rehearsal` of None without tuning; got "
+                    f"{self.rehearsal}."
+                )
         check_choice("cost_scale", self.cost_scale, ("none", "simulated"))
 
     @property
@@ -71,7 +82,8 @@ class CouplingCandidate:
     def name(self) -> str:
         """The method with its setting."""
         scale = " of the embedding" if self.cost_scale == "none" else ""
-        return f"{self.family} (gamma {self.gamma:g}{scale}, tau {self.tau:g})"
+        net = "" if self.rehearsal is None else f", rehearsal {self.rehearsal:g}"
+        return f"{self.family} (gamma {self.gamma:g}{scale}, tau {self.tau:g}{net})"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.distributions import Distribution
 
 from sbi_rope._random import seeded
@@ -112,25 +112,24 @@ def fit_candidates(
     # Copies: a stack can be moved to a device without the others.
     components = copy.deepcopy(components)
     settings = [c for c in candidates if isinstance(c, CouplingCandidate)]
-    nets = {False: rope.embedding_net, True: rope.tuned_embedding_net}
-    used = [tuned for tuned in nets if any(c.tuned == tuned for c in settings)]
-    real, columns, start = [], {}, 0
-    for tuned in used:
-        real.append(embed(nets[tuned], x))
-        columns[tuned] = slice(start, start + real[-1].shape[1])
-        start += real[-1].shape[1]
-    couplings = _couple(settings, dict(zip(used, real, strict=True)), rope, components)
+    nets = _nets(settings, rope, seed)
+    real = {key: embed(net, x) for key, net in nets.items()}
+    columns, start = {}, 0
+    for key, embedded in real.items():
+        columns[key] = slice(start, start + embedded.shape[1])
+        start += embedded.shape[1]
+    couplings = _couple(settings, real, rope, components)
     mixture = MixtureEstimator(
         components.density,
         components.contexts,
         StackedCoupling(  # type: ignore[arg-type]
             couplings=tuple(couplings[c] for c in settings),
             shares=_equal(len(settings), x),
-            real=torch.cat(real, dim=1),
-            columns=tuple(columns[c.tuned] for c in settings),
+            real=torch.cat(list(real.values()), dim=1),
+            columns=tuple(columns[_net_of(c)] for c in settings),
         ),
         x,
-        embedding_net=StackedEmbedding([nets[tuned] for tuned in used]),
+        embedding_net=StackedEmbedding(list(nets.values())),
         unseen=unseen,
         tail_mass=tail_mass,
     )
@@ -152,22 +151,49 @@ def _equal(count: int, like: Tensor) -> Tensor:
     return torch.full((count,), 1.0 / count, dtype=torch.double, device=like.device)
 
 
+# What tells the nets of coupling candidates apart.
+Net = tuple[bool, float | None]
+
+
+def _net_of(candidate: CouplingCandidate) -> Net:
+    return (candidate.tuned, candidate.rehearsal)
+
+
+def _nets(
+    settings: Sequence[CouplingCandidate], rope: RoPE, seed: int
+) -> dict[Net, nn.Module]:
+    nets: dict[Net, nn.Module] = {}
+    for tuned, rehearsal in dict.fromkeys(_net_of(c) for c in settings):
+        if not tuned:
+            net = rope.embedding_net
+        elif rehearsal is None:
+            net = rope.tuned_embedding_net
+        else:
+            other = replace(rope.finetuner, rehearsal=rehearsal)
+            trained = rope.with_finetuner(other).train(
+                seed=seed, show_progress_bars=False
+            )
+            net = trained.tuned_embedding_net
+        nets[tuned, rehearsal] = net
+    return nets
+
+
 def _couple(
     settings: Sequence[CouplingCandidate],
-    real: dict[bool, Tensor],
+    real: dict[Net, Tensor],
     rope: RoPE,
     components: Components,
 ) -> dict[CouplingCandidate, Coupling]:
     """Couple at every setting; along gamma and tau each starts from its neighbour."""
     couplings: dict[CouplingCandidate, Coupling] = {}
-    groups = dict.fromkeys((c.tuned, c.cost_scale) for c in settings)
-    for tuned, cost_scale in groups:
-        group = [c for c in settings if (c.tuned, c.cost_scale) == (tuned, cost_scale)]
+    groups = dict.fromkeys((_net_of(c), c.cost_scale) for c in settings)
+    for net, cost_scale in groups:
+        group = [c for c in settings if (_net_of(c), c.cost_scale) == (net, cost_scale)]
         gammas = sorted({c.gamma for c in group}, reverse=True)
         taus = sorted({c.tau for c in group}, reverse=True)
         coupler: SinkhornCoupler = replace(rope.coupler, cost_scale=cost_scale)
         found = coupler.sweep(
-            real[tuned], components.contexts, gammas=gammas, taus=taus, seed=0
+            real[net], components.contexts, gammas=gammas, taus=taus, seed=0
         )
         by_setting = dict(zip(itertools.product(gammas, taus), found, strict=True))
         couplings.update({c: by_setting[c.gamma, c.tau] for c in group})

@@ -10,7 +10,11 @@ from torch import Tensor, nn
 from sbi_rope import CalibrationFinetuner
 from sbi_rope._random import seeded
 from sbi_rope.errors import InvalidInputError, InvalidTypeError, RoPEWarning
-from sbi_rope.finetuning import STEPS_WITHOUT_HOLDOUT, trainable_copy
+from sbi_rope.finetuning import (
+    STEPS_WITHOUT_HOLDOUT,
+    FinetuneResult,
+    trainable_copy,
+)
 from tests import gaussian
 
 
@@ -229,3 +233,90 @@ def test_unusable_pairs_are_refused() -> None:
         finetune(linear(), x / 0, x)
     with pytest.raises(InvalidTypeError, match="`x` to be a torch"):
         finetune(linear(), x.numpy(), x)  # type: ignore[arg-type]
+
+
+# --- rehearsal ---
+
+
+def rehearsed(
+    net: nn.Module, x: Tensor, targets: Tensor, simulations: Tensor, **settings: float
+) -> FinetuneResult:
+    return CalibrationFinetuner(**settings).finetune(  # type: ignore[arg-type]
+        net,
+        x,
+        lambda count: targets,
+        draw_simulations=lambda count: simulations,
+        seed=0,
+        show_progress_bars=False,
+    )
+
+
+@pytest.mark.parametrize(("rehearsal", "slope"), [(0.5, 2.0), (2.0, 1.0)])
+def test_rehearsal_minimises_the_sum_known_in_closed_form(
+    rehearsal: float, slope: float
+) -> None:
+    """With g(x) = a x, pairs (1, 2), simulations of 1: |a - 2| + rehearsal |a - 1|."""
+    net = nn.Linear(1, 1, bias=False)
+    nn.init.ones_(net.weight)
+    result = rehearsed(
+        net,
+        torch.ones(4, 1),  # too few for a hold-out, which would choose a = 2
+        torch.full((4, 1), 2.0),
+        torch.ones(7, 1),
+        rehearsal=rehearsal,
+        learning_rate=0.05,
+    )
+    found = float(result.embedding_net.weight)  # type: ignore[arg-type]
+    assert found == pytest.approx(slope, abs=0.1)
+
+
+def test_the_loss_of_rehearsal_is_the_weighted_distance_from_where_h_put_them() -> None:
+    x, simulations = torch.randn(4, 2), torch.randn(1, 2)
+    net = linear()
+    result = rehearsed(
+        net, x, x + 3, simulations, rehearsal=0.7, learning_rate=0.1, num_steps=1
+    )
+    g = result.embedding_net
+    distance = (g(x) - x - 3).norm(dim=1).mean()
+    kept = (g(simulations) - net(simulations)).norm(dim=1).mean()
+    assert kept > 0.05
+    found = result.history.training_loss[1]
+    expected = float((distance + 0.7 * kept).detach())
+    assert found == pytest.approx(expected, rel=1e-5)
+
+
+def test_held_out_pairs_are_judged_without_rehearsal() -> None:
+    x, simulations = torch.randn(10, 2), torch.randn(50, 2)
+    result = rehearsed(linear(), x, x + 3, simulations, rehearsal=5.0, num_steps=20)
+    with seeded(0):
+        held_out = torch.randperm(10)[:2]
+    distance = (result.embedding_net(x) - x - 3).norm(dim=1)[held_out].mean()
+    best = result.history.validation_loss[result.history.best_step]
+    assert float(distance) == pytest.approx(best, rel=1e-6)
+
+
+def test_without_rehearsal_nothing_is_simulated() -> None:
+    x = torch.randn(10, 2)
+
+    def never(count: int) -> Tensor:
+        raise AssertionError
+
+    result = CalibrationFinetuner(num_steps=3).finetune(
+        linear(),
+        x,
+        lambda count: x,
+        draw_simulations=never,
+        seed=0,
+        show_progress_bars=False,
+    )
+    assert len(result.history.training_loss) == 4
+
+
+def test_rehearsal_needs_finite_simulations() -> None:
+    x = torch.randn(10, 2)
+    with pytest.raises(InvalidInputError, match="draw_simulations"):
+        finetune(linear(), x, x, rehearsal=1.0)
+    with pytest.raises(InvalidInputError, match="simulations"):
+        rehearsed(linear(), x, x, torch.full((5, 2), math.nan), rehearsal=1.0)
+    with pytest.raises(InvalidInputError, match="rehearsal"):
+        CalibrationFinetuner(rehearsal=-1.0)

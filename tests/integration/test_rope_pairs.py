@@ -1,0 +1,211 @@
+"""Parts of RoPE that folds are made of: some pairs, and their targets."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from sbi_rope import CalibrationFinetuner, RoPE
+from sbi_rope.errors import InvalidTypeError, NotReadyError
+from tests import gaussian, problems
+from tests.stacks import (
+    NUM_OBSERVED,
+    NUM_PAIRS,
+    QUICK,
+    QUIET,
+    observed,
+    parameters,
+    problem,
+    same,
+    the_rope,
+    trained,
+    uneven,
+    unnormalised,
+    untrained,
+)
+
+# Batches and calibration sets are small here on purpose.
+pytestmark = pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
+
+
+def test_targets_are_mean_embeddings_at_the_parameters_of_their_rows() -> None:
+    rope = RoPE(
+        gaussian.posterior(),
+        simulator=gaussian.simulator,
+        finetuner=CalibrationFinetuner(simulations_per_target=4000),
+    )
+    theta, x = gaussian.labelled(6)
+    rope.append_calibration(theta, x)
+    rows = torch.tensor([4, 0, 2])
+    targets = rope.draw_targets(rows, seed=0, **QUIET)
+    # h(S(theta)) = 0.8 (theta + 0.5 eps).
+    error = gaussian.GAIN * gaussian.NOISE_STD / 4000**0.5
+    assert torch.allclose(targets, gaussian.GAIN * theta[rows], atol=5 * error)
+
+
+def test_targets_depend_on_their_own_rows_and_the_seed_only() -> None:
+    theta, x = problem(2, 8, seed=1)
+    rows = torch.tensor([5, 1])
+    rope = untrained(pairs=(theta, x))
+    state = torch.random.get_rng_state()
+    targets = rope.draw_targets(rows, seed=0, **QUIET)
+    assert torch.equal(torch.random.get_rng_state(), state)
+    assert targets.shape == (2, 4)
+    other = theta.clone()
+    other[[0, 2, 3, 4, 6, 7]] *= -0.5
+    rope = untrained(pairs=(other, x + 1))
+    assert torch.equal(rope.draw_targets(rows, seed=0, **QUIET), targets)
+    assert not torch.equal(rope.draw_targets(rows, seed=1, **QUIET), targets)
+
+
+def test_targets_of_stored_simulations_are_the_embeddings_of_the_nearest() -> None:
+    theta = problems.box(2).sample((100,))
+    x = problems.simulate(theta)
+    rope = untrained(simulations=(theta, x), pairs=(theta[:5] + 1e-4, x[:5] + 0.4))
+    rows = torch.tensor([3, 0])
+    with torch.no_grad():
+        expected = rope.embedding_net(x[rows])
+    assert torch.allclose(rope.draw_targets(rows, **QUIET), expected, atol=1e-6)
+
+
+def test_a_rope_with_some_pairs_tunes_on_these_towards_the_targets_given() -> None:
+    rope = the_rope()
+    theta, x = rope.calibration
+    rows = torch.tensor([7, 2, 11, 5, 3, 1])
+    targets = torch.randn(6, 4)
+    part = rope.with_pairs(rows, targets=targets)
+    assert all(map(torch.equal, part.calibration, (theta[rows], x[rows])))
+    with pytest.raises(NotReadyError):
+        _ = part.tuned_embedding_net
+    part.train(seed=4, **QUIET)
+    expected = rope.finetuner.finetune(
+        rope.embedding_net, x[rows], lambda count: targets, seed=4, **QUIET
+    )
+    found = part.tuned_embedding_net
+    assert same(parameters(found), parameters(expected.embedding_net))
+
+
+def test_targets_are_forgotten_when_pairs_are_added_or_drawn_anew_in_every_step() -> (
+    None
+):
+    rope = the_rope()
+    theta, x = rope.calibration
+    rows = torch.arange(6)
+    far = torch.full((6, 4), 100.0)
+    grown = rope.with_pairs(rows, targets=far).append_calibration(theta[6:9], x[6:9])
+    expected = rope.with_pairs(torch.arange(9)).train(seed=0, **QUIET)
+    found = grown.train(seed=0, **QUIET)
+    nets = (found.tuned_embedding_net, expected.tuned_embedding_net)
+    assert same(parameters(nets[0]), parameters(nets[1]))
+
+    finetuner = CalibrationFinetuner(
+        num_steps=3, simulations_per_target=2, resample_targets=True
+    )
+    rope = untrained(finetuner=finetuner)
+    nets = [
+        rope.with_pairs(rows, targets=targets)
+        .train(seed=0, **QUIET)
+        .tuned_embedding_net
+        for targets in (far, None)
+    ]
+    assert same(parameters(nets[0]), parameters(nets[1]))
+
+
+def test_a_rope_with_some_pairs_leaves_the_other_as_it_was() -> None:
+    rope = trained()
+    net, (theta, x) = rope.tuned_embedding_net, rope.calibration
+    part = rope.with_pairs(torch.arange(4)).train(seed=9, **QUIET)
+    part.append_calibration(theta[:3], x[:3])
+    assert all(map(torch.equal, rope.calibration, (theta, x)))
+    assert same(parameters(rope.tuned_embedding_net), parameters(net))
+    assert len(part.calibration[0]) == 7
+
+
+def test_npe_and_calibration_are_copies() -> None:
+    rope = the_rope()
+    original = problems.npe_posterior("mdn")
+    theta, x_o = problems.box(2).sample((NUM_OBSERVED,)), observed()
+    expected = unnormalised(original, theta, x_o)
+    assert torch.allclose(unnormalised(rope.npe, theta, x_o), expected)
+    npe: Any = rope.npe
+    with torch.no_grad():
+        for parameter in npe.posterior_estimator.parameters():
+            parameter.zero_()
+    assert torch.allclose(unnormalised(rope.npe, theta, x_o), expected)
+    assert torch.allclose(unnormalised(original, theta, x_o), expected)
+    pairs = rope.calibration
+    for value in pairs:
+        value.zero_()
+    assert not any(map(torch.equal, pairs, rope.calibration))
+
+
+# --- another finetuner, and rehearsal ---
+
+
+def counted() -> tuple[list[int], RoPE]:
+    calls: list[int] = []
+
+    def simulator(theta: Tensor) -> Tensor:
+        calls.append(len(theta))
+        return uneven(theta)
+
+    rope = RoPE(
+        problems.npe_posterior("mdn", "linear"),
+        simulator=simulator,
+        finetuner=replace(QUICK, rehearsal=1.0),
+    )
+    return calls, rope.append_calibration(*problem(2, NUM_PAIRS, seed=1))
+
+
+def test_rehearsal_keeps_simulations_nearer_to_where_they_were() -> None:
+    x = problems.simulate(problems.box(2).sample((500,)))
+    moved = []
+    for rehearsal in (0.0, 5.0):
+        rope = untrained(finetuner=replace(QUICK, rehearsal=rehearsal))
+        rope.train(seed=0, **QUIET)
+        distance = rope.tuned_embedding_net(x) - rope.embedding_net(x)
+        moved.append(float(distance.norm(dim=1).mean()))
+    assert moved[1] < 0.5 * moved[0]
+
+
+def test_what_is_rehearsed_is_simulated_once_for_all_parts() -> None:
+    calls, rope = counted()
+    rope.train(seed=0, **QUIET)
+    calls.clear()
+    rows = torch.arange(10)
+    targets = rope.draw_targets(rows, seed=0, **QUIET)
+    simulated = sum(calls)
+    part = rope.with_pairs(rows, targets=targets).train(seed=0, **QUIET)
+    assert sum(calls) == simulated
+    # Who drew the simulations first does not matter.
+    _, other = counted()
+    alone = other.with_pairs(rows, targets=targets).train(seed=0, **QUIET)
+    nets = (part.tuned_embedding_net, alone.tuned_embedding_net)
+    assert same(parameters(nets[0]), parameters(nets[1]))
+
+
+def test_stored_simulations_can_be_rehearsed() -> None:
+    theta = problems.box(2).sample((50,))  # fewer than a simulator would be asked for
+    rope = untrained(
+        simulations=(theta, problems.simulate(theta)),
+        finetuner=replace(QUICK, rehearsal=1.0),
+    )
+    assert len(rope.train(seed=0, **QUIET).history.training_loss) > 1
+
+
+def test_another_finetuner_gives_another_net_and_leaves_the_first() -> None:
+    rope = the_rope()
+    net = rope.tuned_embedding_net
+    other = rope.with_finetuner(replace(QUICK, num_steps=3))
+    with pytest.raises(NotReadyError):
+        other.build_posterior(observed())
+    other.train(seed=0, **QUIET)
+    assert same(parameters(rope.tuned_embedding_net), parameters(net))
+    assert rope.finetuner == QUICK
+    expected = untrained(finetuner=replace(QUICK, num_steps=3)).train(seed=0, **QUIET)
+    nets = (other.tuned_embedding_net, expected.tuned_embedding_net)
+    assert same(parameters(nets[0]), parameters(nets[1]))
+    with pytest.raises(InvalidTypeError, match="finetuner"):
+        rope.with_finetuner(QUIET)  # type: ignore[arg-type]
