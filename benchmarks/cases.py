@@ -47,7 +47,9 @@ class Sources:
         options = json.loads(cell.options)
         if cell.task == "hemodynamics" and self.hemodynamics is not None:
             options["simulations"] = self.hemodynamics / "simulator.npz"
-            options["observations"] = self.hemodynamics / "real.npz"
+            # There reality is the simulator, and its people serve as real ones too.
+            if cell.variant != "well_specified":
+                options["observations"] = self.hemodynamics / "real.npz"
         return get_task(
             cell.task, variant=cell.variant or None, root=self.root, **options
         )

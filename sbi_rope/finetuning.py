@@ -31,7 +31,7 @@ __all__ = ["CalibrationFinetuner", "FinetuneResult", "History"]
 
 # Simulations to rehearse with, and how many of them in each step.
 NUM_REHEARSED = 2000
-REHEARSED_IN_STEP = 100
+REHEARSED_IN_STEP = 50
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,7 @@
 """Small stacks that tests share, and what they are made of."""
 
 import functools
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -19,6 +20,7 @@ from sbi_rope.stacking import (
     cross_validate,
     stack,
 )
+from sbi_rope.stacking.cross_validation import draw_seeds
 from tests import problems
 
 QUIET: dict[str, Any] = {"show_progress_bars": False}
@@ -56,6 +58,7 @@ COUPLINGS = (
     CouplingCandidate(gamma=0.4, tau=0.5),
     OT_ONLY,
     CouplingCandidate(gamma=0.3, tau=0.9, tuned=False, cost_scale="none"),
+    CouplingCandidate(gamma=0.2, tau=0.5, rehearsal=20.0),
 )
 CANDIDATES = (*COUPLINGS, PRIOR, NPE, TUNED, FINETUNED)
 
@@ -141,11 +144,29 @@ def midpoints(count: int) -> Tensor:
     return (torch.arange(count) + 0.5) * 2 / count - 1
 
 
+def rope_of(candidate: CouplingCandidate, rope: RoPE) -> RoPE:
+    """The RoPE that a candidate is a setting of, in a stack made with seed 0."""
+    if not candidate.tuned:
+        return rope.with_pairs(torch.arange(0))
+    if candidate.rehearsal is None:
+        return rope
+    other = replace(rope.finetuner, rehearsal=candidate.rehearsal)
+    # `stack` draws three seeds; what is trained on all pairs has the last.
+    return rope.with_finetuner(other).train(seed=draw_seeds(0, 3)[2], **QUIET)
+
+
+def net_of(candidate: CouplingCandidate, rope: RoPE) -> nn.Module:
+    """What a candidate embeds observations by."""
+    if not candidate.tuned:
+        return rope.embedding_net
+    return rope_of(candidate, rope).tuned_embedding_net
+
+
 def coupled_by_hand(
     candidate: CouplingCandidate, rope: RoPE, x: Tensor, contexts: Tensor
 ) -> MixturePosterior:
     """The posterior of one setting of RoPE, without any part of the stack."""
-    net = rope.tuned_embedding_net if candidate.tuned else rope.embedding_net
+    net = net_of(candidate, rope)
     coupler = SinkhornCoupler(
         gamma=candidate.gamma,
         tau=candidate.tau,

@@ -1,5 +1,6 @@
 """Stacks of trained candidates: density, samples, and what they are made of."""
 
+import itertools
 import math
 import pickle
 from typing import Any
@@ -29,14 +30,15 @@ from tests.stacks import (
     QUIET,
     coupled_by_hand,
     midpoints,
+    net_of,
     observed,
+    rope_of,
     stacked,
     the_rope,
     the_scores,
     the_stack,
     trained,
     unnormalised,
-    untrained,
 )
 
 # Batches and calibration sets are small here on purpose.
@@ -45,8 +47,9 @@ pytestmark = pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
 
 def test_couplings_of_a_stack_are_the_couplings_of_rope_at_their_settings() -> None:
     rope, posterior = the_rope(), the_stack()
-    g, h = rope.tuned_embedding_net, rope.embedding_net
-    assert (g(posterior.x_o) - h(posterior.x_o)).abs().max() > 0.1
+    nets = [net_of(COUPLINGS[k], rope) for k in (0, 2, 4)]
+    for net, other in itertools.combinations(nets, 2):
+        assert (net(posterior.x_o) - other(posterior.x_o)).abs().max() > 0.1
     theta = problems.box(2).sample((NUM_OBSERVED,))
     estimator: Any = posterior.posterior_estimator
     found = estimator.candidate_log_probs(theta, posterior.x_o)
@@ -65,11 +68,7 @@ def test_with_the_same_simulations_build_posterior_gives_the_same_density(
 ) -> None:
     theta = problems.box(2).sample((NUM_SIMULATED,))
     simulations = (theta, problems.simulate(theta))
-    rope = untrained(simulations=simulations)
-    if candidate.tuned:
-        rope.train(seed=0, **QUIET)
-    else:
-        rope = rope.with_pairs(torch.arange(0))
+    rope = rope_of(candidate, trained(simulations=simulations))
     coupler = SinkhornCoupler(
         gamma=candidate.gamma, tau=candidate.tau, cost_scale=candidate.cost_scale
     )
@@ -186,7 +185,7 @@ def test_a_trained_stack_extends_to_new_observations() -> None:
     estimator: Any = posterior.posterior_estimator
     couplings = estimator.coupling.couplings
     for k, candidate in enumerate(COUPLINGS):
-        net = rope.tuned_embedding_net if candidate.tuned else rope.embedding_net
+        net = net_of(candidate, rope)
         with torch.no_grad():
             rows = couplings[k].rows(net(x))
         log_q = estimator.component_log_probs(theta)

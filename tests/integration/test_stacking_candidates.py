@@ -67,7 +67,7 @@ def test_the_default_candidates_can_be_stacked() -> None:
     rope = trained(num_pairs=6)
     candidates = default_candidates(gammas=(0.3,), taus=(0.5,))
     posterior = stacked(rope, candidates=candidates, num_folds=2)
-    assert list(posterior.candidate_weights)[2:] == [
+    assert list(posterior.candidate_weights)[3:] == [
         "prior",
         "NPE",
         "tuning-only",

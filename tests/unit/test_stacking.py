@@ -426,10 +426,10 @@ def test_an_observation_outside_the_batch_is_refused_or_extended_to() -> None:
 # --- candidates ---
 
 
-def test_the_default_is_two_grids_the_prior_and_three_kinds_of_npe() -> None:
+def test_the_default_is_three_grids_the_prior_and_three_kinds_of_npe() -> None:
     candidates = default_candidates()
     couplings = [c for c in candidates if isinstance(c, CouplingCandidate)]
-    assert len(couplings) == 32
+    assert len(couplings) == 36
     assert {c.name for c in candidates} - {c.name for c in couplings} == {
         "prior",
         "NPE",
@@ -437,12 +437,16 @@ def test_the_default_is_two_grids_the_prior_and_three_kinds_of_npe() -> None:
         "fine-tuned NPE",
     }
     small = default_candidates(gammas=(0.1,), taus=(1.0, 0.5))
-    assert [c.name for c in small[:4]] == [
+    assert [c.name for c in small[:6]] == [
         "RoPE (gamma 0.1, tau 1)",
         "RoPE (gamma 0.1, tau 0.5)",
+        "RoPE (gamma 0.1, tau 1, rehearsal 1)",
+        "RoPE (gamma 0.1, tau 0.5, rehearsal 1)",
         "OT-only (gamma 0.1, tau 1)",
         "OT-only (gamma 0.1, tau 0.5)",
     ]
+    without = default_candidates(gammas=(0.1,), taus=(1.0, 0.5), rehearsal=None)
+    assert [c.name for c in without] == [c.name for c in (*small[:2], *small[4:])]
 
 
 @pytest.mark.parametrize(
@@ -452,6 +456,8 @@ def test_the_default_is_two_grids_the_prior_and_three_kinds_of_npe() -> None:
         {"gamma": math.nan, "tau": 1.0},
         {"gamma": 0.1, "tau": 1.1},
         {"gamma": 0.1, "tau": -0.1},
+        {"gamma": 0.1, "tau": 1.0, "rehearsal": -1.0},
+        {"gamma": 0.1, "tau": 1.0, "rehearsal": 1.0, "tuned": False},
         {"gamma": 0.1, "tau": 1.0, "tuned": "yes"},
         {"gamma": 0.1, "tau": 1.0, "cost_scale": "real"},
     ],
