@@ -10,7 +10,8 @@ their stacks would have scored: weights need no second run.
 """
 
 import argparse
-import itertools
+import statistics
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,26 +23,23 @@ from benchmarks.cases import Case, Sources
 from benchmarks.cells import Cell
 from benchmarks.store import Cache
 from sbi_rope import RoPE, stack
-from sbi_rope.stacking import CouplingCandidate, default_candidates
+from sbi_rope.stacking import (
+    CouplingCandidate,
+    default_candidates,
+    stacking_weights,
+)
 from sbi_rope.stacking.candidates import Candidate
 
-__all__ = ["Run", "candidates", "run"]
+__all__ = ["CHOICES", "Choice", "Run", "candidates", "report", "run"]
 
 NUM_OTHERS = 300
 GAMMAS = (0.02, 0.05, 0.1, 0.2, 0.4, 0.8)
 TAUS = (1.0, 0.9, 0.5, 0.0)
-REHEARSAL = 1.0
 
 
 def candidates() -> list[Candidate]:
     """Return a grid that contains those of all choices."""
-    return [
-        *default_candidates(gammas=GAMMAS, taus=TAUS),
-        *(
-            CouplingCandidate(gamma=gamma, tau=tau, rehearsal=REHEARSAL)
-            for gamma, tau in itertools.product(GAMMAS, TAUS)
-        ),
-    ]
+    return list(default_candidates(gammas=GAMMAS, taus=TAUS))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -50,6 +48,7 @@ class Run:
 
     Attributes:
         task: The task, with its variant.
+        seed: Of the calibration pairs.
         num_folds: Folds of the calibration pairs.
         names: Of the candidates, K of them.
         held_out: Their log scores on held-out pairs, shape ``(n, K)``.
@@ -60,16 +59,21 @@ class Run:
     """
 
     task: str
+    seed: int
     num_folds: int
     names: tuple[str, ...]
     held_out: Tensor
     others: Tensor
     mass: Tensor
 
-    def score(self, keep: list[int], weights: Tensor) -> float:
+    def score(self, weights: Tensor) -> float:
         """Return the mean log density of the other pairs under a stack."""
-        log_density = torch.logsumexp(self.others[:, keep] + weights.log(), dim=1)
-        return float((log_density - (self.mass[:, keep] @ weights).log()).mean())
+        log_density = torch.logsumexp(self.others + weights.log(), dim=1)
+        return float((log_density - (self.mass @ weights).log()).mean())
+
+    def scores(self) -> Tensor:
+        """Return the mean log density of the other pairs under each candidate."""
+        return (self.others - self.mass.log()).mean(dim=0)
 
     @classmethod
     def load(cls, path: Path) -> "Run":
@@ -77,6 +81,7 @@ class Run:
         with np.load(path) as stored:
             return cls(
                 task=str(stored["task"]),
+                seed=int(stored["seed"]),
                 num_folds=int(stored["num_folds"]),
                 names=tuple(stored["names"].tolist()),
                 **{
@@ -106,12 +111,126 @@ def run(case: Case, n_calibration: int, num_folds: int, seed: int) -> Run:
     both_zero = torch.isneginf(as_scored) & torch.isneginf(normalised)
     return Run(
         task="-".join(filter(None, (case.cell.task, case.cell.variant))),
+        seed=seed,
         num_folds=num_folds,
         names=tuple(posterior.candidate_weights),
         held_out=posterior.report.cross_validation.log_scores,
         others=as_scored + case.task.prior_std.log().sum(),
         mass=(as_scored - normalised).where(~both_zero, 0.0).exp(),
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choice:
+    """One way to make a stack.
+
+    Attributes:
+        gammas: Of the couplings.
+        taus: Of the couplings.
+        rehearsal: Whether there is a rehearsed RoPE beside the other.
+        untuned: Whether there is an OT-only.
+        pseudo_count: As in :func:`sbi_rope.stacking.stacking_weights`.
+    """
+
+    gammas: tuple[float, ...] = (0.05, 0.1, 0.2, 0.4)
+    taus: tuple[float, ...] = TAUS
+    rehearsal: bool = False
+    untuned: bool = True
+    pseudo_count: float = 1.0
+
+    def keeps(self, candidate: Candidate) -> bool:
+        """Tell whether a candidate of the wide grid belongs to this choice."""
+        if not isinstance(candidate, CouplingCandidate):
+            return True
+        return (
+            candidate.gamma in self.gammas
+            and candidate.tau in self.taus
+            and (self.rehearsal or candidate.rehearsal is None)
+            and (self.untuned or candidate.tuned)
+        )
+
+    def weights(self, run: Run) -> Tensor:
+        """Return the weights of all candidates; zero for those that are left out."""
+        known = {candidate.name: candidate for candidate in candidates()}
+        kept = torch.tensor([self.keeps(known[name]) for name in run.names])
+        found = stacking_weights(run.held_out[:, kept], pseudo_count=self.pseudo_count)
+        weights = torch.zeros(len(run.names), dtype=torch.double)
+        weights[kept] = found.weights
+        return weights
+
+
+NEW = (0.02, 0.05, 0.1, 0.4)
+CHOICES = {
+    "gamma .05 to .4, four taus": Choice(),
+    "+ gamma .02": Choice(gammas=(0.02, 0.05, 0.1, 0.2, 0.4)),
+    "+ gamma .8": Choice(gammas=(0.05, 0.1, 0.2, 0.4, 0.8)),
+    "tau 1, .5, 0": Choice(taus=(1.0, 0.5, 0.0)),
+    "tau 1, .5": Choice(taus=(1.0, 0.5)),
+    "gamma .05, .2": Choice(gammas=(0.05, 0.2)),
+    "without OT-only": Choice(untuned=False),
+    "pseudo-count .3": Choice(pseudo_count=0.3),
+    "pseudo-count 3": Choice(pseudo_count=3.0),
+    "pseudo-count 10": Choice(pseudo_count=10.0),
+    "+ rehearsal": Choice(rehearsal=True),
+    "+ rehearsal, gamma .02": Choice(
+        rehearsal=True, gammas=(0.02, 0.05, 0.1, 0.2, 0.4)
+    ),
+    "rehearsal, gamma .02 .05 .1 .4, tau 1 .5": Choice(
+        rehearsal=True, gammas=NEW, taus=(1.0, 0.5)
+    ),
+    "rehearsal, gamma .02 .05 .1 .4, tau 1 .5 0 (the default)": Choice(
+        rehearsal=True, gammas=NEW, taus=(1.0, 0.5, 0.0)
+    ),
+    "the default, pseudo-count .3": Choice(
+        rehearsal=True, gammas=NEW, taus=(1.0, 0.5, 0.0), pseudo_count=0.3
+    ),
+}
+
+
+def report(runs: Sequence[Run]) -> str:
+    """Return a table in Markdown: choices against tasks, as gains over the first.
+
+    The last two rows are the best single candidate, chosen on the pairs it is scored
+    on, and the one with the best held-out score.
+    """
+    groups: dict[tuple[int, int, str], list[Run]] = {}
+    for run in runs:
+        key = (len(run.held_out), run.num_folds, run.task)
+        groups.setdefault(key, []).append(run)
+    groups = dict(sorted(groups.items()))
+
+    def row(score: Callable[[Run], float]) -> list[float]:
+        return [statistics.mean(map(score, group)) for group in groups.values()]
+
+    rows = {
+        name: row(lambda run, choice=choice: run.score(choice.weights(run)))
+        for name, choice in CHOICES.items()
+    }
+    rows["best single candidate for these pairs"] = row(
+        lambda run: float(run.scores().max())
+    )
+    rows["best single candidate by held-out score"] = row(
+        lambda run: float(run.scores()[run.held_out.mean(dim=0).argmax()])
+    )
+    first = next(iter(rows.values()))
+    titles = [
+        f"{task}, {n} pairs, {folds} folds ({len(group)})"
+        for (n, folds, task), group in groups.items()
+    ]
+    lines = [
+        "| | " + " | ".join(titles) + " | mean | worst |",
+        "|---" * (len(titles) + 3) + "|",
+    ]
+    for name, scores in rows.items():
+        if scores is first:
+            entries = [f"{score:.2f}" for score in scores] + ["", ""]
+        else:
+            gains = [score - base for score, base in zip(scores, first, strict=True)]
+            entries = [
+                f"{gain:+.2f}" for gain in (*gains, statistics.mean(gains), min(gains))
+            ]
+        lines.append(f"| {name} | " + " | ".join(entries) + " |")
+    return "\n".join(lines)
 
 
 def main() -> None:
@@ -128,8 +247,8 @@ def main() -> None:
     runs.add_argument("--folds", type=int, default=5)
     runs.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
     runs.add_argument("--preset", default="standard")
-    report = commands.add_parser("report")
-    for command in (runs, report):
+    table = commands.add_parser("report")
+    for command in (runs, table):
         command.add_argument("--out", type=Path, default=Path("results/choices"))
     args = parser.parse_args()
     if args.command == "run":
@@ -146,6 +265,8 @@ def main() -> None:
             result = run(case, args.n_calibration, args.folds, seed)
             np.savez(path, **{k: np.asarray(v) for k, v in vars(result).items()})
             print(name, flush=True)
+    else:
+        print(report([Run.load(path) for path in sorted(args.out.glob("*.npz"))]))
 
 
 if __name__ == "__main__":

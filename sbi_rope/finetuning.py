@@ -65,8 +65,8 @@ class CalibrationFinetuner:
     With ``rehearsal`` :math:`\lambda > 0` it also minimises, over simulations from the
     prior, :math:`\lambda\, \mathbb{E} \lVert g(x_s) - h(x_s) \rVert_2`, which is not in
     the paper: g may not forget where h puts simulations. A large net tuned on few
-    pairs follows these pairs anywhere; see ``docs/benchmark.md`` for where this helps
-    and where it costs.
+    pairs follows these pairs anywhere; ``docs/benchmark.md`` says where this helps and
+    where it costs.
 
     The net is tuned in evaluation mode (no dropout, fixed batch statistics). If h has
     no trainable parameters, because NPE was trained without an embedding net, g is h

@@ -42,6 +42,8 @@ __all__ = [
 
 # Fewest pairs: one to train on and one to score.
 MIN_PAIRS = 2
+# Five folds, but leave-one-out for so few pairs: a fifth of them would be missed.
+NUM_FOLDS, FEW_PAIRS = 5, 10
 # Most unlabelled observations that held-out pairs are coupled together with.
 MAX_BATCH = 2000
 NUM_BOOTSTRAP = 2000
@@ -239,7 +241,7 @@ def cross_validate(
     x_o: Tensor,
     *,
     candidates: Sequence[Candidate] | None = None,
-    num_folds: int = 5,
+    num_folds: int | None = None,
     num_training_folds: int | None = None,
     num_simulations: int | None = None,
     pseudo_count: float = 1.0,
@@ -257,7 +259,8 @@ def cross_validate(
         rope: RoPE with its calibration pairs; it is left as it is.
         x_o: The batch of real observations to be inferred, shape ``(n_o, *event)``.
         candidates: What to score; ``default_candidates()`` if None.
-        num_folds: Folds; as many as there are pairs, if these are fewer.
+        num_folds: Folds, at most as many as there are pairs; 5 if None, leave-one-out
+            of up to 10 pairs.
         num_training_folds: Folds to train on for each held out; all others if None.
             Fewer tell what fewer pairs would have given.
         num_simulations: As in :meth:`~sbi_rope.RoPE.build_posterior`.
@@ -299,13 +302,14 @@ def cross_validate(
 def check_setup(
     rope: RoPE,
     candidates: Sequence[Candidate] | None,
-    num_folds: int,
+    num_folds: int | None,
     pseudo_count: float,
     seed: int | None,
 ) -> tuple[tuple[Candidate, ...], list[int]]:
     """Return the candidates, couplings first, and seeds for all that is random."""
     check_instance("rope", rope, RoPE)
-    check_integer("num_folds", num_folds, minimum=2)
+    if num_folds is not None:
+        check_integer("num_folds", num_folds, minimum=2)
     check_not_negative("pseudo_count", pseudo_count)
     num_pairs = len(rope.calibration[0])
     if num_pairs < MIN_PAIRS:
@@ -330,7 +334,7 @@ def score_folds(
     components: Components,
     candidates: tuple[Candidate, ...],
     *,
-    num_folds: int,
+    num_folds: int | None,
     num_training_folds: int | None = None,
     pseudo_count: float,
     seed: int,
@@ -341,6 +345,8 @@ def score_folds(
     What a fold is scored with depends on its observations, but not on its labels.
     """
     theta, x = rope.calibration
+    if num_folds is None:
+        num_folds = FEW_PAIRS if len(theta) <= FEW_PAIRS else NUM_FOLDS
     num_folds = min(num_folds, len(theta))
     if num_training_folds is None:
         num_training_folds = num_folds - 1

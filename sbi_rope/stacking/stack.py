@@ -18,8 +18,8 @@ from sbi_rope.stacking.report import LearningCurve, StackingReport
 
 __all__ = ["stack"]
 
-# Folds to train on for the learning curve, beside all but one.
-SMALLER = (1, 2)
+# Shares of the folds to train on for the learning curve, beside all but one.
+SMALLER = (0.25, 0.5)
 
 
 def stack(
@@ -27,7 +27,7 @@ def stack(
     x_o: Tensor,
     *,
     candidates: Sequence[Candidate] | None = None,
-    num_folds: int = 5,
+    num_folds: int | None = None,
     num_simulations: int | None = None,
     pseudo_count: float = 1.0,
     learning_curve: bool = False,
@@ -46,10 +46,11 @@ def stack(
         rope: A trained RoPE; it is left as it is, but counts the simulations
             that were dropped.
         x_o: The batch of real observations, shape ``(n_o, *event)``.
-        candidates: What to stack; ``default_candidates()`` if None: RoPE and OT-only at
-            four gammas and four taus, the prior, NPE, tuning-only and fine-tuned NPE.
-        num_folds: Folds of the calibration pairs; leave-one-out if there are fewer
-            pairs.
+        candidates: What to stack; ``default_candidates()`` if None: RoPE, RoPE tuned
+            with rehearsal, and OT-only at four gammas and three taus, the prior, NPE,
+            tuning-only and fine-tuned NPE.
+        num_folds: Folds of the calibration pairs, at most as many as there are pairs; 5
+            if None, or leave-one-out of up to 10 pairs.
         num_simulations: As in :meth:`~sbi_rope.RoPE.build_posterior`.
         pseudo_count: Strength of the Dirichlet prior of the weights, in pairs.
         learning_curve: Whether to train on fewer folds too, so that the report can say
@@ -92,10 +93,11 @@ def stack(
     scores = score_folds(rope, components, chosen, **options)
     curve = None
     if learning_curve:
+        fewer = [int(share * scores.num_folds) for share in SMALLER]
         smaller = [
             score_folds(rope, components, chosen, num_training_folds=folds, **options)
-            for folds in SMALLER
-            if folds < scores.num_folds - 1
+            for folds in fewer
+            if 1 <= folds < scores.num_folds - 1
         ]
         curve = LearningCurve.of([*smaller, scores])
     estimator = fit_candidates(

@@ -69,10 +69,12 @@ def tuned_net(estimator: Any) -> nn.Module:
         (4, 5, [1] * 4),
         (2, 5, [1, 1]),
         (9, 2, [4, 5]),
+        (10, None, [1] * 10),
+        (11, None, [2, 2, 2, 2, 3]),
     ],
 )
 def test_every_pair_is_held_out_once(
-    num_pairs: int, num_folds: int, sizes: list[int]
+    num_pairs: int, num_folds: int | None, sizes: list[int]
 ) -> None:
     rope = untrained(num_pairs=num_pairs)
     seen: list[Tensor] = []
@@ -189,7 +191,11 @@ def test_labels_of_a_fold_reach_the_folds_that_train_on_it_only(
     finetuner = CalibrationFinetuner(
         num_steps=3, simulations_per_target=2, resample_targets=resample
     )
-    options: dict[str, Any] = {"candidates": COUPLINGS[:1], "num_training_folds": 2}
+    options: dict[str, Any] = {
+        "candidates": COUPLINGS[:1],
+        "num_folds": 5,
+        "num_training_folds": 2,
+    }
     theta, x = problem(2, 10, seed=1)
     before = validate(untrained(pairs=(theta, x), finetuner=finetuner), **options)
     reached = []

@@ -1,0 +1,95 @@
+"""The choices inside the stack: what a run says of each."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.choices import CHOICES, Choice, Run, candidates, report
+from sbi_rope.stacking import CouplingCandidate, default_candidates, stacking_weights
+
+NAMES = tuple(candidate.name for candidate in candidates())
+
+
+def a_run(*, task: str = "pendulum", seed: int = 0, n: int = 6) -> Run:
+    generator = torch.Generator().manual_seed(seed)
+    return Run(
+        task=task,
+        seed=seed,
+        num_folds=5,
+        names=NAMES,
+        held_out=torch.randn(n, len(NAMES), generator=generator).double(),
+        others=torch.randn(9, len(NAMES), generator=generator).double(),
+        mass=torch.rand(9, len(NAMES), generator=generator).double(),
+    )
+
+
+def test_the_wide_grid_contains_the_candidates_of_all_choices() -> None:
+    for choice in CHOICES.values():
+        kept = [c for c in candidates() if choice.keeps(c)]
+        couplings = [c for c in kept if isinstance(c, CouplingCandidate)]
+        nets = 1 + choice.untuned + choice.rehearsal
+        assert len(couplings) == nets * len(choice.gammas) * len(choice.taus)
+        assert len(kept) == len(couplings) + 4
+
+
+def test_the_choice_called_default_is_that_of_the_stack() -> None:
+    (choice,) = (c for name, c in CHOICES.items() if name.endswith("(the default)"))
+    kept = {c.name for c in candidates() if choice.keeps(c)}
+    assert kept == {c.name for c in default_candidates()}
+    assert choice.pseudo_count == 1.0
+
+
+def test_weights_are_those_of_the_candidates_that_are_kept() -> None:
+    run, choice = a_run(), Choice(gammas=(0.1,), taus=(1.0,), pseudo_count=2.0)
+    weights = choice.weights(run)
+    kept = [k for k, c in enumerate(candidates()) if choice.keeps(c)]
+    assert len(kept) == 2 + 4
+    expected = stacking_weights(run.held_out[:, kept], pseudo_count=2.0).weights
+    assert torch.equal(weights[kept], expected)
+    assert float(weights.sum()) == pytest.approx(1.0)
+
+
+def test_a_stack_is_scored_as_a_mixture_that_is_normalised() -> None:
+    run = a_run()
+    weights = torch.rand(len(NAMES)).double()
+    weights /= weights.sum()
+    density = (run.others.exp() * weights).sum(dim=1)
+    mass = (run.mass * weights).sum(dim=1)
+    expected = float((density / mass).log().mean())
+    assert run.score(weights) == pytest.approx(expected, rel=1e-6)
+
+
+def test_one_candidate_alone_is_scored_as_itself() -> None:
+    run = a_run()
+    weights = torch.zeros(len(NAMES)).double()
+    weights[3] = 1.0
+    assert run.score(weights) == pytest.approx(float(run.scores()[3]), rel=1e-6)
+
+
+def test_the_report_has_gains_over_the_first_choice() -> None:
+    runs = [a_run(seed=1), a_run(seed=2), a_run(task="sir", n=8)]
+    lines = report(runs).splitlines()
+    assert "pendulum, 6 pairs, 5 folds (2) | sir, 8 pairs, 5 folds (1)" in lines[0]
+    rows = {line.split(" | ")[0].strip("| "): line.split(" | ")[1:] for line in lines}
+    first = [run.score(next(iter(CHOICES.values())).weights(run)) for run in runs]
+    shown = rows[next(iter(CHOICES))]
+    assert shown[0] == f"{(first[0] + first[1]) / 2:.2f}"
+    best = [float(run.scores().max()) for run in runs]
+    gains = [(best[0] + best[1] - first[0] - first[1]) / 2, best[2] - first[2]]
+    shown = rows["best single candidate for these pairs"]
+    assert shown[0] == f"{gains[0]:+.2f}"
+    assert shown[2] == f"{sum(gains) / 2:+.2f}"
+    assert shown[3].startswith(f"{min(gains):+.2f}")
+
+
+def test_a_run_is_read_back_as_it_was_written(tmp_path: Path) -> None:
+    run = a_run()
+    arrays = {name: np.asarray(value) for name, value in vars(run).items()}
+    np.savez(tmp_path / "run.npz", **arrays)
+    found = Run.load(tmp_path / "run.npz")
+    assert (found.task, found.seed, found.num_folds) == ("pendulum", 0, 5)
+    assert found.names == run.names
+    assert torch.equal(found.held_out, run.held_out)
+    assert torch.equal(found.mass, run.mass)
