@@ -178,58 +178,65 @@ CHOICES = {
     "rehearsal, gamma .02 .05 .1 .4, tau 1 .5": Choice(
         rehearsal=True, gammas=NEW, taus=(1.0, 0.5)
     ),
-    "rehearsal, gamma .02 .05 .1 .4, tau 1 .5 0 (the default)": Choice(
+    "rehearsal, gamma .02 .05 .1 .4, tau 1 .5 0 (default)": Choice(
         rehearsal=True, gammas=NEW, taus=(1.0, 0.5, 0.0)
     ),
-    "the default, pseudo-count .3": Choice(
+    "default, pseudo-count .3": Choice(
         rehearsal=True, gammas=NEW, taus=(1.0, 0.5, 0.0), pseudo_count=0.3
     ),
 }
 
 
 def report(runs: Sequence[Run]) -> str:
-    """Return a table in Markdown: choices against tasks, as gains over the first.
+    """Return tables in Markdown: choices against tasks, as gains over the first choice.
 
-    The last two rows are the best single candidate, chosen on the pairs it is scored
-    on, and the one with the best held-out score.
+    One for each number of pairs and folds. The last two rows are the best single
+    candidate, chosen on the pairs it is scored on, and the one with the best held-out
+    score.
     """
-    groups: dict[tuple[int, int, str], list[Run]] = {}
-    for run in runs:
-        key = (len(run.held_out), run.num_folds, run.task)
-        groups.setdefault(key, []).append(run)
-    groups = dict(sorted(groups.items()))
+    settings = sorted({(len(run.held_out), run.num_folds) for run in runs})
+    return "\n\n".join(
+        f"{n} pairs, {folds} folds:\n\n"
+        + _table([r for r in runs if (len(r.held_out), r.num_folds) == (n, folds)])
+        for n, folds in settings
+    )
 
-    def row(score: Callable[[Run], float]) -> list[float]:
-        return [statistics.mean(map(score, group)) for group in groups.values()]
 
-    rows = {
-        name: row(lambda run, choice=choice: run.score(choice.weights(run)))
+def _table(runs: Sequence[Run]) -> str:
+    tasks = {
+        task: [run for run in runs if run.task == task]
+        for task in sorted({run.task for run in runs})
+    }
+    scorers: dict[str, Callable[[Run], float]] = {
+        name: lambda run, choice=choice: run.score(choice.weights(run))
         for name, choice in CHOICES.items()
     }
-    rows["best single candidate for these pairs"] = row(
-        lambda run: float(run.scores().max())
+    scorers["best single candidate for these pairs"] = lambda run: float(
+        run.scores().max()
     )
-    rows["best single candidate by held-out score"] = row(
-        lambda run: float(run.scores()[run.held_out.mean(dim=0).argmax()])
+    scorers["best single candidate by held-out score"] = lambda run: float(
+        run.scores()[run.held_out.mean(dim=0).argmax()]
     )
-    first = next(iter(rows.values()))
-    titles = [
-        f"{task}, {n} pairs, {folds} folds ({len(group)})"
-        for (n, folds, task), group in groups.items()
-    ]
+    rows = {
+        name: [statistics.mean(map(score, drawn)) for drawn in tasks.values()]
+        for name, score in scorers.items()
+    }
+    titles = [f"{task} ({len(drawn)})" for task, drawn in tasks.items()]
     lines = [
-        "| | " + " | ".join(titles) + " | mean | worst |",
+        "| choice | " + " | ".join(titles) + " | mean | worst |",
         "|---" * (len(titles) + 3) + "|",
     ]
+    first = next(iter(rows.values()))
     for name, scores in rows.items():
-        if scores is first:
-            entries = [f"{score:.2f}" for score in scores] + ["", ""]
-        else:
-            gains = [score - base for score, base in zip(scores, first, strict=True)]
-            entries = [
+        gains = [score - base for score, base in zip(scores, first, strict=True)]
+        entries = (
+            [*(f"{score:.2f}" for score in scores), "", ""]
+            if scores is first
+            else [
                 f"{gain:+.2f}" for gain in (*gains, statistics.mean(gains), min(gains))
             ]
-        lines.append(f"| {name} | " + " | ".join(entries) + " |")
+        )
+        lines.append(f"| {name} | {' | '.join(entries)} |")
     return "\n".join(lines)
 
 

@@ -120,6 +120,22 @@ def test_the_test_set_is_as_large_as_what_is_recorded(tmp_path: Path) -> None:
     assert len(case.test_set[0]) == recorded
 
 
+def test_people_of_the_simulator_are_the_real_ones_where_it_is_right(
+    tmp_path: Path,
+) -> None:
+    import sbi_rope.tasks.hemodynamics.data as package
+
+    sources = Sources(hemodynamics=Path(next(iter(package.__path__))))
+    cell = Cell(task="hemodynamics", preset="smoke", method="stack", n_calibration=5)
+    right = replace(cell, variant="well_specified")
+    for one in (cell, right):
+        case = Case.of(one, sources, Cache(tmp_path), "cpu")
+        simulated = {tuple(theta) for theta in case.stored[0].tolist()}
+        # In neither is anyone both simulated and observed.
+        for theta, _ in (case.calibration, case.test_set):
+            assert simulated.isdisjoint(map(tuple, theta.tolist()))
+
+
 def test_what_is_finished_is_not_computed_again(
     suite_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
