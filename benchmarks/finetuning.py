@@ -52,6 +52,7 @@ SETTINGS = {
     "lr 1e-3, bank of 100, 300 steps": {"learning_rate": 1e-3, "num_steps": 300},
     "lr 1e-4, bank of 100, 3000 steps": {"learning_rate": 1e-4, "num_steps": 3000},
     "defaults: better of lr 1e-4 and 1e-3, bank of 100, patience 200": {},
+    "defaults, rehearsal 1": {"rehearsal": 1.0},
     "stored, 1 neighbour": {"num_neighbors": 1},
     "stored, 10 neighbours": {"num_neighbors": 10},
 }

@@ -36,7 +36,8 @@ class History:
 
     Attributes:
         training_loss: Mean loss over the training data during each step, and after the
-            last; of a fine-tuning, the distance in units of the embedding.
+            last; of a fine-tuning, the distance in units of the embedding, with
+            rehearsal the weighted sum of both distances.
         validation_loss: Loss over the held-out data before each step and after the
             last; empty without a hold-out.
         best_step: Number of steps after which the kept net was reached; 0 is the

@@ -66,7 +66,7 @@ class CalibrationFinetuner:
     prior, :math:`\lambda\, \mathbb{E} \lVert g(x_s) - h(x_s) \rVert_2`, which is not in
     the paper: g may not forget where h puts simulations. A large net tuned on few
     pairs follows these pairs anywhere; ``docs/benchmark.md`` says where this helps and
-    where it costs.
+    where it costs. Held-out pairs are judged by their distance alone.
 
     The net is tuned in evaluation mode (no dropout, fixed batch statistics). If h has
     no trainable parameters, because NPE was trained without an embedding net, g is h
@@ -167,7 +167,7 @@ class CalibrationFinetuner:
             check_same_length("x", x, "targets", targets)
             check_finite("targets", targets)
             _check_start(embed(embedding_net, x), targets)
-            rehearsed = self._rehearsed(draw_simulations)
+            keep = self._rehearsed(embedding_net, draw_simulations)
             train, held_out = self._split(x.shape[0])
             results = [
                 self._optimise(
@@ -177,11 +177,7 @@ class CalibrationFinetuner:
                     train.to(x.device),
                     held_out.to(x.device),
                     learning_rate=rate,
-                    keep=(
-                        None
-                        if rehearsed is None
-                        else (rehearsed, embed(embedding_net, rehearsed))
-                    ),
+                    keep=keep,
                     draw_targets=draw_targets if self.resample_targets else None,
                     show_progress_bars=show_progress_bars,
                 )
@@ -190,18 +186,24 @@ class CalibrationFinetuner:
         return min(results, key=lambda result: result.history.kept_validation_loss)
 
     def _rehearsed(
-        self, draw_simulations: Callable[[int], Tensor] | None
-    ) -> Tensor | None:
+        self, h: nn.Module, draw_simulations: Callable[[int], Tensor] | None
+    ) -> tuple[Tensor, Tensor] | None:
+        """Return simulations and where h puts them; None without rehearsal."""
         if not self.rehearsal:
             return None
         if draw_simulations is None:
             raise InvalidInputError(
                 f"Expected `draw_simulations` with rehearsal={self.rehearsal}; got "
-                "None. Give a function of a number k that returns k simulations."
+                "None. Give a function of a number k that returns up to k simulations."
             )
         simulations = check_tensor("simulations", draw_simulations(NUM_REHEARSED))
         check_finite("simulations", simulations)
-        return simulations
+        if not len(simulations):
+            raise InvalidInputError(
+                "Expected `draw_simulations` to return at least one simulation; got "
+                "none."
+            )
+        return simulations, embed(h, simulations)
 
     def _rates_to_try(self, net: nn.Module, held_out: Tensor) -> tuple[float, ...]:
         if len(held_out):

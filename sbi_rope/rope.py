@@ -378,6 +378,9 @@ class RoPE:
     def with_finetuner(self, finetuner: CalibrationFinetuner) -> "RoPE":
         """Return a RoPE with the same pairs and another finetuner, not trained yet.
 
+        Targets that were handed to :meth:`with_pairs` stay, if they are what the other
+        finetuner would have asked for.
+
         Args:
             finetuner: Settings of the tuning.
 
@@ -388,6 +391,9 @@ class RoPE:
         other = copy.copy(self)
         other.finetuner = finetuner
         other._g, other._history = None, None
+        for name in ("simulations_per_target", "num_neighbors"):
+            if getattr(finetuner, name) != getattr(self.finetuner, name):
+                other._targets = None
         return other
 
     def _check_rows(self, rows: Tensor) -> None:

@@ -51,8 +51,9 @@ def diagnose(
        :math:`\theta`? On residuals of pairs that g was not trained on.
 
     Without calibration pairs, g = h, and the second test of 1 and all of 4 are left
-    out. Thresholds are what simulations in the place of the batch exceed; single
-    findings are alarming by chance in about one batch of a hundred.
+    out. The thresholds of tests (1, 3, distances of 2) are what one batch in a hundred
+    of simulations exceeds; those of effective sample sizes are rules of thumb about the
+    coupler's setting.
 
     Args:
         rope: A trained RoPE, or one without calibration pairs; it is left as it is.
@@ -61,8 +62,7 @@ def diagnose(
             are fewer). At least 100.
         coupler: What effective sample sizes are those of; that of ``rope`` if None.
         num_folds: Trainings behind the residuals of 4, each as long as ``rope.train``;
-            None leaves 4 out,
-            and with it the errors of g that 3 allows for.
+            None leaves 4 out, and with it the errors of g that 3 allows for.
         parameter_names: One name for each parameter; "theta_1" and so on if None.
         seed: Seed of everything random; None uses the states of torch, NumPy and
             Python. The simulations are those of ``rope.build_posterior`` under the

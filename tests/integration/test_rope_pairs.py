@@ -188,11 +188,11 @@ def test_what_is_rehearsed_is_simulated_once_for_all_parts() -> None:
 
 def test_stored_simulations_can_be_rehearsed() -> None:
     theta = problems.box(2).sample((50,))  # fewer than a simulator would be asked for
-    rope = untrained(
-        simulations=(theta, problems.simulate(theta)),
-        finetuner=replace(QUICK, rehearsal=1.0),
-    )
-    assert len(rope.train(seed=0, **QUIET).history.training_loss) > 1
+    simulations = (theta, problems.simulate(theta))
+    rope = untrained(simulations=simulations).train(seed=0, **QUIET)
+    other = rope.with_finetuner(replace(QUICK, rehearsal=1.0)).train(seed=0, **QUIET)
+    nets = (rope.tuned_embedding_net, other.tuned_embedding_net)
+    assert not same(parameters(nets[0]), parameters(nets[1]))
 
 
 def test_another_finetuner_gives_another_net_and_leaves_the_first() -> None:
@@ -206,6 +206,14 @@ def test_another_finetuner_gives_another_net_and_leaves_the_first() -> None:
     assert rope.finetuner == QUICK
     expected = untrained(finetuner=replace(QUICK, num_steps=3)).train(seed=0, **QUIET)
     nets = (other.tuned_embedding_net, expected.tuned_embedding_net)
+    assert same(parameters(nets[0]), parameters(nets[1]))
+    # Targets of another number of simulations are not those it would ask for.
+    rows = torch.arange(NUM_PAIRS)
+    known = rope.with_pairs(rows, targets=rope.draw_targets(rows, seed=9, **QUIET))
+    more = replace(QUICK, simulations_per_target=50)
+    again = known.with_finetuner(more).train(seed=0, **QUIET)
+    expected = untrained(finetuner=more).train(seed=0, **QUIET)
+    nets = (again.tuned_embedding_net, expected.tuned_embedding_net)
     assert same(parameters(nets[0]), parameters(nets[1]))
     with pytest.raises(InvalidTypeError, match="finetuner"):
         rope.with_finetuner(QUIET)  # type: ignore[arg-type]

@@ -287,10 +287,13 @@ def test_the_loss_of_rehearsal_is_the_weighted_distance_from_where_h_put_them() 
 
 def test_held_out_pairs_are_judged_without_rehearsal() -> None:
     x, simulations = torch.randn(10, 2), torch.randn(50, 2)
-    result = rehearsed(linear(), x, x + 3, simulations, rehearsal=5.0, num_steps=20)
+    result = rehearsed(
+        linear(), x, x + 3, simulations, rehearsal=0.3, num_steps=20, learning_rate=0.03
+    )
     with seeded(0):
         held_out = torch.randperm(10)[:2]
     distance = (result.embedding_net(x) - x - 3).norm(dim=1)[held_out].mean()
+    assert result.history.best_step > 5
     best = result.history.validation_loss[result.history.best_step]
     assert float(distance) == pytest.approx(best, rel=1e-6)
 
@@ -318,5 +321,7 @@ def test_rehearsal_needs_finite_simulations() -> None:
         finetune(linear(), x, x, rehearsal=1.0)
     with pytest.raises(InvalidInputError, match="simulations"):
         rehearsed(linear(), x, x, torch.full((5, 2), math.nan), rehearsal=1.0)
+    with pytest.raises(InvalidInputError, match="at least one"):
+        rehearsed(linear(), x, x, torch.empty(0, 2), rehearsal=1.0)
     with pytest.raises(InvalidInputError, match="rehearsal"):
         CalibrationFinetuner(rehearsal=-1.0)
