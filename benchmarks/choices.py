@@ -21,7 +21,7 @@ from torch import Tensor
 
 from benchmarks.cases import Case, Sources
 from benchmarks.cells import Cell
-from benchmarks.store import Cache
+from benchmarks.store import Cache, write_atomically
 from sbi_rope import RoPE, stack
 from sbi_rope.stacking import (
     CouplingCandidate,
@@ -67,7 +67,10 @@ class Run:
     mass: Tensor
 
     def score(self, weights: Tensor) -> float:
-        """Return the mean log density of the other pairs under a stack."""
+        """Return the mean log density of the other pairs under a stack.
+
+        A lower bound where NPE and its relatives leak out of the prior.
+        """
         log_density = torch.logsumexp(self.others + weights.log(), dim=1)
         return float((log_density - (self.mass @ weights).log()).mean())
 
@@ -265,12 +268,19 @@ def main() -> None:
         case = Case.of(cell, Sources(root=args.root), Cache(args.out), "cpu")
         args.out.mkdir(parents=True, exist_ok=True)
         for seed in args.seeds:
-            name = f"{args.task}{args.variant}_{args.n_calibration}_{args.folds}_{seed}"
+            name = "_".join(
+                [
+                    *filter(None, (args.task, args.variant, args.preset)),
+                    *map(str, (args.n_calibration, args.folds, seed)),
+                ]
+            )
             path = args.out / f"{name}.npz"
             if path.exists():
                 continue
             result = run(case, args.n_calibration, args.folds, seed)
-            np.savez(path, **{k: np.asarray(v) for k, v in vars(result).items()})
+            arrays = {key: np.asarray(value) for key, value in vars(result).items()}
+            with write_atomically(path) as temporary, temporary.open("wb") as file:
+                np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
             print(name, flush=True)
     else:
         print(report([Run.load(path) for path in sorted(args.out.glob("*.npz"))]))
