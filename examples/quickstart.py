@@ -35,9 +35,7 @@ def train_npe(task: Task, seed: int, num_simulations: int, max_num_epochs: int) 
 
 def main() -> None:
     """Run the study with the arguments of the command line."""
-    parser = argument_parser(
-        __doc__ or "", n_test=500, out="results/quickstart", with_stack=True
-    )
+    parser = argument_parser(__doc__ or "", n_test=500, out="results/quickstart")
     parser.add_argument("--num-simulations", type=int, default=10_000)
     parser.add_argument("--max-num-epochs", type=int, default=8)
     args = parser.parse_args()
