@@ -14,6 +14,8 @@ __all__ = ["Comparison", "comparisons", "stacking_lines"]
 # The goals, fixed beforehand, in nats and ACAUC.
 NEAR, CALIBRATED = 0.1, 0.05
 BASICS = ("prior", "NPE", "tuning-only", "fine-tuned NPE")
+ONE_SETTING = "RoPE (gamma 0.1, tau 1)"
+REHEARSED = "RoPE (gamma 0.1, tau 1, rehearsal 1)"
 EXPLANATION = """\
 LPP on the test set, in standard deviations of the prior. "Best" is the best single
 candidate *chosen on the test set*, which no user can do; "picked" is the one with the
@@ -94,7 +96,7 @@ def stacking_lines(table: Table) -> list[str]:
     lines = ["## The stack against its candidates", "", EXPLANATION]
     lines += [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     lines += [f"| {' | '.join(_entries(one))} |" for one in found]
-    return [*lines, "", *_goals(found)]
+    return [*lines, "", *_goals(found), "", *_rehearsal(found)]
 
 
 def _entries(one: Comparison) -> list[str]:
@@ -144,4 +146,24 @@ def _goals(found: list[Comparison]) -> list[str]:
         missed = [str(one.cell) for one, ok in zip(found, met, strict=True) if not ok]
         if missed and len(missed) <= len(met) / 2:
             lines[-1] += f"; not {', '.join(missed)}"
+    return lines
+
+
+def _rehearsal(found: list[Comparison]) -> list[str]:
+    """Compare RoPE with and without rehearsal, where both were candidates."""
+    both = [one for one in found if ONE_SETTING in one.test and REHEARSED in one.test]
+    if not both:
+        return []
+    lines = [
+        f"{ONE_SETTING} with and without rehearsal, on the test set:",
+        "",
+        "| task | variant | pairs | without | with | gain |",
+        "|---|---|---|---|---|---|",
+    ]
+    for one in both:
+        without, rehearsed = one.test[ONE_SETTING], one.test[REHEARSED]
+        lines.append(
+            f"| {one.cell.task} | {one.cell.variant} | {one.cell.n_calibration} | "
+            f"{without:.2f} | {rehearsed:.2f} | {rehearsed - without:+.2f} |"
+        )
     return lines
