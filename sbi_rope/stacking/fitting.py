@@ -166,7 +166,7 @@ def _nets(
     for tuned, rehearsal in dict.fromkeys(_net_of(c) for c in settings):
         if not tuned:
             net = rope.embedding_net
-        elif rehearsal is None:
+        elif rehearsal in (None, rope.finetuner.rehearsal):
             net = rope.tuned_embedding_net
         else:
             other = replace(rope.finetuner, rehearsal=rehearsal)

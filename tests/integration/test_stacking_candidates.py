@@ -3,6 +3,7 @@
 import copy
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -17,6 +18,7 @@ from sbi_rope.errors import (
     UnsupportedPosteriorError,
 )
 from sbi_rope.stacking import (
+    CouplingCandidate,
     DensityCandidate,
     cross_validate,
     default_candidates,
@@ -29,6 +31,7 @@ from tests.stacks import (
     NUM_OBSERVED,
     OT_ONLY,
     PRIOR,
+    QUICK,
     QUIET,
     observed,
     parameters,
@@ -74,6 +77,19 @@ def test_the_default_candidates_can_be_stacked() -> None:
         "fine-tuned NPE",
     ]
     assert posterior.report.cross_validation.log_scores.isfinite().all()
+
+
+def test_a_rope_that_rehearsed_is_not_trained_again() -> None:
+    rope = trained(finetuner=replace(QUICK, rehearsal=2.0))
+    candidates = [
+        CouplingCandidate(gamma=0.2, tau=1.0, rehearsal=rehearsal)
+        for rehearsal in (None, 2.0, 0.0)
+    ]
+    estimator: Any = stacked(rope, candidates=candidates).posterior_estimator
+    own, same_one, other = map(parameters, estimator.mixture._g.nets)
+    assert same(own, parameters(rope.tuned_embedding_net))
+    assert same(own, same_one)
+    assert not same(own, other)
 
 
 def test_a_user_may_add_a_trained_posterior_of_another_family() -> None:
