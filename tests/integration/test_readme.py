@@ -20,7 +20,7 @@ class TrainedNPE:
 def test_the_lines_repair_a_posterior() -> None:
     code = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
     assert len(code) == 3
-    theta_cal, x_cal = gaussian.labelled(11)  # five folds, not ten
+    theta_cal, x_cal = gaussian.labelled(3)  # three folds, for speed
     names = {
         "npe": TrainedNPE(),
         "simulator": gaussian.simulator,
