@@ -35,6 +35,8 @@ UNSCALED = {"RoPE": "#003050", "OT-only": "#2A6F97"}
 MARKERS = {10: "o", 50: "s", 200: "^", 1000: "D"}
 # More labels than these run into each other.
 MAX_TICKS = 6
+# More panels than this go to another row.
+MAX_COLUMNS = 9
 REFERENCES = {"prior": ("0.6", "prior"), "SBI": ("black", "SBI")}
 # Calibration pairs behind calibration curves and corner plots, where there is a choice.
 SHOWN_PAIRS = 50
@@ -88,13 +90,24 @@ def draw_all(suite: Suite, table: Table, folder: Path) -> list[tuple[str, str]]:
     return drawn
 
 
+def _grid(count: int) -> tuple[int, int]:
+    """Return rows and columns for so many panels; wide figures are wrapped."""
+    rows = math.ceil(count / MAX_COLUMNS)
+    return rows, math.ceil(count / rows)
+
+
 def _curves(axis: str, rows: dict[Cell, dict[str, Any]]) -> Any:
     from matplotlib.figure import Figure
 
     panels = ("task",) if _is_option(axis) else ("task", "variant", "options")
     groups = group_by(rows, *panels)
-    figure = Figure(figsize=(3.1 * len(groups) + 1.9, 5.4), layout="constrained")
-    axes = figure.subplots(2, len(groups), squeeze=False, sharex="col")
+    bands, columns = _grid(len(groups))
+    figure = Figure(figsize=(3.1 * columns + 1.9, 5.4 * bands), layout="constrained")
+    axes = figure.subplots(2 * bands, columns, squeeze=False, sharex="col")
+    # Side by side, as if nothing was wrapped.
+    axes = np.concatenate(np.split(axes, bands), axis=1)
+    for part in axes[:, len(groups) :].flat:
+        part.set_axis_off()
     seen: dict[str, Any] = {}
     for column, (where, cells) in enumerate(groups.items()):
         title = "\n".join(str(part) for part in where if part not in ("", "{}"))
@@ -277,11 +290,15 @@ def _coverage(rows: dict[Cell, dict[str, Any]], table: Table) -> Any:
     shown = {where: cells for where, cells in shown.items() if cells}
     if not shown:
         return None
-    figure = Figure(figsize=(3.0 * len(shown) + 1.9, 3.4), layout="constrained")
-    axes = figure.subplots(1, len(shown), squeeze=False)[0]
+    bands, columns = _grid(len(shown))
+    height = 3.4 + 4.2 * (bands - 1)
+    figure = Figure(figsize=(3.0 * columns + 1.9, height), layout="constrained")
+    axes = figure.subplots(bands, columns, squeeze=False).flatten()
+    for part in axes[len(shown) :]:
+        part.set_axis_off()
     levels = np.arange(1, 100) / 100
     seen: dict[str, Any] = {}
-    for part, (where, cells) in zip(axes, shown.items(), strict=True):
+    for part, (where, cells) in zip(axes, shown.items(), strict=False):
         part.plot([0, 1], [0, 1], color="0.6", lw=0.8)
         for name, cell in cells.items():
             colour, line, _ = _style(cell)
