@@ -384,6 +384,10 @@ class RoPE:
         Args:
             finetuner: Settings of the tuning.
 
+        Returns:
+            Another RoPE, which shares the simulations to rehearse with; this one stays
+            as it is.
+
         Raises:
             InvalidTypeError: If it is something else.
         """

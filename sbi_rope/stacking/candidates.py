@@ -153,9 +153,8 @@ def default_candidates(
             where they are, see :class:`~sbi_rope.CalibrationFinetuner`; None leaves it
             out.
     """
-    nets: list[dict[str, Any]] = [{"tuned": True}, {"tuned": False}]
-    if rehearsal is not None:
-        nets.insert(1, {"rehearsal": rehearsal})
+    rehearsed = [] if rehearsal is None else [{"rehearsal": rehearsal}]
+    nets: list[dict[str, Any]] = [{"tuned": True}, *rehearsed, {"tuned": False}]
     couplings = [
         CouplingCandidate(gamma=gamma, tau=tau, **net)
         for net, gamma, tau in itertools.product(nets, gammas, taus)
