@@ -1,6 +1,7 @@
 """Seeds that leave no trace."""
 
 import random
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from numbers import Integral
@@ -12,6 +13,9 @@ from sbi_rope.errors import InvalidInputError
 
 __all__ = ["seeded"]
 
+# The generators belong to the process, not to a thread.
+_LOCK = threading.RLock()
+
 
 @contextmanager
 def seeded(seed: int | None) -> Iterator[None]:
@@ -20,6 +24,10 @@ def seeded(seed: int | None) -> Iterator[None]:
     sbi's estimators and most simulators draw from the global generators of torch, NumPy
     or Python, so a generator object cannot be passed down. Their states are put back
     afterwards.
+
+    The seeded blocks of a process run one at a time: a thread that enters one waits
+    until no other thread is in one. Blocks of one thread can be nested. A seeded block
+    must not wait for another thread that enters one.
     """
     if seed is None:
         yield
@@ -31,13 +39,14 @@ def seeded(seed: int | None) -> Iterator[None]:
     # Away from the streams of small seeds: whoever trained NPE after manual_seed(0)
     # would meet the same parameters again under seed 0.
     stream = (int(seed) * 0x9E3779B1 + 0x7F4A7C15) % 2**32
-    numpy_state, python_state = np.random.get_state(), random.getstate()  # noqa: NPY002
-    with torch.random.fork_rng(devices=list(range(torch.cuda.device_count()))):
-        torch.manual_seed(stream)
-        np.random.seed(stream)  # noqa: NPY002
-        random.seed(stream)
-        try:
-            yield
-        finally:
-            np.random.set_state(numpy_state)  # noqa: NPY002
-            random.setstate(python_state)
+    with _LOCK:
+        numpy_state, python_state = np.random.get_state(), random.getstate()  # noqa: NPY002
+        with torch.random.fork_rng(devices=list(range(torch.cuda.device_count()))):
+            torch.manual_seed(stream)
+            np.random.seed(stream)  # noqa: NPY002
+            random.seed(stream)
+            try:
+                yield
+            finally:
+                np.random.set_state(numpy_state)  # noqa: NPY002
+                random.setstate(python_state)
