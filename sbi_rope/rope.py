@@ -132,7 +132,8 @@ class RoPE:
         self._estimator = (
             copy.deepcopy(estimator).eval().requires_grad_(requires_grad=False)
         )
-        self._posterior = posterior
+        with seeded(0):  # sbi draws from the prior to look at it
+            self._posterior: Any = posterior_from(posterior, self._estimator)
         self._prior = copy.deepcopy(posterior.prior)
         self._h = embedding_of(self._estimator)
         self._q = headless(self._estimator)

@@ -442,6 +442,31 @@ def test_a_simulator_and_stored_simulations_exclude_each_other() -> None:
         rope(simulations=(THETA, X))
 
 
+def test_what_happens_to_the_users_posterior_later_does_not_matter() -> None:
+    """Moving a posterior of sbi moves its prior and its estimator in place."""
+    posterior = gaussian.posterior()
+    before = torch.get_rng_state()
+    conductor = RoPE(posterior, simulator=gaussian.simulator, finetuner=QUICK)
+    assert torch.equal(torch.get_rng_state(), before)
+    conductor.append_calibration(*gaussian.labelled(20))
+    conductor.train(seed=0, show_progress_bars=False)
+    posterior.prior.loc.fill_(100.0)  # type: ignore[union-attr]
+    posterior.posterior_estimator.log_std.data.fill_(3.0)  # type: ignore[union-attr]
+    posterior.enable_transform = False
+    expected = gaussian.posterior()
+    theta = torch.randn(30, 2)
+    for ours in (conductor.npe, conductor.tuned_posterior()):
+        assert torch.equal(ours.prior.log_prob(theta), expected.prior.log_prob(theta))
+        assert ours.enable_transform
+    assert torch.equal(
+        conductor.npe.log_prob_batched(theta, X_O),
+        expected.log_prob_batched(theta, X_O),
+    )
+    mixture = conductor.build_posterior(X_O, seed=0)
+    # With a transform, map() searches in units of the prior.
+    assert "Affine" in str(mixture.theta_transform)
+
+
 def test_the_default_x_of_the_users_posterior_is_ignored() -> None:
     npe = gaussian.posterior().set_default_x(torch.zeros(1, 2))
     with warnings.catch_warnings():
