@@ -7,9 +7,11 @@ from sbi.utils import mcmc_transform, within_support
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_rope._random import seeded
 from sbi_rope._sbi import BasePotential, NeuralPosterior
 from sbi_rope._validation import check_prior, check_tensor
 from sbi_rope.baselines.base import Method
+from sbi_rope.errors import InvalidInputError
 
 __all__ = ["PriorBaseline", "PriorPosterior"]
 
@@ -23,7 +25,8 @@ class PriorPosterior(NeuralPosterior):
     ``sample`` and ``log_prob`` need no observation; the batched methods take one sample
     set or density for each row of ``x``, whose values are never read. ``potential``
     follows sbi and asks for an ``x`` or a default. ``map`` is the mode of the prior
-    found by sbi's gradient ascent; of a uniform prior, any point.
+    found by sbi's gradient ascent; of a uniform prior, any point. It needs a prior that
+    sbi can transform to an unbounded space; everything else does without.
 
     References:
         | Addressing Misspecification in Simulation-based Inference through Data-driven
@@ -45,10 +48,16 @@ class PriorPosterior(NeuralPosterior):
 
     def __init__(self, prior: Any) -> None:
         check_prior(prior)
-        device = prior.sample(torch.Size((1,))).device
+        transform, self._reason_without_map = None, ""
+        with seeded(0):  # both draw from the prior to look at it
+            device = prior.sample(torch.Size((1,))).device
+            try:
+                transform = mcmc_transform(prior, device=str(device))
+            except Exception as error:  # sbi raises all kinds; only map() needs it
+                self._reason_without_map = f"{type(error).__name__}: {error}"
         super().__init__(
             potential_fn=_PriorPotential(prior, device=device),
-            theta_transform=mcmc_transform(prior, device=str(device)),
+            theta_transform=transform,
         )
         self.prior = prior
         self._purpose = "It is the prior and ignores x."
@@ -115,6 +124,22 @@ class PriorPosterior(NeuralPosterior):
         theta = theta.expand(-1, x.shape[0], -1)
         return self.potential_fn(theta, track_gradients=track_gradients)
 
+    def map(self, *args: Any, **kwargs: Any) -> Tensor:
+        """Return the mode of the prior, as in sbi.
+
+        Raises:
+            InvalidInputError: If sbi cannot transform the prior.
+        """
+        if self._reason_without_map:
+            raise InvalidInputError(
+                "Expected a prior that sbi can transform to an unbounded space, where "
+                f"`map()` searches; got {type(self.prior).__name__}, of which sbi's "
+                f"`mcmc_transform` says {self._reason_without_map}. Give the prior a "
+                "`support` that torch's `biject_to` knows, or a `mean` and a `stddev`; "
+                "or look for the mode among samples by their `log_prob`."
+            )
+        return super().map(*args, **kwargs)
+
     def to(self, device: str | torch.device) -> None:
         """Move the prior and the default x to a device."""
         self.potential_fn.to(device)
@@ -166,7 +191,8 @@ class _PriorPotential(BasePotential):
             inside = within_support(self.prior, theta)
             # torch's distributions raise outside their support: evaluate them at a
             # prior draw there, and overwrite the result.
-            filler = self.prior.sample(torch.Size((1,))).to(theta)
+            with seeded(0):  # evaluating a density draws nothing from the caller
+                filler = self.prior.sample(torch.Size((1,))).to(theta)
             safe = torch.where(inside.unsqueeze(-1), theta, filler)
             # A flat density has no graph back to theta; sbi's map() needs one.
             log_prob = self.prior.log_prob(safe) + 0.0 * safe.sum(dim=-1)

@@ -7,9 +7,17 @@ import pytest
 import torch
 from sbi.diagnostics import run_sbc
 from sbi.utils import BoxUniform, MultipleIndependent
-from torch.distributions import Distribution, Exponential, Independent, Normal
+from torch import Size, Tensor
+from torch.distributions import (
+    Cauchy,
+    Distribution,
+    Exponential,
+    Independent,
+    Normal,
+    constraints,
+)
 
-from sbi_rope.baselines import PriorPosterior
+from sbi_rope.baselines import PriorBaseline, PriorPosterior
 from sbi_rope.errors import InvalidInputError, InvalidTypeError
 from sbi_rope.metrics import acauc, evaluate
 
@@ -26,6 +34,48 @@ def positive() -> Distribution:
     # Unlike sbi's own priors, this one raises outside its support.
     law = Exponential(torch.ones(2), validate_args=True)
     return Independent(law, 1, validate_args=True)
+
+
+def cauchy() -> Distribution:
+    # Without a mean there is nothing to standardise by.
+    return Independent(Cauchy(torch.zeros(2), torch.ones(2)), 1)
+
+
+class Unknown(Distribution):
+    """Standard normal, of which sbi knows neither support nor moments."""
+
+    arg_constraints = {}  # noqa: RUF012
+
+    def __init__(self) -> None:
+        super().__init__(event_shape=Size((2,)), validate_args=False)
+
+    def sample(self, sample_shape: Size = Size()) -> Tensor:  # noqa: B008
+        return torch.randn(*sample_shape, 2)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return Normal(0.0, 1.0).log_prob(value).sum(dim=-1)
+
+
+class Disc(constraints.Constraint):
+    """The unit disc, to which torch has no bijection."""
+
+    event_dim = 1
+
+    def check(self, value: Tensor) -> Tensor:
+        return value.norm(dim=-1) < 1
+
+
+class OnDisc(Unknown):
+    """Uniform over the unit disc."""
+
+    support = Disc()
+
+    def sample(self, sample_shape: Size = Size()) -> Tensor:  # noqa: B008
+        radius = torch.rand(*sample_shape, 1).sqrt()
+        return radius * torch.nn.functional.normalize(super().sample(sample_shape))
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return torch.full(value.shape[:-1], -math.log(math.pi))
 
 
 @pytest.mark.parametrize("sample_shape", [(), (5,), (2, 3)])
@@ -138,3 +188,31 @@ def test_a_prior_over_numbers_instead_of_vectors_is_refused() -> None:
     prior = torch.distributions.Uniform(torch.zeros(2), torch.ones(2))
     with pytest.raises(InvalidInputError, match=r"event shape \(k,\)"):
         PriorPosterior(prior)
+
+
+@pytest.mark.parametrize("prior", [cauchy(), OnDisc()])
+def test_a_prior_that_sbi_cannot_transform_lacks_only_map(prior: Distribution) -> None:
+    posterior = PriorBaseline(prior).train().build_posterior()
+    posterior = pickle.loads(pickle.dumps(posterior))
+    theta = posterior.sample_batched((4,), torch.zeros(3, 5))
+    assert theta.shape == (4, 3, 2)
+    values = posterior.log_prob_batched(theta, torch.zeros(3, 5))
+    assert torch.allclose(values, prior.log_prob(theta))
+    if isinstance(prior, OnDisc):
+        assert posterior.log_prob(torch.ones(1, 2)) == -torch.inf
+    posterior.to("cpu")
+    with pytest.raises(InvalidInputError, match=r"`mcmc_transform` says .*Error"):
+        posterior.set_default_x(torch.zeros(1, 5)).map()
+
+
+@pytest.mark.filterwarnings("ignore:The passed")
+@pytest.mark.parametrize("prior", [box(), normal(), positive(), Unknown()])
+def test_only_sampling_draws_random_numbers(prior: Distribution) -> None:
+    theta = prior.sample(Size((3,)))
+    before = torch.get_rng_state()
+    posterior = PriorPosterior(prior)
+    posterior.log_prob(theta)
+    posterior.to("cpu")
+    assert torch.equal(torch.get_rng_state(), before)
+    posterior.sample((1,))
+    assert not torch.equal(torch.get_rng_state(), before)
