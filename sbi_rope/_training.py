@@ -16,11 +16,15 @@ __all__ = [
     "STEPS_WITHOUT_HOLDOUT",
     "History",
     "fit",
+    "groups_of",
+    "groups_to_hold_out",
+    "split_groups",
     "split_pairs",
+    "too_few_pairs",
     "warn_without_holdout",
 ]
 
-# Fewer pairs than this leave nothing to hold out.
+# Fewer pairs of different parameters than this leave nothing to hold out.
 MIN_PAIRS_FOR_HOLDOUT = 5
 # Without a hold-out nothing says when to stop, so little is risked.
 STEPS_WITHOUT_HOLDOUT = 50
@@ -66,24 +70,122 @@ class History:
         )
 
 
-def split_pairs(num_pairs: int, validation_fraction: float) -> tuple[Tensor, Tensor]:
+def groups_of(theta: Tensor) -> Tensor:
+    """Number rows by their parameters, so that those that share them share a number.
+
+    A network can learn by heart the people it has met. Whether it does well is seen on
+    recordings of others.
+
+    Args:
+        theta: Parameters, shape ``(n, d)``, or any numbers of groups, shape ``(n,)``.
+
+    Returns:
+        Numbers from 0 in the order of first appearance, on the CPU, shape ``(n,)``.
+    """
+    different, of_row = theta.detach().cpu().unique(dim=0, return_inverse=True)
+    num_rows = len(of_row)
+    first = of_row.new_full((len(different),), num_rows)
+    first = first.scatter_reduce(0, of_row, torch.arange(num_rows), "amin")
+    return first.argsort().argsort()[of_row]
+
+
+def split_pairs(
+    theta_or_groups: Tensor, validation_fraction: float
+) -> tuple[Tensor, Tensor]:
     """Return the rows to train on and those held out, at random.
 
-    Of fewer than five pairs none is held out.
+    Rows that share their parameters are on the same side. Held out are the groups, in
+    random order, that bring their rows nearer to the fraction asked for, or else the
+    smallest. Of fewer than five groups none is held out.
+
+    Args:
+        theta_or_groups: What :func:`groups_of` takes.
+        validation_fraction: Share of the rows to hold out.
     """
-    order = torch.randperm(num_pairs)
-    if num_pairs < MIN_PAIRS_FOR_HOLDOUT:
-        return order, order[:0]
-    num_held_out = max(1, round(validation_fraction * num_pairs))
-    return order[num_held_out:], order[:num_held_out]
+    groups = groups_of(theta_or_groups)
+    num_groups = _num_groups(groups)
+    order = torch.randperm(num_groups)
+    # Without shared parameters this is `order` itself.
+    rows = order.argsort()[groups].argsort(stable=True)
+    is_held_out = torch.zeros(num_groups, dtype=torch.bool)
+    if num_groups >= MIN_PAIRS_FOR_HOLDOUT:
+        wanted = max(1, round(validation_fraction * len(groups)))
+        sizes = torch.bincount(groups)[order].tolist()
+        is_held_out[order[groups_to_hold_out(wanted, sizes)]] = True
+    held_out = is_held_out[groups[rows]]
+    return rows[~held_out], rows[held_out]
 
 
-def warn_without_holdout(num_pairs: int) -> None:
+def split_groups(groups: Tensor, num_folds: int) -> list[Tensor]:
+    """Cut rows into folds at random, with the rows of a group in the same fold.
+
+    The folds have as many rows as each other, as far as the groups allow. If there are
+    fewer groups than folds, some folds are empty.
+
+    Args:
+        groups: What :func:`groups_of` takes.
+        num_folds: Number of folds.
+
+    Returns:
+        The rows of each fold.
+    """
+    groups = groups_of(groups)
+    order = torch.randperm(_num_groups(groups))
+    if len(order) == len(groups):
+        return list(order.tensor_split(num_folds))
+    sizes = torch.bincount(groups)
+    fold_of, num_rows = torch.empty_like(order), [0] * num_folds
+    # The largest first, each to the fold with the fewest rows so far.
+    for group in order[sizes[order].argsort(descending=True, stable=True)].tolist():
+        fold = num_rows.index(min(num_rows))
+        fold_of[group] = fold
+        num_rows[fold] += int(sizes[group])
+    return [(fold_of[groups] == fold).nonzero()[:, 0] for fold in range(num_folds)]
+
+
+def _num_groups(groups: Tensor) -> int:
+    return int(groups.max()) + 1 if len(groups) else 0
+
+
+def groups_to_hold_out(wanted: int, sizes: list[int]) -> list[int]:
+    """Choose the groups that bring the rows held out nearer to a number wanted.
+
+    Args:
+        wanted: The number of rows.
+        sizes: The rows of each group, in random order.
+
+    Returns:
+        Indices of the groups chosen: some, but not all. If all groups are too large,
+        it is the smallest.
+    """
+    chosen, total = [], 0
+    for index, size in enumerate(sizes):
+        if total + size - wanted <= wanted - total:
+            chosen.append(index)
+            total += size
+        if total >= wanted:
+            break
+    return chosen[: len(sizes) - 1] or [sizes.index(min(sizes))]
+
+
+def too_few_pairs(theta_or_groups: Tensor) -> str:
+    """Say in words, for a warning, that these pairs are too few to hold some out."""
+    groups = groups_of(theta_or_groups)
+    if _num_groups(groups) == len(groups):
+        return f"Only {len(groups)} calibration pair(s)"
+    return (
+        f"Only {_num_groups(groups)} different parameters among {len(groups)} "
+        "calibration pairs"
+    )
+
+
+def warn_without_holdout(theta_or_groups: Tensor) -> None:
     """Warn that there are too few pairs to choose a net by."""
     warn_user(
-        f"Only {num_pairs} calibration pair(s): none is held out, and tuning stops "
-        f"after at most {STEPS_WITHOUT_HOLDOUT} steps. Append at least "
-        f"{MIN_PAIRS_FOR_HOLDOUT} pairs to choose the best net on a hold-out."
+        f"{too_few_pairs(theta_or_groups)}: none is held out, and tuning stops after "
+        f"at most {STEPS_WITHOUT_HOLDOUT} steps. Append at least "
+        f"{MIN_PAIRS_FOR_HOLDOUT} pairs of different parameters to choose the best net "
+        "on a hold-out."
     )
 
 

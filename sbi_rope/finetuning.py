@@ -59,8 +59,9 @@ class CalibrationFinetuner:
         \Bigr\rVert_2,
 
     starting from g = h, with Adam on all training pairs at once. A fifth of the pairs
-    is held out; the g that does best on them is kept, and the starting point competes,
-    so that tuning never returns something worse than it started from on the hold-out.
+    is held out, pairs of the same parameters together; the g that does best on them is
+    kept, and the starting point competes, so that tuning never returns something worse
+    than it started from on the hold-out.
 
     With ``rehearsal`` :math:`\lambda > 0` it also minimises, over simulations from the
     prior, :math:`\lambda\, \mathbb{E} \lVert g(x_s) - h(x_s) \rVert_2`, which is not in
@@ -139,6 +140,7 @@ class CalibrationFinetuner:
         draw_targets: Callable[[int], Tensor],
         *,
         draw_simulations: Callable[[int], Tensor] | None = None,
+        groups: Tensor | None = None,
         seed: int | None = None,
         show_progress_bars: bool = True,
     ) -> FinetuneResult:
@@ -151,6 +153,9 @@ class CalibrationFinetuner:
                 of k simulations for each pair, shape ``(n_c, l)``.
             draw_simulations: Given a number of simulations k, returns up to k from
                 the prior, shape ``(k, *event)``; only called for ``rehearsal``.
+            groups: A number for each pair, shape ``(n_c,)``. Pairs with the same
+                number, such as recordings of one person, are held out together. None
+                if all pairs are of different parameters.
             seed: Seed of the split and of the simulations; None uses torch's state.
             show_progress_bars: Whether to show the course of the loss.
 
@@ -162,13 +167,14 @@ class CalibrationFinetuner:
         """
         x = check_tensor("x", x)
         check_finite("x", x)
+        groups = _checked_groups(groups, x)
         with seeded(seed):
             targets = check_tensor("targets", draw_targets(self.simulations_per_target))
             check_same_length("x", x, "targets", targets)
             check_finite("targets", targets)
             _check_start(embed(embedding_net, x), targets)
             keep = self._rehearsed(embedding_net, draw_simulations)
-            train, held_out = self._split(x.shape[0])
+            train, held_out = self._split(groups)
             results = [
                 self._optimise(
                     trainable_copy(embedding_net, targets),
@@ -215,10 +221,10 @@ class CalibrationFinetuner:
         )
         return (rate,)
 
-    def _split(self, num_pairs: int) -> tuple[Tensor, Tensor]:
-        train, held_out = split_pairs(num_pairs, self.validation_fraction)
+    def _split(self, groups: Tensor) -> tuple[Tensor, Tensor]:
+        train, held_out = split_pairs(groups, self.validation_fraction)
         if not len(held_out):
-            warn_without_holdout(num_pairs)
+            warn_without_holdout(groups)
         return train, held_out
 
     def _optimise(
@@ -291,6 +297,19 @@ def trainable_copy(embedding_net: nn.Module, embeddings: Tensor) -> nn.Module:
             affine.bias.zero_()
         net = nn.Sequential(net, affine)
     return net.eval()
+
+
+def _checked_groups(groups: Tensor | None, x: Tensor) -> Tensor:
+    if groups is None:
+        return torch.arange(len(x))
+    groups = check_tensor("groups", groups)
+    check_same_length("x", x, "groups", groups)
+    if groups.ndim != 1:
+        raise InvalidInputError(
+            "Expected `groups` with one number for each pair, shape (n_c,); got "
+            f"{tuple(groups.shape)}."
+        )
+    return groups
 
 
 def _check_start(embedded: Tensor, targets: Tensor) -> None:

@@ -23,6 +23,7 @@ from sbi_rope._sbi import (
     with_embedding,
 )
 from sbi_rope._simulations import SimulationSource, Simulator, StoredSimulations
+from sbi_rope._training import groups_of
 from sbi_rope._validation import (
     check_batch,
     check_choice,
@@ -241,6 +242,7 @@ class RoPE:
             draw_simulations=lambda count: self._draw_rehearsal(
                 count, progress=show_progress_bars
             ),
+            groups=groups_of(self._theta_cal),
             seed=seed,
             show_progress_bars=show_progress_bars,
         )

@@ -176,7 +176,7 @@ class CalibrationMLP(UsesCalibration):
                 "Expected at least 2 calibration pairs, by which x is standardised; "
                 "got 1. Append more, or use a method that also sees simulations."
             )
-        train, held_out = split_pairs(len(x), self.training.validation_fraction)
+        train, held_out = split_pairs(theta, self.training.validation_fraction)
         estimator = self._gaussian(theta[train], x[train]).to(self._device)
         history = train_on_pairs(
             estimator,

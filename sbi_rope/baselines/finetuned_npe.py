@@ -99,7 +99,7 @@ class FinetunedNPE(BuildsOnNPE, UsesCalibration):
                 f"{type(start).__name__}. Use NPE instead of FMPE or NPSE."
             )
         theta, x = self._calibration
-        split = split_pairs(len(x), self.training.validation_fraction)
+        split = split_pairs(theta, self.training.validation_fraction)
         has_holdout = len(split[1]) > 0
         rates = self.learning_rates if has_holdout else (min(self.learning_rates),)
         results = []

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sbi_rope._training import History, fit, split_pairs
+from sbi_rope._training import History, fit, split_pairs, too_few_pairs
 from sbi_rope._validation import check_instance
 from sbi_rope.baselines.base import UsesCalibration, UsesSimulations
 from sbi_rope.baselines.training import EstimatorBuilder, Training, estimator_builder
@@ -82,15 +82,15 @@ class JointNPE(UsesSimulations, UsesCalibration):
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         theta, x = self._simulations
         theta_cal, x_cal = self._calibration
-        train, held_out = split_pairs(len(x_cal), self.training.validation_fraction)
+        train, held_out = split_pairs(theta_cal, self.training.validation_fraction)
         theta_held, x_held = theta_cal[held_out], x_cal[held_out]
         if not len(held_out):
             # Nothing real to choose by; simulations at least say when to stop.
             warn_user(
-                f"Only {len(x_cal)} calibration pair(s): none is held out, and the "
-                "best network is chosen on simulations."
+                f"{too_few_pairs(theta_cal)}: none is held out, and the best network "
+                "is chosen on simulations."
             )
-            rows, held_out = split_pairs(len(x), self.training.validation_fraction)
+            rows, held_out = split_pairs(theta, self.training.validation_fraction)
             theta_held, x_held = theta[held_out], x[held_out]
             theta, x = theta[rows], x[rows]
         # As in NPE, the simulations alone say how x and theta are standardised.

@@ -152,7 +152,7 @@ def fit_marginal(
     )
     _start_as_standard_normal(flow)
     flow = flow.to(s.device)
-    train, held_out = split_pairs(len(s), training.validation_fraction)
+    train, held_out = split_pairs(torch.arange(len(s)), training.validation_fraction)
 
     def batches(step: int) -> Any:
         order = train[torch.randperm(len(train))]

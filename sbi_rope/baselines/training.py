@@ -11,6 +11,7 @@ import torch
 from sbi.inference import NPE
 from sbi.neural_nets import posterior_nn
 from torch import Tensor
+from torch.utils.data import DataLoader, SubsetRandomSampler
 
 from sbi_rope._random import seeded
 from sbi_rope._sbi import ConditionalDensityEstimator
@@ -18,6 +19,7 @@ from sbi_rope._training import (
     STEPS_WITHOUT_HOLDOUT,
     History,
     fit,
+    groups_to_hold_out,
     warn_without_holdout,
 )
 from sbi_rope._validation import check_integer, check_positive
@@ -152,7 +154,8 @@ class SimulationTrainer(NPE):
     """sbi's NPE, which holds simulations of the same parameters out together.
 
     Where a few stored people are recorded many times, a network can learn them by
-    heart; only people it has not met say when to stop.
+    heart; only people it has not met say when to stop. Recordings of a single person
+    are split one by one.
     """
 
     def get_dataloaders(  # noqa: D102
@@ -165,31 +168,46 @@ class SimulationTrainer(NPE):
     ) -> tuple[Any, Any]:
         theta = self.get_simulations(starting_round)[0]
         split = None if resume_training else _split_by(theta, validation_fraction)
-        # sbi takes the rows of a training it resumes as they are.
-        if split is not None and len(split[0]) >= training_batch_size:
+        if split is not None:
+            # sbi takes the rows of a training it resumes as they are.
             self.train_indices, self.val_indices = split
             resume_training = True
-        return super().get_dataloaders(
+            # sbi makes no smaller batch of what is left over.
+            training_batch_size = min(training_batch_size, len(split[0]))
+        train, held_out = super().get_dataloaders(
             starting_round,
             training_batch_size,
             validation_fraction,
             resume_training,
             dataloader_kwargs,
         )
+        if split is not None and not len(held_out):
+            rows = self.val_indices
+            held_out = DataLoader(
+                held_out.dataset,
+                batch_size=len(rows),
+                sampler=SubsetRandomSampler(rows.tolist()),
+            )
+        return train, held_out
 
 
 def _split_by(
     theta: Tensor, validation_fraction: float
 ) -> tuple[Tensor, Tensor] | None:
-    """Split rows by their parameters; None if no two rows share theirs."""
+    """Split rows by their parameters; None if no two rows share theirs, or all do."""
     groups, of_row = theta.unique(dim=0, return_inverse=True)
-    if len(groups) == len(theta):
+    if len(groups) in (1, len(theta)):
         return None
     num_held_out = len(theta) - int((1 - validation_fraction) * len(theta))
     order = torch.randperm(len(groups), device=theta.device)
-    rows = torch.bincount(of_row)[order].cumsum(0)
+    sizes = torch.bincount(of_row)[order]
+    rows = sizes.cumsum(0)
     # As many groups as it takes to fill what sbi makes room for.
-    held_out_groups = order[: int((rows < num_held_out).sum()) + 1]
+    num_groups = int((rows < num_held_out).sum()) + 1
+    held_out_groups = order[:num_groups]
+    if rows[num_groups - 1] > len(theta) / 2:  # the last of them is a large one
+        chosen = groups_to_hold_out(num_held_out, sizes.tolist())
+        held_out_groups = order[chosen]
     held_out = torch.isin(of_row, held_out_groups)
     return (~held_out).nonzero()[:, 0], held_out.nonzero()[:, 0]
 
@@ -284,7 +302,7 @@ def train_on_pairs(
     train, held_out = split
     max_num_epochs = training.max_num_epochs
     if not len(held_out):
-        warn_without_holdout(len(x))
+        warn_without_holdout(theta)
         max_num_epochs = min(max_num_epochs, STEPS_WITHOUT_HOLDOUT)
 
     def batches(step: int) -> Iterator[tuple[Tensor, Tensor]]:

@@ -610,6 +610,16 @@ def test_one_calibration_pair_is_enough_with_a_warning(name: str) -> None:
     assert densities(method.build_posterior(), name).isfinite().all()
 
 
+@pytest.mark.parametrize("name", names_that_see(UsesCalibration))
+def test_recordings_of_four_people_leave_none_to_hold_out(name: str) -> None:
+    data, method = data_of(first_task(name)), make(name, first_task(name))
+    feed(method, data, without=UsesCalibration)
+    method.append_calibration(data.theta_cal[:4].repeat(5, 1), data.x_cal)  # type: ignore[attr-defined]
+    with pytest.warns(RoPEWarning, match="Only 4 different parameters among 20"):
+        train(method)
+    assert densities(method.build_posterior(), name).isfinite().all()
+
+
 @pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
 @pytest.mark.parametrize("name", names_that_see(UsesObservations))
 def test_one_observation_is_enough(name: str) -> None:

@@ -325,3 +325,30 @@ def test_rehearsal_needs_finite_simulations() -> None:
         rehearsed(linear(), x, x, torch.empty(0, 2), rehearsal=1.0)
     with pytest.raises(InvalidInputError, match="rehearsal"):
         CalibrationFinetuner(rehearsal=-1.0)
+
+
+def test_pairs_of_a_group_are_held_out_together() -> None:
+    """With g = h at the first step, the pairs of group k are at a distance of k."""
+    x, net = torch.randn(10, 2), linear()
+    groups = torch.tensor([1, 2, 3, 4, 5, 5, 4, 3, 2, 1])
+    targets = net(x).detach() + groups[:, None] * torch.tensor([[1.0, 0.0]])
+    held_out = set()
+    for seed in range(8):
+        result = CalibrationFinetuner(num_steps=1, learning_rate=1e-6).finetune(
+            net,
+            x,
+            lambda count: targets,
+            groups=groups,
+            seed=seed,
+            show_progress_bars=False,
+        )
+        held_out.add(round(result.history.validation_loss[0], 4))
+    assert held_out <= {1.0, 2.0, 3.0, 4.0, 5.0}
+    assert len(held_out) > 1
+
+
+@pytest.mark.parametrize("groups", [torch.zeros(9), torch.zeros(10, 1), [0] * 10])
+def test_groups_have_one_number_for_each_pair(groups: object) -> None:
+    x = torch.randn(10, 2)
+    with pytest.raises((InvalidInputError, InvalidTypeError), match="`groups`"):
+        CalibrationFinetuner().finetune(linear(), x, lambda count: x, groups=groups)  # type: ignore[arg-type]

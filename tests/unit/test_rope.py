@@ -80,6 +80,16 @@ def test_training_needs_calibration_and_building_needs_training() -> None:
         conductor.build_posterior(X_O)
 
 
+def test_recordings_of_the_same_parameters_are_held_out_together() -> None:
+    theta = gaussian.prior().sample((4,)).repeat(5, 1)
+    conductor = rope().append_calibration(theta, gaussian.real_process(theta))
+    with pytest.warns(RoPEWarning, match="Only 4 different parameters among 20"):
+        conductor.train(seed=0, show_progress_bars=False)
+    assert conductor.history.validation_loss == []
+    conductor.append_calibration(*gaussian.labelled(1)).train(show_progress_bars=False)
+    assert conductor.history.validation_loss
+
+
 def test_the_trained_state_serves_many_batches_and_couplers() -> None:
     conductor = trained()
     before = copy.deepcopy(conductor.tuned_embedding_net.state_dict())

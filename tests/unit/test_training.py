@@ -20,7 +20,10 @@ from sbi_rope._training import (
     STEPS_WITHOUT_HOLDOUT,
     History,
     fit,
+    groups_of,
+    split_groups,
     split_pairs,
+    warn_without_holdout,
 )
 from sbi_rope.baselines import Training
 from sbi_rope.baselines.training import (
@@ -263,18 +266,98 @@ class TestSplitPairs:
     def test_each_pair_is_on_one_side(
         self, num_pairs: int, fraction: float, held_out: int
     ) -> None:
-        train, other = split_pairs(num_pairs, fraction)
+        train, other = split_pairs(torch.arange(num_pairs), fraction)
         assert len(other) == held_out
         assert sorted([*train.tolist(), *other.tolist()]) == list(range(num_pairs))
 
     def test_it_is_drawn_at_random(self) -> None:
         torch.manual_seed(0)
-        first = split_pairs(50, 0.2)
-        second = split_pairs(50, 0.2)
+        first = split_pairs(torch.arange(50), 0.2)
+        second = split_pairs(torch.arange(50), 0.2)
         torch.manual_seed(0)
-        again = split_pairs(50, 0.2)
+        again = split_pairs(torch.arange(50), 0.2)
         assert not torch.equal(first[1], second[1])
         assert torch.equal(first[1], again[1])
+
+    @pytest.mark.parametrize(("n", "held_out"), [(3, 0), (5, 1), (50, 10), (51, 10)])
+    def test_of_different_parameters_it_is_a_cut_through_a_permutation(
+        self, n: int, held_out: int
+    ) -> None:
+        theta = torch.randn(n, 2)
+        torch.manual_seed(3)
+        train, other = split_pairs(theta, 0.2)
+        after = torch.rand(())
+        torch.manual_seed(3)
+        order = torch.randperm(n)
+        assert torch.equal(other, order[:held_out])
+        assert torch.equal(train, order[held_out:])
+        assert torch.rand(()) == after
+
+    @pytest.mark.parametrize("seed", range(5))
+    def test_pairs_of_the_same_parameters_are_on_the_same_side(self, seed: int) -> None:
+        torch.manual_seed(seed)
+        theta = torch.randn(12, 2).repeat(5, 1)[torch.randperm(60)]
+        train, other = split_pairs(theta, 0.25)
+        assert sorted([*train.tolist(), *other.tolist()]) == list(range(60))
+        assert len(other) == 15
+        assert not {*map(tuple, theta[train].tolist())} & {
+            *map(tuple, theta[other].tolist())
+        }
+        by_group = split_pairs(groups_of(theta), 0.25)
+        assert len(by_group[1]) == 15
+
+    def test_a_group_larger_than_what_is_held_out_is_trained_on(self) -> None:
+        groups = torch.tensor([0] * 60 + [1] * 10 + [2] * 10 + [3] * 10 + [4] * 10)
+        for _ in range(20):
+            assert len(split_pairs(groups, 0.2)[1]) == 20
+        # All are larger than twice the two rows asked for: the smallest is held out.
+        groups = torch.arange(5).repeat_interleave(torch.tensor([20, 20, 7, 20, 20]))
+        assert groups[split_pairs(groups, 0.02)[1]].tolist() == [2] * 7
+
+    def test_of_few_different_parameters_none_is_held_out(self) -> None:
+        theta = torch.randn(MIN_PAIRS_FOR_HOLDOUT - 1, 2).repeat(10, 1)
+        train, other = split_pairs(theta, 0.2)
+        assert (len(train), len(other)) == (40, 0)
+        with pytest.warns(RoPEWarning, match="Only 4 different parameters among 40"):
+            warn_without_holdout(theta)
+        with pytest.warns(RoPEWarning, match=r"Only 4 calibration pair\(s\)"):
+            warn_without_holdout(theta[:4])
+
+
+class TestGroups:
+    def test_rows_of_the_same_parameters_share_a_number(self) -> None:
+        theta = torch.tensor([[2.0, 1.0], [1.0, 2.0], [2.0, 1.0], [0.0, 0.0]])
+        assert groups_of(theta).tolist() == [0, 1, 0, 2]
+        assert groups_of(theta[:, 0]).tolist() == [0, 1, 0, 2]
+        assert groups_of(torch.randn(30, 3)).tolist() == list(range(30))
+        assert groups_of(theta[:0]).tolist() == []
+
+    @pytest.mark.parametrize(("n", "num_folds"), [(10, 3), (11, 5), (4, 6)])
+    def test_folds_of_different_parameters_are_cut_from_a_permutation(
+        self, n: int, num_folds: int
+    ) -> None:
+        torch.manual_seed(1)
+        folds = split_groups(torch.arange(n), num_folds)
+        torch.manual_seed(1)
+        expected = torch.randperm(n).tensor_split(num_folds)
+        assert len(folds) == num_folds
+        for fold, other in zip(folds, expected, strict=True):
+            assert torch.equal(fold, other)
+
+    def test_folds_keep_groups_whole_and_have_rows_alike(self) -> None:
+        sizes = torch.tensor([9, 1, 1, 4, 2, 3, 6, 1, 1, 2])
+        groups = torch.arange(10).repeat_interleave(sizes)[torch.randperm(30)]
+        folds = split_groups(groups, 3)
+        assert sorted(torch.cat(folds).tolist()) == list(range(30))
+        assert [len(fold) for fold in folds] == [10, 10, 10]
+        of_fold = [set(groups[fold].tolist()) for fold in folds]
+        assert sum(map(len, of_fold)) == 10
+        again = split_groups(groups, 3)
+        assert [set(groups[fold].tolist()) for fold in again] != of_fold
+
+    def test_of_fewer_groups_than_folds_some_folds_are_empty(self) -> None:
+        folds = split_groups(torch.tensor([0, 0, 0, 1, 1]), 4)
+        assert sorted(map(len, folds)) == [0, 0, 2, 3]
 
 
 class TestTraining:
@@ -446,7 +529,29 @@ class TestSimulationTrainer:
         ):
             assert torch.equal(ours, sbis)
 
-    def test_too_few_people_are_split_by_recording(self) -> None:
+    @pytest.mark.parametrize("sizes", [(1, 19), (6, 7, 12), (2, 2, 30)])
+    def test_a_few_people_are_held_out_together_in_smaller_batches(
+        self, sizes: tuple[int, ...]
+    ) -> None:
+        """Fewer than a batch of 20 are left to train on, or hardly any held out."""
+        people = box(2).sample((len(sizes),))
+        theta = people.repeat_interleave(torch.tensor(sizes), dim=0)
+        for seed in range(6):
+            torch.manual_seed(seed)
+            trainer = SimulationTrainer(prior=box(2), show_progress_bars=False)
+            trainer.append_simulations(theta, simulate(theta))
+            loaders = trainer.get_dataloaders(0, 20, 0.3)
+            rows = trainer.train_indices, trainer.val_indices
+            assert sorted(torch.cat(rows).tolist()) == list(range(len(theta)))
+            train, held_out = (set(map(tuple, theta[r].tolist())) for r in rows)
+            assert train
+            assert held_out
+            assert not train & held_out
+            assert len(rows[0]) >= len(rows[1])
+            for loader in loaders:
+                assert sum(len(batch[0]) for batch in loader) > 0
+
+    def test_a_single_person_is_split_by_recording(self) -> None:
         theta = box(2).sample((1,)).repeat(30, 1)
         train, held_out = split_of(SimulationTrainer, theta)
         assert (len(train), len(held_out)) == (24, 6)
@@ -460,7 +565,7 @@ def on_pairs(n: int, **options: Any) -> tuple[Any, Any, History]:
         estimator,
         theta,
         x,
-        split_pairs(n, 0.2),
+        split_pairs(torch.arange(n), 0.2),
         training=Training(training_batch_size=8, **options),
         in_training_mode=True,
         label="Pairs",
@@ -490,7 +595,7 @@ class TestTrainOnPairs:
     def test_the_validation_loss_is_the_mean_over_the_held_out_rows(self) -> None:
         theta, x = pairs(20)
         estimator = small()(theta, x).eval()
-        split = split_pairs(20, 0.2)
+        split = split_pairs(torch.arange(20), 0.2)
         expected = estimator.loss(theta[split[1]], condition=x[split[1]]).mean()
         history = train_on_pairs(
             estimator,

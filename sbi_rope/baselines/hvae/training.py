@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from sbi_rope._random import seeded
-from sbi_rope._training import History, fit, split_pairs
+from sbi_rope._training import History, fit, split_pairs, too_few_pairs
 from sbi_rope.baselines.hvae.estimator import LatentMixture
 from sbi_rope.baselines.hvae.model import HybridVAE
 from sbi_rope.baselines.training import Training
@@ -47,7 +47,7 @@ def train_hybrid(
     Returns:
         The losses and the epoch that was kept.
     """
-    train, held_out = split_pairs(len(x), training.validation_fraction)
+    train, held_out = split_pairs(theta, training.validation_fraction)
     pairs = theta[train], x[train]
     objective = partial(model.objective, weight=weight)
     validation_loss: Callable[[], Tensor] | None = None
@@ -55,11 +55,13 @@ def train_hybrid(
         validation_loss = partial(_held_out_loss, mixture, theta[held_out], x[held_out])
     else:
         warn_user(
-            f"Only {len(x)} calibration pair(s): none is held out, and the networks "
+            f"{too_few_pairs(theta)}: none is held out, and the networks "
             "are chosen by the objective on held-out observations. Append at least 5 "
-            "pairs to choose them by what matters."
+            "pairs of different parameters to choose them by what matters."
         )
-        rows, held_out = split_pairs(len(x_o), training.validation_fraction)
+        rows, held_out = split_pairs(
+            torch.arange(len(x_o)), training.validation_fraction
+        )
         if len(held_out):
             validation_loss = partial(
                 _with_same_draws, objective, x_o[held_out], *pairs
