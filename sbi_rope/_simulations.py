@@ -6,8 +6,8 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
-from tqdm.auto import tqdm
 
+from sbi_rope._progress import progress_bar
 from sbi_rope._random import seeded
 from sbi_rope._validation import (
     check_batch,
@@ -122,8 +122,8 @@ class Simulator:
         self, theta: Tensor, embed: Embedding, *, progress: bool
     ) -> tuple[Tensor, Tensor]:
         statistics, valid = [], []
-        bar = tqdm(
-            total=len(theta), desc="Simulating", disable=not progress, delay=DELAY
+        bar = progress_bar(
+            show=progress, desc="Simulating", total=len(theta), delay=DELAY
         )
         for part in theta.split(BATCHED_CHUNK if self.is_batched else SINGLE_CHUNK):
             x = self(part)

@@ -8,8 +8,8 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from tqdm.auto import tqdm
 
+from sbi_rope._progress import progress_bar
 from sbi_rope.errors import warn_user
 
 __all__ = [
@@ -245,10 +245,10 @@ def fit(
         module.eval()
         return sum(values) / len(values)
 
-    progress = tqdm(
+    progress = progress_bar(
         range(max_num_steps + 1),
+        show=show_progress_bars,
         desc=f"{label} (learning rate {learning_rate:g})",
-        disable=not show_progress_bars,
     )
     for step in progress:
         if validation_loss is not None:
@@ -271,8 +271,11 @@ def fit(
             )
             break
         best_state, best_step = state, newest
+        # Without a refresh of its own: the bar moves at most ten times a second.
         progress.set_postfix(
-            loss=(held_out_loss or training_loss)[-1], best_step=best_step
+            loss=(held_out_loss or training_loss)[-1],
+            best_step=best_step,
+            refresh=False,
         )
         if is_last:
             break

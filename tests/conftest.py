@@ -1,6 +1,7 @@
 """Fixtures and guards shared by all tests."""
 
 import socket
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -34,6 +35,16 @@ def _no_network(
         raise RuntimeError("This test opened a network connection.")
 
     monkeypatch.setattr(socket.socket, "connect", refuse)
+
+
+@pytest.fixture
+def terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> pytest.CaptureFixture[str]:
+    """``capsys`` of a terminal: without one no progress is shown."""
+    # Of the class: pytest makes another one for each phase of a test.
+    monkeypatch.setattr(type(sys.stderr), "isatty", lambda self: True)
+    return capsys
 
 
 @pytest.fixture(scope="session")

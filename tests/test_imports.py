@@ -20,7 +20,7 @@ DEPENDENCIES = "import ot, numpy, torch, tqdm.auto, sbi.inference, sbi.utils"
 
 # A module imports from layers below its own, and from its own package.
 LAYERS = [
-    {"errors"},
+    {"errors", "_progress"},
     {"_validation", "_sbi", "_random", "_training"},
     {"coupling", "finetuning", "metrics", "_simulations"},
     {"mixture", "plots"},

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm.auto import tqdm
 
+from sbi_rope._progress import progress_bar
 from sbi_rope._sbi import SliceSamplerVectorized
 from sbi_rope._validation import check_positive, check_unit_interval
 
@@ -132,12 +132,12 @@ def denoise(
     sigma = error_model.spike_std
     kept = math.ceil(settings.num_draws / settings.num_chains)
     draws, r_hats = [], []
-    with tqdm(
-        total=len(y),
+    with progress_bar(
+        show=show_progress_bars,
         desc="Denoising",
+        total=len(y),
         delay=5.0,
         leave=False,
-        disable=not show_progress_bars,
     ) as bar:
         for part in y.split(GROUP_SIZE):
             start = _starts(part, simulated, error_model, settings.num_chains)

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from tqdm.auto import tqdm
 
+from sbi_rope._progress import progress_bar
 from sbi_rope.diagnosis.report import Finding
 from sbi_rope.diagnosis.simulations import Simulations
 from sbi_rope.rope import RoPE
@@ -85,7 +85,7 @@ def cross_fit(rope: RoPE, *, num_folds: int, show_progress_bars: bool) -> CrossF
     embedded = torch.empty_like(targets)
     order = torch.randperm(len(theta)).to(theta.device)
     folds = order.tensor_split(min(num_folds, len(theta)))
-    for held_out in tqdm(folds, desc="Folds", disable=not show_progress_bars):
+    for held_out in progress_bar(folds, show=show_progress_bars, desc="Folds"):
         others = torch.cat([fold for fold in folds if fold is not held_out])
         part = rope.with_pairs(others, targets=targets[others])
         part.train(show_progress_bars=False)

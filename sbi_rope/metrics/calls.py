@@ -18,8 +18,8 @@ from typing import Any
 import torch
 from sbi.inference import DirectPosterior, EnsemblePosterior, VectorFieldPosterior
 from torch import Tensor
-from tqdm.auto import tqdm
 
+from sbi_rope._progress import progress_bar
 from sbi_rope._sbi import NeuralPosterior
 from sbi_rope._validation import (
     check_batch,
@@ -212,5 +212,5 @@ def _refuse(what: str, bad: Tensor, *, start: int = 0) -> None:
 
 def _chunks(length: int, size: int, text: str, *, show: bool) -> Iterator[slice]:
     starts = range(0, length, size)
-    for start in tqdm(starts, desc=text, disable=not show):
+    for start in progress_bar(starts, show=show, desc=text):
         yield slice(start, start + size)

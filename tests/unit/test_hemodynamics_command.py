@@ -46,10 +46,10 @@ def _generate(file: Path, *options: str) -> int:
 
 
 def test_generate_writes_the_file_and_counts_the_rejected(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, terminal: pytest.CaptureFixture[str]
 ) -> None:
     assert _generate(tmp_path / "x.npz", "--seed", "3") == 0
-    captured = capsys.readouterr()
+    captured = terminal.readouterr()
     beats = load(tmp_path / "x.npz", process="real", population=Population())
     assert (len(beats), beats.settings["seed"]) == (50, 3)
     rejected = sum(beats.rejected.values())

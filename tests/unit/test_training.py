@@ -242,13 +242,36 @@ class TestFit:
 
     @pytest.mark.parametrize("show", [True, False])
     def test_the_progress_is_shown_if_asked_for(
-        self, show: bool, capsys: pytest.CaptureFixture[str]
+        self, show: bool, terminal: pytest.CaptureFixture[str]
     ) -> None:
         module = Number()
         run(module, towards(module, 1), None, show_progress_bars=show)
-        printed = capsys.readouterr()
+        printed = terminal.readouterr()
         assert ("Numbers" in printed.err) is show
+        assert ("best_step" in printed.err) is show
         assert printed.out == ""
+
+    def test_a_terminal_sees_less_than_every_step(
+        self, terminal: pytest.CaptureFixture[str]
+    ) -> None:
+        """Ten refreshes a second: two hundred take twenty seconds."""
+        module = Number()
+        run(
+            module,
+            towards(module, 1),
+            None,
+            show_progress_bars=True,
+            max_num_steps=1000,
+            patience=1001,
+        )
+        assert terminal.readouterr().err.count("Numbers") < 200
+
+    def test_without_a_terminal_nothing_is_shown(
+        self, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        module = Number()
+        run(module, towards(module, 1), None, show_progress_bars=True)
+        assert capsys.readouterr().err == ""
 
 
 class TestSplitPairs:

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm.auto import tqdm
 
+from sbi_rope._progress import progress_bar
 from sbi_rope._validation import check_choice, check_integer
 from sbi_rope.errors import InvalidInputError, SimulationError
 from sbi_rope.tasks.hemodynamics.chunks import Simulate, Work, read_part, run_chunk
@@ -135,13 +135,14 @@ def _simulate_all(
     parts: list[dict[str, np.ndarray]] = []
     tried = accepted = 0
     done = [read_part(file) for file in work.folder.glob("part_*.npz")]
-    bar = tqdm(
+    bar = progress_bar(
         total=n,
         # From before an interrupt: not work that the time left is judged by.
         initial=sum(len(part["index"]) for part in done if part is not None),
         unit="people",
         smoothing=0.1,
-        disable=not progress,
+        show=progress,
+        desc="Simulating",
     )
     with bar:
         while accepted < n:

@@ -1,0 +1,57 @@
+"""Progress is shown to people, and does not fill log files."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sbi_rope._progress import progress_bar
+
+TRAIN = """
+import warnings
+from sbi_rope import CalibrationFinetuner, RoPE
+from tests import gaussian
+
+warnings.simplefilter("ignore")
+rope = RoPE(
+    gaussian.posterior(),
+    simulator=gaussian.simulator,
+    finetuner=CalibrationFinetuner(num_steps=200, rehearsal=0.5),
+)
+rope.append_calibration(*gaussian.labelled(20)).train()
+assert rope.history.best_step > 0
+rope.build_posterior(gaussian.labelled(30)[1])
+"""
+
+
+def test_training_into_a_log_file_writes_next_to_nothing(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    with log.open("wb") as file:
+        run = subprocess.run(
+            [sys.executable, "-c", TRAIN],
+            stdout=file,
+            stderr=file,
+            cwd=Path(__file__).parents[2],
+            check=False,
+        )
+    assert run.returncode == 0, log.read_text()
+    assert log.stat().st_size < 1000
+
+
+@pytest.mark.parametrize("show", [True, False])
+def test_a_bar_is_for_a_terminal_and_for_who_asks(
+    show: bool, terminal: pytest.CaptureFixture[str]
+) -> None:
+    assert list(progress_bar(range(3), show=show, desc="Counting")) == [0, 1, 2]
+    with progress_bar(show=show, desc="By hand", total=2) as bar:
+        bar.update(2)
+    printed = terminal.readouterr()
+    assert ("Counting" in printed.err) is show
+    assert ("By hand: 100%" in printed.err) is show
+    assert printed.out == ""
+
+
+def test_without_a_terminal_there_is_no_bar(capsys: pytest.CaptureFixture[str]) -> None:
+    assert list(progress_bar(range(3), show=True, desc="Counting")) == [0, 1, 2]
+    assert capsys.readouterr() == ("", "")
