@@ -15,6 +15,7 @@ from sbi_rope._validation import (
     check_positive,
     check_unit_interval,
 )
+from sbi_rope.coupling.cost import widest
 from sbi_rope.coupling.fixed_point import Solution, solve_fixed_point
 from sbi_rope.coupling.kernel import marginal_error
 from sbi_rope.coupling.pot import solve_pot
@@ -68,7 +69,8 @@ class SinkhornCoupler:
         tolerance: Largest ``marginal_error`` called converged.
         max_iterations: Iterations after which to stop and say so.
         dtype: ``torch.float64`` (the default) or ``torch.float32``, which takes half
-            the memory and less time.
+            the memory and less time. Devices without float64 (MPS) need
+            ``torch.float32``.
         blocked: Whether to compute the distances anew, block by block, in every
             iteration, so that no matrix of size n_o x n_s is ever held: slower, but
             its memory does not grow with n_o n_s. None (the default) does so for more
@@ -138,8 +140,9 @@ class SinkhornCoupler:
             embeddings. ``converged`` is False if the tolerance was not met.
 
         Raises:
-            InvalidInputError: If the shapes do not fit, a set is empty, or a value is
-                not finite.
+            InvalidInputError: If the shapes do not fit, a set is empty, a value is
+                not finite, or the device of the embeddings has no float64 but
+                ``dtype`` asks for it.
             CouplingError: If the distances overflow, gamma is too small for their
                 digits, or with ``cost_scale="simulated"`` the median distance between
                 simulations is zero.
@@ -225,6 +228,11 @@ class SinkhornCoupler:
         reused: bool,
     ) -> tuple[Problem, float]:
         real, simulated = checked_embeddings(real, simulated)
+        if self.dtype == torch.float64 and widest(real.device) != torch.float64:
+            raise InvalidInputError(
+                f"float64 is not available on {real.device.type}; pass "
+                "SinkhornCoupler(dtype=torch.float32) or move the posterior to the CPU."
+            )
         num_fitted = min(len(real), self.num_fitted or len(real))
         if num_fitted < SMALL_BATCH:
             self._warn_small_batch(num_fitted)

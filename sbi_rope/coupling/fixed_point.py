@@ -59,7 +59,7 @@ def solve_fixed_point(
 
     Args:
         kernel: Returns log q of a potential.
-        start: The first potential, shape ``(n_s,)``, float64.
+        start: The first potential, shape ``(n_s,)``, float64 where the device has it.
         tau: In (0, 1].
         tolerance: Marginal error to reach.
         max_iterations: Most evaluations of the kernel.

@@ -64,7 +64,10 @@ class Kernel:
         self._exact = True
 
     def __call__(self, potential: Tensor) -> Tensor:
-        """Return log q of a potential, both of shape ``(n_s,)`` and float64."""
+        """Return log q of a potential, both of shape ``(n_s,)``.
+
+        Both are in float64, or in float32 on a device without it.
+        """
         absorbed = self._absorbed
         reach = RANGE[self._dtype].reach
         if absorbed is None or float((potential - absorbed).abs().max()) > reach:
@@ -82,7 +85,7 @@ class Kernel:
         self.num_absorptions += 1
         # What is absorbed must be known to the last digit.
         w = potential.to(self._dtype)
-        self._absorbed = w.double()
+        self._absorbed = w.to(potential.dtype)
         spread = float(w.abs().max()) + self.cost.bound / self.gamma
         self._exact = spread <= RANGE[self._dtype].free
         if self._matrix is not None:
@@ -103,7 +106,7 @@ class Kernel:
         return block.sub_(shift[:, None]).clamp_min_(lowest).exp_()
 
     def _products(self, scaling: Tensor) -> tuple[Tensor, Tensor]:
-        """Return K v and the product of K^T with its reciprocal, that in float64."""
+        """Return K v and the product of K^T with its reciprocal, as exact as w."""
         assert self._absorbed is not None
         w = self._absorbed.to(self._dtype)
         row_sums = self._shift.new_empty(len(self._shift))
@@ -131,7 +134,7 @@ class Kernel:
             exponents = w - self.cost.block(rows, index) / self.gamma
             exponents -= row_log_sums[rows, None]
             total = torch.logaddexp(total, torch.logsumexp(exponents, dim=0))
-        log_q[index] = total.double() - math.log(len(row_log_sums))
+        log_q[index] = total.to(log_q.dtype) - math.log(len(row_log_sums))
 
 
 def marginal_error(log_q: Tensor, potential: Tensor, tau: float) -> float:
@@ -146,4 +149,4 @@ def _lost(columns: Tensor, row_sums: Tensor) -> Tensor:
     """Tell in which columns the entries raised to the floor could matter."""
     eps = torch.finfo(row_sums.dtype).eps
     floor = math.exp(RANGE[row_sums.dtype].lowest)
-    return floor * float(row_sums.double().reciprocal().sum()) > eps * columns
+    return floor * float(row_sums.to(columns.dtype).reciprocal().sum()) > eps * columns

@@ -69,7 +69,7 @@ def solve_pot(
         iterations += done
         if not (log["logu"].isfinite().all() and log["logv"].isfinite().all()):
             return best._replace(num_iterations=iterations), False
-        potential = log["logv"].double()
+        potential = log["logv"].to(start.dtype)
         potential = potential - potential.mean()
         error = marginal_error(kernel(potential), potential, tau)
         # If the error stays, POT has lost entries of the kernel to underflow, or the

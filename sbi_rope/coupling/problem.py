@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from sbi_rope._validation import check_batch, check_tensor
-from sbi_rope.coupling.cost import Cost, Distances
+from sbi_rope.coupling.cost import Cost, Distances, widest
 from sbi_rope.coupling.kernel import Kernel
 from sbi_rope.errors import CouplingError, InvalidInputError
 
@@ -49,7 +49,9 @@ class Problem:
                 "The distances between embeddings overflow. Check the scale of the "
                 "observations and of the embedding net's outputs."
             )
-        self.direct = bound > LARGEST_BY_PRODUCT * smallest_gamma
+        # In float32 the rounding of a product always shows.
+        in_float64 = widest(real.device) == torch.float64
+        self.direct = not in_float64 or bound > LARGEST_BY_PRODUCT * smallest_gamma
         self.real = real
         self.simulated = simulated
         self.blocked = blocked
@@ -69,7 +71,8 @@ class Problem:
 
     def zero_potential(self) -> Tensor:
         """Return the potential to start from when nothing is known."""
-        return self.simulated.new_zeros(len(self.simulated), dtype=torch.float64)
+        dtype = widest(self.simulated.device)
+        return self.simulated.new_zeros(len(self.simulated), dtype=dtype)
 
     def check_gamma(self, gamma: float) -> None:
         """Check that the dtype has digits left for distances / gamma.
@@ -132,7 +135,10 @@ def median_distance(simulated: Tensor) -> float:
     Raises:
         CouplingError: If it is zero.
     """
-    subset = simulated[:MAX_FOR_MEDIAN].double()
+    subset = simulated[:MAX_FOR_MEDIAN]
+    if widest(subset.device) != torch.float64:
+        subset = subset.cpu()  # which has float64, and pdist
+    subset = subset.double()
     median = torch.nn.functional.pdist(subset).median() if len(subset) > 1 else 0.0
     if float(median) == 0.0:
         raise CouplingError(

@@ -609,3 +609,103 @@ def test_an_impossible_gamma_in_a_sweep_is_a_named_error() -> None:
     assert next(sweep).converged
     with pytest.raises(CouplingError, match="gamma of at least"):
         next(sweep)
+
+
+class NoFloat64(TorchDispatchMode):
+    """Raise where a device without float64 would."""
+
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
+        result = func(*args, **(kwargs or {}))
+        for value in result if isinstance(result, tuple | list) else (result,):
+            if isinstance(value, Tensor) and value.dtype == torch.float64:
+                raise TypeError(f"{func} made a tensor in float64")
+        return result
+
+
+@pytest.fixture
+def _no_float64(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cost_module, "has_float64", lambda device: False)
+
+
+@pytest.mark.parametrize("blocked", [False, True])
+@pytest.mark.parametrize("tau", [1.0, 0.9])
+def test_a_device_without_float64_couples_in_float32(
+    blocked: bool, tau: float, request: pytest.FixtureRequest
+) -> None:
+    real, simulated = (values.float() + 10 for values in clouds())
+    coupler = SinkhornCoupler(
+        gamma=0.1,
+        tau=tau,
+        dtype=torch.float32,
+        blocked=blocked,
+        tolerance=1e-5,
+        num_fitted=200,
+    )
+    expected = replace(coupler, dtype=torch.float64).couple(real, simulated, seed=0)
+    request.getfixturevalue("_no_float64")
+    with NoFloat64():
+        coupling = coupler.couple(real, simulated, seed=0)
+        weights, rows = coupling.weights, coupling.rows(real[:10])
+        assert coupling.effective_sample_size.isfinite().all()
+        (swept,) = coupler.sweep(real, simulated, gammas=[0.1], taus=[tau], seed=0)
+    assert coupling.converged
+    assert swept.converged
+    assert coupling.potential.dtype == weights.dtype == torch.float32
+    assert total_variation(weights, expected.weights).max() < 1e-3
+    assert torch.equal(rows, weights[:10])
+
+
+@pytest.mark.usefixtures("_no_float64")
+def test_pot_is_given_float32_on_a_device_without_float64() -> None:
+    real, simulated = (values.float() for values in clouds(80, 60))
+    coupler = SinkhornCoupler(dtype=torch.float32, solver="pot", tolerance=1e-5)
+    coupler.couple(real, simulated)  # POT tries all dtypes when it is first used
+    with NoFloat64():
+        coupling = coupler.couple(real, simulated)
+    assert coupling.converged
+
+
+@pytest.mark.usefixtures("_no_float64")
+def test_columns_that_the_kernel_loses_are_restored_without_float64() -> None:
+    real, simulated = (values.float() for values in clouds(80, 60))
+    simulated[0] += 1000.0
+    coupler = SinkhornCoupler(gamma=1.0, dtype=torch.float32, tolerance=1e-4)
+    with NoFloat64():
+        coupling = coupler.couple(real, simulated)
+    assert coupling.converged
+    assert float(coupling.weights[:, 0].mean()) == pytest.approx(1 / 60, rel=1e-2)
+
+
+@pytest.mark.usefixtures("_no_float64")
+def test_distances_on_a_device_without_float64_tell_near_points_apart() -> None:
+    """By a matrix product in float32, they would be wrong by 3e-4 of the radius."""
+    real = 100 * torch.randn(40, 5)
+    coupler = SinkhornCoupler(
+        gamma=1.0, tau=0.5, dtype=torch.float32, cost_scale="simulated", tolerance=1e-5
+    )
+    coupling = coupler.couple(real, real)
+    assert coupling.direct
+    exact = torch.cdist(real.double(), real.double())
+    scale = torch.nn.functional.pdist(real.double()).median()
+    assert coupling.gamma == pytest.approx(float(scale), rel=1e-6)
+    expected = torch.softmax(coupling.potential - exact / coupling.gamma, dim=1)
+    assert torch.allclose(coupling.weights.double(), expected, rtol=1e-4)
+
+
+@pytest.mark.usefixtures("_no_float64")
+def test_float64_on_a_device_without_it_is_refused_with_two_ways_out() -> None:
+    real, simulated = (values.float() for values in clouds(30, 30))
+    with pytest.raises(
+        InvalidInputError,
+        match=r"float64 is not available on cpu; pass SinkhornCoupler\("
+        r"dtype=torch.float32\) or move the posterior to the CPU",
+    ):
+        SinkhornCoupler().couple(real, simulated)
+
+
+def test_only_apples_gpus_are_without_float64() -> None:
+    known = {kind: torch.device(kind) for kind in ("cpu", "cuda", "mps")}
+    answers = {kind: cost_module.has_float64(device) for kind, device in known.items()}
+    assert answers == {"cpu": True, "cuda": True, "mps": False}
