@@ -6,8 +6,7 @@ from torch import Tensor
 
 from sbi_rope import MixturePosterior, RoPE, SinkhornCoupler
 from sbi_rope.metrics import evaluate
-from sbi_rope.mixture import MixtureEstimator
-from tests import gaussian
+from tests import gaussian, problems
 
 
 def with_exact_g(x_o: Tensor, n_s: int, coupler: SinkhornCoupler) -> MixturePosterior:
@@ -18,7 +17,7 @@ def with_exact_g(x_o: Tensor, n_s: int, coupler: SinkhornCoupler) -> MixturePost
     with torch.no_grad():
         contexts = h(gaussian.simulator(gaussian.prior().sample((n_s,))))
         coupling = coupler.couple(h(gaussian.undo(x_o)), contexts)
-    mixture = MixtureEstimator(
+    mixture = problems.coupled_mixture(
         rope.build_posterior(x_o).posterior_estimator.components,
         contexts,
         coupling,

@@ -23,7 +23,7 @@ from torch.distributions import (
 
 from sbi_rope._sbi import headless
 from sbi_rope.baselines.hvae import HVAE
-from sbi_rope.baselines.hvae.estimator import LatentMixture
+from sbi_rope.baselines.hvae.contexts import LatentContexts
 from sbi_rope.baselines.hvae.model import (
     FrozenNPE,
     HybridVAE,
@@ -43,6 +43,7 @@ from sbi_rope.errors import (
     RoPEWarning,
     UnsupportedPosteriorError,
 )
+from sbi_rope.mixture import MixtureEstimator, Part
 from sbi_rope.tasks.pendulum import PendulumSimulator
 
 # --- a linear-Gaussian model whose evidence is known ---
@@ -58,6 +59,8 @@ PRECISION = torch.eye(2) + A.T @ A / NOISE_STD**2
 
 class LinearFlow(nn.Module):
     """The exact q(theta | s) of simulations s = A theta + noise, as a flow."""
+
+    input_shape = torch.Size((2,))
 
     def __init__(self) -> None:
         super().__init__()
@@ -328,15 +331,16 @@ def test_physics_sees_parameters_inside_the_support_alone() -> None:
 # --- the posterior ---
 
 
-def mixture(num_latents: int = 7) -> LatentMixture:
+def mixture(num_latents: int = 7) -> MixtureEstimator:
     torch.manual_seed(0)
-    return LatentMixture(
-        linear_model(shift=1.0, noisy=True, r2p_std=0.3),
+    model = linear_model(shift=1.0, noisy=True, r2p_std=0.3)
+    contexts = LatentContexts(
+        model,
         torch.randn(num_latents, 1),
         torch.randn(num_latents, 4),
-        torch.Size((2,)),
         torch.Size((4,)),
     )
+    return MixtureEstimator([Part(model.npe.flow, contexts)], [1.0], tail_mass=0.0)
 
 
 def test_density_is_the_mean_over_all_draws_of_the_latent() -> None:
