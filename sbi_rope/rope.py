@@ -581,9 +581,7 @@ class RoPE:
         # Each posterior its own net and density: moving one to a device leaves the
         # others.
         net = CoupledNet(copy.deepcopy(batch.embedding_net), [coupling])
-        mixing = CoupledContexts(
-            batch.simulated, batch.x_o, [net], unseen=batch.unseen
-        )
+        mixing = CoupledContexts(batch.simulated, batch.x_o, [net], unseen=batch.unseen)
         part = Part(copy.deepcopy(self._components()), mixing)
         mixture = MixtureEstimator([part], [1.0], tail_mass=batch.tail_mass)
         return MixturePosterior(

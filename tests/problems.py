@@ -258,6 +258,11 @@ def coupled_mixture(
     return MixtureEstimator([Part(density, mixing)], [1.0], tail_mass=tail_mass)
 
 
+def simulated_of(posterior: MixturePosterior) -> Tensor:
+    """The embeddings of the simulations behind a posterior, (n_s, l)."""
+    return posterior.posterior_estimator.coupled[0].simulated
+
+
 def rows_of(posterior: MixturePosterior, x: Tensor) -> Tensor:
     """The weights of the simulations for some observations, (n, n_s)."""
     mixing = posterior.posterior_estimator.coupled[0]

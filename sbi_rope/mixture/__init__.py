@@ -1,4 +1,4 @@
-"""Mixtures of weighted densities: the posteriors of RoPE, and of what is built on it."""
+"""Mixtures of weighted densities: the posterior of RoPE, and others."""
 
 from sbi_rope.mixture.coupled import CoupledContexts, CoupledNet
 from sbi_rope.mixture.estimator import MixtureEstimator

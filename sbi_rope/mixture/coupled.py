@@ -176,7 +176,9 @@ class CoupledContexts(Mixing):
     def weights(self) -> Tensor:
         """The rows of ``x_o``, shape ``(n_o, n_s)``; not to be written to."""
         if len(self.couplings) == 1:
-            return self.couplings[0].weights[: self.num_observed]
+            weights = self.couplings[0].weights
+            whole = self.num_observed == len(weights)
+            return weights if whole else weights[: self.num_observed]
         features = self.features(self.x_o)
         return torch.cat(
             [

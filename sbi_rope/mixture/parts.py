@@ -77,9 +77,9 @@ class Mixing(nn.Module, ABC):
 
     @abstractmethod
     def features(self, x: Tensor) -> Tensor:
-        """Return what is computed once of observations, ``(n, *event)`` to ``(n, ...)``.
+        """Return what is computed once of observations and held for all of them.
 
-        It is held for all observations at once.
+        Shapes are ``(n, *event)`` to ``(n, ...)``.
         """
 
     @abstractmethod
@@ -88,7 +88,7 @@ class Mixing(nn.Module, ABC):
 
 
 class OwnContexts(Mixing):
-    r"""The embeddings of the observation itself, :math:`s_k(x) = h_k(x)`, equal weights.
+    r"""The embeddings of the observation itself, :math:`h_k(x)`, with equal weights.
 
     With one net it makes a part of any amortised posterior. With K nets the density is
     averaged over K embeddings.
@@ -120,8 +120,9 @@ def equal_rows(contexts: Tensor) -> Rows:
 
 
 class Part(nn.Module):
-    r"""A density that is mixed over contexts, :math:`\sum_j a_j(x)\, q(\theta \mid
-    s_j(x))`.
+    r"""A density that is mixed over contexts.
+
+    .. math:: \sum_j a_j(x)\, q(\theta \mid s_j(x))
 
     Args:
         density: :math:`q(\theta \mid s)`, an estimator conditioned on contexts.

@@ -122,12 +122,13 @@ class MixturePosterior(DirectPosterior):
             InvalidInputError: If there are several.
         """
         self._coupled("coupling")
-        if len(self.couplings) > 1:
+        coupling, *others = self.couplings
+        if others:
             raise InvalidInputError(
-                f"Expected a single coupling; got a posterior of {len(self.couplings)} "
-                "couplings. Use `couplings`; `weights` has the rows of them all."
+                f"Expected a single coupling; got a posterior of {1 + len(others)}. "
+                "Use `couplings`; `weights` has the rows of them all."
             )
-        return self.couplings[0]
+        return coupling
 
     @property
     def weights(self) -> Tensor:
@@ -422,10 +423,13 @@ def _purpose(estimator: MixtureEstimator) -> str:
     if not estimator.coupled:
         return f"It is a mixture of {num_parts} posterior densities, for any x."
     coupled = estimator.coupled[0]
-    mixed = f"{coupled.num_contexts} simulated posteriors"
-    if num_parts > 1:
-        mixed = f"{num_parts} posterior densities"
-    return f"It is the mixture of {mixed} for each of {len(coupled.x_o)} real observations."
+    mixed = f"{num_parts} posterior densities"
+    if num_parts == 1:
+        mixed = f"{coupled.num_contexts} simulated posteriors"
+    return (
+        f"It is the mixture of {mixed} for each of {len(coupled.x_o)} real "
+        "observations."
+    )
 
 
 def _as_shape(sample_shape: Any) -> torch.Size:

@@ -214,7 +214,7 @@ def check_candidates(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
         double = sorted({name for name in names if names.count(name) > 1})
         raise InvalidInputError(f"Expected names that differ; got {double} twice.")
     couplings = [c for c in candidates if isinstance(c, CouplingCandidate)]
-    nets = list(dict.fromkeys(c.net for c in couplings))
+    nets = [c.net for c in couplings]
     others = [c for c in candidates if not isinstance(c, CouplingCandidate)]
     return (*sorted(couplings, key=lambda c: nets.index(c.net)), *others)
 

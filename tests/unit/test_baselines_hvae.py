@@ -348,7 +348,8 @@ def test_density_is_the_mean_over_all_draws_of_the_latent() -> None:
     x, theta = EVIDENCE.sample((3,)), torch.randn(5, 3, 2)
     mean, log_variance = Encoder(1.0)(x)
     expected = torch.zeros(5, 3)
-    for epsilon, eta in zip(estimator.z_noise, estimator.x_noise, strict=True):
+    mixing: Any = estimator.parts[0].mixing
+    for epsilon, eta in zip(mixing.z_noise, mixing.x_noise, strict=True):
         z = mean + (0.5 * log_variance).exp() * epsilon
         s = x - z @ B.T + 0.3 * eta
         expected += LinearFlow().log_prob(theta, s).exp() / 7
@@ -364,9 +365,9 @@ def test_density_does_not_depend_on_how_it_is_cut(
     x, theta = EVIDENCE.sample((11,)), torch.randn(5, 11, 2)
     expected = estimator.log_prob(theta, x)
     for entries, pairs in ((4, 1), (8, 10), (56, 20), (100, 100)):
-        module = "sbi_rope.baselines.hvae.estimator"
+        module = "sbi_rope.baselines.hvae.contexts"
         monkeypatch.setattr(f"{module}.MAX_ENTRIES", entries)
-        monkeypatch.setattr(f"{module}.flow_batch", lambda device, n=pairs: n)
+        monkeypatch.setattr("sbi_rope.mixture.chunks.CPU_BATCH", pairs)
         torch.testing.assert_close(estimator.log_prob(theta, x), expected)
         assert estimator.sample(torch.Size((3,)), x).shape == (3, 11, 2)
 
@@ -511,10 +512,10 @@ def test_npe_is_left_as_it_was_and_is_not_trained_inside_either(npe: Any) -> Non
     for name, value in npe.posterior_estimator.state_dict().items():
         torch.testing.assert_close(value, before[name], rtol=0, atol=0)
     inside = headless(npe.posterior_estimator).state_dict()
-    for name, value in estimator.flow.state_dict().items():
+    for name, value in estimator.parts[0].density.state_dict().items():
         torch.testing.assert_close(value, inside[name], rtol=0, atol=0)
     for own, given in zip(
-        estimator.embedding.parameters(),
+        estimator.parts[0].mixing.embedding.parameters(),
         npe.posterior_estimator.embedding_net.parameters(),
         strict=True,
     ):

@@ -236,9 +236,7 @@ class HVAE(BuildsOnNPE, UsesCalibration, UsesObservations):
         """Return NPE mixed over draws of z, with the networks of the model."""
         if x_noise is not None:
             x_noise = x_noise[: len(z_noise)]
-        contexts = LatentContexts(
-            model, z_noise, x_noise, self._observations.shape[1:]
-        )
+        contexts = LatentContexts(model, z_noise, x_noise, self._observations.shape[1:])
         part = Part(model.npe.flow, contexts)
         return MixtureEstimator([part], [1.0], tail_mass=0.0).to(self._device)
 

@@ -49,7 +49,9 @@ def train_hybrid(
     objective = partial(model.objective, weight=weight)
     validation_loss: Callable[[], Tensor] | None = None
     if len(held_out):
-        validation_loss = partial(_held_out_loss, posterior, theta[held_out], x[held_out])
+        validation_loss = partial(
+            _held_out_loss, posterior, theta[held_out], x[held_out]
+        )
     else:
         warn_user(
             f"Only {len(x)} calibration pair(s): none is held out, and the networks "
