@@ -132,6 +132,11 @@ class CoupledContexts(Mixing):
         check_choice("unseen", unseen, ("raise", "extend"))
         if num_observed is not None:
             check_integer("num_observed", num_observed)
+            if num_observed > len(batch):
+                raise InvalidInputError(
+                    f"Expected `num_observed` of at most {len(batch)}, the length of "
+                    f"the batch; got {num_observed}."
+                )
         self._nets = nn.ModuleList(nets)
         check_weights("shares", self.shares, len(self.couplings))
         for coupling in self.couplings:

@@ -215,8 +215,9 @@ def check_candidates(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
         raise InvalidInputError(f"Expected names that differ; got {double} twice.")
     couplings = [c for c in candidates if isinstance(c, CouplingCandidate)]
     nets = [c.net for c in couplings]
+    couplings.sort(key=lambda c: nets.index(c.net))
     others = [c for c in candidates if not isinstance(c, CouplingCandidate)]
-    return (*sorted(couplings, key=lambda c: nets.index(c.net)), *others)
+    return (*couplings, *others)
 
 
 def as_part(name: str, posterior: Any, rope: RoPE) -> Part:
