@@ -210,7 +210,7 @@ def _stack_score(case: Case, cell: Cell) -> Score:
         test_seconds=test_seconds,
         num_simulations=len(case.simulations[0]) + count.new,
         shares_npe=True,
-        converged=posterior.coupling.converged,
+        converged=all(coupling.converged for coupling in posterior.couplings),
         arrays=_candidates(case, posterior),
     )
 

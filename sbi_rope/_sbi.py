@@ -29,6 +29,7 @@ from sbi.neural_nets.estimators.mixed_density_estimator import MixedDensityEstim
 from sbi.neural_nets.estimators.tabpfn_flow import TabPFNFlow
 from sbi.neural_nets.net_builders.flow import build_zuko_unconditional_flow
 from sbi.samplers.mcmc import SliceSamplerVectorized
+from sbi.utils.user_input_checks_utils import move_distribution_to_device
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
@@ -40,6 +41,7 @@ __all__ = [
     "ConditionalEstimator",
     "DirectPosterior",
     "MixedDensity",
+    "MixtureDensity",
     "NeuralPosterior",
     "SliceSamplerVectorized",
     "UnconditionalDensityEstimator",
@@ -51,6 +53,8 @@ __all__ = [
     "embedding_of",
     "estimator_of",
     "headless",
+    "is_bounded",
+    "move_distribution_to_device",
     "posterior_from",
     "with_embedding",
 ]
@@ -68,7 +72,14 @@ def estimator_of(posterior: Any) -> ConditionalEstimator:
     plain = isinstance(posterior, DirectPosterior) and not isinstance(
         posterior, FilteredDirectPosterior | NPE_A_Posterior
     )
-    if not plain or getattr(posterior, "is_mixture", False):
+    if plain and isinstance(posterior.posterior_estimator, MixtureDensity):
+        raise UnsupportedPosteriorError(
+            "Expected `posterior` to be what `NPE(...).build_posterior()` returns; got "
+            f"{type(posterior).__name__} around a mixture of such posteriors, which "
+            "has no single embedding of x. What RoPE, a stack or a baseline has "
+            "repaired cannot be repaired again: pass the posterior it was built from."
+        )
+    if not plain:
         raise UnsupportedPosteriorError(
             "Expected `posterior` to be what `NPE(...).build_posterior()` returns "
             "with sample_with='direct' (a DirectPosterior), or the posterior of FMPE "
@@ -76,6 +87,15 @@ def estimator_of(posterior: Any) -> ConditionalEstimator:
             "posterior whose estimator has an embedding of x."
         )
     return posterior.posterior_estimator
+
+
+def is_bounded(posterior: DirectPosterior) -> bool:
+    """Tell whether a posterior normalises by other means than sbi's own rejection.
+
+    That goes on until enough draws are inside the prior, which may be for ever.
+    """
+    # NPE_A_Posterior of sbi has a method of its own, but of the same kind.
+    return type(posterior).leakage_correction.__module__.split(".")[0] != "sbi"
 
 
 def embedding_of(estimator: ConditionalEstimator) -> nn.Module:
@@ -173,6 +193,13 @@ def posterior_from(
     return DirectPosterior(
         estimator, prior, device=device, enable_transform=posterior.enable_transform
     )
+
+
+class MixtureDensity(ConditionalDensityEstimator):
+    """A density that mixes others given several contexts of an observation.
+
+    So it has no single embedding of x, which could be tuned or taken off.
+    """
 
 
 class MixedDensity(ConditionalDensityEstimator):

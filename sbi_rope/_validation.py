@@ -29,7 +29,11 @@ __all__ = [
     "check_same_length",
     "check_tensor",
     "check_unit_interval",
+    "check_weights",
 ]
+
+# What the sum of weights may be away from one, such as that of float32 numbers.
+ROUNDING_OF_WEIGHTS = 1e-5
 
 
 def check_tensor(name: str, value: Any) -> Tensor:
@@ -166,6 +170,23 @@ def check_unit_interval(name: str, value: Any) -> None:
     """Raise unless ``value`` is a number in [0, 1]."""
     if not _is_number(value) or not 0.0 <= value <= 1.0:
         raise InvalidInputError(f"Expected `{name}` in [0, 1]; got {value!r}.")
+
+
+def check_weights(name: str, value: Any, count: int) -> list[float]:
+    """Return so many numbers, if none is negative and they sum to one."""
+    weights = torch.as_tensor(value, dtype=torch.double)
+    if weights.shape != (count,):
+        raise InvalidInputError(
+            f"Expected `{name}` to be {count} numbers; got shape "
+            f"{tuple(weights.shape)}."
+        )
+    total = float(weights.sum())
+    if not (weights >= 0).all() or not abs(total - 1) < ROUNDING_OF_WEIGHTS:
+        raise InvalidInputError(
+            f"Expected `{name}` without negative numbers and with a sum of one; got "
+            f"{weights.tolist()}, whose sum is {total:g}."
+        )
+    return weights.tolist()
 
 
 def check_choice(name: str, value: Any, choices: Sequence[Any]) -> None:

@@ -44,7 +44,13 @@ from sbi_rope.errors import (
     UnsupportedPosteriorError,
 )
 from sbi_rope.finetuning import CalibrationFinetuner, History
-from sbi_rope.mixture import MixtureEstimator, MixturePosterior
+from sbi_rope.mixture import (
+    CoupledContexts,
+    CoupledNet,
+    MixtureEstimator,
+    MixturePosterior,
+    Part,
+)
 
 __all__ = ["RoPE"]
 
@@ -528,7 +534,7 @@ class RoPE:
         def posteriors() -> Iterator[MixturePosterior]:
             settings = itertools.product(gammas, taus)
             # In our hands: moving a posterior to a device gives it another.
-            shared: dict[str, Tensor] = {}
+            shared: dict[int, Tensor] = {}
             for coupling, (gamma, tau) in zip(couplings, settings, strict=True):
                 if require_convergence:
                     _check_converged(coupling, replace(coupler, gamma=gamma, tau=tau))
@@ -573,18 +579,14 @@ class RoPE:
         batch: "_Batch",
         coupling: Coupling,
         *,
-        shared: dict[str, Tensor] | None = None,
+        shared: dict[int, Tensor] | None = None,
     ) -> MixturePosterior:
-        mixture = MixtureEstimator(
-            copy.deepcopy(self._components()),
-            batch.simulated,
-            coupling,
-            batch.x_o,
-            # Each posterior its own: moving one to a device leaves the others.
-            embedding_net=copy.deepcopy(batch.embedding_net),
-            unseen=batch.unseen,
-            tail_mass=batch.tail_mass,
-        )
+        # Each posterior its own net and density: moving one to a device leaves the
+        # others.
+        net = CoupledNet(copy.deepcopy(batch.embedding_net), [coupling])
+        mixing = CoupledContexts(batch.simulated, batch.x_o, [net], unseen=batch.unseen)
+        part = Part(copy.deepcopy(self._components()), mixing)
+        mixture = MixtureEstimator([part], [1.0], tail_mass=batch.tail_mass)
         return MixturePosterior(
             mixture,
             copy.deepcopy(self._prior),

@@ -16,6 +16,7 @@ from sbi.neural_nets import posterior_nn
 from torch import Tensor, nn
 
 from sbi_rope import CalibrationFinetuner
+from sbi_rope._sbi import is_bounded
 from sbi_rope.baselines import (
     HVAE,
     NNPE,
@@ -241,6 +242,4 @@ def _unrejected(posterior: Any) -> dict[str, bool]:
 
 
 def _rejects_without_bound(posterior: Any) -> bool:
-    return isinstance(posterior, DirectPosterior) and not getattr(
-        posterior, "bounded_rejection", False
-    )
+    return isinstance(posterior, DirectPosterior) and not is_bounded(posterior)

@@ -15,7 +15,13 @@ from torch import Size, Tensor, nn
 from torch.distributions import Bernoulli, Binomial, Distribution, MultivariateNormal
 
 from sbi_rope.coupling import Coupling
-from sbi_rope.mixture import MixtureEstimator, MixturePosterior
+from sbi_rope.mixture import (
+    CoupledContexts,
+    CoupledNet,
+    MixtureEstimator,
+    MixturePosterior,
+    Part,
+)
 
 # Names of `posterior_nn` for continuous parameters, and for mixed ones.
 FAMILIES = [
@@ -160,12 +166,15 @@ class TableCoupling(Coupling):
     def weights(self) -> Tensor:
         return self.table
 
-    def rows(self, real: Tensor) -> Tensor:
-        rows = super().rows(real)
+    def rows(self, real: Tensor, *, distances: Tensor | None = None) -> Tensor:
+        rows = super().rows(real, distances=distances)
         same = (real[:, None] == self.real).all(dim=-1)
         known = same.any(dim=1)
         rows[known] = self.table[same.int().argmax(dim=1)[known]]
         return rows
+
+    def restricted_to(self, rows: Tensor) -> "TableCoupling":
+        return replace(super().restricted_to(rows), table=self.table[rows])
 
     def to(self, device: str | torch.device) -> "TableCoupling":
         return replace(super().to(device), table=self.table.to(device))
@@ -221,7 +230,7 @@ def gaussian_posterior(
         weights = (2 * torch.randn(len(x_o), len(contexts))).double().softmax(dim=1)
     if prior is None:
         prior = box(dim)
-    estimator = MixtureEstimator(
+    estimator = coupled_mixture(
         Gaussians(dim),
         contexts,
         coupling_of(weights, contexts, dtype=dtype),
@@ -231,6 +240,33 @@ def gaussian_posterior(
         tail_mass=tail_mass,
     )
     return MixturePosterior(estimator, prior)
+
+
+def coupled_mixture(
+    density: ConditionalDensityEstimator,
+    contexts: Tensor,
+    coupling: Coupling,
+    x_o: Tensor,
+    *,
+    embedding_net: nn.Module,
+    unseen: Any = "raise",
+    tail_mass: float = 1e-3,
+) -> MixtureEstimator:
+    """The mixture of RoPE: one part, one net, one coupling."""
+    net = CoupledNet(embedding_net, [coupling])
+    mixing = CoupledContexts(contexts, x_o, [net], unseen=unseen)
+    return MixtureEstimator([Part(density, mixing)], [1.0], tail_mass=tail_mass)
+
+
+def simulated_of(posterior: MixturePosterior) -> Tensor:
+    """The embeddings of the simulations behind a posterior, (n_s, l)."""
+    return posterior.posterior_estimator.coupled[0].simulated
+
+
+def rows_of(posterior: MixturePosterior, x: Tensor) -> Tensor:
+    """The weights of the simulations for some observations, (n, n_s)."""
+    mixing = posterior.posterior_estimator.coupled[0]
+    return mixing.rows(mixing.features(x)).weights
 
 
 def standard_normal(dim: int) -> MultivariateNormal:
@@ -243,10 +279,11 @@ def brute_force_log_prob(posterior: MixturePosterior, theta: Tensor) -> Tensor:
     One component at a time, in float64; no support, no tail.
     """
     estimator = posterior.posterior_estimator
+    density = estimator.parts[0].density
     columns = []
-    for context in estimator.contexts:
+    for context in estimator.coupled[0].simulated:
         flat = theta.reshape(-1, theta.shape[-1])
         condition = context[None].expand(len(flat), -1)
-        log_q = estimator.components.log_prob(flat[None], condition)[0]
+        log_q = density.log_prob(flat[None], condition)[0]
         columns.append(log_q.double().reshape(theta.shape[:-1]))
     return torch.logsumexp(torch.stack(columns, -1) + posterior.weights.log(), dim=-1)

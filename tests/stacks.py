@@ -11,7 +11,6 @@ from sbi_rope import CalibrationFinetuner, MixturePosterior, RoPE, SinkhornCoupl
 from sbi_rope._sbi import headless
 from sbi_rope.baselines import FinetunedNPE, PriorPosterior
 from sbi_rope.baselines.training import Training
-from sbi_rope.mixture import MixtureEstimator
 from sbi_rope.stacking import (
     CouplingCandidate,
     CrossValidation,
@@ -175,7 +174,7 @@ def coupled_by_hand(
     )
     with torch.no_grad():
         coupling = coupler.couple(net(x), contexts)
-    estimator = MixtureEstimator(
+    estimator = problems.coupled_mixture(
         headless(rope.npe.posterior_estimator),
         contexts,
         coupling,

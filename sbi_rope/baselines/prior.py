@@ -3,7 +3,7 @@ r"""The prior as a posterior: what is known before any observation."""
 from typing import Any
 
 import torch
-from sbi.utils import mcmc_transform, within_support
+from sbi.utils import mcmc_transform
 from torch import Tensor
 from torch.distributions import Distribution
 
@@ -12,6 +12,7 @@ from sbi_rope._sbi import BasePotential, NeuralPosterior
 from sbi_rope._validation import check_prior, check_tensor
 from sbi_rope.baselines.base import Method
 from sbi_rope.errors import InvalidInputError
+from sbi_rope.mixture.prior import prior_log_prob
 
 __all__ = ["PriorBaseline", "PriorPosterior"]
 
@@ -179,7 +180,7 @@ class PriorBaseline(Method):
 
 
 class _PriorPotential(BasePotential):
-    """Log density of the prior, for any x; the support is checked first."""
+    """Log density of the prior, for any x."""
 
     prior: Distribution
 
@@ -188,13 +189,4 @@ class _PriorPotential(BasePotential):
         with torch.set_grad_enabled(track_gradients):
             # sbi's MultipleIndependent takes theta of two dimensions at most.
             theta = theta.reshape(-1, theta.shape[-1])
-            inside = within_support(self.prior, theta)
-            # torch's distributions raise outside their support: evaluate them at a
-            # prior draw there, and overwrite the result.
-            with seeded(0):  # evaluating a density draws nothing from the caller
-                filler = self.prior.sample(torch.Size((1,))).to(theta)
-            safe = torch.where(inside.unsqueeze(-1), theta, filler)
-            # A flat density has no graph back to theta; sbi's map() needs one.
-            log_prob = self.prior.log_prob(safe) + 0.0 * safe.sum(dim=-1)
-            log_prob = log_prob.where(inside, -torch.inf)
-            return log_prob.reshape(shape)
+            return prior_log_prob(self.prior, theta).reshape(shape)

@@ -1,13 +1,12 @@
 """Robust neural posterior estimation: denoise the statistics, then condition."""
 
-import math
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from sbi_rope._random import seeded
-from sbi_rope._sbi import ConditionalDensityEstimator, embed, estimator_of
+from sbi_rope._sbi import embed, estimator_of
 from sbi_rope._training import History
 from sbi_rope._validation import (
     check_batch,
@@ -25,9 +24,9 @@ from sbi_rope.baselines.statistics import (
 )
 from sbi_rope.baselines.training import EstimatorBuilder, Training
 from sbi_rope.errors import InvalidInputError, warn_user
-from sbi_rope.mixture.chunks import flow_batch
+from sbi_rope.mixture import Mixing, MixtureEstimator, Part, Rows, equal_rows
 
-__all__ = ["RNPE", "DenoisedEstimator"]
+__all__ = ["RNPE", "DenoisedContexts"]
 
 # Chains that disagree by more have not converged.
 MAX_R_HAT = 1.1
@@ -35,63 +34,63 @@ MAX_R_HAT = 1.1
 NUM_STARTS = 5000
 
 
-class DenoisedEstimator(ConditionalDensityEstimator):
-    r"""The mean of NPE over statistics that may be behind an observation.
+class DenoisedContexts(Mixing):
+    r"""Statistics that may be behind an observation, with equal weights.
 
     .. math::
-        \tfrac1M \sum_m q(\theta \mid s_m), \qquad s_m \sim p(s \mid y)
+        s_m \sim p(s \mid y), \quad m = 1, \ldots, M
 
     An observation is denoised when it is first asked for and known by its values from
     then on, so that density and samples belong together. Its draws of s depend on those
     it is denoised together with, through the random numbers alone.
 
     Args:
-        density: :math:`q(\theta \mid s)`.
         net: From x to s.
         marginal: :math:`q(s)` of standardised statistics.
         statistics: Simulated statistics, shape ``(n_s, l)``.
-        condition_shape: Shape of one observation.
+        event_shape: Shape of one observation.
         error_model: :math:`p(y \mid s)`.
         settings: How s is sampled.
         seed: Seed of the chains.
     """
 
-    simulated: Tensor
+    starts: Tensor
 
     def __init__(
         self,
-        density: ConditionalDensityEstimator,
         net: nn.Module,
         marginal: Any,
         statistics: Tensor,
         *,
-        condition_shape: torch.Size,
+        event_shape: torch.Size,
         error_model: SpikeAndSlab,
         settings: ChainSettings,
         seed: int,
     ) -> None:
-        super().__init__(net, density.input_shape, condition_shape)
-        self.density = density
+        super().__init__(event_shape, settings.num_draws)
+        self.net = net
         self.marginal = marginal
         self.standardisation = Standardisation(statistics)
-        self.register_buffer("simulated", self.standardisation(statistics[:NUM_STARTS]))
+        self.register_buffer("starts", self.standardisation(statistics[:NUM_STARTS]))
         self.error_model = error_model
         self.settings = settings
         self.seed = seed
         self._denoised: dict[bytes, tuple[Tensor, Tensor]] = {}
 
-    # --- denoising ---
-
-    def denoised(self, x: Tensor) -> Tensor:
+    def features(self, x: Tensor) -> Tensor:
         """Return the draws of s of each observation, ``(n, num_denoised, l)``."""
-        return torch.stack([draws for draws, _ in self._lookup(x)]).to(self.simulated)
+        return torch.stack([draws for draws, _ in self._lookup(x)]).to(self.starts)
+
+    def rows(self, features: Tensor) -> Rows:
+        """Weigh all draws of an observation equally."""
+        return equal_rows(features)
 
     def r_hat(self, x: Tensor) -> Tensor:
         """Return the largest split-R-hat of each observation's chains, ``(n,)``."""
-        return torch.stack([r_hat for _, r_hat in self._lookup(x)]).to(self.simulated)
+        return torch.stack([r_hat for _, r_hat in self._lookup(x)]).to(self.starts)
 
     def _lookup(self, x: Tensor) -> list[tuple[Tensor, Tensor]]:
-        x = check_batch("x", x, self.condition_shape).to(self.simulated)
+        x = check_batch("x", x, self.event_shape).to(self.starts)
         keys = [row.tobytes() for row in (x.detach().cpu() + 0.0).numpy()]
         # Equal observations are denoised once.
         new = {key: i for i, key in enumerate(keys) if key not in self._denoised}
@@ -106,7 +105,7 @@ class DenoisedEstimator(ConditionalDensityEstimator):
             draws, r_hats = denoise(
                 y,
                 log_density=lambda s: self.marginal.log_prob(s[None])[0],
-                simulated=self.simulated,
+                simulated=self.starts,
                 error_model=self.error_model,
                 settings=self.settings,
             )
@@ -122,52 +121,6 @@ class DenoisedEstimator(ConditionalDensityEstimator):
         for key, s, r_hat in zip(keys, draws.cpu(), r_hats.cpu(), strict=True):
             self._denoised[key] = (s, r_hat)
 
-    # --- density and samples ---
-
-    def log_prob(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
-        """Return the log density, shape ``(S, B)``.
-
-        Args:
-            input: theta, shape ``(S, B, k)`` or ``(B, k)``; B or 1 of them.
-            condition: Observations, shape ``(B, *event)``; B or 1 of them.
-            **kwargs: None; kept for sbi's signature.
-        """
-        theta = input if input.ndim > 2 else input[None]
-        s = self.denoised(condition)
-        num_rows, num_draws = max(theta.shape[1], len(s)), s.shape[1]
-        shape = (len(theta), num_rows, num_draws)
-        theta = theta.expand(-1, num_rows, -1).to(s)
-        s = s.expand(num_rows, -1, -1)
-        pairs = torch.arange(math.prod(shape), device=s.device)
-        log_q = []
-        for batch in pairs.split(flow_batch(s.device)):
-            draw, row = batch % num_draws, batch // num_draws % num_rows
-            points = theta[batch // (num_draws * num_rows), row]
-            log_q.append(self.density.log_prob(points[None], s[row, draw])[0])
-        log_q = torch.cat(log_q).reshape(shape).double()
-        log_prob = torch.logsumexp(log_q, dim=-1) - math.log(num_draws)
-        return log_prob.to(s)
-
-    @torch.no_grad()
-    def sample(
-        self, sample_shape: torch.Size, condition: Tensor, **kwargs: Any
-    ) -> Tensor:
-        """Draw parameters, shape ``(*sample_shape, B, k)``."""
-        s = self.denoised(condition)
-        num_samples = math.prod(sample_shape)
-        row = torch.arange(len(s), device=s.device).repeat(num_samples)
-        draw = torch.randint(s.shape[1], (len(row),), device=s.device)
-        one = torch.Size((1,))
-        parts = [
-            self.density.sample(one, s[row[part], draw[part]])[0]
-            for part in torch.arange(len(row)).split(flow_batch(s.device))
-        ]
-        return torch.cat(parts).reshape(*sample_shape, len(s), *self.input_shape)
-
-    def loss(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
-        """Return the negative log density, shape ``(B,)``."""
-        return -self.log_prob(input[None], condition)[0]
-
 
 class RNPE(BuildsOnNPE):
     r"""NPE averaged over the statistics a simulator may have had behind real ones.
@@ -182,7 +135,8 @@ class RNPE(BuildsOnNPE):
     statistics are drawn by sbi's slice sampler, with the choice between spike and slab
     summed out, and kept with the posterior: the first call about an observation takes
     half a second for eight statistics, later ones little. Chains that disagree
-    are warned of, and ``posterior.posterior_estimator.r_hat(x)`` tells by how much.
+    are warned of, and ``posterior.posterior_estimator.parts[0].mixing.r_hat(x)`` tells
+    by how much.
 
     Sees simulations. Assumes that statistics err independently of each other, any of
     them, and that simulated ones are not tied to each other: a sweep moves one at a
@@ -272,16 +226,16 @@ class RNPE(BuildsOnNPE):
             training=self.training,
             show_progress_bars=show_progress_bars,
         )
-        estimator = DenoisedEstimator(
-            density,
+        denoised = DenoisedContexts(
             net,
             marginal,
             statistics,
-            condition_shape=x.shape[1:],
+            event_shape=x.shape[1:],
             error_model=self.error_model,
             settings=self.settings,
             seed=int(torch.randint(2**31, ())),
         )
+        estimator = MixtureEstimator([Part(density, denoised)], [1.0], tail_mass=0.0)
         return self._direct_posterior(estimator.eval()), history
 
     def _standardised(self, statistics: Tensor) -> Tensor:

@@ -1,8 +1,8 @@
 """What a coupling returns: weights on request, and the evidence of convergence."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -88,7 +88,27 @@ class Coupling:
             sizes[rows] = 1 / self._row_block(self.real[rows]).square().sum(dim=1)
         return sizes
 
-    def rows(self, real: Tensor) -> Tensor:
+    def __getstate__(self) -> dict[str, Any]:
+        # Without weights and distances that were kept, of up to 400 MB.
+        return {entry.name: getattr(self, entry.name) for entry in fields(self)}
+
+    def distances(self, real: Tensor) -> Tensor:
+        r"""Return :math:`C`, which couplings of the same embeddings share.
+
+        Args:
+            real: Embeddings of the observations, shape ``(n, l)``.
+
+        Returns:
+            Shape ``(n, n_s)``. They are the same for another coupling with the same
+            ``simulated`` and ``direct``.
+
+        Raises:
+            InvalidInputError: If the shape does not fit, or a value is not finite.
+        """
+        real = check_batch("real", real, self.simulated.shape[1:])
+        return self._distances(real.to(self.simulated))
+
+    def rows(self, real: Tensor, *, distances: Tensor | None = None) -> Tensor:
         r"""Return the weights of other observations under the same potential.
 
         A good stand-in for coupling again where the effective sample size of the new
@@ -98,6 +118,7 @@ class Coupling:
 
         Args:
             real: Embeddings of the observations, shape ``(n, l)``.
+            distances: What :meth:`distances` returns for them, if it is known.
 
         Returns:
             Weights of shape ``(n, n_s)``; rows sum to one.
@@ -107,7 +128,10 @@ class Coupling:
                 observation is so far away that all its distances are the same.
         """
         real = check_batch("real", real, self.simulated.shape[1:]).to(self.simulated)
-        farthest = self._distances.bound(real)
+        if distances is None:
+            farthest = self._distances.bound(real)
+        else:
+            farthest = float(distances.max())
         limit = 0.1 * self.gamma / torch.finfo(real.dtype).eps
         if not farthest < limit:
             raise InvalidInputError(
@@ -115,7 +139,14 @@ class Coupling:
                 f"{real.dtype} still tells their distances apart; got {farthest:.1e}. "
                 "Such an observation is like no simulation: look at its values."
             )
-        return self._rows(real)
+        return self._rows(real) if distances is None else self._softmax(distances)
+
+    def restricted_to(self, rows: Tensor) -> "Coupling":
+        """Return the coupling of some observations of the batch, by their numbers.
+
+        What it says of its own convergence stays that of the batch.
+        """
+        return replace(self, real=self.real[rows])
 
     def to(self, device: str | torch.device) -> "Coupling":
         """Return the same coupling on another device."""
@@ -133,9 +164,11 @@ class Coupling:
         return weights
 
     def _row_block(self, real: Tensor) -> Tensor:
-        w = self.potential.to(real)
-        cost = self._distances(real)
-        return torch.softmax(torch.add(w, cost, alpha=-1 / self.gamma), dim=1)
+        return self._softmax(self._distances(real))
+
+    def _softmax(self, distances: Tensor) -> Tensor:
+        w = self.potential.to(distances)
+        return torch.softmax(torch.add(w, distances, alpha=-1 / self.gamma), dim=1)
 
     @cached_property
     def _distances(self) -> Distances:

@@ -7,8 +7,8 @@ therefore score such posteriors as the network states them: samples without reje
 ``log_prob`` without renormalisation (but still :math:`-\infty` outside the prior).
 Leakage counts as an error of the posterior.
 
-A posterior whose own rejection is bounded says so by an attribute
-``bounded_rejection = True``, and is called without these arguments.
+A posterior that has replaced sbi's normalisation by a bounded one, as those of this
+package, is called without these arguments.
 """
 
 import warnings
@@ -20,7 +20,7 @@ from sbi.inference import DirectPosterior, EnsemblePosterior, VectorFieldPosteri
 from torch import Tensor
 
 from sbi_rope._progress import progress_bar
-from sbi_rope._sbi import NeuralPosterior
+from sbi_rope._sbi import NeuralPosterior, is_bounded
 from sbi_rope._validation import (
     check_batch,
     check_integer,
@@ -182,9 +182,9 @@ def _is_unbounded(posterior: Any) -> bool:
     """Whether sbi would reject without a bound, and can be told not to."""
     if isinstance(posterior, EnsemblePosterior):
         return any(_is_unbounded(member) for member in posterior.posteriors)
-    return isinstance(
-        posterior, DirectPosterior | VectorFieldPosterior
-    ) and not getattr(posterior, "bounded_rejection", False)
+    if isinstance(posterior, DirectPosterior):
+        return not is_bounded(posterior)
+    return isinstance(posterior, VectorFieldPosterior)
 
 
 def _is_unbounded_direct(posterior: Any) -> bool:

@@ -1,7 +1,23 @@
-"""The posterior of RoPE: a mixture of simulated posteriors."""
+"""Mixtures of weighted densities: the posterior of RoPE, and others."""
 
+from sbi_rope.mixture.coupled import CoupledContexts, CoupledNet
 from sbi_rope.mixture.estimator import MixtureEstimator
+from sbi_rope.mixture.parts import Mixing, OwnContexts, Part, Rows, equal_rows, part_of
 from sbi_rope.mixture.posterior import MixturePosterior
+from sbi_rope.mixture.prior import part_of_prior
 from sbi_rope.mixture.truncation import Leakage
 
-__all__ = ["Leakage", "MixtureEstimator", "MixturePosterior"]
+__all__ = [
+    "CoupledContexts",
+    "CoupledNet",
+    "Leakage",
+    "Mixing",
+    "MixtureEstimator",
+    "MixturePosterior",
+    "OwnContexts",
+    "Part",
+    "Rows",
+    "equal_rows",
+    "part_of",
+    "part_of_prior",
+]

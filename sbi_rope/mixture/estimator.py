@@ -1,170 +1,208 @@
-"""The density of the mixture, as an estimator in the sense of sbi."""
+"""The density of a mixture of weighted parts, as an estimator in the sense of sbi."""
 
-import hashlib
-from collections.abc import Callable, Iterator
-from typing import Any, Literal
+import math
+from collections.abc import Iterator, Sequence
+from itertools import chain
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
-from sbi_rope._sbi import ConditionalDensityEstimator, embed
-from sbi_rope.coupling import Coupling
-from sbi_rope.errors import InvalidInputError, UnseenObservationError, warn_user
-from sbi_rope.mixture.chunks import blocks, flow_batch, keep_freed_memory, num_fitting
+from sbi_rope._sbi import MixtureDensity
+from sbi_rope._validation import (
+    check_batch,
+    check_same_length,
+    check_unit_interval,
+    check_weights,
+)
+from sbi_rope.errors import InvalidInputError
+from sbi_rope.mixture.block import Block
+from sbi_rope.mixture.chunks import blocks, flow_batch, keep_freed_memory
+from sbi_rope.mixture.coupled import CoupledContexts
+from sbi_rope.mixture.density import block_log_prob
+from sbi_rope.mixture.parts import DTYPE, Part
 from sbi_rope.mixture.sampling import Accept, BlockSampler
-from sbi_rope.mixture.truncation import Leakage, component_mass, mixture_mass
+from sbi_rope.mixture.truncation import (
+    LEAKAGE_DRAWS,
+    Leakage,
+    component_mass,
+    own_mass,
+    shared_mass,
+)
 
-__all__ = ["MixtureEstimator", "without_nan"]
+__all__ = ["MixtureEstimator"]
 
 
-class MixtureEstimator(ConditionalDensityEstimator):
-    r"""The density :math:`\sum_j \alpha_{ij}\, q(\theta \mid h(x_{s,j}))` given x_o.
+class MixtureEstimator(MixtureDensity):
+    r"""A mixture of densities that are themselves mixed over contexts.
 
-    An estimator in the sense of sbi, whose condition is a real observation. The prior's
+    .. math::
+        p(\theta \mid x) = \sum_k w_k \sum_j a^k_j(x)\, q_k(\theta \mid s^k_j(x))
+
+    An estimator in the sense of sbi, whose condition is an observation. The prior's
     support is not its business; see :class:`MixturePosterior`.
 
     Args:
-        components: :math:`q(\theta \mid s)`, an estimator conditioned on embeddings.
-        contexts: :math:`h(x_s)`, shape ``(n_s, l)``.
-        coupling: Where the weights come from, ``coupling.rows`` of its features of the
-            observations, ``coupling.real`` of shape ``(n_o, l)``.
-        x_o: The batch of real observations, shape ``(n_o, *event)``.
-        embedding_net: :math:`g`, needed to extend to unseen observations only.
-        unseen: What to do with an x outside the batch: ``"raise"``, or ``"extend"`` by
-            the softmax row of the same potential.
-        tail_mass: Weight of the smallest components of each row that ``log_prob``
-            leaves out; 0 evaluates all.
+        parts: The densities :math:`q_k`, each with its weights :math:`a^k` and contexts
+            :math:`s^k`. Several may be coupled, if their ``x_o`` are the same.
+        weights: :math:`w`, one for each part, which sum to one. Parts of weight zero
+            cost nothing.
+        tail_mass: Weight of the smallest terms for each observation that ``log_prob``
+            leaves out, over all parts together; 0 evaluates all.
+
+    Raises:
+        InvalidInputError: If there is no part, shapes of theta or x differ between
+            parts, or an argument is outside its range.
     """
 
-    contexts: Tensor
-    x_o: Tensor
+    weights: Tensor
 
     def __init__(
         self,
-        components: ConditionalDensityEstimator,
-        contexts: Tensor,
-        coupling: Coupling,
-        x_o: Tensor,
+        parts: Sequence[Part],
+        weights: Sequence[float] | Tensor,
         *,
-        embedding_net: nn.Module,
-        unseen: Literal["raise", "extend"] = "raise",
         tail_mass: float = 1e-3,
     ) -> None:
-        super().__init__(nn.Identity(), components.input_shape, x_o.shape[1:])
-        self.components = components
-        self.coupling = coupling
-        self.unseen = unseen
+        if not len(parts):
+            raise InvalidInputError("Expected at least one part; got none.")
+        first = parts[0]
+        super().__init__(
+            nn.Identity(), first.density.input_shape, first.mixing.event_shape
+        )
+        for part in parts:
+            shapes = (part.density.input_shape, part.mixing.event_shape)
+            if shapes != (self.input_shape, self.condition_shape):
+                raise InvalidInputError(
+                    f"Expected parts of theta {tuple(self.input_shape)} given x "
+                    f"{tuple(self.condition_shape)}, as the first; got theta "
+                    f"{tuple(shapes[0])} given x {tuple(shapes[1])}."
+                )
+        check_unit_interval("tail_mass", tail_mass)
         self.tail_mass = tail_mass
-        self._g = embedding_net
-        self.register_buffer("contexts", contexts)
-        self.register_buffer("x_o", x_o)
-        self._extended: tuple[list[bytes], Tensor] | None = None
-        # The first row of equal observations stands for all of them.
-        self._index: dict[bytes, int] = {}
-        for i, key in enumerate(_keys(x_o)):
-            self._index.setdefault(key, i)
-
-    def to_device(self, device: str | torch.device) -> None:
-        """Move the networks, the batch and the coupling."""
-        self.to(device)
-        self.coupling = self.coupling.to(device)
-        self._extended = None
-
-    def features(self, x: Tensor) -> Tensor:
-        """Return the embeddings of observations, ``(n, *event)`` to ``(n, l)``.
-
-        Raises:
-            UnseenObservationError: If an x is not in the batch and ``unseen="raise"``.
-        """
-        x = x.to(self.x_o)
-        found = [self._index.get(key, -1) for key in _keys(x)]
-        index = torch.tensor(found, dtype=torch.long, device=self.x_o.device)
-        features = self.coupling.real[index.clamp_min(0)]
-        new = index < 0
-        if new.any():
-            features[new] = self._unseen_features(x[new])
-        return features
-
-    def row_blocks(self, features: Tensor) -> Iterator[tuple[slice, Tensor]]:
-        """Yield the weights ``(b, n_s)`` of a block of observations after the other."""
-        for block in blocks(len(features), len(self.contexts)):
-            yield block, self.coupling.rows(features[block])
-
-    def rows(self, x: Tensor) -> Tensor:
-        """Return the mixture weights of observations, ``(n, *event)`` to ``(n, n_s)``.
-
-        Raises:
-            UnseenObservationError: If an x is not in the batch and ``unseen="raise"``.
-        """
-        return self.coupling.rows(self.features(x))
-
-    def _unseen_features(self, x: Tensor) -> Tensor:
-        # log_prob and its normaliser, or the steps of map(), ask for the same ones, and
-        # earn one warning.
-        keys = _keys(x)
-        if self._extended is None or self._extended[0] != keys:
-            self._extended = (keys, self._extend(x))
-        return self._extended[1]
-
-    def _extend(self, x: Tensor) -> Tensor:
-        if self.unseen == "raise":
-            raise UnseenObservationError(
-                f"{len(x)} observation(s) are not in the batch of "
-                f"{len(self.x_o)} this posterior was built for, and a posterior of "
-                "RoPE belongs to its batch. Either couple the new batch, with "
-                "`rope.build_posterior(x_new)` or `stack(rope, x_new)`, or allow rows "
-                "under the old coupling: both take `unseen='extend'`."
-            )
-        features = embed(self._g, x).to(self.coupling.real)
-        smallest = min(
-            float((1.0 / rows.square().sum(dim=1)).min())
-            for _, rows in self.row_blocks(features)
+        self._parts = nn.ModuleList(parts)
+        tensors = chain(self._parts.buffers(), self._parts.parameters())
+        device = next(tensors, torch.empty(0)).device
+        checked = check_weights("weights", weights, len(parts))
+        self.register_buffer(
+            "weights", torch.tensor(checked, dtype=torch.double, device=device)
         )
-        warn_user(
-            f"Extended the coupling to {len(x)} unseen observation(s); smallest "
-            f"effective sample size {smallest:.1f} of {len(self.contexts)} "
-            "simulations. Below about 50, couple the new batch instead."
-        )
-        return features
+        for other in self.coupled[1:]:
+            if not torch.equal(other.x_o, self.coupled[0].x_o):
+                raise InvalidInputError(
+                    "Expected the same `x_o` in all coupled parts; got different ones."
+                )
+
+    @property
+    def parts(self) -> list[Part]:
+        """The parts, whatever they weigh."""
+        return cast("list[Part]", list(self._parts))
+
+    @property
+    def coupled(self) -> list[CoupledContexts]:
+        """What those parts are mixed over that belong to a batch."""
+        mixings = [part.mixing for part in self.parts]
+        return [mixing for mixing in mixings if isinstance(mixing, CoupledContexts)]
+
+    def restricted_to(self, index: int) -> "MixtureEstimator":
+        """Return the same mixture for one observation of the batch.
+
+        It shares densities with this one, but holds no other observation.
+
+        Args:
+            index: The number of the observation in ``x_o``.
+        """
+        parts = [
+            Part(part.density, part.mixing.restricted_to(index))
+            if isinstance(part.mixing, CoupledContexts)
+            else part
+            for part in self.parts
+        ]
+        return MixtureEstimator(parts, self.weights, tail_mass=self.tail_mass)
 
     # --- density ---
 
     def log_prob(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
-        r"""Return :math:`\log \sum_j \alpha_{ij} q(\theta \mid h(x_{s,j}))`.
+        r"""Return :math:`\log p(\theta \mid x)`.
 
         Args:
             input: theta, shape ``(S, B, d)`` or ``(B, d)``; B or 1 of them.
-            condition: Real observations, shape ``(B, *event)``; B or 1 of them.
+            condition: Observations, shape ``(B, *event)``; B or 1 of them.
             **kwargs: None; kept for sbi's signature.
 
         Returns:
             Shape ``(S, B)``. With ``tail_mass`` = t the density is too small by at most
-            t times the largest density among the components left out.
+            t times the largest density among the terms left out.
+
+        Raises:
+            InvalidInputError: If shapes do not fit or theta is NaN.
+            UnseenObservationError: If a part is coupled, an x is not in its batch, and
+                it has ``unseen="raise"``.
         """
-        theta = self._checked(input)
-        features = self.features(condition)
-        num_rows = max(theta.shape[1], len(features))
-        if {theta.shape[1], len(features)} - {1, num_rows}:
+        theta, x = self._checked_theta(input), self._checked_x(condition)
+        num_rows = max(theta.shape[1], len(x))
+        if {theta.shape[1], len(x)} - {1, num_rows}:
             raise InvalidInputError(
                 "Expected as many rows of `theta` as observations, or one of them; "
-                f"got theta {tuple(input.shape)} and {len(features)} observations."
+                f"got theta {tuple(input.shape)} and {len(x)} observations."
             )
         keep_freed_memory(theta.device)
         shape = (len(theta), num_rows)
         if not theta.numel():
             return theta.new_empty(shape)
         # One observation serves all theta with one row of weights.
-        num_columns = len(features)
         theta = theta.expand(-1, num_rows, *self.input_shape)
-        theta = theta.reshape(-1, num_columns, *self.input_shape)
-        parts = [
-            self._block_log_prob(theta[:, block], weights)
-            for block, weights in self.row_blocks(features)
+        theta = theta.reshape(-1, len(x), *self.input_shape)
+        parts, shares = self._used
+        log_probs = [
+            block_log_prob(theta[:, rows], block, tail_mass=self.tail_mass)
+            for rows, block in _blocks(parts, shares, x)
         ]
-        return torch.cat(parts, dim=1).reshape(shape).to(theta)
+        return torch.cat(log_probs, dim=1).reshape(shape).to(theta)
 
-    def _checked(self, theta: Tensor) -> Tensor:
+    @torch.no_grad()
+    def part_log_probs(
+        self, theta: Tensor, x: Tensor, *, numbers: Sequence[int] | None = None
+    ) -> Tensor:
+        r"""Return the log density of each part by itself at pairs.
+
+        Nothing is left out, whatever ``tail_mass`` and the weights are.
+
+        Args:
+            theta: Parameters, shape ``(n, d)``.
+            x: Their observations, shape ``(n, *event)``.
+            numbers: Those of the parts to evaluate, K of them; all if None.
+
+        Returns:
+            :math:`\log \sum_j a^k_j(x_i) q_k(\theta_i \mid s^k_j(x_i))`, shape
+            ``(n, K)``, float64.
+
+        Raises:
+            InvalidInputError: If shapes do not fit or theta is NaN.
+            UnseenObservationError: As in :meth:`log_prob`.
+        """
+        pairs, x = self._checked_theta(theta), self._checked_x(x)
+        check_same_length("theta", pairs[0], "x", x)
+        numbers = range(len(self.parts)) if numbers is None else numbers
+        log_probs = pairs.new_empty(len(x), len(numbers), dtype=torch.double)
+        for column, number in enumerate(numbers):
+            for rows, block in _blocks([self.parts[number]], [1.0], x):
+                log_prob = block_log_prob(pairs[:, rows], block, tail_mass=0.0)
+                log_probs[rows, column] = log_prob[0]
+        return log_probs
+
+    @property
+    def _used(self) -> tuple[list[Part], list[float]]:
+        """The parts that have a weight, and their weights."""
+        used = [
+            (part, share)
+            for part, share in zip(self.parts, self.weights.tolist(), strict=True)
+            if share
+        ]
+        return [part for part, _ in used], [share for _, share in used]
+
+    def _checked_theta(self, theta: Tensor) -> Tensor:
         """Return theta as ``(S, B, d)``."""
         if theta.shape[-len(self.input_shape) :] != self.input_shape:
             raise InvalidInputError(
@@ -175,44 +213,10 @@ class MixtureEstimator(ConditionalDensityEstimator):
             raise InvalidInputError("Expected `theta` without NaN.")
         if theta.ndim == len(self.input_shape) + 1:
             theta = theta[None]
-        return theta.to(self.contexts)
+        return theta.to(self.weights.device, DTYPE)
 
-    def _block_log_prob(self, theta: Tensor, weights: Tensor) -> Tensor:
-        """Return the log density of theta ``(S, b, d)`` for rows ``(b, n_s)``."""
-        row, component, log_weights = self._without_tail(weights)
-        parts = []
-        for part in theta.split(num_fitting(len(row))):
-            log_q = without_nan(self._log_q(part, row, component).double())
-            parts.append(_log_sum_exp(log_q + log_weights, row, len(weights)))
-        return torch.cat(parts)
-
-    def _without_tail(self, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return row, component and log weight of those that carry 1 - tail_mass."""
-        # Summed from the small end, where the digits are.
-        ascending, order = weights.sort(dim=1)
-        tail = ascending.cumsum(dim=1, dtype=torch.float64)
-        kept = (tail > self.tail_mass) & (ascending > 0)
-        kept[:, -1] = True
-        row = kept.nonzero()[:, 0]
-        return row, order[kept], ascending[kept].double().log()
-
-    def _log_q(self, theta: Tensor, row: Tensor, component: Tensor) -> Tensor:
-        """Evaluate K components at theta of their row, ``(S, b, d)`` to ``(S, K)``.
-
-        The flow sees batches of its own size, whatever rows and samples they mix.
-        """
-        shape = (len(theta), len(row))
-        pairs = torch.arange(len(theta) * len(row), device=theta.device)
-        log_q = []
-        for batch in pairs.split(flow_batch(theta.device)):
-            sample, k = batch // len(row), batch % len(row)
-            points = theta[sample, row[k]]
-            if points.requires_grad:
-                # A component without a density at its point has no gradient there.
-                points.register_hook(lambda grad: grad.nan_to_num(nan=0.0))
-            condition = self.contexts[component[k]]
-            log_q.append(self.components.log_prob(points[None], condition)[0])
-        return torch.cat(log_q).reshape(shape)
+    def _checked_x(self, x: Tensor) -> Tensor:
+        return check_batch("x", x, self.condition_shape).to(self.weights.device, DTYPE)
 
     # --- samples ---
 
@@ -225,20 +229,17 @@ class MixtureEstimator(ConditionalDensityEstimator):
         accept: Accept | None = None,
         batch_size: int | None = None,
         show_progress_bars: bool = False,
-        make_sampler: Callable[..., BlockSampler] | None = None,
         **kwargs: Any,
     ) -> Tensor:
         """Draw from the mixtures of a batch.
 
         Args:
             sample_shape: Shape of the draws of each observation.
-            condition: Real observations, shape ``(B, *event)``.
+            condition: Observations, shape ``(B, *event)``.
             accept: Tells which draws ``(n, d)`` to keep; None keeps all.
             batch_size: Most draws the flow makes at a time; if None what is fast on the
                 device.
             show_progress_bars: Whether to show the draws accepted so far.
-            make_sampler: What draws from a block of observations, given the block, its
-                weights, and the options of :class:`BlockSampler`; that class if None.
             **kwargs: None; kept for sbi's signature.
 
         Returns:
@@ -246,79 +247,134 @@ class MixtureEstimator(ConditionalDensityEstimator):
 
         Raises:
             SamplingError: If next to nothing is accepted for some observation.
+            UnseenObservationError: As in :meth:`log_prob`.
         """
-        keep_freed_memory(self.contexts.device)
-        features = self.features(condition)
+        x = self._checked_x(condition)
+        keep_freed_memory(x.device)
         num_samples = torch.Size(sample_shape).numel()
-        shape = (num_samples, len(features), *self.input_shape)
-        theta = self.contexts.new_empty(shape)
-        total = num_samples * len(features)
+        shape = (num_samples, len(x), *self.input_shape)
+        theta = x.new_empty(shape)
+        total = num_samples * len(x)
         with tqdm(total=total, desc="Sampling", disable=not show_progress_bars) as bar:
-            for block, weights in self.row_blocks(features):
-                sampler = (make_sampler or self._sampler)(
+            for rows, block in _blocks(*self._used, x):
+                sampler = BlockSampler(
                     block,
-                    weights,
                     accept=accept,
-                    batch_size=batch_size or flow_batch(theta.device),
-                    first_row=block.start,
+                    batch_size=batch_size or flow_batch(x.device),
+                    first_row=rows.start,
                 )
-                for part in blocks(num_samples, len(weights)):
-                    theta[part, block] = sampler.sample(part.stop - part.start)
-                    bar.update((part.stop - part.start) * len(weights))
+                for part in blocks(num_samples, len(block.weights)):
+                    theta[part, rows] = sampler.sample(part.stop - part.start)
+                    bar.update((part.stop - part.start) * len(block.weights))
         return theta.reshape(*sample_shape, *shape[1:])
 
-    def _sampler(self, block: slice, weights: Tensor, **options: Any) -> BlockSampler:
-        return BlockSampler(self.components, self.contexts, weights, **options)
+    # --- mass inside the prior's support ---
 
     def mass(
-        self, x: Tensor, *, accept: Accept | None, cache: dict[str, Tensor]
+        self,
+        x: Tensor,
+        *,
+        accept: Accept | None,
+        cache: dict[int, Tensor],
+        show_progress_bars: bool = False,
     ) -> Leakage:
-        r"""Return :math:`Z_i = \sum_j \alpha_{ij} Z_j`, the mass that is accepted.
+        r"""Return the mass of each observation's mixture that is accepted.
+
+        .. math:: Z(x) = \sum_k w_k \sum_j a^k_j(x)\, Z_k(s^k_j(x))
+
+        The masses given contexts that observations share are estimated once, from 1024
+        draws each. Those of an observation's own contexts are estimated for each x,
+        from as many draws as the weight of the part deserves; a part that weighs less
+        than one draw in 1024 counts as inside.
 
         Args:
             x: Observations, shape ``(n, *event)``.
             accept: Tells which parameters ``(n, d)`` count; None counts all.
-            cache: Keeps :math:`Z_j`, which is estimated once.
+            cache: Keeps what is estimated once, by the number of the part.
+            show_progress_bars: Whether to show progress, if it takes long.
         """
-        if "component_mass" not in cache:
-            cache["component_mass"] = component_mass(
-                self.components, self.contexts, accept=accept
+        x = self._checked_x(x)
+        mass = torch.zeros(len(x), dtype=torch.double, device=x.device)
+        variance = torch.zeros_like(mass)
+        for k, share in enumerate(self.weights.tolist()):
+            if not share:
+                continue
+            part = self.parts[k]
+            features = part.mixing.features(x)
+            if accept is None:
+                mass += share
+                continue
+            num_draws = math.ceil(LEAKAGE_DRAWS * share)
+            if share < 1 / LEAKAGE_DRAWS:
+                own = Leakage(torch.ones_like(mass), torch.full_like(mass, 0.5))
+            elif part.mixing.contexts is None:
+                own = own_mass(
+                    part,
+                    features,
+                    accept=accept,
+                    num_draws=num_draws,
+                    show_progress_bars=show_progress_bars,
+                )
+            else:
+                of_each = self.component_mass(
+                    k, accept=accept, cache=cache, show_progress_bars=show_progress_bars
+                )
+                own = shared_mass(part, features, of_each)
+            mass += share * own.mass
+            variance += (share * own.standard_error).square()
+        return Leakage(mass, variance.sqrt())
+
+    def component_mass(
+        self,
+        number: int,
+        *,
+        accept: Accept,
+        cache: dict[int, Tensor],
+        show_progress_bars: bool = False,
+    ) -> Tensor:
+        """Return the mass that is accepted given each shared context of a part.
+
+        Args:
+            number: That of the part.
+            accept: Tells which parameters ``(n, d)`` count.
+            cache: Where it is looked up, or left.
+            show_progress_bars: Whether to show progress, if it takes long.
+
+        Returns:
+            Shape ``(c,)``, float64.
+
+        Raises:
+            InvalidInputError: If observations have contexts of their own.
+        """
+        part = self.parts[number]
+        contexts = part.mixing.contexts
+        if contexts is None:
+            raise InvalidInputError(
+                f"Expected the number of a part with shared contexts; got {number}."
             )
-        rows = (weights for _, weights in self.row_blocks(self.features(x)))
-        return mixture_mass(cache["component_mass"], rows, exact=accept is None)
+        if number not in cache:
+            cache[number] = component_mass(
+                part.density,
+                contexts,
+                accept=accept,
+                show_progress_bars=show_progress_bars,
+            )
+        return cache[number]
 
     def loss(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
         """Return the negative log-probability, shape ``(B,)``."""
         return -self.log_prob(input[None], condition)[0]
 
 
-def _keys(x: Tensor) -> list[bytes]:
-    """Return a fingerprint of each row's values."""
-    # Adding zero makes -0.0 and 0.0, which are equal, equal in their bytes too.
-    rows = (x.detach().cpu().flatten(1) + 0.0).contiguous().numpy()
-    return [hashlib.blake2b(row.tobytes(), digest_size=16).digest() for row in rows]
-
-
-def without_nan(log_q: Tensor) -> Tensor:
-    """Let components without a density at some theta not take the others with them."""
-    undefined = torch.isnan(log_q)
-    if not undefined.any():
-        return log_q
-    warn_user(
-        f"{int(undefined.sum())} of {undefined.numel()} component densities are NaN "
-        "and counted as zero: the flow fails at these simulations or parameters. Train "
-        "NPE longer, or with another density estimator."
-    )
-    return log_q.where(~undefined, -torch.inf)
-
-
-def _log_sum_exp(log_terms: Tensor, row: Tensor, num_rows: int) -> Tensor:
-    """Sum the terms ``(S, K)`` of each row, ``(S, num_rows)``."""
-    index = row.expand_as(log_terms)
-    shape = (len(log_terms), num_rows)
-    largest = log_terms.detach().new_full(shape, -torch.inf)
-    largest = largest.scatter_reduce(1, index, log_terms.detach(), "amax")
-    largest = largest.where(torch.isfinite(largest), 0.0)
-    terms = (log_terms - largest.gather(1, index)).exp()
-    total = torch.zeros_like(largest).index_add(1, row, terms)
-    return total.log() + largest
+def _blocks(
+    parts: Sequence[Part], shares: Sequence[float], x: Tensor
+) -> Iterator[tuple[slice, Block]]:
+    """Yield the weighted contexts of a block of observations after the other."""
+    features = [part.mixing.features(x) for part in parts]
+    num_columns = sum(part.mixing.num_contexts for part in parts)
+    for rows in blocks(len(x), num_columns):
+        of_each = [
+            part.mixing.rows(values[rows])
+            for part, values in zip(parts, features, strict=True)
+        ]
+        yield rows, Block(parts, shares, of_each)

@@ -15,27 +15,37 @@ from sbi_rope._sbi import DirectPosterior
 from sbi_rope._validation import check_batch, check_integer
 from sbi_rope.coupling import Coupling
 from sbi_rope.errors import InvalidInputError, InvalidTypeError, SamplingError
+from sbi_rope.mixture.coupled import CoupledContexts
 from sbi_rope.mixture.estimator import MixtureEstimator
+from sbi_rope.mixture.parts import DTYPE
+from sbi_rope.mixture.sampling import Accept
 from sbi_rope.mixture.truncation import Leakage, is_unbounded
 
 __all__ = ["MixturePosterior"]
 
 
 class MixturePosterior(DirectPosterior):
-    r"""The posteriors of a batch of real observations, as an sbi posterior.
+    r"""A mixture of weighted densities as an sbi posterior.
 
-    For observation i of the batch x_o,
+    .. math::
+        p(\theta \mid x)
+        = \frac{\mathbf{1}[\theta \in \operatorname{supp} p]}{Z(x)}
+        \sum_k w_k \sum_j a^k_j(x)\, q_k(\theta \mid s^k_j(x)),
+
+    with Z(x) the mass inside the support of the prior. RoPE's has one part, whose
+    contexts are simulations and whose weights are rows of a coupling:
 
     .. math::
         p(\theta \mid x_{o,i})
         = \frac{\mathbf{1}[\theta \in \operatorname{supp} p]}{Z_i}
         \sum_j \alpha_{ij}\, q(\theta \mid h(x_{s,j})),
-        \qquad Z_i = \sum_j \alpha_{ij} Z_j,
+        \qquad Z_i = \sum_j \alpha_{ij} Z_j .
 
-    with :math:`Z_j` the mass of component j inside the support of the prior. It has all
-    methods of sbi's :class:`DirectPosterior` and works with sbi's diagnostics. These
-    speak about the batch: simulation-based calibration, coverage and the like are
-    meaningful for the x_o of this posterior with their true parameters only.
+    It has all methods of sbi's :class:`DirectPosterior` and works with sbi's
+    diagnostics. With a coupled part it belongs to a batch of observations, and
+    diagnostics speak about that: simulation-based calibration, coverage and the like
+    are meaningful for the x_o of this posterior with their true parameters only.
+    Without one it is amortised and answers any x.
 
     Memory: beside arguments and result, 100 MB and what the flow needs for 16,384 pairs
     of parameter and component (131,072 on a GPU); for sbi's NSF this is 50 MB. To that
@@ -56,14 +66,10 @@ class MixturePosterior(DirectPosterior):
         estimator: The mixture.
         prior: The prior NPE was trained with.
         enable_transform: As in sbi, for ``map()``.
-        shared: What posteriors of the same components, simulations and prior, with
-            other couplings, share: each leaves there what it has estimated of them.
+        shared: What posteriors of the same prior and parts, in the same order, share
+            whatever their weights and couplings are: each leaves there what it has
+            estimated of the simulations that are their contexts.
     """
-
-    # Read by `metrics`: this posterior normalises and rejects in bounded time.
-    bounded_rejection = True
-    # Read by `_sbi`: a repaired posterior cannot be repaired again.
-    is_mixture = True
 
     def __init__(
         self,
@@ -71,48 +77,103 @@ class MixturePosterior(DirectPosterior):
         prior: Distribution,
         *,
         enable_transform: bool = True,
-        shared: dict[str, Tensor] | None = None,
+        shared: dict[int, Tensor] | None = None,
     ) -> None:
         with seeded(0):  # sbi draws from the prior to look at it
             super().__init__(
                 estimator,
                 prior,
-                device=estimator.contexts.device,
+                device=estimator.weights.device,
                 enable_transform=enable_transform,
             )
         self.posterior_estimator: MixtureEstimator = estimator
         # Shared with the views of single observations, so that it is estimated once.
-        self._cache: dict[str, Tensor] = {} if shared is None else shared
-        self._purpose = (
-            f"It is the mixture of {len(estimator.contexts)} simulated posteriors for "
-            f"each of {len(estimator.x_o)} real observations."
-        )
+        self._cache: dict[int, Tensor] = {} if shared is None else shared
+        self._purpose = _purpose(estimator)
+
+    @property
+    def is_amortised(self) -> bool:
+        """Whether it answers any x, and belongs to no batch."""
+        return not self.posterior_estimator.coupled
 
     # --- the batch ---
 
     @property
     def x_o(self) -> Tensor:
-        """The batch of real observations, shape ``(n_o, *event)``."""
-        return self.posterior_estimator.x_o
+        """The batch of real observations, shape ``(n_o, *event)``.
+
+        Raises:
+            InvalidInputError: If the posterior is amortised, as in all of the batch.
+        """
+        return self._coupled("x_o").x_o
+
+    @property
+    def couplings(self) -> tuple[Coupling, ...]:
+        """All couplings of the batch with simulations."""
+        self._coupled("couplings")
+        coupled = self.posterior_estimator.coupled
+        return tuple(coupling for part in coupled for coupling in part.couplings)
 
     @property
     def coupling(self) -> Coupling:
-        """The coupling of the batch with the simulations."""
-        return self.posterior_estimator.coupling
+        """The coupling of the batch with the simulations, if there is a single one.
+
+        Raises:
+            InvalidInputError: If there are several.
+        """
+        self._coupled("coupling")
+        coupling, *others = self.couplings
+        if others:
+            raise InvalidInputError(
+                f"Expected a single coupling; got a posterior of {1 + len(others)}. "
+                "Use `couplings`; `weights` has the rows of them all."
+            )
+        return coupling
 
     @property
     def weights(self) -> Tensor:
-        """Mixture weights, shape ``(n_o, n_s)``; rows sum to one."""
-        return self.coupling.weights
+        """Weights of the simulations, shape ``(n_o, n_s)``; rows sum to one.
+
+        Those of a coupled part by itself, whatever the other parts weigh.
+
+        Raises:
+            InvalidInputError: If there are several coupled parts.
+        """
+        coupled = self._coupled("weights")
+        if len(self.posterior_estimator.coupled) > 1:
+            raise InvalidInputError(
+                "Expected a single coupled part; got several. Use the `weights` of "
+                "each of `posterior.posterior_estimator.coupled`."
+            )
+        return coupled.weights
+
+    def _coupled(self, name: str) -> CoupledContexts:
+        if self.is_amortised:
+            raise InvalidInputError(
+                f"This posterior is amortised: it belongs to no batch and has no "
+                f"`{name}`. Pass the observation, such as `sample((1000,), x=x)`."
+            )
+        return self.posterior_estimator.coupled[0]
 
     def __len__(self) -> int:
-        return len(self.x_o)
+        return len(self._coupled("len()").x_o)
+
+    def __bool__(self) -> bool:
+        return True  # whatever its length
 
     def __getitem__(self, index: int) -> "MixturePosterior":
-        """Return the posterior of one observation, with it as the default x."""
+        """Return the posterior of one observation, with it as the default x.
+
+        It knows no other observation of the batch.
+        """
+        self._coupled("[i]")
+        estimator = self.posterior_estimator.restricted_to(operator.index(index))
         view = copy.copy(self)
-        view.potential_fn = copy.copy(self.potential_fn)
-        view.set_default_x(self.x_o[operator.index(index)][None])
+        view.posterior_estimator = estimator
+        potential_fn: Any = copy.copy(self.potential_fn)
+        potential_fn.posterior_estimator = estimator
+        view.potential_fn = potential_fn
+        view.set_default_x(view.x_o)
         return view
 
     def __iter__(self) -> Iterator["MixturePosterior"]:
@@ -132,9 +193,8 @@ class MixturePosterior(DirectPosterior):
                 f"Cannot move a posterior whose prior has no method `to`: "
                 f"{type(self.prior).__name__}. Use a prior of sbi, such as BoxUniform."
             )
-        self.posterior_estimator.to_device(device)
         # A new one: posteriors of a sweep share it and stay where they are.
-        self._cache = {name: value.to(device) for name, value in self._cache.items()}
+        self._cache = {k: mass.to(device) for k, mass in self._cache.items()}
         super().to(device)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -155,7 +215,7 @@ class MixturePosterior(DirectPosterior):
 
         Args:
             sample_shape: Shape of the draws.
-            x: An observation of the batch; the default x if None.
+            x: An observation, one of the batch if there is one; the default x if None.
             max_sampling_batch_size: Most draws the flow makes at a time; if None what
                 is fast on the device.
             show_progress_bars: Whether to show the draws accepted so far.
@@ -214,6 +274,11 @@ class MixturePosterior(DirectPosterior):
             batch_size=max_sampling_batch_size,
             show_progress_bars=show_progress_bars,
         )
+
+    @property
+    def _bound(self) -> Accept | None:
+        """What tells which parameters are inside the support; None if all are."""
+        return None if is_unbounded(self.prior) else self._inside
 
     def _inside(self, theta: Tensor) -> Tensor:
         return within_support(self.prior, theta).reshape(len(theta))
@@ -317,19 +382,22 @@ class MixturePosterior(DirectPosterior):
 
     # --- normalisation ---
 
-    def leakage(self, x: Tensor) -> Leakage:
+    def leakage(self, x: Tensor, *, show_progress_bars: bool = False) -> Leakage:
         r"""Return the mass of each mixture inside the prior's support, with its error.
 
-        Every component's mass :math:`Z_j` is estimated once from 1024 draws and kept.
-        The draws have random numbers of their own, so that log_prob is a function.
+        The mass of every simulation's posterior, :math:`Z_j`, is estimated once from
+        1024 draws and kept; that of densities of x itself is estimated for each x. The
+        draws have random numbers of their own, so that log_prob is a function.
 
         Args:
             x: Observations, shape ``(B, *event)``.
+            show_progress_bars: Whether to show progress, if it takes long.
         """
         return self.posterior_estimator.mass(
             self._batch_of_x(x),
-            accept=None if is_unbounded(self.prior) else self._inside,
+            accept=self._bound,
             cache=self._cache,
+            show_progress_bars=show_progress_bars,
         )
 
     def leakage_correction(  # type: ignore[override]
@@ -339,15 +407,29 @@ class MixturePosterior(DirectPosterior):
         if kwargs:
             raise InvalidInputError(
                 f"Expected no `leakage_correction_params`; got {sorted(kwargs)}. The "
-                "mass of each component is estimated once, from 1024 draws."
+                "mass inside the prior's support is estimated from 1024 draws."
             )
-        mass = self.leakage(x).mass.to(self.posterior_estimator.contexts)
+        mass = self.leakage(x).mass.to(DTYPE)
         if not (mass > 0).all():
             raise SamplingError(
                 "The mixture of at least one observation has no mass inside the "
                 "support of the prior. Train NPE longer, or pass norm_posterior=False."
             )
         return mass
+
+
+def _purpose(estimator: MixtureEstimator) -> str:
+    num_parts = len(estimator.parts)
+    if not estimator.coupled:
+        return f"It is a mixture of {num_parts} posterior densities, for any x."
+    coupled = estimator.coupled[0]
+    mixed = f"{num_parts} posterior densities"
+    if num_parts == 1:
+        mixed = f"{coupled.num_contexts} simulated posteriors"
+    return (
+        f"It is the mixture of {mixed} for each of {len(coupled.x_o)} real "
+        "observations."
+    )
 
 
 def _as_shape(sample_shape: Any) -> torch.Size:

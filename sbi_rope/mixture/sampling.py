@@ -5,9 +5,10 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from sbi_rope._sbi import ConditionalDensityEstimator
 from sbi_rope.errors import SamplingError
+from sbi_rope.mixture.block import Block
 from sbi_rope.mixture.chunks import num_fitting
+from sbi_rope.mixture.parts import DTYPE
 
 __all__ = ["Accept", "BlockSampler"]
 
@@ -24,9 +25,7 @@ class BlockSampler:
     """Draws from the mixtures of a block of observations.
 
     Args:
-        components: The density of a component given its context.
-        contexts: Contexts of the components, shape ``(n_s, l)``.
-        weights: Rows of the mixture weights, shape ``(b, n_s)``.
+        block: The weighted contexts of the observations.
         accept: Tells which proposals ``(n, d)`` to keep; None keeps all.
         batch_size: Most draws the flow makes at a time.
         first_row: The number of the block's first observation, for messages.
@@ -34,19 +33,18 @@ class BlockSampler:
 
     def __init__(
         self,
-        components: ConditionalDensityEstimator,
-        contexts: Tensor,
-        weights: Tensor,
+        block: Block,
         *,
         accept: Accept | None,
         batch_size: int,
         first_row: int = 0,
     ) -> None:
-        self.components = components
-        self.contexts = contexts
+        self.block = block
         self.accept = accept
         self.batch_size = batch_size
         self.first_row = first_row
+        self.theta_shape = block.parts[0].density.input_shape
+        weights = block.weights
         self.num_rows, self.num_components = weights.shape
         # Inverse transform: row i fills the interval [i, i + 1], so that one search
         # serves all rows. The offset takes digits, hence in double precision.
@@ -78,17 +76,22 @@ class BlockSampler:
         found = torch.searchsorted(self._cumulative, uniform + rows, right=True)
         found = (found - rows * self.num_components).clamp_min_(0)
         chosen = torch.minimum(found, self._last[rows])
-        return torch.cat(
-            [
-                self.components.sample(torch.Size((1,)), self.contexts[part])[0]
-                for part in chosen.split(self.batch_size)
-            ]
-        )
+        theta = self._empty(len(rows))
+        for entries in self.block.by_part(rows, chosen):
+            places = torch.arange(len(entries.which), device=rows.device)
+            for some in places.split(self.batch_size):
+                draws = entries.part.sample(entries.contexts(some))
+                theta[entries.which[some]] = draws
+        return theta
+
+    def _empty(self, count: int) -> Tensor:
+        shape = (count, *self.theta_shape)
+        return torch.empty(shape, dtype=DTYPE, device=self._last.device)
 
     def _fill(self, slots: Tensor) -> Tensor:
         """Propose for every slot, an index of a row, until one is accepted for it."""
         assert self.accept is not None
-        theta = self.contexts.new_empty(len(slots), *self.components.input_shape)
+        theta = self._empty(len(slots))
         still_open = torch.ones(len(slots), dtype=torch.bool, device=slots.device)
         rate = 1.0
         while (open_slots := still_open.nonzero().flatten()).numel():
@@ -118,7 +121,7 @@ class BlockSampler:
             raise SamplingError(
                 f"Less than one in {int(1 / MIN_ACCEPTANCE)} draws lies inside the "
                 f"support of the prior for the observations in rows {numbers} of `x`: "
-                "the posteriors of the simulations leak. Train NPE longer, or with "
+                "the densities it is mixed of leak. Train NPE longer, or with "
                 "z_score_theta='transform_to_unconstrained', or pass "
                 "reject_outside_prior=False."
             )

@@ -1,6 +1,6 @@
 """How much of a mixture lies inside the support of the prior."""
 
-from collections.abc import Iterable
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,12 +11,21 @@ from tqdm.auto import tqdm
 
 from sbi_rope._random import seeded
 from sbi_rope._sbi import ConditionalDensityEstimator
-from sbi_rope.mixture.chunks import flow_batch, keep_freed_memory
+from sbi_rope.mixture.chunks import blocks, flow_batch, keep_freed_memory
+from sbi_rope.mixture.parts import Part
 from sbi_rope.mixture.sampling import Accept
 
-__all__ = ["LEAKAGE_DRAWS", "Leakage", "component_mass", "is_unbounded", "mixture_mass"]
+__all__ = [
+    "LEAKAGE_DRAWS",
+    "Leakage",
+    "component_mass",
+    "is_unbounded",
+    "own_mass",
+    "shared_mass",
+]
 
-# Draws behind each component's mass inside the prior's support.
+# Draws behind the mass of a shared context inside the prior's support, or of a density
+# that has all the weight.
 LEAKAGE_DRAWS = 1024
 
 
@@ -25,8 +34,8 @@ class Leakage:
     r"""The mass of each observation's mixture inside the prior's support.
 
     Attributes:
-        mass: :math:`Z_i = \sum_j \alpha_{ij} Z_j`, shape ``(n,)``.
-        standard_error: Of ``mass``, from the draws behind each :math:`Z_j`.
+        mass: :math:`Z_i`, shape ``(n,)``, float64.
+        standard_error: Of ``mass``, from the draws behind it.
     """
 
     mass: Tensor
@@ -35,48 +44,91 @@ class Leakage:
 
 @torch.no_grad()
 def component_mass(
-    components: ConditionalDensityEstimator,
+    density: ConditionalDensityEstimator,
     contexts: Tensor,
     *,
-    accept: Accept | None,
+    accept: Accept,
+    show_progress_bars: bool = False,
 ) -> Tensor:
-    """Estimate each component's mass inside the support, shape ``(n_s,)``, float64.
+    """Estimate the mass inside the support given each context, ``(c,)``, float64.
 
-    The draws have random numbers of their own. Without a bound (None) it is one.
+    The draws have random numbers of their own.
     """
-    if accept is None:
-        return torch.ones(len(contexts), dtype=torch.double, device=contexts.device)
     keep_freed_memory(contexts.device)
     mass = []
     with seeded(0):
         chunks = contexts.split(max(1, flow_batch(contexts.device) // LEAKAGE_DRAWS))
-        # Some flows need minutes here, and log_prob has no switch for a bar.
-        for part in tqdm(chunks, desc="Normalising", delay=5.0, leave=False):
-            theta = components.sample(torch.Size((LEAKAGE_DRAWS,)), condition=part)
-            inside = accept(theta.reshape(-1, *components.input_shape))
-            mass.append(inside.reshape(LEAKAGE_DRAWS, -1).double().mean(dim=0))
+        # Some flows need minutes here.
+        for some in tqdm(chunks, **_bar(show=show_progress_bars)):
+            mass.append(_share_inside(density, some, accept, LEAKAGE_DRAWS))
     return torch.cat(mass)
 
 
-def mixture_mass(
-    mass: Tensor, row_blocks: Iterable[Tensor], *, exact: bool = False
-) -> Leakage:
-    """Return the mass of mixtures, given that of their components.
+def shared_mass(part: Part, features: Tensor, mass: Tensor) -> Leakage:
+    """Return the mass of a part whose contexts are shared by all observations.
 
     Args:
-        mass: Of each component, shape ``(n_s,)``.
-        row_blocks: The mixture weights, shapes ``(b, n_s)``.
-        exact: Whether the masses are known, not estimated.
+        part: The part.
+        features: Of the observations, shape ``(n, ...)``.
+        mass: What :func:`component_mass` returns for the contexts.
     """
-    # Without the half a draw, components with no or all draws inside had no error.
-    smoothed = (LEAKAGE_DRAWS * mass + 0.5) / (LEAKAGE_DRAWS + 1)
-    variance = smoothed * (1.0 - smoothed) / LEAKAGE_DRAWS * (0.0 if exact else 1.0)
+    variance = _variance(mass, LEAKAGE_DRAWS)
     means, errors = [], []
-    for rows in row_blocks:
-        weights = rows.to(mass)
+    for block in blocks(len(features), part.mixing.num_contexts):
+        weights = part.mixing.rows(features[block]).weights.to(mass)
         means.append(weights @ mass)
         errors.append((weights.square() @ variance).sqrt())
     return Leakage(torch.cat(means), torch.cat(errors))
+
+
+@torch.no_grad()
+def own_mass(
+    part: Part,
+    features: Tensor,
+    *,
+    accept: Accept,
+    num_draws: int,
+    show_progress_bars: bool = False,
+) -> Leakage:
+    """Estimate the mass of a part whose contexts are each observation's own.
+
+    Args:
+        part: The part.
+        features: Of the observations, shape ``(n, ...)``.
+        accept: Tells which parameters ``(n, d)`` are inside the support.
+        num_draws: Draws for each observation, over all its contexts together.
+        show_progress_bars: Whether to show progress, if it takes long.
+    """
+    of_each = math.ceil(num_draws / part.mixing.num_contexts)
+    means, errors = [], []
+    for one in tqdm(features.split(1), **_bar(show=show_progress_bars)):
+        rows = part.mixing.rows(one)
+        weights, contexts = rows.weights[0].double(), rows.contexts[0]
+        # The same random numbers for each, whatever is asked for beside it.
+        with seeded(0):
+            inside = _share_inside(part.density, contexts, accept, of_each)
+        means.append(weights @ inside)
+        errors.append((weights.square() @ _variance(inside, of_each)).sqrt())
+    return Leakage(torch.stack(means), torch.stack(errors))
+
+
+def _share_inside(
+    density: ConditionalDensityEstimator, contexts: Tensor, accept: Accept, draws: int
+) -> Tensor:
+    """Return the share of draws that is accepted, for each context ``(c, l)``."""
+    theta = density.sample(torch.Size((draws,)), condition=contexts)
+    inside = accept(theta.reshape(-1, *density.input_shape))
+    return inside.reshape(draws, -1).double().mean(dim=0)
+
+
+def _variance(share: Tensor, draws: int) -> Tensor:
+    # Without the half a draw, contexts with no or all draws inside had no error.
+    smoothed = (draws * share + 0.5) / (draws + 1)
+    return smoothed * (1.0 - smoothed) / draws
+
+
+def _bar(*, show: bool) -> dict[str, Any]:
+    return {"desc": "Normalising", "delay": 5.0, "leave": False, "disable": not show}
 
 
 def is_unbounded(prior: Distribution) -> bool:

@@ -1,6 +1,5 @@
 """What a stack is made of: couplings at several settings, and other posteriors."""
 
-import copy
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,8 +19,8 @@ from sbi_rope.errors import (
     InvalidTypeError,
     UnsupportedPosteriorError,
 )
+from sbi_rope.mixture import Part, part_of, part_of_prior
 from sbi_rope.rope import RoPE
-from sbi_rope.stacking.parts import Direct, Part, PriorDensity
 
 __all__ = [
     "Candidate",
@@ -79,6 +78,11 @@ class CouplingCandidate:
     def family(self) -> str:
         """The method that it is a setting of."""
         return "RoPE" if self.tuned else "OT-only"
+
+    @property
+    def net(self) -> tuple[bool, float | None]:
+        """What tells the embedding nets of candidates apart."""
+        return (self.tuned, self.rehearsal)
 
     @property
     def name(self) -> str:
@@ -181,7 +185,7 @@ def _finetuned(rope: RoPE, seed: int) -> Any:
 
 
 def check_candidates(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
-    """Return the candidates, couplings first.
+    """Return the candidates, couplings first, with those of one net side by side.
 
     Raises:
         InvalidTypeError: If one is something else.
@@ -209,7 +213,11 @@ def check_candidates(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
     if len(set(names)) < len(names):
         double = sorted({name for name in names if names.count(name) > 1})
         raise InvalidInputError(f"Expected names that differ; got {double} twice.")
-    return tuple(sorted(candidates, key=lambda c: not isinstance(c, CouplingCandidate)))
+    couplings = [c for c in candidates if isinstance(c, CouplingCandidate)]
+    nets = [c.net for c in couplings]
+    couplings.sort(key=lambda c: nets.index(c.net))
+    others = [c for c in candidates if not isinstance(c, CouplingCandidate)]
+    return (*couplings, *others)
 
 
 def as_part(name: str, posterior: Any, rope: RoPE) -> Part:
@@ -226,7 +234,7 @@ def as_part(name: str, posterior: Any, rope: RoPE) -> Part:
                 f"Expected the candidate {name!r} to be of theta {tuple(shape)}; got "
                 f"{tuple(posterior.prior.event_shape)}."
             )
-        return PriorDensity(posterior.prior)
+        return part_of_prior(posterior.prior, rope.calibration[1].shape[1:])
     estimator = estimator_of(posterior)
     if not isinstance(estimator, ConditionalDensityEstimator):
         raise UnsupportedPosteriorError(
@@ -241,5 +249,4 @@ def as_part(name: str, posterior: Any, rope: RoPE) -> Part:
             f"{tuple(theta.shape[1:])}; got x {tuple(shapes[1])} and theta "
             f"{tuple(shapes[0])}."
         )
-    # A copy: the user may train it on, or put it into training mode.
-    return Direct(copy.deepcopy(estimator).eval())
+    return part_of(estimator)

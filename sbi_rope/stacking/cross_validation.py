@@ -95,7 +95,7 @@ class CrossValidation:
     estimators: tuple[StackedEstimator, ...] = field(repr=False)
     prior: Distribution = field(repr=False)
     pseudo_count: float = 1.0
-    shared: dict[str, Tensor] = field(repr=False, default_factory=dict)
+    shared: dict[int, Tensor] = field(repr=False, default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.theta)

@@ -13,7 +13,7 @@ from torch.distributions import Distribution
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed
 from sbi_rope.coupling import Coupling, SinkhornCoupler
-from sbi_rope.mixture import MixtureEstimator
+from sbi_rope.mixture import CoupledContexts, CoupledNet, Part
 from sbi_rope.rope import RoPE
 from sbi_rope.stacking.candidates import (
     Candidate,
@@ -21,9 +21,7 @@ from sbi_rope.stacking.candidates import (
     DensityCandidate,
     as_part,
 )
-from sbi_rope.stacking.coupling import StackedCoupling, StackedEmbedding
 from sbi_rope.stacking.estimator import StackedEstimator
-from sbi_rope.stacking.parts import Part
 
 __all__ = ["Components", "fit_candidates"]
 
@@ -75,8 +73,8 @@ class Components:
             x_o=posterior.x_o,
             prior=posterior.prior,
             enable_transform=posterior.enable_transform,
-            density=estimator.components,
-            contexts=estimator.contexts,
+            density=estimator.parts[0].density,
+            contexts=estimator.coupled[0].simulated,
             fixed={
                 c.name: _built(c, untuned, seed)
                 for c in candidates
@@ -98,7 +96,7 @@ def fit_candidates(
     """Couple a batch at all settings, and build the other candidates.
 
     Args:
-        candidates: Couplings first.
+        candidates: Couplings first, net by net.
         rope: RoPE, tuned on the pairs that may be used.
         x: The batch, shape ``(n, *event)``.
         components: What all fits share.
@@ -114,31 +112,24 @@ def fit_candidates(
     settings = [c for c in candidates if isinstance(c, CouplingCandidate)]
     nets = _nets(settings, rope, seed)
     real = {key: embed(net, x) for key, net in nets.items()}
-    columns, start = {}, 0
-    for key, embedded in real.items():
-        columns[key] = slice(start, start + embedded.shape[1])
-        start += embedded.shape[1]
     couplings = _couple(settings, real, rope, components)
-    mixture = MixtureEstimator(
-        components.density,
-        components.contexts,
-        StackedCoupling(  # type: ignore[arg-type]
-            couplings=tuple(couplings[c] for c in settings),
-            shares=_equal(len(settings), x),
-            real=torch.cat(list(real.values()), dim=1),
-            columns=tuple(columns[_net_of(c)] for c in settings),
-        ),
-        x,
-        embedding_net=StackedEmbedding(list(nets.values())),
-        unseen=unseen,
-        tail_mass=tail_mass,
-    )
-    parts = [
+    share = 1 / len(settings)
+    coupled_nets = []
+    for key, net in nets.items():
+        of_net = [couplings[c] for c in settings if c.net == key]
+        coupled_nets.append(CoupledNet(net, of_net, [share] * len(of_net)))
+    coupled = CoupledContexts(components.contexts, x, coupled_nets, unseen=unseen)
+    others = [
         components.fixed.get(c.name) or _built(c, rope, seed)
         for c in candidates
         if isinstance(c, DensityCandidate)
     ]
-    return StackedEstimator(mixture, parts, _equal(len(candidates), x))
+    return StackedEstimator(
+        Part(components.density, coupled),
+        others,
+        torch.full((len(candidates),), 1 / len(candidates), dtype=torch.double),
+        tail_mass=tail_mass,
+    )
 
 
 def _built(candidate: DensityCandidate, rope: RoPE, seed: int) -> Part:
@@ -147,23 +138,14 @@ def _built(candidate: DensityCandidate, rope: RoPE, seed: int) -> Part:
         return as_part(candidate.name, candidate.build(rope, seed), rope)
 
 
-def _equal(count: int, like: Tensor) -> Tensor:
-    return torch.full((count,), 1.0 / count, dtype=torch.double, device=like.device)
-
-
-# What tells the nets of coupling candidates apart.
 Net = tuple[bool, float | None]
-
-
-def _net_of(candidate: CouplingCandidate) -> Net:
-    return (candidate.tuned, candidate.rehearsal)
 
 
 def _nets(
     settings: Sequence[CouplingCandidate], rope: RoPE, seed: int
 ) -> dict[Net, nn.Module]:
     nets: dict[Net, nn.Module] = {}
-    for tuned, rehearsal in dict.fromkeys(_net_of(c) for c in settings):
+    for tuned, rehearsal in dict.fromkeys(c.net for c in settings):
         if not tuned:
             net = rope.embedding_net
         elif rehearsal in (None, rope.finetuner.rehearsal):
@@ -186,9 +168,9 @@ def _couple(
 ) -> dict[CouplingCandidate, Coupling]:
     """Couple at every setting; along gamma and tau each starts from its neighbour."""
     couplings: dict[CouplingCandidate, Coupling] = {}
-    groups = dict.fromkeys((_net_of(c), c.cost_scale) for c in settings)
+    groups = dict.fromkeys((c.net, c.cost_scale) for c in settings)
     for net, cost_scale in groups:
-        group = [c for c in settings if (_net_of(c), c.cost_scale) == (net, cost_scale)]
+        group = [c for c in settings if (c.net, c.cost_scale) == (net, cost_scale)]
         gammas = sorted({c.gamma for c in group}, reverse=True)
         taus = sorted({c.tau for c in group}, reverse=True)
         coupler: SinkhornCoupler = replace(rope.coupler, cost_scale=cost_scale)

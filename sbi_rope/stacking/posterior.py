@@ -1,6 +1,6 @@
 """The stack of candidates as an sbi posterior."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -56,17 +56,16 @@ class StackedPosterior(MixturePosterior):
         weights: dict[str, float],
         report: "StackingReport | None" = None,
         enable_transform: bool = True,
-        shared: dict[str, Tensor] | None = None,
+        shared: dict[int, Tensor] | None = None,
     ) -> None:
-        posterior: Any = estimator
         super().__init__(
-            posterior, prior, enable_transform=enable_transform, shared=shared
+            estimator, prior, enable_transform=enable_transform, shared=shared
         )
         self.candidate_weights = weights
         self._report = report
         self._purpose = (
             f"It is the stack of {len(weights)} candidate posteriors for each of "
-            f"{len(estimator.x_o)} real observations."
+            f"{len(self)} real observations."
         )
 
     @torch.no_grad()
@@ -84,11 +83,12 @@ class StackedPosterior(MixturePosterior):
             Shape ``(n, K)``, float64, in the order of ``candidate_weights``.
         """
         x = self._batch_of_x(x)
-        self.leakage(x)  # leaves the masses of the components in the cache
-        stacked: Any = self.posterior_estimator
-        return stacked.candidate_log_probs(
-            theta, x, component_mass=self._cache["component_mass"]
-        )
+        estimator = self.posterior_estimator
+        assert isinstance(estimator, StackedEstimator)
+        mass = None
+        if self._bound is not None:
+            mass = estimator.component_mass(0, accept=self._bound, cache=self._cache)
+        return estimator.candidate_log_probs(theta, x, component_mass=mass)
 
     @property
     def report(self) -> "StackingReport":

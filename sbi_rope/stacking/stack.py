@@ -122,9 +122,9 @@ def stack(
 
 
 def _warn_unless_converged(estimator: StackedEstimator) -> None:
-    couplings = estimator.coupling.couplings
-    if not estimator.coupling.converged:
-        open_ones = [c for c in couplings if not c.converged]
+    couplings = estimator.coupled[0].couplings
+    open_ones = [c for c in couplings if not c.converged]
+    if open_ones:
         worst = max(coupling.marginal_error for coupling in open_ones)
         warn_user(
             f"{len(open_ones)} of {len(couplings)} couplings have not converged "

@@ -29,7 +29,6 @@ from sbi_rope._sbi import (
 )
 from sbi_rope.errors import InvalidInputError, LogProbUnavailableError
 from sbi_rope.finetuning import trainable_copy
-from sbi_rope.mixture import MixtureEstimator
 from tests import problems
 
 IDENTITY = "identity"
@@ -417,7 +416,7 @@ def mixed_mixture(npe: Any, *, n_o: int = 20) -> tuple[MixturePosterior, Tensor]
     x_s, x_o = (problems.simulate(npe.prior.sample((n,))) for n in (10, n_o))
     contexts = embed(h, x_s)
     coupling = SinkhornCoupler(gamma=0.1, tau=0.9).couple(embed(h, x_o), contexts)
-    estimator = MixtureEstimator(
+    estimator = problems.coupled_mixture(
         headless(copy.deepcopy(npe.posterior_estimator)),
         contexts,
         coupling,

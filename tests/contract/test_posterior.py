@@ -11,7 +11,7 @@ import torch
 from sbi.inference import DirectPosterior
 from torch import Tensor, nn
 
-from sbi_rope.errors import InvalidInputError, RoPEError
+from sbi_rope.errors import InvalidInputError, RoPEError, UnseenObservationError
 from sbi_rope.mixture import MixturePosterior
 from tests import problems
 from tests.problems import gaussian_posterior
@@ -245,8 +245,12 @@ def test_a_view_is_the_posterior_at_its_observation() -> None:
         torch.manual_seed(i)
         again = posterior.sample((3,), x=posterior.x_o[i], **QUIET)
         assert torch.equal(samples, again)
-    other = posterior[0].log_prob(theta, x=posterior.x_o[4])
-    assert torch.equal(other, posterior.log_prob(theta, x=posterior.x_o[4]))
+    # It knows no other observation.
+    view = posterior[3]
+    assert torch.equal(view.x_o, posterior.x_o[3:4])
+    assert torch.equal(view.weights, posterior.weights[3:4])
+    with pytest.raises(UnseenObservationError, match=r"`posterior\[i\]` knows"):
+        view.log_prob(theta, x=posterior.x_o[4])
 
 
 def test_views_of_image_batches_have_one_image_as_default_x() -> None:
@@ -263,7 +267,7 @@ def test_a_view_changes_neither_the_posterior_nor_other_views() -> None:
     first.potential(theta)
     second.potential(theta)
     first.map(num_iter=2, num_init_samples=10, num_to_optimize=2)
-    first.set_default_x(posterior.x_o[4])
+    first.set_default_x(torch.ones(3))
     assert torch.equal(posterior.default_x, torch.zeros(1, 3))
     assert torch.equal(second.default_x, posterior.x_o[1:2])
     assert torch.equal(
@@ -294,7 +298,7 @@ def test_a_copy_has_the_same_density_and_samples(
     posterior: Any = gaussian_posterior(std=0.8)
     if index is not None:
         posterior = posterior[index]
-    theta = 2 * torch.rand(4, 5, 2) - 1
+    theta = 2 * torch.rand(4, len(posterior), 2) - 1
     expected = posterior.log_prob_batched(theta, posterior.x_o)
     other = make_copy(posterior)
     assert type(other) is MixturePosterior
@@ -353,9 +357,10 @@ def test_several_unseen_observations_in_turn_each_get_their_own_row() -> None:
 
 
 def test_moving_keeps_the_default_x() -> None:
-    posterior = gaussian_posterior()[2]
-    posterior.to("cpu")
-    assert torch.equal(posterior.default_x, posterior.x_o[2:3])
+    posterior = gaussian_posterior()
+    view = posterior[2]
+    view.to("cpu")
+    assert torch.equal(view.default_x, posterior.x_o[2:3])
 
 
 @pytest.mark.gpu
@@ -390,7 +395,7 @@ def test_dropout_in_the_components_does_not_blur_the_density() -> None:
             return super().log_prob(input, self.dropout(condition))
 
     posterior = gaussian_posterior()
-    posterior.posterior_estimator.components = Noisy()
+    posterior.posterior_estimator.parts[0].density = Noisy()
     theta = torch.zeros(1, 2)
     values = {
         float(posterior.log_prob(theta, x=posterior.x_o[0], norm_posterior=False))

@@ -48,7 +48,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
 
 def trained_state(estimator: Any) -> list[Tensor]:
     """All that scores a held-out pair: nets, components, batch and couplings."""
-    couplings = estimator.coupling.couplings
+    couplings = estimator.coupled[0].couplings
     return [
         *estimator.state_dict().values(),
         *(coupling.potential for coupling in couplings),
@@ -57,7 +57,7 @@ def trained_state(estimator: Any) -> list[Tensor]:
 
 
 def tuned_net(estimator: Any) -> nn.Module:
-    return estimator.mixture._g.nets[0]  # that of the first candidate
+    return estimator.coupled[0].nets[0].net  # that of the first candidate
 
 
 @pytest.mark.parametrize(
@@ -111,12 +111,12 @@ def test_held_out_observations_are_coupled_together_with_the_batch() -> None:
     for number, estimator in enumerate(scores.estimators):
         rows = scores.fold == number
         x = torch.cat([scores.x[rows], x_o])
-        contexts = estimator.contexts
+        contexts = estimator.coupled[0].simulated
         alone = coupled_by_hand(OT_ONLY, rope, x, contexts)
         expected = unnormalised(alone, scores.theta[rows], scores.x[rows])[0]
         found = scores.scores_of(OT_ONLY.name)[rows]
         assert torch.allclose(found.float(), expected, atol=1e-3)
-        assert len(estimator.x_o) == int(rows.sum()) + NUM_OBSERVED
+        assert len(estimator.coupled[0].batch) == int(rows.sum()) + NUM_OBSERVED
 
 
 def test_scores_are_those_of_the_candidates_trained_without_the_fold() -> None:
@@ -129,9 +129,10 @@ def test_scores_are_those_of_the_candidates_trained_without_the_fold() -> None:
         # The tuned net of the fold stands behind the tuned candidates.
         alone = copy.deepcopy(the_rope())
         alone._g = tuned_net(estimator)
+        coupled = estimator.coupled[0]
         for candidate in COUPLINGS[:2]:
             by_hand = coupled_by_hand(
-                candidate, alone, estimator.x_o, estimator.contexts
+                candidate, alone, coupled.batch, coupled.simulated
             )
             expected = unnormalised(by_hand, theta, x)[0].double()
             found = scores.scores_of(candidate.name)[rows]
@@ -173,7 +174,7 @@ def test_held_out_observations_train_nothing() -> None:
     x[rows] += 1.0
     after = validate(untrained(pairs=(before.theta, x)))
     nets = [
-        (tuned_net(s.estimators[1]), s.estimators[1].parts) for s in (before, after)
+        (tuned_net(s.estimators[1]), s.estimators[1].parts[1:]) for s in (before, after)
     ]
     assert same(parameters(nets[0][0]), parameters(nets[1][0]))
     for part, other in zip(nets[0][1], nets[1][1], strict=True):
@@ -283,7 +284,7 @@ def test_stored_simulations_serve_as_well() -> None:
     theta = problems.box(2).sample((300,))
     rope = trained(simulations=(theta, problems.simulate(theta)))
     posterior = stacked(rope, num_simulations=None)
-    assert posterior.posterior_estimator.contexts.shape == (300, 4)
+    assert posterior.posterior_estimator.coupled[0].simulated.shape == (300, 4)
     assert posterior.report.cross_validation.log_scores.isfinite().all()
 
 

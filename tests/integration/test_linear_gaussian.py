@@ -6,8 +6,7 @@ from torch import Tensor
 
 from sbi_rope import MixturePosterior, RoPE, SinkhornCoupler
 from sbi_rope.metrics import evaluate
-from sbi_rope.mixture import MixtureEstimator
-from tests import gaussian
+from tests import gaussian, problems
 
 
 def with_exact_g(x_o: Tensor, n_s: int, coupler: SinkhornCoupler) -> MixturePosterior:
@@ -18,8 +17,8 @@ def with_exact_g(x_o: Tensor, n_s: int, coupler: SinkhornCoupler) -> MixturePost
     with torch.no_grad():
         contexts = h(gaussian.simulator(gaussian.prior().sample((n_s,))))
         coupling = coupler.couple(h(gaussian.undo(x_o)), contexts)
-    mixture = MixtureEstimator(
-        rope.build_posterior(x_o).posterior_estimator.components,
+    mixture = problems.coupled_mixture(
+        rope.build_posterior(x_o).posterior_estimator.parts[0].density,
         contexts,
         coupling,
         x_o,
@@ -98,9 +97,9 @@ def test_self_calibration_at_tau_one() -> None:
     batch = posterior.log_prob_batched(
         theta[:, None].expand(-1, 100, -1), x_o, norm_posterior=False
     )
-    estimator = posterior.posterior_estimator
-    simulated = estimator.components.log_prob(
-        theta[:, None].expand(-1, 150, -1), estimator.contexts
+    density = posterior.posterior_estimator.parts[0].density
+    simulated = density.log_prob(
+        theta[:, None].expand(-1, 150, -1), problems.simulated_of(posterior)
     )
     assert batch.exp().mean(dim=1).numpy() == pytest.approx(
         simulated.exp().mean(dim=1).detach().numpy(), abs=1e-6

@@ -54,9 +54,10 @@ def test_couplings_of_a_stack_are_the_couplings_of_rope_at_their_settings() -> N
     estimator: Any = posterior.posterior_estimator
     found = estimator.candidate_log_probs(theta, posterior.x_o)
     assert found.shape == (NUM_OBSERVED, len(CANDIDATES))
+    contexts = problems.simulated_of(posterior)
     for k, candidate in enumerate(COUPLINGS):
-        alone = coupled_by_hand(candidate, rope, posterior.x_o, estimator.contexts)
-        used = estimator.coupling.couplings[k]
+        alone = coupled_by_hand(candidate, rope, posterior.x_o, contexts)
+        used = estimator.coupled[0].couplings[k]
         assert (used.tau, used.gamma) == (candidate.tau, alone.coupling.gamma)
         expected = unnormalised(alone, theta, posterior.x_o)[0]
         assert torch.allclose(found[:, k].float(), expected, atol=1e-3)
@@ -119,7 +120,7 @@ def test_a_stack_is_the_weighted_sum_of_its_candidates() -> None:
     scores = estimator.candidate_log_probs(theta, posterior.x_o)
     weights = torch.tensor(list(posterior.candidate_weights.values())).double()
     assert float(weights.sum()) == pytest.approx(1.0)
-    assert torch.allclose(weights, estimator.weights)
+    assert torch.allclose(weights, estimator.candidate_weights)
     expected = torch.logsumexp(scores + weights.log(), dim=1).float()
     found = unnormalised(posterior, theta, posterior.x_o)[0]
     assert torch.allclose(found, expected, atol=1e-4)
@@ -183,7 +184,7 @@ def test_a_trained_stack_extends_to_new_observations() -> None:
     assert torch.isfinite(found).all()
     rope = the_rope()
     estimator: Any = posterior.posterior_estimator
-    couplings = estimator.coupling.couplings
+    couplings = estimator.coupled[0].couplings
     for k, candidate in enumerate(COUPLINGS):
         net = net_of(candidate, rope)
         with torch.no_grad():
@@ -216,7 +217,7 @@ def test_every_family_can_be_stacked(family: str, embedding: str) -> None:
     estimator: Any = posterior.posterior_estimator
     alone = [
         unnormalised(
-            coupled_by_hand(c, rope, posterior.x_o, estimator.contexts),
+            coupled_by_hand(c, rope, posterior.x_o, estimator.coupled[0].simulated),
             theta,
             posterior.x_o,
         )[0]

@@ -86,7 +86,8 @@ def test_a_rope_that_rehearsed_is_not_trained_again() -> None:
         for rehearsal in (None, 2.0, 0.0)
     ]
     estimator: Any = stacked(rope, candidates=candidates).posterior_estimator
-    own, same_one, other = map(parameters, estimator.mixture._g.nets)
+    nets = [net.net for net in estimator.coupled[0].nets]
+    own, same_one, other = map(parameters, nets)
     assert same(own, parameters(rope.tuned_embedding_net))
     assert same(own, same_one)
     assert not same(own, other)

@@ -150,7 +150,7 @@ def test_the_picture_names_candidates_and_families(with_curve: bool) -> None:
     assert len(figure.axes) == (4 if with_curve else 3)
     labels = [label.get_text() for label in figure.axes[0].get_yticklabels()]
     assert {*labels} == {"stack", *(c.name for c in CANDIDATES)}
-    plots.effective_sample_sizes(the_stack().coupling)
+    plots.effective_sample_sizes(the_stack().couplings[0])
 
 
 def test_stacks_inside_a_cross_validation_have_no_report() -> None:
@@ -186,20 +186,14 @@ def test_the_densities_of_candidates_are_normalised_where_rope_is() -> None:
     assert torch.allclose(halved, expected)
 
 
-def test_the_coupling_of_a_stack_has_converged_if_all_have() -> None:
-    coupling: Any = the_stack().coupling
-    assert coupling.converged
-    first = replace(coupling.couplings[0], converged=False)
-    broken = replace(coupling, couplings=(first, *coupling.couplings[1:]))
-    assert not broken.converged
-
-
 def test_moving_a_stack_leaves_its_report() -> None:
     posterior = the_stack()
     assert posterior.prior is not posterior.report.cross_validation.prior
     _, part = next(iter(posterior.report.cross_validation.posteriors()))
     record = posterior.report.cross_validation.estimators[0]
-    assert part.posterior_estimator.contexts is not record.contexts
+    assert (
+        part.posterior_estimator.coupled[0].simulated is not record.coupled[0].simulated
+    )
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ from torch.distributions import (
 
 from sbi_rope._sbi import headless
 from sbi_rope.baselines.hvae import HVAE
-from sbi_rope.baselines.hvae.estimator import LatentMixture
+from sbi_rope.baselines.hvae.contexts import LatentContexts
 from sbi_rope.baselines.hvae.model import (
     FrozenNPE,
     HybridVAE,
@@ -43,6 +43,7 @@ from sbi_rope.errors import (
     RoPEWarning,
     UnsupportedPosteriorError,
 )
+from sbi_rope.mixture import MixtureEstimator, Part
 from sbi_rope.tasks.pendulum import PendulumSimulator
 
 # --- a linear-Gaussian model whose evidence is known ---
@@ -58,6 +59,8 @@ PRECISION = torch.eye(2) + A.T @ A / NOISE_STD**2
 
 class LinearFlow(nn.Module):
     """The exact q(theta | s) of simulations s = A theta + noise, as a flow."""
+
+    input_shape = torch.Size((2,))
 
     def __init__(self) -> None:
         super().__init__()
@@ -328,15 +331,16 @@ def test_physics_sees_parameters_inside_the_support_alone() -> None:
 # --- the posterior ---
 
 
-def mixture(num_latents: int = 7) -> LatentMixture:
+def mixture(num_latents: int = 7) -> MixtureEstimator:
     torch.manual_seed(0)
-    return LatentMixture(
-        linear_model(shift=1.0, noisy=True, r2p_std=0.3),
+    model = linear_model(shift=1.0, noisy=True, r2p_std=0.3)
+    contexts = LatentContexts(
+        model,
         torch.randn(num_latents, 1),
         torch.randn(num_latents, 4),
-        torch.Size((2,)),
         torch.Size((4,)),
     )
+    return MixtureEstimator([Part(model.npe.flow, contexts)], [1.0], tail_mass=0.0)
 
 
 def test_density_is_the_mean_over_all_draws_of_the_latent() -> None:
@@ -344,7 +348,8 @@ def test_density_is_the_mean_over_all_draws_of_the_latent() -> None:
     x, theta = EVIDENCE.sample((3,)), torch.randn(5, 3, 2)
     mean, log_variance = Encoder(1.0)(x)
     expected = torch.zeros(5, 3)
-    for epsilon, eta in zip(estimator.z_noise, estimator.x_noise, strict=True):
+    mixing: Any = estimator.parts[0].mixing
+    for epsilon, eta in zip(mixing.z_noise, mixing.x_noise, strict=True):
         z = mean + (0.5 * log_variance).exp() * epsilon
         s = x - z @ B.T + 0.3 * eta
         expected += LinearFlow().log_prob(theta, s).exp() / 7
@@ -360,9 +365,9 @@ def test_density_does_not_depend_on_how_it_is_cut(
     x, theta = EVIDENCE.sample((11,)), torch.randn(5, 11, 2)
     expected = estimator.log_prob(theta, x)
     for entries, pairs in ((4, 1), (8, 10), (56, 20), (100, 100)):
-        module = "sbi_rope.baselines.hvae.estimator"
+        module = "sbi_rope.baselines.hvae.contexts"
         monkeypatch.setattr(f"{module}.MAX_ENTRIES", entries)
-        monkeypatch.setattr(f"{module}.flow_batch", lambda device, n=pairs: n)
+        monkeypatch.setattr("sbi_rope.mixture.chunks.CPU_BATCH", pairs)
         torch.testing.assert_close(estimator.log_prob(theta, x), expected)
         assert estimator.sample(torch.Size((3,)), x).shape == (3, 11, 2)
 
@@ -507,10 +512,10 @@ def test_npe_is_left_as_it_was_and_is_not_trained_inside_either(npe: Any) -> Non
     for name, value in npe.posterior_estimator.state_dict().items():
         torch.testing.assert_close(value, before[name], rtol=0, atol=0)
     inside = headless(npe.posterior_estimator).state_dict()
-    for name, value in estimator.flow.state_dict().items():
+    for name, value in estimator.parts[0].density.state_dict().items():
         torch.testing.assert_close(value, inside[name], rtol=0, atol=0)
     for own, given in zip(
-        estimator.embedding.parameters(),
+        estimator.parts[0].mixing.embedding.parameters(),
         npe.posterior_estimator.embedding_net.parameters(),
         strict=True,
     ):

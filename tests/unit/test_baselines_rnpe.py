@@ -12,7 +12,7 @@ from torch.distributions import Normal
 
 from sbi_rope._sbi import estimator_of
 from sbi_rope.baselines.error_model import SpikeAndSlab
-from sbi_rope.baselines.rnpe import RNPE
+from sbi_rope.baselines.rnpe import RNPE, DenoisedContexts
 from sbi_rope.baselines.statistics import Standardisation, fit_marginal
 from sbi_rope.baselines.training import Training
 from sbi_rope.errors import (
@@ -62,6 +62,10 @@ def quick_posterior(**options: Any) -> Any:
     return quick(**options).train(seed=0, show_progress_bars=False).build_posterior()
 
 
+def mixing_of(posterior: Any) -> DenoisedContexts:
+    return posterior.posterior_estimator.parts[0].mixing
+
+
 def closed_form(x: float) -> tuple[float, float]:
     """Mean and sd of theta given x, by quadrature over s in units of its sd."""
     y = gaussian.GAIN * x / STATISTIC_STD
@@ -98,7 +102,7 @@ def test_log_prob_is_the_mean_density_over_the_denoised_statistics() -> None:
     posterior = quick_posterior()
     x, theta = torch.randn(3, 2), torch.randn(4, 3, 2)
     values = posterior.log_prob_batched(theta, x=x, norm_posterior=False)
-    s = posterior.posterior_estimator.denoised(x)
+    s = mixing_of(posterior).features(x)
     for sample in range(4):
         for row in range(3):
             terms = [
@@ -204,16 +208,16 @@ def test_constant_statistics_are_left_out_and_come_back_as_simulated() -> None:
 
 def test_what_was_denoised_is_kept() -> None:
     posterior = quick_posterior()
-    estimator, x = posterior.posterior_estimator, torch.randn(3, 2)
-    first = estimator.denoised(x)
+    mixing, x = mixing_of(posterior), torch.randn(3, 2)
+    first = mixing.features(x)
     # In other company and order, and as -0 for 0.
-    assert torch.equal(estimator.denoised(x[[2, 0]]), first[[2, 0]])
+    assert torch.equal(mixing.features(x[[2, 0]]), first[[2, 0]])
     mixed = torch.cat([torch.randn(2, 2), x[1:2]])
-    assert torch.equal(estimator.denoised(mixed)[2], first[1])
-    zero = estimator.denoised(torch.zeros(1, 2))
-    num_kept = len(estimator._denoised)
-    assert torch.equal(estimator.denoised(-torch.zeros(1, 2)), zero)
-    assert len(estimator._denoised) == num_kept
+    assert torch.equal(mixing.features(mixed)[2], first[1])
+    zero = mixing.features(torch.zeros(1, 2))
+    num_kept = len(mixing._denoised)
+    assert torch.equal(mixing.features(-torch.zeros(1, 2)), zero)
+    assert len(mixing._denoised) == num_kept
 
 
 def test_two_posteriors_of_one_training_are_the_same_function() -> None:
@@ -229,12 +233,12 @@ def test_two_posteriors_of_one_training_are_the_same_function() -> None:
 def test_denoising_leaves_the_random_numbers_of_the_caller_alone() -> None:
     posterior = quick_posterior()
     state = torch.get_rng_state()
-    posterior.posterior_estimator.denoised(torch.randn(1, 2))
+    mixing_of(posterior).features(torch.randn(1, 2))
     torch.set_rng_state(state)
     expected = torch.randn(1, 2)
     torch.set_rng_state(state)
     torch.randn(1, 2)
-    posterior.posterior_estimator.denoised(expected)
+    mixing_of(posterior).features(expected)
     after = torch.randn(1)
     torch.set_rng_state(state)
     torch.randn(1, 2)
@@ -246,7 +250,7 @@ def test_the_posterior_survives_pickling_with_what_was_denoised() -> None:
     theta, x = torch.randn(3, 2), torch.randn(3, 2)
     values = posterior.log_prob_batched(theta, x=x, norm_posterior=False)
     again = pickle.loads(pickle.dumps(posterior))
-    assert len(again.posterior_estimator._denoised) == 3
+    assert len(mixing_of(again)._denoised) == 3
     assert torch.equal(again.log_prob_batched(theta, x=x, norm_posterior=False), values)
 
 
@@ -302,13 +306,13 @@ def test_chains_that_disagree_are_warned_of_and_measured() -> None:
     # Where spike and slab compete, a few draws do not tell their shares.
     x = torch.linspace(3.3, 4.2, 10)[:, None] * torch.tensor([1.0, -1.0])
     with pytest.warns(RoPEWarning, match="R-hat"):
-        posterior.posterior_estimator.denoised(x)
-    assert (posterior.posterior_estimator.r_hat(x) > 1.1).any()
+        mixing_of(posterior).features(x)
+    assert (mixing_of(posterior).r_hat(x) > 1.1).any()
 
 
 def test_chains_that_agree_are_not_warned_of(recwarn: Any) -> None:
-    estimator = one_statistic().build_posterior().posterior_estimator
-    assert (estimator.r_hat(X_O[:2]) < 1.1).all()
+    mixing = mixing_of(one_statistic().build_posterior())
+    assert (mixing.r_hat(X_O[:2]) < 1.1).all()
     assert not [w for w in recwarn if issubclass(w.category, RoPEWarning)]
 
 
@@ -335,9 +339,9 @@ def test_statistics_that_never_vary_are_refused() -> None:
 
 
 def test_an_observation_that_is_not_finite_is_refused() -> None:
-    estimator = quick_posterior().posterior_estimator
+    mixing = mixing_of(quick_posterior())
     with pytest.raises(InvalidInputError, match="finite"):
-        estimator.denoised(torch.tensor([[0.0, math.nan]]))
+        mixing.features(torch.tensor([[0.0, math.nan]]))
 
 
 def test_vector_fields_are_refused() -> None:
@@ -370,7 +374,7 @@ def test_an_error_model_of_another_type_is_refused() -> None:
 
 
 def test_far_observations_are_treated_as_at_the_bound() -> None:
-    estimator = quick_posterior().posterior_estimator
-    far = estimator.denoised(torch.tensor([[1e8, 0.0]]))
+    mixing = mixing_of(quick_posterior())
+    far = mixing.features(torch.tensor([[1e8, 0.0]]))
     assert torch.isfinite(far).all()
     assert float(far.abs().max()) < 10.0

@@ -1,9 +1,12 @@
 """The coupling against a slow log-domain solver, its limits and its failures."""
 
+import copy
 import functools
 import itertools
+import pickle
 import warnings
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import fields, replace
 from typing import Any
 
 import ot
@@ -24,6 +27,10 @@ from sbi_rope.errors import (
 )
 from tests import oracles
 from tests.modes import MODES, digits
+
+
+def through_pickle(coupling: Coupling) -> Coupling:
+    return pickle.loads(pickle.dumps(coupling))
 
 
 def clouds(n_o: int = 60, n_s: int = 60, dim: int = 3) -> tuple[Tensor, Tensor]:
@@ -206,6 +213,44 @@ def test_rows_of_the_batch_are_its_weights_and_new_rows_are_near_a_refit() -> No
     new = torch.randn(1, 3, dtype=torch.float64)
     refit = coupler.couple(torch.cat([real, new]), simulated).weights[-1:]
     assert worst_total_variation(coupling.rows(new), refit) < 0.01
+
+
+@pytest.mark.parametrize("direct", [False, True])
+def test_rows_from_given_distances_are_the_same_rows(direct: bool) -> None:
+    real, simulated = clouds()
+    coupling = replace(SinkhornCoupler().couple(real, simulated), direct=direct)
+    other = replace(coupling, gamma=2 * coupling.gamma)
+    distances = coupling.distances(real)
+    assert torch.allclose(distances, cost_of(real, simulated))
+    for one in (coupling, other):
+        assert torch.equal(one.rows(real, distances=distances), one.rows(real))
+    far = real.clone()
+    far[0] = 1e30
+    with pytest.raises(InvalidInputError, match="away from the simulations"):
+        coupling.rows(far, distances=coupling.distances(far))
+
+
+def test_a_coupling_of_some_observations_has_their_rows() -> None:
+    coupling = SinkhornCoupler().couple(*clouds())
+    some = torch.tensor([5, 2])
+    part = coupling.restricted_to(some)
+    assert torch.allclose(part.weights, coupling.weights[some], atol=1e-12)
+    assert part.marginal_error == coupling.marginal_error
+    assert len(part.effective_sample_size) == 2
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, copy.copy, through_pickle])
+def test_a_copy_of_a_coupling_leaves_what_was_kept(
+    copied: Callable[[Coupling], Coupling],
+) -> None:
+    coupling = SinkhornCoupler().couple(*clouds(300, 300))
+    before = len(pickle.dumps(coupling))
+    weights = coupling.weights
+    assert coupling.weights is weights
+    assert len(pickle.dumps(coupling)) == before < 30_000
+    other = copied(coupling)
+    assert set(vars(other)) == {entry.name for entry in fields(coupling)}
+    assert torch.equal(other.weights, weights)
 
 
 def test_effective_sample_size_counts_equal_weights() -> None:

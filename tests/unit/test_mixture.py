@@ -22,7 +22,8 @@ from sbi_rope.errors import (
     SamplingError,
     UnseenObservationError,
 )
-from sbi_rope.mixture import MixtureEstimator, MixturePosterior, chunks
+from sbi_rope.mixture import MixturePosterior, chunks
+from sbi_rope.mixture import density as density_module
 from sbi_rope.mixture import sampling as sampling_module
 from sbi_rope.mixture import truncation as truncation_module
 from tests import problems
@@ -46,7 +47,7 @@ def flow_posterior(
         coupling = SinkhornCoupler(gamma=0.1, tau=0.9, **coupler).couple(
             embed(h, x_o), contexts
         )
-    estimator = MixtureEstimator(
+    estimator = problems.coupled_mixture(
         headless(copy.deepcopy(npe.posterior_estimator)),
         contexts,
         coupling,
@@ -63,7 +64,7 @@ def log_prob_batched(posterior: MixturePosterior, theta: Tensor) -> Tensor:
 
 def inside_mass(posterior: MixturePosterior) -> Tensor:
     """Z_j of Gaussian components inside the box [-1, 1], in closed form."""
-    mean, log_std = posterior.posterior_estimator.contexts.double().chunk(2, dim=1)
+    mean, log_std = problems.simulated_of(posterior).double().chunk(2, dim=1)
     normal = Normal(mean, log_std.exp())
     one = torch.ones_like(mean)
     return (normal.cdf(one) - normal.cdf(-one)).prod(dim=1)
@@ -71,7 +72,7 @@ def inside_mass(posterior: MixturePosterior) -> Tensor:
 
 def count_draws(posterior: MixturePosterior, monkeypatch: pytest.MonkeyPatch) -> list:
     """Record the number of thetas of every call of the components' sample."""
-    components: Any = posterior.posterior_estimator.components
+    components: Any = posterior.posterior_estimator.parts[0].density
     original, calls = components.sample, []
 
     def sample(sample_shape: Size, condition: Tensor, **kwargs: Any) -> Tensor:
@@ -120,7 +121,7 @@ def test_every_kind_of_coupling_gives_the_log_sum_of_its_own_weights(
 ) -> None:
     posterior = flow_posterior(dtype=dtype, blocked=blocked)
     assert posterior.coupling.real.dtype is dtype
-    rows = posterior.posterior_estimator.rows(posterior.x_o)
+    rows = problems.rows_of(posterior, posterior.x_o)
     assert torch.equal(rows, posterior.weights)
     theta = 2 * torch.rand(10, 6, 2) - 1
     expected = brute_force_log_prob(posterior, theta).float()
@@ -128,7 +129,7 @@ def test_every_kind_of_coupling_gives_the_log_sum_of_its_own_weights(
     assert log_prob.dtype is torch.float32
     assert torch.allclose(log_prob, expected, atol=1e-4, rtol=1e-5)
     leakage = posterior.leakage(posterior.x_o)
-    mass = posterior._cache["component_mass"]
+    mass = posterior._cache[0]
     assert torch.allclose(leakage.mass, posterior.weights.double() @ mass, atol=1e-12)
     normalised = posterior.log_prob_batched(theta, posterior.x_o)
     assert torch.allclose(normalised, log_prob - leakage.mass.log().float(), atol=1e-4)
@@ -159,7 +160,7 @@ def test_the_flow_sees_full_batches_of_pairs_and_never_more(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     posterior = gaussian_posterior(n_o=7, n_s=20)
-    components: Any = posterior.posterior_estimator.components
+    components: Any = posterior.posterior_estimator.parts[0].density
     original, pairs = components.log_prob, []
 
     def log_prob(input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
@@ -191,18 +192,19 @@ def test_weights_and_proposals_stay_within_the_number_of_the_docstring(
     call: Callable[[MixturePosterior], Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     posterior = gaussian_posterior(n_o=30, n_s=12, std=2.0, unseen="extend")
-    estimator, entries = posterior.posterior_estimator, []
-    original, inside, log_q = TableCoupling.rows, posterior._inside, estimator._log_q
+    entries = []
+    original, inside = TableCoupling.rows, posterior._inside
+    log_q = density_module._log_q
 
-    def rows(coupling: TableCoupling, real: Tensor) -> Tensor:
+    def rows(coupling: TableCoupling, real: Tensor, **options: Any) -> Tensor:
         entries.append(len(real) * len(coupling.simulated))
-        return original(coupling, real)
+        return original(coupling, real, **options)
 
     def accept(theta: Tensor) -> Tensor:
         entries.append(len(theta))
         return inside(theta)
 
-    def terms(*arguments: Tensor) -> Tensor:
+    def terms(*arguments: Any) -> Tensor:
         log_terms = log_q(*arguments)
         entries.append(log_terms.numel())
         return log_terms
@@ -214,7 +216,7 @@ def test_weights_and_proposals_stay_within_the_number_of_the_docstring(
     monkeypatch.setattr(TableCoupling, "rows", rows)
     monkeypatch.setattr(TableCoupling, "weights", property(refuse))
     monkeypatch.setattr(posterior, "_inside", accept)
-    monkeypatch.setattr(estimator, "_log_q", terms)
+    monkeypatch.setattr(density_module, "_log_q", terms)
     monkeypatch.setattr(chunks, "MAX_ENTRIES", 100)
     call(posterior)
     assert max(entries) <= 100
@@ -226,7 +228,7 @@ MEMORY = """
 import torch
 
 from sbi_rope.coupling import Coupling
-from sbi_rope.mixture import MixtureEstimator, MixturePosterior
+from sbi_rope.mixture import MixturePosterior
 from tests import problems
 from benchmarks.machine import forget_peak, memory, peak_memory
 
@@ -238,7 +240,7 @@ coupling = Coupling(
     batch_error=0.0, num_fitted=n, num_iterations=0, converged=True, solver="none",
     blocked=True,
 )
-estimator = MixtureEstimator(
+estimator = problems.coupled_mixture(
     problems.Gaussians(dim), simulated, coupling, torch.randn(n, 3),
     embedding_net=torch.nn.Identity(),
 )
@@ -294,8 +296,8 @@ def test_a_component_without_a_density_does_not_take_the_others_with_it(
     estimator = broken.posterior_estimator
     theta = 2 * torch.rand(6, 2) - 1
     expected = brute_force_log_prob(broken, theta)
-    components: Any = estimator.components
-    original, first = components.log_prob, estimator.contexts[0]
+    components: Any = estimator.parts[0].density
+    original, first = components.log_prob, problems.simulated_of(broken)[0]
     share = (
         broken.weights[:, 0]
         * original(theta[None], condition=first.expand(6, -1)).double().exp().flatten()
@@ -331,7 +333,8 @@ def test_the_tail_left_out_obeys_the_bound_of_the_docstring(tail_mass: float) ->
     truncated = log_prob_batched(posterior, theta).double().exp()
 
     # The largest density among the components left out, found independently.
-    estimator = posterior.posterior_estimator
+    simulated = problems.simulated_of(posterior)
+    components = posterior.posterior_estimator.parts[0].density
     bound = torch.zeros(50, 8, dtype=torch.float64)
     num_dropped = 0
     for i, row in enumerate(posterior.weights):
@@ -339,8 +342,8 @@ def test_the_tail_left_out_obeys_the_bound_of_the_docstring(tail_mass: float) ->
         dropped = smallest_first[row[smallest_first].cumsum(0) <= tail_mass][:59]
         num_dropped += len(dropped)
         for j in dropped:
-            condition = estimator.contexts[j].expand(50, -1)
-            density = estimator.components.log_prob(theta[None, :, i], condition)[0]
+            condition = simulated[j].expand(50, -1)
+            density = components.log_prob(theta[None, :, i], condition)[0]
             bound[:, i] = torch.maximum(bound[:, i], density.double().exp())
     missing = full - truncated
     rounding = 1e-6 * full
@@ -486,7 +489,7 @@ def test_samples_have_the_cdf_of_the_truncated_mixture_however_they_are_cut(
     n = 2000 if entries > 1 else 500  # one at a time takes its time
     samples = posterior.sample_batched((n,), posterior.x_o, **QUIET)[..., 0].double()
     one = posterior.sample((n,), x=posterior.x_o[1], **QUIET)[:, 0].double()
-    mean, log_std = posterior.posterior_estimator.contexts.double().T
+    mean, log_std = problems.simulated_of(posterior).double().T
     components = Normal(mean, log_std.exp())
     for i, draws in [*enumerate(samples.T), (1, one)]:
         points = torch.cat([torch.tensor([-1.0, 1.0]), draws.sort().values])[:, None]
@@ -554,7 +557,7 @@ def test_an_accepted_draw_is_kept_whole(device: str) -> None:
                 .expand(*sample_shape, len(condition), 2)
             )
 
-    posterior.posterior_estimator.components = Diagonal(2)
+    posterior.posterior_estimator.parts[0].density = Diagonal(2)
     posterior.to(device)
     samples = posterior.sample_batched((5000,), posterior.x_o, **QUIET)
     assert torch.equal(samples[..., 0], samples[..., 1])
@@ -650,7 +653,7 @@ def test_rejection_gives_up_after_a_bounded_number_of_draws(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     posterior = hopeless_posterior()
-    components: Any = posterior.posterior_estimator.components
+    components: Any = posterior.posterior_estimator.parts[0].density
     original, drawn = components.sample, [0]
 
     def sample(sample_shape: Size, condition: Tensor, **kwargs: Any) -> Tensor:
@@ -865,14 +868,17 @@ def test_an_observation_is_found_by_its_value() -> None:
     x_o[4] = x_o[1]
     x_o[2, 0] = 0.0
     posterior = gaussian_posterior(x_o=x_o)
-    estimator = posterior.posterior_estimator
     rows = posterior.weights
-    assert torch.equal(estimator.rows(x_o)[[0, 1, 2, 3, 5]], rows[[0, 1, 2, 3, 5]])
-    assert torch.equal(estimator.rows(x_o[[5, 0, 0]]), rows[[5, 0, 0]])
-    assert torch.equal(estimator.rows(x_o[4:5]), estimator.rows(x_o[1:2]))
+
+    def found(x: Tensor) -> Tensor:
+        return problems.rows_of(posterior, x)
+
+    assert torch.equal(found(x_o)[[0, 1, 2, 3, 5]], rows[[0, 1, 2, 3, 5]])
+    assert torch.equal(found(x_o[[5, 0, 0]]), rows[[5, 0, 0]])
+    assert torch.equal(found(x_o[4:5]), found(x_o[1:2]))
     negative_zero = x_o[2:3].clone()
     negative_zero[0, 0] = -0.0
-    assert torch.equal(estimator.rows(negative_zero), rows[2:3])
+    assert torch.equal(found(negative_zero), rows[2:3])
 
 
 def test_duplicates_in_the_batch_have_the_same_posterior() -> None:
@@ -903,7 +909,7 @@ def test_double_precision_and_numpy_observations_are_recognised() -> None:
 def test_rows_cannot_be_changed_through_what_was_returned() -> None:
     posterior = gaussian_posterior()
     before = posterior.weights.clone()
-    posterior.posterior_estimator.rows(posterior.x_o)[:] = 0
+    problems.rows_of(posterior, posterior.x_o)[:] = 0
     assert torch.equal(posterior.weights, before)
 
 
@@ -929,20 +935,20 @@ def test_an_unseen_observation_raises_and_both_ways_on_are_named() -> None:
 
 def test_an_unseen_observation_may_extend_the_coupling_with_a_warning() -> None:
     posterior = gaussian_posterior(unseen="extend")
-    estimator = posterior.posterior_estimator
+    net = posterior.posterior_estimator.coupled[0].nets[0].net
     new = torch.randn(2, 3)
-    expected = posterior.coupling.rows(embed(estimator._g, new))
+    expected = posterior.coupling.rows(embed(net, new))
     smallest = float((1 / expected.square().sum(dim=1)).min())
     mixed = torch.cat([new[:1], posterior.x_o[2:3], new[1:]])
     with pytest.warns(RoPEWarning, match=rf"2 unseen.*size {smallest:.1f} of 12"):
-        rows = estimator.rows(mixed)
+        rows = problems.rows_of(posterior, mixed)
     assert torch.allclose(rows[[0, 2]], expected, atol=1e-12)
     assert torch.equal(rows[1], posterior.weights[2])
 
     with pytest.warns(RoPEWarning):
         log_prob = posterior.log_prob(torch.zeros(1, 2), x=new[0], norm_posterior=False)
     extended = gaussian_posterior(
-        n_o=2, weights=expected, contexts=estimator.contexts, x_o=new
+        n_o=2, weights=expected, contexts=problems.simulated_of(posterior), x_o=new
     )
     assert torch.allclose(
         log_prob,

@@ -490,7 +490,7 @@ def test_unseen_observations_are_embedded_by_the_tuned_net() -> None:
     posterior = conductor.build_posterior(X_O, seed=0, unseen="extend")
     new = gaussian.real_process(torch.zeros(3, 2))
     with pytest.warns(RoPEWarning, match="smallest effective sample size"):
-        rows = posterior.posterior_estimator.rows(new)
+        rows = problems.rows_of(posterior, new)
     g, h = conductor.tuned_embedding_net, conductor.embedding_net
     with torch.no_grad():
         assert torch.allclose(rows, posterior.coupling.rows(g(new)))
@@ -558,7 +558,7 @@ def test_moving_our_posterior_moves_nothing_else() -> None:
     npe = gaussian.posterior()
     conductor = RoPE(npe, simulator=gaussian.simulator, finetuner=QUICK)
     posterior = conductor.build_posterior(X_O)
-    posterior.posterior_estimator.to_device("meta")
+    posterior.posterior_estimator.to("meta")
     assert posterior.x_o.is_meta
     assert posterior.weights.is_meta
     assert not next(npe.posterior_estimator.parameters()).is_meta
@@ -667,7 +667,7 @@ def test_a_posterior_of_a_sweep_can_be_moved_without_the_others() -> None:
     first.to("cpu")
     second = next(posteriors)
     # What was moved belongs to the first alone.
-    first._cache["component_mass"] = 0.5 * first._cache["component_mass"]
+    first._cache[0] = 0.5 * first._cache[0]
     coupler = SinkhornCoupler(gamma=0.1)
     expected = conductor.build_posterior(x_o, coupler=coupler, seed=3)
     ours, theirs = (p.log_prob_batched(theta, x_o) for p in (second, expected))

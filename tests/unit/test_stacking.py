@@ -18,15 +18,20 @@ from sbi_rope.errors import (
     RoPEWarning,
     UnseenObservationError,
 )
-from sbi_rope.mixture import MixtureEstimator, chunks
+from sbi_rope.mixture import (
+    CoupledContexts,
+    CoupledNet,
+    Part,
+    chunks,
+    part_of,
+    part_of_prior,
+)
 from sbi_rope.stacking import (
     CouplingCandidate,
     StackedPosterior,
     default_candidates,
 )
-from sbi_rope.stacking.coupling import StackedCoupling, StackedEmbedding
 from sbi_rope.stacking.estimator import StackedEstimator
-from sbi_rope.stacking.parts import Direct, PriorDensity
 from tests import gaussian, problems
 
 # Batches and calibration sets are small here on purpose.
@@ -55,9 +60,9 @@ class Analytic:
         Of the batch, or of other x with their rows of both couplings.
         """
         estimator = self.posterior.posterior_estimator
-        x = estimator.x_o if x is None else x
+        x = self.posterior.x_o if x is None else x
         theta = theta.double()
-        mean, log_std = estimator.contexts.double().chunk(2, dim=1)
+        mean, log_std = estimator.coupled[0].simulated.double().chunk(2, dim=1)
         of_component = Normal(mean, log_std.exp()).log_prob(theta[:, :, None]).sum(-1)
         mixed = [
             torch.einsum("bj,sbj->sb", table.double(), of_component.exp())
@@ -75,9 +80,9 @@ class Analytic:
     def mass(self) -> Tensor:
         """Inside the box, ``(B,)``."""
         estimator = self.posterior.posterior_estimator
-        mean, log_std = estimator.contexts.double().chunk(2, dim=1)
+        mean, log_std = estimator.coupled[0].simulated.double().chunk(2, dim=1)
         of_component = _inside_box(mean, log_std.exp())
-        center = gaussian.GAIN * estimator.x_o.double()
+        center = gaussian.GAIN * self.posterior.x_o.double()
         given_x = _inside_box(center, torch.tensor(gaussian.POSTERIOR_STD).double())
         masses = [table.double() @ of_component for table in self.tables]
         return torch.stack([*masses, given_x, torch.ones_like(given_x)], -1) @ (
@@ -105,25 +110,18 @@ def analytic(
     tables = tuple((2 * torch.randn(n_o, n_s)).double().softmax(dim=1) for _ in "ab")
     couplings = tuple(problems.coupling_of(table, contexts) for table in tables)
     width = couplings[0].real.shape[1]
-    coupling: Any = StackedCoupling(
-        couplings=couplings,
-        shares=torch.full((2,), 0.5, dtype=torch.double),
-        real=torch.cat([coupling.real for coupling in couplings], dim=1),
-        columns=(slice(0, width), slice(width, 2 * width)),
-    )
-    mixture = MixtureEstimator(
-        problems.Gaussians(dim),
-        contexts,
-        coupling,
-        x_o,
-        embedding_net=StackedEmbedding([nn.Linear(dim, width) for _ in "ab"]),
-        unseen=unseen,
+    nets = [CoupledNet(nn.Linear(dim, width), [c], [0.5]) for c in couplings]
+    prior = problems.box(dim)
+    estimator = StackedEstimator(
+        Part(
+            problems.Gaussians(dim),
+            CoupledContexts(contexts, x_o, nets, unseen=unseen),
+        ),
+        [part_of(gaussian.GaussianEstimator(dim)), part_of_prior(prior, (dim,))],
+        torch.full((4,), 0.25, dtype=torch.double),
         tail_mass=0.0,
     )
-    prior = problems.box(dim)
-    parts = [Direct(gaussian.GaussianEstimator(dim)), PriorDensity(prior)]
     of_all = torch.tensor(weights, dtype=torch.double)
-    estimator = StackedEstimator(mixture, parts, torch.full_like(of_all, 0.25))
     posterior = StackedPosterior(
         estimator.with_weights(of_all),
         prior,
@@ -156,7 +154,7 @@ def test_the_log_probs_of_candidates_are_those_of_each_by_itself() -> None:
     known = analytic(dim=2)
     theta = 3 * torch.rand(5, 2) - 1.5
     estimator: Any = known.posterior.posterior_estimator
-    found = estimator.candidate_log_probs(theta, estimator.x_o)
+    found = estimator.candidate_log_probs(theta, known.posterior.x_o)
     expected = known.densities(theta[None])[0].log()
     assert found.dtype is torch.float64
     assert found.shape == (5, 4)
@@ -165,7 +163,7 @@ def test_the_log_probs_of_candidates_are_those_of_each_by_itself() -> None:
     order = torch.tensor([3, 1, 4])
     log_q = estimator.component_log_probs(theta)
     some = estimator.candidate_log_probs(
-        theta[order], estimator.x_o[order], log_q=log_q[order]
+        theta[order], known.posterior.x_o[order], log_q=log_q[order]
     )
     assert torch.allclose(some, expected[order], atol=1e-5)
 
@@ -310,8 +308,6 @@ def test_rows_of_the_merged_coupling_sum_to_one() -> None:
     rows = known.posterior.weights
     expected = (2 * known.tables[0] + known.tables[1]) / 3
     assert torch.allclose(rows, expected)
-    sizes = known.posterior.coupling.effective_sample_size
-    assert torch.allclose(sizes, 1 / expected.square().sum(dim=1))
 
 
 @pytest.mark.parametrize(
@@ -410,10 +406,9 @@ def test_an_observation_outside_the_batch_is_refused_or_extended_to() -> None:
     with pytest.warns(RoPEWarning, match="Extended the coupling"):
         found = posterior.log_prob_batched(theta, x, norm_posterior=False)
     estimator: Any = posterior.posterior_estimator
-    nets = estimator.mixture._g.nets
     tables = [
-        coupling.rows(net(x).detach().double())
-        for coupling, net in zip(estimator.coupling.couplings, nets, strict=True)
+        net.couplings[0].rows(net.net(x).detach().double())
+        for net in estimator.coupled[0].nets
     ]
     densities = known.densities(theta[None], x=x, tables=tables)
     expected = (densities @ known.weights).log().float()

@@ -25,7 +25,7 @@ from sbi_rope._validation import (
     check_tensor,
 )
 from sbi_rope.baselines.base import BuildsOnNPE, UsesCalibration, UsesObservations
-from sbi_rope.baselines.hvae.estimator import LatentMixture
+from sbi_rope.baselines.hvae.contexts import LatentContexts
 from sbi_rope.baselines.hvae.model import FrozenNPE, HybridVAE
 from sbi_rope.baselines.hvae.networks import (
     ConditionalUNet,
@@ -37,6 +37,7 @@ from sbi_rope.baselines.hvae.reparametrisation import check_differentiable
 from sbi_rope.baselines.hvae.training import train_hybrid
 from sbi_rope.baselines.training import EstimatorBuilder, Training
 from sbi_rope.errors import InvalidInputError, InvalidTypeError
+from sbi_rope.mixture import MixtureEstimator, Part
 
 __all__ = ["HVAE"]
 
@@ -49,6 +50,8 @@ DEFAULT_TRAINING = Training(
 )
 # Log-variance at which R2P starts, in units of the standardised data.
 START_LOG_VARIANCE = -9.0
+# Draws of z behind the loss on the held-out pairs.
+NUM_LATENTS_HELD_OUT = 8
 # Draws of the prior on which the physics is tried.
 NUM_DRAWS_CHECKED = 3
 
@@ -211,14 +214,14 @@ class HVAE(BuildsOnNPE, UsesCalibration, UsesObservations):
             if self.noisy
             else None
         )
-        mixture = LatentMixture(
-            model, noise, x_noise, self._prior.event_shape, event_shape
+        mixture, held_out = (
+            self._mixture(model, noise[:count], x_noise)
+            for count in (self.num_latents, NUM_LATENTS_HELD_OUT)
         )
-        mixture.to(self._device)
         weight = self.calibration_weight
         history = train_hybrid(
             model,
-            mixture,
+            held_out,
             self._observations,
             *self._calibration,
             weight=event_shape.numel() if weight is None else weight,
@@ -226,6 +229,16 @@ class HVAE(BuildsOnNPE, UsesCalibration, UsesObservations):
             show_progress_bars=show_progress_bars,
         )
         return posterior_from(npe, mixture.eval()), history
+
+    def _mixture(
+        self, model: HybridVAE, z_noise: Tensor, x_noise: Tensor | None
+    ) -> MixtureEstimator:
+        """Return NPE mixed over draws of z, with the networks of the model."""
+        if x_noise is not None:
+            x_noise = x_noise[: len(z_noise)]
+        contexts = LatentContexts(model, z_noise, x_noise, self._observations.shape[1:])
+        part = Part(model.npe.flow, contexts)
+        return MixtureEstimator([part], [1.0], tail_mass=0.0).to(self._device)
 
     def _model(self, estimator: Any) -> HybridVAE:
         x = torch.cat([self._observations, self._calibration[1]])

@@ -8,20 +8,17 @@ from torch import Tensor
 
 from sbi_rope._random import seeded
 from sbi_rope._training import History, fit, split_pairs, too_few_pairs
-from sbi_rope.baselines.hvae.estimator import LatentMixture
 from sbi_rope.baselines.hvae.model import HybridVAE
 from sbi_rope.baselines.training import Training
 from sbi_rope.errors import warn_user
+from sbi_rope.mixture import MixtureEstimator
 
 __all__ = ["train_hybrid"]
-
-# Draws of z behind the loss on the held-out pairs.
-NUM_LATENTS_HELD_OUT = 8
 
 
 def train_hybrid(
     model: HybridVAE,
-    mixture: LatentMixture,
+    posterior: MixtureEstimator,
     x_o: Tensor,
     theta: Tensor,
     x: Tensor,
@@ -36,7 +33,7 @@ def train_hybrid(
 
     Args:
         model: What is trained.
-        mixture: Its posterior, which shares its networks.
+        posterior: A mixture that shares its networks, to score held-out pairs by.
         x_o: Observations without parameters, shape ``(n, *event)``.
         theta: Parameters of the calibration pairs, shape ``(m, k)``.
         x: Their observations, shape ``(m, *event)``.
@@ -52,7 +49,9 @@ def train_hybrid(
     objective = partial(model.objective, weight=weight)
     validation_loss: Callable[[], Tensor] | None = None
     if len(held_out):
-        validation_loss = partial(_held_out_loss, mixture, theta[held_out], x[held_out])
+        validation_loss = partial(
+            _held_out_loss, posterior, theta[held_out], x[held_out]
+        )
     else:
         warn_user(
             f"{too_few_pairs(theta)}: none is held out, and the networks "
@@ -91,8 +90,8 @@ def _batches(
         yield unlabelled[rows], theta[pairs], x[pairs]
 
 
-def _held_out_loss(mixture: LatentMixture, theta: Tensor, x: Tensor) -> Tensor:
-    return -mixture.log_prob(theta, x, num_latents=NUM_LATENTS_HELD_OUT).mean()
+def _held_out_loss(posterior: MixtureEstimator, theta: Tensor, x: Tensor) -> Tensor:
+    return -posterior.log_prob(theta, x).mean()
 
 
 def _with_same_draws(objective: Callable[..., Tensor], *data: Tensor) -> Tensor:

@@ -1,0 +1,78 @@
+"""What all parts of a mixture give a block of observations."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from sbi_rope.mixture.parts import Part, Rows
+
+__all__ = ["Block", "Entries"]
+
+
+@dataclass(frozen=True, eq=False)
+class Entries:
+    """Weighted contexts that belong to one part.
+
+    Attributes:
+        part: The part.
+        which: Their places among the entries asked for, shape ``(n,)``.
+        row: Their observations.
+        column: Their numbers among the contexts of the part.
+        rows: The weights and contexts of the part.
+    """
+
+    part: Part
+    which: Tensor
+    row: Tensor
+    column: Tensor
+    rows: Rows
+
+    def contexts(self, some: Tensor) -> Tensor:
+        """Return the contexts of some of the entries, ``(m, l)``."""
+        return self.rows.at(self.row[some], self.column[some])
+
+
+class Block:
+    r"""The contexts that all parts give a block of b observations, side by side.
+
+    Args:
+        parts: The parts.
+        shares: Their weights :math:`w_k`, none of them zero.
+        rows: What each gives the observations.
+
+    Attributes:
+        weights: :math:`w_k a^k_{ij}` of all contexts of all parts, shape ``(b, c)``.
+    """
+
+    def __init__(
+        self, parts: Sequence[Part], shares: Sequence[float], rows: Sequence[Rows]
+    ) -> None:
+        self.parts = parts
+        self.rows = rows
+        pairs = zip(shares, rows, strict=True)
+        self.weights = torch.cat([share * part.weights for share, part in pairs], dim=1)
+
+    def without_tail(self, tail_mass: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Return row, column and log weight of the entries that carry 1 - tail_mass."""
+        # Summed from the small end, where the digits are.
+        ascending, order = self.weights.sort(dim=1)
+        tail = ascending.cumsum(dim=1, dtype=torch.float64)
+        kept = (tail > tail_mass) & (ascending > 0)
+        kept[:, -1] = True
+        row = kept.nonzero()[:, 0]
+        return row, order[kept], ascending[kept].double().log()
+
+    def by_part(self, row: Tensor, column: Tensor) -> list[Entries]:
+        """Sort entries of ``weights`` by the parts they belong to."""
+        found, start = [], 0
+        for part, rows in zip(self.parts, self.rows, strict=True):
+            end = start + rows.weights.shape[1]
+            which = ((column >= start) & (column < end)).nonzero().flatten()
+            if len(which):
+                found.append(
+                    Entries(part, which, row[which], column[which] - start, rows)
+                )
+            start = end
+        return found

@@ -1,0 +1,300 @@
+"""Contexts that a batch of observations shares, weighted by couplings."""
+
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Literal, cast
+
+import torch
+from torch import Tensor, nn
+
+from sbi_rope._sbi import embed
+from sbi_rope._validation import (
+    check_batch,
+    check_choice,
+    check_integer,
+    check_same_length,
+    check_weights,
+)
+from sbi_rope.coupling import Coupling
+from sbi_rope.coupling.cost import row_blocks
+from sbi_rope.errors import InvalidInputError, UnseenObservationError, warn_user
+from sbi_rope.mixture.chunks import blocks
+from sbi_rope.mixture.parts import Mixing, Rows
+
+__all__ = ["CoupledContexts", "CoupledNet"]
+
+
+class CoupledNet(nn.Module):
+    r"""An embedding net g, and couplings of what it embedded.
+
+    Args:
+        net: g; needed for unseen observations only.
+        couplings: Couplings of :math:`g(x)` of a batch with the same simulations.
+        shares: How much each counts in the rows of a mixture; one by default.
+    """
+
+    def __init__(
+        self,
+        net: nn.Module,
+        couplings: Sequence[Coupling],
+        shares: Sequence[float] = (1.0,),
+    ) -> None:
+        super().__init__()
+        if not len(couplings) or len(couplings) != len(shares):
+            raise InvalidInputError(
+                "Expected `couplings` and as many `shares`, at least one; got "
+                f"{len(couplings)} and {len(shares)}."
+            )
+        self.net = net
+        self.couplings = tuple(couplings)
+        self.shares = tuple(float(share) for share in shares)
+
+    @property
+    def real(self) -> Tensor:
+        """The embeddings of the batch, shape ``(n, l)``."""
+        return self.couplings[0].real
+
+    def rows(self, real: Tensor) -> Tensor:
+        r"""Return :math:`\sum_k w_k \alpha^{(k)}`, ``(n, l)`` to ``(n, n_s)``."""
+        used = [k for k, share in enumerate(self.shares) if share]
+        total = real.new_zeros(len(real), len(self.couplings[0].simulated))
+        # In blocks that stay in the cache, as couplings compute them themselves.
+        for block in row_blocks(real, total.shape[1]):
+            rows_of_each = self.rows_of_each(real[block], used)
+            for k, rows in zip(used, rows_of_each, strict=True):
+                total[block].add_(rows, alpha=self.shares[k])
+        return total
+
+    def rows_of_each(
+        self, real: Tensor, numbers: Sequence[int] | None = None
+    ) -> Iterator[Tensor]:
+        """Yield the rows of some couplings one after the other, all if None.
+
+        Distances are computed once for all of them.
+        """
+        distances: dict[bool, Tensor] = {}
+        for k in range(len(self.couplings)) if numbers is None else numbers:
+            coupling = self.couplings[k]
+            if coupling.direct not in distances:
+                distances[coupling.direct] = coupling.distances(real)
+            yield coupling.rows(real, distances=distances[coupling.direct])
+
+    def with_shares(self, shares: Sequence[float]) -> "CoupledNet":
+        """Return the same couplings with other shares."""
+        return CoupledNet(self.net, self.couplings, shares)
+
+    def restricted_to(self, rows: Tensor, *, net: nn.Module) -> "CoupledNet":
+        """Return the couplings of some observations, with another net."""
+        couplings = [coupling.restricted_to(rows) for coupling in self.couplings]
+        return CoupledNet(net, couplings, self.shares)
+
+    def to_device(self, device: torch.device) -> None:
+        """Move the couplings."""
+        self.couplings = tuple(coupling.to(device) for coupling in self.couplings)
+
+
+class CoupledContexts(Mixing):
+    r"""The simulations that a batch is coupled with, as contexts of a mixture.
+
+    Row i is :math:`\sum_k w_k \alpha^{(k)}_i` over all couplings of all nets: the
+    mixtures of all couplings have the same components, so that together they need one
+    evaluation of each. RoPE's own posterior has one net and one coupling.
+
+    Observations are found by their values. The first row of equal ones stands for all.
+
+    Args:
+        contexts: :math:`h(x_s)`, shape ``(n_s, l)``.
+        batch: The real observations that were coupled, shape ``(n, *event)``.
+        nets: Embedding nets with couplings of all of the batch, whose shares sum to one
+            over all nets.
+        num_observed: How many observations at the head of the batch are those to be
+            inferred, ``x_o``; all if None.
+        unseen: What to do with an x outside the batch: ``"raise"``, or ``"extend"`` by
+            the softmax row of the same potential.
+
+    Raises:
+        InvalidInputError: If lengths, shapes or shares do not fit.
+    """
+
+    simulated: Tensor
+    batch: Tensor
+
+    def __init__(
+        self,
+        contexts: Tensor,
+        batch: Tensor,
+        nets: Sequence[CoupledNet],
+        *,
+        num_observed: int | None = None,
+        unseen: Literal["raise", "extend"] = "raise",
+    ) -> None:
+        super().__init__(batch.shape[1:], len(contexts))
+        check_choice("unseen", unseen, ("raise", "extend"))
+        if num_observed is not None:
+            check_integer("num_observed", num_observed)
+            if num_observed > len(batch):
+                raise InvalidInputError(
+                    f"Expected `num_observed` of at most {len(batch)}, the length of "
+                    f"the batch; got {num_observed}."
+                )
+        self._nets = nn.ModuleList(nets)
+        check_weights("shares", self.shares, len(self.couplings))
+        for coupling in self.couplings:
+            check_batch("coupling.simulated", coupling.simulated, contexts.shape[1:])
+            check_same_length("contexts", contexts, "simulated", coupling.simulated)
+            check_same_length("batch", batch, "coupling.real", coupling.real)
+        self.num_observed = len(batch) if num_observed is None else num_observed
+        self.unseen: Literal["raise", "extend"] = unseen
+        self.register_buffer("simulated", contexts)
+        self.register_buffer("batch", batch)
+        self._extended: tuple[list[bytes], Tensor] | None = None
+        self._index: dict[bytes, int] = {}
+        for i, key in enumerate(_keys(batch)):
+            self._index.setdefault(key, i)
+
+    @property
+    def contexts(self) -> Tensor:
+        """The embeddings of the simulations, shape ``(n_s, l)``."""
+        return self.simulated
+
+    @property
+    def nets(self) -> list[CoupledNet]:
+        """The embedding nets with their couplings."""
+        return cast("list[CoupledNet]", list(self._nets))
+
+    @property
+    def couplings(self) -> tuple[Coupling, ...]:
+        """All couplings, net by net."""
+        return tuple(coupling for net in self.nets for coupling in net.couplings)
+
+    @property
+    def shares(self) -> tuple[float, ...]:
+        """How much each of :attr:`couplings` counts; they sum to one."""
+        return tuple(share for net in self.nets for share in net.shares)
+
+    @property
+    def x_o(self) -> Tensor:
+        """The observations to be inferred, shape ``(n_o, *event)``."""
+        return self.batch[: self.num_observed]
+
+    @property
+    def weights(self) -> Tensor:
+        """The rows of ``x_o``, shape ``(n_o, n_s)``; not to be written to."""
+        if len(self.couplings) == 1:
+            weights = self.couplings[0].weights
+            whole = self.num_observed == len(weights)
+            return weights if whole else weights[: self.num_observed]
+        features = self.features(self.x_o)
+        return torch.cat(
+            [
+                self.rows(features[block]).weights
+                for block in blocks(len(features), self.num_contexts)
+            ]
+        )
+
+    def features(self, x: Tensor) -> Tensor:
+        """Return the embeddings by all nets, ``(n, *event)`` to ``(n, nets, l)``.
+
+        Raises:
+            UnseenObservationError: If an x is not in the batch and ``unseen="raise"``.
+        """
+        x = x.to(self.batch)
+        found = [self._index.get(key, -1) for key in _keys(x)]
+        index = torch.tensor(found, dtype=torch.long, device=self.batch.device)
+        known = index.clamp_min(0)
+        features = torch.stack([net.real[known] for net in self.nets], dim=1)
+        new = index < 0
+        if new.any():
+            features[new] = self._unseen_features(x[new])
+        return features
+
+    def rows(self, features: Tensor) -> Rows:
+        """Return the rows of a block of observations over the simulations."""
+        pairs = zip(self.nets, features.unbind(dim=1), strict=True)
+        first, *others = (net.rows(real) for net, real in pairs if any(net.shares))
+        return Rows(sum(others, start=first), self.simulated)
+
+    def rows_of_each(self, features: Tensor) -> Iterator[Tensor]:
+        """Yield the rows of each of :attr:`couplings`, ``(n, n_s)``, unweighted."""
+        for net, real in zip(self.nets, features.unbind(dim=1), strict=True):
+            yield from net.rows_of_each(real)
+
+    def with_shares(self, shares: Sequence[float]) -> "CoupledContexts":
+        """Return the same couplings with other shares, in the order of these."""
+        check_weights("shares", shares, len(self.couplings))
+        nets, start = [], 0
+        for net in self.nets:
+            end = start + len(net.couplings)
+            nets.append(net.with_shares(shares[start:end]))
+            start = end
+        return CoupledContexts(
+            self.simulated,
+            self.batch,
+            nets,
+            num_observed=self.num_observed,
+            unseen=self.unseen,
+        )
+
+    def restricted_to(self, index: int) -> "CoupledContexts":
+        """Return the same contexts for one observation, which holds no other.
+
+        Args:
+            index: The number of the observation in ``x_o``.
+        """
+        row = torch.arange(self.num_observed, device=self.batch.device)[index][None]
+        # Nets are what extends.
+        extends = self.unseen == "extend"
+        nets = [
+            net.restricted_to(row, net=net.net if extends else nn.Identity())
+            for net in self.nets
+        ]
+        return CoupledContexts(
+            self.simulated, self.batch[row], nets, unseen=self.unseen
+        )
+
+    def _unseen_features(self, x: Tensor) -> Tensor:
+        # log_prob and its normaliser, or the steps of map(), ask for the same ones, and
+        # earn one warning.
+        keys = _keys(x)
+        if self._extended is None or self._extended[0] != keys:
+            self._extended = (keys, self._extend(x))
+        return self._extended[1]
+
+    def _extend(self, x: Tensor) -> Tensor:
+        if self.unseen == "raise":
+            raise UnseenObservationError(
+                f"{len(x)} observation(s) are not in the batch of "
+                f"{len(self.batch)} this posterior was built for, and a posterior of "
+                "RoPE belongs to its batch; `posterior[i]` knows its own observation "
+                "alone. Either couple the new batch, with "
+                "`rope.build_posterior(x_new)` or `stack(rope, x_new)`, or allow rows "
+                "under the old coupling: both take `unseen='extend'`."
+            )
+        features = torch.stack(
+            [embed(net.net, x).to(net.real) for net in self.nets], dim=1
+        )
+        smallest = min(
+            float((1 / self.rows(features[block]).weights.square().sum(dim=1)).min())
+            for block in blocks(len(features), self.num_contexts)
+        )
+        warn_user(
+            f"Extended the coupling to {len(x)} unseen observation(s); smallest "
+            f"effective sample size {smallest:.1f} of {self.num_contexts} "
+            "simulations. Below about 50, couple the new batch instead."
+        )
+        return features
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:  # noqa: FBT001, FBT002
+        # What `to` calls for each module: couplings are none.
+        moved = super()._apply(fn, recurse)
+        for net in self.nets:
+            net.to_device(self.batch.device)
+        self._extended = None
+        return moved
+
+
+def _keys(x: Tensor) -> list[bytes]:
+    """Return a fingerprint of each row's values."""
+    # Adding zero makes -0.0 and 0.0, which are equal, equal in their bytes too.
+    rows = (x.detach().cpu().flatten(1) + 0.0).contiguous().numpy()
+    return [hashlib.blake2b(row.tobytes(), digest_size=16).digest() for row in rows]

@@ -1,0 +1,124 @@
+"""The prior as a part of a mixture: a density that no observation changes."""
+
+import copy
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from sbi.utils import within_support
+from torch import Tensor, nn
+from torch.distributions import Distribution
+
+from sbi_rope._random import seeded
+from sbi_rope._sbi import ConditionalDensityEstimator, move_distribution_to_device
+from sbi_rope._validation import check_prior
+from sbi_rope.mixture.parts import Mixing, Part, Rows
+
+__all__ = ["PriorDensity", "part_of_prior", "prior_log_prob"]
+
+
+def part_of_prior(prior: Distribution, event_shape: Sequence[int]) -> Part:
+    """Return the prior as a part that ignores the observation.
+
+    Args:
+        prior: A torch distribution over parameters of shape ``(k,)``; it is copied.
+        event_shape: Shape of one observation.
+
+    Raises:
+        InvalidTypeError: If the prior is not a torch distribution.
+        InvalidInputError: If it is not one over vectors.
+    """
+    check_prior(prior)
+    density = PriorDensity(copy.deepcopy(prior))
+    return Part(density, NoContext(event_shape, device=density.placeholder.device))
+
+
+class NoContext(Mixing):
+    """One context for all observations, of width zero.
+
+    Args:
+        event_shape: Shape of one observation.
+        device: Where the density is.
+    """
+
+    empty: Tensor
+
+    def __init__(self, event_shape: Sequence[int], *, device: torch.device) -> None:
+        super().__init__(event_shape, num_contexts=1)
+        self.register_buffer("empty", torch.empty(1, 0, device=device))
+
+    @property
+    def contexts(self) -> Tensor:
+        """The empty context, shape ``(1, 0)``."""
+        return self.empty
+
+    def features(self, x: Tensor) -> Tensor:
+        """Return nothing for each observation, ``(n, 0)``."""
+        return x.new_empty(len(x), 0)
+
+    def rows(self, features: Tensor) -> Rows:
+        """Return a weight of one for each observation."""
+        return Rows(features.new_ones(len(features), 1, dtype=torch.double), self.empty)
+
+
+class PriorDensity(ConditionalDensityEstimator):
+    r"""The prior :math:`p(\theta)`, in the form of an estimator of sbi.
+
+    Args:
+        prior: A torch distribution over parameters of shape ``(k,)``.
+    """
+
+    placeholder: Tensor
+
+    def __init__(self, prior: Distribution) -> None:
+        super().__init__(nn.Identity(), prior.event_shape, torch.Size((0,)))
+        self.prior = prior
+        with seeded(0):
+            like = prior.sample(torch.Size((1,)))
+        # It says where the prior is.
+        self.register_buffer("placeholder", torch.empty(0, device=like.device))
+
+    def log_prob(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
+        """Return the log densities of theta, ``(S, B, d)`` to ``(S, B)``."""
+        flat = input.reshape(-1, *self.input_shape)
+        return prior_log_prob(self.prior, flat).reshape(input.shape[:-1])
+
+    def sample(
+        self, sample_shape: torch.Size, condition: Tensor, **kwargs: Any
+    ) -> Tensor:
+        """Draw for each condition, ``(*sample_shape, B, d)``."""
+        shape = (*sample_shape, len(condition))
+        # sbi's MultipleIndependent knows sample shapes of one dimension only.
+        theta = self.prior.sample(torch.Size((torch.Size(shape).numel(),)))
+        return theta.to(condition).reshape(*shape, *self.input_shape)
+
+    def loss(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
+        """Return the negative log-probability, shape ``(B,)``."""
+        return -self.log_prob(input[None], condition)[0]
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:  # noqa: FBT001, FBT002
+        # What `to` calls for each module: a distribution is none.
+        moved = super()._apply(fn, recurse)
+        device = self.placeholder.device
+        self.prior = move_distribution_to_device(self.prior, str(device))
+        return moved
+
+
+def prior_log_prob(prior: Distribution, theta: Tensor) -> Tensor:
+    r"""Return the log density, :math:`-\infty` outside the support.
+
+    Args:
+        prior: A torch distribution over parameters of shape ``(k,)``.
+        theta: Parameters, shape ``(n, k)``.
+
+    Returns:
+        Shape ``(n,)``, with a graph back to theta even where the density is flat.
+    """
+    inside = within_support(prior, theta)
+    # torch's distributions raise outside their support: evaluate them at a prior draw
+    # there, and overwrite the result.
+    with seeded(0):
+        filler = prior.sample(torch.Size((1,))).to(theta)
+    safe = torch.where(inside.unsqueeze(-1), theta, filler)
+    log_prob = prior.log_prob(safe) + 0.0 * safe.sum(dim=-1)
+    return log_prob.where(inside, -torch.inf)

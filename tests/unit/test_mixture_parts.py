@@ -1,0 +1,742 @@
+"""Mixtures of several kinds of parts against brute force, and amortised ones."""
+
+import copy
+import pickle
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from sbi.inference import DirectPosterior
+from torch import Size, Tensor, nn
+from torch.distributions import Distribution, Normal
+
+from sbi_rope import metrics
+from sbi_rope._sbi import estimator_of, is_bounded
+from sbi_rope.coupling import Coupling
+from sbi_rope.coupling.cost import Distances
+from sbi_rope.errors import (
+    InvalidInputError,
+    RoPEWarning,
+    UnseenObservationError,
+    UnsupportedPosteriorError,
+)
+from sbi_rope.mixture import (
+    CoupledContexts,
+    CoupledNet,
+    MixtureEstimator,
+    MixturePosterior,
+    OwnContexts,
+    Part,
+    chunks,
+    part_of,
+    part_of_prior,
+    truncation,
+)
+from tests import gaussian, problems
+
+QUIET: dict[str, Any] = {"show_progress_bars": False}
+DIM, NUM_SIMULATED, NUM_BATCH = 2, 15, 8
+WEIGHTS = (0.5, 0.3, 0.2)
+SHARES = (0.5, 0.2, 0.3)
+
+
+def coupling(real: Tensor, simulated: Tensor, **options: Any) -> Coupling:
+    """A coupling by a potential drawn at random."""
+    options = {"gamma": 0.5, "direct": False, **options}
+    return Coupling(
+        potential=torch.randn(len(simulated), dtype=torch.double),
+        real=real.detach().double(),
+        simulated=simulated.double(),
+        tau=1.0,
+        marginal_error=0.0,
+        batch_error=0.0,
+        num_fitted=len(real),
+        num_iterations=0,
+        converged=True,
+        solver="none",
+        **options,
+    )
+
+
+def gaussian_net() -> nn.Module:
+    """From x to a mean and a logarithmic standard deviation in each dimension."""
+    net = nn.Linear(3, 2 * DIM)
+    with torch.no_grad():
+        net.weight[DIM:] *= 0.2
+        net.bias[DIM:] = -1.0
+    return net
+
+
+def coupled_part(**options: Any) -> Part:
+    """Two nets, the first with two couplings of its embeddings."""
+    simulated = problems.contexts_of(DIM, NUM_SIMULATED)
+    batch = torch.randn(NUM_BATCH, 3)
+    nets = [nn.Linear(3, 2 * DIM) for _ in range(2)]
+    first, second = (net(batch) for net in nets)
+    pairs = [
+        CoupledNet(
+            nets[0],
+            [coupling(first, simulated), coupling(first, simulated, gamma=0.2)],
+            SHARES[:2],
+        ),
+        CoupledNet(nets[1], [coupling(second, simulated, direct=True)], SHARES[2:]),
+    ]
+    mixing = CoupledContexts(simulated, batch, pairs, **options)
+    return Part(problems.Gaussians(DIM), mixing)
+
+
+def own_part(num_nets: int = 2) -> Part:
+    nets = [gaussian_net() for _ in range(num_nets)]
+    return Part(problems.Gaussians(DIM), OwnContexts(nets, (3,)))
+
+
+def three_parts(
+    weights: Any = WEIGHTS, *, tail_mass: float = 0.0, **options: Any
+) -> MixturePosterior:
+    """A coupled part, one given embeddings of x itself, and the prior."""
+    prior = problems.box(DIM)
+    parts = [coupled_part(**options), own_part(), part_of_prior(prior, (3,))]
+    return MixturePosterior(
+        MixtureEstimator(parts, weights, tail_mass=tail_mass), prior
+    )
+
+
+def amortised(**options: Any) -> MixturePosterior:
+    """Two densities of x itself, neither of which knows a batch."""
+    parts = [own_part(), own_part(1)]
+    estimator = MixtureEstimator(parts, [0.25, 0.75], tail_mass=0.0)
+    return MixturePosterior(estimator, problems.box(DIM), **options)
+
+
+def rows_by_hand(posterior: MixturePosterior, x: Tensor) -> list[Tensor]:
+    """Of each coupling, by its definition."""
+    found = []
+    for net in posterior.posterior_estimator.coupled[0].nets:
+        for one in net.couplings:
+            distances = (net.net(x).double()[:, None] - one.simulated).norm(dim=-1)
+            logits = one.potential - distances / one.gamma
+            found.append(logits.softmax(dim=1).detach())
+    return found
+
+
+def gaussians(theta: Tensor, contexts: Tensor) -> Tensor:
+    """Densities at theta (..., d) given contexts (..., 2 d)."""
+    mean, log_std = contexts.detach().double().chunk(2, dim=-1)
+    return Normal(mean, log_std.exp()).log_prob(theta.double()).sum(-1).exp()
+
+
+def densities(posterior: MixturePosterior, theta: Tensor, x: Tensor) -> Tensor:
+    """Of each part at theta (S, n, d), shape (S, n, 3)."""
+    _, own, _ = posterior.posterior_estimator.parts
+    mixing: Any = own.mixing
+    pairs = zip(SHARES, rows_by_hand(posterior, x), strict=True)
+    rows = sum(share * row for share, row in pairs)
+    simulated = problems.simulated_of(posterior)
+    return torch.stack(
+        [
+            (rows * gaussians(theta[..., None, :], simulated)).sum(dim=-1),
+            torch.stack([gaussians(theta, net(x)) for net in mixing.nets]).mean(0),
+            (theta.abs() <= 1).all(dim=-1).double() / 2**DIM,
+        ],
+        dim=-1,
+    )
+
+
+def masses(posterior: MixturePosterior, x: Tensor) -> Tensor:
+    """Of each part inside the box, shape (n, 3), in closed form."""
+    own: Any = posterior.posterior_estimator.parts[1].mixing
+
+    def inside(contexts: Tensor) -> Tensor:
+        mean, log_std = contexts.detach().double().chunk(2, dim=-1)
+        law, one = Normal(mean, log_std.exp()), torch.ones_like(mean)
+        return (law.cdf(one) - law.cdf(-one)).prod(dim=-1)
+
+    pairs = zip(SHARES, rows_by_hand(posterior, x), strict=True)
+    rows = sum(share * row for share, row in pairs)
+    return torch.stack(
+        [
+            rows @ inside(problems.simulated_of(posterior)),
+            torch.stack([inside(net(x)) for net in own.nets]).mean(dim=0),
+            torch.ones(len(x), dtype=torch.double),
+        ],
+        dim=-1,
+    )
+
+
+def counted(target: Any, name: str, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Record the arguments of every call of a method."""
+    original, calls = getattr(target, name), []
+
+    def record(*arguments: Any, **options: Any) -> Any:
+        calls.append(arguments)
+        return original(*arguments, **options)
+
+    monkeypatch.setattr(target, name, record)
+    return calls
+
+
+# --- density ---
+
+
+@pytest.mark.parametrize(("entries", "batch"), [(2**19, 2**14), (40, 7), (1, 1)])
+def test_log_prob_is_the_log_sum_over_parts_and_contexts(
+    entries: int, batch: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    posterior = three_parts()
+    monkeypatch.setattr(chunks, "MAX_ENTRIES", entries)
+    monkeypatch.setattr(chunks, "CPU_BATCH", batch)
+    theta = 3 * torch.rand(6, NUM_BATCH, DIM) - 1.5
+    expected = densities(posterior, theta, posterior.x_o) @ torch.tensor(
+        WEIGHTS, dtype=torch.double
+    )
+    estimator = posterior.posterior_estimator
+    found = estimator.log_prob(theta, posterior.x_o)
+    assert torch.allclose(found, expected.log().float(), atol=1e-5)
+    one = estimator.log_prob(theta[:, 2:3], posterior.x_o[2:3])
+    assert torch.allclose(one, expected[:, 2:3].log().float(), atol=1e-5)
+
+
+def test_log_probs_of_parts_are_those_of_each_by_itself() -> None:
+    posterior = three_parts(tail_mass=0.5, weights=(1.0, 0.0, 0.0))
+    theta = 2 * torch.rand(NUM_BATCH, DIM) - 1
+    theta[0] = 1.5  # where the prior has no density
+    estimator = posterior.posterior_estimator
+    expected = densities(posterior, theta[None], posterior.x_o)[0].log()
+    found = estimator.part_log_probs(theta, posterior.x_o)
+    assert found.dtype is torch.float64
+    assert torch.allclose(found, expected, atol=1e-5)
+    order = torch.tensor([3, 0, 5])
+    some = estimator.part_log_probs(theta[order], posterior.x_o[order], numbers=(2, 0))
+    assert torch.allclose(some, expected[order][:, [2, 0]], atol=1e-5)
+
+
+def test_the_tail_is_left_out_of_all_parts_together() -> None:
+    posterior = three_parts(tail_mass=0.0)
+    estimator, x = posterior.posterior_estimator, posterior.x_o
+    theta = 2 * torch.rand(40, NUM_BATCH, DIM) - 1
+    whole = estimator.log_prob(theta, x).double().exp()
+    estimator.tail_mass = 0.25
+    cut = estimator.log_prob(theta, x).double().exp()
+    # All but the prior, whose single weight is 0.2, goes by its weights.
+    pairs = zip(SHARES, rows_by_hand(posterior, x), strict=True)
+    rows = sum(0.5 * share * row for share, row in pairs)
+    rows = torch.cat([rows, torch.tensor([[0.15, 0.15, 0.2]]).expand(len(x), 3)], 1)
+    mixing: Any = estimator.parts[1].mixing
+    terms = torch.cat(
+        [
+            gaussians(theta[..., None, :], problems.simulated_of(posterior)),
+            torch.stack([gaussians(theta, net(x)) for net in mixing.nets], dim=-1),
+            torch.full((*theta.shape[:2], 1), 0.25, dtype=torch.double),
+        ],
+        dim=-1,
+    )
+    ascending, order = rows.sort(dim=1)
+    dropped = torch.zeros_like(rows, dtype=torch.bool)
+    dropped.scatter_(1, order, ascending.cumsum(dim=1) <= 0.25)
+    assert dropped[:, :NUM_SIMULATED].any(dim=1).all()
+    assert torch.allclose(whole, (terms * rows).sum(-1), rtol=1e-5)
+    assert torch.allclose(cut, (terms * rows * ~dropped).sum(-1), rtol=1e-5)
+
+
+@pytest.mark.parametrize("alone", range(3))
+def test_parts_of_weight_zero_cost_nothing(
+    alone: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    weights = [float(k == alone) for k in range(3)]
+    posterior = three_parts(weights)
+    calls = []
+    for k, part in enumerate(posterior.posterior_estimator.parts):
+        calls.append([])
+        for target, name in (
+            (part.density, "log_prob"),
+            (part.density, "sample"),
+            (part.mixing, "features"),
+            (part.mixing, "rows"),
+        ):
+            calls[k].append(counted(target, name, monkeypatch))
+    theta = 2 * torch.rand(NUM_BATCH, DIM) - 1
+    posterior.log_prob_batched(theta, posterior.x_o)
+    posterior.sample_batched((3,), posterior.x_o, **QUIET)
+    for k, of_part in enumerate(calls):
+        assert all(len(call) > 0 for call in of_part) == (k == alone)
+        assert not any(of_part) or k == alone
+
+
+def test_gradients_are_those_of_the_sum_of_all_parts() -> None:
+    posterior = three_parts()
+    theta = (0.8 * torch.rand(1, NUM_BATCH, DIM)).requires_grad_()
+    posterior.posterior_estimator.log_prob(theta, posterior.x_o).sum().backward()
+    assert theta.grad is not None
+    exact = theta.detach().double().requires_grad_()
+    weights = torch.tensor(WEIGHTS, dtype=torch.double)
+    (densities(posterior, exact, posterior.x_o) @ weights).log().sum().backward()
+    assert exact.grad is not None
+    assert torch.allclose(theta.grad.double(), exact.grad, atol=1e-4)
+
+
+# --- samples and mass ---
+
+
+@pytest.mark.parametrize("entries", [2**19, 60])
+def test_samples_follow_the_density_of_all_parts(
+    entries: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    posterior, draws = three_parts(), 10_000
+    monkeypatch.setattr(chunks, "MAX_ENTRIES", entries)
+    if entries < 100:
+        draws = 1000
+    x = posterior.x_o[:3]
+    samples = posterior.sample_batched((draws,), x, **QUIET)
+    line = (torch.arange(40) + 0.5) / 20 - 1
+    grid = torch.cartesian_prod(line, line)[:, None].expand(-1, 3, -1)
+    density = densities(posterior, grid, x) @ torch.tensor(WEIGHTS).double()
+    density = density / density.sum(dim=0)
+    for i in range(3):
+        share = density[:, i].reshape(4, 10, 4, 10).sum(dim=(1, 3))
+        edges = [torch.linspace(-1, 1, 5)] * 2
+        counts = torch.histogramdd(samples[:, i], edges).hist / draws
+        error = (share * (1 - share) / draws).sqrt()
+        assert ((counts - share).abs() < 4.5 * error + 2e-3).all()
+
+
+def test_samples_come_from_each_part_as_often_as_it_weighs() -> None:
+    # Spikes at different integers: contexts cannot be confused with each other.
+    weights = (0.5, 0.3, 0.2)
+    parts = []
+    for number in range(3):
+        net = nn.Linear(3, 2)
+        with torch.no_grad():
+            net.weight.zero_()
+            net.bias.copy_(torch.tensor([float(number), -9.0]))
+        parts.append(Part(problems.Gaussians(1), OwnContexts([net], (3,))))
+    estimator = MixtureEstimator(parts, weights)
+    n = 20_000
+    samples = estimator.sample(Size((n,)), torch.randn(2, 3))
+    for column in samples[..., 0].round().long().T:
+        found = column.bincount(minlength=3) / n
+        for share, weight in zip(found.tolist(), weights, strict=True):
+            assert abs(share - weight) < 4 * (weight * (1 - weight) / n) ** 0.5
+
+
+def test_the_mass_is_that_of_all_parts_and_so_is_its_error() -> None:
+    wrong = []
+    for _ in range(10):
+        posterior = three_parts()
+        leakage = posterior.leakage(posterior.x_o)
+        weights = torch.tensor(WEIGHTS, dtype=torch.double)
+        exact = masses(posterior, posterior.x_o) @ weights
+        wrong.append((leakage.mass - exact) / leakage.standard_error)
+        assert exact.min() < 0.9
+        assert (leakage.standard_error < 0.02).all()
+    scores = torch.cat(wrong)
+    assert scores.abs().max() < 4.5
+    assert 0.5 < float(scores.square().mean().sqrt()) < 1.3
+
+
+def test_the_mass_agrees_with_the_share_of_long_sampling() -> None:
+    posterior = three_parts()
+    free = posterior.sample_batched(
+        (20_000,), posterior.x_o, reject_outside_prior=False, **QUIET
+    )
+    share = (free.abs() <= 1).all(dim=-1).double().mean(dim=0)
+    leakage = posterior.leakage(posterior.x_o)
+    error = (leakage.standard_error.square() + share * (1 - share) / 20_000).sqrt()
+    assert ((leakage.mass - share).abs() < 4.5 * error).all()
+
+
+def test_a_part_gets_the_draws_its_weight_deserves(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    weights = [0.9995 - 0.25, 0.25, 0.0005]
+    posterior = three_parts(weights)
+    calls = [
+        counted(part.density, "sample", monkeypatch)
+        for part in posterior.posterior_estimator.parts
+    ]
+    posterior.leakage(posterior.x_o)
+    posterior.leakage(posterior.x_o)
+
+    def draws(of_part: list[Any]) -> int:
+        return sum(Size(shape).numel() for shape, *_ in of_part)
+
+    # Given each simulation once; of the own contexts a quarter each time, over two
+    # nets; the prior weighs less than a draw.
+    assert draws(calls[0]) == truncation.LEAKAGE_DRAWS
+    assert draws(calls[1]) == 2 * NUM_BATCH * 128
+    assert draws(calls[2]) == 0
+
+
+def test_the_mass_of_an_observation_does_not_depend_on_what_is_asked_beside() -> None:
+    posterior = three_parts()
+    together = posterior.leakage(posterior.x_o).mass
+    for i, x in enumerate(posterior.x_o):
+        assert torch.allclose(posterior.leakage(x).mass, together[i], atol=1e-12)
+
+
+def test_progress_of_normalising_is_shown_if_asked_for_and_never_by_log_prob(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    shown: list[bool] = []
+
+    def tqdm(items: Any, *, disable: bool, delay: float, **options: Any) -> Any:
+        assert delay > 0
+        shown.append(not disable)
+        return items
+
+    monkeypatch.setattr(truncation, "tqdm", tqdm)
+    posterior = three_parts()
+    theta = torch.zeros(NUM_BATCH, DIM)
+    posterior.log_prob_batched(theta, posterior.x_o)
+    posterior.log_prob(theta, x=posterior.x_o[0])
+    assert shown
+    assert not any(shown)
+    shown.clear()
+    again = three_parts()
+    again.leakage(again.x_o, show_progress_bars=True)
+    assert all(shown)
+    assert len(shown) == 3
+
+
+# --- couplings ---
+
+
+def test_distances_are_computed_once_for_all_couplings_of_a_net(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    calls = counted(Distances, "__call__", monkeypatch)
+    part = coupled_part()
+    mixing: Any = part.mixing
+    features = mixing.features(mixing.x_o)
+    mixing.rows(features)
+    assert len(calls) == 2
+    list(mixing.rows_of_each(features))
+    assert len(calls) == 4
+    # Those with and those without a matrix product do not share them.
+    first = mixing.nets[0]
+    mixed = CoupledNet(
+        first.net,
+        [*first.couplings, coupling(first.real, mixing.simulated, direct=True)],
+        [0.3, 0.3, 0.4],
+    )
+    calls.clear()
+    mixed.rows(first.real)
+    assert len(calls) == 2
+
+
+def test_couplings_of_share_zero_cost_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    mixing: Any = coupled_part().mixing.with_shares([0.0, 1.0, 0.0])  # type: ignore[operator]
+    assert mixing.shares == (0.0, 1.0, 0.0)
+    calls = counted(Coupling, "rows", monkeypatch)
+    rows = mixing.rows(mixing.features(mixing.x_o)).weights
+    assert [arguments[0] for arguments in calls] == [mixing.couplings[1]]
+    assert torch.equal(rows, mixing.couplings[1].weights)
+
+
+def test_rows_are_the_shares_of_the_couplings() -> None:
+    posterior = three_parts()
+    pairs = zip(SHARES, rows_by_hand(posterior, posterior.x_o), strict=True)
+    expected = sum(share * row for share, row in pairs)
+    assert torch.allclose(posterior.weights, expected, atol=1e-6)
+    mixing = posterior.posterior_estimator.coupled[0]
+    of_each = list(mixing.rows_of_each(mixing.features(posterior.x_o)))
+    by_hand = rows_by_hand(posterior, posterior.x_o)
+    for found, row in zip(of_each, by_hand, strict=True):
+        assert torch.allclose(found, row, atol=1e-6)
+
+
+def test_several_couplings_are_named_and_a_single_one_is_refused() -> None:
+    posterior = three_parts()
+    assert len(posterior.couplings) == 3
+    with pytest.raises(InvalidInputError, match="Use `couplings`"):
+        _ = posterior.coupling
+    assert problems.gaussian_posterior().couplings[0].gamma == 0.5
+
+
+def test_what_was_coupled_may_be_more_than_what_is_inferred() -> None:
+    posterior = three_parts(num_observed=5)
+    mixing = posterior.posterior_estimator.coupled[0]
+    assert len(posterior) == 5
+    assert torch.equal(posterior.x_o, mixing.batch[:5])
+    assert posterior.weights.shape == (5, NUM_SIMULATED)
+    assert len(list(posterior)) == 5
+    with pytest.raises(IndexError):
+        posterior[5]
+    theta = 2 * torch.rand(NUM_BATCH, DIM) - 1
+    weights = torch.tensor(WEIGHTS, dtype=torch.double)
+    expected = densities(posterior, theta[None], mixing.batch)[0] @ weights
+    found = posterior.log_prob_batched(theta, mixing.batch, norm_posterior=False)
+    assert torch.allclose(found[0].double(), expected.log(), atol=1e-5)
+    last = posterior[-1]
+    assert torch.equal(last.default_x, mixing.batch[4:5])
+    # The single coupling of a longer batch has rows for what is inferred alone.
+    first = mixing.nets[0]
+    single = CoupledContexts(
+        mixing.simulated,
+        mixing.batch,
+        [CoupledNet(first.net, first.couplings[:1])],
+        num_observed=3,
+    )
+    assert torch.equal(single.weights, first.couplings[0].weights[:3])
+
+
+def test_unseen_observations_are_embedded_by_every_net() -> None:
+    posterior = three_parts(unseen="extend")
+    x, theta = torch.randn(4, 3), 2 * torch.rand(4, DIM) - 1
+    with pytest.warns(RoPEWarning, match="4 unseen"):
+        found = posterior.log_prob_batched(theta, x, norm_posterior=False)[0]
+    weights = torch.tensor(WEIGHTS, dtype=torch.double)
+    expected = (densities(posterior, theta[None], x)[0] @ weights).log()
+    assert torch.allclose(found.double(), expected, atol=1e-5)
+
+
+# --- the posterior of one observation ---
+
+
+@pytest.mark.parametrize("unseen", ["raise", "extend"])
+def test_a_view_holds_one_observation_and_answers_as_the_whole(unseen: str) -> None:
+    posterior = three_parts(unseen=unseen, num_observed=5)
+    theta = 2 * torch.rand(6, DIM) - 1
+    for i in (0, 3):
+        view = pickle.loads(pickle.dumps(posterior[i]))
+        x = posterior.x_o[i]
+        assert torch.equal(view.log_prob(theta), posterior.log_prob(theta, x=x))
+        torch.manual_seed(i)
+        samples = view.sample((20,), **QUIET)
+        torch.manual_seed(i)
+        assert torch.equal(samples, posterior.sample((20,), x=x, **QUIET))
+        assert torch.equal(view.weights, posterior[i].weights)
+        assert len(view) == 1
+        assert torch.equal(view[0].log_prob(theta), view.log_prob(theta))
+    other = posterior.x_o[1]
+    if unseen == "raise":
+        with pytest.raises(UnseenObservationError, match="knows its own observation"):
+            view.log_prob(theta, x=other)
+    else:
+        with pytest.warns(RoPEWarning, match="1 unseen"):
+            found = view.log_prob(theta, x=other)
+        assert torch.allclose(found, posterior.log_prob(theta, x=other), atol=1e-5)
+
+
+def test_a_pickled_view_does_not_grow_with_the_batch() -> None:
+    def size(n_o: int) -> tuple[int, int]:
+        posterior = problems.gaussian_posterior(x_o=torch.randn(n_o, 1, 16, 16))
+        posterior.log_prob_batched(torch.zeros(n_o, 2), posterior.x_o)
+        return len(pickle.dumps(posterior)), len(pickle.dumps(posterior[1]))
+
+    (small, view), (large, other) = size(10), size(500)
+    assert large > 10 * small
+    assert other < view + 1000
+    assert other < 60_000
+
+
+# --- amortised posteriors ---
+
+
+def test_an_amortised_posterior_answers_any_x() -> None:
+    posterior = amortised()
+    assert posterior.is_amortised
+    assert not three_parts().is_amortised
+    assert "for any x" in str(posterior)
+    theta, x = 2 * torch.rand(7, 4, DIM) - 1, torch.randn(4, 3)
+    weights = torch.tensor([0.25, 0.75], dtype=torch.double)
+    of_each = []
+    for part in posterior.posterior_estimator.parts:
+        mixing: Any = part.mixing
+        of_net = [gaussians(theta, net(x)) for net in mixing.nets]
+        of_each.append(torch.stack(of_net).mean(dim=0))
+    expected = (torch.stack(of_each, dim=-1) @ weights).log()
+    found = posterior.log_prob_batched(theta, x, norm_posterior=False)
+    assert torch.allclose(found.double(), expected, atol=1e-5)
+    normalised = posterior.log_prob_batched(theta, x)
+    mass = posterior.leakage(x).mass.log()
+    assert torch.allclose(normalised.double(), expected - mass, atol=1e-5)
+    for i in range(4):
+        single = posterior.log_prob(theta[:, i], x=x[i])
+        assert torch.allclose(single, normalised[:, i], atol=1e-5)
+    samples = posterior.sample_batched((5,), x, **QUIET)
+    assert samples.shape == (5, 4, DIM)
+    assert (samples.abs() <= 1).all()
+    default = posterior.set_default_x(x[0])
+    assert default.sample((6,), **QUIET).shape == (6, DIM)
+    assert default.map(num_iter=3, num_init_samples=20).shape == (1, DIM)
+    assert metrics.lpp(posterior, theta[0], x).log_probs.shape == (4,)
+
+
+def test_the_part_of_an_npe_is_that_npe() -> None:
+    npe = problems.npe_posterior("nsf")
+    estimator = estimator_of(npe)
+    part = part_of(estimator)
+    posterior = MixturePosterior(MixtureEstimator([part], [1.0]), npe.prior)
+    theta, x = 2 * torch.rand(5, 4, DIM) - 1, torch.randn(4, 3)
+    with torch.no_grad():
+        expected = npe.posterior_estimator.log_prob(theta, x)
+    found = posterior.log_prob_batched(theta, x, norm_posterior=False)
+    assert torch.allclose(found, expected, atol=1e-4)
+    mass = posterior.leakage(x)
+    free = npe.posterior_estimator.sample((5000,), x)
+    share = (free.abs() <= 1).all(dim=-1).double().mean(dim=0)
+    error = (mass.standard_error.square() + share * (1 - share) / 5000).sqrt()
+    assert ((mass.mass - share).abs() < 4.5 * error + 1e-3).all()
+    # A copy, in evaluation mode, whatever becomes of the user's own.
+    ours = {id(parameter) for parameter in posterior.posterior_estimator.parameters()}
+    assert not ours & {id(parameter) for parameter in estimator.parameters()}
+    assert not any(module.training for module in part.modules())
+
+
+@pytest.mark.parametrize(
+    ("call", "name"),
+    [
+        (lambda p: p.x_o, "x_o"),
+        (lambda p: p.coupling, "coupling"),
+        (lambda p: p.couplings, "couplings"),
+        (lambda p: p.weights, "weights"),
+        (len, r"len\(\)"),
+        (lambda p: p[0], r"\[i\]"),
+        (list, "len"),
+    ],
+)
+def test_an_amortised_posterior_has_no_batch(
+    call: Callable[[MixturePosterior], Any], name: str
+) -> None:
+    posterior = amortised()
+    with pytest.raises(InvalidInputError, match=rf"amortised.*`{name}.*Pass the obs"):
+        call(posterior)
+    assert posterior  # although it has no length
+
+
+@pytest.mark.parametrize("make", [amortised, three_parts])
+@pytest.mark.parametrize(
+    "copied", [copy.deepcopy, lambda p: pickle.loads(pickle.dumps(p))]
+)
+def test_a_copy_answers_the_same(
+    make: Callable[[], MixturePosterior], copied: Callable[[Any], MixturePosterior]
+) -> None:
+    posterior = make()
+    x = torch.randn(3, 3) if posterior.is_amortised else posterior.x_o[:3]
+    theta = 2 * torch.rand(4, 3, DIM) - 1
+    expected = posterior.log_prob_batched(theta, x)
+    assert torch.equal(copied(posterior).log_prob_batched(theta, x), expected)
+
+
+def test_moving_a_mixture_moves_couplings_and_prior() -> None:
+    posterior = three_parts()
+    estimator = posterior.posterior_estimator
+    prior: Any = estimator.parts[2].density
+    estimator.to("meta")
+    assert posterior.couplings[0].real.is_meta
+    assert posterior.couplings[2].potential.is_meta
+    assert prior.prior.sample((1,)).is_meta
+    assert not posterior.prior.sample((1,)).is_meta
+
+
+# --- the prior ---
+
+
+class Untransformable(Distribution):
+    """A prior that says nothing of itself but draws and densities."""
+
+    arg_constraints = {}  # noqa: RUF012
+
+    def __init__(self) -> None:
+        super().__init__(Size(), Size((2,)), validate_args=False)
+
+    @property
+    def support(self) -> Any:
+        raise NotImplementedError
+
+    def sample(self, sample_shape: Size = Size()) -> Tensor:  # noqa: B008
+        return torch.rand(*sample_shape, 2)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        inside = ((value >= 0) & (value <= 1)).all(dim=-1)
+        return torch.where(inside, 0.0, -torch.inf)
+
+
+def test_a_prior_that_sbi_cannot_transform_is_a_part_all_the_same() -> None:
+    part = part_of_prior(Untransformable(), (3,))
+    estimator = MixtureEstimator([part], [1.0])
+    theta = torch.tensor([[0.5, 0.5], [1.5, 0.5]])
+    found = estimator.log_prob(theta, torch.zeros(1, 3))[0]
+    assert found.tolist() == [0.0, -torch.inf]
+    samples = estimator.sample(Size((50,)), torch.zeros(2, 3))
+    assert ((samples >= 0) & (samples <= 1)).all()
+
+
+def test_the_density_of_the_prior_leaves_the_random_state_alone() -> None:
+    part = part_of_prior(problems.box(DIM), (3,))
+    state = torch.get_rng_state()
+    part.log_prob(3 * torch.ones(4, DIM), torch.empty(4, 0))
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+# --- what others see, and wrong use ---
+
+
+def test_a_mixture_in_any_posterior_of_sbi_cannot_be_repaired() -> None:
+    posterior = amortised()
+    plain = DirectPosterior(posterior.posterior_estimator, posterior.prior)
+    for one in (posterior, plain):
+        with pytest.raises(UnsupportedPosteriorError, match="cannot be repaired again"):
+            estimator_of(one)
+
+
+def test_bounded_posteriors_are_told_from_those_of_sbi() -> None:
+    posterior = amortised()
+    assert is_bounded(posterior)
+    assert not is_bounded(
+        DirectPosterior(posterior.posterior_estimator, posterior.prior)
+    )
+
+
+@pytest.mark.parametrize(
+    ("make", "match"),
+    [
+        (lambda: MixtureEstimator([], []), "at least one part"),
+        (lambda: MixtureEstimator([own_part()], [0.5]), "sum of one"),
+        (lambda: MixtureEstimator([own_part()] * 2, [1.5, -0.5]), "negative"),
+        (lambda: MixtureEstimator([own_part()], [0.5, 0.5]), "to be 1 numbers"),
+        (lambda: MixtureEstimator([own_part()], [1.0], tail_mass=2.0), "tail_mass"),
+        (
+            lambda: MixtureEstimator(
+                [own_part(), part_of(gaussian.GaussianEstimator(1))], [0.5, 0.5]
+            ),
+            "as the first",
+        ),
+        (
+            lambda: MixtureEstimator([coupled_part(), coupled_part()], [0.5, 0.5]),
+            "same `x_o`",
+        ),
+        (lambda: coupled_part(num_observed=99), "num_observed"),
+        (lambda: coupled_part(unseen="guess"), "unseen"),
+        (lambda: CoupledNet(nn.Identity(), []), "at least one"),
+        (lambda: OwnContexts([], (3,)), "at least one"),
+        (
+            lambda: coupled_part().mixing.with_shares([0.5, 0.5, 0.5]),  # type: ignore[operator]
+            "sum of one",
+        ),
+        (
+            lambda: three_parts().posterior_estimator.part_log_probs(
+                torch.zeros(2, DIM), torch.zeros(3, 3)
+            ),
+            "same number of rows",
+        ),
+        (
+            lambda: amortised().posterior_estimator.component_mass(
+                0, accept=lambda theta: theta[:, 0] > 0, cache={}
+            ),
+            "shared contexts",
+        ),
+    ],
+)
+def test_parts_that_do_not_fit_are_refused_by_name(
+    make: Callable[[], Any], match: str
+) -> None:
+    with pytest.raises(InvalidInputError, match=match):
+        make()
+
+
+def test_an_estimator_without_a_density_is_no_part() -> None:
+    field = problems.vector_field_posterior("fmpe").vector_field_estimator
+    with pytest.raises(UnsupportedPosteriorError, match="Train NPE"):
+        part_of(field)
