@@ -1,6 +1,7 @@
 """Where simulations come from: a simulator, or a stored set of them."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import torch
@@ -23,7 +24,7 @@ from sbi_rope.errors import (
     warn_user,
 )
 
-__all__ = ["SimulationSource", "Simulator", "StoredSimulations"]
+__all__ = ["Moments", "SimulationSource", "Simulator", "StoredSimulations"]
 
 # Simulations held in memory before they are embedded; few if they come one by one, so
 # that a slow simulator shows its progress.
@@ -31,7 +32,34 @@ BATCHED_CHUNK, SINGLE_CHUNK = 1000, 10
 # Seconds of work before it deserves a progress bar.
 DELAY = 2.0
 
+# Entries of simulations kept for training on them; fewer are drawn if each is large.
+MAX_KEPT = 2**27
+# Stored simulations around a theta behind the moments there.
+NUM_AROUND = 50
+
 Embedding = Callable[[Tensor], Tensor]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Moments:
+    """Mean and covariance of the embeddings of simulations at given parameters.
+
+    Attributes:
+        mean: Shape ``(n, l)``, float64.
+        covariance: Shape ``(n, l, l)``, float64.
+    """
+
+    mean: Tensor
+    covariance: Tensor
+
+    def __getitem__(self, rows: Tensor) -> "Moments":
+        return Moments(mean=self.mean[rows], covariance=self.covariance[rows])
+
+    def columns(self, columns: slice) -> "Moments":
+        """Return the moments of some entries of the embeddings."""
+        return Moments(
+            mean=self.mean[:, columns], covariance=self.covariance[:, columns, columns]
+        )
 
 
 class SimulationSource(Protocol):
@@ -52,6 +80,16 @@ class SimulationSource(Protocol):
         self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
     ) -> Tensor:
         """Return the mean embedding of simulations at each theta, ``(n, l)``."""
+        ...
+
+    def moments(
+        self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
+    ) -> Moments:
+        """Return mean and covariance of the embedding of simulations at each theta."""
+        ...
+
+    def kept(self, count: int, *, progress: bool) -> tuple[Tensor, Tensor]:
+        """Return up to ``count`` pairs (theta, x) from the prior, always the same."""
         ...
 
 
@@ -76,6 +114,7 @@ class Simulator:
         self.event_shape = event_shape
         self.like = like
         self.num_dropped = 0
+        self._kept: dict[int, tuple[Tensor, Tensor]] = {}
         # The probe has its own random numbers: seeded results do not depend on it.
         with seeded(0):
             self.is_batched = self._probe()
@@ -99,6 +138,39 @@ class Simulator:
         self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
     ) -> Tensor:
         """Simulate ``count`` times at each theta and average the finite ones."""
+        statistics, valid = self._repeat_at(theta, count, embed, progress=progress)
+        total = statistics.where(valid[..., None], 0.0).sum(dim=1)
+        return total / valid.sum(dim=1, keepdim=True)
+
+    def moments(
+        self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
+    ) -> Moments:
+        """Simulate ``count`` times at each theta; of a single one the variance is 0."""
+        embedded, valid = self._repeat_at(theta, count, embed, progress=progress)
+        number = valid.sum(dim=1)[:, None]
+        embedded = embedded.double().where(valid[..., None], 0.0)
+        mean = embedded.sum(dim=1) / number
+        centred = (embedded - mean[:, None]).where(valid[..., None], 0.0)
+        squares = centred.mT @ centred
+        return Moments(
+            mean=mean, covariance=squares / (number[..., None] - 1).clamp_min(1)
+        )
+
+    def kept(self, count: int, *, progress: bool) -> tuple[Tensor, Tensor]:
+        """Simulate at parameters from the prior once, for all who ask for as many."""
+        count = min(count, max(1, MAX_KEPT // self.event_shape.numel()))
+        if count not in self._kept:
+            # Under a seed of its own, so that nothing depends on who asked first.
+            with seeded(0):
+                self._kept[count] = self.from_prior(
+                    count, count, lambda x: x, progress=progress
+                )
+        return self._kept[count]
+
+    def _repeat_at(
+        self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
+    ) -> tuple[Tensor, Tensor]:
+        """Simulate at each theta, ``(n, count, l)``, and tell what is finite."""
         repeated = theta.repeat_interleave(count, dim=0)
         statistics, valid = self._embed_at(repeated, embed, progress=progress)
         dropped = int((~valid).sum())
@@ -115,8 +187,7 @@ class Simulator:
         _warn_of_dropped(
             dropped, valid.numel(), "simulations at calibration parameters"
         )
-        total = statistics.where(valid[..., None], 0.0).sum(dim=1)
-        return total / valid.sum(dim=1, keepdim=True)
+        return statistics, valid
 
     def _embed_at(
         self, theta: Tensor, embed: Embedding, *, progress: bool
@@ -282,6 +353,35 @@ class StoredSimulations:
         nearest = distance.topk(count, dim=1, largest=False).indices
         statistics = embed(self.x[nearest.flatten()])
         return statistics.reshape(*nearest.shape, -1).mean(dim=1)
+
+    def moments(
+        self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
+    ) -> Moments:
+        """Fit a plane to the embeddings of the stored simulations around each theta.
+
+        Its height is the mean, and the covariance is that of what it leaves over.
+        ``count`` has no effect: how many are around a theta depends on the number of
+        parameters.
+        """
+        number = min(len(self.x), max(NUM_AROUND, 5 * (theta.shape[1] + 1)))
+        distance = torch.cdist(theta / self.theta_std, self.theta / self.theta_std)
+        nearest = distance.topk(number, dim=1, largest=False).indices
+        embedded = embed(self.x[nearest.flatten()]).double()
+        embedded = embedded.reshape(*nearest.shape, -1)
+        offsets = ((self.theta[nearest] - theta[:, None]) / self.theta_std).double()
+        # A ridge keeps the plane level where the parameters around do not vary.
+        design = torch.cat([torch.ones_like(offsets[..., :1]), offsets], dim=-1)
+        ridge = torch.full((design.shape[-1],), 1e-6).to(design)
+        ridge[0] = 0.0
+        normal = design.mT @ design + ridge.diag()
+        plane = torch.linalg.solve(normal, design.mT @ embedded)
+        left_over = embedded - design @ plane
+        freedom = max(1, number - design.shape[-1])
+        return Moments(mean=plane[:, 0], covariance=left_over.mT @ left_over / freedom)
+
+    def kept(self, count: int, *, progress: bool) -> tuple[Tensor, Tensor]:
+        """Return the first stored pairs."""
+        return self.theta[:count], self.x[:count]
 
 
 def _warn_of_dropped(dropped: int, total: int, what: str) -> None:

@@ -1,0 +1,178 @@
+"""From a trained NPE to one that knows how reality differs from its simulator."""
+
+import copy
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from torch import Tensor, nn
+
+from sbi_rope._sbi import ConditionalEstimator, embedding_of, headless, with_embedding
+from sbi_rope._simulations import Moments
+from sbi_rope._training import History
+from sbi_rope.baselines.statistics import Standardisation
+from sbi_rope.discrepancy.model import Discrepancy, DiscrepancyModel
+from sbi_rope.discrepancy.training import train_on_corrected
+from sbi_rope.errors import InvalidInputError
+
+__all__ = ["Correction", "Space", "correct_npe", "fit_discrepancy", "network_of"]
+
+# What of an observation is corrected: h(x), x itself, or g(x) of nets tuned on other
+# pairs. Simulations are represented by h(x) in the last case too, where g puts them.
+Space = Literal["embedding", "input", "tuned"]
+
+# Draws of the discrepancy behind a training.
+NUM_DRAWS = 2000
+# Smallest standard deviation of the error, in standard deviations of simulations. The
+# input of a network can be known better than its output.
+SMALLEST_ERROR = {"embedding": 0.01, "tuned": 0.01, "input": 0.003}
+# Gradient steps. The density behind an embedding net follows within a hundred; a whole
+# network takes longer. Chosen on calibration data, see benchmarks/README.md.
+NUM_STEPS = {"embedding": 120, "tuned": 120, "input": 400}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Correction:
+    """An estimator trained on corrected simulations, and what it was corrected by.
+
+    Attributes:
+        estimator: An estimator of sbi for real observations x.
+        discrepancy: The posterior of gain, offset and error.
+        history: The losses of its training.
+    """
+
+    estimator: Any
+    discrepancy: Discrepancy
+    history: History
+
+
+def network_of(estimator: ConditionalEstimator, space: Space) -> nn.Module:
+    """Return the map from simulations x to what is corrected.
+
+    Raises:
+        InvalidInputError: If the input is to be corrected and is not a vector.
+    """
+    if space != "input":
+        return embedding_of(estimator)
+    if len(estimator.condition_shape) != 1:
+        raise InvalidInputError(
+            "Expected observations of shape (n, l) with space='input'; got (n, "
+            f"{', '.join(map(str, estimator.condition_shape))}). Use "
+            "space='embedding'."
+        )
+    return nn.Identity()
+
+
+def fit_discrepancy(
+    z: Tensor,
+    moments: Moments,
+    standardisation: Standardisation,
+    model: DiscrepancyModel,
+) -> Discrepancy:
+    """Fit the model to calibration pairs, in standard deviations of simulations.
+
+    Args:
+        z: What real observations are represented by, shape ``(n, l)``.
+        moments: Of simulations at their parameters.
+        standardisation: Of z over simulations from the prior.
+        model: The model.
+
+    Raises:
+        InvalidInputError: If nothing varies between simulations.
+    """
+    varies = standardisation.varies
+    if not varies.any():
+        raise InvalidInputError(
+            "Expected simulations that differ from each other; all entries of what "
+            "they are represented by are constant. Train NPE longer, or with another "
+            "embedding net."
+        )
+    std = standardisation.std[varies]
+    covariance = moments.covariance.mean(dim=0)[varies][:, varies]
+    return model.fit(
+        standardisation(z.double()),
+        standardisation(moments.mean),
+        covariance / std / std[:, None],
+    )
+
+
+def correct_npe(
+    estimator: ConditionalEstimator,
+    simulations: tuple[Tensor, Tensor],
+    z: Tensor,
+    moments: Moments,
+    *,
+    space: Space,
+    model: DiscrepancyModel,
+    probabilities: Tensor | None = None,
+    num_steps: int | None = None,
+    learning_rate: float = 2e-3,
+    show_progress_bars: bool = False,
+) -> Correction:
+    """Fit a discrepancy to calibration pairs, and train NPE on corrected simulations.
+
+    Args:
+        estimator: The estimator of NPE; it is left as it is.
+        simulations: Parameters from the prior, shape ``(n_s, d)``, and what a
+            simulation of each is represented by, shape ``(n_s, l)``.
+        z: What the real observations of the pairs are represented by, ``(n_c, l)``.
+        moments: Of simulations at the parameters of the pairs.
+        space: What z is.
+        model: The model of the discrepancy.
+        probabilities: With which simulations are drawn; None takes all alike.
+        num_steps: Gradient steps; chosen by the space if None.
+        learning_rate: Of Adam.
+        show_progress_bars: Whether to show the course of the loss.
+
+    Returns:
+        The corrected estimator. With ``space="tuned"`` its embedding net is h; replace
+        it by that of a tuned net.
+    """
+    theta, z_s = simulations
+    standardisation = Standardisation(z_s.double())
+    discrepancy = fit_discrepancy(z, moments, standardisation, model)
+    corrected = copy.deepcopy(estimator)
+    # The parameters of the density are those of the whole.
+    density: Any = corrected if space == "input" else headless(corrected)
+    history = train_on_corrected(
+        density,
+        theta,
+        z_s,
+        discrepancy.sample(NUM_DRAWS, smallest_error=SMALLEST_ERROR[space]),
+        standardisation,
+        probabilities=probabilities,
+        num_steps=NUM_STEPS[space] if num_steps is None else num_steps,
+        learning_rate=learning_rate,
+        show_progress_bars=show_progress_bars,
+    )
+    if not standardisation.varies.all():
+        corrected = _with_constants(corrected, standardisation, space)
+    return Correction(
+        estimator=corrected.eval(), discrepancy=discrepancy, history=history
+    )
+
+
+class SimulatedConstants(nn.Module):
+    """Gives entries that are the same in all simulations their simulated value.
+
+    The density never saw them vary, and would answer a real value by chance.
+    """
+
+    varies: Tensor
+    values: Tensor
+
+    def __init__(self, standardisation: Standardisation) -> None:
+        super().__init__()
+        self.register_buffer("varies", standardisation.varies)
+        self.register_buffer("values", standardisation.mean)
+
+    def forward(self, z: Tensor) -> Tensor:
+        """Return z with constants in their place, of the same shape."""
+        return z.where(self.varies, self.values.to(z))
+
+
+def _with_constants(
+    estimator: Any, standardisation: Standardisation, space: Space
+) -> Any:
+    net, constants = embedding_of(estimator), SimulatedConstants(standardisation)
+    parts = (constants, net) if space == "input" else (net, constants)
+    return with_embedding(estimator, nn.Sequential(*parts))

@@ -1,0 +1,333 @@
+r"""NPE trained on simulations that were corrected by what calibration pairs tell."""
+
+import copy
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+from sbi_rope._random import seeded
+from sbi_rope._sbi import (
+    ConditionalDensityEstimator,
+    embed,
+    estimator_of,
+    headless,
+    posterior_from,
+)
+from sbi_rope._simulations import (
+    Moments,
+    SimulationSource,
+    Simulator,
+    StoredSimulations,
+)
+from sbi_rope._training import History
+from sbi_rope._validation import (
+    check_choice,
+    check_instance,
+    check_integer,
+    check_positive,
+)
+from sbi_rope.baselines.base import BuildsOnNPE, UsesCalibration
+from sbi_rope.baselines.training import EstimatorBuilder, Training
+from sbi_rope.discrepancy.correction import (
+    Space,
+    correct_npe,
+    network_of,
+)
+from sbi_rope.discrepancy.model import Discrepancy, DiscrepancyModel
+from sbi_rope.discrepancy.parameters import learn_parameters
+from sbi_rope.discrepancy.report import DiscrepancyReport, report_discrepancy
+from sbi_rope.discrepancy.tuning import TUNING, cross_fitted_nets
+from sbi_rope.errors import InvalidInputError, NotReadyError, UnsupportedPosteriorError
+from sbi_rope.finetuning import CalibrationFinetuner
+from sbi_rope.mixture import MixtureEstimator, MixturePosterior, OwnContexts, Part
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+__all__ = ["DiscrepancyNPE"]
+
+# Fewer pairs say nothing about an error.
+MIN_PAIRS = 2
+
+
+class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
+    r"""NPE for reality: trained on simulations with the discrepancy integrated out.
+
+    A Bayesian linear model says how real observations follow from simulations
+    (:class:`DiscrepancyModel`). It is fitted to the calibration pairs, and NPE is
+    trained on for some seconds, on simulations that are corrected by draws from its
+    posterior. What results is an ordinary amortised posterior, for any observation.
+
+    What is corrected depends on ``space``:
+
+    - ``"embedding"``, the embedding h(x) of NPE. Only the density behind it is trained.
+    - ``"input"``, x itself, where it is a vector of a few summaries. All of NPE is
+      trained. Better where h throws away what is needed once the simulator is wrong.
+    - ``"tuned"``: copies g of h are tuned as RoPE tunes its own, each without one fold
+      of the pairs, and the discrepancy is fitted to what is left between g of the
+      pairs in that fold and h of simulations. The posterior averages over the copies.
+      For large nets that never saw the effect which the simulator lacks.
+
+    Sees simulations and the calibration set. Assumes that the same linear correction
+    holds for all parameters. To be preferred from a handful of pairs on;
+    ``docs/discrepancy.md`` says when it fails. FMPE and NPSE posteriors can be
+    corrected too, apart from ``space="tuned"``.
+
+    References:
+        | Bayesian Calibration of Computer Models (Kennedy and O'Hagan, 2001)
+        | https://doi.org/10.1111/1467-9868.00294
+
+    Args:
+        prior: A torch distribution over parameters of shape ``(k,)``.
+        density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns. An
+            embedding net inside it is copied, never trained in place.
+        simulator: Maps parameters to simulations, batched or not. Without one, the
+            appended simulations take its place.
+        space: What is corrected, see above.
+        learn_prior: Whether to learn the distribution of real parameters from those of
+            the pairs, see :func:`~sbi_rope.discrepancy.learn_parameters`. For pairs
+            that are drawn like the observations to be inferred.
+        model: The model of the discrepancy; ``DiscrepancyModel()`` if None.
+        num_simulations: Simulations from the prior to train on, if none were appended.
+        simulations_per_pair: Simulations at the parameters of each pair.
+        num_steps: Gradient steps; 120 for ``"embedding"`` and ``"tuned"``, 400 for
+            ``"input"``, if None.
+        learning_rate: Of Adam, at the start.
+        num_folds: Copies g with ``space="tuned"``, at most as many as pairs.
+        finetuner: How they are tuned; with rehearsal, at a learning rate of 3e-3, if
+            None.
+        npe_training: How NPE is trained; ``Training()`` if None.
+        device: Where to train; data on other devices is moved there.
+
+    Raises:
+        InvalidTypeError: If an argument has the wrong type.
+        InvalidInputError: If an argument is outside its range, or, in ``train``, x is
+            no vector with ``space="input"``.
+        SimulationError: In ``train``, if the simulator fails.
+    """
+
+    def __init__(
+        self,
+        prior: Any,
+        density_estimator: str | EstimatorBuilder = "nsf",
+        *,
+        simulator: Callable[[Tensor], Tensor] | None = None,
+        space: Space = "embedding",
+        learn_prior: bool = False,
+        model: DiscrepancyModel | None = None,
+        num_simulations: int = 20_000,
+        simulations_per_pair: int = 100,
+        num_steps: int | None = None,
+        learning_rate: float = 2e-3,
+        num_folds: int = 5,
+        finetuner: CalibrationFinetuner | None = None,
+        npe_training: Training | None = None,
+        device: str | torch.device = "cpu",
+    ) -> None:
+        check_choice("space", space, ("embedding", "input", "tuned"))
+        check_instance("learn_prior", learn_prior, bool)
+        check_instance("model", model, DiscrepancyModel, optional=True)
+        check_integer("num_simulations", num_simulations, minimum=2)
+        check_integer("simulations_per_pair", simulations_per_pair, minimum=2)
+        if num_steps is not None:
+            check_integer("num_steps", num_steps)
+        check_positive("learning_rate", learning_rate)
+        check_integer("num_folds", num_folds, minimum=2)
+        check_instance("finetuner", finetuner, CalibrationFinetuner, optional=True)
+        super().__init__(
+            prior, density_estimator, npe_training=npe_training, device=device
+        )
+        self.space: Space = space
+        self.learn_prior = learn_prior
+        self.model = DiscrepancyModel() if model is None else model
+        self.num_simulations = num_simulations
+        self.simulations_per_pair = simulations_per_pair
+        self.num_steps = num_steps
+        self.learning_rate = learning_rate
+        self.num_folds = num_folds
+        self.finetuner = TUNING if finetuner is None else finetuner
+        self._simulator = simulator
+        self._discrepancy: Discrepancy | None = None
+
+    @classmethod
+    def from_posterior(
+        cls,
+        posterior: Any,
+        *,
+        simulations: tuple[Tensor, Tensor] | None = None,
+        **options: Any,
+    ) -> "Self":
+        """Start from a trained NPE instead of training one.
+
+        Args:
+            posterior: What ``NPE(...).build_posterior()`` of sbi returns, or the
+                posterior of MNPE, FMPE or NPSE. It is copied and never changed.
+            simulations: Instead of ``simulator``, or beside it, pairs (theta, x) drawn
+                from the prior to train on.
+            **options: Keyword arguments of the constructor, except for ``device`` and
+                what concerns the training of NPE.
+
+        Raises:
+            UnsupportedPosteriorError: If it is not a plain amortised posterior.
+            InvalidInputError: If an option would have no effect.
+        """
+        method = super().from_posterior(posterior, **options)
+        if simulations is not None:
+            method.append_simulations(*simulations)
+        return method
+
+    @property
+    def needs_simulations(self) -> bool:
+        """Whether there is no simulator, or NPE has still to be trained."""
+        return self._npe is None or self._simulator is None
+
+    @property
+    def discrepancy(self) -> Discrepancy:
+        """The posterior of gain, offset and error after the last training.
+
+        Raises:
+            NotReadyError: If ``train()`` was not called since data was appended.
+        """
+        if self._posterior is None or self._discrepancy is None:
+            raise NotReadyError("No discrepancy fitted yet. Call `train()` first.")
+        return self._discrepancy
+
+    def report(
+        self,
+        *,
+        x_names: Sequence[str] | None = None,
+        seed: int | None = 0,
+        show_progress_bars: bool = True,
+    ) -> DiscrepancyReport:
+        """Say what is wrong with the simulator, summary by summary; print the result.
+
+        Needs no training. It speaks of x itself, whatever ``space`` is.
+
+        Args:
+            x_names: Names of the entries of x; numbered if None.
+            seed: Seed of the simulations; None uses the states of torch, NumPy and
+                Python.
+            show_progress_bars: Whether to show the progress of slow simulations.
+
+        Returns:
+            Gain, shift and error of each summary with 95 % intervals, in units of x.
+
+        Raises:
+            NotReadyError: If there are fewer than two pairs, or no simulations.
+            InvalidInputError: If x is not a vector, or the names do not fit.
+            SimulationError: If the simulator fails.
+        """
+        self._check_data()
+        _, x = self._calibration
+        if x.ndim != 2:
+            raise InvalidInputError(
+                "Expected observations of shape (n, l), a summary in each column; got "
+                f"{tuple(x.shape)}. Reduce x to summaries with names first."
+            )
+        with seeded(seed):
+            source = self._source(x)
+            _, simulated = source.kept(
+                self.num_simulations, progress=show_progress_bars
+            )
+            moments = self._moments(source, nn.Identity(), show_progress_bars)
+        return report_discrepancy(
+            x, moments, simulated, model=self.model, x_names=x_names
+        )
+
+    def _check_data(self) -> None:
+        super()._check_data()
+        count = len(self._theta_cal)
+        if count < MIN_PAIRS:
+            raise NotReadyError(
+                f"DiscrepancyNPE needs at least {MIN_PAIRS} calibration pairs; got "
+                f"{count}. Call `append_calibration(theta, x)` first."
+            )
+
+    def _source(self, x: Tensor) -> SimulationSource:
+        like = self._theta_cal
+        if self._simulator is not None:
+            return Simulator(
+                self._simulator, self._prior, event_shape=x.shape[1:], like=like
+            )
+        return StoredSimulations(
+            self._simulations,
+            self._prior,
+            theta_shape=like.shape[1:],
+            event_shape=x.shape[1:],
+            like=like,
+        )
+
+    def _moments(
+        self,
+        source: SimulationSource,
+        net: nn.Module,
+        show_progress_bars: bool,  # noqa: FBT001
+    ) -> Moments:
+        return source.moments(
+            self._theta_cal,
+            self.simulations_per_pair,
+            lambda x: embed(net, x),
+            progress=show_progress_bars,
+        )
+
+    def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
+        npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
+        estimator = estimator_of(npe)
+        theta, x = self._calibration
+        source = self._source(x)
+        net = network_of(estimator, self.space)
+        moments = self._moments(source, net, show_progress_bars)
+        theta_s, x_s = self._bank(source, show_progress_bars)
+        nets, z = [net], embed(net, x)
+        if self.space == "tuned":
+            nets, z = cross_fitted_nets(
+                net,
+                (theta, x),
+                moments,
+                x_s,
+                finetuner=self.finetuner,
+                num_folds=self.num_folds,
+                show_progress_bars=show_progress_bars,
+            )
+        probabilities = None
+        if self.learn_prior:
+            probabilities = learn_parameters(theta, theta_s).probabilities
+        correction = correct_npe(
+            estimator,
+            (theta_s, embed(net, x_s)),
+            z,
+            moments,
+            space=self.space,
+            model=self.model,
+            probabilities=probabilities,
+            num_steps=self.num_steps,
+            learning_rate=self.learning_rate,
+            show_progress_bars=show_progress_bars,
+        )
+        self._discrepancy = correction.discrepancy
+        if self.space != "tuned":
+            return posterior_from(npe, correction.estimator), correction.history
+        return self._averaged(correction.estimator, nets), correction.history
+
+    def _bank(
+        self,
+        source: SimulationSource,
+        show_progress_bars: bool,  # noqa: FBT001
+    ) -> tuple[Tensor, Tensor]:
+        """Return simulations from the prior: those appended, or new ones."""
+        if self._x is not None:
+            return self._simulations
+        return source.kept(self.num_simulations, progress=show_progress_bars)
+
+    def _averaged(self, estimator: Any, nets: Sequence[nn.Module]) -> MixturePosterior:
+        if not isinstance(estimator, ConditionalDensityEstimator):
+            raise UnsupportedPosteriorError(
+                "Expected an estimator with a density with space='tuned', whose "
+                f"posterior is a mixture; got {type(estimator).__name__}. Use "
+                "space='embedding', or NPE instead of FMPE or NPSE."
+            )
+        contexts = OwnContexts(nets, estimator.condition_shape)
+        mixture = MixtureEstimator([Part(headless(estimator), contexts)], [1.0])
+        return MixturePosterior(mixture, copy.deepcopy(self._prior))

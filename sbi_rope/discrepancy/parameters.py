@@ -1,0 +1,129 @@
+r"""The distribution of parameters, learned from those of the calibration pairs."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.distributions import MultivariateNormal
+
+__all__ = ["ParameterDistribution", "learn_parameters"]
+
+# How many pairs the prior's mean and covariance are worth; averaged by evidence.
+STRENGTHS = (2.0, 5.0, 10.0, 30.0, 100.0)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ParameterDistribution:
+    """Which simulations from the prior have parameters like the real ones.
+
+    Attributes:
+        probabilities: Of each simulation, shape ``(n,)``; they sum to one.
+        probability_of_prior: How probable it is that the prior is right as it is.
+    """
+
+    probabilities: Tensor
+    probability_of_prior: float
+
+    @property
+    def effective_sample_size(self) -> float:
+        """How many equally probable simulations would be worth as much."""
+        return float(1.0 / self.probabilities.square().sum())
+
+
+def learn_parameters(theta_cal: Tensor, theta: Tensor) -> ParameterDistribution:
+    r"""Weigh simulations by where the parameters of the calibration pairs are.
+
+    Each parameter is replaced by its normal score u under the prior, so that any prior
+    is a normal distribution :math:`\mathcal N(0, R)` but for how its parameters depend
+    on each other, which R states to first order. Parameters in reality follow
+
+    .. math::
+        u \sim \mathcal N(\mu, \Lambda), \quad
+        \Lambda \sim \mathrm{IW}(c\, R, c + d + 1), \quad
+        \mu \mid \Lambda \sim \mathcal N(0, \Lambda / c),
+
+    with the evidence of each c as its share, or the prior as it is, which is one half
+    probable before any pair is seen. The predictive density of the former is a Student
+    t, and simulations from the prior are drawn with probabilities proportional to
+
+    .. math::
+        \pi + (1 - \pi)\, t(u) / \mathcal N(u; 0, R) .
+
+    Args:
+        theta_cal: Parameters of the pairs, shape ``(n_c, d)``.
+        theta: Parameters of simulations from the prior, shape ``(n, d)``.
+
+    Returns:
+        The probabilities of the simulations.
+    """
+    u_cal, u = normal_scores(theta_cal, theta), normal_scores(theta, theta)
+    correlation = torch.atleast_2d(u.T.cov())
+    # Parameters that depend on each other exactly, such as those of one category.
+    correlation = correlation + 1e-6 * torch.eye(len(correlation)).to(u)
+    normal = MultivariateNormal(torch.zeros_like(u[0]), correlation)
+    fits = [_fit(u_cal, u, correlation, strength) for strength in STRENGTHS]
+    evidence = torch.stack([log_evidence for log_evidence, _ in fits])
+    average = evidence.logsumexp(dim=0) - math.log(len(fits))
+    probability = float(torch.sigmoid(normal.log_prob(u_cal).sum() - average))
+    predictive = torch.stack([log_t for _, log_t in fits], dim=1)
+    log_t = (predictive + evidence.log_softmax(dim=0)).logsumexp(dim=1)
+    ratio = torch.softmax(log_t - normal.log_prob(u), dim=0)
+    uniform = torch.full_like(ratio, 1.0 / len(ratio))
+    return ParameterDistribution(
+        probabilities=probability * uniform + (1.0 - probability) * ratio,
+        probability_of_prior=probability,
+    )
+
+
+def normal_scores(theta: Tensor, reference: Tensor) -> Tensor:
+    """Map each parameter to the normal quantile of its rank among those of a reference.
+
+    Args:
+        theta: Shape ``(m, d)``.
+        reference: Draws from the prior, shape ``(n, d)``.
+
+    Returns:
+        Shape ``(m, d)``, float64; equal values share the middle of their ranks.
+    """
+    ordered = reference.double().T.contiguous().sort(dim=1).values
+    values = theta.double().T.contiguous()
+    below = torch.searchsorted(ordered, values)
+    upto = torch.searchsorted(ordered, values, right=True)
+    rank = (below + upto).double() / 2 + 0.5
+    return torch.special.ndtri(rank / (ordered.shape[1] + 1)).T
+
+
+def _fit(
+    u_cal: Tensor, u: Tensor, correlation: Tensor, strength: float
+) -> tuple[Tensor, Tensor]:
+    """Return the log evidence at one strength, and log predictive densities at u."""
+    n, d = u_cal.shape
+    degrees, scale = strength + d + 1, strength * correlation
+    average = u_cal.mean(dim=0)
+    centred = u_cal - average
+    # The conjugate formulas of a normal distribution with unknown mean and covariance.
+    total = strength + n
+    new_degrees = degrees + n
+    new_scale = scale + centred.T @ centred
+    new_scale = new_scale + strength * n / total * torch.outer(average, average)
+    log_evidence = (
+        -n * d / 2 * math.log(math.pi)
+        + torch.special.multigammaln(u.new_tensor(new_degrees / 2), d)
+        - torch.special.multigammaln(u.new_tensor(degrees / 2), d)
+        + degrees / 2 * torch.logdet(scale)
+        - new_degrees / 2 * torch.logdet(new_scale)
+        + d / 2 * math.log(strength / total)
+    )
+    freedom = new_degrees - d + 1
+    factor = torch.linalg.cholesky(new_scale * (total + 1) / (total * freedom))
+    centred = (u - n / total * average).T
+    squares = torch.linalg.solve_triangular(factor, centred, upper=False).square()
+    log_t = (
+        math.lgamma((freedom + d) / 2)
+        - math.lgamma(freedom / 2)
+        - d / 2 * math.log(freedom * math.pi)
+        - factor.diagonal().log().sum()
+        - (freedom + d) / 2 * torch.log1p(squares.sum(dim=0) / freedom)
+    )
+    return log_evidence, log_t

@@ -1,0 +1,281 @@
+"""What calibration pairs say about a simulator, summary by summary."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sbi_rope._simulations import Moments
+from sbi_rope.baselines.statistics import Standardisation
+from sbi_rope.discrepancy.model import Discrepancy, DiscrepancyModel
+from sbi_rope.errors import InvalidInputError
+
+__all__ = ["DiscrepancyReport", "Interval", "SummaryDiscrepancy", "report_discrepancy"]
+
+NUM_DRAWS = 4000
+# Residuals of so many standard deviations are outliers: one in 16,000 by chance.
+OUTLIER = 4.0
+# With fewer pairs nobody can tell which of them is the odd one.
+MIN_PAIRS_FOR_OUTLIERS = 10
+
+
+@dataclass(frozen=True, kw_only=True)
+class Interval:
+    """An estimate with its 95 % interval.
+
+    Attributes:
+        median: The estimate.
+        low: Lower end.
+        high: Upper end.
+    """
+
+    median: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, draws: Tensor) -> "Interval":
+        """Return the quantiles of draws, shape ``(m,)``."""
+        levels = torch.tensor([0.025, 0.5, 0.975]).to(draws)
+        low, median, high = draws.quantile(levels).tolist()
+        return cls(median=median, low=low, high=high)
+
+    def __str__(self) -> str:
+        return f"{self.median:.3g} [{self.low:.3g}, {self.high:.3g}]"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SummaryDiscrepancy:
+    r"""How one summary of real observations differs from simulated ones.
+
+    .. math::
+        x_o = \bar x + b + a (x_s - \bar x) + e, \qquad e \sim \mathcal N(0, s^2),
+
+    with :math:`\bar x` the mean of simulations from the prior.
+
+    Attributes:
+        name: Name of the summary.
+        gain: a, without a unit.
+        shift: b, in the units of x.
+        error: s, in the units of x, beside the noise of the simulator.
+        size: Typical difference between a simulation and its correction, the root of
+            :math:`E[(b + (a - 1)(x_s - \bar x))^2] + s^2`, in standard deviations of
+            simulations from the prior.
+        probability_of_none: How probable it is that the simulator is right about this
+            summary, if that was as probable as not beforehand.
+        outliers: Rows of calibration pairs that lie more than four standard deviations
+            from what the other pairs suggest.
+    """
+
+    name: str
+    gain: Interval
+    shift: Interval
+    error: Interval
+    size: Interval
+    probability_of_none: float
+    outliers: tuple[int, ...] = ()
+
+    @property
+    def is_off(self) -> bool:
+        """Whether a discrepancy is more probable than none."""
+        return self.probability_of_none < 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiscrepancyReport:
+    """What calibration pairs say about a simulator, summary by summary.
+
+    Print it, or use :meth:`to_dataframe` and :func:`sbi_rope.plots.discrepancy`.
+
+    Attributes:
+        summaries: Of each summary, the one that is most off first.
+        num_pairs: Calibration pairs behind it.
+        constant: Names of summaries that are the same in all simulations, so that
+            nothing can be said about them.
+    """
+
+    summaries: tuple[SummaryDiscrepancy, ...]
+    num_pairs: int
+    constant: tuple[str, ...] = ()
+
+    def __getitem__(self, name: str) -> SummaryDiscrepancy:
+        for summary in self.summaries:
+            if summary.name == name:
+                return summary
+        raise InvalidInputError(
+            f"Expected the name of a summary; got {name!r}. There are "
+            f"{sorted(summary.name for summary in self.summaries)}."
+        )
+
+    def as_rows(self) -> list[dict[str, Any]]:
+        """Return a row for each summary, the one that is most off first."""
+        rows = []
+        for summary in self.summaries:
+            row: dict[str, Any] = {"summary": summary.name}
+            for name in ("size", "shift", "gain", "error"):
+                interval: Interval = getattr(summary, name)
+                row |= {
+                    name: interval.median,
+                    f"{name}_low": interval.low,
+                    f"{name}_high": interval.high,
+                }
+            row["probability_of_none"] = summary.probability_of_none
+            row["outliers"] = list(summary.outliers)
+            rows.append(row)
+        return rows
+
+    def to_dataframe(self) -> Any:
+        """Return :meth:`as_rows` as a pandas table.
+
+        Raises:
+            ImportError: If pandas is not installed.
+        """
+        try:
+            import pandas
+        except ModuleNotFoundError as error:
+            raise ImportError(
+                "pandas is not installed. Run `pip install pandas`, or use `as_rows()`."
+            ) from error
+        return pandas.DataFrame(self.as_rows())
+
+    def __str__(self) -> str:
+        off = [summary for summary in self.summaries if summary.is_off]
+        fine = [summary.name for summary in self.summaries if not summary.is_off]
+        lines = [
+            f"What {self.num_pairs} calibration pairs say about the simulator",
+            "  observed = mean + shift + gain (simulated - mean) + error",
+        ]
+        if off:
+            lines.append(
+                "  95 % intervals; size in standard deviations of simulations, shift "
+                "and error in units of x"
+            )
+            lines += _table(off)
+        if fine:
+            lines.append(f"  no sign of discrepancy: {', '.join(fine)}")
+        if self.constant:
+            lines.append(f"  the same in all simulations: {', '.join(self.constant)}")
+        outliers: dict[int, list[str]] = {}
+        for summary in self.summaries:
+            for row in summary.outliers:
+                outliers.setdefault(row, []).append(summary.name)
+        if outliers:
+            listed = (f"row {row} ({', '.join(n)})" for row, n in outliers.items())
+            lines.append(
+                f"  pairs that do not fit the others: {'; '.join(listed)}. Check these "
+                "labels and measurements."
+            )
+        return "\n".join(lines)
+
+
+def _table(summaries: Sequence[SummaryDiscrepancy]) -> list[str]:
+    heads = ("summary", "size", "shift", "gain", "error")
+    rows = [heads] + [
+        (s.name, str(s.size), str(s.shift), str(s.gain), str(s.error))
+        for s in summaries
+    ]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(heads))]
+    return [
+        "  " + "  ".join(f"{c:<{w}}" for c, w in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    ]
+
+
+def report_discrepancy(
+    x: Tensor,
+    moments: Moments,
+    simulated: Tensor,
+    *,
+    model: DiscrepancyModel,
+    x_names: Sequence[str] | None = None,
+    seed: int = 0,
+) -> DiscrepancyReport:
+    """Fit the discrepancy of each summary by itself.
+
+    Summaries that depend on each other, such as two sensors of one light, cannot share
+    one joint gain without ambiguity. Each by itself is a statement one can check.
+
+    Args:
+        x: Real observations of the calibration pairs, shape ``(n, l)``.
+        moments: Of simulations at their parameters.
+        simulated: Simulations from the prior, shape ``(n_s, l)``.
+        model: The model of the discrepancy.
+        x_names: Names of the summaries; numbered if None.
+        seed: Seed of the draws behind the intervals.
+
+    Raises:
+        InvalidInputError: If there are not as many names as summaries.
+    """
+    width = x.shape[1]
+    names = [f"x[{j}]" for j in range(width)] if x_names is None else list(x_names)
+    if len(names) != width or len(set(names)) != width:
+        raise InvalidInputError(
+            f"Expected `x_names` to be {width} different names, one for each entry of "
+            f"x; got {names}."
+        )
+    standardisation = Standardisation(simulated.double())
+    varies = standardisation.varies.tolist()
+    summaries = []
+    for j in range(width):
+        if not varies[j]:
+            continue
+        mean, std = standardisation.mean[j], standardisation.std[j]
+        z = ((x[:, j].double() - mean) / std)[:, None]
+        m = ((moments.mean[:, j] - mean) / std)[:, None]
+        noise = moments.covariance[:, j, j].mean() / std.square()
+        discrepancy = model.fit(z, m, noise.reshape(1, 1))
+        summaries.append(
+            _summary(names[j], discrepancy, z, m, scale=float(std), seed=seed)
+        )
+    if not summaries:
+        raise InvalidInputError(
+            "Expected simulations that differ from each other; all summaries are "
+            "constant."
+        )
+    return DiscrepancyReport(
+        summaries=tuple(
+            sorted(summaries, key=lambda s: (not s.is_off, -s.size.median))
+        ),
+        num_pairs=len(x),
+        constant=tuple(n for n, v in zip(names, varies, strict=True) if not v),
+    )
+
+
+def _summary(
+    name: str,
+    discrepancy: Discrepancy,
+    z: Tensor,
+    mean: Tensor,
+    *,
+    scale: float,
+    seed: int,
+) -> SummaryDiscrepancy:
+    """Return the statement about one summary, z and mean of shape ``(n, 1)``."""
+    # Of the discrepancy if there is one; how probable that is, is said beside it.
+    draws = replace(discrepancy, probability_of_none=0.0).sample(
+        NUM_DRAWS, smallest_error=0.0, seed=seed
+    )
+    gain, shift = draws.gain[:, 0, 0], draws.offset[:, 0]
+    error = draws.error_factor[:, 0, 0].abs()
+    size = ((gain - 1).square() + shift.square() + error.square()).sqrt()
+    residual = (z - gain.median() * mean - shift.median())[:, 0]
+    return SummaryDiscrepancy(
+        name=name,
+        gain=Interval.of(gain),
+        shift=Interval.of(shift * scale),
+        error=Interval.of(error * scale),
+        size=Interval.of(size),
+        probability_of_none=discrepancy.probability_of_none,
+        outliers=_outliers(residual),
+    )
+
+
+def _outliers(residual: Tensor) -> tuple[int, ...]:
+    if len(residual) < MIN_PAIRS_FOR_OUTLIERS:
+        return ()
+    distance = (residual - residual.median()).abs()
+    # The median distance of a normal variable from its median is .674 sd.
+    std = distance.median() / 0.6745
+    return tuple((distance > OUTLIER * std).nonzero().flatten().tolist())

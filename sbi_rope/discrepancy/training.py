@@ -1,0 +1,86 @@
+r"""Amortisation: training a density on corrected simulations."""
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from sbi_rope._progress import progress_bar
+from sbi_rope._training import History
+from sbi_rope.baselines.statistics import Standardisation
+from sbi_rope.discrepancy.model import DiscrepancyDraws
+
+__all__ = ["train_on_corrected"]
+
+BATCH_SIZE = 500
+CLIP_MAX_NORM = 5.0
+# Steps that one point of the history averages over.
+STEPS_PER_POINT = 20
+
+
+def train_on_corrected(
+    density: Any,
+    theta: Tensor,
+    z: Tensor,
+    draws: DiscrepancyDraws,
+    standardisation: Standardisation,
+    *,
+    probabilities: Tensor | None,
+    num_steps: int,
+    learning_rate: float,
+    show_progress_bars: bool,
+) -> History:
+    r"""Train :math:`q(\theta \mid z)` on simulations as they would be observed.
+
+    .. math::
+        \min_q \; \mathbb E_{(A, b, \Sigma') \mid \text{pairs}}\;
+        \mathbb E_{\theta, z_s} \mathbb E_{e \mid \Sigma'}
+        \bigl[-\log q(\theta \mid A z_s + b + e)\bigr]
+
+    The optimum is the posterior with the discrepancy integrated out. Every step sees
+    other simulations, other draws of the discrepancy and other errors, so that nothing
+    is held out: a network of usual size cannot learn them by heart.
+
+    Args:
+        density: An estimator of sbi that is conditioned on z; trained in place, in
+            evaluation mode.
+        theta: Parameters from the prior, shape ``(n, d)``.
+        z: A simulation of each, shape ``(n, l)``.
+        draws: Of the discrepancy, in the units of ``standardisation``.
+        standardisation: Of z.
+        probabilities: With which each simulation is drawn; None takes all alike.
+        num_steps: Gradient steps.
+        learning_rate: Of Adam, at the start; it falls to zero like a cosine.
+        show_progress_bars: Whether to show the course of the loss.
+
+    Returns:
+        The losses.
+    """
+    density.requires_grad_().eval()
+    optimizer = torch.optim.Adam(density.parameters(), lr=learning_rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, num_steps)
+    z = standardisation(z.double())
+    losses: list[float] = []
+    bar = progress_bar(range(num_steps), show=show_progress_bars, desc="Correcting NPE")
+    for _ in bar:
+        rows = _draw(len(theta), probabilities).to(theta.device)
+        corrected = standardisation.undo(draws.correct(z[rows])).to(theta)
+        loss = density.loss(theta[rows], condition=corrected).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(density.parameters(), CLIP_MAX_NORM)
+        optimizer.step()
+        schedule.step()
+        losses.append(float(loss.detach()))
+        bar.set_postfix(loss=losses[-1], refresh=False)
+    density.requires_grad_(requires_grad=False)
+    parts = torch.tensor(losses).split(STEPS_PER_POINT)
+    return History(
+        [float(part.mean()) for part in parts], [], len(parts) - 1, learning_rate
+    )
+
+
+def _draw(count: int, probabilities: Tensor | None) -> Tensor:
+    if probabilities is None:
+        return torch.randint(count, (BATCH_SIZE,))
+    return torch.multinomial(probabilities.cpu(), BATCH_SIZE, replacement=True)
