@@ -38,11 +38,18 @@ class Correction:
         estimator: An estimator of sbi for real observations x.
         discrepancy: The posterior of gain, offset and error.
         history: The losses of its training.
+        constants: What must come after another embedding net in the place of h; None
+            if all entries of what is corrected vary between simulations.
     """
 
     estimator: Any
     discrepancy: Discrepancy
     history: History
+    constants: "SimulatedConstants | None" = None
+
+    def completed(self, net: nn.Module) -> nn.Module:
+        """Return an embedding net whose output the density knows."""
+        return net if self.constants is None else nn.Sequential(net, self.constants)
 
 
 def network_of(estimator: ConditionalEstimator, space: Space) -> nn.Module:
@@ -144,10 +151,17 @@ def correct_npe(
         learning_rate=learning_rate,
         show_progress_bars=show_progress_bars,
     )
+    constants = None
     if not standardisation.varies.all():
-        corrected = _with_constants(corrected, standardisation, space)
+        constants = SimulatedConstants(standardisation)
+        net = embedding_of(corrected)
+        order = (constants, net) if space == "input" else (net, constants)
+        corrected = with_embedding(corrected, nn.Sequential(*order))
     return Correction(
-        estimator=corrected.eval(), discrepancy=discrepancy, history=history
+        estimator=corrected.eval(),
+        discrepancy=discrepancy,
+        history=history,
+        constants=None if space == "input" else constants,
     )
 
 
@@ -168,11 +182,3 @@ class SimulatedConstants(nn.Module):
     def forward(self, z: Tensor) -> Tensor:
         """Return z with constants in their place, of the same shape."""
         return z.where(self.varies, self.values.to(z))
-
-
-def _with_constants(
-    estimator: Any, standardisation: Standardisation, space: Space
-) -> Any:
-    net, constants = embedding_of(estimator), SimulatedConstants(standardisation)
-    parts = (constants, net) if space == "input" else (net, constants)
-    return with_embedding(estimator, nn.Sequential(*parts))

@@ -309,6 +309,7 @@ class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
         self._discrepancy = correction.discrepancy
         if self.space != "tuned":
             return posterior_from(npe, correction.estimator), correction.history
+        nets = [correction.completed(net) for net in nets]
         return self._averaged(correction.estimator, nets), correction.history
 
     def _bank(
