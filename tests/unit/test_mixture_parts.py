@@ -632,6 +632,18 @@ def test_moving_a_mixture_moves_couplings_and_prior() -> None:
     assert not posterior.prior.sample((1,)).is_meta
 
 
+@pytest.mark.parametrize(
+    "make", [problems.box, problems.standard_normal], ids=["of sbi", "of torch"]
+)
+def test_moving_the_density_of_a_prior_moves_the_prior(
+    make: Callable[[int], Distribution],
+) -> None:
+    prior = make(DIM)
+    part: Any = part_of_prior(prior, (3,)).to("meta")
+    assert part.density.prior.sample((1,)).is_meta
+    assert not prior.sample(Size((1,))).is_meta  # ours is a copy
+
+
 # --- the prior ---
 
 
