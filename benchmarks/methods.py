@@ -24,7 +24,7 @@ from sbi_rope.baselines import (
     TuningOnly,
 )
 
-__all__ = ["EXTRAS", "METHODS", "ONLY_FOR", "ORDER", "STACK"]
+__all__ = ["COUPLED_STACK", "EXTRAS", "METHODS", "ONLY_FOR", "ORDER", "STACK"]
 
 # Tasks whose observations are statistics: NNPE's noise is on them, not on h(x).
 STATISTICS = ("cs", "sir", "linear_gaussian")
@@ -93,7 +93,9 @@ METHODS: dict[str, Callable[[Case], Method]] = {
     ),
 }
 
-STACK = "stack"
+# Of any observation, and of the test set as a batch, with couplings.
+STACK, COUPLED_STACK = "stack", "stack of a batch"
 # All names, in the order of tables.
 ORDER = ("prior", "SBI", "NPE", "NNPE", "RNPE", "NPE-RS", "J-NPE", "MLP")
-ORDER += ("fine-tuned NPE", "HVAE", "tuning-only", "OT-only", "RoPE", STACK)
+ORDER += ("fine-tuned NPE", "HVAE", "tuning-only", "OT-only", "RoPE")
+ORDER += (STACK, COUPLED_STACK)

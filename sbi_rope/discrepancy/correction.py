@@ -27,7 +27,8 @@ NUM_DRAWS = 2000
 SMALLEST_ERROR = {"embedding": 0.01, "tuned": 0.01, "input": 0.003}
 # Gradient steps. The density behind an embedding net follows within a hundred; a whole
 # network takes longer. Chosen on calibration data, see benchmarks/README.md.
-NUM_STEPS = {"embedding": 120, "tuned": 120, "input": 400}
+NUM_STEPS = {"embedding": 80, "tuned": 80, "input": 400}
+LEARNING_RATES = {"embedding": 5e-3, "tuned": 5e-3, "input": 2e-3}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -112,7 +113,7 @@ def correct_npe(
     model: DiscrepancyModel,
     probabilities: Tensor | None = None,
     num_steps: int | None = None,
-    learning_rate: float = 2e-3,
+    learning_rate: float | None = None,
     show_progress_bars: bool = False,
 ) -> Correction:
     """Fit a discrepancy to calibration pairs, and train NPE on corrected simulations.
@@ -127,7 +128,7 @@ def correct_npe(
         model: The model of the discrepancy.
         probabilities: With which simulations are drawn; None takes all alike.
         num_steps: Gradient steps; chosen by the space if None.
-        learning_rate: Of Adam.
+        learning_rate: Of Adam; chosen by the space if None.
         show_progress_bars: Whether to show the course of the loss.
 
     Returns:
@@ -148,7 +149,9 @@ def correct_npe(
         standardisation,
         probabilities=probabilities,
         num_steps=NUM_STEPS[space] if num_steps is None else num_steps,
-        learning_rate=learning_rate,
+        learning_rate=(
+            LEARNING_RATES[space] if learning_rate is None else learning_rate
+        ),
         show_progress_bars=show_progress_bars,
     )
     constants = None

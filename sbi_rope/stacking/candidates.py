@@ -288,12 +288,8 @@ def default_candidates(
             out.
     """
     amortised: tuple[Candidate, ...] = (
-        DensityCandidate(
-            name="prior",
-            build=lambda rope, seed: PriorPosterior(rope.npe.prior),
-            fixed=True,
-        ),
-        DensityCandidate(name="NPE", build=lambda rope, seed: rope.npe, fixed=True),
+        DensityCandidate(name="prior", build=_prior, fixed=True),
+        DensityCandidate(name="NPE", build=_npe, fixed=True),
         FinetunedCandidate(),
         DiscrepancyCandidate(space="embedding"),
         DiscrepancyCandidate(space="input"),
@@ -308,10 +304,23 @@ def default_candidates(
         CouplingCandidate(gamma=gamma, tau=tau, **net)
         for net, gamma, tau in itertools.product(nets, gammas, taus)
     ]
-    tuned = DensityCandidate(
-        name="tuning-only", build=lambda rope, seed: rope.tuned_posterior()
-    )
+    tuned = DensityCandidate(name="tuning-only", build=_tuning_only)
     return (*coupled, *amortised, tuned)
+
+
+# Functions with a name, so that a stack can be pickled.
+
+
+def _prior(rope: RoPE, seed: int) -> PriorPosterior:
+    return PriorPosterior(rope.npe.prior)
+
+
+def _npe(rope: RoPE, seed: int) -> Any:
+    return rope.npe
+
+
+def _tuning_only(rope: RoPE, seed: int) -> Any:
+    return rope.tuned_posterior()
 
 
 def check_candidates(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:

@@ -154,7 +154,7 @@ class CrossValidation:
 
 
 def fold_weights(log_scores: Tensor, fold: Tensor, pseudo_count: float) -> Tensor:
-    """Return for each fold the weights that the scores of the others give, ``(F, K)``."""
+    """Return the weights that the scores of all other folds give, shape ``(F, K)``."""
     numbers: Sequence[int] = range(int(fold.max()) + 1)
     return torch.stack(
         [

@@ -57,7 +57,7 @@ class StackedPosterior(MixturePosterior):
             copy.deepcopy(prior),
             enable_transform=enable_transform,
         )
-        self._versions = versions
+        self.versions = versions
         self.report = report
         self._purpose = (
             f"It is the stack of {len(weights)} candidate posteriors, weighted by "
@@ -83,7 +83,7 @@ class StackedPosterior(MixturePosterior):
         Returns:
             Shape ``(n, K)``, float64, in the order of ``candidate_weights``.
         """
-        return self._versions.log_probs(theta, self._batch_of_x(x))
+        return self.versions.log_probs(theta, self._batch_of_x(x))
 
     def __getitem__(self, index: int) -> "StackedPosterior":
         """Return the posterior of one observation, with it as the default x.
@@ -91,5 +91,5 @@ class StackedPosterior(MixturePosterior):
         It knows no other observation of the batch.
         """
         view: Any = super().__getitem__(index)
-        view._versions = None
+        view.versions = None
         return view

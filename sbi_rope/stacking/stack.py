@@ -20,7 +20,7 @@ from sbi_rope._validation import (
 from sbi_rope.errors import InvalidInputError, NotReadyError, warn_user
 from sbi_rope.metrics.calibration import central_levels
 from sbi_rope.metrics.calls import draw_ranks
-from sbi_rope.mixture import MixturePosterior
+from sbi_rope.mixture import MixturePosterior, Part
 from sbi_rope.rope import RoPE
 from sbi_rope.stacking.candidates import (
     AmortisedCandidate,
@@ -195,7 +195,7 @@ def cross_validate(
 
 
 class _Trainer:
-    """Trains and scores the versions of all candidates; arguments as of :func:`stack`."""
+    """Trains and scores all candidates; its arguments are those of :func:`stack`."""
 
     def __init__(
         self,
@@ -318,7 +318,7 @@ class _Trainer:
                 require_convergence=self.require_convergence,
                 show_progress_bars=self.show,
             )
-        fixed = {
+        fixed: dict[Candidate, list[Part]] = {
             candidate: candidate.parts(folds[0])
             for candidate in chosen
             if isinstance(candidate, AmortisedCandidate) and candidate.fixed
