@@ -27,7 +27,7 @@ NUM_DRAWS = 2000
 SMALLEST_ERROR = {"embedding": 0.01, "tuned": 0.01, "input": 0.003}
 # Gradient steps. The density behind an embedding net follows within a hundred; a whole
 # network takes longer. Chosen on calibration data, see benchmarks/README.md.
-NUM_STEPS = {"embedding": 80, "tuned": 80, "input": 400}
+NUM_STEPS = {"embedding": 150, "tuned": 150, "input": 400}
 LEARNING_RATES = {"embedding": 5e-3, "tuned": 5e-3, "input": 2e-3}
 
 

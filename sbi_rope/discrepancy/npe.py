@@ -92,7 +92,7 @@ class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
         model: The model of the discrepancy; ``DiscrepancyModel()`` if None.
         num_simulations: Simulations from the prior to train on, if none were appended.
         simulations_per_pair: Simulations at the parameters of each pair.
-        num_steps: Gradient steps; 80 for ``"embedding"`` and ``"tuned"``, 400 for
+        num_steps: Gradient steps; 150 for ``"embedding"`` and ``"tuned"``, 400 for
             ``"input"``, if None.
         learning_rate: Of Adam, at the start; 5e-3 and 2e-3 for these if None.
         num_folds: Copies g with ``space="tuned"``, at most as many as pairs.

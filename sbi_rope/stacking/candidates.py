@@ -1,5 +1,6 @@
 """What a stack can be made of."""
 
+import copy
 import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -14,7 +15,7 @@ from sbi_rope._sbi import (
     embedding_of,
     estimator_of,
     headless,
-    posterior_from,
+    with_embedding,
 )
 from sbi_rope._validation import (
     check_choice,
@@ -23,7 +24,7 @@ from sbi_rope._validation import (
     check_positive,
     check_unit_interval,
 )
-from sbi_rope.baselines import FinetunedNPE, PriorPosterior
+from sbi_rope.baselines import PriorPosterior
 from sbi_rope.discrepancy.correction import Space
 from sbi_rope.errors import (
     InvalidInputError,
@@ -38,6 +39,7 @@ from sbi_rope.mixture import (
     part_of_prior,
 )
 from sbi_rope.rope import RoPE
+from sbi_rope.stacking.finetuning import finetune_without
 from sbi_rope.stacking.folds import Fold, Workbench
 
 __all__ = [
@@ -238,32 +240,63 @@ def _has_summaries(bench: Workbench) -> bool:
     return bench.x.ndim == 2 and bench.x.shape[1] <= MAX_SUMMARIES and has_net
 
 
+# A corrected NPE has less far to go than one that is wrong.
+LEARNING_RATE, LEARNING_RATE_CORRECTED = 1e-3, 3e-4
+
+
 @dataclass(frozen=True, kw_only=True)
 class FinetunedCandidate(AmortisedCandidate):
     """NPE, as it is or corrected, with all its parameters trained on the pairs.
 
+    It is the average of several nets, each of which holds another part of the pairs
+    out to know when to stop.
+
     Args:
-        corrected: Whether to start from NPE trained on corrected simulations: those of
-            x itself where it is a short vector, else of its embedding.
+        space: None to start from NPE; else what is corrected in the NPE to start from.
     """
 
-    corrected: bool = False
+    space: Space | None = None
 
     @property
     def name(self) -> str:  # type: ignore[override]
         """The method with its setting."""
-        return "discrepancy, fine-tuned" if self.corrected else "fine-tuned NPE"
+        if self.space is None:
+            return "fine-tuned NPE"
+        return f"{DiscrepancyCandidate(space=self.space).name}, fine-tuned"
+
+    @property
+    def family(self) -> str:
+        """The method that it is a setting of."""
+        return "fine-tuned NPE" if self.space is None else "discrepancy, fine-tuned"
+
+    def applies_to(self, bench: Workbench) -> bool:
+        """Tell whether there are parts to hold out, and the start applies."""
+        start = self.space is None or DiscrepancyCandidate(space=self.space).applies_to(
+            bench
+        )
+        return start and len(bench.folds) > 2
 
     def parts(self, fold: Fold) -> list[Part]:
-        """Train on the pairs, a part of which is held out."""
-        npe = fold.bench.npe
-        if self.corrected:
-            space: Space = "input" if _has_summaries(fold.bench) else "embedding"
-            start = fold.corrected(space, learn_prior=True)
-            npe = posterior_from(npe, start.estimator)
-        method = FinetunedNPE.from_posterior(npe).append_calibration(*fold.pairs)
-        method.train(seed=fold.seed, show_progress_bars=False)
-        return [part_of(estimator_of(method.build_posterior()))]
+        """Train without each part of the pairs."""
+        rate = LEARNING_RATE if self.space is None else LEARNING_RATE_CORRECTED
+        return [
+            part_of(
+                finetune_without(
+                    self._start(fold, number), fold, number, learning_rate=rate
+                )
+            )
+            for number in sorted(fold.used)
+        ]
+
+    def _start(self, fold: Fold, number: int) -> Any:
+        if self.space is None:
+            return estimator_of(fold.bench.npe)
+        corrected = fold.corrected(self.space, learn_prior=True)
+        if self.space != "tuned":
+            return corrected.estimator
+        # The net that has not seen the part which is held out.
+        net = corrected.nets[sorted(fold.used).index(number)]
+        return with_embedding(corrected.estimator, copy.deepcopy(net))
 
 
 Candidate = CouplingCandidate | AmortisedCandidate
@@ -294,7 +327,8 @@ def default_candidates(
         DiscrepancyCandidate(space="embedding"),
         DiscrepancyCandidate(space="input"),
         DiscrepancyCandidate(space="tuned"),
-        FinetunedCandidate(corrected=True),
+        FinetunedCandidate(space="input"),
+        FinetunedCandidate(space="tuned"),
     )
     if not couplings:
         return amortised
