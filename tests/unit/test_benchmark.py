@@ -140,8 +140,8 @@ def test_every_method_has_a_place_in_tables_and_a_line_in_figures() -> None:
 
 def test_without_names_a_task_is_given_to_the_methods_that_can_take_it() -> None:
     everywhere = set(ORDER) - set(EXTRAS) - set(ONLY_FOR)
-    assert set(methods_for("cs", None)) - everywhere == {"discrepancy (input)"}
-    assert set(methods_for("pendulum", None)) - everywhere == {"HVAE"}
+    assert set(methods_for("cs", None)) == everywhere | {"discrepancy (input)"}
+    assert set(methods_for("pendulum", None)) == everywhere | {"HVAE"}
     with pytest.raises(SystemExit, match="only for"):
         methods_for("pendulum", ["discrepancy (input)"])
 
