@@ -32,6 +32,7 @@ NEEDS_CALIBRATION = (
     "tuning-only",
     "RoPE",
     "stack",
+    "stack of a batch",
 )
 NEEDS_COUPLING = ("OT-only", "RoPE")
 KEYS = {"tasks", "variants", "methods", "n_calibration", "gammas", "taus", "options"}

@@ -17,6 +17,7 @@ __all__ = ["LPPAxis", "draw_all"]
 
 STYLES = {
     "stack": ("black", "-", "*"),
+    "stack of a batch": ("black", "--", "*"),
     "RoPE": ("#0072B2", "-", "o"),
     "OT-only": ("#56B4E9", "--", "s"),
     "tuning-only": ("#009E73", "--", "^"),

@@ -27,7 +27,7 @@ from sbi_rope.baselines import (
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.discrepancy.correction import Space
 
-__all__ = ["EXTRAS", "METHODS", "ONLY_FOR", "ORDER", "STACK"]
+__all__ = ["COUPLED_STACK", "EXTRAS", "METHODS", "ONLY_FOR", "ORDER", "STACK"]
 
 # Tasks whose observations are statistics: NNPE's noise is on them, not on h(x).
 STATISTICS = ("cs", "sir", "linear_gaussian")
@@ -141,9 +141,11 @@ METHODS: dict[str, Callable[[Case], Method]] = {
     ),
 }
 
-STACK = "stack"
+# Of any observation, and of the test set as a batch, with couplings.
+STACK, COUPLED_STACK = "stack", "stack of a batch"
 # All names, in the order of tables.
 ORDER = ("prior", "SBI", "NPE", "NNPE", "RNPE", "NPE-RS", "J-NPE", "MLP")
 ORDER += ("fine-tuned NPE", "discrepancy", "discrepancy (input)")
 ORDER += ("discrepancy (tuned)", "discrepancy, prior learned")
-ORDER += ("discrepancy, fine-tuned", "HVAE", "tuning-only", "OT-only", "RoPE", STACK)
+ORDER += ("discrepancy, fine-tuned", "HVAE", "tuning-only", "OT-only", "RoPE")
+ORDER += (STACK, COUPLED_STACK)

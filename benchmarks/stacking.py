@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.cells import Cell
-from benchmarks.methods import STACK
+from benchmarks.methods import COUPLED_STACK, STACK
 from benchmarks.tables import Table
 
 __all__ = ["Comparison", "comparisons", "stacking_lines"]
@@ -71,7 +71,7 @@ def comparisons(table: Table) -> list[Comparison]:
     found = []
     for cell, row in table.rows.items():
         arrays = table.arrays.get(cell, {})
-        if cell.method != STACK or "candidates" not in arrays:
+        if cell.method not in (STACK, COUPLED_STACK) or "candidates" not in arrays:
             continue
         names = [str(name) for name in arrays["candidates"]]
         found.append(

@@ -143,7 +143,7 @@ class Study:
             if self.with_stack:
                 start = time.perf_counter()
                 print("  stacking ...", flush=True)
-                stacked = stack(rope, x_o, seed=seed, show_progress_bars=False)
+                stacked = stack(rope, seed=seed, show_progress_bars=False)
                 score("stack", stacked, start, n)
                 print(stacked.report, flush=True)
                 self._save(plots.stacking_report(stacked.report), f"stack_{name}")

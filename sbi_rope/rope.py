@@ -609,6 +609,11 @@ class RoPE:
         return posterior_from(self._posterior, copy.deepcopy(tuned))
 
     @property
+    def source(self) -> SimulationSource:
+        """Where simulations come from; copies with other pairs share it."""
+        return self._source
+
+    @property
     def npe(self) -> Any:
         """A copy of the NPE posterior that is repaired."""
         return posterior_from(self._posterior, copy.deepcopy(self._estimator))

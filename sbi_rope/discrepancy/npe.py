@@ -92,9 +92,9 @@ class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
         model: The model of the discrepancy; ``DiscrepancyModel()`` if None.
         num_simulations: Simulations from the prior to train on, if none were appended.
         simulations_per_pair: Simulations at the parameters of each pair.
-        num_steps: Gradient steps; 120 for ``"embedding"`` and ``"tuned"``, 400 for
+        num_steps: Gradient steps; 80 for ``"embedding"`` and ``"tuned"``, 400 for
             ``"input"``, if None.
-        learning_rate: Of Adam, at the start.
+        learning_rate: Of Adam, at the start; 5e-3 and 2e-3 for these if None.
         num_folds: Copies g with ``space="tuned"``, at most as many as pairs.
         finetuner: How they are tuned; with rehearsal, at a learning rate of 3e-3, if
             None.
@@ -120,7 +120,7 @@ class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
         num_simulations: int = 20_000,
         simulations_per_pair: int = 100,
         num_steps: int | None = None,
-        learning_rate: float = 2e-3,
+        learning_rate: float | None = None,
         num_folds: int = 5,
         finetuner: CalibrationFinetuner | None = None,
         npe_training: Training | None = None,
@@ -133,7 +133,8 @@ class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
         check_integer("simulations_per_pair", simulations_per_pair, minimum=2)
         if num_steps is not None:
             check_integer("num_steps", num_steps)
-        check_positive("learning_rate", learning_rate)
+        if learning_rate is not None:
+            check_positive("learning_rate", learning_rate)
         check_integer("num_folds", num_folds, minimum=2)
         check_instance("finetuner", finetuner, CalibrationFinetuner, optional=True)
         super().__init__(
@@ -309,6 +310,7 @@ class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
         self._discrepancy = correction.discrepancy
         if self.space != "tuned":
             return posterior_from(npe, correction.estimator), correction.history
+        nets = [correction.completed(net) for net in nets]
         return self._averaged(correction.estimator, nets), correction.history
 
     def _bank(

@@ -1,6 +1,7 @@
 """Mixtures of weighted densities: the posterior of RoPE, and others."""
 
-from sbi_rope.mixture.coupled import CoupledContexts, CoupledNet
+from sbi_rope.mixture.coupled import CoupledContexts
+from sbi_rope.mixture.coupled_net import CoupledNet
 from sbi_rope.mixture.estimator import MixtureEstimator
 from sbi_rope.mixture.parts import Mixing, OwnContexts, Part, Rows, equal_rows, part_of
 from sbi_rope.mixture.posterior import MixturePosterior

@@ -159,7 +159,6 @@ def part_of(estimator: ConditionalEstimator) -> Part:
             "Expected an estimator with a density, such as those of NPE; got "
             f"{type(estimator).__name__}. Train NPE instead of FMPE or NPSE."
         )
-    own = copy.deepcopy(estimator).eval().requires_grad_(requires_grad=False)
-    return Part(
-        headless(own), OwnContexts([embedding_of(own)], estimator.condition_shape)
-    )
+    own = copy.deepcopy(estimator).requires_grad_(requires_grad=False)
+    contexts = OwnContexts([embedding_of(own)], estimator.condition_shape)
+    return Part(headless(own), contexts).eval()

@@ -92,6 +92,10 @@ def own_mass(
 ) -> Leakage:
     """Estimate the mass of a part whose contexts are each observation's own.
 
+    The random numbers are the same in every call. Those of an observation depend on its
+    place among those asked for together, and so does its mass, within the standard
+    error.
+
     Args:
         part: The part.
         features: Of the observations, shape ``(n, ...)``.
@@ -99,17 +103,20 @@ def own_mass(
         num_draws: Draws for each observation, over all its contexts together.
         show_progress_bars: Whether to show progress, if it takes long.
     """
-    of_each = math.ceil(num_draws / part.mixing.num_contexts)
+    num_contexts = part.mixing.num_contexts
+    of_each = math.ceil(num_draws / num_contexts)
+    size = max(1, flow_batch(features.device) // (of_each * num_contexts))
     means, errors = [], []
-    for one in tqdm(features.split(1), **_bar(show=show_progress_bars)):
-        rows = part.mixing.rows(one)
-        weights, contexts = rows.weights[0].double(), rows.contexts[0]
-        # The same random numbers for each, whatever is asked for beside it.
-        with seeded(0):
+    with seeded(0):
+        for block in tqdm(features.split(size), **_bar(show=show_progress_bars)):
+            rows = part.mixing.rows(block)
+            weights, contexts = rows.weights.double(), rows.contexts.flatten(0, 1)
             inside = _share_inside(part.density, contexts, accept, of_each)
-        means.append(weights @ inside)
-        errors.append((weights.square() @ _variance(inside, of_each)).sqrt())
-    return Leakage(torch.stack(means), torch.stack(errors))
+            inside = inside.reshape(weights.shape)
+            means.append((weights * inside).sum(dim=1))
+            variance = weights.square() * _variance(inside, of_each)
+            errors.append(variance.sum(dim=1).sqrt())
+    return Leakage(torch.cat(means), torch.cat(errors))
 
 
 def _share_inside(

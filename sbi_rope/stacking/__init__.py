@@ -1,25 +1,27 @@
 """Stacking: weights over candidate posteriors from held-out calibration pairs."""
 
 from sbi_rope.stacking.candidates import (
+    AmortisedCandidate,
     CouplingCandidate,
     DensityCandidate,
+    DiscrepancyCandidate,
+    FinetunedCandidate,
     default_candidates,
 )
-from sbi_rope.stacking.cross_validation import (
-    CrossValidation,
-    Difference,
-    cross_validate,
-)
+from sbi_rope.stacking.cross_validation import CrossValidation, Difference
 from sbi_rope.stacking.posterior import StackedPosterior
 from sbi_rope.stacking.report import LearningCurve, StackingReport
-from sbi_rope.stacking.stack import stack
+from sbi_rope.stacking.stack import cross_validate, stack
 from sbi_rope.stacking.weights import StackingWeights, stacking_weights
 
 __all__ = [
+    "AmortisedCandidate",
     "CouplingCandidate",
     "CrossValidation",
     "DensityCandidate",
     "Difference",
+    "DiscrepancyCandidate",
+    "FinetunedCandidate",
     "LearningCurve",
     "StackedPosterior",
     "StackingReport",

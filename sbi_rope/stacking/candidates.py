@@ -1,11 +1,21 @@
-"""What a stack is made of: couplings at several settings, and other posteriors."""
+"""What a stack can be made of."""
 
 import itertools
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sbi_rope._sbi import ConditionalDensityEstimator, estimator_of
+import torch
+
+from sbi_rope._random import seeded
+from sbi_rope._sbi import (
+    ConditionalDensityEstimator,
+    embedding_of,
+    estimator_of,
+    headless,
+    posterior_from,
+)
 from sbi_rope._validation import (
     check_choice,
     check_instance,
@@ -14,19 +24,28 @@ from sbi_rope._validation import (
     check_unit_interval,
 )
 from sbi_rope.baselines import FinetunedNPE, PriorPosterior
+from sbi_rope.discrepancy.correction import Space
 from sbi_rope.errors import (
     InvalidInputError,
     InvalidTypeError,
     UnsupportedPosteriorError,
 )
-from sbi_rope.mixture import Part, part_of, part_of_prior
+from sbi_rope.mixture import (
+    MixturePosterior,
+    OwnContexts,
+    Part,
+    part_of,
+    part_of_prior,
+)
 from sbi_rope.rope import RoPE
+from sbi_rope.stacking.folds import Fold, Workbench
 
 __all__ = [
     "Candidate",
     "CouplingCandidate",
     "DensityCandidate",
-    "as_part",
+    "DiscrepancyCandidate",
+    "FinetunedCandidate",
     "check_candidates",
     "default_candidates",
 ]
@@ -35,11 +54,15 @@ __all__ = [
 GAMMAS = (0.02, 0.05, 0.1, 0.4)
 TAUS = (1.0, 0.5, 0.0)
 REHEARSAL = 1.0
+# A vector x with more entries is no list of summaries.
+MAX_SUMMARIES = 20
 
 
 @dataclass(frozen=True, kw_only=True)
 class CouplingCandidate:
     """RoPE, or RoPE without tuning ("OT-only"), at one setting of the coupling.
+
+    Its posterior belongs to a batch of observations.
 
     Args:
         gamma: As in :class:`~sbi_rope.SinkhornCoupler`.
@@ -80,11 +103,6 @@ class CouplingCandidate:
         return "RoPE" if self.tuned else "OT-only"
 
     @property
-    def net(self) -> tuple[bool, float | None]:
-        """What tells the embedding nets of candidates apart."""
-        return (self.tuned, self.rehearsal)
-
-    @property
     def name(self) -> str:
         """The method with its setting."""
         scale = " of the embedding" if self.cost_scale == "none" else ""
@@ -92,9 +110,36 @@ class CouplingCandidate:
         return f"{self.family} (gamma {self.gamma:g}{scale}, tau {self.tau:g}{net})"
 
 
+class AmortisedCandidate(ABC):
+    """A candidate with a density of any observation.
+
+    To implement one, give it a name and define :meth:`parts`.
+
+    Attributes:
+        name: What the report calls it.
+        fixed: Whether it is the same whatever the pairs are.
+    """
+
+    name: str
+    fixed: bool = False
+
+    @property
+    def family(self) -> str:
+        """Its name."""
+        return self.name
+
+    def applies_to(self, bench: Workbench) -> bool:
+        """Tell whether these data allow it; if not, the default stack does without."""
+        return True
+
+    @abstractmethod
+    def parts(self, fold: Fold) -> list[Part]:
+        """Train on the pairs of a fold; return densities that are mixed equally."""
+
+
 @dataclass(frozen=True, kw_only=True)
-class DensityCandidate:
-    """A posterior with a density of its own, trained on calibration pairs or not.
+class DensityCandidate(AmortisedCandidate):
+    """A posterior of your own, trained on calibration pairs or not.
 
     Args:
         name: What the report calls it; any but "stack".
@@ -133,63 +178,157 @@ class DensityCandidate:
                 "`lambda rope, seed: posterior`."
             )
 
+    def parts(self, fold: Fold) -> list[Part]:
+        """Build the posterior, and return its densities."""
+        bench = fold.bench
+        rope = bench.rope.with_pairs(torch.arange(0)) if self.fixed else fold.rope
+        # Whoever forgets the seed, or looks at a prior by drawing from it, leaves no
+        # trace.
+        with seeded(fold.seed):
+            return _parts_of(self.name, self.build(rope, fold.seed), rope)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiscrepancyCandidate(AmortisedCandidate):
+    """NPE on simulations that were corrected by what the pairs tell.
+
+    See :class:`~sbi_rope.discrepancy.DiscrepancyNPE`.
+
+    Args:
+        space: What is corrected.
+        learn_prior: Whether the distribution of parameters is learned from the pairs.
+            The scores of a stack assume in any case that these are drawn like the
+            observations to be inferred.
+    """
+
+    space: Space = "embedding"
+    learn_prior: bool = True
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        """The method with its setting."""
+        space = "" if self.space == "embedding" else f" ({self.space})"
+        return f"discrepancy{space}" + ("" if self.learn_prior else ", given prior")
+
     @property
     def family(self) -> str:
-        """Its name."""
-        return self.name
+        """The method that it is a setting of."""
+        return "discrepancy"
+
+    def applies_to(self, bench: Workbench) -> bool:
+        """Tell whether x is a short vector, or there are folds to tune without."""
+        if self.space == "input":
+            return _has_summaries(bench)
+        return self.space == "embedding" or len(bench.folds) > 2
+
+    def parts(self, fold: Fold) -> list[Part]:
+        """Correct NPE."""
+        corrected = fold.corrected(self.space, learn_prior=self.learn_prior)
+        estimator = corrected.estimator
+        if self.space == "input":
+            return [part_of(estimator)]
+        contexts = OwnContexts(corrected.nets, fold.bench.x.shape[1:])
+        return [Part(headless(estimator), contexts)]
 
 
-Candidate = CouplingCandidate | DensityCandidate
+def _has_summaries(bench: Workbench) -> bool:
+    """Whether x is a short vector that an embedding net could lose something of."""
+    net = embedding_of(estimator_of(bench.npe))
+    has_net = any(True for _ in net.parameters())
+    return bench.x.ndim == 2 and bench.x.shape[1] <= MAX_SUMMARIES and has_net
+
+
+@dataclass(frozen=True, kw_only=True)
+class FinetunedCandidate(AmortisedCandidate):
+    """NPE, as it is or corrected, with all its parameters trained on the pairs.
+
+    Args:
+        corrected: Whether to start from NPE trained on corrected simulations: those of
+            x itself where it is a short vector, else of its embedding.
+    """
+
+    corrected: bool = False
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        """The method with its setting."""
+        return "discrepancy, fine-tuned" if self.corrected else "fine-tuned NPE"
+
+    def parts(self, fold: Fold) -> list[Part]:
+        """Train on the pairs, a part of which is held out."""
+        npe = fold.bench.npe
+        if self.corrected:
+            space: Space = "input" if _has_summaries(fold.bench) else "embedding"
+            start = fold.corrected(space, learn_prior=True)
+            npe = posterior_from(npe, start.estimator)
+        method = FinetunedNPE.from_posterior(npe).append_calibration(*fold.pairs)
+        method.train(seed=fold.seed, show_progress_bars=False)
+        return [part_of(estimator_of(method.build_posterior()))]
+
+
+Candidate = CouplingCandidate | AmortisedCandidate
 
 
 def default_candidates(
     *,
+    couplings: bool = False,
     gammas: Sequence[float] = GAMMAS,
     taus: Sequence[float] = TAUS,
     rehearsal: float | None = REHEARSAL,
 ) -> tuple[Candidate, ...]:
-    """Return RoPE and OT-only over a grid, the prior, NPE, tuned NPE, fine-tuned NPE.
+    """Return the prior, NPE, fine-tuned NPE and the discrepancy models.
 
     Args:
+        couplings: Whether RoPE and OT-only over a grid of gamma and tau take part, and
+            tuning-only; for a stack of a batch of observations.
         gammas: In units of the median distance between simulated embeddings.
         taus: Trust in the prior; 0 lets every observation choose by itself.
         rehearsal: Of a second RoPE over the same grid, whose tuning keeps simulations
             where they are, see :class:`~sbi_rope.CalibrationFinetuner`; None leaves it
             out.
     """
+    amortised: tuple[Candidate, ...] = (
+        DensityCandidate(name="prior", build=_prior, fixed=True),
+        DensityCandidate(name="NPE", build=_npe, fixed=True),
+        FinetunedCandidate(),
+        DiscrepancyCandidate(space="embedding"),
+        DiscrepancyCandidate(space="input"),
+        DiscrepancyCandidate(space="tuned"),
+        FinetunedCandidate(corrected=True),
+    )
+    if not couplings:
+        return amortised
     rehearsed = [] if rehearsal is None else [{"rehearsal": rehearsal}]
     nets: list[dict[str, Any]] = [{"tuned": True}, *rehearsed, {"tuned": False}]
-    couplings = [
+    coupled = [
         CouplingCandidate(gamma=gamma, tau=tau, **net)
         for net, gamma, tau in itertools.product(nets, gammas, taus)
     ]
-    return (
-        *couplings,
-        DensityCandidate(name="prior", build=_prior, fixed=True),
-        DensityCandidate(name="NPE", build=lambda rope, seed: rope.npe, fixed=True),
-        DensityCandidate(
-            name="tuning-only", build=lambda rope, seed: rope.tuned_posterior()
-        ),
-        DensityCandidate(name="fine-tuned NPE", build=_finetuned),
-    )
+    tuned = DensityCandidate(name="tuning-only", build=_tuning_only)
+    return (*coupled, *amortised, tuned)
+
+
+# Functions with a name, so that a stack can be pickled.
 
 
 def _prior(rope: RoPE, seed: int) -> PriorPosterior:
     return PriorPosterior(rope.npe.prior)
 
 
-def _finetuned(rope: RoPE, seed: int) -> Any:
-    method = FinetunedNPE.from_posterior(rope.npe)
-    method.append_calibration(*rope.calibration)
-    return method.train(seed=seed, show_progress_bars=False).build_posterior()
+def _npe(rope: RoPE, seed: int) -> Any:
+    return rope.npe
+
+
+def _tuning_only(rope: RoPE, seed: int) -> Any:
+    return rope.tuned_posterior()
 
 
 def check_candidates(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
-    """Return the candidates, couplings first, with those of one net side by side.
+    """Return the candidates of a user.
 
     Raises:
         InvalidTypeError: If one is something else.
-        InvalidInputError: If there is no coupling among them, or two have one name.
+        InvalidInputError: If there is none, or two have one name.
     """
     if not isinstance(candidates, Sequence):
         raise InvalidTypeError(
@@ -197,56 +336,64 @@ def check_candidates(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
             f"{type(candidates).__name__}."
         )
     for candidate in candidates:
-        if not isinstance(candidate, CouplingCandidate | DensityCandidate):
+        if not isinstance(candidate, CouplingCandidate | AmortisedCandidate):
             raise InvalidTypeError(
-                "Expected `candidates` to be CouplingCandidates and DensityCandidates; "
-                f"got {type(candidate).__name__}. Wrap a posterior that was not "
-                "trained on the calibration pairs: DensityCandidate(name=..., "
-                "build=lambda rope, seed: posterior, fixed=True)."
+                "Expected `candidates` to be candidates, such as those of "
+                f"`default_candidates()`; got {type(candidate).__name__}. Wrap a "
+                "posterior that was not trained on the calibration pairs: "
+                "DensityCandidate(name=..., build=lambda rope, seed: posterior, "
+                "fixed=True)."
             )
-    if not any(isinstance(c, CouplingCandidate) for c in candidates):
+    if not candidates:
         raise InvalidInputError(
-            "Expected at least one CouplingCandidate; got none. Add to the list that "
+            "Expected at least one candidate; got none. Add to the list that "
             "`default_candidates()` returns."
         )
     names = [candidate.name for candidate in candidates]
     if len(set(names)) < len(names):
         double = sorted({name for name in names if names.count(name) > 1})
         raise InvalidInputError(f"Expected names that differ; got {double} twice.")
-    couplings = [c for c in candidates if isinstance(c, CouplingCandidate)]
-    nets = [c.net for c in couplings]
-    couplings.sort(key=lambda c: nets.index(c.net))
-    others = [c for c in candidates if not isinstance(c, CouplingCandidate)]
-    return (*couplings, *others)
+    return tuple(candidates)
 
 
-def as_part(name: str, posterior: Any, rope: RoPE) -> Part:
-    """Return the density of a posterior of NPE, or of the prior.
+def _parts_of(name: str, posterior: Any, rope: RoPE) -> list[Part]:
+    """Return the densities of a posterior of NPE, of an average of them, or the prior.
 
     Raises:
         UnsupportedPosteriorError: If it has none, or is of other parameters or
             observations than those of RoPE.
     """
-    if isinstance(posterior, PriorPosterior):
-        shape = rope.calibration[0].shape[1:]
-        if posterior.prior.event_shape != shape:
-            raise UnsupportedPosteriorError(
-                f"Expected the candidate {name!r} to be of theta {tuple(shape)}; got "
-                f"{tuple(posterior.prior.event_shape)}."
-            )
-        return part_of_prior(posterior.prior, rope.calibration[1].shape[1:])
-    estimator = estimator_of(posterior)
-    if not isinstance(estimator, ConditionalDensityEstimator):
-        raise UnsupportedPosteriorError(
-            f"Expected the candidate {name!r} to have a density to score; got "
-            f"{type(estimator).__name__}. Train NPE instead of FMPE or NPSE."
-        )
     theta, x = rope.calibration
-    shapes = (estimator.input_shape, estimator.condition_shape)
-    if shapes != (theta.shape[1:], x.shape[1:]):
+    if isinstance(posterior, PriorPosterior):
+        parts = [part_of_prior(posterior.prior, x.shape[1:])]
+    elif isinstance(posterior, MixturePosterior):
+        parts = _equal_parts(name, posterior)
+    else:
+        estimator = estimator_of(posterior)
+        if not isinstance(estimator, ConditionalDensityEstimator):
+            raise UnsupportedPosteriorError(
+                f"Expected the candidate {name!r} to have a density to score; got "
+                f"{type(estimator).__name__}. Train NPE instead of FMPE or NPSE."
+            )
+        parts = [part_of(estimator)]
+    for part in parts:
+        shapes = (part.density.input_shape, part.mixing.event_shape)
+        if shapes != (theta.shape[1:], x.shape[1:]):
+            raise UnsupportedPosteriorError(
+                f"Expected the candidate {name!r} to map x {tuple(x.shape[1:])} to "
+                f"theta {tuple(theta.shape[1:])}; got x {tuple(shapes[1])} and theta "
+                f"{tuple(shapes[0])}."
+            )
+    return parts
+
+
+def _equal_parts(name: str, posterior: MixturePosterior) -> list[Part]:
+    estimator = posterior.posterior_estimator
+    weights = estimator.weights
+    if not posterior.is_amortised or not bool((weights == weights[0]).all()):
         raise UnsupportedPosteriorError(
-            f"Expected the candidate {name!r} to map x {tuple(x.shape[1:])} to theta "
-            f"{tuple(theta.shape[1:])}; got x {tuple(shapes[1])} and theta "
-            f"{tuple(shapes[0])}."
+            f"Expected the candidate {name!r} to be amortised, and an average of equal "
+            f"weights if it is a mixture; got {type(posterior).__name__}. Couplings "
+            "are CouplingCandidates."
         )
-    return part_of(estimator)
+    return list(estimator.parts)

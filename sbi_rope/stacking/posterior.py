@@ -1,34 +1,32 @@
 """The stack of candidates as an sbi posterior."""
 
-from typing import TYPE_CHECKING
+import copy
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_rope.errors import NotReadyError
 from sbi_rope.mixture import MixturePosterior
-from sbi_rope.stacking.estimator import StackedEstimator
-
-if TYPE_CHECKING:
-    from sbi_rope.stacking.report import StackingReport
+from sbi_rope.stacking.report import StackingReport
+from sbi_rope.stacking.versions import Versions
 
 __all__ = ["StackedPosterior"]
 
 
 class StackedPosterior(MixturePosterior):
-    r"""A weighted mixture of candidate posteriors for a batch of real observations.
+    r"""A weighted mixture of candidate posteriors.
 
     .. math::
-        p(\theta \mid x_{o,i})
-        = \frac{\mathbf{1}[\theta \in \operatorname{supp} p]}{Z_i}
-        \sum_k w_k\, q_k(\theta \mid x_{o,i}),
-        \qquad Z_i = \sum_k w_k Z_k(x_{o,i}),
+        p(\theta \mid x)
+        = \frac{\mathbf{1}[\theta \in \operatorname{supp} p]}{Z(x)}
+        \sum_k w_k \frac1V \sum_v q_k^{(v)}(\theta \mid x),
 
-    with the weights of :func:`stacking_weights` and :math:`Z_k` the mass of candidate k
-    inside the support of the prior. The couplings among the candidates share their
-    components, so that together they cost as much as one. It has all methods of
-    :class:`~sbi_rope.MixturePosterior`.
+    with the weights of :func:`stacking_weights`, the version :math:`q_k^{(v)}` of
+    candidate k that was trained without fold v of the calibration pairs, and Z(x) the
+    mass inside the support of the prior. With couplings among the candidates it belongs
+    to a batch, as RoPE's posterior does; without, it answers any x. It has all methods
+    of :class:`~sbi_rope.MixturePosterior`.
 
     sbi's ``EnsemblePosterior`` is not used: it has no ``log_prob_batched``, corrects
     each candidate's leakage by itself, which does not end for NPE on misspecified data,
@@ -39,41 +37,44 @@ class StackedPosterior(MixturePosterior):
         | https://arxiv.org/abs/1704.02030
 
     Args:
-        estimator: The stack.
+        versions: The candidates.
         prior: The prior NPE was trained with.
-        weights: Of each candidate by name; they sum to one.
-        report: What the calibration pairs say about it; None of the stacks inside a
-            cross-validation.
+        report: What the calibration pairs say about it.
         enable_transform: As in sbi, for ``map()``.
-        shared: As in :class:`~sbi_rope.MixturePosterior`.
     """
 
     def __init__(
         self,
-        estimator: StackedEstimator,
+        versions: Versions,
         prior: Distribution,
         *,
-        weights: dict[str, float],
-        report: "StackingReport | None" = None,
+        report: StackingReport,
         enable_transform: bool = True,
-        shared: dict[int, Tensor] | None = None,
     ) -> None:
+        weights = report.cross_validation.weights.weights
         super().__init__(
-            estimator, prior, enable_transform=enable_transform, shared=shared
+            versions.estimator(weights),
+            copy.deepcopy(prior),
+            enable_transform=enable_transform,
         )
-        self.candidate_weights = weights
-        self._report = report
+        self.versions = versions
+        self.report = report
         self._purpose = (
-            f"It is the stack of {len(weights)} candidate posteriors for each of "
-            f"{len(self)} real observations."
+            f"It is the stack of {len(weights)} candidate posteriors, weighted by "
+            "their scores on held-out calibration pairs."
         )
+
+    @property
+    def candidate_weights(self) -> dict[str, float]:
+        """The weight of each candidate by name; they sum to one."""
+        scores = self.report.cross_validation
+        return dict(zip(scores.names, scores.weights.weights.tolist(), strict=True))
 
     @torch.no_grad()
     def candidate_log_probs(self, theta: Tensor, x: Tensor) -> Tensor:
         """Return the log density of each candidate by itself at pairs.
 
-        Couplings are normalised inside the support of the prior, as RoPE's posteriors
-        are; the other densities are as they are.
+        Each is the average of its versions, not corrected for leakage.
 
         Args:
             theta: Parameters, shape ``(n, d)``.
@@ -82,24 +83,13 @@ class StackedPosterior(MixturePosterior):
         Returns:
             Shape ``(n, K)``, float64, in the order of ``candidate_weights``.
         """
-        x = self._batch_of_x(x)
-        estimator = self.posterior_estimator
-        assert isinstance(estimator, StackedEstimator)
-        mass = None
-        if self._bound is not None:
-            mass = estimator.component_mass(0, accept=self._bound, cache=self._cache)
-        return estimator.candidate_log_probs(theta, x, component_mass=mass)
+        return self.versions.log_probs(theta, self._batch_of_x(x))
 
-    @property
-    def report(self) -> "StackingReport":
-        """What the calibration pairs say about this stack; print it.
+    def __getitem__(self, index: int) -> "StackedPosterior":
+        """Return the posterior of one observation, with it as the default x.
 
-        Raises:
-            NotReadyError: If this stack is itself a part of a cross-validation.
+        It knows no other observation of the batch.
         """
-        if self._report is None:
-            raise NotReadyError(
-                "This stack was made to score held-out pairs and has no report. Use "
-                "that of the posterior that `stack(rope, x_o)` returns."
-            )
-        return self._report
+        view: Any = super().__getitem__(index)
+        view.versions = None
+        return view

@@ -12,7 +12,6 @@ from torch import Tensor
 from sbi_rope.metrics import (
     CoverageCurve,
     acauc_of,
-    coverage_curve_of,
     expected_coverage_error_of,
 )
 from sbi_rope.stacking.cross_validation import CrossValidation, Difference
@@ -30,7 +29,9 @@ IN_WORDS = {
     "OT-only": "transport without tuning does the work, and labels add little to it",
     "tuning-only": "the tuned embedding is trusted without transport",
     "RoPE": "tuning and transport repair the simulator, as RoPE is meant to",
-    "fine-tuned NPE": "with so many labels the simulator adds little beyond a start",
+    "fine-tuned NPE": "the labels themselves train NPE for these data",
+    "discrepancy": "a linear correction of the simulator explains these data",
+    "discrepancy, fine-tuned": "the corrected simulator is where the labels start from",
 }
 
 
@@ -120,15 +121,15 @@ class StackingReport:
             totals[family] = totals.get(family, 0.0) + weight
         return dict(sorted(totals.items(), key=lambda item: -item[1]))
 
-    @cached_property
+    @property
     def levels(self) -> Tensor:
-        """Levels of held-out pairs; see :meth:`CrossValidation.levels`."""
-        return self.cross_validation.levels()
+        """Levels of held-out pairs; see :class:`CrossValidation`."""
+        return self.cross_validation.levels
 
     @property
     def coverage(self) -> CoverageCurve:
         """Coverage of the stack's central intervals on held-out pairs."""
-        return coverage_curve_of(self.levels)
+        return self.cross_validation.coverage
 
     def as_rows(self) -> list[dict[str, Any]]:
         """Return a row for each candidate, the best held-out score first."""

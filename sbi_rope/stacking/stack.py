@@ -1,30 +1,55 @@
-"""From a trained RoPE to a stack, in one call."""
+"""From a RoPE with calibration pairs to a stack, in one call."""
 
-import copy
 from collections.abc import Sequence
 from typing import Any, Literal
 
+import torch
 from torch import Tensor
 
-from sbi_rope._validation import check_choice, check_unit_interval
-from sbi_rope.errors import warn_user
+from sbi_rope._progress import progress_bar
+from sbi_rope._random import seeded
+from sbi_rope._validation import (
+    check_batch,
+    check_choice,
+    check_finite,
+    check_instance,
+    check_integer,
+    check_not_negative,
+    check_unit_interval,
+)
+from sbi_rope.errors import InvalidInputError, NotReadyError, warn_user
+from sbi_rope.metrics.calibration import central_levels
+from sbi_rope.metrics.calls import draw_ranks
+from sbi_rope.mixture import MixturePosterior, Part
 from sbi_rope.rope import RoPE
-from sbi_rope.stacking.candidates import Candidate
-from sbi_rope.stacking.cross_validation import check_setup, score_folds
-from sbi_rope.stacking.estimator import StackedEstimator
-from sbi_rope.stacking.fitting import Components, fit_candidates
+from sbi_rope.stacking.candidates import (
+    AmortisedCandidate,
+    Candidate,
+    CouplingCandidate,
+    check_candidates,
+    default_candidates,
+)
+from sbi_rope.stacking.couplings import FittedCouplings, fit_couplings
+from sbi_rope.stacking.cross_validation import CrossValidation, fold_weights
+from sbi_rope.stacking.folds import Fold, Workbench, draw_seeds
 from sbi_rope.stacking.posterior import StackedPosterior
 from sbi_rope.stacking.report import LearningCurve, StackingReport
+from sbi_rope.stacking.versions import Versions, train_version
 
-__all__ = ["stack"]
+__all__ = ["cross_validate", "stack"]
 
+# Fewest pairs: one to train on and one to score.
+MIN_PAIRS = 2
+NUM_FOLDS = 5
 # Shares of the folds to train on for the learning curve, beside all but one.
 SMALLER = (0.25, 0.5)
+# Samples of each held-out pair behind the calibration of the stack.
+NUM_SAMPLES = 500
 
 
 def stack(
     rope: RoPE,
-    x_o: Tensor,
+    x_o: Tensor | None = None,
     *,
     candidates: Sequence[Candidate] | None = None,
     num_folds: int | None = None,
@@ -33,102 +58,342 @@ def stack(
     learning_curve: bool = False,
     unseen: Literal["raise", "extend"] = "raise",
     tail_mass: float = 1e-3,
+    require_convergence: bool = True,
     seed: int | None = None,
     show_progress_bars: bool = True,
 ) -> StackedPosterior:
-    r"""Weigh RoPE at many settings and its rivals by their scores on held-out pairs.
+    r"""Weigh corrected, fine-tuned and unchanged NPE by their scores on held-out pairs.
 
-    No gamma or tau is chosen: candidates are scored on calibration pairs that they were
-    not trained on (:func:`cross_validate`), and the posterior is their mixture with the
-    weights that score best (:func:`stacking_weights`).
+    Candidates are trained without each fold of the calibration pairs and scored on it,
+    and the posterior is their mixture with the weights that score best
+    (:func:`stacking_weights`). It is deployed as it was scored: each candidate is the
+    average of its versions, one without each fold. The held-out score is therefore a
+    lower bound, in expectation, for observations like those of the pairs.
+
+    Without ``x_o`` no candidate depends on a batch, and the result answers any
+    observation. With ``x_o``, RoPE and OT-only at many gammas and taus take part, and
+    the result belongs to that batch.
 
     Args:
-        rope: A trained RoPE; it is left as it is, but counts the simulations
-            that were dropped.
-        x_o: The batch of real observations, shape ``(n_o, *event)``.
-        candidates: What to stack; ``default_candidates()`` if None: RoPE, RoPE tuned
-            with rehearsal, and OT-only at four gammas and three taus, the prior, NPE,
-            tuning-only and fine-tuned NPE.
-        num_folds: Folds of the calibration pairs, at most as many as there are pairs; 5
-            if None, or leave-one-out of up to 10 pairs.
-        num_simulations: As in :meth:`~sbi_rope.RoPE.build_posterior`.
+        rope: A RoPE with calibration pairs; it needs no training and is left as it is,
+            but counts the simulations that were dropped.
+        x_o: A batch of real observations, shape ``(n_o, *event)``; None for a posterior
+            of any x.
+        candidates: What to stack; :func:`default_candidates` if None: the prior, NPE,
+            fine-tuned NPE and discrepancy models; with ``x_o`` also tuning-only, and
+            RoPE, RoPE tuned with rehearsal and OT-only at four gammas and three taus.
+        num_folds: Folds of the calibration pairs, 5 if None, at most as many as there
+            are different parameters. Pairs with the same parameters share a fold.
+        num_simulations: Simulations to couple with, as in
+            :meth:`~sbi_rope.RoPE.build_posterior`.
         pseudo_count: Strength of the Dirichlet prior of the weights, in pairs.
         learning_curve: Whether to train on fewer folds too, so that the report can say
             what more labels might add; takes about twice the time.
-        unseen: What the posterior does with an x outside the batch: ``"raise"``, or
-            ``"extend"`` each coupling by one row.
+        unseen: What the posterior of a batch does with an x outside of it: ``"raise"``,
+            or ``"extend"`` each coupling by one row.
         tail_mass: As in :meth:`~sbi_rope.RoPE.build_posterior`.
+        require_convergence: Whether a coupling that has not converged is an error.
         seed: Seed of everything random; None uses the states of torch, NumPy and
             Python.
         show_progress_bars: Whether to show the folds done.
 
     Returns:
-        The stack, an sbi posterior of the batch; ``posterior.report`` says what the
-        pairs say about it.
+        The stack, an sbi posterior; ``posterior.report`` says what the pairs say about
+        it.
 
     Raises:
-        NotReadyError: If RoPE is not trained or has fewer than two pairs.
-        InvalidInputError: If an argument is outside its range or has the wrong shape.
+        NotReadyError: If there are fewer than two pairs with different parameters.
+        InvalidInputError: If an argument is outside its range or has the wrong shape,
+            or there are couplings among the candidates without a batch.
         UnsupportedPosteriorError: If a candidate has no density.
+        CouplingError: If a coupling has not converged.
         SimulationError: If the simulator fails.
     """
     check_choice("unseen", unseen, ("raise", "extend"))
     check_unit_interval("tail_mass", tail_mass)
-    chosen, seeds = check_setup(rope, candidates, num_folds, pseudo_count, seed)
-    _ = rope.tuned_embedding_net  # says so if it is not trained
-    components = Components.of(
+    trainer = _Trainer(
         rope,
         x_o,
-        chosen,
+        candidates=candidates,
+        num_folds=num_folds,
         num_simulations=num_simulations,
-        seed=seeds[0],
-        show_progress_bars=show_progress_bars,
-    )
-    options: dict[str, Any] = {
-        "num_folds": num_folds,
-        "pseudo_count": pseudo_count,
-        "seed": seeds[1],
-        "show_progress_bars": show_progress_bars,
-    }
-    scores = score_folds(rope, components, chosen, **options)
-    curve = None
-    if learning_curve:
-        fewer = [int(share * scores.num_folds) for share in SMALLER]
-        smaller = [
-            score_folds(rope, components, chosen, num_training_folds=folds, **options)
-            for folds in fewer
-            if 1 <= folds < scores.num_folds - 1
-        ]
-        curve = LearningCurve.of([*smaller, scores])
-    estimator = fit_candidates(
-        chosen,
-        rope,
-        components.x_o,
-        components,
-        seed=seeds[2],
+        pseudo_count=pseudo_count,
         unseen=unseen,
         tail_mass=tail_mass,
+        require_convergence=require_convergence,
+        seed=seed,
+        show_progress_bars=show_progress_bars,
     )
-    _warn_unless_converged(estimator)
-    weights = scores.weights.weights
+    versions, scores = trainer.cross_validate(with_refit=True)
+    curve = None
+    if learning_curve:
+        wanted = [int(share * scores.num_folds) for share in SMALLER]
+        smaller = [
+            trainer.cross_validate(num_training_folds=count)[1]
+            for count in dict.fromkeys(wanted)
+            if 1 <= count < scores.num_folds - 1
+        ]
+        curve = LearningCurve.of([*smaller, scores])
     return StackedPosterior(
-        estimator.with_weights(weights),
-        copy.deepcopy(components.prior),  # moving the stack leaves the report
-        enable_transform=components.enable_transform,
-        weights=dict(zip(scores.names, weights.tolist(), strict=True)),
+        versions,
+        trainer.prior,
         report=StackingReport(cross_validation=scores, learning_curve=curve),
-        shared=scores.shared,
+        enable_transform=rope.npe.enable_transform,
     )
 
 
-def _warn_unless_converged(estimator: StackedEstimator) -> None:
-    couplings = estimator.coupled[0].couplings
-    open_ones = [c for c in couplings if not c.converged]
-    if open_ones:
-        worst = max(coupling.marginal_error for coupling in open_ones)
-        warn_user(
-            f"{len(open_ones)} of {len(couplings)} couplings have not converged "
-            f"(marginal error up to {worst:.1e}). They are weighed by their scores as "
-            "they are. Give RoPE a coupler with more `max_iterations`, or leave the "
-            "smallest gammas out."
+def cross_validate(
+    rope: RoPE,
+    x_o: Tensor | None = None,
+    *,
+    candidates: Sequence[Candidate] | None = None,
+    num_folds: int | None = None,
+    num_training_folds: int | None = None,
+    num_simulations: int | None = None,
+    pseudo_count: float = 1.0,
+    require_convergence: bool = True,
+    seed: int | None = None,
+    show_progress_bars: bool = True,
+) -> CrossValidation:
+    """Score candidates on calibration pairs that they were not trained on.
+
+    Args:
+        rope: As in :func:`stack`, and so are the arguments not listed.
+        x_o: As in :func:`stack`.
+        candidates: As in :func:`stack`.
+        num_folds: As in :func:`stack`.
+        num_training_folds: Folds to train on for each held out; all others if None.
+            Fewer tell what fewer pairs would have given.
+        num_simulations: As in :func:`stack`.
+        pseudo_count: As in :func:`stack`.
+        require_convergence: As in :func:`stack`.
+        seed: As in :func:`stack`.
+        show_progress_bars: As in :func:`stack`.
+
+    Returns:
+        The scores, pair by candidate.
+
+    Raises:
+        NotReadyError: As in :func:`stack`.
+        InvalidInputError: As in :func:`stack`.
+        UnsupportedPosteriorError: As in :func:`stack`.
+        CouplingError: As in :func:`stack`.
+        SimulationError: As in :func:`stack`.
+    """
+    trainer = _Trainer(
+        rope,
+        x_o,
+        candidates=candidates,
+        num_folds=num_folds,
+        num_simulations=num_simulations,
+        pseudo_count=pseudo_count,
+        require_convergence=require_convergence,
+        seed=seed,
+        show_progress_bars=show_progress_bars,
+    )
+    return trainer.cross_validate(num_training_folds=num_training_folds)[1]
+
+
+class _Trainer:
+    """Trains and scores all candidates; its arguments are those of :func:`stack`."""
+
+    def __init__(
+        self,
+        rope: RoPE,
+        x_o: Tensor | None,
+        *,
+        candidates: Sequence[Candidate] | None,
+        num_folds: int | None,
+        num_simulations: int | None,
+        pseudo_count: float,
+        require_convergence: bool,
+        seed: int | None,
+        show_progress_bars: bool,
+        unseen: Literal["raise", "extend"] = "raise",
+        tail_mass: float = 1e-3,
+    ) -> None:
+        check_instance("rope", rope, RoPE)
+        if num_folds is not None:
+            check_integer("num_folds", num_folds, minimum=2)
+        if num_simulations is not None:
+            check_integer("num_simulations", num_simulations)
+        check_not_negative("pseudo_count", pseudo_count)
+        check_instance("require_convergence", require_convergence, bool)
+        self.x_o = None if x_o is None else _checked_observations(x_o, rope)
+        self.seeds = draw_seeds(seed, 3)
+        self.bench = Workbench(
+            rope,
+            num_folds=NUM_FOLDS if num_folds is None else num_folds,
+            seed=self.seeds[0],
+            show_progress_bars=show_progress_bars,
         )
+        if len(self.bench.folds) < MIN_PAIRS:
+            raise NotReadyError(
+                f"Expected at least {MIN_PAIRS} calibration pairs with different "
+                f"parameters, to hold some out; got {len(self.bench.folds)}. Call "
+                "`append_calibration(theta, x)` first."
+            )
+        self.candidates = self._chosen(candidates)
+        self.num_simulations = num_simulations
+        self.pseudo_count = pseudo_count
+        self.require_convergence = require_convergence
+        self.unseen: Literal["raise", "extend"] = unseen
+        self.tail_mass = tail_mass
+        self.show = show_progress_bars
+
+    @property
+    def prior(self) -> Any:
+        """The prior NPE was trained with."""
+        return self.bench.npe.prior
+
+    def _chosen(self, candidates: Sequence[Candidate] | None) -> tuple[Candidate, ...]:
+        if candidates is None:
+            chosen = default_candidates(couplings=self.x_o is not None)
+            return tuple(
+                candidate
+                for candidate in chosen
+                if isinstance(candidate, CouplingCandidate)
+                or candidate.applies_to(self.bench)
+            )
+        chosen = check_candidates(candidates)
+        coupled = any(isinstance(c, CouplingCandidate) for c in chosen)
+        if coupled and self.x_o is None:
+            raise InvalidInputError(
+                "Expected `x_o`, a batch of observations, with couplings among the "
+                "candidates; got None. Pass it, or leave them out."
+            )
+        if not coupled and self.x_o is not None:
+            raise InvalidInputError(
+                "Expected couplings among the candidates with `x_o`; got none, so that "
+                "nothing depends on the batch. Leave `x_o` out, or add to "
+                "`default_candidates(couplings=True)`."
+            )
+        return chosen
+
+    def cross_validate(
+        self, *, num_training_folds: int | None = None, with_refit: bool = False
+    ) -> tuple[Versions, CrossValidation]:
+        """Train on the folds after each fold, and score on it.
+
+        Args:
+            num_training_folds: Folds to train on; all others if None.
+            with_refit: Whether to add a version that is trained on all pairs. It is
+                not scored.
+        """
+        bench = self.bench
+        num_folds = len(bench.folds)
+        if num_training_folds is None:
+            num_training_folds = num_folds - 1
+        check_integer("num_training_folds", num_training_folds)
+        if num_training_folds >= num_folds:
+            raise InvalidInputError(
+                f"Expected `num_training_folds` below the number of folds, {num_folds};"
+                f" got {num_training_folds}."
+            )
+        folds = [
+            Fold(bench, [(k + 1 + j) % num_folds for j in range(num_training_folds)])
+            for k in range(num_folds)
+        ]
+        if with_refit:
+            folds.append(Fold(bench, range(num_folds)))
+        versions = self._train(folds)
+        scores = self._score(versions, num_training_folds)
+        return versions, scores
+
+    def _train(self, folds: Sequence[Fold]) -> Versions:
+        chosen = self.candidates
+        bar = progress_bar(folds, show=self.show, desc="Folds")
+        trained = tuple(train_version(chosen, fold) for fold in bar)
+        couplings: FittedCouplings | None = None
+        coupled = [c for c in chosen if isinstance(c, CouplingCandidate)]
+        if coupled:
+            assert self.x_o is not None
+            couplings = fit_couplings(
+                coupled,
+                folds,
+                self.x_o,
+                num_simulations=self.num_simulations,
+                seed=self.seeds[1],
+                unseen=self.unseen,
+                require_convergence=self.require_convergence,
+                show_progress_bars=self.show,
+            )
+        fixed: dict[Candidate, list[Part]] = {
+            candidate: candidate.parts(folds[0])
+            for candidate in chosen
+            if isinstance(candidate, AmortisedCandidate) and candidate.fixed
+        }
+        return Versions(
+            candidates=chosen,
+            fixed=fixed,
+            trained=trained,
+            couplings=couplings,
+            tail_mass=self.tail_mass,
+        )
+
+    def _score(self, versions: Versions, num_training_folds: int) -> CrossValidation:
+        bench = self.bench
+        theta, x = bench.theta, bench.x
+        log_scores = theta.new_empty(
+            len(theta), len(self.candidates), dtype=torch.double
+        )
+        fold = torch.empty(len(theta), dtype=torch.long, device=theta.device)
+        log_q = None
+        if versions.couplings is not None:
+            # The components are the same in all folds.
+            log_q = versions.couplings.component_log_probs(theta)
+        for number, rows in enumerate(bench.folds):
+            fold[rows] = number
+            log_scores[rows] = versions.log_probs(
+                theta[rows],
+                x[rows],
+                [number],
+                log_q=None if log_q is None else log_q[rows],
+            )
+        weights = fold_weights(log_scores, fold, self.pseudo_count)
+        stack_scores = log_scores.new_empty(len(theta))
+        levels = torch.empty_like(theta)
+        shared: dict[int, Tensor] = {}
+        for number, rows in enumerate(bench.folds):
+            posterior = MixturePosterior(
+                versions.estimator(weights[number], [number]),
+                self.prior,
+                enable_transform=False,
+                shared=shared,
+            )
+            log_prob = posterior.log_prob_batched(theta[rows][None], x[rows])[0]
+            stack_scores[rows] = log_prob.double()
+            with seeded(self.seeds[2]):
+                ranks = draw_ranks(
+                    posterior,
+                    theta[rows],
+                    x[rows],
+                    num_samples=NUM_SAMPLES,
+                    chunk_size=NUM_SAMPLES,
+                    show=False,
+                )
+            levels[rows] = central_levels(ranks).to(levels)
+        scores = CrossValidation(
+            names=tuple(candidate.name for candidate in self.candidates),
+            families=tuple(candidate.family for candidate in self.candidates),
+            log_scores=log_scores,
+            fold=fold,
+            num_trained_on=len(theta) * num_training_folds // len(bench.folds),
+            stack_scores=stack_scores,
+            levels=levels,
+            pseudo_count=self.pseudo_count,
+        )
+        if not scores.weights.converged:
+            warn_user(
+                "The weights of the stack have not converged: the held-out score could "
+                f"be better by up to {scores.weights.gap / len(theta):.3f} nats a "
+                "pair. Leave out candidates that are nearly the same."
+            )
+        return scores
+
+
+def _checked_observations(x_o: Tensor, rope: RoPE) -> Tensor:
+    _, x = rope.calibration
+    x_o = check_batch("x_o", x_o, x.shape[1:]).detach().to(x, copy=True)
+    check_finite("x_o", x_o)  # float32 may hold less
+    return x_o

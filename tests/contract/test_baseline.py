@@ -145,9 +145,14 @@ def test_log_probs_have_the_shapes_of_sbi(case: tuple[str, str]) -> None:
     assert values.shape == (2, 3)
     assert values.dtype is torch.float32
     assert not values.requires_grad
+    tolerance = 1e-4
+    if isinstance(posterior, MixturePosterior):  # which is divided by an estimate
+        mass = posterior.leakage(data.x_o[:3])
+        tolerance += 6 * float((mass.standard_error / mass.mass).max())
+    assert tolerance < 0.3
     for i in range(3):
         single = log_prob(posterior, theta[:, i], data.x_o[i])
-        assert torch.allclose(single, values[:, i], atol=1e-4)
+        assert torch.allclose(single, values[:, i], atol=tolerance)
 
 
 @pytest.mark.parametrize("name", GAUSSIAN)

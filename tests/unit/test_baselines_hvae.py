@@ -35,6 +35,7 @@ from sbi_rope.baselines.hvae.reparametrisation import (
     check_differentiable,
     reparametrised_sample,
 )
+from sbi_rope.baselines.hvae.training import train_hybrid
 from sbi_rope.baselines.training import Training
 from sbi_rope.errors import (
     InvalidInputError,
@@ -495,6 +496,23 @@ def test_training_improves_on_npe_for_held_out_real_data(npe: Any) -> None:
     assert float(gain.mean()) > 3 * standard_error
     history = method.history
     assert history.kept_validation_loss < history.validation_loss[0]
+
+
+def test_epochs_are_chosen_by_the_first_few_draws_of_the_posterior(
+    npe: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[Any] = []
+
+    def recorded(model: Any, mixture: Any, *arguments: Any, **options: Any) -> Any:
+        seen.append(mixture.parts[0].mixing)
+        return train_hybrid(model, mixture, *arguments, **options)
+
+    monkeypatch.setattr("sbi_rope.baselines.hvae.method.train_hybrid", recorded)
+    estimator = trained(npe, num_latents=12, noisy=True).build_posterior()
+    mixing = estimator.posterior_estimator.parts[0].mixing
+    assert (mixing.num_contexts, seen[0].num_contexts) == (12, 8)
+    assert torch.equal(seen[0].z_noise, mixing.z_noise[:8])
+    assert torch.equal(seen[0].x_noise, mixing.x_noise[:8])
 
 
 @pytest.fixture(scope="module")

@@ -351,6 +351,7 @@ def test_the_tail_left_out_obeys_the_bound_of_the_docstring(tail_mass: float) ->
     assert (missing >= -rounding).all()
     assert (missing <= tail_mass * bound + rounding).all()
     assert (missing > 10 * rounding).any(), "no component was left out"
+    assert (truncated > 0).all(), "nothing was kept"
 
 
 def contexts(n_s: int, dim: int = 2) -> Tensor:

@@ -565,8 +565,9 @@ def test_an_amortised_posterior_answers_any_x() -> None:
 
 def test_the_part_of_an_npe_is_that_npe() -> None:
     npe = problems.npe_posterior("nsf")
-    estimator = estimator_of(npe)
+    estimator = copy.deepcopy(estimator_of(npe)).train()
     part = part_of(estimator)
+    assert not any(module.training for module in part.modules())
     posterior = MixturePosterior(MixtureEstimator([part], [1.0]), npe.prior)
     theta, x = 2 * torch.rand(5, 4, DIM) - 1, torch.randn(4, 3)
     with torch.no_grad():
@@ -581,7 +582,8 @@ def test_the_part_of_an_npe_is_that_npe() -> None:
     # A copy, in evaluation mode, whatever becomes of the user's own.
     ours = {id(parameter) for parameter in posterior.posterior_estimator.parameters()}
     assert not ours & {id(parameter) for parameter in estimator.parameters()}
-    assert not any(module.training for module in part.modules())
+    assert not any(parameter.requires_grad for parameter in part.parameters())
+    assert all(parameter.requires_grad for parameter in estimator.parameters())
 
 
 @pytest.mark.parametrize(
@@ -628,6 +630,18 @@ def test_moving_a_mixture_moves_couplings_and_prior() -> None:
     assert posterior.couplings[2].potential.is_meta
     assert prior.prior.sample((1,)).is_meta
     assert not posterior.prior.sample((1,)).is_meta
+
+
+@pytest.mark.parametrize(
+    "make", [problems.box, problems.standard_normal], ids=["of sbi", "of torch"]
+)
+def test_moving_the_density_of_a_prior_moves_the_prior(
+    make: Callable[[int], Distribution],
+) -> None:
+    prior = make(DIM)
+    part: Any = part_of_prior(prior, (3,)).to("meta")
+    assert part.density.prior.sample((1,)).is_meta
+    assert not prior.sample(Size((1,))).is_meta  # ours is a copy
 
 
 # --- the prior ---

@@ -1,0 +1,217 @@
+"""RoPE at many settings, each without a fold of the pairs: one part of a mixture."""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, cast
+
+import torch
+from torch import Tensor, nn
+
+from sbi_rope._sbi import embed, estimator_of, headless
+from sbi_rope.coupling import Coupling
+from sbi_rope.errors import CouplingError
+from sbi_rope.mixture import CoupledContexts, CoupledNet, Part
+from sbi_rope.mixture.chunks import flow_slices
+from sbi_rope.mixture.density import without_nan
+from sbi_rope.rope import MIN_SIMULATIONS, RoPE
+from sbi_rope.stacking.candidates import CouplingCandidate
+from sbi_rope.stacking.folds import Fold
+
+__all__ = ["FittedCouplings", "fit_couplings"]
+
+# Which net embeds real observations: whether it is tuned, with how much rehearsal, and
+# in which version; None for h, which all versions share.
+Net = tuple[bool, float | None, int | None]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FittedCouplings:
+    """Couplings of one batch at all settings and in all versions, as one part.
+
+    Attributes:
+        part: The part; its shares are equal.
+        settings: Of each coupling, in the order of the part: the candidate, and the
+            version it belongs to; None for all of them.
+    """
+
+    part: Part
+    settings: tuple[tuple[CouplingCandidate, int | None], ...]
+
+    @property
+    def contexts(self) -> CoupledContexts:
+        """What the part is mixed over."""
+        return cast("CoupledContexts", self.part.mixing)
+
+    def weighted(
+        self, weights: dict[CouplingCandidate, float], versions: Sequence[int]
+    ) -> tuple[Part, float]:
+        """Return the part of some versions, and its weight.
+
+        Args:
+            weights: Of each candidate.
+            versions: Numbers of the versions, which count the same.
+        """
+        shares = []
+        for candidate, version in self.settings:
+            if version is None:
+                shares.append(weights[candidate])
+            else:
+                used = version in versions
+                shares.append(weights[candidate] / len(versions) if used else 0.0)
+        total = sum(shares)
+        if not total:
+            return self.part, 0.0
+        contexts = self.contexts.with_shares([share / total for share in shares])
+        return Part(self.part.density, contexts), total
+
+    @torch.no_grad()
+    def log_probs(
+        self, theta: Tensor, x: Tensor, *, log_q: Tensor | None = None
+    ) -> Tensor:
+        """Return the log density under each coupling by itself at pairs.
+
+        Args:
+            theta: Parameters, shape ``(n, d)``.
+            x: Their observations in the batch, shape ``(n, *event)``.
+            log_q: What :meth:`component_log_probs` returns for theta, if it is known.
+
+        Returns:
+            Shape ``(n, number of couplings)``, float64, not normalised inside the
+            support of the prior.
+        """
+        log_q = self.component_log_probs(theta) if log_q is None else log_q
+        rows_of_each = self.contexts.rows_of_each(self.contexts.features(x))
+        return torch.stack(
+            [torch.logsumexp(rows.log() + log_q, dim=1) for rows in rows_of_each], dim=1
+        ).double()
+
+    @torch.no_grad()
+    def component_log_probs(self, theta: Tensor) -> Tensor:
+        r"""Return :math:`\log q(\theta_i \mid h(x_{s,j}))`, shape ``(n, n_s)``."""
+        contexts = self.contexts.simulated
+        n, n_s = len(theta), len(contexts)
+        index = torch.arange(n * n_s, device=theta.device)
+        log_q = [
+            self.part.log_prob(theta[index[block] // n_s], contexts[index[block] % n_s])
+            for block in flow_slices(n * n_s, theta.device)
+        ]
+        return without_nan(torch.cat(log_q)).reshape(n, n_s)
+
+
+def fit_couplings(
+    candidates: Sequence[CouplingCandidate],
+    versions: Sequence[Fold],
+    x_o: Tensor,
+    *,
+    num_simulations: int | None,
+    seed: int,
+    unseen: Literal["raise", "extend"],
+    require_convergence: bool,
+    show_progress_bars: bool,
+) -> FittedCouplings:
+    """Couple a batch, together with the pairs' observations, at all settings.
+
+    Every observation is coupled in the same way: those to be inferred, and those of the
+    pairs, which say how good each setting is.
+
+    Args:
+        candidates: The settings.
+        versions: What each version may learn from.
+        x_o: The batch, shape ``(n_o, *event)``.
+        num_simulations: As in :meth:`~sbi_rope.RoPE.build_posterior`.
+        seed: Seed of the simulations.
+        unseen: As in :meth:`~sbi_rope.RoPE.build_posterior`.
+        require_convergence: As in :meth:`~sbi_rope.RoPE.build_posterior`.
+        show_progress_bars: Whether to show the progress of slow simulations.
+
+    Raises:
+        CouplingError: If a coupling has not converged and must.
+    """
+    bench = versions[0].bench
+    _, simulated = bench.rope.draw_simulations(
+        num_simulations,
+        at_least=max(len(x_o), MIN_SIMULATIONS),
+        seed=seed,
+        show_progress_bars=show_progress_bars,
+    )
+    batch = torch.cat([x_o, bench.x])
+    nets, settings = [], []
+    for key, net in _nets(candidates, versions).items():
+        of_net = [c for c in candidates if (c.tuned, c.rehearsal) == key[:2]]
+        couplings = _couple(of_net, embed(net, batch), simulated, bench.rope)
+        share = 1.0 / len(couplings)
+        nets.append(CoupledNet(net, couplings, [share] * len(couplings)))
+        settings += [(candidate, key[2]) for candidate in of_net]
+    if require_convergence:
+        _check_converged([c for net in nets for c in net.couplings], settings)
+    nets = [
+        net.with_shares([share / len(nets) for share in net.shares]) for net in nets
+    ]
+    contexts = CoupledContexts(
+        simulated, batch, nets, num_observed=len(x_o), unseen=unseen
+    )
+    return FittedCouplings(
+        part=Part(headless(estimator_of(bench.npe)), contexts), settings=tuple(settings)
+    )
+
+
+def _nets(
+    candidates: Sequence[CouplingCandidate], versions: Sequence[Fold]
+) -> dict[Net, nn.Module]:
+    nets: dict[Net, nn.Module] = {}
+    for tuned, rehearsal in dict.fromkeys((c.tuned, c.rehearsal) for c in candidates):
+        if not tuned:
+            nets[tuned, rehearsal, None] = versions[0].bench.embedding_net
+            continue
+        for number, fold in enumerate(versions):
+            nets[tuned, rehearsal, number] = _tuned_net(fold, rehearsal)
+    return nets
+
+
+def _tuned_net(fold: Fold, rehearsal: float | None) -> nn.Module:
+    finetuner = fold.rope.finetuner
+    if rehearsal in (None, finetuner.rehearsal):
+        return fold.rope.tuned_embedding_net
+    other = fold.rope.with_finetuner(replace(finetuner, rehearsal=rehearsal))
+    return other.train(seed=fold.seed, show_progress_bars=False).tuned_embedding_net
+
+
+def _couple(
+    candidates: Sequence[CouplingCandidate],
+    real: Tensor,
+    simulated: Tensor,
+    rope: RoPE,
+) -> list[Coupling]:
+    """Couple at every setting; along gamma and tau each starts from its neighbour."""
+    found: dict[CouplingCandidate, Coupling] = {}
+    for cost_scale in dict.fromkeys(c.cost_scale for c in candidates):
+        group = [c for c in candidates if c.cost_scale == cost_scale]
+        gammas = sorted({c.gamma for c in group}, reverse=True)
+        taus = sorted({c.tau for c in group}, reverse=True)
+        sweep = replace(rope.coupler, cost_scale=cost_scale).sweep(
+            real, simulated, gammas=gammas, taus=taus, seed=0
+        )
+        grid = dict(zip(itertools.product(gammas, taus), sweep, strict=True))
+        found |= {c: grid[c.gamma, c.tau] for c in group}
+    return [found[c] for c in candidates]
+
+
+def _check_converged(
+    couplings: Sequence[Coupling],
+    settings: Sequence[tuple[CouplingCandidate, int | None]],
+) -> None:
+    open_ones = [
+        (coupling, candidate)
+        for coupling, (candidate, _) in zip(couplings, settings, strict=True)
+        if not coupling.converged
+    ]
+    if open_ones:
+        worst, candidate = max(open_ones, key=lambda one: one[0].marginal_error)
+        raise CouplingError(
+            f"{len(open_ones)} of {len(couplings)} couplings have not converged: "
+            f"marginal error up to {worst.marginal_error:.1e}, of {candidate.name}. "
+            "Give RoPE a coupler with more `max_iterations`, leave the smallest gammas "
+            "out of `default_candidates`, or accept them with "
+            "require_convergence=False."
+        )

@@ -1,0 +1,229 @@
+"""The folds of the calibration pairs, and what their candidates share."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from sbi_rope._random import seeded
+from sbi_rope._sbi import embed, estimator_of
+from sbi_rope._simulations import Moments, Simulator
+from sbi_rope._training import groups_of, split_groups
+from sbi_rope.discrepancy.correction import Correction, Space, correct_npe, network_of
+from sbi_rope.discrepancy.model import DiscrepancyModel
+from sbi_rope.discrepancy.parameters import learn_parameters
+from sbi_rope.discrepancy.tuning import TUNING
+from sbi_rope.rope import RoPE
+
+__all__ = ["Corrected", "Fold", "Workbench", "draw_seeds"]
+
+# Simulations from the prior that the corrected candidates are trained on.
+NUM_SIMULATIONS = 20_000
+# Simulations at the parameters of each pair.
+SIMULATIONS_PER_PAIR = 100
+
+
+def draw_seeds(seed: int | None, count: int) -> list[int]:
+    """Return seeds that follow from one, or from torch's state."""
+    with seeded(seed):
+        return torch.randint(2**31, (count,)).tolist()
+
+
+class Workbench:
+    """What the candidates of all folds share.
+
+    Nothing here depends on the labels of a fold but what is drawn or trained for that
+    fold, under a seed of its own.
+
+    Args:
+        rope: RoPE with all calibration pairs.
+        num_folds: Number of folds, at most as many as there are different parameters.
+        seed: Seed of all that is random.
+        show_progress_bars: Whether to show the progress of slow simulations.
+    """
+
+    def __init__(
+        self,
+        rope: RoPE,
+        *,
+        num_folds: int,
+        seed: int,
+        show_progress_bars: bool,
+    ) -> None:
+        self.rope = rope
+        self.show = show_progress_bars
+        self.theta, self.x = rope.calibration
+        self.groups = groups_of(self.theta)
+        seeds = draw_seeds(seed, 2)
+        with seeded(seeds[0]):
+            split = split_groups(self.groups, num_folds)
+        self.folds = [rows.to(self.theta.device) for rows in split if len(rows)]
+        # One for each set of folds that something can be trained on.
+        self._seeds = draw_seeds(seeds[1], 2 ** len(self.folds))
+        self._nets: dict[frozenset[int], nn.Module] = {}
+
+    def seed_of(self, folds: frozenset[int]) -> int:
+        """Return the seed of what is drawn for, or trained on, some folds."""
+        return self._seeds[sum(2**number for number in folds)]
+
+    def rows_of(self, folds: frozenset[int]) -> Tensor:
+        """Return the rows of some folds."""
+        return torch.cat([self.folds[number] for number in sorted(folds)])
+
+    @cached_property
+    def npe(self) -> Any:
+        """The posterior of NPE."""
+        return self.rope.npe
+
+    @cached_property
+    def simulations(self) -> tuple[Tensor, Tensor]:
+        """Parameters from the prior and a simulation of each."""
+        return self.rope.source.kept(NUM_SIMULATIONS, progress=self.show)
+
+    @cached_property
+    def embedded(self) -> Tensor:
+        """The embeddings h(x) of :attr:`simulations`."""
+        return embed(self.embedding_net, self.simulations[1])
+
+    @cached_property
+    def embedding_net(self) -> nn.Module:
+        """The embedding net h of NPE."""
+        return self.rope.embedding_net
+
+    @cached_property
+    def _all_moments(self) -> Moments:
+        # Of embeddings and of vectors x side by side, from the same simulations.
+        h, is_vector = self.embedding_net, self.x.ndim == 2
+
+        def both(x: Tensor) -> Tensor:
+            embedded = embed(h, x)
+            return torch.cat([embedded, x], dim=1) if is_vector else embedded
+
+        parts = []
+        for number, rows in enumerate(self.folds):
+            with seeded(self.seed_of(frozenset([number]))):
+                parts.append(
+                    self.rope.source.moments(
+                        self.theta[rows],
+                        SIMULATIONS_PER_PAIR,
+                        both,
+                        progress=self.show,
+                    )
+                )
+        order = torch.cat(self.folds).argsort()
+        return Moments(
+            mean=torch.cat([part.mean for part in parts])[order],
+            covariance=torch.cat([part.covariance for part in parts])[order],
+        )
+
+    def moments(self, space: Space) -> Moments:
+        """Return the moments of simulations at all pairs, as ``space`` has them."""
+        width = self.embedded.shape[1]
+        columns = slice(width, None) if space == "input" else slice(0, width)
+        return self._all_moments.columns(columns)
+
+    def tuned_net(self, folds: frozenset[int]) -> nn.Module:
+        """Return an embedding net tuned on some folds, with rehearsal."""
+        if folds not in self._nets:
+            rows, (_, simulated) = self.rows_of(folds), self.simulations
+            targets = self.moments("tuned").mean.to(self.embedded)[rows]
+            self._nets[folds] = TUNING.finetune(
+                self.embedding_net,
+                self.x[rows],
+                lambda count: targets,
+                draw_simulations=lambda count: simulated[:count],
+                groups=self.groups[rows.cpu()],
+                seed=self.seed_of(folds),
+                show_progress_bars=False,
+            ).embedding_net
+        return self._nets[folds]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Corrected:
+    """An estimator trained on corrected simulations, and the nets it is asked with.
+
+    Attributes:
+        estimator: The estimator.
+        nets: Embedding nets of real observations, over which its density is averaged;
+            none with ``space="input"``, where the estimator has its own.
+    """
+
+    estimator: Any
+    nets: tuple[nn.Module, ...]
+
+
+class Fold:
+    """The pairs that one version of each candidate may learn from.
+
+    Args:
+        bench: What all folds share.
+        used: The numbers of the folds to learn from.
+    """
+
+    def __init__(self, bench: Workbench, used: Sequence[int]) -> None:
+        self.bench = bench
+        self.used = frozenset(used)
+        self.rows = bench.rows_of(self.used)
+        self.seed = bench.seed_of(self.used)
+        self._corrected: dict[tuple[Space, bool], Corrected] = {}
+
+    @property
+    def pairs(self) -> tuple[Tensor, Tensor]:
+        """Parameters and observations to learn from."""
+        return self.bench.theta[self.rows], self.bench.x[self.rows]
+
+    @cached_property
+    def rope(self) -> RoPE:
+        """RoPE, tuned on these pairs."""
+        bench, targets = self.bench, None
+        # Stored simulations have targets of their own, the paper's.
+        if isinstance(bench.rope.source, Simulator):
+            targets = bench.moments("embedding").mean.to(bench.embedded)[self.rows]
+        part = bench.rope.with_pairs(self.rows, targets=targets)
+        return part.train(seed=self.seed, show_progress_bars=False)
+
+    def corrected(self, space: Space, *, learn_prior: bool) -> Corrected:
+        """Return NPE, trained on simulations corrected by what these pairs tell."""
+        key = (space, learn_prior)
+        if key not in self._corrected:
+            with seeded(self.seed):
+                self._corrected[key] = self._correct(space, learn_prior=learn_prior)
+        return self._corrected[key]
+
+    def _correct(self, space: Space, *, learn_prior: bool) -> Corrected:
+        bench, (theta, x) = self.bench, self.pairs
+        theta_s, x_s = bench.simulations
+        probabilities = None
+        if learn_prior:
+            probabilities = learn_parameters(theta, theta_s).probabilities
+        estimator = estimator_of(bench.npe)
+        # The versions of all folds share h, which none of them changed.
+        nets = [] if space == "input" else [bench.embedding_net]
+        if space == "tuned":
+            nets = []
+            z = torch.empty_like(bench.embedded[: len(bench.x)])
+            for number in sorted(self.used):
+                net = bench.tuned_net(self.used - {number})
+                rows = bench.folds[number]
+                z[rows] = embed(net, bench.x[rows])
+                nets.append(net)
+            z = z[self.rows]
+        else:
+            z = embed(network_of(estimator, space), x)
+        correction: Correction = correct_npe(
+            estimator,
+            (theta_s, x_s if space == "input" else bench.embedded),
+            z,
+            bench.moments(space)[self.rows],
+            space=space,
+            model=DiscrepancyModel(),
+            probabilities=probabilities,
+        )
+        return Corrected(
+            estimator=correction.estimator,
+            nets=tuple(correction.completed(net) for net in nets),
+        )
