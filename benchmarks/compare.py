@@ -27,7 +27,7 @@ def methods_for(task: str, names: list[str] | None) -> list[str]:
         names = [
             name
             for name in ORDER
-            if name not in EXTRAS or task in ONLY_FOR.get(name, ())
+            if task in ONLY_FOR.get(name, () if name in EXTRAS else (task,))
         ]
     for name in names:
         if name not in ORDER:

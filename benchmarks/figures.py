@@ -17,10 +17,16 @@ __all__ = ["LPPAxis", "draw_all"]
 
 STYLES = {
     "stack": ("black", "-", "*"),
+    "stack of a batch": ("black", "--", "*"),
     "RoPE": ("#0072B2", "-", "o"),
     "OT-only": ("#56B4E9", "--", "s"),
     "tuning-only": ("#009E73", "--", "^"),
     "fine-tuned NPE": ("#E69F00", "-", "D"),
+    "discrepancy": ("#882255", "-", "h"),
+    "discrepancy (input)": ("#882255", "--", "h"),
+    "discrepancy (tuned)": ("#882255", "-.", "h"),
+    "discrepancy, prior learned": ("#882255", ":", "h"),
+    "discrepancy, fine-tuned": ("#AA4499", "-", "p"),
     "J-NPE": ("#CC79A7", "-.", "v"),
     "MLP": ("0.35", ":", "x"),
     "NPE": ("#D55E00", "--", None),

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.cases import Case
+from sbi_rope._training import History
 from sbi_rope.baselines import (
     HVAE,
     NNPE,
@@ -23,6 +24,8 @@ from sbi_rope.baselines import (
     PriorBaseline,
     TuningOnly,
 )
+from sbi_rope.discrepancy import DiscrepancyNPE
+from sbi_rope.discrepancy.correction import Space
 
 __all__ = ["COUPLED_STACK", "EXTRAS", "METHODS", "ONLY_FOR", "ORDER", "STACK"]
 
@@ -30,10 +33,17 @@ __all__ = ["COUPLED_STACK", "EXTRAS", "METHODS", "ONLY_FOR", "ORDER", "STACK"]
 STATISTICS = ("cs", "sir", "linear_gaussian")
 # More entries are no list of statistics that RNPE's chains could go through.
 MAX_STATISTICS = 10
-# A method that takes a differentiable simulator, and the tasks that have one.
-ONLY_FOR = {"HVAE": ("pendulum", "light_tunnel")}
+# With more entries than these, x itself is no list of summaries to be corrected.
+MAX_SUMMARIES = 20
+# Methods for some tasks only: one takes a differentiable simulator, one short x.
+ONLY_FOR = {
+    "HVAE": ("pendulum", "light_tunnel"),
+    "discrepancy (input)": ("cs", "light_tunnel_sensors", "linear_gaussian", "sir"),
+}
 # Channels of its first layer: an eighth of the paper's, for CPUs.
 HVAE_WIDTH = 8
+# Networks that a fine-tuned discrepancy averages over.
+NUM_HOLDOUTS = 5
 # Run where they are asked for by name: they take longer than all others together.
 EXTRAS = ("RNPE", "HVAE")
 
@@ -55,12 +65,45 @@ def _noise_on(case: Case) -> Any:
     return "input" if case.task.name in STATISTICS else "embedding"
 
 
-def _is_short(case: Case) -> bool:
-    return math.prod(case.task.x_shape) <= MAX_STATISTICS
+def _is_short(case: Case, most: int = MAX_STATISTICS) -> bool:
+    return math.prod(case.task.x_shape) <= most
 
 
 def _from_scratch(case: Case) -> tuple[Any, Any]:
     return case.task.get_prior(), case.builder
+
+
+class _ThenFinetuned(DiscrepancyNPE):
+    """A corrected NPE that is then fine-tuned on the same pairs."""
+
+    def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
+        corrected, _ = super()._fit(show_progress_bars=show_progress_bars)
+        method = FinetunedNPE.from_posterior(corrected, num_holdouts=NUM_HOLDOUTS)
+        method.append_calibration(*self._calibration)
+        method.train(show_progress_bars=show_progress_bars)
+        return method.build_posterior(), method.history
+
+
+def _discrepancy(
+    space: Space | None = None,
+    *,
+    kind: type[DiscrepancyNPE] = DiscrepancyNPE,
+    learn_prior: bool = False,
+) -> Callable[[Case], Method]:
+    """Return how a variant is constructed; it corrects x where it is short if None."""
+
+    def construct(case: Case) -> Method:
+        short: Space = "input" if _is_short(case, MAX_SUMMARIES) else "embedding"
+        # Where there is no simulator, `scores` appends simulations.
+        return kind.from_posterior(
+            case.npe,
+            simulator=case.simulator,
+            space=short if space is None else space,
+            learn_prior=learn_prior,
+            num_simulations=case.settings.num_simulations,
+        )
+
+    return construct
 
 
 # How each method without a coupling is constructed; `scores` appends the data.
@@ -85,6 +128,11 @@ METHODS: dict[str, Callable[[Case], Method]] = {
     ),
     "MLP": lambda case: CalibrationMLP(*_from_scratch(case), device=case.device),
     "fine-tuned NPE": lambda case: FinetunedNPE.from_posterior(case.npe),
+    "discrepancy": _discrepancy("embedding"),
+    "discrepancy (input)": _discrepancy("input"),
+    "discrepancy (tuned)": _discrepancy("tuned"),
+    "discrepancy, prior learned": _discrepancy("embedding", learn_prior=True),
+    "discrepancy, fine-tuned": _discrepancy(kind=_ThenFinetuned),
     "HVAE": lambda case: HVAE.from_posterior(
         case.npe, physics=_physics(case), width=HVAE_WIDTH
     ),
@@ -97,5 +145,7 @@ METHODS: dict[str, Callable[[Case], Method]] = {
 STACK, COUPLED_STACK = "stack", "stack of a batch"
 # All names, in the order of tables.
 ORDER = ("prior", "SBI", "NPE", "NNPE", "RNPE", "NPE-RS", "J-NPE", "MLP")
-ORDER += ("fine-tuned NPE", "HVAE", "tuning-only", "OT-only", "RoPE")
+ORDER += ("fine-tuned NPE", "discrepancy", "discrepancy (input)")
+ORDER += ("discrepancy (tuned)", "discrepancy, prior learned")
+ORDER += ("discrepancy, fine-tuned", "HVAE", "tuning-only", "OT-only", "RoPE")
 ORDER += (STACK, COUPLED_STACK)

@@ -32,11 +32,12 @@ marks those that are not significantly worse observation by observation (Wilcoxo
 signed-rank test over test observations, 5 %; it does not know how a method varies from
 training to training, and a few observations can ruin a mean that it does not see: the
 median is in the CSV). SBI is NPE on simulations instead of real observations, and does
-not compete. RoPE and OT-only normalise over the support of the prior; NPE and all other
-posteriors of sbi are scored without leakage correction and without rejection. Methods
-that see no labels have the same score in every column. gamma is in units of the median
-distance between simulated embeddings (`simulated`), or in the units of the embedding as
-in the paper (`none`).
+not compete. Mixtures normalise over the support of the prior (RoPE, OT-only, the stack,
+discrepancies that are tuned or fine-tuned); NPE and all other posteriors of sbi are
+scored without leakage correction and without rejection. Methods that see no labels have
+the same score in every column. gamma is in units of the median distance between
+simulated embeddings (`simulated`), or in the units of the embedding as in the paper
+(`none`).
 """
 
 

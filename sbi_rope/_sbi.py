@@ -9,7 +9,7 @@ the mixed estimator of MNPE, which has no such property, is the exception.
 
 import copy
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, Literal
 
 import torch
@@ -156,22 +156,35 @@ def headless(estimator: ConditionalEstimator) -> Any:
             "Expected the embedding net to return one vector per observation, shape "
             f"(n, l); got {('n', *statistic_shape)}."
         )
-    clone = with_embedding(estimator, nn.Identity())
-    for path in _paths_to(estimator, embedding):
-        for module in _modules_along(clone, path):
-            if isinstance(module, ConditionalEstimator):
-                module._condition_shape = torch.Size(statistic_shape)
+    clone = with_embedding(estimator, nn.Identity(), condition_shape=statistic_shape)
     return MixedDensity(clone) if isinstance(clone, MixedDensityEstimator) else clone
 
 
-def with_embedding(estimator: ConditionalEstimator, embedding: nn.Module) -> Any:
+def with_embedding(
+    estimator: ConditionalEstimator,
+    embedding: nn.Module,
+    *,
+    condition_shape: Sequence[int] | None = None,
+) -> Any:
     r"""Return the estimator with another embedding in the place of :math:`h`.
 
     The other parameters are shared with ``estimator``, which is left as it was.
+
+    Args:
+        estimator: A trained estimator, or a headless one.
+        embedding: What takes the place of its embedding.
+        condition_shape: Shape of what that embeds; as before if None.
     """
     clone: nn.Module = estimator
-    for path in _paths_to(estimator, embedding_of(estimator)):
+    paths = _paths_to(estimator, embedding_of(estimator))
+    for path in paths:
         clone = _replace(clone, path.split("."), embedding)
+    if condition_shape is None:
+        return clone
+    for path in paths:
+        for module in _modules_along(clone, path):
+            if isinstance(module, ConditionalEstimator):
+                module._condition_shape = torch.Size(condition_shape)
     return clone
 
 

@@ -13,6 +13,7 @@ from sbi_rope._progress import progress_bar
 from sbi_rope.errors import warn_user
 
 __all__ = [
+    "MIN_PAIRS_FOR_HOLDOUT",
     "STEPS_WITHOUT_HOLDOUT",
     "History",
     "fit",

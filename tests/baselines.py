@@ -36,6 +36,7 @@ from sbi_rope.baselines import (
     UsesObservations,
     UsesSimulations,
 )
+from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.tasks import Task, get_task
 from tests.conftest import SHARED_DATA
 
@@ -49,6 +50,8 @@ CHAINS: dict[str, Any] = {
     "thin": 1,
 }
 FINETUNER = CalibrationFinetuner(learning_rate=3e-3, num_steps=5)
+
+CORRECTION: dict[str, Any] = {"npe_training": SHORT, "num_steps": 5}
 
 
 @dataclass(frozen=True)
@@ -86,6 +89,24 @@ METHODS: dict[str, Entry] = {
     "calibration_mlp": Entry(CalibrationMLP, lambda task: {"training": SHORT}),
     "finetuned_npe": Entry(
         FinetunedNPE, lambda task: {"npe_training": SHORT, "training": SHORT}
+    ),
+    "finetuned_npe_averaged": Entry(
+        FinetunedNPE,
+        lambda task: {"npe_training": SHORT, "training": SHORT, "num_holdouts": 3},
+    ),
+    # Without a simulator: then they learn the same from a posterior trained beforehand.
+    "discrepancy_embedding": Entry(DiscrepancyNPE, lambda task: CORRECTION),
+    "discrepancy_input": Entry(
+        DiscrepancyNPE, lambda task: {**CORRECTION, "space": "input"}
+    ),
+    "discrepancy_tuned": Entry(
+        DiscrepancyNPE,
+        lambda task: {
+            **CORRECTION,
+            "space": "tuned",
+            "num_folds": 2,
+            "finetuner": FINETUNER,
+        },
     ),
     "npe_rs": Entry(NPERS, lambda task: {"training": SHORT}),
     "nnpe": Entry(NNPE, lambda task: {"npe_training": SHORT, "training": SHORT}),

@@ -2,20 +2,37 @@
 
 import copy
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
+from torch import Tensor
 
 from sbi_rope._sbi import (
     ConditionalDensityEstimator,
     estimator_of,
     posterior_from,
+    with_embedding,
 )
-from sbi_rope._training import History, split_pairs
-from sbi_rope._validation import check_instance, check_positive
+from sbi_rope._training import (
+    MIN_PAIRS_FOR_HOLDOUT,
+    History,
+    groups_of,
+    split_groups,
+    split_pairs,
+)
+from sbi_rope._validation import check_instance, check_integer, check_positive
 from sbi_rope.baselines.base import BuildsOnNPE, UsesCalibration
 from sbi_rope.baselines.training import EstimatorBuilder, Training, train_on_pairs
 from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError
+from sbi_rope.mixture import (
+    MixtureEstimator,
+    MixturePosterior,
+    OwnContexts,
+    part_of,
+)
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 __all__ = ["FinetunedNPE"]
 
@@ -39,9 +56,21 @@ class FinetunedNPE(BuildsOnNPE, UsesCalibration):
     several learning rates and of all epochs the best on them is kept, the starting
     point included.
 
+    With ``num_holdouts`` = K above one this is done K times, each with another part of
+    the pairs held out, and the posterior is the average of the K networks,
+
+    .. math:: p(\theta \mid x) = \tfrac1K \sum_k q_k(\theta \mid h_k(x)) .
+
+    Networks that few pairs have led astray are not astray in the same way, so that an
+    average of five is better than each of them, and better calibrated.
+    It is a :class:`~sbi_rope.mixture.MixturePosterior`, which is divided by its mass
+    inside the prior's support, and says so with an error where there is none.
+
     Sees simulations and the calibration set. Assumes that what NPE has learnt is a good
     start. To be preferred from some 200 pairs on, where it is among the
-    strongest of the cheap methods; with 10 it can be worse than the prior.
+    strongest of the cheap methods; with 10 it can be worse than the prior. The
+    posterior of :class:`~sbi_rope.discrepancy.DiscrepancyNPE` is a better start than
+    that of NPE: pass it to :meth:`from_posterior`.
 
     References:
         | Multifidelity Simulation-based Inference for Computationally Expensive
@@ -52,6 +81,11 @@ class FinetunedNPE(BuildsOnNPE, UsesCalibration):
         prior: A torch distribution over parameters of shape ``(k,)``.
         density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns. An
             embedding net inside it is copied, never trained in place.
+        num_holdouts: How often it is tuned. With one, ``validation_fraction`` of the
+            pairs are held out. With K, the pairs are cut into K parts and each is held
+            out once; if they have fewer than K different parameters there are as many
+            parts as these. With fewer than five different parameters none is held out,
+            and it is tuned once.
         npe_training: How NPE is trained; ``Training()`` if None.
         training: How it is tuned, apart from the learning rate; at most 500 epochs in
             batches of 100, and 50 without improvement, if None.
@@ -61,8 +95,8 @@ class FinetunedNPE(BuildsOnNPE, UsesCalibration):
 
     Raises:
         InvalidTypeError: If an argument has the wrong type.
-        InvalidInputError: If sbi knows no estimator of that name, or a learning rate is
-            not positive.
+        InvalidInputError: If sbi knows no estimator of that name, a learning rate is
+            not positive, or ``num_holdouts`` is not.
         UnsupportedPosteriorError: In ``train``, if the estimator has no density.
     """
 
@@ -71,11 +105,13 @@ class FinetunedNPE(BuildsOnNPE, UsesCalibration):
         prior: Any,
         density_estimator: str | EstimatorBuilder = "nsf",
         *,
+        num_holdouts: int = 1,
         npe_training: Training | None = None,
         training: Training | None = None,
         learning_rates: tuple[float, ...] = (1e-4, 1e-3),
         device: str | torch.device = "cpu",
     ) -> None:
+        check_integer("num_holdouts", num_holdouts)
         check_instance("training", training, Training, optional=True)
         check_instance("learning_rates", learning_rates, tuple)
         if not learning_rates:
@@ -87,19 +123,102 @@ class FinetunedNPE(BuildsOnNPE, UsesCalibration):
         super().__init__(
             prior, density_estimator, npe_training=npe_training, device=device
         )
+        self.num_holdouts = num_holdouts
         self.training = DEFAULT_TRAINING if training is None else training
         self.learning_rates = learning_rates
+        self._starts: list[ConditionalDensityEstimator] = []
+        self._other_histories: tuple[History, ...] = ()
+
+    @classmethod
+    def from_posterior(cls, posterior: Any, **options: Any) -> "Self":
+        """Start from a trained NPE instead of training one.
+
+        Args:
+            posterior: What ``NPE(...).build_posterior()`` of sbi returns, or
+                ``DiscrepancyNPE(...).build_posterior()``. It is copied and never
+                changed. That of ``DiscrepancyNPE(space="tuned")`` averages over K
+                embedding nets: network k starts from the one with net k, and
+                ``num_holdouts`` is K.
+            **options: Keyword arguments of the constructor, except for ``device`` and
+                what concerns the training of NPE.
+
+        Raises:
+            UnsupportedPosteriorError: If it is none of these.
+            InvalidInputError: If an option would have no effect, or ``num_holdouts`` is
+                not the number of embedding nets.
+        """
+        starts = _averaged(posterior)
+        if not starts:
+            return super().from_posterior(posterior, **options)
+        if options.setdefault("num_holdouts", len(starts)) != len(starts):
+            raise InvalidInputError(
+                f"Expected `num_holdouts` of {len(starts)}, one for each embedding net "
+                f"that the posterior averages over; got {options['num_holdouts']!r}. "
+                "Leave it out."
+            )
+        first = posterior_from(posterior, starts[0])
+        method = super().from_posterior(first, **options)
+        method._starts = copy.deepcopy(starts)
+        return method
+
+    @property
+    def history(self) -> History:
+        """The losses of the last training; of several networks, those of the first."""
+        return super().history
+
+    @property
+    def histories(self) -> tuple[History, ...]:
+        """The losses of the last training, of each network."""
+        return (self.history, *self._other_histories)
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
-        start = estimator_of(npe)
+        starts = self._starts or [estimator_of(npe)]
+        splits = self._splits()
+        # There is one start for all splits, or as many as splits. Where pairs are too
+        # few for that, splits are used again.
+        tuned = [
+            self._tuned(
+                starts[k % len(starts)],
+                splits[k % len(splits)],
+                show_progress_bars=show_progress_bars,
+            )
+            for k in range(max(len(starts), len(splits)))
+        ]
+        (estimator, history), *others = tuned
+        self._other_histories = tuple(history for _, history in others)
+        if self.num_holdouts == 1:
+            return posterior_from(npe, estimator), history
+        average = MixtureEstimator(
+            [part_of(estimator) for estimator, _ in tuned],
+            [1.0 / len(tuned)] * len(tuned),
+        )
+        return MixturePosterior(average, copy.deepcopy(self._prior)), history
+
+    def _splits(self) -> list[tuple[Tensor, Tensor]]:
+        """Return the rows to train on and those held out, for each network."""
+        theta, _ = self._calibration
+        groups = groups_of(theta)
+        if self.num_holdouts == 1 or int(groups.max()) + 1 < MIN_PAIRS_FOR_HOLDOUT:
+            return [split_pairs(theta, self.training.validation_fraction)]
+        every = torch.arange(len(groups))
+        parts = [rows for rows in split_groups(groups, self.num_holdouts) if len(rows)]
+        return [(every[~torch.isin(every, rows)], rows) for rows in parts]
+
+    def _tuned(
+        self,
+        start: Any,
+        split: tuple[Tensor, Tensor],
+        *,
+        show_progress_bars: bool,
+    ) -> tuple[ConditionalDensityEstimator, History]:
+        """Tune a copy with each learning rate, and keep the best on the hold-out."""
         if not isinstance(start, ConditionalDensityEstimator):
             raise UnsupportedPosteriorError(
                 "Expected an estimator with a density to tune by; got "
                 f"{type(start).__name__}. Use NPE instead of FMPE or NPSE."
             )
         theta, x = self._calibration
-        split = split_pairs(theta, self.training.validation_fraction)
         has_holdout = len(split[1]) > 0
         rates = self.learning_rates if has_holdout else (min(self.learning_rates),)
         results = []
@@ -116,5 +235,21 @@ class FinetunedNPE(BuildsOnNPE, UsesCalibration):
                 show_progress_bars=show_progress_bars,
             )
             results.append((estimator, history))
-        estimator, history = min(results, key=lambda r: r[1].kept_validation_loss)
-        return posterior_from(npe, estimator), history
+        return min(results, key=lambda r: r[1].kept_validation_loss)
+
+
+def _averaged(posterior: Any) -> list[ConditionalDensityEstimator]:
+    """Return the estimators that a posterior averages over; none if it is no average.
+
+    They share the density.
+    """
+    if not isinstance(posterior, MixturePosterior):
+        return []
+    part, *others = posterior.posterior_estimator.parts
+    if others or not isinstance(part.mixing, OwnContexts):
+        return []
+    shape = part.mixing.event_shape
+    return [
+        with_embedding(part.density, net, condition_shape=shape)
+        for net in part.mixing.nets
+    ]

@@ -16,11 +16,13 @@ from sbi_rope.plots.observations import real_and_simulated
 from sbi_rope.plots.posteriors import pair_plot
 from sbi_rope.plots.stacking import stacking_report
 from sbi_rope.plots.steps import overview
+from sbi_rope.plots.summaries import discrepancy
 
 __all__ = [
     "CouplingLike",
     "FinetuningHistory",
     "calibration_curves",
+    "discrepancy",
     "effective_sample_sizes",
     "finetuning_history",
     "implied_parameters",

@@ -27,12 +27,14 @@ from sbi_rope.baselines import (
     UsesSimulations,
 )
 from sbi_rope.baselines.base import BuildsOnNPE
+from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import (
     InvalidInputError,
     InvalidTypeError,
     NotReadyError,
     RoPEWarning,
 )
+from sbi_rope.mixture import MixturePosterior
 from tests import baselines
 from tests.baselines import (
     CASES,
@@ -143,9 +145,14 @@ def test_log_probs_have_the_shapes_of_sbi(case: tuple[str, str]) -> None:
     assert values.shape == (2, 3)
     assert values.dtype is torch.float32
     assert not values.requires_grad
+    tolerance = 1e-4
+    if isinstance(posterior, MixturePosterior):  # which is divided by an estimate
+        mass = posterior.leakage(data.x_o[:3])
+        tolerance += 6 * float((mass.standard_error / mass.mass).max())
+    assert tolerance < 0.3
     for i in range(3):
         single = log_prob(posterior, theta[:, i], data.x_o[i])
-        assert torch.allclose(single, values[:, i], atol=1e-4)
+        assert torch.allclose(single, values[:, i], atol=tolerance)
 
 
 @pytest.mark.parametrize("name", GAUSSIAN)
@@ -214,6 +221,9 @@ def test_inside_a_bounded_prior_is_the_mass_that_the_samples_have_there(
     weights = log_weights.double().exp()
     inside = within_support(prior, sample(posterior, (4000,), x)).double()
     error = (weights.var() / 20_000 + inside.var() / 4000).sqrt()
+    if isinstance(posterior, MixturePosterior):  # which is divided by an estimate
+        mass = posterior.leakage(x)
+        error = (error.square() + (mass.standard_error / mass.mass).square()).sqrt()
     assert float(error) < 0.1
     assert abs(float(weights.mean() - inside.mean())) < 5 * float(error) + 1e-6
     outside = theta.clone()
@@ -605,6 +615,10 @@ def test_one_calibration_pair_is_enough_with_a_warning(name: str) -> None:
         with pytest.raises(InvalidInputError, match="at least 2 calibration pairs"):
             train(method)
         return
+    if isinstance(method, DiscrepancyNPE):  # one pair says nothing about an error
+        with pytest.raises(NotReadyError, match="at least 2 calibration pairs"):
+            train(method)
+        return
     with pytest.warns(RoPEWarning, match="1 calibration pair"):
         train(method)
     assert densities(method.build_posterior(), name).isfinite().all()
@@ -615,8 +629,13 @@ def test_recordings_of_four_people_leave_none_to_hold_out(name: str) -> None:
     data, method = data_of(first_task(name)), make(name, first_task(name))
     feed(method, data, without=UsesCalibration)
     method.append_calibration(data.theta_cal[:4].repeat(5, 1), data.x_cal)  # type: ignore[attr-defined]
-    with pytest.warns(RoPEWarning, match="Only 4 different parameters among 20"):
-        train(method)
+    if isinstance(method, DiscrepancyNPE):  # which holds none out of all pairs
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RoPEWarning)
+            train(method)
+    else:
+        with pytest.warns(RoPEWarning, match="Only 4 different parameters among 20"):
+            train(method)
     assert densities(method.build_posterior(), name).isfinite().all()
 
 

@@ -8,15 +8,18 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
 from benchmarks.__main__ import main
 from benchmarks.cases import Case, Sources
-from benchmarks.cells import Cell, load_suite
+from benchmarks.cells import NEEDS_CALIBRATION, Cell, load_suite
+from benchmarks.methods import METHODS, ONLY_FOR
 from benchmarks.runner import Workplace, run_cells
 from benchmarks.store import Cache
+from sbi_rope.baselines import UsesCalibration
 
 ROOT = Path(__file__).parents[2]
 SUITE = """
@@ -235,6 +238,40 @@ def test_methods_see_the_same_data_and_repetitions_do_not(tmp_path: Path) -> Non
     assert first.npe is not None
     assert shifted.npe is not None
     assert len(list(tmp_path.glob("npe-*"))) == 1
+
+
+def smoke_case(task: str, folder: Path) -> Case:
+    cell = Cell(task=task, preset="smoke", method="NPE", n_calibration=10)
+    return Case.of(cell, Sources(), Cache(folder), "cpu")
+
+
+def test_what_sees_calibration_pairs_is_run_for_every_number_of_them(
+    tmp_path: Path,
+) -> None:
+    case = smoke_case("linear_gaussian", tmp_path)
+    for name, construct in METHODS.items():
+        if case.task.name in ONLY_FOR.get(name, (case.task.name,)):
+            sees = isinstance(construct(case), UsesCalibration)
+            assert sees == (name in NEEDS_CALIBRATION), name
+
+
+def test_what_is_fine_tuned_is_a_discrepancy_of_x_itself_where_it_is_short(
+    tmp_path: Path,
+) -> None:
+    method: Any = METHODS["discrepancy, fine-tuned"](
+        smoke_case("pendulum", tmp_path / "long")
+    )
+    assert method.space == "embedding"
+    case = smoke_case("linear_gaussian", tmp_path / "short")
+    method = METHODS["discrepancy, fine-tuned"](case)
+    assert method.space == "input"
+    method.append_calibration(*case.calibration)
+    method.train(seed=0, show_progress_bars=False)
+    posterior = method.build_posterior()
+    parts = posterior.posterior_estimator.parts
+    assert len(parts) == 5
+    # The corrected NPE is the start: the discrepancy was fitted, too.
+    assert method.discrepancy.num_pairs == 10
 
 
 def test_the_smoke_suite_knows_all_methods_that_run_everywhere() -> None:

@@ -12,7 +12,9 @@ import pytest
 import torch
 
 from benchmarks.cells import Cell, Suite, list_suites, load_suite
-from benchmarks.figures import LPPAxis
+from benchmarks.compare import methods_for
+from benchmarks.figures import REFERENCES, STYLES, LPPAxis
+from benchmarks.methods import EXTRAS, METHODS, ONLY_FOR, ORDER
 from benchmarks.presets import PRESETS
 from benchmarks.report import worse, write_report
 from benchmarks.store import Cache, Results, write_atomically
@@ -128,6 +130,20 @@ def test_unknown_names_are_refused_with_the_known_ones(
 def test_a_selection_keeps_what_it_names(suite: Suite) -> None:
     cells = suite.select(methods=["prior", "MLP"])
     assert {cell.method for cell in cells} == {"prior", "MLP"}
+
+
+def test_every_method_has_a_place_in_tables_and_a_line_in_figures() -> None:
+    assert set(METHODS) < set(ORDER)
+    assert set(STYLES) == set(ORDER) - set(REFERENCES)
+    assert len(set(STYLES.values())) == len(STYLES)
+
+
+def test_without_names_a_task_is_given_to_the_methods_that_can_take_it() -> None:
+    everywhere = set(ORDER) - set(EXTRAS) - set(ONLY_FOR)
+    assert set(methods_for("cs", None)) == everywhere | {"discrepancy (input)"}
+    assert set(methods_for("pendulum", None)) == everywhere | {"HVAE"}
+    with pytest.raises(SystemExit, match="only for"):
+        methods_for("pendulum", ["discrepancy (input)"])
 
 
 # Files ------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from sbi_rope import plots
+from sbi_rope.discrepancy import DiscrepancyReport, Interval, SummaryDiscrepancy
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.metrics import CoverageCurve, coverage_curve_of
 
@@ -454,3 +455,95 @@ def test_observations_that_cannot_be_drawn_are_refused(
 ) -> None:
     with pytest.raises(InvalidInputError, match=match):
         plots.real_and_simulated(x_o, x_s, names=list(names))
+
+
+# Discrepancies -----------------------------------------------------------------------
+
+
+def interval(low: float, median: float, high: float) -> Interval:
+    return Interval(median=median, low=low, high=high)
+
+
+def summary(name: str, **changes: Any) -> SummaryDiscrepancy:
+    options: dict[str, Any] = {
+        "gain": interval(0.5, 0.75, 1.25),
+        "shift": interval(-200.0, -150.0, 100.0),
+        "error": interval(0.0, 1.0, 2.0),
+        "size": interval(0.25, 0.5, 0.875),
+        "probability_of_none": 0.01,
+    }
+    return SummaryDiscrepancy(name=name, **options | changes)
+
+
+def lines_at(axes: Any, position: int) -> list[Any]:
+    """The interval and the estimate in one line of a panel."""
+    return [line for line in axes.lines if set(line.get_ydata()) == {position}]
+
+
+def test_discrepancy_lists_summaries_from_top_to_bottom_with_their_intervals() -> None:
+    second = summary("b", size=interval(0.0, 0.125, 0.25), gain=interval(1.0, 2.0, 3.0))
+    report = DiscrepancyReport(summaries=(summary("a"), second), num_pairs=7)
+    figure = plots.discrepancy(report)
+    size, _, gain = figure.axes
+    assert [label.get_text() for label in size.get_yticklabels()] == ["a", "b"]
+    assert size.get_ylim()[0] > size.get_ylim()[1]
+    for position, shown in enumerate(report.summaries):
+        for axes, expected in ((size, shown.size), (gain, shown.gain)):
+            line, point = lines_at(axes, position)
+            assert list(line.get_xdata()) == [expected.low, expected.high]
+            assert list(point.get_xdata()) == [expected.median]
+    assert "7 calibration pairs" in figure.get_supxlabel()
+    figure.draw_without_rendering()
+
+
+def test_discrepancy_draws_shifts_of_all_units_and_writes_their_numbers() -> None:
+    small = interval(0.001, 0.0015, 0.002)
+    report = DiscrepancyReport(
+        summaries=(summary("a"), summary("b", shift=small)), num_pairs=7
+    )
+    shift = plots.discrepancy(report).axes[1]
+    drawn = [list(lines_at(shift, k)[0].get_xdata()) for k in range(2)]
+    assert drawn == [[-1.0, 0.5], [0.5, 1.0]]
+    texts = [(text.get_text(), text.xy[1]) for text in shift.texts]
+    assert texts == [("-150 [-200, 100]", 0), ("0.0015 [0.001, 0.002]", 1)]
+    exact = DiscrepancyReport(
+        summaries=(summary("a", shift=interval(0.0, 0.0, 0.0)),), num_pairs=7
+    )
+    line, _ = lines_at(plots.discrepancy(exact).axes[1], 0)
+    assert list(line.get_xdata()) == [0.0, 0.0]
+
+
+def test_discrepancy_marks_where_there_is_none() -> None:
+    report = DiscrepancyReport(summaries=(summary("a"),), num_pairs=7)
+    marks = [axes.lines[-1].get_xdata()[0] for axes in plots.discrepancy(report).axes]
+    assert marks == [0.0, 0.0, 1.0]
+
+
+def test_discrepancy_draws_summaries_without_a_sign_of_one_in_another_colour() -> None:
+    fine = summary("b", probability_of_none=0.8)
+    figure = plots.discrepancy(
+        DiscrepancyReport(summaries=(summary("a"), fine), num_pairs=7)
+    )
+    for axes in figure.axes:
+        colours = [lines_at(axes, position)[0].get_color() for position in range(2)]
+        assert colours[0] != colours[1]
+    texts = legend_texts(figure.legends[0])
+    assert texts == [
+        "a discrepancy is more probable than none",
+        "no sign of a discrepancy",
+    ]
+    alone = plots.discrepancy(DiscrepancyReport(summaries=(fine,), num_pairs=7))
+    assert legend_texts(alone.legends[0]) == texts[1:]
+    assert lines_at(alone.axes[0], 0)[0].get_color() == colours[1]
+
+
+def test_discrepancy_draws_twenty_summaries_and_counts_the_others() -> None:
+    summaries = tuple(summary(f"x[{k}]") for k in range(23))
+    figure = plots.discrepancy(
+        DiscrepancyReport(summaries=summaries, num_pairs=7, constant=("dead",))
+    )
+    labels = [label.get_text() for label in figure.axes[0].get_yticklabels()]
+    assert labels == [f"x[{k}]" for k in range(20)]
+    note = figure.get_supxlabel()
+    assert "; 3 summaries that are less off not shown" in note
+    assert "1 the same in all simulations" in note

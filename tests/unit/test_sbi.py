@@ -182,6 +182,19 @@ def test_with_embedding_shares_all_other_parameters() -> None:
     assert {id(p) for p in swapped.parameters()} == density
 
 
+@pytest.mark.parametrize("family", ["mdn", "made", "maf", "zuko_nsf", "mnpe"])
+def test_what_was_made_headless_can_be_given_an_embedding(family: str) -> None:
+    estimator = fresh_estimator(family)
+    theta = problems.npe_posterior(family).prior.sample((5,))[None]
+    x = torch.randn(5, 3)
+    whole = with_embedding(
+        headless(estimator), embedding_of(estimator), condition_shape=(3,)
+    )
+    assert whole.condition_shape == (3,)
+    assert torch.equal(whole.log_prob(theta, x), estimator.log_prob(theta, x))
+    assert headless(whole).condition_shape == (4,)
+
+
 @pytest.mark.parametrize("training", [True, False])
 def test_headless_leaves_the_mode_of_the_estimator(training: bool) -> None:
     estimator = fresh_estimator().train(training)

@@ -1,0 +1,186 @@
+"""Which summaries a simulator gets wrong, in one picture."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Protocol
+
+from sbi_rope.plots._figures import BLUE, GREY, empty_figure, hide_frame
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["DiscrepancyReportLike", "IntervalLike", "SummaryLike", "discrepancy"]
+
+# Most summaries that are drawn.
+MAX_SUMMARIES = 20
+NO_SIGN = "0.65"
+
+
+class IntervalLike(Protocol):
+    """What :func:`discrepancy` reads of an estimate."""
+
+    @property
+    def median(self) -> float:
+        """The estimate."""
+        ...
+
+    @property
+    def low(self) -> float:
+        """Lower end of its 95 % interval."""
+        ...
+
+    @property
+    def high(self) -> float:
+        """Upper end."""
+        ...
+
+
+class SummaryLike(Protocol):
+    """What :func:`discrepancy` reads of a summary."""
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        ...
+
+    @property
+    def size(self) -> IntervalLike:
+        """Typical difference, in standard deviations of simulations."""
+        ...
+
+    @property
+    def shift(self) -> IntervalLike:
+        """In units of x."""
+        ...
+
+    @property
+    def gain(self) -> IntervalLike:
+        """Without a unit."""
+        ...
+
+    @property
+    def is_off(self) -> bool:
+        """Whether a discrepancy is more probable than none."""
+        ...
+
+
+class DiscrepancyReportLike(Protocol):
+    """What :func:`discrepancy` reads; a report of :mod:`sbi_rope.discrepancy`."""
+
+    @property
+    def summaries(self) -> Sequence[SummaryLike]:
+        """The summaries, the one that is most off first."""
+        ...
+
+    @property
+    def num_pairs(self) -> int:
+        """Calibration pairs behind it."""
+        ...
+
+    @property
+    def constant(self) -> Sequence[str]:
+        """Summaries that are the same in all simulations."""
+        ...
+
+
+def discrepancy(report: DiscrepancyReportLike) -> "Figure":
+    r"""How far each summary of real observations is from simulated ones, and how.
+
+    .. math:: x_o = \bar x + \text{shift} + \text{gain}\,(x_s - \bar x) + \text{error}
+
+    A line for each summary, the one that is most off first, with 95 % intervals. Left,
+    the size of the discrepancy, its error included. Middle, the shift, zero where there
+    is none: every line has a scale of its own, in units of x, and its numbers beside
+    it. Right, the gain, one where there is none. Of the first twenty summaries; those
+    without a sign of a discrepancy are grey.
+
+    Args:
+        report: What ``DiscrepancyNPE.report()`` returns.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ImportError: If matplotlib is not installed.
+    """
+    shown = list(report.summaries[:MAX_SUMMARIES])
+    figure = empty_figure(10.0, 1.4 + 0.3 * len(shown))
+    panels = figure.subplots(1, 3, width_ratios=[1.3, 1.7, 1.0], sharey=True)
+    size, shift, gain = panels
+    for position, summary in enumerate(shown):
+        colour = BLUE if summary.is_off else NO_SIGN
+        _interval(size, position, summary.size, colour)
+        _interval(gain, position, summary.gain, colour)
+        _own_scale(shift, position, summary.shift, colour)
+    for axes, neutral in zip(panels, (0.0, 0.0, 1.0), strict=True):
+        hide_frame(axes)
+        axes.axvline(neutral, color=GREY, lw=0.8, zorder=0)
+    for axes in (shift, gain):
+        axes.tick_params(axis="y", length=0)
+        axes.spines["left"].set_visible(False)
+    size.set_yticks(range(len(shown)), [summary.name for summary in shown], fontsize=9)
+    size.set_ylim(len(shown) - 0.4, -0.6)
+    size.set_xlim(left=0.0)
+    size.set_xlabel("size, in sd of simulations")
+    shift.set_xticks([0.0], ["0"])
+    shift.set_xlabel("shift, in units of x (a scale for each)")
+    gain.set_xlabel("gain")
+    _legend(figure, shown)
+    _note(figure, report)
+    return figure
+
+
+def _interval(
+    axes: "Axes", position: int, interval: IntervalLike, colour: str, unit: float = 1.0
+) -> None:
+    low, median, high = (
+        value / unit for value in (interval.low, interval.median, interval.high)
+    )
+    axes.plot([low, high], [position] * 2, color=colour, lw=1.8, solid_capstyle="butt")
+    axes.plot(median, position, "o", color=colour, markersize=5)
+
+
+def _own_scale(
+    axes: "Axes", position: int, interval: IntervalLike, colour: str
+) -> None:
+    # Units differ from summary to summary. What can be compared is on the left.
+    unit = max(abs(interval.low), abs(interval.high)) or 1.0
+    _interval(axes, position, interval, colour, unit)
+    axes.annotate(
+        f"{interval.median:.3g} [{interval.low:.3g}, {interval.high:.3g}]",
+        (1.0, position),
+        xycoords=axes.get_yaxis_transform(),
+        va="center",
+        ha="right",
+        fontsize=8,
+        color=GREY if colour == NO_SIGN else "black",
+    )
+    axes.set_xlim(-1.1, 3.2)
+
+
+def _legend(figure: "Figure", shown: Sequence[SummaryLike]) -> None:
+    from matplotlib.lines import Line2D
+
+    labels = {
+        BLUE: "a discrepancy is more probable than none",
+        NO_SIGN: "no sign of a discrepancy",
+    }
+    found = {BLUE if summary.is_off else NO_SIGN for summary in shown}
+    handles = [
+        Line2D([], [], color=colour, marker="o", markersize=5, lw=1.8, label=label)
+        for colour, label in labels.items()
+        if colour in found
+    ]
+    figure.legend(
+        handles=handles, loc="outside upper center", ncols=2, frameon=False, fontsize=9
+    )
+
+
+def _note(figure: "Figure", report: DiscrepancyReportLike) -> None:
+    parts = [f"{report.num_pairs} calibration pairs, 95 % intervals"]
+    left_out = len(report.summaries) - MAX_SUMMARIES
+    if left_out > 0:
+        parts.append(f"{left_out} summaries that are less off not shown")
+    if report.constant:
+        parts.append(f"{len(report.constant)} the same in all simulations")
+    figure.supxlabel("; ".join(parts), fontsize=9, color=GREY)

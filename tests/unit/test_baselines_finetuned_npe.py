@@ -1,0 +1,236 @@
+"""Fine-tuned NPE with several hold-outs, and from a corrected start."""
+
+import copy
+import functools
+import math
+from typing import Any
+
+import pytest
+import torch
+from sbi.neural_nets import posterior_nn
+from torch import Tensor, nn
+
+from sbi_rope import RoPE, SinkhornCoupler
+from sbi_rope._random import seeded
+from sbi_rope._training import split_groups, split_pairs
+from sbi_rope.baselines import NPE, FinetunedNPE, Training
+from sbi_rope.baselines.training import train_on_pairs
+from sbi_rope.discrepancy import DiscrepancyNPE
+from sbi_rope.errors import (
+    InvalidInputError,
+    NotReadyError,
+    RoPEWarning,
+    UnsupportedPosteriorError,
+)
+from sbi_rope.mixture import MixturePosterior, OwnContexts
+from sbi_rope.tasks import get_task
+
+pytestmark = pytest.mark.filterwarnings("ignore:Maximum number of epochs")
+
+TASK: Any = get_task("linear_gaussian")
+SHORT = Training(learning_rate=3e-3, max_num_epochs=4, validation_fraction=0.2)
+QUIET: dict[str, Any] = {"seed": 0, "show_progress_bars": False}
+PAIRS = TASK.get_calibration_set(20)
+TEST = TASK.get_test_set(30)
+
+
+@functools.cache
+def npe() -> Any:
+    """The posterior of a short training, for reading only."""
+    net = nn.Sequential(nn.Linear(2, 8), nn.ReLU(), nn.Linear(8, 4))
+    method = NPE(
+        TASK.get_prior(),
+        posterior_nn("maf", embedding_net=net, num_transforms=1, hidden_features=10),
+        npe_training=Training(learning_rate=3e-3, max_num_epochs=5),
+    )
+    method.append_simulations(*TASK.get_simulations(500)).train(**QUIET)
+    return method.build_posterior()
+
+
+@functools.cache
+def discrepancy(space: Any) -> Any:
+    """The posterior of a corrected NPE, for reading only."""
+    method = DiscrepancyNPE.from_posterior(
+        npe(),
+        simulator=TASK.get_simulator(),
+        space=space,
+        num_simulations=500,
+        num_steps=40,
+        num_folds=3,
+    )
+    return method.append_calibration(*PAIRS).train(**QUIET).build_posterior()
+
+
+def finetuned(
+    posterior: Any, pairs: tuple[Tensor, Tensor] = PAIRS, **options: Any
+) -> FinetunedNPE:
+    options = {"training": SHORT, "learning_rates": (3e-3,)} | options
+    method = FinetunedNPE.from_posterior(posterior, **options)
+    return method.append_calibration(*pairs).train(**QUIET)
+
+
+def log_probs(posterior: Any, theta: Tensor = TEST[0], x: Tensor = TEST[1]) -> Tensor:
+    return posterior.log_prob_batched(theta[None], x, norm_posterior=False)[0]
+
+
+def networks(method: FinetunedNPE) -> Tensor:
+    """The log density of each network at the test pairs, ``(n, K)``."""
+    estimator = method.build_posterior().posterior_estimator
+    return estimator.part_log_probs(*TEST)
+
+
+def test_with_one_holdout_it_is_one_network_tuned_on_the_rest() -> None:
+    method = finetuned(npe(), num_holdouts=1)
+    estimator = copy.deepcopy(npe().posterior_estimator).requires_grad_()
+    with seeded(0):
+        history = train_on_pairs(
+            estimator,
+            *PAIRS,
+            split_pairs(PAIRS[0], 0.2),
+            training=SHORT,
+            in_training_mode=False,
+            label="",
+            show_progress_bars=False,
+        )
+    posterior = method.build_posterior()
+    assert not isinstance(posterior, MixturePosterior)
+    expected = estimator.log_prob(TEST[0][None], TEST[1])[0]
+    assert torch.equal(log_probs(posterior), expected)
+    assert method.histories == (history,) == (method.history,)
+    assert torch.equal(log_probs(finetuned(npe()).build_posterior()), expected)
+
+
+@pytest.mark.parametrize("count", [2, 5, 20])
+def test_every_pair_is_held_out_by_one_network(count: int) -> None:
+    method = finetuned(npe(), num_holdouts=count)
+    estimator = method.build_posterior().posterior_estimator
+    with seeded(0):
+        folds = split_groups(PAIRS[0], count)
+    held_out = estimator.part_log_probs(*PAIRS)
+    assert len(method.histories) == len(folds) == held_out.shape[1] == count
+    for k, (rows, history) in enumerate(zip(folds, method.histories, strict=True)):
+        kept = -float(held_out[rows, k].mean())
+        assert history.kept_validation_loss == pytest.approx(kept, rel=1e-4)
+
+
+def test_the_posterior_is_the_average_of_the_networks() -> None:
+    method = finetuned(npe(), num_holdouts=4)
+    of_each = networks(method)
+    assert of_each.std(dim=1).min() > 1e-3
+    expected = of_each.logsumexp(dim=1) - math.log(4)
+    posterior = method.build_posterior()
+    assert torch.allclose(log_probs(posterior).double(), expected, atol=1e-2)
+    assert posterior.is_amortised
+    samples = posterior.sample_batched((50,), TEST[1], show_progress_bars=False)
+    assert samples.shape == (50, 30, 2)
+
+
+def test_people_are_held_out_as_a_whole() -> None:
+    """Six of them, four recordings each, by as many networks as there are people."""
+    pairs = PAIRS[0][:6].repeat(4, 1), TASK.get_simulator()(PAIRS[0][:6].repeat(4, 1))
+    method = finetuned(npe(), pairs, num_holdouts=10)
+    assert len(method.histories) == 6
+    estimator = method.build_posterior().posterior_estimator
+    losses = -estimator.part_log_probs(*pairs).reshape(4, 6, 6).mean(dim=0)
+    kept = losses.new_tensor([h.kept_validation_loss for h in method.histories])
+    difference = (losses - kept).abs()
+    assert difference.amin(dim=0).max() < 1e-4
+    assert sorted(difference.argmin(dim=0).tolist()) == list(range(6))
+
+
+def test_of_fewer_than_five_pairs_none_is_held_out() -> None:
+    pairs = PAIRS[0][:4], PAIRS[1][:4]
+    with pytest.warns(RoPEWarning, match="Only 4 calibration pair"):
+        several = finetuned(npe(), pairs, num_holdouts=3)
+    with pytest.warns(RoPEWarning, match="Only 4 calibration pair"):
+        one = finetuned(npe(), pairs)
+    assert several.histories == (one.history,)
+    expected = log_probs(one.build_posterior())
+    posterior = several.build_posterior()
+    assert isinstance(posterior, MixturePosterior)
+    assert torch.allclose(log_probs(posterior), expected, atol=1e-4)
+
+
+def test_losses_of_an_old_training_are_gone_with_new_pairs() -> None:
+    method = finetuned(npe(), num_holdouts=3)
+    method.append_calibration(*PAIRS)
+    with pytest.raises(NotReadyError):
+        _ = method.histories
+
+
+@pytest.mark.parametrize("count", [0, 1.5, "2", None])
+def test_what_is_no_number_of_holdouts_is_refused(count: Any) -> None:
+    with pytest.raises(InvalidInputError, match="`num_holdouts`"):
+        FinetunedNPE(TASK.get_prior(), num_holdouts=count)
+
+
+# A corrected start.
+
+STILL = Training(learning_rate=1e-9, max_num_epochs=1, validation_fraction=0.2)
+
+
+@pytest.mark.parametrize("space", ["embedding", "input"])
+@pytest.mark.parametrize("count", [1, 3])
+def test_it_can_start_from_a_corrected_npe(space: str, count: int) -> None:
+    start = discrepancy(space)
+    before = log_probs(start)
+    same = finetuned(start, num_holdouts=count, training=STILL, learning_rates=(1e-9,))
+    assert torch.allclose(log_probs(same.build_posterior()), before, atol=1e-3)
+    tuned = finetuned(start, num_holdouts=count)
+    assert not torch.allclose(log_probs(tuned.build_posterior()), before, atol=1e-2)
+    assert torch.equal(log_probs(start), before)
+
+
+def test_each_network_starts_from_one_of_the_tuned_nets() -> None:
+    start = discrepancy("tuned")
+    (part,) = start.posterior_estimator.parts
+    options: Any = {"training": STILL, "learning_rates": (1e-9,)}
+    method = finetuned(start, **options)
+    assert method.num_holdouts == 3
+    of_each = networks(method)
+    contexts = part.mixing.features(TEST[1])
+    for k in range(3):
+        expected = part.density.log_prob(TEST[0][None], contexts[:, k])[0].double()
+        assert torch.allclose(of_each[:, k], expected, atol=1e-3)
+    assert torch.allclose(
+        log_probs(method.build_posterior()), log_probs(start), atol=1e-2
+    )
+
+
+def test_networks_from_tuned_nets_are_tuned_apart_from_each_other() -> None:
+    start = discrepancy("tuned")
+    before = log_probs(start)
+    method = finetuned(start)
+    parts = method.build_posterior().posterior_estimator.parts
+    assert len(parts) == 3
+    for part, other in ((parts[0], parts[1]), (parts[1], parts[2])):
+        assert isinstance(part.mixing, OwnContexts)
+        densities = zip(
+            part.density.parameters(), other.density.parameters(), strict=True
+        )
+        assert any(not torch.equal(one, two) for one, two in densities)
+    assert torch.equal(log_probs(start), before)
+
+
+def test_of_fewer_than_five_pairs_all_tuned_nets_are_kept() -> None:
+    pairs = PAIRS[0][:3], PAIRS[1][:3]
+    with pytest.warns(RoPEWarning, match="Only 3 calibration pair"):
+        method = finetuned(discrepancy("tuned"), pairs)
+    assert len(method.histories) == 3
+
+
+def test_another_number_of_holdouts_than_tuned_nets_is_refused() -> None:
+    start = discrepancy("tuned")
+    with pytest.raises(InvalidInputError, match="`num_holdouts` of 3"):
+        FinetunedNPE.from_posterior(start, num_holdouts=5)
+    assert FinetunedNPE.from_posterior(start, num_holdouts=3).num_holdouts == 3
+
+
+def test_other_mixtures_are_refused() -> None:
+    rope = RoPE(npe(), simulator=TASK.get_simulator())
+    coupled = rope.build_posterior(
+        TEST[1], coupler=SinkhornCoupler(gamma=1.0), num_simulations=50, seed=0
+    )
+    for posterior in (coupled, finetuned(npe(), num_holdouts=3).build_posterior()):
+        with pytest.raises(UnsupportedPosteriorError, match="it was built from"):
+            FinetunedNPE.from_posterior(posterior)
