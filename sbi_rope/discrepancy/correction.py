@@ -20,8 +20,9 @@ __all__ = ["Correction", "Space", "correct_npe", "fit_discrepancy", "network_of"
 # pairs. Simulations are represented by h(x) in the last case too, where g puts them.
 Space = Literal["embedding", "input", "tuned"]
 
-# Draws of the discrepancy behind a training.
-NUM_DRAWS = 2000
+# Draws of the discrepancy behind a training; fewer where there are many entries in
+# each, as with embeddings of a hundred dimensions.
+NUM_DRAWS, MAX_ENTRIES = 2000, 2**22
 # Smallest standard deviation of the error, in standard deviations of simulations. The
 # input of a network can be known better than its output.
 SMALLEST_ERROR = {"embedding": 0.01, "tuned": 0.01, "input": 0.003}
@@ -38,11 +39,14 @@ class Correction:
         estimator: An estimator of sbi for real observations x.
         discrepancy: The posterior of gain, offset and error.
         history: The losses of its training.
+        constants: What to put behind an embedding net, or before the estimator if x
+            itself was corrected; the estimator has it already.
     """
 
     estimator: Any
     discrepancy: Discrepancy
     history: History
+    constants: nn.Module
 
 
 def network_of(estimator: ConditionalEstimator, space: Space) -> nn.Module:
@@ -125,7 +129,7 @@ def correct_npe(
 
     Returns:
         The corrected estimator. With ``space="tuned"`` its embedding net is h; replace
-        it by that of a tuned net.
+        it by a tuned net and the constants.
     """
     theta, z_s = simulations
     standardisation = Standardisation(z_s.double())
@@ -137,17 +141,25 @@ def correct_npe(
         density,
         theta,
         z_s,
-        discrepancy.sample(NUM_DRAWS, smallest_error=SMALLEST_ERROR[space]),
+        discrepancy.sample(
+            min(NUM_DRAWS, max(1, MAX_ENTRIES // len(discrepancy.noise) ** 2)),
+            smallest_error=SMALLEST_ERROR[space],
+        ),
         standardisation,
         probabilities=probabilities,
         num_steps=NUM_STEPS[space] if num_steps is None else num_steps,
         learning_rate=learning_rate,
         show_progress_bars=show_progress_bars,
     )
+    constants: nn.Module = nn.Identity()
     if not standardisation.varies.all():
-        corrected = _with_constants(corrected, standardisation, space)
+        constants = SimulatedConstants(standardisation)
+        corrected = _with_constants(corrected, constants, space)
     return Correction(
-        estimator=corrected.eval(), discrepancy=discrepancy, history=history
+        estimator=corrected.eval(),
+        discrepancy=discrepancy,
+        history=history,
+        constants=constants,
     )
 
 
@@ -170,9 +182,7 @@ class SimulatedConstants(nn.Module):
         return z.where(self.varies, self.values.to(z))
 
 
-def _with_constants(
-    estimator: Any, standardisation: Standardisation, space: Space
-) -> Any:
-    net, constants = embedding_of(estimator), SimulatedConstants(standardisation)
+def _with_constants(estimator: Any, constants: nn.Module, space: Space) -> Any:
+    net = embedding_of(estimator)
     parts = (constants, net) if space == "input" else (net, constants)
     return with_embedding(estimator, nn.Sequential(*parts))

@@ -68,8 +68,9 @@ def train_on_corrected(
         loss = density.loss(theta[rows], condition=corrected).mean()
         optimizer.zero_grad()
         loss.backward()
-        nn.utils.clip_grad_norm_(density.parameters(), CLIP_MAX_NORM)
-        optimizer.step()
+        norm = nn.utils.clip_grad_norm_(density.parameters(), CLIP_MAX_NORM)
+        if norm.isfinite():  # of what the density can say anything about
+            optimizer.step()
         schedule.step()
         losses.append(float(loss.detach()))
         bar.set_postfix(loss=losses[-1], refresh=False)
