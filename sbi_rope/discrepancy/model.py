@@ -228,7 +228,7 @@ class _Regression:
     def log_evidence(self, settings: Sequence[tuple[float, float]]) -> Tensor:
         """Return the log density of the pairs for each error scale and strength."""
         n, width = self.num_pairs, len(self.variances)
-        error_scale, strength = torch.tensor(settings).to(self.variances).unbind(dim=1)
+        error_scale, strength = self.variances.new_tensor(settings).unbind(dim=1)
         scale = strength * error_scale.square()
         degrees = strength + width + 1
         log_det = (self.variances + scale[:, None]).log().sum(dim=1)
