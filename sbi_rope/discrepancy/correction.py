@@ -26,8 +26,9 @@ NUM_DRAWS, MAX_ENTRIES = 2000, 2**22
 # Smallest standard deviation of the error, in standard deviations of simulations. The
 # input of a network can be known better than its output.
 SMALLEST_ERROR = {"embedding": 0.01, "tuned": 0.01, "input": 0.003}
-# Gradient steps. The density behind an embedding net follows within a hundred; a whole
-# network takes longer. Chosen on calibration data, see benchmarks/README.md.
+# Gradient steps of a course. The density behind an embedding net follows within a
+# hundred; a whole network takes longer. Chosen on calibration data, see
+# benchmarks/README.md.
 NUM_STEPS = {"embedding": 120, "tuned": 120, "input": 400}
 
 
@@ -123,7 +124,8 @@ def correct_npe(
         space: What z is.
         model: The model of the discrepancy.
         probabilities: With which simulations are drawn; None takes all alike.
-        num_steps: Gradient steps; chosen by the space if None.
+        num_steps: Gradient steps; if None, courses whose length depends on the space
+            until one changes next to nothing.
         learning_rate: Of Adam.
         show_progress_bars: Whether to show the course of the loss.
 
@@ -148,6 +150,7 @@ def correct_npe(
         standardisation,
         probabilities=probabilities,
         num_steps=NUM_STEPS[space] if num_steps is None else num_steps,
+        until_settled=num_steps is None,
         learning_rate=learning_rate,
         show_progress_bars=show_progress_bars,
     )

@@ -92,8 +92,8 @@ class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
         model: The model of the discrepancy; ``DiscrepancyModel()`` if None.
         num_simulations: Simulations from the prior to train on, if none were appended.
         simulations_per_pair: Simulations at the parameters of each pair.
-        num_steps: Gradient steps; 120 for ``"embedding"`` and ``"tuned"``, 400 for
-            ``"input"``, if None.
+        num_steps: Gradient steps. If None, courses of 120 steps for ``"embedding"``
+            and ``"tuned"`` and of 400 for ``"input"``, until one gains less than .01.
         learning_rate: Of Adam, at the start.
         num_folds: Copies g with ``space="tuned"``, at most as many as pairs.
         finetuner: How they are tuned; with rehearsal, at a learning rate of 3e-3, if
