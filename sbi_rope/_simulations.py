@@ -323,8 +323,10 @@ class StoredSimulations:
         self.num_dropped = int((~valid).sum())
         self.theta = theta[valid].to(like)
         self.x = x[valid].to(like)
-        # "Nearest" is measured in standard deviations of the stored parameters.
-        self.theta_std = self.theta.std(dim=0).clamp_min(1e-12)
+        # "Nearest" is measured in standard deviations of the stored parameters, from
+        # their mean: far from zero float32 could not tell them apart.
+        self._theta_mean = self.theta.mean(dim=0)
+        self._theta_std = self.theta.std(dim=0).clamp_min(1e-12)
 
     def from_prior(
         self, count: int | None, at_least: int, embed: Embedding, *, progress: bool
@@ -349,8 +351,7 @@ class StoredSimulations:
                 f"Expected `num_neighbors` of at most {len(self.x)}, the number of "
                 f"stored simulations; got {count}."
             )
-        distance = torch.cdist(theta / self.theta_std, self.theta / self.theta_std)
-        nearest = distance.topk(count, dim=1, largest=False).indices
+        nearest = self._nearest(theta, count)
         statistics = embed(self.x[nearest.flatten()])
         return statistics.reshape(*nearest.shape, -1).mean(dim=1)
 
@@ -364,11 +365,11 @@ class StoredSimulations:
         parameters.
         """
         number = min(len(self.x), max(NUM_AROUND, 5 * (theta.shape[1] + 1)))
-        distance = torch.cdist(theta / self.theta_std, self.theta / self.theta_std)
-        nearest = distance.topk(number, dim=1, largest=False).indices
+        nearest = self._nearest(theta, number)
         embedded = embed(self.x[nearest.flatten()]).double()
         embedded = embedded.reshape(*nearest.shape, -1)
-        offsets = ((self.theta[nearest] - theta[:, None]) / self.theta_std).double()
+        offsets = self._standardised(self.theta[nearest]).double()
+        offsets = offsets - self._standardised(theta).double()[:, None]
         # A ridge keeps the plane level where the parameters around do not vary.
         design = torch.cat([torch.ones_like(offsets[..., :1]), offsets], dim=-1)
         ridge = torch.full((design.shape[-1],), 1e-6).to(design)
@@ -382,6 +383,15 @@ class StoredSimulations:
     def kept(self, count: int, *, progress: bool) -> tuple[Tensor, Tensor]:
         """Return the first stored pairs."""
         return self.theta[:count], self.x[:count]
+
+    def _nearest(self, theta: Tensor, count: int) -> Tensor:
+        """Return the rows with the nearest parameters, shape ``(n, count)``."""
+        stored = self._standardised(self.theta)
+        distance = torch.cdist(self._standardised(theta), stored)
+        return distance.topk(count, dim=1, largest=False).indices
+
+    def _standardised(self, theta: Tensor) -> Tensor:
+        return (theta - self._theta_mean) / self._theta_std
 
 
 def _warn_of_dropped(dropped: int, total: int, what: str) -> None:

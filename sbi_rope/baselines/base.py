@@ -194,7 +194,7 @@ class UsesSimulations(Method):
             InvalidInputError: If shapes or row counts do not fit, or a theta is not in
                 the support of the prior. Nothing is added then.
         """
-        if not self.needs_simulations:
+        if self._ignores_simulations:
             warn_user(
                 f"{type(self).__name__} starts from a trained posterior and makes no "
                 "use of simulations."
@@ -226,6 +226,11 @@ class UsesSimulations(Method):
     def needs_simulations(self) -> bool:
         """Whether simulations must be appended before the training."""
         return True
+
+    @property
+    def _ignores_simulations(self) -> bool:
+        """Whether simulations that are appended have no effect."""
+        return not self.needs_simulations
 
     def _check_data(self) -> None:
         super()._check_data()

@@ -20,13 +20,15 @@ __all__ = ["Correction", "Space", "correct_npe", "fit_discrepancy", "network_of"
 # pairs. Simulations are represented by h(x) in the last case too, where g puts them.
 Space = Literal["embedding", "input", "tuned"]
 
-# Draws of the discrepancy behind a training.
-NUM_DRAWS = 2000
+# Draws of the discrepancy behind a training; fewer where there are many entries in
+# each, as with embeddings of a hundred dimensions.
+NUM_DRAWS, MAX_ENTRIES = 2000, 2**22
 # Smallest standard deviation of the error, in standard deviations of simulations. The
 # input of a network can be known better than its output.
 SMALLEST_ERROR = {"embedding": 0.01, "tuned": 0.01, "input": 0.003}
-# Gradient steps. The density behind an embedding net follows within a hundred; a whole
-# network takes longer. Chosen on calibration data, see benchmarks/README.md.
+# Gradient steps of a course. The density behind an embedding net follows within a
+# hundred; a whole network takes longer. Chosen on calibration data, see
+# benchmarks/README.md.
 NUM_STEPS = {"embedding": 150, "tuned": 150, "input": 400}
 LEARNING_RATES = {"embedding": 5e-3, "tuned": 5e-3, "input": 2e-3}
 
@@ -39,18 +41,14 @@ class Correction:
         estimator: An estimator of sbi for real observations x.
         discrepancy: The posterior of gain, offset and error.
         history: The losses of its training.
-        constants: What must come after another embedding net in the place of h; None
-            if all entries of what is corrected vary between simulations.
+        constants: What to put behind an embedding net, or before the estimator if x
+            itself was corrected; the estimator has it already.
     """
 
     estimator: Any
     discrepancy: Discrepancy
     history: History
-    constants: "SimulatedConstants | None" = None
-
-    def completed(self, net: nn.Module) -> nn.Module:
-        """Return an embedding net whose output the density knows."""
-        return net if self.constants is None else nn.Sequential(net, self.constants)
+    constants: nn.Module
 
 
 def network_of(estimator: ConditionalEstimator, space: Space) -> nn.Module:
@@ -127,13 +125,14 @@ def correct_npe(
         space: What z is.
         model: The model of the discrepancy.
         probabilities: With which simulations are drawn; None takes all alike.
-        num_steps: Gradient steps; chosen by the space if None.
+        num_steps: Gradient steps; if None, courses whose length depends on the space
+            until one changes next to nothing.
         learning_rate: Of Adam; chosen by the space if None.
         show_progress_bars: Whether to show the course of the loss.
 
     Returns:
         The corrected estimator. With ``space="tuned"`` its embedding net is h; replace
-        it by that of a tuned net.
+        it by a tuned net and the constants.
     """
     theta, z_s = simulations
     standardisation = Standardisation(z_s.double())
@@ -145,26 +144,28 @@ def correct_npe(
         density,
         theta,
         z_s,
-        discrepancy.sample(NUM_DRAWS, smallest_error=SMALLEST_ERROR[space]),
+        discrepancy.sample(
+            min(NUM_DRAWS, max(1, MAX_ENTRIES // len(discrepancy.noise) ** 2)),
+            smallest_error=SMALLEST_ERROR[space],
+        ),
         standardisation,
         probabilities=probabilities,
         num_steps=NUM_STEPS[space] if num_steps is None else num_steps,
+        until_settled=num_steps is None,
         learning_rate=(
             LEARNING_RATES[space] if learning_rate is None else learning_rate
         ),
         show_progress_bars=show_progress_bars,
     )
-    constants = None
+    constants: nn.Module = nn.Identity()
     if not standardisation.varies.all():
         constants = SimulatedConstants(standardisation)
-        net = embedding_of(corrected)
-        order = (constants, net) if space == "input" else (net, constants)
-        corrected = with_embedding(corrected, nn.Sequential(*order))
+        corrected = _with_constants(corrected, constants, space)
     return Correction(
         estimator=corrected.eval(),
         discrepancy=discrepancy,
         history=history,
-        constants=None if space == "input" else constants,
+        constants=constants,
     )
 
 
@@ -185,3 +186,9 @@ class SimulatedConstants(nn.Module):
     def forward(self, z: Tensor) -> Tensor:
         """Return z with constants in their place, of the same shape."""
         return z.where(self.varies, self.values.to(z))
+
+
+def _with_constants(estimator: Any, constants: nn.Module, space: Space) -> Any:
+    net = embedding_of(estimator)
+    parts = (constants, net) if space == "input" else (net, constants)
+    return with_embedding(estimator, nn.Sequential(*parts))

@@ -4,6 +4,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,7 +13,6 @@ from torch.distributions import Chi2, MultivariateNormal
 from sbi_rope._random import seeded
 from sbi_rope._validation import (
     check_batch,
-    check_finite,
     check_integer,
     check_not_negative,
     check_positive,
@@ -24,8 +24,8 @@ from sbi_rope.errors import InvalidInputError
 
 __all__ = ["Discrepancy", "DiscrepancyDraws", "DiscrepancyModel"]
 
-# Settings of the hyper-parameters with less than this share of the evidence are left
-# out.
+# Settings of the hyper-parameters are left out if their evidence is less than this
+# share of that of the best.
 NEGLIGIBLE = 1e-4
 # The prior is less certain of the offset than of the gain, by this factor.
 OFFSET_PRECISION = 1 / 3
@@ -122,32 +122,52 @@ class DiscrepancyModel:
         Raises:
             InvalidInputError: If the shapes do not fit or a value is not finite.
         """
-        z = check_tensor("z", z).double()
-        check_batch("z", z, z.shape[1:])
-        mean = check_batch("mean", mean, z.shape[1:]).to(z)
-        check_same_length("z", z, "mean", mean)
-        covariance = check_batch("covariance", covariance, z.shape[1:]).to(z)
-        check_finite("covariance", covariance)
+        z, mean, covariance = _checked(z, mean, covariance)
         noise = covariance + SMALLEST_NOISE**2 * torch.eye(z.shape[1]).to(z)
-        grid = itertools.product(
-            self.gain_precisions, self.error_scales, self.degrees_of_freedom
-        )
-        terms = [_Term.of(z, mean, *setting) for setting in grid]
-        evidence = torch.stack([term.log_evidence for term in terms])
-        average = evidence.logsumexp(dim=0) - math.log(len(terms))
-        right = MultivariateNormal(mean, noise).log_prob(z).sum()
+        settings = list(itertools.product(self.error_scales, self.degrees_of_freedom))
+        regressions = [_Regression.of(z, mean, k) for k in self.gain_precisions]
+        evidence = torch.stack([r.log_evidence(settings) for r in regressions])
+        average = evidence.logsumexp(dim=(0, 1)) - math.log(evidence.numel())
+        right = _log_evidence_of_none(z - mean, noise)
         probability = _posterior_probability(self.probability_of_none, right - average)
-        shares = torch.softmax(evidence, dim=0)
-        kept = [i for i, share in enumerate(shares.tolist()) if share >= NEGLIGIBLE]
+        kept = evidence > evidence.max() + math.log(NEGLIGIBLE)
+        terms = [regressions[i].at(*settings[j]) for i, j in kept.nonzero().tolist()]
         return Discrepancy(
-            terms=tuple(terms[i] for i in kept),
-            shares=shares[kept] / shares[kept].sum(),
+            terms=tuple(terms),
+            shares=torch.softmax(evidence[kept], dim=0),
             noise=noise,
             probability_of_none=probability,
             log_evidence=float(average),
             log_evidence_of_none=float(right),
             num_pairs=len(z),
         )
+
+
+def _checked(z: Any, mean: Any, covariance: Any) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what describes the pairs in float64."""
+    z = check_tensor("z", z).double()
+    if z.ndim != 2:
+        raise InvalidInputError(
+            f"Expected `z` of shape (n, l); got {tuple(z.shape)}. Flatten it first."
+        )
+    width = z.shape[1]
+    z = check_batch("z", z, (width,))
+    mean = check_batch("mean", mean, (width,)).to(z)
+    check_same_length("z", z, "mean", mean)
+    covariance = check_batch("covariance", covariance, (width,)).to(z)
+    if len(covariance) != width:
+        raise InvalidInputError(
+            f"Expected `covariance` of shape {(width, width)}; got "
+            f"{tuple(covariance.shape)}."
+        )
+    return z, mean, covariance
+
+
+def _log_evidence_of_none(residual: Tensor, noise: Tensor) -> Tensor:
+    """Return the log density of z - m, measured as finely as ``_Regression`` takes."""
+    log_density = MultivariateNormal(torch.zeros_like(residual[0]), noise).log_prob
+    inexact = len(residual) * SMALLEST_NOISE**2 * torch.linalg.inv(noise).trace()
+    return log_density(residual).sum() - inexact / 2
 
 
 def _posterior_probability(prior: float, log_bayes_factor: Tensor) -> float:
@@ -157,81 +177,112 @@ def _posterior_probability(prior: float, log_bayes_factor: Tensor) -> float:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class _Regression:
+    r"""Real observations regressed on simulated means, at one precision of the gain.
+
+    Attributes:
+        coefficients: Mean of :math:`(A, b)^\top`, shape ``(l + 1, l)``.
+        row_factor: Lower Cholesky factor of the covariance of its rows.
+        variances: Eigenvalues of the squares that are left over, shape ``(l,)``.
+        directions: Their eigenvectors, shape ``(l, l)``.
+        log_volume: What the coefficients add to the log evidence.
+        num_pairs: Pairs behind it.
+    """
+
+    coefficients: Tensor
+    row_factor: Tensor
+    variances: Tensor
+    directions: Tensor
+    log_volume: Tensor
+    num_pairs: int
+
+    @classmethod
+    def of(cls, z: Tensor, mean: Tensor, gain_precision: float) -> "_Regression":
+        """Return the conjugate posterior of the coefficients."""
+        n, width = z.shape
+        identity = torch.eye(width).to(z)
+        design = torch.cat([mean, torch.ones_like(mean[:, :1])], dim=1)
+        prior_mean = torch.cat([identity, torch.zeros_like(identity[:1])])
+        precision = torch.full((width + 1,), gain_precision).to(z)
+        precision[-1] *= OFFSET_PRECISION
+        # Relative to the prior mean, where squares are small and so is their rounding.
+        residual = z - design @ prior_mean
+        factor = torch.linalg.cholesky(precision.diag() + design.T @ design)
+        shift = torch.cholesky_solve(design.T @ residual, factor)
+        # A sum of squares, where the usual difference of two could be negative.
+        left_over = residual - design @ shift
+        scatter = left_over.T @ left_over + shift.T @ (precision[:, None] * shift)
+        # What is the same to more digits than anything is measured is no better known.
+        scatter = scatter + n * SMALLEST_NOISE**2 * identity
+        variances, directions = torch.linalg.eigh(scatter)
+        log_det = 2 * factor.diagonal().log().sum()
+        return cls(
+            coefficients=prior_mean + shift,
+            row_factor=torch.linalg.cholesky(torch.cholesky_inverse(factor)),
+            variances=variances.clamp_min(0.0),
+            directions=directions,
+            log_volume=width / 2 * (precision.log().sum() - log_det),
+            num_pairs=n,
+        )
+
+    def log_evidence(self, settings: Sequence[tuple[float, float]]) -> Tensor:
+        """Return the log density of the pairs for each error scale and strength."""
+        n, width = self.num_pairs, len(self.variances)
+        error_scale, strength = self.variances.new_tensor(settings).unbind(dim=1)
+        scale = strength * error_scale.square()
+        degrees = strength + width + 1
+        log_det = (self.variances + scale[:, None]).log().sum(dim=1)
+        return (
+            -n * width / 2 * math.log(math.pi)
+            + self.log_volume
+            + degrees / 2 * width * scale.log()
+            - (degrees + n) / 2 * log_det
+            + torch.special.multigammaln((degrees + n) / 2, width)
+            - torch.special.multigammaln(degrees / 2, width)
+        )
+
+    def at(self, error_scale: float, strength: float) -> "_Term":
+        """Return the posterior at one error scale and strength."""
+        scale = self.variances + strength * error_scale**2
+        return _Term(
+            coefficients=self.coefficients,
+            row_factor=self.row_factor,
+            error_factor=self.directions * scale.sqrt(),
+            degrees=strength + len(scale) + 1 + self.num_pairs,
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class _Term:
     r"""The posterior at one setting of the hyper-parameters.
 
     Attributes:
         coefficients: Mean of :math:`(A, b)^\top`, shape ``(l + 1, l)``.
         row_factor: Lower Cholesky factor of the covariance of its rows.
-        scale: Of the inverse Wishart distribution of :math:`\Sigma`, shape ``(l, l)``.
+        error_factor: L, with :math:`L L^\top` the scale of the inverse Wishart
+            distribution of :math:`\Sigma`, shape ``(l, l)``.
         degrees: Its degrees of freedom.
-        log_evidence: Log density of the pairs.
     """
 
     coefficients: Tensor
     row_factor: Tensor
-    scale: Tensor
+    error_factor: Tensor
     degrees: float
-    log_evidence: Tensor
-
-    @classmethod
-    def of(
-        cls,
-        z: Tensor,
-        mean: Tensor,
-        gain_precision: float,
-        error_scale: float,
-        strength: float,
-    ) -> "_Term":
-        """Return the posterior by the conjugate formulas of a linear regression."""
-        n, width = z.shape
-        identity = torch.eye(width).to(z)
-        design = torch.cat([mean, torch.ones_like(mean[:, :1])], dim=1)
-        prior_mean = torch.cat([identity, torch.zeros_like(identity[:1])])
-        prior_precision = torch.full((width + 1,), gain_precision).to(z)
-        prior_precision[-1] *= OFFSET_PRECISION
-        prior_degrees = strength + width + 1
-        # Relative to the prior mean, where squares are small and so is their rounding.
-        residual = z - design @ prior_mean
-        factor = torch.linalg.cholesky(prior_precision.diag() + design.T @ design)
-        shift = torch.cholesky_solve(design.T @ residual, factor)
-        scale = residual.T @ (residual - design @ shift)
-        scale = (scale + scale.T) / 2 + strength * error_scale**2 * identity
-        degrees = prior_degrees + n
-        log_evidence = (
-            -n * width / 2 * math.log(math.pi)
-            + width / 2 * (prior_precision.log().sum() - _log_det(factor))
-            + prior_degrees / 2 * width * math.log(strength * error_scale**2)
-            - degrees / 2 * _log_det(torch.linalg.cholesky(scale))
-            + torch.special.multigammaln(torch.tensor(degrees / 2).to(z), width)
-            - torch.special.multigammaln(torch.tensor(prior_degrees / 2).to(z), width)
-        )
-        return cls(
-            coefficients=prior_mean + shift,
-            row_factor=torch.linalg.cholesky(torch.cholesky_inverse(factor)),
-            scale=scale,
-            degrees=degrees,
-            log_evidence=log_evidence,
-        )
 
     def sample(self, count: int) -> tuple[Tensor, Tensor, Tensor]:
         r"""Draw :math:`A`, :math:`b` and :math:`\Sigma`."""
-        width = len(self.scale)
+        width, like = len(self.error_factor), self.error_factor
         # Bartlett: T T' is Wishart, and with L L' the scale, L (T T')^-1 L' is inverse
         # Wishart.
-        degrees = self.degrees - torch.arange(width).to(self.scale)
-        triangle = torch.randn(count, width, width).to(self.scale).tril(-1)
+        degrees = self.degrees - torch.arange(width).to(like)
+        triangle = torch.randn(count, width, width).to(like).tril(-1)
         triangle = triangle + torch.diag_embed(Chi2(degrees).sample((count,)).sqrt())
-        identity = torch.eye(width).to(self.scale).expand_as(triangle)
+        identity = torch.eye(width).to(like).expand_as(triangle)
         inverse = torch.linalg.solve_triangular(triangle, identity, upper=False)
-        factor = torch.linalg.cholesky(self.scale) @ inverse.mT
-        noise = torch.randn(count, *self.coefficients.shape).to(self.scale)
+        factor = self.error_factor @ inverse.mT
+        noise = torch.randn(count, *self.coefficients.shape).to(like)
         coefficients = self.coefficients + self.row_factor @ noise @ factor.mT
         return coefficients[:, :-1].mT, coefficients[:, -1], factor @ factor.mT
-
-
-def _log_det(factor: Tensor) -> Tensor:
-    return 2 * factor.diagonal().log().sum()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -92,8 +92,8 @@ class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
         model: The model of the discrepancy; ``DiscrepancyModel()`` if None.
         num_simulations: Simulations from the prior to train on, if none were appended.
         simulations_per_pair: Simulations at the parameters of each pair.
-        num_steps: Gradient steps; 150 for ``"embedding"`` and ``"tuned"``, 400 for
-            ``"input"``, if None.
+        num_steps: Gradient steps. If None, courses of 150 steps for ``"embedding"``
+            and ``"tuned"`` and of 400 for ``"input"``, until one gains less than .01.
         learning_rate: Of Adam, at the start; 5e-3 and 2e-3 for these if None.
         num_folds: Copies g with ``space="tuned"``, at most as many as pairs.
         finetuner: How they are tuned; with rehearsal, at a learning rate of 3e-3, if
@@ -185,6 +185,10 @@ class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
         return self._npe is None or self._simulator is None
 
     @property
+    def _ignores_simulations(self) -> bool:
+        return False  # they are trained on, beside a simulator too
+
+    @property
     def discrepancy(self) -> Discrepancy:
         """The posterior of gain, offset and error after the last training.
 
@@ -204,7 +208,8 @@ class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
     ) -> DiscrepancyReport:
         """Say what is wrong with the simulator, summary by summary; print the result.
 
-        Needs no training. It speaks of x itself, whatever ``space`` is.
+        Needs no training, and no simulations beside a simulator. It speaks of x itself,
+        whatever ``space`` is.
 
         Args:
             x_names: Names of the entries of x; numbered if None.
@@ -220,7 +225,9 @@ class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
             InvalidInputError: If x is not a vector, or the names do not fit.
             SimulationError: If the simulator fails.
         """
-        self._check_data()
+        if self._simulator is None:
+            self._needs("simulations", len(self._theta), "append_simulations(theta, x)")
+        self._check_pairs()
         _, x = self._calibration
         if x.ndim != 2:
             raise InvalidInputError(
@@ -239,6 +246,9 @@ class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
 
     def _check_data(self) -> None:
         super()._check_data()
+        self._check_pairs()
+
+    def _check_pairs(self) -> None:
         count = len(self._theta_cal)
         if count < MIN_PAIRS:
             raise NotReadyError(
@@ -310,7 +320,8 @@ class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
         self._discrepancy = correction.discrepancy
         if self.space != "tuned":
             return posterior_from(npe, correction.estimator), correction.history
-        nets = [correction.completed(net) for net in nets]
+        # Entries that are constant in h need not be so in g.
+        nets = [nn.Sequential(net, correction.constants) for net in nets]
         return self._averaged(correction.estimator, nets), correction.history
 
     def _bank(

@@ -7,6 +7,8 @@ import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
+from sbi_rope._validation import check_batch, check_tensor
+
 __all__ = ["ParameterDistribution", "learn_parameters"]
 
 # How many pairs the prior's mean and covariance are worth; averaged by evidence.
@@ -56,7 +58,14 @@ def learn_parameters(theta_cal: Tensor, theta: Tensor) -> ParameterDistribution:
 
     Returns:
         The probabilities of the simulations.
+
+    Raises:
+        InvalidTypeError: If one of them is not a tensor.
+        InvalidInputError: If the shapes do not fit or a value is not finite.
     """
+    theta = check_tensor("theta", theta)
+    theta = check_batch("theta", theta, theta.shape[1:2])
+    theta_cal = check_batch("theta_cal", theta_cal, theta.shape[1:])
     u_cal, u = normal_scores(theta_cal, theta), normal_scores(theta, theta)
     correlation = torch.atleast_2d(u.T.cov())
     # Parameters that depend on each other exactly, such as those of one category.

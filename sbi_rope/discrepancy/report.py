@@ -1,5 +1,6 @@
 """What calibration pairs say about a simulator, summary by summary."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,8 +16,10 @@ from sbi_rope.errors import InvalidInputError
 __all__ = ["DiscrepancyReport", "Interval", "SummaryDiscrepancy", "report_discrepancy"]
 
 NUM_DRAWS = 4000
-# Residuals of so many standard deviations are outliers: one in 16,000 by chance.
-OUTLIER = 4.0
+# How often one of the pairs, by chance, seems not to fit a summary of the others.
+FALSE_ALARMS = 0.01
+# A standard deviation from a median distance is worth this share of the pairs.
+EFFICIENCY = 0.37
 # With fewer pairs nobody can tell which of them is the odd one.
 MIN_PAIRS_FOR_OUTLIERS = 10
 
@@ -65,8 +68,8 @@ class SummaryDiscrepancy:
             simulations from the prior.
         probability_of_none: How probable it is that the simulator is right about this
             summary, if that was as probable as not beforehand.
-        outliers: Rows of calibration pairs that lie more than four standard deviations
-            from what the other pairs suggest.
+        outliers: Rows of calibration pairs that lie further from what the others
+            suggest than the furthest would by chance in 99 of 100 summaries.
     """
 
     name: str
@@ -261,6 +264,7 @@ def _summary(
     error = draws.error_factor[:, 0, 0].abs()
     size = ((gain - 1).square() + shift.square() + error.square()).sqrt()
     residual = (z - gain.median() * mean - shift.median())[:, 0]
+    noise = float(gain.median().abs() * discrepancy.noise[0, 0].sqrt())
     return SummaryDiscrepancy(
         name=name,
         gain=Interval.of(gain),
@@ -268,14 +272,28 @@ def _summary(
         error=Interval.of(error * scale),
         size=Interval.of(size),
         probability_of_none=discrepancy.probability_of_none,
-        outliers=_outliers(residual),
+        outliers=_outliers(residual, noise),
     )
 
 
-def _outliers(residual: Tensor) -> tuple[int, ...]:
-    if len(residual) < MIN_PAIRS_FOR_OUTLIERS:
+def _outliers(residual: Tensor, noise: float) -> tuple[int, ...]:
+    """Return the rows of outliers; ``noise`` is the standard deviation without any."""
+    n = len(residual)
+    if n < MIN_PAIRS_FOR_OUTLIERS:
         return ()
     distance = (residual - residual.median()).abs()
     # The median distance of a normal variable from its median is .674 sd.
-    std = distance.median() / 0.6745
-    return tuple((distance > OUTLIER * std).nonzero().flatten().tolist())
+    std = (distance.median() / 0.6745).clamp_min(noise)
+    return tuple((distance > _furthest(n) * std).nonzero().flatten().tolist())
+
+
+def _furthest(n: int) -> float:
+    """Return how many standard deviations the furthest of n is away, by chance.
+
+    The standard deviation is itself an estimate, so that a Student t takes the place of
+    the normal distribution; its quantile is that of Wallace's approximation.
+    """
+    level = torch.tensor(1 - FALSE_ALARMS / (2 * n), dtype=torch.double)
+    freedom = EFFICIENCY * (n - 1)
+    score = float(torch.special.ndtri(level)) * (8 * freedom + 3) / (8 * freedom + 1)
+    return math.sqrt(freedom * math.expm1(score**2 / freedom))

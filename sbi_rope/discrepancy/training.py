@@ -1,11 +1,13 @@
 r"""Amortisation: training a density on corrected simulations."""
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from sbi_rope._progress import progress_bar
+from sbi_rope._random import seeded
 from sbi_rope._training import History
 from sbi_rope.baselines.statistics import Standardisation
 from sbi_rope.discrepancy.model import DiscrepancyDraws
@@ -16,6 +18,9 @@ BATCH_SIZE = 500
 CLIP_MAX_NORM = 5.0
 # Steps that one point of the history averages over.
 STEPS_PER_POINT = 20
+# A course that improves the loss by less than this, in nats, is the last; it is seen
+# on so many corrected simulations, the same after each course.
+SETTLED, NUM_COMPARED, MAX_COURSES = 0.01, 2000, 12
 
 
 def train_on_corrected(
@@ -27,6 +32,7 @@ def train_on_corrected(
     *,
     probabilities: Tensor | None,
     num_steps: int,
+    until_settled: bool = False,
     learning_rate: float,
     show_progress_bars: bool,
 ) -> History:
@@ -49,7 +55,9 @@ def train_on_corrected(
         draws: Of the discrepancy, in the units of ``standardisation``.
         standardisation: Of z.
         probabilities: With which each simulation is drawn; None takes all alike.
-        num_steps: Gradient steps.
+        num_steps: Gradient steps of a course.
+        until_settled: Whether to add courses until one changes next to nothing. A
+            density that is much too narrow takes several.
         learning_rate: Of Adam, at the start; it falls to zero like a cosine.
         show_progress_bars: Whether to show the course of the loss.
 
@@ -57,22 +65,21 @@ def train_on_corrected(
         The losses.
     """
     density.requires_grad_().eval()
-    optimizer = torch.optim.Adam(density.parameters(), lr=learning_rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, num_steps)
     z = standardisation(z.double())
-    losses: list[float] = []
-    bar = progress_bar(range(num_steps), show=show_progress_bars, desc="Correcting NPE")
-    for _ in bar:
-        rows = _draw(len(theta), probabilities).to(theta.device)
-        corrected = standardisation.undo(draws.correct(z[rows])).to(theta)
-        loss = density.loss(theta[rows], condition=corrected).mean()
-        optimizer.zero_grad()
-        loss.backward()
-        nn.utils.clip_grad_norm_(density.parameters(), CLIP_MAX_NORM)
-        optimizer.step()
-        schedule.step()
-        losses.append(float(loss.detach()))
-        bar.set_postfix(loss=losses[-1], refresh=False)
+
+    def batch(size: int) -> tuple[Tensor, Tensor]:
+        rows = _draw(len(theta), size, probabilities).to(theta.device)
+        return theta[rows], standardisation.undo(draws.correct(z[rows])).to(theta)
+
+    compared = batch(NUM_COMPARED)
+    loss, losses = _loss(density, *compared), []
+    for _ in range(MAX_COURSES if until_settled else 1):
+        losses += _one_course(
+            density, batch, num_steps, learning_rate, show_progress_bars
+        )
+        before, loss = loss, _loss(density, *compared)
+        if not before - loss > SETTLED:
+            break
     density.requires_grad_(requires_grad=False)
     parts = torch.tensor(losses).split(STEPS_PER_POINT)
     return History(
@@ -80,7 +87,40 @@ def train_on_corrected(
     )
 
 
-def _draw(count: int, probabilities: Tensor | None) -> Tensor:
+def _one_course(
+    density: Any,
+    batch: Callable[[int], tuple[Tensor, Tensor]],
+    num_steps: int,
+    learning_rate: float,
+    show_progress_bars: bool,  # noqa: FBT001
+) -> list[float]:
+    optimizer = torch.optim.Adam(density.parameters(), lr=learning_rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, num_steps)
+    losses: list[float] = []
+    bar = progress_bar(range(num_steps), show=show_progress_bars, desc="Correcting NPE")
+    for _ in bar:
+        theta, corrected = batch(BATCH_SIZE)
+        loss = density.loss(theta, condition=corrected).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(density.parameters(), CLIP_MAX_NORM)
+        for parameter in density.parameters():
+            if parameter.grad is not None:  # of what the density says nothing about
+                parameter.grad.nan_to_num_(0.0, 0.0, 0.0)
+        optimizer.step()
+        schedule.step()
+        losses.append(float(loss.detach()))
+        bar.set_postfix(loss=losses[-1], refresh=False)
+    return losses
+
+
+@torch.no_grad()
+def _loss(density: Any, theta: Tensor, corrected: Tensor) -> float:
+    with seeded(0):  # the loss of a vector field is at random times
+        return float(density.loss(theta, condition=corrected).mean())
+
+
+def _draw(count: int, size: int, probabilities: Tensor | None) -> Tensor:
     if probabilities is None:
-        return torch.randint(count, (BATCH_SIZE,))
-    return torch.multinomial(probabilities.cpu(), BATCH_SIZE, replacement=True)
+        return torch.randint(count, (size,))
+    return torch.multinomial(probabilities.cpu(), size, replacement=True)

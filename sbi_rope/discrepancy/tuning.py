@@ -6,6 +6,7 @@ from torch import Tensor, nn
 from sbi_rope._sbi import embed
 from sbi_rope._simulations import Moments
 from sbi_rope._training import groups_of, split_groups
+from sbi_rope.errors import InvalidInputError
 from sbi_rope.finetuning import CalibrationFinetuner
 
 __all__ = ["TUNING", "cross_fitted_nets"]
@@ -43,9 +44,18 @@ def cross_fitted_nets(
     Returns:
         The copies, and the embedding of each pair by the copy that has not seen it,
         shape ``(n, l)``.
+
+    Raises:
+        InvalidInputError: If all pairs have the same parameters.
     """
     theta, x = pairs
     groups = groups_of(theta)
+    if int(groups.max()) == 0:
+        raise InvalidInputError(
+            "Expected calibration pairs of different parameters with space='tuned', "
+            f"to hold some out; all {len(theta)} have the same. Use "
+            "space='embedding'."
+        )
     folds = [rows for rows in split_groups(groups, num_folds) if len(rows)]
     targets = moments.mean.to(x)
     nets, z = [], torch.empty_like(targets)

@@ -12,7 +12,13 @@ from sbi_rope._random import seeded
 from sbi_rope._sbi import embed, estimator_of
 from sbi_rope._simulations import Moments, Simulator
 from sbi_rope._training import groups_of, split_groups
-from sbi_rope.discrepancy.correction import Correction, Space, correct_npe, network_of
+from sbi_rope.discrepancy.correction import (
+    NUM_STEPS,
+    Correction,
+    Space,
+    correct_npe,
+    network_of,
+)
 from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.parameters import learn_parameters
 from sbi_rope.discrepancy.tuning import TUNING
@@ -222,8 +228,10 @@ class Fold:
             space=space,
             model=DiscrepancyModel(),
             probabilities=probabilities,
+            # One course is enough for what held-out pairs will weigh.
+            num_steps=NUM_STEPS[space],
         )
         return Corrected(
             estimator=correction.estimator,
-            nets=tuple(correction.completed(net) for net in nets),
+            nets=tuple(nn.Sequential(net, correction.constants) for net in nets),
         )

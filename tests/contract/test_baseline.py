@@ -751,7 +751,7 @@ def test_simulations_that_are_not_needed_earn_a_warning(name: str) -> None:
         warnings.simplefilter("always")
         method.append_simulations(data.theta, data.x)
     warned = any("makes no use of simulations" in str(w.message) for w in caught)
-    assert warned is not method.needs_simulations
+    assert warned is method._ignores_simulations
 
 
 @pytest.mark.parametrize("name", BUILDERS)

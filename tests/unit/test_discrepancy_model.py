@@ -1,0 +1,450 @@
+"""The posterior of gain, offset and error, against integrals and simulations."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+from torch import Tensor
+
+from sbi_rope.discrepancy import Discrepancy, DiscrepancyModel
+from sbi_rope.discrepancy.model import SMALLEST_NOISE
+from sbi_rope.errors import InvalidInputError, InvalidTypeError
+
+# Settings of the hyper-parameters k, s and the strength of the error's prior.
+SETTINGS = [(0.5, 0.2, 1.0), (3.0, 0.6, 4.0), (30.0, 0.1, 20.0)]
+DRAWS = 40_000
+
+
+def at(k: float, s: float, strength: float, *, none: float = 0.0) -> DiscrepancyModel:
+    """The model at one setting of its hyper-parameters."""
+    return DiscrepancyModel(
+        gain_precisions=(k,),
+        error_scales=(s,),
+        degrees_of_freedom=(strength,),
+        probability_of_none=none,
+    )
+
+
+def pairs(n: int, width: int, *, error: float = 0.3) -> tuple[Tensor, Tensor]:
+    """Real observations with a gain and an offset, and their simulated means."""
+    mean = torch.randn(n, width, dtype=torch.double)
+    gain = torch.eye(width) + 0.4 * torch.randn(width, width)
+    z = mean @ gain.double().T + 0.5 + error * torch.randn(n, width)
+    return z, mean
+
+
+def no_noise(width: int) -> Tensor:
+    return torch.zeros(width, width)
+
+
+class Quadrature:
+    """The posterior of a, b and log Sigma of one summary on a grid."""
+
+    def __init__(self, z: Tensor, mean: Tensor, setting: tuple[float, ...]) -> None:
+        k, s, strength = setting
+        z, mean = z[:, 0], mean[:, 0]
+        self.a = torch.linspace(-1.0, 3.0, 161).double()[:, None, None]
+        self.b = torch.linspace(-2.0, 3.0, 161).double()[:, None]
+        log_sigma = torch.linspace(math.log(1e-4), math.log(50.0), 300).double()
+        self.sigma = log_sigma.exp()
+        # One entry: the inverse Wishart distribution is an inverse gamma one.
+        shape, rate = (strength + 2) / 2, strength * s**2 / 2
+        log_prior = torch.as_tensor(
+            stats.invgamma.logpdf(self.sigma.numpy(), shape, scale=rate)
+        )
+        log_prior = log_prior + normal(self.a - 1, self.sigma / k)
+        log_prior = log_prior + normal(self.b, self.sigma / (k / 3))
+        squares = sum(
+            (y - self.a * m - self.b) ** 2 for y, m in zip(z, mean, strict=True)
+        )
+        # Each observation is known to so many digits only.
+        squares = squares + len(z) * SMALLEST_NOISE**2
+        log_likelihood = (
+            -squares / (2 * self.sigma) - len(z) / 2 * (2 * math.pi * self.sigma).log()
+        )
+        log_joint = log_prior + log_likelihood + log_sigma
+        cell = (4.0 / 160) * (5.0 / 160) * float(log_sigma[1] - log_sigma[0])
+        self.log_evidence = float(log_joint.logsumexp((0, 1, 2)) + math.log(cell))
+        self.weights = (log_joint - log_joint.logsumexp((0, 1, 2))).exp()
+
+    def moments(self, values: Tensor) -> tuple[float, float]:
+        mean = float((self.weights * values).sum())
+        return mean, float((self.weights * (values - mean) ** 2).sum()) ** 0.5
+
+
+def normal(x: Tensor, variance: Tensor) -> Tensor:
+    return -x.square() / (2 * variance) - (2 * math.pi * variance).log() / 2
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_gain_offset_and_error_of_one_summary_are_those_of_numerical_integration(
+    setting: tuple[float, ...],
+) -> None:
+    z, mean = pairs(7, 1)
+    exact = Quadrature(z, mean, setting)
+    discrepancy = at(*setting).fit(z, mean, no_noise(1))
+    assert discrepancy.log_evidence == pytest.approx(exact.log_evidence, abs=2e-3)
+    # Without noise of the simulator all of Sigma but its floor is error.
+    draws = discrepancy.sample(DRAWS, smallest_error=0.0, seed=0)
+    sigma = (
+        draws.error_factor[:, 0, 0] ** 2
+        + (draws.gain[:, 0, 0] * SMALLEST_NOISE).square()
+    )
+    for drawn, values in [
+        (draws.gain[:, 0, 0], exact.a),
+        (draws.offset[:, 0], exact.b),
+        (sigma.log(), exact.sigma.log()),
+    ]:
+        expected, std = exact.moments(values)
+        assert float(drawn.mean()) == pytest.approx(expected, abs=0.02 * std + 1e-3)
+        assert float(drawn.std()) == pytest.approx(std, rel=0.02)
+
+
+def log_predictive(z: Tensor, mean: Tensor, setting: tuple[float, ...]) -> float:
+    """The evidence as a product of Student t densities, one pair after the other.
+
+    The coefficients as one long vector, with Kronecker products, in NumPy.
+    """
+    k, s, strength = setting
+    width = z.shape[1]
+    precision = np.diag([k] * width + [k / 3])
+    coefficients = np.vstack([np.eye(width), np.zeros((1, width))])
+    scale, degrees = strength * s**2 * np.eye(width), strength + width + 1
+    total = 0.0
+    for y, m in zip(z.numpy(), mean.numpy(), strict=True):
+        x = np.append(m, 1.0)
+        freedom = degrees - width + 1
+        spread = 1 + x @ np.linalg.inv(precision) @ x
+        total += stats.multivariate_t.logpdf(
+            y, x @ coefficients, scale * spread / freedom, df=freedom
+        )
+        error = y - x @ coefficients
+        scale = scale + np.outer(error, error) / spread
+        new = precision + np.outer(x, x)
+        coefficients = np.linalg.solve(new, precision @ coefficients + np.outer(x, y))
+        precision, degrees = new, degrees + 1
+    return float(total)
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+@pytest.mark.parametrize("width", [1, 2, 4])
+def test_the_evidence_is_the_product_of_one_step_ahead_predictions(
+    setting: tuple[float, ...], width: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sbi_rope.discrepancy.model.SMALLEST_NOISE", 0.0)
+    z, mean = pairs(9, width)
+    discrepancy = at(*setting).fit(z, mean, torch.eye(width))
+    expected = log_predictive(z, mean, setting)
+    assert discrepancy.log_evidence == pytest.approx(expected, abs=1e-8)
+
+
+def test_the_evidence_of_a_simulator_that_is_right_is_a_normal_density(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("sbi_rope.discrepancy.model.SMALLEST_NOISE", 0.0)
+    z, mean = pairs(6, 2)
+    noise = torch.tensor([[0.5, 0.2], [0.2, 0.3]]).double()
+    model = replace(at(*SETTINGS[0]), probability_of_none=0.2)
+    discrepancy = model.fit(z, mean, noise)
+    densities = [
+        stats.multivariate_normal.logpdf(y, m, noise.numpy())
+        for y, m in zip(z.numpy(), mean.numpy(), strict=True)
+    ]
+    assert discrepancy.log_evidence_of_none == pytest.approx(sum(densities), abs=1e-8)
+    other = 0.8 * math.exp(discrepancy.log_evidence - sum(densities))
+    expected = 0.2 / (0.2 + other)
+    assert discrepancy.probability_of_none == pytest.approx(expected, rel=1e-8)
+
+
+def test_the_evidence_of_the_grid_is_the_average_of_its_settings() -> None:
+    z, mean = pairs(5, 2)
+    grid = DiscrepancyModel(
+        gain_precisions=(0.3, 3.0), error_scales=(0.1, 0.4), degrees_of_freedom=(2.0,)
+    )
+    whole = grid.fit(z, mean, no_noise(2))
+    single = [
+        at(k, s, 2.0).fit(z, mean, no_noise(2)).log_evidence
+        for k in (0.3, 3.0)
+        for s in (0.1, 0.4)
+    ]
+    evidence = torch.tensor(single, dtype=torch.double)
+    expected = float(evidence.logsumexp(0)) - math.log(4)
+    assert whole.log_evidence == pytest.approx(expected, abs=1e-9)
+    assert torch.allclose(whole.shares, evidence.softmax(0), atol=1e-9)
+
+
+GRID = DiscrepancyModel(
+    gain_precisions=(1.0, 10.0),
+    error_scales=(0.2, 0.6),
+    degrees_of_freedom=(3.0, 20.0),
+)
+
+
+def from_the_prior(n: int, width: int) -> tuple[dict[str, Any], Tensor, Tensor]:
+    """A, b and Sigma from the prior of GRID, by SciPy, and pairs that follow them."""
+    pick = np.random.default_rng(int(torch.randint(2**31, ())))
+    k, s, strength = (
+        float(pick.choice(values))
+        for values in (
+            GRID.gain_precisions,
+            GRID.error_scales,
+            GRID.degrees_of_freedom,
+        )
+    )
+    scale = strength * s**2 * np.eye(width)
+    sigma = stats.invwishart.rvs(strength + width + 1, scale, random_state=pick)
+    coefficients = stats.matrix_normal.rvs(
+        np.hstack([np.eye(width), np.zeros((width, 1))]),
+        rowcov=sigma,
+        colcov=np.diag([1 / k] * width + [3 / k]),
+        random_state=pick,
+    )
+    mean = torch.randn(n, width, dtype=torch.double)
+    design = np.hstack([mean.numpy(), np.ones((n, 1))])
+    z = design @ coefficients.T + pick.multivariate_normal(np.zeros(width), sigma, n)
+    truth = {"gain": coefficients[:, :-1], "offset": coefficients[:, -1], "s": sigma}
+    return truth, torch.as_tensor(z), mean
+
+
+def test_draws_are_calibrated_over_repetitions_from_the_prior() -> None:
+    num_repetitions, num_draws, width = 400, 99, 2
+    ranks: list[list[float]] = []
+    noise = 0.01 * torch.eye(width).double()
+    for repetition in range(num_repetitions):
+        truth, z, mean = from_the_prior(8, width)
+        model = replace(GRID, probability_of_none=0.0)
+        discrepancy = model.fit(z, mean, noise)
+        draws = discrepancy.sample(num_draws, smallest_error=0.0, seed=repetition)
+        total = draws.error_factor @ draws.error_factor.mT
+        total = total + draws.gain @ discrepancy.noise @ draws.gain.mT
+        drawn = [
+            draws.gain[:, 0, 0],
+            draws.gain[:, 0, 1],
+            draws.offset[:, 1],
+            torch.linalg.det(draws.gain),
+            total[:, 0, 0],
+            total[:, 0, 1],
+        ]
+        gain, sigma = truth["gain"], truth["s"]
+        true = [
+            gain[0, 0],
+            gain[0, 1],
+            truth["offset"][1],
+            np.linalg.det(gain),
+            sigma[0, 0],
+            sigma[0, 1],
+        ]
+        ranks.append(
+            [float((d < t).double().mean()) for d, t in zip(drawn, true, strict=True)]
+        )
+    for column in torch.tensor(ranks).T:
+        counts = torch.histc(column, bins=10, min=0.0, max=1.0).numpy()
+        assert stats.chisquare(counts).pvalue > 1e-3, counts
+
+
+def test_a_simulator_that_is_right_is_found_right_and_another_is_not() -> None:
+    noise = 0.04 * torch.eye(3).double()
+    for n in (10, 50, 400):
+        mean = torch.randn(n, 3, dtype=torch.double)
+        z = mean + 0.2 * torch.randn(n, 3)
+        right = DiscrepancyModel().fit(z, mean, noise)
+        assert right.probability_of_none > (0.9 if n < 400 else 0.99)
+        off = DiscrepancyModel().fit(0.6 * z + 0.5, mean, noise)
+        assert off.probability_of_none < 1e-3
+
+
+@pytest.mark.parametrize("n", [2, 50])
+@pytest.mark.parametrize("rounding", [0.0, 1e-3])
+def test_a_simulator_without_noise_that_is_exact_has_no_discrepancy(
+    n: int, rounding: float
+) -> None:
+    mean = torch.randn(n, 2, dtype=torch.double)
+    z = mean + rounding * torch.randn(n, 2)
+    assert DiscrepancyModel().fit(z, mean, no_noise(2)).probability_of_none > 0.8
+
+
+def test_some_draws_correct_nothing_and_the_others_leave_simulated_noise() -> None:
+    z, mean = pairs(30, 2, error=0.1)
+    noise = 0.0025 * torch.eye(2).double()
+    discrepancy = replace(
+        DiscrepancyModel().fit(z, mean, noise), probability_of_none=0.3
+    )
+    draws = discrepancy.sample(5000, seed=0)
+    none = (draws.error_factor == 0).flatten(1).all(dim=1)
+    assert float(none.double().mean()) == pytest.approx(0.3, abs=0.02)
+    assert (draws.gain[none] == torch.eye(2)).all()
+    assert (draws.offset[none] == 0).all()
+    # Of the error of .1 the simulator has made .05 already, times the gain.
+    gain = draws.gain[~none].mean(dim=0)
+    expected = 0.01 * torch.eye(2) - gain @ noise @ gain.T
+    error = (draws.error_factor @ draws.error_factor.mT)[~none].median(dim=0).values
+    assert torch.allclose(error.diagonal(), expected.diagonal(), rtol=0.35)
+    assert float(draws.error_factor[~none].svd().S.min()) >= 0.01 - 1e-9
+
+
+def test_simulations_are_corrected_by_gain_offset_and_error() -> None:
+    z, mean = pairs(40, 2)
+    draws = (
+        DiscrepancyModel(probability_of_none=0.0)
+        .fit(z, mean, no_noise(2))
+        .sample(2000, seed=0)
+    )
+    z_s = torch.tensor([1.0, -2.0]).expand(100_000, 2)
+    corrected = draws.correct(z_s)
+    moved = draws.gain @ z_s[0].double() + draws.offset
+    total = (draws.error_factor @ draws.error_factor.mT).mean(dim=0) + moved.T.cov()
+    assert torch.allclose(corrected.mean(dim=0), moved.mean(dim=0), atol=0.02)
+    assert torch.allclose(corrected.T.cov(), total, rtol=0.05, atol=0.01)
+
+
+def collapsed(n: int = 10) -> Tensor:
+    """One variable three times."""
+    return torch.randn(n, 1).repeat(1, 3)
+
+
+def far_away(scale: float) -> tuple[Tensor, Tensor]:
+    mean = torch.randn(10, 3)
+    z = mean.clone()
+    z[0] += scale
+    return z, mean
+
+
+@pytest.mark.parametrize(
+    ("z", "mean"),
+    [
+        pytest.param(*far_away(1e3), id="outlier"),
+        pytest.param(*far_away(1e6), id="far outlier"),
+        pytest.param(*far_away(1e10), id="absurd outlier"),
+        pytest.param(collapsed(), collapsed(), id="collinear"),
+        pytest.param(torch.ones(10, 3), torch.ones(10, 3), id="one point"),
+        pytest.param(torch.ones(2, 3), torch.zeros(2, 3), id="two equal pairs"),
+        pytest.param(torch.randn(1, 3), torch.randn(1, 3), id="one pair"),
+        pytest.param(torch.randn(10, 20), torch.randn(10, 20), id="wide"),
+        pytest.param(torch.randn(3000, 2), torch.randn(3000, 2), id="long"),
+        pytest.param(torch.randn(10, 2).half(), torch.randn(10, 2), id="half"),
+    ],
+)
+def test_draws_are_finite_whatever_the_pairs(z: Tensor, mean: Tensor) -> None:
+    model = DiscrepancyModel(probability_of_none=0.0)
+    for noise in (0.0, 0.01):
+        covariance = noise * torch.ones(z.shape[1], z.shape[1])
+        discrepancy = model.fit(z, mean, covariance)
+        draws = discrepancy.sample(50, seed=0)
+        corrected = draws.correct(torch.randn(20, z.shape[1]))
+        for value in (draws.gain, draws.offset, draws.error_factor, corrected):
+            assert value.dtype == torch.double
+            assert value.isfinite().all()
+        assert math.isfinite(discrepancy.log_evidence)
+
+
+def test_a_long_grid_without_a_winner_keeps_its_settings() -> None:
+    model = DiscrepancyModel(
+        gain_precisions=[1.0 + 1e-6 * i for i in range(150)],
+        error_scales=[0.2 + 1e-6 * i for i in range(150)],
+        degrees_of_freedom=[3.0],
+    )
+    discrepancy = model.fit(*pairs(3, 1), no_noise(1))
+    assert len(discrepancy.terms) == 150**2
+    assert float(discrepancy.shares.sum()) == pytest.approx(1.0)
+
+
+def test_the_same_seed_gives_the_same_draws_and_leaves_no_trace() -> None:
+    z, mean = pairs(10, 2)
+    before = z.clone(), mean.clone()
+    discrepancy = DiscrepancyModel().fit(z, mean, no_noise(2))
+    state = torch.get_rng_state()
+    one, same, other = (discrepancy.sample(20, seed=seed) for seed in (1, 1, 2))
+    assert torch.equal(torch.get_rng_state(), state)
+    assert torch.equal(one.gain, same.gain)
+    assert torch.equal(one.error_factor, same.error_factor)
+    assert not torch.equal(one.gain, other.gain)
+    assert torch.equal(z, before[0])
+    assert torch.equal(mean, before[1])
+
+
+Z, C = torch.randn(5, 2), torch.eye(2)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "match"),
+    [
+        pytest.param(
+            lambda: DiscrepancyModel(error_scales=()),
+            InvalidInputError,
+            "at least one of `error_scales`",
+            id="empty list",
+        ),
+        pytest.param(
+            lambda: DiscrepancyModel(gain_precisions=(1.0, 0.0)),
+            InvalidInputError,
+            "`gain_precisions` to be positive",
+            id="precision zero",
+        ),
+        pytest.param(
+            lambda: DiscrepancyModel(probability_of_none=1.5),
+            InvalidInputError,
+            "`probability_of_none`",
+            id="probability",
+        ),
+        pytest.param(
+            lambda: DiscrepancyModel().fit(Z.tolist(), Z, C),
+            InvalidTypeError,
+            "`z` to be a torch.Tensor",
+            id="list",
+        ),
+        pytest.param(
+            lambda: DiscrepancyModel().fit(Z[:, 0], Z[:, 0], C),
+            InvalidInputError,
+            r"`z` of shape \(n, l\)",
+            id="z vector",
+        ),
+        pytest.param(
+            lambda: DiscrepancyModel().fit(Z[:, :, None], Z, C),
+            InvalidInputError,
+            r"`z` of shape \(n, l\)",
+            id="z 3-d",
+        ),
+        pytest.param(
+            lambda: DiscrepancyModel().fit(Z, Z[:4], C),
+            InvalidInputError,
+            "`z` and `mean`",
+            id="rows",
+        ),
+        pytest.param(
+            lambda: DiscrepancyModel().fit(Z / 0, Z, C),
+            InvalidInputError,
+            "`z` to be finite",
+            id="nan",
+        ),
+        pytest.param(
+            lambda: DiscrepancyModel().fit(Z, Z, torch.ones(3, 2)),
+            InvalidInputError,
+            r"`covariance` of shape \(2, 2\)",
+            id="covariance",
+        ),
+        pytest.param(
+            lambda: DiscrepancyModel().fit(Z, Z, C).sample(0),
+            InvalidInputError,
+            "`num_draws`",
+            id="draws",
+        ),
+    ],
+)
+def test_what_is_out_of_range_is_refused_by_name(
+    call: Any, error: type, match: str
+) -> None:
+    with pytest.raises(error, match=match):
+        call()
+
+
+def test_a_certain_prior_stays_certain() -> None:
+    z, mean = pairs(20, 2)
+    for certain in (0.0, 1.0):
+        model = DiscrepancyModel(probability_of_none=certain)
+        discrepancy: Discrepancy = model.fit(z, mean, no_noise(2))
+        assert discrepancy.probability_of_none == certain
+        assert len(discrepancy.sample(10)) == 10

@@ -1,0 +1,201 @@
+"""The distribution of parameters, learned from those of the calibration pairs."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+from torch import Tensor
+from torch.distributions import Gamma
+
+from sbi_rope.discrepancy import learn_parameters
+from sbi_rope.discrepancy.parameters import STRENGTHS, _fit, normal_scores
+from sbi_rope.errors import InvalidInputError, InvalidTypeError
+
+CORRELATION = torch.tensor([[1.0, 0.6], [0.6, 1.0]]).double()
+
+
+def step_ahead(
+    u: np.ndarray, new: np.ndarray, correlation: np.ndarray, strength: float
+) -> tuple[float, np.ndarray]:
+    """Evidence and predictive density, by one Student t after the other."""
+    d = u.shape[1]
+    kappa, freedom = strength, strength + d + 1
+    mean, scale = np.zeros(d), strength * correlation
+
+    def log_t(at: np.ndarray) -> np.ndarray:
+        df = freedom - d + 1
+        spread = scale * (kappa + 1) / (kappa * df)
+        return stats.multivariate_t.logpdf(at, mean, spread, df=df)
+
+    evidence = 0.0
+    for row in u:
+        evidence += float(log_t(row))
+        away = row - mean
+        scale = scale + kappa / (kappa + 1) * np.outer(away, away)
+        mean = mean + away / (kappa + 1)
+        kappa, freedom = kappa + 1, freedom + 1
+    return evidence, np.atleast_1d(log_t(new))
+
+
+@pytest.mark.parametrize("d", [1, 2])
+@pytest.mark.parametrize("strength", STRENGTHS)
+def test_evidence_and_prediction_are_those_of_one_pair_after_the_other(
+    d: int, strength: float
+) -> None:
+    u = torch.randn(7, d).double() * 0.5 + 0.8
+    new, correlation = torch.randn(5, d).double(), CORRELATION[:d, :d]
+    evidence, log_t = _fit(u, new, correlation, strength)
+    expected = step_ahead(u.numpy(), new.numpy(), correlation.numpy(), strength)
+    assert float(evidence) == pytest.approx(expected[0], abs=1e-9)
+    assert log_t.numpy() == pytest.approx(expected[1], abs=1e-9)
+
+
+def test_the_evidence_of_one_parameter_is_its_integral() -> None:
+    u, strength = torch.tensor([0.3, 1.1, 0.7]).double()[:, None], 2.0
+    variance = torch.linspace(-9, 9, 2000).double().exp()
+    mean = torch.linspace(-15, 15, 2001).double()[:, None]
+    prior = torch.as_tensor(
+        stats.invgamma.logpdf(variance, (strength + 2) / 2, scale=strength / 2)
+    )
+    for x, v in [(mean, variance / strength), *((y - mean, variance) for y in u)]:
+        prior = prior - x.square() / (2 * v) - (2 * math.pi * v).log() / 2
+    log_cell = math.log((30 / 2000) * (18 / 1999))
+    integral = (prior + variance.log()).logsumexp((0, 1)) + log_cell
+    evidence, _ = _fit(u, u, torch.ones(1, 1).double(), strength)
+    assert float(evidence) == pytest.approx(float(integral), abs=1e-3)
+
+
+def box(n: int) -> Tensor:
+    """Two independent parameters, uniform."""
+    return torch.rand(n, 2)
+
+
+def skewed(n: int) -> Tensor:
+    """A heavy tail, and a parameter that depends on it."""
+    first = Gamma(0.5, 1.0).sample((n, 1))
+    return torch.cat([first, 3 * first + Gamma(2.0, 0.1).sample((n, 1))], dim=1)
+
+
+def discrete(n: int) -> Tensor:
+    """A parameter of three values beside a continuous one."""
+    return torch.stack([torch.randint(3, (n,)).float(), torch.randn(n)], dim=1)
+
+
+def single(n: int) -> Tensor:
+    return 100.0 + 1e-3 * torch.randn(n, 1)
+
+
+PRIORS = [box, skewed, discrete, single]
+
+
+@pytest.mark.parametrize("prior", PRIORS)
+@pytest.mark.parametrize("n", [1, 10, 100])
+def test_pairs_from_the_prior_leave_it_as_it_is(prior: object, n: int) -> None:
+    theta = prior(5000)  # type: ignore[operator]
+    learned = [learn_parameters(prior(n), theta) for _ in range(10)]  # type: ignore[operator]
+    for one in learned:
+        assert one.probabilities.shape == (5000,)
+        assert float(one.probabilities.sum()) == pytest.approx(1.0)
+        assert (one.probabilities >= 0).all()
+    probability = torch.tensor([one.probability_of_prior for one in learned])
+    size = torch.tensor([one.effective_sample_size for one in learned])
+    assert float(probability.median()) > (0.75 if n == 100 else 0.45)
+    assert float(size.median()) > 0.9 * 5000
+
+
+@pytest.mark.parametrize("prior", PRIORS)
+@pytest.mark.parametrize(("n", "least"), [(5, 0.1), (50, 0.3)])
+def test_shifted_pairs_give_more_density_to_others_like_them(
+    prior: object, n: int, least: float
+) -> None:
+    theta = prior(20_000)  # type: ignore[operator]
+    # Reality has the larger values of the last parameter.
+    high = theta[theta[:, -1] > theta[:, -1].quantile(0.7)]
+    gains = []
+    for repetition in range(10):
+        rows = torch.randperm(len(high))
+        learned = learn_parameters(high[rows[:n]], theta)
+        held_out = (theta[:, None] == high[rows[n : n + 200]]).all(dim=2)
+        index = held_out.double().argmax(dim=0)
+        gains.append(float((20_000 * learned.probabilities[index]).log().mean()))
+        if n == 50:
+            assert learned.probability_of_prior < 1e-3, repetition
+            assert learned.effective_sample_size < 0.6 * 20_000
+    # No more than the 1.2 nats of who knows the region.
+    assert least < sum(gains) / 10 < math.log(1 / 0.3)
+
+
+def test_weighted_simulations_have_the_mean_and_spread_of_the_pairs() -> None:
+    theta = torch.randn(50_000, 1)
+    learned = learn_parameters(1.0 + 0.5 * torch.randn(300, 1), theta)
+    mean = (learned.probabilities[:, None] * theta).sum()
+    std = (learned.probabilities[:, None] * (theta - mean).square()).sum().sqrt()
+    assert float(mean) == pytest.approx(1.0, abs=0.1)
+    assert float(std) == pytest.approx(0.5, abs=0.1)
+    equal = torch.full((4,), 0.25)
+    halves = torch.tensor([0.5, 0.5, 0.0, 0.0])
+    for weights, expected in [(equal, 4.0), (halves, 2.0)]:
+        one = type(learned)(probabilities=weights, probability_of_prior=0.0)
+        assert one.effective_sample_size == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("prior", PRIORS)
+def test_normal_scores_do_not_depend_on_the_scale_of_a_parameter(
+    prior: object,
+) -> None:
+    reference, theta = prior(1000), prior(20)  # type: ignore[operator]
+    scores = normal_scores(theta, reference)
+    assert torch.equal(
+        normal_scores(theta.double().exp(), reference.double().exp()), scores
+    )
+    for j in range(theta.shape[1]):  # they keep the order, and ties
+        order = theta[:, j].argsort()
+        assert (scores[order, j].diff() >= 0).all()
+
+
+def test_normal_scores_of_the_reference_are_normal_and_outside_they_are_finite() -> (
+    None
+):
+    reference = Gamma(0.3, 1.0).sample((2000, 1))
+    scores = normal_scores(reference, reference)[:, 0].numpy()
+    assert stats.kstest(scores, "norm").pvalue > 0.99
+    outside = normal_scores(torch.tensor([[-1.0], [1e30]]), reference)
+    assert outside.isfinite().all()
+    assert (outside.abs() > 3.3).all()
+    # Values that are equal share the middle of their ranks: the median of three.
+    three = torch.tensor([[0.0], [1.0], [2.0]]).repeat(100, 1)
+    assert float(normal_scores(torch.ones(1, 1), three)) == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize(
+    ("theta_cal", "theta", "error", "match"),
+    [
+        pytest.param(
+            torch.ones(3, 1), torch.ones(9, 2), InvalidInputError, "`theta_cal`", id="d"
+        ),
+        pytest.param(
+            torch.ones(3, 2) / 0,
+            torch.ones(9, 2),
+            InvalidInputError,
+            "finite",
+            id="inf",
+        ),
+        pytest.param(
+            torch.ones(3, 2), torch.ones(0, 2), InvalidInputError, "`theta`", id="none"
+        ),
+        pytest.param(
+            [[1.0, 1.0]],
+            torch.ones(9, 2),
+            InvalidTypeError,
+            "torch.as_tensor",
+            id="list",
+        ),
+    ],
+)
+def test_what_is_no_batch_of_parameters_is_refused(
+    theta_cal: Tensor, theta: Tensor, error: type, match: str
+) -> None:
+    with pytest.raises(error, match=match):
+        learn_parameters(theta_cal, theta)

@@ -1,0 +1,287 @@
+"""What the report says of discrepancies that were planted, and where there is none."""
+
+import functools
+from typing import Any
+
+import pytest
+import torch
+from scipy import stats
+from torch import Tensor
+
+from sbi_rope._simulations import Moments
+from sbi_rope.discrepancy import (
+    DiscrepancyModel,
+    DiscrepancyNPE,
+    DiscrepancyReport,
+    Interval,
+)
+from sbi_rope.discrepancy.report import report_discrepancy
+from sbi_rope.errors import InvalidInputError, NotReadyError
+from sbi_rope.tasks import get_task
+from tests import problems
+
+# Mean, spread over the prior and noise of four simulated summaries, in their units.
+CENTRE = torch.tensor([100.0, -5.0, 0.0, 2e-6]).double()
+SPREAD = torch.tensor([20.0, 0.5, 1.0, 1e-6]).double()
+NOISE = 0.2 * SPREAD
+NAMES = ["light", "shade", "heat", "dust"]
+# Of the second summary, the others are clean.
+GAIN, SHIFT, ERROR = 0.5, 0.6, 0.3
+MODEL = DiscrepancyModel()
+# Quicker, for many repetitions.
+ONE_SETTING = DiscrepancyModel(
+    gain_precisions=(1.0,), error_scales=(0.1,), degrees_of_freedom=(1.0,)
+)
+
+
+def simulated(n: int) -> Tensor:
+    """Simulations from the prior."""
+    return CENTRE + SPREAD * torch.randn(n, 4).double() + NOISE * torch.randn(n, 4)
+
+
+def pairs(n: int) -> tuple[Tensor, Moments]:
+    """Real observations, and the moments of simulations at their parameters."""
+    mean = CENTRE + SPREAD * torch.randn(n, 4).double()
+    x = mean + NOISE * torch.randn(n, 4)
+    off = CENTRE[1] + SHIFT + GAIN * (x[:, 1] - CENTRE[1]) + ERROR * torch.randn(n)
+    x[:, 1] = off
+    covariance = NOISE.square().diag().expand(n, -1, -1)
+    return x, Moments(mean=mean, covariance=covariance)
+
+
+def report(n: int = 40, *, model: DiscrepancyModel = MODEL) -> DiscrepancyReport:
+    return report_discrepancy(*pairs(n), simulated(5000), model=model, x_names=NAMES)
+
+
+def inside(value: float, interval: Interval) -> bool:
+    return interval.low <= value <= interval.high
+
+
+def test_a_planted_discrepancy_is_found_in_units_of_x_and_the_rest_is_clean() -> None:
+    found = report(200)
+    assert found.summaries[0].name == "shade"
+    shade = found["shade"]
+    assert shade.is_off
+    assert shade.probability_of_none < 1e-6
+    for true, interval, width in [
+        (GAIN, shade.gain, 0.4),
+        (SHIFT, shade.shift, 0.2),
+        (ERROR, shade.error, 0.15),
+    ]:
+        assert inside(true, interval)
+        assert interval.high - interval.low < width
+    size = ((GAIN - 1) ** 2 + (SHIFT**2 + ERROR**2) / (0.5**2 * 1.04)) ** 0.5
+    assert shade.size.median == pytest.approx(size, rel=0.15)
+    for name in ("light", "heat", "dust"):
+        assert not found[name].is_off
+        assert inside(1.0, found[name].gain)
+        assert inside(0.0, found[name].shift)
+        assert found[name].outliers == ()
+    text = str(found)
+    assert "What 200 calibration pairs say" in text
+    clean = next(line for line in text.split("\n") if "no sign of discrep" in line)
+    assert set(clean.split(": ")[1].split(", ")) == {"light", "heat", "dust"}
+    assert "do not fit" not in text
+
+
+@pytest.mark.parametrize("n", [5, 20])
+def test_intervals_cover_at_their_rate_over_repetitions(n: int) -> None:
+    # Gains, shifts and errors differ from time to time, as the model expects.
+    num_repetitions, covered = 250, torch.zeros(3)
+    model = DiscrepancyModel(
+        gain_precisions=(3.0,), error_scales=(0.4,), degrees_of_freedom=(4.0,)
+    )
+    noise, mean_x, spread = 0.01, 7.0, 3.0
+    prior = mean_x + spread * torch.randn(20_000, 1).double()
+    centre, scale = float(prior.mean()), float(prior.std())
+    for repetition in range(num_repetitions):
+        sigma = stats.invgamma.rvs(3.0, scale=2 * 0.16, random_state=repetition)
+        gain = 1 + (sigma / 3) ** 0.5 * float(torch.randn(()))
+        shift = sigma**0.5 * float(torch.randn(()))
+        mean = torch.randn(n, 1).double()
+        z = gain * mean + shift + sigma**0.5 * torch.randn(n, 1)
+        found = report_discrepancy(
+            centre + scale * z,
+            Moments(
+                mean=centre + scale * mean,
+                covariance=torch.full((n, 1, 1), noise * scale**2).double(),
+            ),
+            prior,
+            model=model,
+        )["x[0]"]
+        error = max(sigma - gain**2 * noise, 0.0) ** 0.5
+        covered += torch.tensor(
+            [
+                inside(gain, found.gain),
+                inside(shift * scale, found.shift),
+                inside(error * scale, found.error),
+            ]
+        )
+    # Binomial: 95 % of 250 and more than three standard errors.
+    assert (covered / num_repetitions > 0.95 - 0.045).all(), covered
+    assert (covered / num_repetitions < 0.95 + 0.04).all(), covered
+
+
+def test_where_nothing_is_wrong_summaries_are_rarely_called_off() -> None:
+    off = 0
+    for _ in range(20):
+        summaries = report(20).summaries
+        off += sum(summary.is_off for summary in summaries if summary.name != "shade")
+    assert off <= 3  # of 60
+
+
+@pytest.mark.parametrize("n", [12, 40])
+def test_a_pair_that_does_not_fit_the_others_is_named(n: int) -> None:
+    x, moments = pairs(n)
+    x[3, 2] += 8.0
+    x[5, 3] -= 8e-6
+    found = report_discrepancy(x, moments, simulated(5000), model=MODEL, x_names=NAMES)
+    assert {s.name: s.outliers for s in found.summaries if s.outliers} == {
+        "heat": (3,),
+        "dust": (5,),
+    }
+    text = str(found)
+    assert "pairs that do not fit the others" in text
+    assert "row 3 (heat)" in text
+    assert "row 5 (dust)" in text
+
+
+@pytest.mark.parametrize("n", [10, 30, 300])
+def test_pairs_that_fit_are_rarely_named(n: int) -> None:
+    repetitions = 100 if n < 300 else 30
+    named = [
+        bool(summary.outliers)
+        for _ in range(repetitions)
+        for summary in report(n, model=ONE_SETTING).summaries
+    ]
+    # One in a hundred is meant.
+    assert sum(named) <= 0.03 * len(named)
+
+
+def test_most_pairs_that_agree_to_the_last_digit_do_not_make_outliers_of_others() -> (
+    None
+):
+    # A count that is mostly zero: the median residual says nothing of its spread.
+    mean = torch.zeros(30, 1).double()
+    x = torch.zeros(30, 1)
+    x[::5] = 1.0
+    prior = (torch.rand(1000, 1) < 0.2).double()
+    moments = Moments(mean=mean + 0.2, covariance=torch.full((30, 1, 1), 0.16).double())
+    found = report_discrepancy(x, moments, prior, model=MODEL)
+    assert found.summaries[0].outliers == ()
+
+
+def test_summaries_are_ranked_by_size_those_without_discrepancy_last() -> None:
+    mean = torch.randn(30, 3).double()
+    x = mean + torch.tensor([0.0, 2.0, -5.0])
+    moments = Moments(mean=mean, covariance=0.01 * torch.eye(3).expand(30, 3, 3))
+    found = report_discrepancy(x, moments, torch.randn(500, 3), model=MODEL)
+    assert [summary.name for summary in found.summaries] == ["x[2]", "x[1]", "x[0]"]
+    lines = str(found).split("\n")
+    heads = [i for i, line in enumerate(lines) if line.startswith("  summary")]
+    assert lines[heads[0] + 1].startswith("  x[2]")
+    assert lines[heads[0] + 2].startswith("  x[1]")
+
+
+def test_summaries_that_are_constant_in_simulations_are_named_as_such() -> None:
+    x, moments = pairs(20)
+    constant = simulated(500)
+    constant[:, 0] = 3.0
+    found = report_discrepancy(x, moments, constant, model=MODEL, x_names=NAMES)
+    assert found.constant == ("light",)
+    assert {summary.name for summary in found.summaries} == set(NAMES[1:])
+    assert "the same in all simulations: light" in str(found)
+    with pytest.raises(InvalidInputError, match="all summaries are constant"):
+        report_discrepancy(x, moments, torch.ones(500, 4), model=MODEL)
+
+
+def test_text_rows_and_table_say_the_same() -> None:
+    pandas = pytest.importorskip("pandas")
+    found = report()
+    rows, table = found.as_rows(), found.to_dataframe()
+    assert isinstance(table, pandas.DataFrame)
+    assert table.to_dict("records") == rows
+    assert [row["summary"] for row in rows] == [s.name for s in found.summaries]
+    shade = next(row for row in rows if row["summary"] == "shade")
+    text = str(found)
+    for key in ("size", "shift", "gain", "error"):
+        interval = getattr(found["shade"], key)
+        assert shade[key] == interval.median
+        assert (shade[f"{key}_low"], shade[f"{key}_high"]) == (
+            interval.low,
+            interval.high,
+        )
+        assert f"{interval.median:.3g} [{interval.low:.3g}, " in text
+    assert shade["probability_of_none"] == found["shade"].probability_of_none
+
+
+def test_names_are_checked() -> None:
+    arguments = (*pairs(10), simulated(100))
+    with pytest.raises(InvalidInputError, match=r"got 'nothing'. There are \['dust'"):
+        report()["nothing"]
+    for names in (NAMES[:3], ["light"] * 4):
+        with pytest.raises(InvalidInputError, match="4 different names"):
+            report_discrepancy(*arguments, model=MODEL, x_names=names)
+    found = report_discrepancy(*arguments, model=MODEL)
+    assert {s.name for s in found.summaries} == {f"x[{j}]" for j in range(4)}
+
+
+def method(**options: Any) -> DiscrepancyNPE:
+    return DiscrepancyNPE(problems.box(2), num_simulations=2000, **options)
+
+
+def shifted(n: int = 30) -> tuple[Tensor, Tensor]:
+    """Labelled observations whose second reading is 0.7 too high."""
+    theta = problems.box(2).sample((n,))
+    return theta, problems.simulate(theta) + torch.tensor([0.0, 0.7, 0.0])
+
+
+@pytest.mark.parametrize("stored", [False, True])
+def test_a_method_reports_without_training(stored: bool) -> None:
+    if stored:
+        theta = problems.box(2).sample((3000,))
+        asked = method().append_simulations(theta, problems.simulate(theta))
+    else:
+        asked = method(simulator=problems.simulate)
+    asked.append_calibration(*shifted())
+    state = torch.get_rng_state()
+    found = asked.report(x_names=["a", "b", "c"], show_progress_bars=False)
+    assert torch.equal(torch.get_rng_state(), state)
+    assert found.num_pairs == 30
+    assert [s.name for s in found.summaries if s.is_off] == ["b"]
+    assert inside(0.7, found["b"].shift)
+    again = asked.report(x_names=["a", "b", "c"], show_progress_bars=False)
+    assert again.as_rows() == found.as_rows()
+
+
+def test_what_a_report_lacks_is_asked_for() -> None:
+    with pytest.raises(NotReadyError, match="simulations"):
+        method().append_calibration(*shifted()).report()
+    with pytest.raises(NotReadyError, match="at least 2 calibration pairs; got 0"):
+        method(simulator=problems.simulate).report()
+    images = method(simulator=problems.simulate_image)
+    theta = problems.box(2).sample((5,))
+    images.append_calibration(theta, problems.simulate_image(theta))
+    with pytest.raises(InvalidInputError, match=r"shape \(n, l\).*\(5, 1, 8, 8\)"):
+        images.report()
+
+
+@functools.cache
+def tunnel(root: Any, n: int) -> DiscrepancyReport:
+    task = get_task("light_tunnel_sensors", root=root)
+    asked = DiscrepancyNPE(task.get_prior(), simulator=task.get_simulator())
+    asked.append_calibration(*task.get_calibration_set(n))
+    return asked.report(x_names=task.x_names, show_progress_bars=False)
+
+
+@pytest.mark.parametrize("n", [20, 50, 200])
+def test_the_published_law_of_the_light_tunnel_over_predicts_all_light(
+    chamber_root: Any, n: int
+) -> None:
+    found = tunnel(chamber_root, n)
+    off = {summary.name for summary in found.summaries if summary.is_off}
+    assert off == {f"log_{kind}_{i}" for kind in ("ir", "vis") for i in (1, 2, 3)}
+    for name in off:
+        assert found[name].shift.high < 0  # in log units
+    assert not found["current"].is_off
+    assert "no sign of discrepancy: current" in str(found)
