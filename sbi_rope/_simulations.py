@@ -179,10 +179,11 @@ class Simulator:
         self.num_dropped += dropped
         empty = ~valid.any(dim=1)
         if empty.any():
-            rows = empty.nonzero().flatten()[:5].tolist()
+            # Not the numbers of rows: these may be a part of the pairs.
+            first = theta[empty][:5].tolist()
             raise SimulationError(
-                f"All simulations at the calibration parameters of rows {rows} contain "
-                f"NaN or Inf ({int(empty.sum())} rows in all). Remove these pairs."
+                f"All simulations at the calibration parameters {first} contain NaN or "
+                f"Inf ({int(empty.sum())} pairs in all). Remove these pairs."
             )
         _warn_of_dropped(
             dropped, valid.numel(), "simulations at calibration parameters"
@@ -381,8 +382,12 @@ class StoredSimulations:
         return Moments(mean=plane[:, 0], covariance=left_over.mT @ left_over / freedom)
 
     def kept(self, count: int, *, progress: bool) -> tuple[Tensor, Tensor]:
-        """Return the first stored pairs."""
-        return self.theta[:count], self.x[:count]
+        """Return all stored pairs, or some at random: they may be in some order."""
+        if count >= len(self.x):
+            return self.theta, self.x
+        with seeded(0):
+            chosen = torch.randperm(len(self.x))[:count].to(self.x.device)
+        return self.theta[chosen], self.x[chosen]
 
     def _nearest(self, theta: Tensor, count: int) -> Tensor:
         """Return the rows with the nearest parameters, shape ``(n, count)``."""

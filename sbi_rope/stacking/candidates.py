@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 import torch
 
-from sbi_rope._random import seeded
 from sbi_rope._sbi import (
     ConditionalDensityEstimator,
     embedding_of,
@@ -56,8 +55,6 @@ __all__ = [
 GAMMAS = (0.02, 0.05, 0.1, 0.4)
 TAUS = (1.0, 0.5, 0.0)
 REHEARSAL = 1.0
-# A vector x with more entries is no list of summaries.
-MAX_SUMMARIES = 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +112,8 @@ class CouplingCandidate:
 class AmortisedCandidate(ABC):
     """A candidate with a density of any observation.
 
-    To implement one, give it a name and define :meth:`parts`.
+    To implement one, give it a name and define :meth:`parts`, which is called with
+    random numbers that follow from the seed of the fold.
 
     Attributes:
         name: What the report calls it.
@@ -169,10 +167,7 @@ class DensityCandidate(AmortisedCandidate):
         """Check the types of all fields."""
         check_instance("name", self.name, str)
         check_instance("fixed", self.fixed, bool)
-        if self.name == "stack":
-            raise InvalidInputError(
-                "Expected another name; 'stack' is that of them all."
-            )
+        _check_name(self.name)
         if not callable(self.build):
             raise InvalidTypeError(
                 "Expected `build` to be a function of (rope, seed) that returns a "
@@ -184,10 +179,12 @@ class DensityCandidate(AmortisedCandidate):
         """Build the posterior, and return its densities."""
         bench = fold.bench
         rope = bench.rope.with_pairs(torch.arange(0)) if self.fixed else fold.rope
-        # Whoever forgets the seed, or looks at a prior by drawing from it, leaves no
-        # trace.
-        with seeded(fold.seed):
-            return _parts_of(self.name, self.build(rope, fold.seed), rope)
+        return _parts_of(self.name, self.build(rope, fold.seed), rope)
+
+
+def _check_name(name: str) -> None:
+    if name == "stack":
+        raise InvalidInputError("Expected another name; 'stack' is that of them all.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,6 +202,11 @@ class DiscrepancyCandidate(AmortisedCandidate):
 
     space: Space = "embedding"
     learn_prior: bool = True
+
+    def __post_init__(self) -> None:
+        """Check the values of all fields."""
+        check_choice("space", self.space, ("embedding", "input", "tuned"))
+        check_instance("learn_prior", self.learn_prior, bool)
 
     @property
     def name(self) -> str:  # type: ignore[override]
@@ -237,7 +239,7 @@ def _has_summaries(bench: Workbench) -> bool:
     """Whether x is a short vector that an embedding net could lose something of."""
     net = embedding_of(estimator_of(bench.npe))
     has_net = any(True for _ in net.parameters())
-    return bench.x.ndim == 2 and bench.x.shape[1] <= MAX_SUMMARIES and has_net
+    return bench.has_summaries and has_net
 
 
 # A corrected NPE has less far to go than one that is wrong.
@@ -256,6 +258,10 @@ class FinetunedCandidate(AmortisedCandidate):
     """
 
     space: Space | None = None
+
+    def __post_init__(self) -> None:
+        """Check the types of all fields."""
+        check_instance("corrected", self.corrected, bool)
 
     @property
     def name(self) -> str:  # type: ignore[override]
@@ -384,6 +390,8 @@ def check_candidates(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
             "`default_candidates()` returns."
         )
     names = [candidate.name for candidate in candidates]
+    for name in names:
+        _check_name(name)
     if len(set(names)) < len(names):
         double = sorted({name for name in names if names.count(name) > 1})
         raise InvalidInputError(f"Expected names that differ; got {double} twice.")

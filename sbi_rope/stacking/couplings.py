@@ -1,7 +1,7 @@
 """RoPE at many settings, each without a fold of the pairs: one part of a mixture."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, cast
 
@@ -31,12 +31,12 @@ class FittedCouplings:
 
     Attributes:
         part: The part; its shares are equal.
-        settings: Of each coupling, in the order of the part: the candidate, and the
-            version it belongs to; None for all of them.
+        settings: Of each coupling, in the order of the part: the name of the candidate,
+            and the version it belongs to; None for all of them.
     """
 
     part: Part
-    settings: tuple[tuple[CouplingCandidate, int | None], ...]
+    settings: tuple[tuple[str, int | None], ...]
 
     @property
     def contexts(self) -> CoupledContexts:
@@ -44,21 +44,21 @@ class FittedCouplings:
         return cast("CoupledContexts", self.part.mixing)
 
     def weighted(
-        self, weights: dict[CouplingCandidate, float], versions: Sequence[int]
+        self, weights: Mapping[str, float], versions: Sequence[int]
     ) -> tuple[Part, float]:
         """Return the part of some versions, and its weight.
 
         Args:
-            weights: Of each candidate.
+            weights: Of each candidate, by name.
             versions: Numbers of the versions, which count the same.
         """
         shares = []
-        for candidate, version in self.settings:
+        for name, version in self.settings:
             if version is None:
-                shares.append(weights[candidate])
+                shares.append(weights[name])
             else:
                 used = version in versions
-                shares.append(weights[candidate] / len(versions) if used else 0.0)
+                shares.append(weights[name] / len(versions) if used else 0.0)
         total = sum(shares)
         if not total:
             return self.part, 0.0
@@ -142,7 +142,7 @@ def fit_couplings(
         couplings = _couple(of_net, embed(net, batch), simulated, bench.rope)
         share = 1.0 / len(couplings)
         nets.append(CoupledNet(net, couplings, [share] * len(couplings)))
-        settings += [(candidate, key[2]) for candidate in of_net]
+        settings += [(candidate.name, key[2]) for candidate in of_net]
     if require_convergence:
         _check_converged([c for net in nets for c in net.couplings], settings)
     nets = [
@@ -199,18 +199,18 @@ def _couple(
 
 def _check_converged(
     couplings: Sequence[Coupling],
-    settings: Sequence[tuple[CouplingCandidate, int | None]],
+    settings: Sequence[tuple[str, int | None]],
 ) -> None:
     open_ones = [
-        (coupling, candidate)
-        for coupling, (candidate, _) in zip(couplings, settings, strict=True)
+        (coupling, name)
+        for coupling, (name, _) in zip(couplings, settings, strict=True)
         if not coupling.converged
     ]
     if open_ones:
-        worst, candidate = max(open_ones, key=lambda one: one[0].marginal_error)
+        worst, name = max(open_ones, key=lambda one: one[0].marginal_error)
         raise CouplingError(
             f"{len(open_ones)} of {len(couplings)} couplings have not converged: "
-            f"marginal error up to {worst.marginal_error:.1e}, of {candidate.name}. "
+            f"marginal error up to {worst.marginal_error:.1e}, of {name}. "
             "Give RoPE a coupler with more `max_iterations`, leave the smallest gammas "
             "out of `default_candidates`, or accept them with "
             "require_convergence=False."

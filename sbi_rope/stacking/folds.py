@@ -1,10 +1,11 @@
 """The folds of the calibration pairs, and what their candidates share."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -30,6 +31,10 @@ __all__ = ["Corrected", "Fold", "Workbench", "draw_seeds"]
 NUM_SIMULATIONS = 20_000
 # Simulations at the parameters of each pair.
 SIMULATIONS_PER_PAIR = 100
+# A vector x with more entries is no list of summaries.
+MAX_SUMMARIES = 20
+# Parts that a single fold is cut into, to tune without each.
+NUM_INNER_FOLDS = 5
 
 
 def draw_seeds(seed: int | None, count: int) -> list[int]:
@@ -67,13 +72,13 @@ class Workbench:
         with seeded(seeds[0]):
             split = split_groups(self.groups, num_folds)
         self.folds = [rows.to(self.theta.device) for rows in split if len(rows)]
-        # One for each set of folds that something can be trained on.
-        self._seeds = draw_seeds(seeds[1], 2 ** len(self.folds))
+        self._seed = seeds[1]
         self._nets: dict[frozenset[int], nn.Module] = {}
 
     def seed_of(self, folds: frozenset[int]) -> int:
         """Return the seed of what is drawn for, or trained on, some folds."""
-        return self._seeds[sum(2**number for number in folds)]
+        sequence = np.random.SeedSequence(self._seed, spawn_key=sorted(folds))
+        return int(sequence.generate_state(1)[0])
 
     def rows_of(self, folds: frozenset[int]) -> Tensor:
         """Return the rows of some folds."""
@@ -82,7 +87,8 @@ class Workbench:
     @cached_property
     def npe(self) -> Any:
         """The posterior of NPE."""
-        return self.rope.npe
+        with seeded(0):  # sbi draws from the prior to look at it
+            return self.rope.npe
 
     @cached_property
     def simulations(self) -> tuple[Tensor, Tensor]:
@@ -99,15 +105,24 @@ class Workbench:
         """The embedding net h of NPE."""
         return self.rope.embedding_net
 
+    @property
+    def has_summaries(self) -> bool:
+        """Whether x is a vector of so few entries that each may matter by itself."""
+        return self.x.ndim == 2 and self.x.shape[1] <= MAX_SUMMARIES
+
     @cached_property
-    def _all_moments(self) -> Moments:
-        # Of embeddings and of vectors x side by side, from the same simulations.
-        h, is_vector = self.embedding_net, self.x.ndim == 2
+    def _moments(self) -> Moments:
+        # Of embeddings and of summaries x side by side, from the same simulations.
+        h = self.embedding_net
+        if not self.has_summaries:
+            return self._simulated_moments(lambda x: embed(h, x))
+        return self._simulated_moments(lambda x: torch.cat([embed(h, x), x], dim=1))
 
-        def both(x: Tensor) -> Tensor:
-            embedded = embed(h, x)
-            return torch.cat([embedded, x], dim=1) if is_vector else embedded
+    @cached_property
+    def _moments_of_x(self) -> Moments:
+        return self._simulated_moments(lambda x: x)
 
+    def _simulated_moments(self, represent: Callable[[Tensor], Tensor]) -> Moments:
         parts = []
         for number, rows in enumerate(self.folds):
             with seeded(self.seed_of(frozenset([number]))):
@@ -115,7 +130,7 @@ class Workbench:
                     self.rope.source.moments(
                         self.theta[rows],
                         SIMULATIONS_PER_PAIR,
-                        both,
+                        represent,
                         progress=self.show,
                     )
                 )
@@ -127,25 +142,31 @@ class Workbench:
 
     def moments(self, space: Space) -> Moments:
         """Return the moments of simulations at all pairs, as ``space`` has them."""
+        if space == "input" and not self.has_summaries:
+            return self._moments_of_x
         width = self.embedded.shape[1]
         columns = slice(width, None) if space == "input" else slice(0, width)
-        return self._all_moments.columns(columns)
+        return self._moments.columns(columns)
 
     def tuned_net(self, folds: frozenset[int]) -> nn.Module:
         """Return an embedding net tuned on some folds, with rehearsal."""
         if folds not in self._nets:
-            rows, (_, simulated) = self.rows_of(folds), self.simulations
-            targets = self.moments("tuned").mean.to(self.embedded)[rows]
-            self._nets[folds] = TUNING.finetune(
-                self.embedding_net,
-                self.x[rows],
-                lambda count: targets,
-                draw_simulations=lambda count: simulated[:count],
-                groups=self.groups[rows.cpu()],
-                seed=self.seed_of(folds),
-                show_progress_bars=False,
-            ).embedding_net
+            self._nets[folds] = self.tune(self.rows_of(folds), self.seed_of(folds))
         return self._nets[folds]
+
+    def tune(self, rows: Tensor, seed: int) -> nn.Module:
+        """Return an embedding net tuned on some pairs, with rehearsal."""
+        _, simulated = self.simulations
+        targets = self.moments("tuned").mean.to(self.embedded)[rows]
+        return TUNING.finetune(
+            self.embedding_net,
+            self.x[rows],
+            lambda count: targets,
+            draw_simulations=lambda count: simulated[:count],
+            groups=self.groups[rows.cpu()],
+            seed=seed,
+            show_progress_bars=False,
+        ).embedding_net
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -211,10 +232,8 @@ class Fold:
         nets = [] if space == "input" else [bench.embedding_net]
         if space == "tuned":
             nets = []
-            z = torch.empty_like(bench.embedded[: len(bench.x)])
-            for number in sorted(self.used):
-                net = bench.tuned_net(self.used - {number})
-                rows = bench.folds[number]
+            z = bench.embedded.new_empty(len(bench.x), bench.embedded.shape[1])
+            for net, rows in self._tuned_without():
                 z[rows] = embed(net, bench.x[rows])
                 nets.append(net)
             z = z[self.rows]
@@ -235,3 +254,19 @@ class Fold:
             estimator=correction.estimator,
             nets=tuple(nn.Sequential(net, correction.constants) for net in nets),
         )
+
+    def _tuned_without(self) -> Iterator[tuple[nn.Module, Tensor]]:
+        """Yield nets tuned on some of the pairs, and the rows of others."""
+        bench = self.bench
+        if len(self.used) > 1:
+            for number in sorted(self.used):
+                yield bench.tuned_net(self.used - {number}), bench.folds[number]
+            return
+        split = split_groups(bench.groups[self.rows.cpu()], NUM_INNER_FOLDS)
+        parts = [self.rows[part.to(self.rows.device)] for part in split if len(part)]
+        if len(parts) == 1:  # nothing to tune without
+            yield bench.embedding_net, self.rows
+            return
+        for number, rows in enumerate(parts):
+            others = torch.cat([part for k, part in enumerate(parts) if k != number])
+            yield bench.tune(others, self.seed), rows

@@ -1,12 +1,14 @@
 """The stack of candidates as an sbi posterior."""
 
 import copy
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture import MixturePosterior
 from sbi_rope.stacking.report import StackingReport
 from sbi_rope.stacking.versions import Versions
@@ -22,11 +24,11 @@ class StackedPosterior(MixturePosterior):
         = \frac{\mathbf{1}[\theta \in \operatorname{supp} p]}{Z(x)}
         \sum_k w_k \frac1V \sum_v q_k^{(v)}(\theta \mid x),
 
-    with the weights of :func:`stacking_weights`, the version :math:`q_k^{(v)}` of
-    candidate k that was trained without fold v of the calibration pairs, and Z(x) the
-    mass inside the support of the prior. With couplings among the candidates it belongs
-    to a batch, as RoPE's posterior does; without, it answers any x. It has all methods
-    of :class:`~sbi_rope.MixturePosterior`.
+    with the weights of :func:`stacking_weights`, the versions :math:`q_k^{(v)}` of
+    candidate k, each trained without one fold of the calibration pairs or on all, and
+    Z(x) the mass inside the support of the prior. With couplings among the candidates
+    it belongs to a batch, as RoPE's posterior does; without, it answers any x. It has
+    all methods of :class:`~sbi_rope.MixturePosterior`.
 
     sbi's ``EnsemblePosterior`` is not used: it has no ``log_prob_batched``, corrects
     each candidate's leakage by itself, which does not end for NPE on misspecified data,
@@ -52,17 +54,36 @@ class StackedPosterior(MixturePosterior):
         enable_transform: bool = True,
     ) -> None:
         weights = report.cross_validation.weights.weights
+        estimator = versions.estimator(weights)
+        if versions.couplings is not None:
+            # The same object, so that both move to a device together.
+            couplings = replace(versions.couplings, part=estimator.parts[0])
+            versions = replace(versions, couplings=couplings)
         super().__init__(
-            versions.estimator(weights),
-            copy.deepcopy(prior),
-            enable_transform=enable_transform,
+            estimator, copy.deepcopy(prior), enable_transform=enable_transform
         )
-        self.versions = versions
+        self._versions: Versions | None = versions
         self.report = report
         self._purpose = (
             f"It is the stack of {len(weights)} candidate posteriors, weighted by "
             "their scores on held-out calibration pairs."
         )
+
+    @property
+    def versions(self) -> Versions:
+        """The candidates, each as trained without each fold of the pairs.
+
+        Raises:
+            InvalidInputError: If it is the posterior of one observation of a batch.
+        """
+        if self._versions is None:
+            raise InvalidInputError(
+                "Expected the posterior of the whole batch, which knows its candidates "
+                "one by one; got that of a single observation. Use `posterior.versions`"
+                " or `posterior.candidate_log_probs` instead of those of "
+                "`posterior[i]`."
+            )
+        return self._versions
 
     @property
     def candidate_weights(self) -> dict[str, float]:
@@ -82,6 +103,12 @@ class StackedPosterior(MixturePosterior):
 
         Returns:
             Shape ``(n, K)``, float64, in the order of ``candidate_weights``.
+
+        Raises:
+            InvalidInputError: If shapes do not fit, or it is the posterior of one
+                observation of a batch.
+            UnseenObservationError: If it belongs to a batch, an x is not in it, and
+                ``unseen="raise"``.
         """
         return self.versions.log_probs(theta, self._batch_of_x(x))
 
@@ -91,5 +118,5 @@ class StackedPosterior(MixturePosterior):
         It knows no other observation of the batch.
         """
         view: Any = super().__getitem__(index)
-        view.versions = None
+        view._versions = None
         return view

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from sbi_rope._progress import progress_bar
 from sbi_rope._random import seeded
+from sbi_rope._sbi import ConditionalDensityEstimator, estimator_of
 from sbi_rope._validation import (
     check_batch,
     check_choice,
@@ -17,13 +18,18 @@ from sbi_rope._validation import (
     check_not_negative,
     check_unit_interval,
 )
-from sbi_rope.errors import InvalidInputError, NotReadyError, warn_user
+from sbi_rope.errors import (
+    InvalidInputError,
+    NotReadyError,
+    SamplingError,
+    UnsupportedPosteriorError,
+    warn_user,
+)
 from sbi_rope.metrics.calibration import central_levels
 from sbi_rope.metrics.calls import draw_ranks
-from sbi_rope.mixture import MixturePosterior, Part
+from sbi_rope.mixture import MixturePosterior
 from sbi_rope.rope import RoPE
 from sbi_rope.stacking.candidates import (
-    AmortisedCandidate,
     Candidate,
     CouplingCandidate,
     check_candidates,
@@ -67,8 +73,9 @@ def stack(
     Candidates are trained without each fold of the calibration pairs and scored on it,
     and the posterior is their mixture with the weights that score best
     (:func:`stacking_weights`). It is deployed as it was scored: each candidate is the
-    average of its versions, one without each fold. The held-out score is therefore a
-    lower bound, in expectation, for observations like those of the pairs.
+    average of its versions, one without each fold, and one on all pairs. The held-out
+    score is therefore a lower bound, in expectation, for observations like those of the
+    pairs.
 
     Without ``x_o`` no candidate depends on a batch, and the result answers any
     observation. With ``x_o``, RoPE and OT-only at many gammas and taus take part, and
@@ -105,8 +112,10 @@ def stack(
         NotReadyError: If there are fewer than two pairs with different parameters.
         InvalidInputError: If an argument is outside its range or has the wrong shape,
             or there are couplings among the candidates without a batch.
-        UnsupportedPosteriorError: If a candidate has no density.
+        UnsupportedPosteriorError: If NPE or a candidate has no density.
         CouplingError: If a coupling has not converged.
+        SamplingError: If the candidates have next to no mass inside the prior's support
+            at a held-out observation.
         SimulationError: If the simulator fails.
     """
     check_choice("unseen", unseen, ("raise", "extend"))
@@ -219,6 +228,7 @@ class _Trainer:
             check_integer("num_simulations", num_simulations)
         check_not_negative("pseudo_count", pseudo_count)
         check_instance("require_convergence", require_convergence, bool)
+        _check_pairs(len(rope.calibration[0]))
         self.x_o = None if x_o is None else _checked_observations(x_o, rope)
         self.seeds = draw_seeds(seed, 3)
         self.bench = Workbench(
@@ -227,12 +237,8 @@ class _Trainer:
             seed=self.seeds[0],
             show_progress_bars=show_progress_bars,
         )
-        if len(self.bench.folds) < MIN_PAIRS:
-            raise NotReadyError(
-                f"Expected at least {MIN_PAIRS} calibration pairs with different "
-                f"parameters, to hold some out; got {len(self.bench.folds)}. Call "
-                "`append_calibration(theta, x)` first."
-            )
+        _check_pairs(len(self.bench.folds))
+        _check_density(estimator_of(self.bench.npe))
         self.candidates = self._chosen(candidates)
         self.num_simulations = num_simulations
         self.pseudo_count = pseudo_count
@@ -318,14 +324,9 @@ class _Trainer:
                 require_convergence=self.require_convergence,
                 show_progress_bars=self.show,
             )
-        fixed: dict[Candidate, list[Part]] = {
-            candidate: candidate.parts(folds[0])
-            for candidate in chosen
-            if isinstance(candidate, AmortisedCandidate) and candidate.fixed
-        }
         return Versions(
-            candidates=chosen,
-            fixed=fixed,
+            names=tuple(candidate.name for candidate in chosen),
+            fixed=train_version(chosen, folds[0], fixed=True),
             trained=trained,
             couplings=couplings,
             tail_mass=self.tail_mass,
@@ -353,26 +354,22 @@ class _Trainer:
         weights = fold_weights(log_scores, fold, self.pseudo_count)
         stack_scores = log_scores.new_empty(len(theta))
         levels = torch.empty_like(theta)
-        shared: dict[int, Tensor] = {}
+        # Simulations are contexts of the first part in all folds; what comes after may
+        # differ.
+        masses: dict[int, Tensor] = {}
         for number, rows in enumerate(bench.folds):
+            shared = dict(masses)
             posterior = MixturePosterior(
                 versions.estimator(weights[number], [number]),
                 self.prior,
                 enable_transform=False,
                 shared=shared,
             )
-            log_prob = posterior.log_prob_batched(theta[rows][None], x[rows])[0]
+            log_prob, ranks = self._normalised(posterior, theta[rows], x[rows])
             stack_scores[rows] = log_prob.double()
-            with seeded(self.seeds[2]):
-                ranks = draw_ranks(
-                    posterior,
-                    theta[rows],
-                    x[rows],
-                    num_samples=NUM_SAMPLES,
-                    chunk_size=NUM_SAMPLES,
-                    show=False,
-                )
             levels[rows] = central_levels(ranks).to(levels)
+            if versions.couplings is not None and 0 in shared:
+                masses[0] = shared[0]
         scores = CrossValidation(
             names=tuple(candidate.name for candidate in self.candidates),
             families=tuple(candidate.family for candidate in self.candidates),
@@ -390,6 +387,47 @@ class _Trainer:
                 "pair. Leave out candidates that are nearly the same."
             )
         return scores
+
+    def _normalised(
+        self, posterior: MixturePosterior, theta: Tensor, x: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return log densities inside the prior's support, and ranks of theta there."""
+        try:
+            log_prob = posterior.log_prob_batched(theta[None], x)[0]
+            with seeded(self.seeds[2]):
+                ranks = draw_ranks(
+                    posterior,
+                    theta,
+                    x,
+                    num_samples=NUM_SAMPLES,
+                    chunk_size=NUM_SAMPLES,
+                    show=False,
+                )
+        except SamplingError as error:
+            raise SamplingError(
+                "A stack of these candidates has next to no mass inside the support of "
+                "the prior at a held-out observation, so that it cannot be sampled. "
+                "Add the prior to the candidates, as `default_candidates()` has it."
+            ) from error
+        return log_prob, ranks
+
+
+def _check_pairs(count: int) -> None:
+    if count < MIN_PAIRS:
+        raise NotReadyError(
+            f"Expected at least {MIN_PAIRS} calibration pairs with different "
+            f"parameters, to hold some out; got {count}. Call "
+            "`append_calibration(theta, x)` first."
+        )
+
+
+def _check_density(estimator: Any) -> None:
+    if not isinstance(estimator, ConditionalDensityEstimator):
+        raise UnsupportedPosteriorError(
+            "Expected a RoPE of a posterior with a density, such as that of NPE: the "
+            "density of held-out parameters is what candidates are scored by. Got "
+            f"{type(estimator).__name__}; train NPE instead of FMPE or NPSE."
+        )
 
 
 def _checked_observations(x_o: Tensor, rope: RoPE) -> Tensor:

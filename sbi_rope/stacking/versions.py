@@ -1,17 +1,18 @@
 """All candidates of a stack, in a version for each fold."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from sbi_rope._random import seeded
+from sbi_rope._validation import check_batch, check_same_length
+from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture import MixtureEstimator, Part
-from sbi_rope.stacking.candidates import (
-    AmortisedCandidate,
-    Candidate,
-    CouplingCandidate,
-)
+from sbi_rope.mixture.parts import DTYPE
+from sbi_rope.stacking.candidates import AmortisedCandidate, Candidate
 from sbi_rope.stacking.couplings import FittedCouplings
 from sbi_rope.stacking.folds import Fold
 
@@ -19,14 +20,31 @@ __all__ = ["Versions", "train_version"]
 
 
 def train_version(
-    candidates: Sequence[Candidate], fold: Fold
-) -> dict[Candidate, list[Part]]:
-    """Train what depends on the pairs, on those of a fold; couplings excepted."""
-    return {
-        candidate: candidate.parts(fold)
-        for candidate in candidates
-        if isinstance(candidate, AmortisedCandidate) and not candidate.fixed
-    }
+    candidates: Sequence[Candidate], fold: Fold, *, fixed: bool = False
+) -> dict[str, list[Part]]:
+    """Return the densities of amortised candidates by name.
+
+    Args:
+        candidates: Of which those are trained that are amortised.
+        fold: The pairs to train on.
+        fixed: Whether to take those that depend on no pairs, or all others.
+
+    Raises:
+        InvalidInputError: If a candidate returns none.
+    """
+    trained: dict[str, list[Part]] = {}
+    for candidate in candidates:
+        if not isinstance(candidate, AmortisedCandidate) or candidate.fixed != fixed:
+            continue
+        # Whoever forgets the seed, or looks at a prior by drawing from it, leaves no
+        # trace.
+        with seeded(fold.seed):
+            trained[candidate.name] = list(candidate.parts(fold))
+        if not trained[candidate.name]:
+            raise InvalidInputError(
+                f"Expected at least one density of {candidate.name!r}; got none."
+            )
+    return trained
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -37,16 +55,16 @@ class Versions:
     weighted by what held-out pairs say of them.
 
     Attributes:
-        candidates: K of them.
+        names: Of the candidates, K of them.
         fixed: The densities of candidates that are the same in all versions.
         trained: For each version, the densities of the other amortised candidates.
         couplings: RoPE and OT-only in all versions; None without.
         tail_mass: As in :class:`~sbi_rope.mixture.MixtureEstimator`.
     """
 
-    candidates: tuple[Candidate, ...]
-    fixed: dict[Candidate, list[Part]]
-    trained: tuple[dict[Candidate, list[Part]], ...]
+    names: tuple[str, ...]
+    fixed: dict[str, list[Part]]
+    trained: tuple[dict[str, list[Part]], ...]
     couplings: FittedCouplings | None = None
     tail_mass: float = 1e-3
 
@@ -60,36 +78,47 @@ class Versions:
             numbers: Of the versions, which count the same; all if None.
         """
         numbers = range(len(self.trained)) if numbers is None else numbers
-        of_candidate = dict(zip(self.candidates, weights.tolist(), strict=True))
+        of_name = dict(zip(self.names, weights.tolist(), strict=True))
         parts: list[Part] = []
         shares: list[float] = []
         if self.couplings is not None:
-            coupled, share = self.couplings.weighted(
-                {
-                    candidate: weight
-                    for candidate, weight in of_candidate.items()
-                    if isinstance(candidate, CouplingCandidate)
-                },
-                numbers,
-            )
+            coupled, share = self.couplings.weighted(of_name, numbers)
             parts.append(coupled)
             shares.append(share)
-        for candidate, weight in of_candidate.items():
-            if isinstance(candidate, CouplingCandidate):
+        for name in self.names:
+            if self._is_coupled(name):
                 continue
-            members = self.parts_of(candidate, numbers)
+            members, equal = self.parts_of(name, numbers)
             parts += members
-            shares += [weight / len(members)] * len(members)
+            shares += [of_name[name] * share for share in equal]
         total = sum(shares)
         return MixtureEstimator(
             parts, [share / total for share in shares], tail_mass=self.tail_mass
         )
 
-    def parts_of(self, candidate: Candidate, numbers: Sequence[int]) -> list[Part]:
-        """Return the densities of a candidate in some versions."""
-        if candidate in self.fixed:
-            return self.fixed[candidate]
-        return [part for number in numbers for part in self.trained[number][candidate]]
+    def _is_coupled(self, name: str) -> bool:
+        return name not in self.fixed and name not in self.trained[0]
+
+    def parts_of(
+        self, name: str, numbers: Sequence[int]
+    ) -> tuple[list[Part], list[float]]:
+        """Return the densities of a candidate in some versions, and their shares.
+
+        Versions count the same, and so do the densities of each. No coupling has them.
+        """
+        if name in self.fixed:
+            versions = [self.fixed[name]]
+        else:
+            versions = [self.trained[number][name] for number in numbers]
+        shares = [1.0 / len(versions) / len(of_one) for of_one in versions]
+        return (
+            [part for of_one in versions for part in of_one],
+            [
+                share
+                for share, of_one in zip(shares, versions, strict=True)
+                for _ in of_one
+            ],
+        )
 
     @torch.no_grad()
     def log_probs(
@@ -110,19 +139,31 @@ class Versions:
 
         Returns:
             Shape ``(n, K)``, float64, not corrected for leakage.
+
+        Raises:
+            InvalidInputError: If shapes do not fit or a value is not finite.
+            UnseenObservationError: If there are couplings, and an x is not in their
+                batch, and they do not extend.
         """
         numbers = range(len(self.trained)) if numbers is None else numbers
-        coupled = self._coupled_log_probs(theta, x, numbers, log_q)
-        scores = []
-        for candidate in self.candidates:
-            if isinstance(candidate, CouplingCandidate):
-                of_each = coupled[candidate]
-            else:
-                members = self.parts_of(candidate, numbers)
-                equal = [1.0 / len(members)] * len(members)
-                of_each = MixtureEstimator(members, equal).part_log_probs(theta, x)
-            scores.append(log_mean_exp(of_each))
-        return torch.stack(scores, dim=1)
+        theta = check_batch("theta", theta, self._any.density.input_shape).to(DTYPE)
+        check_same_length("theta", theta, "x", x)
+        scores = self._coupled_log_probs(theta, x, numbers, log_q)
+        for name in self.names:
+            if self._is_coupled(name):
+                continue
+            members, shares = self.parts_of(name, numbers)
+            estimator = MixtureEstimator(members, shares)
+            of_each = estimator.part_log_probs(theta, x)
+            log_shares = estimator.weights.log()
+            scores[name] = (of_each + log_shares).logsumexp(dim=1)
+        return torch.stack([scores[name] for name in self.names], dim=1)
+
+    @property
+    def _any(self) -> Part:
+        if self.couplings is not None:
+            return self.couplings.part
+        return self.parts_of(self.names[0], [0])[0][0]
 
     def _coupled_log_probs(
         self,
@@ -130,23 +171,16 @@ class Versions:
         x: Tensor,
         numbers: Sequence[int],
         log_q: Tensor | None,
-    ) -> dict[CouplingCandidate, Tensor]:
+    ) -> dict[str, Tensor]:
         if self.couplings is None:
             return {}
-        found: dict[CouplingCandidate, list[Tensor]] = {}
+        found: dict[str, list[Tensor]] = {}
         of_each = self.couplings.log_probs(theta, x, log_q=log_q).unbind(dim=1)
-        for (candidate, version), column in zip(
-            self.couplings.settings, of_each, strict=True
-        ):
+        settings = self.couplings.settings
+        for (name, version), column in zip(settings, of_each, strict=True):
             if version is None or version in numbers:
-                found.setdefault(candidate, []).append(column)
+                found.setdefault(name, []).append(column)
         return {
-            candidate: torch.stack(columns, dim=1)
-            for candidate, columns in found.items()
+            name: torch.stack(columns, dim=1).logsumexp(dim=1) - math.log(len(columns))
+            for name, columns in found.items()
         }
-
-
-def log_mean_exp(log_probs: Tensor) -> Tensor:
-    """Return the log of the mean density over the last dimension."""
-    count = log_probs.shape[-1]
-    return log_probs.logsumexp(dim=-1) - torch.tensor(float(count)).log().to(log_probs)
