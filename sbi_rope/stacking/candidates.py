@@ -260,8 +260,8 @@ class FinetunedCandidate(AmortisedCandidate):
     space: Space | None = None
 
     def __post_init__(self) -> None:
-        """Check the types of all fields."""
-        check_instance("corrected", self.corrected, bool)
+        """Check the value of the field."""
+        check_choice("space", self.space, (None, "embedding", "input", "tuned"))
 
     @property
     def name(self) -> str:  # type: ignore[override]
@@ -284,6 +284,11 @@ class FinetunedCandidate(AmortisedCandidate):
 
     def parts(self, fold: Fold) -> list[Part]:
         """Train without each part of the pairs."""
+        if len(fold.used) < 2:
+            # Nothing can be held out; the start is what there is.
+            if self.space is None:
+                return [part_of(estimator_of(fold.bench.npe))]
+            return DiscrepancyCandidate(space=self.space).parts(fold)
         rate = LEARNING_RATE if self.space is None else LEARNING_RATE_CORRECTED
         return [
             part_of(
