@@ -26,6 +26,7 @@ from sbi_rope import (
     stack,
 )
 from sbi_rope.baselines import PriorPosterior
+from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.metrics import Evaluation, evaluate
 from sbi_rope.tasks import Task
 
@@ -53,8 +54,9 @@ class Study:
 
     With ``stored``, RoPE uses these simulations instead of the task's simulator. With
     ``held_out``, NPE is also scored on simulations it has not seen: the row "SBI".
-    ``with_stack`` weighs all settings of RoPE and its rivals and prints the report of
-    the stack; ``with_diagnosis`` prints whether the test observations are fit for RoPE.
+    ``with_stack`` weighs NPE, fine-tuned NPE and discrepancy models and prints the report
+    of the stack, and what is wrong with each summary of x if these have names;
+    ``with_diagnosis`` prints whether the test observations are fit for RoPE.
     """
 
     task: Task
@@ -147,6 +149,12 @@ class Study:
                 score("stack", stacked, start, n)
                 print(stacked.report, flush=True)
                 self._save(plots.stacking_report(stacked.report), f"stack_{name}")
+                if task.x_names:
+                    method = DiscrepancyNPE.from_posterior(npe, **source)
+                    method.append_calibration(theta_cal, x_cal)
+                    report = method.report(x_names=task.x_names)
+                    print(report, flush=True)
+                    self._save(plots.discrepancy(report), f"discrepancy_{name}")
             if self.with_diagnosis:
                 diagnosis = diagnose(
                     rope,
@@ -268,7 +276,7 @@ LPP: mean log-probability of the true parameters, in standard deviations of the 
 (higher is better). ACAUC: 0 is calibrated, above 0 is overconfident. ECE: expected
 coverage error. -inf: share of test observations with density zero. NPE and tuning-only
 are scored without sbi's leakage correction. SBI is NPE on simulations it has not seen.
-RoPE has one setting, fixed beforehand; stack weighs many, and its rivals too.
+RoPE has one setting, fixed beforehand; stack weighs its rivals by held-out pairs.
 With several seeds: mean, and standard deviation of the LPP over seeds (+-).
 """
 
@@ -317,7 +325,7 @@ def argument_parser(
         "--stack",
         action=argparse.BooleanOptionalAction,
         default=with_stack,
-        help="weigh all settings and rivals by held-out pairs; a minute or more each",
+        help="weigh many methods by held-out pairs; a minute or two each",
     )
     parser.add_argument(
         "--diagnose",
