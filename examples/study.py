@@ -54,8 +54,8 @@ class Study:
 
     With ``stored``, RoPE uses these simulations instead of the task's simulator. With
     ``held_out``, NPE is also scored on simulations it has not seen: the row "SBI".
-    ``with_stack`` weighs NPE, fine-tuned NPE and discrepancy models and prints the report
-    of the stack, and what is wrong with each summary of x if these have names;
+    ``with_stack`` weighs NPE, fine-tuned NPE and discrepancy models, prints the report
+    of the stack, and says what is wrong with each summary of x if these have names;
     ``with_diagnosis`` prints whether the test observations are fit for RoPE.
     """
 
