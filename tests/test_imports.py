@@ -26,6 +26,7 @@ LAYERS = [
     {"mixture", "plots"},
     {"rope", "tasks"},
     {"baselines"},
+    {"discrepancy"},
     {"stacking", "diagnosis"},
 ]
 NEVER_IMPORT_EACH_OTHER = [
