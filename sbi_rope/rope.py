@@ -606,7 +606,8 @@ class RoPE:
         if self._g is None:
             raise NotReadyError("No tuned embedding net yet. Call `train()` first.")
         tuned = with_embedding(self._estimator, self._g)
-        return posterior_from(self._posterior, copy.deepcopy(tuned))
+        with seeded(0):  # sbi draws from the prior to look at it
+            return posterior_from(self._posterior, copy.deepcopy(tuned))
 
     @property
     def source(self) -> SimulationSource:
@@ -616,7 +617,8 @@ class RoPE:
     @property
     def npe(self) -> Any:
         """A copy of the NPE posterior that is repaired."""
-        return posterior_from(self._posterior, copy.deepcopy(self._estimator))
+        with seeded(0):
+            return posterior_from(self._posterior, copy.deepcopy(self._estimator))
 
     @property
     def calibration(self) -> tuple[Tensor, Tensor]:

@@ -1,29 +1,104 @@
 """Small stacks that tests share, and what they are made of."""
 
 import functools
-from dataclasses import replace
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from torch import Tensor, nn
 
-from sbi_rope import CalibrationFinetuner, MixturePosterior, RoPE, SinkhornCoupler
-from sbi_rope._sbi import headless
+from sbi_rope import CalibrationFinetuner, RoPE, StackedPosterior
 from sbi_rope.baselines import FinetunedNPE, PriorPosterior
 from sbi_rope.baselines.training import Training
+from sbi_rope.discrepancy import DiscrepancyModel
 from sbi_rope.stacking import (
     CouplingCandidate,
     CrossValidation,
     DensityCandidate,
-    StackedPosterior,
     cross_validate,
+    default_candidates,
     stack,
 )
-from sbi_rope.stacking.cross_validation import draw_seeds
 from tests import problems
 
 QUIET: dict[str, Any] = {"show_progress_bars": False}
 NUM_PAIRS, NUM_OBSERVED, NUM_SIMULATED = 20, 25, 60
+
+
+@contextmanager
+def quick() -> Iterator[None]:
+    """Make all that a stack trains far enough to be another, and no further."""
+    model = DiscrepancyModel(
+        gain_precisions=(1.0,), error_scales=(0.1,), degrees_of_freedom=(3.0,)
+    )
+    tuning = CalibrationFinetuner(rehearsal=1.0, learning_rate=0.02, num_steps=3)
+    steps = dict.fromkeys(("embedding", "tuned", "input"), 4)
+    training = Training(
+        training_batch_size=100, validation_fraction=0.2, max_num_epochs=4
+    )
+    constants = {
+        "sbi_rope.stacking.folds.NUM_SIMULATIONS": 300,
+        "sbi_rope.stacking.folds.SIMULATIONS_PER_PAIR": 5,
+        "sbi_rope.stacking.folds.TUNING": tuning,
+        "sbi_rope.stacking.folds.DiscrepancyModel": lambda: model,
+        "sbi_rope.stacking.stack.NUM_SAMPLES": 40,
+        "sbi_rope.discrepancy.correction.NUM_STEPS": steps,
+        "sbi_rope.discrepancy.correction.NUM_DRAWS": 50,
+        "sbi_rope.discrepancy.training.BATCH_SIZE": 50,
+        "sbi_rope.baselines.finetuned_npe.DEFAULT_TRAINING": training,
+    }
+    with ExitStack() as patches:
+        for name, value in constants.items():
+            patches.enter_context(patch(name, value))
+        yield
+
+
+# Moves the net far enough to tell g from h.
+QUICK = CalibrationFinetuner(num_steps=6, simulations_per_target=3, learning_rate=0.03)
+PRIOR, NPE = (c for c in default_candidates() if c.name in ("prior", "NPE"))
+OT_ONLY = CouplingCandidate(gamma=0.2, tau=0.5, tuned=False)
+ROPE = CouplingCandidate(gamma=0.2, tau=1.0)
+COUPLINGS = (
+    ROPE,
+    CouplingCandidate(gamma=0.4, tau=0.5),
+    OT_ONLY,
+    CouplingCandidate(gamma=0.3, tau=0.9, tuned=False, cost_scale="none"),
+    CouplingCandidate(gamma=0.2, tau=0.5, rehearsal=20.0),
+)
+# All kinds that a stack has by itself, with couplings at a few settings.
+CANDIDATES = (
+    *COUPLINGS,
+    *(
+        candidate
+        for candidate in default_candidates(couplings=True)
+        if not isinstance(candidate, CouplingCandidate)
+    ),
+)
+
+
+def finetuned(rope: RoPE, seed: int) -> Any:
+    method = FinetunedNPE.from_posterior(
+        rope.npe,
+        training=Training(max_num_epochs=2, training_batch_size=100),
+        learning_rates=(1e-2,),
+    )
+    method.append_calibration(*rope.calibration)
+    return method.train(seed=seed, **QUIET).build_posterior()
+
+
+def fitted_prior(rope: RoPE, seed: int) -> PriorPosterior:
+    """A box around the parameters of the pairs."""
+    theta, _ = rope.calibration
+    width = theta.abs().max(dim=0).values + 0.1
+    box = problems.BoxUniform(-width, width)
+    return PriorPosterior(box)
+
+
+# Cheap ones that see the pairs.
+FINETUNED = DensityCandidate(name="mine", build=finetuned)
+FITTED = DensityCandidate(name="fitted prior", build=fitted_prior)
 
 
 def uneven(theta: Tensor) -> Tensor:
@@ -35,34 +110,7 @@ def uneven(theta: Tensor) -> Tensor:
     return problems.simulate(theta) + 0.02 * (torch.poisson(rate) - rate)
 
 
-def quick_finetuned(rope: RoPE, seed: int) -> Any:
-    method = FinetunedNPE.from_posterior(
-        rope.npe, training=Training(max_num_epochs=3), learning_rates=(1e-2,)
-    )
-    method.append_calibration(*rope.calibration)
-    return method.train(seed=seed, **QUIET).build_posterior()
-
-
-# Moves the net far enough to tell g from h.
-QUICK = CalibrationFinetuner(num_steps=15, simulations_per_target=3, learning_rate=0.03)
-PRIOR = DensityCandidate(
-    name="prior", build=lambda rope, seed: PriorPosterior(rope.npe.prior), fixed=True
-)
-NPE = DensityCandidate(name="NPE", build=lambda rope, seed: rope.npe, fixed=True)
-TUNED = DensityCandidate(name="tuned", build=lambda rope, seed: rope.tuned_posterior())
-FINETUNED = DensityCandidate(name="fine-tuned", build=quick_finetuned)
-OT_ONLY = CouplingCandidate(gamma=0.2, tau=0.5, tuned=False)
-COUPLINGS = (
-    CouplingCandidate(gamma=0.2, tau=1.0),
-    CouplingCandidate(gamma=0.4, tau=0.5),
-    OT_ONLY,
-    CouplingCandidate(gamma=0.3, tau=0.9, tuned=False, cost_scale="none"),
-    CouplingCandidate(gamma=0.2, tau=0.5, rehearsal=20.0),
-)
-CANDIDATES = (*COUPLINGS, PRIOR, NPE, TUNED, FINETUNED)
-
-
-def problem(dim: int, n: int, *, seed: int) -> tuple[Tensor, Tensor]:
+def problem(n: int, *, seed: int, dim: int = 2) -> tuple[Tensor, Tensor]:
     """Real observations, shifted against the simulations, with their parameters."""
     with torch.random.fork_rng():
         torch.manual_seed(seed)
@@ -70,119 +118,58 @@ def problem(dim: int, n: int, *, seed: int) -> tuple[Tensor, Tensor]:
         return theta, problems.simulate(theta) + 0.4
 
 
-def untrained(
+def rope_of(
+    pairs: tuple[Tensor, Tensor] | None = None,
+    *,
     family: str = "mdn",
     embedding: str = "linear",
-    *,
-    dim: int = 2,
-    num_pairs: int = NUM_PAIRS,
-    pairs: tuple[Tensor, Tensor] | None = None,
     **options: Any,
 ) -> RoPE:
+    """A RoPE that was not trained: a stack does without."""
     if "simulations" not in options:
-        options["simulator"] = uneven
+        options.setdefault("simulator", uneven)
     options.setdefault("finetuner", QUICK)
-    rope = RoPE(problems.npe_posterior(family, embedding, dim=dim), **options)
-    if pairs is None:
-        pairs = problem(dim, num_pairs, seed=1)
-    return rope.append_calibration(*pairs) if len(pairs[0]) else rope
+    rope = RoPE(problems.npe_posterior(family, embedding), **options)
+    theta, x = problem(NUM_PAIRS, seed=1) if pairs is None else pairs
+    return rope.append_calibration(theta, x) if len(theta) else rope
 
 
-def trained(family: str = "mdn", embedding: str = "linear", **options: Any) -> RoPE:
-    return untrained(family, embedding, **options).train(seed=0, **QUIET)
+def trained() -> RoPE:
+    return rope_of().train(seed=0, **QUIET)
 
 
-def observed(dim: int = 2, n: int = NUM_OBSERVED) -> Tensor:
-    return problem(dim, n, seed=2)[1]
+def observed(n: int = NUM_OBSERVED) -> Tensor:
+    return problem(n, seed=2)[1]
 
 
-def validate(rope: RoPE, **options: Any) -> CrossValidation:
-    options = {
-        "candidates": CANDIDATES,
-        "num_simulations": NUM_SIMULATED,
-        "seed": 0,
-        **QUIET,
-        **options,
-    }
-    return cross_validate(rope, options.pop("x_o", observed()), **options)
+def stacked(rope: RoPE, x_o: Tensor | None = None, **options: Any) -> StackedPosterior:
+    with quick():
+        return stack(rope, x_o, **_options(x_o, options))
 
 
-def stacked(rope: RoPE, **options: Any) -> StackedPosterior:
-    options = {
-        "candidates": CANDIDATES,
-        "num_simulations": NUM_SIMULATED,
-        "tail_mass": 0.0,
-        "seed": 0,
-        **QUIET,
-        **options,
-    }
-    return stack(rope, options.pop("x_o", observed()), **options)
+def validated(rope: RoPE, x_o: Tensor | None = None, **options: Any) -> CrossValidation:
+    with quick():
+        return cross_validate(rope, x_o, **_options(x_o, options))
 
 
-@functools.cache
-def the_rope() -> RoPE:
-    """For reading only, as all of these."""
-    with torch.random.fork_rng():
-        return trained()
-
-
-@functools.cache
-def the_scores() -> CrossValidation:
-    with torch.random.fork_rng():
-        return validate(the_rope())
+def _options(x_o: Tensor | None, options: dict[str, Any]) -> dict[str, Any]:
+    defaults = {"num_simulations": NUM_SIMULATED, "seed": 0, **QUIET}
+    if x_o is not None:
+        defaults["candidates"] = CANDIDATES
+    return {**defaults, **options}
 
 
 @functools.cache
 def the_stack() -> StackedPosterior:
+    """Of any observation; for reading only, as the next."""
     with torch.random.fork_rng():
-        return stacked(the_rope(), unseen="extend")
+        return stacked(rope_of(), tail_mass=0.0)
 
 
-def midpoints(count: int) -> Tensor:
-    """The middles of equal cells of [-1, 1]."""
-    return (torch.arange(count) + 0.5) * 2 / count - 1
-
-
-def rope_of(candidate: CouplingCandidate, rope: RoPE) -> RoPE:
-    """The RoPE that a candidate is a setting of, in a stack made with seed 0."""
-    if not candidate.tuned:
-        return rope.with_pairs(torch.arange(0))
-    if candidate.rehearsal is None:
-        return rope
-    other = replace(rope.finetuner, rehearsal=candidate.rehearsal)
-    # `stack` draws three seeds; what is trained on all pairs has the last.
-    return rope.with_finetuner(other).train(seed=draw_seeds(0, 3)[2], **QUIET)
-
-
-def net_of(candidate: CouplingCandidate, rope: RoPE) -> nn.Module:
-    """What a candidate embeds observations by."""
-    if not candidate.tuned:
-        return rope.embedding_net
-    return rope_of(candidate, rope).tuned_embedding_net
-
-
-def coupled_by_hand(
-    candidate: CouplingCandidate, rope: RoPE, x: Tensor, contexts: Tensor
-) -> MixturePosterior:
-    """The posterior of one setting of RoPE, without any part of the stack."""
-    net = net_of(candidate, rope)
-    coupler = SinkhornCoupler(
-        gamma=candidate.gamma,
-        tau=candidate.tau,
-        cost_scale=candidate.cost_scale,
-        tolerance=1e-9,
-    )
-    with torch.no_grad():
-        coupling = coupler.couple(net(x), contexts)
-    estimator = problems.coupled_mixture(
-        headless(rope.npe.posterior_estimator),
-        contexts,
-        coupling,
-        x,
-        embedding_net=net,
-        tail_mass=0.0,
-    )
-    return MixturePosterior(estimator, rope.npe.prior)
+@functools.cache
+def the_coupled_stack() -> StackedPosterior:
+    with torch.random.fork_rng():
+        return stacked(rope_of(), observed(), tail_mass=0.0, unseen="extend")
 
 
 def unnormalised(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:

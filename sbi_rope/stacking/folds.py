@@ -87,8 +87,7 @@ class Workbench:
     @cached_property
     def npe(self) -> Any:
         """The posterior of NPE."""
-        with seeded(0):  # sbi draws from the prior to look at it
-            return self.rope.npe
+        return self.rope.npe
 
     @cached_property
     def simulations(self) -> tuple[Tensor, Tensor]:

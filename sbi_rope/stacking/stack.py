@@ -147,7 +147,7 @@ def stack(
         versions,
         trainer.prior,
         report=StackingReport(cross_validation=scores, learning_curve=curve),
-        enable_transform=rope.npe.enable_transform,
+        enable_transform=trainer.bench.npe.enable_transform,
     )
 
 

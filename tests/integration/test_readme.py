@@ -6,6 +6,7 @@ from pathlib import Path
 import torch
 
 from tests import gaussian
+from tests.stacks import quick
 
 README = Path(__file__).resolve().parents[2] / "README.md"
 
@@ -28,7 +29,8 @@ def test_the_lines_repair_a_posterior() -> None:
         "x_cal": x_cal,
         "x_o": gaussian.labelled(30)[1],
     }
-    exec(code[0], names)
+    with quick():
+        exec(code[0], names)
     assert names["samples"].shape == (1000, 30, 2)
     assert torch.isfinite(names["samples"]).all()
     # The other blocks are about a fixed setting and another method, by the same names.

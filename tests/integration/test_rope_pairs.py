@@ -18,12 +18,11 @@ from tests.stacks import (
     observed,
     parameters,
     problem,
+    rope_of,
     same,
-    the_rope,
     trained,
     uneven,
     unnormalised,
-    untrained,
 )
 
 # Batches and calibration sets are small here on purpose.
@@ -46,16 +45,16 @@ def test_targets_are_mean_embeddings_at_the_parameters_of_their_rows() -> None:
 
 
 def test_targets_depend_on_their_own_rows_and_the_seed_only() -> None:
-    theta, x = problem(2, 8, seed=1)
+    theta, x = problem(8, seed=1)
     rows = torch.tensor([5, 1])
-    rope = untrained(pairs=(theta, x))
+    rope = rope_of((theta, x))
     state = torch.random.get_rng_state()
     targets = rope.draw_targets(rows, seed=0, **QUIET)
     assert torch.equal(torch.random.get_rng_state(), state)
     assert targets.shape == (2, 4)
     other = theta.clone()
     other[[0, 2, 3, 4, 6, 7]] *= -0.5
-    rope = untrained(pairs=(other, x + 1))
+    rope = rope_of((other, x + 1))
     assert torch.equal(rope.draw_targets(rows, seed=0, **QUIET), targets)
     assert not torch.equal(rope.draw_targets(rows, seed=1, **QUIET), targets)
 
@@ -63,7 +62,7 @@ def test_targets_depend_on_their_own_rows_and_the_seed_only() -> None:
 def test_targets_of_stored_simulations_are_the_embeddings_of_the_nearest() -> None:
     theta = problems.box(2).sample((100,))
     x = problems.simulate(theta)
-    rope = untrained(simulations=(theta, x), pairs=(theta[:5] + 1e-4, x[:5] + 0.4))
+    rope = rope_of((theta[:5] + 1e-4, x[:5] + 0.4), simulations=(theta, x))
     rows = torch.tensor([3, 0])
     with torch.no_grad():
         expected = rope.embedding_net(x[rows])
@@ -71,7 +70,7 @@ def test_targets_of_stored_simulations_are_the_embeddings_of_the_nearest() -> No
 
 
 def test_a_rope_with_some_pairs_tunes_on_these_towards_the_targets_given() -> None:
-    rope = the_rope()
+    rope = trained()
     theta, x = rope.calibration
     rows = torch.tensor([7, 2, 11, 5, 3, 1])
     targets = torch.randn(6, 4)
@@ -90,7 +89,7 @@ def test_a_rope_with_some_pairs_tunes_on_these_towards_the_targets_given() -> No
 def test_targets_are_forgotten_when_pairs_are_added_or_drawn_anew_in_every_step() -> (
     None
 ):
-    rope = the_rope()
+    rope = trained()
     theta, x = rope.calibration
     rows = torch.arange(6)
     far = torch.full((6, 4), 100.0)
@@ -103,7 +102,7 @@ def test_targets_are_forgotten_when_pairs_are_added_or_drawn_anew_in_every_step(
     finetuner = CalibrationFinetuner(
         num_steps=3, simulations_per_target=2, resample_targets=True
     )
-    rope = untrained(finetuner=finetuner)
+    rope = rope_of(finetuner=finetuner)
     nets = [
         rope.with_pairs(rows, targets=targets)
         .train(seed=0, **QUIET)
@@ -124,7 +123,7 @@ def test_a_rope_with_some_pairs_leaves_the_other_as_it_was() -> None:
 
 
 def test_npe_and_calibration_are_copies() -> None:
-    rope = the_rope()
+    rope = trained()
     original = problems.npe_posterior("mdn")
     theta, x_o = problems.box(2).sample((NUM_OBSERVED,)), observed()
     expected = unnormalised(original, theta, x_o)
@@ -156,14 +155,14 @@ def counted() -> tuple[list[int], RoPE]:
         simulator=simulator,
         finetuner=replace(QUICK, rehearsal=1.0),
     )
-    return calls, rope.append_calibration(*problem(2, NUM_PAIRS, seed=1))
+    return calls, rope.append_calibration(*problem(NUM_PAIRS, seed=1))
 
 
 def test_rehearsal_keeps_simulations_nearer_to_where_they_were() -> None:
     x = problems.simulate(problems.box(2).sample((500,)))
     moved = []
     for rehearsal in (0.0, 5.0):
-        rope = untrained(finetuner=replace(QUICK, rehearsal=rehearsal))
+        rope = rope_of(finetuner=replace(QUICK, rehearsal=rehearsal))
         rope.train(seed=0, **QUIET)
         distance = rope.tuned_embedding_net(x) - rope.embedding_net(x)
         moved.append(float(distance.norm(dim=1).mean()))
@@ -189,14 +188,14 @@ def test_what_is_rehearsed_is_simulated_once_for_all_parts() -> None:
 def test_stored_simulations_can_be_rehearsed() -> None:
     theta = problems.box(2).sample((50,))  # fewer than a simulator would be asked for
     simulations = (theta, problems.simulate(theta))
-    rope = untrained(simulations=simulations).train(seed=0, **QUIET)
+    rope = rope_of(simulations=simulations).train(seed=0, **QUIET)
     other = rope.with_finetuner(replace(QUICK, rehearsal=1.0)).train(seed=0, **QUIET)
     nets = (rope.tuned_embedding_net, other.tuned_embedding_net)
     assert not same(parameters(nets[0]), parameters(nets[1]))
 
 
 def test_another_finetuner_gives_another_net_and_leaves_the_first() -> None:
-    rope = the_rope()
+    rope = trained()
     net = rope.tuned_embedding_net
     other = rope.with_finetuner(replace(QUICK, num_steps=3))
     with pytest.raises(NotReadyError):
@@ -204,7 +203,7 @@ def test_another_finetuner_gives_another_net_and_leaves_the_first() -> None:
     other.train(seed=0, **QUIET)
     assert same(parameters(rope.tuned_embedding_net), parameters(net))
     assert rope.finetuner == QUICK
-    expected = untrained(finetuner=replace(QUICK, num_steps=3)).train(seed=0, **QUIET)
+    expected = rope_of(finetuner=replace(QUICK, num_steps=3)).train(seed=0, **QUIET)
     nets = (other.tuned_embedding_net, expected.tuned_embedding_net)
     assert same(parameters(nets[0]), parameters(nets[1]))
     # Targets of another number of simulations are not those it would ask for.
@@ -212,7 +211,7 @@ def test_another_finetuner_gives_another_net_and_leaves_the_first() -> None:
     known = rope.with_pairs(rows, targets=rope.draw_targets(rows, seed=9, **QUIET))
     more = replace(QUICK, simulations_per_target=50)
     again = known.with_finetuner(more).train(seed=0, **QUIET)
-    expected = untrained(finetuner=more).train(seed=0, **QUIET)
+    expected = rope_of(finetuner=more).train(seed=0, **QUIET)
     nets = (again.tuned_embedding_net, expected.tuned_embedding_net)
     assert same(parameters(nets[0]), parameters(nets[1]))
     with pytest.raises(InvalidTypeError, match="finetuner"):

@@ -1,248 +1,501 @@
-"""Stacks of trained candidates: density, samples, and what they are made of."""
+"""Stacks of trained candidates: density, samples, copies, and what they answer."""
 
-import itertools
+import copy
 import math
 import pickle
+from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
+from sbi.utils import BoxUniform
+from torch import Tensor, nn
 
-from sbi_rope import CalibrationFinetuner, RoPE, SinkhornCoupler
-from sbi_rope.errors import (
-    RoPEWarning,
-    UnseenObservationError,
-)
+from sbi_rope import RoPE, SinkhornCoupler
+from sbi_rope._sbi import DirectPosterior, estimator_of
+from sbi_rope.errors import InvalidInputError, RoPEWarning, UnseenObservationError
+from sbi_rope.mixture import MixturePosterior
 from sbi_rope.stacking import (
     CouplingCandidate,
+    DensityCandidate,
+    DiscrepancyCandidate,
+    FinetunedCandidate,
+    default_candidates,
     stacking_weights,
 )
-from tests import problems
+from tests import gaussian, problems
 from tests.stacks import (
     CANDIDATES,
     COUPLINGS,
     FINETUNED,
     NPE,
     NUM_OBSERVED,
-    NUM_SIMULATED,
+    NUM_PAIRS,
     OT_ONLY,
     PRIOR,
     QUIET,
-    coupled_by_hand,
-    midpoints,
-    net_of,
+    ROPE,
     observed,
+    problem,
     rope_of,
     stacked,
-    the_rope,
-    the_scores,
+    the_coupled_stack,
     the_stack,
-    trained,
+    uneven,
     unnormalised,
+    validated,
 )
 
 # Batches and calibration sets are small here on purpose.
 pytestmark = pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
 
 
-def test_couplings_of_a_stack_are_the_couplings_of_rope_at_their_settings() -> None:
-    rope, posterior = the_rope(), the_stack()
-    nets = [net_of(COUPLINGS[k], rope) for k in (0, 2, 4)]
-    for net, other in itertools.combinations(nets, 2):
-        assert (net(posterior.x_o) - other(posterior.x_o)).abs().max() > 0.1
-    theta = problems.box(2).sample((NUM_OBSERVED,))
-    estimator: Any = posterior.posterior_estimator
-    found = estimator.candidate_log_probs(theta, posterior.x_o)
-    assert found.shape == (NUM_OBSERVED, len(CANDIDATES))
-    contexts = problems.simulated_of(posterior)
-    for k, candidate in enumerate(COUPLINGS):
-        alone = coupled_by_hand(candidate, rope, posterior.x_o, contexts)
-        used = estimator.coupled[0].couplings[k]
-        assert (used.tau, used.gamma) == (candidate.tau, alone.coupling.gamma)
-        expected = unnormalised(alone, theta, posterior.x_o)[0]
-        assert torch.allclose(found[:, k].float(), expected, atol=1e-3)
+# --- what it is made of ---
 
 
-@pytest.mark.parametrize("candidate", COUPLINGS)
-def test_with_the_same_simulations_build_posterior_gives_the_same_density(
-    candidate: CouplingCandidate,
-) -> None:
-    theta = problems.box(2).sample((NUM_SIMULATED,))
-    simulations = (theta, problems.simulate(theta))
-    rope = rope_of(candidate, trained(simulations=simulations))
-    coupler = SinkhornCoupler(
-        gamma=candidate.gamma, tau=candidate.tau, cost_scale=candidate.cost_scale
-    )
-    x_o = observed()
-    # All stored simulations are used, in whatever order.
-    alone = rope.build_posterior(x_o, coupler=coupler, seed=5, tail_mass=0.0)
-    posterior = stacked(
-        trained(simulations=simulations),
-        candidates=[candidate],
-        num_simulations=None,
-        num_folds=2,
-    )
-    theta = problems.box(2).sample((4, NUM_OBSERVED))
-    assert torch.allclose(
-        unnormalised(posterior, theta, x_o), unnormalised(alone, theta, x_o), atol=1e-3
-    )
-    assert torch.allclose(
-        posterior.leakage(x_o).mass, alone.leakage(x_o).mass, atol=0.02
-    )
+def test_a_stack_of_one_candidate_is_the_average_of_its_versions() -> None:
+    built: list[Any] = []
 
+    def build(rope: RoPE, seed: int) -> Any:
+        built.append(FINETUNED.build(rope, seed))
+        return built[-1]
 
-def test_direct_candidates_are_scored_as_their_posteriors_without_renormalisation() -> (
-    None
-):
-    rope, posterior = the_rope(), the_stack()
-    x_o = posterior.x_o
-    theta = problems.box(2).sample((NUM_OBSERVED,))
-    estimator: Any = posterior.posterior_estimator
-    names = list(posterior.candidate_weights)
-    found = dict(zip(names, estimator.candidate_log_probs(theta, x_o).T, strict=True))
-    tuned = rope.tuned_posterior()
-    for name, alone in (("NPE", rope.npe), ("tuned", tuned)):
-        expected = unnormalised(alone, theta, x_o)[0]
-        assert torch.allclose(found[name].float(), expected, atol=1e-4)
-    assert torch.allclose(found["prior"], torch.tensor(0.25).log().double())
-    # A density without the bound of the prior: that is what leaks.
-    npe: Any = rope.npe.posterior_estimator
-    outside = estimator.candidate_log_probs(theta + 3, x_o)[:, names.index("NPE")]
+    candidate = DensityCandidate(name="one", build=build)
+    posterior = stacked(rope_of(), candidates=[candidate], tail_mass=0.0)
+    assert len(built) == 6  # without each of five folds, and on all
+    x = observed()
+    theta = 3 * torch.rand(4, NUM_OBSERVED, 2) - 1.5
+    found = posterior.posterior_estimator.log_prob(theta, x)
     with torch.no_grad():
-        expected = npe.log_prob((theta + 3)[None], x_o)[0]
-    assert torch.allclose(outside.float(), expected, atol=1e-3)
+        versions = [p.posterior_estimator.log_prob(theta, x).exp() for p in built]
+    assert torch.allclose(found.exp(), sum(versions) / 6, atol=1e-5)
+    single = posterior.candidate_log_probs(theta[0], x)
+    assert torch.allclose(single[:, 0].float(), found[0], atol=1e-4)
 
 
-def test_a_stack_is_the_weighted_sum_of_its_candidates() -> None:
-    posterior = the_stack()
-    theta = problems.box(2).sample((NUM_OBSERVED,))
-    estimator: Any = posterior.posterior_estimator
-    scores = estimator.candidate_log_probs(theta, posterior.x_o)
-    weights = torch.tensor(list(posterior.candidate_weights.values())).double()
-    assert float(weights.sum()) == pytest.approx(1.0)
-    assert torch.allclose(weights, estimator.candidate_weights)
-    expected = torch.logsumexp(scores + weights.log(), dim=1).float()
-    found = unnormalised(posterior, theta, posterior.x_o)[0]
-    assert torch.allclose(found, expected, atol=1e-4)
+def test_couplings_of_a_version_are_those_of_rope_on_its_pairs_and_the_batch() -> None:
+    posterior, x_o = the_coupled_stack(), observed()
+    theta_cal, x_cal = problem(NUM_PAIRS, seed=1)
+    batch = torch.cat([x_o, x_cal])
+    couplings = posterior.versions.couplings
+    assert couplings is not None
+    contexts = problems.simulated_of(posterior)
+    by_name = {candidate.name: candidate for candidate in COUPLINGS}
+    nets = [net for net in couplings.contexts.nets for _ in net.couplings]
+    theta = torch.cat([problems.box(2).sample((NUM_OBSERVED,)), theta_cal])
+    found = couplings.log_probs(theta, batch)
+    assert torch.equal(posterior.x_o, x_o)
+    for column, ((name, _), net) in enumerate(
+        zip(couplings.settings, nets, strict=True)
+    ):
+        candidate = by_name[name]
+        coupler = SinkhornCoupler(
+            gamma=candidate.gamma,
+            tau=candidate.tau,
+            cost_scale=candidate.cost_scale,
+            tolerance=1e-9,
+        )
+        with torch.no_grad():
+            real = net.net(batch)
+        estimator = problems.coupled_mixture(
+            couplings.part.density,
+            contexts,
+            coupler.couple(real, contexts),
+            batch,
+            embedding_net=net.net,
+            tail_mass=0.0,
+        )
+        expected = estimator.log_prob(theta[None], batch)[0].double()
+        assert torch.allclose(found[:, column], expected, atol=1e-3), name
+    # Five folds and all pairs, with three tuned settings; h is shared by all.
+    versions = [version for _, version in couplings.settings]
+    assert sorted(v for v in versions if v is not None) == sorted([*range(6)] * 3)
+    assert versions.count(None) == 2
 
 
-def test_the_tail_that_is_left_out_weighs_no_more_than_stated() -> None:
-    whole = the_stack()
-    cut = stacked(the_rope(), tail_mass=0.05)
-    theta = problems.box(2).sample((NUM_OBSERVED,))
-    exact, less = (unnormalised(p, theta, whole.x_o).exp() for p in (whole, cut))
-    largest = whole.posterior_estimator.component_log_probs(theta).exp()  # type: ignore[operator]
-    missing = (exact - less)[0]
-    assert (missing >= -1e-5).all()
-    assert (missing <= 0.05 * largest.max(dim=1).values + 1e-5).all()
-    assert (missing > 1e-4).any()
-
-
-def test_weights_are_those_of_the_cross_validation_with_the_same_seed() -> None:
-    posterior, scores = the_stack(), the_scores()
-    assert posterior.report.cross_validation.log_scores.equal(scores.log_scores)
-    assert list(posterior.candidate_weights) == list(scores.names)
-    expected = stacking_weights(scores.log_scores, pseudo_count=1.0).weights
+@pytest.mark.parametrize("coupled", [False, True])
+def test_the_density_is_the_weighted_sum_of_the_candidates(coupled: bool) -> None:
+    posterior = the_coupled_stack() if coupled else the_stack()
+    scores = posterior.report.cross_validation
+    expected = stacking_weights(scores.log_scores).weights
     assert list(posterior.candidate_weights.values()) == expected.tolist()
+    assert list(posterior.candidate_weights) == list(scores.names)
+    x, theta = observed(), problems.box(2).sample((NUM_OBSERVED,))
+    versions = range(len(posterior.versions.trained))
+    each = torch.stack([posterior.versions.log_probs(theta, x, [v]) for v in versions])
+    averaged = each.exp().mean(dim=0)
+    by_candidate = posterior.candidate_log_probs(theta, x)
+    assert torch.allclose(by_candidate.exp(), averaged, atol=1e-4)
+    found = unnormalised(posterior, theta, x)[0].exp()
+    assert torch.allclose(found, (averaged @ expected).float(), rtol=1e-3, atol=1e-5)
 
 
-def test_samples_of_a_trained_stack_follow_its_density() -> None:
-    posterior, draws = the_stack(), 1000
-    samples = posterior.sample_batched((draws,), posterior.x_o[:3], **QUIET)
-    assert samples.shape == (draws, 3, 2)
+@pytest.mark.parametrize("coupled", [False, True])
+def test_the_normalised_density_has_mass_one_and_samples_follow_it(
+    coupled: bool,
+) -> None:
+    posterior = the_coupled_stack() if coupled else the_stack()
+    x, draws = observed()[:3], 1000
+    line = (torch.arange(40) + 0.5) / 20 - 1
+    theta = torch.cartesian_prod(line, line)[:, None].expand(-1, 3, -1)
+    density = posterior.log_prob_batched(theta, x).exp().double()
+    assert torch.allclose(4 * density.mean(dim=0), torch.ones(3).double(), atol=0.05)
+    # They leak, or there would be nothing to normalise.
+    assert (posterior.leakage(x).mass < 0.95).any()
+    samples = posterior.sample_batched((draws,), x, **QUIET)
     assert (samples.abs() <= 1).all()
-    line = midpoints(20)
-    cells = torch.cartesian_prod(line, line)
-    theta = cells[:, None].expand(-1, 3, -1)
-    density = posterior.log_prob_batched(theta, posterior.x_o[:3]).exp()
-    assert torch.allclose(density.mean(dim=0) * 4, torch.ones(3), atol=0.05)
     for i in range(3):
-        # Both parameters in quarters.
-        share = density[:, i].reshape(4, 5, 4, 5).sum(dim=(1, 3)) / density[:, i].sum()
+        share = density[:, i].reshape(4, 10, 4, 10).sum(dim=(1, 3))
+        share = share / share.sum()
         edges = [torch.linspace(-1, 1, 5)] * 2
         counts = torch.histogramdd(samples[:, i], edges).hist / draws
         error = (share * (1 - share) / draws).sqrt()
         assert ((counts - share).abs() < 4.5 * error + 0.01).all()
 
 
-def test_a_pickled_stack_answers_the_same_and_keeps_its_scores() -> None:
+# --- observations of today and tomorrow ---
+
+
+def test_an_observation_alone_has_the_density_that_it_has_among_others() -> None:
     posterior = the_stack()
-    other = pickle.loads(pickle.dumps(posterior))
-    theta = problems.box(2).sample((3, NUM_OBSERVED))
-    expected = posterior.log_prob_batched(theta, posterior.x_o)
-    assert torch.equal(other.log_prob_batched(theta, posterior.x_o), expected)
-    scores = other.report.cross_validation
-    assert torch.equal(scores.log_scores, the_scores().log_scores)
-    assert torch.allclose(scores.stack_scores, the_scores().stack_scores)
-
-
-def test_a_trained_stack_extends_to_new_observations() -> None:
-    posterior, x = the_stack(), observed(n=30)[NUM_OBSERVED:]
+    x = torch.cat([observed(), 3 * torch.randn(5, 3)])
     theta = problems.box(2).sample((len(x),))
+    together = unnormalised(posterior, theta, x)[0]
+    normalised = posterior.log_prob_batched(theta, x)[0]
+    error = posterior.leakage(x)
+    for i in (0, 7, 27):
+        alone = posterior.log_prob(theta[i], x=x[i], norm_posterior=False)
+        assert torch.allclose(alone, together[i], atol=1e-5)
+        difference = posterior.log_prob(theta[i], x=x[i]) - normalised[i]
+        margin = 6 * float(error.standard_error[i] / error.mass[i])
+        assert abs(float(difference)) < margin
+    assert posterior.is_amortised
+    with pytest.raises(InvalidInputError, match="amortised"):
+        _ = posterior.x_o
+
+
+def test_a_stack_of_a_batch_answers_others_only_if_it_extends() -> None:
+    x = observed(30)[NUM_OBSERVED:]
+    theta = problems.box(2).sample((5,))
     with pytest.warns(RoPEWarning, match="Extended the coupling to 5"):
-        found = unnormalised(posterior, theta, x)
-    assert torch.isfinite(found).all()
-    rope = the_rope()
-    estimator: Any = posterior.posterior_estimator
-    couplings = estimator.coupled[0].couplings
-    for k, candidate in enumerate(COUPLINGS):
-        net = net_of(candidate, rope)
-        with torch.no_grad():
-            rows = couplings[k].rows(net(x))
-        log_q = estimator.component_log_probs(theta)
-        expected = torch.logsumexp(rows.log() + log_q, dim=1)
-        scores = estimator.candidate_log_probs(theta, x)[:, k]
-        assert torch.allclose(scores, expected, atol=1e-4)
-    with pytest.raises(UnseenObservationError):
-        stacked(rope, candidates=[OT_ONLY], num_folds=2).sample((1,), x=x[0], **QUIET)
+        assert unnormalised(the_coupled_stack(), theta, x).isfinite().all()
+    posterior = stacked(rope_of(), observed(), candidates=[OT_ONLY, NPE])
+    for call in (posterior.candidate_log_probs, posterior.log_prob_batched):
+        with pytest.raises(UnseenObservationError, match=r"stack\(rope, x_new\)"):
+            call(theta, x)
+
+
+def test_the_posterior_of_one_observation_forgets_the_others() -> None:
+    posterior = the_coupled_stack()
+    view = posterior[3]
+    theta = problems.box(2).sample((4,))
+    expected = posterior.log_prob(theta, x=posterior.x_o[3], norm_posterior=False)
+    again = pickle.loads(pickle.dumps(view))
+    for one in (view, again):
+        found = one.log_prob(theta, norm_posterior=False)
+        assert torch.allclose(found, expected, atol=1e-5)
+        assert one.candidate_weights == posterior.candidate_weights
+        with pytest.raises(InvalidInputError, match=r"posterior\[i\]"):
+            one.candidate_log_probs(theta[:1], posterior.x_o[3:4])
+        with pytest.raises(InvalidInputError, match=r"posterior\[i\]"):
+            _ = one.versions
+    # Asking the one has not taken the candidates from the other.
+    assert posterior.candidate_log_probs(theta[:1], posterior.x_o[:1]).isfinite().all()
+    assert len(pickle.dumps(view)) < len(pickle.dumps(posterior))
+
+
+# --- copies ---
+
+
+@pytest.mark.parametrize("coupled", [False, True])
+def test_copies_answer_the_same_and_stay_where_they_are(coupled: bool) -> None:
+    posterior = the_coupled_stack() if coupled else the_stack()
+    x, theta = observed(), problems.box(2).sample((NUM_OBSERVED,))
+    expected = posterior.log_prob_batched(theta, x)
+    candidates = posterior.candidate_log_probs(theta, x)
+    for other in (pickle.loads(pickle.dumps(posterior)), copy.deepcopy(posterior)):
+        assert torch.equal(other.log_prob_batched(theta, x), expected)
+        assert torch.equal(other.candidate_log_probs(theta, x), candidates)
+        assert str(other.report) == str(posterior.report)
+        other.to("cpu")
+        assert torch.equal(other.candidate_log_probs(theta, x), candidates)
+        # What answers and what is asked for its candidates move together.
+        estimator = other.posterior_estimator
+        couplings = other.versions.couplings
+        if couplings is not None:
+            assert couplings.contexts is estimator.coupled[0]
+        shown = {id(part) for part in estimator.parts}
+        for version in other.versions.trained:
+            assert {id(part) for parts in version.values() for part in parts} <= shown
+
+
+def test_a_stack_of_fifty_pairs_is_a_small_file() -> None:
+    posterior = stacked(rope_of(problem(50, seed=1)), seed=0)
+    x = observed(300)
+    theta = problems.box(2).sample((300,))
+    expected = posterior.log_prob_batched(theta, x)
+    file = pickle.dumps(posterior)
+    assert len(file) < 8e6
+    assert len(pickle.dumps(posterior.report)) < 1e6
+    assert torch.equal(pickle.loads(file).log_prob_batched(theta, x), expected)
+
+
+def test_a_stack_is_pickled_whatever_made_its_candidates() -> None:
+    candidates = [
+        DensityCandidate(name="mine", build=lambda rope, seed: rope.npe),
+        DensityCandidate(name="older", build=lambda rope, seed: rope.npe, fixed=True),
+    ]
+    posterior = stacked(rope_of(), candidates=candidates)
+    assert pickle.loads(pickle.dumps(posterior)).candidate_weights == (
+        posterior.candidate_weights
+    )
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("coupled", [False, True])
+def test_a_stack_and_its_candidates_move_to_a_gpu(coupled: bool) -> None:
+    posterior = copy.deepcopy(the_coupled_stack() if coupled else the_stack())
+    x, theta = observed(), problems.box(2).sample((NUM_OBSERVED,))
+    expected = posterior.candidate_log_probs(theta, x)
+    density = unnormalised(posterior, theta, x)
+    posterior.to("cuda")
+    found = posterior.candidate_log_probs(theta.cuda(), x.cuda()).cpu()
+    assert torch.allclose(found, expected, atol=1e-3)
+    moved = unnormalised(posterior, theta.cuda(), x.cuda()).cpu()
+    assert torch.allclose(moved, density, atol=1e-3)
+
+
+# --- data of all kinds ---
 
 
 @pytest.mark.parametrize(
     ("family", "embedding"),
-    [
-        ("mdn", "linear"),
-        ("mdn", "none"),
-        ("maf", "linear"),
-        ("maf", "none"),
-        ("nsf", "linear"),
-        ("zuko_maf", "linear"),
-    ],
+    [("maf", "none"), ("zuko_maf", "linear"), ("mnpe", "linear")],
 )
 def test_every_family_can_be_stacked(family: str, embedding: str) -> None:
-    rope = trained(family, embedding)
-    candidates = (COUPLINGS[0], OT_ONLY, PRIOR, NPE, FINETUNED)
-    posterior = stacked(rope, candidates=candidates, num_folds=2)
-    theta = problems.box(2).sample((NUM_OBSERVED,))
-    found = unnormalised(posterior, theta, posterior.x_o)[0].double()
-    estimator: Any = posterior.posterior_estimator
-    alone = [
-        unnormalised(
-            coupled_by_hand(c, rope, posterior.x_o, estimator.coupled[0].simulated),
-            theta,
-            posterior.x_o,
-        )[0]
-        for c in candidates[:2]
-    ]
-    alone += [torch.full((NUM_OBSERVED,), math.log(0.25))]
-    alone += [unnormalised(rope.npe, theta, posterior.x_o)[0]]
-    alone += [estimator.candidate_log_probs(theta, posterior.x_o)[:, 4]]
-    weights = torch.tensor(list(posterior.candidate_weights.values())).double()
-    expected = torch.stack([a.double() for a in alone], dim=1)
-    expected = torch.logsumexp(expected + weights.log(), dim=1)
-    assert torch.allclose(found, expected, atol=2e-3)
-    samples = posterior.sample_batched((10,), posterior.x_o, **QUIET)
+    prior = problems.npe_posterior(family, embedding).prior
+    theta = prior.sample((30,))
+    x = problems.simulate(theta) + 0.4
+    rope = rope_of((theta[:8], x[:8]), family=family, embedding=embedding)
+    candidates = [ROPE, OT_ONLY, *CANDIDATES[len(COUPLINGS) :]]
+    if embedding == "none":  # nothing to tune, no summaries that h could lose
+        candidates = [ROPE, *default_candidates()[:4]]
+    posterior = stacked(rope, x[8:], candidates=candidates, num_folds=3)
+    assert posterior.report.cross_validation.log_scores.isfinite().all()
+    assert posterior.log_prob_batched(theta[8:], x[8:]).isfinite().all()
+    samples = posterior.sample_batched((3,), x[8:], **QUIET)
+    assert samples.shape == (3, 22, theta.shape[1])
+
+
+def test_images_are_stacked_without_what_needs_summaries() -> None:
+    theta = problems.box(2).sample((20,))
+    x = problems.simulate_image(theta) + 0.3
+    rope = rope_of(
+        (theta[:10], x[:10]), embedding="cnn", simulator=problems.simulate_image
+    )
+    posterior = stacked(rope)
+    assert set(posterior.candidate_weights) == {
+        *("prior", "NPE", "fine-tuned NPE", "discrepancy", "discrepancy (tuned)"),
+        "discrepancy, fine-tuned",
+    }
+    assert posterior.log_prob_batched(theta, x).isfinite().all()
+    candidates = [DiscrepancyCandidate(space="input")]
+    with pytest.raises(InvalidInputError, match="space='embedding'"):
+        stacked(rope, candidates=candidates)
+
+
+def long_series(theta: Tensor) -> Tensor:
+    return theta @ torch.ones(2, 24) + 0.1 * torch.randn(len(theta), 24)
+
+
+def test_moments_of_a_long_series_are_those_of_its_embedding_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    estimator = gaussian.GaussianEstimator(2)
+    estimator.net = nn.Sequential(nn.Linear(24, 2), estimator.net)
+    estimator._condition_shape = torch.Size((24,))
+    npe = DirectPosterior(estimator, problems.box(2))
+    theta = problems.box(2).sample((8,))
+    rope = RoPE(npe, simulator=long_series)
+    rope.append_calibration(theta, long_series(theta))
+    seen: list[int] = []
+    moments = type(rope.source).moments
+
+    def spied(*args: Any, **options: Any) -> Any:
+        found = moments(*args, **options)
+        seen.append(found.covariance.shape[-1])
+        return found
+
+    monkeypatch.setattr(type(rope.source), "moments", spied)
+    names = stacked(rope).candidate_weights
+    assert set(seen) == {2}
+    assert "discrepancy (input)" not in names
+    # Whoever asks for it gets it.
+    stacked(rope, candidates=[DiscrepancyCandidate(space="input")])
+    assert 24 in seen
+
+
+@pytest.mark.parametrize("count", [15, 200])
+def test_stored_simulations_serve_as_well(count: int) -> None:
+    theta = problems.box(2).sample((count,))
+    rope = rope_of(simulations=(theta, problems.simulate(theta)))
+    for x_o in (None, observed(10)):
+        posterior = stacked(rope, x_o, num_simulations=None)
+        assert posterior.report.cross_validation.log_scores.isfinite().all()
+        assert posterior.sample_batched((2,), observed(10), **QUIET).isfinite().all()
+
+
+class Untransformed(BoxUniform):
+    """A prior that sbi cannot map to an unbounded space."""
+
+    @property
+    def support(self) -> Any:
+        raise NotImplementedError
+
+
+def test_a_prior_that_sbi_cannot_transform_serves_as_well() -> None:
+    prior = Untransformed(-torch.ones(2), torch.ones(2))
+    npe = DirectPosterior(
+        estimator_of(problems.npe_posterior("mdn", "linear")),
+        prior,
+        enable_transform=False,
+    )
+    rope = RoPE(npe, simulator=uneven).append_calibration(*problem(8, seed=1))
+    posterior = stacked(rope, num_folds=3)
+    assert not posterior.enable_transform
+    samples = posterior.sample_batched((5,), observed(4), **QUIET)
     assert (samples.abs() <= 1).all()
 
 
-def test_images_can_be_stacked() -> None:
-    theta = problems.box(2).sample((30,))
-    x = problems.simulate_image(theta) + 0.3
-    rope = RoPE(
-        problems.npe_posterior("mdn", "cnn"),
-        simulator=problems.simulate_image,
-        finetuner=CalibrationFinetuner(num_steps=3, simulations_per_target=2),
+@pytest.mark.parametrize(
+    ("num_pairs", "coupled"), [(2, False), (3, False), (4, True), (2, True)]
+)
+def test_few_pairs_are_left_out_one_by_one(num_pairs: int, coupled: bool) -> None:
+    x_o = observed(1) if coupled else None
+    posterior = stacked(rope_of(problem(num_pairs, seed=1)), x_o, learning_curve=True)
+    scores = posterior.report.cross_validation
+    assert scores.num_folds == num_pairs
+    assert scores.log_scores.isfinite().all()
+    assert scores.stack_scores.isfinite().all()
+    assert math.isclose(sum(posterior.candidate_weights.values()), 1.0)
+    assert posterior.sample((2,), x=observed(1), **QUIET).shape == (2, 2)
+    assert str(posterior.report)
+
+
+# --- what the user hands over ---
+
+
+def test_what_is_handed_over_is_left_as_it_was() -> None:
+    rope, x_o = rope_of(), observed()
+    rope.train(seed=0, **QUIET)
+    npe = problems.npe_posterior("mdn")
+    nets = [npe.posterior_estimator, rope.tuned_embedding_net]
+    before = [copy.deepcopy(net.state_dict()) for net in nets]
+    held = [value.clone() for value in (x_o, *rope.calibration)]
+    coupler, finetuner = rope.coupler, rope.finetuner
+    trained = stacked(rope, x_o)
+    assert all(map(torch.equal, (x_o, *rope.calibration), held))
+    assert (rope.coupler, rope.finetuner) == (coupler, finetuner)
+    nets = [npe.posterior_estimator, rope.tuned_embedding_net]
+    for net, state in zip(nets, before, strict=True):
+        assert all(map(torch.equal, net.state_dict().values(), state.values()))
+    # Nor does it matter whether it was trained.
+    scores = trained.report.cross_validation.log_scores
+    other = the_coupled_stack().report.cross_validation.log_scores
+    assert torch.equal(scores, other)
+
+
+def test_a_stack_does_not_change_with_the_posteriors_it_was_made_of() -> None:
+    another = copy.deepcopy(problems.npe_posterior("maf", "linear"))
+    another.posterior_estimator.train()  # scored in evaluation mode all the same
+    candidate = DensityCandidate(
+        name="older", build=lambda rope, seed: another, fixed=True
     )
-    rope.append_calibration(theta[:8], x[:8]).train(**QUIET)
-    posterior = stacked(rope, x_o=x[8:], num_folds=2)
-    assert posterior.log_prob_batched(theta[8:], x[8:]).isfinite().all()
-    assert posterior.sample_batched((3,), x[8:], **QUIET).shape == (3, 22, 2)
+    posterior = stacked(rope_of(), candidates=[candidate, PRIOR])
+    theta, x = problem(NUM_PAIRS, seed=1)
+    scores = posterior.report.cross_validation.scores_of("older")
+    another.posterior_estimator.eval()
+    expected = unnormalised(another, theta, x)[0]
+    assert torch.allclose(scores.float(), expected, atol=1e-4)
+    before = unnormalised(posterior, theta, x)
+    with torch.no_grad():
+        for parameter in another.posterior_estimator.parameters():
+            parameter += 0.1
+    assert torch.equal(unnormalised(posterior, theta, x), before)
+
+
+def test_a_mixture_of_a_user_counts_as_one_version_however_many_parts_it_has() -> None:
+    sizes: list[int] = []
+
+    def build(rope: RoPE, seed: int) -> Any:
+        # One density in the first versions, three in the last, of the prior in part.
+        sizes.append(1 if len(sizes) < 5 else 3)
+        own = stacked(rope_of(), candidates=[NPE]).posterior_estimator.parts
+        prior = stacked(rope_of(), candidates=[PRIOR]).posterior_estimator.parts
+        parts = own if sizes[-1] == 1 else [*prior, *prior, *own]
+        mixture = type(the_stack().posterior_estimator)(
+            parts, [1 / sizes[-1]] * sizes[-1]
+        )
+        return MixturePosterior(mixture, rope.npe.prior)
+
+    posterior = stacked(
+        rope_of(), candidates=[DensityCandidate(name="mixed", build=build)]
+    )
+    assert sizes == [1] * 5 + [3]
+    x, theta = observed(), problems.box(2).sample((NUM_OBSERVED,))
+    npe = the_stack().candidate_log_probs(theta, x)[:, 1].exp()
+    expected = (5 * npe + (2 * 0.25 + npe) / 3) / 6
+    found = posterior.candidate_log_probs(theta, x)[:, 0].exp()
+    assert torch.allclose(found, expected, atol=1e-5)
+    density = unnormalised(posterior, theta, x)[0].exp()
+    assert torch.allclose(density.double(), expected, atol=1e-4)
+
+
+def test_default_candidates_have_names_and_families_of_their_own() -> None:
+    amortised, all_of_them = default_candidates(), default_candidates(couplings=True)
+    assert [candidate.name for candidate in amortised] == [
+        *("prior", "NPE", "fine-tuned NPE", "discrepancy", "discrepancy (input)"),
+        *("discrepancy (tuned)", "discrepancy, fine-tuned"),
+    ]
+    names = [candidate.name for candidate in all_of_them]
+    assert len(set(names)) == len(names) == 36 + 8
+    assert {c.family for c in all_of_them if isinstance(c, CouplingCandidate)} == {
+        *("RoPE", "OT-only"),
+    }
+    small = default_candidates(
+        couplings=True, gammas=(0.1,), taus=(1.0,), rehearsal=None
+    )
+    assert [candidate.name for candidate in small[:2]] == [
+        *("RoPE (gamma 0.1, tau 1)", "OT-only (gamma 0.1, tau 1)"),
+    ]
+    assert replace(FinetunedCandidate(), corrected=True).name == (
+        "discrepancy, fine-tuned"
+    )
+
+
+def test_a_seed_reproduces_a_stack_and_leaves_no_trace() -> None:
+    theta = problems.box(2).sample((NUM_OBSERVED,))
+    for batch, first in ((None, the_stack()), (observed(), the_coupled_stack())):
+        torch.manual_seed(5)
+        state = torch.get_rng_state()
+        again = stacked(rope_of(), batch, tail_mass=0.0)
+        assert torch.equal(torch.get_rng_state(), state)
+        found, expected = (
+            p.log_prob_batched(theta, observed()) for p in (again, first)
+        )
+        assert torch.equal(found, expected)
+    scores = [
+        validated(rope_of(), candidates=[FINETUNED], seed=seed).log_scores
+        for seed in (0, 1)
+    ]
+    assert not torch.equal(*scores)
+
+
+def test_without_a_seed_the_state_of_torch_decides() -> None:
+    found = []
+    for seed in (5, 5, 6):
+        torch.manual_seed(seed)
+        scores = validated(rope_of(), candidates=[FINETUNED], seed=None)
+        found.append(scores.log_scores)
+    assert torch.equal(found[0], found[1])
+    assert not torch.equal(found[0], found[2])

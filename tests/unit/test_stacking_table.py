@@ -92,7 +92,7 @@ def test_a_goal_that_is_missed_is_counted_as_missed(
 
 def test_rehearsal_is_compared_where_both_were_candidates() -> None:
     assert "| pendulum |  | 10 | -2.00 | -1.50 | +0.50 |" in stacking_lines(a_table())
-    names = {candidate.name for candidate in default_candidates()}
+    names = {candidate.name for candidate in default_candidates(couplings=True)}
     assert {ONE_SETTING, REHEARSED} <= names
 
 
