@@ -47,9 +47,9 @@ class Quadrature:
     def __init__(self, z: Tensor, mean: Tensor, setting: tuple[float, ...]) -> None:
         k, s, strength = setting
         z, mean = z[:, 0], mean[:, 0]
-        self.a = torch.linspace(-1.0, 3.0, 161).double()[:, None, None]
-        self.b = torch.linspace(-2.0, 3.0, 161).double()[:, None]
-        log_sigma = torch.linspace(math.log(1e-4), math.log(50.0), 300).double()
+        self.a = torch.linspace(-1.0, 3.0, 101).double()[:, None, None]
+        self.b = torch.linspace(-2.0, 3.0, 101).double()[:, None]
+        log_sigma = torch.linspace(math.log(1e-4), math.log(50.0), 200).double()
         self.sigma = log_sigma.exp()
         # One entry: the inverse Wishart distribution is an inverse gamma one.
         shape, rate = (strength + 2) / 2, strength * s**2 / 2
@@ -67,7 +67,7 @@ class Quadrature:
             -squares / (2 * self.sigma) - len(z) / 2 * (2 * math.pi * self.sigma).log()
         )
         log_joint = log_prior + log_likelihood + log_sigma
-        cell = (4.0 / 160) * (5.0 / 160) * float(log_sigma[1] - log_sigma[0])
+        cell = (4.0 / 100) * (5.0 / 100) * float(log_sigma[1] - log_sigma[0])
         self.log_evidence = float(log_joint.logsumexp((0, 1, 2)) + math.log(cell))
         self.weights = (log_joint - log_joint.logsumexp((0, 1, 2))).exp()
 
@@ -244,6 +244,26 @@ def test_draws_are_calibrated_over_repetitions_from_the_prior() -> None:
     for column in torch.tensor(ranks).T:
         counts = torch.histc(column, bins=10, min=0.0, max=1.0).numpy()
         assert stats.chisquare(counts).pvalue > 1e-3, counts
+
+
+def test_errors_of_several_summaries_have_the_moments_of_an_inverse_wishart() -> None:
+    k, s, strength, n, width = 2.0, 0.3, 12.0, 6, 4
+    z, mean = pairs(n, width)
+    discrepancy = at(k, s, strength).fit(z, mean, no_noise(width))
+    draws = discrepancy.sample(20_000, smallest_error=0.0, seed=0)
+    total = draws.error_factor @ draws.error_factor.mT
+    total = total + draws.gain @ discrepancy.noise @ draws.gain.mT
+    # The squares left over, with pairs at their prior variance instead of coefficients.
+    design = torch.cat([mean, torch.ones(n, 1)], dim=1)
+    prior = torch.tensor([1 / k] * width + [3 / k]).double()
+    spread = torch.eye(n) + design * prior @ design.T
+    scale = (z - mean).T @ torch.linalg.solve(spread, z - mean)
+    scale = scale + (strength * s**2 + n * SMALLEST_NOISE**2) * torch.eye(width)
+    law = stats.invwishart(strength + width + 1 + n, scale.numpy())
+    expected = torch.as_tensor(law.mean())
+    assert torch.allclose(total.mean(dim=0), expected, rtol=0.02, atol=0.004)
+    variance = torch.as_tensor(law.var())
+    assert torch.allclose(total.var(dim=0), variance, rtol=0.1, atol=1e-4)
 
 
 def test_a_simulator_that_is_right_is_found_right_and_another_is_not() -> None:

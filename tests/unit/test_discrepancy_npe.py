@@ -203,6 +203,13 @@ def test_nothing_that_is_passed_in_is_changed(space: str) -> None:
     assert [p.requires_grad for p in after.parameters()] == flags
 
 
+@pytest.mark.parametrize("space", SPACES)
+def test_training_again_starts_anew(space: str) -> None:
+    made = trained(space=space)
+    first = log_probs(made.build_posterior())
+    assert torch.equal(log_probs(made.train(**QUIET).build_posterior()), first)
+
+
 def test_only_the_density_is_trained_behind_an_embedding_and_all_of_npe_before_it() -> (
     None
 ):

