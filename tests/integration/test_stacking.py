@@ -455,10 +455,11 @@ def test_default_candidates_have_names_and_families_of_their_own() -> None:
     amortised, all_of_them = default_candidates(), default_candidates(couplings=True)
     assert [candidate.name for candidate in amortised] == [
         *("prior", "NPE", "fine-tuned NPE", "discrepancy", "discrepancy (input)"),
-        *("discrepancy (tuned)", "discrepancy, fine-tuned"),
+        *("discrepancy (tuned)", "discrepancy (input), fine-tuned"),
+        "discrepancy (tuned), fine-tuned",
     ]
     names = [candidate.name for candidate in all_of_them]
-    assert len(set(names)) == len(names) == 36 + 8
+    assert len(set(names)) == len(names) == 36 + 9
     assert {c.family for c in all_of_them if isinstance(c, CouplingCandidate)} == {
         *("RoPE", "OT-only"),
     }
@@ -468,7 +469,7 @@ def test_default_candidates_have_names_and_families_of_their_own() -> None:
     assert [candidate.name for candidate in small[:2]] == [
         *("RoPE (gamma 0.1, tau 1)", "OT-only (gamma 0.1, tau 1)"),
     ]
-    assert replace(FinetunedCandidate(), corrected=True).name == (
+    assert replace(FinetunedCandidate(), space="embedding").name == (
         "discrepancy, fine-tuned"
     )
 

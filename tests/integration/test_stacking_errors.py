@@ -278,7 +278,7 @@ def test_whole_numbers_have_the_densities_of_these_numbers() -> None:
         (DensityCandidate, {"name": "mine", "build": finetuned, "fixed": "yes"}),
         (DiscrepancyCandidate, {"space": "output"}),
         (DiscrepancyCandidate, {"learn_prior": "yes"}),
-        (FinetunedCandidate, {"corrected": "yes"}),
+        (FinetunedCandidate, {"space": "x"}),
     ],
 )
 def test_settings_of_candidates_outside_their_range_are_refused(
