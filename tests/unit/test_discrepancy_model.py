@@ -211,7 +211,7 @@ def from_the_prior(n: int, width: int) -> tuple[dict[str, Any], Tensor, Tensor]:
 
 
 def test_draws_are_calibrated_over_repetitions_from_the_prior() -> None:
-    num_repetitions, num_draws, width = 400, 99, 2
+    num_repetitions, num_draws, width = 300, 99, 2
     ranks: list[list[float]] = []
     noise = 0.01 * torch.eye(width).double()
     for repetition in range(num_repetitions):
