@@ -35,9 +35,6 @@ def quick() -> Iterator[None]:
     )
     tuning = CalibrationFinetuner(rehearsal=1.0, learning_rate=0.02, num_steps=3)
     steps = dict.fromkeys(("embedding", "tuned", "input"), 4)
-    training = Training(
-        training_batch_size=100, validation_fraction=0.2, max_num_epochs=4
-    )
     constants = {
         "sbi_rope.stacking.folds.NUM_SIMULATIONS": 300,
         "sbi_rope.stacking.folds.SIMULATIONS_PER_PAIR": 5,
@@ -47,7 +44,7 @@ def quick() -> Iterator[None]:
         "sbi_rope.discrepancy.correction.NUM_STEPS": steps,
         "sbi_rope.discrepancy.correction.NUM_DRAWS": 50,
         "sbi_rope.discrepancy.training.BATCH_SIZE": 50,
-        "sbi_rope.baselines.finetuned_npe.DEFAULT_TRAINING": training,
+        "sbi_rope.stacking.finetuning.MAX_NUM_EPOCHS": 2,
     }
     with ExitStack() as patches:
         for name, value in constants.items():

@@ -242,8 +242,9 @@ def _has_summaries(bench: Workbench) -> bool:
     return bench.has_summaries and has_net
 
 
-# A corrected NPE has less far to go than one that is wrong.
-LEARNING_RATE, LEARNING_RATE_CORRECTED = 1e-3, 3e-4
+# Of fine-tuning, by what is corrected in the start. Trained on the input, a whole
+# network is nearly right already. Chosen on calibration data, see benchmarks/README.md.
+LEARNING_RATES = {None: 1e-3, "embedding": 1e-3, "tuned": 1e-3, "input": 3e-4}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -289,7 +290,7 @@ class FinetunedCandidate(AmortisedCandidate):
             if self.space is None:
                 return [part_of(estimator_of(fold.bench.npe))]
             return DiscrepancyCandidate(space=self.space).parts(fold)
-        rate = LEARNING_RATE if self.space is None else LEARNING_RATE_CORRECTED
+        rate = LEARNING_RATES[self.space]
         return [
             part_of(
                 finetune_without(

@@ -296,7 +296,7 @@ def test_images_are_stacked_without_what_needs_summaries() -> None:
     posterior = stacked(rope)
     assert set(posterior.candidate_weights) == {
         *("prior", "NPE", "fine-tuned NPE", "discrepancy", "discrepancy (tuned)"),
-        "discrepancy, fine-tuned",
+        "discrepancy (tuned), fine-tuned",
     }
     assert posterior.log_prob_batched(theta, x).isfinite().all()
     candidates = [DiscrepancyCandidate(space="input")]
