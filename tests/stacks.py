@@ -41,7 +41,7 @@ def quick() -> Iterator[None]:
         "sbi_rope.stacking.folds.TUNING": tuning,
         "sbi_rope.stacking.folds.DiscrepancyModel": lambda: model,
         "sbi_rope.stacking.stack.NUM_SAMPLES": 40,
-        "sbi_rope.discrepancy.correction.NUM_STEPS": steps,
+        "sbi_rope.stacking.folds.NUM_STEPS": steps,
         "sbi_rope.discrepancy.correction.NUM_DRAWS": 50,
         "sbi_rope.discrepancy.training.BATCH_SIZE": 50,
         "sbi_rope.stacking.finetuning.MAX_NUM_EPOCHS": 2,

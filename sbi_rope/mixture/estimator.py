@@ -313,6 +313,7 @@ class MixtureEstimator(MixtureDensity):
                     features,
                     accept=accept,
                     num_draws=num_draws,
+                    seed=k,
                     show_progress_bars=show_progress_bars,
                 )
             else:

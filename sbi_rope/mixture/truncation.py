@@ -88,6 +88,7 @@ def own_mass(
     *,
     accept: Accept,
     num_draws: int,
+    seed: int,
     show_progress_bars: bool = False,
 ) -> Leakage:
     """Estimate the mass of a part whose contexts are each observation's own.
@@ -101,13 +102,15 @@ def own_mass(
         features: Of the observations, shape ``(n, ...)``.
         accept: Tells which parameters ``(n, d)`` are inside the support.
         num_draws: Draws for each observation, over all its contexts together.
+        seed: Another one for each part. With the same random numbers, the errors of
+            parts that are nearly the same would add up instead of averaging out.
         show_progress_bars: Whether to show progress, if it takes long.
     """
     num_contexts = part.mixing.num_contexts
     of_each = math.ceil(num_draws / num_contexts)
     size = max(1, flow_batch(features.device) // (of_each * num_contexts))
     means, errors = [], []
-    with seeded(0):
+    with seeded(seed):
         for block in tqdm(features.split(size), **_bar(show=show_progress_bars)):
             rows = part.mixing.rows(block)
             weights, contexts = rows.weights.double(), rows.contexts.flatten(0, 1)
