@@ -210,11 +210,14 @@ class Simulator:
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate, theta ``(n, d)`` to x ``(n, *event)``; x may contain NaN."""
+        # A simulator may change its argument, or hand out the same memory twice.
+        theta = theta.clone()
         try:
             if self.is_batched:
                 x = self.function(theta)
             else:
-                x = torch.cat([self._single(self.function(row)) for row in theta])
+                rows = [self._single(self.function(row)).clone() for row in theta]
+                x = torch.cat(rows)
         except SimulationError:
             raise
         except Exception as error:
@@ -382,9 +385,7 @@ class StoredSimulations:
         return Moments(mean=plane[:, 0], covariance=left_over.mT @ left_over / freedom)
 
     def kept(self, count: int, *, progress: bool) -> tuple[Tensor, Tensor]:
-        """Return all stored pairs, or some at random: they may be in some order."""
-        if count >= len(self.x):
-            return self.theta, self.x
+        """Return stored pairs, at random: they may be in some order."""
         with seeded(0):
             chosen = torch.randperm(len(self.x))[:count].to(self.x.device)
         return self.theta[chosen], self.x[chosen]

@@ -22,7 +22,7 @@ Space = Literal["embedding", "input", "tuned"]
 
 # Draws of the discrepancy behind a training; fewer where there are many entries in
 # each, as with embeddings of a hundred dimensions.
-NUM_DRAWS, MAX_ENTRIES = 2000, 2**22
+NUM_DRAWS, MAX_ENTRIES = 2000, 2**24
 # Smallest standard deviation of the error, in standard deviations of simulations. The
 # input of a network can be known better than its output.
 SMALLEST_ERROR = {"embedding": 0.01, "tuned": 0.01, "input": 0.003}

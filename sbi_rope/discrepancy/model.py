@@ -20,7 +20,7 @@ from sbi_rope._validation import (
     check_tensor,
     check_unit_interval,
 )
-from sbi_rope.errors import InvalidInputError
+from sbi_rope.errors import InvalidInputError, InvalidTypeError
 
 __all__ = ["Discrepancy", "DiscrepancyDraws", "DiscrepancyModel"]
 
@@ -29,6 +29,8 @@ __all__ = ["Discrepancy", "DiscrepancyDraws", "DiscrepancyModel"]
 NEGLIGIBLE = 1e-4
 # The prior is less certain of the offset than of the gain, by this factor.
 OFFSET_PRECISION = 1 / 3
+# Entries of the matrices that simulations are corrected by at a time.
+MAX_ENTRIES = 2**22
 # Smallest standard deviation that simulations at one parameter are given, in standard
 # deviations of simulations from the prior: some statistics have no noise at all.
 SMALLEST_NOISE = 0.01
@@ -62,7 +64,8 @@ class DiscrepancyModel:
     The model :math:`z_i \mid \theta_i \sim \mathcal N(m_i, C)`, in which the simulator
     is right, takes part in the average. Its share is ``probability_of_none`` before any
     pair is seen. Where the simulator is right its share goes to one, and nothing is
-    corrected.
+    corrected; unless the noise of z varies several times with the parameters, which one
+    C for all does not describe.
 
     All quantities are in standard deviations of simulations from the prior.
 
@@ -78,6 +81,7 @@ class DiscrepancyModel:
         probability_of_none: How probable it is beforehand that the simulator is right.
 
     Raises:
+        InvalidTypeError: If one of the first three is not a list.
         InvalidInputError: If a list is empty or a number is outside its range.
 
     Example:
@@ -100,6 +104,10 @@ class DiscrepancyModel:
         """Check the ranges of all fields."""
         for name in ("gain_precisions", "error_scales", "degrees_of_freedom"):
             values = getattr(self, name)
+            if not isinstance(values, Sequence):
+                raise InvalidTypeError(
+                    f"Expected `{name}` to be a list of numbers; got {values!r}."
+                )
             if not len(values):
                 raise InvalidInputError(f"Expected at least one of `{name}`; got none.")
             for value in values:
@@ -120,7 +128,8 @@ class DiscrepancyModel:
             The posterior, in float64.
 
         Raises:
-            InvalidInputError: If the shapes do not fit or a value is not finite.
+            InvalidInputError: If the shapes do not fit, a value is not finite, or
+                ``covariance`` is none.
         """
         z, mean, covariance = _checked(z, mean, covariance)
         noise = covariance + SMALLEST_NOISE**2 * torch.eye(z.shape[1]).to(z)
@@ -159,6 +168,13 @@ def _checked(z: Any, mean: Any, covariance: Any) -> tuple[Tensor, Tensor, Tensor
         raise InvalidInputError(
             f"Expected `covariance` of shape {(width, width)}; got "
             f"{tuple(covariance.shape)}."
+        )
+    smallest = torch.linalg.eigvalsh(covariance)[0]
+    margin = 1e-8 * covariance.diagonal().abs().max()
+    if smallest < -margin or not torch.allclose(covariance, covariance.mT):
+        raise InvalidInputError(
+            "Expected `covariance` to be symmetric without negative eigenvalues; the "
+            f"smallest is {float(smallest):.3g}."
         )
     return z, mean, covariance
 
@@ -398,6 +414,12 @@ class DiscrepancyDraws:
         """
         draw = torch.randint(len(self), (len(z_s),)).to(z_s.device)
         noise = torch.randn(z_s.shape, dtype=torch.double).to(z_s.device)
+        # A matrix for each simulation takes a lot of memory where z is wide.
+        size = max(1, MAX_ENTRIES // z_s.shape[1] ** 2)
+        parts = zip(*(rows.split(size) for rows in (z_s, draw, noise)), strict=True)
+        return torch.cat([self._corrected(*part) for part in parts])
+
+    def _corrected(self, z_s: Tensor, draw: Tensor, noise: Tensor) -> Tensor:
         moved = (self.gain[draw] @ z_s.double()[..., None])[..., 0]
         error = (self.error_factor[draw] @ noise[..., None])[..., 0]
         return moved + self.offset[draw] + error

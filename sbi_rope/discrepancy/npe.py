@@ -286,6 +286,8 @@ class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
         estimator = estimator_of(npe)
+        if self.space == "tuned":
+            _check_density(estimator)
         theta, x = self._calibration
         source = self._source(x)
         net = network_of(estimator, self.space)
@@ -335,12 +337,15 @@ class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
         return source.kept(self.num_simulations, progress=show_progress_bars)
 
     def _averaged(self, estimator: Any, nets: Sequence[nn.Module]) -> MixturePosterior:
-        if not isinstance(estimator, ConditionalDensityEstimator):
-            raise UnsupportedPosteriorError(
-                "Expected an estimator with a density with space='tuned', whose "
-                f"posterior is a mixture; got {type(estimator).__name__}. Use "
-                "space='embedding', or NPE instead of FMPE or NPSE."
-            )
         contexts = OwnContexts(nets, estimator.condition_shape)
         mixture = MixtureEstimator([Part(headless(estimator), contexts)], [1.0])
         return MixturePosterior(mixture, copy.deepcopy(self._prior))
+
+
+def _check_density(estimator: Any) -> None:
+    if not isinstance(estimator, ConditionalDensityEstimator):
+        raise UnsupportedPosteriorError(
+            "Expected an estimator with a density with space='tuned', whose posterior "
+            f"is a mixture; got {type(estimator).__name__}. Use space='embedding', or "
+            "NPE instead of FMPE or NPSE."
+        )

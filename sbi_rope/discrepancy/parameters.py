@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.distributions import MultivariateNormal
 
 from sbi_rope._validation import check_batch, check_tensor
+from sbi_rope.errors import InvalidInputError
 
 __all__ = ["ParameterDistribution", "learn_parameters"]
 
@@ -53,8 +54,9 @@ def learn_parameters(theta_cal: Tensor, theta: Tensor) -> ParameterDistribution:
         \pi + (1 - \pi)\, t(u) / \mathcal N(u; 0, R) .
 
     Args:
-        theta_cal: Parameters of the pairs, shape ``(n_c, d)``.
-        theta: Parameters of simulations from the prior, shape ``(n, d)``.
+        theta_cal: Parameters of the pairs, shape ``(n_c, d)``. Those that appear more
+            than once count once: several recordings of a person are one draw.
+        theta: Parameters of simulations from the prior, shape ``(n, d)``, two or more.
 
     Returns:
         The probabilities of the simulations.
@@ -64,8 +66,13 @@ def learn_parameters(theta_cal: Tensor, theta: Tensor) -> ParameterDistribution:
         InvalidInputError: If the shapes do not fit or a value is not finite.
     """
     theta = check_tensor("theta", theta)
-    theta = check_batch("theta", theta, theta.shape[1:2])
-    theta_cal = check_batch("theta_cal", theta_cal, theta.shape[1:])
+    if theta.ndim != 2 or len(theta) < 2:
+        raise InvalidInputError(
+            "Expected `theta` of shape (n, d), with n of two or more; got "
+            f"{tuple(theta.shape)}."
+        )
+    theta = check_batch("theta", theta, theta.shape[1:])
+    theta_cal = check_batch("theta_cal", theta_cal, theta.shape[1:]).unique(dim=0)
     u_cal, u = normal_scores(theta_cal, theta), normal_scores(theta, theta)
     correlation = torch.atleast_2d(u.T.cov())
     # Parameters that depend on each other exactly, such as those of one category.

@@ -58,6 +58,8 @@ def cross_fitted_nets(
         )
     folds = [rows for rows in split_groups(groups, num_folds) if len(rows)]
     targets = moments.mean.to(x)
+    # They may be in some order.
+    simulations = simulations[torch.randperm(len(simulations)).to(simulations.device)]
     nets, z = [], torch.empty_like(targets)
     for held_out in folds:
         used = torch.ones(len(x), dtype=torch.bool)

@@ -53,16 +53,29 @@ class Block:
         self.rows = rows
         pairs = zip(shares, rows, strict=True)
         self.weights = torch.cat([share * part.weights for share, part in pairs], dim=1)
+        # Of thousands of simulations some can be left out. A part of a small weight,
+        # such as the prior, may be all there is far from the others.
+        self._is_shared = torch.cat(
+            [
+                torch.full_like(of_part.weights[0], part.mixing.contexts is not None)
+                for part, of_part in zip(parts, rows, strict=True)
+            ]
+        ).bool()
 
     def without_tail(self, tail_mass: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Return row, column and log weight of the entries that carry 1 - tail_mass."""
+        """Return row, column and log weight of the entries that are not left out.
+
+        Only simulations that observations share are, with a weight of at most
+        ``tail_mass`` together.
+        """
         # Summed from the small end, where the digits are.
-        ascending, order = self.weights.sort(dim=1)
+        ascending, order = self.weights.where(self._is_shared, torch.inf).sort(dim=1)
         tail = ascending.cumsum(dim=1, dtype=torch.float64)
-        kept = (tail > tail_mass) & (ascending > 0)
+        weights = self.weights.gather(1, order)
+        kept = (tail > tail_mass) & (weights > 0)
         kept[:, -1] = True
         row = kept.nonzero()[:, 0]
-        return row, order[kept], ascending[kept].double().log()
+        return row, order[kept], weights[kept].double().log()
 
     def by_part(self, row: Tensor, column: Tensor) -> list[Entries]:
         """Sort entries of ``weights`` by the parts they belong to."""

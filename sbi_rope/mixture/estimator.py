@@ -49,7 +49,8 @@ class MixtureEstimator(MixtureDensity):
         weights: :math:`w`, one for each part, which sum to one. Parts of weight zero
             cost nothing.
         tail_mass: Weight of the smallest terms for each observation that ``log_prob``
-            leaves out, over all parts together; 0 evaluates all.
+            leaves out, among those of contexts that observations share, such as the
+            simulations of a coupling; 0 evaluates all.
 
     Raises:
         InvalidInputError: If there is no part, shapes of theta or x differ between
@@ -284,8 +285,8 @@ class MixtureEstimator(MixtureDensity):
 
         The masses given contexts that observations share are estimated once, from 1024
         draws each. Those of an observation's own contexts are estimated for each x,
-        from as many draws as the weight of the part deserves; a part that weighs less
-        than one draw in 1024 counts as inside.
+        from as many draws as the weight of the part deserves; parts that weigh less
+        than one draw in 1024 together count as inside.
 
         Args:
             x: Observations, shape ``(n, *event)``.
@@ -296,6 +297,8 @@ class MixtureEstimator(MixtureDensity):
         x = self._checked_x(x)
         mass = torch.zeros(len(x), dtype=torch.double, device=x.device)
         variance = torch.zeros_like(mass)
+        ascending, order = self.weights.sort()
+        small = set(order[ascending.cumsum(dim=0) < 1 / LEAKAGE_DRAWS].tolist())
         for k, share in enumerate(self.weights.tolist()):
             if not share:
                 continue
@@ -305,7 +308,7 @@ class MixtureEstimator(MixtureDensity):
                 mass += share
                 continue
             num_draws = math.ceil(LEAKAGE_DRAWS * share)
-            if share < 1 / LEAKAGE_DRAWS:
+            if k in small:
                 own = Leakage(torch.ones_like(mass), torch.full_like(mass, 0.5))
             elif part.mixing.contexts is None:
                 own = own_mass(

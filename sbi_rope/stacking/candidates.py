@@ -39,9 +39,10 @@ from sbi_rope.mixture import (
 )
 from sbi_rope.rope import RoPE
 from sbi_rope.stacking.finetuning import finetune_without
-from sbi_rope.stacking.folds import Fold, Workbench
+from sbi_rope.stacking.folds import NUM_FOLDS, Fold, Workbench
 
 __all__ = [
+    "AmortisedCandidate",
     "Candidate",
     "CouplingCandidate",
     "DensityCandidate",
@@ -315,6 +316,7 @@ Candidate = CouplingCandidate | AmortisedCandidate
 
 
 def default_candidates(
+    rope: RoPE | None = None,
     *,
     couplings: bool = False,
     gammas: Sequence[float] = GAMMAS,
@@ -324,6 +326,8 @@ def default_candidates(
     """Return the prior, NPE, fine-tuned NPE and the discrepancy models.
 
     Args:
+        rope: RoPE with its calibration pairs; leaves out what these do not allow or
+            need, as :func:`stack` does by itself. All if None.
         couplings: Whether RoPE and OT-only over a grid of gamma and tau take part, and
             tuning-only; for a stack of a batch of observations.
         gammas: In units of the median distance between simulated embeddings.
@@ -332,7 +336,7 @@ def default_candidates(
             where they are, see :class:`~sbi_rope.CalibrationFinetuner`; None leaves it
             out.
     """
-    amortised: tuple[Candidate, ...] = (
+    amortised: tuple[AmortisedCandidate, ...] = (
         DensityCandidate(name="prior", build=_prior, fixed=True),
         DensityCandidate(name="NPE", build=_npe, fixed=True),
         FinetunedCandidate(),
@@ -342,6 +346,10 @@ def default_candidates(
         FinetunedCandidate(space="input"),
         FinetunedCandidate(space="tuned"),
     )
+    if rope is not None:
+        check_instance("rope", rope, RoPE)
+        bench = Workbench(rope, num_folds=NUM_FOLDS, seed=0, show_progress_bars=False)
+        amortised = tuple(one for one in amortised if one.applies_to(bench))
     if not couplings:
         return amortised
     rehearsed = [] if rehearsal is None else [{"rehearsal": rehearsal}]
@@ -444,4 +452,4 @@ def _equal_parts(name: str, posterior: MixturePosterior) -> list[Part]:
             f"weights if it is a mixture; got {type(posterior).__name__}. Couplings "
             "are CouplingCandidates."
         )
-    return list(estimator.parts)
+    return copy.deepcopy(estimator).parts

@@ -33,6 +33,8 @@ NUM_SIMULATIONS = 20_000
 SIMULATIONS_PER_PAIR = 100
 # A vector x with more entries is no list of summaries.
 MAX_SUMMARIES = 20
+# Folds of the calibration pairs.
+NUM_FOLDS = 5
 # Parts that a single fold is cut into, to tune without each.
 NUM_INNER_FOLDS = 5
 
@@ -206,8 +208,10 @@ class Fold:
     def rope(self) -> RoPE:
         """RoPE, tuned on these pairs."""
         bench, targets = self.bench, None
-        # Stored simulations have targets of their own, the paper's.
-        if isinstance(bench.rope.source, Simulator):
+        # Stored simulations have targets of their own, the paper's, and so has a tuning
+        # that takes another number of simulations.
+        is_usual = bench.rope.finetuner.simulations_per_target == SIMULATIONS_PER_PAIR
+        if isinstance(bench.rope.source, Simulator) and is_usual:
             targets = bench.moments("embedding").mean.to(bench.embedded)[self.rows]
         part = bench.rope.with_pairs(self.rows, targets=targets)
         return part.train(seed=self.seed, show_progress_bars=False)

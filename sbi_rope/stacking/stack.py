@@ -18,6 +18,7 @@ from sbi_rope._validation import (
     check_not_negative,
     check_unit_interval,
 )
+from sbi_rope.discrepancy.correction import network_of
 from sbi_rope.errors import (
     InvalidInputError,
     NotReadyError,
@@ -30,6 +31,7 @@ from sbi_rope.metrics.calls import draw_ranks
 from sbi_rope.mixture import MixturePosterior
 from sbi_rope.rope import RoPE
 from sbi_rope.stacking.candidates import (
+    AmortisedCandidate,
     Candidate,
     CouplingCandidate,
     check_candidates,
@@ -37,7 +39,7 @@ from sbi_rope.stacking.candidates import (
 )
 from sbi_rope.stacking.couplings import FittedCouplings, fit_couplings
 from sbi_rope.stacking.cross_validation import CrossValidation, fold_weights
-from sbi_rope.stacking.folds import Fold, Workbench, draw_seeds
+from sbi_rope.stacking.folds import NUM_FOLDS, Fold, Workbench, draw_seeds
 from sbi_rope.stacking.posterior import StackedPosterior
 from sbi_rope.stacking.report import LearningCurve, StackingReport
 from sbi_rope.stacking.versions import Versions, train_version
@@ -46,7 +48,6 @@ __all__ = ["cross_validate", "stack"]
 
 # Fewest pairs: one to train on and one to score.
 MIN_PAIRS = 2
-NUM_FOLDS = 5
 # Shares of the folds to train on for the learning curve, beside all but one.
 SMALLER = (0.25, 0.5)
 # Samples of each held-out pair behind the calibration of the stack.
@@ -258,10 +259,13 @@ class _Trainer:
             return tuple(
                 candidate
                 for candidate in chosen
-                if isinstance(candidate, CouplingCandidate)
+                if not isinstance(candidate, AmortisedCandidate)
                 or candidate.applies_to(self.bench)
             )
         chosen = check_candidates(candidates)
+        if any(getattr(candidate, "space", None) == "input" for candidate in chosen):
+            # Before the others are trained.
+            network_of(estimator_of(self.bench.npe), "input")
         coupled = any(isinstance(c, CouplingCandidate) for c in chosen)
         if coupled and self.x_o is None:
             raise InvalidInputError(

@@ -299,9 +299,16 @@ def test_images_are_stacked_without_what_needs_summaries() -> None:
         "discrepancy (tuned), fine-tuned",
     }
     assert posterior.log_prob_batched(theta, x).isfinite().all()
-    candidates = [DiscrepancyCandidate(space="input")]
+    names = [candidate.name for candidate in default_candidates(rope)]
+    assert names == list(posterior.candidate_weights)
+    candidates = [PRIOR, DensityCandidate(name="never", build=never)]
+    candidates += [DiscrepancyCandidate(space="input")]
     with pytest.raises(InvalidInputError, match="space='embedding'"):
         stacked(rope, candidates=candidates)
+
+
+def never(rope: RoPE, seed: int) -> Any:
+    raise AssertionError("What cannot be trained is found before others are.")
 
 
 def long_series(theta: Tensor) -> Tensor:

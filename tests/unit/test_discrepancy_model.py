@@ -321,6 +321,18 @@ def test_simulations_are_corrected_by_gain_offset_and_error() -> None:
     assert torch.allclose(corrected.T.cov(), total, rtol=0.05, atol=0.01)
 
 
+def test_simulations_are_corrected_in_parts_as_in_one_go(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    z, mean = pairs(10, 3)
+    draws = DiscrepancyModel().fit(z, mean, no_noise(3)).sample(50, seed=0)
+    torch.manual_seed(1)
+    expected = draws.correct(z)
+    monkeypatch.setattr("sbi_rope.discrepancy.model.MAX_ENTRIES", 4 * 9)
+    torch.manual_seed(1)
+    assert torch.allclose(draws.correct(z), expected)
+
+
 def collapsed(n: int = 10) -> Tensor:
     """One variable three times."""
     return torch.randn(n, 1).repeat(1, 3)
@@ -445,6 +457,24 @@ Z, C = torch.randn(5, 2), torch.eye(2)
             InvalidInputError,
             r"`covariance` of shape \(2, 2\)",
             id="covariance",
+        ),
+        pytest.param(
+            lambda: DiscrepancyModel().fit(Z, Z, C - 1.5),
+            InvalidInputError,
+            "without negative eigenvalues",
+            id="negative",
+        ),
+        pytest.param(
+            lambda: DiscrepancyModel().fit(Z, Z, C + torch.ones(2, 2).triu(1)),
+            InvalidInputError,
+            "symmetric",
+            id="asymmetric",
+        ),
+        pytest.param(
+            lambda: DiscrepancyModel(gain_precisions=1.0),  # type: ignore[arg-type]
+            InvalidTypeError,
+            "`gain_precisions` to be a list",
+            id="number",
         ),
         pytest.param(
             lambda: DiscrepancyModel().fit(Z, Z, C).sample(0),

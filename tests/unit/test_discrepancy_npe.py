@@ -472,6 +472,38 @@ def test_moments_of_a_simulator_are_those_of_finite_simulations(
     assert (single.covariance == 0).all()
 
 
+def test_a_simulator_may_change_what_it_is_given_and_reuse_its_memory() -> None:
+    def in_place(theta: Tensor) -> Tensor:
+        theta *= 2
+        return theta.expand(-1, 2) + 0.01 * torch.randn(len(theta), 2)
+
+    theta, x = simulator_of(in_place).kept(500, progress=False)
+    assert (theta.abs() <= 1).all()
+    assert torch.allclose(x, 2 * theta.expand(-1, 2), atol=0.1)
+    memory = torch.zeros(2)
+
+    def one_at_a_time(theta: Tensor) -> Tensor:
+        memory[:] = float(theta)
+        return memory
+
+    theta, x = simulator_of(one_at_a_time).kept(50, progress=False)
+    assert torch.equal(x, theta.expand(-1, 2))
+
+
+def test_stored_simulations_are_handed_out_in_no_order() -> None:
+    theta = torch.linspace(-1, 1, 1000)[:, None]
+    stored = StoredSimulations(
+        (theta, noisy(theta)),
+        problems.box(1),
+        theta_shape=torch.Size((1,)),
+        event_shape=torch.Size((2,)),
+        like=theta,
+    )
+    kept, _ = stored.kept(20_000, progress=False)
+    assert torch.equal(kept.sort(dim=0).values, theta)
+    assert abs(float(kept[:100].mean())) < 0.3
+
+
 @pytest.mark.filterwarnings("ignore:Dropped")
 def test_a_pair_without_any_finite_simulation_is_named() -> None:
     def failing(theta: Tensor) -> Tensor:

@@ -155,6 +155,14 @@ def test_normal_scores_do_not_depend_on_the_scale_of_a_parameter(
         assert (scores[order, j].diff() >= 0).all()
 
 
+def test_several_recordings_of_a_person_count_once() -> None:
+    theta, people = box(2000), box(4)
+    once = learn_parameters(people, theta)
+    often = learn_parameters(people.repeat_interleave(25, dim=0), theta)
+    assert often.probability_of_prior == pytest.approx(once.probability_of_prior)
+    assert torch.allclose(often.probabilities, once.probabilities)
+
+
 def test_normal_scores_of_the_reference_are_normal_and_outside_they_are_finite() -> (
     None
 ):
@@ -184,6 +192,12 @@ def test_normal_scores_of_the_reference_are_normal_and_outside_they_are_finite()
         ),
         pytest.param(
             torch.ones(3, 2), torch.ones(0, 2), InvalidInputError, "`theta`", id="none"
+        ),
+        pytest.param(
+            torch.ones(3, 2), torch.ones(1, 2), InvalidInputError, "two or", id="one"
+        ),
+        pytest.param(
+            torch.ones(3), torch.ones(9), InvalidInputError, r"\(n, d\)", id="flat"
         ),
         pytest.param(
             [[1.0, 1.0]],

@@ -1,6 +1,7 @@
 """Mixtures of several kinds of parts against brute force, and amortised ones."""
 
 import copy
+import math
 import pickle
 from collections.abc import Callable
 from typing import Any
@@ -365,6 +366,30 @@ def test_a_part_gets_the_draws_its_weight_deserves(
     assert draws(calls[0]) == truncation.LEAKAGE_DRAWS
     assert draws(calls[1]) == 2 * 128
     assert draws(calls[2]) == 0
+
+
+def test_parts_that_weigh_a_draw_together_are_not_taken_for_inside() -> None:
+    # Each of a hundred weighs less than a draw; a tenth of them does in sum, too.
+    far = part_of_prior(problems.box(DIM, 3.0, 4.0), (3,))
+    weights = torch.cat([torch.tensor([0.95]), torch.full((100,), 0.0005)])
+    parts = [part_of_prior(problems.box(DIM), (3,)), *[far] * 100]
+    posterior = MixturePosterior(MixtureEstimator(parts, weights), problems.box(DIM))
+    leakage = posterior.leakage(torch.zeros(1, 3))
+    assert 0.95 <= float(leakage.mass) < 0.952
+
+
+def test_the_prior_is_never_left_out_of_a_density_however_little_it_weighs() -> None:
+    net = nn.Linear(3, 2 * DIM)
+    with torch.no_grad():
+        net.weight.zero_()
+        net.bias.copy_(torch.tensor([-0.9, -0.9, -3.0, -3.0]))
+    parts = [
+        Part(problems.Gaussians(DIM), OwnContexts([net], (3,))),
+        part_of_prior(problems.box(DIM), (3,)),
+    ]
+    estimator = MixtureEstimator(parts, [0.9999, 0.0001], tail_mass=1e-3)
+    found = estimator.log_prob(torch.full((1, 1, DIM), 0.9), torch.zeros(1, 3))
+    assert float(found) == pytest.approx(math.log(0.0001 / 2**DIM), abs=1e-5)
 
 
 def test_the_mass_of_an_observation_is_the_same_beside_others_within_its_error() -> (
