@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sbi_rope.mixture.parts import Part, Rows
+from sbi_rope.mixture.parts import Mixing, Part, Rows
 
 __all__ = ["Block", "Entries"]
 
@@ -57,7 +57,7 @@ class Block:
         # such as the prior, may be all there is far from the others.
         self._is_shared = torch.cat(
             [
-                torch.full_like(of_part.weights[0], part.mixing.contexts is not None)
+                torch.full_like(of_part.weights[0], _are_shared(part.mixing))
                 for part, of_part in zip(parts, rows, strict=True)
             ]
         ).bool()
@@ -89,3 +89,8 @@ class Block:
                 )
             start = end
         return found
+
+
+def _are_shared(mixing: Mixing) -> bool:
+    """Whether there are several contexts, the same for all observations."""
+    return mixing.contexts is not None and mixing.num_contexts > 1
