@@ -7,7 +7,8 @@
     python -m benchmarks summary
 
 Cells that are finished are kept, whichever suite asked for them, and are not computed
-again. Cells that failed are kept with their error; `--retry` computes them again.
+again. Cells that failed are kept with their error; `--retry` computes them again. `run`
+ends with status 1 if one of its cells failed.
 """
 
 import argparse
@@ -120,11 +121,13 @@ def _run(args: argparse.Namespace) -> int:
     table = write_table(suite, workplace.results, folder)
     path = write_report(suite, table, folder)
     print(f"Written: {path}")
+    failed = 0
     for cell in cells:
         row = table.rows.get(cell)
         if row is not None and row["status"] == "failed":
             print(f"failed: {cell}: {row['error'].splitlines()[0][:150]}")
-    return 0
+            failed += 1
+    return 1 if failed else 0
 
 
 @contextlib.contextmanager

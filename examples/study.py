@@ -5,6 +5,7 @@ Used by the example scripts; a study is (seeds) x (calibration sizes).
 
 import argparse
 import csv
+import itertools
 import statistics
 import time
 from collections.abc import Callable
@@ -257,8 +258,8 @@ class ResultsFile:
 
     def __init__(self, path: Path) -> None:
         if path.exists():
-            older = sum(1 for _ in path.parent.glob("results_*.csv"))
-            path.rename(path.with_name(f"results_{older + 1}.csv"))
+            others = (path.with_name(f"results_{i}.csv") for i in itertools.count(1))
+            path.rename(next(other for other in others if not other.exists()))
         self.path = path
         self.rows: list[dict[str, Any]] = []
         with path.open("w", newline="") as file:

@@ -213,6 +213,18 @@ def test_a_failing_method_does_not_stop_the_others(tmp_path: Path) -> None:
     }
 
 
+def test_a_run_with_a_cell_that_failed_says_so_by_its_status(tmp_path: Path) -> None:
+    suite = tmp_path / "failing.toml"
+    suite.write_text(
+        'title = "Failing"\nquestion = "Does it fail?"\npreset = "smoke"\n'
+        'repetitions = 1\n[[cells]]\ntasks = ["sir"]\nmethods = ["HVAE", "prior"]\n'
+        "n_calibration = [10]\n"
+    )
+    command = ["run", str(suite), "--out", str(tmp_path / "out")]
+    assert main(command) == 1
+    assert main([*command, "--method", "prior"]) == 0
+
+
 def test_methods_see_the_same_data_and_repetitions_do_not(tmp_path: Path) -> None:
     cell = Cell(task="linear_gaussian", preset="smoke", method="NPE", n_calibration=10)
     cases = [
