@@ -169,10 +169,14 @@ class CalibrationFinetuner:
         check_finite("x", x)
         groups = _checked_groups(groups, x)
         with seeded(seed):
-            targets = check_tensor("targets", draw_targets(self.simulations_per_target))
-            check_same_length("x", x, "targets", targets)
-            check_finite("targets", targets)
-            _check_start(embed(embedding_net, x), targets)
+            embedded = embed(embedding_net, x)
+
+            def checked_targets() -> Tensor:
+                targets = draw_targets(self.simulations_per_target)
+                return _checked_targets(targets, embedded)
+
+            targets = checked_targets()
+            _check_start(embedded, targets)
             keep = self._rehearsed(embedding_net, draw_simulations)
             train, held_out = self._split(groups)
             results = [
@@ -184,7 +188,7 @@ class CalibrationFinetuner:
                     held_out.to(x.device),
                     learning_rate=rate,
                     keep=keep,
-                    draw_targets=draw_targets if self.resample_targets else None,
+                    draw_targets=checked_targets if self.resample_targets else None,
                     show_progress_bars=show_progress_bars,
                 )
                 for rate in self._rates_to_try(embedding_net, held_out)
@@ -237,7 +241,7 @@ class CalibrationFinetuner:
         *,
         learning_rate: float,
         keep: tuple[Tensor, Tensor] | None,
-        draw_targets: Callable[[int], Tensor] | None,
+        draw_targets: Callable[[], Tensor] | None,
         show_progress_bars: bool,
     ) -> FinetuneResult:
         has_holdout = held_out.numel() > 0
@@ -249,7 +253,7 @@ class CalibrationFinetuner:
         def all_pairs(step: int) -> list[tuple[Tensor, Tensor]]:
             nonlocal newest
             if draw_targets is not None and 0 < step < num_steps:
-                newest = draw_targets(self.simulations_per_target)
+                newest = draw_targets()
             return [(x[train], newest[train])]
 
         def distance(x: Tensor, targets: Tensor) -> Tensor:
@@ -310,6 +314,18 @@ def _checked_groups(groups: Tensor | None, x: Tensor) -> Tensor:
             f"{tuple(groups.shape)}."
         )
     return groups
+
+
+def _checked_targets(targets: Tensor, embedded: Tensor) -> Tensor:
+    """Return targets that have the shape of the embeddings, and no other that fits."""
+    targets = check_tensor("targets", targets)
+    if targets.shape != embedded.shape:
+        raise InvalidInputError(
+            "Expected a target of the width of the embedding for each pair, shape "
+            f"{tuple(embedded.shape)}; got {tuple(targets.shape)}."
+        )
+    check_finite("targets", targets)
+    return targets
 
 
 def _check_start(embedded: Tensor, targets: Tensor) -> None:

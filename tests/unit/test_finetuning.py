@@ -227,8 +227,15 @@ def test_settings_outside_their_range_are_refused(settings: dict) -> None:
 
 def test_unusable_pairs_are_refused() -> None:
     x = torch.randn(10, 2)
-    with pytest.raises(InvalidInputError, match="same number of rows"):
-        finetune(linear(), x, x[:9])
+    for targets in (x[:9], x[:1], x[:, :1], x[:, :, None]):
+        with pytest.raises(InvalidInputError, match=r"shape \(10, 2\)"):
+            finetune(linear(), x, targets)
+    # Not only those drawn first.
+    later = iter([x, x[:, :1]])
+    with pytest.raises(InvalidInputError, match=r"shape \(10, 2\)"):
+        CalibrationFinetuner(num_steps=3, resample_targets=True).finetune(
+            linear(), x, lambda count: next(later), show_progress_bars=False
+        )
     with pytest.raises(InvalidInputError, match="`x` to be finite"):
         finetune(linear(), x / 0, x)
     with pytest.raises(InvalidTypeError, match="`x` to be a torch"):
