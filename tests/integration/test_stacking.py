@@ -433,7 +433,7 @@ def test_a_stack_does_not_change_with_the_posteriors_it_was_made_of() -> None:
 
 def test_a_mixture_of_a_user_counts_as_one_version_however_many_parts_it_has() -> None:
     sizes: list[int] = []
-    theirs: list[int] = []
+    theirs: list[Any] = []
 
     def build(rope: RoPE, seed: int) -> Any:
         # One density in the first versions, three in the last, of the prior in part.
@@ -444,14 +444,14 @@ def test_a_mixture_of_a_user_counts_as_one_version_however_many_parts_it_has() -
         mixture = type(the_stack().posterior_estimator)(
             parts, [1 / sizes[-1]] * sizes[-1]
         )
-        theirs.extend(map(id, mixture.parts))
+        theirs.extend(mixture.parts)
         return MixturePosterior(mixture, rope.npe.prior)
 
     posterior = stacked(
         rope_of(), candidates=[DensityCandidate(name="mixed", build=build)]
     )
     assert sizes == [1] * 5 + [3]
-    assert not {*map(id, posterior.posterior_estimator.parts)} & {*theirs}
+    assert not {*map(id, posterior.posterior_estimator.parts)} & {*map(id, theirs)}
     x, theta = observed(), problems.box(2).sample((NUM_OBSERVED,))
     npe = the_stack().candidate_log_probs(theta, x)[:, 1].exp()
     expected = (5 * npe + (2 * 0.25 + npe) / 3) / 6
