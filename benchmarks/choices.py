@@ -27,7 +27,7 @@ from benchmarks.store import Cache, write_atomically
 from sbi_rope import RoPE, stack
 from sbi_rope.stacking import stacking_weights
 
-__all__ = ["CHOICES", "Choice", "Run", "report", "run"]
+__all__ = ["CHOICES", "Choice", "Run", "calibration_data", "report", "run"]
 
 NUM_OTHERS = 300
 
@@ -82,8 +82,10 @@ class Run:
             )
 
 
-def run(case: Case, n_calibration: int, num_folds: int, seed: int) -> Run:
-    """Stack on pairs of the calibration set, and score on others of it."""
+def calibration_data(
+    case: Case, n_calibration: int, *, seed: int
+) -> tuple[RoPE, tuple[Tensor, Tensor]]:
+    """Return a RoPE with pairs of the calibration set, and others of it."""
     count = n_calibration + NUM_OTHERS
     recorded = case.task.num_recorded("calibration", seed=seed)
     if recorded is not None:
@@ -96,10 +98,15 @@ def run(case: Case, n_calibration: int, num_folds: int, seed: int) -> Run:
         finetuner=case.settings.finetuner,
     )
     rope.append_calibration(theta[:n_calibration], x[:n_calibration])
+    return rope, (theta[n_calibration:], x[n_calibration:])
+
+
+def run(case: Case, n_calibration: int, num_folds: int, seed: int) -> Run:
+    """Stack on pairs of the calibration set, and score on others of it."""
+    rope, (theta, x) = calibration_data(case, n_calibration, seed=seed)
     start = time.process_time()
     posterior = stack(rope, num_folds=num_folds, seed=seed, show_progress_bars=False)
     seconds = time.process_time() - start
-    theta, x = theta[n_calibration:], x[n_calibration:]
     versions, scores = posterior.versions, posterior.report.cross_validation
     others = [versions.log_probs(theta, x, [v]) for v in range(len(versions.trained))]
     return Run(

@@ -335,6 +335,13 @@ def default_candidates(
         rehearsal: Of a second RoPE over the same grid, whose tuning keeps simulations
             where they are, see :class:`~sbi_rope.CalibrationFinetuner`; None leaves it
             out.
+
+    Returns:
+        The candidates, couplings first.
+
+    Raises:
+        InvalidTypeError: If ``rope`` is something else.
+        InvalidInputError: If a gamma, a tau or the rehearsal is outside its range.
     """
     amortised: tuple[AmortisedCandidate, ...] = (
         DensityCandidate(name="prior", build=_prior, fixed=True),

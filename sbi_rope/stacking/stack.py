@@ -34,6 +34,8 @@ from sbi_rope.stacking.candidates import (
     AmortisedCandidate,
     Candidate,
     CouplingCandidate,
+    DiscrepancyCandidate,
+    FinetunedCandidate,
     check_candidates,
     default_candidates,
 )
@@ -263,7 +265,12 @@ class _Trainer:
                 or candidate.applies_to(self.bench)
             )
         chosen = check_candidates(candidates)
-        if any(getattr(candidate, "space", None) == "input" for candidate in chosen):
+        corrected = [
+            candidate
+            for candidate in chosen
+            if isinstance(candidate, DiscrepancyCandidate | FinetunedCandidate)
+        ]
+        if any(candidate.space == "input" for candidate in corrected):
             # Before the others are trained.
             network_of(estimator_of(self.bench.npe), "input")
         coupled = any(isinstance(c, CouplingCandidate) for c in chosen)
