@@ -77,8 +77,9 @@ def stack(
     and the posterior is their mixture with the weights that score best
     (:func:`stacking_weights`). It is deployed as it was scored: each candidate is the
     average of its versions, one without each fold, and one on all pairs. The held-out
-    score is therefore a lower bound, in expectation, for observations like those of the
-    pairs.
+    score is that of single versions. Their average is better than that in expectation,
+    by Jensen's inequality, for observations like those of the pairs; the version on all
+    pairs is not scored.
 
     Without ``x_o`` no candidate depends on a batch, and the result answers any
     observation. With ``x_o``, RoPE and OT-only at many gammas and taus take part, and
