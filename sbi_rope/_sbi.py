@@ -29,6 +29,7 @@ from sbi.neural_nets.estimators.mixed_density_estimator import MixedDensityEstim
 from sbi.neural_nets.estimators.tabpfn_flow import TabPFNFlow
 from sbi.neural_nets.net_builders.flow import build_zuko_unconditional_flow
 from sbi.samplers.mcmc import SliceSamplerVectorized
+from sbi.utils.sbiutils import Standardize
 from sbi.utils.user_input_checks_utils import move_distribution_to_device
 from torch import Tensor, nn
 from torch.distributions import Distribution
@@ -44,6 +45,7 @@ __all__ = [
     "MixtureDensity",
     "NeuralPosterior",
     "SliceSamplerVectorized",
+    "Standardize",
     "UnconditionalDensityEstimator",
     "VectorFieldDensity",
     "build_zuko_unconditional_flow",

@@ -2,13 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_rope._progress import progress_bar
 from sbi_rope._random import seeded
 from sbi_rope._validation import (
     check_batch,
@@ -24,16 +23,14 @@ from sbi_rope.errors import (
     warn_user,
 )
 
-__all__ = ["Moments", "SimulationSource", "Simulator", "StoredSimulations"]
+__all__ = [
+    "Embedding",
+    "Moments",
+    "SimulationSource",
+    "StoredSimulations",
+    "warn_of_dropped",
+]
 
-# Simulations held in memory before they are embedded; few if they come one by one, so
-# that a slow simulator shows its progress.
-BATCHED_CHUNK, SINGLE_CHUNK = 1000, 10
-# Seconds of work before it deserves a progress bar.
-DELAY = 2.0
-
-# Entries of simulations kept for training on them; fewer are drawn if each is large.
-MAX_KEPT = 2**27
 # Stored simulations around a theta behind the moments there.
 NUM_AROUND = 50
 
@@ -93,206 +90,6 @@ class SimulationSource(Protocol):
         ...
 
 
-class Simulator:
-    """A user's simulator, batched or not, checked on a few draws of the prior."""
-
-    def __init__(
-        self,
-        function: Callable[[Tensor], Tensor],
-        prior: Distribution,
-        *,
-        event_shape: torch.Size,
-        like: Tensor,
-    ) -> None:
-        if not callable(function):
-            raise InvalidTypeError(
-                "Expected `simulator` to be callable, from theta (n, d) to x (n, "
-                f"*event); got {type(function).__name__}."
-            )
-        self.function = function
-        self.prior = prior
-        self.event_shape = event_shape
-        self.like = like
-        self.num_dropped = 0
-        self._kept: dict[int, tuple[Tensor, Tensor]] = {}
-        # The probe has its own random numbers: seeded results do not depend on it.
-        with seeded(0):
-            self.is_batched = self._probe()
-
-    def from_prior(
-        self, count: int | None, at_least: int, embed: Embedding, *, progress: bool
-    ) -> tuple[Tensor, Tensor]:
-        """Simulate at parameters from the prior; drop rows that are not finite."""
-        count = at_least if count is None else count
-        theta = self.prior.sample(torch.Size((count,))).to(self.like)
-        statistics, valid = self._embed_at(theta, embed, progress=progress)
-        if not valid.any():
-            raise SimulationError(
-                f"All {count} simulations from the prior contain NaN or Inf."
-            )
-        self.num_dropped += int((~valid).sum())
-        _warn_of_dropped(int((~valid).sum()), count, "simulations from the prior")
-        return theta[valid], statistics[valid]
-
-    def targets(
-        self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
-    ) -> Tensor:
-        """Simulate ``count`` times at each theta and average the finite ones."""
-        statistics, valid = self._repeat_at(theta, count, embed, progress=progress)
-        total = statistics.where(valid[..., None], 0.0).sum(dim=1)
-        return total / valid.sum(dim=1, keepdim=True)
-
-    def moments(
-        self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
-    ) -> Moments:
-        """Simulate ``count`` times at each theta; of a single one the variance is 0."""
-        embedded, valid = self._repeat_at(theta, count, embed, progress=progress)
-        number = valid.sum(dim=1)[:, None]
-        embedded = embedded.double().where(valid[..., None], 0.0)
-        mean = embedded.sum(dim=1) / number
-        centred = (embedded - mean[:, None]).where(valid[..., None], 0.0)
-        squares = centred.mT @ centred
-        return Moments(
-            mean=mean, covariance=squares / (number[..., None] - 1).clamp_min(1)
-        )
-
-    def kept(self, count: int, *, progress: bool) -> tuple[Tensor, Tensor]:
-        """Simulate at parameters from the prior once, for all who ask for as many."""
-        count = min(count, max(1, MAX_KEPT // self.event_shape.numel()))
-        if count not in self._kept:
-            # Under a seed of its own, so that nothing depends on who asked first.
-            with seeded(0):
-                self._kept[count] = self.from_prior(
-                    count, count, lambda x: x, progress=progress
-                )
-        return self._kept[count]
-
-    def _repeat_at(
-        self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
-    ) -> tuple[Tensor, Tensor]:
-        """Simulate at each theta, ``(n, count, l)``, and tell what is finite."""
-        repeated = theta.repeat_interleave(count, dim=0)
-        statistics, valid = self._embed_at(repeated, embed, progress=progress)
-        dropped = int((~valid).sum())
-        valid = valid.reshape(-1, count)
-        statistics = statistics.reshape(*valid.shape, -1)
-        self.num_dropped += dropped
-        empty = ~valid.any(dim=1)
-        if empty.any():
-            # Not the numbers of rows: these may be a part of the pairs.
-            first = theta[empty][:5].tolist()
-            raise SimulationError(
-                f"All simulations at the calibration parameters {first} contain NaN or "
-                f"Inf ({int(empty.sum())} pairs in all). Remove these pairs."
-            )
-        _warn_of_dropped(
-            dropped, valid.numel(), "simulations at calibration parameters"
-        )
-        return statistics, valid
-
-    def _embed_at(
-        self, theta: Tensor, embed: Embedding, *, progress: bool
-    ) -> tuple[Tensor, Tensor]:
-        statistics, valid = [], []
-        bar = progress_bar(
-            show=progress, desc="Simulating", total=len(theta), delay=DELAY
-        )
-        for part in theta.split(BATCHED_CHUNK if self.is_batched else SINGLE_CHUNK):
-            x = self(part)
-            bar.update(len(part))
-            ok = torch.isfinite(x).flatten(1).all(dim=1)
-            # Embedding nets may refuse NaN: give them zeros, which are dropped later.
-            ok_shape = (-1,) + (1,) * (x.ndim - 1)
-            statistics.append(embed(x.where(ok.reshape(ok_shape), 0.0)))
-            valid.append(ok)
-        bar.close()
-        return torch.cat(statistics), torch.cat(valid)
-
-    def __call__(self, theta: Tensor) -> Tensor:
-        """Simulate, theta ``(n, d)`` to x ``(n, *event)``; x may contain NaN."""
-        # A simulator may change its argument, or hand out the same memory twice.
-        theta = theta.clone()
-        try:
-            if self.is_batched:
-                x = self.function(theta)
-            else:
-                rows = [self._single(self.function(row)).clone() for row in theta]
-                x = torch.cat(rows)
-        except SimulationError:
-            raise
-        except Exception as error:
-            raise SimulationError(
-                f"The simulator raised {type(error).__name__} on theta of shape "
-                f"{tuple(theta.shape)}: {error}"
-            ) from error
-        expected = (theta.shape[0], *self.event_shape)
-        if not isinstance(x, Tensor) or tuple(x.shape) != expected or x.is_complex():
-            raise SimulationError(
-                f"Expected the simulator to return a real tensor of shape {expected}; "
-                f"got {_describe(x)}."
-            )
-        return x.to(self.like)
-
-    def _single(self, x: Any) -> Tensor:
-        """Return one simulation with a leading dimension of one."""
-        if not self._is_single(x):
-            raise SimulationError(
-                f"Expected the simulator to return a tensor of shape "
-                f"{tuple(self.event_shape)} for one theta; got {_describe(x)}."
-            )
-        return x.reshape(1, *self.event_shape)
-
-    def _is_single(self, x: Any) -> bool:
-        shapes = {tuple(self.event_shape), (1, *self.event_shape)}
-        if self.event_shape == (1,):
-            shapes.add(())
-        return isinstance(x, Tensor) and tuple(x.shape) in shapes
-
-    def _probe(self) -> bool:
-        """Find out whether the simulator takes a batch or a single theta."""
-        first = self.prior.sample(torch.Size((1,))).to(self.like)
-        sizes = {first.shape[1], *self.event_shape}
-        # A number of rows that cannot be mistaken for a number of parameters.
-        count = next(n for n in range(3, 3 + len(sizes) + 1) if n not in sizes)
-        theta = first.repeat(count, 1)
-        as_batch = self._attempt(theta)
-        if isinstance(as_batch, Tensor) and as_batch.shape == (
-            count,
-            *self.event_shape,
-        ):
-            self._check_noise(theta, as_batch)
-            return True
-        single = self._attempt(theta[0])
-        if self._is_single(single):
-            return False
-        hint = (
-            " Convert NumPy results with `torch.as_tensor(x, dtype=torch.float32)`."
-            if not isinstance(as_batch, Tensor | Exception)
-            else ""
-        )
-        raise SimulationError(
-            f"Expected `simulator` to map theta {tuple(theta.shape)} to x "
-            f"{(count, *self.event_shape)}, or theta {tuple(theta[0].shape)} to x "
-            f"{tuple(self.event_shape)}; got {_describe(as_batch)} and "
-            f"{_describe(single)}.{hint}"
-        ) from (as_batch if isinstance(as_batch, Exception) else None)
-
-    def _check_noise(self, theta: Tensor, x: Tensor) -> None:
-        """Warn if all rows of a batch get the same noise."""
-        if bool((x == x[:1]).all()) and not torch.equal(self.function(theta), x):
-            warn_user(
-                "`simulator` adds the same noise to all simulations of a batch. Draw "
-                "noise of the shape of the batch, or simulate row by row with "
-                "`lambda theta: torch.stack([simulator(row) for row in theta])`."
-            )
-
-    def _attempt(self, theta: Tensor) -> Any:
-        try:
-            return self.function(theta)
-        except Exception as error:  # any error of user code is an answer here
-            return error
-
-
 class StoredSimulations:
     """Pairs (theta, x) simulated beforehand; pairs that are not finite are dropped."""
 
@@ -322,7 +119,7 @@ class StoredSimulations:
         valid &= torch.isfinite(x).flatten(1).all(dim=1)
         if not valid.any():
             raise SimulationError("All stored simulations contain NaN or Inf.")
-        _warn_of_dropped(int((~valid).sum()), len(valid), "stored simulations")
+        warn_of_dropped(int((~valid).sum()), len(valid), "stored simulations")
         check_in_support("simulations[0]", theta[valid], prior)
         self.num_dropped = int((~valid).sum())
         self.theta = theta[valid].to(like)
@@ -400,16 +197,9 @@ class StoredSimulations:
         return (theta - self._theta_mean) / self._theta_std
 
 
-def _warn_of_dropped(dropped: int, total: int, what: str) -> None:
+def warn_of_dropped(dropped: int, total: int, what: str) -> None:
+    """Warn of simulations that are left out, if there are any."""
     if dropped:
         warn_user(
             f"Dropped {dropped} of {total} {what} because they contain NaN or Inf."
         )
-
-
-def _describe(result: Any) -> str:
-    if isinstance(result, Exception):
-        return f"{type(result).__name__}: {result}"
-    if isinstance(result, Tensor):
-        return f"a tensor of shape {tuple(result.shape)} and dtype {result.dtype}"
-    return f"an object of type {type(result).__name__}"

@@ -4,10 +4,11 @@ Each check raises with the argument's name, what was expected, what came, and wh
 there is one, what to do next. Public functions call them once; private code trusts.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from numbers import Integral, Real
 from typing import Any
 
+import numpy as np
 import torch
 from sbi.utils import within_support
 from torch import Tensor
@@ -24,6 +25,7 @@ __all__ = [
     "check_instance",
     "check_integer",
     "check_not_negative",
+    "check_numbers",
     "check_positive",
     "check_prior",
     "check_same_length",
@@ -156,6 +158,21 @@ def check_not_negative(name: str, value: Any) -> None:
         raise InvalidInputError(
             f"Expected `{name}` to be a finite number of at least 0; got {value!r}."
         )
+
+
+def check_numbers(name: str, value: Any) -> list[float]:
+    """Return a list of at least one number, from anything that holds some."""
+    if isinstance(value, Tensor | np.ndarray):
+        value = value.tolist()
+    numbers = None
+    if isinstance(value, Iterable) and not isinstance(value, str):
+        numbers = list(value)
+    if not numbers or not all(_is_number(number) for number in numbers):
+        raise InvalidInputError(
+            f"Expected `{name}` to be a list of at least one number, such as [0.1, "
+            f"0.5]; got {value!r}."
+        )
+    return numbers
 
 
 def check_integer(name: str, value: Any, *, minimum: int = 1) -> None:

@@ -6,6 +6,7 @@ expect, so that both ``except RoPEError`` and ``except ValueError`` work.
 
 import inspect
 import warnings
+from collections.abc import Sequence
 
 __all__ = [
     "CouplingError",
@@ -49,7 +50,15 @@ class SimulationError(RoPEError, RuntimeError):
 
 
 class CouplingError(RoPEError, RuntimeError):
-    """The optimal transport problem could not be solved as asked."""
+    """The optimal transport problem could not be solved as asked.
+
+    Attributes:
+        simulated_rows: Rows of the simulations that are to blame, if some are.
+    """
+
+    def __init__(self, message: str, *, simulated_rows: Sequence[int] = ()) -> None:
+        super().__init__(message)
+        self.simulated_rows = tuple(simulated_rows)
 
 
 class SamplingError(RoPEError, RuntimeError):

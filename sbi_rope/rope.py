@@ -3,6 +3,7 @@
 import copy
 import itertools
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -22,7 +23,9 @@ from sbi_rope._sbi import (
     posterior_from,
     with_embedding,
 )
-from sbi_rope._simulations import SimulationSource, Simulator, StoredSimulations
+from sbi_rope._simulations import SimulationSource, StoredSimulations
+from sbi_rope._simulator import Simulator
+from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._training import groups_of
 from sbi_rope._validation import (
     check_batch,
@@ -32,6 +35,7 @@ from sbi_rope._validation import (
     check_in_support,
     check_instance,
     check_integer,
+    check_numbers,
     check_same_length,
     check_tensor,
     check_unit_interval,
@@ -41,6 +45,7 @@ from sbi_rope.errors import (
     CouplingError,
     InvalidInputError,
     NotReadyError,
+    SimulationError,
     UnsupportedPosteriorError,
 )
 from sbi_rope.finetuning import CalibrationFinetuner, History
@@ -204,6 +209,8 @@ class RoPE:
         x = self._checked("x", x, self._estimator.condition_shape)
         check_same_length("theta", theta, "x", x)
         check_in_support("theta", theta, self._prior)
+        self._embedded("x", x, self._h)
+        warn_of_far_entries("x", x, self._h)
         self._theta_cal = torch.cat([self._theta_cal, theta])
         self._x_cal = torch.cat([self._x_cal, x])
         self._g, self._history, self._targets = None, None, None
@@ -284,12 +291,21 @@ class RoPE:
 
     def _draw_targets(self, theta: Tensor, count: int, progress: bool) -> Tensor:  # noqa: FBT001
         stored = isinstance(self._source, StoredSimulations)
-        return self._source.targets(
+        targets = self._source.targets(
             theta,
             self.finetuner.num_neighbors if stored else count,
             self._embed_simulations,
             progress=progress,
         )
+        usable = torch.isfinite(torch.linalg.vector_norm(targets, dim=1))
+        if not usable.all():
+            raise SimulationError(
+                "Expected simulations with a finite embedding; got NaN, Inf or numbers "
+                f"too large to compare at the calibration parameters "
+                f"{theta[~usable][:5].tolist()}. Check what the simulator returns "
+                "there, or remove these pairs."
+            )
+        return targets
 
     def _draw_rehearsal(self, count: int, *, progress: bool) -> Tensor:
         # Drawn once for all that share these simulations, such as the folds of a
@@ -358,9 +374,7 @@ class RoPE:
                 "on. Call `train()` first."
             )
         x_o = self._checked("x_o", x_o, self._estimator.condition_shape)
-        real = embed(self._h if self._g is None else self._g, x_o)
-        check_finite("g(x_o)", real)
-        return real
+        return self._embedded("x_o", x_o, self._h if self._g is None else self._g)
 
     def with_pairs(self, rows: Tensor, *, targets: Tensor | None = None) -> "RoPE":
         """Return an untrained RoPE of the same NPE and simulator, with some pairs only.
@@ -468,7 +482,8 @@ class RoPE:
             tail_mass=tail_mass,
             show_progress_bars=show_progress_bars,
         )
-        coupling = coupler.couple(batch.real, batch.simulated, seed=seed)
+        with parameters_named(batch.theta):
+            coupling = coupler.couple(batch.real, batch.simulated, seed=seed)
         if require_convergence:
             _check_converged(coupling, coupler)
         return self._mixture(batch, coupling)
@@ -518,6 +533,7 @@ class RoPE:
             SimulationError: If the simulator fails.
         """
         coupler = self._coupler_or(coupler)
+        gammas, taus = check_numbers("gammas", gammas), check_numbers("taus", taus)
         batch = self._embed_batch(
             x_o,
             num_simulations=num_simulations,
@@ -526,10 +542,10 @@ class RoPE:
             tail_mass=tail_mass,
             show_progress_bars=show_progress_bars,
         )
-        gammas, taus = list(gammas), list(taus)
-        couplings = coupler.sweep(
-            batch.real, batch.simulated, gammas=gammas, taus=taus, seed=seed
-        )
+        with parameters_named(batch.theta):
+            couplings = coupler.sweep(
+                batch.real, batch.simulated, gammas=gammas, taus=taus, seed=seed
+            )
 
         def posteriors() -> Iterator[MixturePosterior]:
             settings = itertools.product(gammas, taus)
@@ -559,7 +575,8 @@ class RoPE:
         check_choice("unseen", unseen, ("raise", "extend"))
         check_unit_interval("tail_mass", tail_mass)
         real = self.embed_observations(x_o)
-        _, simulated = self.draw_simulations(
+        warn_of_far_entries("x_o", x_o.to(real), self._h)
+        theta, simulated = self.draw_simulations(
             num_simulations,
             at_least=max(len(real), MIN_SIMULATIONS),
             seed=seed,
@@ -568,6 +585,7 @@ class RoPE:
         return _Batch(
             x_o=self._checked("x_o", x_o, self._estimator.condition_shape),
             real=real,
+            theta=theta,
             simulated=simulated,
             embedding_net=self._h if self._g is None else self._g,
             unseen=unseen,
@@ -664,6 +682,21 @@ class RoPE:
     def _embed_simulations(self, x: Tensor) -> Tensor:
         return embed(self._h, x)
 
+    def _embedded(self, name: str, x: Tensor, net: nn.Module) -> Tensor:
+        """Return the embedding of observations, if it is finite, and so its length."""
+        embedded = embed(net, x)
+        usable = torch.isfinite(torch.linalg.vector_norm(embedded, dim=1))
+        if not usable.all():
+            rows = (~usable).nonzero().flatten()
+            largest = float(x[rows[0]].abs().max())
+            raise InvalidInputError(
+                f"Expected `{name}` with a finite embedding; got NaN, Inf or numbers "
+                f"too large to compare for {len(rows)} of {len(x)} rows (first: "
+                f"{rows[:5].tolist()}, with values of up to {largest:.2g}). Remove or "
+                "repair these rows."
+            )
+        return embedded
+
     def _checked(self, name: str, value: Tensor, event_shape: torch.Size) -> Tensor:
         """Check a batch of the user and return a copy in the estimator's dtype."""
         check_device(name, check_tensor(name, value), device_of(self._estimator))
@@ -679,10 +712,32 @@ class _Batch:
 
     x_o: Tensor
     real: Tensor
+    theta: Tensor
     simulated: Tensor
     embedding_net: nn.Module
     unseen: Literal["raise", "extend"]
     tail_mass: float
+
+
+@contextmanager
+def parameters_named(theta: Tensor) -> Iterator[None]:
+    """Say what the parameters of simulations are that a coupling failed for.
+
+    Their rows mean nothing to users, for whom they were drawn.
+
+    Args:
+        theta: The parameters of the simulations, shape ``(n_s, d)``.
+    """
+    try:
+        yield
+    except CouplingError as error:
+        if not error.simulated_rows:
+            raise
+        rows = list(error.simulated_rows[:5])
+        raise CouplingError(
+            f"{error} The parameters of these simulations are {theta[rows].tolist()}.",
+            simulated_rows=error.simulated_rows,
+        ) from error
 
 
 def _check_converged(coupling: Coupling, coupler: SinkhornCoupler) -> None:

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from sbi_rope._random import seeded
 from sbi_rope._sbi import ConditionalDensityEstimator, embedding_of
+from sbi_rope._standardisation import leave_out_constants
 from sbi_rope._training import History, split_pairs
 from sbi_rope._validation import check_instance
 from sbi_rope.baselines.base import UsesCalibration
@@ -31,7 +32,7 @@ DEFAULT_TRAINING = Training(
 )
 # In standard deviations of the prior; a share of the held-out error; pairs.
 FARTHEST, FLOOR, PSEUDO_PAIRS = 5.0, 0.1, 2
-# Draws that stand in for the moments of a prior that does not know them.
+# Draws that stand in for the range of the prior, and for moments it does not know.
 NUM_DRAWS = 10_000
 
 
@@ -44,7 +45,8 @@ class DiagonalGaussian(ConditionalDensityEstimator):
         \qquad w = \frac{25 e^v}{25 + e^v}
 
     Mean and standard deviation stay within five standard deviations of the prior. The
-    floor f starts at zero, see :meth:`set_floor`.
+    floor f starts at zero, see :meth:`set_floor`, and the mean has no other bounds at
+    the start, see :meth:`set_range`.
 
     Args:
         net: Maps observations ``(n, *event)`` to means and log-variances ``(n, 2 k)``
@@ -57,6 +59,8 @@ class DiagonalGaussian(ConditionalDensityEstimator):
     mean: Tensor
     std: Tensor
     floor: Tensor
+    lowest: Tensor
+    highest: Tensor
 
     def __init__(
         self,
@@ -69,6 +73,20 @@ class DiagonalGaussian(ConditionalDensityEstimator):
         self.register_buffer("mean", mean)
         self.register_buffer("std", std)
         self.register_buffer("floor", torch.zeros_like(std))
+        self.register_buffer("lowest", torch.full_like(mean, -torch.inf))
+        self.register_buffer("highest", torch.full_like(mean, torch.inf))
+
+    def set_range(self, theta: Tensor) -> None:
+        """Let no mean leave the range of draws from the prior.
+
+        An observation unlike those it was trained on can carry it out of the prior's
+        support, where no draw would ever be accepted.
+
+        Args:
+            theta: Draws from the prior, shape ``(n, k)``.
+        """
+        self.lowest = theta.amin(dim=0).to(self.lowest)
+        self.highest = theta.amax(dim=0).to(self.highest)
 
     @torch.no_grad()
     def set_floor(self, theta: Tensor, x: Tensor) -> None:
@@ -95,7 +113,8 @@ class DiagonalGaussian(ConditionalDensityEstimator):
             -log_variance, torch.full_like(log_variance, -2 * math.log(FARTHEST))
         )
         log_variance = torch.logaddexp(log_variance, 2 * self.floor.log())
-        return self.mean + self.std * mean, self.std.log() + 0.5 * log_variance
+        mean = (self.mean + self.std * mean).clamp(self.lowest, self.highest)
+        return mean, self.std.log() + 0.5 * log_variance
 
     def log_prob(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
         """Return the log density, shape ``(S, B)`` or ``(B,)``."""
@@ -127,7 +146,9 @@ class CalibrationMLP(UsesCalibration):
     anew, with linear outputs for mean and log-variance; where the estimator has no
     embedding net, one with two hidden layers of 64 units. Parameters are standardised
     by the prior. A part of the pairs is held out and the best network on them is kept.
-    No standard deviation is below a tenth of the root mean square error on them.
+    No standard deviation is below a tenth of the root mean square error on them, and no
+    mean is outside the range of the prior. Entries of x that are the same in all pairs
+    are left out.
 
     Sees the calibration set alone. Assumes nothing of the simulator and that the
     posterior is about Gaussian. Says what the labels are worth without a simulator: a
@@ -190,11 +211,13 @@ class CalibrationMLP(UsesCalibration):
         )
         unseen = held_out if len(held_out) else train
         estimator.set_floor(theta[unseen], x[unseen])
+        estimator.set_range(self._prior_draws())
         return self._direct_posterior(estimator), history
 
     def _gaussian(self, theta: Tensor, x: Tensor) -> DiagonalGaussian:
         theta, x = theta.cpu(), x.cpu()
         embedding = embedding_of(self._build(theta, x))
+        leave_out_constants(embedding, x)
         net = embedding_with_head(embedding, 2 * theta.shape[1], x)
         mean, std = self._prior_moments()
         return DiagonalGaussian(net, mean, std, x.shape[1:])
@@ -203,7 +226,10 @@ class CalibrationMLP(UsesCalibration):
         try:
             mean, std = self._prior.mean, self._prior.variance.sqrt()
         except NotImplementedError:
-            with seeded(0):
-                draws = self._prior.sample(torch.Size((NUM_DRAWS,)))
+            draws = self._prior_draws()
             mean, std = draws.mean(dim=0), draws.std(dim=0)
         return mean.float().cpu(), std.float().cpu()
+
+    def _prior_draws(self) -> Tensor:
+        with seeded(0):
+            return self._prior.sample(torch.Size((NUM_DRAWS,)))

@@ -9,10 +9,12 @@ from torch import Tensor
 
 from sbi_rope._sbi import (
     ConditionalDensityEstimator,
+    embedding_of,
     estimator_of,
     posterior_from,
     with_embedding,
 )
+from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._training import (
     MIN_PAIRS_FOR_HOLDOUT,
     History,
@@ -174,6 +176,7 @@ class FinetunedNPE(BuildsOnNPE, UsesCalibration):
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
         starts = self._starts or [estimator_of(npe)]
+        warn_of_far_entries("x", self._calibration[1], embedding_of(starts[0]))
         splits = self._splits()
         # There is one start for all splits, or as many as splits. Where pairs are too
         # few for that, splits are used again.

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from sbi_rope._random import seeded
-from sbi_rope._simulations import Simulator
+from sbi_rope._simulator import Simulator
 from sbi_rope._training import History
 from sbi_rope.baselines.base import BuildsOnNPE
 from sbi_rope.errors import NotReadyError

@@ -12,6 +12,7 @@ from sbi_rope._sbi import (
     embedding_of,
     headless,
 )
+from sbi_rope._standardisation import ROUNDING
 from sbi_rope._training import History, fit, split_pairs
 from sbi_rope.baselines.training import Training
 from sbi_rope.errors import UnsupportedPosteriorError
@@ -32,8 +33,6 @@ HIDDEN, NUM_TRANSFORMS = 64, 1
 SHRINKAGE = 0.01
 # Where the logarithmic scale begins, in standard deviations, and the smallest of those.
 CLIP, SMALLEST = 3.0, 1e-20
-# A standard deviation smaller than this share of the mean is rounding.
-ROUNDING = 1e-6
 
 
 def split_at_statistics(

@@ -12,6 +12,7 @@ from sbi_rope._random import seeded
 from sbi_rope._validation import (
     check_choice,
     check_integer,
+    check_numbers,
     check_positive,
     check_unit_interval,
 )
@@ -186,11 +187,8 @@ class SinkhornCoupler:
                 or as in :meth:`couple`.
             CouplingError: As in :meth:`couple`.
         """
+        gammas, taus = check_numbers("gammas", gammas), check_numbers("taus", taus)
         settings = list(itertools.product(gammas, taus))
-        if not settings:
-            raise InvalidInputError(
-                "Expected at least one value in `gammas` and in `taus`; got none."
-            )
         for gamma, tau in settings:
             replace(self, gamma=gamma, tau=tau)
         smallest = min(gamma for gamma, _ in settings)
@@ -235,7 +233,7 @@ class SinkhornCoupler:
             )
         num_fitted = min(len(real), self.num_fitted or len(real))
         if num_fitted < SMALL_BATCH:
-            self._warn_small_batch(num_fitted)
+            self._warn_small_batch(num_fitted, len(real))
         real, simulated = real.to(self.dtype), simulated.to(self.dtype)
         fitted = None
         if num_fitted < len(real):
@@ -255,7 +253,14 @@ class SinkhornCoupler:
         )
         return problem, scale
 
-    def _warn_small_batch(self, n_o: int) -> None:
+    def _warn_small_batch(self, num_fitted: int, n_o: int) -> None:
+        if num_fitted < n_o:
+            warn_user(
+                f"The coupling is fitted to num_fitted={num_fitted} of {n_o} real "
+                "observations, and balances the prior over these few. Use a num_fitted "
+                f"of at least {SMALL_BATCH}, or None for all."
+            )
+            return
         consequence = (
             "its row is uniform and the posterior is the prior. "
             if n_o == 1 and self.tau == 1.0

@@ -16,6 +16,8 @@ MAX_FOR_MEDIAN = 2000
 LARGEST_EXPONENT = {torch.float64: 1e12, torch.float32: 1e5}
 # Above this the rounding of distances by a matrix product would show in the weights.
 LARGEST_BY_PRODUCT = 1e3
+# Times as far from the centre as half of the simulations: a row that is to blame.
+EXTREME = 1e3
 
 
 class Problem:
@@ -45,9 +47,11 @@ class Problem:
     ) -> None:
         bound = Distances(simulated).bound(real)
         if not bound < 0.1 * torch.finfo(real.dtype).max ** 0.5:
-            raise CouplingError(
-                "The distances between embeddings overflow. Check the scale of the "
-                "observations and of the embedding net's outputs."
+            raise _error(
+                "The distances between embeddings overflow.",
+                real,
+                simulated,
+                otherwise="Check the scale of the embedding net's outputs.",
             )
         # In float32 the rounding of a product always shows.
         in_float64 = widest(real.device) == torch.float64
@@ -85,10 +89,13 @@ class Problem:
             torch.finfo(self.real.dtype).tiny,
         )
         if gamma < smallest:
-            raise CouplingError(
+            raise _error(
                 f"Expected a gamma of at least {smallest:.1e} in units of the "
                 f"embeddings, where {self.real.dtype} has digits left for distances / "
-                f"gamma; got {gamma:.1e}. Use a larger gamma, or dtype=torch.float64."
+                f"gamma; got {gamma:.1e}.",
+                self.real,
+                self.simulated,
+                otherwise="Use a larger gamma, or dtype=torch.float64.",
             )
 
     def kernel(self, gamma: float) -> Kernel:
@@ -103,6 +110,35 @@ class Problem:
         """Return a kernel over all observations, fitted to or not."""
         cost = Cost(self.real, self.simulated, stored=False, direct=self.direct)
         return Kernel(cost, gamma, stored=False)
+
+
+def _error(
+    problem: str, real: Tensor, simulated: Tensor, *, otherwise: str
+) -> CouplingError:
+    """Blame the rows that are far from all others, where there are some."""
+    # float64 holds the squares of all numbers of float32.
+    real, simulated = real.cpu().double(), simulated.cpu().double()
+    centre = simulated.median(dim=0).values
+    distance = torch.linalg.vector_norm(simulated - centre, dim=1)
+    limit = EXTREME * float(distance.median())
+    of_real = torch.linalg.vector_norm(real - centre, dim=1)
+    rows = {
+        name: (values > limit).nonzero().flatten().tolist()
+        for name, values in (("real", of_real), ("simulated", distance))
+    }
+    blamed = [
+        f"{len(found)} of `{name}` (first: {found[:5]})"
+        for name, found in rows.items()
+        if found and len(found) < max(2, len(real) / 2)
+    ]
+    if not blamed:
+        return CouplingError(f"{problem} {otherwise}")
+    return CouplingError(
+        f"{problem} The reason are rows more than {EXTREME:.0f} times as far from the "
+        f"centre of the simulations as half of these are: {' and '.join(blamed)}. "
+        "Remove or repair them.",
+        simulated_rows=rows["simulated"],
+    )
 
 
 def checked_embeddings(real: Tensor, simulated: Tensor) -> tuple[Tensor, Tensor]:

@@ -8,6 +8,7 @@ from torch import Tensor
 from sbi_rope._random import seeded
 from sbi_rope._validation import check_instance, check_integer
 from sbi_rope.coupling import SinkhornCoupler
+from sbi_rope.diagnosis.far_entries import far_findings
 from sbi_rope.diagnosis.misspecification import misspecification_findings
 from sbi_rope.diagnosis.prior_shift import prior_shift
 from sbi_rope.diagnosis.report import Diagnosis, Finding
@@ -20,7 +21,7 @@ from sbi_rope.diagnosis.residuals import (
 from sbi_rope.diagnosis.simulations import Simulations
 from sbi_rope.diagnosis.support import support_of
 from sbi_rope.errors import InvalidInputError
-from sbi_rope.rope import MIN_SIMULATIONS, RoPE
+from sbi_rope.rope import MIN_SIMULATIONS, RoPE, parameters_named
 
 __all__ = ["diagnose"]
 
@@ -49,6 +50,8 @@ def diagnose(
        weighted by the coupling at tau = 0, against the prior.
     4. Does :math:`g(x) - E[h(S(\theta))]` of calibration pairs depend on
        :math:`\theta`? On residuals of pairs that g was not trained on.
+    5. Is an entry of x many standard deviations away from simulations, by which NPE
+       standardised it? Left out where NPE did not.
 
     Without calibration pairs, g = h, and the second test of 1 and all of 4 are left
     out. The thresholds of tests (1, 3, distances of 2) are what one batch in a hundred
@@ -99,7 +102,8 @@ def diagnose(
         )
         names = _names(parameter_names, theta.shape[1])
         _check_enough(theta)
-        coupling = (coupler or rope.coupler).couple(real, simulated)
+        with parameters_named(theta):
+            coupling = (coupler or rope.coupler).couple(real, simulated)
         before = rope.with_pairs(torch.arange(0)).embed_observations(x_o)
         simulations = Simulations(
             theta=_moved(theta), embedded=_moved(simulated), tuned=tuned
@@ -117,6 +121,7 @@ def diagnose(
         findings += shift.findings(simulations, names)
         if held_out is not None:
             findings += _residual_findings(rope, held_out, simulations, notes)
+        findings += far_findings(rope.embedding_net, x_o)
     if not coupling.converged:
         notes.append("The coupling has not converged; its sample sizes are rough.")
     return Diagnosis(

@@ -11,16 +11,14 @@ from sbi_rope._random import seeded
 from sbi_rope._sbi import (
     ConditionalDensityEstimator,
     embed,
+    embedding_of,
     estimator_of,
     headless,
     posterior_from,
 )
-from sbi_rope._simulations import (
-    Moments,
-    SimulationSource,
-    Simulator,
-    StoredSimulations,
-)
+from sbi_rope._simulations import Moments, SimulationSource, StoredSimulations
+from sbi_rope._simulator import Simulator
+from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._training import History
 from sbi_rope._validation import (
     check_choice,
@@ -39,7 +37,12 @@ from sbi_rope.discrepancy.model import Discrepancy, DiscrepancyModel
 from sbi_rope.discrepancy.parameters import learn_parameters
 from sbi_rope.discrepancy.report import DiscrepancyReport, report_discrepancy
 from sbi_rope.discrepancy.tuning import TUNING, cross_fitted_nets
-from sbi_rope.errors import InvalidInputError, NotReadyError, UnsupportedPosteriorError
+from sbi_rope.errors import (
+    InvalidInputError,
+    InvalidTypeError,
+    NotReadyError,
+    UnsupportedPosteriorError,
+)
 from sbi_rope.finetuning import CalibrationFinetuner
 from sbi_rope.mixture import MixtureEstimator, MixturePosterior, OwnContexts, Part
 
@@ -137,6 +140,11 @@ class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
             check_positive("learning_rate", learning_rate)
         check_integer("num_folds", num_folds, minimum=2)
         check_instance("finetuner", finetuner, CalibrationFinetuner, optional=True)
+        if simulator is not None and not callable(simulator):
+            raise InvalidTypeError(
+                "Expected `simulator` to be callable, from theta (n, d) to x (n, "
+                f"*event), or None; got {type(simulator).__name__}."
+            )
         super().__init__(
             prior, density_estimator, npe_training=npe_training, device=device
         )
@@ -289,6 +297,7 @@ class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
         if self.space == "tuned":
             _check_density(estimator)
         theta, x = self._calibration
+        warn_of_far_entries("x", x, embedding_of(estimator))
         source = self._source(x)
         net = network_of(estimator, self.space)
         moments = self._moments(source, net, show_progress_bars)

@@ -20,6 +20,7 @@ from sbi_rope._validation import (
     check_choice,
     check_instance,
     check_not_negative,
+    check_numbers,
     check_positive,
     check_unit_interval,
 )
@@ -343,6 +344,7 @@ def default_candidates(
         InvalidTypeError: If ``rope`` is something else.
         InvalidInputError: If a gamma, a tau or the rehearsal is outside its range.
     """
+    gammas, taus = check_numbers("gammas", gammas), check_numbers("taus", taus)
     amortised: tuple[AmortisedCandidate, ...] = (
         DensityCandidate(name="prior", build=_prior, fixed=True),
         DensityCandidate(name="NPE", build=_npe, fixed=True),

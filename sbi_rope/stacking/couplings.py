@@ -14,7 +14,7 @@ from sbi_rope.errors import CouplingError
 from sbi_rope.mixture import CoupledContexts, CoupledNet, Part
 from sbi_rope.mixture.chunks import flow_slices
 from sbi_rope.mixture.density import without_nan
-from sbi_rope.rope import MIN_SIMULATIONS, RoPE
+from sbi_rope.rope import MIN_SIMULATIONS, RoPE, parameters_named
 from sbi_rope.stacking.candidates import CouplingCandidate
 from sbi_rope.stacking.folds import Fold
 
@@ -129,7 +129,7 @@ def fit_couplings(
         CouplingError: If a coupling has not converged and must.
     """
     bench = versions[0].bench
-    _, simulated = bench.rope.draw_simulations(
+    theta, simulated = bench.rope.draw_simulations(
         num_simulations,
         at_least=max(len(x_o), MIN_SIMULATIONS),
         seed=seed,
@@ -139,7 +139,8 @@ def fit_couplings(
     nets, settings = [], []
     for key, net in _nets(candidates, versions).items():
         of_net = [c for c in candidates if (c.tuned, c.rehearsal) == key[:2]]
-        couplings = _couple(of_net, embed(net, batch), simulated, bench.rope)
+        with parameters_named(theta):
+            couplings = _couple(of_net, embed(net, batch), simulated, bench.rope)
         share = 1.0 / len(couplings)
         nets.append(CoupledNet(net, couplings, [share] * len(couplings)))
         settings += [(candidate.name, key[2]) for candidate in of_net]

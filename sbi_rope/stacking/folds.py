@@ -11,7 +11,8 @@ from torch import Tensor, nn
 
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed, estimator_of
-from sbi_rope._simulations import Moments, Simulator
+from sbi_rope._simulations import Moments
+from sbi_rope._simulator import Simulator
 from sbi_rope._training import groups_of, split_groups
 from sbi_rope.discrepancy.correction import (
     NUM_STEPS,

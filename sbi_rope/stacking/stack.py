@@ -9,6 +9,7 @@ from torch import Tensor
 from sbi_rope._progress import progress_bar
 from sbi_rope._random import seeded
 from sbi_rope._sbi import ConditionalDensityEstimator, estimator_of
+from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._validation import (
     check_batch,
     check_choice,
@@ -446,4 +447,5 @@ def _checked_observations(x_o: Tensor, rope: RoPE) -> Tensor:
     _, x = rope.calibration
     x_o = check_batch("x_o", x_o, x.shape[1:]).detach().to(x, copy=True)
     check_finite("x_o", x_o)  # float32 may hold less
+    warn_of_far_entries("x_o", x_o, rope.embedding_net)
     return x_o

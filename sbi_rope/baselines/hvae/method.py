@@ -16,6 +16,7 @@ from sbi_rope._sbi import (
     headless,
     posterior_from,
 )
+from sbi_rope._standardisation import ROUNDING
 from sbi_rope._training import History
 from sbi_rope._validation import (
     check_batch,
@@ -244,16 +245,17 @@ class HVAE(BuildsOnNPE, UsesCalibration, UsesObservations):
         x = torch.cat([self._observations, self._calibration[1]])
         npe = FrozenNPE(embedding_of(estimator), headless(estimator))
         check_differentiable(npe.flow, embed(npe.embedding, x[:2]))
-        # One number a channel: pixels that never change have no standard deviation.
+        # One number a channel: pixels that never change have no standard deviation. Nor
+        # has a channel that only rounding changes.
         channels = x.transpose(0, 1).flatten(1) if x.ndim == 4 else x.reshape(1, -1)
-        std = channels.std(dim=1)
+        std, mean = torch.std_mean(channels, dim=1)
         unet = partial(
             ConditionalUNet,
             tuple(x.shape[1:]),
             self.latent_dim,
             width=self.width,
-            mean=channels.mean(dim=1),
-            std=std.where(std > 0, 1.0),
+            mean=mean,
+            std=std.where(std > ROUNDING * mean.abs(), 1.0),
             residual=self.residual,
         )
         model = HybridVAE(

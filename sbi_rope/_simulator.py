@@ -1,0 +1,307 @@
+"""A user's simulator: what it takes and returns is found out before it is trusted."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from scipy.stats import ks_2samp
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_rope._progress import progress_bar
+from sbi_rope._random import seeded
+from sbi_rope._simulations import Embedding, Moments, warn_of_dropped
+from sbi_rope.errors import InvalidTypeError, SimulationError, warn_user
+
+__all__ = ["Simulator"]
+
+# Simulations held in memory before they are embedded; few if they come one by one, so
+# that a slow simulator shows its progress.
+BATCHED_CHUNK, SINGLE_CHUNK = 1000, 10
+# Seconds of work before it deserves a progress bar.
+DELAY = 2.0
+# Entries of simulations kept for training on them; fewer are drawn if each is large.
+MAX_KEPT = 2**27
+# Simulations of one theta, and the p-value below which those of a batch are not the
+# same as those one by one.
+NUM_COMPARED, DIFFERENT = 50, 1e-6
+
+
+class Simulator:
+    """A user's simulator, batched or not, checked on a few draws of the prior."""
+
+    def __init__(
+        self,
+        function: Callable[[Tensor], Tensor],
+        prior: Distribution,
+        *,
+        event_shape: torch.Size,
+        like: Tensor,
+    ) -> None:
+        if not callable(function):
+            raise InvalidTypeError(
+                "Expected `simulator` to be callable, from theta (n, d) to x (n, "
+                f"*event); got {type(function).__name__}."
+            )
+        self.function = function
+        self.prior = prior
+        self.event_shape = event_shape
+        self.like = like
+        self.num_dropped = 0
+        self._kept: dict[int, tuple[Tensor, Tensor]] = {}
+        # The probe has its own random numbers: seeded results do not depend on it.
+        with seeded(0):
+            self.is_batched = self._probe()
+
+    def from_prior(
+        self, count: int | None, at_least: int, embed: Embedding, *, progress: bool
+    ) -> tuple[Tensor, Tensor]:
+        """Simulate at parameters from the prior; drop rows that are not finite."""
+        count = at_least if count is None else count
+        theta = self.prior.sample(torch.Size((count,))).to(self.like)
+        statistics, valid = self._embed_at(theta, embed, progress=progress)
+        if not valid.any():
+            raise SimulationError(
+                f"All {count} simulations from the prior contain NaN or Inf."
+            )
+        self.num_dropped += int((~valid).sum())
+        warn_of_dropped(int((~valid).sum()), count, "simulations from the prior")
+        return theta[valid], statistics[valid]
+
+    def targets(
+        self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
+    ) -> Tensor:
+        """Simulate ``count`` times at each theta and average the finite ones."""
+        statistics, valid = self._repeat_at(theta, count, embed, progress=progress)
+        total = statistics.where(valid[..., None], 0.0).sum(dim=1)
+        return total / valid.sum(dim=1, keepdim=True)
+
+    def moments(
+        self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
+    ) -> Moments:
+        """Simulate ``count`` times at each theta; of a single one the variance is 0."""
+        embedded, valid = self._repeat_at(theta, count, embed, progress=progress)
+        number = valid.sum(dim=1)[:, None]
+        embedded = embedded.double().where(valid[..., None], 0.0)
+        mean = embedded.sum(dim=1) / number
+        centred = (embedded - mean[:, None]).where(valid[..., None], 0.0)
+        squares = centred.mT @ centred
+        return Moments(
+            mean=mean, covariance=squares / (number[..., None] - 1).clamp_min(1)
+        )
+
+    def kept(self, count: int, *, progress: bool) -> tuple[Tensor, Tensor]:
+        """Simulate at parameters from the prior once, for all who ask for as many."""
+        count = min(count, max(1, MAX_KEPT // self.event_shape.numel()))
+        if count not in self._kept:
+            # Under a seed of its own, so that nothing depends on who asked first.
+            with seeded(0):
+                self._kept[count] = self.from_prior(
+                    count, count, lambda x: x, progress=progress
+                )
+        return self._kept[count]
+
+    def _repeat_at(
+        self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
+    ) -> tuple[Tensor, Tensor]:
+        """Simulate at each theta, ``(n, count, l)``, and tell what is finite."""
+        repeated = theta.repeat_interleave(count, dim=0)
+        statistics, valid = self._embed_at(repeated, embed, progress=progress)
+        dropped = int((~valid).sum())
+        valid = valid.reshape(-1, count)
+        statistics = statistics.reshape(*valid.shape, -1)
+        self.num_dropped += dropped
+        empty = ~valid.any(dim=1)
+        if empty.any():
+            # Not the numbers of rows: these may be a part of the pairs.
+            first = theta[empty][:5].tolist()
+            raise SimulationError(
+                f"All simulations at the calibration parameters {first} contain NaN or "
+                f"Inf ({int(empty.sum())} pairs in all). Remove these pairs."
+            )
+        warn_of_dropped(dropped, valid.numel(), "simulations at calibration parameters")
+        return statistics, valid
+
+    def _embed_at(
+        self, theta: Tensor, embed: Embedding, *, progress: bool
+    ) -> tuple[Tensor, Tensor]:
+        statistics, valid = [], []
+        bar = progress_bar(
+            show=progress, desc="Simulating", total=len(theta), delay=DELAY
+        )
+        for part in theta.split(BATCHED_CHUNK if self.is_batched else SINGLE_CHUNK):
+            x = self(part)
+            bar.update(len(part))
+            ok = torch.isfinite(x).flatten(1).all(dim=1)
+            # Embedding nets may refuse NaN: give them zeros, which are dropped later.
+            ok_shape = (-1,) + (1,) * (x.ndim - 1)
+            statistics.append(embed(x.where(ok.reshape(ok_shape), 0.0)))
+            valid.append(ok)
+        bar.close()
+        return torch.cat(statistics), torch.cat(valid)
+
+    def __call__(self, theta: Tensor) -> Tensor:
+        """Simulate, theta ``(n, d)`` to x ``(n, *event)``; x may contain NaN."""
+        # A simulator may change its argument, or hand out the same memory twice.
+        theta = theta.clone()
+        try:
+            if self.is_batched:
+                x = self.function(theta)
+            else:
+                rows = [self._single(self.function(row)).clone() for row in theta]
+                x = torch.cat(rows)
+        except SimulationError:
+            raise
+        except Exception as error:
+            raise SimulationError(
+                f"The simulator raised {type(error).__name__} on theta of shape "
+                f"{tuple(theta.shape)}: {error}"
+            ) from error
+        expected = (theta.shape[0], *self.event_shape)
+        if not isinstance(x, Tensor) or tuple(x.shape) != expected or x.is_complex():
+            raise SimulationError(
+                f"Expected the simulator to return a real tensor of shape {expected}; "
+                f"got {_describe(x)}."
+            )
+        return x.to(self.like)
+
+    def _single(self, x: Any) -> Tensor:
+        """Return one simulation with a leading dimension of one."""
+        if not self._is_single(x):
+            raise SimulationError(
+                f"Expected the simulator to return a tensor of shape "
+                f"{tuple(self.event_shape)} for one theta; got {_describe(x)}."
+            )
+        return x.reshape(1, *self.event_shape)
+
+    def _is_single(self, x: Any) -> bool:
+        shapes = {tuple(self.event_shape), (1, *self.event_shape)}
+        if self.event_shape == (1,):
+            shapes.add(())
+        return isinstance(x, Tensor) and tuple(x.shape) in shapes
+
+    def _probe(self) -> bool:
+        """Find out whether the simulator takes a batch or a single theta."""
+        sizes = {*self.prior.event_shape, *self.event_shape}
+        # A number of rows that cannot be mistaken for a number of parameters.
+        count = next(n for n in range(3, 3 + len(sizes) + 1) if n not in sizes)
+        draws = self.prior.sample(torch.Size((2 * count - 1,))).to(self.like)
+        theta = draws[:1].repeat(count, 1)
+        as_batch = self._attempt(theta)
+        if self._is_batch(as_batch, count):
+            self._check_noise(theta, as_batch)
+            one_by_one = self._mixes_rows(draws[:count], draws[count - 1 :])
+            if one_by_one:
+                warn_user(
+                    "`simulator` returns something else for a row of a batch than for "
+                    "the same theta alone: its rows depend on each other. It is called "
+                    "with one theta at a time. If it should take batches, let each "
+                    "row of x depend on the same row of theta only."
+                )
+            return not one_by_one
+        single = self._attempt(theta[0])
+        if self._is_single(single):
+            return False
+        hint = (
+            " Convert NumPy results with `torch.as_tensor(x, dtype=torch.float32)`."
+            if not isinstance(as_batch, Tensor | Exception)
+            else ""
+        )
+        raise SimulationError(
+            f"Expected `simulator` to map theta {tuple(theta.shape)} to x "
+            f"{(count, *self.event_shape)}, or theta {tuple(theta[0].shape)} to x "
+            f"{tuple(self.event_shape)}; got {_describe(as_batch)} and "
+            f"{_describe(single)}.{hint}"
+        ) from (as_batch if isinstance(as_batch, Exception) else None)
+
+    def _check_noise(self, theta: Tensor, x: Tensor) -> None:
+        """Warn if all rows of a batch get the same noise."""
+        if not bool((x == x[:1]).all()):
+            return
+        again = self._attempt(theta)
+        if isinstance(again, Tensor) and not torch.equal(again, x):
+            warn_user(
+                "`simulator` adds the same noise to all simulations of a batch. Draw "
+                "noise of the shape of the batch, or simulate row by row with "
+                "`lambda theta: torch.stack([simulator(row) for row in theta])`."
+            )
+
+    def _mixes_rows(self, theta: Tensor, others: Tensor) -> bool:
+        """Tell whether a simulator for one theta has survived a batch of them.
+
+        Such as ``lambda theta: theta * theta.norm()``, whose rows depend on each other.
+
+        Args:
+            theta: Parameters, shape ``(n, d)``.
+            others: Other parameters, shape ``(n, d)``, to stand beside the first row.
+        """
+        x, x_beside_others = (
+            self._attempt(batch, seed=0)
+            for batch in (theta, torch.cat([theta[:1], others[1:]]))
+        )
+        # What fails here, fails with a clear message when it is called.
+        if not self._is_batch(x, len(theta)):
+            return False
+        if not self._is_batch(x_beside_others, len(theta)):
+            return False
+        if _is_close(x[0], x_beside_others[0]):
+            return False
+        # The rows depend on each other, or only take different random numbers, as where
+        # draws are rejected. Where a single theta works too, that tells.
+        if not self._is_single(self._attempt(theta[0])):
+            return False
+        batch = self._attempt(theta[:1].repeat(NUM_COMPARED, 1))
+        singles = [self._attempt(theta[0]) for _ in range(NUM_COMPARED)]
+        if not self._is_batch(batch, NUM_COMPARED):
+            return False
+        if not all(self._is_single(single) for single in singles):
+            return False
+        single = torch.cat([self._single(single) for single in singles])
+        return _is_different(batch, single.to(batch))
+
+    def _attempt(self, theta: Tensor, *, seed: int | None = None) -> Any:
+        """Return a copy of what the simulator returns, or the error it raises."""
+        try:
+            with seeded(seed):
+                x = self.function(theta.clone())
+        except Exception as error:  # any error of user code is an answer here
+            return error
+        return x.clone() if isinstance(x, Tensor) else x
+
+    def _is_batch(self, x: Any, count: int) -> bool:
+        return isinstance(x, Tensor) and x.shape == (count, *self.event_shape)
+
+
+def _is_close(a: Tensor, b: Tensor) -> bool:
+    """Tell whether two simulations are the same up to rounding."""
+    a, b = a.double(), b.double()
+    scale = float(a.nan_to_num(0.0, 0.0, 0.0).abs().max())
+    return torch.allclose(a, b, rtol=1e-4, atol=1e-5 * scale, equal_nan=True)
+
+
+def _is_different(a: Tensor, b: Tensor) -> bool:
+    """Tell whether two sets of simulations are of different distributions.
+
+    By Kolmogorov and Smirnov's test in each entry, where the medians differ by more
+    than rounding.
+    """
+    a, b = a.flatten(1).double(), b.flatten(1).double()
+    middle_a, middle_b = a.nanmedian(dim=0).values, b.nanmedian(dim=0).values
+    scale = torch.maximum(middle_a.abs(), middle_b.abs())
+    apart = (middle_a - middle_b).abs() > 1e-4 * scale
+    for column in apart.nonzero().flatten().tolist():
+        some = [
+            values[~values.isnan()].cpu().numpy()
+            for values in (a[:, column], b[:, column])
+        ]
+        if ks_2samp(*some).pvalue < DIFFERENT / a.shape[1]:
+            return True
+    return False
+
+
+def _describe(result: Any) -> str:
+    if isinstance(result, Exception):
+        return f"{type(result).__name__}: {result}"
+    if isinstance(result, Tensor):
+        return f"a tensor of shape {tuple(result.shape)} and dtype {result.dtype}"
+    return f"an object of type {type(result).__name__}"

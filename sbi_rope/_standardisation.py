@@ -1,0 +1,85 @@
+"""Real observations in the units by which NPE standardises simulations."""
+
+import torch
+from torch import Tensor, nn
+
+from sbi_rope._sbi import Standardize
+from sbi_rope.errors import warn_user
+
+__all__ = [
+    "FAR",
+    "ROUNDING",
+    "deviations",
+    "leave_out_constants",
+    "warn_of_far_entries",
+]
+
+# Standard deviations of simulations. In the paper's misspecified tasks no measurement
+# is farther than seven; a column that does not vary in simulations gives 100,000.
+FAR = 30.0
+# A standard deviation smaller than this share of the mean is rounding.
+ROUNDING = 1e-6
+
+
+def deviations(embedding_net: nn.Module, x: Tensor) -> Tensor | None:
+    """Return how far each entry is from simulations, in standard deviations of these.
+
+    Args:
+        embedding_net: That of a trained estimator, with sbi's standardising layer.
+        x: Observations, shape ``(n, *event)``.
+
+    Returns:
+        Shape ``(n, *event)``; None where NPE does not standardise x.
+    """
+    layer = _layer(embedding_net)
+    return None if layer is None else ((x - layer._mean) / layer._std).abs()
+
+
+def _layer(embedding_net: nn.Module) -> Standardize | None:
+    layers = (part for part in embedding_net.modules() if isinstance(part, Standardize))
+    return next(layers, None)
+
+
+@torch.no_grad()
+def leave_out_constants(embedding_net: nn.Module, x: Tensor) -> None:
+    """Make a net that was standardised by some observations blind to what they share.
+
+    sbi divides an entry that does not vary by 1e-7, so that the first observation in
+    which it does overwhelms all other entries.
+
+    Args:
+        embedding_net: A net with sbi's standardising layer, which is changed.
+        x: The calibration x that it was standardised by, shape ``(n, *event)``.
+    """
+    layer = _layer(embedding_net)
+    if layer is None or layer._std.shape != x.shape[1:]:
+        return  # one standard deviation for all entries
+    constant = x.std(dim=0) <= ROUNDING * x.abs().amax(dim=0)
+    if not constant.any():
+        return
+    layer._std.masked_fill_(constant, torch.inf)
+    entries = constant.flatten().nonzero().flatten().tolist()
+    warn_user(
+        f"{len(entries)} of the {constant.numel()} entries of the calibration `x` are "
+        f"the same in all pairs that are trained on (first: {entries[:5]}). They tell "
+        "nothing about the parameters and are left out."
+    )
+
+
+def warn_of_far_entries(name: str, x: Tensor, embedding_net: nn.Module) -> None:
+    """Warn of entries where NPE meets numbers unlike any that it was trained on."""
+    far = deviations(embedding_net, x)
+    if far is None or not (far > FAR).any():
+        return
+    far = far.flatten(1)
+    rows = (far > FAR).any(dim=1).nonzero().flatten()
+    columns = (far > FAR).any(dim=0).nonzero().flatten()
+    warn_user(
+        f"{len(columns)} of the {far.shape[1]} entries of `{name}` (first: "
+        f"{columns[:5].tolist()}) are up to {float(far.max()):.1g} standard deviations "
+        f"away from simulations, in {len(rows)} of {len(far)} rows (first: "
+        f"{rows[:5].tolist()}). NPE has seen nothing like it, and what is inferred "
+        "from these rows can be anything. Check the units. Leave out what does not "
+        "vary in simulations, or train NPE with z_score_x='structured', which has one "
+        "standard deviation for all entries."
+    )

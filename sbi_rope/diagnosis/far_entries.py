@@ -1,0 +1,42 @@
+"""Does NPE meet numbers unlike any that it was trained on?"""
+
+from torch import Tensor, nn
+
+from sbi_rope._standardisation import FAR, deviations
+from sbi_rope.diagnosis.report import Finding
+
+__all__ = ["far_findings"]
+
+
+def far_findings(embedding_net: nn.Module, x_o: Tensor) -> list[Finding]:
+    """Judge how far observations are from simulations, entry by entry.
+
+    Args:
+        embedding_net: h, with sbi's standardising layer; without one nothing is found.
+        x_o: The batch, shape ``(n_o, *event)``.
+    """
+    far = deviations(embedding_net, x_o)
+    if far is None:
+        return []
+    far = far.flatten(1)
+    row, column = divmod(int(far.argmax()), far.shape[1])
+    value = float(far.max())
+    return [
+        Finding(
+            name="entries far from simulations",
+            value=value,
+            threshold=FAR,
+            alarming=value > FAR,
+            sentence=(
+                f"Entry {column} of observation {row} is {value:.2g} standard "
+                "deviations of the simulations away from their mean, and none is "
+                "farther."
+            ),
+            reason=(
+                "Alarming above the threshold, far beyond any error of a simulator: "
+                "the units differ, or the entry does not vary in simulations, and what "
+                "NPE makes of it can be anything. Leave it out, or train NPE with "
+                "z_score_x='structured'."
+            ),
+        )
+    ]
