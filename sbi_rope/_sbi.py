@@ -34,6 +34,7 @@ from sbi.utils.user_input_checks_utils import move_distribution_to_device
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
+from sbi_rope._random import seeded
 from sbi_rope.errors import LogProbUnavailableError, UnsupportedPosteriorError
 
 __all__ = [
@@ -50,6 +51,7 @@ __all__ = [
     "VectorFieldDensity",
     "build_zuko_unconditional_flow",
     "device_of",
+    "direct_posterior",
     "dtype_of",
     "embed",
     "embedding_of",
@@ -194,20 +196,35 @@ def posterior_from(
     posterior: Any, estimator: ConditionalEstimator
 ) -> DirectPosterior | VectorFieldPosterior:
     """Return an sbi posterior of the same kind as ``posterior`` around an estimator."""
-    prior = copy.deepcopy(posterior.prior)
-    device = device_of(estimator)
-    if isinstance(estimator, ConditionalVectorFieldEstimator):
+    if not isinstance(estimator, ConditionalVectorFieldEstimator):
+        assert isinstance(estimator, ConditionalDensityEstimator)
+        return direct_posterior(
+            estimator, posterior.prior, enable_transform=posterior.enable_transform
+        )
+    with seeded(0):  # sbi draws from the prior to look at it
         return VectorFieldPosterior(
             estimator,
-            prior,
-            device=device,
+            copy.deepcopy(posterior.prior),
+            device=device_of(estimator),
             enable_transform=posterior.enable_transform,
             sample_with=posterior.sample_with,
         )
-    assert isinstance(estimator, ConditionalDensityEstimator)
-    return DirectPosterior(
-        estimator, prior, device=device, enable_transform=posterior.enable_transform
-    )
+
+
+def direct_posterior(
+    estimator: ConditionalDensityEstimator,
+    prior: Distribution,
+    *,
+    enable_transform: bool = True,
+) -> DirectPosterior:
+    """Return an sbi posterior around an estimator and a copy of the prior."""
+    with seeded(0):  # sbi draws from the prior to look at it
+        return DirectPosterior(
+            estimator,
+            copy.deepcopy(prior),
+            device=device_of(estimator),
+            enable_transform=enable_transform,
+        )
 
 
 class MixtureDensity(ConditionalDensityEstimator):

@@ -14,16 +14,18 @@ from sbi.utils import within_support
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_rope.errors import InvalidInputError, InvalidTypeError
+from sbi_rope.errors import InvalidInputError, InvalidTypeError, NotReadyError
 
 __all__ = [
     "check_batch",
     "check_choice",
     "check_device",
     "check_finite",
+    "check_gradients",
     "check_in_support",
     "check_instance",
     "check_integer",
+    "check_learning_rate",
     "check_not_negative",
     "check_numbers",
     "check_positive",
@@ -32,10 +34,13 @@ __all__ = [
     "check_tensor",
     "check_unit_interval",
     "check_weights",
+    "usable_device",
 ]
 
 # What the sum of weights may be away from one, such as that of float32 numbers.
 ROUNDING_OF_WEIGHTS = 1e-5
+# Steps of Adam are about as long as its learning rate: more is a mistake.
+LARGEST_RATE = 100.0
 
 
 def check_tensor(name: str, value: Any) -> Tensor:
@@ -97,6 +102,26 @@ def check_device(name: str, value: Tensor, device: torch.device) -> None:
         )
 
 
+def usable_device(device: Any) -> torch.device:
+    """Return a device, if there is such a one here."""
+    try:
+        return torch.empty(0, device=device).device
+    except Exception as error:  # torch raises all kinds
+        raise InvalidInputError(
+            "Expected `device` to be one that torch can use here, such as 'cpu'; got "
+            f"{device!r}: {error}"
+        ) from error
+
+
+def check_gradients() -> None:
+    """Raise where torch cannot train anything."""
+    if torch.is_inference_mode_enabled():
+        raise NotReadyError(
+            "Training needs gradients, which torch.inference_mode() rules out. Leave "
+            "it for the training."
+        )
+
+
 def check_instance(
     name: str, value: Any, expected: type, *, optional: bool = False
 ) -> None:
@@ -150,6 +175,15 @@ def check_positive(name: str, value: Any) -> None:
     """Raise unless ``value`` is a finite number above zero."""
     if not _is_number(value) or not 0.0 < value < float("inf"):
         raise InvalidInputError(f"Expected `{name}` to be positive; got {value!r}.")
+
+
+def check_learning_rate(name: str, value: Any) -> None:
+    """Raise unless ``value`` is a positive number that Adam can step by."""
+    check_positive(name, value)
+    if value > LARGEST_RATE:
+        raise InvalidInputError(
+            f"Expected `{name}` of at most {LARGEST_RATE:.0f}; got {value!r}."
+        )
 
 
 def check_not_negative(name: str, value: Any) -> None:

@@ -18,8 +18,10 @@ from sbi_rope._training import (
 )
 from sbi_rope._validation import (
     check_finite,
+    check_gradients,
     check_instance,
     check_integer,
+    check_learning_rate,
     check_not_negative,
     check_positive,
     check_same_length,
@@ -114,7 +116,7 @@ class CalibrationFinetuner:
         if not self._learning_rates:
             raise InvalidInputError("Expected at least one `learning_rate`; got ().")
         for rate in self._learning_rates:
-            check_positive("learning_rate", rate)
+            check_learning_rate("learning_rate", rate)
         check_integer("num_steps", self.num_steps)
         check_integer("patience", self.patience)
         check_integer("simulations_per_target", self.simulations_per_target)
@@ -164,7 +166,9 @@ class CalibrationFinetuner:
 
         Raises:
             InvalidInputError: If shapes do not fit or a value is not finite.
+            NotReadyError: In torch's inference mode.
         """
+        check_gradients()
         x = check_tensor("x", x)
         check_finite("x", x)
         groups = _checked_groups(groups, x)

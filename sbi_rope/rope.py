@@ -32,6 +32,7 @@ from sbi_rope._validation import (
     check_choice,
     check_device,
     check_finite,
+    check_gradients,
     check_in_support,
     check_instance,
     check_integer,
@@ -144,8 +145,7 @@ class RoPE:
         self._estimator = (
             copy.deepcopy(estimator).eval().requires_grad_(requires_grad=False)
         )
-        with seeded(0):  # sbi draws from the prior to look at it
-            self._posterior: Any = posterior_from(posterior, self._estimator)
+        self._posterior: Any = posterior_from(posterior, self._estimator)
         self._prior = copy.deepcopy(posterior.prior)
         self._h = embedding_of(self._estimator)
         self._q = headless(self._estimator)
@@ -232,9 +232,10 @@ class RoPE:
             Itself, so that calls can be chained.
 
         Raises:
-            NotReadyError: If no calibration pairs were appended.
+            NotReadyError: If no calibration pairs were appended, or in inference mode.
             SimulationError: If the simulator fails at the calibration parameters.
         """
+        check_gradients()
         if not len(self._x_cal):
             raise NotReadyError(
                 "No calibration pairs to train on. Call `append_calibration(theta, "
@@ -281,10 +282,12 @@ class RoPE:
             Shape ``(m, l)``. They depend on the parameters of these pairs only.
 
         Raises:
-            InvalidInputError: If a row is not the number of a pair.
+            InvalidInputError: If a row is not the number of a pair, or there is none.
             SimulationError: If the simulator fails.
         """
         self._check_rows(rows)
+        if not len(rows):
+            raise InvalidInputError("Expected `rows` with at least one pair; got none.")
         count = self.finetuner.simulations_per_target
         with seeded(seed):
             return self._draw_targets(self._theta_cal[rows], count, show_progress_bars)
@@ -624,8 +627,7 @@ class RoPE:
         if self._g is None:
             raise NotReadyError("No tuned embedding net yet. Call `train()` first.")
         tuned = with_embedding(self._estimator, self._g)
-        with seeded(0):  # sbi draws from the prior to look at it
-            return posterior_from(self._posterior, copy.deepcopy(tuned))
+        return posterior_from(self._posterior, copy.deepcopy(tuned))
 
     @property
     def source(self) -> SimulationSource:
@@ -635,8 +637,7 @@ class RoPE:
     @property
     def npe(self) -> Any:
         """A copy of the NPE posterior that is repaired."""
-        with seeded(0):
-            return posterior_from(self._posterior, copy.deepcopy(self._estimator))
+        return posterior_from(self._posterior, copy.deepcopy(self._estimator))
 
     @property
     def calibration(self) -> tuple[Tensor, Tensor]:

@@ -17,6 +17,7 @@ from sbi_rope._sbi import (
     ConditionalDensityEstimator,
     DirectPosterior,
     device_of,
+    direct_posterior,
     estimator_of,
     posterior_from,
 )
@@ -24,11 +25,13 @@ from sbi_rope._training import History
 from sbi_rope._validation import (
     check_batch,
     check_finite,
+    check_gradients,
     check_in_support,
     check_instance,
     check_prior,
     check_same_length,
     check_tensor,
+    usable_device,
 )
 from sbi_rope.baselines.training import (
     EstimatorBuilder,
@@ -68,7 +71,7 @@ class Method(ABC):
     def __init__(self, prior: Any, *, device: str | torch.device = "cpu") -> None:
         check_prior(prior)
         self._prior: Distribution = copy.deepcopy(prior)
-        self._device = torch.device(device)
+        self._device = usable_device(device)
         if hasattr(self._prior, "to"):
             self._prior.to(self._device)  # type: ignore[attr-defined]
         elif self._device.type != "cpu":
@@ -94,8 +97,10 @@ class Method(ABC):
             Itself, so that calls can be chained.
 
         Raises:
-            NotReadyError: If data that the method needs was not appended.
+            NotReadyError: If data that the method needs was not appended, or in
+                torch's inference mode.
         """
+        check_gradients()
         self._check_data()
         with seeded(seed):
             self._posterior, self._history = self._fit(
@@ -134,9 +139,7 @@ class Method(ABC):
     def _direct_posterior(
         self, estimator: ConditionalDensityEstimator
     ) -> DirectPosterior:
-        return DirectPosterior(
-            estimator, copy.deepcopy(self._prior), device=str(device_of(estimator))
-        )
+        return direct_posterior(estimator, self._prior)
 
     def _checked_x(self, name: str, x: Any, *, finite: bool = True) -> Tensor:
         x = check_tensor(name, x)

@@ -14,6 +14,7 @@ from sbi_rope._validation import (
     check_batch,
     check_choice,
     check_finite,
+    check_gradients,
     check_instance,
     check_integer,
     check_not_negative,
@@ -226,6 +227,7 @@ class _Trainer:
         unseen: Literal["raise", "extend"] = "raise",
         tail_mass: float = 1e-3,
     ) -> None:
+        check_gradients()
         check_instance("rope", rope, RoPE)
         if num_folds is not None:
             check_integer("num_folds", num_folds, minimum=2)
