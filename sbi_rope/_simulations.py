@@ -115,6 +115,7 @@ class StoredSimulations:
         theta = check_batch("simulations[0]", theta, theta_shape, finite=False)
         x = check_batch("simulations[1]", x, event_shape, finite=False)
         check_same_length("simulations[0]", theta, "simulations[1]", x)
+        theta, x = theta.detach().to(like), x.detach().to(like)
         valid = torch.isfinite(theta).all(dim=1)
         valid &= torch.isfinite(x).flatten(1).all(dim=1)
         if not valid.any():
@@ -122,8 +123,7 @@ class StoredSimulations:
         warn_of_dropped(int((~valid).sum()), len(valid), "stored simulations")
         check_in_support("simulations[0]", theta[valid], prior)
         self.num_dropped = int((~valid).sum())
-        self.theta = theta[valid].to(like)
-        self.x = x[valid].to(like)
+        self.theta, self.x = theta[valid], x[valid]
         # "Nearest" is measured in standard deviations of the stored parameters, from
         # their mean: far from zero float32 could not tell them apart.
         self._theta_mean = self.theta.mean(dim=0)

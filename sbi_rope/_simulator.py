@@ -250,14 +250,14 @@ class Simulator:
         # draws are rejected. Where a single theta works too, that tells.
         if not self._is_single(self._attempt(theta[0])):
             return False
-        batch = self._attempt(theta[:1].repeat(NUM_COMPARED, 1))
-        singles = [self._attempt(theta[0]) for _ in range(NUM_COMPARED)]
-        if not self._is_batch(batch, NUM_COMPARED):
+        among_others = [self._attempt(theta) for _ in range(NUM_COMPARED)]
+        alone = [self._attempt(theta[0]) for _ in range(NUM_COMPARED)]
+        if not all(self._is_batch(x, len(theta)) for x in among_others):
             return False
-        if not all(self._is_single(single) for single in singles):
+        if not all(self._is_single(x) for x in alone):
             return False
-        single = torch.cat([self._single(single) for single in singles])
-        return _is_different(batch, single.to(batch))
+        first = torch.stack([x[0] for x in among_others])
+        return _is_different(first, torch.cat([self._single(x) for x in alone]))
 
     def _attempt(self, theta: Tensor, *, seed: int | None = None) -> Any:
         """Return a copy of what the simulator returns, or the error it raises."""

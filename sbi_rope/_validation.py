@@ -17,6 +17,8 @@ from torch.distributions import Distribution
 from sbi_rope.errors import InvalidInputError, InvalidTypeError, NotReadyError
 
 __all__ = [
+    "as_numbers",
+    "as_shape",
     "check_batch",
     "check_choice",
     "check_device",
@@ -25,13 +27,14 @@ __all__ = [
     "check_in_support",
     "check_instance",
     "check_integer",
-    "check_learning_rate",
     "check_not_negative",
     "check_numbers",
     "check_positive",
     "check_prior",
+    "check_rows",
     "check_same_length",
     "check_tensor",
+    "check_theta",
     "check_unit_interval",
     "check_weights",
     "usable_device",
@@ -39,8 +42,6 @@ __all__ = [
 
 # What the sum of weights may be away from one, such as that of float32 numbers.
 ROUNDING_OF_WEIGHTS = 1e-5
-# Steps of Adam are about as long as its learning rate: more is a mistake.
-LARGEST_RATE = 100.0
 
 
 def check_tensor(name: str, value: Any) -> Tensor:
@@ -159,6 +160,75 @@ def check_same_length(name_a: str, a: Tensor, name_b: str, b: Tensor) -> None:
         )
 
 
+def check_rows(name: str, value: Any, count: int) -> Tensor:
+    """Return numbers of rows, shape ``(m,)``, from 0 to ``count`` - 1."""
+    rows = check_tensor(name, value)
+    whole = rows.ndim == 1 and rows.dtype == torch.long
+    if not whole or bool(((rows < 0) | (rows >= count)).any()):
+        raise InvalidInputError(
+            f"Expected `{name}` to be whole numbers of rows (int64), shape (m,), from "
+            f"0 to {count - 1}; got {rows.dtype} of shape {tuple(rows.shape)}."
+        )
+    return rows
+
+
+def as_numbers(name: str, value: Any) -> Tensor:
+    """Return a tensor of numbers, made from whatever holds some."""
+    if not isinstance(value, Tensor):
+        try:
+            value = torch.as_tensor(value)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise InvalidTypeError(
+                f"Expected `{name}` to be a tensor of numbers, or what torch makes one "
+                f"of; got {type(value).__name__}."
+            ) from error
+    return check_tensor(name, value)
+
+
+def check_theta(theta: Any, event_shape: torch.Size, *, batched: bool) -> Tensor:
+    """Return parameters whose density is asked for.
+
+    Args:
+        theta: What the user gave.
+        event_shape: Shape of one theta, ``(d,)``.
+        batched: Whether there is one theta for each of B observations, shape ``(B,
+            d)``, or several, ``(S, B, d)``; otherwise it is ``(n, d)`` or ``(d,)``.
+
+    Raises:
+        InvalidInputError: If the shape does not fit, there is none, or one is NaN.
+    """
+    theta, dim = as_numbers("theta", theta), event_shape[0]
+    expected = f"(B, {dim}) or (S, B, {dim})" if batched else f"(n, {dim})"
+    ndims = (2, 3) if batched else (1, 2)
+    if theta.ndim not in ndims or theta.shape[-1:] != event_shape:
+        raise InvalidInputError(
+            f"Expected `theta` of shape {expected}; got {tuple(theta.shape)}."
+        )
+    if not theta.numel():
+        raise InvalidInputError(
+            f"Expected at least one `theta`; got shape {tuple(theta.shape)}."
+        )
+    if torch.isnan(theta).any():
+        raise InvalidInputError("Expected `theta` without NaN.")
+    return theta
+
+
+def as_shape(name: str, value: Any) -> torch.Size:
+    """Return the shape of draws, from a tuple of integers."""
+    try:
+        shape = torch.Size(value)
+    except TypeError as error:
+        raise InvalidTypeError(
+            f"Expected `{name}` to be a tuple of integers, such as (1000,); got "
+            f"{value!r}."
+        ) from error
+    if any(size < 0 for size in shape):
+        raise InvalidInputError(
+            f"Expected `{name}` without negative sizes; got {tuple(shape)}."
+        )
+    return shape
+
+
 def check_in_support(name: str, theta: Tensor, prior: Any) -> None:
     """Raise if any row of ``theta`` lies outside the prior's support."""
     outside = ~within_support(prior, theta)
@@ -175,15 +245,6 @@ def check_positive(name: str, value: Any) -> None:
     """Raise unless ``value`` is a finite number above zero."""
     if not _is_number(value) or not 0.0 < value < float("inf"):
         raise InvalidInputError(f"Expected `{name}` to be positive; got {value!r}.")
-
-
-def check_learning_rate(name: str, value: Any) -> None:
-    """Raise unless ``value`` is a positive number that Adam can step by."""
-    check_positive(name, value)
-    if value > LARGEST_RATE:
-        raise InvalidInputError(
-            f"Expected `{name}` of at most {LARGEST_RATE:.0f}; got {value!r}."
-        )
 
 
 def check_not_negative(name: str, value: Any) -> None:

@@ -1,8 +1,10 @@
 """Fine-tuning the embedding net on real observations with known parameters."""
 
 import copy
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -17,11 +19,11 @@ from sbi_rope._training import (
     warn_without_holdout,
 )
 from sbi_rope._validation import (
+    check_batch,
     check_finite,
     check_gradients,
     check_instance,
     check_integer,
-    check_learning_rate,
     check_not_negative,
     check_positive,
     check_same_length,
@@ -116,7 +118,7 @@ class CalibrationFinetuner:
         if not self._learning_rates:
             raise InvalidInputError("Expected at least one `learning_rate`; got ().")
         for rate in self._learning_rates:
-            check_learning_rate("learning_rate", rate)
+            check_positive("learning_rate", rate)
         check_integer("num_steps", self.num_steps)
         check_integer("patience", self.patience)
         check_integer("simulations_per_target", self.simulations_per_target)
@@ -169,11 +171,11 @@ class CalibrationFinetuner:
             NotReadyError: In torch's inference mode.
         """
         check_gradients()
-        x = check_tensor("x", x)
-        check_finite("x", x)
+        check_instance("embedding_net", embedding_net, nn.Module)
+        x = _checked_inputs("x", x, embedding_net)
         groups = _checked_groups(groups, x)
         with seeded(seed):
-            embedded = embed(embedding_net, x)
+            embedded = _embedded("x", x, embedding_net)
 
             def checked_targets() -> Tensor:
                 targets = draw_targets(self.simulations_per_target)
@@ -210,14 +212,8 @@ class CalibrationFinetuner:
                 f"Expected `draw_simulations` with rehearsal={self.rehearsal}; got "
                 "None. Give a function of a number k that returns up to k simulations."
             )
-        simulations = check_tensor("simulations", draw_simulations(NUM_REHEARSED))
-        check_finite("simulations", simulations)
-        if not len(simulations):
-            raise InvalidInputError(
-                "Expected `draw_simulations` to return at least one simulation; got "
-                "none."
-            )
-        return simulations, embed(h, simulations)
+        simulations = _checked_inputs("simulations", draw_simulations(NUM_REHEARSED), h)
+        return simulations, _embedded("simulations", simulations, h)
 
     def _rates_to_try(self, net: nn.Module, held_out: Tensor) -> tuple[float, ...]:
         if len(held_out):
@@ -307,16 +303,42 @@ def trainable_copy(embedding_net: nn.Module, embeddings: Tensor) -> nn.Module:
     return net.eval()
 
 
+def _checked_inputs(name: str, x: Any, net: nn.Module) -> Tensor:
+    """Return what a net is to embed, in the dtype of its parameters."""
+    x = check_tensor(name, x)
+    if x.ndim < 2:
+        raise InvalidInputError(
+            f"Expected `{name}` of shape (n, *event); got {tuple(x.shape)}."
+        )
+    check_batch(name, x, x.shape[1:])
+    known = itertools.chain(net.parameters(), net.buffers())
+    dtypes = [values.dtype for values in known if values.is_floating_point()]
+    x = x.detach().to(dtypes[0] if dtypes else torch.float32)
+    check_finite(name, x)  # the dtype may hold less
+    return x
+
+
+def _embedded(name: str, x: Tensor, net: nn.Module) -> Tensor:
+    try:
+        return embed(net, x)
+    except RuntimeError as error:
+        raise InvalidInputError(
+            f"Expected `{name}` of a shape and on a device that the embedding net can "
+            f"take; it raised for {tuple(x.shape)} on {x.device}: {error}"
+        ) from error
+
+
 def _checked_groups(groups: Tensor | None, x: Tensor) -> Tensor:
     if groups is None:
         return torch.arange(len(x))
     groups = check_tensor("groups", groups)
-    check_same_length("x", x, "groups", groups)
     if groups.ndim != 1:
         raise InvalidInputError(
             "Expected `groups` with one number for each pair, shape (n_c,); got "
             f"{tuple(groups.shape)}."
         )
+    check_finite("groups", groups)
+    check_same_length("x", x, "groups", groups)
     return groups
 
 

@@ -37,6 +37,7 @@ from sbi_rope._validation import (
     check_instance,
     check_integer,
     check_numbers,
+    check_rows,
     check_same_length,
     check_tensor,
     check_unit_interval,
@@ -285,7 +286,7 @@ class RoPE:
             InvalidInputError: If a row is not the number of a pair, or there is none.
             SimulationError: If the simulator fails.
         """
-        self._check_rows(rows)
+        check_rows("rows", rows, len(self._x_cal))
         if not len(rows):
             raise InvalidInputError("Expected `rows` with at least one pair; got none.")
         count = self.finetuner.simulations_per_target
@@ -352,6 +353,7 @@ class RoPE:
         """
         if num_simulations is not None:
             check_integer("num_simulations", num_simulations)
+        check_integer("at_least", at_least)
         with seeded(seed):
             return self._source.from_prior(
                 num_simulations,
@@ -392,8 +394,10 @@ class RoPE:
             InvalidInputError: If a row is not the number of a pair, or there are not as
                 many targets as rows.
         """
-        self._check_rows(rows)
+        check_rows("rows", rows, len(self._x_cal))
         if targets is not None:
+            targets = check_tensor("targets", targets)
+            check_batch("targets", targets, targets.shape[1:])
             check_same_length("rows", rows, "targets", targets)
         part = copy.copy(self)
         part._theta_cal, part._x_cal = self._theta_cal[rows], self._x_cal[rows]
@@ -425,15 +429,6 @@ class RoPE:
             if getattr(finetuner, name) != getattr(self.finetuner, name):
                 other._targets = None
         return other
-
-    def _check_rows(self, rows: Tensor) -> None:
-        rows, count = check_tensor("rows", rows), len(self._x_cal)
-        whole = rows.ndim == 1 and rows.dtype == torch.long
-        if not whole or bool(((rows < 0) | (rows >= count)).any()):
-            raise InvalidInputError(
-                "Expected `rows` to be whole numbers of calibration pairs, shape (m,), "
-                f"from 0 to {count - 1}; got {rows.dtype} of shape {tuple(rows.shape)}."
-            )
 
     def build_posterior(
         self,

@@ -9,7 +9,14 @@ from torch.distributions import Distribution
 
 from sbi_rope._random import seeded
 from sbi_rope._sbi import BasePotential, NeuralPosterior
-from sbi_rope._validation import check_prior, check_tensor
+from sbi_rope._validation import (
+    as_shape,
+    check_batch,
+    check_prior,
+    check_tensor,
+    check_theta,
+    usable_device,
+)
 from sbi_rope.baselines.base import Method
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture.prior import prior_log_prob
@@ -71,7 +78,7 @@ class PriorPosterior(NeuralPosterior):
         **kwargs: Any,
     ) -> Tensor:
         """Draw from the prior, shape ``(*sample_shape, k)``; the rest is ignored."""
-        return self._draw(torch.Size(sample_shape))
+        return self._draw(as_shape("sample_shape", sample_shape))
 
     def sample_batched(
         self,
@@ -85,8 +92,8 @@ class PriorPosterior(NeuralPosterior):
         Options of other posteriors' samplers are taken and ignored, as sbi's base class
         asks.
         """
-        check_tensor("x", x)
-        return self._draw(torch.Size((*sample_shape, x.shape[0])))
+        shape = as_shape("sample_shape", sample_shape)
+        return self._draw(torch.Size((*shape, _number_of_rows(x))))
 
     def _draw(self, shape: torch.Size) -> Tensor:
         # sbi's MultipleIndependent knows sample shapes of one dimension only.
@@ -100,6 +107,7 @@ class PriorPosterior(NeuralPosterior):
         track_gradients: bool = False,  # noqa: FBT001, FBT002
     ) -> Tensor:
         r"""Log density of the prior, :math:`-\infty` outside it, shape ``(n,)``."""
+        theta = check_theta(theta, self.prior.event_shape, batched=False)
         return self.potential_fn(
             torch.atleast_2d(theta), track_gradients=track_gradients
         )
@@ -121,8 +129,15 @@ class PriorPosterior(NeuralPosterior):
         Returns:
             The log density, shape ``(1, n)`` or ``(num_samples, n)``.
         """
+        theta = check_theta(theta, self.prior.event_shape, batched=True)
+        count = _number_of_rows(x)
+        if theta.shape[-2] not in (1, count):
+            raise InvalidInputError(
+                f"Expected as many rows of `theta` as observations, {count}; got "
+                f"{theta.shape[-2]}."
+            )
         theta = theta if theta.ndim > 2 else theta.unsqueeze(0)
-        theta = theta.expand(-1, x.shape[0], -1)
+        theta = theta.expand(-1, count, -1)
         return self.potential_fn(theta, track_gradients=track_gradients)
 
     def map(self, *args: Any, **kwargs: Any) -> Tensor:
@@ -143,6 +158,7 @@ class PriorPosterior(NeuralPosterior):
 
     def to(self, device: str | torch.device) -> None:
         """Move the prior and the default x to a device."""
+        device = usable_device(device)
         self.potential_fn.to(device)
         default_x = self._x
         self.__init__(self.potential_fn.prior)
@@ -177,6 +193,11 @@ class PriorBaseline(Method):
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[PriorPosterior, None]:
         return PriorPosterior(self._prior), None
+
+
+def _number_of_rows(x: Any) -> int:
+    x = check_tensor("x", x)
+    return len(check_batch("x", x, x.shape[1:], finite=False))
 
 
 class _PriorPotential(BasePotential):

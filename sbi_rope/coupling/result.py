@@ -7,7 +7,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import check_batch
+from sbi_rope._validation import check_batch, check_rows, usable_device
 from sbi_rope.coupling.cost import Distances, row_blocks
 from sbi_rope.errors import InvalidInputError
 
@@ -145,11 +145,20 @@ class Coupling:
         """Return the coupling of some observations of the batch, by their numbers.
 
         What it says of its own convergence stays that of the batch.
+
+        Raises:
+            InvalidInputError: If a row is not the number of an observation.
         """
+        check_rows("rows", rows, len(self.real))
         return replace(self, real=self.real[rows])
 
     def to(self, device: str | torch.device) -> "Coupling":
-        """Return the same coupling on another device."""
+        """Return the same coupling on another device.
+
+        Raises:
+            InvalidInputError: If there is no such device.
+        """
+        device = usable_device(device)
         return replace(
             self,
             potential=self.potential.to(device),

@@ -411,7 +411,11 @@ class DiscrepancyDraws:
 
         Returns:
             Shape ``(n, l)``, float64.
+
+        Raises:
+            InvalidInputError: If the shape does not fit or a value is not finite.
         """
+        z_s = check_batch("z_s", z_s, self.offset.shape[1:])
         draw = torch.randint(len(self), (len(z_s),)).to(z_s.device)
         noise = torch.randn(z_s.shape, dtype=torch.double).to(z_s.device)
         # A matrix for each simulation takes a lot of memory where z is wide.

@@ -24,7 +24,7 @@ from sbi_rope._validation import (
     check_choice,
     check_instance,
     check_integer,
-    check_learning_rate,
+    check_positive,
 )
 from sbi_rope.baselines.base import BuildsOnNPE, UsesCalibration
 from sbi_rope.baselines.training import EstimatorBuilder, Training
@@ -137,7 +137,7 @@ class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
         if num_steps is not None:
             check_integer("num_steps", num_steps)
         if learning_rate is not None:
-            check_learning_rate("learning_rate", learning_rate)
+            check_positive("learning_rate", learning_rate)
         check_integer("num_folds", num_folds, minimum=2)
         check_instance("finetuner", finetuner, CalibrationFinetuner, optional=True)
         if simulator is not None and not callable(simulator):

@@ -7,8 +7,8 @@ from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
-from tqdm.auto import tqdm
 
+from sbi_rope._progress import progress_bar
 from sbi_rope._sbi import MixtureDensity
 from sbi_rope._validation import (
     check_batch,
@@ -256,7 +256,7 @@ class MixtureEstimator(MixtureDensity):
         shape = (num_samples, len(x), *self.input_shape)
         theta = x.new_empty(shape)
         total = num_samples * len(x)
-        with tqdm(total=total, desc="Sampling", disable=not show_progress_bars) as bar:
+        with progress_bar(show=show_progress_bars, desc="Sampling", total=total) as bar:
             for rows, block in _blocks(*self._used, x):
                 sampler = BlockSampler(
                     block,

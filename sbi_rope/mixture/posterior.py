@@ -12,9 +12,16 @@ from torch.distributions import Distribution
 
 from sbi_rope._random import seeded
 from sbi_rope._sbi import DirectPosterior
-from sbi_rope._validation import check_batch, check_integer
+from sbi_rope._validation import (
+    as_numbers,
+    as_shape,
+    check_batch,
+    check_integer,
+    check_theta,
+    usable_device,
+)
 from sbi_rope.coupling import Coupling
-from sbi_rope.errors import InvalidInputError, InvalidTypeError, SamplingError
+from sbi_rope.errors import InvalidInputError, SamplingError
 from sbi_rope.mixture.coupled import CoupledContexts
 from sbi_rope.mixture.estimator import MixtureEstimator
 from sbi_rope.mixture.parts import DTYPE
@@ -186,8 +193,10 @@ class MixturePosterior(DirectPosterior):
         again afterwards.
 
         Raises:
-            InvalidInputError: If the prior cannot be moved; nothing is moved then.
+            InvalidInputError: If the prior cannot be moved, or there is no such device;
+                nothing is moved then.
         """
+        device = usable_device(device)
         if not hasattr(self.prior, "to"):
             raise InvalidInputError(
                 f"Cannot move a posterior whose prior has no method `to`: "
@@ -268,7 +277,7 @@ class MixturePosterior(DirectPosterior):
         if max_sampling_batch_size is not None:
             check_integer("max_sampling_batch_size", max_sampling_batch_size)
         return self.posterior_estimator.sample(
-            _as_shape(sample_shape),
+            as_shape("sample_shape", sample_shape),
             self._batch_of_x(x),
             accept=self._inside if reject_outside_prior else None,
             batch_size=max_sampling_batch_size,
@@ -283,8 +292,25 @@ class MixturePosterior(DirectPosterior):
     def _inside(self, theta: Tensor) -> Tensor:
         return within_support(self.prior, theta).reshape(len(theta))
 
+    def set_default_x(self, x: Tensor) -> "MixturePosterior":
+        """Set the observation that methods take when they are given none.
+
+        Raises:
+            InvalidInputError: If the shape does not fit or a value is not finite.
+        """
+        super().set_default_x(self._batch_of_x(x))
+        return self
+
+    def _x_else_default_x(self, x: Any) -> Tensor:
+        if x is None and self.default_x is None:
+            raise InvalidInputError(
+                "Expected `x`, an observation, or a default that was set with "
+                "`set_default_x(x)`; got neither."
+            )
+        return self._batch_of_x(self.default_x if x is None else x)
+
     def _one_x(self, x: Tensor | None) -> Tensor:
-        batch = self._batch_of_x(self._x_else_default_x(x))
+        batch = self._x_else_default_x(x)
         if len(batch) > 1:
             raise InvalidInputError(
                 f"Expected one observation; got {len(batch)}. Use the `_batched` "
@@ -294,7 +320,7 @@ class MixturePosterior(DirectPosterior):
 
     def _batch_of_x(self, x: Tensor) -> Tensor:
         event_shape = self.posterior_estimator.condition_shape
-        x = torch.as_tensor(x, dtype=torch.float32)
+        x = as_numbers("x", x).to(torch.float32)
         if x.shape == event_shape:
             x = x[None]
         if x.shape[1:] != event_shape:
@@ -304,6 +330,62 @@ class MixturePosterior(DirectPosterior):
                 f"{tuple(x.shape)}."
             )
         return check_batch("x", x, event_shape)
+
+    def log_prob(
+        self,
+        theta: Tensor,
+        x: Tensor | None = None,
+        norm_posterior: bool = True,  # noqa: FBT001, FBT002
+        track_gradients: bool = False,  # noqa: FBT001, FBT002
+        leakage_correction_params: dict | None = None,
+    ) -> Tensor:
+        r"""Return :math:`\log p(\theta \mid x)` of one observation.
+
+        Args:
+            theta: Parameters, shape ``(n, d)`` or ``(d,)``.
+            x: An observation, one of the batch if there is one; the default x if None.
+            norm_posterior: As in :meth:`log_prob_batched`, and so are the others.
+            track_gradients: Whether gradients with respect to theta are needed.
+            leakage_correction_params: Not used here; must be None.
+
+        Returns:
+            Shape ``(n,)``; minus infinity outside the prior's support.
+
+        Raises:
+            InvalidInputError: If shapes do not fit, x is not finite or theta is NaN.
+            UnseenObservationError: If x is not in the batch and ``unseen="raise"``.
+            SamplingError: If the mixture has no mass inside the prior's support.
+        """
+        return super().log_prob(
+            check_theta(theta, self.posterior_estimator.input_shape, batched=False),
+            self._one_x(x),
+            norm_posterior,
+            track_gradients,
+            leakage_correction_params,
+        )
+
+    def potential(
+        self,
+        theta: Tensor,
+        x: Tensor | None = None,
+        track_gradients: bool = False,  # noqa: FBT001, FBT002
+    ) -> Tensor:
+        r"""Return :math:`\log p(\theta \mid x)` without normalisation.
+
+        Args:
+            theta: Parameters, shape ``(n, d)`` or ``(d,)``.
+            x: As in :meth:`log_prob`.
+            track_gradients: Whether gradients with respect to theta are needed.
+
+        Returns:
+            Shape ``(n,)``.
+
+        Raises:
+            InvalidInputError: As in :meth:`log_prob`.
+            UnseenObservationError: As in :meth:`log_prob`.
+        """
+        theta = check_theta(theta, self.posterior_estimator.input_shape, batched=False)
+        return super().potential(theta, self._one_x(x), track_gradients)
 
     def log_prob_batched(
         self,
@@ -330,19 +412,8 @@ class MixturePosterior(DirectPosterior):
             UnseenObservationError: If an x is not in the batch and ``unseen="raise"``.
             SamplingError: If a mixture has no mass inside the prior's support.
         """
-        theta = torch.as_tensor(theta)
-        event_shape = self.posterior_estimator.input_shape
-        if theta.ndim < 2 or theta.shape[-len(event_shape) :] != event_shape:
-            raise InvalidInputError(
-                f"Expected `theta` of shape (B, {event_shape[0]}) or (S, B, "
-                f"{event_shape[0]}); got {tuple(theta.shape)}."
-            )
-        if not theta.numel():
-            raise InvalidInputError(
-                f"Expected at least one `theta`; got shape {tuple(theta.shape)}."
-            )
         return super().log_prob_batched(
-            theta,
+            check_theta(theta, self.posterior_estimator.input_shape, batched=True),
             self._batch_of_x(x),
             norm_posterior,
             track_gradients,
@@ -377,6 +448,26 @@ class MixturePosterior(DirectPosterior):
             num_iter=num_iter,
             num_to_optimize=num_to_optimize,
             num_init_samples=num_init_samples,
+            **options,
+        )
+
+    def _calculate_map(
+        self,
+        *,
+        init_method: str | Tensor = "posterior",
+        num_init_samples: int,
+        show_progress_bars: bool,
+        **options: Any,
+    ) -> Tensor:
+        # sbi shows the progress of these draws whatever it was told.
+        if isinstance(init_method, str) and init_method == "posterior":
+            init_method = self.sample(
+                (num_init_samples,), show_progress_bars=show_progress_bars
+            )
+        return super()._calculate_map(
+            init_method=init_method,
+            num_init_samples=num_init_samples,
+            show_progress_bars=show_progress_bars,
             **options,
         )
 
@@ -430,18 +521,3 @@ def _purpose(estimator: MixtureEstimator) -> str:
         f"It is the mixture of {mixed} for each of {len(coupled.x_o)} real "
         "observations."
     )
-
-
-def _as_shape(sample_shape: Any) -> torch.Size:
-    try:
-        shape = torch.Size(sample_shape)
-    except TypeError as error:
-        raise InvalidTypeError(
-            f"Expected `sample_shape` to be a tuple of integers, such as (1000,); got "
-            f"{sample_shape!r}."
-        ) from error
-    if any(size < 0 for size in shape):
-        raise InvalidInputError(
-            f"Expected `sample_shape` without negative sizes; got {tuple(shape)}."
-        )
-    return shape

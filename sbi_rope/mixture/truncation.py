@@ -1,14 +1,15 @@
 """How much of a mixture lies inside the support of the prior."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.distributions import Distribution, constraints
-from tqdm.auto import tqdm
 
+from sbi_rope._progress import progress_bar
 from sbi_rope._random import seeded
 from sbi_rope._sbi import ConditionalDensityEstimator
 from sbi_rope.mixture.chunks import blocks, flow_batch, keep_freed_memory
@@ -59,7 +60,7 @@ def component_mass(
     with seeded(0):
         chunks = contexts.split(max(1, flow_batch(contexts.device) // LEAKAGE_DRAWS))
         # Some flows need minutes here.
-        for some in tqdm(chunks, **_bar(show=show_progress_bars)):
+        for some in _bar(chunks, show=show_progress_bars):
             mass.append(_share_inside(density, some, accept, LEAKAGE_DRAWS))
     return torch.cat(mass)
 
@@ -111,7 +112,7 @@ def own_mass(
     size = max(1, flow_batch(features.device) // (of_each * num_contexts))
     means, errors = [], []
     with seeded(seed):
-        for block in tqdm(features.split(size), **_bar(show=show_progress_bars)):
+        for block in _bar(features.split(size), show=show_progress_bars):
             rows = part.mixing.rows(block)
             weights, contexts = rows.weights.double(), rows.contexts.flatten(0, 1)
             inside = _share_inside(part.density, contexts, accept, of_each)
@@ -137,8 +138,8 @@ def _variance(share: Tensor, draws: int) -> Tensor:
     return smoothed * (1.0 - smoothed) / draws
 
 
-def _bar(*, show: bool) -> dict[str, Any]:
-    return {"desc": "Normalising", "delay": 5.0, "leave": False, "disable": not show}
+def _bar(parts: Iterable[Any], *, show: bool) -> Any:
+    return progress_bar(parts, show=show, desc="Normalising", delay=5.0, leave=False)
 
 
 def is_unbounded(prior: Distribution) -> bool:

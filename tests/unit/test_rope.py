@@ -645,7 +645,7 @@ def test_a_sweep_gives_the_posteriors_of_single_couplings() -> None:
 
 def test_a_sweep_refuses_what_a_single_coupling_refuses() -> None:
     conductor = rope()
-    with pytest.raises(InvalidInputError, match="at least one value"):
+    with pytest.raises(InvalidInputError, match="at least one number"):
         conductor.sweep(X_O, gammas=(), taus=(1.0,))
     with pytest.raises(InvalidInputError, match="`tau`"):
         conductor.sweep(X_O, gammas=(0.5,), taus=(1.5,))

@@ -1,0 +1,115 @@
+"""The model of the discrepancy."""
+
+from typing import Any
+
+from torch import Tensor
+
+from sbi_rope.discrepancy import DiscrepancyModel, DiscrepancyNPE, learn_parameters
+from tests.faults.outcomes import Call
+from tests.faults.problem import (
+    NOISE,
+    PAIRS,
+    PRIOR,
+    QUIET,
+    THETA,
+    THETA_S,
+    X_S,
+    X,
+    fitted_discrepancy,
+    npe,
+)
+
+
+def fitted(**tensors: Tensor) -> Any:
+    given = {"z": X, "mean": THETA, "covariance": NOISE} | tensors
+    return DiscrepancyModel().fit(**given).sample(3, seed=0)
+
+
+CALLS = [
+    Call(
+        name="DiscrepancyModel",
+        run=lambda **options: repr(DiscrepancyModel(**options)),
+        options={
+            "gain_precisions": "numbers",
+            "error_scales": "numbers",
+            "degrees_of_freedom": "numbers",
+            "probability_of_none": "share",
+        },
+    ),
+    Call(
+        name="DiscrepancyModel.fit",
+        run=fitted,
+        tensors={"z": X, "mean": THETA, "covariance": NOISE},
+    ),
+    Call(
+        name="Discrepancy.sample",
+        run=lambda num_draws=3, **options: fitted_discrepancy().sample(
+            num_draws, **{"seed": 0, **options}
+        ),
+        options={
+            "num_draws": "count",
+            "smallest_error": "not negative",
+            "seed": "seed",
+        },
+    ),
+    Call(
+        name="DiscrepancyDraws.correct",
+        run=lambda z_s: fitted_discrepancy().sample(3, seed=0).correct(z_s),
+        tensors={"z_s": X_S},
+        accepts=("z_s: one row less",),
+        is_random=True,
+    ),
+    Call(
+        name="learn_parameters",
+        run=lambda theta_cal=THETA, theta=THETA_S: (
+            learn_parameters(theta_cal, theta).probabilities
+        ),
+        tensors={"theta_cal": THETA, "theta": THETA_S},
+        accepts=("theta_cal: one row less", "theta: one row less"),
+    ),
+    Call(
+        name="DiscrepancyNPE",
+        run=lambda **options: type(DiscrepancyNPE(PRIOR, **options)),
+        options={
+            "density_estimator": "choice",
+            "simulator": "choice",
+            "space": "choice",
+            "learn_prior": "instance",
+            "model": "instance",
+            "num_simulations": "count",
+            "simulations_per_pair": "count",
+            "num_steps": "count",
+            "learning_rate": "positive",
+            "num_folds": "count",
+            "finetuner": "instance",
+            "npe_training": "instance",
+            "device": "device",
+        },
+    ),
+    Call(
+        name="DiscrepancyNPE.train",
+        run=lambda theta=THETA, x=X, seed=0: (
+            DiscrepancyNPE.from_posterior(
+                npe(),
+                simulations=(THETA_S, X_S),
+                num_steps=2,
+            )
+            .append_calibration(theta, x)
+            .train(seed=seed, **QUIET)
+            .history.training_loss
+        ),
+        tensors=PAIRS,
+        options={"seed": "seed"},
+    ),
+    Call(
+        name="DiscrepancyNPE.report",
+        run=lambda x_names=None, seed=0: (
+            DiscrepancyNPE.from_posterior(npe(), simulations=(THETA_S, X_S))
+            .append_calibration(THETA, X)
+            .report(x_names=x_names, seed=seed, **QUIET)
+            .summaries[0]
+            .size.median
+        ),
+        options={"x_names": "names", "seed": "seed"},
+    ),
+]

@@ -1,0 +1,124 @@
+"""Pictures."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from sbi_rope import metrics, plots
+from tests.faults.outcomes import Call
+from tests.faults.problem import (
+    THETA,
+    THETA_S,
+    X_O,
+    X_S,
+    X,
+    discrepancy_report,
+    draw,
+    posterior,
+    stacked,
+    trained,
+)
+
+SAMPLES = draw(7, 50, 2)
+WEIGHTS = torch.full((60,), 1 / 60)
+OVERVIEW: dict[str, Any] = {
+    "simulated": X_S,
+    "before": X_O,
+    "after": X_O,
+    "weights": WEIGHTS,
+    "theta": THETA[0],
+    "parameter_names": ("a", "b"),
+}
+
+
+def drawn(plot: Callable[..., Any]) -> Callable[..., None]:
+    """Call a function that draws, and close what it drew."""
+
+    def run(*given: Any, **arguments: Any) -> None:
+        from matplotlib import pyplot
+
+        pyplot.close(plot(*given, **arguments))
+
+    return run
+
+
+def report_of(name: str) -> Any:
+    return stacked().report if name == "stacking_report" else discrepancy_report()
+
+
+CALLS = [
+    Call(
+        name="overview",
+        run=lambda samples=SAMPLES, **changed: drawn(plots.overview)(
+            samples={"RoPE": samples}, **(OVERVIEW | changed)
+        ),
+        tensors={"simulated": X_S, "samples": SAMPLES, "theta": THETA[0]},
+        options={"parameter_names": "names", "index": "row", "parameters": "names"},
+        accepts=("simulated: one row less", "samples: one row less"),
+    ),
+    Call(
+        name="overview(prior)",
+        run=lambda prior: drawn(plots.overview)(
+            samples={"RoPE": SAMPLES}, prior=prior, **OVERVIEW
+        ),
+        tensors={"prior": THETA_S},
+        accepts=("prior: None", "prior: one row less"),
+    ),
+    Call(
+        name="pair_plot",
+        run=lambda samples=SAMPLES, theta=THETA[0], **options: drawn(plots.pair_plot)(
+            samples={"RoPE": samples}, theta=theta, **options
+        ),
+        tensors={"samples": SAMPLES, "theta": THETA[0]},
+        options={"parameter_names": "names"},
+        accepts=("samples: one row less", "theta: None"),
+    ),
+    Call(
+        name="implied_parameters",
+        run=lambda theta=THETA_S, implied=WEIGHTS, **options: drawn(
+            plots.implied_parameters
+        )(theta=theta, implied=implied, **options),
+        tensors={"theta": THETA_S, "implied": WEIGHTS},
+        options={"parameter_names": "names"},
+    ),
+    Call(
+        name="real_and_simulated",
+        run=drawn(plots.real_and_simulated),
+        tensors={"x_o": X, "x_s": X_S[:20]},
+    ),
+    Call(
+        name="calibration_curves",
+        run=lambda curves=None: drawn(plots.calibration_curves)(
+            {"RoPE": metrics.coverage_curve_of(torch.rand(20, 2))}
+            if curves is None
+            else curves
+        ),
+        options={"curves": "instance"},
+        is_random=True,
+    ),
+    Call(
+        name="effective_sample_sizes",
+        run=lambda coupling=None: drawn(plots.effective_sample_sizes)(
+            posterior().coupling if coupling is None else coupling
+        ),
+        options={"coupling": "instance"},
+    ),
+    Call(
+        name="finetuning_history",
+        run=lambda history=None: drawn(plots.finetuning_history)(
+            trained().history if history is None else history
+        ),
+        options={"history": "instance"},
+    ),
+    *(
+        Call(
+            name=name,
+            run=lambda report=None, name=name: drawn(getattr(plots, name))(
+                report_of(name) if report is None else report
+            ),
+            options={"report": "instance"},
+        )
+        for name in ("discrepancy", "stacking_report")
+    ),
+]

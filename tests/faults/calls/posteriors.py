@@ -1,0 +1,130 @@
+"""Mixtures and stacks as posteriors."""
+
+import copy
+
+from tests.faults.outcomes import Call
+from tests.faults.problem import (
+    QUIET,
+    THETA,
+    THETA_O,
+    X_O,
+    posterior,
+    stacked,
+    stacked_batch,
+)
+
+CALLS = [
+    call
+    for kind, make, x in (
+        ("MixturePosterior", posterior, X_O),
+        ("StackedPosterior", stacked, X_O),
+        ("StackedPosterior of a batch", stacked_batch, X_O),
+    )
+    for call in (
+        Call(
+            name=f"{kind}.sample",
+            run=lambda x=x[:1], sample_shape=(5,), make=make, **options: make().sample(
+                sample_shape, x=x, **QUIET, **options
+            ),
+            tensors={"x": x[:1]},
+            options={"max_sampling_batch_size": "count"},
+            # One observation may come without the dimension of the batch.
+            accepts=("x: a list", "x: a NumPy array", "x: one dimension less"),
+            is_random=True,
+        ),
+        Call(
+            name=f"{kind}.sample_batched",
+            run=lambda x=x, sample_shape=(5,), make=make, **options: (
+                make().sample_batched(sample_shape, x=x, **QUIET, **options)
+            ),
+            tensors={"x": x},
+            options={"max_sampling_batch_size": "count"},
+            accepts=("x: a list", "x: a NumPy array", "x: one row less"),
+            is_random=True,
+        ),
+        Call(
+            name=f"{kind}.log_prob",
+            run=lambda theta=THETA, x=x[:1], make=make: make().log_prob(theta, x=x),
+            tensors={"theta": THETA, "x": x[:1]},
+            accepts=(
+                "theta: a list",
+                "theta: Inf",
+                "theta: a NumPy array",
+                "theta: one row less",
+                "x: a list",
+                "x: a NumPy array",
+                "x: one dimension less",
+            ),
+        ),
+        Call(
+            name=f"{kind}.log_prob_batched",
+            run=lambda theta=THETA_O, x=x, make=make: make().log_prob_batched(
+                theta, x=x
+            ),
+            tensors={"theta": THETA_O, "x": x},
+            accepts=(
+                "theta: a list",
+                "theta: Inf",
+                "theta: a NumPy array",
+                "x: a list",
+                "x: a NumPy array",
+                "x: one dimension less",
+            ),
+        ),
+        Call(
+            name=f"{kind}.potential",
+            run=lambda theta=THETA, x=x[:1], make=make: make().potential(theta, x=x),
+            tensors={"theta": THETA, "x": x[:1]},
+            accepts=(
+                "theta: a list",
+                "theta: Inf",
+                "theta: a NumPy array",
+                "theta: one row less",
+                "x: a list",
+                "x: a NumPy array",
+                "x: one dimension less",
+            ),
+        ),
+        Call(
+            name=f"{kind}.leakage",
+            run=lambda x=x, make=make: make().leakage(x).mass,
+            tensors={"x": x},
+            accepts=("x: a list", "x: a NumPy array", "x: one row less"),
+        ),
+        Call(
+            name=f"{kind}.set_default_x",
+            run=lambda x=x[:1], make=make: (
+                copy.copy(make()).set_default_x(x).potential(THETA)
+            ),
+            tensors={"x": x[:1]},
+            accepts=("x: a list", "x: a NumPy array", "x: one dimension less"),
+        ),
+        Call(
+            name=f"{kind}.map",
+            run=lambda make=make, x=x, **options: (
+                copy.copy(make())
+                .set_default_x(x[0])
+                .map(
+                    **{
+                        "num_iter": 2,
+                        "num_to_optimize": 2,
+                        "num_init_samples": 5,
+                        **QUIET,
+                        **options,
+                    }
+                )
+            ),
+            options={
+                "num_iter": "count",
+                "num_to_optimize": "count",
+                "num_init_samples": "count",
+            },
+            is_random=True,
+        ),
+        Call(
+            name=f"{kind}.to",
+            run=lambda device="cpu", make=make: make().to(device),
+            options={"device": "device"},
+        ),
+    )
+]

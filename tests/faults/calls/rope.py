@@ -1,0 +1,243 @@
+"""RoPE, fine-tuning and coupling."""
+
+import torch
+
+from sbi_rope import CalibrationFinetuner, SinkhornCoupler
+from tests.faults.outcomes import Call
+from tests.faults.problem import (
+    COUPLED,
+    FEWER_X_O,
+    FINETUNER,
+    PAIRS,
+    QUIET,
+    SIMULATIONS,
+    THETA,
+    THETA_S,
+    X_O,
+    X_S,
+    X,
+    npe,
+    posterior,
+    trained,
+    untrained,
+)
+
+CALLS = [
+    Call(
+        name="RoPE(simulations)",
+        run=lambda theta=THETA_S, x=X_S: untrained(
+            simulations=(theta, x)
+        ).draw_simulations(30, seed=0),
+        tensors=SIMULATIONS,
+        accepts=("theta: NaN", "theta: Inf", "x: NaN", "x: Inf"),
+    ),
+    Call(
+        name="RoPE",
+        run=lambda **options: repr(untrained(**options)),
+        options={"finetuner": "instance", "coupler": "instance"},
+    ),
+    Call(
+        name="RoPE.append_calibration",
+        run=lambda theta=THETA, x=X: (
+            untrained().append_calibration(theta, x).calibration
+        ),
+        tensors=PAIRS,
+    ),
+    Call(
+        name="RoPE.train",
+        run=lambda **options: (
+            untrained()
+            .append_calibration(THETA, X)
+            .train(**{"seed": 0, **QUIET, **options})
+            .history.training_loss
+        ),
+        options={"seed": "seed"},
+    ),
+    Call(
+        name="RoPE.draw_targets",
+        run=lambda rows, seed=0: trained().draw_targets(rows, seed=seed),
+        tensors={"rows": torch.tensor([3, 0, 7])},
+        options={"seed": "seed"},
+    ),
+    Call(
+        name="RoPE.with_pairs",
+        run=lambda rows, targets=None: (
+            trained().with_pairs(rows, targets=targets).calibration
+        ),
+        tensors={"rows": torch.tensor([3, 0, 7])},
+        accepts=("rows: no rows",),
+    ),
+    Call(
+        name="RoPE.with_pairs(targets)",
+        run=lambda targets: (
+            trained()
+            .with_pairs(torch.tensor([3, 0, 7, 8]), targets=targets)
+            .train(seed=0, **QUIET)
+            .history.training_loss
+        ),
+        tensors={"targets": X[:4]},
+        accepts=("targets: None",),
+    ),
+    Call(
+        name="RoPE.with_finetuner",
+        run=lambda finetuner=FINETUNER: repr(trained().with_finetuner(finetuner)),
+        options={"finetuner": "instance"},
+    ),
+    Call(
+        name="RoPE.draw_simulations",
+        run=lambda **options: trained().draw_simulations(**{"seed": 0, **options}),
+        options={"num_simulations": "count", "at_least": "count", "seed": "seed"},
+    ),
+    Call(
+        name="RoPE.embed_observations",
+        run=lambda x_o: trained().embed_observations(x_o),
+        tensors={"x_o": X_O},
+        accepts=FEWER_X_O,
+    ),
+    Call(
+        name="RoPE.build_posterior",
+        run=lambda x_o=X_O, **options: (
+            trained()
+            .build_posterior(
+                x_o, **{"seed": 0, "num_simulations": 30, **QUIET, **options}
+            )
+            .weights
+        ),
+        tensors={"x_o": X_O},
+        options={
+            "coupler": "instance",
+            "num_simulations": "count",
+            "seed": "seed",
+            "unseen": "choice",
+            "tail_mass": "share",
+        },
+        accepts=FEWER_X_O,
+    ),
+    Call(
+        name="RoPE.sweep",
+        run=lambda x_o=X_O, gammas=(0.5, 1.0), taus=(1.0, 0.5): [
+            one.weights
+            for one in trained().sweep(
+                x_o, gammas=gammas, taus=taus, num_simulations=30, seed=0, **QUIET
+            )
+        ],
+        tensors={"x_o": X_O},
+        options={"gammas": "numbers", "taus": "numbers"},
+        accepts=FEWER_X_O,
+    ),
+    Call(
+        name="CalibrationFinetuner",
+        run=lambda **options: repr(CalibrationFinetuner(**options)),
+        options={
+            "learning_rate": "positive",
+            "num_steps": "count",
+            "patience": "count",
+            "simulations_per_target": "count",
+            "resample_targets": "instance",
+            "num_neighbors": "count",
+            "validation_fraction": "positive",
+            "rehearsal": "not negative",
+        },
+    ),
+    Call(
+        name="CalibrationFinetuner.finetune",
+        run=lambda x=X, targets=0.8 * THETA, groups=None, simulations=X_S, seed=0: (
+            CalibrationFinetuner(num_steps=2, rehearsal=1.0)
+            .finetune(
+                npe().posterior_estimator.embedding_net,
+                x,
+                lambda count: targets,
+                draw_simulations=lambda count: simulations,
+                groups=groups,
+                seed=seed,
+                **QUIET,
+            )
+            .history.training_loss
+        ),
+        tensors={"x": X, "targets": 0.8 * THETA, "simulations": X_S},
+        options={"seed": "seed"},
+        accepts=("simulations: one row less",),
+    ),
+    Call(
+        name="CalibrationFinetuner.finetune(groups)",
+        run=lambda groups: (
+            CalibrationFinetuner(num_steps=2)
+            .finetune(
+                npe().posterior_estimator.embedding_net,
+                X,
+                lambda count: 0.8 * THETA,
+                groups=groups,
+                seed=0,
+                **QUIET,
+            )
+            .history.training_loss
+        ),
+        tensors={"groups": torch.arange(20) // 2},
+        accepts=("groups: None",),
+    ),
+    Call(
+        name="SinkhornCoupler",
+        run=lambda **options: repr(SinkhornCoupler(**options)),
+        options={
+            "gamma": "positive",
+            "tau": "share",
+            "cost_scale": "choice",
+            "solver": "choice",
+            "tolerance": "positive",
+            "max_iterations": "count",
+            "dtype": "choice",
+            "blocked": "choice",
+            "num_fitted": "count",
+        },
+    ),
+    Call(
+        name="SinkhornCoupler.couple",
+        run=lambda real=X_O, simulated=X_S, seed=0: (
+            SinkhornCoupler().couple(real, simulated, seed=seed).weights
+        ),
+        tensors=COUPLED,
+        accepts=("real: one row less", "simulated: one row less"),
+    ),
+    Call(
+        name="SinkhornCoupler.couple(num_fitted)",
+        run=lambda seed=0: (
+            SinkhornCoupler(num_fitted=20).couple(X_O, X_S, seed=seed).weights
+        ),
+        options={"seed": "seed"},
+    ),
+    Call(
+        name="SinkhornCoupler.sweep",
+        run=lambda real=X_O, simulated=X_S, gammas=(0.5,), taus=(1.0,): [
+            one.weights
+            for one in SinkhornCoupler().sweep(
+                real, simulated, gammas=gammas, taus=taus
+            )
+        ],
+        tensors=COUPLED,
+        options={"gammas": "numbers", "taus": "numbers"},
+        accepts=("real: one row less", "simulated: one row less"),
+    ),
+    Call(
+        name="Coupling.distances",
+        run=lambda real: posterior().coupling.distances(real),
+        tensors={"real": X_O},
+        accepts=("real: one row less",),
+    ),
+    Call(
+        name="Coupling.rows",
+        run=lambda real: posterior().coupling.rows(real),
+        tensors={"real": X_O},
+        accepts=("real: one row less",),
+    ),
+    Call(
+        name="Coupling.restricted_to",
+        run=lambda rows: posterior().coupling.restricted_to(rows).weights,
+        tensors={"rows": torch.tensor([3, 0, 7])},
+        accepts=("rows: no rows",),
+    ),
+    Call(
+        name="Coupling.to",
+        run=lambda device="cpu": posterior().coupling.to(device).weights,
+        options={"device": "device"},
+    ),
+]

@@ -1,0 +1,189 @@
+"""Stacks, their candidates and the diagnosis of a batch."""
+
+from sbi_rope import diagnose, stack
+from sbi_rope.stacking import (
+    CouplingCandidate,
+    DensityCandidate,
+    DiscrepancyCandidate,
+    FinetunedCandidate,
+    cross_validate,
+    default_candidates,
+    stacking_weights,
+)
+from tests.faults.outcomes import Call
+from tests.faults.problem import (
+    CANDIDATES,
+    FEWER_X_O,
+    LOG_SCORES,
+    PAIRS,
+    QUIET,
+    THETA,
+    X_O,
+    X,
+    stacked,
+    trained,
+)
+
+CALLS = [
+    Call(
+        name="StackedPosterior.candidate_log_probs",
+        run=lambda theta=THETA, x=X: stacked().candidate_log_probs(theta, x),
+        tensors=PAIRS,
+        accepts=("x: a list", "x: a NumPy array"),
+    ),
+    Call(
+        name="stack",
+        run=lambda **options: (
+            stack(
+                trained(),
+                **{
+                    "candidates": CANDIDATES,
+                    "num_folds": 2,
+                    "seed": 0,
+                    **QUIET,
+                    **options,
+                },
+            ).candidate_weights
+        ),
+        options={
+            "candidates": "instance",
+            "num_folds": "count",
+            "pseudo_count": "not negative",
+            "unseen": "choice",
+            "tail_mass": "share",
+            "require_convergence": "instance",
+            "seed": "seed",
+        },
+    ),
+    Call(
+        name="stack(x_o)",
+        run=lambda x_o=X_O, **options: (
+            stack(
+                trained(),
+                x_o,
+                **{
+                    "candidates": [CouplingCandidate(gamma=0.5, tau=0.5, tuned=False)],
+                    "num_folds": 2,
+                    "num_simulations": 30,
+                    "seed": 0,
+                    **QUIET,
+                    **options,
+                },
+            ).report.cross_validation.stack_scores
+        ),
+        tensors={"x_o": X_O},
+        options={"num_simulations": "count"},
+        accepts=("x_o: None", *FEWER_X_O),
+    ),
+    Call(
+        name="cross_validate",
+        run=lambda **options: (
+            cross_validate(
+                trained(),
+                **{
+                    "candidates": CANDIDATES,
+                    "num_folds": 3,
+                    "seed": 0,
+                    **QUIET,
+                    **options,
+                },
+            ).log_scores
+        ),
+        options={"num_training_folds": "count", "seed": "seed"},
+    ),
+    Call(
+        name="default_candidates",
+        run=lambda **options: repr(default_candidates(couplings=True, **options)),
+        options={
+            "rope": "instance",
+            "gammas": "numbers",
+            "taus": "numbers",
+            "rehearsal": "not negative",
+        },
+        accepts=("rehearsal: None",),
+    ),
+    Call(
+        name="CouplingCandidate",
+        run=lambda gamma=0.5, tau=0.5, **options: repr(
+            CouplingCandidate(gamma=gamma, tau=tau, **options)
+        ),
+        options={
+            "gamma": "positive",
+            "tau": "share",
+            "cost_scale": "choice",
+            "tuned": "instance",
+            "rehearsal": "not negative",
+        },
+        accepts=("rehearsal: None",),
+    ),
+    Call(
+        name="stacking_weights",
+        run=lambda log_scores=LOG_SCORES, **options: (
+            stacking_weights(log_scores, **options).weights
+        ),
+        tensors={"log_scores": LOG_SCORES},
+        options={
+            "pseudo_count": "not negative",
+            "tolerance": "positive",
+            "max_iterations": "count",
+        },
+        accepts=(
+            "log_scores: one row less",
+            "log_scores: one column more",
+            "log_scores: no rows",
+        ),
+    ),
+    Call(
+        name="diagnose",
+        run=lambda x_o=X_O, **options: (
+            diagnose(
+                trained(),
+                x_o,
+                **{
+                    "num_simulations": 100,
+                    "num_folds": None,
+                    "seed": 0,
+                    **QUIET,
+                    **options,
+                },
+            ).distance
+        ),
+        tensors={"x_o": X_O},
+        options={
+            "num_simulations": "count",
+            "coupler": "instance",
+            "num_folds": "count",
+            "parameter_names": "names",
+            "seed": "seed",
+        },
+        accepts=FEWER_X_O,
+    ),
+    Call(
+        name="FinetunedCandidate",
+        run=lambda **options: repr(FinetunedCandidate(**options)),
+        options={"space": "choice"},
+    ),
+    Call(
+        name="DiscrepancyCandidate",
+        run=lambda space="embedding", **options: repr(
+            DiscrepancyCandidate(space=space, **options)
+        ),
+        options={"space": "choice"},
+    ),
+    Call(
+        name="DensityCandidate",
+        run=lambda name="mine", build=None, **options: repr(
+            DensityCandidate(
+                name=name,
+                build=(lambda rope, seed: rope.npe) if build is None else build,
+                **options,
+            )
+        ),
+        options={"name": "text", "build": "function", "fixed": "instance"},
+    ),
+    Call(
+        name="StackingReport.gain_over",
+        run=lambda name="NPE": stacked().report.gain_over(name),
+        options={"name": "choice"},
+    ),
+]

@@ -1,0 +1,68 @@
+"""Tasks whose data are drawn."""
+
+import functools
+
+from torch import Tensor
+
+from sbi_rope.tasks import Task, get_task
+from tests.faults.outcomes import Call
+
+NAMES = ("cs", "linear_gaussian", "pendulum", "sir")
+
+
+@functools.cache
+def made(name: str) -> Task:
+    return get_task(name)
+
+
+def some_theta(name: str) -> Tensor:
+    return made(name).get_simulations(20)[0]
+
+
+CALLS = [
+    Call(
+        name="get_task",
+        run=lambda name="pendulum", **options: get_task(name, **options).theta_dim,
+        options={"name": "choice", "variant": "choice", "root": "path"},
+    ),
+    *(
+        Call(
+            name=f"{method}({name})",
+            run=lambda n=5, seed=0, name=name, method=method: getattr(
+                made(name), method
+            )(n, seed=seed),
+            options={"n": "count", "seed": "seed"},
+        )
+        for name in NAMES
+        for method in ("get_calibration_set", "get_test_set", "get_simulations")
+    ),
+    *(
+        Call(
+            name=f"num_recorded({name})",
+            run=lambda part="test", seed=0, name=name: made(name).num_recorded(
+                part, seed=seed
+            ),
+            options={"part": "choice", "seed": "seed"},
+        )
+        for name in NAMES
+    ),
+    *(
+        Call(
+            name=f"prior_quantiles({name})",
+            run=lambda theta, name=name: made(name).prior_quantiles(theta),
+            tensors={"theta": some_theta(name)},
+            accepts=("theta: one row less", "theta: no rows"),
+        )
+        for name in NAMES
+    ),
+    *(
+        Call(
+            name=f"get_simulator({name})",
+            run=lambda theta, name=name: made(name).get_simulator()(theta),
+            tensors={"theta": some_theta(name)},
+            accepts=("theta: one row less", "theta: no rows"),
+            is_random=True,
+        )
+        for name in NAMES
+    ),
+]

@@ -1,0 +1,193 @@
+"""Calls a function with a bad argument and tells how it took that."""
+
+import random
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sbi_rope.errors import RoPEError
+
+Verdict = Literal["right", "clear", "raw", "silent"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Call:
+    """A public callable with good arguments.
+
+    Attributes:
+        name: As users write it.
+        run: Called with the arguments by name; returns what is compared.
+        tensors: Its tensors.
+        options: The kind of each option, a key of ``BAD_OPTIONS``.
+        accepts: Names of bad inputs, as "argument: input", that mean something here.
+        is_random: Whether the global random numbers are drawn from, as users expect of
+            a sampler without a seed.
+    """
+
+    name: str
+    run: Callable[..., Any]
+    tensors: dict[str, Tensor] = field(default_factory=dict)
+    options: dict[str, str] = field(default_factory=dict)
+    accepts: tuple[str, ...] = ()
+    is_random: bool = False
+
+    def __str__(self) -> str:
+        return self.name
+
+    def __call__(self, **changed: Any) -> list[Tensor]:
+        """Return the tensors of a call with some arguments changed."""
+        torch.default_generator.manual_seed(0)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return list(tensors_of(self.run(**(self.tensors | changed))))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """How a call took an argument."""
+
+    call: str
+    argument: str
+    value: str
+    verdict: Verdict
+    detail: str
+
+    def __str__(self) -> str:
+        return (
+            f"{self.call}({self.argument}: {self.value}) {self.verdict}: {self.detail}"
+        )
+
+
+def refuse(call: Call, argument: str, label: str, value: Any) -> Outcome:
+    """Call with what must be refused by name."""
+    accepted = f"{argument}: {label}" in call.accepts
+    return _judge(call, argument, label, value, expected="numbers" if accepted else "")
+
+
+def survive(call: Call, argument: str, label: str, value: Any) -> Outcome:
+    """Call with what must be refused, or give numbers."""
+    return _judge(call, argument, label, value, expected="numbers")
+
+
+def agree(call: Call, argument: str, label: str, value: Tensor) -> Outcome:
+    """Call with what must be refused, or give the same as a plain tensor."""
+    return _judge(call, argument, label, value, expected="the same")
+
+
+def _judge(
+    call: Call, argument: str, label: str, value: Any, *, expected: str
+) -> Outcome:
+    def outcome(verdict: Verdict, detail: str) -> Outcome:
+        return Outcome(
+            call=call.name,
+            argument=argument,
+            value=label,
+            verdict=verdict,
+            detail=detail,
+        )
+
+    try:
+        with no_trace(call, value):
+            found = call(**{argument: value})
+    except RoPEError as error:
+        return outcome("clear", str(error))
+    except TraceError as error:
+        return outcome("silent", str(error))
+    except Exception as error:
+        return outcome("raw", f"{type(error).__name__}: {error}")
+    if not expected:
+        return outcome("silent", "was accepted")
+    if any(tensor.isnan().any() for tensor in found if tensor.is_floating_point()):
+        return outcome("silent", "NaN")
+    if expected == "the same":
+        plain = value.detach().float() if value.is_floating_point() else value.float()
+        if not call.tensors[argument].is_floating_point():
+            plain = value.long()
+        same = call(**{argument: plain.clone().contiguous()})
+        if len(same) != len(found) or not all(map(_is_close, same, found)):
+            return outcome("silent", "differs from a plain tensor of float32")
+    return outcome("right", expected)
+
+
+def _is_close(a: Tensor, b: Tensor) -> bool:
+    if a.shape != b.shape:
+        return False
+    return torch.allclose(a.double(), b.double(), rtol=1e-3, atol=1e-4)
+
+
+class TraceError(Exception):
+    """A call has left something behind that it should not have."""
+
+
+@contextmanager
+def no_trace(call: Call, value: Any = None) -> Iterator[None]:
+    """Raise if a call changes its arguments, or any state of the process."""
+    arguments = {name: tensor.clone() for name, tensor in call.tensors.items()}
+    copied = value.clone() if _is_plain(value) else None
+    torch.default_generator.manual_seed(0)
+    before = state_of_process(random_numbers=not call.is_random)
+    try:
+        yield
+    finally:
+        after = state_of_process(random_numbers=not call.is_random)
+        changed = [name for name in before if before[name] != after[name]]
+        changed += [
+            name
+            for name, tensor in arguments.items()
+            if not torch.equal(tensor, call.tensors[name])
+        ]
+        if copied is not None and not copied.equal(value):
+            changed.append("its argument")
+        if changed:
+            raise TraceError(f"changed {', '.join(changed)}")
+
+
+def _is_plain(value: Any) -> bool:
+    return (
+        isinstance(value, Tensor)
+        and not value.is_meta
+        and not value.is_sparse
+        and not bool(value.isnan().any())
+    )
+
+
+def state_of_process(*, random_numbers: bool) -> dict[str, Any]:
+    """Return what a library must leave as it found it."""
+    state: dict[str, Any] = {
+        "the default dtype": torch.get_default_dtype(),
+        "gradient mode": torch.is_grad_enabled(),
+        "the number of threads": torch.get_num_threads(),
+        "deterministic mode": torch.are_deterministic_algorithms_enabled(),
+        "NumPy's error state": tuple(np.geterr().items()),
+        "filters of warnings": tuple(warnings.filters),
+        "print options": str(torch.tensor([1 / 3, 1e-9])),
+    }
+    if random_numbers:
+        state["torch's random numbers"] = torch.get_rng_state().numpy().tobytes()
+        state["NumPy's random numbers"] = np.random.get_state()[1].tobytes()  # noqa: NPY002
+        state["Python's random numbers"] = random.getstate()
+    return state
+
+
+def tensors_of(result: Any) -> Iterator[Tensor]:
+    """Find the tensors and numbers in what a call returns."""
+    if isinstance(result, Tensor):
+        yield result.detach().cpu()
+    elif isinstance(result, bool | str) or result is None:
+        return
+    elif isinstance(result, int | float | np.number):
+        yield torch.tensor(float(result), dtype=torch.double)
+    elif isinstance(result, dict):
+        yield from tensors_of(list(result.values()))
+    elif isinstance(result, list | tuple):
+        for part in result:
+            yield from tensors_of(part)
+    elif is_dataclass(result):
+        for part in fields(result):
+            yield from tensors_of(getattr(result, part.name))

@@ -1,0 +1,48 @@
+"""Pairs every public callable with everything that may be wrong about its arguments."""
+
+import functools
+from collections.abc import Callable, Iterator
+
+from tests.faults.calls import CALLS
+from tests.faults.inputs import (
+    BAD_OPTIONS,
+    BAD_TENSORS,
+    EXTREME_TENSORS,
+    FINE_ROWS,
+    ODD_ROWS,
+    ODD_TENSORS,
+)
+from tests.faults.outcomes import Call, Outcome, agree, refuse, survive
+
+Trial = Callable[[], Outcome]
+
+
+def trials(calls: list[Call] = CALLS) -> Iterator[Trial]:
+    """Yield what to try."""
+    for call in calls:
+        call()  # what it shares with others is made here
+        for name in call.tensors:
+            yield from tensor_trials(call, name)
+        for name in call.options:
+            yield from option_trials(call, name)
+
+
+def tensor_trials(call: Call, name: str) -> Iterator[Trial]:
+    """Yield what to try on a tensor."""
+    good = call.tensors[name]
+    odd = ODD_TENSORS if good.is_floating_point() else ODD_ROWS
+    for judge, kinds in (
+        (refuse, BAD_TENSORS),
+        (survive, EXTREME_TENSORS),
+        (agree, odd),
+    ):
+        for label, spoil in kinds.items():
+            if good.ndim == 1 and label in FINE_ROWS:
+                continue
+            yield functools.partial(judge, call, name, label, spoil(good))
+
+
+def option_trials(call: Call, name: str) -> Iterator[Trial]:
+    """Yield what to try on an option."""
+    for value in BAD_OPTIONS[call.options[name]]:
+        yield functools.partial(refuse, call, name, repr(value), value)

@@ -1,0 +1,114 @@
+"""Entries of x that are far from simulations, or the same in all of them."""
+
+import warnings
+
+import pytest
+import torch
+from sbi.inference import NPE
+from sbi.neural_nets import posterior_nn
+from torch import Tensor, nn
+
+from sbi_rope import CalibrationFinetuner, RoPE, diagnose
+from sbi_rope.baselines import CalibrationMLP, FinetunedNPE, Training
+from sbi_rope.discrepancy import DiscrepancyNPE
+from sbi_rope.errors import RoPEWarning
+from tests import problems
+
+QUIET = {"show_progress_bars": False}
+PRIOR = problems.box(2)
+THETA = torch.linspace(-0.9, 0.9, 60).repeat(2, 1).T
+THETA_CAL = THETA[::2]
+
+
+def simulator(theta: Tensor) -> Tensor:
+    """Two readings, and a setting that never varies."""
+    x = theta + 0.1 * torch.randn_like(theta)
+    return torch.cat([x, torch.full_like(x[:, :1], 5.0)], dim=1)
+
+
+def npe_of(z_score_x: str, *, net: bool = False) -> object:
+    estimator = posterior_nn(
+        "mdn",
+        z_score_x=z_score_x,  # type: ignore[arg-type]
+        hidden_features=5,
+        num_components=1,
+        embedding_net=nn.Linear(3, 2) if net else nn.Identity(),
+    )
+    trainer = NPE(PRIOR, density_estimator=estimator, show_progress_bars=False)
+    trainer.append_simulations(THETA, simulator(THETA)).train(max_num_epochs=1)
+    return trainer.build_posterior()
+
+
+def real(theta: Tensor) -> Tensor:
+    """As simulated, but the setting jitters."""
+    return simulator(theta) + torch.tensor([0.0, 0.0, 0.01]) * torch.randn(
+        len(theta), 1
+    )
+
+
+@pytest.mark.parametrize("net", [False, True])
+def test_a_column_that_only_varies_in_reality_is_named_and_diagnosed(
+    net: bool,
+) -> None:
+    rope = RoPE(
+        npe_of("independent", net=net),
+        simulator=simulator,
+        finetuner=CalibrationFinetuner(num_steps=1),
+    )
+    what = r"1 of the 3 entries of `{}` \(first: \[2\]\) are up to .e\+05 standard"
+    with pytest.warns(RoPEWarning, match=what.format("x")):
+        rope.append_calibration(THETA_CAL, real(THETA_CAL))
+    rope.train(seed=0, **QUIET)
+    with pytest.warns(RoPEWarning, match=what.format("x_o")):
+        rope.build_posterior(real(THETA), require_convergence=False, **QUIET)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        diagnosis = diagnose(rope, real(THETA), num_folds=None, seed=0, **QUIET)
+        usual = diagnose(rope, simulator(THETA), num_folds=None, seed=0, **QUIET)
+    finding = diagnosis["entries far from simulations"]
+    assert finding.alarming
+    assert "Entry 2 of observation" in finding.sentence
+    assert not usual["entries far from simulations"].alarming
+
+
+def test_one_standard_deviation_for_all_entries_earns_no_warning() -> None:
+    rope = RoPE(npe_of("structured"), simulator=simulator)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rope.append_calibration(THETA_CAL, real(THETA_CAL))
+
+
+@pytest.mark.parametrize("method", [FinetunedNPE, DiscrepancyNPE])
+def test_other_methods_that_start_from_npe_warn_too(method: type) -> None:
+    options = {"simulator": simulator, "num_steps": 1}
+    if method is FinetunedNPE:
+        options = {"training": Training(max_num_epochs=1)}
+    trained = method.from_posterior(npe_of("independent"), **options)
+    trained.append_calibration(THETA_CAL, real(THETA_CAL))
+    with pytest.warns(RoPEWarning, match=r"entries of `x` \(first: \[2\]\)"):
+        trained.train(seed=0, **QUIET)
+
+
+def test_a_network_of_real_observations_ignores_what_is_the_same_in_all() -> None:
+    method = CalibrationMLP(PRIOR, training=Training(max_num_epochs=50))
+    method.append_calibration(THETA_CAL, simulator(THETA_CAL))
+    with pytest.warns(RoPEWarning, match=r"1 of the 3 entries.*same.*first: \[2\]"):
+        method.train(seed=0, **QUIET)
+    posterior = method.build_posterior()
+    x = simulator(THETA)
+    changed = x + torch.tensor([0.0, 0.0, 100.0])
+    usual, other = (
+        posterior.log_prob_batched(THETA, x=x, norm_posterior=False)
+        for x in (x, changed)
+    )
+    assert torch.equal(usual, other)
+    assert torch.isfinite(usual).all()
+
+
+def test_its_posterior_of_any_observation_has_mass_inside_the_prior() -> None:
+    method = CalibrationMLP(PRIOR, training=Training(max_num_epochs=50))
+    method.append_calibration(THETA_CAL, THETA_CAL + 1e-4 * torch.randn(30, 2))
+    posterior = method.train(seed=0, **QUIET).build_posterior()
+    far = torch.tensor([[1e4, -1e4], [-1e4, -1e4]])
+    samples = posterior.sample_batched((200,), x=far, **QUIET)
+    assert (samples.abs() <= 1).all()

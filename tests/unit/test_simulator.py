@@ -1,0 +1,117 @@
+"""What users call a simulator, and what is found out about it before it is trusted."""
+
+import warnings
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from sbi_rope._simulator import Simulator
+from sbi_rope.errors import RoPEWarning
+from tests import gaussian, problems
+
+OWN_NOISE = torch.Generator().manual_seed(0)
+
+
+def simulator_of(function: Callable[[Tensor], Tensor]) -> Simulator:
+    return Simulator(
+        function, problems.box(2), event_shape=torch.Size((2,)), like=torch.zeros(1)
+    )
+
+
+def mixes(theta: Tensor) -> Tensor:
+    return theta * theta.norm() + 0.1 * torch.randn_like(theta)
+
+
+def mixes_with_noise_of_its_own(theta: Tensor) -> Tensor:
+    noise = torch.randn(theta.shape, generator=OWN_NOISE)
+    return theta * theta.norm() + 0.1 * noise
+
+
+def centres(theta: Tensor) -> Tensor:
+    return theta - theta.mean()
+
+
+@pytest.mark.parametrize("function", [mixes, mixes_with_noise_of_its_own, centres])
+def test_a_simulator_of_one_theta_that_survives_a_batch_is_called_one_by_one(
+    function: Callable[[Tensor], Tensor],
+) -> None:
+    with pytest.warns(RoPEWarning, match="rows depend on each other"):
+        simulator = simulator_of(function)
+    assert not simulator.is_batched
+    theta = torch.tensor([[0.3, 0.4], [0.6, -0.8]])
+    alone = torch.stack([function(row) for row in theta])
+    assert torch.allclose(simulator(theta), alone, atol=1.0)
+    assert simulator(theta).shape == (2, 2)
+
+
+def has_noise_of_its_own(theta: Tensor) -> Tensor:
+    return theta + torch.randn(theta.shape, generator=OWN_NOISE)
+
+
+def rejects(theta: Tensor) -> Tensor:
+    """How many random numbers it takes depends on all rows."""
+    x = theta + torch.randn_like(theta)
+    while (bad := (x.abs() > 1).any(dim=-1)).any():
+        x[bad] = (theta + torch.randn_like(theta))[bad]
+    return x
+
+
+def takes_batches_only(theta: Tensor) -> Tensor:
+    return torch.cat([theta[:, :1], theta.square().sum(dim=1, keepdim=True)], dim=1)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        gaussian.simulator,
+        has_noise_of_its_own,
+        rejects,
+        takes_batches_only,
+        lambda theta: theta @ torch.tensor([[1.0, 0.3], [-0.2, 0.7]]),
+    ],
+)
+def test_simulators_of_batches_are_taken_for_what_they_are(
+    function: Callable[[Tensor], Tensor],
+) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert simulator_of(function).is_batched
+
+
+def test_simulations_are_copies_of_a_buffer_that_is_used_again() -> None:
+    buffer = torch.zeros(2)
+
+    def reuses(theta: Tensor) -> Tensor:
+        assert theta.ndim == 1
+        return buffer.copy_(theta)
+
+    theta = torch.tensor([[0.3, 0.4], [0.6, -0.8]])
+    assert torch.equal(simulator_of(reuses)(theta), theta)
+
+
+@pytest.mark.parametrize("batched", [True, False])
+def test_a_simulator_that_changes_its_argument_changes_a_copy(batched: bool) -> None:
+    def changes(theta: Tensor) -> Tensor:
+        assert batched or theta.ndim == 1
+        x = theta.clone()
+        theta.mul_(0)
+        return x
+
+    theta = torch.tensor([[0.3, 0.4], [0.6, -0.8]])
+    assert torch.equal(simulator_of(changes)(theta), theta)
+    assert torch.equal(theta[0], torch.tensor([0.3, 0.4]))
+
+
+def test_a_simulator_that_fails_at_its_second_call_is_still_looked_at() -> None:
+    calls = 0
+
+    def fails_later(theta: Tensor) -> Tensor:
+        nonlocal calls
+        calls += 1
+        if calls == 2:
+            raise OSError("busy")
+        return torch.zeros_like(theta)
+
+    assert simulator_of(fails_later).is_batched
