@@ -135,8 +135,10 @@ class Simulator:
             ok = torch.isfinite(x).flatten(1).all(dim=1)
             # Embedding nets may refuse NaN: give them zeros, which are dropped later.
             ok_shape = (-1,) + (1,) * (x.ndim - 1)
-            statistics.append(embed(x.where(ok.reshape(ok_shape), 0.0)))
-            valid.append(ok)
+            embedded = embed(x.where(ok.reshape(ok_shape), 0.0))
+            statistics.append(embedded)
+            # An embedding can overflow where x does not.
+            valid.append(ok & torch.isfinite(embedded).flatten(1).all(dim=1))
         bar.close()
         return torch.cat(statistics), torch.cat(valid)
 

@@ -53,12 +53,15 @@ class CouplingError(RoPEError, RuntimeError):
     """The optimal transport problem could not be solved as asked.
 
     Attributes:
+        reason: The message without these rows.
         simulated_rows: Rows of the simulations that are to blame, if some are.
     """
 
-    def __init__(self, message: str, *, simulated_rows: Sequence[int] = ()) -> None:
-        super().__init__(message)
-        self.simulated_rows = tuple(simulated_rows)
+    def __init__(self, reason: str, *, simulated_rows: Sequence[int] = ()) -> None:
+        self.reason, self.simulated_rows = reason, tuple(simulated_rows)
+        if self.simulated_rows:
+            reason += f" Rows of `simulated`: {list(self.simulated_rows[:5])}."
+        super().__init__(reason)
 
 
 class SamplingError(RoPEError, RuntimeError):

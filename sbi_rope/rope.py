@@ -731,8 +731,8 @@ def parameters_named(theta: Tensor) -> Iterator[None]:
             raise
         rows = list(error.simulated_rows[:5])
         raise CouplingError(
-            f"{error} The parameters of these simulations are {theta[rows].tolist()}.",
-            simulated_rows=error.simulated_rows,
+            f"{error.reason} The parameters of these simulations are "
+            f"{theta[rows].tolist()}."
         ) from error
 
 

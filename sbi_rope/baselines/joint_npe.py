@@ -6,6 +6,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sbi_rope._sbi import embedding_of
+from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._training import History, fit, split_pairs, too_few_pairs
 from sbi_rope._validation import check_instance
 from sbi_rope.baselines.base import UsesCalibration, UsesSimulations
@@ -95,6 +97,7 @@ class JointNPE(UsesSimulations, UsesCalibration):
             theta, x = theta[rows], x[rows]
         # As in NPE, the simulations alone say how x and theta are standardised.
         estimator = self._build(theta.cpu(), x.cpu()).to(self._device)
+        warn_of_far_entries("x", x_cal, embedding_of(estimator))
         half = max(1, min(self.training.training_batch_size // 2, len(x)))
 
         def batches(step: int) -> Iterator[tuple[Tensor, Tensor]]:

@@ -126,11 +126,11 @@ def _error(
         name: (values > limit).nonzero().flatten().tolist()
         for name, values in (("real", of_real), ("simulated", distance))
     }
-    blamed = [
-        f"{len(found)} of `{name}` (first: {found[:5]})"
-        for name, found in rows.items()
-        if found and len(found) < max(2, len(real) / 2)
-    ]
+    blamed = []
+    if 0 < len(rows["real"]) < max(2, len(real) / 2):
+        blamed.append(f"{len(rows['real'])} of `real` (first: {rows['real'][:5]})")
+    if rows["simulated"]:
+        blamed.append(f"{len(rows['simulated'])} of `simulated`")
     if not blamed:
         return CouplingError(f"{problem} {otherwise}")
     return CouplingError(

@@ -11,7 +11,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from sbi_rope import CalibrationFinetuner, MixturePosterior, RoPE, SinkhornCoupler
+from sbi_rope import (
+    CalibrationFinetuner,
+    MixturePosterior,
+    RoPE,
+    SinkhornCoupler,
+    diagnose,
+)
 from sbi_rope.errors import (
     CouplingError,
     InvalidInputError,
@@ -672,3 +678,51 @@ def test_a_posterior_of_a_sweep_can_be_moved_without_the_others() -> None:
     expected = conductor.build_posterior(x_o, coupler=coupler, seed=3)
     ours, theirs = (p.log_prob_batched(theta, x_o) for p in (second, expected))
     assert torch.allclose(ours, theirs, atol=1e-3)
+
+
+def _with(x: Tensor, row: int, value: float) -> Tensor:
+    changed = x.clone()
+    changed[row] = value
+    return changed
+
+
+def test_an_observation_that_is_out_of_all_proportion_is_named_by_its_row() -> None:
+    with pytest.raises(CouplingError, match=r"1 of `real` \(first: \[7\]\)\. Remove"):
+        rope().build_posterior(_with(X_O, 7, 1e15))
+    with pytest.raises(InvalidInputError, match=r"`x_o` with a finite.*\[7\], with va"):
+        rope().build_posterior(_with(X_O, 7, 1e30))
+
+
+def test_simulations_that_are_out_of_all_proportion_are_named_by_parameters() -> None:
+    theta = gaussian.prior().sample((200,))
+    stored = rope(
+        simulator=None, simulations=(theta, _with(gaussian.simulator(theta), 9, 1e30))
+    )
+    named = rf"1 of `simulated`\. .* are \[\[{str(theta[9, 0].item())[:6]}"
+    for call in (
+        lambda: stored.build_posterior(X_O, seed=0),
+        lambda: next(stored.sweep(X_O, gammas=[0.5], taus=[1.0], seed=0)),
+        lambda: diagnose(stored, X_O, seed=0),
+    ):
+        with pytest.raises(CouplingError, match=named):
+            call()
+    conductor = rope(simulator=lambda theta: 1e30 * gaussian.simulator(theta))
+    conductor.append_calibration(*gaussian.labelled(10))
+    with pytest.raises(SimulationError, match="at the calibration parameters"):
+        conductor.train(show_progress_bars=False)
+
+
+def test_a_potential_fitted_to_few_of_many_says_so() -> None:
+    with pytest.warns(RoPEWarning, match="num_fitted=1 of 30 real observations"):
+        rope().build_posterior(X_O, coupler=SinkhornCoupler(num_fitted=1))
+
+
+def test_training_needs_gradients_and_says_so() -> None:
+    with torch.inference_mode():
+        pairs = tuple(values + 0 for values in gaussian.labelled(10))
+        with pytest.raises(NotReadyError, match="inference_mode"):
+            rope().append_calibration(*pairs).train()
+    # What was made in that mode can be trained on outside of it, and looked at inside.
+    conductor = rope().append_calibration(*pairs).train(show_progress_bars=False)
+    with torch.inference_mode():
+        assert conductor.build_posterior(X_O).weights.shape == (30, 1000)
