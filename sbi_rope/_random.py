@@ -9,7 +9,7 @@ from numbers import Integral
 import numpy as np
 import torch
 
-from sbi_rope.errors import InvalidInputError
+from sbi_rope.errors import InvalidInputError, shown
 
 __all__ = ["seeded"]
 
@@ -34,7 +34,7 @@ def seeded(seed: int | None) -> Iterator[None]:
         return
     if isinstance(seed, bool) or not isinstance(seed, Integral) or seed < 0:
         raise InvalidInputError(
-            f"Expected `seed` to be a non-negative integer or None; got {seed!r}."
+            f"Expected `seed` to be a non-negative integer or None; got {shown(seed)}."
         )
     # Away from the streams of small seeds: whoever trained NPE after manual_seed(0)
     # would meet the same parameters again under seed 0.

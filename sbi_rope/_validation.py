@@ -4,8 +4,9 @@ Each check raises with the argument's name, what was expected, what came, and wh
 there is one, what to do next. Public functions call them once; private code trusts.
 """
 
-from collections.abc import Iterable, Sequence
-from numbers import Integral, Real
+from collections.abc import Iterable, Mapping, Sequence
+from numbers import Integral, Rational, Real
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,11 +15,13 @@ from sbi.utils import within_support
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_rope.errors import InvalidInputError, InvalidTypeError, NotReadyError
+from sbi_rope.errors import InvalidInputError, InvalidTypeError, NotReadyError, shown
 
 __all__ = [
+    "as_float32",
     "as_numbers",
     "as_shape",
+    "check_attributes",
     "check_batch",
     "check_choice",
     "check_device",
@@ -27,8 +30,13 @@ __all__ = [
     "check_in_support",
     "check_instance",
     "check_integer",
+    "check_mapping",
+    "check_names",
+    "check_not_nan",
     "check_not_negative",
+    "check_number",
     "check_numbers",
+    "check_path",
     "check_positive",
     "check_prior",
     "check_rows",
@@ -36,12 +44,22 @@ __all__ = [
     "check_tensor",
     "check_theta",
     "check_unit_interval",
+    "check_values",
     "check_weights",
     "usable_device",
 ]
 
 # What the sum of weights may be away from one, such as that of float32 numbers.
 ROUNDING_OF_WEIGHTS = 1e-5
+# Those that torch can compare and add. Of complex numbers, booleans, quantised,
+# eight-bit floating-point and wide unsigned ones, it can do too little.
+DTYPES = {
+    *(torch.float16, torch.bfloat16, torch.float32, torch.float64),
+    *(torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64),
+}
+LARGEST_INTEGER = 2**63 - 1  # that torch can hold
+# No setting is larger, and products with it stay finite in float32.
+LARGEST_NUMBER = 1e30
 
 
 def check_tensor(name: str, value: Any) -> Tensor:
@@ -51,15 +69,47 @@ def check_tensor(name: str, value: Any) -> Tensor:
             f"Expected `{name}` to be a torch.Tensor; got {type(value).__name__}. "
             f"Convert it with `torch.as_tensor({name}, dtype=torch.float32)`."
         )
-    if value.is_complex() or value.dtype == torch.bool:
+    if value.dtype not in DTYPES:
         raise InvalidTypeError(
             f"Expected `{name}` to hold real numbers; got dtype {value.dtype}."
+        )
+    if value.layout != torch.strided or value.is_nested:
+        layout = "a nested tensor" if value.is_nested else f"layout {value.layout}"
+        raise InvalidTypeError(
+            f"Expected `{name}` to be a dense tensor; got {layout}. Convert a sparse "
+            f"one with `{name}.to_dense()`."
         )
     return value
 
 
+def as_float32(name: str, value: Tensor) -> Tensor:
+    """Return a finite tensor as float32, or raise if that has no such numbers."""
+    converted = value.float()
+    if converted is not value and value.dtype == torch.float64:
+        large = value.abs() > torch.finfo(torch.float32).max
+        if large.any():
+            rows = large.flatten(1).any(dim=1) if value.ndim > 1 else large.reshape(-1)
+            first = rows.nonzero().flatten()[:5].tolist()
+            raise InvalidInputError(
+                f"Expected `{name}` to have numbers that float32 holds, up to 3.4e38; "
+                f"got larger ones in {int(rows.sum())} of {rows.numel()} rows (first: "
+                f"{first}). Remove or repair these rows, or use other units."
+            )
+    return converted
+
+
+def check_values(name: str, value: Tensor) -> None:
+    """Raise if a tensor has a shape but no numbers, as on torch's device ``meta``."""
+    if value.is_meta:
+        raise InvalidInputError(
+            f"Expected `{name}` to hold numbers; got a tensor on the device 'meta', "
+            "which has a shape only."
+        )
+
+
 def check_finite(name: str, value: Tensor) -> None:
     """Raise if any entry is NaN or infinite, naming the first rows that are."""
+    check_values(name, value)
     bad = ~torch.isfinite(value)
     if bad.any():
         rows = bad.flatten(1).any(dim=1) if value.ndim > 1 else bad.reshape(-1)
@@ -67,6 +117,16 @@ def check_finite(name: str, value: Tensor) -> None:
         raise InvalidInputError(
             f"Expected `{name}` to be finite; got NaN or Inf in {int(rows.sum())} of "
             f"{rows.numel()} rows (first: {first}). Remove or repair these rows."
+        )
+
+
+def check_not_nan(name: str, value: Tensor) -> None:
+    """Raise if any entry is NaN; infinite ones can still be compared."""
+    check_values(name, value)
+    count = int(torch.isnan(value).sum())
+    if count:
+        raise InvalidInputError(
+            f"Expected `{name}` without NaN; got {count} among {value.numel()} numbers."
         )
 
 
@@ -89,16 +149,23 @@ def check_batch(
         raise InvalidInputError(
             f"Expected `{name}` of shape {expected} with n >= 1; got an empty batch."
         )
+    if 0 in event_shape:
+        raise InvalidInputError(
+            f"Expected `{name}` with at least one number in each row; got shape "
+            f"{tuple(value.shape)}."
+        )
     if finite:
         check_finite(name, value)
     return value
 
 
-def check_device(name: str, value: Tensor, device: torch.device) -> None:
-    """Raise unless a tensor lives on the device of the posterior."""
+def check_device(
+    name: str, value: Tensor, device: torch.device, *, where: str = "the posterior"
+) -> None:
+    """Raise unless a tensor lives on the device of the posterior, or what is named."""
     if value.device != device:
         raise InvalidInputError(
-            f"Expected `{name}` on {device}, where the posterior is; got "
+            f"Expected `{name}` on {device}, where {where} is; got "
             f"{value.device}. Move it with `{name}.to('{device}')`."
         )
 
@@ -132,6 +199,66 @@ def check_instance(
             f"Expected `{name}` to be a {expected.__name__}; got "
             f"{type(value).__name__}."
         )
+
+
+def check_attributes(
+    name: str, value: Any, attributes: Sequence[str], *, like: str
+) -> None:
+    """Raise unless ``value`` has the attributes that are read of it."""
+    missing = [attribute for attribute in attributes if not hasattr(value, attribute)]
+    if missing:
+        raise InvalidTypeError(
+            f"Expected `{name}` to be {like}; got {type(value).__name__}, without "
+            f"{missing}."
+        )
+
+
+def check_mapping(name: str, value: Any, *, like: str) -> None:
+    """Raise unless ``value`` is a dictionary with at least one entry."""
+    if not isinstance(value, Mapping):
+        raise InvalidTypeError(
+            f"Expected `{name}` to be a dictionary of {like} by name; got "
+            f"{type(value).__name__}."
+        )
+    if not value:
+        raise InvalidInputError(f"Expected `{name}` with at least one entry; got none.")
+    check_names(f"the keys of {name}", list(value))
+
+
+def check_names(name: str, value: Any, count: int | None = None) -> list[str]:
+    """Return so many names; one string is not taken for a name a letter."""
+    try:
+        names = None if isinstance(value, str | bytes | Mapping) else list(value)
+    except TypeError:
+        names = None
+    if names is None or not all(isinstance(entry, str) for entry in names):
+        raise InvalidTypeError(
+            f"Expected `{name}` to be a list of strings; got {shown(value)}."
+        )
+    if count is not None and len(names) != count:
+        raise InvalidInputError(
+            f"Expected `{name}` of length {count}; got {len(names)}."
+        )
+    return names
+
+
+def check_path(name: str, value: Any, *, optional: bool = False) -> Path | None:
+    """Return a path with the home folder filled in; None where that is allowed."""
+    if value is None and optional:
+        return None
+    if not isinstance(value, str | Path):
+        alternative = " or None" if optional else ""
+        raise InvalidTypeError(
+            f"Expected `{name}` to be a path{alternative}; got {type(value).__name__}."
+        )
+    if "\0" in str(value):
+        raise InvalidInputError(
+            f"Expected `{name}` to be a path; got {shown(value)}, with a null byte."
+        )
+    try:
+        return Path(value).expanduser()
+    except RuntimeError as error:  # no such user
+        raise InvalidInputError(f"Expected `{name}` to be a path; {error}") from error
 
 
 def check_prior(prior: Any) -> None:
@@ -231,6 +358,8 @@ def as_shape(name: str, value: Any) -> torch.Size:
 
 def check_in_support(name: str, theta: Tensor, prior: Any) -> None:
     """Raise if any row of ``theta`` lies outside the prior's support."""
+    if not len(theta):  # about which sbi cannot tell
+        return
     outside = ~within_support(prior, theta)
     if outside.any():
         first = outside.nonzero().flatten()[:5].tolist()
@@ -241,17 +370,30 @@ def check_in_support(name: str, theta: Tensor, prior: Any) -> None:
         )
 
 
+def check_number(name: str, value: Any) -> None:
+    """Raise unless ``value`` is a finite number."""
+    if not _is_number(value):
+        raise InvalidInputError(
+            f"Expected `{name}` to be a finite number, at most {LARGEST_NUMBER:g} in "
+            f"size; got {shown(value)}."
+        )
+
+
 def check_positive(name: str, value: Any) -> None:
     """Raise unless ``value`` is a finite number above zero."""
-    if not _is_number(value) or not 0.0 < value < float("inf"):
-        raise InvalidInputError(f"Expected `{name}` to be positive; got {value!r}.")
+    if not _is_number(value) or not value > 0.0:
+        raise InvalidInputError(
+            f"Expected `{name}` to be positive, at most {LARGEST_NUMBER:g}; got "
+            f"{shown(value)}."
+        )
 
 
 def check_not_negative(name: str, value: Any) -> None:
     """Raise unless ``value`` is a finite number of at least zero."""
-    if not _is_number(value) or not 0.0 <= value < float("inf"):
+    if not _is_number(value) or not value >= 0.0:
         raise InvalidInputError(
-            f"Expected `{name}` to be a finite number of at least 0; got {value!r}."
+            f"Expected `{name}` to be a finite number of at least 0 and at most "
+            f"{LARGEST_NUMBER:g}; got {shown(value)}."
         )
 
 
@@ -265,28 +407,44 @@ def check_numbers(name: str, value: Any) -> list[float]:
     if not numbers or not all(_is_number(number) for number in numbers):
         raise InvalidInputError(
             f"Expected `{name}` to be a list of at least one number, such as [0.1, "
-            f"0.5]; got {value!r}."
+            f"0.5]; got {shown(value)}."
         )
     return numbers
 
 
-def check_integer(name: str, value: Any, *, minimum: int = 1) -> None:
-    """Raise unless ``value`` is an integer of at least ``minimum``."""
-    if isinstance(value, bool) or not isinstance(value, Integral) or value < minimum:
+def check_integer(
+    name: str, value: Any, *, minimum: int = 1, maximum: int | None = LARGEST_INTEGER
+) -> None:
+    """Raise unless ``value`` is an integer of at least ``minimum``, and not too large.
+
+    Args:
+        name: What the value is called.
+        value: What came.
+        minimum: The smallest value that is accepted.
+        maximum: The largest; unless given, what torch can hold. None for any.
+    """
+    is_integer = isinstance(value, Integral) and not isinstance(value, bool)
+    too_large = is_integer and maximum is not None and int(value) > maximum
+    if not is_integer or int(value) < minimum or too_large:
+        bounds = f"of at least {minimum}"
+        if too_large or maximum not in (None, LARGEST_INTEGER):
+            bounds = f"from {minimum} to {maximum}"
         raise InvalidInputError(
-            f"Expected `{name}` to be an integer of at least {minimum}; got {value!r}."
+            f"Expected `{name}` to be an integer {bounds}; got {shown(value)}."
         )
 
 
 def check_unit_interval(name: str, value: Any) -> None:
     """Raise unless ``value`` is a number in [0, 1]."""
     if not _is_number(value) or not 0.0 <= value <= 1.0:
-        raise InvalidInputError(f"Expected `{name}` in [0, 1]; got {value!r}.")
+        raise InvalidInputError(f"Expected `{name}` in [0, 1]; got {shown(value)}.")
 
 
 def check_weights(name: str, value: Any, count: int) -> list[float]:
     """Return so many numbers, if none is negative and they sum to one."""
-    weights = torch.as_tensor(value, dtype=torch.double)
+    if isinstance(value, Tensor):
+        check_values(name, check_tensor(name, value))
+    weights = _as_numbers(name, value, count)
     if weights.shape != (count,):
         raise InvalidInputError(
             f"Expected `{name}` to be {count} numbers; got shape "
@@ -296,18 +454,49 @@ def check_weights(name: str, value: Any, count: int) -> list[float]:
     if not (weights >= 0).all() or not abs(total - 1) < ROUNDING_OF_WEIGHTS:
         raise InvalidInputError(
             f"Expected `{name}` without negative numbers and with a sum of one; got "
-            f"{weights.tolist()}, whose sum is {total:g}."
+            f"{shown(weights.tolist())}, whose sum is {total:g}."
         )
     return weights.tolist()
 
 
 def check_choice(name: str, value: Any, choices: Sequence[Any]) -> None:
     """Raise unless ``value`` is one of the choices."""
-    if value not in choices:
+    if not any(_is_same(value, choice) for choice in choices):
         raise InvalidInputError(
-            f"Expected `{name}` to be one of {list(choices)}; got {value!r}."
+            f"Expected `{name}` to be one of {list(choices)}; got {shown(value)}."
         )
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool)
+    """Whether a value is a number that tensors of float32 can be multiplied with."""
+    if not isinstance(value, Real) or isinstance(value, bool):
+        return False
+    if isinstance(value, Rational) and not isinstance(value, Integral):
+        return False  # torch knows no fractions
+    try:
+        return abs(float(value)) <= LARGEST_NUMBER  # not so for NaN
+    except OverflowError:  # an integer of more than 300 digits
+        return False
+
+
+def _is_same(value: Any, choice: Any) -> bool:
+    """Compare values of one kind only: arrays answer `==` with arrays."""
+    if isinstance(choice, Integral) and not isinstance(choice, bool):
+        kind: type = Integral
+        if isinstance(value, bool):  # True is 1 to Python, not to a reader
+            return False
+    else:
+        kind = type(choice)
+    return isinstance(value, kind) and bool(value == choice)
+
+
+def _as_numbers(name: str, value: Any, count: int) -> Tensor:
+    """Return real numbers of any container in float64, without their gradients."""
+    try:
+        if torch.as_tensor(value).dtype in DTYPES:
+            return torch.as_tensor(value, dtype=torch.double).detach()
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        pass  # what torch raises for all that is no array of numbers
+    raise InvalidTypeError(
+        f"Expected `{name}` to be {count} real numbers; got {shown(value)}."
+    )

@@ -7,6 +7,7 @@ expect, so that both ``except RoPEError`` and ``except ValueError`` work.
 import inspect
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
 __all__ = [
     "CouplingError",
@@ -21,8 +22,12 @@ __all__ = [
     "SimulationError",
     "UnseenObservationError",
     "UnsupportedPosteriorError",
+    "shown",
     "warn_user",
 ]
+
+
+LONGEST_TEXT = 200  # of a value in a message
 
 
 class RoPEError(Exception):
@@ -82,6 +87,17 @@ class DataNotFoundError(RoPEError, FileNotFoundError):
 
 class RoPEWarning(UserWarning):
     """Something works, but not as well as the caller may think."""
+
+
+def shown(value: Any) -> str:
+    """Return a value as it is written in code, for a message: short, in any case."""
+    try:
+        text = repr(value)
+    except Exception:  # whatever a foreign `repr` raises, and that of huge integers
+        return f"a value of type {type(value).__name__}"
+    if len(text) <= LONGEST_TEXT:
+        return text
+    return f"{text[:LONGEST_TEXT]}... (of type {type(value).__name__})"
 
 
 def warn_user(message: str) -> None:

@@ -47,6 +47,12 @@ def terminal(
     return capsys
 
 
+@pytest.fixture
+def shorter_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let files of causal chambers have fewer rows than the published ones."""
+    monkeypatch.setattr("sbi_rope.tasks.chambers.PUBLISHED_ROWS", {})
+
+
 @pytest.fixture(scope="session")
 def chamber_root() -> Path:
     """Folder with the causal chamber data sets, or skip."""

@@ -10,12 +10,22 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from sbi_rope._validation import (
+    check_batch,
+    check_device,
+    check_not_nan,
+    check_tensor,
+    check_values,
+)
+from sbi_rope.errors import InvalidInputError
+
 __all__ = [
     "ACAUCScore",
     "CoverageCurve",
     "CoverageErrorScore",
     "acauc_of",
     "central_levels",
+    "count_ranks",
     "coverage_curve_of",
     "expected_coverage_error_of",
     "mid_ranks",
@@ -24,6 +34,8 @@ __all__ = [
 
 # Levels and ranks are ratios of integers: equality must survive their rounding.
 ROUNDING = 1e-9
+# What a level may be beyond 1, such as one that was calculated in float32.
+ROUNDING_OF_LEVELS = 1e-6
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -96,10 +108,31 @@ def mid_ranks(samples: Tensor, theta: Tensor) -> Tensor:
     Returns:
         The ranks, strictly between 0 and 1, float64, shape ``(n, k)``.
 
+    Raises:
+        InvalidTypeError: If an argument is no tensor of real numbers.
+        InvalidInputError: If a shape does not fit, there is no sample, or there is a
+            NaN, which is neither above nor below anything. Infinite values are.
+
     Example:
         >>> mid_ranks(torch.tensor([[[0.0]], [[1.0]], [[1.0]]]), torch.tensor([[1.0]]))
         tensor([[0.6250]], dtype=torch.float64)
     """
+    check_tensor("samples", samples)
+    check_batch("theta", theta, check_tensor("theta", theta).shape[-1:], finite=False)
+    if samples.ndim != 3 or samples.shape[1:] != theta.shape or not len(samples):
+        raise InvalidInputError(
+            f"Expected `samples` of shape (M, {theta.shape[0]}, {theta.shape[1]}) with "
+            f"M >= 1, for `theta` of shape {tuple(theta.shape)}; got "
+            f"{tuple(samples.shape)}."
+        )
+    check_device("theta", theta, samples.device, where="`samples`")
+    check_not_nan("samples", samples)
+    check_not_nan("theta", theta)
+    return count_ranks(samples, theta)
+
+
+def count_ranks(samples: Tensor, theta: Tensor) -> Tensor:
+    """Return :func:`mid_ranks` of arguments that are known to be right."""
     below = (samples < theta).sum(dim=0).double()
     equal = (samples == theta).sum(dim=0).double()
     return (below + equal / 2 + 0.5) / (samples.shape[0] + 1)
@@ -113,7 +146,12 @@ def central_levels(ranks: Tensor) -> Tensor:
 
     Returns:
         The levels, same shape.
+
+    Raises:
+        InvalidTypeError: If the ranks are no tensor of real numbers.
+        InvalidInputError: If a rank is not in [0, 1].
     """
+    _check_unit_range("ranks", check_tensor("ranks", ranks))
     return (2.0 * ranks - 1.0).abs()
 
 
@@ -138,11 +176,15 @@ def acauc_of(levels: Tensor) -> ACAUCScore:
     Returns:
         The score with its standard error.
 
+    Raises:
+        InvalidTypeError: If the levels are no tensor of real numbers.
+        InvalidInputError: If their shape is another one, or a level is not in [0, 1].
+
     Example:
         >>> acauc_of(torch.tensor([[0.5], [1.0]])).value
         0.25
     """
-    levels = levels.double()
+    levels = _checked_levels(levels).double()
     per_observation = levels.mean(dim=1)
     return ACAUCScore(
         value=float(per_observation.mean() - 0.5),
@@ -164,7 +206,12 @@ def coverage_curve_of(levels: Tensor) -> CoverageCurve:
 
     Returns:
         The curve at .01, .02, ..., .99.
+
+    Raises:
+        InvalidTypeError: If the levels are no tensor of real numbers.
+        InvalidInputError: If their shape is another one, or a level is not in [0, 1].
     """
+    levels = _checked_levels(levels)
     nominal = _nominal_levels(levels)
     # One level at a time: memory stays that of `levels`, whatever n and k.
     coverage, errors = [], []
@@ -200,7 +247,12 @@ def expected_coverage_error_of(levels: Tensor) -> CoverageErrorScore:
 
     Returns:
         The score with its standard error.
+
+    Raises:
+        InvalidTypeError: If the levels are no tensor of real numbers.
+        InvalidInputError: If their shape is another one, or a level is not in [0, 1].
     """
+    levels = _checked_levels(levels)
     nominal = _nominal_levels(levels)
     distance = levels.new_zeros(levels.shape[1], dtype=torch.float64)
     influence = levels.new_zeros(levels.shape[0], dtype=torch.float64)
@@ -224,6 +276,29 @@ def standard_error_of_mean(values: Tensor) -> float:
     if torch.isinf(values).any():
         return float("inf")
     return float(values.double().std() / values.numel() ** 0.5)
+
+
+def _checked_levels(levels: Tensor) -> Tensor:
+    """Return levels (n, k) without their gradients, which no score has a use for."""
+    shape = check_tensor("levels", levels).shape
+    if levels.ndim != 2:
+        raise InvalidInputError(
+            f"Expected `levels` of shape (n, k); got {tuple(shape)}."
+        )
+    check_batch("levels", levels, shape[1:], finite=False)
+    _check_unit_range("levels", levels)
+    return levels.detach()
+
+
+def _check_unit_range(name: str, values: Tensor) -> None:
+    check_values(name, values)
+    outside = ~((values >= 0) & (values <= 1 + ROUNDING_OF_LEVELS))  # NaN included
+    if outside.any():
+        raise InvalidInputError(
+            f"Expected `{name}` in [0, 1]; got NaN or numbers outside in "
+            f"{int(outside.sum())} of {values.numel()} places, such as "
+            f"{float(values[outside][0])}."
+        )
 
 
 def _nominal_levels(like: Tensor) -> Tensor:

@@ -22,16 +22,24 @@ from torch import Tensor
 from sbi_rope._progress import progress_bar
 from sbi_rope._sbi import NeuralPosterior, is_bounded
 from sbi_rope._validation import (
+    as_float32,
     check_batch,
+    check_device,
     check_integer,
     check_same_length,
     check_tensor,
+    check_values,
 )
-from sbi_rope.errors import InvalidInputError, LogProbUnavailableError
-from sbi_rope.metrics.calibration import mid_ranks
+from sbi_rope.errors import (
+    InvalidInputError,
+    InvalidTypeError,
+    LogProbUnavailableError,
+)
+from sbi_rope.metrics.calibration import count_ranks
 
 __all__ = [
     "CHUNK_SIZE",
+    "check_num_samples",
     "check_test_set",
     "draw_joint_levels",
     "draw_ranks",
@@ -41,6 +49,9 @@ __all__ = [
 
 # Observations treated in one call unless the caller says otherwise.
 CHUNK_SIZE = 100
+
+# Draws of one observation; more fill the memory before they sharpen any score.
+MAX_SAMPLES = 10**8
 
 # Draws whose density is evaluated in one call: some flows embed x once per draw.
 DRAWS_PER_CALL = 10
@@ -53,6 +64,11 @@ EXPECTED_WARNINGS = (
 )
 
 
+def check_num_samples(num_samples: Any) -> None:
+    """Raise unless a number of draws is one that can be asked for."""
+    check_integer("num_samples", num_samples, maximum=MAX_SAMPLES)
+
+
 def check_test_set(
     posterior: Any, theta: Tensor, x: Tensor, chunk_size: int
 ) -> tuple[Tensor, Tensor]:
@@ -61,8 +77,12 @@ def check_test_set(
     check_batch("theta", theta, check_tensor("theta", theta).shape[-1:])
     check_batch("x", x, check_tensor("x", x).shape[1:])
     check_same_length("theta", theta, "x", x)
-    if isinstance(posterior, NeuralPosterior):
-        return theta.float(), x.float()  # sbi's estimators know float32 only
+    if isinstance(posterior, DirectPosterior):
+        estimator = posterior.posterior_estimator
+        check_batch("theta", theta, estimator.input_shape, finite=False)
+        check_batch("x", x, estimator.condition_shape, finite=False)
+    if isinstance(posterior, NeuralPosterior):  # sbi's estimators know float32 only
+        return as_float32("theta", theta), as_float32("x", x)
     return theta, x
 
 
@@ -75,7 +95,10 @@ def evaluate_log_probs(
     parts = []
     for rows in _chunks(theta.shape[0], chunk_size, "Evaluating log_prob", show=show):
         with torch.no_grad():
-            part = posterior.log_prob_batched(theta[rows], x=x[rows], **arguments)
+            part = _returned(
+                "log_prob_batched",
+                posterior.log_prob_batched(theta[rows], x=x[rows], **arguments),
+            )
         if part.numel() != theta[rows].shape[0]:
             raise InvalidInputError(
                 f"Expected `log_prob_batched` to return one value for each of "
@@ -101,7 +124,7 @@ def draw_ranks(
     parts = []
     for rows in _chunks(theta.shape[0], chunk_size, "Drawing samples", show=show):
         samples = _draw(posterior, theta, x, rows, num_samples)
-        parts.append(mid_ranks(samples, theta[rows]))
+        parts.append(count_ranks(samples, theta[rows]))
     return torch.cat(parts)
 
 
@@ -126,7 +149,7 @@ def draw_joint_levels(
         bad = torch.isnan(densities).any(dim=0)
         _refuse("NaN log-probabilities", bad, start=rows.start)
         # Ranking -log p ascending counts the draws that are denser than theta.
-        parts.append(mid_ranks(-densities[1:, :, None], -densities[0, :, None]))
+        parts.append(count_ranks(-densities[1:, :, None], -densities[0, :, None]))
     return torch.cat(parts)
 
 
@@ -141,20 +164,45 @@ def draw_samples(posterior: Any, x: Tensor, *, num_samples: int) -> Tensor:
     Returns:
         Samples, shape ``(num_samples, n, k)``; those of a leaking posterior of sbi may
         lie outside the prior.
+
+    Raises:
+        InvalidTypeError: If the posterior cannot be sampled, or returns no tensor.
+        InvalidInputError: If ``x`` is empty or not finite, or ``num_samples`` out of
+            range.
     """
+    check_num_samples(num_samples)
+    check_batch("x", x, check_tensor("x", x).shape[1:])
+    if isinstance(posterior, NeuralPosterior):
+        x = as_float32("x", x)
+    samples = _sample(posterior, x, num_samples)
+    if samples.ndim != 3 or samples.shape[:2] != (num_samples, len(x)):
+        raise InvalidInputError(
+            f"Expected samples of shape ({num_samples}, {len(x)}, k); `sample_batched` "
+            f"returned {tuple(samples.shape)}."
+        )
+    return samples
+
+
+def _sample(posterior: Any, x: Tensor, num_samples: int) -> Tensor:
+    if not callable(getattr(posterior, "sample_batched", None)):
+        raise InvalidTypeError(
+            "Expected `posterior` with a method `sample_batched`, such as one of sbi; "
+            f"got {type(posterior).__name__}."
+        )
     arguments = {"reject_outside_prior": False} if _is_unbounded(posterior) else {}
     with torch.no_grad(), warnings.catch_warnings():
         for message in EXPECTED_WARNINGS:
             warnings.filterwarnings("ignore", message=message)
-        return posterior.sample_batched(
+        samples = posterior.sample_batched(
             torch.Size((num_samples,)), x=x, show_progress_bars=False, **arguments
         )
+    return _returned("sample_batched", samples)
 
 
 def _draw(
     posterior: Any, theta: Tensor, x: Tensor, rows: slice, num_samples: int
 ) -> Tensor:
-    samples = draw_samples(posterior, x[rows], num_samples=num_samples)
+    samples = _sample(posterior, x[rows], num_samples)
     expected = (num_samples, *theta[rows].shape)
     if tuple(samples.shape) != expected:
         raise InvalidInputError(
@@ -162,6 +210,7 @@ def _draw(
             f"{tuple(samples.shape)}. Check that `theta` has one row for each"
             f" observation and one column for each parameter."
         )
+    check_device("theta", theta, samples.device, where="what the posterior draws")
     bad = torch.isnan(samples).any(dim=0).any(dim=-1)
     _refuse("NaN samples", bad, start=rows.start)
     return samples
@@ -175,7 +224,26 @@ def _density(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:
             # the density they come from is not: a leaking posterior would look
             # under-confident. The estimator states the density of its own draws.
             return posterior.posterior_estimator.log_prob(theta, condition=x)
-        return posterior.log_prob_batched(theta, x=x)
+        density = posterior.log_prob_batched(theta, x=x)
+    if tuple(_returned("log_prob_batched", density).shape) != tuple(theta.shape[:2]):
+        raise InvalidInputError(
+            f"Expected `log_prob_batched` to return one value for each draw, shape "
+            f"{tuple(theta.shape[:2])}; got {tuple(density.shape)}."
+        )
+    return density
+
+
+def _returned(method: str, value: Any) -> Tensor:
+    """Return what a posterior returned, if it is a tensor of numbers."""
+    if not isinstance(value, Tensor):
+        raise InvalidTypeError(
+            f"Expected `{method}` of the posterior to return a torch.Tensor; got "
+            f"{type(value).__name__}. Wrap the posterior in a class whose `{method}` "
+            "returns a tensor, with the dtype and device of `x`."
+        )
+    name = f"posterior.{method}(...)"
+    check_values(name, check_tensor(name, value))
+    return value
 
 
 def _is_unbounded(posterior: Any) -> bool:
@@ -192,7 +260,7 @@ def _is_unbounded_direct(posterior: Any) -> bool:
 
 
 def _require_log_prob(posterior: Any) -> None:
-    if not hasattr(posterior, "log_prob_batched"):
+    if not callable(getattr(posterior, "log_prob_batched", None)):
         raise LogProbUnavailableError(
             f"Expected `posterior` with a method `log_prob_batched`; got "
             f"{type(posterior).__name__}. Its calibration can still be scored with "

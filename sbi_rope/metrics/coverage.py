@@ -18,6 +18,7 @@ from sbi_rope.metrics.calibration import (
 )
 from sbi_rope.metrics.calls import (
     CHUNK_SIZE,
+    check_num_samples,
     check_test_set,
     draw_joint_levels,
     draw_ranks,
@@ -93,7 +94,7 @@ def acauc(
         num_samples = DEFAULT_NUM_SAMPLES[kind]
     if num_observations is None:
         num_observations = MAX_JOINT_OBSERVATIONS if kind == "hpd" else theta.shape[0]
-    check_integer("num_samples", num_samples)
+    check_num_samples(num_samples)
     check_integer("num_observations", num_observations)
     theta, x = _thin(theta, x, num_observations)
     draw = draw_joint_levels if kind == "hpd" else draw_ranks
@@ -205,7 +206,7 @@ def _central_levels(
     show: bool,
 ) -> Tensor:
     theta, x = check_test_set(posterior, theta, x, chunk_size)
-    check_integer("num_samples", num_samples)
+    check_num_samples(num_samples)
     with seeded(seed):
         ranks = draw_ranks(
             posterior,

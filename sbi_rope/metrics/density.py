@@ -6,11 +6,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import check_batch, check_positive, check_same_length
+from sbi_rope._validation import (
+    check_batch,
+    check_not_nan,
+    check_positive,
+    check_same_length,
+    check_tensor,
+)
+from sbi_rope.errors import InvalidInputError
 from sbi_rope.metrics.calibration import standard_error_of_mean
 from sbi_rope.metrics.calls import CHUNK_SIZE, check_test_set, evaluate_log_probs
 
-__all__ = ["LPPScore", "check_theta_std", "lpp"]
+__all__ = ["LPPScore", "check_scales", "check_theta_std", "lpp"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -23,6 +30,15 @@ class LPPScore:
     """
 
     log_probs: Tensor
+
+    def __post_init__(self) -> None:
+        check_tensor("log_probs", self.log_probs)
+        check_batch("log_probs", self.log_probs, (), finite=False)
+        check_not_nan("log_probs", self.log_probs)
+        if torch.isposinf(self.log_probs).any():
+            raise InvalidInputError(
+                "Expected `log_probs` below infinity; got +Inf, which no density has."
+            )
 
     @property
     def mean(self) -> float:
@@ -53,6 +69,7 @@ class LPPScore:
         Args:
             theta_std: The scales :math:`s`, positive, shape ``(k,)``.
         """
+        check_scales(theta_std)
         shift = theta_std.to(self.log_probs).log().sum()
         return LPPScore(log_probs=self.log_probs + shift)
 
@@ -119,6 +136,11 @@ def lpp(
 def check_theta_std(theta_std: Tensor | None, theta: Tensor) -> None:
     """Check that the scales are None or positive, one for each parameter."""
     if theta_std is not None:
-        check_batch("theta_std", theta_std, ())
+        check_scales(theta_std)
         check_same_length("theta_std", theta_std, "theta.T", theta.T)
-        check_positive("theta_std", float(theta_std.min()))
+
+
+def check_scales(theta_std: Tensor) -> None:
+    """Check that the scales are positive."""
+    check_batch("theta_std", theta_std, ())
+    check_positive("theta_std", float(theta_std.min()))

@@ -7,7 +7,6 @@ from typing import Any
 from torch import Tensor
 
 from sbi_rope._random import seeded
-from sbi_rope._validation import check_integer
 from sbi_rope.metrics.calibration import (
     ACAUCScore,
     CoverageCurve,
@@ -19,6 +18,7 @@ from sbi_rope.metrics.calibration import (
 )
 from sbi_rope.metrics.calls import (
     CHUNK_SIZE,
+    check_num_samples,
     check_test_set,
     draw_ranks,
     evaluate_log_probs,
@@ -93,7 +93,7 @@ def evaluate(
         LogProbUnavailableError: If the posterior has no ``log_prob_batched``.
     """
     theta, x = check_test_set(posterior, theta, x, chunk_size)
-    check_integer("num_samples", num_samples)
+    check_num_samples(num_samples)
     check_theta_std(theta_std, theta)
     with seeded(seed):
         natural = LPPScore(

@@ -7,7 +7,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import check_batch, check_tensor
+from sbi_rope._validation import (
+    check_batch,
+    check_mapping,
+    check_names,
+    check_tensor,
+)
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.plots._figures import PRIOR
 
@@ -18,13 +23,8 @@ if TYPE_CHECKING:
 REACH = 1.0
 # Shares of the samples that contours enclose.
 LEVELS = (0.9, 0.5)
+LARGEST = 1e100  # number that is drawn
 GRID = 100
-
-
-def check_not_empty(name: str, value: Mapping[str, Any]) -> None:
-    """Raise unless there is something to draw."""
-    if not value:
-        raise InvalidInputError(f"Expected `{name}` with at least one entry; got none.")
 
 
 def check_samples(
@@ -33,21 +33,39 @@ def check_samples(
     parameter_names: Sequence[str] | None,
 ) -> tuple[dict[str, Tensor], Tensor | None, list[str]]:
     """Return samples and truth on the CPU in float64, and one name a parameter."""
-    check_not_empty("samples", samples)
-    width = check_tensor("samples", next(iter(samples.values()))).shape[-1:]
+    check_mapping("samples", samples, like="posterior samples")
+    first = check_tensor("samples", next(iter(samples.values())))
+    if first.ndim != 2:
+        raise InvalidInputError(
+            "Expected `samples` of shape (num_samples, k) each; got "
+            f"{tuple(first.shape)}."
+        )
+    width = first.shape[1:]
     draws = {
-        name: check_batch(f"samples[{name!r}]", value, width).detach().cpu().double()
+        name: drawable(
+            f"samples[{name!r}]", check_batch(f"samples[{name!r}]", value, width)
+        )
         for name, value in samples.items()
     }
-    names = list(parameter_names or [f"$\\theta_{j + 1}$" for j in range(width[0])])
-    if len(names) != width[0]:
-        raise InvalidInputError(
-            f"Expected `parameter_names` of length {width[0]}; got {len(names)}."
-        )
+    names = [f"$\\theta_{j + 1}$" for j in range(width[0])]
+    if parameter_names is not None:
+        names = check_names("parameter_names", parameter_names, width[0])
     if theta is None:
         return draws, None, names
-    check_batch("theta", check_tensor("theta", theta).reshape(1, -1), width)
-    return draws, theta.detach().cpu().double().reshape(-1), names
+    row = check_batch("theta", check_tensor("theta", theta).reshape(1, -1), width)
+    return draws, drawable("theta", row)[0], names
+
+
+def drawable(name: str, value: Tensor) -> Tensor:
+    """Return checked numbers on the CPU in float64, if axes can hold them."""
+    value = value.detach().cpu().double()
+    # matplotlib's own arithmetic, such as a margin, overflows or divides by zero.
+    if value.numel() and value.abs().max() > LARGEST:
+        raise InvalidInputError(
+            f"Expected `{name}` with numbers up to {LARGEST:g} to draw; got "
+            f"{float(value.abs().max()):g}. Use other units."
+        )
+    return value
 
 
 def central_interval(values: Tensor) -> Tensor:
@@ -112,7 +130,7 @@ def _width(low: Tensor, high: Tensor) -> Tensor:
 def prior_interval(prior: Any, like: Tensor) -> Tensor:
     """Check samples of the prior and return their central 99 %, shape ``(2, k)``."""
     return central_interval(
-        check_batch("prior", prior, like.shape[1:]).detach().cpu().double()
+        drawable("prior", check_batch("prior", prior, like.shape[1:]))
     )
 
 

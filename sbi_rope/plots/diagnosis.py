@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import check_batch, check_finite, check_tensor
+from sbi_rope._validation import check_batch, check_finite, check_names, check_tensor
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.plots._figures import BLUE, GREY, empty_figure, hide_frame
-from sbi_rope.plots._samples import central_interval, with_margin
+from sbi_rope.plots._samples import central_interval, drawable, with_margin
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,17 +47,15 @@ def implied_parameters(
         ImportError: If matplotlib is not installed.
     """
     check_tensor("theta", theta)
-    theta = check_batch("theta", theta, theta.shape[1:]).detach().cpu().double()
     if theta.ndim != 2:
         raise InvalidInputError(
             f"Expected `theta` of shape (n_s, d); got {tuple(theta.shape)}."
         )
+    theta = drawable("theta", check_batch("theta", theta, theta.shape[1:]))
     size = theta.shape[1]
-    names = parameter_names or [f"theta_{k + 1}" for k in range(size)]
-    if len(names) != size:
-        raise InvalidInputError(
-            f"Expected `parameter_names` to hold {size} names; got {len(names)}."
-        )
+    names = [f"theta_{k + 1}" for k in range(size)]
+    if parameter_names is not None:
+        names = check_names("parameter_names", parameter_names, size)
     weights = {"implied": _checked_weights("implied", implied, len(theta))}
     if unshifted is not None:
         weights["unshifted"] = _checked_weights("unshifted", unshifted, len(theta))
@@ -83,7 +81,7 @@ def _draw(axes: "Axes", theta: Tensor, weights: dict[str, Tensor]) -> None:
     hide_frame(axes)
     axes.set_yticks([])
     low, high = with_margin(*central_interval(theta.unsqueeze(1)))[:, 0].tolist()
-    edges = torch.linspace(low, high, NUM_BINS + 1).tolist()
+    edges = torch.linspace(low, high, NUM_BINS + 1, dtype=theta.dtype).tolist()
     axes.set_xlim(low, high)
     # Nothing is cut off at the sides: the outermost bins hold the tails.
     inside = theta.clamp(low, high).numpy()

@@ -7,6 +7,15 @@ from typing import TYPE_CHECKING, Protocol
 import torch
 from torch import Tensor
 
+from sbi_rope._validation import (
+    check_attributes,
+    check_batch,
+    check_instance,
+    check_integer,
+    check_mapping,
+    check_tensor,
+)
+from sbi_rope.errors import InvalidInputError, shown
 from sbi_rope.metrics import CoverageCurve
 from sbi_rope.plots._figures import (
     BLUE,
@@ -16,7 +25,6 @@ from sbi_rope.plots._figures import (
     line_styles,
     new_figure,
 )
-from sbi_rope.plots._samples import check_not_empty
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -81,9 +89,12 @@ def calibration_curves(curves: Mapping[str, CoverageCurve]) -> "Figure":
 
     Raises:
         InvalidInputError: If there is no curve.
+        InvalidTypeError: If the curves are no dictionary, or one is no curve.
         ImportError: If matplotlib is not installed.
     """
-    check_not_empty("curves", curves)
+    check_mapping("curves", curves, like="coverage curves")
+    for name, curve in curves.items():
+        check_instance(f"curves[{name!r}]", curve, CoverageCurve)
     figure, axes = new_figure(7.4, 4.2)
     count = min(curve.num_observations for curve in curves.values())
     alpha = torch.linspace(0.0, 1.0, 201)
@@ -122,13 +133,14 @@ def finetuning_history(history: FinetuningHistory) -> "Figure":
         The figure.
 
     Raises:
+        InvalidTypeError: If something is no history.
+        InvalidInputError: If the losses are not finite, or ``best_step`` is no step.
         ImportError: If matplotlib is not installed.
     """
+    training, validation = _checked_losses(history)
     figure, axes = new_figure(6.0, 3.6)
     from matplotlib.ticker import MaxNLocator
 
-    training = torch.as_tensor(history.training_loss).cpu()
-    validation = torch.as_tensor(history.validation_loss).cpu()
     axes.plot(training, label="training pairs", color=BLUE, lw=1.2)
     kept = training
     if len(validation) > 0:
@@ -169,10 +181,12 @@ def effective_sample_sizes(coupling: CouplingLike) -> "Figure":
         The figure: a histogram on a logarithmic axis.
 
     Raises:
+        InvalidTypeError: If something is no coupling.
+        InvalidInputError: If it has no simulations, or sizes that are not positive.
         ImportError: If matplotlib is not installed.
     """
+    sizes = _checked_sizes(coupling)
     figure, axes = new_figure(6.0, 3.6)
-    sizes = coupling.effective_sample_size.detach().cpu().double()
     num_simulations = len(coupling.simulated)
     edges = torch.logspace(0, math.log10(max(num_simulations, 2)), 41).tolist()
     median = float(sizes.median())
@@ -190,3 +204,57 @@ def effective_sample_sizes(coupling: CouplingLike) -> "Figure":
     axes.set_ylabel(f"observations (of {len(sizes)})")
     axes.legend(frameon=False, loc="upper left")
     return figure
+
+
+def _checked_losses(history: FinetuningHistory) -> tuple[Tensor, Tensor]:
+    check_attributes(
+        "history",
+        history,
+        ["training_loss", "validation_loss", "best_step"],
+        like="the history of a fine-tuning",
+    )
+    training = _losses("training_loss", history.training_loss)
+    validation = _losses("validation_loss", history.validation_loss)
+    kept = validation if len(validation) else training
+    if not len(kept):
+        raise InvalidInputError(
+            "Expected `history.training_loss` with at least one loss; got none."
+        )
+    check_integer(
+        "history.best_step", history.best_step, minimum=0, maximum=len(kept) - 1
+    )
+    return training, validation
+
+
+def _losses(name: str, values: Sequence[float]) -> Tensor:
+    try:
+        losses = torch.as_tensor(values).detach().cpu()
+    except (TypeError, ValueError, RuntimeError):
+        losses = torch.empty((), dtype=torch.bool)
+    if losses.ndim != 1 or losses.is_complex() or losses.dtype == torch.bool:
+        raise InvalidInputError(
+            f"Expected `history.{name}` to be a list of numbers; got {shown(values)}."
+        )
+    return check_batch(f"history.{name}", losses, (), allow_empty=True)
+
+
+def _checked_sizes(coupling: CouplingLike) -> Tensor:
+    check_attributes(
+        "coupling",
+        coupling,
+        ["simulated", "effective_sample_size"],
+        like="a coupling of observations to simulations",
+    )
+    name = "coupling.effective_sample_size"
+    sizes = check_batch(name, coupling.effective_sample_size, ())
+    if not (sizes > 0).all():
+        raise InvalidInputError(
+            f"Expected `{name}` to be positive; got {float(sizes.min())}."
+        )
+    simulated = check_tensor("coupling.simulated", coupling.simulated)
+    if not simulated.ndim or not len(simulated):
+        raise InvalidInputError(
+            "Expected `coupling.simulated` of shape (n_s, l) with n_s >= 1; got "
+            f"{tuple(simulated.shape)}."
+        )
+    return sizes.detach().cpu().double()

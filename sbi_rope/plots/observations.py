@@ -6,9 +6,15 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import check_batch, check_same_length, check_tensor
+from sbi_rope._validation import (
+    check_batch,
+    check_names,
+    check_same_length,
+    check_tensor,
+)
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.plots._figures import BLUE, VERMILLION, empty_figure, hide_frame
+from sbi_rope.plots._samples import drawable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,23 +56,40 @@ def real_and_simulated(
             names is not that of the statistics.
     """
     x_o = check_tensor("x_o", x_o)
-    x_o = check_batch("x_o", x_o, x_o.shape[1:]).detach().cpu()
-    x_s = check_batch("x_s", x_s, x_o.shape[1:]).detach().cpu()
+    check_batch("x_o", x_o, x_o.shape[1:])
+    check_batch("x_s", x_s, x_o.shape[1:])
     check_same_length("x_o", x_o, "x_s", x_s)
-    if x_o.ndim == 2 and names:
-        if len(names) != x_o.shape[1]:
-            raise InvalidInputError(
-                f"Expected {x_o.shape[1]} `names`, one a statistic; got {len(names)}."
-            )
+    check_names("labels", labels, 2)
+    names = check_names("names", names)
+    if names and (x_o.ndim != 2 or len(names) != x_o.shape[1]):
+        raise InvalidInputError(
+            f"Expected as many `names` as statistics in `x_o`; got {len(names)} for "
+            f"`x_o` of shape {tuple(x_o.shape)}."
+        )
+    drawn = slice(None if names else NUM_SHOWN)
+    x_o, x_s = drawable("x_o", x_o[drawn]), drawable("x_s", x_s[drawn])
+    if names:
         return _histograms(x_o, x_s, names, labels)
     if x_o.ndim == 2:
         return _series(x_o, x_s, labels)
     if x_o.ndim == 4 and x_o.shape[1] == 3:
+        _check_brightness("x_o", x_o)
+        _check_brightness("x_s", x_s)
         return _images(x_o, x_s, labels)
     raise InvalidInputError(
         "Expected `x_o` of shape (n, d), (n, length) or (n, 3, height, width); got "
         f"{tuple(x_o.shape)}."
     )
+
+
+def _check_brightness(name: str, images: Tensor) -> None:
+    # Noise may leave [0, 1], and is cut off. Levels of 8 bit would all be white.
+    if images.min() < -1 or images.max() > 2:
+        raise InvalidInputError(
+            f"Expected images `{name}` with values in [0, 1]; got "
+            f"{float(images.min()):g} to {float(images.max()):g}. Divide levels of 8 "
+            "bit by 255."
+        )
 
 
 def _histograms(

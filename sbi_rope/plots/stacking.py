@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 
+from sbi_rope._validation import check_attributes
 from sbi_rope.metrics import CoverageCurve
 from sbi_rope.plots._figures import BLUE, GREY, ORANGE, SKY, empty_figure, hide_frame
 
@@ -82,8 +83,11 @@ def stacking_report(report: StackingReportLike) -> "Figure":
         The figure.
 
     Raises:
+        InvalidTypeError: If something is no report.
         ImportError: If matplotlib is not installed.
     """
+    read = ["learning_curve", "family_weights", "coverage", "comparable_score"]
+    check_attributes("report", report, [*read, "as_rows"], like="the report of a stack")
     curve = report.learning_curve
     widths = [1.7, 1.2, 1.0] if curve is None else [1.7, 1.2, 1.0, 1.0]
     figure = empty_figure(11.0 if curve is None else 14.0, 3.8)

@@ -10,10 +10,12 @@ from torch import Tensor
 from sbi_rope._validation import (
     check_batch,
     check_finite,
+    check_integer,
+    check_names,
     check_same_length,
     check_tensor,
 )
-from sbi_rope.errors import InvalidInputError
+from sbi_rope.errors import InvalidInputError, shown
 from sbi_rope.plots._figures import (
     BLUE,
     PRIOR,
@@ -27,6 +29,7 @@ from sbi_rope.plots._samples import (
     check_samples,
     draw_contours,
     draw_marginal,
+    drawable,
     label_with_share,
     prior_interval,
     robust_limits,
@@ -117,17 +120,15 @@ def overview(
     before, after, simulated, weights = _check_embeddings(
         before, after, simulated, weights
     )
-    if not 0 <= index < len(before):
-        raise InvalidInputError(
-            f"Expected `index` from 0 to {len(before) - 1}, a row of `before`; got "
-            f"{index}."
-        )
+    check_integer("index", index, minimum=0, maximum=len(before) - 1)
+    check_tensor("theta", theta)
+    check_names("parameter_names", parameter_names)
     draws, truth, names = check_samples(samples, theta, parameter_names)
     assert truth is not None
-    shown = _check_parameters(parameters, len(names))
+    chosen = _check_parameters(parameters, len(names))
     interval = None
     if prior is not None:
-        interval = prior_interval(prior, truth.unsqueeze(0))[:, shown]
+        interval = prior_interval(prior, truth.unsqueeze(0))[:, chosen]
 
     figure = empty_figure(12.0, 4.0)
     # Panels of one size, whatever the legends hold.
@@ -150,9 +151,9 @@ def overview(
     _draw_coupling(couple, plane, weights, index)
     _draw_posteriors(
         mix,
-        {name: value[:, shown] for name, value in draws.items()},
-        truth[shown],
-        [names[j] for j in shown],
+        {name: value[:, chosen] for name, value in draws.items()},
+        truth[chosen],
+        [names[j] for j in chosen],
         interval,
     )
     return figure
@@ -349,18 +350,27 @@ def _check_embeddings(
             "Expected `weights` of at least 0, not all of them 0; got "
             f"{float(weights.min()):.3g} to {float(weights.max()):.3g}."
         )
-    before, after, simulated, weights = (
-        value.detach().cpu().double() for value in (before, after, simulated, weights)
+    return (
+        drawable("before", before),
+        drawable("after", after),
+        drawable("simulated", simulated),
+        weights.detach().cpu().double(),
     )
-    return before, after, simulated, weights
 
 
 def _check_parameters(parameters: Sequence[int] | None, k: int) -> list[int]:
-    shown = list(range(min(k, 2)) if parameters is None else parameters)
-    valid = all(0 <= j < k for j in shown) and len(set(shown)) == len(shown)
-    if not valid or len(shown) not in (1, 2):
+    if parameters is None:
+        return list(range(min(k, 2)))
+    is_list = isinstance(parameters, Sequence) and not isinstance(parameters, str)
+    if not is_list or len(parameters) not in (1, 2):
         raise InvalidInputError(
             f"Expected `parameters` to be one or two different indices from 0 to "
-            f"{k - 1}; got {tuple(shown)}."
+            f"{k - 1}; got {shown(parameters)}."
         )
-    return shown
+    for j in parameters:
+        check_integer("parameters", j, minimum=0, maximum=k - 1)
+    if len({*parameters}) != len(parameters):
+        raise InvalidInputError(
+            f"Expected different `parameters`; got {shown(parameters)}."
+        )
+    return list(parameters)

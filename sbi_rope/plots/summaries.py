@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Protocol
 
+from sbi_rope._validation import check_attributes
+from sbi_rope.errors import InvalidInputError
 from sbi_rope.plots._figures import BLUE, GREY, empty_figure, hide_frame
 
 if TYPE_CHECKING:
@@ -101,8 +103,18 @@ def discrepancy(report: DiscrepancyReportLike) -> "Figure":
         The figure.
 
     Raises:
+        InvalidTypeError: If something is no report.
+        InvalidInputError: If the report is of no summary.
         ImportError: If matplotlib is not installed.
     """
+    check_attributes(
+        "report",
+        report,
+        ["summaries", "num_pairs", "constant"],
+        like="what `DiscrepancyNPE.report()` returns",
+    )
+    if not report.summaries:
+        raise InvalidInputError("Expected `report` of at least one summary; got none.")
     shown = list(report.summaries[:MAX_SUMMARIES])
     figure = empty_figure(10.0, 1.4 + 0.3 * len(shown))
     panels = figure.subplots(1, 3, width_ratios=[1.3, 1.7, 1.0], sharey=True)

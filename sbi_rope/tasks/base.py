@@ -2,7 +2,6 @@ r"""What a task is: a prior, a simulator, and labelled real observations."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from numbers import Integral
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar
 
@@ -13,11 +12,13 @@ from torch.distributions import Distribution
 from sbi_rope._validation import (
     check_batch,
     check_choice,
+    check_in_support,
     check_integer,
+    check_path,
     check_positive,
     check_unit_interval,
 )
-from sbi_rope.errors import InvalidInputError, InvalidTypeError
+from sbi_rope.errors import InvalidInputError, InvalidTypeError, shown
 from sbi_rope.tasks.settings import PaperSettings
 from sbi_rope.tasks.splits import MAX_SEED, DrawnPairs, Keep, Part, RecordedPairs
 from sbi_rope.tasks.variants import (
@@ -27,12 +28,16 @@ from sbi_rope.tasks.variants import (
     with_label_noise,
 )
 
-__all__ = ["Task", "check_theta"]
+__all__ = ["Task", "check_parameters", "check_theta"]
 
 Simulator = Callable[[Tensor], Tensor]
 T = TypeVar("T")
 
 LABEL_NOISE = 0.2
+# Products of parameters that are no larger stay finite in float32.
+LARGEST_THETA = 1e15
+# No memory holds more pairs: a slip of the keyboard must not draw for days.
+MAX_PAIRS = 10**9
 
 
 class Task(ABC):
@@ -117,7 +122,7 @@ class Task(ABC):
         if variant is not None:
             check_choice("variant", variant, list(self.variants))
         self.variant = variant
-        self.root = _checked_root(root)
+        self.root = check_path("root", root, optional=True)
         self.label_noise = self._option(
             "label_noise",
             label_noise,
@@ -208,7 +213,7 @@ class Task(ABC):
         if self.variant == "noisy_labels":
             with torch.device("cpu"):
                 std = self.label_noise * self.prior_std
-                theta = with_label_noise(theta, std, self.get_prior(), seed=seed)
+                theta = with_label_noise(theta, std, self.get_prior(), seed=int(seed))
         return theta, x
 
     def get_test_set(self, n: int, *, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -225,8 +230,7 @@ class Task(ABC):
         in a warning. Arguments and result are those of :meth:`get_calibration_set`;
         no parameter is shared with the two sets.
         """
-        check_integer("n", n)
-        _check_seed(seed)
+        n, seed = _checked_size(n), _checked_seed(seed)
         # Whatever torch's default device: every machine has the same sets.
         with torch.device("cpu"):
             return self._simulated_process().take(n, seed=seed, part="simulation")
@@ -249,7 +253,8 @@ class Task(ABC):
             part: ``"calibration"`` or ``"test"``.
             seed: Seed of the set; variants keep other pairs under other seeds.
         """
-        _check_seed(seed)
+        check_choice("part", part, ("calibration", "test"))
+        seed = _checked_seed(seed)
         with torch.device("cpu"):
             process = self._process_of(part)
             if isinstance(process, DrawnPairs):
@@ -257,8 +262,7 @@ class Task(ABC):
             return len(process.rows_kept(seed=seed, part=part, keep=self._keep(part)))
 
     def _labelled_set(self, n: int, *, seed: int, part: Part) -> tuple[Tensor, Tensor]:
-        check_integer("n", n)
-        _check_seed(seed)
+        n, seed = _checked_size(n), _checked_seed(seed)
         with torch.device("cpu"):
             process = self._process_of(part)
             return process.take(n, seed=seed, part=part, keep=self._keep(part))
@@ -294,12 +298,12 @@ class Task(ABC):
         if variant is not None and self.variant != variant:
             raise InvalidInputError(
                 f"`{name}` has no effect without `variant={variant!r}`; got both "
-                f"`{name}={value!r}` and `variant={self.variant!r}`."
+                f"`{name}={shown(value)}` and `variant={self.variant!r}`."
             )
         if variant is None and self.variant == "well_specified":
             raise InvalidInputError(
                 f"`{name}` has no effect with `variant='well_specified'`, where the "
-                f"real process is the simulator; got `{name}={value!r}`."
+                f"real process is the simulator; got `{name}={shown(value)}`."
             )
         return value
 
@@ -310,42 +314,52 @@ class Task(ABC):
         return f"{type(self).__name__}({', '.join(options)})"
 
 
-def check_theta(theta: Any, theta_dim: int) -> Tensor:
+def check_theta(theta: Any, theta_dim: int, *, finite: bool = True) -> Tensor:
     """Return ``theta`` if it is a batch of floating-point parameter vectors.
 
     Args:
         theta: What a simulator was called with; an empty batch is one too.
         theta_dim: Number of parameters.
+        finite: Whether to look at the numbers as well. Functions that torch
+            transforms (``torch.func``) must not.
 
     Raises:
         InvalidTypeError: If ``theta`` is not a tensor of floating-point numbers.
-        InvalidInputError: If its shape is not ``(n, theta_dim)``, or it is not finite.
+        InvalidInputError: If its shape is not ``(n, theta_dim)``, it is not finite, or
+            it is far larger than parameters are.
     """
-    theta = check_batch("theta", theta, (theta_dim,), allow_empty=True)
+    theta = check_batch("theta", theta, (theta_dim,), finite=finite, allow_empty=True)
     if not theta.is_floating_point():
         raise InvalidTypeError(
             f"Expected `theta` to hold floating-point numbers; got {theta.dtype}. "
             "Convert it with `theta.float()`."
         )
+    if finite and theta.numel() and theta.abs().max() > LARGEST_THETA:
+        raise InvalidInputError(
+            f"Expected `theta` with numbers up to {LARGEST_THETA:g}; got "
+            f"{float(theta.abs().max()):g}. Check its units."
+        )
     return theta
 
 
-def _checked_root(root: Any) -> Path | None:
-    if root is None:
-        return None
-    if not isinstance(root, str | Path):
-        raise InvalidTypeError(
-            f"Expected `root` to be a path or None; got {type(root).__name__}."
-        )
-    try:
-        return Path(root).expanduser()
-    except RuntimeError as error:  # no such user
-        raise InvalidInputError(f"Expected `root` to be a path; {error}") from error
+def check_parameters(theta: Any, prior: Distribution) -> Tensor:
+    """Return ``theta`` if it is a batch of parameters that the prior supports.
+
+    Args:
+        theta: What was passed.
+        prior: A prior over vectors.
+    """
+    theta = check_theta(theta, prior.event_shape[0])
+    check_in_support("theta", theta, prior)
+    return theta
 
 
-def _check_seed(seed: Any) -> None:
-    is_integer = isinstance(seed, Integral) and not isinstance(seed, bool)
-    if not is_integer or not 0 <= int(seed) < MAX_SEED:
-        raise InvalidInputError(
-            f"Expected `seed` to be an integer from 0 to {MAX_SEED - 1}; got {seed!r}."
-        )
+def _checked_size(n: Any) -> int:
+    check_integer("n", n, maximum=MAX_PAIRS)
+    return int(n)
+
+
+def _checked_seed(seed: Any) -> int:
+    # An int of Python: those of NumPy overflow in the arithmetic of streams.
+    check_integer("seed", seed, minimum=0, maximum=MAX_SEED - 1)
+    return int(seed)

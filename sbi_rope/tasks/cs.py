@@ -10,9 +10,9 @@ import torch
 from sbi.utils import BoxUniform
 from torch import Tensor, nn
 
-from sbi_rope._validation import check_unit_interval
+from sbi_rope._validation import check_instance, check_unit_interval
 from sbi_rope.errors import InvalidInputError
-from sbi_rope.tasks.base import Task, check_theta
+from sbi_rope.tasks.base import Task, check_parameters, check_theta
 from sbi_rope.tasks.distributions import box
 from sbi_rope.tasks.networks import fully_connected
 from sbi_rope.tasks.settings import STATISTICS_SETTINGS
@@ -70,6 +70,7 @@ class CancerStromaSimulator:
     def __post_init__(self) -> None:
         check_unit_interval("necrosis_probability", self.necrosis_probability)
         check_unit_interval("necrosis_radius", self.necrosis_radius)
+        check_instance("batched", self.batched, bool, optional=True)
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, 3)``, to shape ``(n, 4)``."""
@@ -274,7 +275,8 @@ class CancerStroma(Task):
 
     def prior_quantiles(self, theta: Tensor) -> Tensor:
         """Return relative positions in the box, shape ``(n, 3)``."""
-        return self.get_prior().base_dist.cdf(theta)
+        prior = self.get_prior()
+        return prior.base_dist.cdf(check_parameters(theta, prior))
 
     def get_simulator(self) -> CancerStromaSimulator:
         """Return the simulator without necrosis."""
@@ -282,6 +284,7 @@ class CancerStroma(Task):
 
     def get_embedding_net(self, *, light: bool = False) -> nn.Module:
         """Return the paper's network, which is light already; nine outputs."""
+        check_instance("light", light, bool)
         return fully_connected(len(STATISTICS), (12, 48, 48, 36, 9))
 
     def _real_process(self, part: Part) -> DrawnPairs:

@@ -8,7 +8,10 @@ from sbi.utils import BoxUniform
 from torch import Size, Tensor
 from torch.distributions import Distribution, constraints
 
-__all__ = ["Arcsine", "UniformDistance", "box"]
+from sbi_rope._validation import check_finite, check_tensor
+from sbi_rope.errors import InvalidInputError
+
+__all__ = ["Arcsine", "UniformDistance", "box", "check_size"]
 
 # Nearest relative distance to its ends at which an arcsine density is evaluated.
 ARCSINE_EDGE = 2.0**-23
@@ -36,6 +39,17 @@ def box(
     if closed:
         upper = upper.nextafter(torch.full_like(upper, torch.inf))
     return BoxUniform(lower, upper)
+
+
+def check_size(name: str, value: Any) -> Tensor:
+    """Return the size of a support if it is a tensor of finite, positive numbers."""
+    check_finite(name, check_tensor(name, value))
+    if not value.is_floating_point() or not (value > 0).all():
+        raise InvalidInputError(
+            f"Expected `{name}` to hold positive floating-point numbers; got "
+            f"{value.dtype}, {value.min().item() if value.numel() else None} at least."
+        )
+    return value
 
 
 class Arcsine(Distribution):
@@ -71,7 +85,7 @@ class Arcsine(Distribution):
     has_rsample = True
 
     def __init__(self, width: Tensor, validate_args: bool | None = None) -> None:  # noqa: FBT001
-        self.width = width
+        self.width = check_size("width", width)
         super().__init__(batch_shape=width.shape, validate_args=validate_args)
 
     @property
@@ -154,7 +168,7 @@ class UniformDistance(Distribution):
     has_rsample = True
 
     def __init__(self, width: Tensor, validate_args: bool | None = None) -> None:  # noqa: FBT001
-        self.width = width
+        self.width = check_size("width", width)
         super().__init__(batch_shape=width.shape, validate_args=validate_args)
 
     @property

@@ -9,15 +9,15 @@ from torch import Tensor
 
 from sbi_rope._validation import check_choice, check_in_support, check_instance
 from sbi_rope.errors import InvalidInputError
-from sbi_rope.tasks.base import Task
+from sbi_rope.tasks.base import Task, check_parameters
 from sbi_rope.tasks.chambers import (
+    check_complete,
     check_download,
     find_file,
     find_images,
     read_columns,
     read_images,
     read_names,
-    warn_if_incomplete,
 )
 from sbi_rope.tasks.distributions import Arcsine, box
 from sbi_rope.tasks.light_tunnel_models import (
@@ -41,7 +41,6 @@ INPUTS = ("red", "green", "blue", "pol_1", "pol_2")
 IMAGE_SIZES = (64, 100)
 UNIFORM = "uniform_ap_1.8_iso_500.0_ss_0.005"
 BETA_BINOMIAL = "betab_ap_1.8_iso_500.0_ss_0.005"
-NUM_IMAGES = 10_000  # of the uniform experiment
 # The experiments of the variants that choose their own, calibration and test.
 OWN_EXPERIMENTS = {
     "misspecified_prior": (BETA_BINOMIAL, BETA_BINOMIAL),
@@ -166,6 +165,8 @@ class LightTunnel(Task):
         super().__init__(variant=variant, root=root, label_noise=label_noise)
         check_choice("image_size", image_size, IMAGE_SIZES)
         check_instance("stand_in", stand_in, bool)
+        check_instance("dequantise", dequantise, bool)
+        check_instance("experiment", experiment, str, optional=True)
         self.stand_in = stand_in or variant == "synthetic"
         if experiment is not None and (self.stand_in or variant in OWN_EXPERIMENTS):
             raise InvalidInputError(
@@ -177,8 +178,8 @@ class LightTunnel(Task):
                 f"`sensor_noise` has no effect on recorded images; got {sensor_noise=} "
                 "without `stand_in=True` or `variant='synthetic'`."
             )
-        self.x_shape = (3, image_size, image_size)
-        self.image_size = image_size
+        self.image_size = int(image_size)
+        self.x_shape = (3, self.image_size, self.image_size)
         self.dequantise = dequantise
         self.download = download
         self.experiment = self._option("experiment", experiment, UNIFORM)
@@ -198,6 +199,7 @@ class LightTunnel(Task):
 
     def prior_quantiles(self, theta: Tensor) -> Tensor:
         """Return the distribution functions of colours and alpha, ``(n, 4)``."""
+        theta = check_parameters(theta, self.get_prior())
         colours = _colour_prior().base_dist.cdf(theta[:, :3])
         return torch.cat([colours, _alpha_prior().cdf(theta[:, 3:])], dim=1)
 
@@ -258,8 +260,7 @@ class LightTunnel(Task):
         theta = torch.cat([colour, malus(angles)], dim=1).float()
         check_in_support(f"theta of {table}", theta, self.get_prior())
         names = read_names(path, "image_file")
-        if path.stem == UNIFORM:
-            warn_if_incomplete(path, len(names), NUM_IMAGES, what="images")
+        check_complete(path, len(names), dataset=DATASET)
         return RecordedPairs(
             theta=theta, read_x=partial(self._read_x, folder, names, part)
         )

@@ -6,7 +6,11 @@ import torch
 from torch import Tensor
 from torch.distributions import Beta, Binomial
 
-from sbi_rope._validation import check_integer, check_unit_interval
+from sbi_rope._validation import (
+    check_instance,
+    check_integer,
+    check_unit_interval,
+)
 from sbi_rope.tasks.base import check_theta
 
 __all__ = [
@@ -19,6 +23,7 @@ __all__ = [
 ]
 
 MAX_LEVEL = 255  # of an 8-bit channel, and of a colour of the source
+MAX_SIZE = 10_000  # pixels along a side; a larger image takes more than a gigabyte
 RADIUS = 0.22  # of the light source, as a share of the image
 
 # Constants of model F3 as published with the package causalchamber, fitted by its
@@ -70,7 +75,8 @@ class HexagonSimulator:
     dequantise: bool = False
 
     def __post_init__(self) -> None:
-        check_integer("image_size", self.image_size)
+        check_integer("image_size", self.image_size, maximum=MAX_SIZE)
+        check_instance("dequantise", self.dequantise, bool)
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, 4)``, to ``(n, 3, size, size)``."""
@@ -90,6 +96,7 @@ class HexagonSimulator:
         Returns:
             Images, shape ``(n, 3, size, size)``, differentiable in ``theta``.
         """
+        theta = check_theta(theta, 4, finite=False)
         return _masked(theta[:, 3:] * theta[:, :3] / MAX_LEVEL, self.image_size)
 
 
@@ -131,7 +138,8 @@ class CameraSimulator:
     sensor_noise: float = CAMERA_NOISE
 
     def __post_init__(self) -> None:
-        check_integer("image_size", self.image_size)
+        check_integer("image_size", self.image_size, maximum=MAX_SIZE)
+        check_instance("dequantise", self.dequantise, bool)
         check_unit_interval("sensor_noise", self.sensor_noise)
 
     def __call__(self, theta: Tensor) -> Tensor:
@@ -151,6 +159,7 @@ class CameraSimulator:
             Images, shape ``(n, 3, size, size)``, differentiable in ``theta`` where
             they are not over-exposed.
         """
+        theta = check_theta(theta, 4, finite=False)
         colour, alpha = theta[:, :3] / MAX_LEVEL, theta[:, 3:]
         aligned, crossed = theta.new_tensor(ALIGNED), theta.new_tensor(CROSSED)
         response = theta.new_tensor(RESPONSE).T * theta.new_tensor(WHITE_BALANCE)

@@ -3,8 +3,9 @@ r"""The embedding networks of the light tunnel's images."""
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._validation import check_batch, check_integer
-from sbi_rope.tasks.networks import fully_connected
+from sbi_rope._validation import check_batch, check_instance, check_integer
+from sbi_rope.tasks.light_tunnel_models import MAX_SIZE
+from sbi_rope.tasks.networks import MAX_WIDTH, fully_connected
 
 __all__ = ["ImageEmbedding"]
 
@@ -49,10 +50,14 @@ class ImageEmbedding(nn.Module):
         self, *, image_size: int = 100, output_dim: int = 20, light: bool = False
     ) -> None:
         super().__init__()
+        check_instance("light", light, bool)
         check_integer(
-            "image_size", image_size, minimum=MIN_SIZE_LIGHT if light else MIN_SIZE
+            "image_size",
+            image_size,
+            minimum=MIN_SIZE_LIGHT if light else MIN_SIZE,
+            maximum=MAX_SIZE,
         )
-        check_integer("output_dim", output_dim)
+        check_integer("output_dim", output_dim, maximum=MAX_WIDTH)
         self.image_size = image_size
         self.features = (
             _means(image_size // MIN_SIZE_LIGHT) if light else _convolutions()

@@ -9,13 +9,15 @@ from torch import Tensor, nn
 
 from sbi_rope._validation import (
     check_in_support,
+    check_instance,
     check_not_negative,
     check_positive,
 )
 from sbi_rope.errors import InvalidInputError
-from sbi_rope.tasks.base import Task, check_theta
+from sbi_rope.tasks.base import Task, check_parameters, check_theta
 from sbi_rope.tasks.chambers import (
     CUT_FILE,
+    check_complete,
     check_download,
     find_file,
     read_columns,
@@ -109,8 +111,7 @@ class LightTunnelSimulator:
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, 4)``, to shape ``(n, 7)``."""
-        theta = check_theta(theta, 4)
-        readings = self.readings(theta)
+        readings = self.readings(check_theta(theta, 4))
         light, current = readings[:, :6], readings[:, 6:]
         light = light * (1 + self.relative_noise * torch.randn_like(light))
         current = current + self.current_noise_std * torch.randn_like(current)
@@ -126,6 +127,7 @@ class LightTunnelSimulator:
         Returns:
             Readings, shape ``(n, 7)``, differentiable in ``theta``.
         """
+        theta = check_theta(theta, 4, finite=False)
         colour, angle = theta[:, :3], theta[:, 3:]
         response = theta.new_tensor(RESPONSE).T * theta.new_tensor(GAIN)
         aligned, crossed = theta.new_tensor(ALIGNED), theta.new_tensor(CROSSED)
@@ -229,6 +231,7 @@ class LightTunnelSensors(Task):
         super().__init__(variant=variant, root=root, label_noise=label_noise)
         check_positive("relative_noise", relative_noise)
         check_positive("current_noise_std", current_noise_std)
+        check_instance("experiment", experiment, str, optional=True)
         if experiment is not None and variant in OWN_EXPERIMENTS:
             raise InvalidInputError(
                 f"`experiment` has no effect with `variant={variant!r}`, which chooses "
@@ -252,6 +255,7 @@ class LightTunnelSensors(Task):
 
     def prior_quantiles(self, theta: Tensor) -> Tensor:
         """Return the distribution functions of colours and angle, ``(n, 4)``."""
+        theta = check_parameters(theta, self.get_prior())
         colours = self._colour_prior().base_dist.cdf(theta[:, :3])
         prior = self._angle_prior()
         angle = prior if isinstance(prior, UniformDistance) else prior.base_dist
@@ -275,6 +279,7 @@ class LightTunnelSensors(Task):
 
     def get_embedding_net(self, *, light: bool = False) -> nn.Module:
         """Return a network with three hidden layers of 64 and eight outputs."""
+        check_instance("light", light, bool)
         return fully_connected(len(OUTPUTS), (64, 64, 64, 8))
 
     def _recorded_files(self) -> tuple[Path, ...]:
@@ -297,6 +302,7 @@ class LightTunnelSensors(Task):
         file = Path(DATASET, f"{experiment}.csv")
         path = find_file(file, root=self.root, download=self.download)
         values = read_columns(path, INPUTS + OUTPUTS)
+        check_complete(path, len(values), dataset=DATASET)
         colour, positions, readings = values.split([3, 2, len(OUTPUTS)], dim=1)
         if (readings < 0).any():
             raise InvalidInputError(

@@ -2,14 +2,21 @@ r"""The linear-Gaussian task: every posterior is known."""
 
 import math
 from dataclasses import dataclass
-from numbers import Real
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 from torch.distributions import MultivariateNormal, Normal
 
-from sbi_rope._validation import check_batch, check_integer, check_positive
+from sbi_rope._validation import (
+    check_batch,
+    check_device,
+    check_instance,
+    check_integer,
+    check_number,
+    check_positive,
+    check_same_length,
+)
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.base import Task, check_theta
 from sbi_rope.tasks.networks import fully_connected
@@ -52,14 +59,22 @@ class LinearGaussianSimulator:
     def __post_init__(self) -> None:
         check_integer("dim", self.dim)
         check_positive("noise_std", self.noise_std)
+        _check_gain_and_offset(self.scale, self.shift)
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, d)``, to the same shape."""
         theta = check_theta(theta, self.dim)
-        return self.observe(theta, torch.randn_like(theta))
+        return self._observe(theta, torch.randn_like(theta))
 
     def observe(self, theta: Tensor, noise: Tensor) -> Tensor:
         r"""Return observations for given noise :math:`\varepsilon`, differentiable."""
+        theta = check_theta(theta, self.dim, finite=False)
+        check_batch("noise", noise, (self.dim,), finite=False, allow_empty=True)
+        check_same_length("theta", theta, "noise", noise)
+        check_device("noise", noise, theta.device, where="`theta`")
+        return self._observe(theta, noise)
+
+    def _observe(self, theta: Tensor, noise: Tensor) -> Tensor:
         clean = theta @ self.matrix(theta).T
         return self.scale * (clean + self.noise_std * noise) + self.shift
 
@@ -148,8 +163,7 @@ class LinearGaussian(Task):
         exact = variant == "well_specified"
         self.scale = self._option("scale", scale, 1.0 if exact else 1.4)
         self.shift = self._option("shift", shift, 0.0 if exact else 0.7)
-        _check_finite("scale", self.scale, zero=False)
-        _check_finite("shift", self.shift)
+        _check_gain_and_offset(self.scale, self.shift)
 
     def get_prior(self) -> MultivariateNormal:
         """Return the standard normal prior."""
@@ -158,6 +172,7 @@ class LinearGaussian(Task):
 
     def prior_quantiles(self, theta: Tensor) -> Tensor:
         """Return the normal distribution function of each entry, ``(n, d)``."""
+        theta = check_theta(theta, self.dim)
         return Normal(theta.new_zeros(()), theta.new_ones(())).cdf(theta)
 
     def get_simulator(self) -> LinearGaussianSimulator:
@@ -166,6 +181,7 @@ class LinearGaussian(Task):
 
     def get_embedding_net(self, *, light: bool = False) -> nn.Module:
         """Return a network with two hidden layers of 64 and 2 d outputs."""
+        check_instance("light", light, bool)
         return fully_connected(self.dim, (64, 64, 2 * self.dim))
 
     def get_true_posterior(self, x_o: Tensor) -> MultivariateNormal:
@@ -195,12 +211,10 @@ class LinearGaussian(Task):
         )
 
 
-def _check_finite(name: str, value: float, *, zero: bool = True) -> None:
-    if (
-        isinstance(value, bool)
-        or not isinstance(value, Real)
-        or not math.isfinite(value)
-        or (value == 0 and not zero)
-    ):
-        expected = "a finite number" if zero else "a finite number other than 0"
-        raise InvalidInputError(f"Expected `{name}` to be {expected}; got {value!r}.")
+def _check_gain_and_offset(scale: float, shift: float) -> None:
+    check_number("scale", scale)
+    check_number("shift", shift)
+    if scale == 0:
+        raise InvalidInputError(
+            f"Expected `scale` to be a finite number other than 0; got {scale!r}."
+        )

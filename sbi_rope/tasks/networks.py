@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from sbi_rope._validation import check_batch, check_integer
-from sbi_rope.errors import InvalidInputError
+from sbi_rope.errors import InvalidInputError, InvalidTypeError, shown
 
 __all__ = ["SeriesEmbedding", "fully_connected", "light_series_embedding"]
 
@@ -14,6 +14,7 @@ CHANNELS = (1, 16, 64, 128, 128, 128, 128, 128)
 STRIDES = (1, 2, 1, 2, 1, 2, 1)
 POOLS = ((3, 1), (3, 1), (3, 1))
 HEAD = (512, 128, 32)
+MAX_WIDTH = 10**6  # of a layer; a wider one takes gigabytes
 
 
 class SeriesEmbedding(nn.Module):
@@ -57,10 +58,11 @@ class SeriesEmbedding(nn.Module):
         decimation: int = 1,
     ) -> None:
         super().__init__()
-        check_integer("num_steps", num_steps)
-        check_integer("output_dim", output_dim)
-        check_integer("padding", padding)
+        check_integer("num_steps", num_steps, maximum=MAX_WIDTH)
+        check_integer("output_dim", output_dim, maximum=MAX_WIDTH)
+        check_integer("padding", padding, maximum=MAX_WIDTH)
         check_integer("decimation", decimation)
+        _check_pools(pools)
         self.num_steps = num_steps
         self.decimation = decimation
         self.features = _convolutions(padding, pools)
@@ -100,6 +102,14 @@ def fully_connected(input_dim: int, widths: Sequence[int]) -> nn.Sequential:
           (2): Linear(in_features=64, out_features=8, bias=True)
         )
     """
+    check_integer("input_dim", input_dim, maximum=MAX_WIDTH)
+    if not isinstance(widths, Sequence) or isinstance(widths, str) or not widths:
+        raise InvalidTypeError(
+            f"Expected `widths` to be a list of at least one integer; got "
+            f"{shown(widths)}."
+        )
+    for width in widths:
+        check_integer("widths", width, maximum=MAX_WIDTH)
     layers: list[nn.Module] = []
     for before, after in zip((input_dim, *widths), widths, strict=False):
         layers += [nn.Linear(before, after), nn.ReLU()]
@@ -121,8 +131,8 @@ def light_series_embedding(*, num_steps: int, output_dim: int) -> nn.Sequential:
         >>> net(torch.zeros(5, 50)).shape
         torch.Size([5, 10])
     """
-    check_integer("num_steps", num_steps)
-    check_integer("output_dim", output_dim)
+    check_integer("num_steps", num_steps, maximum=MAX_WIDTH)
+    check_integer("output_dim", output_dim, maximum=MAX_WIDTH)
     layers: list[nn.Module] = [nn.Unflatten(1, (1, num_steps))]
     length = num_steps
     for before, after in ((1, 16), (16, 32), (32, 32)):
@@ -131,6 +141,24 @@ def light_series_embedding(*, num_steps: int, output_dim: int) -> nn.Sequential:
     return nn.Sequential(
         *layers, nn.Flatten(), fully_connected(32 * length, (64, output_dim))
     )
+
+
+def _check_pools(pools: Sequence[tuple[int, int]]) -> None:
+    try:
+        pairs = [(size, step) for size, step in pools]
+    except (TypeError, ValueError) as error:
+        raise InvalidTypeError(
+            f"Expected `pools` to be pairs of a number of neighbours and a stride; got "
+            f"{shown(pools)}."
+        ) from error
+    if len(pairs) != len(POOLS):
+        raise InvalidInputError(
+            f"Expected `pools` to be {len(POOLS)} pairs, one for each mean; got "
+            f"{len(pairs)}."
+        )
+    for size, step in pairs:
+        check_integer("the numbers of neighbours in pools", size)
+        check_integer("the strides in pools", step)
 
 
 def _convolutions(padding: int, pools: Sequence[tuple[int, int]]) -> nn.Sequential:

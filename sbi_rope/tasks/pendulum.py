@@ -9,11 +9,15 @@ from sbi.utils import BoxUniform
 from torch import Tensor, nn
 
 from sbi_rope._validation import (
+    check_batch,
+    check_device,
+    check_instance,
     check_not_negative,
     check_positive,
+    check_same_length,
     check_unit_interval,
 )
-from sbi_rope.tasks.base import Task, check_theta
+from sbi_rope.tasks.base import Task, check_parameters, check_theta
 from sbi_rope.tasks.distributions import box
 from sbi_rope.tasks.networks import SeriesEmbedding, light_series_embedding
 from sbi_rope.tasks.settings import PaperSettings
@@ -58,7 +62,7 @@ class PendulumSimulator:
         theta = check_theta(theta, 2)
         phase = math.pi * (2 * torch.rand_like(theta[:, :1]) - 1)
         damping = self.max_damping * torch.rand_like(theta[:, :1])
-        position = self.position(theta, phase=phase, damping=damping)
+        position = self._position(theta, phase, damping)
         return position + self.noise_std * torch.randn_like(position)
 
     def position(self, theta: Tensor, *, phase: Tensor, damping: Tensor) -> Tensor:
@@ -72,6 +76,14 @@ class PendulumSimulator:
         Returns:
             Positions, shape ``(n, 200)``.
         """
+        theta = check_theta(theta, 2, finite=False)
+        for name, value in (("phase", phase), ("damping", damping)):
+            check_batch(name, value, (1,), finite=False, allow_empty=True)
+            check_same_length("theta", theta, name, value)
+            check_device(name, value, theta.device, where="`theta`")
+        return self._position(theta, phase, damping)
+
+    def _position(self, theta: Tensor, phase: Tensor, damping: Tensor) -> Tensor:
         frequency, amplitude = theta[:, :1], theta[:, 1:]
         time = torch.linspace(
             0.0, DURATION, NUM_STEPS, dtype=theta.dtype, device=theta.device
@@ -170,7 +182,8 @@ class Pendulum(Task):
 
     def prior_quantiles(self, theta: Tensor) -> Tensor:
         """Return relative positions in the box, shape ``(n, 2)``."""
-        return self.get_prior().base_dist.cdf(theta)
+        prior = self.get_prior()
+        return prior.base_dist.cdf(check_parameters(theta, prior))
 
     def get_simulator(self) -> PendulumSimulator:
         """Return the simulator without friction."""
@@ -178,6 +191,7 @@ class Pendulum(Task):
 
     def get_embedding_net(self, *, light: bool = False) -> nn.Module:
         """Return the paper's convolutional network, or a light one; ten outputs."""
+        check_instance("light", light, bool)
         if light:
             return light_series_embedding(num_steps=NUM_STEPS, output_dim=10)
         return SeriesEmbedding(num_steps=NUM_STEPS, output_dim=10)

@@ -9,7 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._validation import check_positive, check_unit_interval
+from sbi_rope._validation import (
+    check_batch,
+    check_instance,
+    check_not_negative,
+    check_positive,
+    check_tensor,
+    check_unit_interval,
+)
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.base import Task, check_theta
 from sbi_rope.tasks.networks import fully_connected
@@ -33,6 +40,7 @@ INFECTED_AT_START = 0.001  # as a fraction of the population
 REVERSION = 0.05  # of the reproduction number to its mean, in 1/day
 # Day 0 is a Friday; 52 of each.
 SATURDAYS, SUNDAYS, MONDAYS = (slice(day, None, 7) for day in (1, 2, 3))
+MAX_STEPS = 100_000  # in a day; hours of work for a few series
 CHUNK_SIZE = 1000  # series that are simulated together on a CPU, in its cache
 
 
@@ -80,12 +88,13 @@ class SIRSimulator:
 
     def __post_init__(self) -> None:
         check_positive("time_step", self.time_step)
-        if abs(round(1 / self.time_step) * self.time_step - 1) > 1e-9:
+        steps = 1 / self.time_step if self.time_step > 1 / (2 * MAX_STEPS) else 0.0
+        if steps > MAX_STEPS or abs(round(steps) * self.time_step - 1) > 1e-9:
             raise InvalidInputError(
-                f"Expected `time_step` to divide a day; got {self.time_step!r}."
+                f"Expected `time_step` to divide a day, into {MAX_STEPS} steps at "
+                f"most; got {self.time_step!r}."
             )
-        if self.volatility != 0:
-            check_positive("volatility", self.volatility)
+        check_not_negative("volatility", self.volatility)
         check_unit_interval("reported_fraction", self.reported_fraction)
 
     def __call__(self, theta: Tensor) -> Tensor:
@@ -104,9 +113,12 @@ class SIRSimulator:
             One number a day, shape ``(n, 365)``, float64.
         """
         theta = check_theta(theta, 2).detach().double()
-        if (theta < 0).any():
+        # With more, a step would take away more people than there are.
+        highest = 1 / self.time_step
+        if ((theta < 0) | (theta > highest)).any():
             raise InvalidInputError(
-                f"Expected rates `theta` of at least 0; got {float(theta.min())!r}."
+                f"Expected rates `theta` from 0 to {highest:g} per day, one over "
+                f"`time_step`; got {float(theta.min())!r} to {float(theta.max())!r}."
             )
         size = CHUNK_SIZE if theta.device.type == "cpu" else max(1, len(theta))
         return torch.cat([self._infections(chunk) for chunk in theta.split(size)])
@@ -169,6 +181,8 @@ def delay_weekend_reports(infections: Tensor, reported_fraction: float) -> Tenso
     Returns:
         Reported numbers of the same shape, with the same total.
     """
+    check_batch("infections", infections, (NUM_DAYS,), finite=False, allow_empty=True)
+    check_unit_interval("reported_fraction", reported_fraction)
     reported = infections.clone()
     reported[:, SATURDAYS] *= reported_fraction
     reported[:, SUNDAYS] *= reported_fraction
@@ -191,6 +205,11 @@ def summarise(series: Tensor) -> Tensor:
         Statistics, shape ``(n, 6)``. A series that reaches half its total on the
         first day has :math:`-\infty` among them.
     """
+    if check_tensor("series", series).ndim != 2 or series.shape[1] < 2:
+        raise InvalidInputError(
+            "Expected `series` of shape (n, days) with two days at least; got "
+            f"{tuple(series.shape)}."
+        )
     reached = series.cumsum(dim=1) > 0.5 * series.sum(dim=1, keepdim=True)
     before, after = series[:, :-1], series[:, 1:]
     before = before - before.mean(dim=1, keepdim=True)
@@ -276,6 +295,7 @@ class SIR(Task):
 
     def prior_quantiles(self, theta: Tensor) -> Tensor:
         r"""Return :math:`4 \beta^2` and :math:`1 - (1 - 2 \gamma)^2`, ``(n, 2)``."""
+        theta = check_theta(theta, 2)
         infection, recovery = (2 * theta.clamp(0.0, 0.5)).unbind(dim=1)
         return torch.stack([infection**2, 1 - (1 - recovery) ** 2], dim=1)
 
@@ -285,6 +305,7 @@ class SIR(Task):
 
     def get_embedding_net(self, *, light: bool = False) -> nn.Module:
         """Return the paper's network, which is light already; six outputs."""
+        check_instance("light", light, bool)
         return fully_connected(len(STATISTICS), (8, 32, 32, 24, 6))
 
     def _real_process(self, part: Part) -> DrawnPairs:

@@ -1,6 +1,5 @@
 r"""The wind tunnel: a hatch position from the pressure after an impulse of a fan."""
 
-from numbers import Real
 from pathlib import Path
 
 import torch
@@ -14,13 +13,13 @@ from sbi_rope._validation import (
     check_unit_interval,
 )
 from sbi_rope.errors import DataNotFoundError, InvalidInputError
-from sbi_rope.tasks.base import Task
+from sbi_rope.tasks.base import Task, check_parameters
 from sbi_rope.tasks.chambers import (
     CUT_FILE,
+    check_complete,
     check_download,
     find_file,
     read_columns,
-    warn_if_incomplete,
 )
 from sbi_rope.tasks.distributions import box
 from sbi_rope.tasks.networks import SeriesEmbedding, light_series_embedding
@@ -33,16 +32,14 @@ from sbi_rope.tasks.wind_tunnel_model import (
     MAX_PRESSURE,
     NUM_STEPS,
     WindTunnelSimulator,
+    check_jitter,
 )
 
 __all__ = ["WindTunnel"]
 
 DATASET = "wt_intake_impulse_v1"
 EXPERIMENT = "load_out_0.5_osr_downwind_4"
-NUM_IMPULSES = 5000  # of this experiment
 COLUMNS = ("flag", "hatch", "pressure_downwind", "pressure_ambient")
-# With a larger shift an impulse would begin before the first sample.
-MAX_JITTER = 0.6  # s
 
 # How the stand-in for the recorded data differs from the simulator.
 WEAKER_FANS = 0.05  # of the pressure they make
@@ -145,8 +142,9 @@ class WindTunnel(Task):
     ) -> None:
         super().__init__(variant=variant, root=root, label_noise=label_noise)
         check_positive("noise_std", noise_std)
-        _check_jitter(onset_jitter)
+        check_jitter(onset_jitter)
         check_instance("stand_in", stand_in, bool)
+        check_instance("experiment", experiment, str, optional=True)
         self.stand_in = stand_in or variant == "synthetic"
         self._check_use(experiment, misspecification_strength)
         self.download = download
@@ -179,7 +177,8 @@ class WindTunnel(Task):
 
     def prior_quantiles(self, theta: Tensor) -> Tensor:
         """Return relative positions of the hatch, shape ``(n, 1)``."""
-        return self.get_prior().base_dist.cdf(theta)
+        prior = self.get_prior()
+        return prior.base_dist.cdf(check_parameters(theta, prior))
 
     def get_simulator(self) -> WindTunnelSimulator:
         """Return the published model with noise and an impulse at a random time."""
@@ -189,6 +188,7 @@ class WindTunnel(Task):
 
     def get_embedding_net(self, *, light: bool = False) -> nn.Module:
         """Return the convolutional network of task C, or a light one; ten outputs."""
+        check_instance("light", light, bool)
         if light:
             return light_series_embedding(num_steps=NUM_STEPS, output_dim=10)
         return SeriesEmbedding(num_steps=NUM_STEPS, output_dim=10, padding=2)
@@ -229,20 +229,10 @@ class WindTunnel(Task):
         flag, hatch, inside, ambient = values.T
         _check_impulses(path, flag)
         theta = _hatch_of_impulses(path, flag, hatch)
-        if self.experiment == EXPERIMENT:
-            warn_if_incomplete(path, len(theta), NUM_IMPULSES, what="impulses")
+        check_complete(path, len(values), dataset=DATASET)
         check_in_support(f"theta of {file}", theta, self.get_prior())
         # Both are near 95 000 Pa, where float32 has steps of 0.008: subtract first.
         return theta, (inside - ambient).reshape(-1, NUM_STEPS).float()
-
-
-def _check_jitter(onset_jitter: float) -> None:
-    is_number = isinstance(onset_jitter, Real) and not isinstance(onset_jitter, bool)
-    if not is_number or not 0.0 <= onset_jitter <= MAX_JITTER:
-        raise InvalidInputError(
-            f"Expected `onset_jitter` from 0 to {MAX_JITTER} s, so that impulses begin "
-            f"after the first sample; got {onset_jitter!r}."
-        )
 
 
 def _check_impulses(path: Path, flag: Tensor) -> None:

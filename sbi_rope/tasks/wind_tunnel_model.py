@@ -9,14 +9,24 @@ import torch
 from torch import Tensor
 
 from sbi_rope._validation import (
+    check_batch,
+    check_device,
     check_not_negative,
+    check_number,
     check_positive,
+    check_same_length,
     check_unit_interval,
 )
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.base import check_theta
 
-__all__ = ["NUM_STEPS", "SAMPLE_TIMES", "WindTunnelSimulator", "pressure_ratio"]
+__all__ = [
+    "NUM_STEPS",
+    "SAMPLE_TIMES",
+    "WindTunnelSimulator",
+    "check_jitter",
+    "pressure_ratio",
+]
 
 NUM_STEPS = 50
 FIRST_LOADED, LAST_LOADED = 5, 24  # samples taken at full load of the intake fan
@@ -49,6 +59,8 @@ MAX_PRESSURE = 74.82473949999999  # Pa
 CLOSED_RATIO, HATCH_EFFECT = 0.75, 0.15  # airflow ratio, and what the hatch adds to it
 MAX_HATCH = 45.0  # degrees
 
+# With a larger shift an impulse would begin before the first sample.
+MAX_JITTER = 0.6  # s
 SUBSTEPS = 100
 SHIFT_STEP = 1e-3  # s
 
@@ -109,8 +121,9 @@ class WindTunnelSimulator:
     exhaust_offset: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("noise_std", "onset_jitter", "noise_correlation"):
-            check_not_negative(name, getattr(self, name))
+        check_not_negative("noise_std", self.noise_std)
+        check_jitter(self.onset_jitter)
+        check_number("exhaust_offset", self.exhaust_offset)
         check_unit_interval("noise_correlation", self.noise_correlation)
         check_positive("max_pressure", self.max_pressure)
         check_positive("inertia", self.inertia)
@@ -119,9 +132,7 @@ class WindTunnelSimulator:
         """Simulate ``theta`` of shape ``(n, 1)``, to shape ``(n, 50)``."""
         theta = check_theta(theta, 1)
         position = torch.rand_like(theta[:, 0], dtype=torch.float64)
-        pressure = self.pressure(
-            theta, onset_shift=self.onset_jitter * (2 * position - 1)
-        )
+        pressure = self._pressure(theta, self.onset_jitter * (2 * position - 1))
         noise = torch.randn_like(pressure)
         if self.noise_correlation:
             noise = noise @ _autoregression(self.noise_correlation).to(noise)
@@ -141,11 +152,18 @@ class WindTunnelSimulator:
         Raises:
             InvalidInputError: If a shift is larger than ``onset_jitter``.
         """
+        theta = check_theta(theta, 1, finite=False)
+        check_batch("onset_shift", onset_shift, (), allow_empty=True)
+        check_same_length("theta", theta, "onset_shift", onset_shift)
+        check_device("onset_shift", onset_shift, theta.device, where="`theta`")
         if (onset_shift.abs() > self.onset_jitter).any():
             raise InvalidInputError(
                 f"Expected `onset_shift` within `onset_jitter={self.onset_jitter}`; "
                 f"got {float(onset_shift.abs().max())}."
             )
+        return self._pressure(theta, onset_shift.double())
+
+    def _pressure(self, theta: Tensor, onset_shift: Tensor) -> Tensor:
         ratio = CLOSED_RATIO + HATCH_EFFECT * theta.double() / MAX_HATCH
         scale = self.max_pressure * (1 - ratio.clamp(max=1.0))
         return scale * self._interpolate(onset_shift)
@@ -159,6 +177,16 @@ class WindTunnelSimulator:
         low, high = shifts[above - 1], shifts[above]
         weight = ((onset_shift - low) / (high - low)).unsqueeze(1)
         return torch.lerp(ratios[above - 1], ratios[above], weight)
+
+
+def check_jitter(onset_jitter: float) -> None:
+    """Raise unless an impulse with this largest shift begins after the first sample."""
+    check_not_negative("onset_jitter", onset_jitter)
+    if onset_jitter > MAX_JITTER:
+        raise InvalidInputError(
+            f"Expected `onset_jitter` from 0 to {MAX_JITTER} s, so that impulses begin "
+            f"after the first sample; got {onset_jitter!r}."
+        )
 
 
 def pressure_ratio(
@@ -181,6 +209,9 @@ def pressure_ratio(
         >>> round(float(s.norm()), 3)
         2.125
     """
+    check_batch("onset_shift", onset_shift, ())
+    check_positive("inertia", inertia)
+    check_number("exhaust_offset", exhaust_offset)
     intake = _fan_speeds(onset_shift, loads=INTAKE_LOADS, inertia=inertia)
     exhaust = _fan_speeds(onset_shift[:1], loads=EXHAUST_LOADS, inertia=inertia)
     return (intake**2 - (exhaust + exhaust_offset) ** 2) / MAX_SPEED**2

@@ -7,6 +7,7 @@ Its labelled sets are in ``test_task_sets.py``, the variants that all tasks have
 import copy
 import pickle
 import warnings
+from typing import Any
 
 import pytest
 import torch
@@ -199,14 +200,26 @@ def test_simulator_can_be_pickled(task: Task) -> None:
         pytest.param(lambda t: t[:, 1:], InvalidInputError, "shape", id="width"),
         pytest.param(lambda t: t * torch.nan, InvalidInputError, "finite", id="nan"),
         pytest.param(lambda t: t.long(), InvalidTypeError, "floating", id="integer"),
+        pytest.param(lambda t: t.to_sparse(), InvalidTypeError, "dense", id="sparse"),
+        pytest.param(
+            lambda t: 1e30 * t.abs(), InvalidInputError, "theta", id="overflow"
+        ),
     ],
 )
-def test_simulator_refuses_what_is_not_a_batch_of_parameters(
+def test_simulator_and_quantiles_refuse_what_is_not_a_batch_of_parameters(
     task: Task, change: object, error: type[RoPEError], match: str
 ) -> None:
     theta = task.get_prior().sample((3,))
     with pytest.raises(error, match=match):
         task.get_simulator()(change(theta))  # type: ignore[operator]
+    with pytest.raises(error, match=match):
+        task.prior_quantiles(change(theta))  # type: ignore[operator]
+
+
+@pytest.mark.parametrize("light", ["x", 1, None])
+def test_a_light_network_is_asked_for_by_a_bool(task: Task, light: Any) -> None:
+    with pytest.raises(InvalidTypeError, match="`light`"):
+        task.get_embedding_net(light=light)
 
 
 def test_sbi_can_simulate_from_the_task(task: Task) -> None:

@@ -31,7 +31,7 @@ def written_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for variant in (None, *TASKS[name].variants)
     ],
 )
-@pytest.mark.filterwarnings("ignore:.*the published file has")
+@pytest.mark.usefixtures("shorter_files")
 class TestRecordedFiles:
     @pytest.fixture
     def recorded(self, name: str, variant: str | None, written_root: Path) -> Task:

@@ -17,6 +17,7 @@ import functools
 import random
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -221,7 +222,7 @@ def test_a_set_does_not_depend_on_the_global_seed(labelled: Task, part: str) -> 
 
 
 @pytest.mark.parametrize("name", sorted(TASKS))
-@pytest.mark.parametrize("n", [0, -1, 2.0, True, "3"])
+@pytest.mark.parametrize("n", [0, -1, 2.0, True, "3", 10**30])
 def test_a_bad_size_is_refused(name: str, root: Path | None, n: object) -> None:
     task = make(name, root=root)
     for part in ("calibration", "test"):
@@ -230,12 +231,32 @@ def test_a_bad_size_is_refused(name: str, root: Path | None, n: object) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(TASKS))
-@pytest.mark.parametrize("seed", [-1, 2**31, 0.5, None, True])
+@pytest.mark.parametrize("seed", [-1, 2**31, 0.5, None, True, [0]])
 def test_a_bad_seed_is_refused(name: str, root: Path | None, seed: object) -> None:
     task = make(name, root=root)
     for part in ("calibration", "test"):
         with pytest.raises(InvalidInputError, match="`seed`"):
             draw(task, part, 5, seed=seed)
+
+
+@OWN_CODE
+@PARTS
+@pytest.mark.parametrize("kind", [np.int64, np.uint8])
+def test_sizes_and_seeds_may_be_integers_of_numpy(
+    labelled: Task, part: str, kind: type
+) -> None:
+    theta, x = draw(labelled, part, kind(5), seed=kind(0))
+    assert torch.equal(theta, shared(labelled, part)[0][:5])
+    assert torch.equal(x, shared(labelled, part)[1][:5])
+
+
+@pytest.mark.parametrize("name", sorted(TASKS))
+@pytest.mark.parametrize("part", ["tset", "simulation", None, ["test"], 0])
+def test_the_size_of_a_part_that_there_is_not_is_refused(
+    name: str, root: Path | None, part: Any
+) -> None:
+    with pytest.raises(InvalidInputError, match=r"`part`.*'calibration', 'test'"):
+        make(name, root=root).num_recorded(part)
 
 
 # Two sets ----------------------------------------------------------------------------

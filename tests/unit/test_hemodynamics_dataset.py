@@ -333,7 +333,7 @@ def _with_nan(array: np.ndarray) -> np.ndarray:
         (_set(format=99), "format 99"),
         (_set(physics=None), r"\['physics'\] are missing"),
         (_set(n=N + 1), "beat"),
-        (_set(process="patient"), "process is unknown"),
+        (_set(process="patient"), r"\['process'\] are no such"),
         (_edit(theta=None), "`theta`.* got none"),
         (_edit(length_factors=None), "`length_factors`.* got none"),
         (_edit(beat=_with_nan), "`beat`.* finite"),
@@ -341,6 +341,12 @@ def _with_nan(array: np.ndarray) -> np.ndarray:
         (_edit(theta=lambda a: a.astype(np.float64)), "`theta`.* float32"),
         (_edit(nuisance_names=lambda a: a[::-1]), "nuisance parameters"),
         (_edit(nuisance_names=None), "nuisance parameters"),
+        (_edit(beat=np.ones_like), "not vary .*row 0"),
+        (_edit(period=np.zeros_like), "`period` that no heart has"),
+        (_edit(index=np.zeros_like), "`index` not above"),
+        (_set(population=3), r"\['population'\] are no such"),
+        (_set(population={"height_sd": 0.1}), r"\['population'\] are no such"),
+        (_set(physics={"courant": 0.1}), r"\['physics'\] are no such"),
     ],
 )
 def test_a_damaged_file_is_refused(

@@ -5,8 +5,10 @@ import math
 import signal
 import warnings
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from sbi.inference import NPE, DirectPosterior
@@ -103,6 +105,103 @@ def test_mid_ranks_split_ties() -> None:
 def test_a_posterior_made_of_ties_ranks_in_the_middle() -> None:
     ranks = metrics.mid_ranks(torch.ones(8, 3, 2), torch.ones(3, 2))
     assert torch.equal(ranks, torch.full((3, 2), 0.5, dtype=torch.float64))
+
+
+SAMPLES, TRUTH = torch.rand(7, 4, 2), torch.rand(4, 2)
+LEVEL_SCORES = (
+    metrics.acauc_of,
+    metrics.coverage_curve_of,
+    metrics.expected_coverage_error_of,
+)
+
+
+def broken(good: Tensor) -> dict[str, tuple[Any, str]]:
+    """Return what may not stand in the place of a tensor, with words of the answer."""
+    return {
+        "nan": (good * torch.nan, "NaN"),
+        "list": (good.tolist(), "torch.Tensor"),
+        "float": (7.0, "torch.Tensor"),
+        "none": (None, "torch.Tensor"),
+        "complex": (good.to(torch.complex64), "real numbers"),
+        "sparse": (good.to_sparse(), "dense"),
+        "meta": (good.to("meta"), "meta"),
+        "vector": (good.flatten(), "shape"),
+        "empty": (good[:, :0], "shape"),
+        "no columns": (good[..., :0], "shape"),
+    }
+
+
+@pytest.mark.parametrize(("theta", "match"), broken(TRUTH).values(), ids=broken(TRUTH))
+def test_ranks_of_what_is_no_parameter_are_refused(theta: Any, match: str) -> None:
+    with pytest.raises((InvalidInputError, InvalidTypeError), match=match):
+        metrics.mid_ranks(SAMPLES, theta)
+
+
+@pytest.mark.parametrize(
+    ("samples", "match"),
+    [
+        *broken(SAMPLES).values(),
+        pytest.param(SAMPLES[:0], "M >= 1", id="no samples"),
+        pytest.param(SAMPLES[:, :1], r"\(M, 4, 2\)", id="one row for all"),
+        pytest.param(SAMPLES[..., :1], r"\(M, 4, 2\)", id="one column for all"),
+    ],
+)
+def test_ranks_among_what_are_no_samples_are_refused(samples: Any, match: str) -> None:
+    with pytest.raises((InvalidInputError, InvalidTypeError), match=match):
+        metrics.mid_ranks(samples, TRUTH)
+
+
+def test_infinite_samples_can_still_be_ranked() -> None:
+    samples = torch.tensor([-torch.inf, 0.0, torch.inf]).reshape(3, 1, 1)
+    assert float(metrics.mid_ranks(samples, torch.tensor([[1.0]]))) == 2.5 / 4
+
+
+@pytest.mark.parametrize("score", LEVEL_SCORES)
+@pytest.mark.parametrize(
+    ("levels", "match"),
+    [
+        *broken(TRUTH).values(),
+        pytest.param(TRUTH + 7, r"\[0, 1\].*8 of 8", id="above"),
+        pytest.param(TRUTH - 1, r"\[0, 1\]", id="below"),
+    ],
+)
+def test_scores_of_what_are_no_levels_are_refused(
+    score: Callable, levels: Any, match: str
+) -> None:
+    with pytest.raises((InvalidInputError, InvalidTypeError), match=match):
+        score(levels)
+
+
+@pytest.mark.parametrize("ranks", [TRUTH + 7, TRUTH - 1, TRUTH * torch.nan, 0.5, None])
+def test_levels_of_what_are_no_ranks_are_refused(ranks: Any) -> None:
+    with pytest.raises((InvalidInputError, InvalidTypeError), match="`ranks`"):
+        metrics.central_levels(ranks)
+
+
+@pytest.mark.parametrize("score", LEVEL_SCORES)
+def test_levels_may_have_gradients_and_any_real_dtype(score: Callable) -> None:
+    levels = TRUTH.mul(256).round().div(256)
+    expected = score(levels).per_parameter
+    for other in (levels.double(), levels.half(), levels.clone().requires_grad_()):
+        assert torch.equal(score(other).per_parameter, expected)
+
+
+@pytest.mark.parametrize(
+    "log_probs",
+    [None, [0.0], 0.0, TRUTH, TRUTH[0, :0], TRUTH[0] * torch.nan, TRUTH[0] / 0.0],
+)
+def test_log_probs_that_no_density_has_are_refused(log_probs: Any) -> None:
+    with pytest.raises((InvalidInputError, InvalidTypeError), match="`log_probs`"):
+        metrics.LPPScore(log_probs=log_probs)
+
+
+@pytest.mark.parametrize(
+    "theta_std", [None, 2.0, [1.0], TRUTH, TRUTH[0, :0], torch.tensor([1.0, -1.0])]
+)
+def test_scales_that_no_parameter_has_are_refused(theta_std: Any) -> None:
+    score = metrics.LPPScore(log_probs=TRUTH[0])
+    with pytest.raises((InvalidInputError, InvalidTypeError), match="`theta_std`"):
+        score.standardised(theta_std)
 
 
 def test_acauc_equals_its_integral_over_levels() -> None:
@@ -518,6 +617,21 @@ def test_a_posterior_with_bounded_rejection_is_called_as_it_is(
             "one column for each parameter",
             id="too many parameters",
         ),
+        pytest.param(
+            lambda a: a.update(theta=a["theta"][:, :0]),
+            InvalidInputError,
+            "at least one number",
+            id="no parameters",
+        ),
+        pytest.param(
+            lambda a: a.update(num_samples=10**30),
+            InvalidInputError,
+            "`num_samples`.*from 1 to",
+            id="too many samples",
+        ),
+        pytest.param(
+            lambda a: a.update(seed=-(10**5000)), InvalidInputError, "`seed`", id="seed"
+        ),
     ],
 )
 def test_evaluate_refuses(
@@ -535,10 +649,68 @@ def test_evaluate_refuses(
         metrics.evaluate(Wide(), **arguments)
 
 
-def test_an_unknown_kind_is_refused() -> None:
+@pytest.mark.parametrize("kind", ["joint", None, ["hpd"], np.array(["hpd", "rank"])])
+def test_an_unknown_kind_is_refused(kind: Any) -> None:
     theta, x = gaussian_pairs(5)
     with pytest.raises(InvalidInputError, match="kind"):
-        metrics.acauc(GaussianPosterior(), theta, x, kind="joint")  # type: ignore[arg-type]
+        metrics.acauc(GaussianPosterior(), theta, x, kind=kind)
+
+
+class Converting(GaussianPosterior):
+    """A posterior whose results are changed by a function."""
+
+    def __init__(self, convert: Callable[[Tensor], Any]) -> None:
+        super().__init__()
+        self.convert = convert
+
+    def sample_batched(self, *args: Any, **kwargs: Any) -> Any:
+        return self.convert(super().sample_batched(*args, **kwargs))
+
+    def log_prob_batched(self, theta: Tensor, x: Tensor) -> Any:
+        return self.convert(super().log_prob_batched(theta, x))
+
+
+SCORES_OF_POSTERIORS = {
+    "lpp": metrics.lpp,
+    "central": metrics.acauc,
+    "hpd": partial(metrics.acauc, kind="hpd"),
+    "curve": metrics.coverage_curve,
+    "error": metrics.expected_coverage_error,
+    "all": metrics.evaluate,
+    "draws": lambda posterior, _, x: metrics.draw_samples(posterior, x, num_samples=5),
+}
+
+
+@pytest.mark.parametrize(
+    "score", SCORES_OF_POSTERIORS.values(), ids=SCORES_OF_POSTERIORS
+)
+@pytest.mark.parametrize(
+    ("posterior", "match"),
+    [
+        (Converting(lambda value: value.numpy()), "_batched` .*Tensor; got ndarray"),
+        (Converting(lambda value: value.tolist()), "_batched` .*Tensor; got list"),
+        (Converting(lambda value: None), "_batched` .*Tensor; got NoneType"),
+        (Converting(lambda value: value.to_sparse()), "_batched.*dense"),
+        (Converting(lambda value: value > 0), "_batched.*bool"),
+        (Converting(lambda value: value.to("meta")), "meta"),
+        (Converting(lambda value: value[..., :1, :1, None]), "shape"),
+        (None, "`posterior` with a method .*got NoneType"),
+        ("npe", "`posterior` with a method .*got str"),
+    ],
+)
+def test_what_is_no_posterior_is_refused(
+    score: Callable, posterior: Any, match: str
+) -> None:
+    with pytest.raises(
+        (InvalidInputError, InvalidTypeError, LogProbUnavailableError), match=match
+    ):
+        score(posterior, *gaussian_pairs(4, k=2))
+
+
+@pytest.mark.parametrize("num_samples", [0, -1, 1.5, "5", True, None, 10**30])
+def test_a_number_of_draws_is_a_positive_integer(num_samples: Any) -> None:
+    with pytest.raises(InvalidInputError, match="`num_samples`"):
+        metrics.draw_samples(GaussianPosterior(), TRUTH, num_samples=num_samples)
 
 
 def test_a_posterior_without_density_is_named() -> None:

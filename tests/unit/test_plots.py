@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sbi_rope import plots
 from sbi_rope.discrepancy import DiscrepancyReport, Interval, SummaryDiscrepancy
-from sbi_rope.errors import InvalidInputError
+from sbi_rope.errors import InvalidInputError, InvalidTypeError
 from sbi_rope.metrics import CoverageCurve, coverage_curve_of
 
 pytest.importorskip("matplotlib")
@@ -81,12 +81,22 @@ def test_pair_plot_leaves_no_open_figure() -> None:
         pytest.param(
             {"a": torch.zeros(5, 2)}, {"prior": torch.zeros(5, 3)}, "prior", id="prior"
         ),
+        pytest.param([torch.zeros(5, 2)], {}, "dictionary", id="list"),
+        pytest.param({1: torch.zeros(5, 2)}, {}, "keys of samples", id="number"),
+        pytest.param({"a": torch.zeros(5, 2).to_sparse()}, {}, "dense", id="sparse"),
+        pytest.param({"a": torch.zeros(5)}, {}, "shape", id="vector"),
+        pytest.param({"a": torch.zeros(5, 0)}, {}, "one number", id="no-columns"),
+        pytest.param({"a": 1e300 * torch.ones(5, 2).double()}, {}, "1e.100", id="huge"),
+        pytest.param(
+            {"a": torch.zeros(5, 2)}, {"parameter_names": "ab"}, "strings", id="string"
+        ),
+        pytest.param(
+            {"a": torch.zeros(5, 2)}, {"parameter_names": [1, 2]}, "strings", id="ints"
+        ),
     ],
 )
-def test_pair_plot_refuses(
-    samples: dict[str, Tensor], kwargs: dict[str, Any], match: str
-) -> None:
-    with pytest.raises(InvalidInputError, match=match):
+def test_pair_plot_refuses(samples: Any, kwargs: dict[str, Any], match: str) -> None:
+    with pytest.raises((InvalidInputError, InvalidTypeError), match=match):
         plots.pair_plot(samples, **kwargs)
 
 
@@ -113,9 +123,7 @@ def test_pair_plot_shows_all_where_no_posterior_is_around_the_truth() -> None:
 
 def test_pair_plot_with_a_prior_reaches_no_further_than_its_width() -> None:
     samples = {"NPE": 30.0 * torch.randn(400, 2), "RoPE": torch.rand(400, 2)}
-    figure = plots.pair_plot(
-        samples, torch.full((2,), 0.5), prior=torch.rand(500, 2), parameter_names="ab"
-    )
+    figure = plots.pair_plot(samples, torch.full((2,), 0.5), prior=torch.rand(500, 2))
     low, high = figure.axes[0].get_xlim()
     assert -1.5 < low < -0.5
     assert 1.5 < high < 2.5
@@ -202,9 +210,67 @@ def test_calibration_band_is_that_of_the_smallest_test_set() -> None:
     assert middle.max() - 0.5 == pytest.approx(1.96 * 0.05, abs=1e-4)
 
 
-def test_calibration_curves_refuse_nothing() -> None:
-    with pytest.raises(InvalidInputError, match="curves"):
-        plots.calibration_curves({})
+@pytest.mark.parametrize("curves", [{}, None, [1], {"a": None}, {"a": torch.rand(3)}])
+def test_calibration_curves_refuse_what_are_none(curves: Any) -> None:
+    with pytest.raises((InvalidInputError, InvalidTypeError), match="curves"):
+        plots.calibration_curves(curves)
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        plots.finetuning_history,
+        plots.effective_sample_sizes,
+        plots.stacking_report,
+        plots.discrepancy,
+    ],
+)
+@pytest.mark.parametrize("value", [None, 3, "x", {}, torch.rand(3)])
+def test_what_is_no_result_is_refused(draw: Any, value: object) -> None:
+    with pytest.raises(InvalidTypeError, match=r"Expected `\w+` to be .*without"):
+        draw(value)
+
+
+@pytest.mark.parametrize(
+    ("training", "validation", "step", "match"),
+    [
+        ([], [], 0, "at least one loss"),
+        ([2.0, 1.0], [], 2, "best_step.*from 0 to 1"),
+        ([2.0, 1.0], [], -1, "best_step"),
+        ([2.0, 1.0], [], 0.5, "best_step"),
+        ([2.0, float("nan")], [], 0, "training_loss.*finite"),
+        ([2.0, 1.0], [1.0, float("inf")], 0, "validation_loss.*finite"),
+        (["a"], [], 0, "training_loss.*numbers"),
+        ([[1.0], [2.0]], [], 0, "training_loss.*numbers"),
+        ([1.0], None, 0, "validation_loss.*numbers"),
+    ],
+)
+def test_histories_that_cannot_be_drawn_are_refused(
+    training: Any, validation: Any, step: Any, match: str
+) -> None:
+    history = SimpleNamespace(
+        training_loss=training, validation_loss=validation, best_step=step
+    )
+    with pytest.raises(InvalidInputError, match=match):
+        plots.finetuning_history(history)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "simulated", "match"),
+    [
+        (torch.ones(4) * torch.nan, torch.rand(9, 2), "finite"),
+        (torch.zeros(4), torch.rand(9, 2), "positive"),
+        (torch.ones(0), torch.rand(9, 2), "empty"),
+        (torch.ones(4), torch.rand(0, 2), "n_s >= 1"),
+        (torch.ones(4), torch.tensor(1.0), "n_s >= 1"),
+    ],
+)
+def test_couplings_that_cannot_be_drawn_are_refused(
+    sizes: Tensor, simulated: Tensor, match: str
+) -> None:
+    coupling = SimpleNamespace(simulated=simulated, effective_sample_size=sizes)
+    with pytest.raises(InvalidInputError, match=match):
+        plots.effective_sample_sizes(coupling)
 
 
 @pytest.mark.parametrize("kind", [list, torch.tensor])
@@ -393,10 +459,16 @@ def test_overview_spreads_out_one_dimensional_embeddings() -> None:
         pytest.param({"parameters": (0, 0)}, "different", id="twice"),
         pytest.param({"parameters": ()}, "one or two", id="none"),
         pytest.param({"parameters": (0, 1, 2)}, "one or two", id="three"),
+        pytest.param({"parameters": 0}, "one or two", id="no-list"),
+        pytest.param({"parameters": (0.0, 1)}, "`parameters`", id="float"),
+        pytest.param({"index": 1.5}, "from 0 to 59", id="half"),
+        pytest.param({"index": True}, "from 0 to 59", id="bool"),
+        pytest.param({"theta": None}, "`theta`", id="no-theta"),
+        pytest.param({"parameter_names": "abc"}, "strings", id="string"),
     ],
 )
 def test_overview_refuses(changes: dict[str, Any], match: str) -> None:
-    with pytest.raises(InvalidInputError, match=match):
+    with pytest.raises((InvalidInputError, InvalidTypeError), match=match):
         plots.overview(**three_steps(**changes))
 
 
@@ -443,6 +515,12 @@ def test_constant_statistics_are_drawn_too() -> None:
         pytest.param(torch.rand(5, 2), torch.rand(5, 2), "a", "names", id="names"),
         pytest.param(torch.rand(5), torch.rand(5), "", r"\(n, d\)", id="no-batch"),
         pytest.param(
+            200 * torch.rand(5, 3, 4, 4), torch.rand(5, 3, 4, 4), "", "255", id="8-bit"
+        ),
+        pytest.param(
+            torch.rand(5, 3, 4, 4), torch.rand(5, 3, 4, 4), "abc", "names", id="images"
+        ),
+        pytest.param(
             torch.rand(5, 1, 4, 4), torch.rand(5, 1, 4, 4), "", "height", id="grey"
         ),
         pytest.param(
@@ -455,6 +533,16 @@ def test_observations_that_cannot_be_drawn_are_refused(
 ) -> None:
     with pytest.raises(InvalidInputError, match=match):
         plots.real_and_simulated(x_o, x_s, names=list(names))
+
+
+@pytest.mark.parametrize(
+    "options", [{"names": "ab"}, {"names": 3}, {"labels": "ab"}, {"labels": ["a"]}]
+)
+def test_names_in_a_picture_are_a_list_of_strings(options: dict[str, Any]) -> None:
+    with pytest.raises(
+        (InvalidInputError, InvalidTypeError), match=next(iter(options))
+    ):
+        plots.real_and_simulated(torch.rand(5, 2), torch.rand(5, 2), **options)
 
 
 # Discrepancies -----------------------------------------------------------------------

@@ -1,14 +1,28 @@
 """The registry and what the base class of tasks does."""
 
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from sbi.utils import within_support
 
-from sbi_rope.errors import InvalidInputError
+from sbi_rope.errors import InvalidInputError, InvalidTypeError
 from sbi_rope.tasks import TASKS, Task, get_task, list_tasks
+from sbi_rope.tasks.cs import CancerStromaSimulator
+from sbi_rope.tasks.distributions import Arcsine, UniformDistance
+from sbi_rope.tasks.hemodynamics.dataset import load
+from sbi_rope.tasks.hemodynamics.generation import generate
+from sbi_rope.tasks.hemodynamics.subject import Physics
+from sbi_rope.tasks.light_tunnel_models import CameraSimulator, HexagonSimulator
+from sbi_rope.tasks.light_tunnel_network import ImageEmbedding
+from sbi_rope.tasks.linear_gaussian import LinearGaussianSimulator
+from sbi_rope.tasks.networks import SeriesEmbedding, fully_connected
+from sbi_rope.tasks.sir import SIRSimulator
+from sbi_rope.tasks.triangle import UniformTriangle
 from sbi_rope.tasks.variants import beta_shaped, with_label_noise
+from sbi_rope.tasks.wind_tunnel_model import WindTunnelSimulator
 
 
 def test_registered_names_are_those_of_the_classes() -> None:
@@ -57,6 +71,73 @@ def test_what_does_not_exist_is_answered_with_what_does(
 ) -> None:
     with pytest.raises(InvalidInputError, match=match):
         call()  # type: ignore[operator]
+
+
+LIST = np.array(["a", "b"])
+OPTIONS = {
+    "cs": {"necrosis_probability": "0.5", "root": 3},
+    "hemodynamics": {"simulations": 3, "observations": b"x", "prior": LIST},
+    "light_tunnel": {
+        "dequantise": "x",
+        "stand_in": 1,
+        "image_size": 64.0,
+        "experiment": ["a"],
+        "download": "no",
+    },
+    "light_tunnel_sensors": {"experiment": 3, "current_noise_std": 1e39},
+    "linear_gaussian": {"scale": 10**400, "shift": "1", "noise_std": 1e39, "dim": 2.0},
+    "pendulum": {"variant": LIST, "max_damping": LIST, "noise_std": True},
+    "sir": {"reported_fraction": LIST, "variant": ["x"], "root": ["a"]},
+    "wind_tunnel": {"onset_jitter": LIST, "experiment": LIST, "stand_in": "yes"},
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "option", "value"),
+    [
+        pytest.param(name, option, value, id=f"{name}-{option}")
+        for name, options in OPTIONS.items()
+        for option, value in options.items()
+    ],
+)
+def test_an_option_of_another_kind_is_refused_by_name(
+    name: str, option: str, value: object
+) -> None:
+    with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`{option}`"):
+        get_task(name, **{option: value})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("make", "argument"),
+    [
+        (lambda: CancerStromaSimulator(batched="x"), "batched"),  # type: ignore[arg-type]
+        (lambda: SIRSimulator(time_step=1e-300), "time_step"),
+        (lambda: SIRSimulator(volatility=-1.0), "volatility"),
+        (lambda: HexagonSimulator(dequantise="x"), "dequantise"),  # type: ignore[arg-type]
+        (lambda: HexagonSimulator(image_size=10**9), "image_size"),
+        (lambda: CameraSimulator(dequantise=1), "dequantise"),  # type: ignore[arg-type]
+        (lambda: LinearGaussianSimulator(scale=0.0), "scale"),
+        (lambda: WindTunnelSimulator(onset_jitter=1e6), "onset_jitter"),
+        (lambda: WindTunnelSimulator(exhaust_offset=float("nan")), "exhaust_offset"),
+        (lambda: Arcsine(1.0), "width"),  # type: ignore[arg-type]
+        (lambda: UniformDistance(torch.tensor([-1.0])), "width"),
+        (lambda: UniformTriangle(torch.tensor(float("nan"))), "high"),
+        (lambda: fully_connected(3, ()), "widths"),
+        (lambda: fully_connected(3, "ab"), "widths"),  # type: ignore[arg-type]
+        (lambda: fully_connected(0, (3,)), "input_dim"),
+        (lambda: SeriesEmbedding(pools=((3, 1),)), "pools"),
+        (lambda: SeriesEmbedding(pools=3), "pools"),  # type: ignore[arg-type]
+        (lambda: ImageEmbedding(light="x"), "light"),  # type: ignore[arg-type]
+        (lambda: Physics(viscoelastic="x"), "viscoelastic"),  # type: ignore[arg-type]
+        (lambda: generate(3, n=1, process="real"), "path"),  # type: ignore[arg-type]
+        (lambda: load(None), "path"),  # type: ignore[arg-type]
+    ],
+)
+def test_a_part_of_a_task_refuses_bad_arguments_by_name(
+    make: Callable[[], object], argument: str
+) -> None:
+    with pytest.raises((InvalidInputError, InvalidTypeError), match=argument):
+        make()
 
 
 def test_repr_names_the_variant() -> None:

@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 
 from sbi_rope.errors import DataNotFoundError, InvalidInputError, RoPEWarning
-from sbi_rope.tasks import chambers
+from sbi_rope.tasks import chambers, get_task
 from sbi_rope.tasks.chambers import (
     KNOWN_ARCHIVES,
+    check_complete,
     check_download,
     find_file,
     find_images,
@@ -21,10 +22,12 @@ from sbi_rope.tasks.chambers import (
     read_images,
     read_names,
     read_table,
-    warn_if_incomplete,
 )
+from sbi_rope.tasks.light_tunnel_sensors import LightTunnelSensors
+from tests.chamber_files import write_camera_experiments, write_impulses
 
 DATASET = "lt_camera_v1"
+SENSORS = "lt_interventions_standard_v1"
 FILE = Path(DATASET, "first_1.8", "first_1.8.csv")
 Unpack = Callable[[Path], None]
 
@@ -102,8 +105,15 @@ def test_columns_come_in_the_order_asked_for(tmp_path: Path) -> None:
         pytest.param("a\n1\n", r"\['b'\] are missing.*get it again", id="column"),
         pytest.param("a,b\n", "to have rows.*get it again", id="empty"),
         pytest.param("", "CSV table.*get it again", id="nothing"),
-        pytest.param("a,b\n1,2\n3\n", r"finite.*\[1\]", id="cut"),
-        pytest.param("a,b\n1,dark\n", "finite", id="word"),
+        pytest.param("a,b\n1,2\n3\n4,5\n", "row 1 ends in the column 'a'", id="row"),
+        pytest.param("a,b\n1,2\n3,4", "last row, 1, ends in the column 'b'", id="end"),
+        pytest.param("a,b\n1,dark\n", "finite.*row 0 has 'dark'.*'b'", id="word"),
+        pytest.param(
+            "a,b\n1,2\n3,\n", "finite.*row 1 has 'nan'.*'b' .1 such", id="nan"
+        ),
+        pytest.param(
+            "a,b\n-1e39,2\n", "row 0 has '-1e.39' in the column 'a'", id="large"
+        ),
     ],
 )
 def test_tables_that_are_cut_are_refused(tmp_path: Path, text: str, match: str) -> None:
@@ -210,12 +220,78 @@ def test_a_download_needs_a_root() -> None:
     check_download(Path("root"), [Path("a/b.csv")], download=True)
 
 
-def test_a_recording_of_another_length_earns_a_warning() -> None:
-    with pytest.warns(RoPEWarning, match="holds 20 impulses, .* has 5000"):
-        warn_if_incomplete(Path("a.csv"), 20, 5000, what="impulses")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        warn_if_incomplete(Path("a.csv"), 5000, 5000, what="impulses")
+@pytest.mark.parametrize(
+    ("dataset", "name", "whole"),
+    [
+        pytest.param(DATASET, "uniform_ap_8.0_iso_500.0", [10_000], id="camera"),
+        pytest.param(DATASET, "betab_ap_1.8_iso_500.0", [10_000], id="crowded"),
+        pytest.param(DATASET, "scm_1_red", [5000], id="first-model"),
+        pytest.param(SENSORS, "uniform_reference", [6000, 10_000], id="reference"),
+        pytest.param(SENSORS, "uniform_v_c_strong", [1000], id="intervention"),
+        pytest.param(
+            "wt_intake_impulse_v1", "load_out_1_osr_downwind_4", [250_000], id="impulse"
+        ),
+    ],
+)
+def test_published_experiments_have_the_rows_they_were_published_with(
+    dataset: str, name: str, whole: list[int]
+) -> None:
+    for rows in whole:
+        check_complete(Path(f"{name}.csv"), rows, dataset=dataset)
+        for found in (1, rows - 1, rows + 1, rows - 50):
+            with pytest.raises(
+                InvalidInputError, match=rf"{name}.csv.*row {found - 1},"
+            ):
+                check_complete(Path(f"{name}.csv"), found, dataset=dataset)
+    check_complete(Path("an_experiment_of_ones_own.csv"), 3, dataset=dataset)
+
+
+@pytest.mark.parametrize("name", ["uniform_reference", "uniform_t_ir_1_strong"])
+def test_a_recording_is_taken_whole_or_not_at_all(
+    chamber_root: Path, tmp_path: Path, name: str
+) -> None:
+    published = (chamber_root / SENSORS / f"{name}.csv").read_bytes()
+    rows = published.splitlines(keepends=True)
+    path = tmp_path / SENSORS / f"{name}.csv"
+    path.parent.mkdir()
+    task = LightTunnelSensors(
+        root=tmp_path, experiment=None if name == "uniform_reference" else name
+    )
+    path.write_bytes(published)
+    assert task.num_recorded("test") == -(-2 * (len(rows) - 1) // 3)
+    for cut in (
+        published[:-1],
+        published[:-2],
+        published[: len(published) * 2 // 3],
+        published[:-1] + b",\n" + rows[-1][:90],
+        b"".join(rows[:-1]),
+        b"".join(rows[:501]),
+        b"".join(rows[:300] + rows[400:]),
+        b"".join([*rows[:300], rows[300][:200], *rows[301:]]),
+    ):
+        path.write_bytes(cut)
+        with pytest.raises(
+            InvalidInputError, match=rf"{name}.csv.*(row|line).*get it again"
+        ):
+            task.get_test_set(1)
+
+
+@pytest.mark.usefixtures("shorter_files")
+@pytest.mark.parametrize("name", ["light_tunnel", "wind_tunnel"])
+def test_no_file_is_read_that_ends_within_a_row(name: str, tmp_path: Path) -> None:
+    if name == "light_tunnel":
+        write_camera_experiments(tmp_path, num_rows=3)
+    else:
+        write_impulses(tmp_path, num_impulses=3)
+    options = {"image_size": 64} if name == "light_tunnel" else {}
+    task = get_task(name, root=tmp_path, **options)
+    path = tmp_path / task.required_files[0]
+    whole = path.read_bytes()
+    task.get_test_set(1)
+    for cut in range(1, len(whole.splitlines()[-1]) + 1):
+        path.write_bytes(whole[:-cut])
+        with pytest.raises(InvalidInputError, match="ends in the column"):
+            task.get_test_set(1)
 
 
 def test_rows_that_end_with_a_comma_are_not_shifted(tmp_path: Path) -> None:

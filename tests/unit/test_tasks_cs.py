@@ -285,7 +285,7 @@ def test_simulator_takes_batches_of_any_size(n: int, batched: bool) -> None:
     assert x.isfinite().all()
 
 
-@pytest.mark.parametrize("rate", [-1.0, 1e30])
+@pytest.mark.parametrize("rate", [-1.0, 2e6])
 def test_rates_out_of_range_are_refused(rate: float) -> None:
     with pytest.raises(InvalidInputError, match=r"from 0 to 1e\+06"):
         CancerStromaSimulator()(torch.tensor([[500.0, rate, 15.0]]))

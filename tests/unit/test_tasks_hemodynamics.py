@@ -161,11 +161,14 @@ def test_shipped_people_have_pressures_of_people(process: str) -> None:
 def test_people_of_another_prior_or_physics_are_refused(tmp_path: Path) -> None:
     source = Path(__file__).parents[2] / "sbi_rope/tasks/hemodynamics/data"
 
-    def changed(process: str, **changes: Any) -> Path:
+    def changed(process: str, *, inside: bool = False, **changes: Any) -> Path:
         arrays = dict(np.load(source / f"{process}.npz"))
         header = json.loads(str(arrays["settings"]))
         for part, values in changes.items():
             header["settings"][part] |= values
+        if inside:
+            ends = torch.tensor([[40.0, 240.0], [90.0, 320.0]]).numpy()
+            arrays["theta"] = arrays["theta"].clip(*ends)
         arrays["settings"] = np.array(json.dumps(header))
         path = tmp_path / f"{process}_{len(list(tmp_path.iterdir()))}.npz"
         np.savez(path, **arrays)
@@ -174,6 +177,10 @@ def test_people_of_another_prior_or_physics_are_refused(tmp_path: Path) -> None:
     other = changed("simulator", population={"prior": "independent"})
     with pytest.raises(InvalidInputError, match="prior='independent'"):
         Hemodynamics(simulations=other).get_simulator()
+    # Only the name of the prior has been changed, which is no other law.
+    with pytest.raises(InvalidInputError, match="support of the prior"):
+        Hemodynamics(simulations=other, prior="independent").get_simulator()
+    other = changed("simulator", inside=True, population={"prior": "independent"})
     assert Hemodynamics(simulations=other, prior="independent").get_simulator()
     elastic = changed("real", physics={"viscoelastic": False})
     with pytest.raises(InvalidInputError, match="viscoelastic is False"):

@@ -30,7 +30,7 @@ from sbi_rope.tasks.light_tunnel_models import (
 from sbi_rope.tasks.light_tunnel_network import ImageEmbedding
 
 # The files of these tests are smaller than the published ones.
-pytestmark = pytest.mark.filterwarnings("ignore:.*the published file has")
+pytestmark = pytest.mark.usefixtures("shorter_files")
 
 SIZE = 64
 WriteData = Callable[..., Path]
@@ -432,7 +432,7 @@ def test_images_too_small_for_the_layers_are_refused(
     light: bool, smallest: int
 ) -> None:
     ImageEmbedding(image_size=smallest, light=light)
-    with pytest.raises(InvalidInputError, match=rf"`image_size`.*{smallest}; got"):
+    with pytest.raises(InvalidInputError, match=rf"`image_size`.*from {smallest} to"):
         ImageEmbedding(image_size=smallest - 1, light=light)
 
 
@@ -571,7 +571,8 @@ def test_of_a_size_that_is_not_there_the_others_are_listed(
         pytest.param({"drop": ("pol_2", "green")}, "'green', 'pol_2'", id="column"),
         pytest.param({"drop": ("image_file",)}, "'image_file'", id="image-file"),
         pytest.param({"num_rows": 0}, "to have rows", id="empty"),
-        pytest.param({"red": "nan"}, r"finite.*\[1\]", id="nan"),
+        pytest.param({"red": "nan"}, r"finite.*row 1 has 'nan'.*'red'", id="nan"),
+        pytest.param({"pol_1": "1e39"}, "row 1 has '1e.39'.*'pol_1'", id="large"),
         pytest.param({"red": 256}, "support of the prior", id="colour"),
         pytest.param({"image_file": ""}, r"column 'image_file'.*\[1\]", id="unnamed"),
     ],

@@ -223,9 +223,10 @@ def test_time_steps_that_do_not_divide_a_day_are_refused(time_step: object) -> N
         SIRSimulator(time_step=time_step)  # type: ignore[arg-type]
 
 
-def test_negative_rates_are_refused() -> None:
-    with pytest.raises(InvalidInputError, match="at least 0"):
-        SIRSimulator()(torch.tensor([[0.2, -0.1]]))
+@pytest.mark.parametrize("rate", [-0.1, 10.5])
+def test_rates_that_no_step_can_take_are_refused(rate: float) -> None:
+    with pytest.raises(InvalidInputError, match="from 0 to 10 per day"):
+        SIRSimulator()(torch.tensor([[0.2, rate]]))
 
 
 # The task ----------------------------------------------------------------------------

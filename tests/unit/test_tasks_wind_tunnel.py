@@ -34,7 +34,7 @@ HEADER = (
 )
 AMBIENT = 95_742.9
 # The files of these tests are shorter than the published ones.
-pytestmark = pytest.mark.filterwarnings("ignore:.*the published file has")
+pytestmark = pytest.mark.usefixtures("shorter_files")
 
 WriteImpulses = Callable[..., Path]
 Schedule = tuple[tuple[float, int, int], ...]  # learning rate, batch, epochs
@@ -583,13 +583,24 @@ def test_an_unknown_experiment_lists_those_there(
             id="hatch-too-wide",
         ),
         pytest.param(
-            lambda rows: change(rows, 7, 8, "nan"), r"finite.*\[6\]", id="nan"
+            lambda rows: change(rows, 7, 8, "nan"),
+            r"finite.*row 6 .*'pressure_downwind'",
+            id="nan",
         ),
         pytest.param(
-            lambda rows: change(rows, 7, 10, ""), r"finite.*\[6\]", id="blank"
+            lambda rows: change(rows, 7, 10, ""),
+            r"finite.*row 6 .*'pressure_ambient'",
+            id="blank",
         ),
         pytest.param(
-            lambda rows: change(rows, 7, 2, "six"), r"finite.*\[6\]", id="word"
+            lambda rows: change(rows, 7, 2, "six"),
+            r"finite.*row 6 .*'six'.*'flag'",
+            id="word",
+        ),
+        pytest.param(
+            lambda rows: change(rows, 7, 10, "1e39"),
+            "row 6 has '1e.39'",
+            id="too-large",
         ),
         pytest.param(lambda rows: change(rows, 7, 9, "nan"), None, id="unread-column"),
     ],

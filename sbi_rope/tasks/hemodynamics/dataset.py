@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import check_choice
+from sbi_rope._validation import check_choice, check_instance, check_path
 from sbi_rope.errors import DataNotFoundError, InvalidInputError
 from sbi_rope.tasks.hemodynamics.population import (
     NUISANCES,
@@ -25,6 +25,8 @@ __all__ = ["FORMAT_VERSION", "BeatSet", "describe_population", "differences", "l
 FORMAT_VERSION = 1
 COMMAND = "python -m sbi_rope.tasks.hemodynamics generate"
 SETTINGS = ("format", "version", "process", "n", "seed", "population", "physics")
+# Lengths of a beat in s, of hearts that beat 30 to 200 times in a minute.
+SHORTEST, LONGEST = 0.3, 2.0
 # Columns of the arrays with a row for each person; 0 for plain numbers.
 COLUMNS = {
     "beat": 256,
@@ -104,7 +106,9 @@ def load(
         InvalidInputError: If it is another kind of file, of another version, broken,
             or made with other settings.
     """
-    path = Path(path)
+    path = Path(str(check_path("path", path)))
+    check_instance("population", population, Population, optional=True)
+    check_instance("physics", physics, Physics, optional=True)
     if not path.is_file():
         raise DataNotFoundError(f"No file {path}. Make it with `{COMMAND}`.")
     try:
@@ -160,10 +164,11 @@ def _check_settings(
     physics: Physics | None,
 ) -> None:
     missing = [name for name in SETTINGS if name not in settings]
-    if missing or settings["process"] not in PROCESSES:
+    unusable = [] if missing else _unusable(settings)
+    if missing or unusable:
         raise InvalidInputError(
             f"Expected {path} to say with which settings it was made; {missing} are "
-            f"missing, or its process is unknown. {_again(path)}"
+            f"missing, {unusable} are no such settings. {_again(path)}"
         )
     asked: dict[str, Any] = {}
     if process is not None:
@@ -179,6 +184,18 @@ def _check_settings(
             f"Expected {path} to be made with the settings asked for; {wrong}. Ask for "
             f"those of the file, or make another one with `{COMMAND}`."
         )
+
+
+def _unusable(settings: dict[str, Any]) -> list[str]:
+    """Return the names of settings that are not of their kind."""
+    population, physics = settings["population"], settings["physics"]
+    usable = {
+        "process": any(settings["process"] == process for process in PROCESSES),
+        "population": isinstance(population, dict) and "prior" in population,
+        "physics": isinstance(physics, dict)
+        and Physics().as_dict().keys() <= {*physics},
+    }
+    return [name for name, is_usable in usable.items() if not is_usable]
 
 
 def _check_arrays(
@@ -203,14 +220,31 @@ def _check_arrays(
                 f"Expected the array `{name}` of {path} to be finite; got NaN or Inf. "
                 f"{_again(path)}"
             )
-    names = (
-        tuple(arrays["nuisance_names"].tolist()) if "nuisance_names" in arrays else ()
-    )
+    _check_people(path, arrays)
+    names = tuple(np.atleast_1d(arrays.get("nuisance_names", ())).tolist())
     if names != NUISANCES:
         raise InvalidInputError(
             f"Expected {path} to have the nuisance parameters {NUISANCES}; got "
             f"{names}. {_again(path)}"
         )
+
+
+def _check_people(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Raise if a person is in the set twice, or has a beat that cannot be recorded."""
+    beat, period, index = arrays["beat"], arrays["period"], arrays["index"]
+    wrong = {
+        "a `beat` that does not vary": beat.min(axis=1) == beat.max(axis=1),
+        "a `period` that no heart has": ~((period >= SHORTEST) & (period <= LONGEST)),
+        "an `index` not above that of the person before": np.diff(index, prepend=-1)
+        < 1,
+    }
+    for what, rows in wrong.items():
+        if rows.any():
+            raise InvalidInputError(
+                f"Expected a set of different people in {path}; {int(rows.sum())} of "
+                f"{len(rows)} rows have {what} (first: row {int(rows.argmax())}). "
+                f"{_again(path)}"
+            )
 
 
 def _again(path: Path) -> str:

@@ -11,8 +11,13 @@ from typing import Any
 import numpy as np
 
 from sbi_rope._progress import progress_bar
-from sbi_rope._validation import check_choice, check_integer
-from sbi_rope.errors import InvalidInputError, SimulationError
+from sbi_rope._validation import (
+    check_choice,
+    check_instance,
+    check_integer,
+    check_path,
+)
+from sbi_rope.errors import InvalidInputError, InvalidTypeError, SimulationError
 from sbi_rope.tasks.hemodynamics.chunks import Simulate, Work, read_part, run_chunk
 from sbi_rope.tasks.hemodynamics.dataset import (
     COLUMNS,
@@ -34,6 +39,7 @@ from sbi_rope.tasks.hemodynamics.subject import Physics
 __all__ = ["generate"]
 
 CHUNK_SIZE = 20  # people in a file of the working folder, some ten seconds of work
+MAX_PEOPLE = 10**8  # a year of work for a thousand cores
 # A process that rejects this many more people than it accepts is not worth the wait.
 MAX_REJECTED = 200
 
@@ -80,11 +86,18 @@ def generate(
         SimulationError: If nearly nobody can be simulated.
         ImportError: If numba or joblib is not installed.
     """
-    path = Path(path)
+    path = Path(str(check_path("path", path)))
     _check_free(path)
-    check_integer("n", n)
-    check_integer("seed", seed, minimum=0)
+    check_integer("n", n, maximum=MAX_PEOPLE)
+    check_integer("seed", seed, minimum=0, maximum=None)
     check_choice("process", process, PROCESSES)
+    check_instance("population", population, Population, optional=True)
+    check_instance("physics", physics, Physics, optional=True)
+    if simulate is not None and not callable(simulate):
+        raise InvalidTypeError(
+            "Expected `simulate` to be a function of a subject and its physics; got "
+            f"{type(simulate).__name__}."
+        )
     if jobs is not None and jobs != -1:
         check_integer("jobs", jobs)
     work = Work(

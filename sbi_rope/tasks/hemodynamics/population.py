@@ -145,8 +145,8 @@ class Population:
             InvalidInputError: If an argument is none of these.
         """
         check_choice("process", process, PROCESSES)
-        check_integer("seed", seed, minimum=0)
-        check_integer("index", index, minimum=0)
+        check_integer("seed", seed, minimum=0, maximum=None)
+        check_integer("index", index, minimum=0, maximum=None)
         entropy = [seed, PROCESSES.index(process), index]
         rng = np.random.default_rng(np.random.SeedSequence(entropy))
         age, stroke_volume, heart_rate, ejection_time = self._draw_heart(rng)

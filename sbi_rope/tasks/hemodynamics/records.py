@@ -6,7 +6,16 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import check_choice, check_not_negative
+from sbi_rope._validation import (
+    check_batch,
+    check_choice,
+    check_device,
+    check_instance,
+    check_not_negative,
+    check_same_length,
+    check_tensor,
+)
+from sbi_rope.errors import InvalidInputError
 
 __all__ = ["NUM_STEPS", "SAMPLE_RATE", "Recorder"]
 
@@ -63,6 +72,8 @@ class Recorder:
         Returns:
             Recordings, shape ``(n, 1000)``, with the dtype of ``beat``.
         """
+        _check_beats(beat, period)
+        check_instance("generator", generator, torch.Generator, optional=True)
         like = {"dtype": beat.dtype, "device": beat.device}
         start = torch.rand((len(beat),), generator=generator, **like)
         noise = torch.randn((len(beat), NUM_STEPS), generator=generator, **like)
@@ -74,7 +85,28 @@ class Recorder:
             mean, scale = GLOBAL_SCALE
             return (pressure - mean) / scale
         centred = pressure - pressure.mean(dim=1, keepdim=True)
+        if not centred.any(dim=1).all():
+            raise InvalidInputError(
+                "Expected every `beat` to vary; got one with a single pressure, which "
+                "has no scale. Pass `normalisation='global'`, or leave it out."
+            )
         return centred / centred.square().mean(dim=1, keepdim=True).sqrt()
+
+
+def _check_beats(beat: Tensor, period: Tensor) -> None:
+    if check_tensor("beat", beat).ndim != 2 or not beat.is_floating_point():
+        raise InvalidInputError(
+            "Expected `beat` of shape (n, m), floating-point numbers; got "
+            f"{tuple(beat.shape)}, {beat.dtype}."
+        )
+    check_batch("beat", beat, beat.shape[1:], allow_empty=True)
+    check_batch("period", period, (), allow_empty=True)
+    check_same_length("beat", beat, "period", period)
+    check_device("period", period, beat.device, where="`beat`")
+    if not (period > 0).all():
+        raise InvalidInputError(
+            f"Expected `period` to be positive; got {float(period.min())}."
+        )
 
 
 def play(beat: Tensor, period: Tensor, *, start: Tensor) -> Tensor:

@@ -1,12 +1,18 @@
 """One person, as far as the circulation model knows, and how finely it is solved."""
 
-import math
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
-from sbi_rope._validation import check_integer, check_positive, check_unit_interval
-from sbi_rope.errors import InvalidInputError
+from sbi_rope._validation import (
+    check_instance,
+    check_integer,
+    check_number,
+    check_positive,
+    check_unit_interval,
+)
+from sbi_rope.errors import InvalidInputError, shown
 
 __all__ = ["NUM_SEGMENTS", "Beat", "Physics", "Subject"]
 
@@ -69,7 +75,8 @@ class Subject:
     def __post_init__(self) -> None:
         for name, (low, high) in PHYSIOLOGICAL.items():
             value = getattr(self, name)
-            if not low <= value <= high:  # NaN included
+            check_number(name, value)
+            if not low <= value <= high:
                 raise InvalidInputError(
                     f"Expected `{name}` from {low:g} to {high:g}; got {value!r}. Units "
                     "are years, beats per minute, ml, ms, mmHg and m/s."
@@ -90,14 +97,7 @@ class Subject:
                 f"Expected `outflow_pressure` below `mean_pressure`; got "
                 f"{self.outflow_pressure:g} and {self.mean_pressure:g} mmHg."
             )
-        factors = self.length_factors
-        if len(factors) != NUM_SEGMENTS or not all(
-            0.0 < factor < math.inf for factor in factors
-        ):
-            raise InvalidInputError(
-                f"Expected `length_factors` to be {NUM_SEGMENTS} positive numbers; got "
-                f"{len(factors)} from {min(factors, default=None)!r}."
-            )
+        _check_factors(self.length_factors)
 
     @property
     def period(self) -> float:
@@ -139,6 +139,7 @@ class Physics:
             check_positive(name, getattr(self, name))
             check_unit_interval(name, getattr(self, name))
         check_integer("num_cycles", self.num_cycles, minimum=2)
+        check_instance("viscoelastic", self.viscoelastic, bool)
 
     def as_dict(self) -> dict[str, float | int | bool]:
         """Return all settings by name, as stored with a data set."""
@@ -148,6 +149,18 @@ class Physics:
             field.name: kinds.get(field.name, float)(getattr(self, field.name))
             for field in fields(self)
         }
+
+
+def _check_factors(factors: Any) -> None:
+    try:
+        values = np.asarray(factors, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        values = np.full(0, np.nan)
+    if values.shape != (NUM_SEGMENTS,) or not ((values > 0) & (values < np.inf)).all():
+        raise InvalidInputError(
+            f"Expected `length_factors` to be {NUM_SEGMENTS} positive numbers; got "
+            f"{shown(factors)}."
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

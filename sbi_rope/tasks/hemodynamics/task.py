@@ -9,9 +9,15 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._validation import check_choice, check_positive
+from sbi_rope._validation import (
+    check_choice,
+    check_in_support,
+    check_instance,
+    check_path,
+    check_positive,
+)
 from sbi_rope.errors import InvalidInputError
-from sbi_rope.tasks.base import Task, check_theta
+from sbi_rope.tasks.base import Task, check_parameters, check_theta
 from sbi_rope.tasks.hemodynamics.dataset import BeatSet, differences, load
 from sbi_rope.tasks.hemodynamics.population import Population, Process
 from sbi_rope.tasks.hemodynamics.prior import PopulationPrior
@@ -168,7 +174,8 @@ class Hemodynamics(Task):
         check_positive("noise_std", noise_std)
         check_choice("prior", prior, ("population", "independent"))
         self.prior: Literal["population", "independent"] = prior
-        self.simulations = simulations
+        self.simulations = check_path("simulations", simulations, optional=True)
+        observations = check_path("observations", observations, optional=True)
         self.observations = self._option("observations", observations, None)
         self.recorder = Recorder(noise_std=noise_std, normalisation=normalisation)
 
@@ -178,7 +185,8 @@ class Hemodynamics(Task):
 
     def prior_quantiles(self, theta: Tensor) -> Tensor:
         """Return the distribution functions of both parameters, ``(n, 2)``."""
-        return self.get_prior().marginal_cdf(theta)
+        prior = self.get_prior()
+        return prior.marginal_cdf(check_parameters(theta, prior))
 
     def get_simulator(self) -> NearestBeatSimulator:
         """Return the simulator that looks simulated people up."""
@@ -194,6 +202,7 @@ class Hemodynamics(Task):
 
     def get_embedding_net(self, *, light: bool = False) -> nn.Module:
         """Return the paper's convolutional network, or a light one; five outputs."""
+        check_instance("light", light, bool)
         if light:
             return light_series_embedding(num_steps=NUM_STEPS, output_dim=5)
         pools = ((4, 2), (4, 2), (4, 1))
@@ -230,16 +239,17 @@ class Hemodynamics(Task):
         read_x = partial(_record_once, self.recorder, beat, period, keys)
         return RecordedPairs(theta=people.theta[chosen], read_x=read_x)
 
-    def _load(self, path: str | Path | None, process: Process) -> BeatSet:
+    def _load(self, path: Path | None, process: Process) -> BeatSet:
         if path is None:
             path = Path(str(files(SHIPPED) / f"{process}.npz"))
-        people = load(Path(path).expanduser(), process=process)
+        people = load(path, process=process)
         made_with = people.settings["population"]["prior"]
         if made_with != self.prior:
             raise InvalidInputError(
                 f"Expected people of the prior {self.prior!r} in {path}; got those of "
                 f"{made_with!r}. Pass `prior={made_with!r}`, or other files."
             )
+        check_in_support(f"theta of {path}", people.theta, self.get_prior())
         return people
 
 
