@@ -290,6 +290,7 @@ def check_same_length(name_a: str, a: Tensor, name_b: str, b: Tensor) -> None:
 def check_rows(name: str, value: Any, count: int) -> Tensor:
     """Return numbers of rows, shape ``(m,)``, from 0 to ``count`` - 1."""
     rows = check_tensor(name, value)
+    check_values(name, rows)
     whole = rows.ndim == 1 and rows.dtype == torch.long
     if not whole or bool(((rows < 0) | (rows >= count)).any()):
         raise InvalidInputError(
@@ -335,8 +336,7 @@ def check_theta(theta: Any, event_shape: torch.Size, *, batched: bool) -> Tensor
         raise InvalidInputError(
             f"Expected at least one `theta`; got shape {tuple(theta.shape)}."
         )
-    if torch.isnan(theta).any():
-        raise InvalidInputError("Expected `theta` without NaN.")
+    check_not_nan("theta", theta)
     return theta
 
 

@@ -347,8 +347,8 @@ def _checked_targets(targets: Tensor, embedded: Tensor) -> Tensor:
     targets = check_tensor("targets", targets)
     if targets.shape != embedded.shape:
         raise InvalidInputError(
-            "Expected a target of the width of the embedding for each pair, shape "
-            f"{tuple(embedded.shape)}; got {tuple(targets.shape)}."
+            "Expected `targets` with one for each pair, as wide as the embedding, "
+            f"shape {tuple(embedded.shape)}; got {tuple(targets.shape)}."
         )
     check_finite("targets", targets)
     return targets

@@ -549,7 +549,9 @@ class RoPE:
             settings = itertools.product(gammas, taus)
             # In our hands: moving a posterior to a device gives it another.
             shared: dict[int, Tensor] = {}
-            for coupling, (gamma, tau) in zip(couplings, settings, strict=True):
+            for gamma, tau in settings:
+                with parameters_named(batch.theta):
+                    coupling = next(couplings)
                 if require_convergence:
                     _check_converged(coupling, replace(coupler, gamma=gamma, tau=tau))
                 yield self._mixture(batch, coupling, shared=shared)
@@ -717,9 +719,9 @@ class _Batch:
 
 @contextmanager
 def parameters_named(theta: Tensor) -> Iterator[None]:
-    """Say what the parameters of simulations are that a coupling failed for.
+    """Say which observations and simulations a coupling failed for, in RoPE's words.
 
-    Their rows mean nothing to users, for whom they were drawn.
+    The rows of simulations mean nothing to users, for whom they were drawn.
 
     Args:
         theta: The parameters of the simulations, shape ``(n_s, d)``.
@@ -727,13 +729,12 @@ def parameters_named(theta: Tensor) -> Iterator[None]:
     try:
         yield
     except CouplingError as error:
-        if not error.simulated_rows:
-            raise
-        rows = list(error.simulated_rows[:5])
-        raise CouplingError(
-            f"{error.reason} The parameters of these simulations are "
-            f"{theta[rows].tolist()}."
-        ) from error
+        reason = error.reason.replace("`real`", "`x_o`")
+        reason = reason.replace("`simulated`", "the simulations")
+        if error.simulated_rows:
+            rows = list(error.simulated_rows[:5])
+            reason += f" Their parameters are {theta[rows].tolist()}."
+        raise CouplingError(reason) from error
 
 
 def _check_converged(coupling: Coupling, coupler: SinkhornCoupler) -> None:

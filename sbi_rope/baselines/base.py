@@ -31,6 +31,7 @@ from sbi_rope._validation import (
     check_prior,
     check_same_length,
     check_tensor,
+    check_values,
     usable_device,
 )
 from sbi_rope.baselines.training import (
@@ -149,6 +150,7 @@ class Method(ABC):
             )
         shape = x.shape[1:] if self._event_shape is None else self._event_shape
         x = check_batch(name, x, shape, finite=False)
+        check_values(name, x)
         x = x.detach().to(self._device, torch.float32, copy=True)
         if finite:
             check_finite(name, x)  # float32 may hold less

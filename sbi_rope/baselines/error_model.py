@@ -3,6 +3,7 @@ r"""The error model of RNPE and NNPE, and statistics with its errors taken away.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,7 +11,14 @@ from torch import Tensor
 
 from sbi_rope._progress import progress_bar
 from sbi_rope._sbi import SliceSamplerVectorized
-from sbi_rope._validation import check_positive, check_unit_interval
+from sbi_rope._validation import (
+    check_not_nan,
+    check_positive,
+    check_tensor,
+    check_unit_interval,
+    check_values,
+)
+from sbi_rope.errors import InvalidTypeError
 
 __all__ = ["ChainSettings", "SpikeAndSlab", "denoise", "split_r_hat"]
 
@@ -65,20 +73,41 @@ class SpikeAndSlab:
         check_positive("bound", self.bound)
 
     def sample_like(self, x: Tensor) -> Tensor:
-        """Draw noise of the shape, dtype and device of a tensor."""
+        """Draw noise of the shape, dtype and device of a tensor.
+
+        Raises:
+            InvalidTypeError: If it is no tensor of floating-point numbers.
+        """
+        _check_floating("x", x)
         spike = self.spike_std * torch.randn_like(x)
         slab = torch.empty_like(x).cauchy_(sigma=self.slab_scale)
         is_slab = torch.rand_like(x) < self.slab_probability
         return slab.where(is_slab, spike).clamp(-self.bound, self.bound)
 
     def log_prob(self, noise: Tensor) -> Tensor:
-        """Return the log density of every entry of y - s, without the bound."""
+        """Return the log density of every entry of y - s, without the bound.
+
+        Raises:
+            InvalidTypeError: If it is no tensor of floating-point numbers.
+            InvalidInputError: If an entry is NaN.
+        """
+        _check_floating("noise", noise)
+        check_not_nan("noise", noise)
         z = noise / self.spike_std
         spike = -0.5 * z**2 - math.log(self.spike_std * math.sqrt(2 * math.pi))
         z = noise / self.slab_scale
         slab = -torch.log1p(z**2) - math.log(self.slab_scale * math.pi)
         share = torch.tensor(self.slab_probability).to(noise)
         return torch.logaddexp(spike + torch.log1p(-share), slab + share.log())
+
+
+def _check_floating(name: str, value: Any) -> None:
+    check_values(name, check_tensor(name, value))
+    if not value.is_floating_point():
+        raise InvalidTypeError(
+            f"Expected `{name}` to hold floating-point numbers; got {value.dtype}. "
+            "Convert it with `.float()`."
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

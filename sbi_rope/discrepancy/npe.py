@@ -24,6 +24,7 @@ from sbi_rope._validation import (
     check_choice,
     check_instance,
     check_integer,
+    check_names,
     check_positive,
 )
 from sbi_rope.baselines.base import BuildsOnNPE, UsesCalibration
@@ -233,6 +234,8 @@ class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
             InvalidInputError: If x is not a vector, or the names do not fit.
             SimulationError: If the simulator fails.
         """
+        if x_names is not None:
+            x_names = check_names("x_names", x_names)
         if self._simulator is None:
             self._needs("simulations", len(self._theta), "append_simulations(theta, x)")
         self._check_pairs()

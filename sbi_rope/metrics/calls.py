@@ -171,7 +171,7 @@ def draw_samples(posterior: Any, x: Tensor, *, num_samples: int) -> Tensor:
             range.
     """
     check_num_samples(num_samples)
-    check_batch("x", x, check_tensor("x", x).shape[1:])
+    check_batch("x", x, _event_shape(posterior, check_tensor("x", x)))
     if isinstance(posterior, NeuralPosterior):
         x = as_float32("x", x)
     samples = _sample(posterior, x, num_samples)
@@ -181,6 +181,12 @@ def draw_samples(posterior: Any, x: Tensor, *, num_samples: int) -> Tensor:
             f"returned {tuple(samples.shape)}."
         )
     return samples
+
+
+def _event_shape(posterior: Any, x: Tensor) -> torch.Size:
+    """Return the shape of an observation, that of ``x`` itself where it is unknown."""
+    estimator = getattr(posterior, "posterior_estimator", None)
+    return getattr(estimator, "condition_shape", x.shape[1:])
 
 
 def _sample(posterior: Any, x: Tensor, num_samples: int) -> Tensor:

@@ -204,7 +204,8 @@ class MixturePosterior(DirectPosterior):
             )
         # A new one: posteriors of a sweep share it and stay where they are.
         self._cache = {k: mass.to(device) for k, mass in self._cache.items()}
-        super().to(device)
+        with seeded(0):  # sbi draws from the prior to look at it
+            super().to(device)
 
     def __getstate__(self) -> dict[str, Any]:
         # sbi hands out its own __dict__, which a shallow copy would then share.
@@ -442,7 +443,13 @@ class MixturePosterior(DirectPosterior):
 
         Returns:
             Shape ``(1, d)``.
+
+        Raises:
+            InvalidInputError: If a number is outside its range.
         """
+        check_integer("num_iter", num_iter)
+        check_integer("num_to_optimize", num_to_optimize)
+        check_integer("num_init_samples", num_init_samples)
         return super().map(
             x=x,
             num_iter=num_iter,

@@ -185,6 +185,8 @@ class DensityCandidate(AmortisedCandidate):
 
 
 def _check_name(name: str) -> None:
+    if not isinstance(name, str) or not name:
+        raise InvalidTypeError(f"Expected a `name` of some letters; got {name!r}.")
     if name == "stack":
         raise InvalidInputError("Expected another name; 'stack' is that of them all.")
 

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sbi_rope._validation import check_instance
 from sbi_rope.metrics import (
     CoverageCurve,
     acauc_of,
@@ -94,6 +95,7 @@ class StackingReport:
 
     def gain_over(self, name: str) -> Difference | None:
         """Return the gain of the stack over a candidate; None if there is none such."""
+        check_instance("name", name, str)
         if name not in self.cross_validation.names:
             return None
         return self.cross_validation.difference("stack", name)

@@ -11,6 +11,7 @@ from sbi_rope._validation import (
     check_not_negative,
     check_positive,
     check_tensor,
+    check_values,
 )
 from sbi_rope.errors import InvalidInputError, warn_user
 
@@ -118,7 +119,8 @@ def stacking_weights(
 
 
 def _checked_scores(log_scores: Tensor) -> Tensor:
-    scores = check_tensor("log_scores", log_scores).detach().double()
+    check_values("log_scores", check_tensor("log_scores", log_scores))
+    scores = log_scores.detach().double()
     if scores.ndim != 2 or not scores.shape[1]:
         raise InvalidInputError(
             "Expected `log_scores` of shape (pairs, candidates), with one candidate at "

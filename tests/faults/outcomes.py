@@ -72,12 +72,16 @@ def refuse(call: Call, argument: str, label: str, value: Any) -> Outcome:
 
 def survive(call: Call, argument: str, label: str, value: Any) -> Outcome:
     """Call with what must be refused, or give numbers."""
-    return _judge(call, argument, label, value, expected="numbers")
+    accepted = f"{argument}: {label}" in call.accepts
+    expected = "anything" if accepted else "numbers"
+    return _judge(call, argument, label, value, expected=expected)
 
 
 def agree(call: Call, argument: str, label: str, value: Tensor) -> Outcome:
     """Call with what must be refused, or give the same as a plain tensor."""
-    return _judge(call, argument, label, value, expected="the same")
+    accepted = f"{argument}: {label}" in call.accepts
+    expected = "numbers" if accepted else "the same"
+    return _judge(call, argument, label, value, expected=expected)
 
 
 def _judge(
@@ -103,7 +107,8 @@ def _judge(
         return outcome("raw", f"{type(error).__name__}: {error}")
     if not expected:
         return outcome("silent", "was accepted")
-    if any(tensor.isnan().any() for tensor in found if tensor.is_floating_point()):
+    numbers = [tensor for tensor in found if tensor.is_floating_point()]
+    if expected != "anything" and any(tensor.isnan().any() for tensor in numbers):
         return outcome("silent", "NaN")
     if expected == "the same":
         plain = value.detach().float() if value.is_floating_point() else value.float()

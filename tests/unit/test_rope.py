@@ -687,7 +687,7 @@ def _with(x: Tensor, row: int, value: float) -> Tensor:
 
 
 def test_an_observation_that_is_out_of_all_proportion_is_named_by_its_row() -> None:
-    with pytest.raises(CouplingError, match=r"1 of `real` \(first: \[7\]\)\. Remove"):
+    with pytest.raises(CouplingError, match=r"1 of `x_o` \(first: \[7\]\)\. Remove"):
         rope().build_posterior(_with(X_O, 7, 1e15))
     with pytest.raises(InvalidInputError, match=r"`x_o` with a finite.*\[7\], with va"):
         rope().build_posterior(_with(X_O, 7, 1e30))
@@ -698,7 +698,7 @@ def test_simulations_that_are_out_of_all_proportion_are_named_by_parameters() ->
     stored = rope(
         simulator=None, simulations=(theta, _with(gaussian.simulator(theta), 9, 1e30))
     )
-    named = rf"1 of `simulated`\. .* are \[\[{str(theta[9, 0].item())[:6]}"
+    named = rf"1 of the simulations\. .* are \[\[{str(theta[9, 0].item())[:6]}"
     for call in (
         lambda: stored.build_posterior(X_O, seed=0),
         lambda: next(stored.sweep(X_O, gammas=[0.5], taus=[1.0], seed=0)),

@@ -92,5 +92,6 @@ NOT_CALLED = {
         _FOR_STACK,
     ),
     "PriorPosterior.map": "sbi's own",
+    "shown": "shows anything",
     "warn_user": "says what it is told",
 }

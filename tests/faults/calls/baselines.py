@@ -31,9 +31,18 @@ def appended(method: Any, what: str, *data: Tensor) -> Any:
     }[what]()
 
 
+# No draw and no density is NaN for these.
+OF_NOISE = {"log_prob": ("Inf",), "sample_like": ("NaN", "Inf")}
 # Where the values of x are never read.
 ANY_X = tuple(
-    f"x: {what}" for what in ("one dimension more", "one column more", "NaN", "Inf")
+    f"x: {what}"
+    for what in (
+        "one dimension more",
+        "one column more",
+        "NaN",
+        "Inf",
+        "without values",
+    )
 )
 # What each baseline may be given, and how it is made.
 DATA = {
@@ -141,17 +150,7 @@ CALLS += [
         name="PriorPosterior.sample_batched",
         run=lambda x: baselines.PriorPosterior(PRIOR).sample_batched((3,), x),
         tensors={"x": X},
-        accepts=tuple(
-            f"x: {what}"
-            for what in (
-                "one dimension more",
-                "one column more",
-                "one row less",
-                "one dimension less",
-                "NaN",
-                "Inf",
-            )
-        ),
+        accepts=("x: one row less", "x: one dimension less", *ANY_X),
         is_random=True,
     ),
     Call(
@@ -178,6 +177,11 @@ CALLS += [
                     "one row less",
                     "no dimension",
                     "no rows",
+                    # The result has the dtype of the argument.
+                    "float64",
+                    "half",
+                    "bfloat16",
+                    *OF_NOISE[method],
                 )
             ),
             is_random=True,

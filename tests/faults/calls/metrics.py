@@ -18,7 +18,7 @@ from tests.faults.problem import (
     stacked,
 )
 
-LEVELS = torch.linspace(0.01, 0.99, 40).reshape(20, 2)
+LEVELS = torch.linspace(0.0132, 0.9871, 40).reshape(20, 2)
 SAMPLES = draw(6, 50, 20, 2)
 
 
@@ -84,7 +84,15 @@ CALLS = [
             name=score.__name__,
             run=score,
             tensors={"levels": LEVELS},
-            accepts=("levels: one row less", "levels: one column more"),
+            accepts=(
+                "levels: one row less",
+                "levels: one column more",
+                # Which has no standard error.
+                "levels: one row",
+                # In which levels are others.
+                "levels: half",
+                "levels: bfloat16",
+            ),
         )
         for score in (
             metrics.acauc_of,
@@ -96,13 +104,26 @@ CALLS = [
         name="central_levels",
         run=metrics.central_levels,
         tensors={"ranks": LEVELS},
-        accepts=("ranks: one row less", "ranks: one column more"),
+        # Each entry by itself.
+        accepts=tuple(
+            f"ranks: {what}"
+            for what in (
+                "one row less",
+                "one column more",
+                "no dimension",
+                "one dimension more",
+                "one dimension less",
+                "no rows",
+                "bfloat16",
+            )
+        ),
     ),
     Call(
         name="mid_ranks",
         run=lambda samples=SAMPLES, theta=THETA: metrics.mid_ranks(samples, theta),
         tensors={"samples": SAMPLES, "theta": THETA},
-        accepts=("samples: one row less",),
+        # Infinite numbers have ranks.
+        accepts=("samples: one row less", "samples: Inf", "theta: Inf"),
     ),
     Call(
         name="draw_samples",

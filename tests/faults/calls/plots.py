@@ -32,6 +32,10 @@ OVERVIEW: dict[str, Any] = {
 }
 
 
+# Two labels may be the same, and theta may be a column.
+LABELS = ("theta: one dimension more", "parameter_names: ['a', 'a']")
+
+
 def drawn(plot: Callable[..., Any]) -> Callable[..., None]:
     """Call a function that draws, and close what it drew."""
 
@@ -55,7 +59,7 @@ CALLS = [
         ),
         tensors={"simulated": X_S, "samples": SAMPLES, "theta": THETA[0]},
         options={"parameter_names": "names", "index": "row", "parameters": "names"},
-        accepts=("simulated: one row less", "samples: one row less"),
+        accepts=("samples: one row less", *LABELS),
     ),
     Call(
         name="overview(prior)",
@@ -72,7 +76,7 @@ CALLS = [
         ),
         tensors={"samples": SAMPLES, "theta": THETA[0]},
         options={"parameter_names": "names"},
-        accepts=("samples: one row less", "theta: None"),
+        accepts=("samples: one row less", "theta: None", *LABELS),
     ),
     Call(
         name="implied_parameters",
@@ -81,6 +85,7 @@ CALLS = [
         )(theta=theta, implied=implied, **options),
         tensors={"theta": THETA_S, "implied": WEIGHTS},
         options={"parameter_names": "names"},
+        accepts=("theta: one column more", *LABELS),
     ),
     Call(
         name="real_and_simulated",

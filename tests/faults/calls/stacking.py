@@ -185,5 +185,6 @@ CALLS = [
         name="StackingReport.gain_over",
         run=lambda name="NPE": stacked().report.gain_over(name),
         options={"name": "choice"},
+        accepts=("name: 'x'",),
     ),
 ]

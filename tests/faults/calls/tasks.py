@@ -7,6 +7,8 @@ from torch import Tensor
 from sbi_rope.tasks import Task, get_task
 from tests.faults.outcomes import Call
 
+# The result has the dtype of the argument.
+OTHER_DTYPES = tuple(f"theta: {dtype}" for dtype in ("float64", "half", "bfloat16"))
 NAMES = ("cs", "linear_gaussian", "pendulum", "sir")
 
 
@@ -51,7 +53,7 @@ CALLS = [
             name=f"prior_quantiles({name})",
             run=lambda theta, name=name: made(name).prior_quantiles(theta),
             tensors={"theta": some_theta(name)},
-            accepts=("theta: one row less", "theta: no rows"),
+            accepts=("theta: one row less", "theta: no rows", *OTHER_DTYPES),
         )
         for name in NAMES
     ),
@@ -60,7 +62,15 @@ CALLS = [
             name=f"get_simulator({name})",
             run=lambda theta, name=name: made(name).get_simulator()(theta),
             tensors={"theta": some_theta(name)},
-            accepts=("theta: one row less", "theta: no rows"),
+            accepts=(
+                "theta: one row less",
+                "theta: no rows",
+                *OTHER_DTYPES,
+                # Outside the prior a simulation may fail, which NaN says.
+                "theta: all entries of 1e-30",
+                "theta: one value only",
+                "theta: a constant column",
+            ),
             is_random=True,
         )
         for name in NAMES
