@@ -23,6 +23,7 @@ from benchmarks.estimators import posterior_with, state_of
 from benchmarks.presets import PRESETS
 from benchmarks.store import Cache, Results
 from sbi_rope._files import set_aside, write_atomically
+from sbi_rope._sbi import embedding_of
 from sbi_rope.errors import NotWritableError, RoPEWarning
 from sbi_rope.tasks import get_task
 from tests.results import empty, fill_with_garbage, remove, result_of, truncate
@@ -113,7 +114,9 @@ def replace_by_another(path: Path) -> None:
     """Put the file of another cell in its place."""
     other = replace(FINISHED, repetition=1)
     results = Results(path.parent)
-    results.write(other, *result_of(other, [-1.0, -1.0]))
+    # Nothing but its cell tells the row from the one it replaces.
+    log_probs = [-1.0, -2.0] if path.suffix == ".json" else [-1.0, -1.0]
+    results.write(other, *result_of(other, log_probs))
     path.write_bytes((path.parent / f"{other.key}{path.suffix}").read_bytes())
 
 
@@ -282,10 +285,13 @@ def test_a_rebuilt_estimator_is_the_trained_one(task: str, preset: str) -> None:
         for one in (rebuilt, posterior)
     )
     assert torch.equal(ours, theirs)
-    # What is done to it later changes neither the state nor the next one.
+    # What is done to it later changes neither the state nor what is built next.
     for weights in rebuilt.posterior_estimator.parameters():
         weights.data.zero_()
     assert all(torch.equal(state[name], values) for name, values in before.items())
+    assert any(
+        weights.any() for weights in embedding_of(builder(theta, x)).parameters()
+    )
 
 
 def test_npe_of_an_older_version_is_not_opened(
