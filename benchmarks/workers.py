@@ -1,7 +1,6 @@
 """Calls in parallel, by processes that end with the one that started them."""
 
 import os
-from collections.abc import Callable
 from typing import Any
 
 import joblib
@@ -22,17 +21,16 @@ def parallel(
         calls: Functions, each with its arguments.
         bar: A progress bar that counts what the results hold.
     """
+    # Dask watches over its own workers, which may be on other machines.
+    watch = {"initializer": end_with, "initargs": (os.getpid(),)}
     results = []
     # The way that knows external backends, dask's among them.
-    with joblib.parallel_config(backend=backend, n_jobs=jobs):
+    with joblib.parallel_config(
+        backend=backend, n_jobs=jobs, **(watch if backend == "loky" else {})
+    ):
         run = joblib.Parallel(return_as="generator_unordered", batch_size=1)
-        for result in run(joblib.delayed(_call)(os.getpid(), *call) for call in calls):
+        for result in run(joblib.delayed(call[0])(*call[1:]) for call in calls):
             results.append(result)
             if bar is not None:
                 bar.update(len(result))
     return results
-
-
-def _call(parent: int, function: Callable[..., Any], *arguments: Any) -> Any:
-    end_with(parent)
-    return function(*arguments)

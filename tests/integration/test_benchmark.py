@@ -231,11 +231,45 @@ def test_what_is_finished_is_not_computed_again(
     assert before.stat().st_mtime_ns > modified
 
 
+def children_of(process: subprocess.Popen[Any]) -> list[Any]:
+    psutil = pytest.importorskip("psutil")
+    return psutil.Process(process.pid).children(recursive=True)
+
+
+def left_alive(workers: list[Any], *, seconds: float = 30.0) -> list[Any]:
+    """Return those that have not ended after a while."""
+    psutil = pytest.importorskip("psutil")
+    deadline = time.monotonic() + seconds
+    while workers and time.monotonic() < deadline:
+        time.sleep(0.1)
+        alive = []
+        for worker in workers:
+            with contextlib.suppress(psutil.NoSuchProcess):
+                if worker.is_running() and worker.status() != psutil.STATUS_ZOMBIE:
+                    alive.append(worker)
+        workers = alive
+    return workers
+
+
+@pytest.mark.slow
+def test_workers_that_are_just_starting_end_with_their_run(
+    suite_file: Path, tmp_path: Path
+) -> None:
+    command = [sys.executable, "-m", "benchmarks", "run", str(suite_file)]
+    command += ["--out", str(tmp_path), "--jobs", "2", "--method", "NPE", "RoPE"]
+    process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL)
+    while len(workers := children_of(process)) < 2:
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.kill()
+    process.wait()
+    assert not left_alive(workers)
+
+
 @pytest.mark.slow
 def test_a_killed_run_takes_its_workers_along_and_resumes_to_the_same_table(
     suite_file: Path, uninterrupted: list[dict[str, str]], tmp_path: Path
 ) -> None:
-    psutil = pytest.importorskip("psutil")
     command = [sys.executable, "-m", "benchmarks", "run", str(suite_file)]
     command += ["--out", str(tmp_path), "--jobs", "2"]
     with (tmp_path / "output").open("w") as output:
@@ -244,20 +278,12 @@ def test_a_killed_run_takes_its_workers_along_and_resumes_to_the_same_table(
     while len(list(cells.glob("*.json"))) < 2:
         assert process.poll() is None, (tmp_path / "output").read_text()
         time.sleep(0.05)
-    workers = psutil.Process(process.pid).children(recursive=True)
+    workers = children_of(process)
     assert len(workers) >= 2
     process.kill()  # the parent alone, which has no time to tell its children
     process.wait()
 
-    def is_alive(worker: Any) -> bool:
-        with contextlib.suppress(psutil.NoSuchProcess):
-            return worker.is_running() and worker.status() != psutil.STATUS_ZOMBIE
-        return False
-
-    deadline = time.monotonic() + 20.0
-    while any(map(is_alive, workers)) and time.monotonic() < deadline:
-        time.sleep(0.1)
-    assert not any(map(is_alive, workers))
+    assert not left_alive(workers)
     finished = {path: path.stat().st_mtime_ns for path in cells.glob("*.json")}
     assert 2 <= len(finished) < len(uninterrupted)
     damaged = sorted(finished)[0].with_suffix(".npz")
