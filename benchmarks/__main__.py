@@ -8,7 +8,7 @@
 
 Cells that are finished are kept, whichever suite asked for them, and are not computed
 again. Cells that failed are kept with their error; `--retry` computes them again. `run`
-ends with status 1 if one of its cells failed.
+ends with status 1 if one of its cells failed or has no result.
 """
 
 import argparse
@@ -22,6 +22,7 @@ from benchmarks.report import write_report
 from benchmarks.runner import Workplace, run_cells
 from benchmarks.summary import write_summary
 from benchmarks.tables import read_table, write_table
+from sbi_rope.errors import RoPEError
 
 DEFAULT_OUT = Path("results/benchmark")
 PUBLISHED = Path(__file__).parent / "results"
@@ -90,7 +91,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     _add_out(summary, PUBLISHED)
     args = parser.parse_args(arguments)
-    return args.command(args)
+    try:
+        return args.command(args)
+    except RoPEError as error:
+        # What the user can put right: the message says how, a traceback would hide it.
+        raise SystemExit(f"{type(error).__name__}: {error}") from error
 
 
 def _add_out(parser: argparse.ArgumentParser, default: Path) -> None:
@@ -121,13 +126,17 @@ def _run(args: argparse.Namespace) -> int:
     table = write_table(suite, workplace.results, folder)
     path = write_report(suite, table, folder)
     print(f"Written: {path}")
-    failed = 0
+    unfinished = 0
     for cell in cells:
         row = table.rows.get(cell)
-        if row is not None and row["status"] == "failed":
+        if row is None:
+            print(f"no result: {cell}")
+        elif row["status"] == "failed":
             print(f"failed: {cell}: {row['error'].splitlines()[0][:150]}")
-            failed += 1
-    return 1 if failed else 0
+        else:
+            continue
+        unfinished += 1
+    return 1 if unfinished else 0
 
 
 @contextlib.contextmanager
@@ -175,7 +184,7 @@ def _report(args: argparse.Namespace) -> int:
         folder = args.out / suite.name
         if not (folder / "results.csv").exists():
             raise SystemExit(f"No results of {suite.name} in {args.out}.")
-        print(f"Written: {write_report(suite, read_table(folder), folder)}")
+        print(f"Written: {write_report(suite, read_table(suite, folder), folder)}")
     return 0
 
 

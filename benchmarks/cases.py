@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.cells import Cell
+from benchmarks.estimators import posterior_with, state_of
 from benchmarks.presets import PRESETS, Settings
 from benchmarks.store import Cache
 from sbi_rope.baselines import NPE
@@ -134,7 +135,7 @@ class Case:
                 "number": self.settings.num_simulations,
                 "seed": self.seed,
             }
-            pairs = self.cache.get("simulations", content, draw)
+            pairs = self.cache.get("simulations", content, draw, unpack=_as_pairs)
         return {
             name: (theta.to(self.device), x.to(self.device))
             for name, (theta, x) in pairs.items()
@@ -210,6 +211,22 @@ class Case:
                 "seconds": time.perf_counter() - start,
             }
 
+        def pack(entry: dict[str, Any]) -> dict[str, Any]:
+            return {
+                "state": state_of(entry["posterior"]),
+                "seconds": entry["seconds"],
+            }
+
+        def unpack(kept: dict[str, Any]) -> dict[str, Any]:
+            posterior = posterior_with(
+                kept["state"],
+                prior=self.task.get_prior(),
+                build=self.builder,
+                simulations=self.simulations,
+                device=self.device,
+            )
+            return {"posterior": posterior, "seconds": float(kept["seconds"])}
+
         # By their content: variants that change real data only share an NPE.
         content = {
             "simulations": [digest(part) for part in self.simulations],
@@ -219,7 +236,15 @@ class Case:
             "light_net": self.settings.light_net,
             "device": self.device,
         }
-        return self.cache.get("npe", content, train)
+        return self.cache.get("npe", content, train, pack=pack, unpack=unpack)
+
+
+def _as_pairs(kept: dict[str, Pairs]) -> dict[str, Pairs]:
+    """Return stored pairs if they are pairs, and raise an error if they are not."""
+    pairs = {str(name): (theta, x) for name, (theta, x) in kept.items()}
+    if not pairs or any(len(theta) != len(x) for theta, x in pairs.values()):
+        raise ValueError("it holds no pairs of parameters and simulations.")
+    return pairs
 
 
 def digest(tensor: Tensor) -> str:

@@ -3,11 +3,14 @@
 import hashlib
 import itertools
 import json
+import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
+
+from sbi_rope.errors import InvalidInputError
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -35,6 +38,10 @@ NEEDS_CALIBRATION = (
     "stack of a batch",
 )
 NEEDS_COUPLING = ("OT-only", "RoPE")
+NEEDED = ("title", "question", "preset", "repetitions", "cells")
+AXES = ("n_calibration", "gamma", "tau")
+# Neither a folder nor, with a dot in front, a hidden file or the folder above.
+FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 KEYS = {"tasks", "variants", "methods", "n_calibration", "gammas", "taus", "options"}
 
 
@@ -158,28 +165,55 @@ def load_suite(name: str) -> Suite:
 
     Raises:
         SystemExit: If there is none, or it holds an unknown key.
+        InvalidInputError: If a key is missing, or a name cannot be used.
     """
     path = Path(name) if name.endswith(".toml") else FOLDER / f"{name}.toml"
     if not path.exists():
         raise SystemExit(f"No suite {name!r}; there are {list_suites()}.")
-    data = tomllib.loads(path.read_text())
+    data = tomllib.loads(path.read_text(encoding="utf-8"))
+    missing = [key for key in NEEDED if key not in data]
+    if missing:
+        raise InvalidInputError(
+            f"Expected {', '.join(NEEDED)} in {path}; {', '.join(missing)} is missing."
+        )
     cells: dict[Cell, None] = {}
+    options: set[str] = set()
     for block in data["cells"]:
         unknown = set(block) - KEYS
         if unknown:
             raise SystemExit(
                 f"Unknown key(s) {sorted(unknown)} in {path}; there are {sorted(KEYS)}."
             )
+        options |= set(block.get("options", {}))
         for repetition in range(data["repetitions"]):
             for cell in _cells_of(block, data, repetition):
                 cells.setdefault(cell)
     return Suite(
-        name=path.stem,
+        name=_file_name(path.stem, f"the name of {path}"),
         title=data["title"],
         question=data["question"],
-        x_axis=data.get("x_axis", "n_calibration"),
+        x_axis=_axis(data.get("x_axis", AXES[0]), (*AXES, *sorted(options)), path),
         cells=tuple(cells),
     )
+
+
+def _axis(axis: Any, known: Sequence[str], path: Path) -> str:
+    if axis not in known:
+        raise InvalidInputError(
+            f"Expected x_axis in {path} to be one of {', '.join(known)}; got {axis!r}."
+        )
+    return _file_name(axis, f"x_axis in {path}")
+
+
+def _file_name(name: str, what: str) -> str:
+    """Return a name that becomes one of a file, if it stays inside of its folder."""
+    if not FILE_NAME.fullmatch(name):
+        raise InvalidInputError(
+            f"Expected {what} to begin with a letter or a digit and to hold letters, "
+            f"digits, '_', '-' and '.' only, because files are named by it; got "
+            f"{name!r}."
+        )
+    return name
 
 
 def _cells_of(

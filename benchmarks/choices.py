@@ -23,8 +23,11 @@ from torch import Tensor
 
 from benchmarks.cases import Case, Sources
 from benchmarks.cells import Cell
-from benchmarks.store import Cache, write_atomically
+from benchmarks.checks import read_archive
+from benchmarks.store import Cache
 from sbi_rope import RoPE, stack
+from sbi_rope._files import set_aside, write_atomically
+from sbi_rope.errors import InvalidInputError, warn_user
 from sbi_rope.stacking import stacking_weights
 
 __all__ = ["CHOICES", "Choice", "Run", "calibration_data", "report", "run"]
@@ -68,8 +71,13 @@ class Run:
 
     @classmethod
     def load(cls, path: Path) -> "Run":
-        """Read what :func:`run` wrote."""
-        with np.load(path) as stored:
+        """Read what :func:`run` wrote.
+
+        Raises:
+            InvalidInputError: If the file is damaged.
+        """
+        try:
+            stored = read_archive(path)
             return cls(
                 task=str(stored["task"]),
                 seed=int(stored["seed"]),
@@ -80,6 +88,11 @@ class Run:
                     for name in ("fold", "held_out", "others")
                 },
             )
+        except (ValueError, TypeError, KeyError) as error:
+            raise InvalidInputError(
+                f"Expected {path} to hold a run; {error}. Remove it, or let `run` set "
+                "it aside and make it again."
+            ) from error
 
 
 def calibration_data(
@@ -274,7 +287,11 @@ def _run(args: argparse.Namespace) -> None:
         )
         path = args.out / f"{name}.npz"
         if path.exists():
-            continue
+            try:
+                Run.load(path)
+                continue
+            except InvalidInputError as error:
+                warn_user(f"{path} is damaged and is now {set_aside(path)}. {error}")
         result = run(case, args.n_calibration, args.folds, seed)
         arrays = {key: np.asarray(value) for key, value in vars(result).items()}
         with write_atomically(path) as temporary, temporary.open("wb") as file:

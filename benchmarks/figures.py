@@ -12,6 +12,7 @@ import torch
 from benchmarks.cells import Cell, Suite
 from benchmarks.tables import Table, group_by, mean_and_spread
 from sbi_rope import plots
+from sbi_rope._files import write_atomically
 
 __all__ = ["LPPAxis", "draw_all"]
 
@@ -89,9 +90,9 @@ def draw_all(suite: Suite, table: Table, folder: Path) -> list[tuple[str, str]]:
     ):
         if figure is None:
             continue
-        folder.mkdir(parents=True, exist_ok=True)
-        # No metadata: the same table has to give the same bytes.
-        figure.savefig(folder / name, dpi=90, metadata={"Software": None})
+        with write_atomically(folder / name) as path:
+            # No metadata: the same table has to give the same bytes.
+            figure.savefig(path, format="png", dpi=90, metadata={"Software": None})
         drawn.append((name, what))
     return drawn
 

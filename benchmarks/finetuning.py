@@ -1,7 +1,7 @@
 """How to tune the embedding net: learning rate, steps, and Monte-Carlo targets.
 
 Scores every setting on labelled real observations of the calibration part that were
-not tuned on; the test part is never touched. One row a run is appended to a CSV file,
+not tuned on; the test part is never touched. One row a run is added to a CSV file,
 and runs that are in it already are skipped, so that it can be interrupted.
 
     python -m benchmarks.finetuning --task light_tunnel_sensors --root FOLDER
@@ -19,6 +19,8 @@ from torch import Tensor
 
 from benchmarks.npe import trained_npe
 from sbi_rope import CalibrationFinetuner, RoPE, SinkhornCoupler
+from sbi_rope._files import set_aside, write_atomically
+from sbi_rope.errors import InvalidInputError, warn_user
 from sbi_rope.metrics import lpp
 from sbi_rope.tasks import Task, get_task
 
@@ -136,32 +138,55 @@ def main() -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     npe = trained_npe(task, seed=0, cache=args.out)
     path = args.out / f"{task.name}.csv"
-    done = set()
-    if path.exists():
-        with path.open(newline="") as file:
-            for row in csv.DictReader(file):
-                done.add((row["setting"], int(row["n_calibration"]), int(row["seed"])))
-    else:
-        path.write_text(",".join(COLUMNS) + "\n")
+    rows = read_rows(path)
+    done = {(row["setting"], row["n_calibration"], row["seed"]) for row in rows}
     for seed in args.seeds:
         for n in args.n_calibration:
             for setting in args.settings:
-                if (setting, n, seed) in done:
+                if (setting, str(n), str(seed)) in done:
                     continue
                 row = run(task, npe, setting, n, seed)
-                with path.open("a", newline="") as file:
-                    csv.DictWriter(file, COLUMNS).writerow(row)
+                rows.append({name: str(value) for name, value in row.items()})
+                write_rows(path, rows)
                 print(*row.values(), sep=" | ", flush=True)
-    print_table(path)
+    print_table(rows)
 
 
-def print_table(path: Path) -> None:
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """Return the finished runs; a damaged file is set aside, with a warning."""
+    if not path.exists():
+        return []
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+        for number, row in enumerate(rows, 2):
+            if set(row) != set(COLUMNS) or None in row.values():
+                raise InvalidInputError(f"row {number} is not whole")
+            for name in COLUMNS[2:]:
+                float(row[name])
+    except (ValueError, csv.Error) as error:
+        warn_user(f"{path} is damaged and is now {set_aside(path)}: {error}.")
+        return []
+    return rows
+
+
+def write_rows(path: Path, rows: list[dict[str, str]]) -> None:
+    """Write all runs, so that the file is whole whenever this is interrupted."""
+    with (
+        write_atomically(path) as temporary,
+        temporary.open("w", newline="", encoding="utf-8") as file,
+    ):
+        writer = csv.DictWriter(file, COLUMNS)
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def print_table(rows: list[dict[str, str]]) -> None:
     """Print the means over seeds, in the form of benchmarks/README.md."""
     groups: dict[tuple[int, str], list[dict[str, str]]] = {}
-    with path.open(newline="") as file:
-        for row in csv.DictReader(file):
-            key = (int(row["n_calibration"]), row["setting"])
-            groups.setdefault(key, []).append(row)
+    for row in rows:
+        key = (int(row["n_calibration"]), row["setting"])
+        groups.setdefault(key, []).append(row)
     print(
         "| pairs | setting | best step | distance | tuning-only LPP | RoPE LPP | "
         "seconds | seeds |\n|---|---|---|---|---|---|---|---|"
@@ -173,12 +198,12 @@ def print_table(path: Path) -> None:
         "rope_lpp_z": 2,
         "seconds": 1,
     }
-    for (n, setting), rows in sorted(groups.items(), key=lambda item: item[0][0]):
+    for (n, setting), group in sorted(groups.items(), key=lambda item: item[0][0]):
         means = [
-            f"{sum(float(row[column]) for row in rows) / len(rows):.{places}f}"
+            f"{sum(float(row[column]) for row in group) / len(group):.{places}f}"
             for column, places in digits.items()
         ]
-        print(f"| {n} | {setting} | {' | '.join(means)} | {len(rows)} |")
+        print(f"| {n} | {setting} | {' | '.join(means)} | {len(group)} |")
 
 
 if __name__ == "__main__":

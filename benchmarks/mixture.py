@@ -26,6 +26,7 @@ from sbi.neural_nets import posterior_nn
 from sbi.utils import BoxUniform
 from torch import Tensor
 
+from benchmarks.estimators import posterior_with, state_of
 from benchmarks.machine import describe_machine, forget_peak, memory, peak_memory
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -63,14 +64,19 @@ def trained_npe(estimator: str, dim: int) -> Any:
     """Train for a few epochs: the cost does not depend on the weights."""
     warnings.simplefilter("ignore")
     torch.manual_seed(0)
-    theta = prior_of(dim).sample((5000,))
     npe = NPE(
         prior_of(dim),
         density_estimator=posterior_nn(estimator),
         show_progress_bars=False,
     )
-    npe.append_simulations(theta, simulate(theta)).train(max_num_epochs=3)
+    npe.append_simulations(*simulations_of(dim, 5000)).train(max_num_epochs=3)
     return npe.build_posterior()
+
+
+def simulations_of(dim: int, number: int) -> tuple[Tensor, Tensor]:
+    """Draw parameters and simulations."""
+    theta = prior_of(dim).sample((number,))
+    return theta, simulate(theta)
 
 
 def main() -> None:
@@ -101,10 +107,14 @@ def main() -> None:
         for dim in args.theta_dim:
             with tempfile.TemporaryDirectory() as folder:
                 path = Path(folder) / "npe.pt"
-                torch.save(trained_npe(estimator, dim), path)
+                torch.save(state_of(trained_npe(estimator, dim)), path)
                 for _ in range(args.repeats):
                     for name, root in versions.items():
-                        settings = vars(args) | {"npe": path, "theta_dim": dim}
+                        settings = vars(args) | {
+                            "npe": path,
+                            "theta_dim": dim,
+                            "estimator": estimator,
+                        }
                         row = settings | measured(settings | {"root": root})
                         row |= {"version": name, "estimator": estimator}
                         cells = [str(row[key]) for key in COLUMNS.values()]
@@ -132,7 +142,13 @@ def measure(settings: dict[str, Any]) -> None:
 
     warnings.simplefilter("ignore")
     torch.set_num_threads(settings["threads"])
-    npe = torch.load(settings["npe"], weights_only=False)
+    dim = settings["theta_dim"]
+    npe = posterior_with(
+        torch.load(settings["npe"], weights_only=True),
+        prior=prior_of(dim),
+        build=posterior_nn(settings["estimator"]),
+        simulations=simulations_of(dim, 100),
+    )
     torch.manual_seed(1)
     theta = npe.prior.sample((settings["n_o"],))
     x_o = 1.1 * simulate(theta) + 0.1

@@ -80,7 +80,9 @@ class Published:
         there = [name for name in suites if (folder / name / "results.csv").exists()]
         if not there:
             raise SystemExit(f"No results in {folder}. Use `run` first, or --out.")
-        return cls(suites, {name: read_table(folder / name) for name in there})
+        return cls(
+            suites, {name: read_table(suites[name], folder / name) for name in there}
+        )
 
     @cached_property
     def rows(self) -> dict[str, list[Row]]:

@@ -12,8 +12,8 @@ from benchmarks import figures
 from benchmarks.cells import Cell, Suite
 from benchmarks.methods import ORDER
 from benchmarks.stacking import stacking_lines
-from benchmarks.store import write_atomically
 from benchmarks.tables import Table, group_by, mean_and_spread
+from sbi_rope._files import write_atomically
 
 __all__ = ["label_of", "write_report"]
 

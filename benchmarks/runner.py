@@ -1,95 +1,37 @@
 """Runs cells, in parallel, and keeps what is finished."""
 
 import functools
-import hashlib
 import itertools
-import json
 import subprocess
 import time
 import traceback
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import joblib
 import numpy as np
 import torch
 from sbi.utils.metrics import c2st
 from tqdm.auto import tqdm
 
-from benchmarks.cases import Case, Sources
+from benchmarks.cases import Case
 from benchmarks.cells import Cell
 from benchmarks.machine import forget_peak, peak_memory
 from benchmarks.methods import ONLY_FOR
 from benchmarks.scoring import Failure, Score, scores
-from benchmarks.store import Cache, Results, write_atomically
+from benchmarks.workers import parallel
+from benchmarks.workplace import Workplace
 from sbi_rope.metrics import draw_samples
 
 __all__ = ["Workplace", "run_cells"]
 
-# Raised when the same cell gives another result than before.
-FORMAT = 1
 PACKAGES = ("torch", "sbi", "POT", "numpy")
 # Observations and samples behind the comparison with a posterior in closed form.
 C2ST_OBSERVATIONS, C2ST_SAMPLES = 5, 500
 # Posterior samples of the first observation that are kept for a picture.
 KEPT_SAMPLES = 300
-
-
-@dataclass(frozen=True, kw_only=True)
-class Workplace:
-    """Where a run reads and writes, and what it runs on.
-
-    Attributes:
-        folder: Results of cells and what they share are kept below it.
-        sources: Where recorded data are.
-        device: Where networks are trained.
-    """
-
-    folder: Path
-    sources: Sources
-    device: str = "cpu"
-
-    def claim(self) -> None:
-        """Make sure that all in this folder was made in the same way.
-
-        Raises:
-            SystemExit: If it holds results of other data, devices or settings.
-        """
-        place = {
-            "format": FORMAT,
-            "root": str(self.sources.root and self.sources.root.resolve()),
-            "hemodynamics": str(
-                self.sources.hemodynamics and self.sources.hemodynamics.resolve()
-            ),
-            "device": self.device,
-            "presets": hashlib.sha256(
-                (Path(__file__).parent / "presets.py").read_bytes()
-            ).hexdigest(),
-        }
-        path = self.folder / "place.json"
-        if not path.exists():
-            with write_atomically(path) as temporary:
-                temporary.write_text(json.dumps(place, indent=1))
-        before = json.loads(path.read_text())
-        other = [name for name, value in place.items() if before.get(name) != value]
-        if other:
-            raise SystemExit(
-                f"{self.folder} holds results of another {', '.join(other)} "
-                f"({[before.get(name) for name in other]}). Use another --out."
-            )
-
-    @property
-    def results(self) -> Results:
-        """The finished cells."""
-        return Results(self.folder / "cells")
-
-    @property
-    def cache(self) -> Cache:
-        """What cells share."""
-        return Cache(self.folder / "cache")
 
 
 def run_cells(
@@ -113,47 +55,49 @@ def run_cells(
 
     Returns:
         The number of cells that were ``"kept"``, ``"finished"`` and ``"failed"``.
+
+    Raises:
+        InvalidInputError: If another run is at work in the folder.
+        NotWritableError: If nothing can be written to it.
+        SystemExit: If it holds results of other data, devices or settings.
     """
-    waiting = [
-        cell
-        for cell in cells
-        if again or _is_missing(workplace.results.read(cell), retry=retry)
-    ]
-    counts = {"kept": len(cells) - len(waiting), "finished": 0, "failed": 0}
     if backend == "threading":
         raise SystemExit("Threads share random numbers; use loky or another backend.")
-    workplace.claim()
-    missing = set(waiting)
-    # Whole groups, also where only some of their cells are missing: a sweep starts each
-    # coupling from its neighbour, and a resumed run must pass by the same ones.
-    groups = [group for group in _grouped(cells) if missing & set(group)]
-    # What methods share is made first, so that no two jobs make it at the same time.
-    shared = {group[0].group[:5]: group[0] for group in groups}
-    _parallel(jobs, backend, [(prepare, cell, workplace) for cell in shared.values()])
-    bar = tqdm(total=len(waiting), desc="Cells", smoothing=0.1)
-    calls = [
-        (run_group, group, [cell for cell in group if cell in missing], workplace)
-        for group in groups
-    ]
-    for ended in _parallel(jobs, backend, calls, bar=bar):
-        for status in ended:
+    with workplace.claimed():
+        workplace.results.set_damaged_aside(cells)
+        waiting = {
+            cell
+            for cell in cells
+            if again or _is_missing(workplace.results.read(cell), retry=retry)
+        }
+        counts = {"kept": len(cells) - len(waiting), "finished": 0, "failed": 0}
+        for status in _run(cells, waiting, workplace, jobs=jobs, backend=backend):
             counts[status] += 1
-    bar.close()
     return counts
 
 
-def _parallel(
-    jobs: int, backend: str, calls: list[tuple[Any, ...]], bar: Any = None
-) -> list[Any]:
-    results = []
-    # The way that knows external backends, dask's among them.
-    with joblib.parallel_config(backend=backend, n_jobs=jobs):
-        parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1)
-        for result in parallel(joblib.delayed(f)(*args) for f, *args in calls):
-            results.append(result)
-            if bar is not None:
-                bar.update(len(result))
-    return results
+def _run(
+    cells: Sequence[Cell],
+    waiting: set[Cell],
+    workplace: Workplace,
+    *,
+    jobs: int,
+    backend: str,
+) -> list[str]:
+    """Run those that wait, and return how each ended."""
+    # Whole groups, also where only some of their cells are missing: a sweep starts each
+    # coupling from its neighbour, and a resumed run must pass by the same ones.
+    groups = [group for group in _grouped(cells) if waiting & set(group)]
+    # What methods share is made first, so that no two jobs make it at the same time.
+    shared = {group[0].group[:5]: group[0] for group in groups}
+    parallel(jobs, backend, [(prepare, cell, workplace) for cell in shared.values()])
+    calls = [
+        (run_group, group, [cell for cell in group if cell in waiting], workplace)
+        for group in groups
+    ]
+    with tqdm(total=len(waiting), desc="Cells", smoothing=0.1) as bar:
+        ended = parallel(jobs, backend, calls, bar=bar)
+    return [status for statuses in ended for status in statuses]
 
 
 def _is_missing(row: dict[str, Any] | None, *, retry: bool) -> bool:
@@ -282,12 +226,19 @@ def _arrays(score: Score) -> dict[str, np.ndarray]:
         torch.manual_seed(0)
         samples = draw_samples(score.posterior, x, num_samples=KEPT_SAMPLES)
     return {
-        "log_probs": evaluation.lpp.log_probs.cpu().numpy().astype(np.float32),
+        "log_probs": _shortened(evaluation.lpp.log_probs.cpu().numpy()),
         "coverage": evaluation.coverage.average.cpu().numpy().astype(np.float32),
         **score.arrays,
         "samples": samples[:, 0].cpu().numpy().astype(np.float32),
         "theta": score.test_set[0][0].cpu().numpy().astype(np.float32),
     }
+
+
+def _shortened(values: np.ndarray) -> np.ndarray:
+    """Return values in single precision, unless one would become infinite."""
+    with np.errstate(over="ignore"):
+        short = values.astype(np.float32)
+    return short if np.array_equal(np.isinf(short), np.isinf(values)) else values
 
 
 @functools.cache

@@ -31,8 +31,8 @@ from benchmarks.statements import (
     verdict,
     write_statements,
 )
-from benchmarks.store import write_atomically
 from benchmarks.tables import group_by
+from sbi_rope._files import write_atomically
 
 __all__ = ["write_summary"]
 

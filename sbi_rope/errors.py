@@ -16,6 +16,7 @@ __all__ = [
     "InvalidTypeError",
     "LogProbUnavailableError",
     "NotReadyError",
+    "NotWritableError",
     "RoPEError",
     "RoPEWarning",
     "SamplingError",
@@ -83,6 +84,10 @@ class LogProbUnavailableError(RoPEError, NotImplementedError):
 
 class DataNotFoundError(RoPEError, FileNotFoundError):
     """The files of a data set are not where they were looked for."""
+
+
+class NotWritableError(RoPEError, OSError):
+    """Nothing can be written where results are to be kept."""
 
 
 class RoPEWarning(UserWarning):

@@ -20,8 +20,8 @@ DEPENDENCIES = "import ot, numpy, torch, tqdm.auto, sbi.inference, sbi.utils"
 
 # A module imports from layers below its own, and from its own package.
 LAYERS = [
-    {"errors", "_progress"},
-    {"_validation", "_sbi", "_random", "_training"},
+    {"errors", "_progress", "_processes"},
+    {"_validation", "_sbi", "_random", "_training", "_files"},
     {"coupling", "finetuning", "metrics", "_simulations"},
     {"mixture", "plots"},
     {"rope", "tasks"},

@@ -1,8 +1,8 @@
 """The benchmark's runner on real cells, interrupted, in parallel, and with failures."""
 
+import contextlib
 import csv
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -20,6 +20,7 @@ from benchmarks.methods import METHODS, ONLY_FOR
 from benchmarks.runner import Workplace, run_cells
 from benchmarks.store import Cache
 from sbi_rope.baselines import UsesCalibration
+from sbi_rope.errors import RoPEWarning
 
 ROOT = Path(__file__).parents[2]
 SUITE = """
@@ -88,7 +89,8 @@ def test_a_cell_missing_from_a_sweep_comes_back_the_same(
     )
     path = tmp_path / "cells" / f"{last.key}.json"
     path.write_text("{")  # as if killed while writing in place
-    main(command)
+    with pytest.warns(RoPEWarning, match="is damaged and is computed again"):
+        main(command)
     expected = [row for row in uninterrupted if row["method"] == "RoPE"]
     assert rows_of(tmp_path) == expected
 
@@ -100,6 +102,81 @@ def test_a_folder_refuses_results_of_other_data(
     main(command)
     with pytest.raises(SystemExit, match="another root"):
         main([*command, "--again", "--root", str(tmp_path)])
+
+
+def test_a_folder_whose_place_is_damaged_says_that_its_past_is_not_known(
+    suite_file: Path, tmp_path: Path
+) -> None:
+    command = ["run", str(suite_file), "--out", str(tmp_path), "--method", "prior"]
+    main(command)
+    place = tmp_path / "place.json"
+    good = place.read_text()
+    for number, content in enumerate(("", "{", "[1]"), 1):
+        place.write_text(content)
+        with pytest.warns(RoPEWarning) as warned:
+            main(command)
+        texts = " ".join(str(one.message) for one in warned)
+        assert "place.json is damaged and is now" in texts
+        assert "made with is not known" in texts
+        assert (tmp_path / f"place.json.damaged-{number}").read_text() == content
+        assert place.read_text() == good
+
+
+def test_two_runs_do_not_share_a_folder(
+    suite_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("benchmarks.workplace.PATIENCE", 0.1)
+    command = ["run", str(suite_file), "--out", str(tmp_path), "--method", "prior"]
+    with (
+        Workplace(folder=tmp_path, sources=Sources()).claimed(),
+        pytest.raises(SystemExit, match=r"another process works in .*another --out"),
+    ):
+        main(command)
+    assert not (tmp_path / "cells").exists()
+    # Neither the lock of a run that ended nor its file is in the way.
+    assert main(command) == 0
+
+
+@pytest.mark.parametrize("name", ["out", "out/below"])
+def test_a_folder_that_cannot_be_written_to_is_refused_in_words(
+    name: str, suite_file: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "out").write_text("a file")
+    with pytest.raises(SystemExit, match=r"can be written to.*Use another --out"):
+        main(["run", str(suite_file), "--out", str(tmp_path / name)])
+
+
+def test_a_read_only_folder_is_refused_in_words(
+    suite_file: Path, tmp_path: Path
+) -> None:
+    tmp_path.chmod(0o500)
+    if os.access(tmp_path, os.W_OK):
+        pytest.skip("this user may write to read-only folders")
+    with pytest.raises(SystemExit, match=r"can be written to.*Use another --out"):
+        main(["run", str(suite_file), "--out", str(tmp_path)])
+
+
+def test_an_axis_cannot_lead_out_of_the_folder(
+    suite_file: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "evil.toml"
+    path.write_text(f'x_axis = "../../../evil"\n{SUITE}')
+    with pytest.raises(SystemExit, match="Expected x_axis in"):
+        main(["run", str(path), "--out", str(tmp_path / "a" / "b" / "out")])
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_cell_without_a_result_is_no_success(
+    suite_file: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    # As if a worker had lost it.
+    monkeypatch.setattr("benchmarks.runner.run_group", lambda *_: [])
+    command = ["run", str(suite_file), "--out", str(tmp_path), "--method", "prior"]
+    assert main(command) == 1
+    assert "no result: pendulum prior #0" in capsys.readouterr().out
 
 
 def test_stored_people_are_shared_out_without_overlap(tmp_path: Path) -> None:
@@ -154,26 +231,74 @@ def test_what_is_finished_is_not_computed_again(
     assert before.stat().st_mtime_ns > modified
 
 
+def children_of(process: subprocess.Popen[Any]) -> list[Any]:
+    psutil = pytest.importorskip("psutil")
+    return psutil.Process(process.pid).children(recursive=True)
+
+
+def left_alive(workers: list[Any], *, seconds: float = 30.0) -> list[Any]:
+    """Return those that have not ended after a while."""
+    psutil = pytest.importorskip("psutil")
+    deadline = time.monotonic() + seconds
+    while workers and time.monotonic() < deadline:
+        time.sleep(0.1)
+        alive = []
+        for worker in workers:
+            with contextlib.suppress(psutil.NoSuchProcess):
+                if worker.is_running() and worker.status() != psutil.STATUS_ZOMBIE:
+                    alive.append(worker)
+        workers = alive
+    return workers
+
+
 @pytest.mark.slow
-def test_a_killed_run_resumes_to_the_same_table(
+def test_workers_that_are_just_starting_end_with_their_run(
+    suite_file: Path, tmp_path: Path
+) -> None:
+    command = [sys.executable, "-m", "benchmarks", "run", str(suite_file)]
+    command += ["--out", str(tmp_path), "--jobs", "2", "--method", "NPE", "RoPE"]
+    process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL)
+    while len(workers := children_of(process)) < 2:
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.kill()
+    process.wait()
+    assert not left_alive(workers)
+
+
+@pytest.mark.slow
+def test_a_killed_run_takes_its_workers_along_and_resumes_to_the_same_table(
     suite_file: Path, uninterrupted: list[dict[str, str]], tmp_path: Path
 ) -> None:
     command = [sys.executable, "-m", "benchmarks", "run", str(suite_file)]
-    command += ["--out", str(tmp_path)]
-    process = subprocess.Popen(
-        command,
-        cwd=ROOT,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )
-    while len(list((tmp_path / "cells").glob("*.json"))) < 2:
-        assert process.poll() is None, "it ended before it could be killed"
+    command += ["--out", str(tmp_path), "--jobs", "2"]
+    with (tmp_path / "output").open("w") as output:
+        process = subprocess.Popen(command, cwd=ROOT, stdout=output, stderr=output)
+    cells = tmp_path / "cells"
+    while len(list(cells.glob("*.json"))) < 2:
+        assert process.poll() is None, (tmp_path / "output").read_text()
         time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGKILL)
+    workers = children_of(process)
+    assert len(workers) >= 2
+    process.kill()  # the parent alone, which has no time to tell its children
     process.wait()
-    assert len(list((tmp_path / "cells").glob("*.json"))) < 7
-    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+
+    assert not left_alive(workers)
+    finished = {path: path.stat().st_mtime_ns for path in cells.glob("*.json")}
+    assert 2 <= len(finished) < len(uninterrupted)
+    damaged = sorted(finished)[0].with_suffix(".npz")
+    damaged.write_bytes(damaged.read_bytes()[:100])
+
+    again = subprocess.run(
+        command, cwd=ROOT, check=True, capture_output=True, text=True
+    )
+    assert "is damaged and is computed again" in again.stderr
+    assert damaged.with_name(f"{damaged.name}.damaged-1").exists()
+    kept = len(finished) - 1
+    assert f"{kept} kept, {len(uninterrupted) - kept} finished" in again.stdout
+    for path, modified in finished.items():
+        computed_again = path.stat().st_mtime_ns != modified
+        assert computed_again == (path.stem == damaged.stem)
     assert rows_of(tmp_path) == uninterrupted
 
 

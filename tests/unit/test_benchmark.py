@@ -1,8 +1,7 @@
-"""The benchmark's cells, files and reports, without training anything."""
+"""The benchmark's cells, reports and presets, without training anything."""
 
 import json
 import math
-import multiprocessing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,30 +10,17 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.cells import Cell, Suite, list_suites, load_suite
+from benchmarks.cells import Suite, list_suites, load_suite
 from benchmarks.compare import methods_for
 from benchmarks.figures import REFERENCES, STYLES, LPPAxis
 from benchmarks.methods import EXTRAS, METHODS, ONLY_FOR, ORDER
 from benchmarks.presets import PRESETS
 from benchmarks.report import worse, write_report
-from benchmarks.store import Cache, Results, write_atomically
+from benchmarks.store import Results
 from benchmarks.tables import Table, mean_and_spread, read_table, write_table
+from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks import get_task, list_tasks
-
-SUITE = """
-title = "Tiny"
-question = "Nothing."
-preset = "smoke"
-repetitions = 2
-
-[[cells]]
-tasks = ["linear_gaussian"]
-methods = ["prior", "MLP", "OT-only", "RoPE"]
-n_calibration = [10, 50]
-gammas = { simulated = [0.1, 0.2], none = [0.5] }
-taus = [1.0, 0.9]
-options = { dim = [2, 3] }
-"""
+from tests.results import SUITE, result_of, write_results
 
 
 @pytest.fixture
@@ -42,39 +28,6 @@ def suite(tmp_path: Path) -> Suite:
     path = tmp_path / "tiny.toml"
     path.write_text(SUITE)
     return load_suite(str(path))
-
-
-def row_of(cell: Cell, **scores: Any) -> dict[str, Any]:
-    row = {
-        "task": cell.task,
-        "status": "finished",
-        "lpp": -3.0,
-        "lpp_z": -2.0,
-        "lpp_median": -1.9,
-        "lpp_standard_error": 0.1,
-        "neg_inf_fraction": 0.0,
-        "acauc": 0.01,
-        "acauc_standard_error": 0.01,
-        "acauc_per_parameter": "a=0.0100; b=0.0200",
-        "expected_coverage_error": 0.02,
-        "c2st": None,
-        "converged": True,
-        "n_test": 4,
-        "stand_in": False,
-        "num_simulations": 100,
-    }
-    fields = {name: getattr(cell, name) for name in cell.__dataclass_fields__}
-    return {**row, **fields, **scores}
-
-
-def arrays_of(log_probs: list[float]) -> dict[str, np.ndarray]:
-    generator = np.random.default_rng(0)
-    return {
-        "log_probs": np.array(log_probs, dtype=np.float32),
-        "coverage": np.linspace(0.01, 0.99, 99, dtype=np.float32),
-        "samples": generator.normal(size=(50, 2)).astype(np.float32),
-        "theta": np.zeros(2, dtype=np.float32),
-    }
 
 
 # Cells and suites -------------------------------------------------------------------
@@ -127,6 +80,50 @@ def test_unknown_names_are_refused_with_the_known_ones(
         load_suite(str(path))
 
 
+@pytest.mark.parametrize(
+    "axis", ["../../../evil", "/evil", "..", "", "lpp", 3, 'dim"', ".hidden"]
+)
+def test_an_axis_is_a_setting_of_the_suite_and_never_a_path(
+    axis: Any, tmp_path: Path
+) -> None:
+    path = tmp_path / "axis.toml"
+    path.write_text(f"x_axis = {json.dumps(axis)}\n{SUITE}")
+    with pytest.raises(InvalidInputError, match="x_axis in"):
+        load_suite(str(path))
+    path.write_text(f'x_axis = "dim"\n{SUITE}')
+    assert load_suite(str(path)).x_axis == "dim"
+
+
+def test_an_option_with_the_name_of_a_path_is_no_axis(tmp_path: Path) -> None:
+    path = tmp_path / "axis.toml"
+    text = SUITE.replace("{ dim = [2, 3] }", '{ "../evil" = [2, 3] }')
+    path.write_text(f'x_axis = "../evil"\n{text}')
+    with pytest.raises(InvalidInputError, match="files are named by it"):
+        load_suite(str(path))
+
+
+@pytest.mark.parametrize("name", ["..", ".hidden", "a b"])
+def test_a_suite_whose_name_cannot_be_that_of_a_folder_is_refused(
+    name: str, tmp_path: Path
+) -> None:
+    path = tmp_path / f"{name}.toml"
+    path.write_text(SUITE)
+    with pytest.raises(InvalidInputError, match="Expected the name of"):
+        load_suite(str(path))
+
+
+def test_a_suite_without_a_title_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "untitled.toml"
+    path.write_text(SUITE.replace('title = "Tiny"', ""))
+    with pytest.raises(InvalidInputError, match="title is missing"):
+        load_suite(str(path))
+
+
+def test_ci_expects_as_many_finished_cells_as_the_smoke_suite_has() -> None:
+    script = (Path(__file__).parents[2] / ".ci" / "run").read_text()
+    assert f"\nexpected={len(load_suite('smoke').cells)} " in script
+
+
 def test_a_selection_keeps_what_it_names(suite: Suite) -> None:
     cells = suite.select(methods=["prior", "MLP"])
     assert {cell.method for cell in cells} == {"prior", "MLP"}
@@ -146,134 +143,12 @@ def test_without_names_a_task_is_given_to_the_methods_that_can_take_it() -> None
         methods_for("pendulum", ["discrepancy (input)"])
 
 
-# Files ------------------------------------------------------------------------------
-
-
-def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path) -> None:
-    path = tmp_path / "file.txt"
-    path.write_text("old")
-
-    def interrupted() -> None:
-        with write_atomically(path) as temporary:
-            temporary.write_text("ne")
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        interrupted()
-    assert path.read_text() == "old"
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_files_can_be_read_by_whoever_can_read_others(tmp_path: Path) -> None:
-    plain, path = tmp_path / "plain.txt", tmp_path / "file.txt"
-    plain.write_text("text")
-    with write_atomically(path) as temporary:
-        temporary.write_text("text")
-    assert path.stat().st_mode == plain.stat().st_mode
-
-
-def test_the_cache_computes_once_and_again_if_the_entry_is_damaged(
-    tmp_path: Path,
-) -> None:
-    cache, calls = Cache(tmp_path), []
-
-    def compute() -> list[int]:
-        calls.append(1)
-        return [1, 2]
-
-    for _ in range(2):
-        assert cache.get("thing", {"seed": 0}, compute) == [1, 2]
-    assert len(calls) == 1
-    cache.get("thing", {"seed": 1}, compute)
-    assert len(calls) == 2
-    for path in tmp_path.glob("thing-*"):
-        data = bytearray(path.read_bytes())
-        data[-10] ^= 1
-        path.write_bytes(bytes(data))
-    with pytest.warns(UserWarning, match="damaged"):
-        assert cache.get("thing", {"seed": 0}, compute) == [1, 2]
-    assert len(calls) == 3
-    assert cache.get("thing", {"seed": 0}, compute) == [1, 2]
-    assert len(calls) == 3
-
-
-def write_many(folder: Path, number: int) -> None:
-    results = Results(folder)
-    for _ in range(30):
-        for repetition in range(3):
-            cell = Cell(task="a", method="prior", repetition=repetition)
-            results.write(cell, {"value": [number] * 1000}, {"x": np.full(9, number)})
-
-
-def test_two_processes_on_one_folder_leave_whole_files(tmp_path: Path) -> None:
-    context = multiprocessing.get_context("fork")
-    processes = [
-        context.Process(target=write_many, args=(tmp_path, number)) for number in (1, 2)
-    ]
-    for process in processes:
-        process.start()
-    for process in processes:
-        process.join()
-        assert process.exitcode == 0
-    results = Results(tmp_path)
-    for repetition in range(3):
-        cell = Cell(task="a", method="prior", repetition=repetition)
-        row = results.read(cell)
-        assert row is not None
-        assert len(set(row["value"])) == 1
-        assert len(set(results.read_arrays(cell)["x"])) == 1
-    assert len(list(tmp_path.iterdir())) == 6
-
-
-def test_a_damaged_result_counts_as_not_run(tmp_path: Path) -> None:
-    results = Results(tmp_path)
-    cell = Cell(task="a", method="prior")
-    results.write(cell, {"status": "finished"}, {})
-    path = tmp_path / f"{cell.key}.json"
-    path.write_text(path.read_text()[:-3])
-    assert results.read(cell) is None
-
-
-# Tables and reports -----------------------------------------------------------------
+# Reports ----------------------------------------------------------------------------
 
 
 @pytest.fixture
 def results(suite: Suite, tmp_path: Path) -> Results:
-    """All cells but those of the second repetition; the prior has one -inf."""
-    results = Results(tmp_path / "cells")
-    for cell in suite.cells:
-        if cell.repetition:
-            continue
-        if cell.method == "MLP":
-            row = row_of(cell) | {"status": "failed", "error": "ValueError: no"}
-            results.write(cell, row, {})
-            continue
-        if cell.method == "prior":
-            scores = {"lpp_z": -math.inf, "neg_inf_fraction": 0.25}
-            log_probs = [-math.inf, -1.0, -1.0, -1.0]
-        else:
-            value = {"OT-only": -2.0, "RoPE": -1.0}[cell.method]
-            scores = {"lpp_z": value}
-            log_probs = [value + 0.1 * i for i in (-1, 0, 0, 1)]
-        results.write(cell, row_of(cell, **scores), arrays_of(log_probs))
-    return results
-
-
-def test_a_table_survives_being_written_and_read(
-    suite: Suite, results: Results, tmp_path: Path
-) -> None:
-    written = write_table(suite, results, tmp_path / "out")
-    read = read_table(tmp_path / "out")
-    assert list(read.rows) == list(written.rows)
-    for cell, row in written.rows.items():
-        for name in ("lpp_z", "acauc", "status", "converged", "n_test", "error"):
-            assert read.rows[cell][name] == row.get(name, ""), name
-        for name, values in written.arrays.get(cell, {}).items():
-            assert np.array_equal(read.arrays[cell][name], values)
-    manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
-    assert manifest["not run"] == 42
-    assert manifest["failed"] == 4
-    assert manifest["finished"] == 38
+    return write_results(suite, tmp_path / "cells")
 
 
 def test_the_same_table_gives_the_same_bytes(
@@ -284,7 +159,7 @@ def test_the_same_table_gives_the_same_bytes(
     for name in ("first", "second"):
         write_report(suite, table, tmp_path / name)
         # What is read from the CSV is what was in memory.
-        table = read_table(tmp_path / "out")
+        table = read_table(suite, tmp_path / "out")
         files = sorted((tmp_path / name).iterdir())
         contents.append({path.name: path.read_bytes() for path in files})
     assert contents[0].keys() == contents[1].keys()
@@ -345,9 +220,8 @@ def test_a_method_with_a_missing_repetition_still_competes(
                 continue
             value = {"prior": -3.0, "RoPE": -1.0}[cell.method]
             noise = np.random.default_rng(cell.repetition).normal(size=50)
-            results.write(
-                cell, row_of(cell, lpp_z=value), arrays_of(list(value + 0.1 * noise))
-            )
+            noise -= noise.mean()
+            results.write(cell, *result_of(cell, list(value + 0.1 * noise)))
     table = write_table(suite, results, tmp_path / "out")
     text = write_report(suite, table, tmp_path / "out").read_text()
     assert "**-1.00**" in text
@@ -363,11 +237,8 @@ def test_a_method_without_labels_can_be_best_at_one_size_only(
             continue
         if cell.method in ("prior", "MLP"):
             value = {0: -2.0, 10: -3.0, 50: -1.0}[cell.n_calibration]
-            results.write(
-                cell,
-                row_of(cell, lpp_z=value),
-                arrays_of([value + 0.1 * i for i in range(9)]),
-            )
+            log_probs = [value + 0.1 * i for i in range(-4, 5)]
+            results.write(cell, *result_of(cell, log_probs))
     table = write_table(suite, results, tmp_path / "out")
     text = write_report(suite, table, tmp_path / "out").read_text()
     assert "| prior | **-2.00** | -2.00 |" in text
@@ -379,8 +250,8 @@ def test_losses_are_listed_against_every_method(suite: Suite, tmp_path: Path) ->
     for cell in suite.cells:
         if cell.repetition == 0 and cell.method in ("RoPE", "MLP"):
             value = {"RoPE": -2.0, "MLP": -1.0}[cell.method]
-            log_probs = [value + 0.1 * i for i in range(9)]
-            results.write(cell, row_of(cell, lpp_z=value), arrays_of(log_probs))
+            log_probs = [value + 0.1 * i for i in range(-4, 5)]
+            results.write(cell, *result_of(cell, log_probs))
     table = write_table(suite, results, tmp_path / "out")
     text = write_report(suite, table, tmp_path / "out").read_text()
     assert "gamma=0.1 tau=1 #0: -2.00; MLP -1.00\n" in text

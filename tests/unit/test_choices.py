@@ -10,6 +10,7 @@ from benchmarks.cases import Case, Sources
 from benchmarks.cells import Cell
 from benchmarks.choices import CHOICES, Choice, Run, report, run
 from benchmarks.store import Cache
+from sbi_rope.errors import InvalidInputError
 from sbi_rope.stacking import default_candidates, stacking_weights
 from tests.stacks import quick
 
@@ -91,6 +92,14 @@ def test_a_run_is_read_back_as_it_was_written(tmp_path: Path) -> None:
     assert (found.names, found.num_folds) == (one.names, NUM_FOLDS)
     for name in ("fold", "held_out", "others"):
         assert torch.equal(getattr(found, name), getattr(one, name))
+
+
+def test_a_damaged_run_is_refused_by_the_name_of_its_file(tmp_path: Path) -> None:
+    path = tmp_path / "run.npz"
+    for content in (b"", b"garbage", b"PK\x03\x04garbage"):
+        path.write_bytes(content)
+        with pytest.raises(InvalidInputError, match=r"run\.npz to hold a run"):
+            Run.load(path)
 
 
 def test_a_run_scores_pairs_that_the_stack_has_not_seen(tmp_path: Path) -> None:

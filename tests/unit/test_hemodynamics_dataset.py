@@ -199,6 +199,16 @@ def test_a_broken_part_is_made_again(made: Path, tmp_path: Path) -> None:
     assert path.read_bytes() == made.read_bytes()
 
 
+def test_a_part_with_other_people_is_made_again(made: Path, tmp_path: Path) -> None:
+    path = tmp_path / "again.npz"
+    with pytest.raises(KeyboardInterrupt):
+        _make(path, simulate=Interrupted(2 * CHUNK_SIZE))
+    first, second = sorted((tmp_path / "again.npz.parts").glob("part_*"))[:2]
+    second.write_bytes(first.read_bytes())
+    _make(path)
+    assert path.read_bytes() == made.read_bytes()
+
+
 def test_work_with_other_settings_is_not_mixed(tmp_path: Path) -> None:
     path = tmp_path / "again.npz"
     with pytest.raises(KeyboardInterrupt):

@@ -70,9 +70,14 @@ def read_part(file: Path) -> dict[str, np.ndarray] | None:
     """Return the people of a chunk; None if they are still to be simulated."""
     try:
         arrays = read_arrays(file)
-    except ValueError:  # not there, or broken: then it is made again
+        people = arrays["index"].tolist()
+        people += [int(line.split()[0]) for line in json.loads(str(arrays["rejected"]))]
+    except (ValueError, KeyError):  # not there, or broken: then it is made again
         return None
-    return arrays if {*COLUMNS, "rejected"} <= set(arrays) else None
+    # A part that was renamed or copied would let the same people in twice.
+    expected = list(range(*map(int, file.stem.split("_")[1:])))
+    complete = set(COLUMNS) <= set(arrays) and sorted(people) == expected
+    return arrays if complete else None
 
 
 def _arrays(

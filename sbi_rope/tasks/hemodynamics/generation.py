@@ -1,6 +1,7 @@
 """Making data sets: many people, in parallel, with nothing lost at an interrupt."""
 
 import json
+import os
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from importlib import import_module
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from sbi_rope._processes import end_with
 from sbi_rope._progress import progress_bar
 from sbi_rope._validation import (
     check_choice,
@@ -194,12 +196,19 @@ def _parallel(
 ) -> Iterable[tuple[int, int]]:
     import joblib
 
-    calls: Iterator[Any] = (joblib.delayed(run_chunk)(work, chunk) for chunk in chunks)
+    calls: Iterator[Any] = (
+        joblib.delayed(_run_chunk_for)(os.getpid(), work, chunk) for chunk in chunks
+    )
     try:
         parallel = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")
     except ValueError:  # some backends only return everything at once
         parallel = joblib.Parallel(n_jobs=jobs)
     return parallel(calls)  # type: ignore[return-value]
+
+
+def _run_chunk_for(parent: int, work: Work, chunk: range) -> tuple[int, int]:
+    end_with(parent)
+    return run_chunk(work, chunk)
 
 
 # Files -------------------------------------------------------------------------------

@@ -1,7 +1,6 @@
 """Arrays in files that are whole or not there, with the same bytes every time."""
 
 import json
-import os
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -9,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from sbi_rope._files import write_atomically
 
 __all__ = ["read_arrays", "read_json", "write_arrays", "write_json"]
 
@@ -22,18 +23,16 @@ FIXED_DATE = (1980, 1, 1, 0, 0, 0)  # equal arrays make equal files
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Write arrays to an uncompressed npz file that is there once it is whole."""
-    temporary = _temporary(path)
-    try:
-        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
-            for name, array in arrays.items():
-                member = zipfile.ZipInfo(f"{name}.npy", FIXED_DATE)
-                with archive.open(member, "w", force_zip64=True) as file:
-                    np.lib.format.write_array(
-                        file, np.asarray(array, order="C"), allow_pickle=False
-                    )
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with (
+        write_atomically(path) as temporary,
+        zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive,
+    ):
+        for name, array in arrays.items():
+            member = zipfile.ZipInfo(f"{name}.npy", FIXED_DATE)
+            with archive.open(member, "w", force_zip64=True) as file:
+                np.lib.format.write_array(
+                    file, np.asarray(array, order="C"), allow_pickle=False
+                )
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -51,12 +50,8 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 def write_json(path: Path, content: Any) -> None:
     """Write settings to a file that is there once it is whole."""
-    temporary = _temporary(path)
-    try:
+    with write_atomically(path) as temporary:
         temporary.write_text(json.dumps(content, indent=1), encoding="utf-8")
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def read_json(path: Path) -> Any:
@@ -66,7 +61,3 @@ def read_json(path: Path) -> Any:
         ValueError: If the file does not hold any.
     """
     return json.loads(path.read_text(encoding="utf-8"))
-
-
-def _temporary(path: Path) -> Path:
-    return path.with_name(f".{path.name}.{os.getpid()}.tmp")
