@@ -6,6 +6,7 @@ Used by the example scripts; a study is (seeds) x (calibration sizes).
 import argparse
 import csv
 import itertools
+import os
 import statistics
 import time
 from collections.abc import Callable
@@ -75,7 +76,12 @@ class Study:
 
     def run(self) -> list[dict[str, Any]]:
         """Run all seeds and sizes; rows are written as they are finished."""
-        self.out.mkdir(parents=True, exist_ok=True)
+        try:
+            self.out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise SystemExit(f"Cannot write to {self.out}: {error}") from error
+        if not os.access(self.out, os.W_OK):
+            raise SystemExit(f"Cannot write to {self.out}; pass another `--out`.")
         results = ResultsFile(self.out / "results.csv")
         for seed in self.seeds:
             self._run_seed(seed, results)

@@ -292,11 +292,12 @@ def _is_different(a: Tensor, b: Tensor) -> bool:
     scale = torch.maximum(middle_a.abs(), middle_b.abs())
     apart = (middle_a - middle_b).abs() > 1e-4 * scale
     for column in apart.nonzero().flatten().tolist():
-        some = [
+        first, second = (
             values[~values.isnan()].cpu().numpy()
             for values in (a[:, column], b[:, column])
-        ]
-        if ks_2samp(*some).pvalue < DIFFERENT / a.shape[1]:
+        )
+        test: Any = ks_2samp(first, second)
+        if test.pvalue < DIFFERENT / a.shape[1]:
             return True
     return False
 

@@ -1,5 +1,7 @@
 """Real observations in the units by which NPE standardises simulations."""
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
@@ -35,7 +37,7 @@ def deviations(embedding_net: nn.Module, x: Tensor) -> Tensor | None:
     return None if layer is None else ((x - layer._mean) / layer._std).abs()
 
 
-def _layer(embedding_net: nn.Module) -> Standardize | None:
+def _layer(embedding_net: nn.Module) -> Any:
     layers = (part for part in embedding_net.modules() if isinstance(part, Standardize))
     return next(layers, None)
 

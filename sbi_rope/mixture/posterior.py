@@ -303,12 +303,13 @@ class MixturePosterior(DirectPosterior):
         return self
 
     def _x_else_default_x(self, x: Any) -> Tensor:
-        if x is None and self.default_x is None:
+        x = self.default_x if x is None else x
+        if x is None:
             raise InvalidInputError(
                 "Expected `x`, an observation, or a default that was set with "
                 "`set_default_x(x)`; got neither."
             )
-        return self._batch_of_x(self.default_x if x is None else x)
+        return self._batch_of_x(x)
 
     def _one_x(self, x: Tensor | None) -> Tensor:
         batch = self._x_else_default_x(x)
@@ -458,7 +459,7 @@ class MixturePosterior(DirectPosterior):
             **options,
         )
 
-    def _calculate_map(
+    def _calculate_map(  # type: ignore[override]
         self,
         *,
         init_method: str | Tensor = "posterior",
