@@ -4,6 +4,7 @@ Each check raises with the argument's name, what was expected, what came, and wh
 there is one, what to do next. Public functions call them once; private code trusts.
 """
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from numbers import Integral, Rational, Real
 from pathlib import Path
@@ -18,6 +19,7 @@ from torch.distributions import Distribution
 from sbi_rope.errors import InvalidInputError, InvalidTypeError, NotReadyError, shown
 
 __all__ = [
+    "LARGEST_SETTING",
     "as_float32",
     "as_numbers",
     "as_shape",
@@ -58,8 +60,8 @@ DTYPES = {
     *(torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64),
 }
 LARGEST_INTEGER = 2**63 - 1  # that torch can hold
-# No setting is larger, and products with it stay finite in float32.
-LARGEST_NUMBER = 1e30
+# Products of such a number with data of a usual size stay finite in float32.
+LARGEST_SETTING = 1e30
 
 
 def check_tensor(name: str, value: Any) -> Tensor:
@@ -370,30 +372,29 @@ def check_in_support(name: str, theta: Tensor, prior: Any) -> None:
         )
 
 
-def check_number(name: str, value: Any) -> None:
-    """Raise unless ``value`` is a finite number."""
-    if not _is_number(value):
+def check_number(name: str, value: Any, *, maximum: float = math.inf) -> None:
+    """Raise unless ``value`` is a finite number, of at most ``maximum`` in size."""
+    if not _is_number(value) or not abs(value) <= maximum:
         raise InvalidInputError(
-            f"Expected `{name}` to be a finite number, at most {LARGEST_NUMBER:g} in "
-            f"size; got {shown(value)}."
-        )
-
-
-def check_positive(name: str, value: Any) -> None:
-    """Raise unless ``value`` is a finite number above zero."""
-    if not _is_number(value) or not value > 0.0:
-        raise InvalidInputError(
-            f"Expected `{name}` to be positive, at most {LARGEST_NUMBER:g}; got "
+            f"Expected `{name}` to be a finite number{_in_words(maximum)}; got "
             f"{shown(value)}."
         )
 
 
-def check_not_negative(name: str, value: Any) -> None:
-    """Raise unless ``value`` is a finite number of at least zero."""
-    if not _is_number(value) or not value >= 0.0:
+def check_positive(name: str, value: Any, *, maximum: float = math.inf) -> None:
+    """Raise unless ``value`` is a finite number above zero, at most ``maximum``."""
+    if not _is_number(value) or not 0.0 < value <= maximum:
         raise InvalidInputError(
-            f"Expected `{name}` to be a finite number of at least 0 and at most "
-            f"{LARGEST_NUMBER:g}; got {shown(value)}."
+            f"Expected `{name}` to be positive{_in_words(maximum)}; got {shown(value)}."
+        )
+
+
+def check_not_negative(name: str, value: Any, *, maximum: float = math.inf) -> None:
+    """Raise unless ``value`` is a finite number from zero to ``maximum``."""
+    if not _is_number(value) or not 0.0 <= value <= maximum:
+        raise InvalidInputError(
+            f"Expected `{name}` to be a finite number of at least 0"
+            f"{_in_words(maximum)}; got {shown(value)}."
         )
 
 
@@ -468,15 +469,19 @@ def check_choice(name: str, value: Any, choices: Sequence[Any]) -> None:
 
 
 def _is_number(value: Any) -> bool:
-    """Whether a value is a number that tensors of float32 can be multiplied with."""
+    """Whether a value is a number that tensors can be multiplied with, and finite."""
     if not isinstance(value, Real) or isinstance(value, bool):
         return False
     if isinstance(value, Rational) and not isinstance(value, Integral):
         return False  # torch knows no fractions
     try:
-        return abs(float(value)) <= LARGEST_NUMBER  # not so for NaN
+        return math.isfinite(float(value))
     except OverflowError:  # an integer of more than 300 digits
         return False
+
+
+def _in_words(maximum: float) -> str:
+    return "" if maximum == math.inf else f", at most {maximum:g}"
 
 
 def _is_same(value: Any, choice: Any) -> bool:

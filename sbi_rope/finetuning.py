@@ -19,6 +19,7 @@ from sbi_rope._training import (
     warn_without_holdout,
 )
 from sbi_rope._validation import (
+    LARGEST_SETTING,
     check_batch,
     check_finite,
     check_gradients,
@@ -118,7 +119,7 @@ class CalibrationFinetuner:
         if not self._learning_rates:
             raise InvalidInputError("Expected at least one `learning_rate`; got ().")
         for rate in self._learning_rates:
-            check_positive("learning_rate", rate)
+            check_positive("learning_rate", rate, maximum=LARGEST_SETTING)
         check_integer("num_steps", self.num_steps)
         check_integer("patience", self.patience)
         check_integer("simulations_per_target", self.simulations_per_target)

@@ -21,9 +21,10 @@ DEPENDENCIES = "import ot, numpy, torch, tqdm.auto, sbi.inference, sbi.utils"
 # A module imports from layers below its own, and from its own package.
 LAYERS = [
     {"errors", "_progress", "_processes"},
-    {"_validation", "_sbi", "_random", "_training", "_files"},
-    {"coupling", "finetuning", "metrics", "_simulations"},
-    {"mixture", "plots"},
+    {"_random", "_files"},
+    {"_validation", "_sbi", "_training"},
+    {"coupling", "finetuning", "metrics", "_simulations", "_standardisation"},
+    {"mixture", "plots", "_simulator"},
     {"rope", "tasks"},
     {"baselines"},
     {"discrepancy"},

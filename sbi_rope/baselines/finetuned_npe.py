@@ -22,7 +22,12 @@ from sbi_rope._training import (
     split_groups,
     split_pairs,
 )
-from sbi_rope._validation import check_instance, check_integer, check_positive
+from sbi_rope._validation import (
+    LARGEST_SETTING,
+    check_instance,
+    check_integer,
+    check_positive,
+)
 from sbi_rope.baselines.base import BuildsOnNPE, UsesCalibration
 from sbi_rope.baselines.training import EstimatorBuilder, Training, train_on_pairs
 from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError
@@ -121,7 +126,7 @@ class FinetunedNPE(BuildsOnNPE, UsesCalibration):
                 "Expected at least one of `learning_rates`; got ()."
             )
         for rate in learning_rates:
-            check_positive("learning_rates", rate)
+            check_positive("learning_rates", rate, maximum=LARGEST_SETTING)
         super().__init__(
             prior, density_estimator, npe_training=npe_training, device=device
         )

@@ -22,7 +22,7 @@ from sbi_rope._training import (
     groups_to_hold_out,
     warn_without_holdout,
 )
-from sbi_rope._validation import check_integer, check_positive
+from sbi_rope._validation import LARGEST_SETTING, check_integer, check_positive
 from sbi_rope.errors import InvalidInputError, InvalidTypeError
 
 __all__ = [
@@ -67,7 +67,7 @@ class Training:
     def __post_init__(self) -> None:
         """Check the ranges of all fields."""
         check_integer("training_batch_size", self.training_batch_size)
-        check_positive("learning_rate", self.learning_rate)
+        check_positive("learning_rate", self.learning_rate, maximum=LARGEST_SETTING)
         check_positive("validation_fraction", self.validation_fraction)
         if self.validation_fraction > 0.5:
             raise InvalidInputError(

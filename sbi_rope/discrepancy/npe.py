@@ -21,6 +21,7 @@ from sbi_rope._simulator import Simulator
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._training import History
 from sbi_rope._validation import (
+    LARGEST_SETTING,
     check_choice,
     check_instance,
     check_integer,
@@ -138,7 +139,7 @@ class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
         if num_steps is not None:
             check_integer("num_steps", num_steps)
         if learning_rate is not None:
-            check_positive("learning_rate", learning_rate)
+            check_positive("learning_rate", learning_rate, maximum=LARGEST_SETTING)
         check_integer("num_folds", num_folds, minimum=2)
         check_instance("finetuner", finetuner, CalibrationFinetuner, optional=True)
         if simulator is not None and not callable(simulator):

@@ -287,7 +287,10 @@ def _checked_levels(levels: Tensor) -> Tensor:
         )
     check_batch("levels", levels, shape[1:], finite=False)
     _check_unit_range("levels", levels)
-    return levels.detach()
+    levels = levels.detach()
+    # Of 16 bits, they would be compared with levels that have been rounded as coarsely.
+    is_coarse = levels.dtype in (torch.float16, torch.bfloat16)
+    return levels.float() if is_coarse else levels
 
 
 def _check_unit_range(name: str, values: Tensor) -> None:

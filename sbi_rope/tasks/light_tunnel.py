@@ -165,7 +165,6 @@ class LightTunnel(Task):
         super().__init__(variant=variant, root=root, label_noise=label_noise)
         check_choice("image_size", image_size, IMAGE_SIZES)
         check_instance("stand_in", stand_in, bool)
-        check_instance("dequantise", dequantise, bool)
         check_instance("experiment", experiment, str, optional=True)
         self.stand_in = stand_in or variant == "synthetic"
         if experiment is not None and (self.stand_in or variant in OWN_EXPERIMENTS):
@@ -185,7 +184,7 @@ class LightTunnel(Task):
         self.experiment = self._option("experiment", experiment, UNIFORM)
         check_download(self.root, self.required_files, download=download)
         self.sensor_noise = self._option("sensor_noise", sensor_noise, CAMERA_NOISE)
-        self._camera()  # refuses a bad `sensor_noise` now
+        self._camera()  # refuses a bad `sensor_noise` or `dequantise` now
 
     def get_prior(self) -> MultipleIndependent:
         """Return the prior: uniform colours, and the law of a squared cosine.

@@ -8,6 +8,7 @@ from sbi.utils import BoxUniform, MultipleIndependent
 from torch import Tensor, nn
 
 from sbi_rope._validation import (
+    LARGEST_SETTING,
     check_in_support,
     check_instance,
     check_not_negative,
@@ -106,8 +107,12 @@ class LightTunnelSimulator:
     current_noise_std: float = 4.0
 
     def __post_init__(self) -> None:
-        check_not_negative("relative_noise", self.relative_noise)
-        check_not_negative("current_noise_std", self.current_noise_std)
+        check_not_negative(
+            "relative_noise", self.relative_noise, maximum=LARGEST_SETTING
+        )
+        check_not_negative(
+            "current_noise_std", self.current_noise_std, maximum=LARGEST_SETTING
+        )
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, 4)``, to shape ``(n, 7)``."""
@@ -229,8 +234,8 @@ class LightTunnelSensors(Task):
         current_noise_std: float = 4.0,
     ) -> None:
         super().__init__(variant=variant, root=root, label_noise=label_noise)
-        check_positive("relative_noise", relative_noise)
-        check_positive("current_noise_std", current_noise_std)
+        check_positive("relative_noise", relative_noise, maximum=LARGEST_SETTING)
+        check_positive("current_noise_std", current_noise_std, maximum=LARGEST_SETTING)
         check_instance("experiment", experiment, str, optional=True)
         if experiment is not None and variant in OWN_EXPERIMENTS:
             raise InvalidInputError(

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.distributions import MultivariateNormal, Normal
 
 from sbi_rope._validation import (
+    LARGEST_SETTING,
     check_batch,
     check_device,
     check_instance,
@@ -58,7 +59,7 @@ class LinearGaussianSimulator:
 
     def __post_init__(self) -> None:
         check_integer("dim", self.dim)
-        check_positive("noise_std", self.noise_std)
+        check_positive("noise_std", self.noise_std, maximum=LARGEST_SETTING)
         _check_gain_and_offset(self.scale, self.shift)
 
     def __call__(self, theta: Tensor) -> Tensor:
@@ -153,7 +154,7 @@ class LinearGaussian(Task):
             raise InvalidInputError(
                 f"Expected `dim` to be at most {MAX_DIM}; got {dim}."
             )
-        check_positive("noise_std", noise_std)
+        check_positive("noise_std", noise_std, maximum=LARGEST_SETTING)
         self.dim = dim
         self.parameter_names = tuple(f"theta_{k + 1}" for k in range(dim))
         self.parameter_units = ("1",) * dim
@@ -212,8 +213,8 @@ class LinearGaussian(Task):
 
 
 def _check_gain_and_offset(scale: float, shift: float) -> None:
-    check_number("scale", scale)
-    check_number("shift", shift)
+    check_number("scale", scale, maximum=LARGEST_SETTING)
+    check_number("shift", shift, maximum=LARGEST_SETTING)
     if scale == 0:
         raise InvalidInputError(
             f"Expected `scale` to be a finite number other than 0; got {scale!r}."

@@ -9,6 +9,7 @@ from sbi.utils import BoxUniform
 from torch import Tensor, nn
 
 from sbi_rope._validation import (
+    LARGEST_SETTING,
     check_batch,
     check_device,
     check_instance,
@@ -54,8 +55,8 @@ class PendulumSimulator:
     max_damping: float = 0.0
 
     def __post_init__(self) -> None:
-        check_not_negative("noise_std", self.noise_std)
-        check_not_negative("max_damping", self.max_damping)
+        check_not_negative("noise_std", self.noise_std, maximum=LARGEST_SETTING)
+        check_not_negative("max_damping", self.max_damping, maximum=LARGEST_SETTING)
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, 2)``, to shape ``(n, 200)``."""
@@ -161,7 +162,7 @@ class Pendulum(Task):
         max_damping: float | None = None,
     ) -> None:
         super().__init__(variant=variant, root=root, label_noise=label_noise)
-        check_positive("noise_std", noise_std)
+        check_positive("noise_std", noise_std, maximum=LARGEST_SETTING)
         self.noise_std = noise_std
         damping = 0.0 if variant == "well_specified" else 1.0
         self.max_damping = self._option("max_damping", max_damping, damping)

@@ -7,6 +7,7 @@ from sbi.utils import BoxUniform
 from torch import Tensor, nn
 
 from sbi_rope._validation import (
+    LARGEST_SETTING,
     check_in_support,
     check_instance,
     check_positive,
@@ -141,7 +142,7 @@ class WindTunnel(Task):
         onset_jitter: float = 0.3,
     ) -> None:
         super().__init__(variant=variant, root=root, label_noise=label_noise)
-        check_positive("noise_std", noise_std)
+        check_positive("noise_std", noise_std, maximum=LARGEST_SETTING)
         check_jitter(onset_jitter)
         check_instance("stand_in", stand_in, bool)
         check_instance("experiment", experiment, str, optional=True)

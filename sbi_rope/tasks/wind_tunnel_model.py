@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from sbi_rope._validation import (
+    LARGEST_SETTING,
     check_batch,
     check_device,
     check_not_negative,
@@ -121,12 +122,12 @@ class WindTunnelSimulator:
     exhaust_offset: float = 0.0
 
     def __post_init__(self) -> None:
-        check_not_negative("noise_std", self.noise_std)
+        check_not_negative("noise_std", self.noise_std, maximum=LARGEST_SETTING)
         check_jitter(self.onset_jitter)
-        check_number("exhaust_offset", self.exhaust_offset)
+        check_number("exhaust_offset", self.exhaust_offset, maximum=LARGEST_SETTING)
         check_unit_interval("noise_correlation", self.noise_correlation)
-        check_positive("max_pressure", self.max_pressure)
-        check_positive("inertia", self.inertia)
+        check_positive("max_pressure", self.max_pressure, maximum=LARGEST_SETTING)
+        check_positive("inertia", self.inertia, maximum=LARGEST_SETTING)
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, 1)``, to shape ``(n, 50)``."""
@@ -210,8 +211,8 @@ def pressure_ratio(
         2.125
     """
     check_batch("onset_shift", onset_shift, ())
-    check_positive("inertia", inertia)
-    check_number("exhaust_offset", exhaust_offset)
+    check_positive("inertia", inertia, maximum=LARGEST_SETTING)
+    check_number("exhaust_offset", exhaust_offset, maximum=LARGEST_SETTING)
     intake = _fan_speeds(onset_shift, loads=INTAKE_LOADS, inertia=inertia)
     exhaust = _fan_speeds(onset_shift[:1], loads=EXHAUST_LOADS, inertia=inertia)
     return (intake**2 - (exhaust + exhaust_offset) ** 2) / MAX_SPEED**2

@@ -107,7 +107,9 @@ def test_a_posterior_made_of_ties_ranks_in_the_middle() -> None:
     assert torch.equal(ranks, torch.full((3, 2), 0.5, dtype=torch.float64))
 
 
-SAMPLES, TRUTH = torch.rand(7, 4, 2), torch.rand(4, 2)
+GENERATOR = torch.Generator().manual_seed(0)
+SAMPLES = torch.rand(7, 4, 2, generator=GENERATOR)
+TRUTH = torch.rand(4, 2, generator=GENERATOR)
 LEVEL_SCORES = (
     metrics.acauc_of,
     metrics.coverage_curve_of,

@@ -10,6 +10,7 @@ import torch
 from sbi.utils import BoxUniform
 
 from sbi_rope._validation import (
+    LARGEST_SETTING,
     as_float32,
     check_attributes,
     check_batch,
@@ -31,12 +32,12 @@ from sbi_rope._validation import (
 )
 from sbi_rope.errors import InvalidInputError, InvalidTypeError, shown
 
-X = torch.rand(3, 2)
+X = torch.tensor([[0.1, 0.9], [0.2, 0.8], [0.3, 0.7]])
 HUGE = 10**5000
 # No number at all, whatever is asked for.
 NO_NUMBERS = [
     *(None, "1", b"1", True, 1 + 1j, [1.0], {}, object(), HUGE, -HUGE),
-    *(np.array([1.0, 2.0]), torch.tensor(1.0), float("nan"), float("inf"), 1e39),
+    *(np.array([1.0, 2.0]), torch.tensor(1.0), float("nan"), float("inf")),
 ]
 
 
@@ -136,6 +137,14 @@ def test_numbers_of_python_and_numpy_are_accepted(value: float) -> None:
         check_unit_interval,
     ):
         check("a", value)
+
+
+def test_a_number_may_have_a_largest_size() -> None:
+    for check in (check_number, check_positive, check_not_negative):
+        check("a", 1e300)
+        check("a", 1e30, maximum=LARGEST_SETTING)
+        with pytest.raises(InvalidInputError, match=r"at most 1e\+30; got 1e\+39"):
+            check("a", 1e39, maximum=LARGEST_SETTING)
 
 
 @pytest.mark.parametrize("value", [3, np.int64(3), np.uint8(3)])

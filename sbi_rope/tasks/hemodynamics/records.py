@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from sbi_rope._validation import (
+    LARGEST_SETTING,
     check_batch,
     check_choice,
     check_device,
@@ -56,7 +57,7 @@ class Recorder:
     normalisation: Normalisation = "per_record"
 
     def __post_init__(self) -> None:
-        check_not_negative("noise_std", self.noise_std)
+        check_not_negative("noise_std", self.noise_std, maximum=LARGEST_SETTING)
         check_choice("normalisation", self.normalisation, ("per_record", "global"))
 
     def __call__(

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from sbi_rope._validation import (
+    LARGEST_SETTING,
     check_choice,
     check_in_support,
     check_instance,
@@ -171,7 +172,7 @@ class Hemodynamics(Task):
         normalisation: Normalisation = "per_record",
     ) -> None:
         super().__init__(variant=variant, root=root, label_noise=label_noise)
-        check_positive("noise_std", noise_std)
+        check_positive("noise_std", noise_std, maximum=LARGEST_SETTING)
         check_choice("prior", prior, ("population", "independent"))
         self.prior: Literal["population", "independent"] = prior
         self.simulations = check_path("simulations", simulations, optional=True)
