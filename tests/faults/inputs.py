@@ -67,9 +67,11 @@ ODD_ROWS = {
 # Must be refused, by the kind of an option.
 BAD_OPTIONS: dict[str, list[Any]] = {
     "positive": [0, -1.0, math.nan, math.inf, "x", True, [1.0], torch.ones(2)],
+    # Of Adam, whose steps are no longer numbers then.
+    "rate": [0, -1.0, math.nan, math.inf, 1e38, "x", True, torch.ones(2)],
     "not negative": [-1.0, math.nan, math.inf, "x", True, [1.0], None],
     "share": [-0.1, 1.1, math.nan, "x", True, [0.5]],
-    "count": [0, -1, 1.5, math.nan, "x", True, [3], torch.ones(2)],
+    "count": [0, -1, 1.5, math.nan, 10**30, "x", True, [3], torch.ones(2)],
     "choice": ["x", 3, np.array([1, 2]), [], {"a": 1}, torch.ones(2)],
     "seed": [-1, 1.5, "x", True, [0], torch.ones(2)],
     "numbers": [0.5, "x", [], [math.nan], [-1.0], [None], ["x"], None],

@@ -124,7 +124,7 @@ CALLS += [
         run=lambda **options: repr(baselines.Training(**options)),
         options={
             "training_batch_size": "count",
-            "learning_rate": "positive",
+            "learning_rate": "rate",
             "validation_fraction": "positive",
             "stop_after_epochs": "count",
             "max_num_epochs": "count",

@@ -79,7 +79,7 @@ CALLS = [
             "num_simulations": "count",
             "simulations_per_pair": "count",
             "num_steps": "count",
-            "learning_rate": "positive",
+            "learning_rate": "rate",
             "num_folds": "count",
             "finetuner": "instance",
             "npe_training": "instance",

@@ -129,7 +129,7 @@ CALLS = [
         name="CalibrationFinetuner",
         run=lambda **options: repr(CalibrationFinetuner(**options)),
         options={
-            "learning_rate": "positive",
+            "learning_rate": "rate",
             "num_steps": "count",
             "patience": "count",
             "simulations_per_target": "count",
