@@ -309,12 +309,13 @@ class VectorFieldDensity(ConditionalDensityEstimator):
         self, sample_shape: torch.Size, condition: Tensor, **kwargs: Any
     ) -> Tensor:
         """Solve the ODE or SDE for every condition; no prior support is enforced."""
-        posterior = VectorFieldPosterior(
-            self.vector_field,
-            self.prior,
-            device=condition.device,
-            sample_with=self.sample_with,
-        )
+        with seeded(0):  # sbi draws from the prior to look at it
+            posterior = VectorFieldPosterior(
+                self.vector_field,
+                self.prior,
+                device=condition.device,
+                sample_with=self.sample_with,
+            )
         with warnings.catch_warnings():
             # Draws outside the prior are rejected by the mixture; the batch is ours.
             warnings.filterwarnings("ignore", message=".*outside the prior support")

@@ -381,7 +381,6 @@ def test_the_samples_of_a_vector_field_are_those_of_sbi(method: str) -> None:
     torch.manual_seed(3)
     samples = components.sample(torch.Size((2,)), embed(embedding_of(estimator), x))
     torch.manual_seed(3)
-    # Made anew, because making one uses random numbers.
     expected = posterior_from(original, estimator).sample_batched(
         (2,), x, show_progress_bars=False, reject_outside_prior=False
     )

@@ -577,7 +577,7 @@ def test_the_choice_of_observations_has_a_seed_of_its_own() -> None:
 
 
 def test_few_fitted_observations_are_warned_about_like_a_small_batch() -> None:
-    with pytest.warns(RoPEWarning, match="a batch of 10 real"):
+    with pytest.warns(RoPEWarning, match="num_fitted=10 of "):
         SinkhornCoupler(num_fitted=10).couple(*clouds())
 
 

@@ -409,12 +409,12 @@ def test_progress_of_normalising_is_shown_if_asked_for_and_never_by_log_prob(
 ) -> None:
     shown: list[bool] = []
 
-    def tqdm(items: Any, *, disable: bool, delay: float, **options: Any) -> Any:
+    def bar(items: Any, *, show: bool, delay: float, **options: Any) -> Any:
         assert delay > 0
-        shown.append(not disable)
+        shown.append(show)
         return items
 
-    monkeypatch.setattr(truncation, "tqdm", tqdm)
+    monkeypatch.setattr(truncation, "progress_bar", bar)
     posterior = three_parts()
     theta = torch.zeros(NUM_BATCH, DIM)
     posterior.log_prob_batched(theta, posterior.x_o)

@@ -34,9 +34,17 @@ from sbi_rope.errors import InvalidInputError, InvalidTypeError, shown
 
 X = torch.tensor([[0.1, 0.9], [0.2, 0.8], [0.3, 0.7]])
 HUGE = 10**5000
+
+
 # No number at all, whatever is asked for.
+class _Thing:
+    def __repr__(self) -> str:
+        return "a thing"  # without an address, which changes from run to run
+
+
+THING = _Thing()
 NO_NUMBERS = [
-    *(None, "1", b"1", True, 1 + 1j, [1.0], {}, object(), HUGE, -HUGE),
+    *(None, "1", b"1", True, 1 + 1j, [1.0], {}, THING, HUGE, -HUGE),
     *(np.array([1.0, 2.0]), torch.tensor(1.0), float("nan"), float("inf")),
 ]
 
@@ -179,7 +187,7 @@ def test_weights_keep_their_digits() -> None:
 @pytest.mark.parametrize(
     "value",
     [
-        *(None, 3, "ab", b"ab", {0.5, 0.6}, {}, object(), [0.5, None], [0.5, "a"]),
+        *(None, 3, "ab", b"ab", {0.5, 0.6}, {}, THING, [0.5, None], [0.5, "a"]),
         *([0.5 + 0j, 0.5], [True, False], [HUGE, 1], [[0.5], [0.5, 0.5]], [[0.5, 0.5]]),
         *([float("nan"), 1.0], [1.5, -0.5], [0.5, 0.6], X, X[0].to_sparse()),
         *(X[0].to("meta"), np.array([0.5, 0.6]), np.array(["a", "b"])),
@@ -210,7 +218,7 @@ def test_choices_are_accepted(value: Any, choices: tuple) -> None:
 @pytest.mark.parametrize(
     "value",
     [
-        *("c", 64.0, ["a"], {}, b"a", object(), float("nan"), HUGE),
+        *("c", 64.0, ["a"], {}, b"a", THING, float("nan"), HUGE),
         *(np.array(["a", "b"]), np.array([64, 1]), np.array("a"), X, torch.tensor(64)),
     ],
     ids=shown,
@@ -232,7 +240,7 @@ def test_names_are_a_list_of_strings() -> None:
     assert check_names("names", np.array(["a", "b"])) == ["a", "b"]
     with pytest.raises(InvalidInputError, match="length 2; got 1"):
         check_names("names", ["a"], 2)
-    for value in ("ab", b"ab", None, 3, [1, 2], ["a", None], {"a": 1}, object()):
+    for value in ("ab", b"ab", None, 3, [1, 2], ["a", None], {"a": 1}, THING):
         with pytest.raises(InvalidTypeError, match="`names` to be a list of strings"):
             check_names("names", value)
 
@@ -257,7 +265,7 @@ def test_an_object_is_asked_for_what_is_read_of_it() -> None:
 def test_a_path_is_a_string_or_a_path() -> None:
     assert check_path("root", "~/a") == Path("~/a").expanduser()
     assert check_path("root", None, optional=True) is None
-    for value in (None, 3, b"a", ["a"], object()):
+    for value in (None, 3, b"a", ["a"], THING):
         with pytest.raises(InvalidTypeError, match="`root` to be a path; got"):
             check_path("root", value)
     for text in ("a\0b", "~nobody_of_this_name/a"):
