@@ -22,7 +22,7 @@ from benchmarks.report import write_report
 from benchmarks.runner import Workplace, run_cells
 from benchmarks.summary import write_summary
 from benchmarks.tables import read_table, write_table
-from sbi_rope.errors import RoPEError
+from sbi_rope.errors import InvalidInputError, RoPEError
 
 DEFAULT_OUT = Path("results/benchmark")
 PUBLISHED = Path(__file__).parent / "results"
@@ -60,7 +60,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     run.add_argument("--jobs", type=int, default=1, help="at a time; -1: all cores")
     run.add_argument(
-        "--backend", default="loky", help="backend of joblib (%(default)s)"
+        "--backend",
+        default="loky",
+        choices=["loky", "multiprocessing", "threading", "sequential", "dask"],
+        help="backend of joblib (%(default)s)",
     )
     run.add_argument("--scheduler", help="address of a dask scheduler")
     run.add_argument("--device", default="cpu", help="%(default)s, or cuda")
@@ -103,6 +106,10 @@ def _add_out(parser: argparse.ArgumentParser, default: Path) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
+    if args.jobs == 0:
+        raise InvalidInputError("Expected `--jobs` of 1 or more, or -1; got 0.")
+    if args.scheduler and args.backend != "dask":
+        raise InvalidInputError("Expected `--backend dask` with `--scheduler`.")
     suite = load_suite(args.suite)
     cells = suite.select(
         tasks=args.tasks, methods=args.methods, repetitions=args.repetitions

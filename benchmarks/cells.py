@@ -170,7 +170,12 @@ def load_suite(name: str) -> Suite:
     path = Path(name) if name.endswith(".toml") else FOLDER / f"{name}.toml"
     if not path.exists():
         raise SystemExit(f"No suite {name!r}; there are {list_suites()}.")
-    data = tomllib.loads(path.read_text(encoding="utf-8"))
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InvalidInputError(
+            f"Expected a suite in TOML; got {path}: {error}"
+        ) from error
     missing = [key for key in NEEDED if key not in data]
     if missing:
         raise InvalidInputError(

@@ -35,7 +35,11 @@ from torch import Tensor, nn
 from torch.distributions import Distribution
 
 from sbi_rope._random import seeded
-from sbi_rope.errors import LogProbUnavailableError, UnsupportedPosteriorError
+from sbi_rope.errors import (
+    InvalidInputError,
+    LogProbUnavailableError,
+    UnsupportedPosteriorError,
+)
 
 __all__ = [
     "BasePotential",
@@ -50,6 +54,7 @@ __all__ = [
     "UnconditionalDensityEstimator",
     "VectorFieldDensity",
     "build_zuko_unconditional_flow",
+    "copy_of_prior",
     "device_of",
     "direct_posterior",
     "dtype_of",
@@ -82,6 +87,11 @@ def estimator_of(posterior: Any) -> ConditionalEstimator:
             f"{type(posterior).__name__} around a mixture of such posteriors, which "
             "has no single embedding of x. What RoPE, a stack or a baseline has "
             "repaired cannot be repaired again: pass the posterior it was built from."
+        )
+    if not plain and hasattr(posterior, "build_posterior"):
+        raise UnsupportedPosteriorError(
+            f"Expected `posterior` to be a posterior; got {type(posterior).__name__}, "
+            "which makes one: pass what its `build_posterior()` returns."
         )
     if not plain:
         raise UnsupportedPosteriorError(
@@ -204,11 +214,27 @@ def posterior_from(
     with seeded(0):  # sbi draws from the prior to look at it
         return VectorFieldPosterior(
             estimator,
-            copy.deepcopy(posterior.prior),
+            copy_of_prior(posterior.prior),
             device=device_of(estimator),
             enable_transform=posterior.enable_transform,
             sample_with=posterior.sample_with,
         )
+
+
+def copy_of_prior(prior: Any) -> Any:
+    """Copy a prior, which sbi moves to devices in place.
+
+    Raises:
+        InvalidInputError: If it cannot be copied.
+    """
+    try:
+        return copy.deepcopy(prior)
+    except Exception as error:  # of whatever it holds
+        raise InvalidInputError(
+            f"Expected a prior that can be copied; `copy.deepcopy` of this "
+            f"{type(prior).__name__} raised {type(error).__name__}: {error}. Detach "
+            "its tensors from their graph, and leave out what cannot be copied."
+        ) from error
 
 
 def direct_posterior(
@@ -221,7 +247,7 @@ def direct_posterior(
     with seeded(0):  # sbi draws from the prior to look at it
         return DirectPosterior(
             estimator,
-            copy.deepcopy(prior),
+            copy_of_prior(prior),
             device=device_of(estimator),
             enable_transform=enable_transform,
         )
@@ -350,7 +376,8 @@ def embed(net: nn.Module, x: Tensor, *, batch_size: int = 1000) -> Tensor:
     net.eval()
     try:
         with torch.no_grad():
-            return torch.cat([net(part) for part in x.split(batch_size)])
+            # A net may change its argument, as activations in place do.
+            return torch.cat([net(part.clone()) for part in x.split(batch_size)])
     finally:
         for module, training in modes.items():
             module.training = training

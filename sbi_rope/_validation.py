@@ -26,6 +26,7 @@ __all__ = [
     "check_attributes",
     "check_batch",
     "check_choice",
+    "check_default_dtype",
     "check_device",
     "check_finite",
     "check_gradients",
@@ -183,6 +184,16 @@ def usable_device(device: Any) -> torch.device:
         ) from error
 
 
+def check_default_dtype() -> None:
+    """Raise where torch makes numbers that sbi's networks cannot take."""
+    dtype = torch.get_default_dtype()
+    if dtype != torch.float32:
+        raise NotReadyError(
+            f"sbi computes in float32, but torch's default dtype is {dtype}. Call "
+            "`torch.set_default_dtype(torch.float32)`; data may have any dtype."
+        )
+
+
 def check_gradients() -> None:
     """Raise where torch cannot train anything."""
     if torch.is_inference_mode_enabled():
@@ -295,9 +306,12 @@ def check_rows(name: str, value: Any, count: int) -> Tensor:
     check_values(name, rows)
     whole = rows.ndim == 1 and rows.dtype == torch.long
     if not whole or bool(((rows < 0) | (rows >= count)).any()):
+        got = f"{rows.dtype} of shape {tuple(rows.shape)}"
+        if rows.ndim == 1 and len(rows):
+            got += f" with numbers from {rows.min()} to {rows.max()}"
         raise InvalidInputError(
             f"Expected `{name}` to be whole numbers of rows (int64), shape (m,), from "
-            f"0 to {count - 1}; got {rows.dtype} of shape {tuple(rows.shape)}."
+            f"0 to {count - 1}; got {got}."
         )
     return rows
 

@@ -14,6 +14,7 @@ from sbi_rope._random import seeded
 from sbi_rope._sbi import (
     ConditionalDensityEstimator,
     VectorFieldDensity,
+    copy_of_prior,
     device_of,
     dtype_of,
     embed,
@@ -30,6 +31,7 @@ from sbi_rope._training import groups_of
 from sbi_rope._validation import (
     check_batch,
     check_choice,
+    check_default_dtype,
     check_device,
     check_finite,
     check_gradients,
@@ -134,6 +136,7 @@ class RoPE:
     ) -> None:
         check_instance("finetuner", finetuner, CalibrationFinetuner, optional=True)
         check_instance("coupler", coupler, SinkhornCoupler, optional=True)
+        check_default_dtype()
         estimator = estimator_of(posterior)
         embedding_of(estimator)
         if dtype_of(estimator) != torch.float32:
@@ -147,7 +150,7 @@ class RoPE:
             copy.deepcopy(estimator).eval().requires_grad_(requires_grad=False)
         )
         self._posterior: Any = posterior_from(posterior, self._estimator)
-        self._prior = copy.deepcopy(posterior.prior)
+        self._prior = copy_of_prior(posterior.prior)
         self._h = embedding_of(self._estimator)
         self._q = headless(self._estimator)
         self._g: nn.Module | None = None
@@ -237,6 +240,7 @@ class RoPE:
             SimulationError: If the simulator fails at the calibration parameters.
         """
         check_gradients()
+        check_instance("finetuner", self.finetuner, CalibrationFinetuner)
         if not len(self._x_cal):
             raise NotReadyError(
                 "No calibration pairs to train on. Call `append_calibration(theta, "
@@ -399,6 +403,7 @@ class RoPE:
             targets = check_tensor("targets", targets)
             check_batch("targets", targets, targets.shape[1:])
             check_same_length("rows", rows, "targets", targets)
+            targets = targets.clone()
         part = copy.copy(self)
         part._theta_cal, part._x_cal = self._theta_cal[rows], self._x_cal[rows]
         part._targets = targets
@@ -559,8 +564,9 @@ class RoPE:
         return posteriors()
 
     def _coupler_or(self, coupler: SinkhornCoupler | None) -> SinkhornCoupler:
-        check_instance("coupler", coupler, SinkhornCoupler, optional=True)
-        return self.coupler if coupler is None else coupler
+        coupler = self.coupler if coupler is None else coupler
+        check_instance("coupler", coupler, SinkhornCoupler)
+        return coupler
 
     def _embed_batch(
         self,

@@ -16,6 +16,7 @@ from sbi_rope._random import seeded
 from sbi_rope._sbi import (
     ConditionalDensityEstimator,
     DirectPosterior,
+    copy_of_prior,
     device_of,
     direct_posterior,
     estimator_of,
@@ -24,6 +25,7 @@ from sbi_rope._sbi import (
 from sbi_rope._training import History
 from sbi_rope._validation import (
     check_batch,
+    check_default_dtype,
     check_finite,
     check_gradients,
     check_in_support,
@@ -71,7 +73,8 @@ class Method(ABC):
 
     def __init__(self, prior: Any, *, device: str | torch.device = "cpu") -> None:
         check_prior(prior)
-        self._prior: Distribution = copy.deepcopy(prior)
+        check_default_dtype()
+        self._prior: Distribution = copy_of_prior(prior)
         self._device = usable_device(device)
         if hasattr(self._prior, "to"):
             self._prior.to(self._device)  # type: ignore[attr-defined]
@@ -103,7 +106,8 @@ class Method(ABC):
         """
         check_gradients()
         self._check_data()
-        with seeded(seed):
+        # Whatever the caller's own setting of gradients.
+        with torch.enable_grad(), seeded(seed):
             self._posterior, self._history = self._fit(
                 show_progress_bars=show_progress_bars
             )
@@ -162,6 +166,10 @@ class Method(ABC):
         check_finite(name, theta)
         return theta
 
+    def _no_theta(self) -> Tensor:
+        shape = (0, *self._prior.event_shape)
+        return torch.empty(shape, dtype=torch.float32, device=self._device)
+
     def _append(self, old: Tensor | None, new: Tensor) -> Tensor:
         self._event_shape = new.shape[1:]
         self._posterior = self._history = None
@@ -179,7 +187,7 @@ class UsesSimulations(Method):
 
     def __init__(self, prior: Any, *, device: str | torch.device = "cpu") -> None:
         super().__init__(prior, device=device)
-        self._theta = torch.empty(0, *self._prior.event_shape, device=self._device)
+        self._theta = self._no_theta()
         self._x: Tensor | None = None
 
     def append_simulations(self, theta: Tensor, x: Tensor) -> "Self":
@@ -248,7 +256,7 @@ class UsesCalibration(Method):
 
     def __init__(self, prior: Any, *, device: str | torch.device = "cpu") -> None:
         super().__init__(prior, device=device)
-        self._theta_cal = torch.empty(0, *self._prior.event_shape, device=self._device)
+        self._theta_cal = self._no_theta()
         self._x_cal: Tensor | None = None
 
     def append_calibration(self, theta: Tensor, x: Tensor) -> "Self":

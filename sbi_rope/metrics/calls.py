@@ -97,7 +97,8 @@ def evaluate_log_probs(
         with torch.no_grad():
             part = _returned(
                 "log_prob_batched",
-                posterior.log_prob_batched(theta[rows], x=x[rows], **arguments),
+                # A copy: embedding nets may change their argument.
+                posterior.log_prob_batched(theta[rows], x=x[rows].clone(), **arguments),
             )
         if part.numel() != theta[rows].shape[0]:
             raise InvalidInputError(
@@ -144,7 +145,10 @@ def draw_joint_levels(
         samples = _draw(posterior, theta, x, rows, num_samples)
         draws = torch.cat([theta[rows].unsqueeze(0).to(samples), samples])
         densities = torch.cat(
-            [_density(posterior, part, x[rows]) for part in draws.split(DRAWS_PER_CALL)]
+            [
+                _density(posterior, part, x[rows].clone())
+                for part in draws.split(DRAWS_PER_CALL)
+            ]
         )
         bad = torch.isnan(densities).any(dim=0)
         _refuse("NaN log-probabilities", bad, start=rows.start)
@@ -200,7 +204,10 @@ def _sample(posterior: Any, x: Tensor, num_samples: int) -> Tensor:
         for message in EXPECTED_WARNINGS:
             warnings.filterwarnings("ignore", message=message)
         samples = posterior.sample_batched(
-            torch.Size((num_samples,)), x=x, show_progress_bars=False, **arguments
+            torch.Size((num_samples,)),
+            x=x.clone(),
+            show_progress_bars=False,
+            **arguments,
         )
     return _returned("sample_batched", samples)
 

@@ -186,10 +186,11 @@ class CoupledContexts(Mixing):
     def _unseen_features(self, x: Tensor) -> Tensor:
         # log_prob and its normaliser, or the steps of map(), ask for the same ones, and
         # earn one warning.
-        keys = _keys(x)
-        if self._extended is None or self._extended[0] != keys:
-            self._extended = (keys, self._extend(x))
-        return self._extended[1]
+        keys, kept = _keys(x), self._extended
+        if kept is None or kept[0] != keys:
+            # In one go, and not read again: another thread may ask for others.
+            self._extended = kept = (keys, self._extend(x))
+        return kept[1]
 
     def _extend(self, x: Tensor) -> Tensor:
         if self.unseen == "raise":

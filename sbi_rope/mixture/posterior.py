@@ -21,7 +21,7 @@ from sbi_rope._validation import (
     usable_device,
 )
 from sbi_rope.coupling import Coupling
-from sbi_rope.errors import InvalidInputError, SamplingError
+from sbi_rope.errors import InvalidInputError, InvalidTypeError, SamplingError
 from sbi_rope.mixture.coupled import CoupledContexts
 from sbi_rope.mixture.estimator import MixtureEstimator
 from sbi_rope.mixture.parts import DTYPE
@@ -174,6 +174,11 @@ class MixturePosterior(DirectPosterior):
         It knows no other observation of the batch.
         """
         self._coupled("[i]")
+        if isinstance(index, bool) or not hasattr(index, "__index__"):
+            raise InvalidTypeError(
+                f"Expected the number of an observation; got {index!r}. For several, "
+                "use the `_batched` methods with their x."
+            )
         estimator = self.posterior_estimator.restricted_to(operator.index(index))
         view = copy.copy(self)
         view.posterior_estimator = estimator
@@ -299,7 +304,7 @@ class MixturePosterior(DirectPosterior):
         Raises:
             InvalidInputError: If the shape does not fit or a value is not finite.
         """
-        super().set_default_x(self._batch_of_x(x))
+        super().set_default_x(self._batch_of_x(x).clone())
         return self
 
     def _x_else_default_x(self, x: Any) -> Tensor:
@@ -451,13 +456,14 @@ class MixturePosterior(DirectPosterior):
         check_integer("num_iter", num_iter)
         check_integer("num_to_optimize", num_to_optimize)
         check_integer("num_init_samples", num_init_samples)
-        return super().map(
-            x=x,
-            num_iter=num_iter,
-            num_to_optimize=num_to_optimize,
-            num_init_samples=num_init_samples,
-            **options,
-        )
+        with torch.enable_grad():  # whatever the caller's own setting
+            return super().map(
+                x=x,
+                num_iter=num_iter,
+                num_to_optimize=num_to_optimize,
+                num_init_samples=num_init_samples,
+                **options,
+            )
 
     def _calculate_map(  # type: ignore[override]
         self,

@@ -15,6 +15,9 @@ __all__ = ["Accept", "BlockSampler"]
 # Rejection sampling gives an observation up if, after so many proposals, less than this
 # share of them lies inside the prior's support.
 MIN_PROPOSALS, MIN_ACCEPTANCE = 100_000, 1e-3
+# Of observations without a single accepted draw after so many proposals, all proposals
+# count together: a batch that leaks as a whole need not try for each.
+MIN_WITHOUT_ANY = 5_000
 # Draws that take a flow about as long as a single one.
 SMALL_BATCH = 512
 
@@ -81,7 +84,8 @@ class BlockSampler:
             places = torch.arange(len(entries.which), device=rows.device)
             for some in places.split(self.batch_size):
                 draws = entries.part.sample(entries.contexts(some))
-                theta[entries.which[some]] = draws
+                # Under torch's autocast and default dtypes these may be others.
+                theta[entries.which[some]] = draws.to(DTYPE)
         return theta
 
     def _empty(self, count: int) -> Tensor:
@@ -116,6 +120,9 @@ class BlockSampler:
         hopeless = (self._proposed >= MIN_PROPOSALS) & (
             self._inside < MIN_ACCEPTANCE * self._proposed
         )
+        without_any = (self._proposed >= MIN_WITHOUT_ANY) & (self._inside == 0)
+        if int(self._proposed[without_any].sum()) >= MIN_PROPOSALS:
+            hopeless |= without_any
         if hopeless.any():
             numbers = (hopeless.nonzero().flatten()[:5] + self.first_row).tolist()
             raise SamplingError(

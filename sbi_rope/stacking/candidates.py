@@ -29,6 +29,7 @@ from sbi_rope.discrepancy.correction import Space
 from sbi_rope.errors import (
     InvalidInputError,
     InvalidTypeError,
+    RoPEError,
     UnsupportedPosteriorError,
 )
 from sbi_rope.mixture import (
@@ -181,7 +182,16 @@ class DensityCandidate(AmortisedCandidate):
         """Build the posterior, and return its densities."""
         bench = fold.bench
         rope = bench.rope.with_pairs(torch.arange(0)) if self.fixed else fold.rope
-        return _parts_of(self.name, self.build(rope, fold.seed), rope)
+        try:
+            posterior = self.build(rope, fold.seed)
+        except RoPEError:
+            raise
+        except Exception as error:
+            raise InvalidInputError(
+                f"The `build` of the candidate {self.name!r} raised "
+                f"{type(error).__name__}: {error}"
+            ) from error
+        return _parts_of(self.name, posterior, rope)
 
 
 def _check_name(name: str) -> None:

@@ -291,6 +291,7 @@ class _Trainer:
             )
         return chosen
 
+    @torch.enable_grad()  # whatever the caller's own setting
     def cross_validate(
         self, *, num_training_folds: int | None = None, with_refit: bool = False
     ) -> tuple[Versions, CrossValidation]:

@@ -3,12 +3,15 @@
 import copy
 import itertools
 import pickle
+import sys
+import threading
 import warnings
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 import torch
+from sbi.inference import NPE, DirectPosterior
 from torch import Tensor
 
 from sbi_rope import (
@@ -17,6 +20,7 @@ from sbi_rope import (
     RoPE,
     SinkhornCoupler,
     diagnose,
+    stack,
 )
 from sbi_rope.errors import (
     CouplingError,
@@ -26,7 +30,10 @@ from sbi_rope.errors import (
     RoPEError,
     RoPEWarning,
     SimulationError,
+    UnsupportedPosteriorError,
 )
+from sbi_rope.metrics import evaluate
+from sbi_rope.stacking import default_candidates
 from tests import gaussian, problems
 
 QUICK = CalibrationFinetuner(num_steps=20)
@@ -726,3 +733,121 @@ def test_training_needs_gradients_and_says_so() -> None:
     conductor = rope().append_calibration(*pairs).train(show_progress_bars=False)
     with torch.inference_mode():
         assert conductor.build_posterior(X_O).weights.shape == (30, 1000)
+
+
+class ChangesItsArgument(torch.nn.Module):
+    """An embedding net that works in place."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.linear = torch.nn.Linear(2, 2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x -= 5.0
+        return self.linear(x)
+
+
+def test_an_embedding_net_that_works_in_place_changes_no_data() -> None:
+    estimator = gaussian.GaussianEstimator()
+    estimator.net = ChangesItsArgument()
+    npe = DirectPosterior(estimator, gaussian.prior())
+    theta, x = gaussian.labelled(20)
+    theta_o, x_o = theta.clone(), x.clone()
+    conductor = RoPE(npe, simulator=gaussian.simulator, finetuner=QUICK)
+    conductor.append_calibration(theta, x).train(seed=0, show_progress_bars=False)
+    assert torch.equal(conductor.calibration[1], x_o)
+    evaluate(npe, theta_o, x_o, num_samples=10)
+    assert torch.equal(x_o, x)
+    posterior = conductor.build_posterior(x_o, seed=0)
+    first, second = (posterior.log_prob_batched(theta, x_o) for _ in range(2))
+    assert torch.equal(first, second)
+    assert torch.equal(x_o, x)
+
+
+def test_targets_are_kept_as_they_were_handed_over() -> None:
+    rows = torch.arange(12)
+    conductor = rope().append_calibration(*gaussian.labelled(12))
+    targets = conductor.draw_targets(rows, seed=0)
+    parts = [conductor.with_pairs(rows, targets=targets.clone()) for _ in range(2)]
+    changed = targets.clone()
+    parts.append(conductor.with_pairs(rows, targets=changed))
+    changed.fill_(99.0)
+    nets = [part.train(seed=0, show_progress_bars=False) for part in parts]
+    embedded = [net.embed_observations(X_O) for net in nets]
+    assert torch.equal(embedded[0], embedded[1])
+    assert torch.equal(embedded[0], embedded[2])
+
+
+def test_a_default_x_is_a_copy() -> None:
+    posterior = rope().build_posterior(X_O, seed=0)
+    x, theta = X_O[3].clone(), torch.zeros(4, 2)
+    posterior.set_default_x(x)
+    before = posterior.log_prob(theta)
+    x.zero_()
+    assert torch.equal(posterior.log_prob(theta), before)
+
+
+def test_threads_get_the_densities_of_their_own_unseen_observations() -> None:
+    posterior = rope().build_posterior(X_O, num_simulations=60, seed=0, unseen="extend")
+    xs = [X_O[i : i + 1] + 0.5 for i in range(4)]
+    theta = torch.zeros(5, 2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        expected = [posterior.log_prob(theta, x=x) for x in xs]
+        wrong = []
+
+        def ask(i: int) -> None:
+            for _ in range(40):
+                found = posterior.log_prob(theta, x=xs[i])
+                if not torch.allclose(found, expected[i], atol=1e-5):
+                    wrong.append(i)
+
+        interval = sys.getswitchinterval()
+        sys.setswitchinterval(1e-6)
+        try:
+            threads = [threading.Thread(target=ask, args=(i,)) for i in range(4)]
+            for thread in threads:
+                thread.start()
+            for thread in threads:
+                thread.join()
+        finally:
+            sys.setswitchinterval(interval)
+    assert not wrong
+
+
+def test_training_and_the_mode_work_where_gradients_are_off() -> None:
+    with torch.no_grad():
+        conductor = trained()
+        posterior = conductor.build_posterior(X_O, num_simulations=60, seed=0)
+        mode = posterior[0].map(num_iter=5, num_to_optimize=2, num_init_samples=10)
+        stacked = stack(conductor, candidates=default_candidates()[:3], num_folds=2)
+    assert torch.isfinite(mode).all()
+    assert len(stacked.candidate_weights) == 3
+
+
+@pytest.mark.parametrize("index", [slice(1, 3), True, "0", None])
+def test_what_is_no_number_of_an_observation_is_refused(index: object) -> None:
+    posterior = rope().build_posterior(X_O, num_simulations=60, seed=0)
+    with pytest.raises(InvalidTypeError, match="number of an observation"):
+        posterior[index]  # type: ignore[index]
+
+
+def test_other_default_dtypes_are_refused() -> None:
+    torch.set_default_dtype(torch.float64)
+    try:
+        with pytest.raises(NotReadyError, match=r"set_default_dtype\(torch.float32\)"):
+            rope()
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
+def test_a_prior_that_cannot_be_copied_is_named() -> None:
+    npe = gaussian.posterior()
+    npe.prior.lock = threading.Lock()  # type: ignore[union-attr]
+    with pytest.raises(InvalidInputError, match=r"prior that can be copied.*lock"):
+        RoPE(npe, simulator=gaussian.simulator)
+
+
+def test_a_trainer_in_the_place_of_a_posterior_is_told_from_it() -> None:
+    with pytest.raises(UnsupportedPosteriorError, match="`build_posterior\\(\\)`"):
+        RoPE(NPE(gaussian.prior()), simulator=gaussian.simulator)

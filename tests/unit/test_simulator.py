@@ -3,12 +3,13 @@
 import warnings
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from sbi_rope._simulator import Simulator
-from sbi_rope.errors import RoPEWarning
+from sbi_rope.errors import RoPEWarning, SimulationError
 from tests import gaussian, problems
 
 OWN_NOISE = torch.Generator().manual_seed(0)
@@ -115,3 +116,46 @@ def test_a_simulator_that_fails_at_its_second_call_is_still_looked_at() -> None:
         return torch.zeros_like(theta)
 
     assert simulator_of(fails_later).is_batched
+
+
+def adds_up(theta: Tensor) -> Tensor:
+    """The first row is right, the others hold those before them."""
+    assert theta.ndim == 2
+    return theta.cumsum(dim=0)
+
+
+def flips(theta: Tensor) -> Tensor:
+    assert theta.ndim == 2
+    return theta.flip(0) + 0.1 * torch.randn_like(theta)
+
+
+@pytest.mark.parametrize("function", [adds_up, flips])
+def test_a_simulator_that_mixes_rows_and_takes_no_single_theta_is_refused(
+    function: Callable[[Tensor], Tensor],
+) -> None:
+    with pytest.raises(SimulationError, match="changes with the other rows"):
+        simulator_of(function)
+
+
+@pytest.mark.parametrize(
+    "convert", [Tensor.to_sparse, lambda x: x.to("meta")], ids=["sparse", "meta"]
+)
+def test_simulations_that_hold_no_numbers_are_refused(
+    convert: Callable[[Tensor], Tensor],
+) -> None:
+    with pytest.raises(SimulationError, match="got a tensor of shape"):
+        simulator_of(lambda theta: convert(theta))
+
+
+def test_a_simulator_that_sets_the_seed_is_warned_about() -> None:
+    def reseeds(theta: Tensor) -> Tensor:
+        torch.manual_seed(1)
+        return theta + torch.randn_like(theta)
+
+    def reseeds_numpy(theta: Tensor) -> Tensor:
+        np.random.seed(1)  # noqa: NPY002
+        return theta + torch.randn_like(theta)
+
+    for function in (reseeds, reseeds_numpy):
+        with pytest.warns(RoPEWarning, match="sets the seed"):
+            simulator_of(function)
