@@ -32,7 +32,7 @@ NUM_COMPARED, DIFFERENT = 50, 1e-6
 LONGEST = 5.0
 
 
-_State = tuple[bytes, bytes, Any]
+_State = tuple[bytes, tuple[Any, ...], Any]
 
 
 class Simulator:
@@ -200,7 +200,6 @@ class Simulator:
         as_batch = self._attempt(theta)
         if self._is_batch(as_batch, count):
             self._check_noise(theta, as_batch)
-            self._check_seeds(theta)
             one_by_one = self._mixes_rows(draws[:count], draws[count - 1 :])
             if one_by_one and not self._is_single(self._attempt(draws[0])):
                 raise SimulationError(
@@ -216,9 +215,9 @@ class Simulator:
                     "row of x depend on the same row of theta only."
                 )
             return not one_by_one
-        single = self._attempt(theta[0])
+        single, state = self._attempt_under(0, theta[0])
         if self._is_single(single):
-            self._check_seeds(theta[0])
+            self._check_seeds(theta[0], state)
             return False
         hint = (
             " Convert NumPy results with `torch.as_tensor(x, dtype=torch.float32)`."
@@ -237,7 +236,7 @@ class Simulator:
         if not bool((x == x[:1]).all()):
             return
         again = self._attempt(theta)
-        if isinstance(again, Tensor) and not torch.equal(again, x):
+        if self._is_batch(again, len(x)) and not torch.equal(again, x):
             warn_user(
                 "`simulator` adds the same noise to all simulations of a batch. Draw "
                 "noise of the shape of the batch, or simulate row by row with "
@@ -258,16 +257,18 @@ class Simulator:
         batches.append(torch.cat([others[:-1], theta[-1:]]))
         rows = ((0, 1), (-1, 2))
         start = time.perf_counter()
-        tried = [self._attempt_under(0, batch) for batch in (*batches, theta)]
+        tried = [self._attempt_under(0, batch) for batch in batches]
         seconds = (time.perf_counter() - start) / len(tried)
-        # What fails here, fails with a clear message when it is called.
-        if not all(self._is_batch(x, len(theta)) for x, _ in tried):
-            return False
         xs: list[Any] = [x for x, _ in tried]
+        states = [state for _, state in tried]
+        # What fails here, fails with a clear message when it is called.
+        if not all(self._is_batch(x, len(theta)) for x in xs):
+            return False
+        self._check_seeds(theta, states[0])
         if all(_is_close(xs[0][row], xs[k][row]) for row, k in rows):
             return False
-        same_numbers = all(state == tried[0][1] for _, state in tried)
-        if same_numbers and xs[0].equal(xs[-1]):
+        again, _ = self._attempt_under(0, theta)
+        if states.count(states[0]) == len(states) and xs[0].equal(again):
             return True
         # The rows may depend on each other, or only take other random numbers, as where
         # draws are rejected or the simulator has a generator of its own.
@@ -290,15 +291,20 @@ class Simulator:
             of_numpy: Any = np.random.get_state()  # noqa: NPY002
             return x, (
                 torch.get_rng_state().numpy().tobytes(),
-                of_numpy[1].tobytes(),
+                (of_numpy[1].tobytes(), *of_numpy[2:]),
                 random.getstate(),
             )
 
-    def _check_seeds(self, theta: Tensor) -> None:
-        """Warn if the simulator sets a seed, and so repeats its noise at every call."""
-        (_, first), (_, second) = (self._attempt_under(seed, theta) for seed in (0, 1))
+    def _check_seeds(self, theta: Tensor, after_zero: _State) -> None:
+        """Warn if the simulator sets a seed, and so repeats its noise at every call.
+
+        Args:
+            theta: Parameters.
+            after_zero: The state of the random numbers after a call under seed 0.
+        """
+        _, after_one = self._attempt_under(1, theta)
         # Whoever uses no random numbers leaves the states that the seeds set.
-        if any(a == b for a, b in zip(first, second, strict=True)):
+        if any(a == b for a, b in zip(after_zero, after_one, strict=True)):
             warn_user(
                 "`simulator` sets the seed of the random numbers itself, so that every "
                 "call of it has the same noise. Leave the seed to the caller."

@@ -175,7 +175,7 @@ def state_of_process(*, random_numbers: bool) -> dict[str, Any]:
     }
     if random_numbers:
         state["torch's random numbers"] = torch.get_rng_state().numpy().tobytes()
-        state["NumPy's random numbers"] = np.random.get_state()[1].tobytes()  # noqa: NPY002
+        state["NumPy's random numbers"] = str(np.random.get_state())  # noqa: NPY002
         state["Python's random numbers"] = random.getstate()
     return state
 
