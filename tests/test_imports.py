@@ -166,33 +166,28 @@ def layer(part: str) -> int:
     return next(i for i, parts in enumerate(LAYERS) if part in parts)
 
 
-EACH_MODULE = pytest.mark.parametrize(
-    "path", [pytest.param(path, id=module_name(path)) for path in modules()]
-)
+def test_every_module_has_a_layer() -> None:
+    for path in modules():
+        part = part_of(module_name(path))
+        assert part is None or part in set().union(*LAYERS), f"give {part} a place"
 
 
-@EACH_MODULE
-def test_every_module_has_a_layer(path: Path) -> None:
-    part = part_of(module_name(path))
-    assert part is None or part in set().union(*LAYERS), f"give {part} a place"
-
-
-@EACH_MODULE
-def test_no_module_imports_the_package_as_a_whole(path: Path) -> None:
+def test_no_module_imports_the_package_as_a_whole() -> None:
     # It would hide which layer is meant, and close a circle.
-    names = {name for name in imports_of(path) if name.startswith("sbi_rope.")}
-    parts = {part_of(name) for name in names}
-    assert parts <= set().union(*LAYERS)
+    for path in modules():
+        names = {name for name in imports_of(path) if name.startswith("sbi_rope.")}
+        parts = {part_of(name) for name in names}
+        assert parts <= set().union(*LAYERS), path
 
 
-@EACH_MODULE
-def test_imports_run_from_upper_to_lower_layers(path: Path) -> None:
-    part = part_of(module_name(path))
-    if part is None:
-        return  # the package's own __init__ may import all
-    for other in parts_imported(path) - {part}:
-        # Metrics, for one, are below plots; equals do not know each other.
-        assert layer(other) < layer(part), f"{part} imports {other}"
+def test_imports_run_from_upper_to_lower_layers() -> None:
+    for path in modules():
+        part = part_of(module_name(path))
+        if part is None:
+            continue  # the package's own __init__ may import all
+        for other in parts_imported(path) - {part}:
+            # Metrics, for one, are below plots; equals do not know each other.
+            assert layer(other) < layer(part), f"{path}: {part} imports {other}"
 
 
 @pytest.mark.parametrize(("one", "other"), NEVER_IMPORT_EACH_OTHER)
@@ -217,12 +212,12 @@ def names_beyond_public(names: set[str]) -> set[str]:
     return beyond
 
 
-@EACH_MODULE
-def test_only_one_module_reaches_into_sbi(path: Path) -> None:
-    if module_name(path) == "sbi_rope._sbi":
-        return
-    beyond = names_beyond_public(imports_of(path))
-    assert not beyond, f"take {sorted(beyond)} from sbi_rope._sbi"
+def test_only_one_module_reaches_into_sbi() -> None:
+    for path in modules():
+        if module_name(path) == "sbi_rope._sbi":
+            continue
+        beyond = names_beyond_public(imports_of(path))
+        assert not beyond, f"{path}: take {sorted(beyond)} from sbi_rope._sbi"
 
 
 def test_the_check_for_reaching_into_sbi_tells_modules_from_names() -> None:
@@ -232,8 +227,9 @@ def test_the_check_for_reaching_into_sbi_tells_modules_from_names() -> None:
     assert names_beyond_public(deep) == deep
 
 
-@EACH_MODULE
-def test_plots_and_data_libraries_are_imported_where_they_are_used(path: Path) -> None:
-    packages = {name.split(".")[0] for name in imports_of(path, top_level=True)}
-    assert packages.isdisjoint({"matplotlib", "pandas", "causalchamber", "six"})
-    assert "sbi.analysis" not in imports_of(path, top_level=True)
+def test_plots_and_data_libraries_are_imported_where_they_are_used() -> None:
+    for path in modules():
+        names = imports_of(path, top_level=True)
+        packages = {name.split(".")[0] for name in names}
+        assert packages.isdisjoint({"matplotlib", "pandas", "causalchamber", "six"})
+        assert "sbi.analysis" not in names, path

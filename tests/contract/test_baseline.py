@@ -7,7 +7,6 @@ import pickle
 import random
 import warnings
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -312,13 +311,6 @@ def test_training_can_be_chained_and_says_nothing(
     assert printed.out == printed.err == ""
 
 
-@pytest.mark.parametrize("seed", [-1, 1.5, "0"])
-def test_a_seed_that_is_none_is_refused(name: str, seed: Any) -> None:
-    method = feed(make(name, first_task(name)), data_of(first_task(name)))
-    with pytest.raises(InvalidInputError, match="seed"):
-        method.train(seed=seed, show_progress_bars=False)
-
-
 @pytest.mark.parametrize("name", LEARNERS)
 def test_an_untrained_method_has_no_posterior(name: str) -> None:
     method = feed(make(name, first_task(name)), data_of(first_task(name)))
@@ -414,47 +406,6 @@ def test_data_with_gradients_get_none(name: str) -> None:
 
 
 @pytest.mark.parametrize(("name", "call"), LABELLED)
-@pytest.mark.parametrize(
-    ("error", "message", "spoil"),
-    [
-        (InvalidTypeError, "`theta`", lambda t, x: (t.numpy(), x)),
-        (InvalidTypeError, "`x`", lambda t, x: (t, x.tolist())),
-        (InvalidTypeError, "`x`", lambda t, x: (t, x > 0)),
-        (InvalidInputError, "`theta` of shape", lambda t, x: (t[:, :1], x)),
-        (InvalidInputError, "`theta` of shape", lambda t, x: (t[0], x)),
-        (InvalidInputError, "`theta` of shape", lambda t, x: (t[:0], x[:0])),
-        (InvalidInputError, "`theta` and `x`", lambda t, x: (t[:3], x)),
-        (InvalidInputError, "`theta` to be finite", lambda t, x: (t * torch.nan, x)),
-        (InvalidInputError, "`x`", lambda t, x: (t, x[0, ..., 0].mean())),
-        (InvalidInputError, "`x`", lambda t, x: (t, x.flatten(1)[:, 0])),
-    ],
-    ids=[
-        "theta is an array",
-        "x is a list",
-        "x is boolean",
-        "theta too narrow",
-        "one theta",
-        "empty",
-        "rows",
-        "NaN in theta",
-        "x is a number",
-        "x is a row of numbers",
-    ],
-)
-def test_bad_pairs_are_refused_by_name(
-    name: str,
-    call: str,
-    error: type[Exception],
-    message: str,
-    spoil: Callable[[Tensor, Tensor], tuple[Any, Any]],
-) -> None:
-    data = data_of(first_task(name))
-    method = make(name, first_task(name))
-    with pytest.raises(error, match=message):
-        getattr(method, call)(*spoil(data.theta_cal, data.x_cal))
-
-
-@pytest.mark.parametrize(("name", "call"), LABELLED)
 def test_parameters_outside_the_prior_are_refused(name: str, call: str) -> None:
     task = METHODS[name].tasks[-1]
     if not task_of(task).has_data:
@@ -462,35 +413,6 @@ def test_parameters_outside_the_prior_are_refused(name: str, call: str) -> None:
     data = data_of(task)
     with pytest.raises(InvalidInputError, match="`theta` inside the support"):
         getattr(make(name, task), call)(data.theta_cal + 1e4, data.x_cal)
-
-
-@pytest.mark.parametrize("name", names_that_see(UsesCalibration))
-def test_calibration_pairs_with_nan_are_refused(name: str) -> None:
-    data = data_of(first_task(name))
-    x = data.x_cal.clone()
-    x[3] = torch.nan
-    with pytest.raises(InvalidInputError, match=r"`x` to be finite.*\[3\]"):
-        make(name, first_task(name)).append_calibration(data.theta_cal, x)  # type: ignore[attr-defined]
-
-
-@pytest.mark.parametrize("name", names_that_see(UsesObservations))
-@pytest.mark.parametrize(
-    ("error", "spoil"),
-    [
-        (InvalidTypeError, lambda x: x.numpy()),
-        (InvalidInputError, lambda x: x[:0]),
-        (InvalidInputError, lambda x: x * torch.nan),
-        (InvalidInputError, lambda x: x[0, ..., 0].mean()),
-        (InvalidInputError, lambda x: x.flatten(1)[:, 0]),
-    ],
-    ids=["array", "empty", "NaN", "number", "row of numbers"],
-)
-def test_bad_observations_are_refused_by_name(
-    name: str, error: type[Exception], spoil: Callable[[Tensor], Any]
-) -> None:
-    method: Any = make(name, first_task(name))
-    with pytest.raises(error, match="`x_o`"):
-        method.append_observations(spoil(data_of(first_task(name)).x_o))
 
 
 @pytest.mark.parametrize(("name", "part"), PARTS)
@@ -518,30 +440,8 @@ def test_what_is_refused_is_not_appended(name: str, part: type[Method]) -> None:
     assert torch.equal(densities(posterior, name), expected_densities(name))
 
 
-@pytest.mark.parametrize(("name", "part"), PARTS)
-def test_an_x_beyond_single_precision_is_not_finite(
-    name: str, part: type[Method]
-) -> None:
-    data, method = data_of(first_task(name)), make(name, first_task(name))
-    big = replace(data, x=huge(data.x), x_cal=huge(data.x_cal), x_o=huge(data.x_o))
-    with pytest.raises(InvalidInputError, match=r"`x(_o)?` .* finite"):
-        append(method, CALLS[part], big)
-
-
 def huge(value: Tensor) -> Tensor:
     return torch.full_like(value, 1e300, dtype=torch.float64)
-
-
-@pytest.mark.parametrize(("name", "call"), LABELLED)
-def test_a_theta_beyond_single_precision_is_refused(name: str, call: str) -> None:
-    data, method = data_of(first_task(name)), make(name, first_task(name))
-    with pytest.raises(InvalidInputError, match="`theta`"):
-        getattr(method, call)(huge(data.theta_cal), data.x_cal)
-
-
-def test_what_is_no_prior_is_refused(name: str) -> None:
-    with pytest.raises(InvalidTypeError, match="`prior`"):
-        make(name, first_task(name), prior="uniform")
 
 
 @pytest.mark.parametrize(

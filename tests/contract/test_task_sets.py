@@ -7,7 +7,8 @@ A contract is checked for all tasks and those of their variants that could break
   own. Elsewhere a variant that all tasks have runs the methods of ``Task``, the same
   for all: one task with a process to draw from and one with recordings stand for the
   rest.
-* The standard process alone, where arguments are refused before the variant is read.
+
+What is refused is tried in ``tests/faults``.
 
 Sets are drawn once for all tests that read them (:func:`shared`); what must be
 reproduced is drawn anew and compared with them.
@@ -17,7 +18,6 @@ import functools
 import random
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +25,6 @@ import torch
 from sbi.utils import within_support
 from torch import Tensor
 
-from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks import TASKS, Task
 from sbi_rope.tasks.variants import COMMON_VARIANTS
 from tests.tasks import (
@@ -221,42 +220,12 @@ def test_a_set_does_not_depend_on_the_global_seed(labelled: Task, part: str) -> 
     assert torch.equal(draw(labelled, part, 5)[1], expected[1][:5])
 
 
-@pytest.mark.parametrize("name", sorted(TASKS))
-@pytest.mark.parametrize("n", [0, -1, 2.0, True, "3", 10**30])
-def test_a_bad_size_is_refused(name: str, root: Path | None, n: object) -> None:
-    task = make(name, root=root)
-    for part in ("calibration", "test"):
-        with pytest.raises(InvalidInputError, match="`n`"):
-            draw(task, part, n)
-
-
-@pytest.mark.parametrize("name", sorted(TASKS))
-@pytest.mark.parametrize("seed", [-1, 2**31, 0.5, None, True, [0]])
-def test_a_bad_seed_is_refused(name: str, root: Path | None, seed: object) -> None:
-    task = make(name, root=root)
-    for part in ("calibration", "test"):
-        with pytest.raises(InvalidInputError, match="`seed`"):
-            draw(task, part, 5, seed=seed)
-
-
 @OWN_CODE
 @PARTS
-@pytest.mark.parametrize("kind", [np.int64, np.uint8])
-def test_sizes_and_seeds_may_be_integers_of_numpy(
-    labelled: Task, part: str, kind: type
-) -> None:
-    theta, x = draw(labelled, part, kind(5), seed=kind(0))
+def test_sizes_and_seeds_may_be_integers_of_numpy(labelled: Task, part: str) -> None:
+    theta, x = draw(labelled, part, np.int64(5), seed=np.uint8(0))
     assert torch.equal(theta, shared(labelled, part)[0][:5])
     assert torch.equal(x, shared(labelled, part)[1][:5])
-
-
-@pytest.mark.parametrize("name", sorted(TASKS))
-@pytest.mark.parametrize("part", ["tset", "simulation", None, ["test"], 0])
-def test_the_size_of_a_part_that_there_is_not_is_refused(
-    name: str, root: Path | None, part: Any
-) -> None:
-    with pytest.raises(InvalidInputError, match=r"`part`.*'calibration', 'test'"):
-        make(name, root=root).num_recorded(part)
 
 
 # Two sets ----------------------------------------------------------------------------

@@ -35,7 +35,7 @@ CALLS = [
             )(n, seed=seed),
             options={"n": "count", "seed": "seed"},
         )
-        for name in NAMES
+        for name in (*NAMES, "hemodynamics")
         for method in ("get_calibration_set", "get_test_set", "get_simulations")
     ),
     *(
