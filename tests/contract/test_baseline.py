@@ -440,10 +440,6 @@ def test_what_is_refused_is_not_appended(name: str, part: type[Method]) -> None:
     assert torch.equal(densities(posterior, name), expected_densities(name))
 
 
-def huge(value: Tensor) -> Tensor:
-    return torch.full_like(value, 1e300, dtype=torch.float64)
-
-
 @pytest.mark.parametrize(
     "name", [name for name in METHODS if baselines.takes_estimator(name)]
 )
