@@ -90,8 +90,8 @@ def estimator_of(posterior: Any) -> ConditionalEstimator:
         )
     if not plain and hasattr(posterior, "build_posterior"):
         raise UnsupportedPosteriorError(
-            f"Expected `posterior` to be a posterior; got {type(posterior).__name__}, "
-            "which makes one: pass what its `build_posterior()` returns."
+            "Expected `posterior` to be what `NPE(...).build_posterior()` returns; got "
+            f"{type(posterior).__name__}, which has still to build it."
         )
     if not plain:
         raise UnsupportedPosteriorError(

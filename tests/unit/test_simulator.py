@@ -63,10 +63,21 @@ def takes_batches_only(theta: Tensor) -> Tensor:
     return torch.cat([theta[:, :1], theta.square().sum(dim=1, keepdim=True)], dim=1)
 
 
+def has_noise_of_a_generator_made_anew(theta: Tensor) -> Tensor:
+    """How many of its random numbers a row takes depends on the rows before."""
+    generator = torch.Generator().manual_seed(int(torch.randint(10**9, ())))
+    counts = 1 + (5 * theta[:, 0].abs()).long()
+    sums = [
+        torch.randn(int(n), generator=generator).sum() / n**0.5 for n in counts.flip(0)
+    ]
+    return theta + torch.stack(sums)[:, None].flip(0)
+
+
 @pytest.mark.parametrize(
     "function",
     [
         gaussian.simulator,
+        has_noise_of_a_generator_made_anew,
         has_noise_of_its_own,
         rejects,
         takes_batches_only,
