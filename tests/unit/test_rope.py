@@ -849,5 +849,5 @@ def test_a_prior_that_cannot_be_copied_is_named() -> None:
 
 
 def test_a_trainer_in_the_place_of_a_posterior_is_told_from_it() -> None:
-    with pytest.raises(UnsupportedPosteriorError, match="`build_posterior\\(\\)`"):
+    with pytest.raises(UnsupportedPosteriorError, match="has still to build it"):
         RoPE(NPE(gaussian.prior()), simulator=gaussian.simulator)
