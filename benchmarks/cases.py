@@ -17,7 +17,7 @@ from benchmarks.cells import Cell
 from benchmarks.estimators import posterior_with, state_of
 from benchmarks.presets import PRESETS, Settings
 from benchmarks.store import Cache
-from sbi_rope.baselines import NPE
+from sbi_rope.baselines import PlainNPE
 from sbi_rope.tasks import Task, get_task
 
 __all__ = ["Case", "CountingSimulator", "Sources"]
@@ -198,7 +198,7 @@ class Case:
     def _npe(self) -> dict[str, Any]:
         def train() -> dict[str, Any]:
             start = time.perf_counter()
-            npe = NPE(
+            npe = PlainNPE(
                 self.task.get_prior(),
                 self.builder,
                 npe_training=self.settings.training,

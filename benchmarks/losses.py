@@ -35,7 +35,7 @@ from benchmarks.cases import Case, CountingSimulator, Pairs, Sources
 from benchmarks.cells import Cell
 from benchmarks.store import Cache
 from sbi_rope import RoPE, SinkhornCoupler
-from sbi_rope.baselines import SBI
+from sbi_rope.baselines import ReferenceNPE
 from sbi_rope.metrics import Evaluation, draw_samples, evaluate
 
 __all__ = ["Loss", "as_line", "losses", "target_distances"]
@@ -106,7 +106,7 @@ def losses(
             f"{case.task.name} has stored simulations only: those of the test "
             "parameters, which this command compares with, cannot be made."
         )
-    sbi = SBI.from_posterior(case.npe)
+    sbi = ReferenceNPE.from_posterior(case.npe)
     sbi.train(seed=case.seed, show_progress_bars=False)
     simulated = sbi.simulated_test_set(case.test_set[0], case.simulator, seed=case.seed)
     yield _without_coupling(case, sbi.build_posterior(), simulated)

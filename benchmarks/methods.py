@@ -13,15 +13,15 @@ from sbi_rope._training import History
 from sbi_rope.baselines import (
     HVAE,
     NNPE,
-    NPE,
     NPERS,
     RNPE,
-    SBI,
     CalibrationMLP,
     FinetunedNPE,
     JointNPE,
     Method,
+    PlainNPE,
     PriorBaseline,
+    ReferenceNPE,
     TuningOnly,
 )
 from sbi_rope.discrepancy import DiscrepancyNPE
@@ -109,8 +109,8 @@ def _discrepancy(
 # How each method without a coupling is constructed; `scores` appends the data.
 METHODS: dict[str, Callable[[Case], Method]] = {
     "prior": lambda case: PriorBaseline(case.task.get_prior(), device=case.device),
-    "SBI": lambda case: SBI.from_posterior(case.npe),
-    "NPE": lambda case: NPE.from_posterior(case.npe),
+    "SBI": lambda case: ReferenceNPE.from_posterior(case.npe),
+    "NPE": lambda case: PlainNPE.from_posterior(case.npe),
     "NNPE": lambda case: NNPE.from_posterior(
         case.npe, training=case.settings.training, noise_on=_noise_on(case)
     ),

@@ -15,8 +15,8 @@ from benchmarks.cells import NEEDS_COUPLING, Cell
 from benchmarks.methods import COUPLED_STACK, METHODS, STACK
 from sbi_rope import RoPE, SinkhornCoupler
 from sbi_rope.baselines import (
-    SBI,
     BuildsOnNPE,
+    ReferenceNPE,
     UsesCalibration,
     UsesObservations,
     UsesSimulations,
@@ -110,7 +110,7 @@ def _score(case: Case, cell: Cell) -> Score:
     seconds = time.perf_counter() - start
     used = len(case.simulations[0]) if isinstance(method, UsesSimulations) else 0
     used += count.new
-    if isinstance(method, SBI):
+    if isinstance(method, ReferenceNPE):
         if case.simulator is None:
             assert case.held_out is not None
             pairs = case.held_out

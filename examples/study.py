@@ -171,7 +171,7 @@ class Study:
                     show_progress_bars=False,
                 )
                 print(diagnosis, flush=True)
-                self._save(diagnosis.plot(), f"diagnosis_{name}")
+                self._save(plots.implied_parameters(diagnosis), f"diagnosis_{name}")
             self._draw(name, npe, rope, posterior, theta_o, curves)
 
     def _draw(

@@ -23,7 +23,6 @@ __all__ = [
     "as_float32",
     "as_numbers",
     "as_shape",
-    "check_attributes",
     "check_batch",
     "check_choice",
     "check_default_dtype",
@@ -211,18 +210,6 @@ def check_instance(
         raise InvalidTypeError(
             f"Expected `{name}` to be a {expected.__name__}; got "
             f"{type(value).__name__}."
-        )
-
-
-def check_attributes(
-    name: str, value: Any, attributes: Sequence[str], *, like: str
-) -> None:
-    """Raise unless ``value`` has the attributes that are read of it."""
-    missing = [attribute for attribute in attributes if not hasattr(value, attribute)]
-    if missing:
-        raise InvalidTypeError(
-            f"Expected `{name}` to be {like}; got {type(value).__name__}, without "
-            f"{missing}."
         )
 
 

@@ -20,16 +20,16 @@ from sbi_rope._sbi import is_bounded
 from sbi_rope.baselines import (
     HVAE,
     NNPE,
-    NPE,
     NPERS,
     RNPE,
-    SBI,
     CalibrationMLP,
     FinetunedNPE,
     JointNPE,
     Method,
     OTOnly,
+    PlainNPE,
     PriorBaseline,
+    ReferenceNPE,
     Training,
     TuningOnly,
     UsesCalibration,
@@ -72,8 +72,8 @@ def swing(theta: Tensor) -> Tensor:
 
 METHODS: dict[str, Entry] = {
     "prior": Entry(PriorBaseline),
-    "npe": Entry(NPE, lambda task: {"npe_training": SHORT}),
-    "sbi": Entry(SBI, lambda task: {"npe_training": SHORT}),
+    "npe": Entry(PlainNPE, lambda task: {"npe_training": SHORT}),
+    "sbi": Entry(ReferenceNPE, lambda task: {"npe_training": SHORT}),
     "tuning_only": Entry(
         TuningOnly, lambda task: {"npe_training": SHORT, "finetuner": FINETUNER}
     ),

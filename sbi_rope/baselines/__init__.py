@@ -13,7 +13,7 @@ from sbi_rope.baselines.finetuned_npe import FinetunedNPE
 from sbi_rope.baselines.hvae import HVAE
 from sbi_rope.baselines.joint_npe import JointNPE
 from sbi_rope.baselines.nnpe import NNPE
-from sbi_rope.baselines.npe import NPE, SBI
+from sbi_rope.baselines.npe import PlainNPE, ReferenceNPE
 from sbi_rope.baselines.npe_rs import NPERS
 from sbi_rope.baselines.ot_only import OTOnly
 from sbi_rope.baselines.prior import PriorBaseline, PriorPosterior
@@ -24,18 +24,18 @@ from sbi_rope.baselines.tuning_only import TuningOnly
 __all__ = [
     "HVAE",
     "NNPE",
-    "NPE",
     "NPERS",
     "RNPE",
-    "SBI",
     "BuildsOnNPE",
     "CalibrationMLP",
     "FinetunedNPE",
     "JointNPE",
     "Method",
     "OTOnly",
+    "PlainNPE",
     "PriorBaseline",
     "PriorPosterior",
+    "ReferenceNPE",
     "SpikeAndSlab",
     "Training",
     "TuningOnly",

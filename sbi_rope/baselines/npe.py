@@ -12,10 +12,10 @@ from sbi_rope._training import History
 from sbi_rope.baselines.base import BuildsOnNPE
 from sbi_rope.errors import NotReadyError
 
-__all__ = ["NPE", "SBI"]
+__all__ = ["PlainNPE", "ReferenceNPE"]
 
 
-class NPE(BuildsOnNPE):
+class PlainNPE(BuildsOnNPE):
     r"""Neural posterior estimation, trained on simulations and trusted on real data.
 
     .. math::
@@ -37,7 +37,7 @@ class NPE(BuildsOnNPE):
         >>> from sbi_rope.baselines import Training
         >>> prior = BoxUniform(torch.zeros(1), torch.ones(1))
         >>> theta = prior.sample((200,))
-        >>> method = NPE(prior, "mdn", npe_training=Training(max_num_epochs=1))
+        >>> method = PlainNPE(prior, "mdn", npe_training=Training(max_num_epochs=1))
         >>> method = method.append_simulations(theta, theta + 0.1)
         >>> posterior = method.train(show_progress_bars=False).build_posterior()
         >>> posterior.sample((5,), x=torch.ones(1), show_progress_bars=False).shape
@@ -48,12 +48,12 @@ class NPE(BuildsOnNPE):
         return self._trained_npe(show_progress_bars=show_progress_bars)
 
 
-class SBI(NPE):
-    """NPE on simulations in the place of real observations: the reference.
+class ReferenceNPE(PlainNPE):
+    """NPE on simulations in the place of real observations: the reference, "SBI".
 
     Not a method for real data, but what inference would give if the simulator were
-    right: the posterior is that of :class:`NPE`, and is scored on fresh simulations of
-    the test parameters, :meth:`simulated_test_set`.
+    right: the posterior is that of :class:`PlainNPE`, and is scored on fresh
+    simulations of the test parameters, :meth:`simulated_test_set`.
 
     Sees simulations. Training sees no labels; the test parameters are only simulated
     from, after the training.

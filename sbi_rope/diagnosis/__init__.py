@@ -1,4 +1,4 @@
-"""Diagnosis of a batch: can it be trusted to what RoPE does with it?"""
+"""Diagnosis of a batch: are the assumptions of RoPE about it fulfilled?"""
 
 from sbi_rope.diagnosis.batch import diagnose
 from sbi_rope.diagnosis.report import Diagnosis, Finding

@@ -2,12 +2,9 @@
 
 import textwrap
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from torch import Tensor
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 __all__ = ["Diagnosis", "Finding"]
 
@@ -79,21 +76,6 @@ class Diagnosis:
     def as_rows(self) -> list[dict[str, Any]]:
         """Return a row for each finding, ready for a dataframe."""
         return [asdict(finding) for finding in self.findings]
-
-    def plot(self) -> "Figure":
-        """Draw the prior and the distribution the batch implies, for each parameter.
-
-        Raises:
-            ImportError: If matplotlib is not installed.
-        """
-        from sbi_rope.plots.diagnosis import implied_parameters
-
-        return implied_parameters(
-            self.theta,
-            implied=self.implied,
-            unshifted=self.unshifted,
-            parameter_names=self.parameter_names,
-        )
 
     def __str__(self) -> str:
         count = len(self.alarming)

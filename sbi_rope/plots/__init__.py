@@ -6,8 +6,6 @@ when a function is called: ``pip install sbi-rope[benchmarks]``.
 
 from sbi_rope.plots.diagnosis import implied_parameters
 from sbi_rope.plots.diagnostics import (
-    CouplingLike,
-    FinetuningHistory,
     calibration_curves,
     effective_sample_sizes,
     finetuning_history,
@@ -19,8 +17,6 @@ from sbi_rope.plots.steps import overview
 from sbi_rope.plots.summaries import discrepancy
 
 __all__ = [
-    "CouplingLike",
-    "FinetuningHistory",
     "calibration_curves",
     "discrepancy",
     "effective_sample_sizes",

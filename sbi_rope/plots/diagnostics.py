@@ -1,21 +1,14 @@
 """How well calibrated posteriors are, and how the steps of RoPE went."""
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Protocol
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
 
-from sbi_rope._validation import (
-    check_attributes,
-    check_batch,
-    check_instance,
-    check_integer,
-    check_mapping,
-    check_tensor,
-)
-from sbi_rope.errors import InvalidInputError, shown
+from sbi_rope._validation import check_batch, check_instance, check_mapping
+from sbi_rope.coupling import Coupling
+from sbi_rope.finetuning import History
 from sbi_rope.metrics import CoverageCurve
 from sbi_rope.plots._figures import (
     BLUE,
@@ -30,45 +23,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
-    "CouplingLike",
-    "FinetuningHistory",
     "calibration_curves",
     "effective_sample_sizes",
     "finetuning_history",
 ]
-
-
-class FinetuningHistory(Protocol):
-    """What :func:`finetuning_history` reads; :class:`sbi_rope.finetuning.History`."""
-
-    @property
-    def training_loss(self) -> Sequence[float]:
-        """Loss before each step and after the last."""
-        ...
-
-    @property
-    def validation_loss(self) -> Sequence[float]:
-        """The same over held-out pairs; may be empty."""
-        ...
-
-    @property
-    def best_step(self) -> int:
-        """Step of the kept network; 0 is the starting point."""
-        ...
-
-
-class CouplingLike(Protocol):
-    """What :func:`effective_sample_sizes` reads of a coupling."""
-
-    @property
-    def simulated(self) -> Tensor:
-        """The embeddings of the simulations, shape ``(n_s, l)``."""
-        ...
-
-    @property
-    def effective_sample_size(self) -> Tensor:
-        """Effective number of simulations behind each row, shape ``(n_o,)``."""
-        ...
 
 
 def calibration_curves(curves: Mapping[str, CoverageCurve]) -> "Figure":
@@ -121,23 +79,29 @@ def calibration_curves(curves: Mapping[str, CoverageCurve]) -> "Figure":
     return figure
 
 
-def finetuning_history(history: FinetuningHistory) -> "Figure":
+def finetuning_history(history: History) -> "Figure":
     """Losses of a fine-tuning, with the kept step marked.
 
     Args:
-        history: Losses before each step and after the last, as
-            :class:`sbi_rope.finetuning.History` holds them. Without a hold-out only the
-            training loss is drawn.
+        history: Losses before each step and after the last, ``rope.history``. Without a
+            hold-out only the training loss is drawn.
 
     Returns:
         The figure.
 
     Raises:
         InvalidTypeError: If something is no history.
-        InvalidInputError: If the losses are not finite, or ``best_step`` is no step.
+        InvalidInputError: If the losses are not finite.
         ImportError: If matplotlib is not installed.
     """
-    training, validation = _checked_losses(history)
+    check_instance("history", history, History)
+    training, validation = (
+        check_batch(f"history.{name}", torch.tensor(losses), (), allow_empty=True)
+        for name, losses in (
+            ("training_loss", history.training_loss),
+            ("validation_loss", history.validation_loss),
+        )
+    )
     figure, axes = new_figure(6.0, 3.6)
     from matplotlib.ticker import MaxNLocator
 
@@ -167,7 +131,7 @@ def finetuning_history(history: FinetuningHistory) -> "Figure":
     return figure
 
 
-def effective_sample_sizes(coupling: CouplingLike) -> "Figure":
+def effective_sample_sizes(coupling: Coupling) -> "Figure":
     r"""How many simulations stand behind each observation's posterior.
 
     The effective sample size of a row is :math:`1 / \sum_j \alpha_{ij}^2`: 1 if a
@@ -175,17 +139,17 @@ def effective_sample_sizes(coupling: CouplingLike) -> "Figure":
     and the posterior is the average over all simulations.
 
     Args:
-        coupling: A coupling of observations to simulations.
+        coupling: A coupling of observations to simulations, ``posterior.coupling``.
 
     Returns:
         The figure: a histogram on a logarithmic axis.
 
     Raises:
         InvalidTypeError: If something is no coupling.
-        InvalidInputError: If it has no simulations, or sizes that are not positive.
         ImportError: If matplotlib is not installed.
     """
-    sizes = _checked_sizes(coupling)
+    check_instance("coupling", coupling, Coupling)
+    sizes = coupling.effective_sample_size.detach().cpu().double()
     figure, axes = new_figure(6.0, 3.6)
     num_simulations = len(coupling.simulated)
     edges = torch.logspace(0, math.log10(max(num_simulations, 2)), 41).tolist()
@@ -204,57 +168,3 @@ def effective_sample_sizes(coupling: CouplingLike) -> "Figure":
     axes.set_ylabel(f"observations (of {len(sizes)})")
     axes.legend(frameon=False, loc="upper left")
     return figure
-
-
-def _checked_losses(history: FinetuningHistory) -> tuple[Tensor, Tensor]:
-    check_attributes(
-        "history",
-        history,
-        ["training_loss", "validation_loss", "best_step"],
-        like="the history of a fine-tuning",
-    )
-    training = _losses("training_loss", history.training_loss)
-    validation = _losses("validation_loss", history.validation_loss)
-    kept = validation if len(validation) else training
-    if not len(kept):
-        raise InvalidInputError(
-            "Expected `history.training_loss` with at least one loss; got none."
-        )
-    check_integer(
-        "history.best_step", history.best_step, minimum=0, maximum=len(kept) - 1
-    )
-    return training, validation
-
-
-def _losses(name: str, values: Sequence[float]) -> Tensor:
-    try:
-        losses = torch.as_tensor(values).detach().cpu()
-    except (TypeError, ValueError, RuntimeError):
-        losses = torch.empty((), dtype=torch.bool)
-    if losses.ndim != 1 or losses.is_complex() or losses.dtype == torch.bool:
-        raise InvalidInputError(
-            f"Expected `history.{name}` to be a list of numbers; got {shown(values)}."
-        )
-    return check_batch(f"history.{name}", losses, (), allow_empty=True)
-
-
-def _checked_sizes(coupling: CouplingLike) -> Tensor:
-    check_attributes(
-        "coupling",
-        coupling,
-        ["simulated", "effective_sample_size"],
-        like="a coupling of observations to simulations",
-    )
-    name = "coupling.effective_sample_size"
-    sizes = check_batch(name, coupling.effective_sample_size, ())
-    if not (sizes > 0).all():
-        raise InvalidInputError(
-            f"Expected `{name}` to be positive; got {float(sizes.min())}."
-        )
-    simulated = check_tensor("coupling.simulated", coupling.simulated)
-    if not simulated.ndim or not len(simulated):
-        raise InvalidInputError(
-            "Expected `coupling.simulated` of shape (n_s, l) with n_s >= 1; got "
-            f"{tuple(simulated.shape)}."
-        )
-    return sizes.detach().cpu().double()

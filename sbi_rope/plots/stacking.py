@@ -1,72 +1,26 @@
 """What the calibration pairs say about a stack, in one picture."""
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import torch
 
-from sbi_rope._validation import check_attributes
+from sbi_rope._validation import check_instance
 from sbi_rope.metrics import CoverageCurve
 from sbi_rope.plots._figures import BLUE, GREY, ORANGE, SKY, empty_figure, hide_frame
+from sbi_rope.stacking import LearningCurve, StackingReport
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["LearningCurveLike", "StackingReportLike", "stacking_report"]
+__all__ = ["stacking_report"]
 
 # Most candidates that are named.
 MAX_CANDIDATES = 12
 
 
-class LearningCurveLike(Protocol):
-    """What :func:`stacking_report` reads of a learning curve."""
-
-    @property
-    def num_pairs(self) -> Sequence[int]:
-        """Pairs trained on."""
-        ...
-
-    @property
-    def scores(self) -> Sequence[float]:
-        """Mean held-out scores."""
-        ...
-
-    @property
-    def standard_errors(self) -> Sequence[float]:
-        """Of the scores."""
-        ...
-
-
-class StackingReportLike(Protocol):
-    """What :func:`stacking_report` reads; :class:`sbi_rope.stacking.StackingReport`."""
-
-    @property
-    def learning_curve(self) -> LearningCurveLike | None:
-        """The held-out score by the number of pairs trained on."""
-        ...
-
-    @property
-    def family_weights(self) -> Mapping[str, float]:
-        """The weight of each method."""
-        ...
-
-    @property
-    def coverage(self) -> CoverageCurve:
-        """Coverage on held-out pairs."""
-        ...
-
-    @property
-    def comparable_score(self) -> tuple[float, float]:
-        """Mean score of the stack as those of candidates, and its standard error."""
-        ...
-
-    def as_rows(self) -> list[dict[str, Any]]:
-        """Candidates with their weights and scores, the best first."""
-        ...
-
-
-def stacking_report(report: StackingReportLike) -> "Figure":
+def stacking_report(report: StackingReport) -> "Figure":
     """Held-out scores of the candidates, weights, coverage, and the learning curve.
 
     Left, the mean log score of the best candidates on pairs they were not trained on,
@@ -77,7 +31,7 @@ def stacking_report(report: StackingReportLike) -> "Figure":
     the number of pairs it was trained on.
 
     Args:
-        report: The report of a stack.
+        report: The report of a stack, ``posterior.report``.
 
     Returns:
         The figure.
@@ -86,8 +40,7 @@ def stacking_report(report: StackingReportLike) -> "Figure":
         InvalidTypeError: If something is no report.
         ImportError: If matplotlib is not installed.
     """
-    read = ["learning_curve", "family_weights", "coverage", "comparable_score"]
-    check_attributes("report", report, [*read, "as_rows"], like="the report of a stack")
+    check_instance("report", report, StackingReport)
     curve = report.learning_curve
     widths = [1.7, 1.2, 1.0] if curve is None else [1.7, 1.2, 1.0, 1.0]
     figure = empty_figure(11.0 if curve is None else 14.0, 3.8)
@@ -102,7 +55,7 @@ def stacking_report(report: StackingReportLike) -> "Figure":
     return figure
 
 
-def _scores(axes: "Axes", report: StackingReportLike) -> None:
+def _scores(axes: "Axes", report: StackingReport) -> None:
     finite = [row for row in report.as_rows() if row["score"] > -float("inf")]
     rows = finite[:MAX_CANDIDATES][::-1]
     for position, row in enumerate(rows):
@@ -145,7 +98,7 @@ def _coverage(axes: "Axes", curve: CoverageCurve) -> None:
     axes.set(xlabel="credible level", ylabel="share of held-out pairs inside")
 
 
-def _learning_curve(axes: "Axes", curve: LearningCurveLike) -> None:
+def _learning_curve(axes: "Axes", curve: LearningCurve) -> None:
     axes.errorbar(
         curve.num_pairs,
         curve.scores,

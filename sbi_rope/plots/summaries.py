@@ -1,9 +1,10 @@
 """Which summaries a simulator gets wrong, in one picture."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
-from sbi_rope._validation import check_attributes
+from sbi_rope._validation import check_instance
+from sbi_rope.discrepancy import DiscrepancyReport, Interval, SummaryDiscrepancy
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.plots._figures import BLUE, GREY, empty_figure, hide_frame
 
@@ -11,81 +12,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["DiscrepancyReportLike", "IntervalLike", "SummaryLike", "discrepancy"]
+__all__ = ["discrepancy"]
 
 # Most summaries that are drawn.
 MAX_SUMMARIES = 20
 NO_SIGN = "0.65"
 
 
-class IntervalLike(Protocol):
-    """What :func:`discrepancy` reads of an estimate."""
-
-    @property
-    def median(self) -> float:
-        """The estimate."""
-        ...
-
-    @property
-    def low(self) -> float:
-        """Lower end of its 95 % interval."""
-        ...
-
-    @property
-    def high(self) -> float:
-        """Upper end."""
-        ...
-
-
-class SummaryLike(Protocol):
-    """What :func:`discrepancy` reads of a summary."""
-
-    @property
-    def name(self) -> str:
-        """Its name."""
-        ...
-
-    @property
-    def size(self) -> IntervalLike:
-        """Typical difference, in standard deviations of simulations."""
-        ...
-
-    @property
-    def shift(self) -> IntervalLike:
-        """In units of x."""
-        ...
-
-    @property
-    def gain(self) -> IntervalLike:
-        """Without a unit."""
-        ...
-
-    @property
-    def is_off(self) -> bool:
-        """Whether a discrepancy is more probable than none."""
-        ...
-
-
-class DiscrepancyReportLike(Protocol):
-    """What :func:`discrepancy` reads; a report of :mod:`sbi_rope.discrepancy`."""
-
-    @property
-    def summaries(self) -> Sequence[SummaryLike]:
-        """The summaries, the one that is most off first."""
-        ...
-
-    @property
-    def num_pairs(self) -> int:
-        """Calibration pairs behind it."""
-        ...
-
-    @property
-    def constant(self) -> Sequence[str]:
-        """Summaries that are the same in all simulations."""
-        ...
-
-
-def discrepancy(report: DiscrepancyReportLike) -> "Figure":
+def discrepancy(report: DiscrepancyReport) -> "Figure":
     r"""How far each summary of real observations is from simulated ones, and how.
 
     .. math:: x_o = \bar x + \text{shift} + \text{gain}\,(x_s - \bar x) + \text{error}
@@ -107,12 +41,7 @@ def discrepancy(report: DiscrepancyReportLike) -> "Figure":
         InvalidInputError: If the report is of no summary.
         ImportError: If matplotlib is not installed.
     """
-    check_attributes(
-        "report",
-        report,
-        ["summaries", "num_pairs", "constant"],
-        like="what `DiscrepancyNPE.report()` returns",
-    )
+    check_instance("report", report, DiscrepancyReport)
     if not report.summaries:
         raise InvalidInputError("Expected `report` of at least one summary; got none.")
     shown = list(report.summaries[:MAX_SUMMARIES])
@@ -143,7 +72,7 @@ def discrepancy(report: DiscrepancyReportLike) -> "Figure":
 
 
 def _interval(
-    axes: "Axes", position: int, interval: IntervalLike, colour: str, unit: float = 1.0
+    axes: "Axes", position: int, interval: Interval, colour: str, unit: float = 1.0
 ) -> None:
     low, median, high = (
         value / unit for value in (interval.low, interval.median, interval.high)
@@ -152,9 +81,7 @@ def _interval(
     axes.plot(median, position, "o", color=colour, markersize=5)
 
 
-def _own_scale(
-    axes: "Axes", position: int, interval: IntervalLike, colour: str
-) -> None:
+def _own_scale(axes: "Axes", position: int, interval: Interval, colour: str) -> None:
     # Units differ from summary to summary. What can be compared is on the left.
     unit = max(abs(interval.low), abs(interval.high)) or 1.0
     _interval(axes, position, interval, colour, unit)
@@ -170,7 +97,7 @@ def _own_scale(
     axes.set_xlim(-1.1, 3.2)
 
 
-def _legend(figure: "Figure", shown: Sequence[SummaryLike]) -> None:
+def _legend(figure: "Figure", shown: Sequence[SummaryDiscrepancy]) -> None:
     from matplotlib.lines import Line2D
 
     labels = {
@@ -188,7 +115,7 @@ def _legend(figure: "Figure", shown: Sequence[SummaryLike]) -> None:
     )
 
 
-def _note(figure: "Figure", report: DiscrepancyReportLike) -> None:
+def _note(figure: "Figure", report: DiscrepancyReport) -> None:
     parts = [f"{report.num_pairs} calibration pairs, 95 % intervals"]
     left_out = len(report.summaries) - MAX_SUMMARIES
     if left_out > 0:

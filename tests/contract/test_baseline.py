@@ -18,9 +18,9 @@ from torch import Tensor, nn
 import sbi_rope.baselines
 from sbi_rope._random import seeded
 from sbi_rope.baselines import (
-    NPE,
     CalibrationMLP,
     Method,
+    PlainNPE,
     UsesCalibration,
     UsesObservations,
     UsesSimulations,
@@ -596,7 +596,9 @@ def test_a_posterior_trained_beforehand_does_as_well(name: str) -> None:
     task = first_task(name)
     data = data_of(task)
     expected = expected_densities(name)
-    npe = NPE(task_of(task).get_prior(), baselines.builder(task), npe_training=SHORT)
+    npe = PlainNPE(
+        task_of(task).get_prior(), baselines.builder(task), npe_training=SHORT
+    )
     npe.append_simulations(data.theta, data.x)
     with seeded(0):
         train(npe, seed=None)

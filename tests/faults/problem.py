@@ -8,7 +8,7 @@ from sbi.inference import DirectPosterior
 from sbi.utils import BoxUniform
 from torch import Tensor
 
-from sbi_rope import CalibrationFinetuner, RoPE, stack
+from sbi_rope import CalibrationFinetuner, RoPE, diagnose, stack
 from sbi_rope.discrepancy import DiscrepancyModel, DiscrepancyNPE
 from sbi_rope.stacking import CouplingCandidate, default_candidates
 from tests import gaussian
@@ -81,6 +81,12 @@ def stacked_batch() -> Any:
 @functools.cache
 def fitted_discrepancy() -> Any:
     return DiscrepancyModel().fit(X, THETA, NOISE)
+
+
+@functools.cache
+def diagnosed() -> Any:
+    options: dict[str, Any] = {"num_simulations": 100, "num_folds": None, "seed": 0}
+    return diagnose(trained(), X_O, **options, **QUIET)
 
 
 @functools.cache

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.distributions import Normal
 
 from sbi_rope._random import seeded
-from sbi_rope.baselines import NPE, Training
+from sbi_rope.baselines import PlainNPE, Training
 from sbi_rope.discrepancy import Discrepancy, DiscrepancyDraws, DiscrepancyModel
 from sbi_rope.discrepancy.npe import DiscrepancyNPE
 from sbi_rope.tasks import get_task
@@ -86,7 +86,7 @@ def npe() -> Any:
     builder = posterior_nn("mdn", hidden_features=20, num_components=2)
     with seeded(0):
         theta = prior.sample((5000,))
-        method = NPE(prior, builder, npe_training=TRAINING)
+        method = PlainNPE(prior, builder, npe_training=TRAINING)
         method.append_simulations(theta, simulator(theta))
         return method.train(**QUIET).build_posterior()
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from sbi_rope import RoPE, SinkhornCoupler
 from sbi_rope._random import seeded
 from sbi_rope._training import split_groups, split_pairs
-from sbi_rope.baselines import NPE, FinetunedNPE, Training
+from sbi_rope.baselines import FinetunedNPE, PlainNPE, Training
 from sbi_rope.baselines.training import train_on_pairs
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import (
@@ -38,7 +38,7 @@ TEST = TASK.get_test_set(30)
 def npe() -> Any:
     """The posterior of a short training, for reading only."""
     net = nn.Sequential(nn.Linear(2, 8), nn.ReLU(), nn.Linear(8, 4))
-    method = NPE(
+    method = PlainNPE(
         TASK.get_prior(),
         posterior_nn("maf", embedding_net=net, num_transforms=1, hidden_features=10),
         npe_training=Training(learning_rate=3e-3, max_num_epochs=5),

@@ -16,7 +16,7 @@ from torch.distributions import Independent, Normal
 from sbi_rope._sbi import embedding_of, estimator_of
 from sbi_rope.baselines.error_model import SpikeAndSlab
 from sbi_rope.baselines.nnpe import NNPE
-from sbi_rope.baselines.npe import NPE
+from sbi_rope.baselines.npe import PlainNPE
 from sbi_rope.baselines.statistics import SoftClip
 from sbi_rope.baselines.training import Training
 from sbi_rope.errors import (
@@ -53,7 +53,7 @@ def trained_npe() -> Any:
     with torch.random.fork_rng():
         torch.manual_seed(0)
         theta = prior().sample(torch.Size((1500,)))
-        method = NPE(
+        method = PlainNPE(
             prior(),
             posterior_nn("mdn", hidden_features=50, num_components=4),
             npe_training=Training(learning_rate=2e-3, max_num_epochs=30),

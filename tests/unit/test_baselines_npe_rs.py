@@ -10,7 +10,7 @@ from sbi.neural_nets import posterior_nn
 from torch import Tensor, nn
 
 from sbi_rope._sbi import embed, embedding_of
-from sbi_rope.baselines import NPE, NPERS, Training
+from sbi_rope.baselines import NPERS, PlainNPE, Training
 from sbi_rope.baselines.npe_rs import squared_mmd
 from sbi_rope.errors import InvalidInputError, RoPEWarning
 from tests.problems import standard_normal
@@ -158,8 +158,8 @@ def method(
     theta, theta_o = prior.sample((n,)), prior.sample((200,))
     x, x_o = simulate(theta), simulate(theta_o, shift)
     density = builder(net() if embedding_net is None else embedding_net)
-    if kind is NPE:
-        method = NPE(prior, density, npe_training=training)
+    if kind is PlainNPE:
+        method = PlainNPE(prior, density, npe_training=training)
         return method.append_simulations(theta, x)
     method = NPERS(prior, density, training=training, **options)
     return method.append_simulations(theta, x).append_observations(x_o)
@@ -205,7 +205,7 @@ class TestWhatItLearns:
 
     def test_where_the_simulator_is_right_it_stays_near_npe(self) -> None:
         """Within 0.1 nats of NPE and of the exact posterior; of the prior it is 1."""
-        npe = trained(1000, kind=NPE, training=CONVERGED)
+        npe = trained(1000, kind=PlainNPE, training=CONVERGED)
         robust = trained(1000, training=CONVERGED)
         npe_score, exact, _ = self.scores(npe, 0.0)
         score, _, _ = self.scores(robust, 0.0)
@@ -219,7 +219,7 @@ class TestWhatItLearns:
 
         The posterior loses at most 1.5 nats of the exact one.
         """
-        npe = trained(1000, kind=NPE, training=CONVERGED)
+        npe = trained(1000, kind=PlainNPE, training=CONVERGED)
         robust = trained(1000, shift=SHIFT, training=CONVERGED)
         npe_score, exact, npe_gap = self.scores(npe, SHIFT)
         score, _, gap = self.scores(robust, SHIFT)
@@ -229,7 +229,7 @@ class TestWhatItLearns:
 
 
 def test_without_regularisation_it_is_npe() -> None:
-    expected = densities(trained(kind=NPE))
+    expected = densities(trained(kind=PlainNPE))
     assert torch.equal(densities(trained(regularisation=0)), expected)
     assert not torch.equal(densities(trained()), expected)
 
@@ -238,7 +238,7 @@ def test_without_regularisation_it_is_npe() -> None:
 def test_without_a_net_to_regularise_it_is_npe_and_says_so(frozen: bool) -> None:
     embedding_net = nn.Linear(2, 2) if frozen else nn.Identity()
     embedding_net.requires_grad_(requires_grad=False)
-    expected = densities(trained(kind=NPE, embedding_net=embedding_net))
+    expected = densities(trained(kind=PlainNPE, embedding_net=embedding_net))
     with pytest.warns(RoPEWarning, match="nothing to regularise"):
         robust = trained(embedding_net=embedding_net)
     assert torch.equal(densities(robust), expected)

@@ -22,15 +22,15 @@ from sbi_rope import CalibrationFinetuner, RoPE, SinkhornCoupler
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embedding_of, posterior_from
 from sbi_rope.baselines import (
-    NPE,
-    SBI,
     CalibrationMLP,
     FinetunedNPE,
     JointNPE,
     Method,
     OTOnly,
+    PlainNPE,
     PriorBaseline,
     PriorPosterior,
+    ReferenceNPE,
     Training,
     TuningOnly,
 )
@@ -77,7 +77,7 @@ def real(n: int = 20) -> tuple[Tensor, Tensor]:
 @functools.cache
 def npe() -> Any:
     """A well-trained NPE, for reading only."""
-    method = NPE(TASK.get_prior(), builder(), npe_training=LONG)
+    method = PlainNPE(TASK.get_prior(), builder(), npe_training=LONG)
     return method.append_simulations(*simulations(2000)).train(**QUIET)
 
 
@@ -102,7 +102,7 @@ class TestWithPlentyOfPairs:
         assert self.loss_of(npe()) > 2
 
     def test_npe_is_right_where_its_simulator_is(self) -> None:
-        theta, x = SBI.simulated_test_set(npe(), *self.fresh())
+        theta, x = ReferenceNPE.simulated_test_set(npe(), *self.fresh())
         exact = TASK.get_simulator().posterior(x).log_prob(theta.double()).mean()
         scored = log_probs(npe().build_posterior(), theta, x).mean()
         assert abs(float(exact - scored)) < 0.05
@@ -429,8 +429,10 @@ class TestRoPEsParts:
 
 
 class TestSBI:
-    def method(self) -> SBI:
-        return SBI(TASK.get_prior(), builder()).append_simulations(*simulations())
+    def method(self) -> ReferenceNPE:
+        return ReferenceNPE(TASK.get_prior(), builder()).append_simulations(
+            *simulations()
+        )
 
     def test_each_test_parameter_has_a_simulation_of_its_own(self) -> None:
         theta = TASK.get_test_set(2000)[0]
@@ -468,12 +470,12 @@ class TestSBI:
         assert 0 < len(kept) < 50
 
     def test_the_shape_of_a_simulation_has_to_be_known(self) -> None:
-        method = SBI(TASK.get_prior(), builder())
+        method = ReferenceNPE(TASK.get_prior(), builder())
         with pytest.raises(NotReadyError, match=r"append_simulations\(theta, x\)"):
             method.simulated_test_set(torch.zeros(2, 2), TASK.get_simulator())
 
     def test_it_knows_the_shape_of_a_posterior_trained_beforehand(self) -> None:
-        method = SBI.from_posterior(npe().build_posterior())
+        method = ReferenceNPE.from_posterior(npe().build_posterior())
         _, x = method.simulated_test_set(torch.zeros(3, 2), TASK.get_simulator())
         assert x.shape == (3, 2)
 
@@ -495,7 +497,7 @@ class TestBase:
 
     def test_npe_given_beforehand_comes_back_as_it_was(self) -> None:
         posterior = gaussian.posterior()
-        method = NPE.from_posterior(posterior).train(**QUIET)
+        method = PlainNPE.from_posterior(posterior).train(**QUIET)
         theta, x = gaussian.labelled(6)
         scored = log_probs(method.build_posterior(), theta, x)
         assert torch.equal(scored, log_probs(posterior, theta, x))
@@ -503,7 +505,7 @@ class TestBase:
     @pytest.mark.parametrize("family", ["fmpe", "npse"])
     def test_npe_given_beforehand_may_be_a_vector_field(self, family: str) -> None:
         posterior = problems.vector_field_posterior(family)
-        method = NPE.from_posterior(posterior).train(**QUIET)
+        method = PlainNPE.from_posterior(posterior).train(**QUIET)
         built = method.build_posterior()
         assert type(built) is type(posterior)
         assert built is not posterior
@@ -512,12 +514,12 @@ class TestBase:
         method = PriorBaseline(TASK.get_prior()).train()
         with pytest.raises(NotReadyError, match="PriorBaseline"):
             _ = method.history
-        ready = NPE.from_posterior(npe().build_posterior()).train(**QUIET)
+        ready = PlainNPE.from_posterior(npe().build_posterior()).train(**QUIET)
         with pytest.raises(NotReadyError, match="NPE"):
             _ = ready.history
 
     def test_the_losses_are_those_of_the_last_training(self) -> None:
-        method = NPE(TASK.get_prior(), builder(), npe_training=SHORT)
+        method = PlainNPE(TASK.get_prior(), builder(), npe_training=SHORT)
         method.append_simulations(*simulations())
         first = method.train(**QUIET).history
         assert method.train(seed=1, show_progress_bars=False).history != first
@@ -537,14 +539,14 @@ class TestBase:
         source = problems.npe_posterior()  # its embedding net has a dropout layer
         posterior = posterior_from(source, copy.deepcopy(source.posterior_estimator))
         posterior.posterior_estimator.train()
-        method = NPE.from_posterior(posterior)
+        method = PlainNPE.from_posterior(posterior)
         assert posterior.posterior_estimator.training
         built = method.train(**QUIET).build_posterior()
         assert not built.posterior_estimator.training
 
     def test_a_posterior_that_changes_after_it_was_given_changes_nothing(self) -> None:
         posterior = gaussian.posterior()
-        method = NPE.from_posterior(posterior)
+        method = PlainNPE.from_posterior(posterior)
         theta, x = gaussian.labelled(6)
         expected = log_probs(posterior, theta, x)
         with torch.no_grad():

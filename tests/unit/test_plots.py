@@ -1,16 +1,16 @@
 """The plots show what their labels say; looks are judged by eye."""
 
 import builtins
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from sbi_rope import plots
+from sbi_rope import SinkhornCoupler, plots
 from sbi_rope.discrepancy import DiscrepancyReport, Interval, SummaryDiscrepancy
 from sbi_rope.errors import InvalidInputError, InvalidTypeError
+from sbi_rope.finetuning import History
 from sbi_rope.metrics import CoverageCurve, coverage_curve_of
 
 pytest.importorskip("matplotlib")
@@ -217,69 +217,21 @@ def test_calibration_curves_refuse_what_are_none(curves: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    "draw",
+    ("training", "validation", "match"),
     [
-        plots.finetuning_history,
-        plots.effective_sample_sizes,
-        plots.stacking_report,
-        plots.discrepancy,
+        ([2.0, float("nan")], [], "training_loss.*finite"),
+        ([2.0, 1.0], [1.0, float("inf")], "validation_loss.*finite"),
     ],
 )
-@pytest.mark.parametrize("value", [None, 3, "x", {}, torch.rand(3)])
-def test_what_is_no_result_is_refused(draw: Any, value: object) -> None:
-    with pytest.raises(InvalidTypeError, match=r"Expected `\w+` to be .*without"):
-        draw(value)
-
-
-@pytest.mark.parametrize(
-    ("training", "validation", "step", "match"),
-    [
-        ([], [], 0, "at least one loss"),
-        ([2.0, 1.0], [], 2, "best_step.*from 0 to 1"),
-        ([2.0, 1.0], [], -1, "best_step"),
-        ([2.0, 1.0], [], 0.5, "best_step"),
-        ([2.0, float("nan")], [], 0, "training_loss.*finite"),
-        ([2.0, 1.0], [1.0, float("inf")], 0, "validation_loss.*finite"),
-        (["a"], [], 0, "training_loss.*numbers"),
-        ([[1.0], [2.0]], [], 0, "training_loss.*numbers"),
-        ([1.0], None, 0, "validation_loss.*numbers"),
-    ],
-)
-def test_histories_that_cannot_be_drawn_are_refused(
-    training: Any, validation: Any, step: Any, match: str
+def test_losses_that_are_not_finite_are_refused(
+    training: list[float], validation: list[float], match: str
 ) -> None:
-    history = SimpleNamespace(
-        training_loss=training, validation_loss=validation, best_step=step
-    )
     with pytest.raises(InvalidInputError, match=match):
-        plots.finetuning_history(history)
+        plots.finetuning_history(History(training, validation, 0, 1e-3))
 
 
-@pytest.mark.parametrize(
-    ("sizes", "simulated", "match"),
-    [
-        (torch.ones(4) * torch.nan, torch.rand(9, 2), "finite"),
-        (torch.zeros(4), torch.rand(9, 2), "positive"),
-        (torch.ones(0), torch.rand(9, 2), "empty"),
-        (torch.ones(4), torch.rand(0, 2), "n_s >= 1"),
-        (torch.ones(4), torch.tensor(1.0), "n_s >= 1"),
-    ],
-)
-def test_couplings_that_cannot_be_drawn_are_refused(
-    sizes: Tensor, simulated: Tensor, match: str
-) -> None:
-    coupling = SimpleNamespace(simulated=simulated, effective_sample_size=sizes)
-    with pytest.raises(InvalidInputError, match=match):
-        plots.effective_sample_sizes(coupling)
-
-
-@pytest.mark.parametrize("kind", [list, torch.tensor])
-def test_finetuning_history_marks_the_kept_step(kind: Any) -> None:
-    history = SimpleNamespace(
-        training_loss=kind([3.0, 2.0, 1.0]),
-        validation_loss=kind([3.0, 2.5, 2.75]),
-        best_step=1,
-    )
+def test_finetuning_history_marks_the_kept_step() -> None:
+    history = History([3.0, 2.0, 1.0], [3.0, 2.5, 2.75], 1, 1e-3)
     axes = plots.finetuning_history(history).axes[0]
     mark = axes.lines[-1]
     assert (mark.get_xdata()[0], mark.get_ydata()[0]) == (1, 2.5)
@@ -288,7 +240,7 @@ def test_finetuning_history_marks_the_kept_step(kind: Any) -> None:
 
 
 def test_finetuning_history_without_holdout_draws_the_training_loss_only() -> None:
-    history = SimpleNamespace(training_loss=[3.0, 2.0], validation_loss=[], best_step=0)
+    history = History([3.0, 2.0], [], 0, 1e-3)
     axes = plots.finetuning_history(history).axes[0]
     texts = legend_texts(axes.get_legend())
     assert texts == ["training pairs", "kept: step 0 (the starting point)"]
@@ -296,12 +248,9 @@ def test_finetuning_history_without_holdout_draws_the_training_loss_only() -> No
 
 @pytest.mark.parametrize("num_simulations", [1, 50])
 def test_effective_sample_sizes_count_every_row(num_simulations: int) -> None:
-    weights = torch.softmax(torch.randn(30, num_simulations), dim=1)
-    weights[0] = 0.0
-    weights[0, 0] = 1.0
-    coupling = SimpleNamespace(
-        simulated=weights[0], effective_sample_size=1.0 / weights.square().sum(dim=1)
-    )
+    simulated = torch.randn(num_simulations, 2)
+    real = torch.cat([torch.randn(29, 2), 100 * simulated[:1]])
+    coupling = SinkhornCoupler(gamma=1.0, tau=0.0).couple(real, simulated)
     axes = plots.effective_sample_sizes(coupling).axes[0]
     assert sum(bar.get_height() for bar in axes.patches) == 30
     assert axes.patches[0].get_x() < axes.patches[-1].get_x()

@@ -12,7 +12,6 @@ from sbi.utils import BoxUniform
 from sbi_rope._validation import (
     LARGEST_SETTING,
     as_float32,
-    check_attributes,
     check_batch,
     check_choice,
     check_device,
@@ -252,14 +251,6 @@ def test_a_mapping_has_entries_with_names() -> None:
     for value in (None, 3, "a", [1], X, {1: X}):
         with pytest.raises(InvalidTypeError, match="samples"):
             check_mapping("samples", value, like="samples")
-
-
-def test_an_object_is_asked_for_what_is_read_of_it() -> None:
-    check_attributes("x", X, ["shape", "dtype"], like="a tensor")
-    with pytest.raises(
-        InvalidTypeError, match=r"a tensor; got int, without \['shape'\]"
-    ):
-        check_attributes("x", 3, ["shape", "real"], like="a tensor")
 
 
 def test_a_path_is_a_string_or_a_path() -> None:

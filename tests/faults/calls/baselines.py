@@ -51,8 +51,8 @@ DATA = {
     "observations": {"x_o": X_O},
 }
 METHODS: dict[str, Any] = {
-    "NPE": baselines.NPE,
-    "SBI": baselines.SBI,
+    "PlainNPE": baselines.PlainNPE,
+    "ReferenceNPE": baselines.ReferenceNPE,
     "NNPE": baselines.NNPE,
     "RNPE": baselines.RNPE,
     "NPERS": baselines.NPERS,
@@ -111,8 +111,8 @@ CALLS += [
         is_random=True,
     ),
     Call(
-        name="SBI.simulated_test_set",
-        run=lambda theta, seed=0: baselines.SBI.from_posterior(
+        name="ReferenceNPE.simulated_test_set",
+        run=lambda theta, seed=0: baselines.ReferenceNPE.from_posterior(
             npe()
         ).simulated_test_set(theta, gaussian.simulator, seed=seed),
         tensors={"theta": THETA},

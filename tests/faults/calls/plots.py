@@ -13,6 +13,7 @@ from tests.faults.problem import (
     X_O,
     X_S,
     X,
+    diagnosed,
     discrepancy_report,
     draw,
     posterior,
@@ -80,12 +81,10 @@ CALLS = [
     ),
     Call(
         name="implied_parameters",
-        run=lambda theta=THETA_S, implied=WEIGHTS, **options: drawn(
-            plots.implied_parameters
-        )(theta=theta, implied=implied, **options),
-        tensors={"theta": THETA_S, "implied": WEIGHTS},
-        options={"parameter_names": "names"},
-        accepts=("theta: one column more", *LABELS),
+        run=lambda diagnosis=None: drawn(plots.implied_parameters)(
+            diagnosed() if diagnosis is None else diagnosis
+        ),
+        options={"diagnosis": "instance"},
     ),
     Call(
         name="real_and_simulated",
