@@ -133,7 +133,8 @@ def _share_inside(
 
 
 def _variance(share: Tensor, draws: int) -> Tensor:
-    # Without the half a draw, contexts with no or all draws inside had no error.
+    # Half a draw is added to those inside and to those outside. Otherwise a context
+    # whose draws are all inside, or all outside, would seem to have no error.
     smoothed = (draws * share + 0.5) / (draws + 1)
     return smoothed * (1.0 - smoothed) / draws
 
