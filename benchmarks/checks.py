@@ -3,8 +3,6 @@
 import functools
 import json
 import math
-import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -17,34 +15,14 @@ from sbi_rope.errors import InvalidInputError
 from sbi_rope.metrics.calibration import standard_error_of_mean
 from sbi_rope.tasks import Task, get_task
 
-__all__ = ["check_scores", "read_archive", "read_mapping"]
+__all__ = ["check_scores", "read_mapping"]
 
-# What numpy and zipfile raise for files that are no archives of arrays, or cut.
-BROKEN = (
-    *(OSError, ValueError, KeyError, EOFError, AttributeError, NotImplementedError),
-    *(RuntimeError, zipfile.BadZipFile, zlib.error),
-)
 # Log-probabilities are kept in single precision, and sums of them depend on the order.
 RELATIVE, ABSOLUTE = 1e-6, 1e-6
 # `acauc_per_parameter` has four digits.
 ROUNDED = 1e-4
 # Arrays of every finished cell, and their dimensions.
 NEEDED = {"log_probs": 1, "coverage": 1, "samples": 2, "theta": 1}
-
-
-def read_archive(path: Path) -> dict[str, np.ndarray]:
-    """Read all arrays of an npz file; nothing in it is executed.
-
-    Raises:
-        ValueError: If the file is none, or is damaged.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except BROKEN as error:  # AttributeError: a single array
-        raise ValueError(
-            f"expected whole arrays; got {type(error).__name__}: {error}"
-        ) from error
 
 
 def read_mapping(path: Path) -> dict[str, Any]:

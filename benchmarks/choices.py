@@ -23,10 +23,9 @@ from torch import Tensor
 
 from benchmarks.cases import Case, Sources
 from benchmarks.cells import Cell
-from benchmarks.checks import read_archive
 from benchmarks.store import Cache
 from sbi_rope import RoPE, stack
-from sbi_rope._files import set_aside, write_atomically
+from sbi_rope._files import read_arrays, set_aside, write_atomically
 from sbi_rope.errors import InvalidInputError, warn_user
 from sbi_rope.stacking import stacking_weights
 
@@ -77,7 +76,7 @@ class Run:
             InvalidInputError: If the file is damaged.
         """
         try:
-            stored = read_archive(path)
+            stored = read_arrays(path)
             return cls(
                 task=str(stored["task"]),
                 seed=int(stored["seed"]),

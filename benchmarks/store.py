@@ -13,9 +13,9 @@ import numpy as np
 import torch
 
 from benchmarks.cells import Cell
-from benchmarks.checks import check_scores, read_archive, read_mapping
+from benchmarks.checks import check_scores, read_mapping
 from benchmarks.schema import check_row
-from sbi_rope._files import set_aside, write_atomically
+from sbi_rope._files import read_arrays, set_aside, write_atomically
 from sbi_rope.errors import warn_user
 
 __all__ = ["Cache", "Results"]
@@ -126,7 +126,7 @@ class Results:
 
     def read_arrays(self, cell: Cell) -> dict[str, np.ndarray]:
         """Return what is kept of a finished cell besides its row."""
-        return read_archive(self.folder / f"{cell.key}.npz")
+        return read_arrays(self.folder / f"{cell.key}.npz")
 
     def write(
         self, cell: Cell, row: dict[str, Any], arrays: dict[str, np.ndarray]

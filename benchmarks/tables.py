@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 
 from benchmarks.cells import Cell, Suite
-from benchmarks.checks import check_scores, read_archive, read_mapping
+from benchmarks.checks import check_scores, read_mapping
 from benchmarks.machine import describe_machine
 from benchmarks.runner import PACKAGES, git_commit
 from benchmarks.schema import CELL_COLUMNS, COLUMNS, as_text, check_row, from_text
 from benchmarks.store import Results
-from sbi_rope._files import write_atomically
+from sbi_rope._files import read_arrays, write_atomically
 from sbi_rope.errors import InvalidInputError
 
 __all__ = [
@@ -168,7 +168,7 @@ def _read_arrays(
         return arrays
     by_key = {cell.key: cell for cell in suite.cells}
     with _naming(path.name):
-        archive = read_archive(path)
+        archive = read_arrays(path)
     for name, values in archive.items():
         key, _, part = name.partition("/")
         cell = by_key.get(key)

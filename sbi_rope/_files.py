@@ -4,12 +4,37 @@ import contextlib
 import itertools
 import os
 import secrets
+import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+
 from sbi_rope.errors import NotWritableError
 
-__all__ = ["set_aside", "write_atomically"]
+__all__ = ["read_arrays", "set_aside", "write_atomically"]
+
+# What numpy and zipfile raise for files that are no archives of arrays, or cut.
+BROKEN = (
+    *(OSError, ValueError, KeyError, EOFError, AttributeError, NotImplementedError),
+    *(RuntimeError, zipfile.BadZipFile, zlib.error),
+)
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Read all arrays of an npz file, up to its last byte; nothing in it is executed.
+
+    Raises:
+        ValueError: If the file is none, or is damaged.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except BROKEN as error:  # AttributeError: a single array
+        raise ValueError(
+            f"expected whole arrays; got {type(error).__name__}: {error}"
+        ) from error
 
 
 @contextlib.contextmanager

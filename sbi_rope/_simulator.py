@@ -200,7 +200,10 @@ class Simulator:
         as_batch = self._attempt(theta)
         if self._is_batch(as_batch, count):
             self._check_noise(theta, as_batch)
-            one_by_one = self._mixes_rows(draws[:count], draws[count - 1 :])
+            theta = draws[:count]
+            x, state = self._attempt_under(0, theta)
+            self._check_seeds(theta, state)
+            one_by_one = self._mixes_rows(x, theta, draws[count - 1 :])
             if one_by_one and not self._is_single(self._attempt(draws[0])):
                 raise SimulationError(
                     "Expected `simulator` to return x (n, *event) whose rows depend "
@@ -243,27 +246,26 @@ class Simulator:
                 "`lambda theta: torch.stack([simulator(row) for row in theta])`."
             )
 
-    def _mixes_rows(self, theta: Tensor, others: Tensor) -> bool:
+    def _mixes_rows(self, x: Any, theta: Tensor, others: Tensor) -> bool:
         """Tell whether a simulator for one theta has survived a batch of them.
 
         Such as ``lambda theta: theta * theta.norm()``, whose rows depend on each other.
 
         Args:
+            x: What the simulator returns for theta under seed 0.
             theta: Parameters, shape ``(n, d)``.
-            others: Other parameters, shape ``(n, d)``, to stand beside the first row.
+            others: Other parameters, shape ``(n, d)``, to stand beside a row of theta.
         """
         # The first row and the last, each beside others than before.
         batches = [theta, torch.cat([theta[:1], others[1:]])]
         batches.append(torch.cat([others[:-1], theta[-1:]]))
         rows = ((0, 1), (-1, 2))
         start = time.perf_counter()
-        tried = [self._attempt_under(0, batch) for batch in batches]
-        seconds = (time.perf_counter() - start) / len(tried)
-        xs: list[Any] = [x for x, _ in tried]
+        xs: list[Any] = [x, *(self._attempt_under(0, b)[0] for b in batches[1:])]
+        seconds = (time.perf_counter() - start) / len(batches[1:])
         # What fails here, fails with a clear message when it is called.
         if not all(self._is_batch(x, len(theta)) for x in xs):
             return False
-        self._check_seeds(theta, tried[0][1])
         if all(_is_close(xs[0][row], xs[k][row]) for row, k in rows):
             return False
         # The rows may depend on each other, or only take other random numbers, as where

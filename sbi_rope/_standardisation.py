@@ -16,8 +16,8 @@ __all__ = [
     "warn_of_far_entries",
 ]
 
-# Standard deviations of simulations. In the paper's misspecified tasks no measurement
-# is farther than seven; a column that does not vary in simulations gives 100,000.
+# Standard deviations of simulations. No measurement of the tasks is half as far. A
+# column that does not vary in simulations, but by 0.01 in reality, is at 100,000.
 FAR = 30.0
 # A standard deviation smaller than this share of the mean is rounding.
 ROUNDING = 1e-6

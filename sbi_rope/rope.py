@@ -94,6 +94,8 @@ class RoPE:
             fits one observation only, which cannot be recognised here.
         simulator: Maps parameters ``(n, d)`` to simulations ``(n, *event)``, or one
             ``(d,)`` to one ``(*event)``; simulations with NaN are dropped and counted.
+            A row of x may depend on the same row of theta only, which is tried on some
+            fifteen simulations.
         simulations: Instead of a simulator, stored pairs (theta, x) drawn from the
             prior. Fine-tuning then uses those with the nearest parameters.
         finetuner: Settings of step 1; ``CalibrationFinetuner()`` if None.
@@ -103,6 +105,7 @@ class RoPE:
         UnsupportedPosteriorError: If the posterior has no embedding to work with.
         InvalidInputError: If both or none of simulator and simulations are given, or
             their shapes do not fit the posterior.
+        NotReadyError: If torch's default dtype is not float32.
         SimulationError: If the simulator raises or returns something unusable.
 
     Example:

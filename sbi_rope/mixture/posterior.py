@@ -301,6 +301,12 @@ class MixturePosterior(DirectPosterior):
     def set_default_x(self, x: Tensor) -> "MixturePosterior":
         """Set the observation that methods take when they are given none.
 
+        Args:
+            x: An observation, shape ``(*event)`` or ``(1, *event)``; it is copied.
+
+        Returns:
+            Itself, so that calls can be chained.
+
         Raises:
             InvalidInputError: If the shape does not fit or a value is not finite.
         """

@@ -27,7 +27,7 @@ BAD_TENSORS: dict[str, Callable[[Tensor], Any]] = {
     "bool": lambda good: good > 0,
     "sparse": lambda good: good.to_sparse(),
     "without values": lambda good: good.to("meta"),
-    "a quantity of objects": lambda good: np.array([object()] * len(good)),
+    "an array of objects": lambda good: np.array([object()] * len(good)),
 }
 # Must be refused or give numbers: what is inferred from them may be of little use.
 EXTREME_TENSORS: dict[str, Callable[[Tensor], Any]] = {

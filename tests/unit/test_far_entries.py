@@ -1,6 +1,7 @@
 """Entries of x that are far from simulations, or the same in all of them."""
 
 import warnings
+from pathlib import Path
 
 import pytest
 import torch
@@ -9,9 +10,11 @@ from sbi.neural_nets import posterior_nn
 from torch import Tensor, nn
 
 from sbi_rope import CalibrationFinetuner, RoPE, diagnose
+from sbi_rope._standardisation import FAR
 from sbi_rope.baselines import CalibrationMLP, FinetunedNPE, Training
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import RoPEWarning
+from sbi_rope.tasks import get_task
 from tests import problems
 
 QUIET = {"show_progress_bars": False}
@@ -112,3 +115,24 @@ def test_its_posterior_of_any_observation_has_mass_inside_the_prior() -> None:
     far = torch.tensor([[1e4, -1e4], [-1e4, -1e4]])
     samples = posterior.sample_batched((200,), x=far, **QUIET)
     assert (samples.abs() <= 1).all()
+
+
+@pytest.mark.parametrize(
+    "name", ["cs", "hemodynamics", "linear_gaussian", "pendulum", "sir"]
+)
+def test_no_measurement_of_a_task_is_half_as_far_as_what_is_warned_of(
+    name: str,
+) -> None:
+    task = get_task(name)
+    _, simulated = task.get_simulations(200)
+    _, measured = task.get_calibration_set(30)
+    std, mean = torch.std_mean(simulated, dim=0)
+    assert ((measured - mean).abs() < FAR / 2 * std).all()
+
+
+def test_no_measurement_of_the_sensors_is_half_as_far(chamber_root: Path) -> None:
+    task = get_task("light_tunnel_sensors", root=chamber_root)
+    _, simulated = task.get_simulations(500)
+    _, measured = task.get_calibration_set(200)
+    std, mean = torch.std_mean(simulated, dim=0)
+    assert ((measured - mean).abs() < FAR / 2 * std).all()

@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 import torch
 
+from sbi_rope._files import read_arrays
 from sbi_rope.errors import DataNotFoundError, InvalidInputError, SimulationError
 from sbi_rope.tasks.hemodynamics.dataset import BeatSet, load
 from sbi_rope.tasks.hemodynamics.generation import CHUNK_SIZE, generate
 from sbi_rope.tasks.hemodynamics.population import NUISANCES, Population
-from sbi_rope.tasks.hemodynamics.store import read_arrays, write_arrays
+from sbi_rope.tasks.hemodynamics.store import write_arrays
 from sbi_rope.tasks.hemodynamics.subject import Beat, Physics, Subject
 from tests.fresh import imported_anew
 

@@ -42,9 +42,11 @@ def test_a_simulator_of_one_theta_that_survives_a_batch_is_called_one_by_one(
         simulator = simulator_of(function)
     assert not simulator.is_batched
     theta = torch.tensor([[0.3, 0.4], [0.6, -0.8]])
-    alone = torch.stack([function(row) for row in theta])
-    assert torch.allclose(simulator(theta), alone, atol=1.0)
-    assert simulator(theta).shape == (2, 2)
+    # Means of so many that their errors are below a twentieth of what mixing changes.
+    count = 800
+    alone = [sum(function(row) for _ in range(count)) / count for row in theta]
+    means = simulator(theta.repeat(count, 1)).unflatten(0, (count, 2)).mean(dim=0)
+    assert torch.allclose(means, torch.stack(alone), atol=0.02)
 
 
 def has_noise_of_its_own(theta: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sbi_rope._files import read_arrays
 from sbi_rope._validation import check_choice, check_instance, check_path
 from sbi_rope.errors import DataNotFoundError, InvalidInputError
 from sbi_rope.tasks.hemodynamics.population import (
@@ -17,7 +18,6 @@ from sbi_rope.tasks.hemodynamics.population import (
     Population,
     Process,
 )
-from sbi_rope.tasks.hemodynamics.store import read_arrays
 from sbi_rope.tasks.hemodynamics.subject import NUM_SEGMENTS, Physics
 
 __all__ = ["FORMAT_VERSION", "BeatSet", "describe_population", "differences", "load"]

@@ -2,7 +2,6 @@
 
 import json
 import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,13 +10,8 @@ import numpy as np
 
 from sbi_rope._files import write_atomically
 
-__all__ = ["read_arrays", "read_json", "write_arrays", "write_json"]
+__all__ = ["read_json", "write_arrays", "write_json"]
 
-# What numpy and zipfile raise for files that are no archives of arrays, or cut.
-BROKEN = (
-    *(OSError, ValueError, KeyError, EOFError, AttributeError, NotImplementedError),
-    *(RuntimeError, zipfile.BadZipFile, zlib.error),
-)
 FIXED_DATE = (1980, 1, 1, 0, 0, 0)  # equal arrays make equal files
 
 
@@ -33,19 +27,6 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
                 np.lib.format.write_array(
                     file, np.asarray(array, order="C"), allow_pickle=False
                 )
-
-
-def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Read all arrays of an npz file, up to its last byte.
-
-    Raises:
-        ValueError: If the file is none, or is broken.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except BROKEN as error:  # AttributeError: a single array
-        raise ValueError(f"{type(error).__name__}: {error}") from error
 
 
 def write_json(path: Path, content: Any) -> None:
