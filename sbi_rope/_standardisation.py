@@ -44,7 +44,7 @@ def _layer(embedding_net: nn.Module) -> Any:
 
 @torch.no_grad()
 def leave_out_constants(embedding_net: nn.Module, x: Tensor) -> None:
-    """Make a net that was standardised by some observations blind to what they share.
+    """Make a net ignore the entries that are the same in all calibration pairs.
 
     sbi divides an entry that does not vary by 1e-7, so that the first observation in
     which it does overwhelms all other entries.
@@ -80,8 +80,8 @@ def warn_of_far_entries(name: str, x: Tensor, embedding_net: nn.Module) -> None:
         f"{len(columns)} of the {far.shape[1]} entries of `{name}` (first: "
         f"{columns[:5].tolist()}) are up to {float(far.max()):.1g} standard deviations "
         f"away from simulations, in {len(rows)} of {len(far)} rows (first: "
-        f"{rows[:5].tolist()}). NPE has seen nothing like it, and what is inferred "
-        "from these rows can be anything. Check the units. Leave out what does not "
+        f"{rows[:5].tolist()}). NPE was trained on nothing like it, and its answers "
+        "for these rows cannot be trusted. Check the units. Leave out what does not "
         "vary in simulations, or train NPE with z_score_x='structured', which has one "
         "standard deviation for all entries."
     )

@@ -16,7 +16,8 @@ MAX_FOR_MEDIAN = 2000
 LARGEST_EXPONENT = {torch.float64: 1e12, torch.float32: 1e5}
 # Above this the rounding of distances by a matrix product would show in the weights.
 LARGEST_BY_PRODUCT = 1e3
-# Times as far from the centre as half of the simulations: a row that is to blame.
+# A row is to blame if it is so many times as far from the centre as the median
+# simulation.
 EXTREME = 1e3
 
 
@@ -134,8 +135,8 @@ def _error(
     if not blamed:
         return CouplingError(f"{problem} {otherwise}")
     return CouplingError(
-        f"{problem} The reason are rows more than {EXTREME:.0f} times as far from the "
-        f"centre of the simulations as half of these are: {' and '.join(blamed)}. "
+        f"{problem} Some rows are more than {EXTREME:.0f} times as far from the centre "
+        f"of the simulations as a typical simulation: {' and '.join(blamed)}. "
         "Remove or repair them.",
         simulated_rows=rows["simulated"],
     )

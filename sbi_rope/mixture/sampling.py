@@ -15,8 +15,8 @@ __all__ = ["Accept", "BlockSampler"]
 # Rejection sampling gives an observation up if, after so many proposals, less than this
 # share of them lies inside the prior's support.
 MIN_PROPOSALS, MIN_ACCEPTANCE = 100_000, 1e-3
-# Of observations without a single accepted draw after so many proposals, all proposals
-# count together: a batch that leaks as a whole need not try for each.
+# Observations of which so many proposals were all rejected are counted together: where
+# a whole batch leaks, MIN_PROPOSALS for all of them are enough.
 MIN_WITHOUT_ANY = 5_000
 # Draws that take a flow about as long as a single one.
 SMALL_BATCH = 512
