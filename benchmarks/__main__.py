@@ -19,9 +19,10 @@ from pathlib import Path
 from benchmarks.cases import Sources
 from benchmarks.cells import Suite, list_suites, load_suite
 from benchmarks.report import write_report
-from benchmarks.runner import Workplace, run_cells
+from benchmarks.runner import run_cells
+from benchmarks.store import Workplace
 from benchmarks.summary import write_summary
-from benchmarks.tables import read_table, write_table
+from benchmarks.table import read_table, write_table
 from sbi_rope.errors import InvalidInputError, RoPEError
 
 DEFAULT_OUT = Path("results/benchmark")
@@ -135,14 +136,13 @@ def _run(args: argparse.Namespace) -> int:
     print(f"Written: {path}")
     unfinished = 0
     for cell in cells:
-        row = table.rows.get(cell)
-        if row is None:
+        status = table.status(cell)
+        if status == "not run":
             print(f"no result: {cell}")
-        elif row["status"] == "failed":
-            print(f"failed: {cell}: {row['error'].splitlines()[0][:150]}")
-        else:
-            continue
-        unfinished += 1
+        elif status == "failed":
+            error = table.rows["error"][cell].splitlines()[0]
+            print(f"failed: {cell}: {error[:150]}")
+        unfinished += status != "finished"
     return 1 if unfinished else 0
 
 

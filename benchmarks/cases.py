@@ -1,26 +1,27 @@
 """The data and the trained NPE that all methods of a table share."""
 
+import copy
 import hashlib
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import torch
+from sbi.inference.posteriors import DirectPosterior
 from torch import Tensor
 
 from benchmarks.cells import Cell
-from benchmarks.estimators import posterior_with, state_of
 from benchmarks.presets import PRESETS, Settings
 from benchmarks.store import Cache
 from sbi_rope.baselines import PlainNPE
 from sbi_rope.tasks import Task, get_task
 
-__all__ = ["Case", "CountingSimulator", "Sources"]
+__all__ = ["Case", "CountingSimulator", "Sources", "posterior_with", "state_of"]
 
 Pairs = tuple[Tensor, Tensor]
 
@@ -251,3 +252,44 @@ def digest(tensor: Tensor) -> str:
     """Return a checksum of a tensor's values."""
     values = tensor.detach().cpu().contiguous().numpy()
     return hashlib.sha256(values.tobytes()).hexdigest()
+
+
+# Trained estimators as tensors, so that reading them runs no code --------------------
+
+
+def state_of(posterior: Any) -> dict[str, Tensor]:
+    """Return the weights and buffers of the estimator in a posterior of NPE."""
+    state = posterior.posterior_estimator.state_dict()
+    return {name: values.detach().cpu().clone() for name, values in state.items()}
+
+
+def posterior_with(
+    state: Mapping[str, Tensor],
+    *,
+    prior: Any,
+    build: Callable[[Tensor, Tensor], Any],
+    simulations: tuple[Tensor, Tensor],
+    device: str = "cpu",
+) -> DirectPosterior:
+    """Build a posterior of NPE anew, and give it the weights of a trained one.
+
+    Args:
+        state: What :func:`state_of` returned.
+        prior: The prior.
+        build: What sbi's ``posterior_nn(...)`` returns.
+        simulations: Pairs of the shapes that it was trained on.
+        device: Where to put it.
+
+    Raises:
+        RuntimeError: If the weights are those of another estimator.
+    """
+    # Its first weights are random, and none of them is kept.
+    with torch.random.fork_rng():
+        # `build` may put its own embedding net into each estimator that it builds.
+        estimator = copy.deepcopy(build(*simulations))
+    estimator.load_state_dict(state)
+    estimator = estimator.to(device).eval()
+    prior = copy.deepcopy(prior)
+    if hasattr(prior, "to"):
+        prior.to(device)
+    return DirectPosterior(estimator, prior, device=device)

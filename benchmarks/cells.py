@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from benchmarks.methods import METHODS
 from sbi_rope.errors import InvalidInputError
 
 if sys.version_info >= (3, 11):
@@ -20,24 +21,6 @@ else:
 __all__ = ["FOLDER", "Cell", "Suite", "list_suites", "load_suite"]
 
 FOLDER = Path(__file__).parent / "suites"
-# Which part of a cell a method depends on; the others are left empty, so that no cell
-# is computed twice.
-NEEDS_CALIBRATION = (
-    "J-NPE",
-    "MLP",
-    "fine-tuned NPE",
-    "discrepancy",
-    "discrepancy (input)",
-    "discrepancy (tuned)",
-    "discrepancy, prior learned",
-    "discrepancy, fine-tuned",
-    "HVAE",
-    "tuning-only",
-    "RoPE",
-    "stack",
-    "stack of a batch",
-)
-NEEDS_COUPLING = ("OT-only", "RoPE")
 NEEDED = ("title", "question", "preset", "repetitions", "cells")
 AXES = ("n_calibration", "gamma", "tau")
 # Neither a folder nor, with a dot in front, a hidden file or the folder above.
@@ -240,20 +223,24 @@ def _cells_of(
             "method": method,
             "repetition": repetition,
         }
-        sizes = block["n_calibration"] if method in NEEDS_CALIBRATION else [0]
-        for n in sizes:
-            if method not in NEEDS_COUPLING:
-                yield Cell(**shared, n_calibration=n)
-                continue
-            for scale, gammas in block.get("gammas", {"simulated": [0.1]}).items():
-                for gamma, tau in itertools.product(gammas, block.get("taus", [1.0])):
-                    yield Cell(
-                        **shared,
-                        n_calibration=n,
-                        gamma=float(gamma),
-                        tau=float(tau),
-                        cost_scale=scale,
-                    )
+        # What a method does not depend on is left empty, so that no cell is computed
+        # twice.
+        entry = METHODS.get(method)
+        if entry is None:
+            raise InvalidInputError(
+                f"Expected methods of the benchmark in a suite; got {method!r}. There "
+                f"are {', '.join(METHODS)}."
+            )
+        sizes = block["n_calibration"] if entry.pairs else [0]
+        couplings: list[dict[str, Any]] = [{}]
+        if entry.couples:
+            couplings = [
+                {"cost_scale": scale, "gamma": float(gamma), "tau": float(tau)}
+                for scale, gammas in block.get("gammas", {"simulated": [0.1]}).items()
+                for gamma, tau in itertools.product(gammas, block.get("taus", [1.0]))
+            ]
+        for n, coupling in itertools.product(sizes, couplings):
+            yield Cell(**shared, n_calibration=n, **coupling)
 
 
 def _as_list(value: Any) -> list[Any]:

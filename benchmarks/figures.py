@@ -2,40 +2,23 @@
 
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 
 from benchmarks.cells import Cell, Suite
-from benchmarks.tables import Table, group_by, mean_and_spread
+from benchmarks.methods import METHODS
+from benchmarks.table import Table
 from sbi_rope import plots
 from sbi_rope._files import write_atomically
 
 __all__ = ["LPPAxis", "draw_all"]
 
-STYLES = {
-    "stack": ("black", "-", "*"),
-    "stack of a batch": ("black", "--", "*"),
-    "RoPE": ("#0072B2", "-", "o"),
-    "OT-only": ("#56B4E9", "--", "s"),
-    "tuning-only": ("#009E73", "--", "^"),
-    "fine-tuned NPE": ("#E69F00", "-", "D"),
-    "discrepancy": ("#882255", "-", "h"),
-    "discrepancy (input)": ("#882255", "--", "h"),
-    "discrepancy (tuned)": ("#882255", "-.", "h"),
-    "discrepancy, prior learned": ("#882255", ":", "h"),
-    "discrepancy, fine-tuned": ("#AA4499", "-", "p"),
-    "J-NPE": ("#CC79A7", "-.", "v"),
-    "MLP": ("0.35", ":", "x"),
-    "NPE": ("#D55E00", "--", None),
-    "NNPE": ("#8B4513", "-.", None),
-    "RNPE": ("#8B4513", ":", None),
-    "NPE-RS": ("#7F3C8D", ":", None),
-    "HVAE": ("#117733", "-.", "P"),
-}
+WHERE = ["task", "variant", "options"]
 # With the distances as they are, as in the paper.
 UNSCALED = {"RoPE": "#003050", "OT-only": "#2A6F97"}
 # Lines that differ in calibration pairs only.
@@ -44,9 +27,10 @@ MARKERS = {10: "o", 50: "s", 200: "^", 1000: "D"}
 MAX_TICKS = 6
 # More panels than this go to another row.
 MAX_COLUMNS = 9
-REFERENCES = {"prior": ("0.6", "prior"), "SBI": ("black", "SBI")}
 # Calibration pairs behind calibration curves and corner plots, where there is a choice.
 SHOWN_PAIRS = 50
+# Methods in corner plots.
+CORNERS = ("NPE", "RoPE", "fine-tuned NPE", "prior")
 
 
 class LPPAxis:
@@ -75,8 +59,8 @@ class LPPAxis:
 
 def draw_all(suite: Suite, table: Table, folder: Path) -> list[tuple[str, str]]:
     """Draw the figures of a suite; return their files and what they show."""
-    rows = {c: r for c, r in table.rows.items() if r["status"] == "finished"}
-    if not rows:
+    rows = table.finished
+    if not len(rows):
         return []
     drawn = []
     for name, what, figure in (
@@ -85,8 +69,8 @@ def draw_all(suite: Suite, table: Table, folder: Path) -> list[tuple[str, str]]:
             f"LPP and ACAUC against {suite.x_axis}",
             _curves(suite.x_axis, rows),
         ),
-        ("calibration.png", "Coverage of central intervals", _coverage(rows, table)),
-        *_corners(rows, table),
+        ("calibration.png", "Coverage of central intervals", _coverage(table)),
+        *_corners(table),
     ):
         if figure is None:
             continue
@@ -103,11 +87,11 @@ def _grid(count: int) -> tuple[int, int]:
     return rows, math.ceil(count / rows)
 
 
-def _curves(axis: str, rows: dict[Cell, dict[str, Any]]) -> Any:
+def _curves(axis: str, rows: pd.DataFrame) -> Any:
     from matplotlib.figure import Figure
 
-    panels = ("task",) if _is_option(axis) else ("task", "variant", "options")
-    groups = group_by(rows, *panels)
+    panels = ["task"] if _is_option(axis) else WHERE
+    groups = rows.groupby(panels, sort=False)
     bands, columns = _grid(len(groups))
     figure = Figure(figsize=(3.1 * columns + 1.9, 5.4 * bands), layout="constrained")
     axes = figure.subplots(2 * bands, columns, squeeze=False, sharex="col")
@@ -116,13 +100,11 @@ def _curves(axis: str, rows: dict[Cell, dict[str, Any]]) -> Any:
     for part in axes[:, len(groups) :].flat:
         part.set_axis_off()
     seen: dict[str, Any] = {}
-    for column, (where, cells) in enumerate(groups.items()):
-        title = "\n".join(str(part) for part in where if part not in ("", "{}"))
-        if any(rows[cell]["stand_in"] for cell in cells):
-            title += "\n(stand-in)"
+    for column, (where, group) in enumerate(groups):
+        title = _title(where) + ("\n(stand-in)" if group["stand_in"].any() else "")
         axes[0, column].set_title(title, size="medium")
-        _panel(axes[0, column], axis, cells, rows, "lpp_z", seen)
-        _panel(axes[1, column], axis, cells, rows, "acauc", seen)
+        _panel(axes[0, column], axis, group, "lpp_z", seen)
+        _panel(axes[1, column], axis, group, "acauc", seen)
         axes[1, column].axhline(0, color="0.6", lw=0.8)
         axes[1, column].set_xlabel(axis.replace("_", " "))
         for part in axes[:, column]:
@@ -134,47 +116,36 @@ def _curves(axis: str, rows: dict[Cell, dict[str, Any]]) -> Any:
 
 
 def _panel(
-    axes: Any,
-    axis: str,
-    cells: list[Cell],
-    rows: dict[Cell, dict[str, Any]],
-    score: str,
-    seen: dict[str, Any],
+    axes: Any, axis: str, rows: pd.DataFrame, score: str, seen: dict[str, Any]
 ) -> None:
-    lines = _lines(axis, cells)
-    values = [rows[c][score] for c in cells if math.isfinite(rows[c][score])]
-    positions = sorted({_position(axis, c) for c in cells} - {None})
-    if not values or not positions:
+    rows = rows.assign(position=[_position(axis, cell) for cell in rows.index])
+    positions = sorted(rows["position"].dropna().unique())
+    values = rows[score][np.isfinite(rows[score])]
+    if not len(values) or not positions:
         return
     if score == "lpp_z":
-        prior = _mean_of("prior", cells, rows, default=min(values))
-        top = _mean_of("SBI", cells, rows, default=prior)
-        scale = LPPAxis(prior, max(top, max(values)))
-        axes.set_yscale("function", functions=(scale.forward, scale.inverse))
-        bottom = scale.inverse(scale.forward(min(values)) - 0.1)
-        axes.set_ylim(bottom, scale.inverse(scale.forward(max(values)) + 0.1))
-        _set_ticks(axes, scale, min(values), max(values))
-    for label, group in lines.items():
-        colour, line, marker = _style(group[0])
-        if axis != "n_calibration" and group[0].n_calibration:
-            marker = MARKERS.get(group[0].n_calibration, marker)
-        points = _points(axis, group, rows, score)
-        if not points:
-            mean, _ = mean_and_spread([rows[c][score] for c in group])
-            if not math.isfinite(mean):
-                (handle,) = axes.plot(
-                    positions, [axes.get_ylim()[0]] * len(positions), "v", color=colour
-                )
-                seen.setdefault(label, handle)
-                continue
-            handle = axes.axhline(mean, color=colour, ls=line, lw=1.3)
-        else:
-            x, y, spread = zip(*points, strict=True)
+        _set_scale(axes, rows, values)
+    bottom = axes.get_ylim()[0]
+    for label, line in rows.groupby(_lines(axis, rows), sort=False):
+        cell = line.index[0]
+        colour, style, marker = _style(cell)
+        if axis != "n_calibration" and cell.n_calibration:
+            marker = MARKERS.get(cell.n_calibration, marker)
+        points = line.groupby("position")[score].agg(["mean", "std"]).fillna(0.0)
+        mean = line[score].mean()
+        if len(points):
+            x, y = points.index, points["mean"]
+            # One -inf makes a mean -inf, and is shown at the lower edge.
+            lost = np.isinf(y)
             handle = axes.errorbar(
-                x, y, spread, color=colour, ls=line, marker=marker, ms=4, lw=1.6
+                x, y, points["std"], color=colour, ls=style, marker=marker, ms=4, lw=1.6
             )
-            lost = [p for p, v in zip(x, y, strict=True) if not math.isfinite(v)]
-            axes.plot(lost, [axes.get_ylim()[0]] * len(lost), "v", color=colour)
+            axes.plot(x[lost], np.full(lost.sum(), bottom), "v", color=colour)
+        elif np.isfinite(mean):
+            handle = axes.axhline(mean, color=colour, ls=style, lw=1.3)
+        else:
+            edge = [bottom] * len(positions)
+            (handle,) = axes.plot(positions, edge, "v", color=colour)
         seen.setdefault(label, handle)
     if positions[0] > 0 and positions[-1] / positions[0] >= 8:
         axes.set_xscale("log")
@@ -183,12 +154,20 @@ def _panel(
     axes.minorticks_off()
 
 
-def _mean_of(
-    method: str, cells: list[Cell], rows: dict[Cell, dict[str, Any]], default: float
-) -> float:
-    values = [rows[c]["lpp_z"] for c in cells if c.method == method]
-    values = [value for value in values if math.isfinite(value)]
-    return sum(values) / len(values) if values else default
+def _set_scale(axes: Any, rows: pd.DataFrame, values: pd.Series) -> None:
+    """Give an axis of LPPs the paper's scale, from the prior and the line "SBI"."""
+
+    def mean_of(method: str, default: float) -> float:
+        known = values[rows["method"][values.index] == method]
+        return known.mean() if len(known) else default
+
+    low, high = values.min(), values.max()
+    prior = mean_of("prior", low)
+    scale = LPPAxis(prior, max(mean_of("SBI", prior), high))
+    axes.set_yscale("function", functions=(scale.forward, scale.inverse))
+    bottom = scale.inverse(scale.forward(low) - 0.1)
+    axes.set_ylim(bottom, scale.inverse(scale.forward(high) + 0.1))
+    _set_ticks(axes, scale, low, high)
 
 
 def _set_ticks(axes: Any, scale: LPPAxis, low: float, high: float) -> None:
@@ -209,49 +188,37 @@ def _round_down(value: float) -> float:
     return max(m for m in (1, 2, 5) if m * power <= value * (1 + 1e-9)) * power
 
 
-def _lines(axis: str, cells: list[Cell]) -> dict[str, list[Cell]]:
-    """Group cells into lines: all that is not on the axis tells them apart."""
-    lines: dict[str, list[Cell]] = {}
-    several = {
-        name: len({getattr(c, name) for c in cells if c.method == "RoPE"}) > 1
-        for name in ("gamma", "tau", "cost_scale", "n_calibration")
-    }
-    for cell in cells:
+def _lines(axis: str, rows: pd.DataFrame) -> list[str]:
+    """Name the line of each row: all that is not on the axis tells lines apart."""
+    rope = rows[rows["method"] == "RoPE"]
+    several = [
+        name
+        for name in ("gamma", "tau", "n_calibration")
+        if name != axis and rope[name].nunique() > 1
+    ]
+    labels = []
+    for cell in rows.index:
         label = cell.method
-        for name in ("gamma", "tau", "n_calibration"):
-            value = getattr(cell, name)
-            if several[name] and name != axis and value:
+        for name in several:
+            if value := getattr(cell, name):
                 label += f", {name.replace('n_calibration', 'n_c')} {value:g}"
-        if several["cost_scale"] and cell.cost_scale == "none":
+        if cell.cost_scale == "none" and rope["cost_scale"].nunique() > 1:
             label += ", unscaled"
-        lines.setdefault(label, []).append(cell)
-    return lines
+        labels.append(label)
+    return labels
+
+
+def _title(where: tuple[str, ...]) -> str:
+    return "\n".join(part for part in where if part not in ("", "{}"))
 
 
 def _style(cell: Cell) -> tuple[str, str, str | None]:
-    if cell.method in REFERENCES:
-        return REFERENCES[cell.method][0], "-", None
-    colour, line, marker = STYLES[cell.method]
+    colour, line, marker = METHODS[cell.method].style
     if cell.cost_scale == "none":
         colour = UNSCALED[cell.method]
     if cell.tau is not None and cell.tau < 1:
         line = ":"
     return colour, line, marker
-
-
-def _points(
-    axis: str, cells: list[Cell], rows: dict[Cell, dict[str, Any]], score: str
-) -> list[tuple[float, float, float]]:
-    values: dict[float, list[float]] = {}
-    for cell in cells:
-        position = _position(axis, cell)
-        if position is not None:
-            values.setdefault(position, []).append(rows[cell][score])
-    points = []
-    for position in sorted(values):
-        mean, spread = mean_and_spread(values[position])
-        points.append((position, mean, 0.0 if math.isnan(spread) else spread))
-    return points
 
 
 def _position(axis: str, cell: Cell) -> float | None:
@@ -269,17 +236,16 @@ def _is_option(axis: str) -> bool:
 # Calibration curves and corner plots ------------------------------------------------
 
 
-def _shown(rows: Iterable[Cell]) -> dict[tuple[Any, ...], dict[str, Cell]]:
+def _shown(table: Table, array: str) -> dict[tuple[str, ...], dict[str, Cell]]:
     """By task: a cell of each method, all with about as many calibration pairs."""
-    shown: dict[tuple[Any, ...], dict[str, Cell]] = {}
-    for where, cells in group_by(rows, "task", "variant", "options").items():
-        chosen: dict[str, Cell] = {}
-        for cell in cells:
-            best = chosen.get(cell.method)
-            if best is None or _distance(cell) < _distance(best):
-                chosen[cell.method] = cell
-        shown[where] = chosen
-    return shown
+    shown: dict[tuple[str, ...], dict[str, Cell]] = {}
+    for where, rows in table.finished.groupby(WHERE, sort=False):
+        nearest = {
+            name: min(part.index, key=_distance)
+            for name, part in rows.groupby("method", sort=False)
+        }
+        shown[where] = {n: c for n, c in nearest.items() if array in table.arrays[c]}
+    return {where: cells for where, cells in shown.items() if cells}
 
 
 def _distance(cell: Cell) -> tuple[Any, ...]:
@@ -287,14 +253,10 @@ def _distance(cell: Cell) -> tuple[Any, ...]:
     return pairs, cell.cost_scale != "simulated", -(cell.tau or 0), cell.repetition
 
 
-def _coverage(rows: dict[Cell, dict[str, Any]], table: Table) -> Any:
+def _coverage(table: Table) -> Any:
     from matplotlib.figure import Figure
 
-    shown = {
-        where: {n: c for n, c in cells.items() if "coverage" in table.arrays[c]}
-        for where, cells in _shown(rows).items()
-    }
-    shown = {where: cells for where, cells in shown.items() if cells}
+    shown = _shown(table, "coverage")
     if not shown:
         return None
     bands, columns = _grid(len(shown))
@@ -312,8 +274,7 @@ def _coverage(rows: dict[Cell, dict[str, Any]], table: Table) -> Any:
             curve = table.arrays[cell]["coverage"]
             (handle,) = part.plot(levels, curve, color=colour, ls=line, lw=1.4)
             seen.setdefault(name, handle)
-        title = "\n".join(str(w) for w in where if w not in ("", "{}"))
-        part.set(xlim=(0, 1), ylim=(0, 1), box_aspect=1, title=title)
+        part.set(xlim=(0, 1), ylim=(0, 1), box_aspect=1, title=_title(where))
         part.set_xlabel("credible level")
         part.spines[["top", "right"]].set_visible(False)
     axes[0].set_ylabel("share of true parameters inside")
@@ -321,24 +282,17 @@ def _coverage(rows: dict[Cell, dict[str, Any]], table: Table) -> Any:
     return figure
 
 
-def _corners(
-    rows: dict[Cell, dict[str, Any]], table: Table
-) -> Iterable[tuple[str, str, Any]]:
-    for where, cells in _shown(rows).items():
-        arrays = {
-            name: table.arrays[cell]
-            for name, cell in cells.items()
-            if name in ("NPE", "RoPE", "fine-tuned NPE", "prior")
-            and "samples" in table.arrays[cell]
-        }
+def _corners(table: Table) -> Iterator[tuple[str, str, Any]]:
+    for where, cells in _shown(table, "samples").items():
+        arrays = {name: table.arrays[c] for name, c in cells.items() if name in CORNERS}
         if "RoPE" not in arrays:
             continue
         samples = {n: torch.from_numpy(a["samples"]) for n, a in arrays.items()}
         prior = samples.pop("prior", None)
         theta = torch.from_numpy(arrays["RoPE"]["theta"])
-        name = "-".join(str(w) for w in where if w not in ("", "{}"))
+        name = _title(where).replace("\n", "-")
         name = "".join(c if c.isalnum() or c in "-_." else "_" for c in name)
-        scores = rows[cells["RoPE"]]["acauc_per_parameter"].split("; ")
+        scores = table.rows["acauc_per_parameter"][cells["RoPE"]].split("; ")
         figure = plots.pair_plot(
             samples,
             theta,

@@ -1,20 +1,20 @@
-"""The methods of the benchmark, and how each is constructed on a case."""
+"""The methods of the benchmark: one entry each, and how it is constructed on a case."""
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from benchmarks.cases import Case
 from sbi_rope._training import History
 from sbi_rope.baselines import (
     HVAE,
     NNPE,
     NPERS,
     RNPE,
+    BuildsOnNPE,
     CalibrationMLP,
     FinetunedNPE,
     JointNPE,
@@ -23,11 +23,17 @@ from sbi_rope.baselines import (
     PriorBaseline,
     ReferenceNPE,
     TuningOnly,
+    UsesCalibration,
+    UsesObservations,
+    UsesSimulations,
 )
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.discrepancy.correction import Space
 
-__all__ = ["COUPLED_STACK", "EXTRAS", "METHODS", "ONLY_FOR", "ORDER", "STACK"]
+if TYPE_CHECKING:
+    from benchmarks.cases import Case
+
+__all__ = ["COUPLED_STACK", "METHODS", "STACK", "Entry", "append_data", "methods_where"]
 
 # Tasks whose observations are statistics: NNPE's noise is on them, not on h(x).
 STATISTICS = ("cs", "sir", "linear_gaussian")
@@ -35,20 +41,64 @@ STATISTICS = ("cs", "sir", "linear_gaussian")
 MAX_STATISTICS = 10
 # With more entries than these, x itself is no list of summaries to be corrected.
 MAX_SUMMARIES = 20
-# Methods for some tasks only: one takes a differentiable simulator, one short x.
-ONLY_FOR = {
-    "HVAE": ("pendulum", "light_tunnel"),
-    "discrepancy (input)": ("cs", "light_tunnel_sensors", "linear_gaussian", "sir"),
-}
-# Channels of its first layer: an eighth of the paper's, for CPUs.
+# Channels of HVAE's first layer: an eighth of the paper's, for CPUs.
 HVAE_WIDTH = 8
 # Networks that a fine-tuned discrepancy averages over.
 NUM_HOLDOUTS = 5
-# Run where they are asked for by name: they take longer than all others together.
-EXTRAS = ("RNPE", "HVAE")
+# Of any observation, and of the test set as a batch, with couplings.
+STACK, COUPLED_STACK = "stack", "stack of a batch"
 
 
-def _physics(case: Case) -> Callable[[Tensor], Tensor]:
+@dataclass(frozen=True, kw_only=True)
+class Entry:
+    """What the benchmark knows of a method.
+
+    Attributes:
+        build: Constructs it on a case; None for what `scoring.py` makes itself.
+        style: Colour, line and marker in figures.
+        pairs: Whether it sees calibration pairs.
+        couples: Whether it has gamma and tau.
+        tasks: The only tasks that it can be run on; None for all.
+        extra: Whether it is run only where it is asked for by name.
+    """
+
+    style: tuple[str, str, str | None]
+    build: "Callable[[Case], Method] | None" = None
+    pairs: bool = False
+    couples: bool = False
+    tasks: tuple[str, ...] | None = None
+    extra: bool = False
+
+
+def methods_where(holds: Callable[[Entry], object]) -> tuple[str, ...]:
+    """Return the names of methods with a property, in the order of tables."""
+    return tuple(name for name, entry in METHODS.items() if holds(entry))
+
+
+def append_data(method: Method, name: str, case: "Case") -> tuple[int, bool]:
+    """Give a method all data that it can see.
+
+    Returns:
+        The number of simulations of NPE behind it, and whether it starts from the NPE
+        that methods share.
+    """
+    if isinstance(method, UsesSimulations) and method.needs_simulations:
+        # Without a simulator, tuning-only looks targets up among stored simulations.
+        stored = name == "tuning-only"
+        method.append_simulations(*(case.stored if stored else case.simulations))
+    if isinstance(method, UsesCalibration):
+        method.append_calibration(*case.calibration)
+    if isinstance(method, UsesObservations):
+        method.append_observations(case.test_set[1])
+    simulated = isinstance(method, UsesSimulations)
+    count = len(case.simulations[0]) if simulated else 0
+    return count, isinstance(method, BuildsOnNPE)
+
+
+# How methods are constructed ----------------------------------------------------------
+
+
+def _physics(case: "Case") -> Callable[[Tensor], Tensor]:
     """Return the simulator without noise and nuisances, differentiable in theta."""
     simulator: Any = case.task.get_simulator()
     if case.task.name == "light_tunnel":
@@ -61,15 +111,15 @@ def _physics(case: Case) -> Callable[[Tensor], Tensor]:
     return at_rest
 
 
-def _noise_on(case: Case) -> Any:
+def _noise_on(case: "Case") -> Any:
     return "input" if case.task.name in STATISTICS else "embedding"
 
 
-def _is_short(case: Case, most: int = MAX_STATISTICS) -> bool:
-    return math.prod(case.task.x_shape) <= most
+def _short_space(case: "Case", most: int) -> Space:
+    return "input" if math.prod(case.task.x_shape) <= most else "embedding"
 
 
-def _from_scratch(case: Case) -> tuple[Any, Any]:
+def _from_scratch(case: "Case") -> tuple[Any, Any]:
     return case.task.get_prior(), case.builder
 
 
@@ -89,63 +139,114 @@ def _discrepancy(
     *,
     kind: type[DiscrepancyNPE] = DiscrepancyNPE,
     learn_prior: bool = False,
-) -> Callable[[Case], Method]:
+) -> "Callable[[Case], Method]":
     """Return how a variant is constructed; it corrects x where it is short if None."""
-
-    def construct(case: Case) -> Method:
-        short: Space = "input" if _is_short(case, MAX_SUMMARIES) else "embedding"
-        # Where there is no simulator, `scores` appends simulations.
-        return kind.from_posterior(
-            case.npe,
-            simulator=case.simulator,
-            space=short if space is None else space,
-            learn_prior=learn_prior,
-            num_simulations=case.settings.num_simulations,
-        )
-
-    return construct
+    # Where there is no simulator, simulations are appended.
+    return lambda case: kind.from_posterior(
+        case.npe,
+        simulator=case.simulator,
+        space=space or _short_space(case, MAX_SUMMARIES),
+        learn_prior=learn_prior,
+        num_simulations=case.settings.num_simulations,
+    )
 
 
-# How each method without a coupling is constructed; `scores` appends the data.
-METHODS: dict[str, Callable[[Case], Method]] = {
-    "prior": lambda case: PriorBaseline(case.task.get_prior(), device=case.device),
-    "SBI": lambda case: ReferenceNPE.from_posterior(case.npe),
-    "NPE": lambda case: PlainNPE.from_posterior(case.npe),
-    "NNPE": lambda case: NNPE.from_posterior(
-        case.npe, training=case.settings.training, noise_on=_noise_on(case)
+# All methods, in the order of tables. A new one is a line here.
+METHODS: dict[str, Entry] = {
+    "prior": Entry(
+        style=("0.6", "-", None),
+        build=lambda case: PriorBaseline(case.task.get_prior(), device=case.device),
     ),
-    # Its chains do not mix on embeddings wider than what they are made from.
-    "RNPE": lambda case: RNPE.from_posterior(
-        case.npe, noise_on="input" if _is_short(case) else "embedding"
+    "SBI": Entry(
+        style=("black", "-", None),
+        build=lambda case: ReferenceNPE.from_posterior(case.npe),
     ),
-    "NPE-RS": lambda case: NPERS(
-        *_from_scratch(case), training=case.settings.training, device=case.device
+    "NPE": Entry(
+        style=("#D55E00", "--", None),
+        build=lambda case: PlainNPE.from_posterior(case.npe),
     ),
-    "J-NPE": lambda case: JointNPE(
-        *_from_scratch(case),
-        training=replace(case.settings.training, validation_fraction=0.2),
-        device=case.device,
+    "NNPE": Entry(
+        style=("#8B4513", "-.", None),
+        build=lambda case: NNPE.from_posterior(
+            case.npe, training=case.settings.training, noise_on=_noise_on(case)
+        ),
     ),
-    "MLP": lambda case: CalibrationMLP(*_from_scratch(case), device=case.device),
-    "fine-tuned NPE": lambda case: FinetunedNPE.from_posterior(case.npe),
-    "discrepancy": _discrepancy("embedding"),
-    "discrepancy (input)": _discrepancy("input"),
-    "discrepancy (tuned)": _discrepancy("tuned"),
-    "discrepancy, prior learned": _discrepancy("embedding", learn_prior=True),
-    "discrepancy, fine-tuned": _discrepancy(kind=_ThenFinetuned),
-    "HVAE": lambda case: HVAE.from_posterior(
-        case.npe, physics=_physics(case), width=HVAE_WIDTH
+    # It takes longer than all others together. Its chains do not mix on embeddings
+    # wider than what they are made from.
+    "RNPE": Entry(
+        style=("#8B4513", ":", None),
+        extra=True,
+        build=lambda case: RNPE.from_posterior(
+            case.npe, noise_on=_short_space(case, MAX_STATISTICS)
+        ),
     ),
-    "tuning-only": lambda case: TuningOnly.from_posterior(
-        case.npe, simulator=case.simulator, finetuner=case.settings.finetuner
+    "NPE-RS": Entry(
+        style=("#7F3C8D", ":", None),
+        build=lambda case: NPERS(
+            *_from_scratch(case), training=case.settings.training, device=case.device
+        ),
     ),
+    "J-NPE": Entry(
+        style=("#CC79A7", "-.", "v"),
+        pairs=True,
+        build=lambda case: JointNPE(
+            *_from_scratch(case),
+            training=replace(case.settings.training, validation_fraction=0.2),
+            device=case.device,
+        ),
+    ),
+    "MLP": Entry(
+        style=("0.35", ":", "x"),
+        pairs=True,
+        build=lambda case: CalibrationMLP(*_from_scratch(case), device=case.device),
+    ),
+    "fine-tuned NPE": Entry(
+        style=("#E69F00", "-", "D"),
+        pairs=True,
+        build=lambda case: FinetunedNPE.from_posterior(case.npe),
+    ),
+    "discrepancy": Entry(
+        style=("#882255", "-", "h"), pairs=True, build=_discrepancy("embedding")
+    ),
+    # It corrects x itself, which has to be short.
+    "discrepancy (input)": Entry(
+        style=("#882255", "--", "h"),
+        pairs=True,
+        tasks=("cs", "light_tunnel_sensors", "linear_gaussian", "sir"),
+        build=_discrepancy("input"),
+    ),
+    "discrepancy (tuned)": Entry(
+        style=("#882255", "-.", "h"), pairs=True, build=_discrepancy("tuned")
+    ),
+    "discrepancy, prior learned": Entry(
+        style=("#882255", ":", "h"),
+        pairs=True,
+        build=_discrepancy("embedding", learn_prior=True),
+    ),
+    "discrepancy, fine-tuned": Entry(
+        style=("#AA4499", "-", "p"),
+        pairs=True,
+        build=_discrepancy(kind=_ThenFinetuned),
+    ),
+    # It takes a differentiable simulator.
+    "HVAE": Entry(
+        style=("#117733", "-.", "P"),
+        pairs=True,
+        tasks=("pendulum", "light_tunnel"),
+        extra=True,
+        build=lambda case: HVAE.from_posterior(
+            case.npe, physics=_physics(case), width=HVAE_WIDTH
+        ),
+    ),
+    "tuning-only": Entry(
+        style=("#009E73", "--", "^"),
+        pairs=True,
+        build=lambda case: TuningOnly.from_posterior(
+            case.npe, simulator=case.simulator, finetuner=case.settings.finetuner
+        ),
+    ),
+    "OT-only": Entry(style=("#56B4E9", "--", "s"), couples=True),
+    "RoPE": Entry(style=("#0072B2", "-", "o"), pairs=True, couples=True),
+    STACK: Entry(style=("black", "-", "*"), pairs=True),
+    COUPLED_STACK: Entry(style=("black", "--", "*"), pairs=True),
 }
-
-# Of any observation, and of the test set as a batch, with couplings.
-STACK, COUPLED_STACK = "stack", "stack of a batch"
-# All names, in the order of tables.
-ORDER = ("prior", "SBI", "NPE", "NNPE", "RNPE", "NPE-RS", "J-NPE", "MLP")
-ORDER += ("fine-tuned NPE", "discrepancy", "discrepancy (input)")
-ORDER += ("discrepancy (tuned)", "discrepancy, prior learned")
-ORDER += ("discrepancy, fine-tuned", "HVAE", "tuning-only", "OT-only", "RoPE")
-ORDER += (STACK, COUPLED_STACK)

@@ -1,14 +1,15 @@
 """Committed tables, in the words that the summary speaks of them."""
 
-import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from benchmarks.cells import Suite, list_suites, load_suite
-from benchmarks.tables import Table, group_by, mean_and_spread, read_table
+import pandas as pd
+
+from benchmarks.cells import Cell, Suite, list_suites, load_suite
+from benchmarks.table import Table, markdown, number_text, read_table
 
 __all__ = [
     "FIXED",
@@ -18,21 +19,18 @@ __all__ = [
     "SIZE",
     "TASKS",
     "Published",
-    "Row",
     "Setting",
     "acauc_text",
     "both_texts",
     "entry",
-    "finished",
     "gap",
     "lpp_text",
     "mean",
-    "name_of",
-    "number_text",
+    "runs_of",
     "table",
 ]
 
-Row = dict[str, Any]
+table = partial(markdown, rule=" --- ")
 
 SIZE = 50
 MISSING = "-"
@@ -85,20 +83,21 @@ class Published:
         )
 
     @cached_property
-    def rows(self) -> dict[str, list[Row]]:
+    def rows(self) -> dict[str, pd.DataFrame]:
         """Rows by suite, of the repetitions in which a task is complete.
 
         Of all repetitions where none is: a mean over more of them for one method than
         for the next would compare data, not methods.
         """
-        rows: dict[str, list[Row]] = {name: [] for name in self.suites}
-        for name, table in self.tables.items():
-            cells = self.suites[name].cells
-            for group in group_by(cells, "task", "variant").values():
-                runs = list(group_by(group, "repetition").values())
-                whole = [run for run in runs if all(cell in table.rows for cell in run)]
-                kept = [cell for run in whole or runs for cell in run]
-                rows[name] += [table.rows[c] for c in kept if c in table.rows]
+        rows = {}
+        for name, suite in self.suites.items():
+            known = self.tables.get(name, Table.of({}, {})).rows
+            there = set(known.index)
+            kept: list[Cell] = []
+            for runs in runs_of(suite).values():
+                whole = [run for run in runs if there.issuperset(run)]
+                kept += [cell for run in whole or runs for cell in run if cell in there]
+            rows[name] = known.loc[kept].infer_objects()
         return rows
 
     def select(
@@ -109,18 +108,15 @@ class Published:
         size: int = SIZE,
         setting: Setting = FIXED,
         **fields: str,
-    ) -> list[Row]:
+    ) -> pd.DataFrame:
         """Return the rows of a method, one a repetition."""
-        return [
-            row
-            for row in self.rows[suite]
-            if row["method"] == method
-            and row["n_calibration"] in (0, size)
-            and row["gamma"] in (None, setting.gamma)
-            and row["tau"] in (None, setting.tau)
-            and row["cost_scale"] in ("", setting.cost_scale)
-            and all(row[name] == value for name, value in fields.items())
-        ]
+        rows = self.rows[suite]
+        rows = rows[(rows["method"] == method) & rows["n_calibration"].isin([0, size])]
+        coupled = (rows[[*setting._fields]] == setting).all(axis=1)
+        chosen = rows["gamma"].isna() | coupled
+        for name, value in fields.items():
+            chosen &= rows[name] == value
+        return rows[chosen]
 
     def above(self, method: str, other: str, **chosen: Any) -> float | None:
         """Return how far the LPP of a method is above that of another."""
@@ -131,77 +127,70 @@ class Published:
         cells = self.suites[suite].cells
         return sorted({c.n_calibration for c in cells if c.task == task} - {0})
 
-    def name(self, task: str, *, suite: str = "main") -> str:
+    def letter(self, task: str, *, suite: str = "main") -> str:
         """Return a task's letter, marked if a model stands in for recorded data."""
-        stands_in = any(r["stand_in"] for r in self.rows[suite] if r["task"] == task)
+        rows = self.rows[suite]
+        stands_in = (rows["stand_in"] == True)[rows["task"] == task].any()  # noqa: E712
         return LETTERS[task] + (" (stand-in)" if stands_in else "")
 
+    def name(self, task: str, *, suite: str = "main") -> str:
+        """Name a task with its letter, marked if a model stands in for it."""
+        return self.letter(task, suite=suite).replace(
+            LETTERS[task], f"{LETTERS[task]} {task}", 1
+        )
 
-def finished(rows: Iterable[Row]) -> list[Row]:
-    """Return the rows that have scores."""
-    return [row for row in rows if row["status"] == "finished"]
+
+def runs_of(suite: Suite) -> dict[tuple[str, str], list[list[Cell]]]:
+    """Return the cells of each repetition, by task and variant."""
+    runs: dict[tuple[str, str], dict[int, list[Cell]]] = {}
+    for cell in suite.cells:
+        where = runs.setdefault((cell.task, cell.variant), {})
+        where.setdefault(cell.repetition, []).append(cell)
+    return {where: [*parts.values()] for where, parts in runs.items()}
 
 
-def mean(rows: Iterable[Row], column: str = "lpp_z") -> float | None:
+def _finished(rows: pd.DataFrame) -> pd.DataFrame:
+    return rows[rows["status"] == "finished"]
+
+
+def mean(rows: pd.DataFrame, column: str = "lpp_z") -> float | None:
     """Return the mean over repetitions; None of no rows."""
-    values = [row[column] for row in finished(rows)]
-    return sum(values) / len(values) if values else None
+    values = _finished(rows)[column]
+    return float(values.mean()) if len(values) else None
 
 
-def gap(ours: Iterable[Row], theirs: Iterable[Row]) -> float | None:
+def gap(ours: pd.DataFrame, theirs: pd.DataFrame) -> float | None:
     """Return the mean difference in LPP over the repetitions that both have."""
-    other = {row["repetition"]: row["lpp_z"] for row in finished(theirs)}
-    pairs = [
-        (row["lpp_z"], other[row["repetition"]])
-        for row in finished(ours)
-        if row["repetition"] in other
-    ]
+    scores = (_finished(rows)[["repetition", "lpp_z"]] for rows in (ours, theirs))
+    pairs = pd.merge(*scores, on="repetition", suffixes=("", "_other"))
     # Two that are -inf do not differ.
-    differences = [0.0 if a == b == -math.inf else a - b for a, b in pairs]
-    return sum(differences) / len(pairs) if pairs else None
+    differences = (pairs["lpp_z"] - pairs["lpp_z_other"]).fillna(0.0)
+    return float(differences.mean()) if len(pairs) else None
 
 
 # Texts ------------------------------------------------------------------------------
 
 
-def table(head: Sequence[str], lines: Iterable[Sequence[str]]) -> list[str]:
-    """Return a table in Markdown."""
-    return [f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *lines)]
-
-
-def name_of(published: Published, task: str, *, suite: str = "main") -> str:
-    """Name a task with its letter, marked if a model stands in for it."""
-    letter, *mark = published.name(task, suite=suite).split(" ", 1)
-    return " ".join([letter, task, *mark])
-
-
-def entry(rows: Sequence[Row], text: Callable[[Sequence[Row]], str]) -> str:
+def entry(rows: pd.DataFrame, text: Callable[[pd.DataFrame], str]) -> str:
     """Return scores as text, with what failed."""
-    scored = finished(rows)
-    if not scored:
-        return "failed" if rows else MISSING
+    scored = _finished(rows)
+    if not len(scored):
+        return "failed" if len(rows) else MISSING
     failed = len(rows) - len(scored)
     return text(scored) + (f" ({failed} of {len(rows)} failed)" if failed else "")
 
 
-def lpp_text(rows: Sequence[Row]) -> str:
+def lpp_text(rows: pd.DataFrame) -> str:
     """Return the LPP over repetitions, and whether a coupling has not converged."""
-    text = number_text([row["lpp_z"] for row in rows], ".2f")
-    return text + ("" if all(r["converged"] for r in rows) else " (not converged)")
+    text = number_text(rows["lpp_z"], ".2f")
+    return text + ("" if rows["converged"].all() else " (not converged)")
 
 
-def acauc_text(rows: Sequence[Row]) -> str:
+def acauc_text(rows: pd.DataFrame) -> str:
     """Return the ACAUC over repetitions."""
-    return number_text([row["acauc"] for row in rows], "+.3f")
+    return number_text(rows["acauc"], "+.3f")
 
 
-def number_text(values: list[float], form: str) -> str:
-    """Return a mean with its spread, if there is one."""
-    value, spread = mean_and_spread(values)
-    text = f"{value:{form}}"
-    return text if math.isnan(spread) else f"{text} ± {spread:{form.lstrip('+')}}"
-
-
-def both_texts(rows: Sequence[Row]) -> str:
+def both_texts(rows: pd.DataFrame) -> str:
     """Return the mean LPP with the mean ACAUC in brackets."""
     return f"{mean(rows):.2f} ({mean(rows, 'acauc'):+.2f})"

@@ -1,22 +1,25 @@
 """A suite's tables in Markdown and its figures, from the committed results alone."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import pandas as pd
 from scipy.stats import wilcoxon
 
 from benchmarks import figures
 from benchmarks.cells import Cell, Suite
-from benchmarks.methods import ORDER
-from benchmarks.stacking import stacking_lines
-from benchmarks.tables import Table, group_by, mean_and_spread
+from benchmarks.methods import METHODS
+from benchmarks.stacks import stacking_lines
+from benchmarks.table import Table, markdown, number_text
 from sbi_rope._files import write_atomically
 
-__all__ = ["label_of", "write_report"]
+__all__ = ["write_report"]
 
+# Cells with the same of these are of one section.
+WHERE = ["task", "variant", "options"]
+SETTING = ["cost_scale", "gamma", "tau"]
 # Lines to compare with, not methods that compete.
 REFERENCES = ("SBI",)
 SIGNIFICANT = 0.05
@@ -46,20 +49,19 @@ def write_report(suite: Suite, table: Table, folder: Path) -> Path:
 
     The same table gives the same bytes.
     """
-    finished = {
-        cell: row for cell, row in table.rows.items() if row["status"] == "finished"
-    }
+    finished = table.finished
+    cells = pd.DataFrame([vars(cell) for cell in suite.cells])
     lines = [f"# {suite.title}", "", suite.question, "", EXPLANATION]
-    lines += [f"Settings: `{preset}`." for (preset,) in group_by(suite.cells, "preset")]
-    for where, cells in group_by(suite.cells, "task", "variant", "options").items():
-        rows = {cell: finished[cell] for cell in cells if cell in finished}
-        lines += ["", f"## {_title(where, rows.values())}", ""]
-        lines += _section(rows, table) if rows else ["Not run."]
+    lines += [f"Settings: `{preset}`." for preset in cells["preset"].unique()]
+    for where in cells[WHERE].drop_duplicates().itertuples(index=False, name=None):
+        rows = finished[(finished[WHERE] == where).all(axis=1)]
+        lines += ["", f"## {_title(where, rows)}", ""]
+        lines += _section(rows, table) if len(rows) else ["Not run."]
     for name, what in figures.draw_all(suite, table, folder):
         lines += ["", f"![{what}]({name})"]
     if stacked := stacking_lines(table):
         lines += ["", *stacked]
-    if any(cell.method == "RoPE" for cell in suite.cells):
+    if "RoPE" in set(cells["method"]):
         lines += ["", "## Where RoPE loses", "", *_losses(finished, table)]
     lines += ["", "## What was not run", "", *_missing(suite, table)]
     path = folder / "report.md"
@@ -68,118 +70,83 @@ def write_report(suite: Suite, table: Table, folder: Path) -> Path:
     return path
 
 
-def label_of(cell: Cell, *, settings: int = 2) -> str:
-    """Name a method, with gamma and tau if there are several settings of it."""
-    if cell.gamma is None or settings < 2:
-        return cell.method
-    scale = " of the embedding" if cell.cost_scale == "none" else ""
-    return f"{cell.method} (gamma {cell.gamma:g}{scale}, tau {cell.tau:g})"
+def _title(where: tuple[str, ...], rows: pd.DataFrame) -> str:
+    title = ", ".join(part for part in where if part not in ("", "{}"))
+    stands_in = rows["stand_in"].any()
+    return title + (" (a model stands in for the recorded data)" if stands_in else "")
 
 
-def labels_of(cells: Iterable[Cell]) -> dict[Cell, str]:
-    """Name the method of each cell as briefly as they can be told apart."""
-    labels = {}
-    for _, group in group_by(cells, "method").items():
-        settings = {(cell.gamma, cell.tau, cell.cost_scale) for cell in group}
-        for cell in group:
-            labels[cell] = label_of(cell, settings=len(settings))
+def _section(rows: pd.DataFrame, table: Table) -> list[str]:
+    rows = rows.assign(label=_labels(rows))
+    sizes = sorted({*rows["n_calibration"]} - {0}) or [0]
+    order = [*METHODS]
+    ranked = rows.assign(rank=rows["method"].map(order.index))
+    names = ranked.sort_values(["rank", *SETTING])["label"].unique()
+    marks = {size: _marks(_with_pairs(rows, size), table) for size in sizes}
+
+    def lpp(part: pd.DataFrame, size: int) -> str:
+        entry = number_text(part["lpp_z"], ".2f")
+        if not part["converged"].all():
+            entry += " (not converged)"
+        return marks[size].get(part["label"].iloc[0], "{}").format(entry)
+
+    def calibration(part: pd.DataFrame, size: int) -> str:
+        acauc, error = part[["acauc", "expected_coverage_error"]].mean()
+        return f"{acauc:+.3f} ({error:.3f})"
+
+    def entries(name: str, text: Callable[[pd.DataFrame, int], str]) -> Iterable[str]:
+        for size in sizes:
+            part = _with_pairs(rows[rows["label"] == name], size)
+            yield text(part, size) if len(part) else ""
+
+    heads = ["-" if size == 0 else str(size) for size in sizes]
+    lines = [
+        f"{rows['n_test'].iloc[0]} test observations, "
+        f"{rows['repetition'].nunique()} repetition(s).{_setting(rows)}",
+    ]
+    for score, text in (("LPP", lpp), ("ACAUC (ECE)", calibration)):
+        parts = [[name, *entries(name, text)] for name in names]
+        lines += ["", *markdown((f"{score}, calibration pairs", *heads), parts)]
+    return lines
+
+
+def _with_pairs(rows: pd.DataFrame, size: int) -> pd.DataFrame:
+    """Return the rows of methods that see so many pairs, or none."""
+    return rows[rows["n_calibration"].isin([0, size])]
+
+
+def _labels(rows: pd.DataFrame) -> list[str]:
+    """Name the method of each row as briefly as they can be told apart."""
+    settings = rows.groupby("method")[SETTING].apply(lambda g: len(g.drop_duplicates()))
+    labels = []
+    for cell in rows.index:
+        label = cell.method
+        if cell.gamma is not None and settings[label] > 1:
+            scale = " of the embedding" if cell.cost_scale == "none" else ""
+            label += f" (gamma {cell.gamma:g}{scale}, tau {cell.tau:g})"
+        labels.append(label)
     return labels
 
 
-def _title(where: tuple[Any, ...], rows: Iterable[dict[str, Any]]) -> str:
-    task, variant, options = where
-    title = task
-    if variant:
-        title += f", {variant}"
-    if options != "{}":
-        title += f", {options}"
-    if any(row["stand_in"] for row in rows):
-        title += " (a model stands in for the recorded data)"
-    return title
-
-
-def _section(rows: dict[Cell, dict[str, Any]], table: Table) -> list[str]:
-    labels = labels_of(rows)
-    sizes = sorted({cell.n_calibration for cell in rows} - {0}) or [0]
-    names = sorted(set(labels.values()), key=lambda name: _rank(name, labels))
-    marks = {size: _marks(rows, labels, size, table) for size in sizes}
-    lines = [
-        f"{next(iter(rows.values()))['n_test']} test observations, "
-        f"{len({cell.repetition for cell in rows})} repetition(s).{_settings(rows)}",
-        "",
-    ]
-    for score, text in (("LPP", _lpp), ("ACAUC (ECE)", _calibration)):
-        heads = " | ".join("-" if size == 0 else str(size) for size in sizes)
-        lines.append(f"| {score}, calibration pairs | {heads} |")
-        lines.append("|---" * (len(sizes) + 1) + "|")
-        for name in names:
-            entries = []
-            for size in sizes:
-                of_cell = [
-                    rows[cell]
-                    for cell in rows
-                    if labels[cell] == name and cell.n_calibration in (0, size)
-                ]
-                entry = text(of_cell) if of_cell else ""
-                if entry and score == "LPP":
-                    entry = _marked(entry, marks[size].get(name))
-                entries.append(entry)
-            lines.append(f"| {name} | {' | '.join(entries)} |")
-        lines.append("")
-    return lines[:-1]
-
-
-def _settings(rows: Iterable[Cell]) -> str:
+def _setting(rows: pd.DataFrame) -> str:
     """Return the setting of the couplings, where there is a single one."""
-    settings = {(c.gamma, c.tau, c.cost_scale) for c in rows if c.gamma is not None}
+    settings = rows[SETTING].dropna().drop_duplicates()
     if len(settings) != 1:
         return ""
-    ((gamma, tau, scale),) = settings
+    scale, gamma, tau = settings.iloc[0]
     return f" Couplings: gamma = {gamma:g} ({scale}), tau = {tau:g}."
-
-
-def _rank(name: str, labels: dict[Cell, str]) -> tuple[int, Any]:
-    cell = next(cell for cell, label in labels.items() if label == name)
-    setting = (cell.cost_scale, cell.gamma, cell.tau)
-    return ORDER.index(cell.method), setting if cell.gamma is not None else ()
-
-
-def _lpp(rows: Sequence[dict[str, Any]]) -> str:
-    mean, spread = mean_and_spread([row["lpp_z"] for row in rows])
-    text = f"{mean:.2f}" if math.isfinite(mean) else "-inf"
-    if math.isfinite(spread):
-        text += f" ± {spread:.2f}"
-    if any(not row["converged"] for row in rows):
-        text += " (not converged)"
-    return text
-
-
-def _calibration(rows: Sequence[dict[str, Any]]) -> str:
-    acauc, _ = mean_and_spread([row["acauc"] for row in rows])
-    error, _ = mean_and_spread([row["expected_coverage_error"] for row in rows])
-    return f"{acauc:+.3f} ({error:.3f})"
 
 
 # Comparisons ------------------------------------------------------------------------
 
 
-def _marked(entry: str, kind: str | None) -> str:
-    return f"**{entry}**" if kind == "best" else f"{entry}*" if kind else entry
-
-
-def _marks(
-    rows: dict[Cell, dict[str, Any]],
-    labels: dict[Cell, str],
-    size: int,
-    table: Table,
-) -> dict[str, str]:
-    """Return which methods are best with so many pairs, or nearly."""
+def _marks(rows: pd.DataFrame, table: Table) -> dict[str, str]:
+    """Return formats for the entries of the methods that are best, or nearly."""
     scores: dict[str, dict[int, np.ndarray]] = {}
-    for cell in rows:
-        if cell.n_calibration in (0, size) and cell.method not in REFERENCES:
-            log_probs = table.arrays[cell].get("log_probs")
-            if log_probs is not None:
-                scores.setdefault(labels[cell], {})[cell.repetition] = log_probs
+    for cell, label in rows["label"].items():
+        log_probs = table.arrays[cell].get("log_probs")
+        if cell.method not in REFERENCES and log_probs is not None:
+            scores.setdefault(label, {})[cell.repetition] = log_probs
     means = {
         name: float(np.mean([part.astype(float).mean() for part in parts.values()]))
         for name, parts in scores.items()
@@ -187,7 +154,7 @@ def _marks(
     if not means or max(means.values()) == -math.inf:
         return {}
     best = max(means, key=means.__getitem__)
-    marks = {best: "best"}
+    marks = {best: "**{}**"}
     for name, parts in scores.items():
         # Of repetitions that both have: only these are the same observations.
         common = sorted(parts.keys() & scores[best].keys())
@@ -198,7 +165,7 @@ def _marks(
             for which in (name, best)
         )
         if len(ours) == len(others) and not worse(ours, others):
-            marks[name] = "near"
+            marks[name] = "{}*"
     return marks
 
 
@@ -218,33 +185,27 @@ def worse(values: np.ndarray, best: np.ndarray) -> bool:
     return bool(wilcoxon(difference, alternative="less").pvalue < SIGNIFICANT)
 
 
-def _losses(finished: dict[Cell, dict[str, Any]], table: Table) -> list[str]:
+def _losses(finished: pd.DataFrame, table: Table) -> list[str]:
     """List the cells of RoPE that another method beats with as many pairs, or none."""
     lines = []
-    for cell, row in finished.items():
-        if cell.method != "RoPE":
-            continue
-        rivals = []
-        for other, rival in finished.items():
-            same = all(
-                getattr(cell, name) == getattr(other, name)
-                for name in ("task", "variant", "options", "repetition", "preset")
-            )
-            setting = (other.gamma, other.tau, other.cost_scale)
-            comparable = other.n_calibration in (0, cell.n_calibration) and (
-                other.gamma is None
-                or setting == (cell.gamma, cell.tau, cell.cost_scale)
-            )
-            if other.method in (*REFERENCES, "RoPE") or not same or not comparable:
-                continue
-            if row["lpp_z"] < rival["lpp_z"]:
-                sure = _surely_worse(table, cell, other)
-                rivals.append(
-                    f"{other.method} {rival['lpp_z']:.2f}"
-                    f"{'' if sure else ' (not significant)'}"
-                )
-        if rivals:
-            lines.append(f"- {cell}: {row['lpp_z']:.2f}; {', '.join(rivals)}")
+    others = finished[~finished["method"].isin([*REFERENCES, "RoPE"])]
+    for cell, row in finished[finished["method"] == "RoPE"].iterrows():
+        rivals = others[
+            (
+                others[[*WHERE, "repetition", "preset"]]
+                == row[[*WHERE, "repetition", "preset"]]
+            ).all(axis=1)
+            & others["n_calibration"].isin([0, cell.n_calibration])
+            & (others["gamma"].isna() | (others[SETTING] == row[SETTING]).all(axis=1))
+            & (others["lpp_z"] > row["lpp_z"])
+        ]
+        if len(rivals):
+            listed = [
+                f"{other.method} {lpp:.2f}"
+                f"{'' if _surely_worse(table, cell, other) else ' (not significant)'}"
+                for other, lpp in rivals["lpp_z"].items()
+            ]
+            lines.append(f"- {cell}: {row['lpp_z']:.2f}; {', '.join(listed)}")
     return lines or ["In no cell that was run."]
 
 
@@ -258,25 +219,22 @@ def _surely_worse(table: Table, cell: Cell, other: Cell) -> bool:
 
 def _missing(suite: Suite, table: Table) -> list[str]:
     lines = []
-    missing = [cell for cell in suite.cells if cell not in table.rows]
-    failed = [cell for cell in suite.cells if _status(cell, table) == "failed"]
-    if missing:
-        lines.append(f"{len(missing)} of {len(suite.cells)} cells were not run:")
-        lines.append("")
-        groups = group_by(missing, "task", "variant", "options", "repetition")
-        for (task, variant, options, repetition), cells in groups.items():
-            methods = ", ".join(dict.fromkeys(cell.method for cell in cells))
+    missing = pd.DataFrame(
+        [vars(cell) for cell in suite.cells if table.status(cell) == "not run"]
+    )
+    failed = table.rows[table.rows["status"] == "failed"]
+    if len(missing):
+        lines += [f"{len(missing)} of {len(suite.cells)} cells were not run:", ""]
+        groups = missing.groupby([*WHERE, "repetition"], sort=False)["method"]
+        for (task, variant, options, repetition), methods in groups:
             names = " ".join(n for n in (task, variant) if n)
             names += "" if options == "{}" else f" {options}"
-            lines.append(f"- {names} #{repetition}: {len(cells)} cells ({methods})")
-    if failed:
+            listed = ", ".join(methods.unique())
+            lines.append(f"- {names} #{repetition}: {len(methods)} cells ({listed})")
+    if len(failed):
         lines += ["", f"{len(failed)} cells failed:", ""]
         lines += [
-            f"- {cell}: {table.rows[cell]['error'].splitlines()[0][:200]}"
-            for cell in failed[:MAX_LISTED]
+            f"- {cell}: {error.splitlines()[0][:200]}"
+            for cell, error in failed["error"].head(MAX_LISTED).items()
         ]
     return lines or ["Everything was run."]
-
-
-def _status(cell: Cell, table: Table) -> str:
-    return table.rows[cell]["status"] if cell in table.rows else "not run"

@@ -2,6 +2,7 @@
 
 import functools
 import itertools
+import os
 import subprocess
 import time
 import traceback
@@ -11,6 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import joblib
 import numpy as np
 import torch
 from sbi.utils.metrics import c2st
@@ -19,13 +21,13 @@ from tqdm.auto import tqdm
 from benchmarks.cases import Case
 from benchmarks.cells import Cell
 from benchmarks.machine import forget_peak, peak_memory
-from benchmarks.methods import ONLY_FOR
+from benchmarks.methods import METHODS
 from benchmarks.scoring import Failure, Score, scores
-from benchmarks.workers import parallel
-from benchmarks.workplace import Workplace
+from benchmarks.store import Workplace
+from sbi_rope._processes import end_with
 from sbi_rope.metrics import draw_samples
 
-__all__ = ["Workplace", "run_cells"]
+__all__ = ["PACKAGES", "git_commit", "run_cells"]
 
 PACKAGES = ("torch", "sbi", "POT", "numpy")
 # Observations and samples behind the comparison with a posterior in closed form.
@@ -90,14 +92,40 @@ def _run(
     groups = [group for group in _grouped(cells) if waiting & set(group)]
     # What methods share is made first, so that no two jobs make it at the same time.
     shared = {group[0].group[:5]: group[0] for group in groups}
-    parallel(jobs, backend, [(prepare, cell, workplace) for cell in shared.values()])
+    _parallel(jobs, backend, [(prepare, cell, workplace) for cell in shared.values()])
     calls = [
         (run_group, group, [cell for cell in group if cell in waiting], workplace)
         for group in groups
     ]
     with tqdm(total=len(waiting), desc="Cells", smoothing=0.1) as bar:
-        ended = parallel(jobs, backend, calls, bar=bar)
+        ended = _parallel(jobs, backend, calls, bar=bar)
     return [status for statuses in ended for status in statuses]
+
+
+def _parallel(
+    jobs: int, backend: str, calls: list[tuple[Any, ...]], bar: Any = None
+) -> list[Any]:
+    """Return the results of calls, in the order in which they end.
+
+    Args:
+        jobs: Calls at a time.
+        backend: Name of a backend of joblib.
+        calls: Functions, each with its arguments.
+        bar: A progress bar that counts what the results hold.
+    """
+    # Dask watches over its own workers, which may be on other machines.
+    watch = {"initializer": end_with, "initargs": (os.getpid(),)}
+    results = []
+    # The way that knows external backends, dask's among them.
+    with joblib.parallel_config(
+        backend=backend, n_jobs=jobs, **(watch if backend == "loky" else {})
+    ):
+        run = joblib.Parallel(return_as="generator_unordered", batch_size=1)
+        for result in run(joblib.delayed(call[0])(*call[1:]) for call in calls):
+            results.append(result)
+            if bar is not None:
+                bar.update(len(result))
+    return results
 
 
 def _is_missing(row: dict[str, Any] | None, *, retry: bool) -> bool:
@@ -163,8 +191,8 @@ def run_group(group: list[Cell], cells: list[Cell], workplace: Workplace) -> lis
 
 
 def _check_data(case: Case) -> None:
-    tasks = ONLY_FOR.get(case.cell.method, (case.cell.task,))
-    if case.cell.task not in tasks:
+    tasks = METHODS[case.cell.method].tasks
+    if tasks is not None and case.cell.task not in tasks:
         raise ValueError(f"{case.cell.method} is only for {', '.join(tasks)}.")
 
 

@@ -3,28 +3,21 @@
 import itertools
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from benchmarks.cases import Case
-from benchmarks.cells import NEEDS_COUPLING, Cell
-from benchmarks.methods import COUPLED_STACK, METHODS, STACK
+from benchmarks.cases import Case, Pairs
+from benchmarks.cells import Cell
+from benchmarks.methods import COUPLED_STACK, METHODS, STACK, append_data
 from sbi_rope import RoPE, SinkhornCoupler
-from sbi_rope.baselines import (
-    BuildsOnNPE,
-    ReferenceNPE,
-    UsesCalibration,
-    UsesObservations,
-    UsesSimulations,
-)
+from sbi_rope.baselines import ReferenceNPE
 from sbi_rope.metrics import Evaluation, evaluate
 from sbi_rope.stacking import StackedPosterior, stack
 
-__all__ = ["Failure", "Score", "scores"]
+__all__ = ["Failure", "Score", "evaluate_on", "rope_of", "scores"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,13 +42,13 @@ class Score:
 
     cell: Cell
     posterior: Any
-    test_set: tuple[Tensor, Tensor]
+    test_set: Pairs
     evaluation: Evaluation
     train_seconds: float
-    couple_seconds: float
     test_seconds: float
     num_simulations: int
-    shares_npe: bool
+    couple_seconds: float = 0.0
+    shares_npe: bool = True
     converged: bool = True
     arrays: dict[str, np.ndarray] = field(default_factory=dict)
 
@@ -81,52 +74,41 @@ def scores(
     Raises:
         Exception: Whatever stops all cells, such as a failing training.
     """
-    if case.cell.method in NEEDS_COUPLING:
+    method = case.cell.method
+    if METHODS[method].couples:
         yield from _coupled_scores(case, cells, group)
-    elif case.cell.method in (STACK, COUPLED_STACK):
-        for cell in cells:
-            yield _stack_score(case, cell)
     else:
+        score = _stack_score if method in (STACK, COUPLED_STACK) else _score
         for cell in cells:
-            yield _score(case, cell)
+            yield score(case, cell)
 
 
 def _score(case: Case, cell: Cell) -> Score:
-    theta, x_o = case.test_set
-    pairs = (theta, x_o)
+    pairs = case.test_set
     count = _Count(case)
-    method = METHODS[cell.method](case)
+    build = METHODS[cell.method].build
+    assert build is not None
+    method = build(case)
     start = time.perf_counter()
-    if isinstance(method, UsesSimulations) and method.needs_simulations:
-        # Without a simulator, tuning-only looks targets up among stored simulations.
-        stored = cell.method == "tuning-only"
-        method.append_simulations(*(case.stored if stored else case.simulations))
-    if isinstance(method, UsesCalibration):
-        method.append_calibration(*case.calibration)
-    if isinstance(method, UsesObservations):
-        method.append_observations(x_o)
+    used, shares_npe = append_data(method, cell.method, case)
     method.train(seed=case.seed, show_progress_bars=False)
     posterior = method.build_posterior()
     seconds = time.perf_counter() - start
-    used = len(case.simulations[0]) if isinstance(method, UsesSimulations) else 0
     used += count.new
     if isinstance(method, ReferenceNPE):
         if case.simulator is None:
             assert case.held_out is not None
             pairs = case.held_out
         else:
-            pairs = method.simulated_test_set(theta, case.simulator, seed=case.seed)
-    evaluation, test_seconds = _evaluate(case, posterior, pairs)
-    return Score(
-        cell=cell,
-        posterior=posterior,
-        test_set=pairs,
-        evaluation=evaluation,
+            pairs = method.simulated_test_set(pairs[0], case.simulator, seed=case.seed)
+    return _scored(
+        case,
+        cell,
+        posterior,
+        pairs,
         train_seconds=seconds,
-        couple_seconds=0.0,
-        test_seconds=test_seconds,
         num_simulations=used,
-        shares_npe=isinstance(method, BuildsOnNPE),
+        shares_npe=shares_npe,
     )
 
 
@@ -134,9 +116,9 @@ def _coupled_scores(
     case: Case, cells: Sequence[Cell], group: Sequence[Cell]
 ) -> Iterator[Score | Failure]:
     count = _Count(case)
-    rope = _rope(case)
+    rope = rope_of(case)
     start = time.perf_counter()
-    if case.cell.method == "RoPE":
+    if METHODS[case.cell.method].pairs:
         rope.append_calibration(*case.calibration)
         rope.train(seed=case.seed, show_progress_bars=False)
     train_seconds = time.perf_counter() - start
@@ -160,27 +142,20 @@ def _coupled_scores(
         couple_seconds = time.perf_counter() - start
         cell = wanted.get(setting)
         if cell is not None:
-            try:
-                evaluation, test_seconds = _evaluate(case, posterior, case.test_set)
-            except Exception as error:  # such as no mass inside the prior's support
-                yield Failure(cell=cell, error=error)
-            else:
-                yield Score(
-                    cell=cell,
-                    posterior=posterior,
-                    test_set=case.test_set,
-                    evaluation=evaluation,
-                    train_seconds=train_seconds,
-                    couple_seconds=couple_seconds,
-                    test_seconds=test_seconds,
-                    num_simulations=used,
-                    converged=posterior.coupling.converged,
-                    shares_npe=True,
-                )
+            yield _scored_or_failed(
+                case,
+                cell,
+                posterior,
+                train_seconds=train_seconds,
+                couple_seconds=couple_seconds,
+                num_simulations=used,
+                converged=posterior.coupling.converged,
+            )
         start = time.perf_counter()
 
 
-def _rope(case: Case) -> RoPE:
+def rope_of(case: Case) -> RoPE:
+    """Return RoPE on a case, without calibration pairs."""
     return RoPE(
         case.npe,
         simulator=case.simulator,
@@ -193,22 +168,18 @@ def _stack_score(case: Case, cell: Cell) -> Score:
     batch = case.test_set[1] if cell.method == COUPLED_STACK else None
     count = _Count(case)
     start = time.perf_counter()
-    rope = _rope(case).append_calibration(*case.calibration)
+    rope = rope_of(case).append_calibration(*case.calibration)
     posterior = stack(rope, batch, seed=case.seed, show_progress_bars=False)
     train_seconds = time.perf_counter() - start
-    evaluation, test_seconds = _evaluate(case, posterior, case.test_set)
-    return Score(
-        cell=cell,
-        posterior=posterior,
-        test_set=case.test_set,
-        evaluation=evaluation,
+    score = _scored(
+        case,
+        cell,
+        posterior,
+        case.test_set,
         train_seconds=train_seconds,
-        couple_seconds=0.0,
-        test_seconds=test_seconds,
         num_simulations=len(case.simulations[0]) + count.new,
-        shares_npe=True,
-        arrays=_candidates(case, posterior),
     )
+    return replace(score, arrays=_candidates(case, posterior))
 
 
 def _candidates(case: Case, posterior: StackedPosterior) -> dict[str, np.ndarray]:
@@ -241,15 +212,36 @@ class _Count:
         return 0 if self.simulator is None else self.simulator.count - self.before
 
 
-def _evaluate(
-    case: Case, posterior: Any, pairs: tuple[Tensor, Tensor]
-) -> tuple[Evaluation, float]:
-    start = time.perf_counter()
-    evaluation = evaluate(
+def evaluate_on(case: Case, posterior: Any, pairs: Pairs) -> Evaluation:
+    """Score a posterior with the settings of a case."""
+    return evaluate(
         posterior,
         *pairs,
         theta_std=case.task.prior_std.to(pairs[0]),
         num_samples=case.settings.num_samples,
         seed=case.seed,
     )
-    return evaluation, time.perf_counter() - start
+
+
+def _scored(
+    case: Case, cell: Cell, posterior: Any, pairs: Pairs, **costs: Any
+) -> Score:
+    start = time.perf_counter()
+    evaluation = evaluate_on(case, posterior, pairs)
+    return Score(
+        cell=cell,
+        posterior=posterior,
+        test_set=pairs,
+        evaluation=evaluation,
+        test_seconds=time.perf_counter() - start,
+        **costs,
+    )
+
+
+def _scored_or_failed(
+    case: Case, cell: Cell, posterior: Any, **costs: Any
+) -> Score | Failure:
+    try:
+        return _scored(case, cell, posterior, case.test_set, **costs)
+    except Exception as error:  # such as no mass inside the prior's support
+        return Failure(cell=cell, error=error)

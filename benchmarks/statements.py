@@ -72,7 +72,7 @@ class Statement:
         """Judge the statement task by task; all numbers have to be there."""
         checks = []
         for letter in self.letters:
-            name = published.name(TASKS[letter[0]], suite=self.suite) + letter[1:]
+            name = published.letter(TASKS[letter[0]], suite=self.suite) + letter[1:]
             values = self.values(published, letter, setting)
             known = [value for value in values if value is not None]
             if not known or len(known) < len(values):

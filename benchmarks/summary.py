@@ -1,27 +1,32 @@
 """What all suites say together: a page beside the tables, a block for the README."""
 
+import json
 import math
 import os
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from benchmarks.methods import ORDER, STACK
-from benchmarks.other_suites import other_suites
+import pandas as pd
+
+from benchmarks.cells import Cell
+from benchmarks.methods import METHODS, STACK, methods_where
 from benchmarks.published import (
     FIXED,
     LETTERS,
+    MISSING,
     PAPER,
     SIZE,
     Published,
-    Row,
     acauc_text,
     both_texts,
     entry,
+    gap,
     lpp_text,
     mean,
-    name_of,
+    runs_of,
     table,
 )
 from benchmarks.statements import (
@@ -31,7 +36,7 @@ from benchmarks.statements import (
     verdict,
     write_statements,
 )
-from benchmarks.tables import group_by
+from benchmarks.table import Table
 from sbi_rope._files import write_atomically
 
 __all__ = ["write_summary"]
@@ -100,7 +105,7 @@ def _page(published: Published) -> list[str]:
         *(f"LPP (ACAUC), {FIXED}.", "", *_by_size(published), ""),
         *("## What the paper states", "", *write_statements(published), ""),
         *("## Where RoPE loses", "", *_losses(published), ""),
-        *("## What the other suites say", *other_suites(published)),
+        *("## What the other suites say", *_other_suites(published)),
     ]
 
 
@@ -124,20 +129,22 @@ def _overview(published: Published) -> list[str]:
     for name, suite in published.suites.items():
         if name in LEFT_OUT:
             continue
-        rows = published.tables[name].rows if name in published.tables else {}
-        statuses = [rows[c]["status"] if c in rows else "not run" for c in suite.cells]
-        whole, stand_ins = [], []
-        for where, cells in group_by(suite.cells, "task", "variant").items():
-            parts = group_by(cells, "repetition").values()
-            count = sum(all(cell in rows for cell in part) for part in parts)
-            whole.append(f"{' '.join(where).strip()} {count}/{len(parts)}")
-            if any(rows[cell]["stand_in"] for cell in cells if cell in rows):
-                stand_ins.append(" ".join(where).strip())
+        known = published.tables.get(name, Table.of({}, {}))
+        there = set(known.rows.index)
+        statuses = [known.status(cell) for cell in suite.cells]
+        complete, stand_ins = [], []
+        for where, runs in runs_of(suite).items():
+            place = " ".join(where).strip()
+            whole = sum(there.issuperset(run) for run in runs)
+            complete.append(f"{place} {whole}/{len(runs)}")
+            cells = [cell for run in runs for cell in run if cell in there]
+            if (known.rows["stand_in"][cells] == True).any():  # noqa: E712
+                stand_ins.append(place)
         lines.append(
             [
-                f"[{name}]({name}/report.md)" if rows else name,
-                *(str(statuses.count(s)) for s in ("finished", "failed", "not run")),
-                ", ".join(whole) if rows else "none",
+                f"[{name}]({name}/report.md)" if there else name,
+                *(statuses.count(s) for s in ("finished", "failed", "not run")),
+                ", ".join(complete) if there else "none",
                 ", ".join(stand_ins),
             ]
         )
@@ -149,30 +156,27 @@ def _overview(published: Published) -> list[str]:
 
 
 def _tasks(published: Published) -> list[str]:
-    run = {row["task"] for row in published.rows["main"]}
+    run = set(published.rows["main"]["task"])
     return [task for task in LETTERS if task in run]
 
 
 def _main(
     published: Published,
-    text: Callable[[Sequence[Row]], str],
+    text: Callable[[pd.DataFrame], str],
     *,
     with_settings: Sequence[str],
 ) -> list[str]:
     """Return a table of methods and tasks, and of some methods in other settings."""
     tasks = _tasks(published)
     columns = [
-        {name: published.select(name, task=task) for name in ORDER} for task in tasks
+        {name: published.select(name, task=task) for name in METHODS} for task in tasks
     ]
     bold = [_best(column) if text is lpp_text else None for column in columns]
-    counts = [
-        len({row["repetition"] for rows in column.values() for row in rows})
-        for column in columns
-    ]
+    counts = [pd.concat(column.values())["repetition"].nunique() for column in columns]
     lines = [["repetitions", *map(str, counts)]]
-    for name in ORDER:
+    for name in METHODS:
         entries = [entry(column[name], text) for column in columns]
-        if any(column[name] for column in columns):
+        if any(len(column[name]) for column in columns):
             marked = [
                 f"**{entry}**" if name == best else entry
                 for entry, best in zip(entries, bold, strict=True)
@@ -184,12 +188,12 @@ def _main(
             lines.append([f"{name} ({setting})", *(entry(p, text) for p in parts)])
     missing = [f"{LETTERS[task]} {task}" for task in LETTERS if task not in tasks]
     return [
-        *table(("", *(name_of(published, task) for task in tasks)), lines),
+        *table(("", *(published.name(task) for task in tasks)), lines),
         *(["", f"Not run: {', '.join(missing)}."] if missing else []),
     ]
 
 
-def _best(rows: dict[str, list[Row]]) -> str | None:
+def _best(rows: dict[str, pd.DataFrame]) -> str | None:
     scores = {name: mean(part) for name, part in rows.items() if name != "SBI"}
     known = {name: score for name, score in scores.items() if score is not None}
     best = max(known, key=known.__getitem__, default=None)
@@ -207,7 +211,7 @@ def _by_size(published: Published) -> list[str]:
         parts = [published.select("RoPE", task=task, size=size) for size in sizes]
         rope = [entry(part, both_texts) for part in parts]
         ends = entries["prior"], entries["OT-only"]
-        lines.append([name_of(published, task), *ends, *rope, entries["SBI"]])
+        lines.append([published.name(task), *ends, *rope, entries["SBI"]])
     return table(("", "prior", "OT-only", *(f"{n} pairs" for n in sizes), "SBI"), lines)
 
 
@@ -230,7 +234,7 @@ def _compared(published: Published) -> list[Compared]:
             lpp = mean(published.select("RoPE", task=task, size=size))
             gaps = {
                 other: published.above("RoPE", other, task=task, size=size)
-                for other in ORDER
+                for other in METHODS
                 # The stack contains RoPE.
                 if other not in ("RoPE", "SBI", STACK)
             }
@@ -263,9 +267,9 @@ def _stack_in_words(published: Published) -> list[str]:
     for task in _tasks(published):
         for size in published.sizes(task):
             rows = {
-                name: published.select(name, task=task, size=size) for name in ORDER
+                name: published.select(name, task=task, size=size) for name in METHODS
             }
-            if rows[STACK]:
+            if len(rows[STACK]):
                 results.append(_best(rows) == STACK)
     if not results:
         return []
@@ -286,7 +290,7 @@ def _losses(published: Published) -> list[str]:
         losses = [gaps.get(name, 0.0) for name in ("prior", "OT-only")]
         lines.append(
             [
-                *(name_of(published, task), str(size), f"{lpp:.2f}"),
+                *(published.name(task), str(size), f"{lpp:.2f}"),
                 *(f"{value:.2f}" if value < 0 else "" for value in losses),
                 f"{gaps[best]:.2f} {best}",
             ]
@@ -298,3 +302,112 @@ def _losses(published: Published) -> list[str]:
         _in_words(compared) + (f" Best where RoPE is not: {others}." if others else ""),
         *(["", *table(head, lines)] if lines else []),
     ]
+
+
+# The other suites -------------------------------------------------------------------
+
+
+def _above_npe(published: Published, rows: pd.DataFrame) -> str:
+    task = rows["task"].iloc[0]
+    npe = published.select("NPE", suite="wellspecified", task=task)
+    difference = gap(rows, npe)
+    return MISSING if difference is None else f"{difference:+.2f}"
+
+
+def _weight(cell: Cell) -> str:
+    weight = json.loads(cell.options).get("misspecification_weight")
+    return "prior shifted" if weight is None else f"weight {weight:g}"
+
+
+def _unit(cell: Cell) -> str:
+    unit = "embedding" if cell.cost_scale == "none" else "median distance"
+    return f"in units of the {unit}"
+
+
+class Grid(NamedTuple):
+    """A small table of a suite: what is in its lines, columns and entries.
+
+    Attributes:
+        what: What the table shows.
+        column: What differs from column to column.
+        line: What differs from line to line, besides the task.
+        beside: Methods whose LPP on the same data stands in the name of a line.
+        text: An entry.
+        methods: Those that are shown.
+        all_sizes: Whether to show all numbers of calibration pairs.
+    """
+
+    what: str
+    column: Callable[[Cell], float]
+    line: Callable[[Cell], str]
+    beside: tuple[str, ...] = ()
+    text: Callable[[Published, pd.DataFrame], str] = lambda _, rows: both_texts(rows)
+    methods: tuple[str, ...] = ("RoPE",)
+    all_sizes: bool = False
+
+
+GRIDS = {
+    "gamma": Grid(
+        f"RoPE, {SIZE} pairs, by gamma: LPP (ACAUC).",
+        column=lambda cell: cell.gamma or 0.0,
+        line=_unit,
+        beside=("prior", "SBI"),
+    ),
+    "tau": Grid(
+        f"RoPE, {SIZE} pairs, by tau: LPP (ACAUC).",
+        column=lambda cell: cell.tau or 0.0,
+        line=_weight,
+        beside=("prior", "NPE"),
+    ),
+    "wellspecified": Grid(
+        "RoPE above NPE, by calibration pairs.",
+        column=lambda cell: cell.n_calibration,
+        line=lambda cell: f"tau {cell.tau:g}",
+        beside=("prior", "NPE"),
+        text=_above_npe,
+        all_sizes=True,
+    ),
+    "labels": Grid(
+        f"LPP with {SIZE} pairs, by noise on their labels in %.",
+        column=lambda cell: 100 * json.loads(cell.options).get("label_noise", 0.0),
+        line=lambda cell: cell.method,
+        text=lambda _, rows: lpp_text(rows),
+        methods=methods_where(lambda entry: entry.pairs),
+    ),
+}
+
+
+def _other_suites(published: Published) -> list[str]:
+    """Return a small table of each suite that one is defined for, and that has rows."""
+    lines = []
+    for name, grid in GRIDS.items():
+        lines += ["", f"### {published.suites[name].title}", ""]
+        if len(published.rows[name]):
+            lines += [grid.what, "", *_grid(published, name, grid)]
+        else:
+            lines += ["Not run."]
+    return lines
+
+
+def _grid(published: Published, suite: str, grid: Grid) -> list[str]:
+    def name(cell: Cell) -> str:
+        same = {"task": cell.task, "variant": cell.variant, "options": cell.options}
+        lpps = [
+            f"{other} {entry(published.select(other, suite=suite, **same), lpp_text)}"
+            for other in grid.beside
+        ]
+        text = f"{published.name(cell.task, suite=suite)}, {grid.line(cell)}"
+        return text + (f" ({', '.join(lpps)})" if lpps else "")
+
+    rows = published.rows[suite]
+    rows = rows[rows["method"].isin(grid.methods)]
+    rows = rows[grid.all_sizes | (rows["n_calibration"] == SIZE)]
+    places = [[name(cell) for cell in rows.index], rows.index.map(grid.column)]
+    entries = {
+        place: entry(part, partial(grid.text, published))
+        for place, part in rows.groupby(places)
+    }
+    names = dict.fromkeys(places[0])
+    columns = sorted({column for _, column in entries})
+    lines = [[n, *(entries.get((n, c), MISSING) for c in columns)] for n in names]
+    return table(("", *(f"{column:g}" for column in columns)), lines)

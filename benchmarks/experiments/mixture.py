@@ -1,21 +1,23 @@
-"""How long the mixture takes: densities, samples, and one observation at a time.
+"""How long does the mixture take: densities, samples, and one observation at a time?
 
-Prints one Markdown table. Every row is a process of its own; its memory is that of the
-whole process, most of which is Python, torch and sbi. With ``--before`` each row is
-measured on another checkout of the package too, in turns; compare within a run.
+The table "The mixture: how fast" of `benchmarks/README.md`. Every row is a process of
+its own; its memory is that of the whole process, most of which is Python, torch and sbi.
+With ``--before`` each row is measured on another checkout of the package too, in turns;
+compare within a run.
 
-    python -m benchmarks.mixture
-    python -m benchmarks.mixture --before ../old-checkout --theta-dim 2 --repeats 2
+    python -m benchmarks.experiments.mixture
+    python -m benchmarks.experiments.mixture --before ../old-checkout --theta-dim 2
 """
 
 import argparse
+import itertools
 import json
 import subprocess
 import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,10 +28,11 @@ from sbi.neural_nets import posterior_nn
 from sbi.utils import BoxUniform
 from torch import Tensor
 
-from benchmarks.estimators import posterior_with, state_of
-from benchmarks.machine import describe_machine, forget_peak, memory, peak_memory
+from benchmarks.experiments.common import Row, begin, show
+from benchmarks.machine import forget_peak, memory, peak_memory
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
+NAME = "benchmarks.experiments.mixture"
 X_DIM = 10
 COLUMNS = {
     "version": "version",
@@ -69,62 +72,52 @@ def trained_npe(estimator: str, dim: int) -> Any:
         density_estimator=posterior_nn(estimator),
         show_progress_bars=False,
     )
-    npe.append_simulations(*simulations_of(dim, 5000)).train(max_num_epochs=3)
+    theta = prior_of(dim).sample((5000,))
+    npe.append_simulations(theta, simulate(theta)).train(max_num_epochs=3)
     return npe.build_posterior()
 
 
-def simulations_of(dim: int, number: int) -> tuple[Tensor, Tensor]:
-    """Draw parameters and simulations."""
-    theta = prior_of(dim).sample((number,))
-    return theta, simulate(theta)
+OPTIONS = {
+    "--theta-dim": {"type": int, "nargs": "+", "default": [2, 4]},
+    "--estimator": {"nargs": "+", "default": ["nsf"]},
+    "--n-o": {"type": int, "default": 2000},
+    "--n-s": {"type": int, "default": 2000},
+    "--num-samples": {"type": int, "default": 5000},
+    "--num-single": {"type": int, "default": 200},
+    "--gamma": {"type": float, "default": 0.5},
+    "--tau": {"type": float, "default": 0.9},
+    "--repeats": {"type": int, "default": 1},
+    "--before": {"type": Path, "help": "another checkout to measure too"},
+}
 
 
-def main() -> None:
-    """Print one row for each dimension, version and repetition."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--theta-dim", type=int, nargs="+", default=[2, 4])
-    parser.add_argument("--estimator", nargs="+", default=["nsf"])
-    parser.add_argument("--n-o", type=int, default=2000)
-    parser.add_argument("--n-s", type=int, default=2000)
-    parser.add_argument("--num-samples", type=int, default=5000)
-    parser.add_argument("--num-single", type=int, default=200)
-    parser.add_argument("--gamma", type=float, default=0.5)
-    parser.add_argument("--tau", type=float, default=0.9)
-    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
-    parser.add_argument("--repeats", type=int, default=1)
-    parser.add_argument("--before", type=Path, help="another checkout to measure too")
-    args = parser.parse_args()
+def rows(args: argparse.Namespace) -> Iterator[Row]:
+    """Yield one row for each dimension, version and repetition."""
     versions = {"now": ROOT}
     if args.before is not None:
         versions = {"before": args.before.resolve(), **versions}
-    print(describe_machine(threads=args.threads))
     print(
         f"{args.n_o} observations, {args.n_s} components, {args.num_samples} samples "
         f"each, gamma {args.gamma}, tau {args.tau}\n"
     )
-    print("| " + " | ".join(COLUMNS) + " |\n" + "|---" * len(COLUMNS) + "|", flush=True)
-    for estimator in args.estimator:
-        for dim in args.theta_dim:
-            with tempfile.TemporaryDirectory() as folder:
-                path = Path(folder) / "npe.pt"
-                torch.save(state_of(trained_npe(estimator, dim)), path)
-                for _ in range(args.repeats):
-                    for name, root in versions.items():
-                        settings = vars(args) | {
-                            "npe": path,
-                            "theta_dim": dim,
-                            "estimator": estimator,
-                        }
-                        row = settings | measured(settings | {"root": root})
-                        row |= {"version": name, "estimator": estimator}
-                        cells = [str(row[key]) for key in COLUMNS.values()]
-                        print("| " + " | ".join(cells) + " |", flush=True)
+    for estimator, dim in itertools.product(args.estimator, args.theta_dim):
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "npe.pt"
+            # Of sbi alone: it can be read whatever the version of this package.
+            torch.save(trained_npe(estimator, dim), path)
+            for _, (name, root) in itertools.product(
+                range(args.repeats), versions.items()
+            ):
+                settings = vars(args) | {"theta_dim": dim, "estimator": estimator}
+                settings |= {"npe": path, "root": root, "version": name}
+                row = settings | measured(settings)
+                yield {column: row[key] for column, key in COLUMNS.items()}
 
 
 def measured(settings: dict[str, Any]) -> dict[str, Any]:
     """Measure a cell in a process of its own."""
     done = subprocess.run(
-        [sys.executable, "-m", "benchmarks.mixture", json.dumps(settings, default=str)],
+        [sys.executable, "-m", NAME, json.dumps(settings, default=str)],
         cwd=ROOT,
         capture_output=True,
         text=True,
@@ -142,13 +135,7 @@ def measure(settings: dict[str, Any]) -> None:
 
     warnings.simplefilter("ignore")
     torch.set_num_threads(settings["threads"])
-    dim = settings["theta_dim"]
-    npe = posterior_with(
-        torch.load(settings["npe"], weights_only=True),
-        prior=prior_of(dim),
-        build=posterior_nn(settings["estimator"]),
-        simulations=simulations_of(dim, 100),
-    )
+    npe = torch.load(settings["npe"], weights_only=False)  # written by this command
     torch.manual_seed(1)
     theta = npe.prior.sample((settings["n_o"],))
     x_o = 1.1 * simulate(theta) + 0.1
@@ -196,4 +183,4 @@ if __name__ == "__main__":
     if len(sys.argv) == 2 and sys.argv[1].startswith("{"):
         measure(json.loads(sys.argv[1]))
     else:
-        main()
+        show(rows(begin(__doc__, OPTIONS)))

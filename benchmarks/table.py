@@ -4,103 +4,112 @@ import contextlib
 import csv
 import hashlib
 import json
-import math
 import platform
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from benchmarks.cells import Cell, Suite
-from benchmarks.checks import check_scores, read_mapping
 from benchmarks.machine import describe_machine
 from benchmarks.runner import PACKAGES, git_commit
-from benchmarks.schema import CELL_COLUMNS, COLUMNS, as_text, check_row, from_text
-from benchmarks.store import Results
+from benchmarks.schema import (
+    CELL_COLUMNS,
+    COLUMNS,
+    as_text,
+    check_row,
+    check_scores,
+    from_text,
+)
+from benchmarks.store import Results, read_mapping
 from sbi_rope._files import read_arrays, write_atomically
 from sbi_rope.errors import InvalidInputError
 
 __all__ = [
-    "COLUMNS",
+    "Rows",
     "Table",
-    "group_by",
-    "mean_and_spread",
+    "markdown",
+    "number_text",
     "read_table",
     "write_table",
 ]
 
+Rows = dict[Cell, dict[str, Any]]
+Arrays = dict[Cell, dict[str, np.ndarray]]
+
 ARRAYS = "arrays.npz"
 CHECKSUM = "sha256 of the lines of results.csv"
+COUNTED = ("finished", "failed", "not run")
 
 
-class Table:
-    """The rows of a suite that were run, and what belongs to them.
+class Table(NamedTuple):
+    """The cells of a suite that were run, and what belongs to them.
 
     Attributes:
-        rows: Values by column, in the order of the suite's cells.
+        rows: One row a cell, in the order of the suite; see `schema.py` for its
+            columns. The index holds the cells.
         arrays: By cell: log-probabilities, coverage, samples of one posterior.
     """
 
-    def __init__(
-        self,
-        rows: dict[Cell, dict[str, Any]],
-        arrays: dict[Cell, dict[str, np.ndarray]],
-    ) -> None:
-        self.rows = rows
-        self.arrays = arrays
+    rows: pd.DataFrame
+    arrays: Arrays
+
+    @classmethod
+    def of(cls, rows: Rows, arrays: Arrays) -> "Table":
+        """Return the table of some rows."""
+        # Cells are no sequences, but an index of objects has to be asked for.
+        index = pd.Index([*rows], dtype=object)
+        values = [[row.get(name) for name in COLUMNS] for row in rows.values()]
+        frame = pd.DataFrame(values, index=index, columns=[*COLUMNS], dtype=object)
+        return cls(frame, arrays)
+
+    @property
+    def finished(self) -> pd.DataFrame:
+        """The rows that have scores, with numbers as numbers."""
+        return self.rows[self.rows["status"] == "finished"].infer_objects()
+
+    def status(self, cell: Cell) -> str:
+        """Return "finished", "failed" or "not run"."""
+        return self.rows["status"].get(cell, "not run")
 
 
 def write_table(suite: Suite, results: Results, folder: Path) -> Table:
     """Collect the results of a suite into `folder`: CSV, arrays, manifest."""
-    rows, arrays = {}, {}
-    for cell in suite.cells:
-        found = results.load(cell)
-        if found is None:
-            continue
-        row, parts = found
-        rows[cell] = {"suite": suite.name, **row}
-        if row["status"] == "finished":
-            arrays[cell] = parts
-    with (
-        write_atomically(folder / "results.csv") as path,
-        path.open("w", newline="", encoding="utf-8") as file,
-    ):
-        writer = csv.DictWriter(file, COLUMNS, extrasaction="ignore")
-        writer.writeheader()
-        for row in rows.values():
-            writer.writerow({name: as_text(row.get(name)) for name in COLUMNS})
+    found = {cell: results.load(cell) for cell in suite.cells}
+    known = {cell: result for cell, result in found.items() if result is not None}
+    table = Table.of(
+        {cell: {"suite": suite.name, **row} for cell, (row, _) in known.items()},
+        {c: parts for c, (row, parts) in known.items() if row["status"] == "finished"},
+    )
+    texts = table.rows.apply(lambda column: column.map(as_text))
+    with write_atomically(folder / "results.csv") as path:
+        texts.to_csv(path, index=False, lineterminator="\r\n", encoding="utf-8")
     flat = {
         f"{cell.key}/{name}": values
-        for cell, parts in arrays.items()
+        for cell, parts in table.arrays.items()
         for name, values in parts.items()
     }
-    with (
-        write_atomically(folder / ARRAYS) as path,
-        path.open("wb") as file,
-    ):
-        np.savez_compressed(file, **flat)
-    statuses = [row["status"] for row in rows.values()]
+    with write_atomically(folder / ARRAYS) as path, path.open("wb") as file:
+        np.savez_compressed(file, **flat)  # type: ignore[arg-type]
+    statuses = [table.status(cell) for cell in suite.cells]
     manifest = {
         "suite": suite.name,
         "cells": len(suite.cells),
-        "finished": statuses.count("finished"),
-        "failed": statuses.count("failed"),
-        "not run": len(suite.cells) - len(rows),
+        **{status: statuses.count(status) for status in COUNTED},
         "written": time.strftime("%Y-%m-%dT%H:%M:%S"),
         "machine": describe_machine(threads=1),
         "system": platform.platform(),
         "packages": list(PACKAGES),
         "git commit of this table": git_commit(),
-        "git commits of the cells": sorted(
-            {row["git_commit"] for row in rows.values() if "git_commit" in row}
-        ),
+        "git commits of the cells": sorted(table.rows["git_commit"].dropna().unique()),
         CHECKSUM: _checksum(folder / "results.csv"),
     }
     with write_atomically(folder / "manifest.json") as path:
         path.write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
-    return Table(rows, arrays)
+    return table
 
 
 def read_table(suite: Suite, folder: Path) -> Table:
@@ -123,16 +132,16 @@ def read_table(suite: Suite, folder: Path) -> Table:
             f"`python -m benchmarks run {suite.name} --out {folder.parent}`, or undo "
             "the change."
         ) from error
-    return Table(rows, arrays)
+    return Table.of(rows, arrays)
 
 
 # Checks of what was read -------------------------------------------------------------
 
 
-def _read_rows(suite: Suite, path: Path) -> dict[Cell, dict[str, Any]]:
+def _read_rows(suite: Suite, path: Path) -> Rows:
     known = set(suite.cells)
-    rows: dict[Cell, dict[str, Any]] = {}
-    numbers: dict[Cell, int] = {}
+    rows: Rows = {}
+    # Not by pandas, which fills rows that are too short, and cuts others silently.
     with path.open(newline="", encoding="utf-8") as file:
         reader = csv.DictReader(file)
         if tuple(reader.fieldnames or ()) != COLUMNS:
@@ -155,15 +164,14 @@ def _read_rows(suite: Suite, path: Path) -> dict[Cell, dict[str, Any]]:
                 if cell not in known:
                     raise ValueError(f"{cell} is no cell of the suite {suite.name}")
                 if cell in rows:
-                    raise ValueError(f"{cell} is in row {numbers[cell]} already")
-            rows[cell], numbers[cell] = row, number
+                    first = [*rows].index(cell) + 2
+                    raise ValueError(f"{cell} is in row {first} already")
+            rows[cell] = row
     return rows
 
 
-def _read_arrays(
-    suite: Suite, rows: dict[Cell, dict[str, Any]], path: Path
-) -> dict[Cell, dict[str, np.ndarray]]:
-    arrays: dict[Cell, dict[str, np.ndarray]] = {cell: {} for cell in rows}
+def _read_arrays(suite: Suite, rows: Rows, path: Path) -> Arrays:
+    arrays: Arrays = {cell: {} for cell in rows}
     if not path.exists():
         return arrays
     by_key = {cell.key: cell for cell in suite.cells}
@@ -186,9 +194,7 @@ def _read_arrays(
     return arrays
 
 
-def _check_manifest(
-    rows: dict[Cell, dict[str, Any]], path: Path, manifest: Path
-) -> None:
+def _check_manifest(rows: Rows, path: Path, manifest: Path) -> None:
     if not manifest.exists():
         return
     with _naming(manifest.name):
@@ -225,24 +231,23 @@ def _checksum(path: Path) -> str:
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 
-# Rows --------------------------------------------------------------------------------
+# Texts -------------------------------------------------------------------------------
 
 
-def group_by(cells: Iterable[Cell], *names: str) -> dict[tuple[Any, ...], list[Cell]]:
-    """Group cells by some of their fields, in order of appearance."""
-    groups: dict[tuple[Any, ...], list[Cell]] = {}
-    for cell in cells:
-        groups.setdefault(tuple(getattr(cell, name) for name in names), []).append(cell)
-    return groups
+def markdown(
+    head: Sequence[str], lines: Iterable[Iterable[object]], *, rule: str = "---"
+) -> list[str]:
+    """Return a table in Markdown; ``rule`` is below each column of the head."""
+    first, *entries = (f"| {' | '.join(map(str, line))} |" for line in (head, *lines))
+    return [first, f"|{'|'.join([rule] * len(head))}|", *entries]
 
 
-def mean_and_spread(values: list[float]) -> tuple[float, float]:
-    """Return the mean and, of several values, the standard deviation.
+def number_text(values: pd.Series, form: str) -> str:
+    """Return the mean over repetitions and, of several, the standard deviation.
 
     One -inf makes the mean -inf, without a spread.
     """
-    mean = sum(values) / len(values)
-    if len(values) < 2 or not math.isfinite(mean):
-        return mean, math.nan
-    variance = sum((value - mean) ** 2 for value in values) / (len(values) - 1)
-    return mean, math.sqrt(variance)
+    mean = float(values.mean())
+    if len(values) < 2 or not np.isfinite(mean):
+        return f"{mean:{form}}"
+    return f"{mean:{form}} ± {values.std():{form.lstrip('+')}}"

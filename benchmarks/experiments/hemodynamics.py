@@ -1,14 +1,14 @@
-"""How long a beat of the arteries takes.
+"""How long does a beat of the arteries take?
 
-Prints one Markdown table: seconds a person by length of cells, for elastic and
-viscoelastic walls, on one core and on all; and how long the solver takes to compile the
-first time. Wall times and the scaling are those of the cores that are free: where the
-CPU seconds of all jobs are those of one, jobs do not slow each other down. People are
-those of the simulator's population. Compiled code is kept next to the package; its
-compilation is measured in a process with an empty cache.
+The table "Blood flow: how fast" of `benchmarks/README.md`: seconds a person by length of
+cells, for elastic and viscoelastic walls, on one core and on all; and how long the
+solver takes to compile the first time. Wall times and the scaling are those of the cores
+that are free: where the CPU seconds of all jobs are those of one, jobs do not slow each
+other down. People are those of the simulator's population. Compiled code is kept next to
+the package; its compilation is measured in a process with an empty cache.
 
-    python -m benchmarks.hemodynamics
-    python -m benchmarks.hemodynamics --people 20 --cell-lengths 0.01
+    python -m benchmarks.experiments.hemodynamics
+    python -m benchmarks.experiments.hemodynamics --people 20 --cell-lengths 0.01
 """
 
 import argparse
@@ -23,7 +23,7 @@ from itertools import product
 
 from joblib import Parallel, delayed
 
-from benchmarks.machine import describe_machine
+from benchmarks.experiments.common import Row, begin, show
 from sbi_rope.errors import SimulationError
 from sbi_rope.tasks.hemodynamics.grid import build_grid
 from sbi_rope.tasks.hemodynamics.network import build_network
@@ -43,49 +43,39 @@ print(time.perf_counter() - start)
 """
 
 
-def main() -> None:
-    """Print the compile time and one row a setting."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--people", type=int, default=50)
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
-    parser.add_argument(
-        "--cell-lengths", type=float, nargs="+", default=[0.02, 0.01, 0.005]
-    )
-    args = parser.parse_args()
-    print(f"{describe_machine(threads=1)}, numba {version('numba')}", end="\n\n")
-    print(f"Compiling, once: {compile_seconds():.1f} s", end="\n\n")
-    print(
-        f"| cell cm | walls | points | CPU s, 1 job | CPU s, {args.jobs} jobs | "
-        f"wall s, 1 job | wall s, {args.jobs} jobs | scaling | rejected |"
-    )
-    print("|---|---|---|---|---|---|---|---|---|")
-    population = Population()
-    people = [population.draw("simulator", 0, i) for i in range(args.people)]
-    for row in rows(people, args.cell_lengths, args.jobs):
-        print(f"| {' | '.join(row)} |", flush=True)
+OPTIONS = {
+    "--people": {"type": int, "default": 50},
+    "--jobs": {"type": int, "default": os.cpu_count() or 1},
+    "--cell-lengths": {"type": float, "nargs": "+", "default": [0.02, 0.01, 0.005]},
+}
 
 
-def rows(
-    people: list[Subject], cell_lengths: list[float], jobs: int
-) -> Iterator[list[str]]:
+def rows(args: argparse.Namespace) -> Iterator[Row]:
     """Measure each setting, after a beat that is not counted."""
-    for cell_length, viscoelastic in product(cell_lengths, (False, True)):
+    print(f"numba {version('numba')}; compiling, once: {compile_seconds():.1f} s\n")
+    population, jobs = Population(), args.jobs
+    people = [population.draw("simulator", 0, i) for i in range(args.people)]
+    for cell_length, viscoelastic in product(args.cell_lengths, (False, True)):
         physics = Physics(cell_length=cell_length, viscoelastic=viscoelastic)
         simulate_beat(BASELINE, physics)
         single = [simulate(subject, physics) for subject in people]
         cpu, alone, failed = (sum(column) for column in zip(*single, strict=True))
         busy, together = parallel_seconds(people, physics, jobs)
-        yield [
-            f"{100 * cell_length:g}",
-            "viscoelastic" if viscoelastic else "elastic",
-            str(len(build_grid(build_network(BASELINE, physics), cell_length).slope)),
-            f"{cpu / len(people):.3f}",
-            f"{busy / len(people):.3f}",
-            f"{alone / len(people):.3f}",
-            f"{together / len(people):.3f}",
-            f"{alone / (together * jobs):.2f}",
-            str(failed),
-        ]
+        grid = build_grid(build_network(BASELINE, physics), cell_length)
+        seconds = {
+            "CPU s, 1 job": cpu,
+            f"CPU s, {jobs} jobs": busy,
+            "wall s, 1 job": alone,
+            f"wall s, {jobs} jobs": together,
+        }
+        yield {
+            "cell cm": f"{100 * cell_length:g}",
+            "walls": "viscoelastic" if viscoelastic else "elastic",
+            "points": len(grid.slope),
+            **{name: f"{value / len(people):.3f}" for name, value in seconds.items()},
+            "scaling": f"{alone / (together * jobs):.2f}",
+            "rejected": failed,
+        }
 
 
 def simulate(subject: Subject, physics: Physics) -> tuple[float, float, int]:
@@ -132,4 +122,4 @@ def compile_seconds() -> float:
 
 
 if __name__ == "__main__":
-    main()
+    show(rows(begin(__doc__, OPTIONS, threads=1)))

@@ -1,9 +1,10 @@
-"""Where RoPE loses: its score on a task, taken apart.
+"""Where does RoPE lose? Its score on a task, taken apart, as in `docs/benchmark.md`.
 
-    python -m benchmarks.losses --task pendulum --n-calibration 10
-    python -m benchmarks.losses --task sir --n-calibration 50 --gamma 0.1 0.05 0.02
+    python -m benchmarks.experiments.losses --task pendulum --n-calibration 10
+    python -m benchmarks.experiments.losses --task sir --n-calibration 50 \\
+        --gamma 0.1 0.05 0.02
 
-prints one table. From line to line one more thing goes wrong:
+From line to line one more thing goes wrong:
 
 - SBI: NPE on simulations of the test parameters.
 - transport alone: the same simulations, coupled and mixed, so that the difference is
@@ -24,21 +25,21 @@ tuning can go below. ESS is the median of the couplings' effective sample sizes,
 import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
 from sbi.utils import within_support
 from torch import Tensor, nn
 
-from benchmarks.cases import Case, CountingSimulator, Pairs, Sources
-from benchmarks.cells import Cell
-from benchmarks.store import Cache
-from sbi_rope import RoPE, SinkhornCoupler
+from benchmarks.cases import Case, CountingSimulator, Pairs
+from benchmarks.experiments.common import Row, add_task, begin, show
+from benchmarks.experiments.data import case_of
+from benchmarks.scoring import evaluate_on, rope_of
+from sbi_rope import SinkhornCoupler
 from sbi_rope.baselines import ReferenceNPE
-from sbi_rope.metrics import Evaluation, draw_samples, evaluate
+from sbi_rope.metrics import Evaluation, draw_samples
 
-__all__ = ["Loss", "as_line", "losses", "target_distances"]
+__all__ = ["Loss", "as_row", "losses", "target_distances"]
 
 # Most calibration pairs to tune on.
 MAX_PAIRS = 1000
@@ -163,7 +164,7 @@ def _without_coupling(case: Case, posterior: Any, test_set: Pairs) -> Loss:
     inside = within_support(case.task.get_prior(), draws.flatten(0, 1))
     return Loss(
         name="SBI",
-        evaluation=_evaluate(case, posterior, test_set),
+        evaluation=evaluate_on(case, posterior, test_set),
         inside=float(inside.double().mean()),
     )
 
@@ -177,7 +178,7 @@ def _with_coupling(
     num_simulations: int | None,
 ) -> Iterator[Loss]:
     assert case.simulator is not None
-    rope = RoPE(case.npe, simulator=case.simulator, finetuner=case.settings.finetuner)
+    rope = rope_of(case)
     h = g = rope.embedding_net
     if stage.tuned_on is not None:
         rope.append_calibration(*stage.tuned_on)
@@ -205,7 +206,7 @@ def _with_coupling(
         unit = coupling.gamma / gamma
         yield Loss(
             name=stage.name,
-            evaluation=_evaluate(case, posterior, stage.test_set),
+            evaluation=evaluate_on(case, posterior, stage.test_set),
             inside=float(posterior.leakage(stage.test_set[1]).mass.mean()),
             gamma=gamma,
             effective_sample_size=float(coupling.effective_sample_size.median()),
@@ -215,26 +216,30 @@ def _with_coupling(
         )
 
 
-def _evaluate(case: Case, posterior: Any, test_set: Pairs) -> Evaluation:
-    return evaluate(
-        posterior,
-        *test_set,
-        theta_std=case.task.prior_std.to(test_set[0]),
-        num_samples=case.settings.num_samples,
-        seed=case.seed,
-    )
+# The table --------------------------------------------------------------------------
+
+OPTIONS = {
+    "--n-calibration": {"type": int, "required": True},
+    "--repetition": {"type": int, "default": 0},
+    "--gamma": {"type": float, "nargs": "+", "default": [0.1]},
+    "--tau": {"type": float, "default": 1.0},
+    "--num-simulations": {"type": int, "help": "to couple with"},
+}
 
 
-# The command ------------------------------------------------------------------------
+def rows(args: argparse.Namespace) -> Iterator[Row]:
+    """Yield one row a line and gamma."""
+    case = case_of(args, n_calibration=args.n_calibration, repetition=args.repetition)
+    print(f"{case.task!r}, preset {args.preset}, repetition {args.repetition},")
+    print(f"{len(case.test_set[0])} test observations, tau {args.tau:g}.\n")
+    for loss in losses(
+        case, gammas=args.gamma, tau=args.tau, num_simulations=args.num_simulations
+    ):
+        yield as_row(loss)
 
-HEADER = (
-    "| scored | gamma | LPP (z) | median | ACAUC | ESS | inside | distance, pairs | "
-    "distance, test |\n|---|---|---|---|---|---|---|---|---|"
-)
 
-
-def as_line(loss: Loss) -> str:
-    """Return a line of the Markdown table."""
+def as_row(loss: Loss) -> Row:
+    """Return a row of the table."""
     score = loss.evaluation.lpp_z
     assert score is not None
     gamma = size = "-"
@@ -244,11 +249,17 @@ def as_line(loss: Loss) -> str:
     mean = "-inf"
     if not score.neg_inf_fraction:
         mean = f"{score.mean:.2f} ± {score.standard_error:.2f}"
-    return (
-        f"| {loss.name} | {gamma} | {mean} | {score.median:.2f} | "
-        f"{loss.evaluation.acauc.value:+.3f} | {size} | {loss.inside:.3f} | "
-        f"{_summary(loss.calibration)} | {_summary(loss.test)} |"
-    )
+    return {
+        "scored": loss.name,
+        "gamma": gamma,
+        "LPP (z)": mean,
+        "median": f"{score.median:.2f}",
+        "ACAUC": f"{loss.evaluation.acauc.value:+.3f}",
+        "ESS": size,
+        "inside": f"{loss.inside:.3f}",
+        "distance, pairs": _summary(loss.calibration),
+        "distance, test": _summary(loss.test),
+    }
 
 
 def _summary(distances: Tensor | None) -> str:
@@ -257,38 +268,5 @@ def _summary(distances: Tensor | None) -> str:
     return f"{distances.mean():.3f}, {distances.median():.3f}"
 
 
-def main() -> None:
-    """Print one row a line and gamma."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--task", required=True)
-    parser.add_argument("--variant", default="")
-    parser.add_argument("--root", type=Path, help="folder of recorded data")
-    parser.add_argument("--n-calibration", type=int, required=True)
-    parser.add_argument("--repetition", type=int, default=0)
-    parser.add_argument("--gamma", type=float, nargs="+", default=[0.1])
-    parser.add_argument("--tau", type=float, default=1.0)
-    parser.add_argument("--num-simulations", type=int, help="to couple with")
-    parser.add_argument("--preset", default="standard")
-    parser.add_argument("--out", type=Path, default=Path("results/losses"))
-    args = parser.parse_args()
-    cell = Cell(
-        task=args.task,
-        variant=args.variant,
-        preset=args.preset,
-        method="RoPE",
-        n_calibration=args.n_calibration,
-        repetition=args.repetition,
-    )
-    case = Case.of(cell, Sources(root=args.root), Cache(args.out), "cpu")
-    print(f"{case.task!r}, preset {args.preset}, repetition {args.repetition},")
-    print(f"{len(case.test_set[0])} test observations, tau {args.tau:g}.\n\n{HEADER}")
-    for loss in losses(
-        case, gammas=args.gamma, tau=args.tau, num_simulations=args.num_simulations
-    ):
-        print(as_line(loss), flush=True)
-
-
 if __name__ == "__main__":
-    main()
+    show(rows(begin(__doc__, add_task(OPTIONS))))

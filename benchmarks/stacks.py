@@ -7,7 +7,7 @@ import numpy as np
 
 from benchmarks.cells import Cell
 from benchmarks.methods import COUPLED_STACK, STACK
-from benchmarks.tables import Table
+from benchmarks.table import Table, markdown
 
 __all__ = ["Comparison", "comparisons", "stacking_lines"]
 
@@ -69,7 +69,7 @@ class Comparison:
 def comparisons(table: Table) -> list[Comparison]:
     """Return all stacks of a table that were finished."""
     found = []
-    for cell, row in table.rows.items():
+    for cell, row in table.rows.iterrows():
         arrays = table.arrays.get(cell, {})
         if cell.method not in (STACK, COUPLED_STACK) or "candidates" not in arrays:
             continue
@@ -77,7 +77,7 @@ def comparisons(table: Table) -> list[Comparison]:
         found.append(
             Comparison(
                 cell=cell,
-                row=row,
+                row=row.to_dict(),
                 test=dict(zip(names, arrays["test"].tolist(), strict=False)),
                 held_out=dict(zip(names, arrays["held_out"].tolist(), strict=True)),
                 held_out_error=float(arrays["held_out_error"][-1]),
@@ -94,8 +94,7 @@ def stacking_lines(table: Table) -> list[str]:
     heads = ("task", "variant", "pairs", *BASICS, "best", "", "picked", "**stack**")
     heads += ("stack - best", "held out", "ACAUC", "ECE", "s")
     lines = ["## The stack against its candidates", "", EXPLANATION]
-    lines += [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
-    lines += [f"| {' | '.join(_entries(one))} |" for one in found]
+    lines += markdown(heads, map(_entries, found))
     return [*lines, "", *_goals(found), "", *_rehearsal(found)]
 
 
@@ -155,16 +154,12 @@ def _rehearsal(found: list[Comparison]) -> list[str]:
     both = [one for one in found if ONE_SETTING in one.test and REHEARSED in one.test]
     if not both:
         return []
-    lines = [
-        f"{ONE_SETTING} with and without rehearsal, on the test set:",
-        "",
-        "| task | variant | pairs | without | with | gain |",
-        "|---|---|---|---|---|---|",
-    ]
+    lines = []
     for one in both:
         without, rehearsed = one.test[ONE_SETTING], one.test[REHEARSED]
-        lines.append(
-            f"| {one.cell.task} | {one.cell.variant} | {one.cell.n_calibration} | "
-            f"{without:.2f} | {rehearsed:.2f} | {rehearsed - without:+.2f} |"
-        )
-    return lines
+        numbers = f"{without:.2f}", f"{rehearsed:.2f}", f"{rehearsed - without:+.2f}"
+        cell = one.cell
+        lines.append([cell.task, cell.variant, cell.n_calibration, *numbers])
+    heads = ("task", "variant", "pairs", "without", "with", "gain")
+    what = f"{ONE_SETTING} with and without rehearsal, on the test set:"
+    return [what, "", *markdown(heads, lines)]

@@ -1,12 +1,13 @@
-"""How fast the coupling is solved, side by side with POT and OTT-JAX.
+"""How fast is the coupling solved, side by side with POT and OTT-JAX?
 
-Every section prints one Markdown table. Seconds are the smallest of several
-repetitions, in which the competitors of a cell take turns; compare within a cell, not
-across tables. Without an error there is no comparison: every row shows the marginal
-error of its potential, computed by one and the same function in float64.
+The tables of "The coupling: how fast" in `benchmarks/README.md`. Seconds are the
+smallest of several repetitions, in which the competitors of a cell take turns; compare
+within a cell, not across tables. Without an error there is no comparison: every row
+shows the marginal error of its potential, computed by one and the same function in
+float64.
 
-    python -m benchmarks.coupling
-    python -m benchmarks.coupling --sections solvers floor --n 500 2000 --repeats 7
+    python -m benchmarks.experiments.coupling
+    python -m benchmarks.experiments.coupling --sections solvers floor --n 500 2000
 """
 
 import argparse
@@ -16,7 +17,7 @@ import subprocess
 import sys
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -25,7 +26,8 @@ import ot
 import torch
 from torch import Tensor
 
-from benchmarks.machine import describe_machine, peak_memory
+from benchmarks.experiments.common import Row, begin, show
+from benchmarks.machine import peak_memory
 from sbi_rope import SinkhornCoupler
 from sbi_rope.coupling import Coupling
 from sbi_rope.coupling.cost import Cost
@@ -153,13 +155,11 @@ def ott(cost: Cost, gamma: float, tau: float) -> Solver | None:
     return run
 
 
-def error_of(
-    outcome: Outcome, real: Tensor, simulated: Tensor, gamma: float, tau: float
-) -> float:
+def error_of(outcome: Outcome, cost: Cost, gamma: float, tau: float) -> float:
     """Return the marginal error of a potential, in float64 whatever the solver."""
     if not torch.isfinite(outcome.potential).all():
         return math.nan
-    cost = Cost(real.double(), simulated.double(), stored=False)
+    cost = Cost(cost.real.double(), cost.simulated.double(), stored=False)
     potential = outcome.potential - outcome.potential.mean()
     log_q = Kernel(cost, gamma, stored=False)(potential)
     return marginal_error(log_q, potential, tau)
@@ -197,15 +197,25 @@ def iterations_for_accuracy(cost: Cost, gamma: float, tau: float) -> int:
     return plain
 
 
-def compare_solvers(args: argparse.Namespace) -> None:
-    """From stored distances to rows: our own core, POT, OTT-JAX."""
-    print(
-        "| n | dtype | gamma | tau | solver | iterations | error | ms | x own |\n"
-        "|---|---|---|---|---|---|---|---|---|"
-    )
+def repeats(args: argparse.Namespace, n: int) -> int:
+    """Return how often to repeat: large problems are long enough to be steady."""
+    return args.repeats if n <= 2000 else min(args.repeats, 2)
+
+
+def problems(args: argparse.Namespace) -> Iterator[tuple[Cost, dict[str, Any]]]:
+    """Yield stored distances, and settings to solve with."""
     for n, name, (gamma, tau) in itertools.product(args.n, args.dtypes, SETTINGS):
-        real, simulated = embeddings(n, DTYPES[name])
-        cost = Cost(real, simulated, stored=True)
+        cost = Cost(*embeddings(n, DTYPES[name]), stored=True)
+        yield cost, {"n": n, "dtype": name, "gamma": gamma, "tau": tau}
+
+
+# Sections: each yields the rows of a table --------------------------------------------
+
+
+def compare_solvers(args: argparse.Namespace) -> Iterator[Row]:
+    """From stored distances to rows: our own core, POT, OTT-JAX."""
+    for cost, setting in problems(args):
+        gamma, tau = setting["gamma"], setting["tau"]
         by_pot = partial(pot, cost, gamma, tau)
         solvers: dict[str, Solver] = {
             "own": partial(own, cost, gamma, tau),
@@ -218,34 +228,22 @@ def compare_solvers(args: argparse.Namespace) -> None:
         }
         cut = iterations_for_accuracy(cost, gamma, tau)
         if cut < 10_000:
-            solvers["POT sinkhorn cut at equal accuracy (numpy)"] = partial(
-                by_pot, cut=cut
-            )
+            equal = partial(by_pot, cut=cut)
+            solvers["POT sinkhorn cut at equal accuracy (numpy)"] = equal
         by_ott = ott(cost, gamma, tau)
         if by_ott is not None:
             solvers["OTT-JAX as shipped"] = by_ott
-        results = race(solvers, repeats(args, n))
+        results = race(solvers, repeats(args, setting["n"]))
         for key, (seconds, outcome) in results.items():
-            error = error_of(outcome, real, simulated, gamma, tau)
-            shown = "failed (NaN)" if math.isnan(error) else f"{error:.0e}"
-            print(
-                f"| {n} | {name} | {gamma} | {tau} | {key} | "
-                f"{outcome.num_iterations} | {shown} | {1e3 * seconds:.1f} | "
-                f"{seconds / results['own'][0]:.2f} |",
-                flush=True,
-            )
-
-
-def repeats(args: argparse.Namespace, n: int) -> int:
-    """Return how often to repeat: large problems are long enough to be steady."""
-    return args.repeats if n <= 2000 else min(args.repeats, 2)
-
-
-def from_embeddings(
-    real: Tensor, simulated: Tensor, gamma: float, tau: float
-) -> Tensor:
-    """Couple with the default solver."""
-    return SinkhornCoupler(gamma=gamma, tau=tau).couple(real, simulated).weights
+            error = error_of(outcome, cost, gamma, tau)
+            yield {
+                **setting,
+                "solver": key,
+                "iterations": outcome.num_iterations,
+                "error": "failed (NaN)" if math.isnan(error) else f"{error:.0e}",
+                "ms": f"{1e3 * seconds:.1f}",
+                "x own": f"{seconds / results['own'][0]:.2f}",
+            }
 
 
 def from_embeddings_by_pot(
@@ -255,27 +253,30 @@ def from_embeddings_by_pot(
     return pot(Cost(real, simulated, stored=True), gamma, tau, numpy=numpy).rows
 
 
-def compare_default(args: argparse.Namespace) -> None:
+def compare_default(args: argparse.Namespace) -> Iterator[Row]:
     """From embeddings to rows: the coupler with its defaults, and POT as shipped."""
-    print(
-        "| n | gamma | tau | coupler ms | distances + POT as shipped ms (numpy) | "
-        "(torch) | coupler / faster POT |\n|---|---|---|---|---|---|---|"
-    )
-    for n, setting in itertools.product(args.n, SETTINGS):
-        problem = (*embeddings(n, torch.float64), *setting)
+    for n, (gamma, tau) in itertools.product(args.n, SETTINGS):
+        points = embeddings(n, torch.float64)
+        coupler = SinkhornCoupler(gamma=gamma, tau=tau)
+        by_pot = partial(from_embeddings_by_pot, *points, gamma, tau)
         tasks = {
-            "coupler": partial(from_embeddings, *problem),
-            "numpy": partial(from_embeddings_by_pot, *problem, numpy=True),
-            "torch": partial(from_embeddings_by_pot, *problem, numpy=False),
+            "coupler": lambda c=coupler, p=points: c.couple(*p).weights,
+            "numpy": partial(by_pot, numpy=True),
+            "torch": partial(by_pot, numpy=False),
         }
         results = race(tasks, repeats(args, n))
         ms = {name: 1e3 * seconds for name, (seconds, _) in results.items()}
-        ratio = ms["coupler"] / min(ms["numpy"], ms["torch"])
-        print(
-            f"| {n} | {setting[0]} | {setting[1]} | {ms['coupler']:.1f} | "
-            f"{ms['numpy']:.1f} | {ms['torch']:.1f} | {ratio:.2f} |",
-            flush=True,
-        )
+        yield {
+            "n": n,
+            "gamma": gamma,
+            "tau": tau,
+            "coupler ms": f"{ms['coupler']:.1f}",
+            "distances + POT as shipped ms (numpy)": f"{ms['numpy']:.1f}",
+            "(torch)": f"{ms['torch']:.1f}",
+            "coupler / faster POT": (
+                f"{ms['coupler'] / min(ms['numpy'], ms['torch']):.2f}"
+            ),
+        }
 
 
 def products(matrix: Tensor, ones: Tensor) -> None:
@@ -285,17 +286,12 @@ def products(matrix: Tensor, ones: Tensor) -> None:
         matrix.T @ ones
 
 
-def compare_with_floor(args: argparse.Namespace) -> None:
+def compare_with_floor(args: argparse.Namespace) -> Iterator[Row]:
     """From stored distances to a potential: our own core, and the least it can cost."""
-    print(
-        "| n | dtype | gamma | tau | iterations | own ms | exp pass ms | 2 GEMVs ms | "
-        "floor ms | floor / own |\n|---|---|---|---|---|---|---|---|---|---|"
-    )
-    for n, name, (gamma, tau) in itertools.product(args.n, args.dtypes, SETTINGS):
-        cost = Cost(*embeddings(n, DTYPES[name]), stored=True)
-        distances = cost.block(slice(None))
+    for cost, setting in problems(args):
+        n, distances = setting["n"], cost.block(slice(None))
         tasks = {
-            "own": partial(solved, cost, gamma, tau),
+            "own": partial(solved, cost, setting["gamma"], setting["tau"]),
             # Into new memory, which the solver needs too.
             "exp": partial(torch.exp, distances),
             "gemv": partial(products, torch.exp(-distances), distances.new_ones(n)),
@@ -304,12 +300,15 @@ def compare_with_floor(args: argparse.Namespace) -> None:
         ms = {key: 1e3 * seconds for key, (seconds, _) in results.items()}
         iterations = results["own"][1].num_iterations
         floor = ms["exp"] + iterations * ms["gemv"] / 10
-        print(
-            f"| {n} | {name} | {gamma} | {tau} | {iterations} | {ms['own']:.1f} | "
-            f"{ms['exp']:.1f} | {ms['gemv'] / 10:.2f} | {floor:.1f} | "
-            f"{floor / ms['own']:.2f} |",
-            flush=True,
-        )
+        yield {
+            **setting,
+            "iterations": iterations,
+            "own ms": f"{ms['own']:.1f}",
+            "exp pass ms": f"{ms['exp']:.1f}",
+            "2 GEMVs ms": f"{ms['gemv'] / 10:.2f}",
+            "floor ms": f"{floor:.1f}",
+            "floor / own": f"{floor / ms['own']:.2f}",
+        }
 
 
 def one_by_one(
@@ -329,14 +328,10 @@ def warm(
     return list(coupler.sweep(*points, gammas=grid[0], taus=grid[1]))
 
 
-def compare_sweeps(args: argparse.Namespace) -> None:
+def compare_sweeps(args: argparse.Namespace) -> Iterator[Row]:
     """Ten gammas times five taus: warm starts, cold starts, and the plain iteration."""
     gammas = torch.logspace(math.log10(5.0), math.log10(0.05), 10).tolist()
     grid = [gammas, [0.5, 0.7, 0.9, 0.99, 1.0]]
-    print(
-        "| n | dtype | solver | iterations | not converged of 50 | s | x warm |\n"
-        "|---|---|---|---|---|---|---|"
-    )
     for n, name in itertools.product(args.n, args.dtypes):
         points = embeddings(n, DTYPES[name])
         coupler = SinkhornCoupler(dtype=DTYPES[name])
@@ -348,30 +343,31 @@ def compare_sweeps(args: argparse.Namespace) -> None:
         }
         results = race(tasks, 1 if n > 500 else args.repeats)
         for key, (seconds, couplings) in results.items():
-            failed = sum(not coupling.converged for coupling in couplings)
-            iterations = sum(coupling.num_iterations for coupling in couplings)
-            print(
-                f"| {n} | {name} | {key} | {iterations} | {failed} | {seconds:.2f} | "
-                f"{seconds / results['own, warm'][0]:.2f} |",
-                flush=True,
-            )
+            yield {
+                "n": n,
+                "dtype": name,
+                "solver": key,
+                "iterations": sum(one.num_iterations for one in couplings),
+                "not converged of 50": sum(not one.converged for one in couplings),
+                "s": f"{seconds:.2f}",
+                "x warm": f"{seconds / results['own, warm'][0]:.2f}",
+            }
 
 
-def compare_memory(args: argparse.Namespace) -> None:
+def compare_memory(args: argparse.Namespace) -> Iterator[Row]:
     """Blocked and stored solutions, each in a process of its own."""
-    print(
-        "| n | dtype | mode | iterations | error | s | peak memory beyond the inputs, "
-        "MB |\n|---|---|---|---|---|---|---|"
-    )
-    for n, name in itertools.product([*args.n, 20_000], args.dtypes):
-        for mode in ("blocked", "stored"):
-            if mode == "stored" and n > 10_000:
-                print(f"| {n} | {name} | {mode} | not run | | | |", flush=True)
-                continue
-            command = [sys.executable, "-m", "benchmarks.coupling", "--threads"]
-            command += [str(args.threads), "--measure", str(n), name, mode]
+    columns = ("iterations", "error", "s", "peak memory beyond the inputs, MB")
+    modes = ("blocked", "stored")
+    for n, name, mode in itertools.product([*args.n, 20_000], args.dtypes, modes):
+        values = ["not run", "", "", ""]
+        if mode == "blocked" or n <= 10_000:
+            command = [sys.executable, "-m", "benchmarks.experiments.coupling"]
+            command += ["--threads", str(args.threads)]
+            command += ["--measure", str(n), name, mode]
             run = subprocess.run(command, capture_output=True, text=True, check=True)
-            print(f"| {n} | {name} | {mode} | {run.stdout.strip()} |", flush=True)
+            values = run.stdout.splitlines()[-1].split()
+        measured = dict(zip(columns, values, strict=True))
+        yield {"n": n, "dtype": name, "mode": mode, **measured}
 
 
 def measure(n: int, name: str, mode: str) -> None:
@@ -386,17 +382,13 @@ def measure(n: int, name: str, mode: str) -> None:
     coupling = coupler.couple(real, simulated)
     seconds = time.perf_counter() - start
     print(
-        f"{coupling.num_iterations} | {coupling.marginal_error:.0e} | {seconds:.2f} | "
+        f"{coupling.num_iterations} {coupling.marginal_error:.0e} {seconds:.2f} "
         f"{peak_memory() - before:.0f}"
     )
 
 
-def compare_subsets(args: argparse.Namespace) -> None:
+def compare_subsets(args: argparse.Namespace) -> Iterator[Row]:
     """Potentials fitted to some of 10,000 observations, 2000 simulations."""
-    print(
-        "| gamma | tau | fitted to | s | batch error | row TV to the full fit, mean | "
-        "max |\n|---|---|---|---|---|---|---|"
-    )
     real, simulated = embeddings(10_000, torch.float64)
     simulated = simulated[:2000]
     for gamma, tau in [(0.5, 0.9), (0.1, 0.9)]:
@@ -407,20 +399,19 @@ def compare_subsets(args: argparse.Namespace) -> None:
             part = replace(coupler, num_fitted=count).couple(real, simulated, seed=0)
             seconds = time.perf_counter() - start
             distance = (part.weights - full.weights).abs().sum(dim=1) / 2
-            print(
-                f"| {gamma} | {tau} | {count} | {seconds:.2f} | "
-                f"{part.batch_error:.1e} | "
-                f"{float(distance.mean()):.3f} | {float(distance.max()):.3f} |",
-                flush=True,
-            )
+            yield {
+                "gamma": gamma,
+                "tau": tau,
+                "fitted to": count,
+                "s": f"{seconds:.2f}",
+                "batch error": f"{part.batch_error:.1e}",
+                "row TV to the full fit, mean": f"{float(distance.mean()):.3f}",
+                "max": f"{float(distance.max()):.3f}",
+            }
 
 
-def check_extremes(args: argparse.Namespace) -> None:
+def check_extremes(args: argparse.Namespace) -> Iterator[Row]:
     """NaN, and what converged, over gamma / max(C), tau, dtype, solver and mode."""
-    print(
-        "| gamma / max(C) | mode | converged of 4 taus | most iterations | "
-        "largest error | NaN |\n|---|---|---|---|---|---|"
-    )
     real, simulated = embeddings(500, torch.float64)
     largest = float(torch.cdist(real, simulated).max())
     modes = [("own", False), ("own", True), ("pot", False)]
@@ -438,14 +429,14 @@ def check_extremes(args: argparse.Namespace) -> None:
             ).couple(real, simulated)
             for tau in (1.0, 0.99, 0.9, 0.5)
         ]
-        nan = sum(not torch.isfinite(c.weights).all() for c in couplings)
-        print(
-            f"| {ratio} | {solver} {name}{' blocked' * blocked} | "
-            f"{sum(c.converged for c in couplings)} | "
-            f"{max(c.num_iterations for c in couplings)} | "
-            f"{max(c.marginal_error for c in couplings):.0e} | {nan} |",
-            flush=True,
-        )
+        yield {
+            "gamma / max(C)": ratio,
+            "mode": f"{solver} {name}{' blocked' * blocked}",
+            "converged of 4 taus": sum(one.converged for one in couplings),
+            "most iterations": max(one.num_iterations for one in couplings),
+            "largest error": f"{max(one.marginal_error for one in couplings):.0e}",
+            "NaN": sum(not torch.isfinite(one.weights).all() for one in couplings),
+        }
 
 
 SECTIONS = {
@@ -457,26 +448,24 @@ SECTIONS = {
     "subsets": compare_subsets,
     "extremes": check_extremes,
 }
+OPTIONS = {
+    "--sections": {"nargs": "+", "choices": SECTIONS, "default": [*SECTIONS]},
+    "--n": {"type": int, "nargs": "+", "default": [500, 2000]},
+    "--dtypes": {"nargs": "+", "choices": DTYPES, "default": [*DTYPES]},
+    "--repeats": {"type": int, "default": 5},
+    "--measure": {"nargs": 3, "help": argparse.SUPPRESS},
+}
 
 
 def main() -> None:
     """Print the sections asked for."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--sections", nargs="+", choices=SECTIONS, default=[*SECTIONS])
-    parser.add_argument("--n", type=int, nargs="+", default=[500, 2000])
-    parser.add_argument("--dtypes", nargs="+", choices=DTYPES, default=[*DTYPES])
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--measure", nargs=3, help=argparse.SUPPRESS)
-    args = parser.parse_args()
-    torch.set_num_threads(args.threads)
+    args = begin(__doc__, OPTIONS, threads=1)
     if args.measure:
         measure(int(args.measure[0]), *args.measure[1:])
         return
-    print(describe_machine(threads=args.threads), flush=True)
     for section in args.sections:
         print(f"\n{SECTIONS[section].__doc__}\n", flush=True)
-        SECTIONS[section](args)
+        show(SECTIONS[section](args))
 
 
 if __name__ == "__main__":

@@ -1,0 +1,62 @@
+"""How long and how fast are a stack's candidates to be fine-tuned?
+
+The table of rates and patiences of "The choices inside the stack" in
+`benchmarks/README.md`. A candidate is trained without each of some folds of the
+calibration pairs. The average of these versions is scored on 300 others of the
+calibration set, not of the test set.
+
+    python -m benchmarks.experiments.patience --task pendulum --starts NPE tuned
+"""
+
+import argparse
+import itertools
+from collections.abc import Iterator
+from unittest.mock import patch
+
+import torch
+
+from benchmarks.experiments.common import Row, add_task, begin, show
+from benchmarks.experiments.data import calibration_data, case_of
+from sbi_rope.mixture import MixtureEstimator
+from sbi_rope.stacking import FinetunedCandidate
+from sbi_rope.stacking.folds import Fold, Workbench
+
+RATES, PATIENCES = (1e-3, 3e-4), (20, 50)
+SPACES = {"NPE": None, "embedding": "embedding", "input": "input", "tuned": "tuned"}
+NUM_FOLDS = 5
+OPTIONS = {
+    "--n-calibration": {"type": int, "default": 200},
+    "--starts": {"nargs": "+", "default": ["NPE", "tuned"], "choices": SPACES},
+    "--versions": {"type": int, "default": 2, "help": "folds to train without"},
+}
+
+
+def rows(args: argparse.Namespace) -> Iterator[Row]:
+    """Yield LPPs in standard deviations of the prior, by start, rate and patience."""
+    case = case_of(args, method="stack")
+    rope, (theta, x) = calibration_data(case, args.n_calibration, seed=1)
+    bench = Workbench(rope, num_folds=NUM_FOLDS, seed=1, show_progress_bars=False)
+    numbers = range(len(bench.folds))
+    folds = [
+        Fold(bench, [number for number in numbers if number != left_out])
+        for left_out in numbers[: args.versions]
+    ]
+    for start, rate, patience in itertools.product(args.starts, RATES, PATIENCES):
+        candidate = FinetunedCandidate(space=SPACES[start])
+        with (
+            patch("sbi_rope.stacking.finetuning.PATIENCE", patience),
+            patch.dict(
+                "sbi_rope.stacking.candidates.LEARNING_RATES", {candidate.space: rate}
+            ),
+        ):
+            parts = [part for fold in folds for part in candidate.parts(fold)]
+        estimator = MixtureEstimator(parts, [1.0 / len(parts)] * len(parts))
+        log_prob = estimator.part_log_probs(theta, x).logsumexp(dim=1)
+        lpp = log_prob.mean() - torch.tensor(float(len(parts))).log()
+        lpp = float(lpp + case.task.prior_std.log().sum())
+        setting = {"start": start, "rate": f"{rate:g}", "patience": patience}
+        yield {**setting, "LPP": f"{lpp:.2f}"}
+
+
+if __name__ == "__main__":
+    show(rows(begin(__doc__, add_task(OPTIONS), threads=1)))
