@@ -112,7 +112,7 @@ class Published:
         """Return the rows of a method, one a repetition."""
         rows = self.rows[suite]
         rows = rows[(rows["method"] == method) & rows["n_calibration"].isin([0, size])]
-        coupled = (rows[[*setting._fields]] == setting).all(axis=1)
+        coupled = (rows[[*setting._fields]] == [*setting]).all(axis=1)
         chosen = rows["gamma"].isna() | coupled
         for name, value in fields.items():
             chosen &= rows[name] == value

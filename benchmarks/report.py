@@ -54,7 +54,7 @@ def write_report(suite: Suite, table: Table, folder: Path) -> Path:
     lines = [f"# {suite.title}", "", suite.question, "", EXPLANATION]
     lines += [f"Settings: `{preset}`." for preset in cells["preset"].unique()]
     for where in cells[WHERE].drop_duplicates().itertuples(index=False, name=None):
-        rows = finished[(finished[WHERE] == where).all(axis=1)]
+        rows = finished[(finished[WHERE] == [*where]).all(axis=1)]
         lines += ["", f"## {_title(where, rows)}", ""]
         lines += _section(rows, table) if len(rows) else ["Not run."]
     for name, what in figures.draw_all(suite, table, folder):

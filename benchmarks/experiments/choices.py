@@ -6,8 +6,7 @@ and every version is scored on 300 others of the calibration set, not of the tes
 Choices are compared by what their stacks would have scored, so that none needs a second
 run. Runs are kept, so that the experiment can be interrupted.
 
-    python -m benchmarks.experiments.choices --task pendulum --n-calibration 10 \\
-        --seeds 1 2 3
+    python -m benchmarks.experiments.choices --task pendulum --n-calibration 10
 """
 
 import argparse
@@ -160,8 +159,8 @@ def rows(args: argparse.Namespace) -> Iterator[Row]:
 def comparison(runs: Mapping[str, Sequence[Run]]) -> Iterator[Row]:
     """Yield choices against tasks, as gains over the first choice.
 
-    The last rows are the best single candidate, chosen on the pairs it is scored on, the
-    one with the best held-out score, and the seconds.
+    The last rows are the best single candidate, chosen on the pairs it is scored on,
+    the one with the best held-out score, and the seconds.
 
     Args:
         runs: By task, one for each draw of the pairs.

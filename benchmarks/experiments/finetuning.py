@@ -4,7 +4,6 @@ The tables of "Tuning the embedding net" in `benchmarks/README.md`. Every settin
 scored on labelled real observations of the calibration part that were not tuned on; the
 test part is never touched. Runs are kept, so that the experiment can be interrupted.
 
-    python -m benchmarks.experiments.finetuning --task light_tunnel_sensors --root FOLDER
     python -m benchmarks.experiments.finetuning --task pendulum
 """
 
@@ -12,6 +11,7 @@ import argparse
 import itertools
 import time
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import pandas as pd
@@ -73,17 +73,17 @@ def rows(args: argparse.Namespace) -> Iterator[Row]:
     cache = cache_of(args.out)
     npe = trained_npe(task, seed=0, cache=cache)
     for n, setting in itertools.product(args.n_calibration, args.settings):
+        content = {
+            "task": task.name,
+            "setting": setting,
+            "options": SETTINGS[setting],
+            "pairs": n,
+        }
         runs = [
             cache.get(
                 "finetuning",
-                {
-                    "task": task.name,
-                    "setting": setting,
-                    "options": SETTINGS[setting],
-                    "pairs": n,
-                    "seed": seed,
-                },
-                lambda s=seed: run(task, npe, setting, n, s),
+                {**content, "seed": seed},
+                partial(run, task, npe, setting, n, seed),
             )
             for seed in args.seeds
         ]

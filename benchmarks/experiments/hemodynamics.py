@@ -1,11 +1,10 @@
 """How long does a beat of the arteries take?
 
-The table "Blood flow: how fast" of `benchmarks/README.md`: seconds a person by length of
-cells, for elastic and viscoelastic walls, on one core and on all; and how long the
-solver takes to compile the first time. Wall times and the scaling are those of the cores
-that are free: where the CPU seconds of all jobs are those of one, jobs do not slow each
-other down. People are those of the simulator's population. Compiled code is kept next to
-the package; its compilation is measured in a process with an empty cache.
+The table "Blood flow: how fast" of `benchmarks/README.md`: seconds a person by length
+of cells, for elastic and viscoelastic walls, on one core and on all; and how long the
+solver takes to compile the first time. Wall times and the scaling are those of the
+cores that are free: where the CPU seconds of all jobs are those of one, jobs do not
+slow each other down. Compilation is measured in a process with an empty cache.
 
     python -m benchmarks.experiments.hemodynamics
     python -m benchmarks.experiments.hemodynamics --people 20 --cell-lengths 0.01

@@ -1,8 +1,7 @@
 """Where does RoPE lose? Its score on a task, taken apart, as in `docs/benchmark.md`.
 
     python -m benchmarks.experiments.losses --task pendulum --n-calibration 10
-    python -m benchmarks.experiments.losses --task sir --n-calibration 50 \\
-        --gamma 0.1 0.05 0.02
+    python -m benchmarks.experiments.losses --task sir --n-calibration 50
 
 From line to line one more thing goes wrong:
 

@@ -10,16 +10,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import benchmarks.npe
 import numpy as np
 import pytest
 import torch
+from benchmarks.estimators import posterior_with, state_of
 from sbi.inference.posteriors import DirectPosterior
 
-import benchmarks.npe
 from benchmarks import finetuning
 from benchmarks.cases import Case, Sources
 from benchmarks.cells import Cell
-from benchmarks.estimators import posterior_with, state_of
 from benchmarks.presets import PRESETS
 from benchmarks.store import Cache, Results
 from sbi_rope._files import set_aside, write_atomically

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from benchmarks.cells import Cell
-from benchmarks.stacking import (
+from benchmarks.stacks import (
     ONE_SETTING,
     REHEARSED,
     Comparison,
     comparisons,
     stacking_lines,
 )
-from benchmarks.tables import Table
+from benchmarks.table import Table
 from sbi_rope.stacking import default_candidates
 
 TEST = {"prior": -3.0, "NPE": -9.0, ONE_SETTING: -2.0, REHEARSED: -1.5}
@@ -37,7 +37,7 @@ def a_table(
         "held_out": np.array([*HELD_OUT.values(), held_out]),
         "held_out_error": np.array([0.0] * 4 + [0.2]),
     }
-    return Table({cell: row, other: dict(row)}, {cell: arrays, other: {}})
+    return Table.of({cell: row, other: dict(row)}, {cell: arrays, other: {}})
 
 
 def the_comparison(**options: float) -> Comparison:
@@ -97,4 +97,4 @@ def test_rehearsal_is_compared_where_both_were_candidates() -> None:
 
 
 def test_without_a_stack_nothing_is_said() -> None:
-    assert stacking_lines(Table({}, {})) == []
+    assert stacking_lines(Table.of({}, {})) == []

@@ -6,13 +6,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pytest
 
 from benchmarks.__main__ import main
 from benchmarks.cells import Cell, load_suite
-from benchmarks.statements import FIXED, STATEMENTS, Published, gap, verdict
+from benchmarks.published import FIXED, Published, gap
+from benchmarks.schema import COLUMNS
+from benchmarks.statements import STATEMENTS, verdict
 from benchmarks.summary import write_summary
-from benchmarks.tables import COLUMNS
 
 # A cell to its LPP and ACAUC, or None if it was not run, or "failed".
 Scores = Callable[[Cell], tuple[float, float] | str | None]
@@ -110,8 +112,12 @@ def test_the_block_replaces_what_is_between_the_markers_and_nothing_else(
     folder: Path, readme: Path
 ) -> None:
     publish(folder, "main", by_method(RoPE=0.0))
-    write(folder, readme)
+    assert main(["summary", "--out", str(folder), "--readme", str(readme)]) == 0
     text = readme.read_text()
+    page = (folder / "README.md").read_bytes()
+    write(folder, readme)
+    # The same tables give the same bytes.
+    assert (readme.read_text(), (folder / "README.md").read_bytes()) == (text, page)
     assert text.startswith("before\n<!-- results -->\n")
     assert text.endswith("\n<!-- /results -->\nafter\n")
     assert "replaced" not in text
@@ -119,45 +125,26 @@ def test_the_block_replaces_what_is_between_the_markers_and_nothing_else(
     assert len(text.splitlines()) < 45
 
 
-def test_the_same_tables_give_the_same_bytes(folder: Path, readme: Path) -> None:
-    publish(folder, "main", by_method(RoPE=0.0))
-    contents = []
-    for _ in range(2):
-        page = write_summary(folder, readme)
-        contents.append((page.read_bytes(), readme.read_bytes()))
-    assert contents[0] == contents[1]
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
+def test_a_readme_without_a_place_for_the_block_is_refused_and_nothing_written(
+    folder: Path, readme: Path
+) -> None:
+    publish(folder, "main", by_method())
+    for text in (
         "nothing",
         "<!-- results -->",
         "<!-- /results --> <!-- results -->",
         "<!-- results --><!-- results --><!-- /results -->",
-    ],
-)
-def test_a_readme_without_a_place_for_the_block_is_refused_and_nothing_written(
-    folder: Path, readme: Path, text: str
-) -> None:
-    publish(folder, "main", by_method())
-    readme.write_text(text)
-    with pytest.raises(SystemExit, match=r"README\.md needs one line <!-- results -->"):
-        write(folder, readme)
-    assert readme.read_text() == text
-    assert not (folder / "README.md").exists()
+    ):
+        readme.write_text(text)
+        with pytest.raises(SystemExit, match=r"README\.md needs one line <!-- results"):
+            write(folder, readme)
+        assert readme.read_text() == text
+        assert not (folder / "README.md").exists()
 
 
 def test_a_folder_without_results_is_refused(folder: Path, readme: Path) -> None:
     with pytest.raises(SystemExit, match="No results in"):
         write(folder, readme)
-
-
-def test_the_command_writes_both(folder: Path, readme: Path) -> None:
-    publish(folder, "main", by_method())
-    assert main(["summary", "--out", str(folder), "--readme", str(readme)]) == 0
-    assert (folder / "README.md").exists()
-    assert "replaced" not in readme.read_text()
 
 
 # The suite main ---------------------------------------------------------------------
@@ -263,18 +250,16 @@ def test_losses_of_rope_are_counted_and_listed_with_their_gap(
 
 
 def test_an_infinite_loss_is_a_loss_and_two_of_them_are_equal() -> None:
-    def rows(*values: float) -> list[dict[str, Any]]:
-        return [
-            {"repetition": number, "lpp_z": value, "status": "finished"}
-            for number, value in enumerate(values)
-        ]
+    def rows(*values: float) -> pd.DataFrame:
+        scores = {"repetition": range(len(values)), "lpp_z": values}
+        return pd.DataFrame({**scores, "status": "finished"})
 
     assert gap(rows(-math.inf), rows(-1.0)) == -math.inf
     assert gap(rows(-1.0), rows(-math.inf)) == math.inf
     assert gap(rows(-math.inf), rows(-math.inf)) == 0.0
     # Only of repetitions that both have.
     assert gap(rows(1.0, 2.0), rows(0.5)) == 0.5
-    assert gap(rows(1.0), []) is None
+    assert gap(rows(1.0), rows()) is None
 
 
 # Statements -------------------------------------------------------------------------
