@@ -24,7 +24,6 @@ from sbi_rope._validation import (
     check_positive,
     check_unit_interval,
 )
-from sbi_rope.baselines import PriorPosterior
 from sbi_rope.discrepancy.correction import Space
 from sbi_rope.errors import (
     InvalidInputError,
@@ -36,6 +35,7 @@ from sbi_rope.mixture import (
     MixturePosterior,
     OwnContexts,
     Part,
+    PriorPosterior,
     part_of,
     part_of_prior,
 )
