@@ -79,7 +79,7 @@ class _ThenFinetuned(DiscrepancyNPE):
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         corrected, _ = super()._fit(show_progress_bars=show_progress_bars)
         method = FinetunedNPE.from_posterior(corrected, num_holdouts=NUM_HOLDOUTS)
-        method.append_calibration(*self._calibration)
+        method.append_calibration(*self._data.calibration)
         method.train(show_progress_bars=show_progress_bars)
         return method.build_posterior(), method.history
 

@@ -14,13 +14,7 @@ from benchmarks.cases import Case
 from benchmarks.cells import NEEDS_COUPLING, Cell
 from benchmarks.methods import COUPLED_STACK, METHODS, STACK
 from sbi_rope import RoPE, SinkhornCoupler
-from sbi_rope.baselines import (
-    BuildsOnNPE,
-    ReferenceNPE,
-    UsesCalibration,
-    UsesObservations,
-    UsesSimulations,
-)
+from sbi_rope.baselines import ReferenceNPE
 from sbi_rope.metrics import Evaluation, evaluate
 from sbi_rope.stacking import StackedPosterior, stack
 from sbi_rope.sweep import sweep
@@ -98,18 +92,18 @@ def _score(case: Case, cell: Cell) -> Score:
     count = _Count(case)
     method = METHODS[cell.method](case)
     start = time.perf_counter()
-    if isinstance(method, UsesSimulations) and method.needs_simulations:
+    if method.needs_simulations:
         # Without a simulator, tuning-only looks targets up among stored simulations.
         stored = cell.method == "tuning-only"
         method.append_simulations(*(case.stored if stored else case.simulations))
-    if isinstance(method, UsesCalibration):
+    if "calibration" in method.sees:
         method.append_calibration(*case.calibration)
-    if isinstance(method, UsesObservations):
+    if "observations" in method.sees:
         method.append_observations(x_o)
     method.train(seed=case.seed, show_progress_bars=False)
     posterior = method.build_posterior()
     seconds = time.perf_counter() - start
-    used = len(case.simulations[0]) if isinstance(method, UsesSimulations) else 0
+    used = len(case.simulations[0]) if "simulations" in method.sees else 0
     used += count.new
     if isinstance(method, ReferenceNPE):
         if case.simulator is None:
@@ -127,7 +121,7 @@ def _score(case: Case, cell: Cell) -> Score:
         couple_seconds=0.0,
         test_seconds=test_seconds,
         num_simulations=used,
-        shares_npe=isinstance(method, BuildsOnNPE),
+        shares_npe=method.starts_from_npe,
     )
 
 

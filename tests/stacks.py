@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from sbi_rope import CalibrationFinetuner, RoPE, StackedPosterior
 from sbi_rope.baselines import FinetunedNPE, PriorPosterior
-from sbi_rope.baselines.training import Training
 from sbi_rope.discrepancy import DiscrepancyModel
 from sbi_rope.stacking import (
     CouplingCandidate,
@@ -21,6 +20,7 @@ from sbi_rope.stacking import (
     default_candidates,
     stack,
 )
+from sbi_rope.trainers.training import Training
 from tests import problems
 
 QUIET: dict[str, Any] = {"show_progress_bars": False}

@@ -12,15 +12,13 @@ from sbi_rope._sbi import (
     embedding_of,
     headless,
 )
-from sbi_rope._standardisation import ROUNDING
 from sbi_rope._training import History, fit, split_pairs
-from sbi_rope.baselines.training import Training
 from sbi_rope.errors import UnsupportedPosteriorError
+from sbi_rope.trainers.training import Training
 
 __all__ = [
     "NoiseOn",
     "SoftClip",
-    "Standardisation",
     "fit_marginal",
     "split_at_statistics",
 ]
@@ -55,39 +53,6 @@ def split_at_statistics(
     if noise_on == "input":
         return nn.Identity(), estimator
     return embedding_of(estimator), headless(estimator)
-
-
-class Standardisation(nn.Module):
-    """Statistics in units of their standard deviation over simulations, and back.
-
-    Statistics that are the same in all simulations cannot be in these units. They are
-    left out on the way there, and have their simulated value on the way back.
-
-    Args:
-        simulated: Statistics of simulations, shape ``(n, l)``.
-    """
-
-    mean: Tensor
-    std: Tensor
-    varies: Tensor
-
-    def __init__(self, simulated: Tensor) -> None:
-        super().__init__()
-        std, mean = torch.std_mean(simulated, dim=0)
-        self.register_buffer("mean", mean)
-        self.register_buffer("std", std)
-        self.register_buffer("varies", std > ROUNDING * mean.abs())
-
-    def forward(self, statistics: Tensor) -> Tensor:
-        """Standardise, ``(..., l)`` to ``(..., l')``."""
-        return ((statistics - self.mean) / self.std)[..., self.varies]
-
-    def undo(self, standardised: Tensor) -> Tensor:
-        """Return statistics in their own units, ``(..., l')`` to ``(..., l)``."""
-        shape = (*standardised.shape[:-1], len(self.mean))
-        statistics = self.mean.expand(shape).clone()
-        statistics[..., self.varies] += standardised * self.std[self.varies]
-        return statistics
 
 
 class SoftClip(nn.Module):

@@ -6,6 +6,7 @@ from sbi_rope.mixture.estimator import MixtureEstimator
 from sbi_rope.mixture.parts import Mixing, OwnContexts, Part, Rows, equal_rows, part_of
 from sbi_rope.mixture.posterior import MixturePosterior
 from sbi_rope.mixture.prior import part_of_prior
+from sbi_rope.mixture.prior_posterior import PriorPosterior
 from sbi_rope.mixture.truncation import Leakage
 
 __all__ = [
@@ -17,6 +18,7 @@ __all__ = [
     "MixturePosterior",
     "OwnContexts",
     "Part",
+    "PriorPosterior",
     "Rows",
     "equal_rows",
     "part_of",

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_rope._random import seeded
-from sbi_rope._sbi import DirectPosterior
+from sbi_rope._sbi import BaseDirectPosterior, describe
 from sbi_rope._validation import (
     as_numbers,
     as_shape,
@@ -31,7 +31,7 @@ from sbi_rope.mixture.truncation import Leakage, is_unbounded
 __all__ = ["MixturePosterior"]
 
 
-class MixturePosterior(DirectPosterior):
+class MixturePosterior(BaseDirectPosterior):
     r"""A mixture of weighted densities as an sbi posterior.
 
     .. math::
@@ -96,7 +96,7 @@ class MixturePosterior(DirectPosterior):
         self.posterior_estimator: MixtureEstimator = estimator
         # Shared with the views of single observations, so that it is estimated once.
         self._cache: dict[int, Tensor] = {} if shared is None else shared
-        self._purpose = _purpose(estimator)
+        describe(self, _purpose(estimator))
 
     @property
     def is_amortised(self) -> bool:
@@ -212,10 +212,6 @@ class MixturePosterior(DirectPosterior):
         with seeded(0):  # sbi draws from the prior to look at it
             super().to(device)
 
-    def __getstate__(self) -> dict[str, Any]:
-        # sbi hands out its own __dict__, which a shallow copy would then share.
-        return dict(self.__dict__)
-
     # --- sampling ---
 
     def sample(  # type: ignore[override]
@@ -313,7 +309,7 @@ class MixturePosterior(DirectPosterior):
         super().set_default_x(self._batch_of_x(x).clone())
         return self
 
-    def _x_else_default_x(self, x: Any) -> Tensor:
+    def _x_or_default(self, x: Any) -> Tensor:
         x = self.default_x if x is None else x
         if x is None:
             raise InvalidInputError(
@@ -323,7 +319,7 @@ class MixturePosterior(DirectPosterior):
         return self._batch_of_x(x)
 
     def _one_x(self, x: Tensor | None) -> Tensor:
-        batch = self._x_else_default_x(x)
+        batch = self._x_or_default(x)
         if len(batch) > 1:
             raise InvalidInputError(
                 f"Expected one observation; got {len(batch)}. Use the `_batched` "
@@ -470,26 +466,6 @@ class MixturePosterior(DirectPosterior):
                 num_init_samples=num_init_samples,
                 **options,
             )
-
-    def _calculate_map(  # type: ignore[override]
-        self,
-        *,
-        init_method: str | Tensor = "posterior",
-        num_init_samples: int,
-        show_progress_bars: bool,
-        **options: Any,
-    ) -> Tensor:
-        # sbi shows the progress of these draws whatever it was told.
-        if isinstance(init_method, str) and init_method == "posterior":
-            init_method = self.sample(
-                (num_init_samples,), show_progress_bars=show_progress_bars
-            )
-        return super()._calculate_map(
-            init_method=init_method,
-            num_init_samples=num_init_samples,
-            show_progress_bars=show_progress_bars,
-            **options,
-        )
 
     # --- normalisation ---
 

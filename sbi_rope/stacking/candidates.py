@@ -19,7 +19,6 @@ from sbi_rope._validation import (
     check_positive,
     check_unit_interval,
 )
-from sbi_rope.baselines import PriorPosterior
 from sbi_rope.errors import (
     InvalidInputError,
     InvalidTypeError,
@@ -29,6 +28,7 @@ from sbi_rope.errors import (
 from sbi_rope.mixture import (
     MixturePosterior,
     Part,
+    PriorPosterior,
     part_of,
     part_of_prior,
 )

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from sbi_rope._validation import check_instance, check_numbers
-from sbi_rope.baselines import PriorPosterior
+from sbi_rope.mixture import PriorPosterior
 from sbi_rope.rope import RoPE
 from sbi_rope.stacking.candidates import (
     AmortisedCandidate,

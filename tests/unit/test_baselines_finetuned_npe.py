@@ -14,7 +14,6 @@ from sbi_rope import RoPE, SinkhornCoupler
 from sbi_rope._random import seeded
 from sbi_rope._training import split_groups, split_pairs
 from sbi_rope.baselines import FinetunedNPE, PlainNPE, Training
-from sbi_rope.baselines.training import train_on_pairs
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import (
     InvalidInputError,
@@ -24,6 +23,7 @@ from sbi_rope.errors import (
 )
 from sbi_rope.mixture import MixturePosterior, OwnContexts
 from sbi_rope.tasks import get_task
+from sbi_rope.trainers.training import train_on_pairs
 
 pytestmark = pytest.mark.filterwarnings("ignore:Maximum number of epochs")
 

@@ -36,7 +36,6 @@ from sbi_rope.baselines.hvae.reparametrisation import (
     reparametrised_sample,
 )
 from sbi_rope.baselines.hvae.training import train_hybrid
-from sbi_rope.baselines.training import Training
 from sbi_rope.errors import (
     InvalidInputError,
     InvalidTypeError,
@@ -46,6 +45,7 @@ from sbi_rope.errors import (
 )
 from sbi_rope.mixture import MixtureEstimator, Part
 from sbi_rope.tasks.pendulum import PendulumSimulator
+from sbi_rope.trainers.training import Training
 
 # --- a linear-Gaussian model whose evidence is known ---
 # theta ~ N(0, I_2), z ~ N(0, 1), x = A theta + B z + noise of standard deviation 0.5.

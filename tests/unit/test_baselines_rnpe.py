@@ -14,7 +14,6 @@ from sbi_rope._sbi import estimator_of
 from sbi_rope.baselines.error_model import SpikeAndSlab
 from sbi_rope.baselines.rnpe import RNPE, DenoisedContexts
 from sbi_rope.baselines.statistics import Standardisation, fit_marginal
-from sbi_rope.baselines.training import Training
 from sbi_rope.errors import (
     InvalidInputError,
     InvalidTypeError,
@@ -23,6 +22,7 @@ from sbi_rope.errors import (
     UnsupportedPosteriorError,
 )
 from sbi_rope.metrics import lpp
+from sbi_rope.trainers.training import Training
 from tests import gaussian, problems
 
 # theta ~ N(0, 1), x = theta + 0.5 eps, q(theta | s) = N(s, 0.2) with s = 0.8 x.

@@ -228,10 +228,6 @@ class TestCalibrationMLP:
         assert torch.allclose(estimator.mean, shift.loc, atol=0.1)  # type: ignore[arg-type]
         assert torch.allclose(estimator.std, shift.scale, rtol=0.05)  # type: ignore[arg-type]
 
-    def test_it_makes_no_use_of_simulations(self) -> None:
-        method: Any = CalibrationMLP(TASK.get_prior(), builder())
-        assert not hasattr(method, "append_simulations")
-
 
 class TestJointNPE:
     def method(self, n_cal: int, **options: Any) -> JointNPE:

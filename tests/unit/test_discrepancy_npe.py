@@ -17,8 +17,8 @@ from sbi_rope import CalibrationFinetuner
 from sbi_rope._sbi import embedding_of, estimator_of, with_embedding
 from sbi_rope._simulations import StoredSimulations
 from sbi_rope._simulator import Simulator
+from sbi_rope._standardisation import Standardisation
 from sbi_rope.baselines import Training
-from sbi_rope.baselines.statistics import Standardisation
 from sbi_rope.discrepancy import DiscrepancyModel, DiscrepancyNPE
 from sbi_rope.discrepancy.model import DiscrepancyDraws
 from sbi_rope.discrepancy.training import train_on_corrected

@@ -15,6 +15,7 @@ from sbi.inference import NPE
 from sbi.neural_nets import posterior_nn
 from torch import Tensor, nn
 
+from sbi_rope._sbi.trainer import SimulationTrainer
 from sbi_rope._training import (
     MIN_PAIRS_FOR_HOLDOUT,
     STEPS_WITHOUT_HOLDOUT,
@@ -26,14 +27,13 @@ from sbi_rope._training import (
     warn_without_holdout,
 )
 from sbi_rope.baselines import Training
-from sbi_rope.baselines.training import (
+from sbi_rope.errors import InvalidInputError, InvalidTypeError, RoPEWarning
+from sbi_rope.trainers.training import (
     MIN_SIMULATIONS,
-    SimulationTrainer,
     estimator_builder,
     train_on_pairs,
-    train_with_sbi,
+    train_on_simulations,
 )
-from sbi_rope.errors import InvalidInputError, InvalidTypeError, RoPEWarning
 from tests.problems import box, simulate
 
 pytestmark = [
@@ -480,8 +480,7 @@ def pairs(n: int) -> tuple[Tensor, Tensor]:
 def with_sbi(n: int = 60, **options: Any) -> tuple[Any, History]:
     settings: dict[str, Any] = {"max_num_epochs": 5, "training_batch_size": 20}
     settings.update(options)
-    return train_with_sbi(
-        SimulationTrainer,
+    return train_on_simulations(
         box(2),
         estimator_builder(small()),
         *pairs(n),

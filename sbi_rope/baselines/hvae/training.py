@@ -9,9 +9,9 @@ from torch import Tensor
 from sbi_rope._random import seeded
 from sbi_rope._training import History, fit, split_pairs, too_few_pairs
 from sbi_rope.baselines.hvae.model import HybridVAE
-from sbi_rope.baselines.training import Training
 from sbi_rope.errors import warn_user
 from sbi_rope.mixture import MixtureEstimator
+from sbi_rope.trainers.training import Training
 
 __all__ = ["train_hybrid"]
 
