@@ -51,8 +51,8 @@ SETTINGS = {
     "lr 3e-4, bank of 100": {"learning_rate": 3e-4},
     "lr 1e-3, bank of 100": {"learning_rate": 1e-3},
     "lr 3e-3, bank of 100": {"learning_rate": 3e-3},
-    "lr 1e-3, bank of 100, 300 steps": {"learning_rate": 1e-3, "num_steps": 300},
-    "lr 1e-4, bank of 100, 3000 steps": {"learning_rate": 1e-4, "num_steps": 3000},
+    "lr 1e-3, bank of 100, 300 steps": {"learning_rate": 1e-3, "max_num_epochs": 300},
+    "lr 1e-4, bank of 100, 3000 steps": {"learning_rate": 1e-4, "max_num_epochs": 3000},
     "defaults: better of lr 1e-4 and 1e-3, bank of 100, patience 200": {},
     "defaults, rehearsal 1": {"rehearsal": 1.0},
     "stored, 1 neighbour": {"num_neighbors": 1},
@@ -63,7 +63,7 @@ COLUMNS = (
     "setting",
     "n_calibration",
     "seed",
-    "best_step",
+    "best_epoch",
     "distance",
     "tuning_lpp_z",
     "rope_lpp_z",
@@ -72,7 +72,7 @@ COLUMNS = (
 # Named learning rates run to their last step, so that they can be compared.
 for _options in SETTINGS.values():
     if "learning_rate" in _options:
-        _options["patience"] = 10_000
+        _options["stop_after_epochs"] = 10_000
 # Labelled calibration rows; the first ones are tuned on, the last ones scored on.
 NUM_LABELLED, NUM_SCORED = 1000, 500
 
@@ -103,7 +103,7 @@ def run(task: Task, npe: Any, setting: str, n: int, seed: int) -> dict[str, Any]
         "setting": setting,
         "n_calibration": n,
         "seed": seed,
-        "best_step": rope.history.best_step,
+        "best_epoch": rope.history.best_epoch,
         "distance": round(distance_to_targets(task, rope, theta_v, x_v), 4),
         "tuning_lpp_z": round(
             lpp(rope.tuned_posterior(), theta_v, x_v, theta_std=task.prior_std).mean, 4
@@ -192,7 +192,7 @@ def print_table(rows: list[dict[str, str]]) -> None:
         "seconds | seeds |\n|---|---|---|---|---|---|---|---|"
     )
     digits = {
-        "best_step": 0,
+        "best_epoch": 0,
         "distance": 3,
         "tuning_lpp_z": 2,
         "rope_lpp_z": 2,
