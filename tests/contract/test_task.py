@@ -32,7 +32,9 @@ OTHER_PRIORS = [
 ]
 
 pytestmark = pytest.mark.usefixtures("chamber_extract")
-TASK = pytest.mark.parametrize("kind", [(name, None) for name in sorted(TASKS)], ids=str)
+TASK = pytest.mark.parametrize(
+    "kind", [(name, None) for name in sorted(TASKS)], ids=str
+)
 PRIOR = pytest.mark.parametrize(
     "kind", [*((name, None) for name in sorted(TASKS)), *OTHER_PRIORS], ids=str
 )
@@ -218,9 +220,7 @@ def test_sbi_simulates_and_builds_a_posterior_on_the_task(task: Task) -> None:
     assert x.shape == (20, *task.x_shape)
     theta, x = task.get_simulations(200)
     build = posterior_nn(
-        "mdn",
-        embedding_net=task.get_embedding_net(light=True),
-        z_score_x=task.z_score_x,
+        "mdn", embedding_net=task.get_embedding_net(), z_score_x=task.z_score_x
     )
     posterior = DirectPosterior(build(theta, x), prior).set_default_x(x[:1])
     assert torch.isfinite(

@@ -1,11 +1,11 @@
 """The labelled sets of every task: reproducible, disjoint, of the law they should have.
 
 All sets are made by the same code: ``Task`` asks for a ``DrawnPairs`` or a
-``RecordedPairs`` and takes from it. That it is so, and which task overrides what, is
-the first test; ``tests/unit/test_tasks_splits.py`` tests that code. The contract is then
-checked for the standard process of every task, for its well-specified one, and for
-the variants that run code of a task's own. One task with a process to draw from and one
-with recordings stand for the others in the variants that all tasks have.
+``RecordedPairs`` and takes from it. The first test shows this, and which task overrides
+what; ``tests/unit/test_tasks_splits.py`` tests that code. The contract is then checked
+for the standard process of every task, and for the variants that run code of a task's
+own. One task with a process to draw from and one with recordings stand for the others
+in the variants that all tasks have.
 
 Sets are drawn once for all tests that read them (:func:`shared`); what must be
 reproduced is drawn anew and compared with them.
@@ -52,7 +52,10 @@ def runs_code_of_its_own(name: str, variant: str | None) -> bool:
     """Whether no other task's tests run what this variant of this task runs."""
     if variant not in COMMON_VARIANTS or name in FOR_THE_REST:
         return True
-    methods = {"biased_calibration": "_keep", "well_specified": "_well_specified_process"}
+    methods = {
+        "biased_calibration": "_keep",
+        "well_specified": "_well_specified_process",
+    }
     return name in OVERRIDDEN.get(methods.get(variant, ""), set())
 
 
@@ -182,9 +185,7 @@ def test_a_set_depends_on_nothing_but_its_seed_and_leaves_no_trace(
         finally:
             torch.set_default_dtype(torch.float32)
         for found, whole in ((small, expected), (again, other), (elsewhere, expected)):
-            assert all(
-                torch.equal(a, b[:7]) for a, b in zip(found, whole, strict=True)
-            )
+            assert all(torch.equal(a, b[:7]) for a, b in zip(found, whole, strict=True))
     assert capfd.readouterr() == ("", "")
 
 

@@ -38,9 +38,7 @@ def main(source: Path) -> None:
     (target / "pwdb_population.json").write_text(text)
     for case in ("cca", "ibif"):
         for name in (f"{case}.yaml", f"{case}_inlet.dat", "LICENSE"):
-            shutil.copyfile(
-                blood / "reference_openbf" / name, target / "openbf" / name
-            )
+            shutil.copyfile(blood / "reference_openbf" / name, target / "openbf" / name)
         with np.load(blood / "reference_openbf" / f"ref_{case}.npz") as waves:
             pressures = {name: waves[name] for name in waves if name.endswith("__P")}
         np.savez(target / "openbf" / f"ref_{case}.npz", **pressures)

@@ -20,6 +20,7 @@ from sbi_rope.tasks.hemodynamics.network import (
 from sbi_rope.tasks.hemodynamics.openbf import read_case
 from sbi_rope.tasks.hemodynamics.subject import NUM_SEGMENTS, Physics
 from sbi_rope.tasks.hemodynamics.validation import BASELINE
+from sbi_rope.tasks.hemodynamics.waveforms import SITES
 from tests.conftest import SHARED_DATA
 
 OPENBF_TEXT = """project_name: tube
@@ -104,26 +105,23 @@ def test_every_blind_end_has_a_vascular_bed_and_nothing_else_has() -> None:
 # Stiffness ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("velocity", [4.0, 6.1, 11.0])
-@pytest.mark.parametrize("diameter", [0.8, 1.2])
-def test_the_walls_give_the_wave_velocity_asked_for(
-    velocity: float, diameter: float
-) -> None:
+def test_the_walls_give_the_wave_velocity_asked_for() -> None:
     factors = tuple(1 + 0.2 * np.sin(np.arange(NUM_SEGMENTS)))
-    subject = replace(
-        BASELINE,
-        pulse_wave_velocity=velocity,
-        diameter_factor=diameter,
-        length_factors=factors,
-    )
-    network = build_network(subject, Physics())
-    measured = carotid_femoral_velocity(
-        network.length,
-        network.inlet_radius,
-        network.outlet_radius,
-        network.stiffness[2, 0],
-    )
-    assert measured == pytest.approx(velocity, rel=1e-6)
+    for velocity, diameter in ((4.0, 1.2), (6.1, 0.8), (11.0, 1.2)):
+        subject = replace(
+            BASELINE,
+            pulse_wave_velocity=velocity,
+            diameter_factor=diameter,
+            length_factors=factors,
+        )
+        network = build_network(subject, Physics())
+        measured = carotid_femoral_velocity(
+            network.length,
+            network.inlet_radius,
+            network.outlet_radius,
+            network.stiffness[2, 0],
+        )
+        assert measured == pytest.approx(velocity, rel=1e-6)
 
 
 def test_in_equal_tubes_the_wave_velocity_is_that_of_each() -> None:
@@ -179,6 +177,20 @@ def test_only_walls_of_segments_longer_than_11_mm_are_viscous() -> None:
 def test_walls_can_be_elastic() -> None:
     network = build_network(BASELINE, Physics(viscoelastic=False))
     assert not network.wall_viscosity.any()
+
+
+def test_pressures_are_recorded_in_the_arteries_that_the_sites_are_named_after() -> (
+    None
+):
+    found = {
+        site: (arteries.SEGMENTS[segment][0], position)
+        for site, (segment, position) in SITES.items()
+    }
+    assert found == {
+        "radial": ("left radial", 0.5),
+        "brachial": ("left brachial", 0.5),
+        "aortic": ("ascending aorta", 0.0),
+    }
 
 
 # Geometry ----------------------------------------------------------------------------

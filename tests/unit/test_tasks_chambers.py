@@ -187,7 +187,9 @@ def test_an_image_of_another_size_or_mode_is_refused(tmp_path: Path) -> None:
             read_images(tmp_path, ["0.png"], 16)
 
 
-def test_the_message_about_a_missing_size_lists_the_sizes_there_are(tmp_path: Path) -> None:
+def test_the_message_about_a_missing_size_lists_the_sizes_there_are(
+    tmp_path: Path,
+) -> None:
     for name in ("images_100", "images_full", "other"):
         (tmp_path / DATASET / "first" / name).mkdir(parents=True)
     experiment = tmp_path / DATASET / "first"

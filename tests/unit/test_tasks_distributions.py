@@ -6,7 +6,6 @@ from torch.distributions import Beta, biject_to
 
 from sbi_rope.tasks.distributions import Arcsine, UniformDistance, box
 
-
 Law = type[UniformDistance] | type[Arcsine]
 LAWS = pytest.mark.parametrize("law", [UniformDistance, Arcsine])
 
@@ -19,7 +18,9 @@ def distance() -> UniformDistance:
     return UniformDistance(torch.tensor([40.0]), validate_args=False)
 
 
-def test_the_density_of_a_distance_is_that_of_a_scaled_beta(distance: UniformDistance) -> None:
+def test_the_density_of_a_distance_is_that_of_a_scaled_beta(
+    distance: UniformDistance,
+) -> None:
     d = torch.linspace(0.1, 39.9, 50)
     beta = Beta(torch.tensor(1.0), torch.tensor(2.0))
     expected = beta.log_prob(d / 40) - torch.tensor(40.0).log()
@@ -34,14 +35,18 @@ def test_the_density_is_the_derivative_of_the_distribution_function(law: Law) ->
     torch.testing.assert_close(density, some.log_prob(d).exp())
 
 
-def test_the_density_of_a_distance_is_zero_beyond_its_ends(distance: UniformDistance) -> None:
+def test_the_density_of_a_distance_is_zero_beyond_its_ends(
+    distance: UniformDistance,
+) -> None:
     values = torch.tensor([-1e-3, 0.0, 40.0, 40.1])
     expected = torch.tensor([0.0, 0.05, 0.0, 0.0])
     torch.testing.assert_close(distance.log_prob(values).exp(), expected)
     assert distance.support.check(values).tolist() == [False, True, True, False]
 
 
-def test_draws_of_a_distance_are_those_of_uniform_draws(distance: UniformDistance) -> None:
+def test_draws_of_a_distance_are_those_of_uniform_draws(
+    distance: UniformDistance,
+) -> None:
     draws = distance.sample((20_000,)).flatten()
     uniform = 40 * torch.rand(2, 20_000) - 15
     levels = torch.linspace(0.01, 0.99, 50)
