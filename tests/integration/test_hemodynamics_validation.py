@@ -75,7 +75,7 @@ def test_small_waves_come_closer_to_the_linear_equations_with_finer_cells(
     assert fine < 0.6 * coarse
 
 
-def test_a_bifurcation_reflects_what_its_admittances_say() -> None:
+def test_a_bifurcation_reflects_waves_as_its_admittances_predict() -> None:
     measured, exact = reflection()
     assert exact > 0.25
     assert measured == pytest.approx(exact, abs=0.01)
@@ -176,7 +176,7 @@ def test_stiffer_arteries_have_a_larger_pulse(beat: Beat) -> None:
 # The table ---------------------------------------------------------------------------
 
 
-def test_without_the_waves_of_openbf_these_rows_are_not_run(
+def test_the_table_leaves_out_openbf_where_its_waves_are_missing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(validation, "_exact_rows", lambda: ())

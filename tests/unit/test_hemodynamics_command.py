@@ -73,7 +73,7 @@ def test_options_of_generate_reach_population_and_physics(tmp_path: Path) -> Non
     )
 
 
-def test_an_interrupt_says_how_to_go_on(
+def test_after_an_interrupt_the_command_says_how_to_go_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def stop(subject: Subject, physics: Physics) -> Beat:
@@ -136,7 +136,7 @@ def test_info_summarises_a_file(
     assert f"smaller time step: {young}\n" in out
 
 
-def test_info_about_no_data_set_is_an_error_of_one_line(
+def test_info_refuses_a_file_that_is_no_data_set_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["info", str(tmp_path / "none.npz")]) == 2

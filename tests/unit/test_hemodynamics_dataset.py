@@ -134,7 +134,7 @@ def test_settings_are_stored(made: Path) -> None:
     assert settings["physics"] == Physics().as_dict()
 
 
-def test_the_simulator_needs_no_lengths(tmp_path: Path) -> None:
+def test_files_of_the_simulator_hold_no_lengths_of_arteries(tmp_path: Path) -> None:
     narrow = _make(tmp_path / "a.npz", n=3, process="simulator")
     assert narrow.length_factors is None
     wide = Population(segment_sd=0.4)
@@ -157,7 +157,7 @@ def test_the_simulator_needs_no_lengths(tmp_path: Path) -> None:
         pytest.param("loky", marks=pytest.mark.slow),
     ],
 )
-def test_bytes_do_not_depend_on_jobs_and_backend(
+def test_a_file_has_the_same_bytes_for_any_number_of_jobs_and_any_backend(
     backend: str, made: Path, tmp_path: Path
 ) -> None:
     with joblib.parallel_config(backend=backend, n_jobs=2):
@@ -166,7 +166,7 @@ def test_bytes_do_not_depend_on_jobs_and_backend(
     assert [path.name for path in tmp_path.iterdir()] == ["again.npz"]
 
 
-def test_bytes_are_the_same_from_a_backend_without_generators(
+def test_a_file_has_the_same_bytes_from_a_backend_without_generators(
     made: Path, tmp_path: Path
 ) -> None:
     with joblib.parallel_config(backend="multiprocessing"):

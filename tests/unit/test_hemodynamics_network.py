@@ -82,7 +82,7 @@ def test_the_geometry_is_the_published_one() -> None:
     np.testing.assert_allclose(table, expected * [1, 1, 1e3, 1e3, 1e3])
 
 
-def test_all_segments_hang_together() -> None:
+def test_all_segments_are_connected_with_the_heart() -> None:
     reached = {arteries.SEGMENTS[0][1]}
     for _ in range(NUM_SEGMENTS):
         for segment in arteries.SEGMENTS:
@@ -204,7 +204,7 @@ def test_short_segments_are_stretched_and_no_others() -> None:
     np.testing.assert_allclose(network.length, np.maximum(table * factors, 0.02))
 
 
-def test_the_diameter_factor_is_that_of_large_arteries() -> None:
+def test_the_diameter_factor_widens_large_arteries_only() -> None:
     wide = build_network(replace(BASELINE, diameter_factor=1.1), Physics())
     usual = build_network(BASELINE, Physics())
     ratio = wide.outlet_radius / usual.outlet_radius
@@ -248,7 +248,7 @@ def test_compliances_add_up_to_those_of_the_beds() -> None:
     assert outlets.compliance.sum() / 1e-6 * MMHG == pytest.approx(expected)
 
 
-def test_most_outlets_reflect_nothing_at_once() -> None:
+def test_most_outlets_have_the_impedance_of_their_artery() -> None:
     network = build_network(BASELINE, Physics())
     segment, radius = network.outlets.segment, network.outlet_radius
     impedance = [
@@ -259,7 +259,7 @@ def test_most_outlets_reflect_nothing_at_once() -> None:
     assert set(segment[~matched] + 1) <= {26}
 
 
-def test_a_strong_heart_leaves_every_bed_a_resistance() -> None:
+def test_every_outlet_has_a_resistance_even_behind_a_strong_heart() -> None:
     subject = replace(BASELINE, stroke_volume=110.0, pulse_wave_velocity=9.0)
     outlets = build_network(subject, Physics()).outlets
     assert (outlets.distal_resistance > 0).all()

@@ -74,7 +74,7 @@ def test_age_and_heart_follow_their_laws(people: dict[str, np.ndarray]) -> None:
     assert abs(np.corrcoef([volume, rate, noise])[np.triu_indices(3, 1)]).max() < 0.08
 
 
-def test_ejection_time_is_explained_to_half_by_weissler(
+def test_weisslers_formula_explains_half_of_the_variance_of_the_ejection_time(
     people: dict[str, np.ndarray],
 ) -> None:
     time = people["ejection_time"]

@@ -158,7 +158,9 @@ def test_independent_density_is_a_product() -> None:
     assert total == pytest.approx(whole)
 
 
-def test_there_is_no_density_outside(prior: PopulationPrior) -> None:
+def test_the_prior_has_no_density_outside_of_its_support(
+    prior: PopulationPrior,
+) -> None:
     outside = torch.tensor([[20.0, 280.0], [60.0, 400.0], [200.0, 280.0], [60.0, 0.0]])
     assert prior.log_prob(outside).tolist() == [-torch.inf] * 4
     assert not within_support(prior, outside).any()
@@ -210,7 +212,7 @@ def test_prior_can_be_copied_expanded_and_moved(prior: PopulationPrior) -> None:
     assert PopulationPrior(Population()).mean.device.type == "cpu"
 
 
-def test_density_has_gradients_made_in_inference_mode_or_not() -> None:
+def test_a_prior_made_in_inference_mode_has_a_density_with_gradients() -> None:
     with torch.inference_mode():
         prior = PopulationPrior()
     theta = torch.tensor([60.0, 280.0], requires_grad=True)

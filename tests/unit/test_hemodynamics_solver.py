@@ -191,7 +191,7 @@ def test_a_joint_within_a_tube_changes_nothing(viscosity: float) -> None:
 # Waves -------------------------------------------------------------------------------
 
 
-def test_a_wave_arrives_when_its_velocity_says() -> None:
+def test_a_wave_travels_at_the_velocity_of_the_tube_law() -> None:
     tube = make_network([(0, 1)], length=[2.0], radius=[(0.01, 0.01)], outlets=[0])
     pulse = np.zeros(400)
     pulse[:20] = np.sin(np.linspace(0, np.pi, 20)) ** 2
@@ -240,7 +240,9 @@ def test_a_flow_that_is_too_strong_is_reported() -> None:
         run(loop(), 1.0 * HALF_SINE)
 
 
-def test_without_numba_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_numba_the_message_names_the_extra_to_install(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setitem(sys.modules, "numba", None)
     monkeypatch.delitem(
         sys.modules, "sbi_rope.tasks.hemodynamics.kernels", raising=False

@@ -30,7 +30,7 @@ def test_tasks_are_registered_and_listed_under_their_names() -> None:
     assert list_tasks() == sorted(TASKS)
 
 
-def test_get_task_passes_everything_on() -> None:
+def test_get_task_passes_all_options_on_to_the_task() -> None:
     task = get_task(
         "pendulum",
         variant="misspecified_prior",
@@ -152,7 +152,9 @@ def test_the_beta_shape_looks_at_the_first_three_parameters_only() -> None:
     assert torch.equal(beta_shaped(u), beta_shaped(u[:, :3]))
 
 
-def test_label_noise_stays_in_the_support_and_begins_like_that_of_more_labels() -> None:
+def test_label_noise_stays_in_the_support_and_does_not_depend_on_later_rows() -> (
+    None
+):
     prior = get_task("pendulum").get_prior()
     theta = prior.sample(torch.Size((250,)))
     std = torch.tensor([1.0, 3.0])

@@ -382,7 +382,7 @@ def test_a_download_without_the_data_set_is_an_error(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_without_the_internet_the_other_way_is_named(
+def test_without_the_internet_the_message_names_the_page_to_download_from(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def offline(module: str) -> None:

@@ -175,7 +175,7 @@ def test_a_tissue_without_a_cancer_cell_has_no_statistics() -> None:
         pytest.param(REAL, CancerStroma(), id="real"),
     ],
 )
-def test_means_under_the_prior_are_the_known_ones(
+def test_means_under_the_prior_are_those_of_an_independent_implementation(
     table: tuple[tuple[float, ...], tuple[float, ...]], task: CancerStroma
 ) -> None:
     _, x = task.get_test_set(1500)

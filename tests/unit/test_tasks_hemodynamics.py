@@ -35,7 +35,7 @@ def test_a_beat_is_repeated_at_125_hz() -> None:
             torch.testing.assert_close(played[0], expected, atol=1e-4, rtol=0.0)
 
 
-def test_records_have_mean_0_and_deviation_1_before_the_noise() -> None:
+def test_recordings_have_mean_0_and_standard_deviation_1_before_the_noise() -> None:
     beat = 90 + 20 * sine().expand(5, -1)
     x = Recorder(noise_std=0.0)(beat, torch.linspace(0.5, 1.2, 5))
     torch.testing.assert_close(
@@ -65,7 +65,7 @@ def test_noise_is_added_after_the_normalisation() -> None:
     assert (noisy - clean).std() == pytest.approx(0.1, rel=0.01)
 
 
-def test_starts_are_uniform_over_the_beat() -> None:
+def test_recordings_start_uniformly_within_the_beat() -> None:
     # The first sample of a straight ramp tells where it began.
     ramp = torch.arange(256, dtype=torch.float64).expand(4000, -1)
     recorder = Recorder(noise_std=0.0, normalisation="global")
@@ -110,7 +110,7 @@ def test_every_stored_person_is_simulated_before_one_comes_again() -> None:
     assert torch.equal(more[: len(stored)], theta)
 
 
-def test_a_real_person_has_one_recording() -> None:
+def test_each_real_person_is_recorded_once() -> None:
     task = Hemodynamics()
     first, second = (task.get_calibration_set(40, seed=seed) for seed in (0, 1))
     same = (first[0].unsqueeze(1) == second[0]).all(dim=2).nonzero()
@@ -119,7 +119,7 @@ def test_a_real_person_has_one_recording() -> None:
         assert torch.equal(first[1][i], second[1][j])
 
 
-def test_well_specified_people_are_not_those_to_train_on() -> None:
+def test_well_specified_observations_are_of_people_who_are_not_trained_on() -> None:
     task = Hemodynamics(variant="well_specified")
     trained = {tuple(row) for row in task.get_simulator().theta.tolist()}
     people = [task.get_calibration_set(50)[0], task.get_test_set(100)[0]]
@@ -128,7 +128,7 @@ def test_well_specified_people_are_not_those_to_train_on() -> None:
     assert len(trained) == pytest.approx(half, abs=1)
 
 
-def test_parameters_lie_in_the_prior_and_follow_it() -> None:
+def test_the_parameters_of_the_people_of_the_package_follow_the_prior() -> None:
     task = Hemodynamics()
     theta = task.get_simulator().theta
     assert torch.isfinite(task.get_prior().log_prob(theta)).all()

@@ -408,7 +408,7 @@ def test_the_networks_refuse_images_of_another_shape_and_those_too_small() -> No
             ImageEmbedding(image_size=smallest - 1, light=light)
 
 
-def test_light_network_sees_means_over_squares() -> None:
+def test_the_light_network_starts_from_means_over_squares() -> None:
     net = ImageEmbedding(light=True)
     means = net.features(HexagonSimulator()(torch.tensor([[255.0, 0.0, 51.0, 1.0]])))
     red, green, blue = means.reshape(3, 10, 10)
@@ -423,7 +423,7 @@ def test_light_network_sees_means_over_squares() -> None:
 # Recorded images ---------------------------------------------------------------------
 
 
-def test_rows_become_parameters_and_images(write_data: WriteData) -> None:
+def test_rows_of_a_file_become_parameters_and_images(write_data: WriteData) -> None:
     task = LightTunnel(root=write_data(), image_size=SIZE)
     theta, x = all_recorded(task)
     assert sorted(theta[:, 0].tolist()) == list(range(12))
@@ -464,7 +464,7 @@ def test_dequantised_images_get_the_same_noise_whenever_they_are_read(
     assert torch.equal(other[1][row], x[0])
 
 
-def test_flipped_turns_test_images_only(write_data: WriteData) -> None:
+def test_the_flipped_variant_turns_test_images_only(write_data: WriteData) -> None:
     root = write_data()
     task = LightTunnel(root=root, image_size=SIZE, variant="flipped")
     for part, flipped in (("calibration", False), ("test", True)):

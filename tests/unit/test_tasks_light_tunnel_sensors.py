@@ -217,7 +217,9 @@ def test_a_recorded_row_becomes_the_parameters_and_the_observation(
     assert x[row, 6] == 72.0
 
 
-def test_rows_become_parameters_and_logarithms(write_table: WriteTable) -> None:
+def test_rows_of_a_file_become_parameters_and_logarithms_of_readings(
+    write_table: WriteTable,
+) -> None:
     theta, x = all_recorded(LightTunnelSensors(root=write_table()), num_rows=9)
     order = theta[:, 0].argsort()
     i = torch.arange(9.0)
@@ -338,7 +340,7 @@ def test_light_does_not_tell_an_angle_from_its_supplement() -> None:
     torch.testing.assert_close(x[0], x[1])
 
 
-def test_sensor_settings_change_the_test_set_alone(chamber_extract: Path) -> None:
+def test_sensor_settings_change_the_test_set_only(chamber_extract: Path) -> None:
     task = LightTunnelSensors(root=chamber_extract, variant="sensor_settings")
     standard = LightTunnelSensors(root=chamber_extract)
     theta, x = standard.get_calibration_set(100)

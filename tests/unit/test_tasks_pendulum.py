@@ -29,7 +29,7 @@ def test_positions_are_a_damped_cosine() -> None:
     assert x[1, -1] == pytest.approx(3.0 * math.exp(-5.0))
 
 
-def test_noise_is_that_of_the_sensor() -> None:
+def test_the_noise_has_the_standard_deviation_of_the_sensor() -> None:
     theta = torch.tensor([[0.0, 2.0]]).expand(1000, -1)
     # At frequency 0 a series is constant but for the noise at every step.
     for simulator in (Pendulum().get_simulator(), PendulumSimulator()):

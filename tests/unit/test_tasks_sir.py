@@ -116,7 +116,7 @@ def test_finer_steps_on_one_brownian_path_converge() -> None:
     assert errors[2] < 0.05
 
 
-def test_numpy_and_torch_integrate_alike() -> None:
+def test_numpy_and_torch_give_the_same_epidemics() -> None:
     theta = SIR().get_prior().sample((20,)).double().T
     noise = torch.randn(50, 10, 20, dtype=torch.float64)
     days = torch.stack(list(integrate(theta, noise, volatility=0.05)))
@@ -124,7 +124,7 @@ def test_numpy_and_torch_integrate_alike() -> None:
     np.testing.assert_allclose(days.numpy(), arrays, rtol=1e-10)
 
 
-def test_epidemic_starts_with_one_in_a_thousand() -> None:
+def test_an_epidemic_starts_with_one_person_in_a_thousand_infected() -> None:
     x = SIRSimulator().infections(SIR().get_prior().sample((10,)))
     assert x.shape == (10, 365)
     assert x.dtype == torch.float64
@@ -181,7 +181,7 @@ def test_statistics_are_those_of_a_naive_implementation() -> None:
         np.testing.assert_allclose(summarise(series).numpy(), expected, rtol=1e-9)
 
 
-def test_means_under_the_prior_are_the_known_ones() -> None:
+def test_means_under_the_prior_are_those_of_an_independent_implementation() -> None:
     _, x = SIR().get_simulations(3000)
     mean, std = torch.tensor(MEAN), torch.tensor(STD)
     error = (std**2 / 20_000 + x.var(dim=0) / 3000).sqrt()
@@ -190,7 +190,7 @@ def test_means_under_the_prior_are_the_known_ones() -> None:
     torch.testing.assert_close(x.std(dim=0), std, rtol=0.1, atol=0.0)
 
 
-def test_delay_shifts_the_autocorrelation_alone() -> None:
+def test_the_delay_of_reports_changes_the_autocorrelation_only() -> None:
     theta = SIR().get_prior().sample((3000,))
     simulated = seeded(SIRSimulator(), theta)
     real = seeded(SIRSimulator(reported_fraction=0.95), theta)

@@ -113,7 +113,7 @@ def test_pairs_with_nan_are_replaced_jointly_and_counted() -> None:
     assert (theta[:, 0] >= 0.1).all()
 
 
-def test_a_process_without_valid_pairs_does_not_run_for_ever() -> None:
+def test_a_process_without_valid_pairs_is_stopped_with_an_error() -> None:
     pairs = DrawnPairs(
         draw_theta=lambda n: torch.rand(n, 2),
         observe=lambda theta: theta * torch.nan,

@@ -141,7 +141,7 @@ def test_pressure_at_known_timing_is_that_of_causalchamber() -> None:
             )
 
 
-def test_samples_are_taken_at_the_recorded_times() -> None:
+def test_simulated_samples_are_taken_at_the_recorded_times() -> None:
     times = torch.tensor(SAMPLE_TIMES, dtype=torch.float64)
     assert times.shape == (50,)
     assert times[[5, 24, 25, 49]].tolist() == [0.78639, 3.66501, 3.94014, 7.58541]
@@ -186,7 +186,7 @@ def test_an_impulse_begins_and_ends_with_its_shift() -> None:
         assert (row[ended] < 0).all()
 
 
-def test_at_a_later_time_the_ratio_follows_the_equation_of_motion() -> None:
+def test_before_the_impulse_the_fans_follow_the_equation_of_motion() -> None:
     # Riccati's equation with constant torque: w = w_c tanh(w_c K t / I + c).
     max_speed, inertia = 3000 * math.pi / 30, 0.5 * 0.059**2 * 0.02
     drag = 0.05 * (0.27 - 0.166) / max_speed**2
@@ -420,7 +420,7 @@ def test_the_stand_in_has_other_fans_and_correlated_noise() -> None:
     )
 
 
-def test_the_stand_in_looks_like_a_hatch_open_wider() -> None:
+def test_to_the_simulator_the_stand_in_looks_like_a_hatch_that_is_open_wider() -> None:
     theta, x = WindTunnel(variant="synthetic", onset_jitter=0.0).get_test_set(2000)
     error = Oracle().estimate(x) - theta[:, 0]
     # Far more than the posterior's 0.38 degrees, far less than the prior's width.
