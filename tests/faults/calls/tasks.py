@@ -1,4 +1,4 @@
-"""Tasks whose data are drawn."""
+"""Tasks: how they are asked for, their sets, simulators and quantiles."""
 
 import functools
 
