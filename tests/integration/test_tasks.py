@@ -20,7 +20,7 @@ def task(request: pytest.FixtureRequest) -> Task:
     if "synthetic" in TASKS[name].variants:
         return get_task(name, variant="synthetic", **options)
     if get_task(name).required_files:
-        root = request.getfixturevalue("chamber_root")
+        root = request.getfixturevalue("chamber_extract")
         return get_task(name, root=root, **options)
     return get_task(name, **options)
 
