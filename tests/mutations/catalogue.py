@@ -36,9 +36,9 @@ class Mutation:
         return text.replace(self.before, self.after)
 
     def faults(self, root: Path = ROOT) -> list[str]:
-        """Return why the mutation cannot be made; nothing if it can."""
-        missing = [name for name in (self.file, *self.tests) if not is_file(root, name)]
-        if missing:
+        """Return why the mutation cannot be made; an empty list if it can."""
+        names = (self.file, *self.tests)
+        if missing := [name for name in names if not (root / name).is_file()]:
             return [f"there is no file {name}" for name in missing]
         text = (root / self.file).read_text(encoding="utf-8")
         if (count := text.count(self.before)) != 1:
@@ -47,10 +47,6 @@ class Mutation:
         if ast.dump(unbroken) == ast.dump(broken):
             return ["`after` means the same as `before`"]
         return []
-
-
-def is_file(root: Path, name: str) -> bool:
-    return (root / name).is_file()
 
 
 def read_mutations() -> list[Mutation]:
@@ -63,7 +59,7 @@ def read_mutations() -> list[Mutation]:
 
 
 def faults_of(mutations: list[Mutation]) -> list[str]:
-    """Return what is wrong with a list, each in a line; nothing if all can be made."""
+    """Return why some mutations of a list cannot be made, each with its name."""
     return [
         f"{mutation.name}: {fault}"
         for mutation in mutations
