@@ -106,11 +106,14 @@ def test_every_pair_is_held_out_by_one_network(count: int) -> None:
     estimator = method.build_posterior().posterior_estimator
     with seeded(0):
         folds = split_groups(PAIRS[0], count)
-    held_out = estimator.part_log_probs(*PAIRS)
+    held_out, at_start = estimator.part_log_probs(*PAIRS), log_probs(npe(), *PAIRS)
     assert len(method.histories) == len(folds) == held_out.shape[1] == count
     for k, (rows, history) in enumerate(zip(folds, method.histories, strict=True)):
         kept = -float(held_out[rows, k].mean())
         assert history.kept_validation_loss == pytest.approx(kept, rel=1e-4)
+        others = torch.cat([fold for fold in folds if fold is not rows])
+        first = -float(at_start[others].mean())
+        assert history.training_loss[0] == pytest.approx(first, rel=1e-4)
 
 
 def test_the_posterior_is_the_average_of_the_networks() -> None:

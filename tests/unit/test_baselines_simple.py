@@ -249,14 +249,19 @@ class TestJointNPE:
         kept = history.kept_validation_loss
         assert -float(scores.mean()) == pytest.approx(kept, rel=1e-5)
 
-    def test_each_batch_is_half_simulations_and_half_pairs(self) -> None:
+    def test_each_batch_is_half_simulations_and_half_pairs_of_those_to_train_on(
+        self,
+    ) -> None:
         """Seen by a net that counts: real observations are marked by their size."""
         seen: list[tuple[int, int]] = []
+        pairs: set[tuple[float, ...]] = set()
 
         class Counter(nn.Linear):
             def forward(self, x: Tensor) -> Tensor:
                 if self.training and torch.is_grad_enabled() and len(x) > 1:
-                    seen.append((len(x), int((x.abs() > 50).all(dim=1).sum())))
+                    is_real = (x.abs() > 50).all(dim=1)
+                    seen.append((len(x), int(is_real.sum())))
+                    pairs.update(tuple(row) for row in x[is_real].tolist())
                 return super().forward(x)
 
         method = JointNPE(
@@ -269,6 +274,7 @@ class TestJointNPE:
         method.append_calibration(theta, x + 1000).train(**QUIET)
         assert set(seen) == {(20, 10)}
         assert len(seen) == 2 * 6
+        assert len(pairs) == 18  # two are held out
 
 
 class TestFinetunedNPE:

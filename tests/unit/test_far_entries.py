@@ -10,7 +10,8 @@ from sbi.neural_nets import posterior_nn
 from torch import Tensor, nn
 
 from sbi_rope import CalibrationFinetuner, RoPE, diagnose
-from sbi_rope._standardisation import FAR
+from sbi_rope._sbi import Standardize
+from sbi_rope._standardisation import FAR, deviations
 from sbi_rope.baselines import CalibrationMLP, FinetunedNPE, Training
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import RoPEWarning
@@ -47,6 +48,13 @@ def real(theta: Tensor) -> Tensor:
     return simulator(theta) + torch.tensor([0.0, 0.0, 0.01]) * torch.randn(
         len(theta), 1
     )
+
+
+def test_distances_from_simulations_count_below_as_above() -> None:
+    net = Standardize(torch.tensor([2.0, -1.0]), torch.tensor([5.0, 0.1]))
+    far = deviations(net, torch.tensor([[-8.0, -2.0], [12.0, 0.0]]))
+    assert far is not None
+    assert torch.allclose(far, torch.tensor([[2.0, 10.0], [2.0, 10.0]]))
 
 
 @pytest.mark.parametrize("net", [False, True])
