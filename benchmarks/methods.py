@@ -14,7 +14,6 @@ from sbi_rope.baselines import (
     NNPE,
     NPERS,
     RNPE,
-    BuildsOnNPE,
     CalibrationMLP,
     FinetunedNPE,
     JointNPE,
@@ -23,9 +22,6 @@ from sbi_rope.baselines import (
     PriorBaseline,
     ReferenceNPE,
     TuningOnly,
-    UsesCalibration,
-    UsesObservations,
-    UsesSimulations,
 )
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.discrepancy.correction import Space
@@ -82,17 +78,16 @@ def append_data(method: Method, name: str, case: "Case") -> tuple[int, bool]:
         The number of simulations of NPE behind it, and whether it starts from the NPE
         that methods share.
     """
-    if isinstance(method, UsesSimulations) and method.needs_simulations:
+    if method.needs_simulations:
         # Without a simulator, tuning-only looks targets up among stored simulations.
         stored = name == "tuning-only"
         method.append_simulations(*(case.stored if stored else case.simulations))
-    if isinstance(method, UsesCalibration):
+    if "calibration" in method.sees:
         method.append_calibration(*case.calibration)
-    if isinstance(method, UsesObservations):
+    if "observations" in method.sees:
         method.append_observations(case.test_set[1])
-    simulated = isinstance(method, UsesSimulations)
-    count = len(case.simulations[0]) if simulated else 0
-    return count, isinstance(method, BuildsOnNPE)
+    count = len(case.simulations[0]) if "simulations" in method.sees else 0
+    return count, method.starts_from_npe
 
 
 # How methods are constructed ----------------------------------------------------------
@@ -129,7 +124,7 @@ class _ThenFinetuned(DiscrepancyNPE):
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         corrected, _ = super()._fit(show_progress_bars=show_progress_bars)
         method = FinetunedNPE.from_posterior(corrected, num_holdouts=NUM_HOLDOUTS)
-        method.append_calibration(*self._calibration)
+        method.append_calibration(*self._data.calibration)
         method.train(show_progress_bars=show_progress_bars)
         return method.build_posterior(), method.history
 

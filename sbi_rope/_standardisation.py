@@ -1,16 +1,15 @@
 """Real observations in the units by which NPE standardises simulations."""
 
-from typing import Any
-
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._sbi import Standardize
+from sbi_rope._sbi import standardisation_of
 from sbi_rope.errors import warn_user
 
 __all__ = [
     "FAR",
     "ROUNDING",
+    "Standardisation",
     "deviations",
     "leave_out_constants",
     "warn_of_far_entries",
@@ -33,13 +32,11 @@ def deviations(embedding_net: nn.Module, x: Tensor) -> Tensor | None:
     Returns:
         Shape ``(n, *event)``; None where NPE does not standardise x.
     """
-    layer = _layer(embedding_net)
-    return None if layer is None else ((x - layer._mean) / layer._std).abs()
-
-
-def _layer(embedding_net: nn.Module) -> Any:
-    layers = (part for part in embedding_net.modules() if isinstance(part, Standardize))
-    return next(layers, None)
+    mean_and_std = standardisation_of(embedding_net)
+    if mean_and_std is None:
+        return None
+    mean, std = mean_and_std
+    return ((x - mean) / std).abs()
 
 
 @torch.no_grad()
@@ -53,13 +50,13 @@ def leave_out_constants(embedding_net: nn.Module, x: Tensor) -> None:
         embedding_net: A net with sbi's standardising layer, which is changed.
         x: The calibration x that it was standardised by, shape ``(n, *event)``.
     """
-    layer = _layer(embedding_net)
-    if layer is None or layer._std.shape != x.shape[1:]:
+    mean_and_std = standardisation_of(embedding_net)
+    if mean_and_std is None or mean_and_std[1].shape != x.shape[1:]:
         return  # one standard deviation for all entries
     constant = x.std(dim=0) <= ROUNDING * x.abs().amax(dim=0)
     if not constant.any():
         return
-    layer._std.masked_fill_(constant, torch.inf)
+    mean_and_std[1].masked_fill_(constant, torch.inf)
     entries = constant.flatten().nonzero().flatten().tolist()
     warn_user(
         f"{len(entries)} of the {constant.numel()} entries of the calibration `x` are "
@@ -85,3 +82,36 @@ def warn_of_far_entries(name: str, x: Tensor, embedding_net: nn.Module) -> None:
         "vary in simulations, or train NPE with z_score_x='structured', which has one "
         "standard deviation for all entries."
     )
+
+
+class Standardisation(nn.Module):
+    """Statistics in units of their standard deviation over simulations, and back.
+
+    Statistics that are the same in all simulations cannot be in these units. They are
+    left out on the way there, and have their simulated value on the way back.
+
+    Args:
+        simulated: Statistics of simulations, shape ``(n, l)``.
+    """
+
+    mean: Tensor
+    std: Tensor
+    varies: Tensor
+
+    def __init__(self, simulated: Tensor) -> None:
+        super().__init__()
+        std, mean = torch.std_mean(simulated, dim=0)
+        self.register_buffer("mean", mean)
+        self.register_buffer("std", std)
+        self.register_buffer("varies", std > ROUNDING * mean.abs())
+
+    def forward(self, statistics: Tensor) -> Tensor:
+        """Standardise, ``(..., l)`` to ``(..., l')``."""
+        return ((statistics - self.mean) / self.std)[..., self.varies]
+
+    def undo(self, standardised: Tensor) -> Tensor:
+        """Return statistics in their own units, ``(..., l')`` to ``(..., l)``."""
+        shape = (*standardised.shape[:-1], len(self.mean))
+        statistics = self.mean.expand(shape).clone()
+        statistics[..., self.varies] += standardised * self.std[self.varies]
+        return statistics

@@ -13,8 +13,8 @@ from sbi_rope._progress import progress_bar
 from sbi_rope.errors import warn_user
 
 __all__ = [
+    "EPOCHS_WITHOUT_HOLDOUT",
     "MIN_PAIRS_FOR_HOLDOUT",
-    "STEPS_WITHOUT_HOLDOUT",
     "History",
     "fit",
     "groups_of",
@@ -28,37 +28,37 @@ __all__ = [
 # Fewer pairs of different parameters than this leave nothing to hold out.
 MIN_PAIRS_FOR_HOLDOUT = 5
 # Without a hold-out nothing says when to stop, so little is risked.
-STEPS_WITHOUT_HOLDOUT = 50
+EPOCHS_WITHOUT_HOLDOUT = 50
 
 
 @dataclass(frozen=True)
 class History:
     """The course of a training, for plotting.
 
-    A step is a gradient step over all pairs for ``CalibrationFinetuner``, and a pass
-    over the data for the baselines. What sbi's trainers report starts after the first
-    pass, which is step 0 then.
+    An epoch is a pass over the training data. For ``CalibrationFinetuner`` it is one
+    gradient step over all pairs. What sbi's trainers report starts after the first
+    epoch, which is number 0 then.
 
     Attributes:
-        training_loss: Mean loss over the training data during each step, and after the
+        training_loss: Mean loss over the training data during each epoch, and after the
             last; of a fine-tuning, the distance in units of the embedding, with
             rehearsal the weighted sum of both distances.
-        validation_loss: Loss over the held-out data before each step and after the
+        validation_loss: Loss over the held-out data before each epoch and after the
             last; empty without a hold-out.
-        best_step: Number of steps after which the kept net was reached; 0 is the
+        best_epoch: Number of epochs after which the kept net was reached; 0 is the
             starting point.
         learning_rate: The learning rate of this course, the best of those tried.
     """
 
     training_loss: list[float] = field(repr=False)
     validation_loss: list[float] = field(repr=False)
-    best_step: int
+    best_epoch: int
     learning_rate: float
 
     @property
     def kept_validation_loss(self) -> float:
         """The validation loss of the kept net; 0 without a hold-out, inf for NaN."""
-        loss = self.validation_loss[self.best_step] if self.validation_loss else 0.0
+        loss = self.validation_loss[self.best_epoch] if self.validation_loss else 0.0
         return math.inf if math.isnan(loss) else loss
 
     def __repr__(self) -> str:
@@ -66,8 +66,8 @@ class History:
         if not loss:
             loss, what = self.training_loss, "training_loss"
         return (
-            f"History({what} {loss[0]:.3g} -> {loss[self.best_step]:.3g}, "
-            f"best_step={self.best_step}, learning_rate={self.learning_rate:g})"
+            f"History({what} {loss[0]:.3g} -> {loss[self.best_epoch]:.3g}, "
+            f"best_epoch={self.best_epoch}, learning_rate={self.learning_rate:g})"
         )
 
 
@@ -184,7 +184,7 @@ def warn_without_holdout(theta_or_groups: Tensor) -> None:
     """Warn that there are too few pairs to choose a net by."""
     warn_user(
         f"{too_few_pairs(theta_or_groups)}: none is held out, and tuning stops after "
-        f"at most {STEPS_WITHOUT_HOLDOUT} steps. Append at least "
+        f"at most {EPOCHS_WITHOUT_HOLDOUT} epochs. Append at least "
         f"{MIN_PAIRS_FOR_HOLDOUT} pairs of different parameters to choose the best net "
         "on a hold-out."
     )
@@ -197,8 +197,8 @@ def fit(
     *,
     validation_loss: Callable[[], Tensor] | None,
     learning_rate: float,
-    max_num_steps: int,
-    patience: int,
+    max_num_epochs: int,
+    stop_after_epochs: int,
     clip_max_norm: float | None = None,
     in_training_mode: bool = True,
     label: str,
@@ -211,29 +211,29 @@ def fit(
 
     Args:
         module: What to train, in place.
-        batches: Given the number of the step, the batches to pass over.
+        batches: Given the number of the epoch, the batches to pass over.
         loss: Of a batch, its mean loss.
         validation_loss: The loss over the held-out data, if there are any.
         learning_rate: Step size of Adam.
-        max_num_steps: Most passes over the batches.
-        patience: Steps without a new best after which to stop.
+        max_num_epochs: Most passes over the batches.
+        stop_after_epochs: Epochs without a new best after which to stop.
         clip_max_norm: Largest norm of a gradient; None does not clip.
         in_training_mode: Whether dropout and batch statistics are active in training.
         label: What the progress bar and warnings call it.
         show_progress_bars: Whether to show the course of the loss.
 
     Returns:
-        The losses and the step that was kept.
+        The losses and the epoch that was kept.
     """
     optimizer = torch.optim.Adam(module.parameters(), lr=learning_rate)
     training_loss: list[float] = []
     held_out_loss: list[float] = []
-    best_state, best_step = copy.deepcopy(module.state_dict()), 0
+    best_state, best_epoch = copy.deepcopy(module.state_dict()), 0
 
-    def one_pass(step: int, *, update: bool) -> float:
+    def one_pass(epoch: int, *, update: bool) -> float:
         module.train(in_training_mode and update)
         values = []
-        for batch in batches(step):
+        for batch in batches(epoch):
             value = loss(*batch)
             values.append(float(value.detach()))
             if not update:
@@ -247,35 +247,35 @@ def fit(
         return sum(values) / len(values)
 
     progress = progress_bar(
-        range(max_num_steps + 1),
+        range(max_num_epochs + 1),
         show=show_progress_bars,
         desc=f"{label} (learning rate {learning_rate:g})",
     )
-    for step in progress:
+    for epoch in progress:
         if validation_loss is not None:
             module.eval()
             with torch.no_grad():
                 held_out_loss.append(float(validation_loss()))
         improved = validation_loss is None or _is_below(
-            held_out_loss[-1], held_out_loss[best_step]
+            held_out_loss[-1], held_out_loss[best_epoch]
         )
         state = copy.deepcopy(module.state_dict()) if improved else best_state
-        newest = step if improved else best_step
-        is_last = step == max_num_steps or step - newest >= patience
+        newest = epoch if improved else best_epoch
+        is_last = epoch == max_num_epochs or epoch - newest >= stop_after_epochs
         with torch.set_grad_enabled(not is_last):
-            training_loss.append(one_pass(step, update=not is_last))
+            training_loss.append(one_pass(epoch, update=not is_last))
         if not math.isfinite(training_loss[-1]):
             warn_user(
-                f"{label}: the loss is not finite after {step} steps with learning "
+                f"{label}: the loss is not finite after {epoch} epochs with learning "
                 f"rate {learning_rate:g}; the best net before is kept. Use a smaller "
                 "learning rate."
             )
             break
-        best_state, best_step = state, newest
+        best_state, best_epoch = state, newest
         # Without a refresh of its own: the bar moves at most ten times a second.
         progress.set_postfix(
             loss=(held_out_loss or training_loss)[-1],
-            best_step=best_step,
+            best_epoch=best_epoch,
             refresh=False,
         )
         if is_last:
@@ -283,7 +283,7 @@ def fit(
     progress.close()
     module.load_state_dict(best_state)
     module.eval()
-    return History(training_loss, held_out_loss, best_step, learning_rate)
+    return History(training_loss, held_out_loss, best_epoch, learning_rate)
 
 
 def _is_below(loss: float, best: float) -> bool:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed
 from sbi_rope._training import (
-    STEPS_WITHOUT_HOLDOUT,
+    EPOCHS_WITHOUT_HOLDOUT,
     History,
     fit,
     split_pairs,
@@ -34,9 +34,9 @@ from sbi_rope.errors import InvalidInputError
 
 __all__ = ["CalibrationFinetuner", "FinetuneResult", "History"]
 
-# Simulations to rehearse with, and how many of them in each step.
+# Simulations to rehearse with, and how many of them in each epoch.
 NUM_REHEARSED = 2000
-REHEARSED_IN_STEP = 50
+REHEARSED_IN_EPOCH = 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,7 @@ class FinetuneResult:
 
     Attributes:
         embedding_net: :math:`g`, in evaluation mode.
-        history: Losses and the step that was kept.
+        history: Losses and the epoch that was kept.
     """
 
     embedding_net: nn.Module
@@ -70,9 +70,11 @@ class CalibrationFinetuner:
 
     With ``rehearsal`` :math:`\lambda > 0` it also minimises, over simulations from the
     prior, :math:`\lambda\, \mathbb{E} \lVert g(x_s) - h(x_s) \rVert_2`, which is not in
-    the paper: g may not forget where h puts simulations. A large net tuned on few
-    pairs follows these pairs anywhere; ``docs/benchmark.md`` says where this helps and
-    where it costs. Held-out pairs are judged by their distance alone.
+    the paper. In the terms of continual learning this is rehearsal with feature
+    distillation: the old net teaches the new one on the old data, so that g does not
+    forget where h puts simulations. It helps where a large net is tuned on few pairs;
+    ``docs/benchmark.md`` says where it helps and where it costs. Held-out pairs are
+    judged by their distance alone.
 
     The net is tuned in evaluation mode (no dropout, fixed batch statistics). If h has
     no trainable parameters, because NPE was trained without an embedding net, g is h
@@ -82,32 +84,36 @@ class CalibrationFinetuner:
         | Addressing Misspecification in Simulation-based Inference through Data-driven
           Calibration (Wehenkel et al., 2025), eq. 6 and Algorithm 1, step 2
         | https://arxiv.org/abs/2405.08719
+        | Learning without Forgetting (Li and Hoiem, 2016), for the distillation
+        | https://arxiv.org/abs/1606.09282
 
     Args:
-        learning_rate: Step size of Adam. Of several, each is tried from the start and
-            the best on the held-out pairs is kept. A deep embedding net is best tuned
-            with the smaller of the defaults, an affine map with the larger, and so
-            they are without a hold-out.
-        num_steps: Most gradient steps, each over all training pairs.
-        patience: Steps without a new best on the held-out pairs after which to stop.
-        simulations_per_target: Simulations behind each expectation. One, as in the
-            paper, pulls g to the noise of single simulations.
-        resample_targets: Draw new simulations at every step, as in the paper, instead
-            of one bank before the first. Costs ``num_steps`` times the simulations.
+        learning_rate: Step size of Adam. Of several, each is tried from the start, and
+            the net that is best on the held-out pairs is kept. Without a hold-out a
+            deep embedding net is tuned with the smallest rate and an affine map with
+            the largest, which is what suits them best.
+        max_num_epochs: Most epochs. Each is one gradient step over all training pairs.
+        stop_after_epochs: Epochs without a new best on the held-out pairs after which
+            to stop.
+        simulations_per_target: Simulations that each expectation is the mean of. With
+            one, as in the paper, g is pulled to the noise of single simulations.
+        resample_targets: Whether to draw new simulations in every epoch, as the paper
+            does, instead of one bank before the first. This costs ``max_num_epochs``
+            times the simulations.
         num_neighbors: With stored simulations in the place of a simulator, the
             expectation is the mean over so many simulations with the nearest
             parameters.
         validation_fraction: Share of the pairs that is held out.
-        rehearsal: :math:`\lambda`, the weight of keeping simulations where they are;
-            0 as in the paper.
+        rehearsal: :math:`\lambda`, the weight of keeping simulations where they are.
+            The default is 0, as in the paper.
 
     Raises:
         InvalidInputError: If an argument is outside its range.
     """
 
     learning_rate: float | tuple[float, ...] = (1e-4, 1e-3)
-    num_steps: int = 1000
-    patience: int = 200
+    max_num_epochs: int = 1000
+    stop_after_epochs: int = 200
     simulations_per_target: int = 100
     resample_targets: bool = False
     num_neighbors: int = 1
@@ -120,8 +126,8 @@ class CalibrationFinetuner:
             raise InvalidInputError("Expected at least one `learning_rate`; got ().")
         for rate in self._learning_rates:
             check_positive("learning_rate", rate, maximum=LARGEST_SETTING)
-        check_integer("num_steps", self.num_steps)
-        check_integer("patience", self.patience)
+        check_integer("max_num_epochs", self.max_num_epochs)
+        check_integer("stop_after_epochs", self.stop_after_epochs)
         check_integer("simulations_per_target", self.simulations_per_target)
         check_integer("num_neighbors", self.num_neighbors)
         check_instance("resample_targets", self.resample_targets, bool)
@@ -246,14 +252,14 @@ class CalibrationFinetuner:
         show_progress_bars: bool,
     ) -> FinetuneResult:
         has_holdout = held_out.numel() > 0
-        num_steps = self.num_steps
+        max_num_epochs = self.max_num_epochs
         if not has_holdout:
-            num_steps = min(num_steps, STEPS_WITHOUT_HOLDOUT)
+            max_num_epochs = min(max_num_epochs, EPOCHS_WITHOUT_HOLDOUT)
         newest = targets
 
-        def all_pairs(step: int) -> list[tuple[Tensor, Tensor]]:
+        def all_pairs(epoch: int) -> list[tuple[Tensor, Tensor]]:
             nonlocal newest
-            if draw_targets is not None and 0 < step < num_steps:
+            if draw_targets is not None and 0 < epoch < max_num_epochs:
                 newest = draw_targets()
             return [(x[train], newest[train])]
 
@@ -263,7 +269,7 @@ class CalibrationFinetuner:
         def loss(x: Tensor, targets: Tensor) -> Tensor:
             if keep is None:
                 return distance(x, targets)
-            some = torch.randint(len(keep[0]), (REHEARSED_IN_STEP,)).to(x.device)
+            some = torch.randint(len(keep[0]), (REHEARSED_IN_EPOCH,)).to(x.device)
             kept = distance(keep[0][some], keep[1][some])
             return distance(x, targets) + self.rehearsal * kept
 
@@ -277,8 +283,8 @@ class CalibrationFinetuner:
                 else None
             ),
             learning_rate=learning_rate,
-            max_num_steps=num_steps,
-            patience=self.patience,
+            max_num_epochs=max_num_epochs,
+            stop_after_epochs=self.stop_after_epochs,
             in_training_mode=False,
             label="Fine-tuning",
             show_progress_bars=show_progress_bars,

@@ -32,12 +32,10 @@ from sbi_rope.baselines import (
     ReferenceNPE,
     Training,
     TuningOnly,
-    UsesCalibration,
-    UsesObservations,
-    UsesSimulations,
 )
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.tasks import Task, get_task
+from sbi_rope.trainers.data import Kind
 from tests.conftest import SHARED_DATA
 
 VECTOR_TASKS = ("linear_gaussian", "light_tunnel_sensors")
@@ -49,7 +47,7 @@ CHAINS: dict[str, Any] = {
     "warmup": 2,
     "thin": 1,
 }
-FINETUNER = CalibrationFinetuner(learning_rate=3e-3, num_steps=5)
+FINETUNER = CalibrationFinetuner(learning_rate=3e-3, max_num_epochs=5)
 
 CORRECTION: dict[str, Any] = {"npe_training": SHORT, "num_steps": 5}
 
@@ -196,28 +194,29 @@ def takes_estimator(name: str) -> bool:
     return "density_estimator" in inspect.signature(METHODS[name].kind).parameters
 
 
-def sees(name: str, part: type[Method]) -> bool:
-    return issubclass(METHODS[name].kind, part)
-
-
-def names_that_see(part: type[Method]) -> list[str]:
-    return [name for name in METHODS if sees(name, part)]
+def names_that_see(kind: Kind) -> list[str]:
+    return [name for name, entry in METHODS.items() if kind in entry.kind.sees]
 
 
 def first_task(name: str) -> str:
     return METHODS[name].tasks[0]
 
 
-def feed(method: Method, data: Data, *, without: type[Method] | None = None) -> Method:
-    """Append all that a method may see, leaving out one part."""
-    wants = isinstance(method, UsesSimulations) and method.needs_simulations
-    if wants and without is not UsesSimulations:
-        method.append_simulations(data.theta, data.x)  # type: ignore[attr-defined]
-    if isinstance(method, UsesCalibration) and without is not UsesCalibration:
-        method.append_calibration(data.theta_cal, data.x_cal)
-    if isinstance(method, UsesObservations) and without is not UsesObservations:
-        method.append_observations(data.x_o)
+def feed(method: Method, data: Data, *, without: Kind | None = None) -> Method:
+    """Append all that a method may see, leaving out one kind of data."""
+    for kind in sorted(method.sees - {without}, reverse=True):
+        if kind != "simulations" or method.needs_simulations:
+            append(method, kind, data)
     return method
+
+
+def append(method: Method, kind: Kind, data: Data) -> Method:
+    """Append one kind of data."""
+    if kind == "simulations":
+        return method.append_simulations(data.theta, data.x)
+    if kind == "calibration":
+        return method.append_calibration(data.theta_cal, data.x_cal)
+    return method.append_observations(data.x_o)
 
 
 def train(method: Method, *, seed: int | None = 0) -> Method:

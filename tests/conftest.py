@@ -8,6 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 
+# Small parts of published data, which come with the repository.
+TEST_DATA = Path(__file__).resolve().parent / "data"
+EXTRACT_ROWS = {
+    "lt_interventions_standard_v1": {"uniform_reference": (450,), "uniform_*": (30,)}
+}
+# The whole data sets, which some machines have beside the repository.
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
@@ -53,9 +59,19 @@ def shorter_files(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sbi_rope.tasks.chambers.PUBLISHED_ROWS", {})
 
 
+@pytest.fixture
+def chamber_extract(monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Folder with the first rows of recorded experiments, see ``tests/data``.
+
+    The reader expects these numbers of rows in place of the published ones.
+    """
+    monkeypatch.setattr("sbi_rope.tasks.chambers.PUBLISHED_ROWS", EXTRACT_ROWS)
+    return TEST_DATA / "causal_chamber"
+
+
 @pytest.fixture(scope="session")
 def chamber_root() -> Path:
-    """Folder with the causal chamber data sets, or skip."""
+    """Folder with the whole causal chamber data sets, or skip."""
     root = SHARED_DATA / "causal_chamber"
     if not root.is_dir():
         pytest.skip("the causal chamber data are not on this machine")

@@ -5,7 +5,9 @@ from typing import Any
 import pytest
 import torch
 
-__all__ = ["MODES", "digits"]
+from sbi_rope import SinkhornCoupler
+
+__all__ = ["MODES", "digits", "raw_coupler"]
 
 # Settings of SinkhornCoupler.
 MODES = [
@@ -21,3 +23,8 @@ MODES = [
 def digits(mode: dict[str, Any], *, double: float, single: float) -> float:
     """Return the tolerance for the dtype of a mode."""
     return double if mode["dtype"] == torch.float64 else single
+
+
+def raw_coupler(**settings: Any) -> SinkhornCoupler:
+    """A coupler of distances as they are, with the paper's gamma unless it is given."""
+    return SinkhornCoupler(**{"gamma": 0.5, "cost_scale": "none", **settings})

@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from sbi_rope import CalibrationFinetuner, RoPE, StackedPosterior
 from sbi_rope.baselines import FinetunedNPE, PriorPosterior
-from sbi_rope.baselines.training import Training
 from sbi_rope.discrepancy import DiscrepancyModel
 from sbi_rope.stacking import (
     CouplingCandidate,
@@ -21,6 +20,7 @@ from sbi_rope.stacking import (
     default_candidates,
     stack,
 )
+from sbi_rope.trainers.training import Training
 from tests import problems
 
 QUIET: dict[str, Any] = {"show_progress_bars": False}
@@ -33,14 +33,14 @@ def quick() -> Iterator[None]:
     model = DiscrepancyModel(
         gain_precisions=(1.0,), error_scales=(0.1,), degrees_of_freedom=(3.0,)
     )
-    tuning = CalibrationFinetuner(rehearsal=1.0, learning_rate=0.02, num_steps=3)
+    tuning = CalibrationFinetuner(rehearsal=1.0, learning_rate=0.02, max_num_epochs=3)
     steps = dict.fromkeys(("embedding", "tuned", "input"), 4)
     constants = {
         "sbi_rope.stacking.folds.NUM_SIMULATIONS": 300,
         "sbi_rope.stacking.folds.SIMULATIONS_PER_PAIR": 5,
         "sbi_rope.stacking.folds.TUNING": tuning,
         "sbi_rope.stacking.folds.DiscrepancyModel": lambda: model,
-        "sbi_rope.stacking.stack.NUM_SAMPLES": 40,
+        "sbi_rope.stacking.trainer.NUM_SAMPLES": 40,
         "sbi_rope.stacking.folds.NUM_STEPS": steps,
         "sbi_rope.discrepancy.correction.NUM_DRAWS": 50,
         "sbi_rope.discrepancy.training.BATCH_SIZE": 50,
@@ -53,7 +53,9 @@ def quick() -> Iterator[None]:
 
 
 # Moves the net far enough to tell g from h.
-QUICK = CalibrationFinetuner(num_steps=6, simulations_per_target=3, learning_rate=0.03)
+QUICK = CalibrationFinetuner(
+    max_num_epochs=6, simulations_per_target=3, learning_rate=0.03
+)
 PRIOR, NPE = (c for c in default_candidates() if c.name in ("prior", "NPE"))
 OT_ONLY = CouplingCandidate(gamma=0.2, tau=0.5, tuned=False)
 ROPE = CouplingCandidate(gamma=0.2, tau=1.0)

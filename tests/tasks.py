@@ -1,47 +1,50 @@
-"""Tasks as the contract tests make them, and ways to compare their sets."""
+"""Tasks as the tests make them, and ways to compare their sets and their refusals."""
 
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from sbi_rope.errors import InvalidInputError, InvalidTypeError
 from sbi_rope.tasks import Task, get_task
+from tests.conftest import TEST_DATA
 
 __all__ = [
+    "ROOTS",
     "SUBTLE",
-    "at_most",
+    "accepted",
+    "as_many",
     "draw",
     "largest_z",
     "make",
-    "root_fixture",
     "rows_of",
     "same_rows",
 ]
 
-# Fixtures that give the folder of a task's recorded data; other tasks are synthetic.
-ROOT_FIXTURES = {"light_tunnel_sensors": "chamber_root"}
+# Folders with the recorded data of tasks; the other tasks are drawn here. What reads
+# them needs the fixture `chamber_extract`.
+ROOTS: dict[str, Path] = {"light_tunnel_sensors": TEST_DATA / "causal_chamber"}
 # Small images are quick to write, read and compare.
 # Without 8-bit levels, no two of them are equal. Recorded sets have their own tests.
 OPTIONS: dict[str, dict[str, Any]] = {
     "light_tunnel": {"image_size": 64, "stand_in": True, "dequantise": True},
     "wind_tunnel": {"stand_in": True},
 }
-# Tasks with few stored observations, and how many these tests may take at once.
-LARGEST = {"hemodynamics": 60}
 # Tasks whose misspecification takes more than means and variances of x to see.
 SUBTLE = {"hemodynamics"}
 
 
 def make(name: str, **options: Any) -> Task:
-    return get_task(name, **OPTIONS.get(name, {}), **options)
+    """Return a task that has its data."""
+    return get_task(name, root=ROOTS.get(name), **OPTIONS.get(name, {}), **options)
 
 
-def root_fixture(name: str) -> str | None:
-    return ROOT_FIXTURES.get(name)
-
-
-def at_most(n: int, name: str) -> int:
-    return min(n, LARGEST.get(name, n))
+def as_many(n: int, task: Task, part: str, *, seed: int = 0) -> int:
+    """Return ``n``, or the number of recorded pairs where there are fewer."""
+    recorded = task.num_recorded(part, seed=seed)  # type: ignore[arg-type]
+    return n if recorded is None else min(n, recorded)
 
 
 def draw(
@@ -67,11 +70,34 @@ def coarse(x: Tensor) -> Tensor:
     return x.flatten(1).double()
 
 
-def largest_z(a: Tensor, b: Tensor) -> float:
-    """Largest difference between means and variances of entries, in standard errors."""
+def largest_z(a: Tensor, b: Tensor, *, paired: bool = False) -> float:
+    """Largest difference between means and variances of entries, in standard errors.
+
+    Paired rows belong to the same parameters, whose scatter is then left out.
+    """
     a, b = coarse(a), coarse(b)
     centre = (a.mean(dim=0) + b.mean(dim=0)) / 2
     a, b = (torch.cat([x, (x - centre) ** 2], dim=1) for x in (a, b))
     error = (a.var(dim=0) / len(a) + b.var(dim=0) / len(b)).sqrt()
+    if paired:
+        error = ((a - b).var(dim=0) / len(a)).sqrt()
     difference = (a.mean(dim=0) - b.mean(dim=0)).abs()
     return float((difference / error)[difference > 0].max())
+
+
+def accepted(cases: Mapping[str, tuple[Callable[[], object], str]]) -> list[str]:
+    """Return the bad calls that are not refused, or not in the words expected.
+
+    Args:
+        cases: A call that must be refused and a word of the message, by a name.
+    """
+    wrong = []
+    for name, (call, word) in cases.items():
+        try:
+            call()
+        except (InvalidInputError, InvalidTypeError) as error:
+            if word not in str(error):
+                wrong.append(f"{name}: expected {word!r} in {str(error)!r}")
+        else:
+            wrong.append(f"{name}: was accepted")
+    return wrong

@@ -2,14 +2,18 @@
 
 import ast
 import functools
+import importlib
+import inspect
 import json
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 from typing import Any
 
 import pytest
 import sbi
+from sbi.inference import DirectPosterior
 
 import sbi_rope
 
@@ -18,17 +22,34 @@ PACKAGE = Path(sbi_rope.__file__).parent
 # What `import sbi_rope` uses of others; these may import what they like.
 DEPENDENCIES = "import ot, numpy, torch, tqdm.auto, sbi.inference, sbi.utils"
 
-# A module imports from layers below its own, and from its own package.
+# A module imports from layers below its own, and from its own package. Those of one
+# layer do not know each other.
 LAYERS = [
+    # They know nothing of inference, and everything may raise errors and show progress.
     {"errors", "_progress", "_processes"},
+    # They raise errors: of seeds and of files.
     {"_random", "_files"},
-    {"_validation", "_sbi", "_training"},
-    {"coupling", "finetuning", "metrics", "_simulations", "_standardisation"},
+    # They raise errors and warn: of arguments, and of a training that goes wrong.
+    {"_validation", "_training"},
+    # sbi's trainer is told by `_training` which simulations to hold out together.
+    {"_sbi"},
+    # Each works on embeddings or posteriors, which `_sbi` takes out of an estimator.
+    {"coupling", "finetuning", "metrics", "_npe", "_simulations", "_standardisation"},
+    # A mixture has the couplings of a batch as weights. A simulator is a source of
+    # simulations like stored ones.
     {"mixture", "_simulator"},
-    {"rope", "tasks"},
-    {"baselines"},
-    {"discrepancy"},
-    {"stacking", "diagnosis"},
+    # A batch is coupled, and its couplings make a mixture. Trainers train networks, and
+    # average them in a mixture. Tasks have simulators.
+    {"batch", "trainers", "tasks"},
+    # RoPE conducts fine-tuning, coupling and mixture.
+    {"rope"},
+    # A sweep asks RoPE for many mixtures. The NPE that knows the discrepancy is a
+    # trainer.
+    {"sweep", "discrepancy"},
+    # Stacks weigh posteriors of RoPE and of the discrepancy. The diagnosis looks at the
+    # parts of RoPE. Baselines are trainers, two of which are stages of RoPE.
+    {"stacking", "diagnosis", "baselines"},
+    # Plots know what they draw.
     {"plots"},
 ]
 NEVER_IMPORT_EACH_OTHER = [
@@ -75,9 +96,12 @@ def state():
 {DEPENDENCIES}
 torch.manual_seed(0); numpy.random.seed(0); random.seed(0)
 theirs, before = state(), set(sys.modules)
-import sbi_rope, sbi_rope.metrics, sbi_rope.baselines, sbi_rope.tasks
+import sbi_rope
+alone = sorted(set(sys.modules) - before)
+import sbi_rope.metrics, sbi_rope.baselines, sbi_rope.tasks
 new, ours = sorted(set(sys.modules) - before), state()
-print(json.dumps(dict(new=new, all=sorted(sys.modules), theirs=theirs, ours=ours)))
+everything = sorted(sys.modules)
+print(json.dumps(dict(alone=alone, new=new, all=everything, theirs=theirs, ours=ours)))
 """
 
 
@@ -110,6 +134,11 @@ def test_importing_loads_nothing_heavy_that_its_dependencies_do_not(
         assert name not in fresh["all"]
     # Whatever the list above forgets.
     assert packages - set(sys.stdlib_module_names) <= {"sbi_rope", "sbi"}
+
+
+def test_importing_the_package_loads_no_baseline(fresh: dict[str, Any]) -> None:
+    assert {part_of(name) for name in fresh["alone"]} >= {"trainers", "stacking"}
+    assert not [name for name in fresh["alone"] if part_of(name) == "baselines"]
 
 
 def test_importing_changes_no_state_of_torch_beyond_what_sbi_changes(
@@ -215,7 +244,7 @@ def names_beyond_public(names: set[str]) -> set[str]:
 
 def test_only_one_module_reaches_into_sbi() -> None:
     for path in modules():
-        if module_name(path) == "sbi_rope._sbi":
+        if part_of(module_name(path)) == "_sbi":
             continue
         beyond = names_beyond_public(imports_of(path))
         assert not beyond, f"{path}: take {sorted(beyond)} from sbi_rope._sbi"
@@ -226,6 +255,97 @@ def test_the_check_for_reaching_into_sbi_tells_modules_from_names() -> None:
     assert names_beyond_public(public) == set()
     deep = {"sbi.inference.posteriors.base_posterior", "sbi.utils.torchutils"}
     assert names_beyond_public(deep) == deep
+
+
+# Without an underscore, but as much inside sbi's trainers as the names that have one.
+INSIDE_TRAINERS = {"get_dataloaders", "train_indices", "val_indices"}
+
+
+def is_private(name: str) -> bool:
+    return name.startswith("_") and not name.startswith("__")
+
+
+def is_of_oneself(node: ast.Attribute) -> bool:
+    """Whether it is an attribute of self, cls or super()."""
+    value = node.value.func if isinstance(node.value, ast.Call) else node.value
+    return isinstance(value, ast.Name) and value.id in ("self", "cls", "super")
+
+
+def private_names(tree: ast.AST) -> set[str]:
+    """Private names that classes define, or use of themselves."""
+    names = {
+        node.attr
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Attribute) and is_of_oneself(node)
+    }
+    names |= {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+    return {name for name in names if is_private(name)} | names & INSIDE_TRAINERS
+
+
+@functools.cache
+def private_names_of(kind: type) -> frozenset[str]:
+    source = textwrap.dedent(inspect.getsource(kind))
+    return frozenset(private_names(ast.parse(source)))
+
+
+@functools.cache
+def private_names_of_sbi() -> frozenset[str]:
+    """Those of all classes of sbi, from its source."""
+    found: set[str] = set()
+    for path in Path(sbi.__file__).parent.rglob("*.py"):
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ClassDef):
+                found |= private_names(node)
+    return frozenset(found | INSIDE_TRAINERS)
+
+
+def inherited_insides(kind: type) -> set[str]:
+    """What a class uses or overrides of the insides of its bases in sbi."""
+    bases = [base for base in kind.__mro__ if base.__module__.startswith("sbi.")]
+    if not bases:
+        return set()
+    return set(private_names_of(kind)) & set().union(*map(private_names_of, bases))
+
+
+def foreign_insides(tree: ast.AST) -> set[str]:
+    """What a file uses of the insides of objects that may be sbi's.
+
+    A private name that the classes of the same file have is taken for theirs.
+    """
+    used = {
+        node.attr
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Attribute) and not is_of_oneself(node)
+    }
+    return used & private_names_of_sbi() - private_names(tree)
+
+
+def test_only_one_module_uses_what_is_private_to_sbi() -> None:
+    for path in modules():
+        name = module_name(path)
+        if part_of(name) == "_sbi" or path.name == "__main__.py":
+            continue
+        insides = foreign_insides(ast.parse(path.read_text(encoding="utf-8")))
+        for kind in vars(importlib.import_module(name)).values():
+            if inspect.isclass(kind) and kind.__module__ == name:
+                insides |= inherited_insides(kind)
+        assert not insides, f"{path}: {sorted(insides)} belong into sbi_rope._sbi"
+
+
+def test_the_check_for_what_is_private_to_sbi_finds_it() -> None:
+    class Planted(DirectPosterior):
+        def map(self) -> Any:  # type: ignore[override]
+            return self._x, self._of_our_own, super()._map  # type: ignore[misc]
+
+        def _calculate_map(self) -> Any:  # type: ignore[override]
+            return None
+
+    assert inherited_insides(Planted) == {"_x", "_map", "_calculate_map"}
+    known = {"_neural_net", "_condition_shape", "_loss", "_x", "_purpose", "_mean"}
+    assert known | INSIDE_TRAINERS <= private_names_of_sbi()
+    planted = "def f(npe, ours): return npe._neural_net, npe.val_indices, ours._of_ours"
+    assert foreign_insides(ast.parse(planted)) == {"_neural_net", "val_indices"}
+    assert foreign_insides(ast.parse("class A:\n def f(self): self._x = 1")) == set()
 
 
 def test_plots_and_data_libraries_are_imported_where_they_are_used() -> None:

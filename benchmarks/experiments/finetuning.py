@@ -41,8 +41,8 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "lr 3e-4, bank of 100": {"learning_rate": 3e-4},
     "lr 1e-3, bank of 100": {"learning_rate": 1e-3},
     "lr 3e-3, bank of 100": {"learning_rate": 3e-3},
-    "lr 1e-3, bank of 100, 300 steps": {"learning_rate": 1e-3, "num_steps": 300},
-    "lr 1e-4, bank of 100, 3000 steps": {"learning_rate": 1e-4, "num_steps": 3000},
+    "lr 1e-3, bank of 100, 300 steps": {"learning_rate": 1e-3, "max_num_epochs": 300},
+    "lr 1e-4, bank of 100, 3000 steps": {"learning_rate": 1e-4, "max_num_epochs": 3000},
     "defaults: better of lr 1e-4 and 1e-3, bank of 100, patience 200": {},
     "defaults, rehearsal 1": {"rehearsal": 1.0},
     "stored, 1 neighbour": {"num_neighbors": 1},
@@ -51,7 +51,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
 # Named learning rates run to their last step, so that they can be compared.
 for _options in SETTINGS.values():
     if "learning_rate" in _options:
-        _options["patience"] = 10_000
+        _options["stop_after_epochs"] = 10_000
 # Columns of the table, with the format of their means over seeds.
 FORMATS = {
     "best step": ".0f",
@@ -114,7 +114,7 @@ def run(task: Task, npe: Any, setting: str, n: int, seed: int) -> dict[str, floa
     natural = posterior.log_prob_batched(theta_v, x_v, norm_posterior=False)
     tuned = lpp(rope.tuned_posterior(), theta_v, x_v, theta_std=task.prior_std)
     return {
-        "best step": rope.history.best_step,
+        "best step": rope.history.best_epoch,
         "distance": distance_to_targets(task, rope, theta_v, x_v),
         "tuning-only LPP": tuned.mean,
         "RoPE LPP": float(natural.mean() + task.prior_std.log().sum()),

@@ -1,32 +1,24 @@
 """The methods RoPE is compared with, each used like an sbi trainer or posterior."""
 
-from sbi_rope.baselines.base import (
-    BuildsOnNPE,
-    Method,
-    UsesCalibration,
-    UsesObservations,
-    UsesSimulations,
-)
 from sbi_rope.baselines.calibration_mlp import CalibrationMLP
 from sbi_rope.baselines.error_model import SpikeAndSlab
-from sbi_rope.baselines.finetuned_npe import FinetunedNPE
 from sbi_rope.baselines.hvae import HVAE
 from sbi_rope.baselines.joint_npe import JointNPE
 from sbi_rope.baselines.nnpe import NNPE
 from sbi_rope.baselines.npe import PlainNPE, ReferenceNPE
 from sbi_rope.baselines.npe_rs import NPERS
 from sbi_rope.baselines.ot_only import OTOnly
-from sbi_rope.baselines.prior import PriorBaseline, PriorPosterior
+from sbi_rope.baselines.prior import PriorBaseline
 from sbi_rope.baselines.rnpe import RNPE
-from sbi_rope.baselines.training import Training
 from sbi_rope.baselines.tuning_only import TuningOnly
+from sbi_rope.mixture import PriorPosterior
+from sbi_rope.trainers import FinetunedNPE, Method, Training
 
 __all__ = [
     "HVAE",
     "NNPE",
     "NPERS",
     "RNPE",
-    "BuildsOnNPE",
     "CalibrationMLP",
     "FinetunedNPE",
     "JointNPE",
@@ -39,7 +31,4 @@ __all__ = [
     "SpikeAndSlab",
     "Training",
     "TuningOnly",
-    "UsesCalibration",
-    "UsesObservations",
-    "UsesSimulations",
 ]

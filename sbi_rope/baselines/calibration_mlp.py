@@ -7,19 +7,19 @@ import torch
 from torch import Tensor, nn
 
 from sbi_rope._random import seeded
-from sbi_rope._sbi import ConditionalDensityEstimator, embedding_of
+from sbi_rope._sbi import ConditionalDensityEstimator, direct_posterior, embedding_of
 from sbi_rope._standardisation import leave_out_constants
 from sbi_rope._training import History, split_pairs
 from sbi_rope._validation import check_instance
-from sbi_rope.baselines.base import UsesCalibration
 from sbi_rope.baselines.networks import embedding_with_head
-from sbi_rope.baselines.training import (
+from sbi_rope.errors import InvalidInputError
+from sbi_rope.trainers.base import Method
+from sbi_rope.trainers.training import (
     EstimatorBuilder,
     Training,
     estimator_builder,
     train_on_pairs,
 )
-from sbi_rope.errors import InvalidInputError
 
 __all__ = ["CalibrationMLP", "DiagonalGaussian"]
 
@@ -51,8 +51,8 @@ class DiagonalGaussian(ConditionalDensityEstimator):
     Args:
         net: Maps observations ``(n, *event)`` to means and log-variances ``(n, 2 k)``
             of theta in units of ``std`` about ``mean``.
-        mean: m, shape ``(k,)``.
-        std: s, shape ``(k,)``.
+        mean: m, shape ``(d,)``.
+        std: s, shape ``(d,)``.
         condition_shape: Shape of one observation.
     """
 
@@ -83,7 +83,7 @@ class DiagonalGaussian(ConditionalDensityEstimator):
         support, where no draw would ever be accepted.
 
         Args:
-            theta: Draws from the prior, shape ``(n, k)``.
+            theta: Draws from the prior, shape ``(n, d)``.
         """
         self.lowest = theta.amin(dim=0).to(self.lowest)
         self.highest = theta.amax(dim=0).to(self.highest)
@@ -96,7 +96,7 @@ class DiagonalGaussian(ConditionalDensityEstimator):
         without bound, and one such observation then decides any mean of log densities.
 
         Args:
-            theta: Parameters it was not trained on, shape ``(n, k)``.
+            theta: Parameters it was not trained on, shape ``(n, d)``.
             x: Their observations, shape ``(n, *event)``.
         """
         error = (theta - self._moments(x)[0]) / self.std
@@ -135,7 +135,7 @@ class DiagonalGaussian(ConditionalDensityEstimator):
         return -self.log_prob(input, condition)
 
 
-class CalibrationMLP(UsesCalibration):
+class CalibrationMLP(Method):
     r"""Regression from real observations to a diagonal Gaussian, without simulations.
 
     .. math::
@@ -164,7 +164,7 @@ class CalibrationMLP(UsesCalibration):
         | https://arxiv.org/abs/2405.08719
 
     Args:
-        prior: A torch distribution over parameters of shape ``(k,)``.
+        prior: A torch distribution over parameters of shape ``(d,)``.
         density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns; only its
             embedding net and its standardisation of x are used.
         training: How it is trained; at most 2000 epochs in batches of 100 at a learning
@@ -176,6 +176,8 @@ class CalibrationMLP(UsesCalibration):
         InvalidInputError: If sbi knows no estimator of that name; in ``train``, if
             there is one pair only.
     """
+
+    sees = frozenset({"calibration"})
 
     def __init__(
         self,
@@ -191,7 +193,7 @@ class CalibrationMLP(UsesCalibration):
         self.training = DEFAULT_TRAINING if training is None else training
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
-        theta, x = self._calibration
+        theta, x = self._data.calibration
         if len(x) < 2:
             raise InvalidInputError(
                 "Expected at least 2 calibration pairs, by which x is standardised; "
@@ -212,7 +214,7 @@ class CalibrationMLP(UsesCalibration):
         unseen = held_out if len(held_out) else train
         estimator.set_floor(theta[unseen], x[unseen])
         estimator.set_range(self._prior_draws())
-        return self._direct_posterior(estimator), history
+        return direct_posterior(estimator, self._prior), history
 
     def _gaussian(self, theta: Tensor, x: Tensor) -> DiagonalGaussian:
         theta, x = theta.cpu(), x.cpu()

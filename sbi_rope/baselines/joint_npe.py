@@ -6,20 +6,20 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sbi_rope._sbi import embedding_of
+from sbi_rope._sbi import direct_posterior, embedding_of
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._training import History, fit, split_pairs, too_few_pairs
 from sbi_rope._validation import check_instance
-from sbi_rope.baselines.base import UsesCalibration, UsesSimulations
-from sbi_rope.baselines.training import EstimatorBuilder, Training, estimator_builder
 from sbi_rope.errors import warn_user
+from sbi_rope.trainers.base import Method
+from sbi_rope.trainers.training import EstimatorBuilder, Training, estimator_builder
 
 __all__ = ["JointNPE"]
 
 DEFAULT_TRAINING = Training(validation_fraction=0.2)
 
 
-class JointNPE(UsesSimulations, UsesCalibration):
+class JointNPE(Method):
     r"""NPE whose batches are half simulations, half calibration pairs (J-NPE).
 
     .. math::
@@ -45,7 +45,7 @@ class JointNPE(UsesSimulations, UsesCalibration):
         | https://arxiv.org/abs/2405.08719
 
     Args:
-        prior: A torch distribution over parameters of shape ``(k,)``.
+        prior: A torch distribution over parameters of shape ``(d,)``.
         density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns. An
             embedding net inside it is copied, never trained in place.
         training: How it is trained; the held-out share is that of the calibration
@@ -68,6 +68,8 @@ class JointNPE(UsesSimulations, UsesCalibration):
         torch.Size([5, 1])
     """
 
+    sees = frozenset({"simulations", "calibration"})
+
     def __init__(
         self,
         prior: Any,
@@ -82,8 +84,8 @@ class JointNPE(UsesSimulations, UsesCalibration):
         self.training = DEFAULT_TRAINING if training is None else training
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
-        theta, x = self._simulations
-        theta_cal, x_cal = self._calibration
+        theta, x = self._data.simulations
+        theta_cal, x_cal = self._data.calibration
         train, held_out = split_pairs(theta_cal, self.training.validation_fraction)
         theta_held, x_held = theta_cal[held_out], x_cal[held_out]
         if not len(held_out):
@@ -118,10 +120,10 @@ class JointNPE(UsesSimulations, UsesCalibration):
             loss,
             validation_loss=lambda: loss(theta_held, x_held),
             learning_rate=self.training.learning_rate,
-            max_num_steps=self.training.max_num_epochs,
-            patience=self.training.stop_after_epochs,
+            max_num_epochs=self.training.max_num_epochs,
+            stop_after_epochs=self.training.stop_after_epochs,
             clip_max_norm=self.training.clip_max_norm,
             label="J-NPE",
             show_progress_bars=show_progress_bars,
         )
-        return self._direct_posterior(estimator), history
+        return direct_posterior(estimator, self._prior), history

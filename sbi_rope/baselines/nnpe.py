@@ -1,7 +1,6 @@
 """Noisy neural posterior estimation: NPE trained on statistics with errors."""
 
 import copy
-from functools import partial
 from typing import Any
 
 import torch
@@ -16,20 +15,20 @@ from sbi_rope._sbi import (
 )
 from sbi_rope._training import History
 from sbi_rope._validation import check_choice, check_instance
-from sbi_rope.baselines.base import BuildsOnNPE
 from sbi_rope.baselines.error_model import SpikeAndSlab
 from sbi_rope.baselines.statistics import NoiseOn, SoftClip, split_at_statistics
-from sbi_rope.baselines.training import (
+from sbi_rope.trainers.base import Method
+from sbi_rope.trainers.starting_npe import StartingNPE
+from sbi_rope.trainers.training import (
     EstimatorBuilder,
-    SimulationTrainer,
     Training,
-    train_with_sbi,
+    train_on_simulations,
 )
 
 __all__ = ["NNPE"]
 
 
-class NNPE(BuildsOnNPE):
+class NNPE(Method):
     r"""NPE trained on simulated statistics with the errors real ones may have.
 
     .. math::
@@ -64,7 +63,7 @@ class NNPE(BuildsOnNPE):
         | https://arxiv.org/abs/2210.06564
 
     Args:
-        prior: A torch distribution over parameters of shape ``(k,)``.
+        prior: A torch distribution over parameters of shape ``(d,)``.
         density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns. An
             embedding net inside it is copied, never trained in place.
         noise_on: Where the noise goes: ``"embedding"`` or ``"input"``.
@@ -91,6 +90,9 @@ class NNPE(BuildsOnNPE):
         torch.Size([5, 1])
     """
 
+    sees = frozenset({"simulations"})
+    starts_from_npe = True
+
     def __init__(
         self,
         prior: Any,
@@ -105,9 +107,8 @@ class NNPE(BuildsOnNPE):
         check_choice("noise_on", noise_on, ("embedding", "input"))
         check_instance("error_model", error_model, SpikeAndSlab, optional=True)
         check_instance("training", training, Training, optional=True)
-        super().__init__(
-            prior, density_estimator, npe_training=npe_training, device=device
-        )
+        npe = StartingNPE(density_estimator, npe_training)
+        super().__init__(prior, npe=npe, device=device)
         self.noise_on: NoiseOn = noise_on
         self.error_model = SpikeAndSlab() if error_model is None else error_model
         self.training = Training() if training is None else training
@@ -122,7 +123,7 @@ class NNPE(BuildsOnNPE):
         estimator = copy.deepcopy(estimator_of(npe)).requires_grad_()
         # The density shares its parameters with the estimator.
         net, density = split_at_statistics(estimator, self.noise_on)
-        theta, x = self._simulations
+        theta, x = self._data.simulations
         statistics = embed(net, x)
         clip = SoftClip(statistics)
         density = with_embedding(density, nn.Sequential(clip, embedding_of(density)))
@@ -130,12 +131,12 @@ class NNPE(BuildsOnNPE):
             estimator = with_embedding(estimator, nn.Sequential(net, clip))
         else:
             estimator = density
-        trained, history = train_with_sbi(
-            partial(
-                _TrainerWithNoise,
-                noise=self.error_model,
-                scale=clip.std,
-            ),
+        scale = clip.std
+
+        def with_noise(statistics: Tensor) -> Tensor:
+            return statistics + scale * self.error_model.sample_like(statistics)
+
+        trained, history = train_on_simulations(
             self._prior,
             # sbi tries it on the CPU, and moves it to the data's device.
             lambda theta, x: density.cpu(),
@@ -143,21 +144,9 @@ class NNPE(BuildsOnNPE):
             statistics,
             training=self.training,
             show_progress_bars=show_progress_bars,
+            change_x=with_noise,  # anew in every batch
         )
         # It shares its parameters with the estimator, on whatever device.
         density.load_state_dict(trained.state_dict())
         estimator = estimator.to(self._device)
         return posterior_from(npe, estimator.eval()), history
-
-
-class _TrainerWithNoise(SimulationTrainer):
-    """sbi's trainer, with fresh noise on x in every batch it takes a loss of."""
-
-    def __init__(self, *, noise: SpikeAndSlab, scale: Tensor, **options: Any) -> None:
-        super().__init__(**options)
-        self._noise = noise
-        self._scale = scale
-
-    def _loss(self, theta: Tensor, x: Tensor, *args: Any, **kwargs: Any) -> Tensor:
-        noisy = x + self._scale * self._noise.sample_like(x)
-        return super()._loss(theta, noisy, *args, **kwargs)

@@ -9,13 +9,15 @@ from torch import Tensor
 from sbi_rope._random import seeded
 from sbi_rope._simulator import Simulator
 from sbi_rope._training import History
-from sbi_rope.baselines.base import BuildsOnNPE
 from sbi_rope.errors import NotReadyError
+from sbi_rope.trainers.base import Method
+from sbi_rope.trainers.starting_npe import StartingNPE
+from sbi_rope.trainers.training import EstimatorBuilder, Training
 
 __all__ = ["PlainNPE", "ReferenceNPE"]
 
 
-class PlainNPE(BuildsOnNPE):
+class PlainNPE(Method):
     r"""Neural posterior estimation, trained on simulations and trusted on real data.
 
     .. math::
@@ -32,6 +34,17 @@ class PlainNPE(BuildsOnNPE):
           (Greenberg et al., 2019)
         | https://arxiv.org/abs/1905.07488
 
+    Args:
+        prior: A torch distribution over parameters of shape ``(d,)``.
+        density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns. An
+            embedding net inside it is copied, never trained in place.
+        npe_training: How NPE is trained; ``Training()`` if None.
+        device: Where to train; data on other devices is moved there.
+
+    Raises:
+        InvalidTypeError: If an argument has the wrong type.
+        InvalidInputError: If sbi knows no estimator of that name.
+
     Example:
         >>> from sbi.utils import BoxUniform
         >>> from sbi_rope.baselines import Training
@@ -44,11 +57,25 @@ class PlainNPE(BuildsOnNPE):
         torch.Size([5, 1])
     """
 
+    sees = frozenset({"simulations"})
+    starts_from_npe = True
+
+    def __init__(
+        self,
+        prior: Any,
+        density_estimator: str | EstimatorBuilder = "nsf",
+        *,
+        npe_training: Training | None = None,
+        device: str | torch.device = "cpu",
+    ) -> None:
+        npe = StartingNPE(density_estimator, npe_training)
+        super().__init__(prior, npe=npe, device=device)
+
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History | None]:
         return self._trained_npe(show_progress_bars=show_progress_bars)
 
 
-class ReferenceNPE(PlainNPE):
+class ReferenceNPE(Method):
     """NPE on simulations in the place of real observations: the reference, "SBI".
 
     Not a method for real data, but what inference would give if the simulator were
@@ -62,7 +89,35 @@ class ReferenceNPE(PlainNPE):
         | Addressing Misspecification in Simulation-based Inference through Data-driven
           Calibration (Wehenkel et al., 2025), section 4, Baselines
         | https://arxiv.org/abs/2405.08719
+
+    Args:
+        prior: A torch distribution over parameters of shape ``(d,)``.
+        density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns. An
+            embedding net inside it is copied, never trained in place.
+        npe_training: How NPE is trained; ``Training()`` if None.
+        device: Where to train; data on other devices is moved there.
+
+    Raises:
+        InvalidTypeError: If an argument has the wrong type.
+        InvalidInputError: If sbi knows no estimator of that name.
     """
+
+    sees = frozenset({"simulations"})
+    starts_from_npe = True
+
+    def __init__(
+        self,
+        prior: Any,
+        density_estimator: str | EstimatorBuilder = "nsf",
+        *,
+        npe_training: Training | None = None,
+        device: str | torch.device = "cpu",
+    ) -> None:
+        npe = StartingNPE(density_estimator, npe_training)
+        super().__init__(prior, npe=npe, device=device)
+
+    def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History | None]:
+        return self._trained_npe(show_progress_bars=show_progress_bars)
 
     def simulated_test_set(
         self,
@@ -74,7 +129,7 @@ class ReferenceNPE(PlainNPE):
         """Return the test parameters, each with one simulation.
 
         Args:
-            theta: Test parameters, shape ``(n, k)``.
+            theta: Test parameters, shape ``(n, d)``.
             simulator: Maps parameters to simulations, batched or not.
             seed: Seed of the simulations; None uses the states of torch, NumPy and
                 Python.
@@ -85,15 +140,15 @@ class ReferenceNPE(PlainNPE):
         Raises:
             SimulationError: If the simulator fails.
         """
-        theta = self._checked_theta("theta", theta)
-        if self._event_shape is None:
+        theta = self._data.checked_theta("theta", theta)
+        if self._data.event_shape is None:
             raise NotReadyError(
                 "The shape of a simulation is not known yet. Call "
                 "`append_simulations(theta, x)` first."
             )
         with seeded(seed):
             x = Simulator(
-                simulator, self._prior, event_shape=self._event_shape, like=theta
+                simulator, self._prior, event_shape=self._data.event_shape, like=theta
             )(theta)
         valid = torch.isfinite(x).flatten(1).all(dim=1)
         return theta[valid], x[valid]

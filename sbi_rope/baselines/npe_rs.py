@@ -5,18 +5,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sbi_rope._sbi import embedding_of
+from sbi_rope._sbi import direct_posterior, embedding_of
 from sbi_rope._training import History
 from sbi_rope._validation import check_instance, check_integer, check_not_negative
-from sbi_rope.baselines.base import UsesObservations, UsesSimulations
-from sbi_rope.baselines.training import (
+from sbi_rope.errors import warn_user
+from sbi_rope.trainers.base import Method
+from sbi_rope.trainers.training import (
     EstimatorBuilder,
-    SimulationTrainer,
     Training,
     estimator_builder,
-    train_with_sbi,
+    train_on_simulations,
 )
-from sbi_rope.errors import warn_user
 
 __all__ = ["NPERS", "squared_mmd"]
 
@@ -71,7 +70,7 @@ def _squared_distances(a: Tensor, b: Tensor) -> Tensor:
     return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist").square()
 
 
-class NPERS(UsesSimulations, UsesObservations):
+class NPERS(Method):
     r"""NPE with robust statistics: the embedding may not tell real from simulated.
 
     .. math::
@@ -107,7 +106,7 @@ class NPERS(UsesSimulations, UsesObservations):
         | https://arxiv.org/abs/2305.15871
 
     Args:
-        prior: A torch distribution over parameters of shape ``(k,)``.
+        prior: A torch distribution over parameters of shape ``(d,)``.
         density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns, with an
             embedding net. The net is copied, never trained in place.
         regularisation: The weight :math:`\beta`; at 0 the method is NPE.
@@ -138,6 +137,8 @@ class NPERS(UsesSimulations, UsesObservations):
         torch.Size([5, 1])
     """
 
+    sees = frozenset({"simulations", "observations"})
+
     def __init__(
         self,
         prior: Any,
@@ -161,22 +162,19 @@ class NPERS(UsesSimulations, UsesObservations):
         self.training = Training() if training is None else training
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
-        theta, x = self._simulations
+        theta, x = self._data.simulations
 
         def penalty(estimator: Any) -> Tensor | None:
             return self._penalty(estimator, x)
 
-        def make_trainer(**options: Any) -> SimulationTrainer:
-            return _PenalisedNPE(penalty, **options)
-
-        estimator, history = train_with_sbi(
-            make_trainer,
+        estimator, history = train_on_simulations(
             self._prior,
             self._build,
             theta,
             x,
             training=self.training,
             show_progress_bars=show_progress_bars,
+            penalty=penalty,
         )
         if self.regularisation and not _has_trainable_embedding(estimator):
             warn_user(
@@ -184,7 +182,7 @@ class NPERS(UsesSimulations, UsesObservations):
                 "no embedding net that can be trained: what was trained is NPE. Pass "
                 "`posterior_nn(..., embedding_net=net)` as `density_estimator`."
             )
-        return self._direct_posterior(estimator), history
+        return direct_posterior(estimator, self._prior), history
 
     def _penalty(self, estimator: Any, x: Tensor) -> Tensor | None:
         r"""Return :math:`\beta \mathrm{MMD}^2`; None if nothing depends on it."""
@@ -192,27 +190,13 @@ class NPERS(UsesSimulations, UsesObservations):
             return None
         embedding = embedding_of(estimator)
         simulations = _some(x, self.num_mmd_simulations)
-        observations = _some(self._observations, self.num_mmd_observations)
+        observations = _some(self._data.observations, self.num_mmd_observations)
         # Batch normalisation would centre each of the two sets, and dropout is noise.
         embedding.eval()
         simulated = embedding(simulations).flatten(1)
         observed = embedding(observations).flatten(1)
         embedding.train()
         return self.regularisation * squared_mmd(simulated, observed)
-
-
-class _PenalisedNPE(SimulationTrainer):
-    """sbi's NPE with a penalty in the training loss that depends on the estimator."""
-
-    def __init__(self, penalty: Any, **options: Any) -> None:
-        super().__init__(**options)
-        self._penalty = penalty
-
-    def _loss(self, *args: Any, **kwargs: Any) -> Tensor:
-        loss = super()._loss(*args, **kwargs)
-        assert self._neural_net is not None
-        penalty = self._penalty(self._neural_net) if self._neural_net.training else None
-        return loss if penalty is None else loss + penalty
 
 
 def _some(rows: Tensor, size: int) -> Tensor:

@@ -7,16 +7,17 @@ import torch
 from torch import Tensor
 
 from sbi_rope._validation import check_instance, check_integer
-from sbi_rope.baselines.base import UsesObservations
-from sbi_rope.baselines.stage import StageOfRoPE
-from sbi_rope.baselines.training import EstimatorBuilder, Training
 from sbi_rope.coupling import SinkhornCoupler
 from sbi_rope.mixture import MixturePosterior
+from sbi_rope.rope import RoPE
+from sbi_rope.trainers.base import Method
+from sbi_rope.trainers.starting_npe import StartingNPE
+from sbi_rope.trainers.training import EstimatorBuilder, Training
 
 __all__ = ["OTOnly"]
 
 
-class OTOnly(StageOfRoPE, UsesObservations):
+class OTOnly(Method):
     r"""Transport between :math:`h(x_o)` and :math:`h(x_s)`: RoPE without calibration.
 
     Step 3 of RoPE without step 2, g = h.
@@ -33,7 +34,7 @@ class OTOnly(StageOfRoPE, UsesObservations):
         | https://arxiv.org/abs/2405.08719
 
     Args:
-        prior: A torch distribution over parameters of shape ``(k,)``.
+        prior: A torch distribution over parameters of shape ``(d,)``.
         density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns. An
             embedding net inside it is copied, never trained in place.
         simulator: Maps parameters to simulations, batched or not. Without one, the
@@ -49,6 +50,9 @@ class OTOnly(StageOfRoPE, UsesObservations):
         CouplingError: In ``train``, if the transport has not converged.
     """
 
+    sees = frozenset({"simulations", "observations"})
+    starts_from_npe = True
+
     def __init__(
         self,
         prior: Any,
@@ -63,22 +67,27 @@ class OTOnly(StageOfRoPE, UsesObservations):
         check_instance("coupler", coupler, SinkhornCoupler, optional=True)
         if num_simulations is not None:
             check_integer("num_simulations", num_simulations)
-        super().__init__(
-            prior,
-            density_estimator,
-            simulator=simulator,
-            npe_training=npe_training,
-            device=device,
-        )
+        npe = StartingNPE(density_estimator, npe_training)
+        super().__init__(prior, npe=npe, device=device)
+        self._simulator = simulator
         self.coupler = coupler
         self.num_simulations = num_simulations
 
+    @property
+    def needs_simulations(self) -> bool:
+        """Whether there is something to train or to look up on simulations."""
+        return self._simulator is None or not self._has_npe
+
     def _fit(self, *, show_progress_bars: bool) -> tuple[MixturePosterior, Any]:
-        rope, history = self._rope(
-            coupler=self.coupler, show_progress_bars=show_progress_bars
+        npe, history = self._trained_npe(show_progress_bars=show_progress_bars)
+        rope = RoPE(
+            npe,
+            simulator=self._simulator,
+            simulations=self._data.simulations if self._simulator is None else None,
+            coupler=self.coupler,
         )
         posterior = rope.build_posterior(
-            self._observations,
+            self._data.observations,
             num_simulations=self.num_simulations,
             show_progress_bars=show_progress_bars,
         )

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from sbi_rope._random import seeded
-from sbi_rope._sbi import embed, estimator_of
+from sbi_rope._sbi import direct_posterior, embed, estimator_of
+from sbi_rope._standardisation import Standardisation
 from sbi_rope._training import History
 from sbi_rope._validation import (
     check_batch,
@@ -14,19 +15,19 @@ from sbi_rope._validation import (
     check_instance,
     check_integer,
 )
-from sbi_rope.baselines.base import BuildsOnNPE
 from sbi_rope.baselines.error_model import ChainSettings, SpikeAndSlab, denoise
 from sbi_rope.baselines.statistics import (
     NoiseOn,
-    Standardisation,
     fit_marginal,
     split_at_statistics,
 )
-from sbi_rope.baselines.training import EstimatorBuilder, Training
 from sbi_rope.errors import InvalidInputError, warn_user
 from sbi_rope.mixture import Mixing, MixtureEstimator, Part, Rows, equal_rows
+from sbi_rope.trainers.base import Method
+from sbi_rope.trainers.starting_npe import StartingNPE
+from sbi_rope.trainers.training import EstimatorBuilder, Training
 
-__all__ = ["RNPE", "DenoisedContexts"]
+__all__ = ["RNPE", "DenoisedEmbeddings"]
 
 # Chains that disagree by more have not converged.
 MAX_R_HAT = 1.1
@@ -34,7 +35,7 @@ MAX_R_HAT = 1.1
 NUM_STARTS = 5000
 
 
-class DenoisedContexts(Mixing):
+class DenoisedEmbeddings(Mixing):
     r"""Statistics that may be behind an observation, with equal weights.
 
     .. math::
@@ -77,13 +78,13 @@ class DenoisedContexts(Mixing):
         self.seed = seed
         self._denoised: dict[bytes, tuple[Tensor, Tensor]] = {}
 
-    def features(self, x: Tensor) -> Tensor:
+    def embed(self, x: Tensor) -> Tensor:
         """Return the draws of s of each observation, ``(n, num_denoised, l)``."""
         return torch.stack([draws for draws, _ in self._lookup(x)]).to(self.starts)
 
-    def rows(self, features: Tensor) -> Rows:
+    def rows(self, embedded: Tensor) -> Rows:
         """Weigh all draws of an observation equally."""
-        return equal_rows(features)
+        return equal_rows(embedded)
 
     def r_hat(self, x: Tensor) -> Tensor:
         """Return the largest split-R-hat of each observation's chains, ``(n,)``."""
@@ -122,7 +123,7 @@ class DenoisedContexts(Mixing):
             self._denoised[key] = (s, r_hat)
 
 
-class RNPE(BuildsOnNPE):
+class RNPE(Method):
     r"""NPE averaged over the statistics a simulator may have had behind real ones.
 
     .. math::
@@ -155,7 +156,7 @@ class RNPE(BuildsOnNPE):
         | https://arxiv.org/abs/2210.06564
 
     Args:
-        prior: A torch distribution over parameters of shape ``(k,)``.
+        prior: A torch distribution over parameters of shape ``(d,)``.
         density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns. An
             embedding net inside it is copied, never trained in place.
         noise_on: What the statistics are: the ``"embedding"`` of NPE, or the
@@ -175,6 +176,9 @@ class RNPE(BuildsOnNPE):
             its range, or, in ``train``, no statistic varies.
         UnsupportedPosteriorError: In ``train``, if the estimator has no density.
     """
+
+    sees = frozenset({"simulations"})
+    starts_from_npe = True
 
     def __init__(
         self,
@@ -199,9 +203,8 @@ class RNPE(BuildsOnNPE):
         check_integer("num_denoised", num_denoised, minimum=4 * num_chains)
         check_integer("warmup", warmup)
         check_integer("thin", thin)
-        super().__init__(
-            prior, density_estimator, npe_training=npe_training, device=device
-        )
+        npe = StartingNPE(density_estimator, npe_training)
+        super().__init__(prior, npe=npe, device=device)
         self.noise_on: NoiseOn = noise_on
         self.error_model = SpikeAndSlab() if error_model is None else error_model
         self.settings = ChainSettings(
@@ -217,7 +220,7 @@ class RNPE(BuildsOnNPE):
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
         net, density = split_at_statistics(estimator_of(npe), self.noise_on)
-        _, x = self._simulations
+        _, x = self._data.simulations
         statistics = embed(net, x)
         s = self._standardised(statistics)
         marginal, history = fit_marginal(
@@ -226,7 +229,7 @@ class RNPE(BuildsOnNPE):
             training=self.training,
             show_progress_bars=show_progress_bars,
         )
-        denoised = DenoisedContexts(
+        denoised = DenoisedEmbeddings(
             net,
             marginal,
             statistics,
@@ -236,7 +239,7 @@ class RNPE(BuildsOnNPE):
             seed=int(torch.randint(2**31, ())),
         )
         estimator = MixtureEstimator([Part(density, denoised)], [1.0], tail_mass=0.0)
-        return self._direct_posterior(estimator.eval()), history
+        return direct_posterior(estimator.eval(), self._prior), history
 
     def _standardised(self, statistics: Tensor) -> Tensor:
         if statistics.ndim != 2:

@@ -12,15 +12,13 @@ from sbi_rope._sbi import (
     embedding_of,
     headless,
 )
-from sbi_rope._standardisation import ROUNDING
 from sbi_rope._training import History, fit, split_pairs
-from sbi_rope.baselines.training import Training
 from sbi_rope.errors import UnsupportedPosteriorError
+from sbi_rope.trainers.training import Training
 
 __all__ = [
     "NoiseOn",
     "SoftClip",
-    "Standardisation",
     "fit_marginal",
     "split_at_statistics",
 ]
@@ -55,39 +53,6 @@ def split_at_statistics(
     if noise_on == "input":
         return nn.Identity(), estimator
     return embedding_of(estimator), headless(estimator)
-
-
-class Standardisation(nn.Module):
-    """Statistics in units of their standard deviation over simulations, and back.
-
-    Statistics that are the same in all simulations cannot be in these units. They are
-    left out on the way there, and have their simulated value on the way back.
-
-    Args:
-        simulated: Statistics of simulations, shape ``(n, l)``.
-    """
-
-    mean: Tensor
-    std: Tensor
-    varies: Tensor
-
-    def __init__(self, simulated: Tensor) -> None:
-        super().__init__()
-        std, mean = torch.std_mean(simulated, dim=0)
-        self.register_buffer("mean", mean)
-        self.register_buffer("std", std)
-        self.register_buffer("varies", std > ROUNDING * mean.abs())
-
-    def forward(self, statistics: Tensor) -> Tensor:
-        """Standardise, ``(..., l)`` to ``(..., l')``."""
-        return ((statistics - self.mean) / self.std)[..., self.varies]
-
-    def undo(self, standardised: Tensor) -> Tensor:
-        """Return statistics in their own units, ``(..., l')`` to ``(..., l)``."""
-        shape = (*standardised.shape[:-1], len(self.mean))
-        statistics = self.mean.expand(shape).clone()
-        statistics[..., self.varies] += standardised * self.std[self.varies]
-        return statistics
 
 
 class SoftClip(nn.Module):
@@ -166,8 +131,8 @@ def fit_marginal(
         loss,
         validation_loss=lambda: loss(s[held_out]),
         learning_rate=training.learning_rate,
-        max_num_steps=training.max_num_epochs,
-        patience=training.stop_after_epochs,
+        max_num_epochs=training.max_num_epochs,
+        stop_after_epochs=training.stop_after_epochs,
         clip_max_norm=training.clip_max_norm,
         label="Density of the statistics",
         show_progress_bars=show_progress_bars,

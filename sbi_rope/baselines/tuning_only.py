@@ -8,15 +8,16 @@ from torch import Tensor
 
 from sbi_rope._training import History
 from sbi_rope._validation import check_instance
-from sbi_rope.baselines.base import UsesCalibration
-from sbi_rope.baselines.stage import StageOfRoPE
-from sbi_rope.baselines.training import EstimatorBuilder, Training
 from sbi_rope.finetuning import CalibrationFinetuner
+from sbi_rope.rope import RoPE
+from sbi_rope.trainers.base import Method
+from sbi_rope.trainers.starting_npe import StartingNPE
+from sbi_rope.trainers.training import EstimatorBuilder, Training
 
 __all__ = ["TuningOnly"]
 
 
-class TuningOnly(StageOfRoPE, UsesCalibration):
+class TuningOnly(Method):
     r"""The flow on the tuned embedding, :math:`q(\theta \mid g(x_o))`.
 
     Step 2 of RoPE without step 3: :meth:`RoPE.tuned_posterior
@@ -33,7 +34,7 @@ class TuningOnly(StageOfRoPE, UsesCalibration):
         | https://arxiv.org/abs/2405.08719
 
     Args:
-        prior: A torch distribution over parameters of shape ``(k,)``.
+        prior: A torch distribution over parameters of shape ``(d,)``.
         density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns. An
             embedding net inside it is copied, never trained in place.
         simulator: Maps parameters to simulations, batched or not. Without one, the
@@ -47,6 +48,9 @@ class TuningOnly(StageOfRoPE, UsesCalibration):
         InvalidInputError: If sbi knows no estimator of that name.
     """
 
+    sees = frozenset({"simulations", "calibration"})
+    starts_from_npe = True
+
     def __init__(
         self,
         prior: Any,
@@ -58,19 +62,24 @@ class TuningOnly(StageOfRoPE, UsesCalibration):
         device: str | torch.device = "cpu",
     ) -> None:
         check_instance("finetuner", finetuner, CalibrationFinetuner, optional=True)
-        super().__init__(
-            prior,
-            density_estimator,
-            simulator=simulator,
-            npe_training=npe_training,
-            device=device,
-        )
+        npe = StartingNPE(density_estimator, npe_training)
+        super().__init__(prior, npe=npe, device=device)
+        self._simulator = simulator
         self.finetuner = finetuner
 
+    @property
+    def needs_simulations(self) -> bool:
+        """Whether there is something to train or to look up on simulations."""
+        return self._simulator is None or not self._has_npe
+
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
-        rope, _ = self._rope(
-            finetuner=self.finetuner, show_progress_bars=show_progress_bars
+        npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
+        rope = RoPE(
+            npe,
+            simulator=self._simulator,
+            simulations=self._data.simulations if self._simulator is None else None,
+            finetuner=self.finetuner,
         )
-        rope.append_calibration(*self._calibration)
+        rope.append_calibration(*self._data.calibration)
         rope.train(show_progress_bars=show_progress_bars)
         return rope.tuned_posterior(), rope.history

@@ -55,15 +55,16 @@ class SinkhornCoupler:
         | https://arxiv.org/abs/2405.08719
 
     Args:
-        gamma: Entropic regularisation, positive, in units of the cost. Small values
-            give sharp posteriors, large values the prior. Default 0.5, as in the
-            paper.
+        gamma: Entropic regularisation, positive. A small value gives sharp posteriors,
+            and a large one gives the prior. Its unit is that of ``cost_scale``. The
+            paper's value is 0.5 with ``cost_scale="none"``.
         tau: Trust in the prior, in [0, 1]. 1 (the default) uses all simulations
             equally, as a well-specified prior asks for; 0 lets every observation
             choose its simulations alone.
-        cost_scale: ``"none"`` takes the distances as they are, as in the paper.
-            ``"simulated"`` divides them by the median distance between simulations, so
-            that a gamma means the same whatever the units of the embedding net.
+        cost_scale: ``"simulated"`` (the default) divides the distances by the median
+            distance between simulated embeddings, so that a gamma means the same
+            whatever the units of the embedding net. ``"none"`` takes the distances as
+            they are, as the paper does.
         solver: ``"own"`` iterates the simulation-side potential with Anderson
             acceleration; ``"pot"`` is POT's ``sinkhorn_unbalanced``, with our own
             solver taking over where its scalings over- or underflow.
@@ -95,9 +96,9 @@ class SinkhornCoupler:
         True
     """
 
-    gamma: float = 0.5
+    gamma: float = 0.1
     tau: float = 1.0
-    cost_scale: Literal["none", "simulated"] = "none"
+    cost_scale: Literal["none", "simulated"] = "simulated"
     solver: Literal["own", "pot"] = "own"
     tolerance: float = 1e-6
     max_iterations: int = 10_000

@@ -8,8 +8,8 @@ from torch import Tensor, nn
 
 from sbi_rope._sbi import ConditionalEstimator, embedding_of, headless, with_embedding
 from sbi_rope._simulations import Moments
+from sbi_rope._standardisation import Standardisation
 from sbi_rope._training import History
-from sbi_rope.baselines.statistics import Standardisation
 from sbi_rope.discrepancy.model import Discrepancy, DiscrepancyModel
 from sbi_rope.discrepancy.training import train_on_corrected
 from sbi_rope.errors import InvalidInputError

@@ -28,8 +28,6 @@ from sbi_rope._validation import (
     check_names,
     check_positive,
 )
-from sbi_rope.baselines.base import BuildsOnNPE, UsesCalibration
-from sbi_rope.baselines.training import EstimatorBuilder, Training
 from sbi_rope.discrepancy.correction import (
     Space,
     correct_npe,
@@ -46,7 +44,10 @@ from sbi_rope.errors import (
     UnsupportedPosteriorError,
 )
 from sbi_rope.finetuning import CalibrationFinetuner
-from sbi_rope.mixture import MixtureEstimator, MixturePosterior, OwnContexts, Part
+from sbi_rope.mixture import MixtureEstimator, MixturePosterior, OwnEmbeddings, Part
+from sbi_rope.trainers.base import Method
+from sbi_rope.trainers.starting_npe import StartingNPE
+from sbi_rope.trainers.training import EstimatorBuilder, Training
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -57,7 +58,7 @@ __all__ = ["DiscrepancyNPE"]
 MIN_PAIRS = 2
 
 
-class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
+class DiscrepancyNPE(Method):
     r"""NPE for reality: trained on simulations with the discrepancy integrated out.
 
     A Bayesian linear model says how real observations follow from simulations
@@ -85,7 +86,7 @@ class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
         | https://doi.org/10.1111/1467-9868.00294
 
     Args:
-        prior: A torch distribution over parameters of shape ``(k,)``.
+        prior: A torch distribution over parameters of shape ``(d,)``.
         density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns. An
             embedding net inside it is copied, never trained in place.
         simulator: Maps parameters to simulations, batched or not. Without one, the
@@ -112,6 +113,9 @@ class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
             no vector with ``space="input"``.
         SimulationError: In ``train``, if the simulator fails.
     """
+
+    sees = frozenset({"simulations", "calibration"})
+    starts_from_npe = True
 
     def __init__(
         self,
@@ -147,9 +151,8 @@ class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
                 "Expected `simulator` to be callable, from theta (n, d) to x (n, "
                 f"*event), or None; got {type(simulator).__name__}."
             )
-        super().__init__(
-            prior, density_estimator, npe_training=npe_training, device=device
-        )
+        npe = StartingNPE(density_estimator, npe_training)
+        super().__init__(prior, npe=npe, device=device)
         self.space: Space = space
         self.learn_prior = learn_prior
         self.model = DiscrepancyModel() if model is None else model
@@ -192,7 +195,7 @@ class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
     @property
     def needs_simulations(self) -> bool:
         """Whether there is no simulator, or NPE has still to be trained."""
-        return self._npe is None or self._simulator is None
+        return self._simulator is None or not self._has_npe
 
     @property
     def _ignores_simulations(self) -> bool:
@@ -238,9 +241,9 @@ class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
         if x_names is not None:
             x_names = check_names("x_names", x_names)
         if self._simulator is None:
-            self._needs("simulations", len(self._theta), "append_simulations(theta, x)")
+            self._check_some("simulations")
         self._check_pairs()
-        _, x = self._calibration
+        _, x = self._data.calibration
         if x.ndim != 2:
             raise InvalidInputError(
                 "Expected observations of shape (n, l), a summary in each column; got "
@@ -261,7 +264,7 @@ class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
         self._check_pairs()
 
     def _check_pairs(self) -> None:
-        count = len(self._theta_cal)
+        count = self._data.count("calibration")
         if count < MIN_PAIRS:
             raise NotReadyError(
                 f"DiscrepancyNPE needs at least {MIN_PAIRS} calibration pairs; got "
@@ -269,13 +272,13 @@ class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
             )
 
     def _source(self, x: Tensor) -> SimulationSource:
-        like = self._theta_cal
+        like, _ = self._data.calibration
         if self._simulator is not None:
             return Simulator(
                 self._simulator, self._prior, event_shape=x.shape[1:], like=like
             )
         return StoredSimulations(
-            self._simulations,
+            self._data.simulations,
             self._prior,
             theta_shape=like.shape[1:],
             event_shape=x.shape[1:],
@@ -289,7 +292,7 @@ class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
         show_progress_bars: bool,  # noqa: FBT001
     ) -> Moments:
         return source.moments(
-            self._theta_cal,
+            self._data.calibration[0],
             self.simulations_per_pair,
             lambda x: embed(net, x),
             progress=show_progress_bars,
@@ -300,7 +303,7 @@ class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
         estimator = estimator_of(npe)
         if self.space == "tuned":
             _check_density(estimator)
-        theta, x = self._calibration
+        theta, x = self._data.calibration
         warn_of_far_entries("x", x, embedding_of(estimator))
         source = self._source(x)
         net = network_of(estimator, self.space)
@@ -345,13 +348,13 @@ class DiscrepancyNPE(BuildsOnNPE, UsesCalibration):
         show_progress_bars: bool,  # noqa: FBT001
     ) -> tuple[Tensor, Tensor]:
         """Return simulations from the prior: those appended, or new ones."""
-        if self._x is not None:
-            return self._simulations
+        if self._data.count("simulations"):
+            return self._data.simulations
         return source.kept(self.num_simulations, progress=show_progress_bars)
 
     def _averaged(self, estimator: Any, nets: Sequence[nn.Module]) -> MixturePosterior:
-        contexts = OwnContexts(nets, estimator.condition_shape)
-        mixture = MixtureEstimator([Part(headless(estimator), contexts)], [1.0])
+        embeddings = OwnEmbeddings(nets, estimator.condition_shape)
+        mixture = MixtureEstimator([Part(headless(estimator), embeddings)], [1.0])
         return MixturePosterior(mixture, copy.deepcopy(self._prior))
 
 

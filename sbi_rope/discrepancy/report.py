@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sbi_rope._simulations import Moments
-from sbi_rope.baselines.statistics import Standardisation
+from sbi_rope._standardisation import Standardisation
 from sbi_rope.discrepancy.model import Discrepancy, DiscrepancyModel
 from sbi_rope.errors import InvalidInputError
 

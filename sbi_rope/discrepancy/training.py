@@ -8,8 +8,8 @@ from torch import Tensor, nn
 
 from sbi_rope._progress import progress_bar
 from sbi_rope._random import seeded
+from sbi_rope._standardisation import Standardisation
 from sbi_rope._training import History
-from sbi_rope.baselines.statistics import Standardisation
 from sbi_rope.discrepancy.model import DiscrepancyDraws
 
 __all__ = ["train_on_corrected"]

@@ -117,7 +117,7 @@ def lpp(
 
     Example:
         >>> from sbi.utils import BoxUniform
-        >>> from sbi_rope.baselines import PriorPosterior
+        >>> from sbi_rope.mixture import PriorPosterior
         >>> prior = BoxUniform(torch.zeros(1), torch.ones(1))
         >>> score = lpp(PriorPosterior(prior), torch.rand(9, 1), torch.rand(9, 2))
         >>> score.mean

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_rope._random import seeded
-from sbi_rope._sbi import DirectPosterior
+from sbi_rope._sbi import BaseDirectPosterior, describe
 from sbi_rope._validation import (
     as_numbers,
     as_shape,
@@ -22,7 +22,7 @@ from sbi_rope._validation import (
 )
 from sbi_rope.coupling import Coupling
 from sbi_rope.errors import InvalidInputError, InvalidTypeError, SamplingError
-from sbi_rope.mixture.coupled import CoupledContexts
+from sbi_rope.mixture.coupled import CoupledEmbeddings
 from sbi_rope.mixture.estimator import MixtureEstimator
 from sbi_rope.mixture.parts import DTYPE
 from sbi_rope.mixture.sampling import Accept
@@ -31,7 +31,7 @@ from sbi_rope.mixture.truncation import Leakage, is_unbounded
 __all__ = ["MixturePosterior"]
 
 
-class MixturePosterior(DirectPosterior):
+class MixturePosterior(BaseDirectPosterior):
     r"""A mixture of weighted densities as an sbi posterior.
 
     .. math::
@@ -40,7 +40,7 @@ class MixturePosterior(DirectPosterior):
         \sum_k w_k \sum_j a^k_j(x)\, q_k(\theta \mid s^k_j(x)),
 
     with Z(x) the mass inside the support of the prior. RoPE's has one part, whose
-    contexts are simulations and whose weights are rows of a coupling:
+    embeddings are simulations and whose weights are rows of a coupling:
 
     .. math::
         p(\theta \mid x_{o,i})
@@ -75,7 +75,7 @@ class MixturePosterior(DirectPosterior):
         enable_transform: As in sbi, for ``map()``.
         shared: What posteriors of the same prior and parts, in the same order, share
             whatever their weights and couplings are: each leaves there what it has
-            estimated of the simulations that are their contexts.
+            estimated of the simulations that are their embeddings.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class MixturePosterior(DirectPosterior):
         self.posterior_estimator: MixtureEstimator = estimator
         # Shared with the views of single observations, so that it is estimated once.
         self._cache: dict[int, Tensor] = {} if shared is None else shared
-        self._purpose = _purpose(estimator)
+        describe(self, _purpose(estimator))
 
     @property
     def is_amortised(self) -> bool:
@@ -154,7 +154,7 @@ class MixturePosterior(DirectPosterior):
             )
         return coupled.weights
 
-    def _coupled(self, name: str) -> CoupledContexts:
+    def _coupled(self, name: str) -> CoupledEmbeddings:
         if self.is_amortised:
             raise InvalidInputError(
                 f"This posterior is amortised: it belongs to no batch and has no "
@@ -211,10 +211,6 @@ class MixturePosterior(DirectPosterior):
         self._cache = {k: mass.to(device) for k, mass in self._cache.items()}
         with seeded(0):  # sbi draws from the prior to look at it
             super().to(device)
-
-    def __getstate__(self) -> dict[str, Any]:
-        # sbi hands out its own __dict__, which a shallow copy would then share.
-        return dict(self.__dict__)
 
     # --- sampling ---
 
@@ -313,7 +309,7 @@ class MixturePosterior(DirectPosterior):
         super().set_default_x(self._batch_of_x(x).clone())
         return self
 
-    def _x_else_default_x(self, x: Any) -> Tensor:
+    def _x_or_default(self, x: Any) -> Tensor:
         x = self.default_x if x is None else x
         if x is None:
             raise InvalidInputError(
@@ -323,7 +319,7 @@ class MixturePosterior(DirectPosterior):
         return self._batch_of_x(x)
 
     def _one_x(self, x: Tensor | None) -> Tensor:
-        batch = self._x_else_default_x(x)
+        batch = self._x_or_default(x)
         if len(batch) > 1:
             raise InvalidInputError(
                 f"Expected one observation; got {len(batch)}. Use the `_batched` "
@@ -471,26 +467,6 @@ class MixturePosterior(DirectPosterior):
                 **options,
             )
 
-    def _calculate_map(  # type: ignore[override]
-        self,
-        *,
-        init_method: str | Tensor = "posterior",
-        num_init_samples: int,
-        show_progress_bars: bool,
-        **options: Any,
-    ) -> Tensor:
-        # sbi shows the progress of these draws whatever it was told.
-        if isinstance(init_method, str) and init_method == "posterior":
-            init_method = self.sample(
-                (num_init_samples,), show_progress_bars=show_progress_bars
-            )
-        return super()._calculate_map(
-            init_method=init_method,
-            num_init_samples=num_init_samples,
-            show_progress_bars=show_progress_bars,
-            **options,
-        )
-
     # --- normalisation ---
 
     def leakage(self, x: Tensor, *, show_progress_bars: bool = False) -> Leakage:
@@ -536,7 +512,7 @@ def _purpose(estimator: MixtureEstimator) -> str:
     coupled = estimator.coupled[0]
     mixed = f"{num_parts} posterior densities"
     if num_parts == 1:
-        mixed = f"{coupled.num_contexts} simulated posteriors"
+        mixed = f"{coupled.num_embeddings} simulated posteriors"
     return (
         f"It is the mixture of {mixed} for each of {len(coupled.x_o)} real "
         "observations."

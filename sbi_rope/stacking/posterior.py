@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_rope._sbi import describe
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture import MixturePosterior
 from sbi_rope.stacking.report import StackingReport
@@ -64,9 +65,10 @@ class StackedPosterior(MixturePosterior):
         )
         self._versions: Versions | None = versions
         self.report = report
-        self._purpose = (
+        describe(
+            self,
             f"It is the stack of {len(weights)} candidate posteriors, weighted by "
-            "their scores on held-out calibration pairs."
+            "their scores on held-out calibration pairs.",
         )
 
     @property

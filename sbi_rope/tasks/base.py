@@ -1,4 +1,4 @@
-r"""What a task is: a prior, a simulator, and labelled real observations."""
+r"""The base class of all tasks: a prior, a simulator and labelled observations."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -148,7 +148,10 @@ class Task(ABC):
 
     @property
     def required_files(self) -> tuple[Path, ...]:
-        """Recorded files the sets are read from, below ``root``; none if drawn."""
+        """Recorded files below ``root`` that the sets are read from.
+
+        There are none for sets that are drawn.
+        """
         if self.variant == "well_specified":
             return ()
         return self._recorded_files()
@@ -171,7 +174,7 @@ class Task(ABC):
 
     @abstractmethod
     def get_simulator(self) -> Simulator:
-        """Return the simulator, from theta ``(n, theta_dim)`` to ``(n, *x_shape)``.
+        """Return the simulator, from theta ``(n, d)`` to x ``(n, *x_shape)``.
 
         It draws from torch's global generator, on the device of theta.
         """
@@ -197,11 +200,11 @@ class Task(ABC):
 
         Args:
             n: Number of observations.
-            seed: Which set. With the same seed, a smaller set is the beginning of a
-                larger one. No set shares an observation with any test set.
+            seed: Number of the set. With the same seed, a smaller set is the beginning
+                of a larger one. No set shares an observation with any test set.
 
         Returns:
-            Parameters of shape ``(n, theta_dim)`` and observations of shape
+            Parameters of shape ``(n, d)`` and observations of shape
             ``(n, *x_shape)``, both float32.
 
         Raises:
@@ -247,11 +250,11 @@ class Task(ABC):
         return self._simulated_process()
 
     def num_recorded(self, part: Part, *, seed: int = 0) -> int | None:
-        """Return how many pairs a set can have; None if any number can be drawn.
+        """Return how many pairs a set can have, or None if any number can be drawn.
 
         Args:
             part: ``"calibration"`` or ``"test"``.
-            seed: Seed of the set; variants keep other pairs under other seeds.
+            seed: Seed of the set. Variants keep other pairs under other seeds.
         """
         check_choice("part", part, ("calibration", "test"))
         seed = _checked_seed(seed)
@@ -325,8 +328,8 @@ def check_theta(theta: Any, theta_dim: int, *, finite: bool = True) -> Tensor:
 
     Raises:
         InvalidTypeError: If ``theta`` is not a tensor of floating-point numbers.
-        InvalidInputError: If its shape is not ``(n, theta_dim)``, it is not finite, or
-            it is far larger than parameters are.
+        InvalidInputError: If its shape is not ``(n, theta_dim)``, if it is not finite,
+            or if it is far larger than parameters are.
     """
     theta = check_batch("theta", theta, (theta_dim,), finite=finite, allow_empty=True)
     if not theta.is_floating_point():

@@ -1,4 +1,4 @@
-r"""Reading the causal chambers' recorded experiments.
+r"""Readers of the recorded experiments of the causal chambers.
 
 References:
     | Causal chambers as a real-world physical testbed for AI methodology
@@ -68,7 +68,7 @@ LARGEST_READING = 1e30
 def check_download(
     root: Path | None, required: Sequence[Path], *, download: bool
 ) -> None:
-    """Raise if files are required and to be downloaded to nowhere."""
+    """Raise if files are to be downloaded and no ``root`` is given for them."""
     check_instance("download", download, bool)
     if download and required and root is None:
         raise InvalidInputError(
@@ -162,10 +162,10 @@ def read_columns(path: Path, columns: Sequence[str]) -> Tensor:
 
 
 def check_complete(path: Path, found: int, *, dataset: str) -> None:
-    """Raise if a published experiment has not the rows that it was published with.
+    """Raise unless a published experiment has as many rows as were published.
 
-    A file that has been cut between two rows shows it by nothing else, and the rows
-    that are left would be split in another way than everybody else's.
+    Nothing else shows that a file has been cut between two rows. The rows that are
+    left would be split in another way than those of the whole file.
 
     Args:
         path: The file that was read; its name is that of the experiment.
@@ -256,10 +256,10 @@ def read_images(folder: Path, names: Sequence[str], size: int) -> Tensor:
 
 
 def _check_lines(path: Path) -> None:
-    """Raise if a row ends before the last column, or the last one without a line end.
+    """Raise if a row ends before its last column, or the last row without a line end.
 
-    pandas takes missing columns for empty ones, and a number that lost its last digits
-    for a number.
+    pandas would take the missing columns for empty ones. It cannot tell that a number
+    at the end of the file has lost its last digits.
     """
     line, number, commas, width, columns = b"\n", 0, 0, 0, [""]
     with path.open("rb") as file:

@@ -1,4 +1,4 @@
-r"""Cancer and stromal cells: a tissue whose tumours die from the inside."""
+r"""Task A: cells of a tissue in which tumours die from the inside."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -270,7 +270,7 @@ class CancerStroma(Task):
         )
 
     def get_prior(self) -> BoxUniform:
-        """Return the uniform prior, log density -log 221000."""
+        """Return the uniform prior, whose log density is -log 221000."""
         return box((200.0, 3.0, 10.0), (1500.0, 20.0, 20.0))
 
     def prior_quantiles(self, theta: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-r"""The light tunnel: a coloured hexagon for the images of a camera."""
+r"""Task E: images of a light tunnel, for which the simulator paints hexagons."""
 
 from functools import partial
 from pathlib import Path
@@ -278,7 +278,7 @@ class LightTunnel(Task):
         return self._oriented(levels, part)
 
     def _oriented(self, x: Tensor, part: Part) -> Tensor:
-        """Return images as the variant has them in one part."""
+        """Return images the way up that they have in one part of the variant."""
         return x.flip(-2) if self.variant == "flipped" and part == "test" else x
 
 

@@ -1,4 +1,4 @@
-r"""Images of the light tunnel after two published models, and a camera's noise."""
+r"""Two published models of the light tunnel's images, one with a camera's noise."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-r"""The light tunnel's sensors: a published law, and what was measured."""
+r"""Readings of the light tunnel's sensors, by a published law and as recorded."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,4 +1,4 @@
-r"""The linear-Gaussian task: every posterior is known."""
+r"""The linear-Gaussian task, whose posteriors are all known."""
 
 import math
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-r"""The pendulum: a friction-less simulator for a damped swing."""
+r"""Task C: a damped pendulum, and a simulator without friction."""
 
 import math
 from dataclasses import dataclass
@@ -178,7 +178,7 @@ class Pendulum(Task):
         )
 
     def get_prior(self) -> BoxUniform:
-        """Return the uniform prior on [0, 3] x [0.5, 10], log density -log 28.5."""
+        """Return the uniform prior on [0, 3] x [0.5, 10]; its density is 1 / 28.5."""
         return box((0.0, 0.5), (3.0, 10.0))
 
     def prior_quantiles(self, theta: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-r"""An epidemic: weekend infections that are reported on Monday."""
+r"""Task B: an epidemic, of which the reports of a weekend come in part on Monday."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -290,7 +290,7 @@ class SIR(Task):
         self._real = SIRSimulator(reported_fraction=self.reported_fraction)
 
     def get_prior(self) -> UniformTriangle:
-        """Return the uniform prior on the triangle, log density log 8."""
+        """Return the uniform prior on the triangle, whose density is 8."""
         return UniformTriangle(torch.tensor(0.5, dtype=torch.float32))
 
     def prior_quantiles(self, theta: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-r"""Labelled pairs that never appear in two sets.
+r"""Sets of labelled pairs that share no observation.
 
 A task's pairs come from a process that can be drawn from (:class:`DrawnPairs`), each
 part on random streams of its own, or from recorded data (:class:`RecordedPairs`),
@@ -45,11 +45,10 @@ class DrawnPairs:
     r"""Labelled observations of a process that is drawn on request.
 
     Parameters are drawn on the CPU in blocks of fixed size, and the first rows are
-    kept: a smaller set is the beginning of a larger one. The caller's generators,
-    those of all devices included, are left as they were; other threads must not draw
-    from them meanwhile. Pairs whose observation is
-    not finite are dropped with their parameters, drawn again, and counted in a
-    warning.
+    kept. A smaller set is therefore the beginning of a larger one. The caller's random
+    generators, those of all devices included, are left as they were. Other threads
+    must not draw from them meanwhile. Pairs whose observation is not finite are dropped
+    with their parameters and drawn again. A warning tells how many they were.
 
     Args:
         draw_theta: Draws a number of parameters, shape ``(n, d)``, from torch's
@@ -145,11 +144,11 @@ class RecordedPairs:
     def take(
         self, n: int, *, seed: int, part: Part, keep: Keep | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Return ``n`` pairs of one part; a smaller choice begins a larger one.
+        """Return ``n`` pairs of one part, which begin with those of a smaller ``n``.
 
         Args:
             n: Number of pairs.
-            seed: Which rows to choose.
+            seed: The seed by which rows are chosen.
             part: The part to choose from.
             keep: Which parameters may stay; all, if it is not given.
 

@@ -1,4 +1,4 @@
-r"""The wind tunnel: a hatch position from the pressure after an impulse of a fan."""
+r"""Task F: the position of a hatch, from the pressure after an impulse of a fan."""
 
 from pathlib import Path
 
@@ -173,7 +173,7 @@ class WindTunnel(Task):
             )
 
     def get_prior(self) -> BoxUniform:
-        """Return the uniform prior on [0, 45] degrees, log density -log 45."""
+        """Return the uniform prior on [0, 45] degrees, whose density is 1 / 45."""
         return box((0.0,), (MAX_HATCH,), closed=True)
 
     def prior_quantiles(self, theta: Tensor) -> Tensor:

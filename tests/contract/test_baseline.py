@@ -21,11 +21,7 @@ from sbi_rope.baselines import (
     CalibrationMLP,
     Method,
     PlainNPE,
-    UsesCalibration,
-    UsesObservations,
-    UsesSimulations,
 )
-from sbi_rope.baselines.base import BuildsOnNPE
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import (
     InvalidInputError,
@@ -34,11 +30,13 @@ from sbi_rope.errors import (
     RoPEWarning,
 )
 from sbi_rope.mixture import MixturePosterior
+from sbi_rope.trainers.data import Kind
 from tests import baselines
 from tests.baselines import (
     CASES,
     METHODS,
     SHORT,
+    append,
     data_of,
     feed,
     first_task,
@@ -62,21 +60,16 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:Capping max_sampling_batch_size"),
 ]
 
-CALLS = {
-    UsesSimulations: "append_simulations",
-    UsesCalibration: "append_calibration",
-    UsesObservations: "append_observations",
-}
+KINDS: tuple[Kind, ...] = ("simulations", "calibration", "observations")
 PARTS = [
-    pytest.param(name, part, id=f"{name}-{call}")
-    for part, call in CALLS.items()
-    for name in names_that_see(part)
+    pytest.param(name, kind, id=f"{name}-{kind}")
+    for kind in KINDS
+    for name in names_that_see(kind)
 ]
 LABELLED = [
-    pytest.param(name, call, id=f"{name}-{call}")
-    for part, call in CALLS.items()
-    for name in names_that_see(part)
-    if part is not UsesObservations
+    pytest.param(name, f"append_{kind}", id=f"{name}-{kind}")
+    for kind in KINDS[:2]
+    for name in names_that_see(kind)
 ]
 LEARNERS = [name for name in METHODS if name != "prior"]
 GAUSSIAN = [name for name, task in CASES if task == "linear_gaussian"]
@@ -167,7 +160,7 @@ def test_where_nothing_leaks_sbis_defaults_do_as_well(name: str) -> None:
 
 def test_the_posterior_knows_the_shape_of_an_observation(case: tuple[str, str]) -> None:
     posterior, (name, task) = result(*case), case
-    if not isinstance(trained(name, task), UsesSimulations | UsesCalibration):
+    if not trained(name, task).sees & {"simulations", "calibration"}:
         pytest.skip("it has no estimator")
     estimator = posterior.posterior_estimator
     assert estimator.condition_shape == data_of(task).x_o.shape[1:]
@@ -318,35 +311,26 @@ def test_an_untrained_method_has_no_posterior(name: str) -> None:
         method.build_posterior()
 
 
-@pytest.mark.parametrize(("name", "part"), PARTS)
+@pytest.mark.parametrize(("name", "kind"), PARTS)
 def test_data_appended_after_the_training_ask_for_another(
-    name: str, part: type[Method]
+    name: str, kind: Kind
 ) -> None:
     method = copy.deepcopy(trained(name, first_task(name)))
     data = data_of(first_task(name))
-    append(method, CALLS[part], data)
+    append(method, kind, data)
     with pytest.raises(NotReadyError, match=r"train\(\)"):
         method.build_posterior()
     with pytest.raises(NotReadyError):
         _ = method.history
 
 
-def append(method: Any, call: str, data: baselines.Data) -> Any:
-    arguments = {
-        "append_simulations": (data.theta, data.x),
-        "append_calibration": (data.theta_cal, data.x_cal),
-        "append_observations": (data.x_o,),
-    }[call]
-    return getattr(method, call)(*arguments)
-
-
-@pytest.mark.parametrize(("name", "part"), PARTS)
+@pytest.mark.parametrize(("name", "kind"), PARTS)
 def test_missing_data_are_asked_for_by_the_call_that_takes_them(
-    name: str, part: type[Method]
+    name: str, kind: Kind
 ) -> None:
     method = make(name, first_task(name))
-    feed(method, data_of(first_task(name)), without=part)
-    with pytest.raises(NotReadyError, match=rf"{CALLS[part]}\("):
+    feed(method, data_of(first_task(name)), without=kind)
+    with pytest.raises(NotReadyError, match=rf"append_{kind}\("):
         method.train(seed=0, show_progress_bars=False)
 
 
@@ -415,10 +399,8 @@ def test_parameters_outside_the_prior_are_refused(name: str, call: str) -> None:
         getattr(make(name, task), call)(data.theta_cal + 1e4, data.x_cal)
 
 
-@pytest.mark.parametrize(("name", "part"), PARTS)
-def test_an_x_of_another_shape_than_the_first_is_refused(
-    name: str, part: type[Method]
-) -> None:
+@pytest.mark.parametrize(("name", "kind"), PARTS)
+def test_an_x_of_another_shape_than_the_first_is_refused(name: str, kind: Kind) -> None:
     data = data_of(first_task(name))
     method = feed(make(name, first_task(name)), data)
     longer = data.map(lambda v: torch.cat([v, v], dim=-1))
@@ -426,16 +408,16 @@ def test_an_x_of_another_shape_than_the_first_is_refused(
         data.theta, longer.x, data.theta_cal, longer.x_cal, data.theta_o, longer.x_o
     )
     with pytest.raises(InvalidInputError, match=r"`x(_o)?` of shape"):
-        append(method, CALLS[part], mixed)
+        append(method, kind, mixed)
 
 
-@pytest.mark.parametrize(("name", "part"), PARTS)
-def test_what_is_refused_is_not_appended(name: str, part: type[Method]) -> None:
+@pytest.mark.parametrize(("name", "kind"), PARTS)
+def test_what_is_refused_is_not_appended(name: str, kind: Kind) -> None:
     data = data_of(first_task(name))
     method = feed(make(name, first_task(name)), data)
     bad = data.map(lambda v: v.clone().index_fill_(0, torch.tensor(1), torch.nan))
     with pytest.raises(InvalidInputError):
-        append(method, CALLS[part], bad)
+        append(method, kind, bad)
     posterior = train(method).build_posterior()
     assert torch.equal(densities(posterior, name), expected_densities(name))
 
@@ -482,31 +464,31 @@ def test_an_option_of_another_type_is_refused(name: str, option: str) -> None:
 # Data that are few or broken.
 
 
-@pytest.mark.parametrize("name", names_that_see(UsesSimulations))
+@pytest.mark.parametrize("name", names_that_see("simulations"))
 def test_simulations_with_nan_are_dropped_with_a_warning(name: str) -> None:
     data, method = data_of(first_task(name)), make(name, first_task(name))
     x = torch.cat([data.x[:7], data.x[:2] * torch.nan, data.x[7:]])
     x[8].flatten()[0] = torch.inf
     theta = torch.cat([data.theta[:7], data.theta[:2], data.theta[7:]])
-    feed(method, data, without=UsesSimulations)
+    feed(method, data, without="simulations")
     with pytest.warns(RoPEWarning, match="Dropped 2 of 202 simulations"):
-        method.append_simulations(theta, x)  # type: ignore[attr-defined]
+        method.append_simulations(theta, x)
     posterior = train(method).build_posterior()
     assert torch.equal(densities(posterior, name), expected_densities(name))
 
 
-@pytest.mark.parametrize("name", names_that_see(UsesSimulations))
+@pytest.mark.parametrize("name", names_that_see("simulations"))
 def test_simulations_that_all_have_nan_are_refused(name: str) -> None:
     data, method = data_of(first_task(name)), make(name, first_task(name))
     with pytest.raises(InvalidInputError, match="`x` that are finite"):
-        method.append_simulations(data.theta, data.x * torch.nan)  # type: ignore[attr-defined]
+        method.append_simulations(data.theta, data.x * torch.nan)
 
 
-@pytest.mark.parametrize("name", names_that_see(UsesCalibration))
+@pytest.mark.parametrize("name", names_that_see("calibration"))
 def test_one_calibration_pair_is_enough_with_a_warning(name: str) -> None:
     data, method = data_of(first_task(name)), make(name, first_task(name))
-    feed(method, data, without=UsesCalibration)
-    method.append_calibration(data.theta_cal[:1], data.x_cal[:1])  # type: ignore[attr-defined]
+    feed(method, data, without="calibration")
+    method.append_calibration(data.theta_cal[:1], data.x_cal[:1])
     if isinstance(method, CalibrationMLP):  # which has nothing else to standardise by
         with pytest.raises(InvalidInputError, match="at least 2 calibration pairs"):
             train(method)
@@ -520,11 +502,11 @@ def test_one_calibration_pair_is_enough_with_a_warning(name: str) -> None:
     assert densities(method.build_posterior(), name).isfinite().all()
 
 
-@pytest.mark.parametrize("name", names_that_see(UsesCalibration))
+@pytest.mark.parametrize("name", names_that_see("calibration"))
 def test_recordings_of_four_people_leave_none_to_hold_out(name: str) -> None:
     data, method = data_of(first_task(name)), make(name, first_task(name))
-    feed(method, data, without=UsesCalibration)
-    method.append_calibration(data.theta_cal[:4].repeat(5, 1), data.x_cal)  # type: ignore[attr-defined]
+    feed(method, data, without="calibration")
+    method.append_calibration(data.theta_cal[:4].repeat(5, 1), data.x_cal)
     if isinstance(method, DiscrepancyNPE):  # which holds none out of all pairs
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RoPEWarning)
@@ -536,11 +518,11 @@ def test_recordings_of_four_people_leave_none_to_hold_out(name: str) -> None:
 
 
 @pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
-@pytest.mark.parametrize("name", names_that_see(UsesObservations))
+@pytest.mark.parametrize("name", names_that_see("observations"))
 def test_one_observation_is_enough(name: str) -> None:
     data, method = data_of(first_task(name)), make(name, first_task(name))
-    feed(method, data, without=UsesObservations)
-    method.append_observations(data.x_o[:1])  # type: ignore[attr-defined]
+    feed(method, data, without="observations")
+    method.append_observations(data.x_o[:1])
     posterior = train(method).build_posterior()
     assert log_prob(posterior, data.theta[:5], data.x_o[0]).isfinite().all()
 
@@ -566,11 +548,9 @@ def test_every_method_is_held_to_this_contract() -> None:
 @pytest.mark.parametrize("kind", public_methods())
 def test_no_method_takes_labels_of_observations(kind: type[Method]) -> None:
     calls = {name for name, _ in inspect.getmembers(kind) if name.startswith("append_")}
-    expected = {call for part, call in CALLS.items() if issubclass(kind, part)}
-    assert calls == expected
-    if "append_observations" in calls:
-        signature = inspect.signature(kind.append_observations)  # type: ignore[attr-defined]
-        assert list(signature.parameters) == ["self", "x_o"]
+    assert calls == {f"append_{kind}" for kind in KINDS}
+    signature = inspect.signature(kind.append_observations)
+    assert list(signature.parameters) == ["self", "x_o"]
     assert list(inspect.signature(kind.train).parameters) == [
         "self",
         "seed",
@@ -578,9 +558,23 @@ def test_no_method_takes_labels_of_observations(kind: type[Method]) -> None:
     ]
 
 
+def test_data_that_a_method_does_not_see_are_refused(name: str) -> None:
+    method, data = make(name, first_task(name)), data_of(first_task(name))
+    words = {
+        "simulations": "simulations",
+        "calibration": "calibration pairs",
+        "observations": "unlabelled observations",
+    }
+    sees = " and ".join(words[kind] for kind in KINDS if kind in method.sees)
+    for kind in set(KINDS) - method.sees:
+        says = f"sees {words[kind]}; .* sees {'only ' + sees if sees else 'no data'}"
+        with pytest.raises(InvalidInputError, match=says):
+            append(method, kind, data)
+
+
 # NPE trained beforehand.
 
-BUILDERS = names_that_see(BuildsOnNPE)
+BUILDERS = [name for name, entry in METHODS.items() if entry.kind.starts_from_npe]
 
 
 def given(name: str, posterior: Any) -> Any:
@@ -588,7 +582,7 @@ def given(name: str, posterior: Any) -> Any:
     task = first_task(name)
     options = dict(METHODS[name].options(task_of(task)))
     options.pop("npe_training")
-    return METHODS[name].kind.from_posterior(posterior, **options)  # type: ignore[attr-defined]
+    return METHODS[name].kind.from_posterior(posterior, **options)
 
 
 @pytest.mark.parametrize("name", BUILDERS)
@@ -636,7 +630,7 @@ def test_options_without_effect_beside_a_trained_posterior_are_refused(
 ) -> None:
     posterior = result("npe", first_task(name))
     with pytest.raises(InvalidInputError, match=f"`{option}`"):
-        METHODS[name].kind.from_posterior(posterior, **{option: None})  # type: ignore[attr-defined]
+        METHODS[name].kind.from_posterior(posterior, **{option: None})
 
 
 @pytest.mark.parametrize("name", BUILDERS)
@@ -650,6 +644,13 @@ def test_simulations_that_are_not_needed_earn_a_warning(name: str) -> None:
         method.append_simulations(data.theta, data.x)
     warned = any("makes no use of simulations" in str(w.message) for w in caught)
     assert warned is method._ignores_simulations
+
+
+@pytest.mark.parametrize("name", sorted(METHODS.keys() - set(BUILDERS)))
+def test_a_method_that_does_not_start_from_npe_takes_no_posterior(name: str) -> None:
+    posterior = result("npe", first_task(name))
+    with pytest.raises(InvalidInputError, match="method that starts from NPE"):
+        METHODS[name].kind.from_posterior(posterior)
 
 
 @pytest.mark.parametrize("name", BUILDERS)

@@ -19,7 +19,6 @@ from benchmarks.cells import NEEDS_CALIBRATION, Cell, load_suite
 from benchmarks.methods import METHODS, ONLY_FOR
 from benchmarks.runner import Workplace, run_cells
 from benchmarks.store import Cache
-from sbi_rope.baselines import UsesCalibration
 from sbi_rope.errors import RoPEWarning
 
 ROOT = Path(__file__).parents[2]
@@ -388,7 +387,7 @@ def test_what_sees_calibration_pairs_is_run_for_every_number_of_them(
     case = smoke_case("linear_gaussian", tmp_path)
     for name, construct in METHODS.items():
         if case.task.name in ONLY_FOR.get(name, (case.task.name,)):
-            sees = isinstance(construct(case), UsesCalibration)
+            sees = "calibration" in construct(case).sees
             assert sees == (name in NEEDS_CALIBRATION), name
 
 

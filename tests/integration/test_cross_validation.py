@@ -2,11 +2,11 @@
 
 import functools
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from sbi_rope import CalibrationFinetuner, RoPE
 from sbi_rope._training import groups_of
@@ -17,10 +17,11 @@ from sbi_rope.stacking import (
     CrossValidation,
     DensityCandidate,
     StackedPosterior,
-    candidates,
     stacking_weights,
+    trained_candidates,
 )
-from sbi_rope.stacking.folds import Workbench
+from sbi_rope.stacking.finetuning import finetune_without
+from sbi_rope.stacking.folds import Fold, Workbench
 from tests import problems
 from tests.stacks import (
     CANDIDATES,
@@ -112,7 +113,10 @@ def test_recordings_of_a_person_are_never_on_both_sides(
     person_of = {tuple(row): int(p) for row, p in zip(x.tolist(), people, strict=True)}
     tuned: list[tuple[set[int], Tensor]] = []
     splits: list[tuple[set[int], set[int]]] = []
-    finetune, without = CalibrationFinetuner.finetune, candidates.finetune_without
+    finetune, without = (
+        CalibrationFinetuner.finetune,
+        trained_candidates.finetune_without,
+    )
 
     def spied_finetune(self: Any, h: Any, x: Tensor, *args: Any, **options: Any) -> Any:
         tuned.append(({person_of[tuple(row)] for row in x.tolist()}, options["groups"]))
@@ -130,7 +134,7 @@ def test_recordings_of_a_person_are_never_on_both_sides(
         return without(start, fold, part, **options)
 
     monkeypatch.setattr(CalibrationFinetuner, "finetune", spied_finetune)
-    monkeypatch.setattr(candidates, "finetune_without", spied_without)
+    monkeypatch.setattr(trained_candidates, "finetune_without", spied_without)
     scores = validated(rope_of((theta, x)), observed(), num_folds=4)
     fold_of = {int(p): int(f) for p, f in zip(people, scores.fold, strict=True)}
     assert all(
@@ -150,6 +154,32 @@ def test_recordings_of_a_person_are_never_on_both_sides(
     assert splits
     assert len(splits) % 12 == 0
     assert all(known.isdisjoint(others) and others for known, others in splits)
+
+
+class Indifferent(nn.Module):
+    """An estimator at its best, which notes what it is trained on and judged by."""
+
+    trained: ClassVar[set[float]] = set()
+    judged: ClassVar[set[float]] = set()
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.zeros(()))
+
+    def loss(self, theta: Tensor, condition: Tensor) -> Tensor:
+        rows = self.trained if torch.is_grad_enabled() else self.judged
+        rows.update(condition[:, 0].tolist())
+        return self.weight.square().expand(len(theta))
+
+
+def test_a_net_is_not_tuned_on_the_part_that_tells_it_when_to_stop() -> None:
+    bench = Workbench(
+        rope_of(problem(12, seed=1)), num_folds=4, seed=0, show_progress_bars=False
+    )
+    finetune_without(Indifferent(), Fold(bench, [0, 1, 3]), 1, learning_rate=1e-3)
+    assert Indifferent.judged == set(bench.x[bench.folds[1], 0].tolist())
+    others = torch.cat([bench.folds[0], bench.folds[3]])
+    assert Indifferent.trained == set(bench.x[others, 0].tolist())
 
 
 # --- labels ---
@@ -223,7 +253,7 @@ def test_with_fewer_training_folds_labels_reach_those_that_train_on_them(
     # So few train a fold that none of them is held out.
     theta, x = problem(10, seed=1)
     finetuner = CalibrationFinetuner(
-        num_steps=3, simulations_per_target=2, resample_targets=resample
+        max_num_epochs=3, simulations_per_target=2, resample_targets=resample
     )
     tuned = [c for c in CANDIDATES if c.name == "tuning-only"]
     options: dict[str, Any] = {"candidates": tuned, "num_training_folds": 2}

@@ -31,7 +31,9 @@ def gaussian_stack(
     theta: Tensor, x: Tensor, x_o: Tensor | None = None, *, seed: int = 0
 ) -> StackedPosterior:
     """Of all default candidates, with a small grid of couplings if there is a batch."""
-    finetuner = CalibrationFinetuner(learning_rate=1e-2, num_steps=100, patience=30)
+    finetuner = CalibrationFinetuner(
+        learning_rate=1e-2, max_num_epochs=100, stop_after_epochs=30
+    )
     rope = RoPE(gaussian.posterior(), simulator=gaussian.simulator, finetuner=finetuner)
     rope.append_calibration(theta, x)
     candidates = default_candidates(
@@ -69,7 +71,7 @@ def test_where_the_simulator_is_wrong_a_stack_is_better_than_npe_and_the_prior(
     assert found > float(exact) - 0.25
     # And it says so.
     for name in ("prior", "NPE"):
-        gain = posterior.report.gain_over(name)
+        gain = posterior.report.gains.get(name)
         assert gain is not None
         assert gain.low > 0
 

@@ -14,7 +14,6 @@ from sbi_rope import RoPE, SinkhornCoupler
 from sbi_rope._random import seeded
 from sbi_rope._training import split_groups, split_pairs
 from sbi_rope.baselines import FinetunedNPE, PlainNPE, Training
-from sbi_rope.baselines.training import train_on_pairs
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import (
     InvalidInputError,
@@ -22,8 +21,9 @@ from sbi_rope.errors import (
     RoPEWarning,
     UnsupportedPosteriorError,
 )
-from sbi_rope.mixture import MixturePosterior, OwnContexts
+from sbi_rope.mixture import MixturePosterior, OwnEmbeddings
 from sbi_rope.tasks import get_task
+from sbi_rope.trainers.training import train_on_pairs
 
 pytestmark = pytest.mark.filterwarnings("ignore:Maximum number of epochs")
 
@@ -106,11 +106,14 @@ def test_every_pair_is_held_out_by_one_network(count: int) -> None:
     estimator = method.build_posterior().posterior_estimator
     with seeded(0):
         folds = split_groups(PAIRS[0], count)
-    held_out = estimator.part_log_probs(*PAIRS)
+    held_out, at_start = estimator.part_log_probs(*PAIRS), log_probs(npe(), *PAIRS)
     assert len(method.histories) == len(folds) == held_out.shape[1] == count
     for k, (rows, history) in enumerate(zip(folds, method.histories, strict=True)):
         kept = -float(held_out[rows, k].mean())
         assert history.kept_validation_loss == pytest.approx(kept, rel=1e-4)
+        others = torch.cat([fold for fold in folds if fold is not rows])
+        first = -float(at_start[others].mean())
+        assert history.training_loss[0] == pytest.approx(first, rel=1e-4)
 
 
 def test_the_posterior_is_the_average_of_the_networks() -> None:
@@ -204,7 +207,7 @@ def test_networks_from_tuned_nets_are_tuned_apart_from_each_other() -> None:
     parts = method.build_posterior().posterior_estimator.parts
     assert len(parts) == 3
     for part, other in ((parts[0], parts[1]), (parts[1], parts[2])):
-        assert isinstance(part.mixing, OwnContexts)
+        assert isinstance(part.mixing, OwnEmbeddings)
         densities = zip(
             part.density.parameters(), other.density.parameters(), strict=True
         )

@@ -18,7 +18,6 @@ from sbi_rope.baselines.error_model import SpikeAndSlab
 from sbi_rope.baselines.nnpe import NNPE
 from sbi_rope.baselines.npe import PlainNPE
 from sbi_rope.baselines.statistics import SoftClip
-from sbi_rope.baselines.training import Training
 from sbi_rope.errors import (
     InvalidInputError,
     InvalidTypeError,
@@ -26,6 +25,7 @@ from sbi_rope.errors import (
     UnsupportedPosteriorError,
 )
 from sbi_rope.metrics import lpp
+from sbi_rope.trainers.training import Training
 from tests import problems
 
 ONCE = Training(max_num_epochs=1, training_batch_size=50)

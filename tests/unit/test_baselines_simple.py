@@ -228,10 +228,6 @@ class TestCalibrationMLP:
         assert torch.allclose(estimator.mean, shift.loc, atol=0.1)  # type: ignore[arg-type]
         assert torch.allclose(estimator.std, shift.scale, rtol=0.05)  # type: ignore[arg-type]
 
-    def test_it_makes_no_use_of_simulations(self) -> None:
-        method: Any = CalibrationMLP(TASK.get_prior(), builder())
-        assert not hasattr(method, "append_simulations")
-
 
 class TestJointNPE:
     def method(self, n_cal: int, **options: Any) -> JointNPE:
@@ -253,14 +249,19 @@ class TestJointNPE:
         kept = history.kept_validation_loss
         assert -float(scores.mean()) == pytest.approx(kept, rel=1e-5)
 
-    def test_each_batch_is_half_simulations_and_half_pairs(self) -> None:
+    def test_each_batch_is_half_simulations_and_half_pairs_of_those_to_train_on(
+        self,
+    ) -> None:
         """Seen by a net that counts: real observations are marked by their size."""
         seen: list[tuple[int, int]] = []
+        pairs: set[tuple[float, ...]] = set()
 
         class Counter(nn.Linear):
             def forward(self, x: Tensor) -> Tensor:
                 if self.training and torch.is_grad_enabled() and len(x) > 1:
-                    seen.append((len(x), int((x.abs() > 50).all(dim=1).sum())))
+                    is_real = (x.abs() > 50).all(dim=1)
+                    seen.append((len(x), int(is_real.sum())))
+                    pairs.update(tuple(row) for row in x[is_real].tolist())
                 return super().forward(x)
 
         method = JointNPE(
@@ -273,6 +274,7 @@ class TestJointNPE:
         method.append_calibration(theta, x + 1000).train(**QUIET)
         assert set(seen) == {(20, 10)}
         assert len(seen) == 2 * 6
+        assert len(pairs) == 18  # two are held out
 
 
 class TestFinetunedNPE:
@@ -319,7 +321,7 @@ class TestFinetunedNPE:
         )
         theta, x = simulations(2050)
         method.append_calibration(theta[2000:], x[2000:]).train(**QUIET)
-        assert method.history.best_step == 0
+        assert method.history.best_epoch == 0
         expected = log_probs(npe().build_posterior(), theta[:9], x[:9])
         posterior = method.build_posterior()
         assert torch.equal(log_probs(posterior, theta[:9], x[:9]), expected)
@@ -360,7 +362,7 @@ class TestRoPEsParts:
             if stored
             else {"simulator": TASK.get_simulator()}
         )
-        finetuner = CalibrationFinetuner(learning_rate=1e-2, num_steps=10)
+        finetuner = CalibrationFinetuner(learning_rate=1e-2, max_num_epochs=10)
         posterior = npe().build_posterior()
         rope = RoPE(posterior, finetuner=finetuner, **source)
         rope.append_calibration(*real()).train(**QUIET)
@@ -420,7 +422,7 @@ class TestRoPEsParts:
         method = TuningOnly.from_posterior(
             npe().build_posterior(), simulator=TASK.get_simulator()
         )
-        method.finetuner = CalibrationFinetuner(learning_rate=1e-2, num_steps=10)
+        method.finetuner = CalibrationFinetuner(learning_rate=1e-2, max_num_epochs=10)
         method.append_calibration(*real()).train(**QUIET)
         tuned = method.build_posterior().posterior_estimator
         start = npe().build_posterior().posterior_estimator

@@ -26,7 +26,7 @@ from sbi_rope.errors import (
     RoPEWarning,
 )
 from tests import oracles
-from tests.modes import MODES, digits
+from tests.modes import MODES, digits, raw_coupler
 
 
 def through_pickle(coupling: Coupling) -> Coupling:
@@ -68,7 +68,7 @@ def test_rows_equal_those_of_the_oracle(
     mode: dict[str, Any], ratio: float, tau: float
 ) -> None:
     real, simulated, gamma, expected, change = solved_by_the_oracle(ratio, tau)
-    coupler = SinkhornCoupler(
+    coupler = raw_coupler(
         gamma=gamma,
         tau=tau,
         tolerance=digits(mode, double=1e-10, single=1e-6),
@@ -98,7 +98,7 @@ def test_rows_equal_those_of_the_oracle(
 @pytest.mark.parametrize("mode", MODES)
 def test_the_plan_minimises_the_objective_of_the_paper(mode: dict[str, Any]) -> None:
     real, simulated = clouds(8, 6)
-    coupling = SinkhornCoupler(
+    coupling = raw_coupler(
         gamma=0.5, tau=0.7, tolerance=digits(mode, double=1e-12, single=1e-6), **mode
     ).couple(real, simulated)
     cost = cost_of(real, simulated)
@@ -120,7 +120,7 @@ def test_marginal_error_measures_the_optimality_conditions(
     mode: dict[str, Any], tau: float, gamma: float
 ) -> None:
     real, simulated = clouds(30, 40)
-    coupler = SinkhornCoupler(
+    coupler = raw_coupler(
         gamma=gamma, tau=tau, tolerance=digits(mode, double=1e-12, single=1e-6), **mode
     )
     rough = replace(coupler, max_iterations=2).couple(real, simulated)
@@ -142,30 +142,28 @@ def test_marginal_error_measures_the_optimality_conditions(
 
 
 def test_large_gamma_gives_uniform_rows() -> None:
-    coupling = SinkhornCoupler(gamma=1e8).couple(*clouds(30, 40))
+    coupling = raw_coupler(gamma=1e8).couple(*clouds(30, 40))
     assert (coupling.weights - 1 / 40).abs().max() < 1e-8
 
 
 def test_tau_zero_is_the_row_softmax_of_the_cost() -> None:
     real, simulated = clouds(30, 40)
-    coupling = SinkhornCoupler(gamma=0.3, tau=0.0).couple(real, simulated)
+    coupling = raw_coupler(gamma=0.3, tau=0.0).couple(real, simulated)
     expected = torch.softmax(-cost_of(real, simulated) / 0.3, dim=1)
     assert torch.allclose(coupling.weights, expected, atol=1e-14)
     assert (coupling.num_iterations, coupling.solver) == (0, "none")
-    nearly = SinkhornCoupler(gamma=0.3, tau=1e-6).couple(real, simulated)
+    nearly = raw_coupler(gamma=0.3, tau=1e-6).couple(real, simulated)
     assert torch.allclose(nearly.weights, expected, atol=1e-5)
 
 
 def test_tau_one_has_uniform_column_marginals() -> None:
-    coupling = SinkhornCoupler(gamma=0.3, tau=1.0, tolerance=1e-10).couple(
-        *clouds(30, 40)
-    )
+    coupling = raw_coupler(gamma=0.3, tau=1.0, tolerance=1e-10).couple(*clouds(30, 40))
     assert (coupling.weights.mean(dim=0) - 1 / 40).abs().sum() < 1e-10
 
 
 def test_permuting_the_inputs_permutes_the_weights() -> None:
     real, simulated = clouds(30, 40)
-    coupler = SinkhornCoupler(gamma=0.3, tau=0.9, tolerance=1e-12)
+    coupler = raw_coupler(gamma=0.3, tau=0.9, tolerance=1e-12)
     rows, columns = torch.randperm(30), torch.randperm(40)
     permuted = coupler.couple(real[rows], simulated[columns]).weights
     expected = coupler.couple(real, simulated).weights[rows][:, columns]
@@ -174,8 +172,8 @@ def test_permuting_the_inputs_permutes_the_weights() -> None:
 
 def test_scaling_cost_and_gamma_together_changes_nothing() -> None:
     real, simulated = clouds(30, 40)
-    coupler = SinkhornCoupler(gamma=0.3, tau=0.9, tolerance=1e-12)
-    scaled = SinkhornCoupler(gamma=30.0, tau=0.9, tolerance=1e-12)
+    coupler = raw_coupler(gamma=0.3, tau=0.9, tolerance=1e-12)
+    scaled = raw_coupler(gamma=30.0, tau=0.9, tolerance=1e-12)
     assert torch.allclose(
         coupler.couple(real, simulated).weights,
         scaled.couple(100 * real, 100 * simulated).weights,
@@ -197,7 +195,7 @@ def test_simulated_cost_scale_makes_gamma_free_of_units() -> None:
 @pytest.mark.parametrize(("n_o", "n_s"), [(25, 80), (80, 25), (30, 1)])
 def test_numbers_of_observations_and_simulations_may_differ(n_o: int, n_s: int) -> None:
     real, simulated = clouds(n_o, n_s)
-    coupling = SinkhornCoupler(gamma=0.5, tolerance=1e-10).couple(real, simulated)
+    coupling = raw_coupler(gamma=0.5, tolerance=1e-10).couple(real, simulated)
     expected, _ = oracles.semi_balanced_plan(
         cost_of(real, simulated), gamma=0.5, tau=1.0
     )
@@ -207,7 +205,7 @@ def test_numbers_of_observations_and_simulations_may_differ(n_o: int, n_s: int) 
 
 def test_rows_of_the_batch_are_its_weights_and_new_rows_are_near_a_refit() -> None:
     real, simulated = clouds(200, 200)
-    coupler = SinkhornCoupler(gamma=1.0, tau=0.9, tolerance=1e-10)
+    coupler = raw_coupler(gamma=1.0, tau=0.9, tolerance=1e-10)
     coupling = coupler.couple(real, simulated)
     assert torch.allclose(coupling.rows(real), coupling.weights, atol=1e-14)
     new = torch.randn(1, 3, dtype=torch.float64)
@@ -218,7 +216,7 @@ def test_rows_of_the_batch_are_its_weights_and_new_rows_are_near_a_refit() -> No
 @pytest.mark.parametrize("direct", [False, True])
 def test_rows_from_given_distances_are_the_same_rows(direct: bool) -> None:
     real, simulated = clouds()
-    coupling = replace(SinkhornCoupler().couple(real, simulated), direct=direct)
+    coupling = replace(raw_coupler().couple(real, simulated), direct=direct)
     other = replace(coupling, gamma=2 * coupling.gamma)
     distances = coupling.distances(real)
     assert torch.allclose(distances, cost_of(real, simulated))
@@ -231,7 +229,7 @@ def test_rows_from_given_distances_are_the_same_rows(direct: bool) -> None:
 
 
 def test_a_coupling_of_some_observations_has_their_rows() -> None:
-    coupling = SinkhornCoupler().couple(*clouds())
+    coupling = raw_coupler().couple(*clouds())
     some = torch.tensor([5, 2])
     part = coupling.restricted_to(some)
     assert torch.allclose(part.weights, coupling.weights[some], atol=1e-12)
@@ -243,7 +241,7 @@ def test_a_coupling_of_some_observations_has_their_rows() -> None:
 def test_a_copy_of_a_coupling_leaves_what_was_kept(
     copied: Callable[[Coupling], Coupling],
 ) -> None:
-    coupling = SinkhornCoupler().couple(*clouds(300, 300))
+    coupling = raw_coupler().couple(*clouds(300, 300))
     before = len(pickle.dumps(coupling))
     weights = coupling.weights
     assert coupling.weights is weights
@@ -294,7 +292,7 @@ def test_underflow_in_pot_is_rescued_and_reported(tau: float) -> None:
         )
     assert any("Numerical errors" in str(w.message) for w in caught)
 
-    coupler = SinkhornCoupler(gamma=gamma, tau=tau, solver="pot", tolerance=1e-10)
+    coupler = raw_coupler(gamma=gamma, tau=tau, solver="pot", tolerance=1e-10)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         coupling = coupler.couple(real, simulated)
@@ -312,7 +310,7 @@ def test_columns_that_underflow_are_solved_in_the_log_domain(
     # No observation is near the last five simulations: their columns of the kernel
     # vanish, in float64 too, and at a small tau nothing forces them to come back.
     real, simulated, _ = far_clouds()
-    coupler = SinkhornCoupler(
+    coupler = raw_coupler(
         gamma=0.05, tau=0.5, tolerance=digits(mode, double=1e-12, single=1e-6), **mode
     )
     coupling = coupler.couple(real, simulated)
@@ -336,7 +334,7 @@ def test_columns_that_underflow_are_solved_in_the_log_domain(
 def test_what_cannot_converge_says_so_and_stays_finite(mode: dict[str, Any]) -> None:
     real, simulated, gamma = far_clouds()
     gamma = gamma * digits(mode, double=1.0, single=10.0)
-    coupling = SinkhornCoupler(gamma=gamma, max_iterations=20, **mode).couple(
+    coupling = raw_coupler(gamma=gamma, max_iterations=20, **mode).couple(
         real, simulated
     )
     assert not coupling.converged
@@ -355,9 +353,7 @@ def test_no_nan_over_gamma_and_tau(mode: dict[str, Any]) -> None:
     for ratio, tau in itertools.product(
         [1e3, 1.0, 1e-1, 1e-2, 1e-3, smallest], [1.0, 0.9, 0.5, 1e-3, 0.0]
     ):
-        coupler = SinkhornCoupler(
-            gamma=ratio * scale, tau=tau, max_iterations=100, **mode
-        )
+        coupler = raw_coupler(gamma=ratio * scale, tau=tau, max_iterations=100, **mode)
         coupling = coupler.couple(real, simulated)
         assert torch.isfinite(coupling.weights).all(), (ratio, tau)
         assert torch.isfinite(coupling.potential).all(), (ratio, tau)
@@ -370,14 +366,14 @@ def test_a_gamma_beyond_the_digits_of_the_distances_is_refused(
 ) -> None:
     real, simulated = clouds(25, 25)
     for tau in (1.0, 0.0):
-        coupler = SinkhornCoupler(gamma=1e-13, tau=tau, dtype=dtype)
+        coupler = raw_coupler(gamma=1e-13, tau=tau, dtype=dtype)
         with pytest.raises(CouplingError, match=r"gamma of at least .* larger gamma"):
             coupler.couple(real, simulated)
 
 
 def test_embeddings_far_from_the_origin_need_no_larger_gamma() -> None:
     real, simulated = clouds(30, 40)
-    coupler = SinkhornCoupler(gamma=0.1, tolerance=1e-10)
+    coupler = raw_coupler(gamma=0.1, tolerance=1e-10)
     moved = coupler.couple(real + 1e7, simulated + 1e7)
     weights = coupler.couple(real, simulated).weights
     assert worst_total_variation(moved.weights, weights) < 1e-6
@@ -386,17 +382,17 @@ def test_embeddings_far_from_the_origin_need_no_larger_gamma() -> None:
 def test_equal_points_everywhere_give_uniform_rows() -> None:
     ones = torch.ones(20, 2)
     assert torch.allclose(
-        SinkhornCoupler().couple(ones, ones).weights, torch.tensor(1 / 20).double()
+        raw_coupler().couple(ones, ones).weights, torch.tensor(1 / 20).double()
     )
 
 
 def test_a_small_batch_is_warned_about_and_one_row_at_tau_one_is_uniform() -> None:
     real, simulated = clouds(1, 40)
     with pytest.warns(RoPEWarning, match=r"smaller tau.*unseen='extend'"):
-        coupling = SinkhornCoupler(gamma=0.1, tau=1.0).couple(real, simulated)
+        coupling = raw_coupler(gamma=0.1, tau=1.0).couple(real, simulated)
     assert torch.allclose(coupling.weights, torch.tensor(1 / 40).double(), atol=1e-6)
     with pytest.warns(RoPEWarning):
-        sharp = SinkhornCoupler(gamma=0.1, tau=0.1).couple(real, simulated)
+        sharp = raw_coupler(gamma=0.1, tau=0.1).couple(real, simulated)
     assert sharp.effective_sample_size < 30
 
 
@@ -425,7 +421,7 @@ def test_a_small_batch_is_warned_about_and_one_row_at_tau_one_is_uniform() -> No
 )
 def test_settings_outside_their_range_are_refused(settings: dict, match: str) -> None:
     with pytest.raises(InvalidInputError, match=match):
-        SinkhornCoupler(**settings)
+        raw_coupler(**settings)
 
 
 X = torch.zeros(20, 2)
@@ -447,7 +443,7 @@ def test_unusable_embeddings_are_refused(
     real: Tensor, simulated: Tensor, error: type, match: str
 ) -> None:
     with pytest.raises(error, match=match):
-        SinkhornCoupler().couple(real, simulated)
+        raw_coupler().couple(real, simulated)
 
 
 def test_simulations_without_spread_cannot_set_the_scale() -> None:
@@ -457,7 +453,7 @@ def test_simulations_without_spread_cannot_set_the_scale() -> None:
 
 def test_distances_that_overflow_are_refused() -> None:
     with pytest.raises(CouplingError, match="overflow"):
-        SinkhornCoupler().couple(X.double() + 1e200, X.double())
+        raw_coupler().couple(X.double() + 1e200, X.double())
 
 
 def balanced_overflow() -> tuple[Tensor, Tensor, float]:
@@ -468,7 +464,7 @@ def balanced_overflow() -> tuple[Tensor, Tensor, float]:
 
 def test_where_pots_scalings_overflow_the_rows_stay_exact_and_finite() -> None:
     real, simulated, gamma = balanced_overflow()
-    coupler = SinkhornCoupler(
+    coupler = raw_coupler(
         gamma=gamma, solver="pot", max_iterations=600, anderson_memory=0
     )
     coupling = coupler.couple(real, simulated)
@@ -485,7 +481,7 @@ def test_where_pots_scalings_overflow_the_rows_stay_exact_and_finite() -> None:
 
 def test_where_plain_iterations_do_not_get_there_accelerated_ones_do() -> None:
     real, simulated, gamma = balanced_overflow()
-    coupler = SinkhornCoupler(gamma=gamma, max_iterations=3000)
+    coupler = raw_coupler(gamma=gamma, max_iterations=3000)
     plain = replace(coupler, anderson_memory=0).couple(real, simulated)
     accelerated = coupler.couple(real, simulated)
     assert (plain.num_iterations, plain.converged) == (3000, False)
@@ -495,7 +491,7 @@ def test_where_plain_iterations_do_not_get_there_accelerated_ones_do() -> None:
 
 def test_iterations_of_all_solvers_count_together() -> None:
     real, simulated, gamma = far_clouds()
-    coupler = SinkhornCoupler(gamma=gamma, solver="pot", max_iterations=37)
+    coupler = raw_coupler(gamma=gamma, solver="pot", max_iterations=37)
     coupling = coupler.couple(real, simulated)
     assert coupling.solver == "own"
     assert coupling.num_iterations == 37
@@ -505,7 +501,7 @@ def test_pot_goes_on_from_where_it_was() -> None:
     # Starting each burst anew would never get past the longest burst.
     real, simulated = clouds(250, 250, dim=10)
     gamma = 1e-2 * float(cost_of(real, simulated).max())
-    coupler = SinkhornCoupler(gamma=gamma, solver="pot", tolerance=1e-8)
+    coupler = raw_coupler(gamma=gamma, solver="pot", tolerance=1e-8)
     coupling = coupler.couple(real, simulated)
     assert coupling.solver == "pot"
     assert coupling.num_iterations > 1000
@@ -515,7 +511,7 @@ def test_pot_goes_on_from_where_it_was() -> None:
 @pytest.mark.parametrize("solver", ["own", "pot"])
 def test_a_tolerance_below_the_digits_ends_early_and_says_so(solver: str) -> None:
     real, simulated = clouds()
-    coupler = SinkhornCoupler(solver=solver, dtype=torch.float32, tolerance=1e-14)
+    coupler = raw_coupler(solver=solver, dtype=torch.float32, tolerance=1e-14)
     coupling = coupler.couple(real, simulated)
     assert not coupling.converged
     assert coupling.num_iterations < 2000
@@ -527,7 +523,8 @@ def test_the_default_tolerance_reports_its_distance_from_the_oracle(
     mode: dict[str, Any],
 ) -> None:
     real, simulated, gamma, expected, _ = solved_by_the_oracle(0.1, 0.9)
-    coupling = SinkhornCoupler(gamma=gamma, tau=0.9, **mode).couple(real, simulated)
+    coupling = raw_coupler(gamma=gamma, tau=0.9, **mode).couple(real, simulated)
+    assert coupling.solver == mode["solver"]  # POT needs no help here
     assert coupling.marginal_error <= 1e-6
     assert worst_total_variation(coupling.weights, expected) < 1e-4
 
@@ -548,7 +545,7 @@ def test_a_rescue_in_the_middle_keeps_to_the_budget() -> None:
     )
     assert not healthy
     assert 0 < solution.num_iterations < 300
-    coupler = SinkhornCoupler(
+    coupler = raw_coupler(
         gamma=gamma, solver="pot", max_iterations=300, anderson_memory=0
     )
     coupling = coupler.couple(real, simulated)

@@ -20,7 +20,7 @@ from sbi_rope.coupling.fixed_point import solve_fixed_point
 from sbi_rope.coupling.kernel import Kernel, marginal_error
 from sbi_rope.errors import CouplingError, InvalidInputError, RoPEWarning
 from tests.memory import run_alone
-from tests.modes import MODES, digits
+from tests.modes import MODES, digits, raw_coupler
 
 
 def clouds(n_o: int = 300, n_s: int = 200) -> tuple[Tensor, Tensor]:
@@ -74,7 +74,7 @@ def test_the_unit_of_the_embeddings_does_not_matter(
     dtype: torch.dtype, scale: float
 ) -> None:
     real, simulated = clouds(60, 50)
-    coupler = SinkhornCoupler(gamma=0.1, tau=0.9, dtype=dtype)
+    coupler = raw_coupler(gamma=0.1, tau=0.9, dtype=dtype)
     expected = coupler.couple(real, simulated)
     scaled = replace(coupler, gamma=0.1 * scale).couple(scale * real, scale * simulated)
     assert scaled.converged
@@ -90,9 +90,7 @@ def test_distances_beyond_the_dtype_are_refused(dtype: torch.dtype) -> None:
     real, simulated = clouds(60, 50)
     scale = 1e20 if dtype == torch.float32 else 1.5e154
     with pytest.raises(CouplingError, match="overflow"):
-        SinkhornCoupler(gamma=scale, dtype=dtype).couple(
-            scale * real, scale * simulated
-        )
+        raw_coupler(gamma=scale, dtype=dtype).couple(scale * real, scale * simulated)
 
 
 @pytest.mark.parametrize("blocked", [False, True])
@@ -104,9 +102,7 @@ def test_a_gamma_small_against_the_distances_gets_exact_distances(
     simulated[:20] += 1e6
     real = 1e-3 * torch.randn(60, 2, dtype=torch.float64)
     real[:20] += 1e6
-    coupling = SinkhornCoupler(gamma=1e-3, tau=0.5, blocked=blocked).couple(
-        real, simulated
-    )
+    coupling = raw_coupler(gamma=1e-3, tau=0.5, blocked=blocked).couple(real, simulated)
     cost = (real[:, None] - simulated).norm(dim=2)
     rows = torch.softmax(coupling.potential - cost / 1e-3, dim=1)
     assert coupling.direct
@@ -118,7 +114,7 @@ def test_a_gamma_small_against_the_distances_gets_exact_distances(
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_gamma_below_the_numbers_of_the_dtype_is_refused(dtype: torch.dtype) -> None:
     with pytest.raises(CouplingError, match="gamma of at least"):
-        SinkhornCoupler(gamma=1e-310, dtype=dtype).couple(
+        raw_coupler(gamma=1e-310, dtype=dtype).couple(
             torch.ones(30, 2), torch.ones(20, 2)
         )
 
@@ -128,7 +124,7 @@ def test_a_gamma_below_the_numbers_of_the_dtype_is_refused(dtype: torch.dtype) -
 def test_rows_of_an_observation_beyond_all_distances_are_refused(
     dtype: torch.dtype, value: float
 ) -> None:
-    coupling = SinkhornCoupler(dtype=dtype).couple(*clouds(60, 50))
+    coupling = raw_coupler(dtype=dtype).couple(*clouds(60, 50))
     far = torch.full((1, 5), value, dtype=torch.float64)
     with pytest.raises(InvalidInputError, match="`real` at most"):
         coupling.rows(far)
@@ -218,7 +214,7 @@ def test_the_size_of_the_blocks_changes_nothing(
     mode: dict[str, Any], block: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real, simulated = clouds(60, 50)
-    coupler = SinkhornCoupler(
+    coupler = raw_coupler(
         gamma=0.3, tau=0.9, tolerance=digits(mode, double=1e-10, single=1e-6), **mode
     )
     expected = coupler.couple(real, simulated)
@@ -234,7 +230,7 @@ def test_the_size_of_the_blocks_changes_nothing(
 @pytest.mark.parametrize("mode", MODES)
 def test_rows_are_read_in_any_portion(mode: dict[str, Any]) -> None:
     real, simulated = clouds(60, 50)
-    coupling = SinkhornCoupler(gamma=0.3, tau=0.9, **mode).couple(real, simulated)
+    coupling = raw_coupler(gamma=0.3, tau=0.9, **mode).couple(real, simulated)
     parts = [coupling.rows(part) for part in coupling.real.split([1, 20, 39])]
     assert (torch.cat(parts) - coupling.weights).abs().max() < digits(
         mode, double=1e-13, single=1e-6
@@ -243,10 +239,10 @@ def test_rows_are_read_in_any_portion(mode: dict[str, Any]) -> None:
 
 def test_blocked_weights_are_computed_but_not_kept() -> None:
     real, simulated = clouds(60, 50)
-    blocked = SinkhornCoupler(blocked=True).couple(real, simulated)
+    blocked = raw_coupler(blocked=True).couple(real, simulated)
     assert blocked.weights is not blocked.weights
     assert torch.equal(blocked.weights, blocked.weights)
-    kept = SinkhornCoupler(blocked=False).couple(real, simulated)
+    kept = raw_coupler(blocked=False).couple(real, simulated)
     assert kept.weights is kept.weights
 
 
@@ -255,15 +251,15 @@ def test_blocks_are_chosen_where_the_distances_would_be_too_many(
 ) -> None:
     real, simulated = clouds(60, 50)
     monkeypatch.setattr("sbi_rope.coupling.coupler.MAX_STORED", 60 * 50)
-    assert not SinkhornCoupler().couple(real, simulated).blocked
+    assert not raw_coupler().couple(real, simulated).blocked
     monkeypatch.setattr("sbi_rope.coupling.coupler.MAX_STORED", 60 * 50 - 1)
-    assert SinkhornCoupler().couple(real, simulated).blocked
-    stored = SinkhornCoupler(blocked=False)
+    assert raw_coupler().couple(real, simulated).blocked
+    stored = raw_coupler(blocked=False)
     assert not stored._set_up(real, simulated, 0, gamma=1.0, reused=False)[0].blocked
-    pot = SinkhornCoupler(solver="pot")
+    pot = raw_coupler(solver="pot")
     assert not pot._set_up(real, simulated, 0, gamma=1.0, reused=True)[0].blocked
     # A part may be stored where the whole may not, and its weights not kept.
-    part = SinkhornCoupler(num_fitted=59)
+    part = raw_coupler(num_fitted=59)
     assert not part._set_up(real, simulated, 0, gamma=1.0, reused=False)[0].blocked
     assert part.couple(real, simulated).blocked
 
@@ -274,11 +270,11 @@ from benchmarks.machine import forget_peak, memory, peak_memory
 from sbi_rope import SinkhornCoupler
 torch.manual_seed(0)
 real, simulated = torch.randn(4000, 4), torch.randn(4000, 4)
-SinkhornCoupler(blocked=True).couple(real[:200], simulated[:200])
+SinkhornCoupler(gamma=0.5, blocked=True).couple(real[:200], simulated[:200])
 for blocked in (True, False):
     before = memory()
     forget_peak()
-    coupling = SinkhornCoupler(blocked=blocked).couple(real, simulated)
+    coupling = SinkhornCoupler(gamma=0.5, blocked=blocked).couple(real, simulated)
     coupling.effective_sample_size
     coupling.rows(real[:100])
     print(peak_memory() - before)
@@ -310,7 +306,7 @@ def test_blocked_couplings_make_no_matrix(
     real, simulated = clouds(400, 500)
     monkeypatch.setattr(cost_module, "CPU_BLOCK", 20_000)
     with LargestTensor() as largest:
-        coupling = SinkhornCoupler(gamma=0.3, blocked=blocked).couple(real, simulated)
+        coupling = raw_coupler(gamma=0.3, blocked=blocked).couple(real, simulated)
         assert coupling.effective_sample_size.shape == (400,)
         coupling.rows(real[:20])
     if blocked:
@@ -434,7 +430,7 @@ def test_a_sweep_yields_single_solutions_in_the_order_asked_for(
 ) -> None:
     real, simulated = clouds()
     tolerance = digits(mode, double=1e-10, single=1e-6)
-    coupler = SinkhornCoupler(tolerance=tolerance, **mode)
+    coupler = raw_coupler(tolerance=tolerance, **mode)
     sweep = list(coupler.sweep(real, simulated, gammas=GAMMAS, taus=TAUS))
     assert [(c.gamma, c.tau) for c in sweep] == list(itertools.product(GAMMAS, TAUS))
     for coupling in sweep:
@@ -450,7 +446,7 @@ def test_a_sweep_yields_single_solutions_in_the_order_asked_for(
 def test_warm_starts_save_iterations(mode: dict[str, Any]) -> None:
     real, simulated = clouds()
     gammas, taus = [1.0, 0.5, 0.3, 0.2, 0.15, 0.1], [0.9, 1.0]
-    coupler = SinkhornCoupler(**mode)
+    coupler = raw_coupler(**mode)
     warm = sum(
         c.num_iterations
         for c in coupler.sweep(real, simulated, gammas=gammas, taus=taus)
@@ -474,7 +470,7 @@ def test_a_sweep_computes_only_what_was_asked_for_so_far(
         return solve_one(self, *arguments)
 
     monkeypatch.setattr(SinkhornCoupler, "_solve", spy)
-    sweep = SinkhornCoupler().sweep(real, simulated, gammas=[1.0, 0.5], taus=[1.0, 0.5])
+    sweep = raw_coupler().sweep(real, simulated, gammas=[1.0, 0.5], taus=[1.0, 0.5])
     assert solved == []
     next(sweep)
     assert solved == [(1.0, 1.0)]
@@ -483,7 +479,7 @@ def test_a_sweep_computes_only_what_was_asked_for_so_far(
 
 
 def test_a_sweep_keeps_no_coupling_that_it_has_handed_out() -> None:
-    sweep = SinkhornCoupler().sweep(*clouds(), gammas=[1.0, 0.5, 1.0], taus=[1.0])
+    sweep = raw_coupler().sweep(*clouds(), gammas=[1.0, 0.5, 1.0], taus=[1.0])
     first, second = next(sweep), next(sweep)
     again = next(sweep)
     assert again is first  # asked for twice
@@ -514,7 +510,7 @@ def test_settings_of_a_sweep_are_checked_before_anything_is_solved(
     gammas: list[float], taus: list[float], match: str
 ) -> None:
     with pytest.raises(InvalidInputError, match=match):
-        SinkhornCoupler().sweep(*clouds(), gammas=gammas, taus=taus)
+        raw_coupler().sweep(*clouds(), gammas=gammas, taus=taus)
 
 
 # --- potentials fitted to some of the observations ---
@@ -525,7 +521,7 @@ def fits_to_parts() -> tuple[Any, list[Any]]:
     with torch.random.fork_rng():
         torch.manual_seed(0)
         real, simulated = clouds(3000, 200)
-    coupler = SinkhornCoupler(gamma=0.5, tau=0.9, tolerance=1e-9)
+    coupler = raw_coupler(gamma=0.5, tau=0.9, tolerance=1e-9)
     parts = [
         replace(coupler, num_fitted=count).couple(real, simulated, seed=1)
         for count in (100, 500, 2000)
@@ -557,16 +553,16 @@ def test_the_error_of_a_partial_fit_over_the_whole_batch_is_reported() -> None:
 
 def test_fitting_to_all_observations_is_the_full_fit() -> None:
     real, simulated = clouds()
-    full = SinkhornCoupler().couple(real, simulated)
+    full = raw_coupler().couple(real, simulated)
     for count in (300, 301):
-        coupling = SinkhornCoupler(num_fitted=count).couple(real, simulated)
+        coupling = raw_coupler(num_fitted=count).couple(real, simulated)
         assert torch.equal(coupling.potential, full.potential)
         assert (coupling.num_fitted, coupling.batch_error) == (300, full.marginal_error)
 
 
 def test_the_choice_of_observations_has_a_seed_of_its_own() -> None:
     real, simulated = clouds()
-    coupler = SinkhornCoupler(num_fitted=50)
+    coupler = raw_coupler(num_fitted=50)
     state = torch.get_rng_state()
     first, again, other = (
         coupler.couple(real, simulated, seed=seed).potential for seed in (1, 1, 2)
@@ -578,7 +574,7 @@ def test_the_choice_of_observations_has_a_seed_of_its_own() -> None:
 
 def test_few_fitted_observations_are_warned_about_like_a_small_batch() -> None:
     with pytest.warns(RoPEWarning, match="num_fitted=10 of "):
-        SinkhornCoupler(num_fitted=10).couple(*clouds())
+        raw_coupler(num_fitted=10).couple(*clouds())
 
 
 # --- on a GPU ---
@@ -591,7 +587,7 @@ def test_a_gpu_gives_the_rows_of_the_cpu(
     mode: dict[str, Any], gamma: float, tau: float
 ) -> None:
     real, simulated = clouds()
-    coupler = SinkhornCoupler(
+    coupler = raw_coupler(
         gamma=gamma, tau=tau, tolerance=digits(mode, double=1e-9, single=1e-6), **mode
     )
     expected = coupler.couple(real, simulated)
@@ -603,7 +599,7 @@ def test_a_gpu_gives_the_rows_of_the_cpu(
 
 
 def test_an_impossible_gamma_in_a_sweep_is_a_named_error() -> None:
-    sweep = SinkhornCoupler(dtype=torch.float32).sweep(
+    sweep = raw_coupler(dtype=torch.float32).sweep(
         *clouds(), gammas=[1.0, 1e-9], taus=[1.0]
     )
     assert next(sweep).converged
@@ -635,7 +631,7 @@ def test_a_device_without_float64_couples_in_float32(
     blocked: bool, tau: float, request: pytest.FixtureRequest
 ) -> None:
     real, simulated = (values.float() + 10 for values in clouds())
-    coupler = SinkhornCoupler(
+    coupler = raw_coupler(
         gamma=0.1,
         tau=tau,
         dtype=torch.float32,
@@ -660,7 +656,7 @@ def test_a_device_without_float64_couples_in_float32(
 @pytest.mark.usefixtures("_no_float64")
 def test_pot_is_given_float32_on_a_device_without_float64() -> None:
     real, simulated = (values.float() for values in clouds(80, 60))
-    coupler = SinkhornCoupler(dtype=torch.float32, solver="pot", tolerance=1e-5)
+    coupler = raw_coupler(dtype=torch.float32, solver="pot", tolerance=1e-5)
     coupler.couple(real, simulated)  # POT tries all dtypes when it is first used
     with NoFloat64():
         coupling = coupler.couple(real, simulated)
@@ -671,7 +667,7 @@ def test_pot_is_given_float32_on_a_device_without_float64() -> None:
 def test_columns_that_the_kernel_loses_are_restored_without_float64() -> None:
     real, simulated = (values.float() for values in clouds(80, 60))
     simulated[0] += 1000.0
-    coupler = SinkhornCoupler(gamma=1.0, dtype=torch.float32, tolerance=1e-4)
+    coupler = raw_coupler(gamma=1.0, dtype=torch.float32, tolerance=1e-4)
     with NoFloat64():
         coupling = coupler.couple(real, simulated)
     assert coupling.converged
@@ -702,7 +698,7 @@ def test_float64_on_a_device_without_it_is_refused_with_two_ways_out() -> None:
         match=r"float64 is not available on cpu; pass SinkhornCoupler\("
         r"dtype=torch.float32\) or move the posterior to the CPU",
     ):
-        SinkhornCoupler().couple(real, simulated)
+        raw_coupler().couple(real, simulated)
 
 
 def test_only_apples_gpus_are_without_float64() -> None:

@@ -306,6 +306,22 @@ def test_some_draws_correct_nothing_and_the_others_leave_simulated_noise() -> No
     assert float(draws.error_factor[~none].svd().S.min()) >= 0.01 - 1e-9
 
 
+def test_the_noise_that_the_simulator_has_made_is_taken_off_times_the_gain() -> None:
+    z, mean = pairs(30, 2, error=1.0)
+
+    def total(noise: Tensor) -> Tensor:
+        discrepancy = GRID.fit(z, mean, noise)
+        draws = replace(discrepancy, probability_of_none=0.0).sample(
+            100, smallest_error=0.0, seed=0
+        )
+        assert (draws.gain - torch.eye(2)).abs().mean() > 0.1
+        error = draws.error_factor @ draws.error_factor.mT
+        return error + draws.gain @ discrepancy.noise @ draws.gain.mT
+
+    noise = torch.tensor([[0.04, 0.02], [0.02, 0.09]])
+    assert torch.allclose(total(noise), total(no_noise(2)))
+
+
 def test_simulations_are_corrected_by_gain_offset_and_error() -> None:
     z, mean = pairs(40, 2)
     draws = (

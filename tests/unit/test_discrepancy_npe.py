@@ -4,6 +4,7 @@ import copy
 import functools
 import random
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,13 +16,14 @@ from torch import Tensor, nn
 
 from sbi_rope import CalibrationFinetuner
 from sbi_rope._sbi import embedding_of, estimator_of, with_embedding
-from sbi_rope._simulations import StoredSimulations
+from sbi_rope._simulations import Moments, StoredSimulations
 from sbi_rope._simulator import Simulator
+from sbi_rope._standardisation import Standardisation
 from sbi_rope.baselines import Training
-from sbi_rope.baselines.statistics import Standardisation
 from sbi_rope.discrepancy import DiscrepancyModel, DiscrepancyNPE
 from sbi_rope.discrepancy.model import DiscrepancyDraws
 from sbi_rope.discrepancy.training import train_on_corrected
+from sbi_rope.discrepancy.tuning import cross_fitted_nets
 from sbi_rope.errors import (
     InvalidInputError,
     InvalidTypeError,
@@ -47,7 +49,7 @@ SMALL: dict[str, Any] = {
     "num_simulations": 300,
     "num_steps": 4,
     "num_folds": 2,
-    "finetuner": CalibrationFinetuner(num_steps=3, rehearsal=1.0),
+    "finetuner": CalibrationFinetuner(max_num_epochs=3, rehearsal=1.0),
 }
 QUIET: dict[str, Any] = {"seed": 0, "show_progress_bars": False}
 
@@ -473,6 +475,14 @@ def test_moments_of_a_simulator_are_those_of_finite_simulations(
     assert (single.covariance == 0).all()
 
 
+def test_the_covariance_of_few_simulations_is_right_on_average() -> None:
+    theta = torch.zeros(5000, 1)
+    moments = simulator_of(noisy).moments(theta, 3, lambda x: x, progress=False)
+    expected = 0.25 * (MIXING.T @ MIXING).double()
+    # Divided by three instead of two, it would be off by a third.
+    assert torch.allclose(moments.covariance.mean(dim=0), expected, atol=0.02)
+
+
 def test_a_simulator_may_change_what_it_is_given_and_reuse_its_memory() -> None:
     def in_place(theta: Tensor) -> Tensor:
         theta *= 2
@@ -535,8 +545,14 @@ def test_moments_of_stored_simulations_follow_the_slope_around_a_parameter(
     assert torch.allclose(moments.mean, signal, atol=0.45)
     expected = 0.25 * (MIXING.T @ MIXING).double()
     assert torch.allclose(moments.covariance.mean(dim=0), expected, atol=0.12)
-    targets = stored.targets(at + centre, 50, lambda x: x, progress=False).double()
-    assert torch.allclose(targets[1], signal[1], atol=0.3)
+    targets = stored.targets(
+        at + centre,
+        lambda x: x,
+        simulations_per_target=1,
+        num_neighbors=50,
+        progress=False,
+    )
+    assert torch.allclose(targets[1].double(), signal[1], atol=0.3)
 
 
 def test_few_stored_simulations_take_the_slope_of_all() -> None:
@@ -613,6 +629,39 @@ def test_images_cannot_be_corrected_themselves() -> None:
     made.append_calibration(theta, problems.simulate_image(theta))
     with pytest.raises(InvalidInputError, match=r"\(n, 1, 8, 8\). Use space='embed"):
         made.train(**QUIET)
+
+
+class Remembering(nn.Module):
+    """Tells of each observation whether it has been tuned on it."""
+
+    def __init__(self, x: Tensor) -> None:
+        super().__init__()
+        self.known = x
+
+    def forward(self, x: Tensor) -> Tensor:
+        same = (x[:, None] == self.known).all(dim=-1)
+        return same.any(dim=1, keepdim=True).float()
+
+
+def test_pairs_are_embedded_by_a_net_that_was_tuned_on_all_others() -> None:
+    theta, x = labelled()
+    finetuner: Any = SimpleNamespace(
+        finetune=lambda h, x, *rest, **options: SimpleNamespace(
+            embedding_net=Remembering(x)
+        )
+    )
+    moments = Moments(mean=torch.zeros(12, 1), covariance=torch.zeros(12, 1, 1))
+    nets, z = cross_fitted_nets(
+        nn.Identity(),
+        (theta, x),
+        moments,
+        x,
+        finetuner=finetuner,
+        num_folds=3,
+        show_progress_bars=False,
+    )
+    assert (z == 0).all()
+    assert [float(net(x).sum()) for net in nets] == [8, 8, 8]
 
 
 def test_pairs_of_one_parameter_leave_nothing_to_hold_out_of_a_tuning() -> None:

@@ -10,7 +10,8 @@ from sbi.neural_nets import posterior_nn
 from torch import Tensor, nn
 
 from sbi_rope import CalibrationFinetuner, RoPE, diagnose
-from sbi_rope._standardisation import FAR
+from sbi_rope._sbi import Standardize
+from sbi_rope._standardisation import FAR, deviations
 from sbi_rope.baselines import CalibrationMLP, FinetunedNPE, Training
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import RoPEWarning
@@ -49,6 +50,13 @@ def real(theta: Tensor) -> Tensor:
     )
 
 
+def test_distances_from_simulations_count_below_as_above() -> None:
+    net = Standardize(torch.tensor([2.0, -1.0]), torch.tensor([5.0, 0.1]))
+    far = deviations(net, torch.tensor([[-8.0, -2.0], [12.0, 0.0]]))
+    assert far is not None
+    assert torch.allclose(far, torch.tensor([[2.0, 10.0], [2.0, 10.0]]))
+
+
 @pytest.mark.parametrize("net", [False, True])
 def test_a_column_that_only_varies_in_reality_is_named_and_diagnosed(
     net: bool,
@@ -56,7 +64,7 @@ def test_a_column_that_only_varies_in_reality_is_named_and_diagnosed(
     rope = RoPE(
         npe_of("independent", net=net),
         simulator=simulator,
-        finetuner=CalibrationFinetuner(num_steps=1),
+        finetuner=CalibrationFinetuner(max_num_epochs=1),
     )
     what = r"1 of the 3 entries of `{}` \(first: \[2\]\) are up to .e\+05 standard"
     with pytest.warns(RoPEWarning, match=what.format("x")):

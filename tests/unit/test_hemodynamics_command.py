@@ -73,7 +73,7 @@ def test_options_of_generate_reach_population_and_physics(tmp_path: Path) -> Non
     )
 
 
-def test_an_interrupt_says_how_to_go_on(
+def test_after_an_interrupt_the_command_says_how_to_go_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def stop(subject: Subject, physics: Physics) -> Beat:
@@ -86,27 +86,24 @@ def test_an_interrupt_says_how_to_go_on(
     assert _generate(tmp_path / "x.npz") == 0
 
 
-@pytest.mark.parametrize(
-    ("options", "word"),
-    [
+def test_errors_of_generate_are_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for options, word in (
         (["--n", "0"], "`n`"),
         (["--height-sd", "-1"], "height_sd"),
         (["--cell-length", "0"], "cell_length"),
         (["--seed", "-1"], "seed"),
         (["--jobs", "0"], "jobs"),
-    ],
-)
-def test_errors_of_generate_are_one_line(
-    options: list[str],
-    word: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert _generate(tmp_path / "x.npz", *options) == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1
-    assert word in lines[0]
+    ):
+        assert _generate(tmp_path / "x.npz", *options) == 2
+        lines = capsys.readouterr().err.splitlines()
+        assert len(lines) == 1
+        assert word in lines[0]
     assert not list(tmp_path.iterdir())
+    (tmp_path / "file").write_text("")
+    assert _generate(tmp_path / "file" / "x.npz") == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
 
 
 def test_generate_keeps_a_file_that_is_there(
@@ -117,14 +114,6 @@ def test_generate_keeps_a_file_that_is_there(
     assert _generate(file) == 2
     assert "Expected no file" in capsys.readouterr().err
     assert file.read_text() == "mine"
-
-
-def test_a_place_that_cannot_be_written_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "file").write_text("")
-    assert _generate(tmp_path / "file" / "x.npz") == 2
-    assert len(capsys.readouterr().err.splitlines()) == 1
 
 
 def test_info_summarises_a_file(
@@ -147,7 +136,7 @@ def test_info_summarises_a_file(
     assert f"smaller time step: {young}\n" in out
 
 
-def test_info_about_no_data_set_is_an_error_of_one_line(
+def test_info_refuses_a_file_that_is_no_data_set_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["info", str(tmp_path / "none.npz")]) == 2
@@ -166,19 +155,16 @@ def _table(passed: bool | None) -> Any:
     return lambda reference: rows
 
 
-@pytest.mark.parametrize(("passed", "status"), [(True, 0), (None, 0), (False, 1)])
-def test_validate_prints_the_table_and_tells_whether_all_is_well(
-    passed: bool | None,
-    status: int,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+def test_validate_prints_the_table_and_tells_whether_a_row_failed(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     validation = pytest.importorskip("sbi_rope.tasks.hemodynamics.validation")
-    monkeypatch.setattr(validation, "validation_table", _table(passed))
-    assert main(["validate"]) == status
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[1].split() == ["mass", "2e-05", "<", "1e-4", "1", "yes"]
-    assert lines[2].split()[:3] == ["cca", "not", "run"]
+    for passed, status in ((True, 0), (None, 0), (False, 1)):
+        monkeypatch.setattr(validation, "validation_table", _table(passed))
+        assert main(["validate"]) == status
+        lines = capsys.readouterr().out.splitlines()
+        assert lines[1].split() == ["mass", "2e-05", "<", "1e-4", "1", "yes"]
+        assert lines[2].split()[:3] == ["cca", "not", "run"]
 
 
 def test_validate_draws_beats_of_both_processes(

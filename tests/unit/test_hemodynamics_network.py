@@ -20,6 +20,7 @@ from sbi_rope.tasks.hemodynamics.network import (
 from sbi_rope.tasks.hemodynamics.openbf import read_case
 from sbi_rope.tasks.hemodynamics.subject import NUM_SEGMENTS, Physics
 from sbi_rope.tasks.hemodynamics.validation import BASELINE
+from sbi_rope.tasks.hemodynamics.waveforms import SITES
 from tests.conftest import SHARED_DATA
 
 OPENBF_TEXT = """project_name: tube
@@ -81,7 +82,7 @@ def test_the_geometry_is_the_published_one() -> None:
     np.testing.assert_allclose(table, expected * [1, 1, 1e3, 1e3, 1e3])
 
 
-def test_all_segments_hang_together() -> None:
+def test_all_segments_are_connected_with_the_heart() -> None:
     reached = {arteries.SEGMENTS[0][1]}
     for _ in range(NUM_SEGMENTS):
         for segment in arteries.SEGMENTS:
@@ -104,26 +105,23 @@ def test_every_blind_end_has_a_vascular_bed_and_nothing_else_has() -> None:
 # Stiffness ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("velocity", [4.0, 6.1, 11.0])
-@pytest.mark.parametrize("diameter", [0.8, 1.2])
-def test_the_walls_give_the_wave_velocity_asked_for(
-    velocity: float, diameter: float
-) -> None:
+def test_the_walls_give_the_wave_velocity_asked_for() -> None:
     factors = tuple(1 + 0.2 * np.sin(np.arange(NUM_SEGMENTS)))
-    subject = replace(
-        BASELINE,
-        pulse_wave_velocity=velocity,
-        diameter_factor=diameter,
-        length_factors=factors,
-    )
-    network = build_network(subject, Physics())
-    measured = carotid_femoral_velocity(
-        network.length,
-        network.inlet_radius,
-        network.outlet_radius,
-        network.stiffness[2, 0],
-    )
-    assert measured == pytest.approx(velocity, rel=1e-6)
+    for velocity, diameter in ((4.0, 1.2), (6.1, 0.8), (11.0, 1.2)):
+        subject = replace(
+            BASELINE,
+            pulse_wave_velocity=velocity,
+            diameter_factor=diameter,
+            length_factors=factors,
+        )
+        network = build_network(subject, Physics())
+        measured = carotid_femoral_velocity(
+            network.length,
+            network.inlet_radius,
+            network.outlet_radius,
+            network.stiffness[2, 0],
+        )
+        assert measured == pytest.approx(velocity, rel=1e-6)
 
 
 def test_in_equal_tubes_the_wave_velocity_is_that_of_each() -> None:
@@ -181,6 +179,20 @@ def test_walls_can_be_elastic() -> None:
     assert not network.wall_viscosity.any()
 
 
+def test_pressures_are_recorded_in_the_arteries_that_the_sites_are_named_after() -> (
+    None
+):
+    found = {
+        site: (arteries.SEGMENTS[segment][0], position)
+        for site, (segment, position) in SITES.items()
+    }
+    assert found == {
+        "radial": ("left radial", 0.5),
+        "brachial": ("left brachial", 0.5),
+        "aortic": ("ascending aorta", 0.0),
+    }
+
+
 # Geometry ----------------------------------------------------------------------------
 
 
@@ -192,7 +204,7 @@ def test_short_segments_are_stretched_and_no_others() -> None:
     np.testing.assert_allclose(network.length, np.maximum(table * factors, 0.02))
 
 
-def test_the_diameter_factor_is_that_of_large_arteries() -> None:
+def test_the_diameter_factor_widens_large_arteries_only() -> None:
     wide = build_network(replace(BASELINE, diameter_factor=1.1), Physics())
     usual = build_network(BASELINE, Physics())
     ratio = wide.outlet_radius / usual.outlet_radius
@@ -236,7 +248,7 @@ def test_compliances_add_up_to_those_of_the_beds() -> None:
     assert outlets.compliance.sum() / 1e-6 * MMHG == pytest.approx(expected)
 
 
-def test_most_outlets_reflect_nothing_at_once() -> None:
+def test_most_outlets_have_the_impedance_of_their_artery() -> None:
     network = build_network(BASELINE, Physics())
     segment, radius = network.outlets.segment, network.outlet_radius
     impedance = [
@@ -247,7 +259,7 @@ def test_most_outlets_reflect_nothing_at_once() -> None:
     assert set(segment[~matched] + 1) <= {26}
 
 
-def test_a_strong_heart_leaves_every_bed_a_resistance() -> None:
+def test_every_outlet_has_a_resistance_even_behind_a_strong_heart() -> None:
     subject = replace(BASELINE, stroke_volume=110.0, pulse_wave_velocity=9.0)
     outlets = build_network(subject, Physics()).outlets
     assert (outlets.distal_resistance > 0).all()

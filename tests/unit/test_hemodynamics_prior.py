@@ -51,12 +51,7 @@ def _grid(prior: PopulationPrior, points: int = 801) -> tuple[Tensor, float]:
     return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1), area
 
 
-def test_density_integrates_to_one(prior: PopulationPrior) -> None:
-    theta, area = _grid(prior)
-    assert float(prior.log_prob(theta).exp().sum()) * area == pytest.approx(1, abs=2e-3)
-
-
-def test_people_follow_the_density(
+def test_people_follow_the_density_and_its_moments(
     prior: PopulationPrior, kind: str, people: dict[str, Tensor]
 ) -> None:
     theta = people[kind]
@@ -75,6 +70,9 @@ def test_people_follow_the_density(
     chi_squared = ((counts - expected)[large] ** 2 / expected[large]).sum()
     assert chi_squared < large.sum() + 4 * (2 * large.sum()) ** 0.5
     assert large.sum() > 30
+    torch.testing.assert_close(prior.mean, theta.mean(dim=0), rtol=0.01, atol=0.0)
+    torch.testing.assert_close(prior.stddev, theta.std(dim=0), rtol=0.03, atol=0.0)
+    assert prior.mean.dtype == prior.variance.dtype == torch.float32
 
 
 def test_draws_follow_the_density(prior: PopulationPrior) -> None:
@@ -94,21 +92,12 @@ def test_draws_follow_the_density(prior: PopulationPrior) -> None:
     assert float(draws[:, 0].mean()) == pytest.approx(float(mean[0]), abs=0.25)
 
 
-@pytest.mark.parametrize(("start", "end"), [(1.0, 1.0), (0.0, 2.0), (3.0, 0.5)])
-def test_draws_within_a_cell_follow_a_linear_density(start: float, end: float) -> None:
+def test_draws_within_a_cell_follow_a_linear_density() -> None:
     uniform = torch.linspace(0.0, 1.0, 21, dtype=torch.float64)
-    place = _linear_quantile(uniform, torch.tensor(start), torch.tensor(end))
-    below = start * place + (end - start) * place**2 / 2
-    torch.testing.assert_close(below / ((start + end) / 2), uniform)
-
-
-def test_moments_are_those_of_people(
-    prior: PopulationPrior, kind: str, people: dict[str, Tensor]
-) -> None:
-    theta = people[kind]
-    torch.testing.assert_close(prior.mean, theta.mean(dim=0), rtol=0.01, atol=0.0)
-    torch.testing.assert_close(prior.stddev, theta.std(dim=0), rtol=0.03, atol=0.0)
-    assert prior.mean.dtype == prior.variance.dtype == torch.float32
+    for start, end in ((1.0, 1.0), (0.0, 2.0), (3.0, 0.5)):
+        place = _linear_quantile(uniform, torch.tensor(start), torch.tensor(end))
+        below = start * place + (end - start) * place**2 / 2
+        torch.testing.assert_close(below / ((start + end) / 2), uniform)
 
 
 def test_stroke_volume_and_ejection_time_are_correlated() -> None:
@@ -123,29 +112,30 @@ def _cut_normal(
     return np.where(inside, norm.pdf(value, mean, sd) / 0.9544997361, 0.0)
 
 
-@pytest.mark.parametrize("theta", [(60.0, 280.0), (75.0, 310.0), (40.0, 262.0)])
-def test_density_is_the_integral_over_age_and_heart_rate(
-    theta: tuple[float, float],
-) -> None:
-    volume, time = theta
+def test_density_is_the_integral_over_age_and_heart_rate() -> None:
     start, slope, noise_sd = ejection_time_slopes()
     age = 25 + 50 * (np.arange(2000) + 0.5) / 2000
     rate = (50 + 52 * (np.arange(2000) + 0.5) / 2000)[:, None]
     mean, sd = tables.stroke_volume_law(age)
-    predicted = start + slope * tables.weissler_time(volume, rate)
-    joint = (
-        _cut_normal(volume, mean, sd)
-        * _cut_normal(rate, tables.heart_rate_mean(age), tables.HEART_RATE_SD)
-        * _cut_normal(time, predicted, noise_sd)
-    )
-    expected = joint.mean() * 52  # ages have the density 1 / 50
-    found = float(PopulationPrior().log_prob(torch.tensor(theta)).exp())
-    assert found == pytest.approx(expected, rel=5e-3)
+    law_of_rate = _cut_normal(rate, tables.heart_rate_mean(age), tables.HEART_RATE_SD)
+    for volume, time in ((60.0, 280.0), (75.0, 310.0), (40.0, 262.0)):
+        predicted = start + slope * tables.weissler_time(volume, rate)
+        joint = (
+            _cut_normal(volume, mean, sd)
+            * law_of_rate
+            * _cut_normal(time, predicted, noise_sd)
+        )
+        expected = joint.mean() * 52  # ages have the density 1 / 50
+        found = PopulationPrior().log_prob(torch.tensor([volume, time])).exp()
+        assert float(found) == pytest.approx(expected, rel=5e-3)
 
 
-def test_marginal_cdf_is_the_integral_of_the_density(prior: PopulationPrior) -> None:
+def test_the_density_integrates_to_the_marginal_cdf_and_to_one(
+    prior: PopulationPrior,
+) -> None:
     grid, area = _grid(prior)
     mass = prior.log_prob(grid).exp() * area
+    assert float(mass.sum()) == pytest.approx(1, abs=2e-3)
     for row in (150, 350, 500):
         theta = grid[row, row].float().unsqueeze(0)
         below = [mass[:row].sum() + mass[row].sum() / 2]
@@ -168,7 +158,9 @@ def test_independent_density_is_a_product() -> None:
     assert total == pytest.approx(whole)
 
 
-def test_there_is_no_density_outside(prior: PopulationPrior) -> None:
+def test_the_prior_has_no_density_outside_of_its_support(
+    prior: PopulationPrior,
+) -> None:
     outside = torch.tensor([[20.0, 280.0], [60.0, 400.0], [200.0, 280.0], [60.0, 0.0]])
     assert prior.log_prob(outside).tolist() == [-torch.inf] * 4
     assert not within_support(prior, outside).any()
@@ -220,7 +212,7 @@ def test_prior_can_be_copied_expanded_and_moved(prior: PopulationPrior) -> None:
     assert PopulationPrior(Population()).mean.device.type == "cpu"
 
 
-def test_density_has_gradients_made_in_inference_mode_or_not() -> None:
+def test_a_prior_made_in_inference_mode_has_a_density_with_gradients() -> None:
     with torch.inference_mode():
         prior = PopulationPrior()
     theta = torch.tensor([60.0, 280.0], requires_grad=True)

@@ -250,7 +250,9 @@ def test_finetuning_history_without_holdout_draws_the_training_loss_only() -> No
 def test_effective_sample_sizes_count_every_row(num_simulations: int) -> None:
     simulated = torch.randn(num_simulations, 2)
     real = torch.cat([torch.randn(29, 2), 100 * simulated[:1]])
-    coupling = SinkhornCoupler(gamma=1.0, tau=0.0).couple(real, simulated)
+    coupling = SinkhornCoupler(gamma=1.0, tau=0.0, cost_scale="none").couple(
+        real, simulated
+    )
     axes = plots.effective_sample_sizes(coupling).axes[0]
     assert sum(bar.get_height() for bar in axes.patches) == 30
     assert axes.patches[0].get_x() < axes.patches[-1].get_x()

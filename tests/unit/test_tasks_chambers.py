@@ -55,7 +55,7 @@ def random_image(size: int = 16) -> Tensor:
 # Files and tables --------------------------------------------------------------------
 
 
-def test_a_file_that_is_there_is_found(tmp_path: Path) -> None:
+def test_a_file_is_found_below_the_root(tmp_path: Path) -> None:
     unpack(tmp_path)
     assert find_file(FILE, root=tmp_path) == tmp_path / FILE
 
@@ -67,27 +67,21 @@ def test_without_a_root_the_file_and_the_ways_to_get_it_are_named() -> None:
     assert f"causal-chamber/tree/main/datasets/{DATASET}" in str(error.value)
 
 
-@pytest.mark.parametrize(
-    ("root", "file", "match"),
-    [
-        pytest.param("gone", FILE, r"There is no folder .*gone\.", id="root"),
-        pytest.param("", Path("x_v1/x.csv"), r"no folder .*x_v1\.", id="data-set"),
-        pytest.param(
-            "",
-            Path(DATASET, "b", "b.csv"),
-            r"The data set has \['first_1.8', 'table_0.5'\]",
-            id="experiment",
-        ),
-    ],
-)
-def test_of_a_missing_file_it_is_said_what_is_there_instead(
-    tmp_path: Path, root: str, file: Path, match: str
-) -> None:
+def test_the_message_about_a_missing_file_says_what_is_there(tmp_path: Path) -> None:
     unpack(tmp_path)
     (tmp_path / DATASET / "table_0.5.csv").write_text("")
     (tmp_path / DATASET / "LICENSE.txt").write_text("")
-    with pytest.raises(DataNotFoundError, match=match):
-        find_file(file, root=tmp_path / root)
+    for root, file, match in (
+        ("gone", FILE, r"There is no folder .*gone\."),
+        ("", Path("x_v1/x.csv"), r"no folder .*x_v1\."),
+        (
+            "",
+            Path(DATASET, "b", "b.csv"),
+            r"The data set has \['first_1.8', 'table_0.5'\]",
+        ),
+    ):
+        with pytest.raises(DataNotFoundError, match=match):
+            find_file(file, root=tmp_path / root)
 
 
 def test_columns_come_in_the_order_asked_for(tmp_path: Path) -> None:
@@ -102,21 +96,19 @@ def test_columns_come_in_the_order_asked_for(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        pytest.param("a\n1\n", r"\['b'\] are missing.*get it again", id="column"),
-        pytest.param("a,b\n", "to have rows.*get it again", id="empty"),
-        pytest.param("", "CSV table.*get it again", id="nothing"),
-        pytest.param("a,b\n1,2\n3\n4,5\n", "row 1 ends in the column 'a'", id="row"),
-        pytest.param("a,b\n1,2\n3,4", "last row, 1, ends in the column 'b'", id="end"),
-        pytest.param("a,b\n1,dark\n", "finite.*row 0 has 'dark'.*'b'", id="word"),
-        pytest.param(
-            "a,b\n1,2\n3,\n", "finite.*row 1 has 'nan'.*'b' .1 such", id="nan"
-        ),
-        pytest.param(
-            "a,b\n-1e39,2\n", "row 0 has '-1e.39' in the column 'a'", id="large"
-        ),
+        ("a\n1\n", r"\['b'\] are missing.*get it again"),
+        ("a,b\n", "to have rows.*get it again"),
+        ("", "CSV table.*get it again"),
+        ("a,b\n1,2\n3\n4,5\n", "row 1 ends in the column 'a'"),
+        ("a,b\n1,2\n3,4", "last row, 1, ends in the column 'b'"),
+        ("a,b\n1,dark\n", "finite.*row 0 has 'dark'.*'b'"),
+        ("a,b\n1,2\n3,\n", "finite.*row 1 has 'nan'.*'b' .1 such"),
+        ("a,b\n-1e39,2\n", "row 0 has '-1e.39' in the column 'a'"),
     ],
 )
-def test_tables_that_are_cut_are_refused(tmp_path: Path, text: str, match: str) -> None:
+def test_a_damaged_table_is_refused_with_the_place_of_the_damage(
+    tmp_path: Path, text: str, match: str
+) -> None:
     (tmp_path / "t.csv").write_text(text)
     with pytest.raises(InvalidInputError, match=rf"t\.csv.*{match}"):
         read_columns(tmp_path / "t.csv", ["a", "b"])
@@ -146,9 +138,6 @@ def test_images_are_read_channels_first_in_the_order_asked_for(tmp_path: Path) -
     images = read_images(tmp_path, ["2.png", "0.png"], 16)
     assert images.dtype == torch.uint8
     assert torch.equal(images, torch.stack([written["2.png"], written["0.png"]]))
-
-
-def test_no_names_are_no_images(tmp_path: Path) -> None:
     assert read_images(tmp_path, [], 16).shape == (0, 3, 16, 16)
 
 
@@ -165,7 +154,7 @@ def test_a_missing_image_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("extension", ["png", "jpg"])
-def test_an_image_cut_anywhere_is_refused_or_read_as_the_whole(
+def test_an_image_that_was_cut_anywhere_is_refused_or_read_as_the_whole(
     tmp_path: Path, extension: str
 ) -> None:
     path = tmp_path / f"0.{extension}"
@@ -185,22 +174,22 @@ def test_an_image_cut_anywhere_is_refused_or_read_as_the_whole(
     assert refused > 0.9 * len(content)
 
 
-@pytest.mark.parametrize("size", [8, 17])
-def test_an_image_of_another_size_is_refused(tmp_path: Path, size: int) -> None:
+def test_an_image_of_another_size_or_mode_is_refused(tmp_path: Path) -> None:
     write_image(tmp_path / "0.png", random_image())
-    match = rf"0\.png.*{size} x {size} pixels in mode RGB; got 16 x 16"
-    with pytest.raises(InvalidInputError, match=match):
-        read_images(tmp_path, ["0.png"], size)
+    for size in (8, 17):
+        match = rf"0\.png.*{size} x {size} pixels in mode RGB; got 16 x 16"
+        with pytest.raises(InvalidInputError, match=match):
+            read_images(tmp_path, ["0.png"], size)
+    for mode in ("L", "RGBA", "P", "1"):
+        write_image(tmp_path / "0.png", random_image(), mode=mode)
+        match = rf"0\.png.*RGB; got .*mode {mode}\."
+        with pytest.raises(InvalidInputError, match=match):
+            read_images(tmp_path, ["0.png"], 16)
 
 
-@pytest.mark.parametrize("mode", ["L", "RGBA", "P", "1"])
-def test_an_image_that_is_not_rgb_is_refused(tmp_path: Path, mode: str) -> None:
-    write_image(tmp_path / "0.png", random_image(), mode=mode)
-    with pytest.raises(InvalidInputError, match=rf"0\.png.*RGB; got .*mode {mode}\."):
-        read_images(tmp_path, ["0.png"], 16)
-
-
-def test_sizes_that_are_there_are_listed(tmp_path: Path) -> None:
+def test_the_message_about_a_missing_size_lists_the_sizes_there_are(
+    tmp_path: Path,
+) -> None:
     for name in ("images_100", "images_full", "other"):
         (tmp_path / DATASET / "first" / name).mkdir(parents=True)
     experiment = tmp_path / DATASET / "first"
@@ -220,38 +209,32 @@ def test_a_download_needs_a_root() -> None:
     check_download(Path("root"), [Path("a/b.csv")], download=True)
 
 
-@pytest.mark.parametrize(
-    ("dataset", "name", "whole"),
-    [
-        pytest.param(DATASET, "uniform_ap_8.0_iso_500.0", [10_000], id="camera"),
-        pytest.param(DATASET, "betab_ap_1.8_iso_500.0", [10_000], id="crowded"),
-        pytest.param(DATASET, "scm_1_red", [5000], id="first-model"),
-        pytest.param(SENSORS, "uniform_reference", [6000, 10_000], id="reference"),
-        pytest.param(SENSORS, "uniform_v_c_strong", [1000], id="intervention"),
-        pytest.param(
-            "wt_intake_impulse_v1", "load_out_1_osr_downwind_4", [250_000], id="impulse"
-        ),
-    ],
-)
-def test_published_experiments_have_the_rows_they_were_published_with(
-    dataset: str, name: str, whole: list[int]
-) -> None:
-    for rows in whole:
-        check_complete(Path(f"{name}.csv"), rows, dataset=dataset)
-        for found in (1, rows - 1, rows + 1, rows - 50):
-            with pytest.raises(
-                InvalidInputError, match=rf"{name}.csv.*row {found - 1},"
-            ):
-                check_complete(Path(f"{name}.csv"), found, dataset=dataset)
-    check_complete(Path("an_experiment_of_ones_own.csv"), 3, dataset=dataset)
+def test_a_published_experiment_must_have_as_many_rows_as_were_published() -> None:
+    for dataset, name, whole in (
+        (DATASET, "uniform_ap_8.0_iso_500.0", [10_000]),
+        (DATASET, "betab_ap_1.8_iso_500.0", [10_000]),
+        (DATASET, "scm_1_red", [5000]),
+        (SENSORS, "uniform_reference", [6000, 10_000]),
+        (SENSORS, "uniform_v_c_strong", [1000]),
+        ("wt_intake_impulse_v1", "load_out_1_osr_downwind_4", [250_000]),
+    ):
+        path = Path(f"{name}.csv")
+        for rows in whole:
+            check_complete(path, rows, dataset=dataset)
+            for found in (1, rows - 1, rows + 1, rows - 50):
+                match = rf"{name}.csv.*row {found - 1},"
+                with pytest.raises(InvalidInputError, match=match):
+                    check_complete(path, found, dataset=dataset)
+        check_complete(Path("an_experiment_of_ones_own.csv"), 3, dataset=dataset)
 
 
 @pytest.mark.parametrize("name", ["uniform_reference", "uniform_t_ir_1_strong"])
-def test_a_recording_is_taken_whole_or_not_at_all(
-    chamber_root: Path, tmp_path: Path, name: str
+def test_a_recording_that_was_cut_anywhere_is_refused(
+    chamber_extract: Path, tmp_path: Path, name: str
 ) -> None:
-    published = (chamber_root / SENSORS / f"{name}.csv").read_bytes()
+    published = (chamber_extract / SENSORS / f"{name}.csv").read_bytes()
     rows = published.splitlines(keepends=True)
+    middle = len(rows) // 2
     path = tmp_path / SENSORS / f"{name}.csv"
     path.parent.mkdir()
     task = LightTunnelSensors(
@@ -265,15 +248,25 @@ def test_a_recording_is_taken_whole_or_not_at_all(
         published[: len(published) * 2 // 3],
         published[:-1] + b",\n" + rows[-1][:90],
         b"".join(rows[:-1]),
-        b"".join(rows[:501]),
-        b"".join(rows[:300] + rows[400:]),
-        b"".join([*rows[:300], rows[300][:200], *rows[301:]]),
+        b"".join(rows[: middle + 1]),
+        b"".join(rows[:middle] + rows[middle + 5 :]),
+        b"".join([*rows[:middle], rows[middle][:200], *rows[middle + 1 :]]),
     ):
         path.write_bytes(cut)
         with pytest.raises(
             InvalidInputError, match=rf"{name}.csv.*(row|line).*get it again"
         ):
             task.get_test_set(1)
+
+
+def test_the_extract_is_the_beginning_of_the_published_files(
+    chamber_root: Path, chamber_extract: Path
+) -> None:
+    extracts = list((chamber_extract / SENSORS).glob("*.csv"))
+    assert len(extracts) == 14
+    for extract in extracts:
+        published = (chamber_root / SENSORS / extract.name).read_bytes()
+        assert published.startswith(extract.read_bytes())
 
 
 @pytest.mark.usefixtures("shorter_files")
@@ -311,7 +304,7 @@ def test_a_download_puts_the_whole_data_set_in_its_place(
     assert [path.name for path in root.iterdir()] == [DATASET]
 
 
-def test_without_being_asked_for_nothing_is_downloaded(
+def test_nothing_is_downloaded_unless_it_is_asked_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls = stub_downloads(monkeypatch, unpack)
@@ -353,7 +346,7 @@ def test_a_download_cut_off_half_way_leaves_nothing(
     assert find_file(FILE, root=tmp_path, download=True).is_file()
 
 
-def test_what_an_earlier_process_left_is_not_taken_for_data(
+def test_an_unfinished_download_of_an_earlier_process_is_not_taken_for_data(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     unpack(tmp_path / ".download_killed")
@@ -389,7 +382,7 @@ def test_a_download_without_the_data_set_is_an_error(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_without_the_internet_the_other_way_is_named(
+def test_without_the_internet_the_message_names_the_page_to_download_from(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def offline(module: str) -> None:
@@ -409,7 +402,7 @@ def test_a_download_without_the_package_says_what_to_install(
         find_file(FILE, root=tmp_path, download=True)
 
 
-def test_a_data_set_published_anew_earns_a_warning(
+def test_a_data_set_that_was_published_anew_is_downloaded_with_a_warning(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stub_downloads(monkeypatch, unpack, published="0123")
@@ -419,7 +412,7 @@ def test_a_data_set_published_anew_earns_a_warning(
 
 
 @pytest.mark.parametrize("published", [None, KNOWN_ARCHIVES[DATASET]])
-def test_the_known_data_set_earns_none(
+def test_the_known_data_set_is_downloaded_without_a_warning(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, published: str | None
 ) -> None:
     stub_downloads(monkeypatch, unpack, published=published)

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from sbi_rope.tasks import list_tasks
-from sbi_rope.tasks.__main__ import main
+from sbi_rope.tasks import get_task, list_tasks
+from sbi_rope.tasks.__main__ import _state_of_data, main
 from tests.fresh import imported_anew
 
 PNG = b"\x89PNG"
@@ -20,35 +20,20 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sbi_rope.tasks.__main__.BUDGET", 0.0)
 
 
-def test_the_list_has_a_line_for_every_task(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_list_has_a_line_for_every_task_and_says_whether_its_data_are_there(
+    capsys: pytest.CaptureFixture[str], chamber_extract: Path, tmp_path: Path
+) -> None:
     assert main([]) == 0
     lines = {
         line.split()[0]: line for line in capsys.readouterr().out.splitlines() if line
     }
     assert set(list_tasks()) <= set(lines)
-    assert "no --root" in lines["light_tunnel_sensors"]
+    assert "recorded, no --root" in lines["light_tunnel_sensors"]
     assert lines["pendulum"].split()[1:4] == ["2", "200", "drawn"]
     assert int(lines["pendulum"].split()[-1].replace(",", "")) > 0
-
-
-def test_the_list_says_whether_recorded_data_are_there(
-    capsys: pytest.CaptureFixture[str], chamber_root: Path, tmp_path: Path
-) -> None:
-    main(["--root", str(chamber_root)])
-    assert "recorded, found" in capsys.readouterr().out
-    main(["--root", str(tmp_path)])
-    assert "recorded, missing" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("name", list_tasks())
-def test_a_task_is_described(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = [name, "-n", "50", "--variant", "well_specified"]
-    assert main(arguments) == 0
-    out = capsys.readouterr().out
-    assert "prior (50 draws)" in out
-    assert "simulated x (50 draws)" in out
-    assert "well-specified x (50 test observations)" in out
-    assert "prior_shift: " in out
+    sensors = "light_tunnel_sensors"
+    assert _state_of_data(get_task(sensors, root=chamber_extract)) == "recorded, found"
+    assert _state_of_data(get_task(sensors, root=tmp_path)) == "recorded, missing"
 
 
 def test_summaries_are_those_of_the_draws(capsys: pytest.CaptureFixture[str]) -> None:
@@ -73,40 +58,42 @@ def test_without_data_the_missing_file_is_named(
     assert "real x (" not in out
 
 
-@pytest.mark.parametrize("name", list_tasks())
-def test_a_picture_is_written(name: str, tmp_path: Path) -> None:
+# One task each of statistics, series and images.
+@pytest.mark.parametrize("name", ["cs", "pendulum", "light_tunnel"])
+def test_a_task_is_described_and_drawn(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     pytest.importorskip("matplotlib")
     path = tmp_path / "new" / "x.png"
     arguments = [name, "-n", "50", "--variant", "well_specified", "--plot", str(path)]
     assert main(arguments) == 0
     assert path.read_bytes().startswith(PNG)
+    out = capsys.readouterr().out
+    assert "prior (50 draws)" in out
+    assert "simulated x (50 draws)" in out
+    assert "well-specified x (50 test observations)" in out
+    assert "prior_shift: " in out
 
 
-@pytest.mark.parametrize(
-    ("arguments", "match"),
-    [
-        pytest.param(["pendulu"], "'pendulum'", id="name"),
-        pytest.param(["pendulum", "--variant", "no"], "prior_shift", id="variant"),
-        pytest.param(["pendulum", "-n", "0"], "`n`", id="n"),
-        pytest.param(["pendulum", "-n", "9", "--plot", "x.doc"], "x.doc", id="format"),
-        pytest.param(
-            ["light_tunnel_sensors", "-n", "9", "--plot", "x.png"], "`root`", id="data"
-        ),
-    ],
-)
 def test_errors_are_one_line_and_a_status(
-    arguments: list[str],
-    match: str,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert main(arguments) == 2
-    captured = capsys.readouterr()
-    assert match in captured.err
-    assert "Traceback" not in captured.err
-    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "file").write_text("")
+    for arguments, word in (
+        (["pendulu"], "'pendulum'"),
+        (["pendulum", "--variant", "no"], "prior_shift"),
+        (["pendulum", "-n", "0"], "`n`"),
+        (["pendulum", "-n", "9", "--plot", "x.doc"], "x.doc"),
+        (["pendulum", "-n", "9", "--plot", "noformat"], "noformat"),
+        (["pendulum", "-n", "9", "--plot", "file/x.png"], "file"),
+        (["light_tunnel_sensors", "-n", "9", "--plot", "x.png"], "`root`"),
+    ):
+        assert main(arguments) == 2
+        captured = capsys.readouterr()
+        assert word in captured.err
+        assert "Traceback" not in captured.err
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_a_picture_without_a_task_is_refused(tmp_path: Path) -> None:
@@ -140,20 +127,14 @@ def test_the_module_runs_as_a_command_of_its_own() -> None:
     assert done.stderr == ""
 
 
-@pytest.mark.parametrize("name", ["light_tunnel", "wind_tunnel"])
-def test_a_stand_in_is_called_one(
-    name: str, capsys: pytest.CaptureFixture[str]
+def test_real_data_and_their_stand_ins_are_described_as_what_they_are(
+    capsys: pytest.CaptureFixture[str], chamber_extract: Path
 ) -> None:
-    assert main([name, "-n", "20", "--stand-in", "--variant", "prior_shift"]) == 0
+    arguments = ["wind_tunnel", "-n", "20", "--stand-in", "--variant", "prior_shift"]
+    assert main(arguments) == 0
     out = capsys.readouterr().out
     assert "stand-in x (20 test observations)" in out
     assert "stand_in=True" in out
-
-
-@pytest.mark.parametrize("plot", ["noformat", "file/x.png"])
-def test_a_picture_that_cannot_be_written_is_explained(
-    plot: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "file").write_text("")
-    assert main(["pendulum", "-n", "9", "--plot", str(tmp_path / plot)]) == 2
-    assert "Traceback" not in capsys.readouterr().err
+    root = str(chamber_extract)
+    assert main(["light_tunnel_sensors", "-n", "20", "--root", root]) == 0
+    assert "real x (20 test observations)" in capsys.readouterr().out

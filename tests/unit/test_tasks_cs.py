@@ -1,7 +1,9 @@
 """Cancer and stromal cells."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from sbi_rope.tasks.cs import (
     tissue_statistics,
 )
 from sbi_rope.tasks.splits import DrawnPairs
+from tests.tasks import accepted
 
 NECROSIS = CancerStromaSimulator(necrosis_probability=0.75)
 # Means and standard deviations of 1500 draws of an independent implementation, under
@@ -86,19 +89,16 @@ def pad(tissues: list[dict]) -> dict:
 # The statistics ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("radius", [0.0, 0.8, 1.0])
-@pytest.mark.parametrize("seed", range(5))
-def test_statistics_are_those_of_a_naive_implementation(
-    seed: int, radius: float
-) -> None:
-    tissue = random_tissue(seed)
-    x = tissue_statistics(**tissue, necrosis_radius=radius)
-    assert list(x) == pytest.approx(
-        naive_statistics(**tissue, radius=radius), rel=1e-12
-    )
+def test_statistics_are_those_of_a_naive_implementation() -> None:
+    for seed in range(5):
+        tissue = random_tissue(seed)
+        for radius in (0.0, 0.8, 1.0):
+            x = tissue_statistics(**tissue, necrosis_radius=radius)
+            expected = naive_statistics(**tissue, radius=radius)
+            assert list(x) == pytest.approx(expected, rel=1e-12)
 
 
-def test_padded_statistics_are_those_of_each_tissue() -> None:
+def test_statistics_of_padded_tissues_are_those_of_each_tissue() -> None:
     tissues = [random_tissue(seed) for seed in range(60)]
     # Too few cells for a parent, no stromal cell, no cell at all.
     tissues += [random_tissue(0, num_cells=n) for n in (0, 1, 5, 14, 40)]
@@ -120,15 +120,7 @@ def test_a_parent_owns_one_cell_more_than_its_daughters() -> None:
     assert x[:2] == (92, 8)
 
 
-@pytest.mark.parametrize(
-    ("radius", "num_cancer"),
-    [
-        pytest.param(0.5, 3, id="strictly-inside"),
-        pytest.param(0.75, 2, id="one-inside"),
-        pytest.param(1.0, 2, id="boundary-stays"),
-    ],
-)
-def test_discs_are_closed_and_necrosis_is_open(radius: float, num_cancer: int) -> None:
+def test_a_cell_on_the_edge_of_the_necrosis_is_alive() -> None:
     # Distances 0.25, 0.5, 0.5 and 1 from the parent, whose disc has radius 0.5.
     tissue = {
         "cells": np.array([[0.25, 0.5, 0.0, 1.0], [0.0, 0.0, 0.5, 0.0]]),
@@ -136,35 +128,27 @@ def test_discs_are_closed_and_necrosis_is_open(radius: float, num_cancer: int) -
         "num_daughters": np.array([1]),
         "necrotic": np.array([True]),
     }
-    expected = (1, num_cancer, 0.5, 0.5)
-    assert tissue_statistics(**tissue, necrosis_radius=radius) == expected
-    batch = batched_statistics(**pad([tissue]), necrosis_radius=radius)
-    assert tuple(batch[0].tolist()) == expected
+    for radius, num_cancer in ((0.5, 3), (0.75, 2), (1.0, 2)):
+        expected = (1, num_cancer, 0.5, 0.5)
+        assert tissue_statistics(**tissue, necrosis_radius=radius) == expected
+        batch = batched_statistics(**pad([tissue]), necrosis_radius=radius)
+        assert tuple(batch[0].tolist()) == expected
 
 
-@pytest.mark.parametrize(
-    ("num_cells", "defined"),
-    [
-        pytest.param(0, False, id="no-cell"),
-        pytest.param(7, False, id="too-few"),
-        pytest.param(8, False, id="no-stromal-cell"),
-        pytest.param(9, True, id="one-stromal-cell"),
-    ],
-)
-def test_a_tissue_without_a_stromal_cell_has_no_statistics(
-    num_cells: int, defined: bool
-) -> None:
-    tissue = random_tissue(0, num_cells=num_cells) | {
-        "parents": np.full((2, 1), 0.5),
-        "num_daughters": np.array([7]),
-        "necrotic": np.array([False]),
-    }
-    x = np.array(tissue_statistics(**tissue, necrosis_radius=0.8))
-    assert np.isfinite(x).tolist() == [defined] * 4
-    # Next to a larger tissue.
-    batch = pad([tissue, random_tissue(1)])
-    together = batched_statistics(**batch, necrosis_radius=0.8)
-    np.testing.assert_allclose(together[0].numpy(), x, rtol=1e-12)
+def test_a_tissue_without_a_stromal_cell_has_no_statistics() -> None:
+    # Without a cell, with too few for the parent, without and with a stromal one.
+    for num_cells, defined in ((0, False), (7, False), (8, False), (9, True)):
+        tissue = random_tissue(0, num_cells=num_cells) | {
+            "parents": np.full((2, 1), 0.5),
+            "num_daughters": np.array([7]),
+            "necrotic": np.array([False]),
+        }
+        x = np.array(tissue_statistics(**tissue, necrosis_radius=0.8))
+        assert np.isfinite(x).tolist() == [defined] * 4
+        # Next to a larger tissue.
+        batch = pad([tissue, random_tissue(1)])
+        together = batched_statistics(**batch, necrosis_radius=0.8)
+        np.testing.assert_allclose(together[0].numpy(), x, rtol=1e-12)
 
 
 def test_a_tissue_without_a_cancer_cell_has_no_statistics() -> None:
@@ -191,7 +175,7 @@ def test_a_tissue_without_a_cancer_cell_has_no_statistics() -> None:
         pytest.param(REAL, CancerStroma(), id="real"),
     ],
 )
-def test_means_under_the_prior_are_the_known_ones(
+def test_means_under_the_prior_are_those_of_an_independent_implementation(
     table: tuple[tuple[float, ...], tuple[float, ...]], task: CancerStroma
 ) -> None:
     _, x = task.get_test_set(1500)
@@ -201,7 +185,7 @@ def test_means_under_the_prior_are_the_known_ones(
 
 
 @pytest.mark.parametrize("simulator", [CancerStromaSimulator(), NECROSIS])
-def test_one_after_the_other_and_together_follow_one_law(
+def test_tissues_simulated_together_follow_the_law_of_single_ones(
     simulator: CancerStromaSimulator,
 ) -> None:
     # Few parents, of which one more or less would show.
@@ -219,7 +203,7 @@ def test_rows_of_a_batch_belong_to_their_parameters() -> None:
     assert (num_cells[1::2] < 500).all()
 
 
-def test_numbers_of_cells_have_the_rate_of_theta() -> None:
+def test_the_number_of_cells_is_poisson_with_the_rate_of_theta() -> None:
     theta = torch.tensor([[500.0, 5.0, 15.0]]).expand(1000, -1)
     num_cells = CancerStromaSimulator()(theta)[:, :2].sum(dim=1)
     assert num_cells.mean() == pytest.approx(500.0, abs=4 * (500 / 1000) ** 0.5)
@@ -238,19 +222,13 @@ def test_necrosis_takes_half_of_the_cancer_cells_and_no_stromal_cell() -> None:
 
 
 @pytest.mark.parametrize("batched", [False, True])
-@pytest.mark.parametrize(
-    "without",
-    [{"necrosis_probability": 0.0}, {"necrosis_radius": 0.0}],
-    ids=["probability", "radius"],
-)
-def test_without_necrosis_the_simulator_is_exact(
-    batched: bool, without: dict[str, float]
-) -> None:
+def test_without_necrosis_the_simulator_is_exact(batched: bool) -> None:
     theta = CancerStroma().get_prior().sample((50,))
     simulated = seeded(CancerStromaSimulator(batched=batched), theta)
-    changed = replace(NECROSIS, batched=batched, **without)
-    assert torch.equal(seeded(changed, theta), simulated)
-    assert not torch.equal(seeded(replace(NECROSIS, batched=batched), theta), simulated)
+    necrosis = replace(NECROSIS, batched=batched)
+    for without in ({"necrosis_probability": 0.0}, {"necrosis_radius": 0.0}):
+        assert torch.equal(seeded(replace(necrosis, **without), theta), simulated)
+    assert not torch.equal(seeded(necrosis, theta), simulated)
 
 
 @pytest.mark.parametrize("batched", [False, True])
@@ -276,31 +254,28 @@ def test_pairs_that_are_not_defined_are_replaced_together() -> None:
 
 
 @pytest.mark.parametrize("batched", [False, True])
-@pytest.mark.parametrize("n", [0, 1, 300])
-def test_simulator_takes_batches_of_any_size(n: int, batched: bool) -> None:
-    theta = torch.tensor([[200.0, 3.0, 10.0]], dtype=torch.float64).expand(n, -1)
-    x = CancerStromaSimulator(batched=batched)(theta)
-    assert x.shape == (n, 4)
-    assert x.dtype == torch.float64
-    assert x.isfinite().all()
+def test_the_simulator_takes_batches_of_any_size(batched: bool) -> None:
+    for n in (0, 1, 300):
+        theta = torch.tensor([[200.0, 3.0, 10.0]], dtype=torch.float64).expand(n, -1)
+        x = CancerStromaSimulator(batched=batched)(theta)
+        assert x.shape == (n, 4)
+        assert x.dtype == torch.float64
+        assert x.isfinite().all()
 
 
-@pytest.mark.parametrize("rate", [-1.0, 2e6])
-def test_rates_out_of_range_are_refused(rate: float) -> None:
-    with pytest.raises(InvalidInputError, match=r"from 0 to 1e\+06"):
-        CancerStromaSimulator()(torch.tensor([[500.0, rate, 15.0]]))
+def test_rates_out_of_range_are_refused() -> None:
+    for rate in (-1.0, 2e6):
+        with pytest.raises(InvalidInputError, match=r"from 0 to 1e\+06"):
+            CancerStromaSimulator()(torch.tensor([[500.0, rate, 15.0]]))
 
 
 # The task ----------------------------------------------------------------------------
 
 
-def test_prior_log_density_is_analytic() -> None:
+def test_density_and_quantiles_of_the_prior_are_analytic() -> None:
     theta, _ = CancerStroma().get_test_set(20)
     log_prob = CancerStroma().get_prior().log_prob(theta)
     torch.testing.assert_close(log_prob, torch.full((20,), -math.log(1300 * 17 * 10)))
-
-
-def test_prior_quantiles_are_relative_positions() -> None:
     theta = torch.tensor([[200.0, 20.0, 12.5], [850.0, 11.5, 20.0]])
     expected = torch.tensor([[0.0, 1.0, 0.25], [0.5, 0.5, 1.0]])
     torch.testing.assert_close(CancerStroma().prior_quantiles(theta), expected)
@@ -332,22 +307,21 @@ def test_network_has_the_widths_of_the_paper() -> None:
         assert widths == [12, 48, 48, 36, 9]
 
 
-@pytest.mark.parametrize(
-    ("options", "match"),
-    [
-        pytest.param({"necrosis_probability": 1.1}, "necrosis_probability", id="p"),
-        pytest.param({"necrosis_radius": -0.1}, "necrosis_radius", id="radius"),
-        pytest.param({"necrosis_radius": math.nan}, "necrosis_radius", id="nan"),
-        pytest.param(
-            {"variant": "well_specified", "necrosis_radius": 0.5},
-            "no effect",
-            id="well-specified",
-        ),
-    ],
-)
-def test_options_out_of_range_are_refused(options: dict, match: str) -> None:
-    with pytest.raises(InvalidInputError, match=match):
-        CancerStroma(**options)
+def test_options_out_of_range_or_without_effect_are_refused() -> None:
+    def make(**options: Any) -> Callable[[], object]:
+        return lambda: CancerStroma(**options)
+
+    assert not accepted(
+        {
+            "p": (make(necrosis_probability=1.1), "necrosis_probability"),
+            "radius": (make(necrosis_radius=-0.1), "necrosis_radius"),
+            "nan": (make(necrosis_radius=math.nan), "necrosis_radius"),
+            "without effect": (
+                make(variant="well_specified", necrosis_radius=0.5),
+                "no effect",
+            ),
+        }
+    )
 
 
 def seeded(simulator: CancerStromaSimulator, theta: Tensor) -> Tensor:

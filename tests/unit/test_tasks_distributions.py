@@ -6,34 +6,47 @@ from torch.distributions import Beta, biject_to
 
 from sbi_rope.tasks.distributions import Arcsine, UniformDistance, box
 
+Law = type[UniformDistance] | type[Arcsine]
+LAWS = pytest.mark.parametrize("law", [UniformDistance, Arcsine])
+
+
+# Both laws ---------------------------------------------------------------------------
+
 
 @pytest.fixture
 def distance() -> UniformDistance:
     return UniformDistance(torch.tensor([40.0]), validate_args=False)
 
 
-def test_density_is_that_of_a_scaled_beta(distance: UniformDistance) -> None:
+def test_the_density_of_a_distance_is_that_of_a_scaled_beta(
+    distance: UniformDistance,
+) -> None:
     d = torch.linspace(0.1, 39.9, 50)
     beta = Beta(torch.tensor(1.0), torch.tensor(2.0))
     expected = beta.log_prob(d / 40) - torch.tensor(40.0).log()
     torch.testing.assert_close(distance.log_prob(d), expected)
 
 
-def test_density_is_the_derivative_of_the_distribution_function() -> None:
-    distance = UniformDistance(torch.tensor([40.0], dtype=torch.float64))
+@LAWS
+def test_the_density_is_the_derivative_of_the_distribution_function(law: Law) -> None:
+    some = law(torch.tensor([40.0], dtype=torch.float64))
     d = torch.linspace(0.5, 39.5, 20, dtype=torch.float64, requires_grad=True)
-    (density,) = torch.autograd.grad(distance.cdf(d).sum(), d)
-    torch.testing.assert_close(density, distance.log_prob(d).exp())
+    (density,) = torch.autograd.grad(some.cdf(d).sum(), d)
+    torch.testing.assert_close(density, some.log_prob(d).exp())
 
 
-def test_density_at_the_ends(distance: UniformDistance) -> None:
+def test_the_density_of_a_distance_is_zero_beyond_its_ends(
+    distance: UniformDistance,
+) -> None:
     values = torch.tensor([-1e-3, 0.0, 40.0, 40.1])
     expected = torch.tensor([0.0, 0.05, 0.0, 0.0])
     torch.testing.assert_close(distance.log_prob(values).exp(), expected)
     assert distance.support.check(values).tolist() == [False, True, True, False]
 
 
-def test_draws_are_distances_of_uniform_draws(distance: UniformDistance) -> None:
+def test_draws_of_a_distance_are_those_of_uniform_draws(
+    distance: UniformDistance,
+) -> None:
     draws = distance.sample((20_000,)).flatten()
     uniform = 40 * torch.rand(2, 20_000) - 15
     levels = torch.linspace(0.01, 0.99, 50)
@@ -45,36 +58,39 @@ def test_draws_are_distances_of_uniform_draws(distance: UniformDistance) -> None
     )
 
 
-def test_quantile_function_inverts_the_distribution_function(
-    distance: UniformDistance,
-) -> None:
-    level = torch.tensor([0.0, 1e-6, 0.3, 0.999, 1.0])
-    torch.testing.assert_close(distance.cdf(distance.icdf(level)), level)
-    assert distance.icdf(level[[0, -1]]).tolist() == [0.0, 40.0]
+@LAWS
+def test_the_quantile_function_inverts_the_distribution_function(law: Law) -> None:
+    some = law(torch.tensor([40.0]))
+    level = torch.tensor([0.0, 1e-3, 0.3, 0.5, 0.999, 1.0])
+    torch.testing.assert_close(some.cdf(some.icdf(level)), level)
+    assert some.icdf(level[[0, -1]]).tolist() == [0.0, 40.0]
 
 
-def test_mean_and_standard_deviation_are_those_of_draws(
-    distance: UniformDistance,
-) -> None:
-    draws = distance.sample((50_000,))
-    torch.testing.assert_close(draws.mean(dim=0), distance.mean, rtol=0.02, atol=0.0)
-    torch.testing.assert_close(draws.std(dim=0), distance.stddev, rtol=0.02, atol=0.0)
+@LAWS
+def test_mean_and_standard_deviation_are_those_of_draws(law: Law) -> None:
+    some = law(torch.tensor([40.0]))
+    draws = some.sample(torch.Size((50_000,)))
+    torch.testing.assert_close(draws.mean(dim=0), some.mean, rtol=0.02, atol=0.0)
+    torch.testing.assert_close(draws.std(dim=0), some.stddev, rtol=0.02, atol=0.0)
 
 
-def test_draws_are_differentiable_in_the_width() -> None:
+@LAWS
+def test_draws_are_differentiable_in_the_width(law: Law) -> None:
     width = torch.tensor([2.0], requires_grad=True)
-    draws = UniformDistance(width).rsample((100,))
+    draws = law(width).rsample(torch.Size((100,)))
     draws.sum().backward()
     assert width.grad is not None
     torch.testing.assert_close(width.grad, draws.detach().sum(dim=0) / 2)
 
 
-def test_values_outside_raise_when_arguments_are_validated() -> None:
-    distance = UniformDistance(torch.tensor([1.0]), validate_args=True)
+@LAWS
+def test_values_outside_are_refused_when_arguments_are_validated(law: Law) -> None:
+    some = law(torch.tensor([1.0]), validate_args=True)
     with pytest.raises(ValueError, match="support"):
-        distance.log_prob(torch.tensor([2.0]))
-    with pytest.raises(ValueError, match="width"):
-        UniformDistance(torch.tensor([-1.0]), validate_args=True)
+        some.log_prob(torch.tensor([2.0]))
+    for width in (-1.0, 0.0):
+        with pytest.raises(ValueError, match="width"):
+            law(torch.tensor([width]), validate_args=True)
 
 
 def test_support_has_a_bijection_from_the_real_line(distance: UniformDistance) -> None:
@@ -83,10 +99,11 @@ def test_support_has_a_bijection_from_the_real_line(distance: UniformDistance) -
     assert constrained[1] == 20.0
 
 
-def test_expanding_repeats_the_width(distance: UniformDistance) -> None:
-    expanded = distance.expand((3,))
+@LAWS
+def test_expanding_repeats_the_width(law: Law) -> None:
+    expanded = law(torch.tensor([1.0]), validate_args=False).expand((3,))
     assert expanded.batch_shape == (3,)
-    assert expanded.sample((2,)).shape == (2, 3)
+    assert expanded.sample(torch.Size((2,))).shape == (2, 3)
 
 
 # Arcsine -----------------------------------------------------------------------------
@@ -111,21 +128,6 @@ def test_arcsine_density_scales_with_the_width() -> None:
     wide, unit = Arcsine(torch.tensor([40.0])), Arcsine(torch.tensor([1.0]))
     expected = unit.log_prob(alpha) - torch.tensor(40.0).log()
     torch.testing.assert_close(wide.log_prob(40 * alpha), expected)
-
-
-def test_arcsine_density_is_the_derivative_of_the_distribution_function() -> None:
-    malus = Arcsine(torch.tensor([3.0], dtype=torch.float64))
-    alpha = torch.linspace(0.01, 2.99, 20, dtype=torch.float64, requires_grad=True)
-    (density,) = torch.autograd.grad(malus.cdf(alpha).sum(), alpha)
-    torch.testing.assert_close(density, malus.log_prob(alpha).exp())
-
-
-def test_arcsine_quantile_function_inverts_the_distribution_function(
-    malus: Arcsine,
-) -> None:
-    level = torch.tensor([0.0, 1e-3, 0.3, 0.5, 0.9, 1.0])
-    torch.testing.assert_close(malus.cdf(malus.icdf(level)), level)
-    torch.testing.assert_close(malus.icdf(level[[0, 3, 5]]), torch.tensor([0, 0.5, 1]))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -154,42 +156,19 @@ def test_arcsine_draws_are_squared_cosines_of_uniform_angles(malus: Arcsine) -> 
     assert torch.isfinite(malus.log_prob(draws)).all()
 
 
-def test_arcsine_draws_are_differentiable_in_the_width() -> None:
-    width = torch.tensor([2.0], requires_grad=True)
-    draws = Arcsine(width).rsample((100,))
-    draws.sum().backward()
-    assert width.grad is not None
-    torch.testing.assert_close(width.grad, draws.detach().sum(dim=0) / 2)
-
-
-def test_arcsine_refuses_values_outside_when_arguments_are_validated() -> None:
-    malus = Arcsine(torch.tensor([1.0]), validate_args=True)
-    with pytest.raises(ValueError, match="support"):
-        malus.log_prob(torch.tensor([1.5]))
-    with pytest.raises(ValueError, match="width"):
-        Arcsine(torch.tensor([0.0]), validate_args=True)
-
-
-def test_expanding_an_arcsine_repeats_the_width(malus: Arcsine) -> None:
-    expanded = malus.expand((3,))
-    assert expanded.batch_shape == (3,)
-    assert expanded.sample((2,)).shape == (2, 3)
-
-
 # Boxes -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("closed", [False, True])
-def test_box_is_uniform_and_float32_whatever_the_default_dtype(closed: bool) -> None:
-    default = torch.get_default_dtype()
+def test_a_box_is_uniform_and_float32_whatever_the_default_dtype() -> None:
     torch.set_default_dtype(torch.float64)
     try:
-        law = box((0.0, -1.0), (2.0, 3.0), closed=closed)
+        laws = [box((0.0, -1.0), (2.0, 3.0), closed=closed) for closed in (False, True)]
     finally:
-        torch.set_default_dtype(default)
-    draws = law.sample(torch.Size((4000,)))
-    assert draws.dtype == torch.float32
-    assert law.log_prob(draws).exp().tolist() == pytest.approx([1 / 8] * 4000)
+        torch.set_default_dtype(torch.float32)
+    for law in laws:
+        draws = law.sample(torch.Size((4000,)))
+        assert draws.dtype == torch.float32
+        assert law.log_prob(draws).exp().tolist() == pytest.approx([1 / 8] * 4000)
 
 
 def test_closed_box_has_a_density_at_its_upper_end_and_not_beyond() -> None:

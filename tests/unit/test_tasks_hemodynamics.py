@@ -2,7 +2,7 @@
 
 import json
 import math
-import pickle
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import torch
 from sbi_rope.errors import DataNotFoundError, InvalidInputError
 from sbi_rope.tasks.hemodynamics.records import NUM_STEPS, Recorder, play
 from sbi_rope.tasks.hemodynamics.task import Hemodynamics
+from tests.tasks import accepted
 
 
 def sine(num_phases: int = 256) -> torch.Tensor:
@@ -23,17 +24,18 @@ def sine(num_phases: int = 256) -> torch.Tensor:
 # Recordings --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("period", [0.4, 0.8123, 1.5])
-@pytest.mark.parametrize("start", [0.0, 0.3, 0.999])
-def test_a_beat_is_repeated_at_125_hz(period: float, start: float) -> None:
-    played = play(sine(), torch.tensor([period]), start=torch.tensor([start]))
+def test_a_beat_is_repeated_at_125_hz() -> None:
     time = torch.arange(NUM_STEPS, dtype=torch.float64) / 125
-    expected = (2 * math.pi * (start + time / period)).sin()
-    # Linear interpolation of a sine between 256 points is off by at most (pi/256)^2/2.
-    torch.testing.assert_close(played[0], expected, atol=1e-4, rtol=0.0)
+    for period in (0.4, 0.8123, 1.5):
+        for start in (0.0, 0.3, 0.999):
+            played = play(sine(), torch.tensor([period]), start=torch.tensor([start]))
+            expected = (2 * math.pi * (start + time / period)).sin()
+            # Linear interpolation of a sine between 256 points is off by at most
+            # (pi / 256)^2 / 2.
+            torch.testing.assert_close(played[0], expected, atol=1e-4, rtol=0.0)
 
 
-def test_records_have_mean_0_and_deviation_1_before_the_noise() -> None:
+def test_recordings_have_mean_0_and_standard_deviation_1_before_the_noise() -> None:
     beat = 90 + 20 * sine().expand(5, -1)
     x = Recorder(noise_std=0.0)(beat, torch.linspace(0.5, 1.2, 5))
     torch.testing.assert_close(
@@ -63,7 +65,7 @@ def test_noise_is_added_after_the_normalisation() -> None:
     assert (noisy - clean).std() == pytest.approx(0.1, rel=0.01)
 
 
-def test_starts_are_uniform_over_the_beat() -> None:
+def test_recordings_start_uniformly_within_the_beat() -> None:
     # The first sample of a straight ramp tells where it began.
     ramp = torch.arange(256, dtype=torch.float64).expand(4000, -1)
     recorder = Recorder(noise_std=0.0, normalisation="global")
@@ -75,7 +77,7 @@ def test_starts_are_uniform_over_the_beat() -> None:
 # The task ----------------------------------------------------------------------------
 
 
-def test_simulations_at_stored_parameters_are_of_that_person() -> None:
+def test_simulations_at_stored_parameters_are_of_the_person_stored() -> None:
     simulator = Hemodynamics(noise_std=1e-6).get_simulator()
     rows = torch.randint(len(simulator.theta), (50,))
     x = simulator(simulator.theta[rows])
@@ -86,7 +88,7 @@ def test_simulations_at_stored_parameters_are_of_that_person() -> None:
     assert torch.equal(x, expected)
 
 
-def test_simulations_in_between_are_of_the_nearest_person() -> None:
+def test_simulations_between_stored_parameters_are_of_the_nearest_person() -> None:
     simulator = Hemodynamics().get_simulator()
     theta = Hemodynamics().get_prior().sample(torch.Size((100,)))
     scaled = (theta.unsqueeze(1) - simulator.theta) / simulator.theta_std
@@ -108,7 +110,7 @@ def test_every_stored_person_is_simulated_before_one_comes_again() -> None:
     assert torch.equal(more[: len(stored)], theta)
 
 
-def test_a_real_person_has_one_recording() -> None:
+def test_each_real_person_is_recorded_once() -> None:
     task = Hemodynamics()
     first, second = (task.get_calibration_set(40, seed=seed) for seed in (0, 1))
     same = (first[0].unsqueeze(1) == second[0]).all(dim=2).nonzero()
@@ -117,7 +119,7 @@ def test_a_real_person_has_one_recording() -> None:
         assert torch.equal(first[1][i], second[1][j])
 
 
-def test_well_specified_people_are_not_those_to_train_on() -> None:
+def test_well_specified_observations_are_of_people_who_are_not_trained_on() -> None:
     task = Hemodynamics(variant="well_specified")
     trained = {tuple(row) for row in task.get_simulator().theta.tolist()}
     people = [task.get_calibration_set(50)[0], task.get_test_set(100)[0]]
@@ -126,7 +128,7 @@ def test_well_specified_people_are_not_those_to_train_on() -> None:
     assert len(trained) == pytest.approx(half, abs=1)
 
 
-def test_parameters_lie_in_the_prior_and_follow_it() -> None:
+def test_the_parameters_of_the_people_of_the_package_follow_the_prior() -> None:
     task = Hemodynamics()
     theta = task.get_simulator().theta
     assert torch.isfinite(task.get_prior().log_prob(theta)).all()
@@ -135,7 +137,7 @@ def test_parameters_lie_in_the_prior_and_follow_it() -> None:
     assert (levels - steps).abs().max() < 2 / len(theta) ** 0.5
 
 
-def test_shipped_sets_are_small_and_of_known_seeds() -> None:
+def test_the_people_of_the_package_are_few_and_of_a_known_seed() -> None:
     task = Hemodynamics()
     for process in ("simulator", "real"):
         people = task._load(None, process)
@@ -146,16 +148,16 @@ def test_shipped_sets_are_small_and_of_known_seeds() -> None:
     assert sum(path.stat().st_size for path in folder.glob("*.npz")) < 3_000_000
 
 
-@pytest.mark.parametrize("process", ["simulator", "real"])
-def test_shipped_people_have_pressures_of_people(process: str) -> None:
-    beat = Hemodynamics()._load(None, process).beat  # type: ignore[arg-type]
-    systolic, diastolic = beat.amax(dim=1), beat.amin(dim=1)
-    # Means over the population as in the study that the design follows.
-    assert systolic.mean() == pytest.approx(124, abs=4)
-    assert diastolic.mean() == pytest.approx(74, abs=3)
-    assert (systolic - diastolic).mean() == pytest.approx(50, abs=5)
-    assert beat.mean() == pytest.approx(95, abs=3)
-    assert 30 < beat.min() < beat.max() < 220
+def test_the_people_of_the_package_have_the_pressures_of_the_literature() -> None:
+    for process in ("simulator", "real"):
+        beat = Hemodynamics()._load(None, process).beat
+        systolic, diastolic = beat.amax(dim=1), beat.amin(dim=1)
+        # Means over the population as in the study that the design follows.
+        assert systolic.mean() == pytest.approx(124, abs=4)
+        assert diastolic.mean() == pytest.approx(74, abs=3)
+        assert (systolic - diastolic).mean() == pytest.approx(50, abs=5)
+        assert beat.mean() == pytest.approx(95, abs=3)
+        assert 30 < beat.min() < beat.max() < 220
 
 
 def test_people_of_another_prior_or_physics_are_refused(tmp_path: Path) -> None:
@@ -187,30 +189,17 @@ def test_people_of_another_prior_or_physics_are_refused(tmp_path: Path) -> None:
         Hemodynamics(observations=elastic).get_test_set(1)
 
 
-def test_the_simulator_does_not_depend_on_the_default_device() -> None:
-    expected = Hemodynamics().get_simulator()
+def test_simulations_keep_the_dtype_whatever_the_default_device() -> None:
+    simulator = Hemodynamics().get_simulator()
+    for dtype in (torch.float64, torch.float16):
+        x = simulator(simulator.theta[:3].to(dtype))
+        assert x.dtype == dtype
+        assert torch.isfinite(x).all()
     with torch.device("meta"):
-        assert torch.equal(Hemodynamics().get_simulator().theta, expected.theta)
+        assert torch.equal(Hemodynamics().get_simulator().theta, simulator.theta)
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float16])
-def test_simulations_keep_the_dtype(dtype: torch.dtype) -> None:
-    simulator = Hemodynamics().get_simulator()
-    x = simulator(simulator.theta[:3].to(dtype))
-    assert x.dtype == dtype
-    assert torch.isfinite(x).all()
-
-
-def test_the_simulator_can_be_pickled() -> None:
-    simulator = Hemodynamics().get_simulator()
-    theta = simulator.theta[:3]
-    torch.manual_seed(0)
-    expected = simulator(theta)
-    torch.manual_seed(0)
-    assert torch.equal(pickle.loads(pickle.dumps(simulator))(theta), expected)
-
-
-def test_networks_are_the_papers_and_a_light_one() -> None:
+def test_the_networks_return_five_statistics_of_a_recording() -> None:
     task = Hemodynamics()
     net = task.get_embedding_net()
     assert net.num_features == 1024
@@ -232,32 +221,28 @@ def test_paper_settings_are_those_of_the_appendix() -> None:
     assert (settings.joint_epochs, settings.joint_epoch_size) == (50, 6000)
 
 
-def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
+def test_missing_files_and_files_of_the_other_process_are_refused(
+    tmp_path: Path,
+) -> None:
     missing = tmp_path / "people.npz"
     with pytest.raises(DataNotFoundError, match="generate"):
         Hemodynamics(simulations=missing).get_simulator()
     with pytest.raises(DataNotFoundError, match="generate"):
         Hemodynamics(observations=missing).get_test_set(1)
-
-
-def test_files_of_the_other_process_are_refused() -> None:
     folder = Path(__file__).parents[2] / "sbi_rope/tasks/hemodynamics/data"
     with pytest.raises(InvalidInputError, match="process"):
         Hemodynamics(simulations=folder / "real.npz").get_simulator()
 
 
-@pytest.mark.parametrize(
-    ("options", "match"),
-    [
-        pytest.param({"noise_std": 0.0}, "noise_std", id="noise"),
-        pytest.param({"normalisation": "none"}, "normalisation", id="normalisation"),
-        pytest.param(
-            {"variant": "well_specified", "observations": "x.npz"},
-            "no effect",
-            id="observations",
-        ),
-    ],
-)
-def test_options_out_of_range_are_refused(options: dict, match: str) -> None:
-    with pytest.raises(InvalidInputError, match=match):
-        Hemodynamics(**options)
+def test_options_out_of_range_or_without_effect_are_refused() -> None:
+    exact = partial(Hemodynamics, variant="well_specified")
+    assert not accepted(
+        {
+            "noise": (partial(Hemodynamics, noise_std=0.0), "noise_std"),
+            "normalisation": (
+                partial(Hemodynamics, normalisation="none"),  # type: ignore[arg-type]
+                "normalisation",
+            ),
+            "observations": (partial(exact, observations="x.npz"), "no effect"),
+        }
+    )

@@ -8,16 +8,13 @@ from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.networks import SeriesEmbedding, fully_connected
 
 
-@pytest.mark.parametrize(
-    ("num_steps", "padding", "num_features"),
-    [(200, 1, 2048), (193, 1, 2048), (201, 1, 2176), (100, 1, 512), (1000, 1, 14848)],
-)
-def test_flatten_size_follows_the_length(
-    num_steps: int, padding: int, num_features: int
-) -> None:
-    net = SeriesEmbedding(num_steps=num_steps, padding=padding)
-    assert net.num_features == num_features
-    assert net(torch.randn(2, num_steps)).shape == (2, 10)
+def test_the_number_of_features_follows_the_length_of_the_series() -> None:
+    for num_steps, num_features in (
+        *((200, 2048), (193, 2048), (201, 2176), (100, 512), (1000, 14_848)),
+    ):
+        net = SeriesEmbedding(num_steps=num_steps, padding=1)
+        assert net.num_features == num_features
+        assert net(torch.randn(2, num_steps)).shape == (2, 10)
 
 
 def test_layers_are_those_of_the_paper() -> None:
@@ -48,28 +45,25 @@ def test_layers_are_those_of_the_paper() -> None:
     assert [type(layer) for layer in net.features] == expected
 
 
-def test_short_series_need_more_padding() -> None:
+def test_series_of_less_than_73_steps_need_more_padding_than_the_paper_has() -> None:
     with pytest.raises(InvalidInputError, match=r"`num_steps`.*got 50.*`padding`"):
         SeriesEmbedding(num_steps=50)
     assert SeriesEmbedding(num_steps=50, padding=2)(torch.randn(2, 50)).shape == (2, 10)
-
-
-def test_the_shortest_series_with_the_padding_of_the_paper_has_73_steps() -> None:
     SeriesEmbedding(num_steps=73)
     with pytest.raises(InvalidInputError, match="got 72"):
         SeriesEmbedding(num_steps=72)
 
 
-@pytest.mark.parametrize("shape", [(3, 100), (200,), (3, 1, 200)])
-def test_series_of_another_shape_are_refused(shape: tuple[int, ...]) -> None:
-    with pytest.raises(InvalidInputError, match=r"`x` of shape \(n, 200\)"):
-        SeriesEmbedding()(torch.zeros(shape))
+def test_series_of_another_shape_are_refused() -> None:
+    for shape in ((3, 100), (200,), (3, 1, 200)):
+        with pytest.raises(InvalidInputError, match=r"`x` of shape \(n, 200\)"):
+            SeriesEmbedding()(torch.zeros(shape))
 
 
-@pytest.mark.parametrize("option", ["num_steps", "output_dim", "padding"])
-def test_sizes_are_positive(option: str) -> None:
-    with pytest.raises(InvalidInputError, match=option):
-        SeriesEmbedding(**{option: 0})
+def test_sizes_of_a_network_must_be_positive() -> None:
+    for option in ("num_steps", "output_dim", "padding"):
+        with pytest.raises(InvalidInputError, match=option):
+            SeriesEmbedding(**{option: 0})
 
 
 def test_fully_connected_has_relu_between_layers_only() -> None:

@@ -55,14 +55,11 @@ def test_sets_of_all_seeds_and_parts_differ() -> None:
     assert len(set(first)) == 3 * len(SEEDS)
 
 
-@pytest.mark.parametrize("n", [1, BLOCK_SIZE, BLOCK_SIZE + 1])
-def test_drawn_pairs_are_as_many_as_asked(n: int) -> None:
-    theta, x = drawn().take(n, seed=0, part="test")
-    assert theta.shape == (n, 2)
-    assert x.shape == (n, 3)
-
-
-def test_blocks_differ() -> None:
+def test_drawn_pairs_are_as_many_as_asked_for() -> None:
+    for n in (1, BLOCK_SIZE, BLOCK_SIZE + 1):
+        theta, x = drawn().take(n, seed=0, part="test")
+        assert theta.shape == (n, 2)
+        assert x.shape == (n, 3)
     theta, _ = drawn().take(2 * BLOCK_SIZE, seed=0, part="test")
     assert not torch.equal(theta[:BLOCK_SIZE], theta[BLOCK_SIZE:])
 
@@ -85,21 +82,18 @@ def test_the_random_state_survives_an_error() -> None:
     assert torch.equal(before, torch.get_rng_state())
 
 
-@pytest.mark.parametrize("n", [10, 250])
-def test_kept_pairs_follow_the_chances_and_stay_together(n: int) -> None:
-    theta, x = drawn().take(n, seed=0, part="test", keep=first_half)
-    assert len(theta) == n
-    assert (theta[:, 0] < 0.5).all()
-    assert torch.equal(theta[:, 0], x[:, 0])
+def test_kept_pairs_follow_the_chances_and_begin_a_larger_set() -> None:
+    sets = []
+    for n in (10, 250):
+        theta, x = drawn().take(n, seed=0, part="test", keep=first_half)
+        assert len(theta) == n
+        assert (theta[:, 0] < 0.5).all()
+        assert torch.equal(theta[:, 0], x[:, 0])
+        sets.append(theta)
+    assert torch.equal(sets[0], sets[1][:10])
 
 
-def test_a_small_kept_set_begins_a_larger_one() -> None:
-    few, _ = drawn().take(10, seed=0, part="test", keep=first_half)
-    many, _ = drawn().take(250, seed=0, part="test", keep=first_half)
-    assert torch.equal(few, many[:10])
-
-
-def test_a_chance_between_0_and_1_thins_out() -> None:
+def test_a_chance_between_0_and_1_thins_out_drawn_pairs() -> None:
     theta, _ = drawn().take(
         2000, seed=0, part="test", keep=lambda theta: theta[:, 0].double()
     )
@@ -119,7 +113,7 @@ def test_pairs_with_nan_are_replaced_jointly_and_counted() -> None:
     assert (theta[:, 0] >= 0.1).all()
 
 
-def test_a_process_without_valid_pairs_does_not_run_for_ever() -> None:
+def test_a_process_without_valid_pairs_is_stopped_with_an_error() -> None:
     pairs = DrawnPairs(
         draw_theta=lambda n: torch.rand(n, 2),
         observe=lambda theta: theta * torch.nan,
@@ -128,7 +122,7 @@ def test_a_process_without_valid_pairs_does_not_run_for_ever() -> None:
         pairs.take(3, seed=0, part="test")
 
 
-def test_threads_get_the_set_of_one_thread() -> None:
+def test_sets_drawn_in_several_threads_are_those_of_one_thread() -> None:
     expected, _ = drawn().take(2000, seed=0, part="test")
     with ThreadPoolExecutor(4) as threads:
         sets = threads.map(
@@ -156,14 +150,14 @@ def test_parts_are_a_partition_that_does_not_depend_on_the_seed() -> None:
     assert calibration == rows(6, 2, "calibration")
 
 
-def test_the_seed_picks_rows_within_a_part() -> None:
+def test_the_seed_decides_which_rows_of_a_part_are_taken() -> None:
     first, second = (
         recorded(300).take(10, seed=seed, part="calibration")[0] for seed in (0, 1)
     )
     assert set(first.flatten().tolist()) != set(second.flatten().tolist())
 
 
-def test_the_split_is_not_that_of_the_file_order() -> None:
+def test_the_split_does_not_follow_the_order_of_the_file() -> None:
     rows = torch.tensor(recorded(3000).rows_of("calibration"))
     assert rows.double().mean() == pytest.approx(1500, abs=100)
     assert rows.double().std() == pytest.approx(3000 / 12**0.5, rel=0.05)
@@ -181,7 +175,7 @@ def test_only_the_chosen_rows_are_read() -> None:
     assert len(read) == 5
 
 
-def test_recorded_rows_are_kept_by_their_chances() -> None:
+def test_recorded_rows_without_a_chance_are_left_out() -> None:
     pairs = recorded(3000)
     theta, _ = pairs.take(
         300, seed=0, part="calibration", keep=lambda t: (t[:, 0] < 1500).double()
@@ -193,7 +187,7 @@ def test_recorded_rows_are_kept_by_their_chances() -> None:
     assert torch.equal(few, theta[:7])
 
 
-def test_chances_of_recorded_rows_thin_them_out() -> None:
+def test_a_chance_between_0_and_1_thins_out_recorded_rows() -> None:
     with pytest.raises(InvalidInputError) as raised:
         recorded(3000).take(
             1000, seed=0, part="calibration", keep=lambda t: 0.3 * torch.ones(len(t))
@@ -202,9 +196,9 @@ def test_chances_of_recorded_rows_thin_them_out() -> None:
     assert available == pytest.approx(300, abs=5 * (1000 * 0.3 * 0.7) ** 0.5)
 
 
-@pytest.mark.parametrize(("part", "size"), [("calibration", 3), ("test", 7)])
-def test_asking_for_more_rows_than_there_are_names_their_number(
-    part: Part, size: int
-) -> None:
-    with pytest.raises(InvalidInputError, match=f"at most {size}, .*got {size + 1}"):
-        recorded(10).take(size + 1, seed=0, part=part)
+def test_asking_for_more_rows_than_there_are_names_their_number() -> None:
+    parts: tuple[tuple[Part, int], ...] = (("calibration", 3), ("test", 7))
+    for part, size in parts:
+        match = f"at most {size}, .*got {size + 1}"
+        with pytest.raises(InvalidInputError, match=match):
+            recorded(10).take(size + 1, seed=0, part=part)

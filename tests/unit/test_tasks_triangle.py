@@ -5,7 +5,6 @@ import pickle
 import pytest
 import torch
 from sbi.utils import mcmc_transform, within_support
-from sbi.utils.user_input_checks import process_prior
 from scipy.stats import ks_2samp, kstest
 from torch.autograd.functional import jacobian
 from torch.distributions import biject_to
@@ -46,7 +45,7 @@ def test_triangle_is_filled_uniformly(triangle: UniformTriangle) -> None:
     assert torch.corrcoef(torch.stack([ratio, draws[:, 0]]))[0, 1].abs() < 0.02
 
 
-def test_triangle_moments_are_those_of_draws(triangle: UniformTriangle) -> None:
+def test_moments_of_the_triangle_are_those_of_draws(triangle: UniformTriangle) -> None:
     draws = triangle.sample((50_000,))
     torch.testing.assert_close(draws.mean(dim=0), triangle.mean, rtol=0.02, atol=0.0)
     torch.testing.assert_close(draws.std(dim=0), triangle.stddev, rtol=0.02, atol=0.0)
@@ -83,15 +82,6 @@ def test_sbi_keeps_one_log_determinant_a_row_of_the_triangle(
     z = to_unconstrained(theta)
     assert to_unconstrained.log_abs_det_jacobian(theta, z).shape == (7,)
     torch.testing.assert_close(to_unconstrained.inv(z), theta)
-
-
-def test_triangle_passes_the_checks_of_sbi_unchanged() -> None:
-    triangle = UniformTriangle(torch.tensor(0.5))
-    processed, theta_dim, _ = process_prior(triangle)
-    assert processed is triangle
-    assert theta_dim == 2
-    outside = torch.tensor([[0.1, 0.2]])
-    assert processed.log_prob(outside).tolist() == [-torch.inf]
 
 
 def test_triangle_can_be_copied_expanded_and_moved(triangle: UniformTriangle) -> None:

@@ -25,8 +25,7 @@ from sbi_rope._validation import (
     check_not_negative,
     check_tensor,
 )
-from sbi_rope.baselines.base import BuildsOnNPE, UsesCalibration, UsesObservations
-from sbi_rope.baselines.hvae.contexts import LatentContexts
+from sbi_rope.baselines.hvae.embeddings import LatentEmbeddings
 from sbi_rope.baselines.hvae.model import FrozenNPE, HybridVAE
 from sbi_rope.baselines.hvae.networks import (
     ConditionalUNet,
@@ -36,9 +35,11 @@ from sbi_rope.baselines.hvae.networks import (
 from sbi_rope.baselines.hvae.prior import ContinuedPrior
 from sbi_rope.baselines.hvae.reparametrisation import check_differentiable
 from sbi_rope.baselines.hvae.training import train_hybrid
-from sbi_rope.baselines.training import EstimatorBuilder, Training
 from sbi_rope.errors import InvalidInputError, InvalidTypeError
 from sbi_rope.mixture import MixtureEstimator, Part
+from sbi_rope.trainers.base import Method
+from sbi_rope.trainers.starting_npe import StartingNPE
+from sbi_rope.trainers.training import EstimatorBuilder, Training
 
 __all__ = ["HVAE"]
 
@@ -57,7 +58,7 @@ NUM_LATENTS_HELD_OUT = 8
 NUM_DRAWS_CHECKED = 3
 
 
-class HVAE(BuildsOnNPE, UsesCalibration, UsesObservations):
+class HVAE(Method):
     r"""An auto-encoder of real data with the simulator in its middle and NPE before it.
 
     .. math::
@@ -113,12 +114,12 @@ class HVAE(BuildsOnNPE, UsesCalibration, UsesObservations):
         | https://arxiv.org/abs/2405.08719
 
     Args:
-        prior: A torch distribution over parameters of shape ``(k,)``, its support a
+        prior: A torch distribution over parameters of shape ``(d,)``, its support a
             box, whose sides may be infinite.
         density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns; a
             normalizing flow. An embedding net inside it is copied, never trained in
             place.
-        physics: f, from theta ``(n, k)`` to ``(n, *event)``: the simulator without
+        physics: f, from theta ``(n, d)`` to ``(n, *event)``: the simulator without
             noise and nuisances, differentiable by torch.
         npe_training: How NPE is trained; ``Training()`` if None.
         training: How the networks are trained; at most 100 passes over the observations
@@ -143,6 +144,9 @@ class HVAE(BuildsOnNPE, UsesCalibration, UsesObservations):
         UnsupportedPosteriorError: In ``train``, if the estimator is not a flow.
     """
 
+    sees = frozenset({"simulations", "calibration", "observations"})
+    starts_from_npe = True
+
     def __init__(
         self,
         prior: Any,
@@ -163,16 +167,15 @@ class HVAE(BuildsOnNPE, UsesCalibration, UsesObservations):
         if not callable(physics):
             raise InvalidTypeError(
                 "Expected `physics` to be callable, a differentiable function from "
-                f"theta (n, k) to (n, *event); got {type(physics).__name__}."
+                f"theta (n, d) to (n, *event); got {type(physics).__name__}."
             )
         check_integer("width", width)
         check_integer("latent_dim", latent_dim)
         check_integer("num_latents", num_latents)
         if calibration_weight is not None:
             check_not_negative("calibration_weight", calibration_weight)
-        super().__init__(
-            prior, density_estimator, npe_training=npe_training, device=device
-        )
+        npe = StartingNPE(density_estimator, npe_training)
+        super().__init__(prior, npe=npe, device=device)
         ContinuedPrior(self._prior)  # early, for its error
         self.training = DEFAULT_TRAINING if training is None else training
         self.physics = physics
@@ -186,13 +189,13 @@ class HVAE(BuildsOnNPE, UsesCalibration, UsesObservations):
     def _check_data(self) -> None:
         # Before NPE is trained, which takes a while.
         super()._check_data()
-        assert self._event_shape is not None
-        check_event_shape(tuple(self._event_shape))
+        assert self._data.event_shape is not None
+        check_event_shape(tuple(self._data.event_shape))
         with seeded(0):
             theta = self._prior.sample(torch.Size((NUM_DRAWS_CHECKED,)))
         theta = theta.to(self._device, torch.float32).requires_grad_()
         x = check_tensor("physics(theta)", self.physics(theta))
-        check_batch("physics(theta)", x, self._event_shape)
+        check_batch("physics(theta)", x, self._data.event_shape)
         if len(x) != len(theta) or not x.requires_grad:
             raise InvalidInputError(
                 "Expected `physics` to be differentiable, with one result for each "
@@ -207,7 +210,7 @@ class HVAE(BuildsOnNPE, UsesCalibration, UsesObservations):
             copy.deepcopy(estimator_of(npe)).eval().requires_grad_(requires_grad=False)
         )
         model = self._model(estimator)
-        event_shape = self._observations.shape[1:]
+        event_shape = self._data.observations.shape[1:]
         # On the CPU, so that a seed means the same on every device.
         noise = torch.randn(self.num_latents, self.latent_dim, device="cpu")
         x_noise = (
@@ -223,8 +226,8 @@ class HVAE(BuildsOnNPE, UsesCalibration, UsesObservations):
         history = train_hybrid(
             model,
             held_out,
-            self._observations,
-            *self._calibration,
+            self._data.observations,
+            *self._data.calibration,
             weight=event_shape.numel() if weight is None else weight,
             training=self.training,
             show_progress_bars=show_progress_bars,
@@ -237,12 +240,14 @@ class HVAE(BuildsOnNPE, UsesCalibration, UsesObservations):
         """Return NPE mixed over draws of z, with the networks of the model."""
         if x_noise is not None:
             x_noise = x_noise[: len(z_noise)]
-        contexts = LatentContexts(model, z_noise, x_noise, self._observations.shape[1:])
-        part = Part(model.npe.flow, contexts)
+        embeddings = LatentEmbeddings(
+            model, z_noise, x_noise, self._data.observations.shape[1:]
+        )
+        part = Part(model.npe.flow, embeddings)
         return MixtureEstimator([part], [1.0], tail_mass=0.0).to(self._device)
 
     def _model(self, estimator: Any) -> HybridVAE:
-        x = torch.cat([self._observations, self._calibration[1]])
+        x = torch.cat([self._data.observations, self._data.calibration[1]])
         npe = FrozenNPE(embedding_of(estimator), headless(estimator))
         check_differentiable(npe.flow, embed(npe.embedding, x[:2]))
         # One number a channel: pixels that never change have no standard deviation. Nor

@@ -46,7 +46,7 @@ class HybridVAE(nn.Module):
         reality_to_physics: R2P, from (x_o, z) to mean and log-variance.
         physics_to_reality: P2R, likewise.
         npe: The frozen NPE.
-        physics: f, from theta ``(n, k)`` to ``(n, *event)``, differentiable.
+        physics: f, from theta ``(n, d)`` to ``(n, *event)``, differentiable.
         prior: p(theta).
         noisy: Whether R2P is drawn from; otherwise its mean is taken.
     """

@@ -41,7 +41,7 @@ class ContinuedPrior:
     infinity and without a gradient; this one is finite and leads back inside.
 
     Args:
-        prior: A torch distribution over parameters of shape ``(k,)``, its support a
+        prior: A torch distribution over parameters of shape ``(d,)``, its support a
             box, whose sides may be infinite.
         device: Where the parameters will be.
 
@@ -68,18 +68,18 @@ class ContinuedPrior:
         self.high = high.to(device) - MARGIN * self.std
 
     def nearest(self, theta: Tensor) -> Tensor:
-        """Return the nearest points in the box, ``(n, k)``."""
+        """Return the nearest points in the box, ``(n, d)``."""
         return theta.clamp(self.low, self.high)
 
     def log_prob(self, theta: Tensor) -> Tensor:
-        """Return the continued log density, ``(n, k)`` to ``(n,)``."""
+        """Return the continued log density, ``(n, d)`` to ``(n,)``."""
         inside = self.nearest(theta)
         distance = ((theta - inside).abs() / (FLANK * self.std)).sum(dim=1)
         return self._prior.log_prob(inside) - distance
 
 
 def _ends(support: Any, num_parameters: int) -> tuple[Tensor, Tensor]:
-    """Return the lower and upper ends of a box, each ``(k,)``."""
+    """Return the lower and upper ends of a box, each ``(d,)``."""
     while isinstance(support, constraints.independent):
         support = support.base_constraint
     if isinstance(support, constraints.cat):

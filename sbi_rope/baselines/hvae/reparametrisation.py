@@ -29,7 +29,7 @@ def reparametrised_sample(flow: Any, condition: Tensor) -> Tensor:
         condition: Its conditions s, shape ``(n, l)``.
 
     Returns:
-        Parameters, shape ``(n, k)``.
+        Parameters, shape ``(n, d)``.
     """
     with torch.no_grad():
         theta = flow.sample(torch.Size((1,)), condition)[0]

@@ -9,9 +9,9 @@ from torch import Tensor
 from sbi_rope._random import seeded
 from sbi_rope._training import History, fit, split_pairs, too_few_pairs
 from sbi_rope.baselines.hvae.model import HybridVAE
-from sbi_rope.baselines.training import Training
 from sbi_rope.errors import warn_user
 from sbi_rope.mixture import MixtureEstimator
+from sbi_rope.trainers.training import Training
 
 __all__ = ["train_hybrid"]
 
@@ -72,8 +72,8 @@ def train_hybrid(
         objective,
         validation_loss=validation_loss,
         learning_rate=training.learning_rate,
-        max_num_steps=training.max_num_epochs,
-        patience=training.stop_after_epochs,
+        max_num_epochs=training.max_num_epochs,
+        stop_after_epochs=training.stop_after_epochs,
         clip_max_norm=training.clip_max_norm,
         label="HVAE",
         show_progress_bars=show_progress_bars,

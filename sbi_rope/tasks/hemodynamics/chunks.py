@@ -1,4 +1,4 @@
-"""A few people at a time: simulated, written to a file, and read from it."""
+"""Files of a few people each, in which a data set is made."""
 
 import json
 import re
@@ -23,13 +23,13 @@ Simulate = Callable[[Subject, Physics], Beat]
 
 @dataclass(frozen=True, kw_only=True)
 class Work:
-    """What to simulate, how, and where to keep it until it is complete.
+    """The people to simulate, how, and the folder for unfinished work.
 
     Attributes:
         process: ``"simulator"`` or ``"real"``.
         seed: Number of the cohort.
-        population: Who is drawn.
-        physics: How the equations are discretised.
+        population: The law that people are drawn from.
+        physics: The settings to solve the equations with.
         simulate: Returns the beat of a subject.
         folder: Folder for parts of the work.
     """

@@ -42,7 +42,7 @@ COLUMNS = {
 
 @dataclass(frozen=True, kw_only=True)
 class BeatSet:
-    """Beats of ``n`` people, with what made them. All on the CPU.
+    """Beats of ``n`` people and the settings they were made with, on the CPU.
 
     Attributes:
         beat: Pressure at the left wrist over one beat, in mmHg, at 256 equally spaced
@@ -92,7 +92,7 @@ def load(
     population: Population | None = None,
     physics: Physics | None = None,
 ) -> BeatSet:
-    """Read a data set and check that it is whole, and the one that was asked for.
+    """Read a data set, and check that it is whole and the one that was asked for.
 
     Args:
         path: A file that ``python -m sbi_rope.tasks.hemodynamics generate`` made.
@@ -139,13 +139,13 @@ def load(
 
 
 def describe_population(population: Population, process: Process) -> dict[str, Any]:
-    """Return the settings that matter for a process: lengths do for the real one."""
+    """Return the settings that matter for a process, lengths for the real one only."""
     settings = population.as_dict()
     return settings if process == "real" else {"prior": settings["prior"]}
 
 
 def differences(found: dict[str, Any], asked: dict[str, Any]) -> str:
-    """Return in words which settings are not those asked for; empty if all are."""
+    """Return in words which settings are not those asked for, if there are any."""
     words = []
     for name, value in asked.items():
         other = found.get(name)

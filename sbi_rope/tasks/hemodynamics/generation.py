@@ -1,4 +1,4 @@
-"""Making data sets: many people, in parallel, with nothing lost at an interrupt."""
+"""Makes data sets of many people in parallel, and goes on after an interrupt."""
 
 import json
 import os
@@ -69,8 +69,8 @@ def generate(
         n: Number of people.
         process: ``"simulator"`` or ``"real"``.
         seed: Number of the cohort; people of different cohorts are independent.
-        population: Who is drawn.
-        physics: How the equations are discretised.
+        population: The law that people are drawn from.
+        physics: The settings to solve the equations with.
         jobs: Number of jobs of joblib, -1 for as many as there are cores; unless
             given, that of the surrounding ``joblib.parallel_config``, the backend of
             which is used in any case.

@@ -1,4 +1,4 @@
-r"""A network of arteries cut into cells, as flat arrays.
+r"""Flat arrays of a network of arteries that is cut into cells.
 
 Each segment has points at the borders of its cells, numbered from ``first`` on, and
 faces between them: face ``i`` lies between the points ``i`` and ``i + 1``. Points carry
@@ -19,7 +19,7 @@ ELASTIC = 1e30  # inverse viscosity of an elastic wall: no viscous pressure resu
 
 
 class Grid(NamedTuple):
-    r"""What the kernels know of a network.
+    r"""The arrays of a network that the kernels read.
 
     The tube law at a point is :math:`p = s (\sqrt A - e)`. Shapes: ``m`` segments,
     ``P`` points, ``N`` nodes, ``E = 2 m`` ends of segments, sorted by node, ``k``
@@ -27,11 +27,11 @@ class Grid(NamedTuple):
 
     Attributes:
         first: First point of a segment, ``(m,)``.
-        num_cells: ``(m,)``.
-        cell_length: In m, ``(m,)``.
+        num_cells: Number of cells of a segment, ``(m,)``.
+        cell_length: Length of the cells of a segment, in m, ``(m,)``.
         face_density: Inverse cell length, 0 between segments, in m^-1, ``(P,)``.
         point_density: The same around points, 0 at ends of segments, ``(P,)``.
-        nodes: At the inlet and outlet, ``(m, 2)``.
+        nodes: Nodes at the inlet and outlet of a segment, ``(m, 2)``.
         friction: Wall friction per flow, in m^2 s^-1, ``(P,)``.
         partner: Face that the momentum flux into a segment comes from, at its inlet
             and outlet, or ``NO_PARTNER`` or ``SOURCE``, ``(m, 2)``.
@@ -40,8 +40,8 @@ class Grid(NamedTuple):
         inverse_viscosity: :math:`A_d \Delta x / \Gamma`, with the length of the cell
             around the point, ``(P,)``.
         end_start: Where the ends at a node begin, ``(N + 1,)``.
-        end_point: ``(E,)``.
-        end_face: ``(E,)``.
+        end_point: Point at an end of a segment, ``(E,)``.
+        end_face: Face next to an end of a segment, ``(E,)``.
         end_sign: 1 where a positive flow goes into the node, -1 otherwise, ``(E,)``.
         end_half: Half the length of the cell, in m, ``(E,)``.
         end_compliance: Compliance of the half cell per root of its area, in m^2 Pa^-1,
@@ -53,12 +53,12 @@ class Grid(NamedTuple):
         pivots: Order in which nodes are eliminated, ``(N,)``.
         coupled_start: Where the nodes that a pivot is coupled with begin, ``(N + 1,)``.
         coupled: Nodes that are coupled with a pivot when it is eliminated.
-        has_outlet: ``(N,)``.
-        outlet_node: ``(k,)``.
+        has_outlet: Whether a node is an outlet, ``(N,)``.
+        outlet_node: Node of an outlet, ``(k,)``.
         outlet_law: :math:`R_1, R_2, C`, ``(3, k)``.
-        outlet_pressure: In Pa.
+        outlet_pressure: Pressure behind the outlets, in Pa.
         source_node: The node that blood enters at.
-        density: Of blood, in kg m^-3.
+        density: Density of blood, in kg m^-3.
     """
 
     first: np.ndarray
@@ -92,25 +92,25 @@ class Grid(NamedTuple):
 
 
 class State(NamedTuple):
-    """Everything that changes, shape ``(P,)`` over points unless stated.
+    """The arrays that change, of shape ``(P,)`` over points unless stated.
 
     Attributes:
         area: Cross-section, in m^2.
         root: Its square root.
         pressure: Elastic part of the pressure, in Pa.
         viscous: Viscous part of the pressure, in Pa.
-        flow: At faces, in m^3 s^-1.
+        flow: Flow through faces, in m^3 s^-1.
         free_flow: Flow that results without viscous pressure.
-        velocity: At faces, in m/s.
+        velocity: Velocity at faces, in m/s.
         flux: Momentum flux over density.
         mobility: Flow that a viscous pressure difference makes at a face.
         inflow: Net flow into the cell around a point.
         share: Viscous pressure of a point per that of the next one.
         coupling: The same per that at the inlet of its segment.
-        volume: Of the cells around nodes, in m^3, ``(N,)``.
-        node_inflow: ``(N,)``.
-        node_viscous: ``(N,)``.
-        matrix: Of the viscous pressures at nodes, ``(N, N)``.
+        volume: Volume of the cells around nodes, in m^3, ``(N,)``.
+        node_inflow: Net flow into the cells around nodes, ``(N,)``.
+        node_viscous: Viscous part of the pressure at nodes, ``(N,)``.
+        matrix: Matrix of the equations for ``node_viscous``, ``(N, N)``.
         leaving: Flow through outlets, ``(k,)``.
         stored: Pressure in the compliance of outlets, in Pa, ``(k,)``.
     """

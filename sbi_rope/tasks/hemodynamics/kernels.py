@@ -1,4 +1,4 @@
-r"""The loops of the solver, compiled.
+r"""The compiled loops of the solver.
 
 A step takes flows from :math:`t - \Delta t / 2` to :math:`t + \Delta t / 2`, then areas
 and pressures from :math:`t` to :math:`t + \Delta t`.

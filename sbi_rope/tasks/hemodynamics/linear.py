@@ -1,4 +1,4 @@
-r"""Small waves in a network, exactly: harmonic by harmonic, without a grid in time.
+r"""Exact small waves in a network, by harmonics and without a grid in time.
 
 An independent solution that the solver is compared with.
 """

@@ -23,7 +23,7 @@ MAX_PROXIMAL = 0.9  # part of an outlet's resistance
 
 @dataclass(frozen=True, kw_only=True)
 class Outlets:
-    r"""Where segments end in the microvasculature: three-element Windkessels.
+    r"""Three-element Windkessels in which segments end, for the microvasculature.
 
     .. math:: Q = (p - p_c) / R_1, \qquad
         C \dot p_c = Q - (p_c - p_{out}) / R_2

@@ -1,4 +1,4 @@
-"""Who is drawn: hearts and arteries of healthy men of 25 to 75 years."""
+"""The law of the hearts and arteries of healthy men of 25 to 75 years."""
 
 from dataclasses import asdict, dataclass
 from functools import lru_cache

@@ -1,4 +1,4 @@
-r"""Recordings of a stored beat: a random start, eight seconds, a scale, and noise."""
+r"""Recordings of stored beats: eight seconds from a random start, with noise."""
 
 from dataclasses import dataclass
 from typing import Literal

@@ -1,4 +1,4 @@
-"""Arrays in files that are whole or not there, with the same bytes every time."""
+"""Writes arrays and settings to files, whole or not at all, always the same bytes."""
 
 import json
 import zipfile

@@ -1,4 +1,4 @@
-"""One person, as far as the circulation model knows, and how finely it is solved."""
+"""A person in the model of the circulation, and settings to solve it with."""
 
 from dataclasses import dataclass, fields
 from typing import Any
@@ -107,7 +107,7 @@ class Subject:
 
 @dataclass(frozen=True, kw_only=True)
 class Physics:
-    """How the equations of blood flow are discretised and solved.
+    """Settings with which the equations of blood flow are solved.
 
     Attributes:
         cell_length: Length of a cell, in m: segments are cut into the number of cells
@@ -165,7 +165,7 @@ def _check_factors(factors: Any) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Beat:
-    """One converged beat of a subject, or why there is none.
+    """One converged beat of a subject.
 
     Attributes:
         period: Length of the beat, in s.

@@ -1,4 +1,4 @@
-r"""Task D: stroke volume and ejection time from the pulse at the wrist."""
+r"""Task D: stroke volume and ejection time, from the pulse at the wrist."""
 
 from dataclasses import dataclass
 from functools import partial

@@ -1,4 +1,4 @@
-r"""How right the simulated waves are: against openBF, exact solutions, themselves."""
+r"""Compares simulated waves with openBF, exact solutions and finer simulations."""
 
 import math
 from collections.abc import Iterator

@@ -57,6 +57,7 @@ NOT_CALLED = {
             "LearningCurve",
             "ParameterDistribution",
             "StackingReport",
+            "StackingReport.of",
             "StackingWeights",
             "SummaryDiscrepancy",
         ),
@@ -64,11 +65,11 @@ NOT_CALLED = {
     ),
     **dict.fromkeys(
         (
-            "CoupledContexts",
+            "CoupledEmbeddings",
             "CoupledNet",
             "MixtureEstimator",
             "MixturePosterior",
-            "OwnContexts",
+            "OwnEmbeddings",
             "Part",
             "Rows",
             "StackedPosterior",

@@ -24,11 +24,7 @@ from tests.faults.problem import (
 
 def appended(method: Any, what: str, *data: Tensor) -> Any:
     getattr(method, f"append_{what}")(*data)
-    return {
-        "calibration": lambda: method._calibration,
-        "simulations": lambda: method._simulations,
-        "observations": lambda: method._observations,
-    }[what]()
+    return getattr(method._data, what)
 
 
 # No draw and no density is NaN for these.
@@ -84,7 +80,7 @@ CALLS = [
     )
     for name, make in METHODS.items()
     for what, tensors in DATA.items()
-    if hasattr(make if isinstance(make, type) else make.func, f"append_{what}")
+    if what in (make if isinstance(make, type) else make.func).sees
 ]
 CALLS += [
     Call(

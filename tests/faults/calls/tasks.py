@@ -1,15 +1,18 @@
-"""Tasks whose data are drawn."""
+"""Tasks: how they are asked for, their sets, simulators and quantiles."""
 
 import functools
 
 from torch import Tensor
 
-from sbi_rope.tasks import Task, get_task
+from sbi_rope.tasks import TASKS, Task, get_task
 from tests.faults.outcomes import Call
 
 # The result has the dtype of the argument.
 OTHER_DTYPES = tuple(f"theta: {dtype}" for dtype in ("float64", "half", "bfloat16"))
-NAMES = ("cs", "linear_gaussian", "pendulum", "sir")
+NAMES = tuple(TASKS)
+# All sets are made by the same code, see `tests/contract/test_task_sets.py`: one task
+# that is drawn, and one that is recorded, stand for the others.
+WITH_SETS = ("pendulum", "hemodynamics")
 
 
 @functools.cache
@@ -35,7 +38,7 @@ CALLS = [
             )(n, seed=seed),
             options={"n": "count", "seed": "seed"},
         )
-        for name in (*NAMES, "hemodynamics")
+        for name in WITH_SETS
         for method in ("get_calibration_set", "get_test_set", "get_simulations")
     ),
     *(
@@ -46,7 +49,7 @@ CALLS = [
             ),
             options={"part": "choice", "seed": "seed"},
         )
-        for name in NAMES
+        for name in WITH_SETS
     ),
     *(
         Call(

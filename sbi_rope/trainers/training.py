@@ -1,25 +1,20 @@
-"""How the baselines are trained: on simulations by sbi, on pairs by our loop."""
+"""How networks are trained: on simulations by sbi, on calibration pairs by our loop."""
 
-import contextlib
 import copy
-import io
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
-from sbi.inference import NPE
 from sbi.neural_nets import posterior_nn
 from torch import Tensor
-from torch.utils.data import DataLoader, SubsetRandomSampler
 
 from sbi_rope._random import seeded
-from sbi_rope._sbi import ConditionalDensityEstimator
+from sbi_rope._sbi import ConditionalDensityEstimator, train_npe
 from sbi_rope._training import (
-    STEPS_WITHOUT_HOLDOUT,
+    EPOCHS_WITHOUT_HOLDOUT,
     History,
     fit,
-    groups_to_hold_out,
     warn_without_holdout,
 )
 from sbi_rope._validation import LARGEST_SETTING, check_integer, check_positive
@@ -27,11 +22,10 @@ from sbi_rope.errors import InvalidInputError, InvalidTypeError
 
 __all__ = [
     "EstimatorBuilder",
-    "SimulationTrainer",
     "Training",
     "estimator_builder",
     "train_on_pairs",
-    "train_with_sbi",
+    "train_on_simulations",
 ]
 
 # Returns an untrained estimator for pairs (theta, x) like those it is shown.
@@ -78,27 +72,6 @@ class Training:
         check_integer("max_num_epochs", self.max_num_epochs)
         if self.clip_max_norm is not None:
             check_positive("clip_max_norm", self.clip_max_norm)
-
-
-class _NoTracker:
-    """Keeps sbi from writing a folder of logs next to the user's work."""
-
-    log_dir = None
-
-    def log_metric(self, name: str, value: float, step: int | None = None) -> None:
-        """Ignore a number."""
-
-    def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:
-        """Ignore numbers."""
-
-    def log_params(self, params: dict[str, Any]) -> None:
-        """Ignore parameters."""
-
-    def add_figure(self, name: str, figure: Any, step: int | None = None) -> None:
-        """Ignore a figure."""
-
-    def flush(self) -> None:
-        """Do nothing."""
 
 
 def estimator_builder(density_estimator: Any) -> EstimatorBuilder:
@@ -150,70 +123,7 @@ def estimator_builder(density_estimator: Any) -> EstimatorBuilder:
     return build
 
 
-class SimulationTrainer(NPE):
-    """sbi's NPE, which holds simulations of the same parameters out together.
-
-    Where a few stored people are recorded many times, a network can learn them by
-    heart; only people it has not met say when to stop. Recordings of a single person
-    are split one by one.
-    """
-
-    def get_dataloaders(  # noqa: D102
-        self,
-        starting_round: int = 0,
-        training_batch_size: int = 200,
-        validation_fraction: float = 0.1,
-        resume_training: bool = False,  # noqa: FBT001, FBT002
-        dataloader_kwargs: dict[str, Any] | None = None,
-    ) -> tuple[Any, Any]:
-        theta = self.get_simulations(starting_round)[0]
-        split = None if resume_training else _split_by(theta, validation_fraction)
-        if split is not None:
-            # sbi takes the rows of a training it resumes as they are.
-            self.train_indices, self.val_indices = split
-            resume_training = True
-            # sbi makes no smaller batch of what is left over.
-            training_batch_size = min(training_batch_size, len(split[0]))
-        train, held_out = super().get_dataloaders(
-            starting_round,
-            training_batch_size,
-            validation_fraction,
-            resume_training,
-            dataloader_kwargs,
-        )
-        if split is not None and not len(held_out):
-            rows = self.val_indices
-            held_out = DataLoader(
-                held_out.dataset,
-                batch_size=len(rows),
-                sampler=SubsetRandomSampler(rows.tolist()),
-            )
-        return train, held_out
-
-
-def _split_by(
-    theta: Tensor, validation_fraction: float
-) -> tuple[Tensor, Tensor] | None:
-    """Split rows by their parameters; None if no two rows share theirs, or all do."""
-    groups, of_row = theta.unique(dim=0, return_inverse=True)
-    if len(groups) in (1, len(theta)):
-        return None
-    num_held_out = len(theta) - int((1 - validation_fraction) * len(theta))
-    order = torch.randperm(len(groups), device=theta.device)
-    sizes = torch.bincount(of_row)[order]
-    rows = sizes.cumsum(0)
-    # As many groups as it takes to fill what sbi makes room for.
-    num_groups = int((rows < num_held_out).sum()) + 1
-    held_out_groups = order[:num_groups]
-    if rows[num_groups - 1] > len(theta) / 2:  # the last of them is a large one
-        chosen = groups_to_hold_out(num_held_out, sizes.tolist())
-        held_out_groups = order[chosen]
-    held_out = torch.isin(of_row, held_out_groups)
-    return (~held_out).nonzero()[:, 0], held_out.nonzero()[:, 0]
-
-
-def train_with_sbi(
-    make_trainer: Callable[..., SimulationTrainer],
+def train_on_simulations(
     prior: Any,
     build: EstimatorBuilder,
     theta: Tensor,
@@ -221,18 +131,21 @@ def train_with_sbi(
     *,
     training: Training,
     show_progress_bars: bool,
+    change_x: Callable[[Tensor], Tensor] | None = None,
+    penalty: Callable[[Any], Tensor | None] | None = None,
 ) -> tuple[ConditionalDensityEstimator, History]:
-    """Train an estimator on simulations with one of sbi's trainers.
+    """Train an estimator on simulations with sbi's trainer of NPE.
 
     Args:
-        make_trainer: ``SimulationTrainer`` or a subclass of it, called with the words
-            of its constructor.
         prior: The prior.
         build: Returns the untrained estimator.
-        theta: Parameters, shape ``(n, k)``.
+        theta: Parameters, shape ``(n, d)``.
         x: Simulations, shape ``(n, *event)``, on the device to train on.
         training: Batch size, learning rate and so on.
         show_progress_bars: Whether sbi shows the number of epochs.
+        change_x: Applied to the x of every batch before its loss is taken.
+        penalty: Of the estimator, a term that is added to the loss of every training
+            batch; None adds nothing.
 
     Returns:
         The trained estimator, in evaluation mode, and its losses epoch by epoch.
@@ -245,31 +158,16 @@ def train_with_sbi(
             f"Expected at least {MIN_SIMULATIONS} simulations to train on; got "
             f"{len(x)}."
         )
-    trainer = make_trainer(
-        prior=prior,
-        density_estimator=build,
-        device=str(x.device),
-        tracker=_NoTracker(),
+    return train_npe(
+        prior,
+        build,
+        theta,
+        x,
+        change_x=change_x,
+        penalty=penalty,
         show_progress_bars=show_progress_bars,
+        **asdict(training),
     )
-    # sbi prints that it has converged whether or not it was asked to be quiet.
-    quiet = (
-        contextlib.nullcontext()
-        if show_progress_bars
-        else contextlib.redirect_stdout(io.StringIO())
-    )
-    with quiet:
-        trainer.append_simulations(theta, x)
-        # sbi trains one epoch more than it is told, and at least two.
-        options: dict[str, Any] = asdict(training)
-        options["max_num_epochs"] = max(1, training.max_num_epochs - 1)
-        estimator = trainer.train(**options)
-    losses = trainer.summary["validation_loss"]
-    best = min(range(len(losses)), key=losses.__getitem__)
-    history = History(
-        trainer.summary["training_loss"], losses, best, training.learning_rate
-    )
-    return estimator.eval(), history
 
 
 def train_on_pairs(
@@ -287,7 +185,7 @@ def train_on_pairs(
 
     Args:
         estimator: A density estimator of sbi.
-        theta: Parameters, shape ``(n, k)``.
+        theta: Parameters, shape ``(n, d)``.
         x: Real observations, shape ``(n, *event)``.
         split: The rows to train on and those held out; without the latter, training
             stops early.
@@ -303,7 +201,7 @@ def train_on_pairs(
     max_num_epochs = training.max_num_epochs
     if not len(held_out):
         warn_without_holdout(theta)
-        max_num_epochs = min(max_num_epochs, STEPS_WITHOUT_HOLDOUT)
+        max_num_epochs = min(max_num_epochs, EPOCHS_WITHOUT_HOLDOUT)
 
     def batches(step: int) -> Iterator[tuple[Tensor, Tensor]]:
         order = train[torch.randperm(len(train))]
@@ -321,8 +219,8 @@ def train_on_pairs(
             (lambda: loss(theta[held_out], x[held_out])) if len(held_out) else None
         ),
         learning_rate=training.learning_rate,
-        max_num_steps=max_num_epochs,
-        patience=training.stop_after_epochs,
+        max_num_epochs=max_num_epochs,
+        stop_after_epochs=training.stop_after_epochs,
         clip_max_norm=training.clip_max_norm,
         in_training_mode=in_training_mode,
         label=label,

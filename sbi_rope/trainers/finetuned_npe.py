@@ -28,15 +28,16 @@ from sbi_rope._validation import (
     check_integer,
     check_positive,
 )
-from sbi_rope.baselines.base import BuildsOnNPE, UsesCalibration
-from sbi_rope.baselines.training import EstimatorBuilder, Training, train_on_pairs
 from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError
 from sbi_rope.mixture import (
     MixtureEstimator,
     MixturePosterior,
-    OwnContexts,
+    OwnEmbeddings,
     part_of,
 )
+from sbi_rope.trainers.base import Method
+from sbi_rope.trainers.starting_npe import StartingNPE
+from sbi_rope.trainers.training import EstimatorBuilder, Training, train_on_pairs
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -51,7 +52,7 @@ DEFAULT_TRAINING = Training(
 )
 
 
-class FinetunedNPE(BuildsOnNPE, UsesCalibration):
+class FinetunedNPE(Method):
     r"""NPE trained on simulations, then as a whole on the calibration pairs.
 
     .. math::
@@ -85,7 +86,7 @@ class FinetunedNPE(BuildsOnNPE, UsesCalibration):
         | https://arxiv.org/abs/2502.08416
 
     Args:
-        prior: A torch distribution over parameters of shape ``(k,)``.
+        prior: A torch distribution over parameters of shape ``(d,)``.
         density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns. An
             embedding net inside it is copied, never trained in place.
         num_holdouts: How often it is tuned. With one, ``validation_fraction`` of the
@@ -107,6 +108,9 @@ class FinetunedNPE(BuildsOnNPE, UsesCalibration):
         UnsupportedPosteriorError: In ``train``, if the estimator has no density.
     """
 
+    sees = frozenset({"simulations", "calibration"})
+    starts_from_npe = True
+
     def __init__(
         self,
         prior: Any,
@@ -127,9 +131,8 @@ class FinetunedNPE(BuildsOnNPE, UsesCalibration):
             )
         for rate in learning_rates:
             check_positive("learning_rates", rate, maximum=LARGEST_SETTING)
-        super().__init__(
-            prior, density_estimator, npe_training=npe_training, device=device
-        )
+        npe = StartingNPE(density_estimator, npe_training)
+        super().__init__(prior, npe=npe, device=device)
         self.num_holdouts = num_holdouts
         self.training = DEFAULT_TRAINING if training is None else training
         self.learning_rates = learning_rates
@@ -181,7 +184,7 @@ class FinetunedNPE(BuildsOnNPE, UsesCalibration):
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
         starts = self._starts or [estimator_of(npe)]
-        warn_of_far_entries("x", self._calibration[1], embedding_of(starts[0]))
+        warn_of_far_entries("x", self._data.calibration[1], embedding_of(starts[0]))
         splits = self._splits()
         # There is one start for all splits, or as many as splits. Where pairs are too
         # few for that, splits are used again.
@@ -205,7 +208,7 @@ class FinetunedNPE(BuildsOnNPE, UsesCalibration):
 
     def _splits(self) -> list[tuple[Tensor, Tensor]]:
         """Return the rows to train on and those held out, for each network."""
-        theta, _ = self._calibration
+        theta, _ = self._data.calibration
         groups = groups_of(theta)
         if self.num_holdouts == 1 or int(groups.max()) + 1 < MIN_PAIRS_FOR_HOLDOUT:
             return [split_pairs(theta, self.training.validation_fraction)]
@@ -226,7 +229,7 @@ class FinetunedNPE(BuildsOnNPE, UsesCalibration):
                 "Expected an estimator with a density to tune by; got "
                 f"{type(start).__name__}. Use NPE instead of FMPE or NPSE."
             )
-        theta, x = self._calibration
+        theta, x = self._data.calibration
         has_holdout = len(split[1]) > 0
         rates = self.learning_rates if has_holdout else (min(self.learning_rates),)
         results = []
@@ -254,7 +257,7 @@ def _averaged(posterior: Any) -> list[ConditionalDensityEstimator]:
     if not isinstance(posterior, MixturePosterior):
         return []
     part, *others = posterior.posterior_estimator.parts
-    if others or not isinstance(part.mixing, OwnContexts):
+    if others or not isinstance(part.mixing, OwnEmbeddings):
         return []
     shape = part.mixing.event_shape
     return [

@@ -1,0 +1,163 @@
+"""What is inside the posteriors of sbi, and posteriors made around an estimator."""
+
+import copy
+from typing import Any
+
+from sbi.inference.posteriors.base_posterior import NeuralPosterior
+from sbi.inference.posteriors.direct_posterior import DirectPosterior
+from sbi.inference.posteriors.filtered_direct_posterior import FilteredDirectPosterior
+from sbi.inference.posteriors.npe_a_posterior import NPE_A_Posterior
+from sbi.inference.posteriors.vector_field_posterior import VectorFieldPosterior
+from sbi.neural_nets.estimators.base import (
+    ConditionalDensityEstimator,
+    ConditionalEstimator,
+    ConditionalVectorFieldEstimator,
+)
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_rope._random import seeded
+from sbi_rope._sbi.densities import MixtureDensity
+from sbi_rope._sbi.embedding import device_of
+from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError
+
+__all__ = [
+    "BaseDirectPosterior",
+    "copy_of_prior",
+    "describe",
+    "direct_posterior",
+    "estimator_of",
+    "is_bounded",
+    "posterior_from",
+]
+
+
+def estimator_of(posterior: Any) -> ConditionalEstimator:
+    """Return the trained estimator inside an sbi posterior.
+
+    Raises:
+        UnsupportedPosteriorError: If the posterior is not a plain amortised posterior
+            of NPE, FMPE or NPSE.
+    """
+    if isinstance(posterior, VectorFieldPosterior):
+        return posterior.vector_field_estimator
+    plain = isinstance(posterior, DirectPosterior) and not isinstance(
+        posterior, FilteredDirectPosterior | NPE_A_Posterior
+    )
+    if plain and isinstance(posterior.posterior_estimator, MixtureDensity):
+        raise UnsupportedPosteriorError(
+            "Expected `posterior` to be what `NPE(...).build_posterior()` returns; got "
+            f"{type(posterior).__name__} around a mixture of such posteriors, which "
+            "has no single embedding of x. What RoPE, a stack or a baseline has "
+            "repaired cannot be repaired again: pass the posterior it was built from."
+        )
+    if not plain and hasattr(posterior, "build_posterior"):
+        raise UnsupportedPosteriorError(
+            "Expected `posterior` to be what `NPE(...).build_posterior()` returns; got "
+            f"{type(posterior).__name__}, which has still to build it."
+        )
+    if not plain:
+        raise UnsupportedPosteriorError(
+            "Expected `posterior` to be what `NPE(...).build_posterior()` returns "
+            "with sample_with='direct' (a DirectPosterior), or the posterior of FMPE "
+            f"or NPSE; got {type(posterior).__name__}. RoPE needs an amortised "
+            "posterior whose estimator has an embedding of x."
+        )
+    return posterior.posterior_estimator
+
+
+def is_bounded(posterior: DirectPosterior) -> bool:
+    """Tell whether a posterior normalises by other means than sbi's own rejection.
+
+    That goes on until enough draws are inside the prior, which may be for ever.
+    """
+    # NPE_A_Posterior of sbi has a method of its own, but of the same kind.
+    return type(posterior).leakage_correction.__module__.split(".")[0] != "sbi"
+
+
+def posterior_from(
+    posterior: Any, estimator: ConditionalEstimator
+) -> DirectPosterior | VectorFieldPosterior:
+    """Return an sbi posterior of the same kind as ``posterior`` around an estimator."""
+    if not isinstance(estimator, ConditionalVectorFieldEstimator):
+        assert isinstance(estimator, ConditionalDensityEstimator)
+        return direct_posterior(
+            estimator, posterior.prior, enable_transform=posterior.enable_transform
+        )
+    with seeded(0):  # sbi draws from the prior to look at it
+        return VectorFieldPosterior(
+            estimator,
+            copy_of_prior(posterior.prior),
+            device=device_of(estimator),
+            enable_transform=posterior.enable_transform,
+            sample_with=posterior.sample_with,
+        )
+
+
+def copy_of_prior(prior: Any) -> Any:
+    """Copy a prior, which sbi moves to devices in place.
+
+    Raises:
+        InvalidInputError: If it cannot be copied.
+    """
+    try:
+        return copy.deepcopy(prior)
+    except Exception as error:  # of whatever it holds
+        raise InvalidInputError(
+            f"Expected a prior that can be copied; `copy.deepcopy` of this "
+            f"{type(prior).__name__} raised {type(error).__name__}: {error}. Detach "
+            "its tensors from their graph, and leave out what cannot be copied."
+        ) from error
+
+
+def direct_posterior(
+    estimator: ConditionalDensityEstimator,
+    prior: Distribution,
+    *,
+    enable_transform: bool = True,
+) -> DirectPosterior:
+    """Return an sbi posterior around an estimator and a copy of the prior."""
+    with seeded(0):  # sbi draws from the prior to look at it
+        return DirectPosterior(
+            estimator,
+            copy_of_prior(prior),
+            device=device_of(estimator),
+            enable_transform=enable_transform,
+        )
+
+
+def describe(posterior: NeuralPosterior, purpose: str) -> None:
+    """Set the sentence that ``str(posterior)`` ends with."""
+    posterior._purpose = purpose
+
+
+class BaseDirectPosterior(DirectPosterior):
+    """sbi's DirectPosterior, for our own posteriors to derive from.
+
+    ``map()`` shows the progress of its draws only if it was asked to, and shallow
+    copies share no state.
+    """
+
+    def __getstate__(self) -> dict[str, Any]:
+        # sbi hands out its own __dict__, which a shallow copy would then share.
+        return dict(self.__dict__)
+
+    def _calculate_map(  # type: ignore[override]
+        self,
+        *,
+        init_method: str | Tensor = "posterior",
+        num_init_samples: int,
+        show_progress_bars: bool,
+        **options: Any,
+    ) -> Tensor:
+        # sbi shows the progress of these draws whatever it was told.
+        if isinstance(init_method, str) and init_method == "posterior":
+            init_method = self.sample(
+                (num_init_samples,), show_progress_bars=show_progress_bars
+            )
+        return super()._calculate_map(
+            init_method=init_method,
+            num_init_samples=num_init_samples,
+            show_progress_bars=show_progress_bars,
+            **options,
+        )

@@ -1,0 +1,183 @@
+r"""The prior as a posterior: what is known before any observation."""
+
+from typing import Any
+
+import torch
+from sbi.utils import mcmc_transform
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_rope._random import seeded
+from sbi_rope._sbi import BasePotential, NeuralPosterior, describe
+from sbi_rope._validation import (
+    as_shape,
+    check_batch,
+    check_prior,
+    check_tensor,
+    check_theta,
+    usable_device,
+)
+from sbi_rope.errors import InvalidInputError
+from sbi_rope.mixture.prior import prior_log_prob
+
+__all__ = ["PriorPosterior"]
+
+
+class PriorPosterior(NeuralPosterior):
+    r"""The prior :math:`p(\theta)`, in the form of an sbi posterior that ignores x.
+
+    It is calibrated whenever the prior is right, and its log posterior probability is
+    the bar that an estimate must clear to have learnt anything from x.
+
+    ``sample`` and ``log_prob`` need no observation; the batched methods take one sample
+    set or density for each row of ``x``, whose values are never read. ``potential``
+    follows sbi and asks for an ``x`` or a default. ``map`` is the mode of the prior
+    found by sbi's gradient ascent; of a uniform prior, any point. It needs a prior that
+    sbi can transform to an unbounded space; everything else does without.
+
+    References:
+        | Addressing Misspecification in Simulation-based Inference through Data-driven
+        | Calibration (Wehenkel et al., 2025), section 4, Baselines
+        | https://arxiv.org/abs/2405.08719
+
+    Args:
+        prior: A torch distribution over parameters of shape ``(d,)``.
+
+    Raises:
+        InvalidTypeError: If the prior is not a torch distribution.
+
+    Example:
+        >>> from sbi.utils import BoxUniform
+        >>> posterior = PriorPosterior(BoxUniform(torch.zeros(2), torch.ones(2)))
+        >>> posterior.sample_batched((5,), x=torch.zeros(3, 7)).shape
+        torch.Size([5, 3, 2])
+    """
+
+    def __init__(self, prior: Any) -> None:
+        check_prior(prior)
+        transform, self._reason_without_map = None, ""
+        with seeded(0):  # both draw from the prior to look at it
+            device = prior.sample(torch.Size((1,))).device
+            try:
+                transform = mcmc_transform(prior, device=str(device))
+            except Exception as error:  # sbi raises all kinds; only map() needs it
+                self._reason_without_map = f"{type(error).__name__}: {error}"
+        super().__init__(
+            potential_fn=_PriorPotential(prior, device=device),
+            theta_transform=transform,
+        )
+        self.prior = prior
+        describe(self, "It is the prior and ignores x.")
+
+    def sample(
+        self,
+        sample_shape: Any = (),
+        x: Tensor | None = None,
+        show_progress_bars: bool = True,  # noqa: FBT001, FBT002
+        **kwargs: Any,
+    ) -> Tensor:
+        """Draw from the prior, shape ``(*sample_shape, d)``; the rest is ignored."""
+        return self._draw(as_shape("sample_shape", sample_shape))
+
+    def sample_batched(
+        self,
+        sample_shape: Any,
+        x: Tensor,
+        show_progress_bars: bool = True,  # noqa: FBT001, FBT002
+        **kwargs: Any,
+    ) -> Tensor:
+        """Draw from the prior for each row of ``x``, ``(*sample_shape, n, d)``.
+
+        Options of other posteriors' samplers are taken and ignored, as sbi's base class
+        asks.
+        """
+        shape = as_shape("sample_shape", sample_shape)
+        return self._draw(torch.Size((*shape, _number_of_rows(x))))
+
+    def _draw(self, shape: torch.Size) -> Tensor:
+        # sbi's MultipleIndependent knows sample shapes of one dimension only.
+        samples = self.prior.sample(torch.Size((shape.numel(),)))
+        return samples.reshape(*shape, *samples.shape[1:])
+
+    def log_prob(
+        self,
+        theta: Tensor,
+        x: Tensor | None = None,
+        track_gradients: bool = False,  # noqa: FBT001, FBT002
+    ) -> Tensor:
+        r"""Log density of the prior, :math:`-\infty` outside it, shape ``(n,)``."""
+        theta = check_theta(theta, self.prior.event_shape, batched=False)
+        return self.potential_fn(
+            torch.atleast_2d(theta), track_gradients=track_gradients
+        )
+
+    def log_prob_batched(
+        self,
+        theta: Tensor,
+        x: Tensor,
+        track_gradients: bool = False,  # noqa: FBT001, FBT002
+    ) -> Tensor:
+        """Log density of the prior for each row of ``x``, as sbi shapes it.
+
+        Args:
+            theta: Parameters, one for each row of ``x``, shape ``(n, d)``, or several,
+                ``(num_samples, n, d)``.
+            x: Observations, shape ``(n, *event_shape)``; only their number counts.
+            track_gradients: Whether gradients with respect to theta are needed.
+
+        Returns:
+            The log density, shape ``(1, n)`` or ``(num_samples, n)``.
+        """
+        theta = check_theta(theta, self.prior.event_shape, batched=True)
+        count = _number_of_rows(x)
+        if theta.shape[-2] not in (1, count):
+            raise InvalidInputError(
+                f"Expected as many rows of `theta` as observations, {count}; got "
+                f"{theta.shape[-2]}."
+            )
+        theta = theta if theta.ndim > 2 else theta.unsqueeze(0)
+        theta = theta.expand(-1, count, -1)
+        return self.potential_fn(theta, track_gradients=track_gradients)
+
+    def map(self, *args: Any, **kwargs: Any) -> Tensor:
+        """Return the mode of the prior, as in sbi.
+
+        Raises:
+            InvalidInputError: If sbi cannot transform the prior.
+        """
+        if self._reason_without_map:
+            raise InvalidInputError(
+                "Expected a prior that sbi can transform to an unbounded space, where "
+                f"`map()` searches; got {type(self.prior).__name__}, of which sbi's "
+                f"`mcmc_transform` says {self._reason_without_map}. Give the prior a "
+                "`support` that torch's `biject_to` knows, or a `mean` and a `stddev`; "
+                "or look for the mode among samples by their `log_prob`."
+            )
+        return super().map(*args, **kwargs)
+
+    def to(self, device: str | torch.device) -> None:
+        """Move the prior and the default x to a device."""
+        device = usable_device(device)
+        self.potential_fn.to(device)
+        default_x = self.default_x
+        self.__init__(self.potential_fn.prior)
+        if default_x is not None:
+            self.set_default_x(default_x)
+
+
+def _number_of_rows(x: Any) -> int:
+    x = check_tensor("x", x)
+    return len(check_batch("x", x, x.shape[1:], finite=False))
+
+
+class _PriorPotential(BasePotential):
+    """Log density of the prior, for any x."""
+
+    prior: Distribution
+
+    def __call__(self, theta: Tensor, track_gradients: bool = True) -> Tensor:  # noqa: FBT001, FBT002
+        shape = theta.shape[:-1]
+        with torch.set_grad_enabled(track_gradients):
+            # sbi's MultipleIndependent takes theta of two dimensions at most.
+            theta = theta.reshape(-1, theta.shape[-1])
+            return prior_log_prob(self.prior, theta).reshape(shape)

@@ -1,0 +1,286 @@
+r"""What all methods have in common: data goes in, a posterior of sbi comes out."""
+
+import copy
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_rope._random import seeded
+from sbi_rope._sbi import copy_of_prior, device_of, estimator_of
+from sbi_rope._training import History
+from sbi_rope._validation import (
+    check_default_dtype,
+    check_gradients,
+    check_prior,
+    usable_device,
+)
+from sbi_rope.errors import InvalidInputError, NotReadyError, warn_user
+from sbi_rope.trainers.data import Data, Kind
+from sbi_rope.trainers.starting_npe import StartingNPE
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+__all__ = ["Method"]
+
+# What data are called in messages, and the call that takes them.
+DATA: dict[Kind, tuple[str, str]] = {
+    "simulations": ("simulations", "append_simulations(theta, x)"),
+    "calibration": ("calibration pairs", "append_calibration(theta, x)"),
+    "observations": ("unlabelled observations", "append_observations(x_o)"),
+}
+
+
+class Method(ABC):
+    """A method of inference: construct, append data, ``train``, ``build_posterior``.
+
+    What is passed in is copied or only read. Appending data after a training asks for
+    another one, which starts anew. No method takes the parameters of the observations
+    to be inferred.
+
+    A subclass says which data it ``sees`` and returns a posterior from ``_fit``.
+
+    Attributes:
+        sees: The kinds of data that can be appended.
+        starts_from_npe: Whether it starts from NPE, so that :meth:`from_posterior` can
+            take a trained one.
+
+    Args:
+        prior: A torch distribution over parameters of shape ``(d,)``.
+        npe: The NPE to start from, of a method that does.
+        device: Where to train; data on other devices is moved there.
+
+    Raises:
+        InvalidTypeError: If the prior is not a torch distribution.
+    """
+
+    sees: ClassVar[frozenset[Kind]]
+    starts_from_npe: ClassVar[bool] = False
+
+    def __init__(
+        self,
+        prior: Any,
+        *,
+        npe: StartingNPE | None = None,
+        device: str | torch.device = "cpu",
+    ) -> None:
+        check_prior(prior)
+        check_default_dtype()
+        self._prior: Distribution = copy_of_prior(prior)
+        self._device = usable_device(device)
+        if hasattr(self._prior, "to"):
+            self._prior.to(self._device)  # type: ignore[attr-defined]
+        elif self._device.type != "cpu":
+            raise InvalidInputError(
+                f"Cannot move the prior to {device}: a {type(prior).__name__} has no "
+                "method `to`. Use a prior of sbi, such as BoxUniform."
+            )
+        self._data = Data(self._prior, self._device)
+        self._npe = npe
+        self._posterior: Any = None
+        self._history: History | None = None
+
+    @classmethod
+    def from_posterior(cls, posterior: Any, **options: Any) -> "Self":
+        """Start from a trained NPE instead of training one.
+
+        Args:
+            posterior: What ``NPE(...).build_posterior()`` of sbi returns. It is copied
+                and never changed.
+            **options: Keyword arguments of the constructor, except for ``device`` and
+                what concerns the training of NPE.
+
+        Returns:
+            The method. If its ``needs_simulations`` is False, simulations that are
+            appended have no effect, and earn a warning.
+
+        Raises:
+            UnsupportedPosteriorError: If it is not a plain amortised posterior.
+            InvalidInputError: If an option would have no effect, or the method does not
+                start from NPE.
+        """
+        if not cls.starts_from_npe:
+            raise InvalidInputError(
+                f"Expected a method that starts from NPE; {cls.__name__} makes no use "
+                f"of a trained posterior. Construct it with `{cls.__name__}(prior)`."
+            )
+        for name in ("density_estimator", "npe_training"):
+            if name in options:
+                raise InvalidInputError(
+                    f"Expected no `{name}` beside a trained posterior; it would have "
+                    "no effect."
+                )
+        estimator = estimator_of(posterior)
+        method = cls(posterior.prior, device=device_of(estimator), **options)
+        assert method._npe is not None
+        method._npe.replace_by(posterior)
+        method._data.event_shape = estimator.condition_shape
+        return method
+
+    def append_simulations(self, theta: Tensor, x: Tensor) -> "Self":
+        """Add simulations; may be called repeatedly.
+
+        Simulations with NaN or Inf are dropped with a warning.
+
+        Args:
+            theta: Parameters drawn from the prior, shape ``(n, d)``.
+            x: Their simulations, shape ``(n, *event)``.
+
+        Returns:
+            Itself, so that calls can be chained.
+
+        Raises:
+            InvalidTypeError: If one of them is not a tensor.
+            InvalidInputError: If the method does not see simulations, shapes or row
+                counts do not fit, or a theta is not in the support of the prior.
+                Nothing is added then.
+        """
+        self._check_seen("simulations")
+        if self._ignores_simulations:
+            warn_user(
+                f"{type(self).__name__} starts from a trained posterior and makes no "
+                "use of simulations."
+            )
+        self._data.append_simulations(theta, x)
+        return self._untrained()
+
+    def append_calibration(self, theta: Tensor, x: Tensor) -> "Self":
+        """Add real observations with known parameters; may be called repeatedly.
+
+        Args:
+            theta: Parameters, shape ``(n, d)``, inside the prior's support.
+            x: Real observations, shape ``(n, *event)``.
+
+        Returns:
+            Itself, so that calls can be chained.
+
+        Raises:
+            InvalidTypeError: If one of them is not a tensor.
+            InvalidInputError: If the method does not see calibration pairs, shapes or
+                row counts do not fit, a value is not finite, or a theta is outside the
+                prior's support. Nothing is added then.
+        """
+        self._check_seen("calibration")
+        self._data.append_calibration(theta, x)
+        return self._untrained()
+
+    def append_observations(self, x_o: Tensor) -> "Self":
+        """Add real observations without labels; may be called repeatedly.
+
+        Args:
+            x_o: Real observations, shape ``(n_o, *event)``.
+
+        Returns:
+            Itself, so that calls can be chained.
+
+        Raises:
+            InvalidTypeError: If it is not a tensor.
+            InvalidInputError: If the method does not see observations, the shape does
+                not fit, or a value is not finite.
+        """
+        self._check_seen("observations")
+        self._data.append_observations(x_o)
+        return self._untrained()
+
+    def train(
+        self, *, seed: int | None = None, show_progress_bars: bool = True
+    ) -> "Self":
+        """Train on all data appended so far, from the start.
+
+        Args:
+            seed: Seed of everything random, for torch, NumPy and Python; None uses
+                their states.
+            show_progress_bars: Whether to show the course of the training.
+
+        Returns:
+            Itself, so that calls can be chained.
+
+        Raises:
+            NotReadyError: If data that the method needs was not appended, or in
+                torch's inference mode.
+        """
+        check_gradients()
+        self._check_data()
+        # Whatever the caller's own setting of gradients.
+        with torch.enable_grad(), seeded(seed):
+            self._posterior, self._history = self._fit(
+                show_progress_bars=show_progress_bars
+            )
+        return self
+
+    def build_posterior(self) -> Any:
+        """Return a copy of the trained posterior, a posterior of sbi.
+
+        Raises:
+            NotReadyError: If ``train()`` was not called since data was appended.
+        """
+        if self._posterior is None:
+            raise NotReadyError(
+                f"{type(self).__name__} is not trained, or data was appended since. "
+                "Call `train()` first."
+            )
+        return copy.deepcopy(self._posterior)
+
+    @property
+    def history(self) -> History:
+        """The losses of the last training."""
+        if self._history is None:
+            raise NotReadyError(f"{type(self).__name__} has no losses to show.")
+        return self._history
+
+    @property
+    def needs_simulations(self) -> bool:
+        """Whether simulations must be appended before the training."""
+        return "simulations" in self.sees and not self._has_npe
+
+    @property
+    def _ignores_simulations(self) -> bool:
+        """Whether simulations that are appended have no effect."""
+        return not self.needs_simulations
+
+    @property
+    def _has_npe(self) -> bool:
+        """Whether it starts from an NPE that was trained beforehand."""
+        return self._npe is not None and self._npe.is_given
+
+    @abstractmethod
+    def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History | None]:
+        """Return the trained posterior and how it came about."""
+
+    def _trained_npe(self, *, show_progress_bars: bool) -> tuple[Any, History | None]:
+        """Return the posterior of the NPE to start from, and how that came about."""
+        assert self._npe is not None
+        return self._npe.posterior(
+            self._prior, self._data, show_progress_bars=show_progress_bars
+        )
+
+    def _check_data(self) -> None:
+        """Raise unless all data that is needed was appended."""
+        for kind in reversed(DATA):
+            if kind in self.sees and (kind != "simulations" or self.needs_simulations):
+                self._check_some(kind)
+
+    def _check_some(self, kind: Kind) -> None:
+        what, call = DATA[kind]
+        if not self._data.count(kind):
+            raise NotReadyError(
+                f"{type(self).__name__} needs {what}. Call `{call}` first."
+            )
+
+    def _check_seen(self, kind: Kind) -> None:
+        if kind in self.sees:
+            return
+        what, call = DATA[kind]
+        seen = [name for other, (name, _) in DATA.items() if other in self.sees]
+        sees = f"only {' and '.join(seen)}" if seen else "no data"
+        raise InvalidInputError(
+            f"Expected a method that sees {what}; {type(self).__name__} sees "
+            f"{sees}. Leave out `{call}`, or use another method."
+        )
+
+    def _untrained(self) -> "Self":
+        self._posterior = self._history = None
+        return self

@@ -1,0 +1,149 @@
+"""The data that a method was shown, checked and kept on one device."""
+
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_rope._validation import (
+    check_batch,
+    check_finite,
+    check_in_support,
+    check_same_length,
+    check_tensor,
+    check_values,
+)
+from sbi_rope.errors import InvalidInputError, warn_user
+
+__all__ = ["Data", "Kind", "Pairs"]
+
+Kind = Literal["simulations", "calibration", "observations"]
+
+
+class Pairs:
+    """Parameters, each with its x, which are appended bit by bit."""
+
+    def __init__(self) -> None:
+        self._theta: Tensor | None = None
+        self._x: Tensor | None = None
+
+    def append(self, theta: Tensor, x: Tensor) -> None:
+        """Add some, theta ``(n, d)`` and x ``(n, *event)``."""
+        self._theta = _joined(self._theta, theta)
+        self._x = _joined(self._x, x)
+
+    def __len__(self) -> int:
+        return 0 if self._theta is None else len(self._theta)
+
+    @property
+    def tensors(self) -> tuple[Tensor, Tensor]:
+        """All theta ``(n, d)`` and x ``(n, *event)``; some were appended."""
+        assert self._theta is not None
+        assert self._x is not None
+        return self._theta, self._x
+
+
+class Data:
+    """Simulations, calibration pairs and observations with x of the same shape.
+
+    All are copied, in float32. What does not fit is refused, and nothing of it is
+    added.
+
+    Args:
+        prior: Over parameters of shape ``(d,)``, on the device.
+        device: Where the data are kept.
+
+    Attributes:
+        event_shape: Shape of one x, that of the first which was appended; None before.
+    """
+
+    def __init__(self, prior: Distribution, device: torch.device) -> None:
+        self._prior = prior
+        self._device = device
+        self.event_shape: torch.Size | None = None
+        self._simulations, self._calibration = Pairs(), Pairs()
+        self._x_o: Tensor | None = None
+
+    @property
+    def simulations(self) -> tuple[Tensor, Tensor]:
+        """Theta ``(n, d)`` and simulated x ``(n, *event)``."""
+        return self._simulations.tensors
+
+    @property
+    def calibration(self) -> tuple[Tensor, Tensor]:
+        """Theta ``(n, d)`` and the real x ``(n, *event)`` recorded at them."""
+        return self._calibration.tensors
+
+    @property
+    def observations(self) -> Tensor:
+        """Real x without parameters, ``(n_o, *event)``."""
+        assert self._x_o is not None
+        return self._x_o
+
+    def count(self, kind: Kind) -> int:
+        """Return how many simulations, calibration pairs or observations there are."""
+        if kind == "observations":
+            return 0 if self._x_o is None else len(self._x_o)
+        return len(self._simulations if kind == "simulations" else self._calibration)
+
+    def append_simulations(self, theta: Any, x: Any) -> None:
+        """Add simulations; those with NaN or Inf are dropped with a warning."""
+        theta = self.checked_theta("theta", theta)
+        check_in_support("theta", theta, self._prior)
+        x = self._checked_x("x", x)
+        check_same_length("theta", theta, "x", x)
+        valid = torch.isfinite(x).flatten(1).all(dim=1)
+        if not valid.any():
+            raise InvalidInputError(
+                "Expected simulations `x` that are finite; all contain NaN or Inf."
+            )
+        if not valid.all():
+            warn_user(
+                f"Dropped {int((~valid).sum())} of {len(x)} simulations because they "
+                "contain NaN or Inf."
+            )
+        self._simulations.append(theta[valid], x[valid])
+        self.event_shape = x.shape[1:]
+
+    def append_calibration(self, theta: Any, x: Any) -> None:
+        """Add calibration pairs."""
+        theta = self.checked_theta("theta", theta)
+        check_in_support("theta", theta, self._prior)
+        x = self._checked_x("x", x)
+        check_finite("x", x)
+        check_same_length("theta", theta, "x", x)
+        self._calibration.append(theta, x)
+        self.event_shape = x.shape[1:]
+
+    def append_observations(self, x_o: Any) -> None:
+        """Add observations without parameters."""
+        x_o = self._checked_x("x_o", x_o)
+        check_finite("x_o", x_o)
+        self._x_o = _joined(self._x_o, x_o)
+        self.event_shape = x_o.shape[1:]
+
+    def checked_theta(self, name: str, theta: Any) -> Tensor:
+        """Return a copy of parameters ``(n, d)``, which have to be finite."""
+        theta = check_batch(name, theta, self._prior.event_shape)
+        theta = self._copied(theta)
+        check_finite(name, theta)  # float32 may hold less
+        return theta
+
+    def _checked_x(self, name: str, x: Any) -> Tensor:
+        x = check_tensor(name, x)
+        if self.event_shape is None and x.ndim < 2:
+            raise InvalidInputError(
+                f"Expected `{name}` of shape (n, *event); got {tuple(x.shape)}."
+            )
+        shape = x.shape[1:] if self.event_shape is None else self.event_shape
+        x = check_batch(name, x, shape, finite=False)
+        check_values(name, x)
+        return self._copied(x)
+
+    def _copied(self, tensor: Tensor) -> Tensor:
+        return tensor.detach().to(self._device, torch.float32, copy=True)
+
+
+def _joined(old: Tensor | None, new: Tensor) -> Tensor:
+    return new if old is None else torch.cat([old, new])
