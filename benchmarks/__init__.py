@@ -1,1 +1,17 @@
-"""Experiments behind the numbers in the documentation; not part of the wheel."""
+"""The benchmark: what is run, how it is scored, and how it is reported.
+
+In the order of the work:
+
+- `presets.py` and `suites/`: settings, and the lists of what is run.
+- `methods.py`: the methods, one entry each.
+- `cells.py`: a method on one set of data, and the suites of such cells.
+- `cases.py`: the data of a cell, and the NPE that methods share.
+- `scoring.py`: scores of cells, and what they cost.
+- `runner.py`: runs cells in parallel. `store.py` keeps what they gave.
+- `schema.py` and `table.py`: the table of a suite, and how it is checked.
+- `report.py`, `figures.py`, `stacks.py`: the page of a suite.
+- `published.py`, `statements.py`, `other_suites.py`, `summary.py`: the page of all.
+- `__main__.py`: the command.
+
+What is measured beside it is in `experiments/`, one module for each question.
+"""

@@ -4,16 +4,15 @@ Used by the example scripts; a study is (seeds) x (calibration sizes).
 """
 
 import argparse
-import csv
 import itertools
 import os
-import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import torch
 from sbi.inference import NPE
 from sbi.neural_nets import posterior_nn
@@ -27,6 +26,7 @@ from sbi_rope import (
     plots,
     stack,
 )
+from sbi_rope._files import write_atomically
 from sbi_rope.baselines import PriorPosterior
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.metrics import Evaluation, evaluate
@@ -268,14 +268,16 @@ class ResultsFile:
             path.rename(next(other for other in others if not other.exists()))
         self.path = path
         self.rows: list[dict[str, Any]] = []
-        with path.open("w", newline="") as file:
-            csv.DictWriter(file, COLUMNS).writeheader()
+        self._write()
 
     def append(self, **row: Any) -> None:
         """Add a row to the file."""
         self.rows.append(row)
-        with self.path.open("a", newline="") as file:
-            csv.DictWriter(file, COLUMNS).writerow(row)
+        self._write()
+
+    def _write(self) -> None:
+        with write_atomically(self.path) as path:
+            pd.DataFrame(self.rows, columns=[*COLUMNS]).to_csv(path, index=False)
 
 
 EXPLANATION = """
@@ -292,24 +294,24 @@ def print_table(rows: list[dict[str, Any]], *, explain: bool = True) -> None:
     """Print the mean over seeds of each method and calibration size."""
     if explain:
         print(EXPLANATION)
-    print(
-        f"{'method':<12}{'pairs':>6}{'LPP':>10}{'+-':>7}{'ACAUC':>9}{'ECE':>8}"
-        f"{'-inf':>7}"
-    )
     order = ("prior", "SBI", "NPE", "tuning-only", "OT-only", "RoPE", "stack")
-    keys = dict.fromkeys((row["method"], row["n_calibration"]) for row in rows)
-    for method, n in sorted(keys, key=lambda key: (order.index(key[0]), key[1])):
-        group = [r for r in rows if (r["method"], r["n_calibration"]) == (method, n)]
-
-        def mean(column: str, group: list[dict[str, Any]] = group) -> float:
-            return sum(row[column] for row in group) / len(group)
-
-        scores = [row["lpp_z"] for row in group]
-        spread = f"{statistics.stdev(scores):.2f}" if len(scores) > 1 else "-"
-        print(
-            f"{method:<12}{n or '-':>6}{mean('lpp_z'):>10.2f}{spread:>7}"
-            f"{mean('acauc'):>9.3f}{mean('expected_coverage_error'):>8.3f}{mean('neg_inf_fraction'):>7.2f}"
+    frame = pd.DataFrame(rows)
+    frame["method"] = pd.Categorical(frame["method"], order)
+    groups = frame.groupby(["method", "n_calibration"], observed=True)
+    columns = ["lpp_z", "acauc", "expected_coverage_error", "neg_inf_fraction"]
+    table = groups[columns].mean()
+    table.insert(1, "+-", groups["lpp_z"].std())
+    table.columns = ["LPP", "+-", "ACAUC", "ECE", "-inf"]
+    table = table.rename_axis(["method", "pairs"]).reset_index()
+    table["pairs"] = table["pairs"].replace({0: "-"})
+    print(
+        table.to_string(
+            index=False,
+            na_rep="-",
+            float_format="{:.2f}".format,
+            formatters=dict.fromkeys(("ACAUC", "ECE"), "{:.3f}".format),
         )
+    )
 
 
 def argument_parser(

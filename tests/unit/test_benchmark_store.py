@@ -5,20 +5,16 @@ import io
 import multiprocessing
 import os
 import warnings
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import benchmarks.npe
 import numpy as np
 import pytest
 import torch
-from benchmarks.estimators import posterior_with, state_of
 from sbi.inference.posteriors import DirectPosterior
 
-from benchmarks import finetuning
-from benchmarks.cases import Case, Sources
+from benchmarks.cases import Case, Sources, posterior_with, state_of
 from benchmarks.cells import Cell
 from benchmarks.presets import PRESETS
 from benchmarks.store import Cache, Results
@@ -120,35 +116,27 @@ def replace_by_another(path: Path) -> None:
     path.write_bytes((path.parent / f"{other.key}{path.suffix}").read_bytes())
 
 
-@pytest.mark.parametrize(
-    ("end", "damage"),
-    [
-        (end, damage)
-        for end in ("json", "npz")
-        for damage in (truncate, empty, fill_with_garbage, replace_by_another)
-    ]
-    + [("npz", remove)],
-)
-def test_a_damaged_result_counts_as_not_run_and_is_set_aside(
-    end: str, damage: Callable[[Path], None], tmp_path: Path
-) -> None:
-    results = Results(tmp_path)
-    results.write(FINISHED, *result_of(FINISHED, [-1.0, -2.0]))
-    assert results.read(FINISHED) is not None
-    path = tmp_path / f"{FINISHED.key}.{end}"
-    damage(path)
-    content = path.read_bytes() if path.exists() else None
-    with pytest.warns(RoPEWarning, match="damaged and counts as not run"):
-        assert results.read(FINISHED) is None
-    with pytest.warns(RoPEWarning, match="damaged and is computed again"):
-        results.set_damaged_aside([FINISHED])
-    assert not path.exists()
-    if content is not None:
-        assert path.with_name(f"{path.name}.damaged-1").read_bytes() == content
-    # Now it is as if it had never been run.
-    with warnings.catch_warnings(action="error"):
-        assert results.read(FINISHED) is None
-        results.set_damaged_aside([FINISHED])
+def test_a_damaged_result_counts_as_not_run_and_is_set_aside(tmp_path: Path) -> None:
+    damages = (truncate, empty, fill_with_garbage, replace_by_another)
+    cases = [(end, damage) for end in ("json", "npz") for damage in damages]
+    for number, (end, damage) in enumerate([*cases, ("npz", remove)]):
+        results = Results(tmp_path / str(number))
+        results.write(FINISHED, *result_of(FINISHED, [-1.0, -2.0]))
+        assert results.read(FINISHED) is not None
+        path = results.folder / f"{FINISHED.key}.{end}"
+        damage(path)
+        content = path.read_bytes() if path.exists() else None
+        with pytest.warns(RoPEWarning, match="damaged and counts as not run"):
+            assert results.read(FINISHED) is None
+        with pytest.warns(RoPEWarning, match="damaged and is computed again"):
+            results.set_damaged_aside([FINISHED])
+        assert not path.exists()
+        if content is not None:
+            assert path.with_name(f"{path.name}.damaged-1").read_bytes() == content
+        # Now it is as if it had never been run.
+        with warnings.catch_warnings(action="error"):
+            assert results.read(FINISHED) is None
+            results.set_damaged_aside([FINISHED])
 
 
 def test_what_is_set_aside_replaces_nothing(tmp_path: Path) -> None:
@@ -192,24 +180,6 @@ def test_a_file_is_on_the_disk_before_it_gets_its_name(
         temporary.write_text("text")
     # The file while it had its first name, and the folder with the new one.
     assert synced == [(path.stat().st_ino, False), (tmp_path.stat().st_ino, True)]
-
-
-@pytest.mark.parametrize("damage", [truncate, empty, fill_with_garbage])
-def test_runs_of_fine_tuning_are_set_aside_if_their_file_is_damaged(
-    damage: Callable[[Path], None], tmp_path: Path
-) -> None:
-    path = tmp_path / "pendulum.csv"
-    row = dict.fromkeys(finetuning.COLUMNS, "123456789")
-    finetuning.write_rows(path, [row, row])
-    assert finetuning.read_rows(path) == [row, row]
-    damage(path)
-    if damage is empty:  # as after a start without a finished run
-        assert finetuning.read_rows(path) == []
-        return
-    content = path.read_bytes()
-    with pytest.warns(RoPEWarning, match="is damaged and is now"):
-        assert finetuning.read_rows(path) == []
-    assert (tmp_path / "pendulum.csv.damaged-1").read_bytes() == content
 
 
 # Trained estimators -------------------------------------------------------------------
@@ -292,25 +262,3 @@ def test_a_rebuilt_estimator_is_the_trained_one(task: str, preset: str) -> None:
     assert any(
         weights.any() for weights in embedding_of(builder(theta, x)).parameters()
     )
-
-
-def test_npe_of_an_older_version_is_not_opened(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    small = (200, {"num_transforms": 1}, {"max_num_epochs": 1})
-    monkeypatch.setitem(benchmarks.npe.SETTINGS, "linear_gaussian", small)
-    old = tmp_path / "npe_linear_gaussian_0.pt"
-    torch.save(Thief(tmp_path / "proof"), old)
-    task = get_task("linear_gaussian")
-
-    def npe() -> Any:
-        return benchmarks.npe.trained_npe(task, seed=0, cache=tmp_path)
-
-    with pytest.warns(RoPEWarning, match=r"older version, and is not opened"):
-        trained = npe()
-    assert not (tmp_path / "proof").exists()
-    old.unlink()
-    monkeypatch.setattr(benchmarks.npe, "NPE", None)  # as it is not trained again
-    theta, x = task.get_test_set(3)
-    ours, theirs = (one.log_prob_batched(theta[None], x) for one in (npe(), trained))
-    assert torch.equal(ours, theirs)
