@@ -55,6 +55,11 @@ class Setting(NamedTuple):
     tau: float
     cost_scale: str
 
+    @classmethod
+    def of(cls, cell: Cell) -> "Setting":
+        """Return the setting of a cell."""
+        return cls(cell.gamma or 0.0, cell.tau or 0.0, cell.cost_scale)
+
     def __str__(self) -> str:
         scale = " of the embedding" if self.cost_scale == "none" else ""
         return f"gamma {self.gamma:g}{scale}, tau {self.tau:g}"
@@ -100,6 +105,10 @@ class Published:
             rows[name] = known.loc[kept].infer_objects()
         return rows
 
+    @cached_property
+    def _by_method(self) -> dict[str, dict[str, list[Cell]]]:
+        return {name: rows.groupby("method").groups for name, rows in self.rows.items()}
+
     def select(
         self,
         method: str,
@@ -110,13 +119,15 @@ class Published:
         **fields: str,
     ) -> pd.DataFrame:
         """Return the rows of a method, one a repetition."""
-        rows = self.rows[suite]
-        rows = rows[(rows["method"] == method) & rows["n_calibration"].isin([0, size])]
-        coupled = (rows[[*setting._fields]] == [*setting]).all(axis=1)
-        chosen = rows["gamma"].isna() | coupled
-        for name, value in fields.items():
-            chosen &= rows[name] == value
-        return rows[chosen]
+        cells = self._by_method[suite].get(method, [])
+        chosen = [
+            cell
+            for cell in cells
+            if cell.n_calibration in (0, size)
+            and (cell.gamma is None or Setting.of(cell) == setting)
+            and all(getattr(cell, name) == value for name, value in fields.items())
+        ]
+        return self.rows[suite].loc[chosen]
 
     def above(self, method: str, other: str, **chosen: Any) -> float | None:
         """Return how far the LPP of a method is above that of another."""

@@ -223,7 +223,7 @@ def _bounds(
     yield _near("neg_inf_fraction", float(lost.mean()), ABSOLUTE)
     mean = float(log_probs.mean())
     yield _near("lpp", mean, rounding)
-    unit = float(task.prior_std.double().log().sum())
+    unit = _unit(task)
     yield _near("lpp_z", mean + unit, rounding)
     values = torch.from_numpy(log_probs)
     median = float(values.quantile(0.5, interpolation="nearest"))
@@ -261,6 +261,11 @@ def _per_parameter(row: Mapping[str, Any]) -> tuple[tuple[str, ...], list[float]
             "column acauc_per_parameter: expected entries like red=-0.0030; "
             f"got {text!r}"
         ) from error
+
+
+@functools.cache
+def _unit(task: Task) -> float:
+    return float(task.prior_std.double().log().sum())
 
 
 @functools.cache
