@@ -152,9 +152,7 @@ def test_the_beta_shape_looks_at_the_first_three_parameters_only() -> None:
     assert torch.equal(beta_shaped(u), beta_shaped(u[:, :3]))
 
 
-def test_label_noise_stays_in_the_support_and_does_not_depend_on_later_rows() -> (
-    None
-):
+def test_label_noise_stays_in_the_support_and_does_not_depend_on_later_rows() -> None:
     prior = get_task("pendulum").get_prior()
     theta = prior.sample(torch.Size((250,)))
     std = torch.tensor([1.0, 3.0])
