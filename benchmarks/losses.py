@@ -37,6 +37,7 @@ from benchmarks.store import Cache
 from sbi_rope import RoPE, SinkhornCoupler
 from sbi_rope.baselines import ReferenceNPE
 from sbi_rope.metrics import Evaluation, draw_samples, evaluate
+from sbi_rope.sweep import sweep
 
 __all__ = ["Loss", "as_line", "losses", "target_distances"]
 
@@ -190,7 +191,8 @@ def _with_coupling(
         for pairs in (stage.tuned_on or stage.looked_at, stage.test_set)
     )
     assert test is not None
-    posteriors = rope.sweep(
+    posteriors = sweep(
+        rope,
         stage.test_set[1],
         gammas=gammas,
         taus=[tau],

@@ -51,7 +51,8 @@ def scores(
         with (
             patch("sbi_rope.stacking.finetuning.PATIENCE", patience),
             patch.dict(
-                "sbi_rope.stacking.candidates.LEARNING_RATES", {candidate.space: rate}
+                "sbi_rope.stacking.trained_candidates.LEARNING_RATES",
+                {candidate.space: rate},
             ),
         ):
             parts = [part for fold in folds for part in candidate.parts(fold)]

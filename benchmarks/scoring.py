@@ -17,6 +17,7 @@ from sbi_rope import RoPE, SinkhornCoupler
 from sbi_rope.baselines import ReferenceNPE
 from sbi_rope.metrics import Evaluation, evaluate
 from sbi_rope.stacking import StackedPosterior, stack
+from sbi_rope.sweep import sweep
 
 __all__ = ["Failure", "Score", "scores"]
 
@@ -139,7 +140,8 @@ def _coupled_scores(
     gammas = sorted({cell.gamma for cell in group if cell.gamma}, reverse=True)
     taus = sorted({cell.tau for cell in group if cell.tau is not None}, reverse=True)
     start = time.perf_counter()
-    posteriors = rope.sweep(
+    posteriors = sweep(
+        rope,
         case.test_set[1],
         gammas=gammas,
         taus=taus,

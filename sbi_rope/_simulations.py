@@ -28,6 +28,7 @@ __all__ = [
     "Moments",
     "SimulationSource",
     "StoredSimulations",
+    "draw_targets",
     "warn_of_dropped",
 ]
 
@@ -74,9 +75,19 @@ class SimulationSource(Protocol):
         ...
 
     def targets(
-        self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
+        self,
+        theta: Tensor,
+        embed: Embedding,
+        *,
+        simulations_per_target: int,
+        num_neighbors: int,
+        progress: bool,
     ) -> Tensor:
-        """Return the mean embedding of simulations at each theta, ``(n, l)``."""
+        """Return the mean embedding of simulations at each theta, ``(n, l)``.
+
+        A simulator makes ``simulations_per_target`` at each; stored simulations are
+        those with the ``num_neighbors`` nearest parameters.
+        """
         ...
 
     def moments(
@@ -144,15 +155,21 @@ class StoredSimulations:
         return self.theta[chosen], embed(self.x[chosen])
 
     def targets(
-        self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
+        self,
+        theta: Tensor,
+        embed: Embedding,
+        *,
+        simulations_per_target: int,
+        num_neighbors: int,
+        progress: bool,
     ) -> Tensor:
-        """Average over the ``count`` stored simulations with the nearest parameters."""
-        if count > len(self.x):
+        """Average over the stored simulations with the nearest parameters."""
+        if num_neighbors > len(self.x):
             raise InvalidInputError(
                 f"Expected `num_neighbors` of at most {len(self.x)}, the number of "
-                f"stored simulations; got {count}."
+                f"stored simulations; got {num_neighbors}."
             )
-        nearest = self._nearest(theta, count)
+        nearest = self._nearest(theta, num_neighbors)
         statistics = embed(self.x[nearest.flatten()])
         return statistics.reshape(*nearest.shape, -1).mean(dim=1)
 
@@ -195,6 +212,49 @@ class StoredSimulations:
 
     def _standardised(self, theta: Tensor) -> Tensor:
         return (theta - self._theta_mean) / self._theta_std
+
+
+def draw_targets(
+    source: SimulationSource,
+    theta: Tensor,
+    embed: Embedding,
+    *,
+    simulations_per_target: int,
+    num_neighbors: int,
+    progress: bool,
+) -> Tensor:
+    r"""Return where tuning moves some pairs, :math:`E_\varepsilon[h(S(\theta_i))]`.
+
+    Args:
+        source: Where simulations come from.
+        theta: Parameters of the pairs, shape ``(n, d)``.
+        embed: The embedding h.
+        simulations_per_target: Simulations behind each, made by a simulator.
+        num_neighbors: Stored simulations behind each.
+        progress: Whether to show the progress of slow simulations.
+
+    Returns:
+        Shape ``(n, l)``.
+
+    Raises:
+        SimulationError: If the simulator fails, or an embedding is not finite.
+    """
+    targets = source.targets(
+        theta,
+        embed,
+        simulations_per_target=simulations_per_target,
+        num_neighbors=num_neighbors,
+        progress=progress,
+    )
+    usable = torch.isfinite(torch.linalg.vector_norm(targets, dim=1))
+    if not usable.all():
+        raise SimulationError(
+            "Expected simulations with a finite embedding; got NaN, Inf or numbers "
+            f"too large to compare at the calibration parameters "
+            f"{theta[~usable][:5].tolist()}. Check what the simulator returns "
+            "there, or remove these pairs."
+        )
+    return targets
 
 
 def warn_of_dropped(dropped: int, total: int, what: str) -> None:

@@ -13,10 +13,21 @@ from torch.distributions import Distribution
 
 from sbi_rope._progress import progress_bar
 from sbi_rope._random import seeded
-from sbi_rope._simulations import Embedding, Moments, warn_of_dropped
-from sbi_rope.errors import InvalidTypeError, SimulationError, warn_user
+from sbi_rope._simulations import (
+    Embedding,
+    Moments,
+    SimulationSource,
+    StoredSimulations,
+    warn_of_dropped,
+)
+from sbi_rope.errors import (
+    InvalidInputError,
+    InvalidTypeError,
+    SimulationError,
+    warn_user,
+)
 
-__all__ = ["Simulator"]
+__all__ = ["Simulator", "source_of"]
 
 # Simulations held in memory before they are embedded; few if they come one by one, so
 # that a slow simulator shows its progress.
@@ -77,10 +88,18 @@ class Simulator:
         return theta[valid], statistics[valid]
 
     def targets(
-        self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
+        self,
+        theta: Tensor,
+        embed: Embedding,
+        *,
+        simulations_per_target: int,
+        num_neighbors: int,
+        progress: bool,
     ) -> Tensor:
-        """Simulate ``count`` times at each theta and average the finite ones."""
-        statistics, valid = self._repeat_at(theta, count, embed, progress=progress)
+        """Simulate several times at each theta and average the finite ones."""
+        statistics, valid = self._repeat_at(
+            theta, simulations_per_target, embed, progress=progress
+        )
         total = statistics.where(valid[..., None], 0.0).sum(dim=1)
         return total / valid.sum(dim=1, keepdim=True)
 
@@ -319,6 +338,43 @@ class Simulator:
 
     def _is_batch(self, x: Any, count: int) -> bool:
         return _holds_numbers(x) and x.shape == (count, *self.event_shape)
+
+
+def source_of(
+    prior: Distribution,
+    *,
+    simulator: Callable[[Tensor], Tensor] | None,
+    simulations: tuple[Tensor, Tensor] | None,
+    event_shape: torch.Size,
+    like: Tensor,
+) -> SimulationSource:
+    """Return where simulations come from: a simulator, or stored ones.
+
+    Args:
+        prior: The prior, from which parameters are drawn.
+        simulator: Maps parameters to simulations, batched or not.
+        simulations: Stored pairs (theta, x).
+        event_shape: Shape of one observation.
+        like: Parameters whose shape, dtype and device simulations have to fit.
+
+    Raises:
+        InvalidInputError: If both or none of simulator and simulations are given.
+    """
+    if (simulator is None) == (simulations is None):
+        raise InvalidInputError(
+            "Expected exactly one of `simulator` and `simulations`; got "
+            f"{'none' if simulator is None else 'both'}."
+        )
+    if simulations is not None:
+        return StoredSimulations(
+            simulations,
+            prior,
+            theta_shape=like.shape[1:],
+            event_shape=event_shape,
+            like=like,
+        )
+    assert simulator is not None
+    return Simulator(simulator, prior, event_shape=event_shape, like=like)
 
 
 def _holds_numbers(x: Any) -> bool:

@@ -36,13 +36,16 @@ LAYERS = [
     # Each works on embeddings or posteriors, which `_sbi` takes out of an estimator.
     {"coupling", "finetuning", "metrics", "_simulations", "_standardisation"},
     # A mixture has the couplings of a batch as weights; a simulator is a source of
-    # simulations like stored ones.
-    {"mixture", "_simulator"},
-    # RoPE conducts fine-tuning, coupling and mixture. Trainers train networks, and
-    # average them in a mixture. Tasks have simulators.
-    {"rope", "trainers", "tasks"},
-    # The NPE that knows the discrepancy is a trainer.
-    {"discrepancy"},
+    # simulations like stored ones; a trained NPE is an estimator taken apart.
+    {"mixture", "_simulator", "_npe"},
+    # A batch is coupled by NPE with simulations, into a mixture. Tasks have simulators.
+    {"batch", "tasks"},
+    # RoPE conducts fine-tuning, and the coupling of a batch. Trainers train networks,
+    # and average them in a mixture.
+    {"rope", "trainers"},
+    # A sweep couples a batch of RoPE again and again. The NPE that knows the
+    # discrepancy is a trainer.
+    {"sweep", "discrepancy"},
     # Stacks weigh posteriors of RoPE and of the discrepancy. The diagnosis looks at the
     # parts of RoPE. Baselines are trainers, two of which are stages of RoPE.
     {"stacking", "diagnosis", "baselines"},

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor
 
 from sbi_rope._random import seeded
@@ -21,7 +20,7 @@ from sbi_rope.diagnosis.residuals import (
 from sbi_rope.diagnosis.simulations import Simulations
 from sbi_rope.diagnosis.support import support_of
 from sbi_rope.errors import InvalidInputError
-from sbi_rope.rope import MIN_SIMULATIONS, RoPE, parameters_named
+from sbi_rope.rope import RoPE
 
 __all__ = ["diagnose"]
 
@@ -91,24 +90,20 @@ def diagnose(
         check_integer("num_simulations", num_simulations, minimum=FEWEST_SIMULATIONS)
     if num_folds is not None:
         check_integer("num_folds", num_folds, minimum=2)
-    real = rope.embed_observations(x_o)
     tuned = len(rope.calibration[0]) > 0
     with seeded(seed):
-        # First, so that they are those of a posterior under the same seed.
-        theta, simulated = rope.draw_simulations(
-            num_simulations,
-            at_least=max(len(real), MIN_SIMULATIONS),
-            show_progress_bars=show_progress_bars,
+        # First, so that the simulations are those of a posterior under the same seed.
+        batch = rope.embed(
+            x_o, num_simulations=num_simulations, show_progress_bars=show_progress_bars
         )
-        names = _names(parameter_names, theta.shape[1])
-        _check_enough(theta)
-        with parameters_named(theta):
-            coupling = (coupler or rope.coupler).couple(real, simulated)
-        before = rope.with_pairs(torch.arange(0)).embed_observations(x_o)
+        names = _names(parameter_names, batch.theta.shape[1])
+        _check_enough(batch.theta)
+        coupling = batch.couple(coupler or rope.coupler)
+        before = batch.npe.embed("x_o", batch.x_o, batch.npe.h)
         simulations = Simulations(
-            theta=_moved(theta), embedded=_moved(simulated), tuned=tuned
+            theta=_moved(batch.theta), embedded=_moved(batch.simulated), tuned=tuned
         )
-        real, sizes = _moved(real), _moved(coupling.effective_sample_size)
+        real, sizes = _moved(batch.real), _moved(coupling.effective_sample_size)
         findings = misspecification_findings(
             _moved(before), real if tuned else None, simulations
         )
@@ -121,7 +116,7 @@ def diagnose(
         findings += shift.findings(simulations, names)
         if held_out is not None:
             findings += _residual_findings(rope, held_out, simulations, notes)
-        findings += far_findings(rope.embedding_net, x_o)
+        findings += far_findings(batch.npe.h, batch.x_o)
     if not coupling.converged:
         notes.append("The coupling has not converged; its sample sizes are rough.")
     return Diagnosis(

@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 
 from sbi_rope._progress import progress_bar
+from sbi_rope._sbi import embed
+from sbi_rope._simulations import draw_targets
 from sbi_rope.diagnosis.report import Finding
 from sbi_rope.diagnosis.simulations import Simulations
 from sbi_rope.rope import RoPE
@@ -80,8 +82,15 @@ def cross_fit(rope: RoPE, *, num_folds: int, show_progress_bars: bool) -> CrossF
         show_progress_bars: Whether to show the folds done.
     """
     theta, x = rope.calibration
-    rows = torch.arange(len(theta), device=theta.device)
-    targets = rope.draw_targets(rows, show_progress_bars=False)
+    h = rope.embedding_net
+    targets = draw_targets(
+        rope.source,
+        theta,
+        lambda x: embed(h, x),
+        simulations_per_target=rope.finetuner.simulations_per_target,
+        num_neighbors=rope.finetuner.num_neighbors,
+        progress=False,
+    )
     embedded = torch.empty_like(targets)
     order = torch.randperm(len(theta)).to(theta.device)
     folds = order.tensor_split(min(num_folds, len(theta)))
@@ -89,7 +98,7 @@ def cross_fit(rope: RoPE, *, num_folds: int, show_progress_bars: bool) -> CrossF
         others = torch.cat([fold for fold in folds if fold is not held_out])
         part = rope.with_pairs(others, targets=targets[others])
         part.train(show_progress_bars=False)
-        embedded[held_out] = part.embed_observations(x[held_out])
+        embedded[held_out] = embed(part.tuned_embedding_net, x[held_out])
     return CrossFitted(embedded=embedded.cpu().double(), targets=targets.cpu().double())
 
 

@@ -4,14 +4,16 @@ from sbi_rope.stacking.candidates import (
     AmortisedCandidate,
     CouplingCandidate,
     DensityCandidate,
-    DiscrepancyCandidate,
-    FinetunedCandidate,
-    default_candidates,
 )
 from sbi_rope.stacking.cross_validation import CrossValidation, Difference
+from sbi_rope.stacking.defaults import default_candidates
 from sbi_rope.stacking.posterior import StackedPosterior
 from sbi_rope.stacking.report import LearningCurve, StackingReport
 from sbi_rope.stacking.stack import cross_validate, stack
+from sbi_rope.stacking.trained_candidates import (
+    DiscrepancyCandidate,
+    FinetunedCandidate,
+)
 from sbi_rope.stacking.weights import StackingWeights, stacking_weights
 
 __all__ = [

@@ -1,7 +1,6 @@
 """What a stack can be made of."""
 
 import copy
-import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,20 +10,15 @@ import torch
 
 from sbi_rope._sbi import (
     ConditionalDensityEstimator,
-    embedding_of,
     estimator_of,
-    headless,
-    with_embedding,
 )
 from sbi_rope._validation import (
     check_choice,
     check_instance,
     check_not_negative,
-    check_numbers,
     check_positive,
     check_unit_interval,
 )
-from sbi_rope.discrepancy.correction import Space
 from sbi_rope.errors import (
     InvalidInputError,
     InvalidTypeError,
@@ -33,31 +27,21 @@ from sbi_rope.errors import (
 )
 from sbi_rope.mixture import (
     MixturePosterior,
-    OwnContexts,
     Part,
     PriorPosterior,
     part_of,
     part_of_prior,
 )
 from sbi_rope.rope import RoPE
-from sbi_rope.stacking.finetuning import finetune_without
-from sbi_rope.stacking.folds import NUM_FOLDS, Fold, Workbench
+from sbi_rope.stacking.folds import Fold, Workbench
 
 __all__ = [
     "AmortisedCandidate",
     "Candidate",
     "CouplingCandidate",
     "DensityCandidate",
-    "DiscrepancyCandidate",
-    "FinetunedCandidate",
     "check_candidates",
-    "default_candidates",
 ]
-
-# Chosen on calibration data, see benchmarks/README.md.
-GAMMAS = (0.02, 0.05, 0.1, 0.4)
-TAUS = (1.0, 0.5, 0.0)
-REHEARSAL = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,201 +185,7 @@ def _check_name(name: str) -> None:
         raise InvalidInputError("Expected another name; 'stack' is that of them all.")
 
 
-@dataclass(frozen=True, kw_only=True)
-class DiscrepancyCandidate(AmortisedCandidate):
-    """NPE on simulations that were corrected by what the pairs tell.
-
-    See :class:`~sbi_rope.discrepancy.DiscrepancyNPE`.
-
-    Args:
-        space: What is corrected.
-        learn_prior: Whether the distribution of parameters is learned from the pairs.
-            The scores of a stack assume in any case that these are drawn like the
-            observations to be inferred.
-    """
-
-    space: Space = "embedding"
-    learn_prior: bool = True
-
-    def __post_init__(self) -> None:
-        """Check the values of all fields."""
-        check_choice("space", self.space, ("embedding", "input", "tuned"))
-        check_instance("learn_prior", self.learn_prior, bool)
-
-    @property
-    def name(self) -> str:  # type: ignore[override]
-        """The method with its setting."""
-        space = "" if self.space == "embedding" else f" ({self.space})"
-        return f"discrepancy{space}" + ("" if self.learn_prior else ", given prior")
-
-    @property
-    def family(self) -> str:
-        """The method that it is a setting of."""
-        return "discrepancy"
-
-    def applies_to(self, bench: Workbench) -> bool:
-        """Tell whether x is a short vector, or there are folds to tune without."""
-        if self.space == "input":
-            return _has_summaries(bench)
-        return self.space == "embedding" or len(bench.folds) > 2
-
-    def parts(self, fold: Fold) -> list[Part]:
-        """Correct NPE."""
-        corrected = fold.corrected(self.space, learn_prior=self.learn_prior)
-        estimator = corrected.estimator
-        if self.space == "input":
-            return [part_of(estimator)]
-        contexts = OwnContexts(corrected.nets, fold.bench.x.shape[1:])
-        return [Part(headless(estimator), contexts)]
-
-
-def _has_summaries(bench: Workbench) -> bool:
-    """Whether x is a short vector that an embedding net could lose something of."""
-    net = embedding_of(estimator_of(bench.npe))
-    has_net = any(True for _ in net.parameters())
-    return bench.has_summaries and has_net
-
-
-# Of fine-tuning, by what is corrected in the start. Trained on the input, a whole
-# network is nearly right already. Chosen on calibration data, see benchmarks/README.md.
-LEARNING_RATES = {None: 1e-3, "embedding": 1e-3, "tuned": 1e-3, "input": 3e-4}
-
-
-@dataclass(frozen=True, kw_only=True)
-class FinetunedCandidate(AmortisedCandidate):
-    """NPE, as it is or corrected, with all its parameters trained on the pairs.
-
-    It is the average of several nets, each of which holds another part of the pairs
-    out to know when to stop.
-
-    Args:
-        space: None to start from NPE; else what is corrected in the NPE to start from.
-    """
-
-    space: Space | None = None
-
-    def __post_init__(self) -> None:
-        """Check the value of the field."""
-        check_choice("space", self.space, (None, "embedding", "input", "tuned"))
-
-    @property
-    def name(self) -> str:  # type: ignore[override]
-        """The method with its setting."""
-        if self.space is None:
-            return "fine-tuned NPE"
-        return f"{DiscrepancyCandidate(space=self.space).name}, fine-tuned"
-
-    @property
-    def family(self) -> str:
-        """The method that it is a setting of."""
-        return "fine-tuned NPE" if self.space is None else "discrepancy, fine-tuned"
-
-    def applies_to(self, bench: Workbench) -> bool:
-        """Tell whether there are parts to hold out, and the start applies."""
-        start = self.space is None or DiscrepancyCandidate(space=self.space).applies_to(
-            bench
-        )
-        return start and len(bench.folds) > 2
-
-    def parts(self, fold: Fold) -> list[Part]:
-        """Train without each part of the pairs."""
-        if len(fold.used) < 2:
-            # Nothing can be held out; the start is what there is.
-            if self.space is None:
-                return [part_of(estimator_of(fold.bench.npe))]
-            return DiscrepancyCandidate(space=self.space).parts(fold)
-        rate = LEARNING_RATES[self.space]
-        return [
-            part_of(
-                finetune_without(
-                    self._start(fold, number), fold, number, learning_rate=rate
-                )
-            )
-            for number in sorted(fold.used)
-        ]
-
-    def _start(self, fold: Fold, number: int) -> Any:
-        if self.space is None:
-            return estimator_of(fold.bench.npe)
-        corrected = fold.corrected(self.space, learn_prior=True)
-        if self.space != "tuned":
-            return corrected.estimator
-        # The net that has not seen the part which is held out.
-        net = corrected.nets[sorted(fold.used).index(number)]
-        return with_embedding(corrected.estimator, copy.deepcopy(net))
-
-
 Candidate = CouplingCandidate | AmortisedCandidate
-
-
-def default_candidates(
-    rope: RoPE | None = None,
-    *,
-    couplings: bool = False,
-    gammas: Sequence[float] = GAMMAS,
-    taus: Sequence[float] = TAUS,
-    rehearsal: float | None = REHEARSAL,
-) -> tuple[Candidate, ...]:
-    """Return the prior, NPE, fine-tuned NPE and the discrepancy models.
-
-    Args:
-        rope: RoPE with its calibration pairs; leaves out what these do not allow or
-            need, as :func:`stack` does by itself. All if None.
-        couplings: Whether RoPE and OT-only over a grid of gamma and tau take part, and
-            tuning-only; for a stack of a batch of observations.
-        gammas: In units of the median distance between simulated embeddings.
-        taus: Trust in the prior; 0 lets every observation choose by itself.
-        rehearsal: Of a second RoPE over the same grid, whose tuning keeps simulations
-            where they are, see :class:`~sbi_rope.CalibrationFinetuner`; None leaves it
-            out.
-
-    Returns:
-        The candidates, couplings first.
-
-    Raises:
-        InvalidTypeError: If ``rope`` is something else.
-        InvalidInputError: If a gamma, a tau or the rehearsal is outside its range.
-    """
-    gammas, taus = check_numbers("gammas", gammas), check_numbers("taus", taus)
-    amortised: tuple[AmortisedCandidate, ...] = (
-        DensityCandidate(name="prior", build=_prior, fixed=True),
-        DensityCandidate(name="NPE", build=_npe, fixed=True),
-        FinetunedCandidate(),
-        DiscrepancyCandidate(space="embedding"),
-        DiscrepancyCandidate(space="input"),
-        DiscrepancyCandidate(space="tuned"),
-        FinetunedCandidate(space="input"),
-        FinetunedCandidate(space="tuned"),
-    )
-    if rope is not None:
-        check_instance("rope", rope, RoPE)
-        bench = Workbench(rope, num_folds=NUM_FOLDS, seed=0, show_progress_bars=False)
-        amortised = tuple(one for one in amortised if one.applies_to(bench))
-    if not couplings:
-        return amortised
-    rehearsed = [] if rehearsal is None else [{"rehearsal": rehearsal}]
-    nets: list[dict[str, Any]] = [{"tuned": True}, *rehearsed, {"tuned": False}]
-    coupled = [
-        CouplingCandidate(gamma=gamma, tau=tau, **net)
-        for net, gamma, tau in itertools.product(nets, gammas, taus)
-    ]
-    tuned = DensityCandidate(name="tuning-only", build=_tuning_only)
-    return (*coupled, *amortised, tuned)
-
-
-# Functions with a name, so that a stack can be pickled.
-
-
-def _prior(rope: RoPE, seed: int) -> PriorPosterior:
-    return PriorPosterior(rope.npe.prior)
-
-
-def _npe(rope: RoPE, seed: int) -> Any:
-    return rope.npe
-
-
-def _tuning_only(rope: RoPE, seed: int) -> Any:
-    return rope.tuned_posterior()
 
 
 def check_candidates(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:

@@ -8,13 +8,15 @@ from typing import Literal, cast
 import torch
 from torch import Tensor, nn
 
+from sbi_rope._random import seeded
 from sbi_rope._sbi import embed, estimator_of, headless
+from sbi_rope.batch import parameters_named
 from sbi_rope.coupling import Coupling
 from sbi_rope.errors import CouplingError
 from sbi_rope.mixture import CoupledContexts, CoupledNet, Part
 from sbi_rope.mixture.chunks import flow_slices
 from sbi_rope.mixture.density import without_nan
-from sbi_rope.rope import MIN_SIMULATIONS, RoPE, parameters_named
+from sbi_rope.rope import MIN_SIMULATIONS, RoPE
 from sbi_rope.stacking.candidates import CouplingCandidate
 from sbi_rope.stacking.folds import Fold
 
@@ -129,12 +131,14 @@ def fit_couplings(
         CouplingError: If a coupling has not converged and must.
     """
     bench = versions[0].bench
-    theta, simulated = bench.rope.draw_simulations(
-        num_simulations,
-        at_least=max(len(x_o), MIN_SIMULATIONS),
-        seed=seed,
-        show_progress_bars=show_progress_bars,
-    )
+    # Those that RoPE would couple the batch with.
+    with seeded(seed):
+        theta, simulated = bench.rope.source.from_prior(
+            num_simulations,
+            max(len(x_o), MIN_SIMULATIONS),
+            lambda x: embed(bench.embedding_net, x),
+            progress=show_progress_bars,
+        )
     batch = torch.cat([x_o, bench.x])
     nets, settings = [], []
     for key, net in _nets(candidates, versions).items():
@@ -174,8 +178,8 @@ def _tuned_net(fold: Fold, rehearsal: float | None) -> nn.Module:
     finetuner = fold.rope.finetuner
     if rehearsal in (None, finetuner.rehearsal):
         return fold.rope.tuned_embedding_net
-    other = fold.rope.with_finetuner(replace(finetuner, rehearsal=rehearsal))
-    return other.train(seed=fold.seed, show_progress_bars=False).tuned_embedding_net
+    other = fold.tuned(replace(finetuner, rehearsal=rehearsal))
+    return other.tuned_embedding_net
 
 
 def _couple(

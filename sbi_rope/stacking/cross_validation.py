@@ -5,10 +5,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import numpy as np
 import torch
+from scipy.stats import bootstrap
 from torch import Tensor
 
-from sbi_rope._random import seeded
 from sbi_rope._validation import check_choice
 from sbi_rope.metrics import CoverageCurve, coverage_curve_of
 from sbi_rope.stacking.weights import StackingWeights, stacking_weights
@@ -120,14 +121,19 @@ class CrossValidation:
         difference = self.scores_of(name) - self.scores_of(other)
         # Where both are minus infinity, neither is better.
         difference = difference.nan_to_num(nan=0.0, posinf=torch.inf, neginf=-torch.inf)
-        with seeded(seed):
-            rows = torch.randint(len(difference), (NUM_BOOTSTRAP, len(difference)))
-        means = difference[rows.to(difference.device)].mean(dim=1).sort().values
-        margin = int(0.025 * NUM_BOOTSTRAP)
+        with np.errstate(invalid="ignore"):  # of infinite means
+            means = bootstrap(
+                (difference.cpu().numpy(),),
+                np.mean,
+                n_resamples=NUM_BOOTSTRAP,
+                method="percentile",
+                rng=np.random.default_rng(seed),
+            ).bootstrap_distribution
+        # Quantiles that are one of the means: scipy's own lie between two of them, of
+        # which one may be infinite.
+        low, high = np.quantile(means, [0.025, 0.975], method="inverted_cdf")
         return Difference(
-            mean=float(difference.mean()),
-            low=float(means[margin]),
-            high=float(means[-1 - margin]),
+            mean=float(difference.mean()), low=float(low), high=float(high)
         )
 
     def as_rows(self) -> list[dict[str, Any]]:

@@ -1,12 +1,13 @@
 """Fine-tuning on the pairs of a fold, a net without each part of them."""
 
 import copy
-import math
+from collections.abc import Iterator
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from sbi_rope._training import fit
 from sbi_rope.stacking.folds import Fold
 
 __all__ = ["finetune_without"]
@@ -41,29 +42,29 @@ def finetune_without(start: Any, fold: Fold, part: int, *, learning_rate: float)
     """
     bench = fold.bench
     train, held_out = bench.rows_of(fold.used - {part}), bench.folds[part]
-    estimator = copy.deepcopy(start).requires_grad_().eval()
-    optimizer = torch.optim.Adam(estimator.parameters(), lr=learning_rate)
+    estimator = copy.deepcopy(start).requires_grad_()
+    # Parts of a fold are passed over in the same order, whatever was drawn before.
     order = torch.Generator().manual_seed(fold.seed)
 
     def loss(rows: Tensor) -> Tensor:
         return estimator.loss(bench.theta[rows], condition=bench.x[rows]).mean()
 
-    best_loss, best_epoch = math.inf, 0
-    best_state = copy.deepcopy(estimator.state_dict())
-    for epoch in range(MAX_NUM_EPOCHS + 1):
-        with torch.no_grad():
-            newest = float(loss(held_out))
-        # No NaN is better than anything.
-        if newest < best_loss:
-            best_loss, best_epoch = newest, epoch
-            best_state = copy.deepcopy(estimator.state_dict())
-        if epoch - best_epoch >= PATIENCE:
-            break
+    def batches(epoch: int) -> Iterator[tuple[Tensor]]:
         shuffled = train[torch.randperm(len(train), generator=order).to(train.device)]
         for rows in shuffled.split(BATCH_SIZE):
-            optimizer.zero_grad()
-            loss(rows).backward()
-            nn.utils.clip_grad_norm_(estimator.parameters(), CLIP_MAX_NORM)
-            optimizer.step()
-    estimator.load_state_dict(best_state)
+            yield (rows,)
+
+    fit(
+        estimator,
+        batches,
+        loss,
+        validation_loss=lambda: loss(held_out),
+        learning_rate=learning_rate,
+        max_num_steps=MAX_NUM_EPOCHS,
+        patience=PATIENCE,
+        clip_max_norm=CLIP_MAX_NORM,
+        in_training_mode=False,
+        label="Fine-tuning NPE",
+        show_progress_bars=False,
+    )
     return estimator.requires_grad_(requires_grad=False)

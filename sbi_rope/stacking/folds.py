@@ -24,6 +24,7 @@ from sbi_rope.discrepancy.correction import (
 from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.parameters import learn_parameters
 from sbi_rope.discrepancy.tuning import TUNING
+from sbi_rope.finetuning import CalibrationFinetuner
 from sbi_rope.rope import RoPE
 
 __all__ = ["Corrected", "Fold", "Workbench", "draw_seeds"]
@@ -208,13 +209,17 @@ class Fold:
     @cached_property
     def rope(self) -> RoPE:
         """RoPE, tuned on these pairs."""
+        return self.tuned(self.bench.rope.finetuner)
+
+    def tuned(self, finetuner: CalibrationFinetuner) -> RoPE:
+        """Return RoPE, tuned on these pairs with the settings of a finetuner."""
         bench, targets = self.bench, None
         # Stored simulations have targets of their own, the paper's, and so has a tuning
         # that takes another number of simulations.
-        is_usual = bench.rope.finetuner.simulations_per_target == SIMULATIONS_PER_PAIR
+        is_usual = finetuner.simulations_per_target == SIMULATIONS_PER_PAIR
         if isinstance(bench.rope.source, Simulator) and is_usual:
             targets = bench.moments("embedding").mean.to(bench.embedded)[self.rows]
-        part = bench.rope.with_pairs(self.rows, targets=targets)
+        part = bench.rope.with_pairs(self.rows, targets=targets, finetuner=finetuner)
         return part.train(seed=self.seed, show_progress_bars=False)
 
     def corrected(self, space: Space, *, learn_prior: bool) -> Corrected:

@@ -2,8 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -11,7 +10,9 @@ from torch import Tensor
 
 from sbi_rope._validation import check_instance
 from sbi_rope.metrics import (
+    ACAUCScore,
     CoverageCurve,
+    CoverageErrorScore,
     acauc_of,
     expected_coverage_error_of,
 )
@@ -23,6 +24,9 @@ __all__ = ["LearningCurve", "StackingReport"]
 MOSTLY = 0.5
 # Of the intervals whose coverage the text states.
 LEVEL = 0.9
+
+# What a stack is compared with, by the names of candidates, and as the text calls it.
+REFERENCES = {"prior": "the prior", "NPE": "NPE as it was"}
 
 IN_WORDS = {
     "prior": "your labels do not support anything sharper than the prior",
@@ -80,48 +84,69 @@ class LearningCurve:
 class StackingReport:
     """Did calibration help, by what, and how far can the stack be trusted?
 
-    All numbers are of pairs that the candidates were not trained on; the weights of the
+    All numbers are of pairs that the candidates were not trained on. The weights of the
     stack that scores a pair come from the scores of the other folds. The score of the
-    stack is that of its normalised density; gains compare densities that are not
+    stack is that of its normalised density. Gains compare densities that are not
     corrected for leakage.
+
+    Make one with :meth:`of`, which computes the numbers once. Printing a report
+    computes nothing.
 
     Attributes:
         cross_validation: The scores behind it.
         learning_curve: Of the stack, if it was asked for.
+        score: Mean held-out log score of the stack, and its standard error.
+        comparable_score: The same, not corrected for leakage, as the scores of the
+            candidates are.
+        gains: What the stack gains over each candidate that does not depend on the
+            pairs, by name ("prior" and "NPE", where these are candidates).
+        family_weights: The weight of each method, summed over its settings, from large
+            to small.
+        acauc: Of the stack's central intervals.
+        coverage_error: Of the stack's central intervals.
+        share_inside: Share of the parameters inside their 90 % intervals.
     """
 
     cross_validation: CrossValidation
-    learning_curve: LearningCurve | None = field(default=None)
+    learning_curve: LearningCurve | None
+    score: tuple[float, float]
+    comparable_score: tuple[float, float]
+    gains: dict[str, Difference]
+    family_weights: dict[str, float]
+    acauc: ACAUCScore
+    coverage_error: CoverageErrorScore
+    share_inside: float
 
-    def gain_over(self, name: str) -> Difference | None:
-        """Return the gain of the stack over a candidate; None if there is none such."""
-        check_instance("name", name, str)
-        if name not in self.cross_validation.names:
-            return None
-        return self.cross_validation.difference("stack", name)
+    @classmethod
+    def of(
+        cls,
+        cross_validation: CrossValidation,
+        learning_curve: LearningCurve | None = None,
+    ) -> "StackingReport":
+        """Compute what there is to say about a stack.
 
-    @property
-    def score(self) -> tuple[float, float]:
-        """The mean held-out log score of the stack, and its standard error."""
-        scores = self.cross_validation.stack_scores
-        return float(scores.mean()), float(scores.std() / len(scores) ** 0.5)
-
-    @property
-    def comparable_score(self) -> tuple[float, float]:
-        """The same, not corrected for leakage, as the scores of the candidates are."""
-        scores = self.cross_validation.scores_of("stack")
-        return float(scores.mean()), float(scores.std() / len(scores) ** 0.5)
-
-    @cached_property
-    def family_weights(self) -> dict[str, float]:
-        """The weight of each method, summed over its settings, from large to small."""
-        totals: dict[str, float] = {}
-        rows = self.cross_validation
-        for family, weight in zip(
-            rows.families, rows.weights.weights.tolist(), strict=True
-        ):
-            totals[family] = totals.get(family, 0.0) + weight
-        return dict(sorted(totals.items(), key=lambda item: -item[1]))
+        Args:
+            cross_validation: The scores of its candidates.
+            learning_curve: Of the stack, if it was asked for.
+        """
+        check_instance("cross_validation", cross_validation, CrossValidation)
+        check_instance("learning_curve", learning_curve, LearningCurve, optional=True)
+        scores, levels = cross_validation, cross_validation.levels
+        return cls(
+            cross_validation=scores,
+            learning_curve=learning_curve,
+            score=_mean_and_error(scores.stack_scores),
+            comparable_score=_mean_and_error(scores.scores_of("stack")),
+            gains={
+                name: scores.difference("stack", name)
+                for name in REFERENCES
+                if name in scores.names
+            },
+            family_weights=_family_weights(scores),
+            acauc=acauc_of(levels),
+            coverage_error=expected_coverage_error_of(levels),
+            share_inside=float((levels <= LEVEL).double().mean()),
+        )
 
     @property
     def levels(self) -> Tensor:
@@ -168,16 +193,13 @@ class StackingReport:
 
     def _gains(self) -> list[str]:
         lines = []
-        for name in ("prior", "NPE"):
-            gain = self.gain_over(name)
-            if gain is None:
-                continue
+        for name, gain in self.gains.items():
             if gain.low > 0:
-                verdict = f"better than {_called(name)}"
+                verdict = f"better than {REFERENCES[name]}"
             elif gain.high < 0:
-                verdict = f"WORSE than {_called(name)}"
+                verdict = f"WORSE than {REFERENCES[name]}"
             else:
-                verdict = f"not shown to differ from {_called(name)}"
+                verdict = f"not shown to differ from {REFERENCES[name]}"
             lines.append(
                 f"  {verdict}: {gain.mean:+.2f} nats a pair, 95 % interval "
                 f"{gain.low:+.2f} to {gain.high:+.2f}"
@@ -197,9 +219,7 @@ class StackingReport:
         return [line, f"  weights: {shares}"]
 
     def _calibration(self) -> list[str]:
-        levels = self.levels
-        acauc, error = acauc_of(levels), expected_coverage_error_of(levels)
-        inside = (levels <= LEVEL).double().mean()
+        acauc, error = self.acauc, self.coverage_error
         if abs(acauc.value) <= 2 * acauc.standard_error:
             verdict = "calibrated as far as these pairs can tell"
         else:
@@ -207,7 +227,7 @@ class StackingReport:
         return [
             f"  {verdict}: ACAUC {acauc.value:+.3f} +- {acauc.standard_error:.3f}, "
             f"coverage error {error.value:.3f}; {LEVEL:.0%} intervals hold "
-            f"{float(inside):.0%} of the parameters"
+            f"{self.share_inside:.0%} of the parameters"
         ]
 
     def _more_labels(self) -> list[str]:
@@ -225,5 +245,13 @@ class StackingReport:
         return lines
 
 
-def _called(name: str) -> str:
-    return {"prior": "the prior", "NPE": "NPE as it was"}[name]
+def _mean_and_error(scores: Tensor) -> tuple[float, float]:
+    return float(scores.mean()), float(scores.std() / len(scores) ** 0.5)
+
+
+def _family_weights(scores: CrossValidation) -> dict[str, float]:
+    totals: dict[str, float] = {}
+    weights = scores.weights.weights.tolist()
+    for family, weight in zip(scores.families, weights, strict=True):
+        totals[family] = totals.get(family, 0.0) + weight
+    return dict(sorted(totals.items(), key=lambda item: -item[1]))

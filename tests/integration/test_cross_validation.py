@@ -17,8 +17,8 @@ from sbi_rope.stacking import (
     CrossValidation,
     DensityCandidate,
     StackedPosterior,
-    candidates,
     stacking_weights,
+    trained_candidates,
 )
 from sbi_rope.stacking.folds import Workbench
 from tests import problems
@@ -112,7 +112,10 @@ def test_recordings_of_a_person_are_never_on_both_sides(
     person_of = {tuple(row): int(p) for row, p in zip(x.tolist(), people, strict=True)}
     tuned: list[tuple[set[int], Tensor]] = []
     splits: list[tuple[set[int], set[int]]] = []
-    finetune, without = CalibrationFinetuner.finetune, candidates.finetune_without
+    finetune, without = (
+        CalibrationFinetuner.finetune,
+        trained_candidates.finetune_without,
+    )
 
     def spied_finetune(self: Any, h: Any, x: Tensor, *args: Any, **options: Any) -> Any:
         tuned.append(({person_of[tuple(row)] for row in x.tolist()}, options["groups"]))
@@ -130,7 +133,7 @@ def test_recordings_of_a_person_are_never_on_both_sides(
         return without(start, fold, part, **options)
 
     monkeypatch.setattr(CalibrationFinetuner, "finetune", spied_finetune)
-    monkeypatch.setattr(candidates, "finetune_without", spied_without)
+    monkeypatch.setattr(trained_candidates, "finetune_without", spied_without)
     scores = validated(rope_of((theta, x)), observed(), num_folds=4)
     fold_of = {int(p): int(f) for p, f in zip(people, scores.fold, strict=True)}
     assert all(

@@ -301,9 +301,8 @@ def test_something_else_than_rope_is_refused(call: Callable[..., Any]) -> None:
 )
 def test_rows_that_are_no_pairs_are_refused(rows: torch.Tensor) -> None:
     rope = rope_of()
-    for call in (rope.with_pairs, rope.draw_targets):
-        with pytest.raises(InvalidInputError, match="rows"):
-            call(rows)
+    with pytest.raises(InvalidInputError, match="rows"):
+        rope.with_pairs(rows)
 
 
 def test_simulations_may_be_few_and_pairs_many() -> None:

@@ -69,7 +69,7 @@ def test_where_the_simulator_is_wrong_a_stack_is_better_than_npe_and_the_prior(
     assert found > float(exact) - 0.25
     # And it says so.
     for name in ("prior", "NPE"):
-        gain = posterior.report.gain_over(name)
+        gain = posterior.report.gains.get(name)
         assert gain is not None
         assert gain.low > 0
 

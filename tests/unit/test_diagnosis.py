@@ -150,20 +150,22 @@ def test_its_simulations_and_sizes_are_those_of_a_posterior(tuned: RoPE) -> None
     posterior = tuned.build_posterior(x_o, coupler=sharp, num_simulations=300, seed=0)
     expected = posterior.coupling.effective_sample_size
     assert torch.allclose(diagnosis.effective_sample_size, expected)
-    theta, embedded = tuned.draw_simulations(300, seed=0, show_progress_bars=False)
-    assert torch.equal(embedded, posterior.coupling.simulated.to(embedded))
-    assert torch.equal(diagnosis.theta, theta.double())
+    batch = tuned.embed(x_o, num_simulations=300, seed=0, show_progress_bars=False)
+    simulated = posterior.coupling.simulated
+    assert torch.equal(batch.simulated, simulated.to(batch.simulated))
+    assert torch.equal(diagnosis.theta, batch.theta.double())
 
 
 def test_simulated_parameters_belong_to_their_embeddings() -> None:
     noiseless = conductor(simulator=lambda theta: theta + 0.0)
-    theta, embedded = noiseless.draw_simulations(50, show_progress_bars=False)
-    assert torch.allclose(embedded, gaussian.GAIN * theta)
-    pairs = (theta, 2.0 * theta)
+    x_o = torch.zeros(5, 2)
+    batch = noiseless.embed(x_o, num_simulations=50, show_progress_bars=False)
+    assert torch.allclose(batch.simulated, gaussian.GAIN * batch.theta)
+    pairs = (batch.theta, 2.0 * batch.theta)
     stored = conductor(simulator=None, simulations=pairs)
-    theta, embedded = stored.draw_simulations(20, show_progress_bars=False)
-    assert theta.shape == (20, 2)
-    assert torch.allclose(embedded, 2.0 * gaussian.GAIN * theta)
+    batch = stored.embed(x_o, num_simulations=20, show_progress_bars=False)
+    assert batch.theta.shape == (20, 2)
+    assert torch.allclose(batch.simulated, 2.0 * gaussian.GAIN * batch.theta)
 
 
 def test_parameters_of_simulations_with_nan_are_dropped_with_them() -> None:
@@ -172,9 +174,11 @@ def test_parameters_of_simulations_with_nan_are_dropped_with_them() -> None:
 
     rope = conductor(simulator=simulator)
     with pytest.warns(UserWarning, match="Dropped"):
-        theta, embedded = rope.draw_simulations(50, show_progress_bars=False)
-    assert (theta[:, 0] > 0).all()
-    assert torch.allclose(embedded, gaussian.GAIN * theta)
+        batch = rope.embed(
+            torch.zeros(5, 2), num_simulations=50, show_progress_bars=False
+        )
+    assert (batch.theta[:, 0] > 0).all()
+    assert torch.allclose(batch.simulated, gaussian.GAIN * batch.theta)
 
 
 def test_the_same_seed_gives_the_same_diagnosis_and_leaves_the_callers_state(

@@ -535,8 +535,14 @@ def test_moments_of_stored_simulations_follow_the_slope_around_a_parameter(
     assert torch.allclose(moments.mean, signal, atol=0.45)
     expected = 0.25 * (MIXING.T @ MIXING).double()
     assert torch.allclose(moments.covariance.mean(dim=0), expected, atol=0.12)
-    targets = stored.targets(at + centre, 50, lambda x: x, progress=False).double()
-    assert torch.allclose(targets[1], signal[1], atol=0.3)
+    targets = stored.targets(
+        at + centre,
+        lambda x: x,
+        simulations_per_target=1,
+        num_neighbors=50,
+        progress=False,
+    )
+    assert torch.allclose(targets[1].double(), signal[1], atol=0.3)
 
 
 def test_few_stored_simulations_take_the_slope_of_all() -> None:

@@ -34,6 +34,7 @@ from sbi_rope.errors import (
 )
 from sbi_rope.metrics import evaluate
 from sbi_rope.stacking import default_candidates
+from sbi_rope.sweep import sweep
 from tests import gaussian, problems
 
 QUICK = CalibrationFinetuner(num_steps=20)
@@ -260,7 +261,13 @@ def test_nearest_parameters_are_nearest_in_standard_deviations() -> None:
     # In plain units (0, 50) is nearest. In standard deviations, about 0.5 and 24, 40 of
     # the second parameter count for less than 0.9 of the first.
     theta = torch.tensor([[0.9, 40.0]])
-    target = source.targets(theta, 1, lambda value: value, progress=False)
+    target = source.targets(
+        theta,
+        lambda value: value,
+        simulations_per_target=9,
+        num_neighbors=1,
+        progress=False,
+    )
     assert target.tolist() == [[1.0, 0.0]]
 
 
@@ -519,7 +526,13 @@ def test_targets_are_means_over_the_finite_simulations() -> None:
     theta = torch.tensor([[1.0, -1.0], [0.5, 2.0]])
     source = rope(simulator=simulator)._source
     with pytest.warns(RoPEWarning, match="Dropped"):
-        target = source.targets(theta, 50, lambda x: x, progress=False)
+        target = source.targets(
+            theta,
+            lambda x: x,
+            simulations_per_target=50,
+            num_neighbors=1,
+            progress=False,
+        )
     assert torch.allclose(target, theta)
     assert 20 < source.num_dropped < 80
 
@@ -577,7 +590,7 @@ def test_moving_our_posterior_moves_nothing_else() -> None:
     assert not next(npe.posterior_estimator.parameters()).is_meta
     # sbi moves a prior in place: ours is a copy.
     assert posterior.prior is not npe.prior
-    assert posterior.prior is not conductor._prior
+    assert posterior.prior is not conductor._npe.prior
     assert torch.isfinite(conductor.build_posterior(X_O).weights).all()
 
 
@@ -644,7 +657,7 @@ def test_a_sweep_gives_the_posteriors_of_single_couplings() -> None:
     conductor = trained()
     theta = torch.randn(30, 2)
     gammas, taus = (0.5, 0.1), (1.0, 0.8)
-    swept = list(conductor.sweep(X_O, gammas=gammas, taus=taus, seed=3))
+    swept = list(sweep(conductor, X_O, gammas=gammas, taus=taus, seed=3))
     settings = itertools.product(gammas, taus)
     for posterior, (gamma, tau) in zip(swept, settings, strict=True):
         single = conductor.build_posterior(
@@ -659,13 +672,13 @@ def test_a_sweep_gives_the_posteriors_of_single_couplings() -> None:
 def test_a_sweep_refuses_what_a_single_coupling_refuses() -> None:
     conductor = rope()
     with pytest.raises(InvalidInputError, match="at least one number"):
-        conductor.sweep(X_O, gammas=(), taus=(1.0,))
+        sweep(conductor, X_O, gammas=(), taus=(1.0,))
     with pytest.raises(InvalidInputError, match="`tau`"):
-        conductor.sweep(X_O, gammas=(0.5,), taus=(1.5,))
+        sweep(conductor, X_O, gammas=(0.5,), taus=(1.5,))
     with pytest.raises(InvalidInputError, match="`x_o`"):
-        conductor.sweep(X_O[:, :1], gammas=(0.5,), taus=(1.0,))
+        sweep(conductor, X_O[:, :1], gammas=(0.5,), taus=(1.0,))
     coupler = SinkhornCoupler(max_iterations=1)
-    posteriors = conductor.sweep(X_O, gammas=(0.01,), taus=(1.0,), coupler=coupler)
+    posteriors = sweep(conductor, X_O, gammas=(0.01,), taus=(1.0,), coupler=coupler)
     with pytest.raises(CouplingError, match=r"now 0\.01"):
         next(posteriors)
 
@@ -674,7 +687,7 @@ def test_a_posterior_of_a_sweep_can_be_moved_without_the_others() -> None:
     conductor = RoPE(problems.npe_posterior(), simulator=problems.simulate)
     x_o, theta = 0.3 * torch.randn(30, 3), torch.rand(30, 2) - 0.5
     settings = {"gammas": iter((0.5, 0.1)), "taus": (1.0,), "seed": 3}
-    posteriors = conductor.sweep(x_o, **settings)  # type: ignore[arg-type]
+    posteriors = sweep(conductor, x_o, **settings)  # type: ignore[arg-type]
     first = next(posteriors)
     first.log_prob_batched(theta, x_o)
     first.to("cpu")
@@ -708,7 +721,7 @@ def test_simulations_that_are_out_of_all_proportion_are_named_by_parameters() ->
     named = rf"1 of the simulations\. .* are \[\[{str(theta[9, 0].item())[:6]}"
     for call in (
         lambda: stored.build_posterior(X_O, seed=0),
-        lambda: next(stored.sweep(X_O, gammas=[0.5], taus=[1.0], seed=0)),
+        lambda: next(sweep(stored, X_O, gammas=[0.5], taus=[1.0], seed=0)),
         lambda: diagnose(stored, X_O, seed=0),
     ):
         with pytest.raises(CouplingError, match=named):
@@ -767,13 +780,13 @@ def test_an_embedding_net_that_works_in_place_changes_no_data() -> None:
 def test_targets_are_kept_as_they_were_handed_over() -> None:
     rows = torch.arange(12)
     conductor = rope().append_calibration(*gaussian.labelled(12))
-    targets = conductor.draw_targets(rows, seed=0)
+    targets = gaussian.GAIN * conductor.calibration[0]
     parts = [conductor.with_pairs(rows, targets=targets.clone()) for _ in range(2)]
     changed = targets.clone()
     parts.append(conductor.with_pairs(rows, targets=changed))
     changed.fill_(99.0)
     nets = [part.train(seed=0, show_progress_bars=False) for part in parts]
-    embedded = [net.embed_observations(X_O) for net in nets]
+    embedded = [net.embed(X_O).real for net in nets]
     assert torch.equal(embedded[0], embedded[1])
     assert torch.equal(embedded[0], embedded[2])
 

@@ -57,6 +57,7 @@ NOT_CALLED = {
             "LearningCurve",
             "ParameterDistribution",
             "StackingReport",
+            "StackingReport.of",
             "StackingWeights",
             "SummaryDiscrepancy",
         ),

@@ -3,11 +3,11 @@
 import torch
 
 from sbi_rope import CalibrationFinetuner, SinkhornCoupler
+from sbi_rope.sweep import sweep
 from tests.faults.outcomes import Call
 from tests.faults.problem import (
     COUPLED,
     FEWER_X_O,
-    FINETUNER,
     PAIRS,
     QUIET,
     SIMULATIONS,
@@ -25,9 +25,11 @@ from tests.faults.problem import (
 CALLS = [
     Call(
         name="RoPE(simulations)",
-        run=lambda theta=THETA_S, x=X_S: untrained(
-            simulations=(theta, x)
-        ).draw_simulations(30, seed=0),
+        run=lambda theta=THETA_S, x=X_S: (
+            untrained(simulations=(theta, x))
+            .embed(X_O, num_simulations=30, seed=0)
+            .simulated
+        ),
         tensors=SIMULATIONS,
         accepts=("theta: NaN", "theta: Inf", "x: NaN", "x: Inf"),
     ),
@@ -54,17 +56,10 @@ CALLS = [
         options={"seed": "seed"},
     ),
     Call(
-        name="RoPE.draw_targets",
-        run=lambda rows, seed=0: trained().draw_targets(rows, seed=seed),
-        tensors={"rows": torch.tensor([3, 0, 7])},
-        options={"seed": "seed"},
-    ),
-    Call(
         name="RoPE.with_pairs",
-        run=lambda rows, targets=None: (
-            trained().with_pairs(rows, targets=targets).calibration
-        ),
+        run=lambda rows, **options: trained().with_pairs(rows, **options).calibration,
         tensors={"rows": torch.tensor([3, 0, 7])},
+        options={"finetuner": "instance"},
         accepts=("rows: no rows",),
     ),
     Call(
@@ -79,19 +74,12 @@ CALLS = [
         accepts=("targets: None",),
     ),
     Call(
-        name="RoPE.with_finetuner",
-        run=lambda finetuner=FINETUNER: repr(trained().with_finetuner(finetuner)),
-        options={"finetuner": "instance"},
-    ),
-    Call(
-        name="RoPE.draw_simulations",
-        run=lambda **options: trained().draw_simulations(**{"seed": 0, **options}),
-        options={"num_simulations": "count", "at_least": "count", "seed": "seed"},
-    ),
-    Call(
-        name="RoPE.embed_observations",
-        run=lambda x_o: trained().embed_observations(x_o),
+        name="RoPE.embed",
+        run=lambda x_o=X_O, **options: (
+            trained().embed(x_o, **{"seed": 0, "num_simulations": 30, **options}).real
+        ),
         tensors={"x_o": X_O},
+        options={"num_simulations": "count", "seed": "seed"},
         accepts=FEWER_X_O,
     ),
     Call(
@@ -114,11 +102,17 @@ CALLS = [
         accepts=FEWER_X_O,
     ),
     Call(
-        name="RoPE.sweep",
+        name="sweep",
         run=lambda x_o=X_O, gammas=(0.5, 1.0), taus=(1.0, 0.5): [
             one.weights
-            for one in trained().sweep(
-                x_o, gammas=gammas, taus=taus, num_simulations=30, seed=0, **QUIET
+            for one in sweep(
+                trained(),
+                x_o,
+                gammas=gammas,
+                taus=taus,
+                num_simulations=30,
+                seed=0,
+                **QUIET,
             )
         ],
         tensors={"x_o": X_O},

@@ -181,10 +181,4 @@ CALLS = [
         ),
         options={"name": "text", "build": "function", "fixed": "instance"},
     ),
-    Call(
-        name="StackingReport.gain_over",
-        run=lambda name="NPE": stacked().report.gain_over(name),
-        options={"name": "choice"},
-        accepts=("name: 'x'",),
-    ),
 ]

@@ -1,0 +1,145 @@
+"""A trained NPE, taken apart into its embedding and its density."""
+
+import copy
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from sbi_rope._sbi import (
+    ConditionalDensityEstimator,
+    VectorFieldDensity,
+    copy_of_prior,
+    device_of,
+    dtype_of,
+    embed,
+    embedding_of,
+    estimator_of,
+    headless,
+    posterior_from,
+    with_embedding,
+)
+from sbi_rope._validation import (
+    check_batch,
+    check_device,
+    check_finite,
+    check_in_support,
+    check_same_length,
+    check_tensor,
+)
+from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError
+
+__all__ = ["TrainedNPE"]
+
+
+class TrainedNPE:
+    r"""A copy of a trained estimator :math:`q(\theta \mid h(x))`, in its two parts.
+
+    Neither training nor moving a posterior to another device may touch what belongs to
+    the user, so the estimator and the prior are copied, and what is handed out is a
+    copy again.
+
+    Args:
+        posterior: What ``NPE(...).build_posterior()`` returns, or the posterior of
+            MNPE, FMPE or NPSE.
+
+    Attributes:
+        estimator: The copy of the estimator, in evaluation mode.
+        prior: The copy of the prior.
+        h: The embedding net of the copy, with sbi's standardising layer.
+        like: An empty tensor of shape ``(0, d)`` with the dtype and device of the
+            estimator.
+
+    Raises:
+        UnsupportedPosteriorError: If the posterior has no embedding to work with, or is
+            not in float32.
+    """
+
+    def __init__(self, posterior: Any) -> None:
+        estimator = estimator_of(posterior)
+        embedding_of(estimator)
+        if dtype_of(estimator) != torch.float32:
+            raise UnsupportedPosteriorError(
+                f"Expected an estimator in float32; got {dtype_of(estimator)}. sbi "
+                "converts every x to float32; convert the estimator with `.float()`."
+            )
+        self.estimator = (
+            copy.deepcopy(estimator).eval().requires_grad_(requires_grad=False)
+        )
+        self._posterior: Any = posterior_from(posterior, self.estimator)
+        self.prior = copy_of_prior(posterior.prior)
+        self.h = embedding_of(self.estimator)
+        self._q = headless(self.estimator)
+        self.like = torch.empty(
+            0,
+            *estimator.input_shape,
+            dtype=dtype_of(estimator),
+            device=device_of(estimator),
+        )
+
+    @property
+    def event_shape(self) -> torch.Size:
+        """The shape of one observation."""
+        return self.estimator.condition_shape
+
+    @property
+    def enable_transform(self) -> bool:
+        """Whether sbi's ``map`` is to search in an unbounded space."""
+        return self._posterior.enable_transform
+
+    def posterior(self, embedding_net: nn.Module | None = None) -> Any:
+        """Return a copy of the sbi posterior.
+
+        Args:
+            embedding_net: What takes the place of h; h itself if None.
+        """
+        estimator = self.estimator
+        if embedding_net is not None:
+            estimator = with_embedding(estimator, embedding_net)
+        return posterior_from(self._posterior, copy.deepcopy(estimator))
+
+    def density(self) -> ConditionalDensityEstimator:
+        r"""Return a copy of :math:`q(\theta \mid s)`, given an embedding s."""
+        density = self._q
+        if not isinstance(density, ConditionalDensityEstimator):
+            sample_with = self._posterior.sample_with
+            density = VectorFieldDensity(density, self.prior, sample_with)
+        return copy.deepcopy(density)
+
+    def embed(self, name: str, x: Tensor, embedding_net: nn.Module) -> Tensor:
+        """Return the embeddings of a user's observations, shape ``(n, l)``.
+
+        Raises:
+            InvalidInputError: If one of them is not finite, or its length is not.
+        """
+        embedded = embed(embedding_net, x)
+        usable = torch.isfinite(torch.linalg.vector_norm(embedded, dim=1))
+        if not usable.all():
+            rows = (~usable).nonzero().flatten()
+            largest = float(x[rows[0]].abs().max())
+            raise InvalidInputError(
+                f"Expected `{name}` with a finite embedding; got NaN, Inf or numbers "
+                f"too large to compare for {len(rows)} of {len(x)} rows (first: "
+                f"{rows[:5].tolist()}, with values of up to {largest:.2g}). Remove or "
+                "repair these rows."
+            )
+        return embedded
+
+    def checked_pairs(self, theta: Any, x: Any) -> tuple[Tensor, Tensor]:
+        """Return a copy of a user's labelled observations, in the estimator's dtype."""
+        theta = self._checked("theta", theta, self.estimator.input_shape)
+        x = self.checked_x("x", x)
+        check_same_length("theta", theta, "x", x)
+        check_in_support("theta", theta, self.prior)
+        return theta, x
+
+    def checked_x(self, name: str, x: Any) -> Tensor:
+        """Return a copy of a user's observations, in the estimator's dtype."""
+        return self._checked(name, x, self.event_shape)
+
+    def _checked(self, name: str, value: Any, event_shape: torch.Size) -> Tensor:
+        check_device(name, check_tensor(name, value), self.like.device)
+        value = check_batch(name, value, event_shape)
+        value = value.detach().to(self.like.dtype, copy=True)
+        check_finite(name, value)  # the estimator's dtype may hold less
+        return value

@@ -1,0 +1,157 @@
+"""A batch of real observations and the simulations that it is coupled with."""
+
+import copy
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Literal
+
+from torch import Tensor, nn
+
+from sbi_rope._npe import TrainedNPE
+from sbi_rope.coupling import Coupling, SinkhornCoupler
+from sbi_rope.errors import CouplingError
+from sbi_rope.mixture import (
+    CoupledContexts,
+    CoupledNet,
+    MixtureEstimator,
+    MixturePosterior,
+    Part,
+)
+
+__all__ = ["EmbeddedBatch", "check_converged", "parameters_named"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class EmbeddedBatch:
+    r"""Real observations and simulations, each as its embedding.
+
+    It is what :meth:`RoPE.embed <sbi_rope.RoPE.embed>` returns, and what the coupling
+    sees.
+
+    Attributes:
+        x_o: The observations, shape ``(n_o, *event)``.
+        real: Their embeddings :math:`g(x_o)`, shape ``(n_o, l)``.
+        theta: The parameters of the simulations, shape ``(n_s, d)``.
+        simulated: The embeddings :math:`h(x_s)` of these, shape ``(n_s, l)``.
+        npe: The NPE that the embeddings belong to.
+        embedding_net: g, or h if nothing was tuned.
+    """
+
+    x_o: Tensor
+    real: Tensor
+    theta: Tensor
+    simulated: Tensor
+    npe: TrainedNPE
+    embedding_net: nn.Module
+
+    def couple(self, coupler: SinkhornCoupler, *, seed: int | None = None) -> Coupling:
+        """Couple the observations with the simulations.
+
+        Args:
+            coupler: Settings of the transport.
+            seed: As in :meth:`SinkhornCoupler.couple
+                <sbi_rope.SinkhornCoupler.couple>`.
+
+        Raises:
+            CouplingError: If the embeddings cannot be coupled; it names the parameters
+                of the simulations concerned.
+        """
+        with parameters_named(self.theta):
+            return coupler.couple(self.real, self.simulated, seed=seed)
+
+    def sweep(
+        self,
+        coupler: SinkhornCoupler,
+        *,
+        gammas: Sequence[float],
+        taus: Sequence[float],
+        seed: int | None = None,
+    ) -> Iterator[Coupling]:
+        """Couple at every gamma and every tau, each when it is asked for.
+
+        Args:
+            coupler: Settings other than gamma and tau.
+            gammas: As in :meth:`SinkhornCoupler.sweep
+                <sbi_rope.SinkhornCoupler.sweep>`.
+            taus: As there.
+            seed: As there.
+
+        Raises:
+            InvalidInputError: If a gamma or tau is outside its range, or there is none.
+            CouplingError: As in :meth:`couple`.
+        """
+        with parameters_named(self.theta):
+            couplings = coupler.sweep(
+                self.real, self.simulated, gammas=gammas, taus=taus, seed=seed
+            )
+
+        def named() -> Iterator[Coupling]:
+            with parameters_named(self.theta):
+                yield from couplings
+
+        return named()
+
+    def posterior(
+        self,
+        coupling: Coupling,
+        *,
+        unseen: Literal["raise", "extend"] = "raise",
+        tail_mass: float = 1e-3,
+        shared: dict[int, Tensor] | None = None,
+    ) -> MixturePosterior:
+        """Return the mixture of simulated posteriors that a coupling gives.
+
+        Args:
+            coupling: What :meth:`couple` returned.
+            unseen: As in :meth:`~sbi_rope.RoPE.build_posterior`.
+            tail_mass: As in :meth:`~sbi_rope.RoPE.build_posterior`.
+            shared: What posteriors of the same simulations may share, see
+                :class:`~sbi_rope.MixturePosterior`.
+        """
+        # Each posterior has its own net and density: moving one to another device
+        # leaves the others where they are.
+        net = CoupledNet(copy.deepcopy(self.embedding_net), [coupling])
+        mixing = CoupledContexts(self.simulated, self.x_o, [net], unseen=unseen)
+        mixture = MixtureEstimator(
+            [Part(self.npe.density(), mixing)], [1.0], tail_mass=tail_mass
+        )
+        return MixturePosterior(
+            mixture,
+            copy.deepcopy(self.npe.prior),
+            enable_transform=self.npe.enable_transform,
+            shared=shared,
+        )
+
+
+@contextmanager
+def parameters_named(theta: Tensor) -> Iterator[None]:
+    """Say which observations and simulations a coupling failed for, in RoPE's words.
+
+    The rows of simulations mean nothing to users, for whom they were drawn.
+
+    Args:
+        theta: The parameters of the simulations, shape ``(n_s, d)``.
+    """
+    try:
+        yield
+    except CouplingError as error:
+        reason = error.reason.replace("`real`", "`x_o`")
+        reason = reason.replace("`simulated`", "the simulations")
+        if error.simulated_rows:
+            rows = list(error.simulated_rows[:5])
+            reason += f" Their parameters are {theta[rows].tolist()}."
+        raise CouplingError(reason) from error
+
+
+def check_converged(coupling: Coupling, coupler: SinkhornCoupler) -> None:
+    """Raise a CouplingError unless a coupling has converged."""
+    if coupling.converged:
+        return
+    raise CouplingError(
+        f"The coupling has not converged: marginal error {coupling.marginal_error:.1e} "
+        f"after {coupling.num_iterations} iterations, tolerance "
+        f"{coupler.tolerance:.1e}. Use a larger gamma (now {coupler.gamma}), tau < 1 "
+        f"(now {coupler.tau}), more max_iterations, or accept it with "
+        "require_convergence=False."
+    )

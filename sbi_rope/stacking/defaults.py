@@ -1,0 +1,97 @@
+"""What a stack is made of unless its user says otherwise."""
+
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+from sbi_rope._validation import check_instance, check_numbers
+from sbi_rope.mixture import PriorPosterior
+from sbi_rope.rope import RoPE
+from sbi_rope.stacking.candidates import (
+    AmortisedCandidate,
+    Candidate,
+    CouplingCandidate,
+    DensityCandidate,
+)
+from sbi_rope.stacking.folds import NUM_FOLDS, Workbench
+from sbi_rope.stacking.trained_candidates import (
+    DiscrepancyCandidate,
+    FinetunedCandidate,
+)
+
+__all__ = ["default_candidates"]
+
+# Chosen on calibration data, see benchmarks/README.md.
+GAMMAS = (0.02, 0.05, 0.1, 0.4)
+TAUS = (1.0, 0.5, 0.0)
+REHEARSAL = 1.0
+
+
+def default_candidates(
+    rope: RoPE | None = None,
+    *,
+    couplings: bool = False,
+    gammas: Sequence[float] = GAMMAS,
+    taus: Sequence[float] = TAUS,
+    rehearsal: float | None = REHEARSAL,
+) -> tuple[Candidate, ...]:
+    """Return the prior, NPE, fine-tuned NPE and the discrepancy models.
+
+    Args:
+        rope: RoPE with its calibration pairs; leaves out what these do not allow or
+            need, as :func:`stack` does by itself. All if None.
+        couplings: Whether RoPE and OT-only over a grid of gamma and tau take part, and
+            tuning-only; for a stack of a batch of observations.
+        gammas: In units of the median distance between simulated embeddings.
+        taus: Trust in the prior; 0 lets every observation choose by itself.
+        rehearsal: Of a second RoPE over the same grid, whose tuning keeps simulations
+            where they are, see :class:`~sbi_rope.CalibrationFinetuner`; None leaves it
+            out.
+
+    Returns:
+        The candidates, couplings first.
+
+    Raises:
+        InvalidTypeError: If ``rope`` is something else.
+        InvalidInputError: If a gamma, a tau or the rehearsal is outside its range.
+    """
+    gammas, taus = check_numbers("gammas", gammas), check_numbers("taus", taus)
+    amortised: tuple[AmortisedCandidate, ...] = (
+        DensityCandidate(name="prior", build=_prior, fixed=True),
+        DensityCandidate(name="NPE", build=_npe, fixed=True),
+        FinetunedCandidate(),
+        DiscrepancyCandidate(space="embedding"),
+        DiscrepancyCandidate(space="input"),
+        DiscrepancyCandidate(space="tuned"),
+        FinetunedCandidate(space="input"),
+        FinetunedCandidate(space="tuned"),
+    )
+    if rope is not None:
+        check_instance("rope", rope, RoPE)
+        bench = Workbench(rope, num_folds=NUM_FOLDS, seed=0, show_progress_bars=False)
+        amortised = tuple(one for one in amortised if one.applies_to(bench))
+    if not couplings:
+        return amortised
+    rehearsed = [] if rehearsal is None else [{"rehearsal": rehearsal}]
+    nets: list[dict[str, Any]] = [{"tuned": True}, *rehearsed, {"tuned": False}]
+    coupled = [
+        CouplingCandidate(gamma=gamma, tau=tau, **net)
+        for net, gamma, tau in itertools.product(nets, gammas, taus)
+    ]
+    tuned = DensityCandidate(name="tuning-only", build=_tuning_only)
+    return (*coupled, *amortised, tuned)
+
+
+# Functions with a name, so that a stack can be pickled.
+
+
+def _prior(rope: RoPE, seed: int) -> PriorPosterior:
+    return PriorPosterior(rope.npe.prior)
+
+
+def _npe(rope: RoPE, seed: int) -> Any:
+    return rope.npe
+
+
+def _tuning_only(rope: RoPE, seed: int) -> Any:
+    return rope.tuned_posterior()

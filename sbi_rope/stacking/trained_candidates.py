@@ -1,0 +1,139 @@
+"""The candidates of a stack that are trained on the calibration pairs."""
+
+import copy
+from dataclasses import dataclass
+from typing import Any
+
+from sbi_rope._sbi import embedding_of, estimator_of, headless, with_embedding
+from sbi_rope._validation import check_choice, check_instance
+from sbi_rope.discrepancy.correction import Space
+from sbi_rope.mixture import OwnContexts, Part, part_of
+from sbi_rope.stacking.candidates import AmortisedCandidate
+from sbi_rope.stacking.finetuning import finetune_without
+from sbi_rope.stacking.folds import Fold, Workbench
+
+__all__ = ["DiscrepancyCandidate", "FinetunedCandidate"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiscrepancyCandidate(AmortisedCandidate):
+    """NPE on simulations that were corrected by what the pairs tell.
+
+    See :class:`~sbi_rope.discrepancy.DiscrepancyNPE`.
+
+    Args:
+        space: What is corrected.
+        learn_prior: Whether the distribution of parameters is learned from the pairs.
+            The scores of a stack assume in any case that these are drawn like the
+            observations to be inferred.
+    """
+
+    space: Space = "embedding"
+    learn_prior: bool = True
+
+    def __post_init__(self) -> None:
+        """Check the values of all fields."""
+        check_choice("space", self.space, ("embedding", "input", "tuned"))
+        check_instance("learn_prior", self.learn_prior, bool)
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        """The method with its setting."""
+        space = "" if self.space == "embedding" else f" ({self.space})"
+        return f"discrepancy{space}" + ("" if self.learn_prior else ", given prior")
+
+    @property
+    def family(self) -> str:
+        """The method that it is a setting of."""
+        return "discrepancy"
+
+    def applies_to(self, bench: Workbench) -> bool:
+        """Tell whether x is a short vector, or there are folds to tune without."""
+        if self.space == "input":
+            return _has_summaries(bench)
+        return self.space == "embedding" or len(bench.folds) > 2
+
+    def parts(self, fold: Fold) -> list[Part]:
+        """Correct NPE."""
+        corrected = fold.corrected(self.space, learn_prior=self.learn_prior)
+        estimator = corrected.estimator
+        if self.space == "input":
+            return [part_of(estimator)]
+        contexts = OwnContexts(corrected.nets, fold.bench.x.shape[1:])
+        return [Part(headless(estimator), contexts)]
+
+
+def _has_summaries(bench: Workbench) -> bool:
+    """Whether x is a short vector that an embedding net could lose something of."""
+    net = embedding_of(estimator_of(bench.npe))
+    has_net = any(True for _ in net.parameters())
+    return bench.has_summaries and has_net
+
+
+# Of fine-tuning, by what is corrected in the start. Trained on the input, a whole
+# network is nearly right already. Chosen on calibration data, see benchmarks/README.md.
+LEARNING_RATES = {None: 1e-3, "embedding": 1e-3, "tuned": 1e-3, "input": 3e-4}
+
+
+@dataclass(frozen=True, kw_only=True)
+class FinetunedCandidate(AmortisedCandidate):
+    """NPE, as it is or corrected, with all its parameters trained on the pairs.
+
+    It is the average of several nets, each of which holds another part of the pairs
+    out to know when to stop.
+
+    Args:
+        space: None to start from NPE; else what is corrected in the NPE to start from.
+    """
+
+    space: Space | None = None
+
+    def __post_init__(self) -> None:
+        """Check the value of the field."""
+        check_choice("space", self.space, (None, "embedding", "input", "tuned"))
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        """The method with its setting."""
+        if self.space is None:
+            return "fine-tuned NPE"
+        return f"{DiscrepancyCandidate(space=self.space).name}, fine-tuned"
+
+    @property
+    def family(self) -> str:
+        """The method that it is a setting of."""
+        return "fine-tuned NPE" if self.space is None else "discrepancy, fine-tuned"
+
+    def applies_to(self, bench: Workbench) -> bool:
+        """Tell whether there are parts to hold out, and the start applies."""
+        start = self.space is None or DiscrepancyCandidate(space=self.space).applies_to(
+            bench
+        )
+        return start and len(bench.folds) > 2
+
+    def parts(self, fold: Fold) -> list[Part]:
+        """Train without each part of the pairs."""
+        if len(fold.used) < 2:
+            # Nothing can be held out; the start is what there is.
+            if self.space is None:
+                return [part_of(estimator_of(fold.bench.npe))]
+            return DiscrepancyCandidate(space=self.space).parts(fold)
+        rate = LEARNING_RATES[self.space]
+        return [
+            part_of(
+                finetune_without(
+                    self._start(fold, number), fold, number, learning_rate=rate
+                )
+            )
+            for number in sorted(fold.used)
+        ]
+
+    def _start(self, fold: Fold, number: int) -> Any:
+        if self.space is None:
+            return estimator_of(fold.bench.npe)
+        corrected = fold.corrected(self.space, learn_prior=True)
+        if self.space != "tuned":
+            return corrected.estimator
+        # The net that has not seen the part which is held out.
+        net = corrected.nets[sorted(fold.used).index(number)]
+        return with_embedding(corrected.estimator, copy.deepcopy(net))

@@ -1,0 +1,299 @@
+"""How the candidates of a stack are trained and scored, fold by fold."""
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from sbi_rope._progress import progress_bar
+from sbi_rope._random import seeded
+from sbi_rope._sbi import ConditionalDensityEstimator, estimator_of
+from sbi_rope._standardisation import warn_of_far_entries
+from sbi_rope._validation import (
+    check_batch,
+    check_finite,
+    check_gradients,
+    check_instance,
+    check_integer,
+    check_not_negative,
+)
+from sbi_rope.discrepancy.correction import network_of
+from sbi_rope.errors import (
+    InvalidInputError,
+    NotReadyError,
+    SamplingError,
+    UnsupportedPosteriorError,
+    warn_user,
+)
+from sbi_rope.metrics.calibration import central_levels
+from sbi_rope.metrics.calls import draw_ranks
+from sbi_rope.mixture import MixturePosterior
+from sbi_rope.rope import RoPE
+from sbi_rope.stacking.candidates import (
+    AmortisedCandidate,
+    Candidate,
+    CouplingCandidate,
+    check_candidates,
+)
+from sbi_rope.stacking.couplings import FittedCouplings, fit_couplings
+from sbi_rope.stacking.cross_validation import CrossValidation, fold_weights
+from sbi_rope.stacking.defaults import default_candidates
+from sbi_rope.stacking.folds import NUM_FOLDS, Fold, Workbench, draw_seeds
+from sbi_rope.stacking.trained_candidates import (
+    DiscrepancyCandidate,
+    FinetunedCandidate,
+)
+from sbi_rope.stacking.versions import Versions, train_version
+
+__all__ = ["StackTrainer"]
+
+# Fewest pairs: one to train on and one to score.
+MIN_PAIRS = 2
+# Samples of each held-out pair behind the calibration of the stack.
+NUM_SAMPLES = 500
+
+
+class StackTrainer:
+    """Trains and scores all candidates; its arguments are those of :func:`stack`."""
+
+    def __init__(
+        self,
+        rope: RoPE,
+        x_o: Tensor | None,
+        *,
+        candidates: Sequence[Candidate] | None,
+        num_folds: int | None,
+        num_simulations: int | None,
+        pseudo_count: float,
+        require_convergence: bool,
+        seed: int | None,
+        show_progress_bars: bool,
+        unseen: Literal["raise", "extend"] = "raise",
+        tail_mass: float = 1e-3,
+    ) -> None:
+        check_gradients()
+        check_instance("rope", rope, RoPE)
+        if num_folds is not None:
+            check_integer("num_folds", num_folds, minimum=2)
+        if num_simulations is not None:
+            check_integer("num_simulations", num_simulations)
+        check_not_negative("pseudo_count", pseudo_count)
+        check_instance("require_convergence", require_convergence, bool)
+        _check_pairs(len(rope.calibration[0]))
+        self.x_o = None if x_o is None else _checked_observations(x_o, rope)
+        self.seeds = draw_seeds(seed, 3)
+        self.bench = Workbench(
+            rope,
+            num_folds=NUM_FOLDS if num_folds is None else num_folds,
+            seed=self.seeds[0],
+            show_progress_bars=show_progress_bars,
+        )
+        _check_pairs(len(self.bench.folds))
+        _check_density(estimator_of(self.bench.npe))
+        self.candidates = self._chosen(candidates)
+        self.num_simulations = num_simulations
+        self.pseudo_count = pseudo_count
+        self.require_convergence = require_convergence
+        self.unseen: Literal["raise", "extend"] = unseen
+        self.tail_mass = tail_mass
+        self.show = show_progress_bars
+
+    @property
+    def prior(self) -> Any:
+        """The prior NPE was trained with."""
+        return self.bench.npe.prior
+
+    def _chosen(self, candidates: Sequence[Candidate] | None) -> tuple[Candidate, ...]:
+        if candidates is None:
+            chosen = default_candidates(couplings=self.x_o is not None)
+            return tuple(
+                candidate
+                for candidate in chosen
+                if not isinstance(candidate, AmortisedCandidate)
+                or candidate.applies_to(self.bench)
+            )
+        chosen = check_candidates(candidates)
+        corrected = [
+            candidate
+            for candidate in chosen
+            if isinstance(candidate, DiscrepancyCandidate | FinetunedCandidate)
+        ]
+        if any(candidate.space == "input" for candidate in corrected):
+            # Before the others are trained.
+            network_of(estimator_of(self.bench.npe), "input")
+        coupled = any(isinstance(c, CouplingCandidate) for c in chosen)
+        if coupled and self.x_o is None:
+            raise InvalidInputError(
+                "Expected `x_o`, a batch of observations, with couplings among the "
+                "candidates; got None. Pass it, or leave them out."
+            )
+        if not coupled and self.x_o is not None:
+            raise InvalidInputError(
+                "Expected couplings among the candidates with `x_o`; got none, so that "
+                "nothing depends on the batch. Leave `x_o` out, or add to "
+                "`default_candidates(couplings=True)`."
+            )
+        return chosen
+
+    @torch.enable_grad()  # whatever the caller's own setting
+    def cross_validate(
+        self, *, num_training_folds: int | None = None, with_refit: bool = False
+    ) -> tuple[Versions, CrossValidation]:
+        """Train on the folds after each fold, and score on it.
+
+        Args:
+            num_training_folds: Folds to train on; all others if None.
+            with_refit: Whether to add a version that is trained on all pairs. It is
+                not scored.
+        """
+        bench = self.bench
+        num_folds = len(bench.folds)
+        if num_training_folds is None:
+            num_training_folds = num_folds - 1
+        check_integer("num_training_folds", num_training_folds)
+        if num_training_folds >= num_folds:
+            raise InvalidInputError(
+                f"Expected `num_training_folds` below the number of folds, {num_folds};"
+                f" got {num_training_folds}."
+            )
+        folds = [
+            Fold(bench, [(k + 1 + j) % num_folds for j in range(num_training_folds)])
+            for k in range(num_folds)
+        ]
+        if with_refit:
+            folds.append(Fold(bench, range(num_folds)))
+        versions = self._train(folds)
+        scores = self._score(versions, num_training_folds)
+        return versions, scores
+
+    def _train(self, folds: Sequence[Fold]) -> Versions:
+        chosen = self.candidates
+        bar = progress_bar(folds, show=self.show, desc="Folds")
+        trained = tuple(train_version(chosen, fold) for fold in bar)
+        couplings: FittedCouplings | None = None
+        coupled = [c for c in chosen if isinstance(c, CouplingCandidate)]
+        if coupled:
+            assert self.x_o is not None
+            couplings = fit_couplings(
+                coupled,
+                folds,
+                self.x_o,
+                num_simulations=self.num_simulations,
+                seed=self.seeds[1],
+                unseen=self.unseen,
+                require_convergence=self.require_convergence,
+                show_progress_bars=self.show,
+            )
+        return Versions(
+            names=tuple(candidate.name for candidate in chosen),
+            fixed=train_version(chosen, folds[0], fixed=True),
+            trained=trained,
+            couplings=couplings,
+            tail_mass=self.tail_mass,
+        )
+
+    def _score(self, versions: Versions, num_training_folds: int) -> CrossValidation:
+        bench = self.bench
+        theta, x = bench.theta, bench.x
+        log_scores = theta.new_empty(
+            len(theta), len(self.candidates), dtype=torch.double
+        )
+        fold = torch.empty(len(theta), dtype=torch.long, device=theta.device)
+        log_q = None
+        if versions.couplings is not None:
+            # The components are the same in all folds.
+            log_q = versions.couplings.component_log_probs(theta)
+        for number, rows in enumerate(bench.folds):
+            fold[rows] = number
+            log_scores[rows] = versions.log_probs(
+                theta[rows],
+                x[rows],
+                [number],
+                log_q=None if log_q is None else log_q[rows],
+            )
+        weights = fold_weights(log_scores, fold, self.pseudo_count)
+        stack_scores = log_scores.new_empty(len(theta))
+        levels = torch.empty_like(theta)
+        # Simulations are contexts of the first part in all folds; what comes after may
+        # differ.
+        masses: dict[int, Tensor] = {}
+        for number, rows in enumerate(bench.folds):
+            shared = dict(masses)
+            posterior = MixturePosterior(
+                versions.estimator(weights[number], [number]),
+                self.prior,
+                enable_transform=False,
+                shared=shared,
+            )
+            log_prob, ranks = self._normalised(posterior, theta[rows], x[rows])
+            stack_scores[rows] = log_prob.double()
+            levels[rows] = central_levels(ranks).to(levels)
+            if versions.couplings is not None and 0 in shared:
+                masses[0] = shared[0]
+        scores = CrossValidation(
+            names=tuple(candidate.name for candidate in self.candidates),
+            families=tuple(candidate.family for candidate in self.candidates),
+            log_scores=log_scores,
+            fold=fold,
+            num_trained_on=len(theta) * num_training_folds // len(bench.folds),
+            stack_scores=stack_scores,
+            levels=levels,
+            pseudo_count=self.pseudo_count,
+        )
+        if not scores.weights.converged:
+            warn_user(
+                "The weights of the stack have not converged: the held-out score could "
+                f"be better by up to {scores.weights.gap / len(theta):.3f} nats a "
+                "pair. Leave out candidates that are nearly the same."
+            )
+        return scores
+
+    def _normalised(
+        self, posterior: MixturePosterior, theta: Tensor, x: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return log densities inside the prior's support, and ranks of theta there."""
+        try:
+            log_prob = posterior.log_prob_batched(theta[None], x)[0]
+            with seeded(self.seeds[2]):
+                ranks = draw_ranks(
+                    posterior,
+                    theta,
+                    x,
+                    num_samples=NUM_SAMPLES,
+                    chunk_size=NUM_SAMPLES,
+                    show=False,
+                )
+        except SamplingError as error:
+            raise SamplingError(
+                "A stack of these candidates has next to no mass inside the support of "
+                "the prior at a held-out observation, so that it cannot be sampled. "
+                "Add the prior to the candidates, as `default_candidates()` has it."
+            ) from error
+        return log_prob, ranks
+
+
+def _check_pairs(count: int) -> None:
+    if count < MIN_PAIRS:
+        raise NotReadyError(
+            f"Expected at least {MIN_PAIRS} calibration pairs with different "
+            f"parameters, to hold some out; got {count}. Call "
+            "`append_calibration(theta, x)` first."
+        )
+
+
+def _check_density(estimator: Any) -> None:
+    if not isinstance(estimator, ConditionalDensityEstimator):
+        raise UnsupportedPosteriorError(
+            "Expected a RoPE of a posterior with a density, such as that of NPE: the "
+            "density of held-out parameters is what candidates are scored by. Got "
+            f"{type(estimator).__name__}; train NPE instead of FMPE or NPSE."
+        )
+
+
+def _checked_observations(x_o: Tensor, rope: RoPE) -> Tensor:
+    _, x = rope.calibration
+    x_o = check_batch("x_o", x_o, x.shape[1:]).detach().to(x, copy=True)
+    check_finite("x_o", x_o)  # float32 may hold less
+    warn_of_far_entries("x_o", x_o, rope.embedding_net)
+    return x_o

@@ -1,0 +1,98 @@
+"""RoPE at many settings of the coupling."""
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Literal
+
+from torch import Tensor
+
+from sbi_rope._standardisation import warn_of_far_entries
+from sbi_rope._validation import (
+    check_choice,
+    check_instance,
+    check_numbers,
+    check_unit_interval,
+)
+from sbi_rope.batch import check_converged
+from sbi_rope.coupling import SinkhornCoupler
+from sbi_rope.mixture import MixturePosterior
+from sbi_rope.rope import RoPE
+
+__all__ = ["sweep"]
+
+
+def sweep(
+    rope: RoPE,
+    x_o: Tensor,
+    *,
+    gammas: Sequence[float],
+    taus: Sequence[float],
+    coupler: SinkhornCoupler | None = None,
+    num_simulations: int | None = None,
+    seed: int | None = None,
+    unseen: Literal["raise", "extend"] = "raise",
+    require_convergence: bool = True,
+    tail_mass: float = 1e-3,
+    show_progress_bars: bool = True,
+) -> Iterator[MixturePosterior]:
+    """Couple a batch at every gamma and every tau, with the same simulations.
+
+    The posteriors are those of :meth:`~sbi_rope.RoPE.build_posterior` at each setting,
+    up to the tolerance of the coupler. They take less time: the simulations are drawn
+    and embedded once, their posteriors are normalised once, and each coupling starts
+    from its neighbour (:meth:`SinkhornCoupler.sweep
+    <sbi_rope.SinkhornCoupler.sweep>`).
+
+    Args:
+        rope: A trained RoPE, or one without calibration pairs; it is left as it is.
+        x_o: As in :meth:`~sbi_rope.RoPE.build_posterior`, and so are the arguments not
+            listed.
+        gammas: Values of gamma; descending ones are handed out soonest.
+        taus: Values of tau.
+        coupler: Settings other than gamma and tau; those of ``rope`` if None.
+        num_simulations: As in :meth:`~sbi_rope.RoPE.build_posterior`.
+        seed: As in :meth:`~sbi_rope.RoPE.build_posterior`.
+        unseen: As in :meth:`~sbi_rope.RoPE.build_posterior`.
+        require_convergence: As in :meth:`~sbi_rope.RoPE.build_posterior`.
+        tail_mass: As in :meth:`~sbi_rope.RoPE.build_posterior`.
+        show_progress_bars: As in :meth:`~sbi_rope.RoPE.build_posterior`.
+
+    Returns:
+        An iterator over the posteriors: all taus of the first gamma, then of the
+        second, and so on.
+
+    Raises:
+        InvalidInputError: If there is no gamma or tau or one is outside its range, or
+            as in :meth:`~sbi_rope.RoPE.build_posterior`.
+        NotReadyError: As in :meth:`~sbi_rope.RoPE.build_posterior`.
+        CouplingError: When the iteration reaches a coupling that has not converged.
+        SimulationError: If the simulator fails.
+    """
+    check_instance("rope", rope, RoPE)
+    settings = rope.coupler if coupler is None else coupler
+    check_instance("coupler", settings, SinkhornCoupler)
+    gammas, taus = check_numbers("gammas", gammas), check_numbers("taus", taus)
+    check_choice("unseen", unseen, ("raise", "extend"))
+    check_unit_interval("tail_mass", tail_mass)
+    batch = rope.embed(
+        x_o,
+        num_simulations=num_simulations,
+        seed=seed,
+        show_progress_bars=show_progress_bars,
+    )
+    warn_of_far_entries("x_o", batch.x_o, batch.npe.h)
+    couplings = batch.sweep(settings, gammas=gammas, taus=taus, seed=seed)
+
+    def posteriors() -> Iterator[MixturePosterior]:
+        # In our hands: moving a posterior to a device gives it another.
+        shared: dict[int, Tensor] = {}
+        pairs = itertools.product(gammas, taus)
+        for (gamma, tau), coupling in zip(pairs, couplings, strict=True):
+            if require_convergence:
+                check_converged(coupling, replace(settings, gamma=gamma, tau=tau))
+            yield batch.posterior(
+                coupling, unseen=unseen, tail_mass=tail_mass, shared=shared
+            )
+
+    return posteriors()
