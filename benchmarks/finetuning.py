@@ -63,7 +63,7 @@ COLUMNS = (
     "setting",
     "n_calibration",
     "seed",
-    "best_step",
+    "best_epoch",
     "distance",
     "tuning_lpp_z",
     "rope_lpp_z",
@@ -103,7 +103,7 @@ def run(task: Task, npe: Any, setting: str, n: int, seed: int) -> dict[str, Any]
         "setting": setting,
         "n_calibration": n,
         "seed": seed,
-        "best_step": rope.history.best_step,
+        "best_epoch": rope.history.best_epoch,
         "distance": round(distance_to_targets(task, rope, theta_v, x_v), 4),
         "tuning_lpp_z": round(
             lpp(rope.tuned_posterior(), theta_v, x_v, theta_std=task.prior_std).mean, 4
@@ -192,7 +192,7 @@ def print_table(rows: list[dict[str, str]]) -> None:
         "seconds | seeds |\n|---|---|---|---|---|---|---|---|"
     )
     digits = {
-        "best_step": 0,
+        "best_epoch": 0,
         "distance": 3,
         "tuning_lpp_z": 2,
         "rope_lpp_z": 2,

@@ -62,7 +62,7 @@ def smoke(task: Task) -> Settings:
         num_samples=50,
         flow="maf",
         flow_options={"num_transforms": 1, "hidden_features": 10},
-        finetuner=CalibrationFinetuner(num_steps=20, simulations_per_target=5),
+        finetuner=CalibrationFinetuner(max_num_epochs=20, simulations_per_target=5),
     )
 
 
@@ -120,8 +120,8 @@ def paper(task: Task) -> Settings:
         ),
         finetuner=CalibrationFinetuner(
             learning_rate=stated.finetuning_learning_rate or 1e-4,
-            num_steps=stated.finetuning_steps or 5000,
-            patience=stated.finetuning_steps or 5000,
+            max_num_epochs=stated.finetuning_steps or 5000,
+            stop_after_epochs=stated.finetuning_steps or 5000,
             simulations_per_target=1,
             resample_targets=True,
         ),

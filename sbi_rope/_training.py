@@ -13,8 +13,8 @@ from sbi_rope._progress import progress_bar
 from sbi_rope.errors import warn_user
 
 __all__ = [
+    "EPOCHS_WITHOUT_HOLDOUT",
     "MIN_PAIRS_FOR_HOLDOUT",
-    "STEPS_WITHOUT_HOLDOUT",
     "History",
     "best_of_learning_rates",
     "fit",
@@ -30,7 +30,7 @@ Trained = TypeVar("Trained")
 # Fewer pairs of different parameters than this leave nothing to hold out.
 MIN_PAIRS_FOR_HOLDOUT = 5
 # Without a hold-out nothing says when to stop, so little is risked.
-STEPS_WITHOUT_HOLDOUT = 50
+EPOCHS_WITHOUT_HOLDOUT = 50
 
 
 @dataclass(frozen=True)
@@ -47,20 +47,20 @@ class History:
             rehearsal the weighted sum of both distances.
         validation_loss: Loss over the held-out data before each step and after the
             last; empty without a hold-out.
-        best_step: Number of steps after which the kept net was reached; 0 is the
+        best_epoch: Number of steps after which the kept net was reached; 0 is the
             starting point.
         learning_rate: The learning rate of this course, the best of those tried.
     """
 
     training_loss: list[float] = field(repr=False)
     validation_loss: list[float] = field(repr=False)
-    best_step: int
+    best_epoch: int
     learning_rate: float
 
     @property
     def kept_validation_loss(self) -> float:
         """The validation loss of the kept net; 0 without a hold-out, inf for NaN."""
-        loss = self.validation_loss[self.best_step] if self.validation_loss else 0.0
+        loss = self.validation_loss[self.best_epoch] if self.validation_loss else 0.0
         return math.inf if math.isnan(loss) else loss
 
     def __repr__(self) -> str:
@@ -68,8 +68,8 @@ class History:
         if not loss:
             loss, what = self.training_loss, "training_loss"
         return (
-            f"History({what} {loss[0]:.3g} -> {loss[self.best_step]:.3g}, "
-            f"best_step={self.best_step}, learning_rate={self.learning_rate:g})"
+            f"History({what} {loss[0]:.3g} -> {loss[self.best_epoch]:.3g}, "
+            f"best_epoch={self.best_epoch}, learning_rate={self.learning_rate:g})"
         )
 
 
@@ -189,7 +189,7 @@ def warn_without_holdout(theta_or_groups: Tensor) -> None:
     """Warn that there are too few pairs to choose a net by."""
     warn_user(
         f"{too_few_pairs(theta_or_groups)}: none is held out, and tuning stops after "
-        f"at most {STEPS_WITHOUT_HOLDOUT} steps. Append at least "
+        f"at most {EPOCHS_WITHOUT_HOLDOUT} steps. Append at least "
         f"{MIN_PAIRS_FOR_HOLDOUT} pairs of different parameters to choose the best net "
         "on a hold-out."
     )
@@ -202,8 +202,8 @@ def fit(
     *,
     validation_loss: Callable[[], Tensor] | None,
     learning_rate: float,
-    max_num_steps: int,
-    patience: int,
+    max_num_epochs: int,
+    stop_after_epochs: int,
     clip_max_norm: float | None = None,
     in_training_mode: bool = True,
     label: str,
@@ -220,8 +220,8 @@ def fit(
         loss: Of a batch, its mean loss.
         validation_loss: The loss over the held-out data, if there are any.
         learning_rate: Step size of Adam.
-        max_num_steps: Most passes over the batches.
-        patience: Steps without a new best after which to stop.
+        max_num_epochs: Most passes over the batches.
+        stop_after_epochs: Steps without a new best after which to stop.
         clip_max_norm: Largest norm of a gradient; None does not clip.
         in_training_mode: Whether dropout and batch statistics are active in training.
         label: What the progress bar and warnings call it.
@@ -233,7 +233,7 @@ def fit(
     optimizer = torch.optim.Adam(module.parameters(), lr=learning_rate)
     training_loss: list[float] = []
     held_out_loss: list[float] = []
-    best_state, best_step = copy.deepcopy(module.state_dict()), 0
+    best_state, best_epoch = copy.deepcopy(module.state_dict()), 0
 
     def one_pass(step: int, *, update: bool) -> float:
         module.train(in_training_mode and update)
@@ -252,7 +252,7 @@ def fit(
         return sum(values) / len(values)
 
     progress = progress_bar(
-        range(max_num_steps + 1),
+        range(max_num_epochs + 1),
         show=show_progress_bars,
         desc=f"{label} (learning rate {learning_rate:g})",
     )
@@ -262,11 +262,11 @@ def fit(
             with torch.no_grad():
                 held_out_loss.append(float(validation_loss()))
         improved = validation_loss is None or _is_below(
-            held_out_loss[-1], held_out_loss[best_step]
+            held_out_loss[-1], held_out_loss[best_epoch]
         )
         state = copy.deepcopy(module.state_dict()) if improved else best_state
-        newest = step if improved else best_step
-        is_last = step == max_num_steps or step - newest >= patience
+        newest = step if improved else best_epoch
+        is_last = step == max_num_epochs or step - newest >= stop_after_epochs
         with torch.set_grad_enabled(not is_last):
             training_loss.append(one_pass(step, update=not is_last))
         if not math.isfinite(training_loss[-1]):
@@ -276,11 +276,11 @@ def fit(
                 "learning rate."
             )
             break
-        best_state, best_step = state, newest
+        best_state, best_epoch = state, newest
         # Without a refresh of its own: the bar moves at most ten times a second.
         progress.set_postfix(
             loss=(held_out_loss or training_loss)[-1],
-            best_step=best_step,
+            best_epoch=best_epoch,
             refresh=False,
         )
         if is_last:
@@ -288,7 +288,7 @@ def fit(
     progress.close()
     module.load_state_dict(best_state)
     module.eval()
-    return History(training_loss, held_out_loss, best_step, learning_rate)
+    return History(training_loss, held_out_loss, best_epoch, learning_rate)
 
 
 def best_of_learning_rates(

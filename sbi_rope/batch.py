@@ -12,7 +12,7 @@ from sbi_rope._npe import TrainedNPE
 from sbi_rope.coupling import Coupling, SinkhornCoupler
 from sbi_rope.errors import CouplingError
 from sbi_rope.mixture import (
-    CoupledContexts,
+    CoupledEmbeddings,
     CoupledNet,
     MixtureEstimator,
     MixturePosterior,
@@ -112,7 +112,7 @@ class EmbeddedBatch:
         # Each posterior has its own net and density: moving one to another device
         # leaves the others where they are.
         net = CoupledNet(copy.deepcopy(self.embedding_net), [coupling])
-        mixing = CoupledContexts(self.simulated, self.x_o, [net], unseen=unseen)
+        mixing = CoupledEmbeddings(self.simulated, self.x_o, [net], unseen=unseen)
         mixture = MixtureEstimator(
             [Part(self.npe.density(), mixing)], [1.0], tail_mass=tail_mass
         )

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed
 from sbi_rope._training import (
-    STEPS_WITHOUT_HOLDOUT,
+    EPOCHS_WITHOUT_HOLDOUT,
     History,
     best_of_learning_rates,
     fit,
@@ -89,12 +89,12 @@ class CalibrationFinetuner:
             the best on the held-out pairs is kept. A deep embedding net is best tuned
             with the smaller of the defaults, an affine map with the larger, and so
             they are without a hold-out.
-        num_steps: Most gradient steps, each over all training pairs.
-        patience: Steps without a new best on the held-out pairs after which to stop.
+        max_num_epochs: Most gradient steps, each over all training pairs.
+        stop_after_epochs: Steps without a new best on the held-out pairs after which to stop.
         simulations_per_target: Simulations behind each expectation. One, as in the
             paper, pulls g to the noise of single simulations.
         resample_targets: Draw new simulations at every step, as in the paper, instead
-            of one bank before the first. Costs ``num_steps`` times the simulations.
+            of one bank before the first. Costs ``max_num_epochs`` times the simulations.
         num_neighbors: With stored simulations in the place of a simulator, the
             expectation is the mean over so many simulations with the nearest
             parameters.
@@ -107,8 +107,8 @@ class CalibrationFinetuner:
     """
 
     learning_rate: float | tuple[float, ...] = (1e-4, 1e-3)
-    num_steps: int = 1000
-    patience: int = 200
+    max_num_epochs: int = 1000
+    stop_after_epochs: int = 200
     simulations_per_target: int = 100
     resample_targets: bool = False
     num_neighbors: int = 1
@@ -121,8 +121,8 @@ class CalibrationFinetuner:
             raise InvalidInputError("Expected at least one `learning_rate`; got ().")
         for rate in self._learning_rates:
             check_positive("learning_rate", rate, maximum=LARGEST_SETTING)
-        check_integer("num_steps", self.num_steps)
-        check_integer("patience", self.patience)
+        check_integer("max_num_epochs", self.max_num_epochs)
+        check_integer("stop_after_epochs", self.stop_after_epochs)
         check_integer("simulations_per_target", self.simulations_per_target)
         check_integer("num_neighbors", self.num_neighbors)
         check_instance("resample_targets", self.resample_targets, bool)
@@ -245,14 +245,14 @@ class CalibrationFinetuner:
         show_progress_bars: bool,
     ) -> tuple[nn.Module, History]:
         has_holdout = held_out.numel() > 0
-        num_steps = self.num_steps
+        max_num_epochs = self.max_num_epochs
         if not has_holdout:
-            num_steps = min(num_steps, STEPS_WITHOUT_HOLDOUT)
+            max_num_epochs = min(max_num_epochs, EPOCHS_WITHOUT_HOLDOUT)
         newest = targets
 
         def all_pairs(step: int) -> list[tuple[Tensor, Tensor]]:
             nonlocal newest
-            if draw_targets is not None and 0 < step < num_steps:
+            if draw_targets is not None and 0 < step < max_num_epochs:
                 newest = draw_targets()
             return [(x[train], newest[train])]
 
@@ -276,8 +276,8 @@ class CalibrationFinetuner:
                 else None
             ),
             learning_rate=learning_rate,
-            max_num_steps=num_steps,
-            patience=self.patience,
+            max_num_epochs=max_num_epochs,
+            stop_after_epochs=self.stop_after_epochs,
             in_training_mode=False,
             label="Fine-tuning",
             show_progress_bars=show_progress_bars,

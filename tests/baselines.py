@@ -47,7 +47,7 @@ CHAINS: dict[str, Any] = {
     "warmup": 2,
     "thin": 1,
 }
-FINETUNER = CalibrationFinetuner(learning_rate=3e-3, num_steps=5)
+FINETUNER = CalibrationFinetuner(learning_rate=3e-3, max_num_epochs=5)
 
 CORRECTION: dict[str, Any] = {"npe_training": SHORT, "num_steps": 5}
 

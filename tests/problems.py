@@ -16,7 +16,7 @@ from torch.distributions import Bernoulli, Binomial, Distribution, MultivariateN
 
 from sbi_rope.coupling import Coupling
 from sbi_rope.mixture import (
-    CoupledContexts,
+    CoupledEmbeddings,
     CoupledNet,
     MixtureEstimator,
     MixturePosterior,
@@ -201,7 +201,7 @@ def coupling_of(
     )
 
 
-def contexts_of(dim: int, n_s: int, *, std: float = 0.3) -> Tensor:
+def embeddings_of(dim: int, n_s: int, *, std: float = 0.3) -> Tensor:
     """Means over [-1, 1], standard deviations around ``std``."""
     mean = 2 * torch.rand(n_s, dim) - 1
     return torch.cat([mean, math.log(std) + 0.3 * torch.randn(n_s, dim)], dim=1)
@@ -215,25 +215,25 @@ def gaussian_posterior(
     prior: Distribution | None = None,
     std: float = 0.3,
     weights: Tensor | None = None,
-    contexts: Tensor | None = None,
+    embeddings: Tensor | None = None,
     x_o: Tensor | None = None,
     unseen: Any = "raise",
     tail_mass: float = 0.0,
     dtype: torch.dtype = torch.float64,
 ) -> MixturePosterior:
     """A mixture of analytic Gaussians; x_o has three readings, g maps them linearly."""
-    if contexts is None:
-        contexts = contexts_of(dim, n_s, std=std)
+    if embeddings is None:
+        embeddings = embeddings_of(dim, n_s, std=std)
     if x_o is None:
         x_o = torch.randn(n_o, 3)
     if weights is None:
-        weights = (2 * torch.randn(len(x_o), len(contexts))).double().softmax(dim=1)
+        weights = (2 * torch.randn(len(x_o), len(embeddings))).double().softmax(dim=1)
     if prior is None:
         prior = box(dim)
     estimator = coupled_mixture(
         Gaussians(dim),
-        contexts,
-        coupling_of(weights, contexts, dtype=dtype),
+        embeddings,
+        coupling_of(weights, embeddings, dtype=dtype),
         x_o,
         embedding_net=nn.Linear(x_o[0].numel(), 2 * dim),
         unseen=unseen,
@@ -244,7 +244,7 @@ def gaussian_posterior(
 
 def coupled_mixture(
     density: ConditionalDensityEstimator,
-    contexts: Tensor,
+    embeddings: Tensor,
     coupling: Coupling,
     x_o: Tensor,
     *,
@@ -254,7 +254,7 @@ def coupled_mixture(
 ) -> MixtureEstimator:
     """The mixture of RoPE: one part, one net, one coupling."""
     net = CoupledNet(embedding_net, [coupling])
-    mixing = CoupledContexts(contexts, x_o, [net], unseen=unseen)
+    mixing = CoupledEmbeddings(embeddings, x_o, [net], unseen=unseen)
     return MixtureEstimator([Part(density, mixing)], [1.0], tail_mass=tail_mass)
 
 
@@ -266,7 +266,7 @@ def simulated_of(posterior: MixturePosterior) -> Tensor:
 def rows_of(posterior: MixturePosterior, x: Tensor) -> Tensor:
     """The weights of the simulations for some observations, (n, n_s)."""
     mixing = posterior.posterior_estimator.coupled[0]
-    return mixing.rows(mixing.features(x)).weights
+    return mixing.rows(mixing.embed(x)).weights
 
 
 def standard_normal(dim: int) -> MultivariateNormal:
@@ -281,9 +281,9 @@ def brute_force_log_prob(posterior: MixturePosterior, theta: Tensor) -> Tensor:
     estimator = posterior.posterior_estimator
     density = estimator.parts[0].density
     columns = []
-    for context in estimator.coupled[0].simulated:
+    for embedding in estimator.coupled[0].simulated:
         flat = theta.reshape(-1, theta.shape[-1])
-        condition = context[None].expand(len(flat), -1)
+        condition = embedding[None].expand(len(flat), -1)
         log_q = density.log_prob(flat[None], condition)[0]
         columns.append(log_q.double().reshape(theta.shape[:-1]))
     return torch.logsumexp(torch.stack(columns, -1) + posterior.weights.log(), dim=-1)

@@ -33,7 +33,7 @@ def quick() -> Iterator[None]:
     model = DiscrepancyModel(
         gain_precisions=(1.0,), error_scales=(0.1,), degrees_of_freedom=(3.0,)
     )
-    tuning = CalibrationFinetuner(rehearsal=1.0, learning_rate=0.02, num_steps=3)
+    tuning = CalibrationFinetuner(rehearsal=1.0, learning_rate=0.02, max_num_epochs=3)
     steps = dict.fromkeys(("embedding", "tuned", "input"), 4)
     constants = {
         "sbi_rope.stacking.folds.NUM_SIMULATIONS": 300,
@@ -53,7 +53,9 @@ def quick() -> Iterator[None]:
 
 
 # Moves the net far enough to tell g from h.
-QUICK = CalibrationFinetuner(num_steps=6, simulations_per_target=3, learning_rate=0.03)
+QUICK = CalibrationFinetuner(
+    max_num_epochs=6, simulations_per_target=3, learning_rate=0.03
+)
 PRIOR, NPE = (c for c in default_candidates() if c.name in ("prior", "NPE"))
 OT_ONLY = CouplingCandidate(gamma=0.2, tau=0.5, tuned=False)
 ROPE = CouplingCandidate(gamma=0.2, tau=1.0)

@@ -27,7 +27,7 @@ from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
 from sbi_rope.trainers.training import EstimatorBuilder, Training
 
-__all__ = ["RNPE", "DenoisedContexts"]
+__all__ = ["RNPE", "DenoisedEmbeddings"]
 
 # Chains that disagree by more have not converged.
 MAX_R_HAT = 1.1
@@ -35,7 +35,7 @@ MAX_R_HAT = 1.1
 NUM_STARTS = 5000
 
 
-class DenoisedContexts(Mixing):
+class DenoisedEmbeddings(Mixing):
     r"""Statistics that may be behind an observation, with equal weights.
 
     .. math::
@@ -78,13 +78,13 @@ class DenoisedContexts(Mixing):
         self.seed = seed
         self._denoised: dict[bytes, tuple[Tensor, Tensor]] = {}
 
-    def features(self, x: Tensor) -> Tensor:
+    def embed(self, x: Tensor) -> Tensor:
         """Return the draws of s of each observation, ``(n, num_denoised, l)``."""
         return torch.stack([draws for draws, _ in self._lookup(x)]).to(self.starts)
 
-    def rows(self, features: Tensor) -> Rows:
+    def rows(self, embedded: Tensor) -> Rows:
         """Weigh all draws of an observation equally."""
-        return equal_rows(features)
+        return equal_rows(embedded)
 
     def r_hat(self, x: Tensor) -> Tensor:
         """Return the largest split-R-hat of each observation's chains, ``(n,)``."""
@@ -229,7 +229,7 @@ class RNPE(Method):
             training=self.training,
             show_progress_bars=show_progress_bars,
         )
-        denoised = DenoisedContexts(
+        denoised = DenoisedEmbeddings(
             net,
             marginal,
             statistics,

@@ -44,7 +44,7 @@ from sbi_rope.errors import (
     UnsupportedPosteriorError,
 )
 from sbi_rope.finetuning import CalibrationFinetuner
-from sbi_rope.mixture import MixtureEstimator, MixturePosterior, OwnContexts, Part
+from sbi_rope.mixture import MixtureEstimator, MixturePosterior, OwnEmbeddings, Part
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
 from sbi_rope.trainers.training import EstimatorBuilder, Training
@@ -353,8 +353,8 @@ class DiscrepancyNPE(Method):
         return source.kept(self.num_simulations, progress=show_progress_bars)
 
     def _averaged(self, estimator: Any, nets: Sequence[nn.Module]) -> MixturePosterior:
-        contexts = OwnContexts(nets, estimator.condition_shape)
-        mixture = MixtureEstimator([Part(headless(estimator), contexts)], [1.0])
+        embeddings = OwnEmbeddings(nets, estimator.condition_shape)
+        mixture = MixtureEstimator([Part(headless(estimator), embeddings)], [1.0])
         return MixturePosterior(mixture, copy.deepcopy(self._prior))
 
 

@@ -14,7 +14,7 @@ __all__ = ["TUNING", "cross_fitted_nets"]
 # Rehearsal keeps simulations where h puts them, where the density knows them. The rate
 # and the patience take an eighth of the time of the finetuner's defaults and leave no
 # larger distances, see benchmarks/README.md.
-TUNING = CalibrationFinetuner(rehearsal=1.0, learning_rate=3e-3, patience=50)
+TUNING = CalibrationFinetuner(rehearsal=1.0, learning_rate=3e-3, stop_after_epochs=50)
 
 
 def cross_fitted_nets(

@@ -1,22 +1,29 @@
 """Mixtures of weighted densities: the posterior of RoPE, and others."""
 
-from sbi_rope.mixture.coupled import CoupledContexts
+from sbi_rope.mixture.coupled import CoupledEmbeddings
 from sbi_rope.mixture.coupled_net import CoupledNet
 from sbi_rope.mixture.estimator import MixtureEstimator
-from sbi_rope.mixture.parts import Mixing, OwnContexts, Part, Rows, equal_rows, part_of
+from sbi_rope.mixture.parts import (
+    Mixing,
+    OwnEmbeddings,
+    Part,
+    Rows,
+    equal_rows,
+    part_of,
+)
 from sbi_rope.mixture.posterior import MixturePosterior
 from sbi_rope.mixture.prior import part_of_prior
 from sbi_rope.mixture.prior_posterior import PriorPosterior
 from sbi_rope.mixture.truncation import Leakage
 
 __all__ = [
-    "CoupledContexts",
+    "CoupledEmbeddings",
     "CoupledNet",
     "Leakage",
     "Mixing",
     "MixtureEstimator",
     "MixturePosterior",
-    "OwnContexts",
+    "OwnEmbeddings",
     "Part",
     "PriorPosterior",
     "Rows",

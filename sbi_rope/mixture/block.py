@@ -13,14 +13,14 @@ __all__ = ["Block", "Entries"]
 
 @dataclass(frozen=True, eq=False)
 class Entries:
-    """Weighted contexts that belong to one part.
+    """Weighted embeddings that belong to one part.
 
     Attributes:
         part: The part.
         which: Their places among the entries asked for, shape ``(n,)``.
         row: Their observations.
-        column: Their numbers among the contexts of the part.
-        rows: The weights and contexts of the part.
+        column: Their numbers among the embeddings of the part.
+        rows: The weights and embeddings of the part.
     """
 
     part: Part
@@ -29,13 +29,13 @@ class Entries:
     column: Tensor
     rows: Rows
 
-    def contexts(self, some: Tensor) -> Tensor:
-        """Return the contexts of some of the entries, ``(m, l)``."""
+    def embeddings(self, some: Tensor) -> Tensor:
+        """Return the embeddings of some of the entries, ``(m, l)``."""
         return self.rows.at(self.row[some], self.column[some])
 
 
 class Block:
-    r"""The contexts that all parts give a block of b observations, side by side.
+    r"""The embeddings that all parts give a block of b observations, side by side.
 
     Args:
         parts: The parts.
@@ -43,7 +43,7 @@ class Block:
         rows: What each gives the observations.
 
     Attributes:
-        weights: :math:`w_k a^k_{ij}` of all contexts of all parts, shape ``(b, c)``.
+        weights: :math:`w_k a^k_{ij}` of all embeddings of all parts, shape ``(b, c)``.
     """
 
     def __init__(
@@ -92,5 +92,5 @@ class Block:
 
 
 def _are_shared(mixing: Mixing) -> bool:
-    """Whether there are several contexts, the same for all observations."""
-    return mixing.contexts is not None and mixing.num_contexts > 1
+    """Whether there are several embeddings, the same for all observations."""
+    return mixing.embeddings is not None and mixing.num_embeddings > 1

@@ -1,4 +1,4 @@
-"""Contexts that a batch of observations shares, weighted by couplings."""
+"""Embeddings that a batch of observations shares, weighted by couplings."""
 
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
@@ -21,11 +21,11 @@ from sbi_rope.mixture.chunks import blocks
 from sbi_rope.mixture.coupled_net import CoupledNet
 from sbi_rope.mixture.parts import Mixing, Rows
 
-__all__ = ["CoupledContexts"]
+__all__ = ["CoupledEmbeddings"]
 
 
-class CoupledContexts(Mixing):
-    r"""The simulations that a batch is coupled with, as contexts of a mixture.
+class CoupledEmbeddings(Mixing):
+    r"""The simulations that a batch is coupled with, as embeddings of a mixture.
 
     Row i is :math:`\sum_k w_k \alpha^{(k)}_i` over all couplings of all nets: the
     mixtures of all couplings have the same components, so that together they need one
@@ -34,7 +34,7 @@ class CoupledContexts(Mixing):
     Observations are found by their values. The first row of equal ones stands for all.
 
     Args:
-        contexts: :math:`h(x_s)`, shape ``(n_s, l)``.
+        embeddings: :math:`h(x_s)`, shape ``(n_s, l)``.
         batch: The real observations that were coupled, shape ``(n, *event)``.
         nets: Embedding nets with couplings of all of the batch, whose shares sum to one
             over all nets.
@@ -52,14 +52,14 @@ class CoupledContexts(Mixing):
 
     def __init__(
         self,
-        contexts: Tensor,
+        embeddings: Tensor,
         batch: Tensor,
         nets: Sequence[CoupledNet],
         *,
         num_observed: int | None = None,
         unseen: Literal["raise", "extend"] = "raise",
     ) -> None:
-        super().__init__(batch.shape[1:], len(contexts))
+        super().__init__(batch.shape[1:], len(embeddings))
         check_choice("unseen", unseen, ("raise", "extend"))
         if num_observed is not None:
             check_integer("num_observed", num_observed)
@@ -71,12 +71,12 @@ class CoupledContexts(Mixing):
         self._nets = nn.ModuleList(nets)
         check_weights("shares", self.shares, len(self.couplings))
         for coupling in self.couplings:
-            check_batch("coupling.simulated", coupling.simulated, contexts.shape[1:])
-            check_same_length("contexts", contexts, "simulated", coupling.simulated)
+            check_batch("coupling.simulated", coupling.simulated, embeddings.shape[1:])
+            check_same_length("embeddings", embeddings, "simulated", coupling.simulated)
             check_same_length("batch", batch, "coupling.real", coupling.real)
         self.num_observed = len(batch) if num_observed is None else num_observed
         self.unseen: Literal["raise", "extend"] = unseen
-        self.register_buffer("simulated", contexts)
+        self.register_buffer("simulated", embeddings)
         self.register_buffer("batch", batch)
         self._extended: tuple[list[bytes], Tensor] | None = None
         self._index: dict[bytes, int] = {}
@@ -84,7 +84,7 @@ class CoupledContexts(Mixing):
             self._index.setdefault(key, i)
 
     @property
-    def contexts(self) -> Tensor:
+    def embeddings(self) -> Tensor:
         """The embeddings of the simulations, shape ``(n_s, l)``."""
         return self.simulated
 
@@ -115,15 +115,15 @@ class CoupledContexts(Mixing):
             weights = self.couplings[0].weights
             whole = self.num_observed == len(weights)
             return weights if whole else weights[: self.num_observed]
-        features = self.features(self.x_o)
+        embedded = self.embed(self.x_o)
         return torch.cat(
             [
-                self.rows(features[block]).weights
-                for block in blocks(len(features), self.num_contexts)
+                self.rows(embedded[block]).weights
+                for block in blocks(len(embedded), self.num_embeddings)
             ]
         )
 
-    def features(self, x: Tensor) -> Tensor:
+    def embed(self, x: Tensor) -> Tensor:
         """Return the embeddings by all nets, ``(n, *event)`` to ``(n, nets, l)``.
 
         Raises:
@@ -133,24 +133,24 @@ class CoupledContexts(Mixing):
         found = [self._index.get(key, -1) for key in _keys(x)]
         index = torch.tensor(found, dtype=torch.long, device=self.batch.device)
         known = index.clamp_min(0)
-        features = torch.stack([net.real[known] for net in self.nets], dim=1)
+        embedded = torch.stack([net.real[known] for net in self.nets], dim=1)
         new = index < 0
         if new.any():
-            features[new] = self._unseen_features(x[new])
-        return features
+            embedded[new] = self._unseen_embedded(x[new])
+        return embedded
 
-    def rows(self, features: Tensor) -> Rows:
+    def rows(self, embedded: Tensor) -> Rows:
         """Return the rows of a block of observations over the simulations."""
-        pairs = zip(self.nets, features.unbind(dim=1), strict=True)
+        pairs = zip(self.nets, embedded.unbind(dim=1), strict=True)
         first, *others = (net.rows(real) for net, real in pairs if any(net.shares))
         return Rows(sum(others, start=first), self.simulated)
 
-    def rows_of_each(self, features: Tensor) -> Iterator[Tensor]:
+    def rows_of_each(self, embedded: Tensor) -> Iterator[Tensor]:
         """Yield the rows of each of :attr:`couplings`, ``(n, n_s)``, unweighted."""
-        for net, real in zip(self.nets, features.unbind(dim=1), strict=True):
+        for net, real in zip(self.nets, embedded.unbind(dim=1), strict=True):
             yield from net.rows_of_each(real)
 
-    def with_shares(self, shares: Sequence[float]) -> "CoupledContexts":
+    def with_shares(self, shares: Sequence[float]) -> "CoupledEmbeddings":
         """Return the same couplings with other shares, in the order of these."""
         check_weights("shares", shares, len(self.couplings))
         nets, start = [], 0
@@ -158,7 +158,7 @@ class CoupledContexts(Mixing):
             end = start + len(net.couplings)
             nets.append(net.with_shares(shares[start:end]))
             start = end
-        return CoupledContexts(
+        return CoupledEmbeddings(
             self.simulated,
             self.batch,
             nets,
@@ -166,8 +166,8 @@ class CoupledContexts(Mixing):
             unseen=self.unseen,
         )
 
-    def restricted_to(self, index: int) -> "CoupledContexts":
-        """Return the same contexts for one observation, which holds no other.
+    def restricted_to(self, index: int) -> "CoupledEmbeddings":
+        """Return the same embeddings for one observation, which holds no other.
 
         Args:
             index: The number of the observation in ``x_o``.
@@ -179,11 +179,11 @@ class CoupledContexts(Mixing):
             net.restricted_to(row, net=net.net if extends else nn.Identity())
             for net in self.nets
         ]
-        return CoupledContexts(
+        return CoupledEmbeddings(
             self.simulated, self.batch[row], nets, unseen=self.unseen
         )
 
-    def _unseen_features(self, x: Tensor) -> Tensor:
+    def _unseen_embedded(self, x: Tensor) -> Tensor:
         # log_prob and its normaliser, or the steps of map(), ask for the same ones, and
         # earn one warning.
         keys, kept = _keys(x), self._extended
@@ -202,19 +202,19 @@ class CoupledContexts(Mixing):
                 "`rope.build_posterior(x_new)` or `stack(rope, x_new)`, or allow rows "
                 "under the old coupling: both take `unseen='extend'`."
             )
-        features = torch.stack(
+        embedded = torch.stack(
             [embed(net.net, x).to(net.real) for net in self.nets], dim=1
         )
         smallest = min(
-            float((1 / self.rows(features[block]).weights.square().sum(dim=1)).min())
-            for block in blocks(len(features), self.num_contexts)
+            float((1 / self.rows(embedded[block]).weights.square().sum(dim=1)).min())
+            for block in blocks(len(embedded), self.num_embeddings)
         )
         warn_user(
             f"Extended the coupling to {len(x)} unseen observation(s); smallest "
-            f"effective sample size {smallest:.1f} of {self.num_contexts} "
+            f"effective sample size {smallest:.1f} of {self.num_embeddings} "
             "simulations. Below about 50, couple the new batch instead."
         )
-        return features
+        return embedded
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:  # noqa: FBT001, FBT002
         # What `to` calls for each module: couplings are none.

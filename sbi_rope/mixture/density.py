@@ -45,7 +45,7 @@ def _log_q(theta: Tensor, entries: Entries) -> Tensor:
         if points.requires_grad:
             # A component without a density at its point has no gradient there.
             points.register_hook(lambda grad: grad.nan_to_num(nan=0.0))
-        log_q.append(entries.part.log_prob(points, entries.contexts(k)))
+        log_q.append(entries.part.log_prob(points, entries.embeddings(k)))
     return torch.cat(log_q).reshape(shape)
 
 

@@ -19,7 +19,7 @@ from sbi_rope._validation import (
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture.block import Block
 from sbi_rope.mixture.chunks import blocks, flow_batch, keep_freed_memory
-from sbi_rope.mixture.coupled import CoupledContexts
+from sbi_rope.mixture.coupled import CoupledEmbeddings
 from sbi_rope.mixture.density import block_log_prob
 from sbi_rope.mixture.parts import DTYPE, Part
 from sbi_rope.mixture.sampling import Accept, BlockSampler
@@ -35,7 +35,7 @@ __all__ = ["MixtureEstimator"]
 
 
 class MixtureEstimator(MixtureDensity):
-    r"""A mixture of densities that are themselves mixed over contexts.
+    r"""A mixture of densities that are themselves mixed over embeddings.
 
     .. math::
         p(\theta \mid x) = \sum_k w_k \sum_j a^k_j(x)\, q_k(\theta \mid s^k_j(x))
@@ -44,12 +44,12 @@ class MixtureEstimator(MixtureDensity):
     support is not its business; see :class:`MixturePosterior`.
 
     Args:
-        parts: The densities :math:`q_k`, each with its weights :math:`a^k` and contexts
+        parts: The densities :math:`q_k`, each with its weights :math:`a^k` and embeddings
             :math:`s^k`. Several may be coupled, if their ``x_o`` are the same.
         weights: :math:`w`, one for each part, which sum to one. Parts of weight zero
             cost nothing.
         tail_mass: Weight of the smallest terms for each observation that ``log_prob``
-            leaves out, among those of contexts that observations share, such as the
+            leaves out, among those of embeddings that observations share, such as the
             simulations of a coupling; 0 evaluates all.
 
     Raises:
@@ -101,10 +101,10 @@ class MixtureEstimator(MixtureDensity):
         return cast("list[Part]", list(self._parts))
 
     @property
-    def coupled(self) -> list[CoupledContexts]:
+    def coupled(self) -> list[CoupledEmbeddings]:
         """What those parts are mixed over that belong to a batch."""
         mixings = [part.mixing for part in self.parts]
-        return [mixing for mixing in mixings if isinstance(mixing, CoupledContexts)]
+        return [mixing for mixing in mixings if isinstance(mixing, CoupledEmbeddings)]
 
     def restricted_to(self, index: int) -> "MixtureEstimator":
         """Return the same mixture for one observation of the batch.
@@ -116,7 +116,7 @@ class MixtureEstimator(MixtureDensity):
         """
         parts = [
             Part(part.density, part.mixing.restricted_to(index))
-            if isinstance(part.mixing, CoupledContexts)
+            if isinstance(part.mixing, CoupledEmbeddings)
             else part
             for part in self.parts
         ]
@@ -283,8 +283,8 @@ class MixtureEstimator(MixtureDensity):
 
         .. math:: Z(x) = \sum_k w_k \sum_j a^k_j(x)\, Z_k(s^k_j(x))
 
-        The masses given contexts that observations share are estimated once, from 1024
-        draws each. Those of an observation's own contexts are estimated for each x,
+        The masses given embeddings that observations share are estimated once, from 1024
+        draws each. Those of an observation's own embeddings are estimated for each x,
         from as many draws as the weight of the part deserves; parts that weigh less
         than one draw in 1024 together count as inside.
 
@@ -303,17 +303,17 @@ class MixtureEstimator(MixtureDensity):
             if not share:
                 continue
             part = self.parts[k]
-            features = part.mixing.features(x)
+            embedded = part.mixing.embed(x)
             if accept is None:
                 mass += share
                 continue
             num_draws = math.ceil(LEAKAGE_DRAWS * share)
             if k in small:
                 own = Leakage(torch.ones_like(mass), torch.full_like(mass, 0.5))
-            elif part.mixing.contexts is None:
+            elif part.mixing.embeddings is None:
                 own = own_mass(
                     part,
-                    features,
+                    embedded,
                     accept=accept,
                     num_draws=num_draws,
                     seed=k,
@@ -323,7 +323,7 @@ class MixtureEstimator(MixtureDensity):
                 of_each = self.component_mass(
                     k, accept=accept, cache=cache, show_progress_bars=show_progress_bars
                 )
-                own = shared_mass(part, features, of_each)
+                own = shared_mass(part, embedded, of_each)
             mass += share * own.mass
             variance += (share * own.standard_error).square()
         return Leakage(mass, variance.sqrt())
@@ -336,7 +336,7 @@ class MixtureEstimator(MixtureDensity):
         cache: dict[int, Tensor],
         show_progress_bars: bool = False,
     ) -> Tensor:
-        """Return the mass that is accepted given each shared context of a part.
+        """Return the mass that is accepted given each shared embedding of a part.
 
         Args:
             number: That of the part.
@@ -348,18 +348,18 @@ class MixtureEstimator(MixtureDensity):
             Shape ``(c,)``, float64.
 
         Raises:
-            InvalidInputError: If observations have contexts of their own.
+            InvalidInputError: If observations have embeddings of their own.
         """
         part = self.parts[number]
-        contexts = part.mixing.contexts
-        if contexts is None:
+        embeddings = part.mixing.embeddings
+        if embeddings is None:
             raise InvalidInputError(
-                f"Expected the number of a part with shared contexts; got {number}."
+                f"Expected the number of a part with shared embeddings; got {number}."
             )
         if number not in cache:
             cache[number] = component_mass(
                 part.density,
-                contexts,
+                embeddings,
                 accept=accept,
                 show_progress_bars=show_progress_bars,
             )
@@ -373,12 +373,12 @@ class MixtureEstimator(MixtureDensity):
 def _blocks(
     parts: Sequence[Part], shares: Sequence[float], x: Tensor
 ) -> Iterator[tuple[slice, Block]]:
-    """Yield the weighted contexts of a block of observations after the other."""
-    features = [part.mixing.features(x) for part in parts]
-    num_columns = sum(part.mixing.num_contexts for part in parts)
+    """Yield the weighted embeddings of a block of observations after the other."""
+    embedded = [part.mixing.embed(x) for part in parts]
+    num_columns = sum(part.mixing.num_embeddings for part in parts)
     for rows in blocks(len(x), num_columns):
         of_each = [
             part.mixing.rows(values[rows])
-            for part, values in zip(parts, features, strict=True)
+            for part, values in zip(parts, embedded, strict=True)
         ]
         yield rows, Block(parts, shares, of_each)

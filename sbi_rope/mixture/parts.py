@@ -1,4 +1,4 @@
-"""The parts of a mixture: a density, and what gives an observation its contexts."""
+"""The parts of a mixture: a density, and what gives an observation its embeddings."""
 
 import copy
 from abc import ABC, abstractmethod
@@ -20,7 +20,7 @@ from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError
 __all__ = [
     "DTYPE",
     "Mixing",
-    "OwnContexts",
+    "OwnEmbeddings",
     "Part",
     "Rows",
     "equal_rows",
@@ -33,61 +33,61 @@ DTYPE = torch.float32
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """The weighted contexts of a block of observations.
+    """The weighted embeddings of a block of observations.
 
     Attributes:
         weights: Rows that sum to one, shape ``(b, c)``.
-        contexts: Those of all observations, shape ``(c, l)``, or each one's own, shape
+        embeddings: Those of all observations, shape ``(c, l)``, or each one's own, shape
             ``(b, c, l)``.
     """
 
     weights: Tensor
-    contexts: Tensor
+    embeddings: Tensor
 
     def at(self, row: Tensor, column: Tensor) -> Tensor:
-        """Return the contexts of some entries of the weights, ``(n, l)``."""
-        if self.contexts.ndim == 2:
-            return self.contexts[column]
-        return self.contexts[row, column]
+        """Return the embeddings of some entries of the weights, ``(n, l)``."""
+        if self.embeddings.ndim == 2:
+            return self.embeddings[column]
+        return self.embeddings[row, column]
 
 
 class Mixing(nn.Module, ABC):
-    r"""What gives an observation its contexts :math:`s_j(x)` and their weights.
+    r"""What gives an observation its embeddings :math:`s_j(x)` and their weights.
 
     To implement one, call the constructor with the shape of one observation and the
-    number of contexts, and define the two methods.
+    number of embeddings, and define the two methods.
 
     Attributes:
         event_shape: Shape of one observation.
-        num_contexts: Contexts of each observation, c.
+        num_embeddings: Embeddings of each observation, c.
     """
 
-    def __init__(self, event_shape: Sequence[int], num_contexts: int) -> None:
+    def __init__(self, event_shape: Sequence[int], num_embeddings: int) -> None:
         super().__init__()
         self.event_shape = torch.Size(event_shape)
-        self.num_contexts = num_contexts
+        self.num_embeddings = num_embeddings
 
     @property
-    def contexts(self) -> Tensor | None:
-        """Contexts that all observations share, ``(c, l)``; None if each has its own.
+    def embeddings(self) -> Tensor | None:
+        """Embeddings that all observations share, ``(c, l)``; None if each has its own.
 
         The mass of a shared one inside the prior's support is estimated once.
         """
         return None
 
     @abstractmethod
-    def features(self, x: Tensor) -> Tensor:
+    def embed(self, x: Tensor) -> Tensor:
         """Return what is computed once of observations and held for all of them.
 
         Shapes are ``(n, *event)`` to ``(n, ...)``.
         """
 
     @abstractmethod
-    def rows(self, features: Tensor) -> Rows:
-        """Return the weighted contexts of a block of observations."""
+    def rows(self, embedded: Tensor) -> Rows:
+        """Return the weighted embeddings of a block of observations."""
 
 
-class OwnContexts(Mixing):
+class OwnEmbeddings(Mixing):
     r"""The embeddings of the observation itself, :math:`h_k(x)`, with equal weights.
 
     With one net it makes a part of any amortised posterior. With K nets the density is
@@ -104,29 +104,31 @@ class OwnContexts(Mixing):
         super().__init__(event_shape, len(nets))
         self.nets = nn.ModuleList(nets)
 
-    def features(self, x: Tensor) -> Tensor:
+    def embed(self, x: Tensor) -> Tensor:
         """Embed observations, ``(n, *event)`` to ``(n, K, l)``."""
         return torch.stack([embed(net, x) for net in self.nets], dim=1)
 
-    def rows(self, features: Tensor) -> Rows:
+    def rows(self, embedded: Tensor) -> Rows:
         """Weigh all embeddings of an observation equally."""
-        return equal_rows(features)
+        return equal_rows(embedded)
 
 
-def equal_rows(contexts: Tensor) -> Rows:
-    """Return own contexts ``(b, c, l)`` with equal weights."""
-    shape = contexts.shape[:2]
-    return Rows(contexts.new_full(shape, 1 / shape[1], dtype=torch.double), contexts)
+def equal_rows(embeddings: Tensor) -> Rows:
+    """Return own embeddings ``(b, c, l)`` with equal weights."""
+    shape = embeddings.shape[:2]
+    return Rows(
+        embeddings.new_full(shape, 1 / shape[1], dtype=torch.double), embeddings
+    )
 
 
 class Part(nn.Module):
-    r"""A density that is mixed over contexts.
+    r"""A density that is mixed over embeddings.
 
     .. math:: \sum_j a_j(x)\, q(\theta \mid s_j(x))
 
     Args:
-        density: :math:`q(\theta \mid s)`, an estimator conditioned on contexts.
-        mixing: The weights and contexts of an observation.
+        density: :math:`q(\theta \mid s)`, an estimator conditioned on embeddings.
+        mixing: The weights and embeddings of an observation.
     """
 
     density: ConditionalDensityEstimator
@@ -137,13 +139,13 @@ class Part(nn.Module):
         self.density = density
         self.mixing = mixing
 
-    def log_prob(self, theta: Tensor, contexts: Tensor) -> Tensor:
+    def log_prob(self, theta: Tensor, embeddings: Tensor) -> Tensor:
         """Return the log densities of pairs, ``(n, d)`` and ``(n, l)`` to ``(n,)``."""
-        return self.density.log_prob(theta[None], contexts)[0]
+        return self.density.log_prob(theta[None], embeddings)[0]
 
-    def sample(self, contexts: Tensor) -> Tensor:
-        """Draw once given each context, ``(n, l)`` to ``(n, d)``."""
-        return self.density.sample(torch.Size((1,)), contexts)[0]
+    def sample(self, embeddings: Tensor) -> Tensor:
+        """Draw once given each embedding, ``(n, l)`` to ``(n, d)``."""
+        return self.density.sample(torch.Size((1,)), embeddings)[0]
 
 
 def part_of(estimator: ConditionalEstimator) -> Part:
@@ -160,5 +162,5 @@ def part_of(estimator: ConditionalEstimator) -> Part:
             f"{type(estimator).__name__}. Train NPE instead of FMPE or NPSE."
         )
     own = copy.deepcopy(estimator).requires_grad_(requires_grad=False)
-    contexts = OwnContexts([embedding_of(own)], estimator.condition_shape)
-    return Part(headless(own), contexts).eval()
+    embeddings = OwnEmbeddings([embedding_of(own)], estimator.condition_shape)
+    return Part(headless(own), embeddings).eval()

@@ -22,7 +22,7 @@ from sbi_rope._validation import (
 )
 from sbi_rope.coupling import Coupling
 from sbi_rope.errors import InvalidInputError, InvalidTypeError, SamplingError
-from sbi_rope.mixture.coupled import CoupledContexts
+from sbi_rope.mixture.coupled import CoupledEmbeddings
 from sbi_rope.mixture.estimator import MixtureEstimator
 from sbi_rope.mixture.parts import DTYPE
 from sbi_rope.mixture.sampling import Accept
@@ -40,7 +40,7 @@ class MixturePosterior(BaseDirectPosterior):
         \sum_k w_k \sum_j a^k_j(x)\, q_k(\theta \mid s^k_j(x)),
 
     with Z(x) the mass inside the support of the prior. RoPE's has one part, whose
-    contexts are simulations and whose weights are rows of a coupling:
+    embeddings are simulations and whose weights are rows of a coupling:
 
     .. math::
         p(\theta \mid x_{o,i})
@@ -75,7 +75,7 @@ class MixturePosterior(BaseDirectPosterior):
         enable_transform: As in sbi, for ``map()``.
         shared: What posteriors of the same prior and parts, in the same order, share
             whatever their weights and couplings are: each leaves there what it has
-            estimated of the simulations that are their contexts.
+            estimated of the simulations that are their embeddings.
     """
 
     def __init__(
@@ -154,7 +154,7 @@ class MixturePosterior(BaseDirectPosterior):
             )
         return coupled.weights
 
-    def _coupled(self, name: str) -> CoupledContexts:
+    def _coupled(self, name: str) -> CoupledEmbeddings:
         if self.is_amortised:
             raise InvalidInputError(
                 f"This posterior is amortised: it belongs to no batch and has no "
@@ -512,7 +512,7 @@ def _purpose(estimator: MixtureEstimator) -> str:
     coupled = estimator.coupled[0]
     mixed = f"{num_parts} posterior densities"
     if num_parts == 1:
-        mixed = f"{coupled.num_contexts} simulated posteriors"
+        mixed = f"{coupled.num_embeddings} simulated posteriors"
     return (
         f"It is the mixture of {mixed} for each of {len(coupled.x_o)} real "
         "observations."

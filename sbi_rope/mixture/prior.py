@@ -30,11 +30,11 @@ def part_of_prior(prior: Distribution, event_shape: Sequence[int]) -> Part:
     """
     check_prior(prior)
     density = PriorDensity(copy.deepcopy(prior))
-    return Part(density, NoContext(event_shape, device=density.placeholder.device))
+    return Part(density, NoEmbedding(event_shape, device=density.placeholder.device))
 
 
-class NoContext(Mixing):
-    """One context for all observations, of width zero.
+class NoEmbedding(Mixing):
+    """One embedding for all observations, of width zero.
 
     Args:
         event_shape: Shape of one observation.
@@ -44,21 +44,21 @@ class NoContext(Mixing):
     empty: Tensor
 
     def __init__(self, event_shape: Sequence[int], *, device: torch.device) -> None:
-        super().__init__(event_shape, num_contexts=1)
+        super().__init__(event_shape, num_embeddings=1)
         self.register_buffer("empty", torch.empty(1, 0, device=device))
 
     @property
-    def contexts(self) -> Tensor:
-        """The empty context, shape ``(1, 0)``."""
+    def embeddings(self) -> Tensor:
+        """The empty embedding, shape ``(1, 0)``."""
         return self.empty
 
-    def features(self, x: Tensor) -> Tensor:
+    def embed(self, x: Tensor) -> Tensor:
         """Return nothing for each observation, ``(n, 0)``."""
         return x.new_empty(len(x), 0)
 
-    def rows(self, features: Tensor) -> Rows:
+    def rows(self, embedded: Tensor) -> Rows:
         """Return a weight of one for each observation."""
-        return Rows(features.new_ones(len(features), 1, dtype=torch.double), self.empty)
+        return Rows(embedded.new_ones(len(embedded), 1, dtype=torch.double), self.empty)
 
 
 class PriorDensity(ConditionalDensityEstimator):

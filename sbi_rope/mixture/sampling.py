@@ -28,7 +28,7 @@ class BlockSampler:
     """Draws from the mixtures of a block of observations.
 
     Args:
-        block: The weighted contexts of the observations.
+        block: The weighted embeddings of the observations.
         accept: Tells which proposals ``(n, d)`` to keep; None keeps all.
         batch_size: Most draws the flow makes at a time.
         first_row: The number of the block's first observation, for messages.
@@ -83,7 +83,7 @@ class BlockSampler:
         for entries in self.block.by_part(rows, chosen):
             places = torch.arange(len(entries.which), device=rows.device)
             for some in places.split(self.batch_size):
-                draws = entries.part.sample(entries.contexts(some))
+                draws = entries.part.sample(entries.embeddings(some))
                 # Under torch's autocast and default dtypes these may be others.
                 theta[entries.which[some]] = draws.to(DTYPE)
         return theta

@@ -25,7 +25,7 @@ __all__ = [
     "shared_mass",
 ]
 
-# Draws behind the mass of a shared context inside the prior's support, or of a density
+# Draws behind the mass of a shared embedding inside the prior's support, or of a density
 # that has all the weight.
 LEAKAGE_DRAWS = 1024
 
@@ -46,37 +46,39 @@ class Leakage:
 @torch.no_grad()
 def component_mass(
     density: ConditionalDensityEstimator,
-    contexts: Tensor,
+    embeddings: Tensor,
     *,
     accept: Accept,
     show_progress_bars: bool = False,
 ) -> Tensor:
-    """Estimate the mass inside the support given each context, ``(c,)``, float64.
+    """Estimate the mass inside the support given each embedding, ``(c,)``, float64.
 
     The draws have random numbers of their own.
     """
-    keep_freed_memory(contexts.device)
+    keep_freed_memory(embeddings.device)
     mass = []
     with seeded(0):
-        chunks = contexts.split(max(1, flow_batch(contexts.device) // LEAKAGE_DRAWS))
+        chunks = embeddings.split(
+            max(1, flow_batch(embeddings.device) // LEAKAGE_DRAWS)
+        )
         # Some flows need minutes here.
         for some in _bar(chunks, show=show_progress_bars):
             mass.append(_share_inside(density, some, accept, LEAKAGE_DRAWS))
     return torch.cat(mass)
 
 
-def shared_mass(part: Part, features: Tensor, mass: Tensor) -> Leakage:
-    """Return the mass of a part whose contexts are shared by all observations.
+def shared_mass(part: Part, embedded: Tensor, mass: Tensor) -> Leakage:
+    """Return the mass of a part whose embeddings are shared by all observations.
 
     Args:
         part: The part.
-        features: Of the observations, shape ``(n, ...)``.
-        mass: What :func:`component_mass` returns for the contexts.
+        embedded: Of the observations, shape ``(n, ...)``.
+        mass: What :func:`component_mass` returns for the embeddings.
     """
     variance = _variance(mass, LEAKAGE_DRAWS)
     means, errors = [], []
-    for block in blocks(len(features), part.mixing.num_contexts):
-        weights = part.mixing.rows(features[block]).weights.to(mass)
+    for block in blocks(len(embedded), part.mixing.num_embeddings):
+        weights = part.mixing.rows(embedded[block]).weights.to(mass)
         means.append(weights @ mass)
         errors.append((weights.square() @ variance).sqrt())
     return Leakage(torch.cat(means), torch.cat(errors))
@@ -85,14 +87,14 @@ def shared_mass(part: Part, features: Tensor, mass: Tensor) -> Leakage:
 @torch.no_grad()
 def own_mass(
     part: Part,
-    features: Tensor,
+    embedded: Tensor,
     *,
     accept: Accept,
     num_draws: int,
     seed: int,
     show_progress_bars: bool = False,
 ) -> Leakage:
-    """Estimate the mass of a part whose contexts are each observation's own.
+    """Estimate the mass of a part whose embeddings are each observation's own.
 
     The random numbers are the same in every call. Those of an observation depend on its
     place among those asked for together, and so does its mass, within the standard
@@ -100,22 +102,22 @@ def own_mass(
 
     Args:
         part: The part.
-        features: Of the observations, shape ``(n, ...)``.
+        embedded: Of the observations, shape ``(n, ...)``.
         accept: Tells which parameters ``(n, d)`` are inside the support.
-        num_draws: Draws for each observation, over all its contexts together.
+        num_draws: Draws for each observation, over all its embeddings together.
         seed: Another one for each part. With the same random numbers, the errors of
             parts that are nearly the same would add up instead of averaging out.
         show_progress_bars: Whether to show progress, if it takes long.
     """
-    num_contexts = part.mixing.num_contexts
-    of_each = math.ceil(num_draws / num_contexts)
-    size = max(1, flow_batch(features.device) // (of_each * num_contexts))
+    num_embeddings = part.mixing.num_embeddings
+    of_each = math.ceil(num_draws / num_embeddings)
+    size = max(1, flow_batch(embedded.device) // (of_each * num_embeddings))
     means, errors = [], []
     with seeded(seed):
-        for block in _bar(features.split(size), show=show_progress_bars):
+        for block in _bar(embedded.split(size), show=show_progress_bars):
             rows = part.mixing.rows(block)
-            weights, contexts = rows.weights.double(), rows.contexts.flatten(0, 1)
-            inside = _share_inside(part.density, contexts, accept, of_each)
+            weights, embeddings = rows.weights.double(), rows.embeddings.flatten(0, 1)
+            inside = _share_inside(part.density, embeddings, accept, of_each)
             inside = inside.reshape(weights.shape)
             means.append((weights * inside).sum(dim=1))
             variance = weights.square() * _variance(inside, of_each)
@@ -124,16 +126,16 @@ def own_mass(
 
 
 def _share_inside(
-    density: ConditionalDensityEstimator, contexts: Tensor, accept: Accept, draws: int
+    density: ConditionalDensityEstimator, embeddings: Tensor, accept: Accept, draws: int
 ) -> Tensor:
-    """Return the share of draws that is accepted, for each context ``(c, l)``."""
-    theta = density.sample(torch.Size((draws,)), condition=contexts)
+    """Return the share of draws that is accepted, for each embedding ``(c, l)``."""
+    theta = density.sample(torch.Size((draws,)), condition=embeddings)
     inside = accept(theta.reshape(-1, *density.input_shape))
     return inside.reshape(draws, -1).double().mean(dim=0)
 
 
 def _variance(share: Tensor, draws: int) -> Tensor:
-    # Half a draw is added to those inside and to those outside. Otherwise a context
+    # Half a draw is added to those inside and to those outside. Otherwise a embedding
     # whose draws are all inside, or all outside, would seem to have no error.
     smoothed = (draws * share + 0.5) / (draws + 1)
     return smoothed * (1.0 - smoothed) / draws

@@ -110,7 +110,7 @@ def finetuning_history(history: History) -> "Figure":
     if len(validation) > 0:
         axes.plot(validation, label="held-out pairs", color=VERMILLION, lw=1.2)
         kept = validation
-    step = history.best_step
+    step = history.best_epoch
     suffix = " (the starting point)" if step == 0 else ""
     axes.axvline(step, color=GREY, lw=0.8)
     axes.plot(

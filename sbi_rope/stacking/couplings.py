@@ -13,7 +13,7 @@ from sbi_rope._sbi import embed, estimator_of, headless
 from sbi_rope.batch import parameters_named
 from sbi_rope.coupling import Coupling
 from sbi_rope.errors import CouplingError
-from sbi_rope.mixture import CoupledContexts, CoupledNet, Part
+from sbi_rope.mixture import CoupledEmbeddings, CoupledNet, Part
 from sbi_rope.mixture.chunks import flow_batch
 from sbi_rope.mixture.density import without_nan
 from sbi_rope.rope import MIN_SIMULATIONS, RoPE
@@ -41,9 +41,9 @@ class FittedCouplings:
     settings: tuple[tuple[str, int | None], ...]
 
     @property
-    def contexts(self) -> CoupledContexts:
+    def embeddings(self) -> CoupledEmbeddings:
         """What the part is mixed over."""
-        return cast("CoupledContexts", self.part.mixing)
+        return cast("CoupledEmbeddings", self.part.mixing)
 
     def weighted(
         self, weights: Mapping[str, float], versions: Sequence[int]
@@ -64,8 +64,8 @@ class FittedCouplings:
         total = sum(shares)
         if not total:
             return self.part, 0.0
-        contexts = self.contexts.with_shares([share / total for share in shares])
-        return Part(self.part.density, contexts), total
+        embeddings = self.embeddings.with_shares([share / total for share in shares])
+        return Part(self.part.density, embeddings), total
 
     @torch.no_grad()
     def log_probs(
@@ -83,7 +83,7 @@ class FittedCouplings:
             support of the prior.
         """
         log_q = self.component_log_probs(theta) if log_q is None else log_q
-        rows_of_each = self.contexts.rows_of_each(self.contexts.features(x))
+        rows_of_each = self.embeddings.rows_of_each(self.embeddings.embed(x))
         return torch.stack(
             [torch.logsumexp(rows.log() + log_q, dim=1) for rows in rows_of_each], dim=1
         ).double()
@@ -91,11 +91,11 @@ class FittedCouplings:
     @torch.no_grad()
     def component_log_probs(self, theta: Tensor) -> Tensor:
         r"""Return :math:`\log q(\theta_i \mid h(x_{s,j}))`, shape ``(n, n_s)``."""
-        contexts = self.contexts.simulated
-        n, n_s = len(theta), len(contexts)
+        embeddings = self.embeddings.simulated
+        n, n_s = len(theta), len(embeddings)
         pairs = torch.arange(n * n_s, device=theta.device)
         log_q = [
-            self.part.log_prob(theta[batch // n_s], contexts[batch % n_s])
+            self.part.log_prob(theta[batch // n_s], embeddings[batch % n_s])
             for batch in pairs.split(flow_batch(theta.device))
         ]
         return without_nan(torch.cat(log_q)).reshape(n, n_s)
@@ -153,11 +153,12 @@ def fit_couplings(
     nets = [
         net.with_shares([share / len(nets) for share in net.shares]) for net in nets
     ]
-    contexts = CoupledContexts(
+    embeddings = CoupledEmbeddings(
         simulated, batch, nets, num_observed=len(x_o), unseen=unseen
     )
     return FittedCouplings(
-        part=Part(headless(estimator_of(bench.npe)), contexts), settings=tuple(settings)
+        part=Part(headless(estimator_of(bench.npe)), embeddings),
+        settings=tuple(settings),
     )
 
 

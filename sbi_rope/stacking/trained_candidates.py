@@ -7,7 +7,7 @@ from typing import Any
 from sbi_rope._sbi import embedding_of, estimator_of, headless, with_embedding
 from sbi_rope._validation import check_choice, check_instance
 from sbi_rope.discrepancy.correction import Space
-from sbi_rope.mixture import OwnContexts, Part, part_of
+from sbi_rope.mixture import OwnEmbeddings, Part, part_of
 from sbi_rope.stacking.candidates import AmortisedCandidate
 from sbi_rope.stacking.finetuning import finetune_without
 from sbi_rope.stacking.folds import Fold, Workbench
@@ -59,8 +59,8 @@ class DiscrepancyCandidate(AmortisedCandidate):
         estimator = corrected.estimator
         if self.space == "input":
             return [part_of(estimator)]
-        contexts = OwnContexts(corrected.nets, fold.bench.x.shape[1:])
-        return [Part(headless(estimator), contexts)]
+        embeddings = OwnEmbeddings(corrected.nets, fold.bench.x.shape[1:])
+        return [Part(headless(estimator), embeddings)]
 
 
 def _has_summaries(bench: Workbench) -> bool:

@@ -215,7 +215,7 @@ class StackTrainer:
         weights = fold_weights(log_scores, fold, self.pseudo_count)
         stack_scores = log_scores.new_empty(len(theta))
         levels = torch.empty_like(theta)
-        # Simulations are contexts of the first part in all folds; what comes after may
+        # Simulations are embeddings of the first part in all folds; what comes after may
         # differ.
         masses: dict[int, Tensor] = {}
         for number, rows in enumerate(bench.folds):

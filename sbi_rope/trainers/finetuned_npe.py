@@ -33,7 +33,7 @@ from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError
 from sbi_rope.mixture import (
     MixtureEstimator,
     MixturePosterior,
-    OwnContexts,
+    OwnEmbeddings,
     part_of,
 )
 from sbi_rope.trainers.base import Method
@@ -262,7 +262,7 @@ def _averaged(posterior: Any) -> list[ConditionalDensityEstimator]:
     if not isinstance(posterior, MixturePosterior):
         return []
     part, *others = posterior.posterior_estimator.parts
-    if others or not isinstance(part.mixing, OwnContexts):
+    if others or not isinstance(part.mixing, OwnEmbeddings):
         return []
     shape = part.mixing.event_shape
     return [

@@ -12,7 +12,7 @@ from torch import Tensor
 from sbi_rope._random import seeded
 from sbi_rope._sbi import ConditionalDensityEstimator, train_npe
 from sbi_rope._training import (
-    STEPS_WITHOUT_HOLDOUT,
+    EPOCHS_WITHOUT_HOLDOUT,
     History,
     fit,
     warn_without_holdout,
@@ -201,7 +201,7 @@ def train_on_pairs(
     max_num_epochs = training.max_num_epochs
     if not len(held_out):
         warn_without_holdout(theta)
-        max_num_epochs = min(max_num_epochs, STEPS_WITHOUT_HOLDOUT)
+        max_num_epochs = min(max_num_epochs, EPOCHS_WITHOUT_HOLDOUT)
 
     def batches(step: int) -> Iterator[tuple[Tensor, Tensor]]:
         order = train[torch.randperm(len(train))]
@@ -219,8 +219,8 @@ def train_on_pairs(
             (lambda: loss(theta[held_out], x[held_out])) if len(held_out) else None
         ),
         learning_rate=training.learning_rate,
-        max_num_steps=max_num_epochs,
-        patience=training.stop_after_epochs,
+        max_num_epochs=max_num_epochs,
+        stop_after_epochs=training.stop_after_epochs,
         clip_max_norm=training.clip_max_norm,
         in_training_mode=in_training_mode,
         label=label,

@@ -116,11 +116,11 @@ def test_the_density_on_embeddings_is_that_of_the_estimator(
     npe: Any, estimator: Any
 ) -> None:
     theta, x = batch_for(npe)
-    q, contexts = headless(estimator), embed(embedding_of(estimator), x)
-    assert contexts.shape == (6, *q.condition_shape)
-    assert contexts.std(dim=0).min() > 0, "the embedding ignores x"
+    q, embeddings = headless(estimator), embed(embedding_of(estimator), x)
+    assert embeddings.shape == (6, *q.condition_shape)
+    assert embeddings.std(dim=0).min() > 0, "the embedding ignores x"
     with torch.no_grad():
-        difference = q.log_prob(theta, contexts) - estimator.log_prob(theta, x)
+        difference = q.log_prob(theta, embeddings) - estimator.log_prob(theta, x)
     assert difference.abs().max() == 0
 
 
@@ -129,12 +129,12 @@ def test_the_samples_on_embeddings_are_those_of_the_estimator(
     npe: Any, estimator: Any
 ) -> None:
     _, x = batch_for(npe)
-    q, contexts = headless(estimator), embed(embedding_of(estimator), x)
+    q, embeddings = headless(estimator), embed(embedding_of(estimator), x)
     with torch.no_grad():
         torch.manual_seed(3)
         expected = estimator.sample((5,), x)
         torch.manual_seed(3)
-        samples = q.sample((5,), contexts)
+        samples = q.sample((5,), embeddings)
     assert samples.shape == (5, 6, *estimator.input_shape)
     assert (samples - expected).abs().max() == 0
 
@@ -198,13 +198,13 @@ def test_tuning_starts_at_the_embedding_and_follows_shifted_targets(
     assert torch.equal(embed(start, x), before)
 
     targets = before + 0.5
-    result = CalibrationFinetuner(num_steps=40, learning_rate=0.02).finetune(
+    result = CalibrationFinetuner(max_num_epochs=40, learning_rate=0.02).finetune(
         h, x, lambda count: targets, seed=0, show_progress_bars=False
     )
     history = result.history
-    assert history.best_step > 0
+    assert history.best_epoch > 0
     assert history.training_loss[0] == pytest.approx(0.5 * before.shape[1] ** 0.5)
-    assert history.training_loss[history.best_step] < 0.8 * history.training_loss[0]
+    assert history.training_loss[history.best_epoch] < 0.8 * history.training_loss[0]
     assert torch.equal(embed(h, x), before), "tuning changed the embedding net itself"
 
 
@@ -232,7 +232,7 @@ def repaired(family: str, embedding: str = "linear", dim: int = 2) -> Repaired:
         torch.manual_seed(2)
         theta = npe.prior.sample((30,))
         x = simulate(theta) + 0.2
-        finetuner = CalibrationFinetuner(num_steps=3)
+        finetuner = CalibrationFinetuner(max_num_epochs=3)
         rope = RoPE(npe, simulator=simulate, finetuner=finetuner)
         rope.append_calibration(theta[:10], x[:10]).train(seed=0, **QUIET)
         posterior = rope.build_posterior(x[10:], num_simulations=8, seed=0)
@@ -413,11 +413,11 @@ def mixed_mixture(npe: Any, *, n_o: int = 20) -> tuple[MixturePosterior, Tensor]
     """A mixture of mixed densities, and the simulations behind it."""
     h = embedding_of(npe.posterior_estimator)
     x_s, x_o = (problems.simulate(npe.prior.sample((n,))) for n in (10, n_o))
-    contexts = embed(h, x_s)
-    coupling = SinkhornCoupler(gamma=0.1, tau=0.9).couple(embed(h, x_o), contexts)
+    embeddings = embed(h, x_s)
+    coupling = SinkhornCoupler(gamma=0.1, tau=0.9).couple(embed(h, x_o), embeddings)
     estimator = problems.coupled_mixture(
         headless(copy.deepcopy(npe.posterior_estimator)),
-        contexts,
+        embeddings,
         coupling,
         x_o,
         embedding_net=h,

@@ -26,7 +26,7 @@ X_S = THETA_S + 0.5 * draw(3, 60, 2)
 X_O = 1.4 * draw(4, 24, 2) + 0.7
 THETA_O = draw(5, 24, 2)
 LOG_SCORES = -THETA.square()
-FINETUNER = CalibrationFinetuner(num_steps=2)
+FINETUNER = CalibrationFinetuner(max_num_epochs=2)
 
 
 NOISE = torch.eye(2) / 4

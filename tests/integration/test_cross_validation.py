@@ -226,7 +226,7 @@ def test_with_fewer_training_folds_labels_reach_those_that_train_on_them(
     # So few train a fold that none of them is held out.
     theta, x = problem(10, seed=1)
     finetuner = CalibrationFinetuner(
-        num_steps=3, simulations_per_target=2, resample_targets=resample
+        max_num_epochs=3, simulations_per_target=2, resample_targets=resample
     )
     tuned = [c for c in CANDIDATES if c.name == "tuning-only"]
     options: dict[str, Any] = {"candidates": tuned, "num_training_folds": 2}

@@ -104,7 +104,7 @@ def test_targets_are_forgotten_when_pairs_are_added_or_drawn_anew_in_every_step(
     assert same(parameters(nets[0]), parameters(nets[1]))
 
     finetuner = CalibrationFinetuner(
-        num_steps=3, simulations_per_target=2, resample_targets=True
+        max_num_epochs=3, simulations_per_target=2, resample_targets=True
     )
     rope = rope_of(finetuner=finetuner)
     nets = [
@@ -202,13 +202,15 @@ def test_stored_simulations_can_be_rehearsed() -> None:
 def test_another_finetuner_gives_another_net_and_leaves_the_first() -> None:
     rope = trained()
     net = rope.tuned_embedding_net
-    other = rope.with_pairs(ALL, finetuner=replace(QUICK, num_steps=3))
+    other = rope.with_pairs(ALL, finetuner=replace(QUICK, max_num_epochs=3))
     with pytest.raises(NotReadyError):
         other.build_posterior(observed())
     other.train(seed=0, **QUIET)
     assert same(parameters(rope.tuned_embedding_net), parameters(net))
     assert rope.finetuner == QUICK
-    expected = rope_of(finetuner=replace(QUICK, num_steps=3)).train(seed=0, **QUIET)
+    expected = rope_of(finetuner=replace(QUICK, max_num_epochs=3)).train(
+        seed=0, **QUIET
+    )
     nets = (other.tuned_embedding_net, expected.tuned_embedding_net)
     assert same(parameters(nets[0]), parameters(nets[1]))
     with pytest.raises(InvalidTypeError, match="finetuner"):

@@ -57,7 +57,7 @@ def repaired() -> tuple[RoPE, MixturePosterior, Tensor]:
         rope = RoPE(
             npe,
             simulator=problems.simulate,
-            finetuner=CalibrationFinetuner(num_steps=200, learning_rate=1e-2),
+            finetuner=CalibrationFinetuner(max_num_epochs=200, learning_rate=1e-2),
             coupler=SinkhornCoupler(gamma=0.1),
         )
         rope.append_calibration(theta[:30], x[:30]).train(seed=0, **QUIET)

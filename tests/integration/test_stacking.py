@@ -79,9 +79,9 @@ def test_couplings_of_a_version_are_those_of_rope_on_its_pairs_and_the_batch() -
     batch = torch.cat([x_o, x_cal])
     couplings = posterior.versions.couplings
     assert couplings is not None
-    contexts = problems.simulated_of(posterior)
+    embeddings = problems.simulated_of(posterior)
     by_name = {candidate.name: candidate for candidate in COUPLINGS}
-    nets = [net for net in couplings.contexts.nets for _ in net.couplings]
+    nets = [net for net in couplings.embeddings.nets for _ in net.couplings]
     theta = torch.cat([problems.box(2).sample((NUM_OBSERVED,)), theta_cal])
     found = couplings.log_probs(theta, batch)
     assert torch.equal(posterior.x_o, x_o)
@@ -99,8 +99,8 @@ def test_couplings_of_a_version_are_those_of_rope_on_its_pairs_and_the_batch() -
             real = net.net(batch)
         estimator = problems.coupled_mixture(
             couplings.part.density,
-            contexts,
-            coupler.couple(real, contexts),
+            embeddings,
+            coupler.couple(real, embeddings),
             batch,
             embedding_net=net.net,
             tail_mass=0.0,
@@ -223,7 +223,7 @@ def test_copies_answer_the_same_and_stay_where_they_are(coupled: bool) -> None:
         estimator = other.posterior_estimator
         couplings = other.versions.couplings
         if couplings is not None:
-            assert couplings.contexts is estimator.coupled[0]
+            assert couplings.embeddings is estimator.coupled[0]
         shown = {id(part) for part in estimator.parts}
         for version in other.versions.trained:
             assert {id(part) for parts in version.values() for part in parts} <= shown

@@ -310,7 +310,7 @@ def test_simulations_may_be_few_and_pairs_many() -> None:
     rope = rope_of(
         problem(30, seed=1),
         simulations=(theta, problems.simulate(theta)),
-        finetuner=CalibrationFinetuner(num_steps=2, num_neighbors=3),
+        finetuner=CalibrationFinetuner(max_num_epochs=2, num_neighbors=3),
     )
     candidates = [ROPE, DiscrepancyCandidate(space="tuned")]
     posterior = stacked(rope, observed(3), candidates=candidates, num_simulations=None)

@@ -31,7 +31,9 @@ def gaussian_stack(
     theta: Tensor, x: Tensor, x_o: Tensor | None = None, *, seed: int = 0
 ) -> StackedPosterior:
     """Of all default candidates, with a small grid of couplings if there is a batch."""
-    finetuner = CalibrationFinetuner(learning_rate=1e-2, num_steps=100, patience=30)
+    finetuner = CalibrationFinetuner(
+        learning_rate=1e-2, max_num_epochs=100, stop_after_epochs=30
+    )
     rope = RoPE(gaussian.posterior(), simulator=gaussian.simulator, finetuner=finetuner)
     rope.append_calibration(theta, x)
     candidates = default_candidates(

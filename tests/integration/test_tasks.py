@@ -43,7 +43,7 @@ def test_rope_runs_on_the_task(task: Task) -> None:
     rope = RoPE(
         npe.build_posterior(),
         simulator=task.get_simulator(),
-        finetuner=CalibrationFinetuner(num_steps=20),
+        finetuner=CalibrationFinetuner(max_num_epochs=20),
         coupler=SinkhornCoupler(gamma=0.3, cost_scale="simulated"),
     )
     rope.append_calibration(*task.get_calibration_set(12))

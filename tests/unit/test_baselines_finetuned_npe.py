@@ -21,7 +21,7 @@ from sbi_rope.errors import (
     RoPEWarning,
     UnsupportedPosteriorError,
 )
-from sbi_rope.mixture import MixturePosterior, OwnContexts
+from sbi_rope.mixture import MixturePosterior, OwnEmbeddings
 from sbi_rope.tasks import get_task
 from sbi_rope.trainers.training import train_on_pairs
 
@@ -204,7 +204,7 @@ def test_networks_from_tuned_nets_are_tuned_apart_from_each_other() -> None:
     parts = method.build_posterior().posterior_estimator.parts
     assert len(parts) == 3
     for part, other in ((parts[0], parts[1]), (parts[1], parts[2])):
-        assert isinstance(part.mixing, OwnContexts)
+        assert isinstance(part.mixing, OwnEmbeddings)
         densities = zip(
             part.density.parameters(), other.density.parameters(), strict=True
         )

@@ -23,7 +23,7 @@ from torch.distributions import (
 
 from sbi_rope._sbi import headless
 from sbi_rope.baselines.hvae import HVAE
-from sbi_rope.baselines.hvae.contexts import LatentContexts
+from sbi_rope.baselines.hvae.embeddings import LatentEmbeddings
 from sbi_rope.baselines.hvae.model import (
     FrozenNPE,
     HybridVAE,
@@ -335,7 +335,7 @@ def test_physics_sees_parameters_inside_the_support_alone() -> None:
 def mixture(num_latents: int = 7) -> MixtureEstimator:
     torch.manual_seed(0)
     model = linear_model(shift=1.0, noisy=True, r2p_std=0.3)
-    contexts = LatentContexts(
+    contexts = LatentEmbeddings(
         model,
         torch.randn(num_latents, 1),
         torch.randn(num_latents, 4),
@@ -366,7 +366,7 @@ def test_density_does_not_depend_on_how_it_is_cut(
     x, theta = EVIDENCE.sample((11,)), torch.randn(5, 11, 2)
     expected = estimator.log_prob(theta, x)
     for entries, pairs in ((4, 1), (8, 10), (56, 20), (100, 100)):
-        module = "sbi_rope.baselines.hvae.contexts"
+        module = "sbi_rope.baselines.hvae.embeddings"
         monkeypatch.setattr(f"{module}.MAX_ENTRIES", entries)
         monkeypatch.setattr("sbi_rope.mixture.chunks.CPU_BATCH", pairs)
         torch.testing.assert_close(estimator.log_prob(theta, x), expected)
@@ -510,7 +510,7 @@ def test_epochs_are_chosen_by_the_first_few_draws_of_the_posterior(
     monkeypatch.setattr("sbi_rope.baselines.hvae.method.train_hybrid", recorded)
     estimator = trained(npe, num_latents=12, noisy=True).build_posterior()
     mixing = estimator.posterior_estimator.parts[0].mixing
-    assert (mixing.num_contexts, seen[0].num_contexts) == (12, 8)
+    assert (mixing.num_embeddings, seen[0].num_embeddings) == (12, 8)
     assert torch.equal(seen[0].z_noise, mixing.z_noise[:8])
     assert torch.equal(seen[0].x_noise, mixing.x_noise[:8])
 
@@ -525,7 +525,7 @@ def test_npe_is_left_as_it_was_and_is_not_trained_inside_either(npe: Any) -> Non
     before = copy.deepcopy(npe.posterior_estimator.state_dict())
     # Chosen by the bound, which improves within an epoch.
     method = trained(npe, num_pairs=3)
-    assert method.history.best_step > 0
+    assert method.history.best_epoch > 0
     estimator = method.build_posterior().posterior_estimator
     for name, value in npe.posterior_estimator.state_dict().items():
         torch.testing.assert_close(value, before[name], rtol=0, atol=0)
@@ -558,7 +558,7 @@ def test_same_seed_gives_the_same_posterior_and_another_seed_another(npe: Any) -
     theta, x = real(5, seed=3)
     # Chosen by the bound, which improves within an epoch.
     methods = [trained(npe, num_pairs=3, seed=seed) for seed in (0, 0, 1)]
-    assert all(method.history.best_step > 0 for method in methods)
+    assert all(method.history.best_epoch > 0 for method in methods)
     one, same, other = (scores(m.build_posterior(), theta, x) for m in methods)
     torch.testing.assert_close(one, same, rtol=0, atol=0)
     assert (one != other).any()

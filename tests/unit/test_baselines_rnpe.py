@@ -13,7 +13,7 @@ from torch.distributions import Normal
 from sbi_rope._sbi import estimator_of
 from sbi_rope._standardisation import Standardisation
 from sbi_rope.baselines.error_model import SpikeAndSlab
-from sbi_rope.baselines.rnpe import RNPE, DenoisedContexts
+from sbi_rope.baselines.rnpe import RNPE, DenoisedEmbeddings
 from sbi_rope.baselines.statistics import fit_marginal
 from sbi_rope.errors import (
     InvalidInputError,
@@ -63,7 +63,7 @@ def quick_posterior(**options: Any) -> Any:
     return quick(**options).train(seed=0, show_progress_bars=False).build_posterior()
 
 
-def mixing_of(posterior: Any) -> DenoisedContexts:
+def mixing_of(posterior: Any) -> DenoisedEmbeddings:
     return posterior.posterior_estimator.parts[0].mixing
 
 
@@ -103,7 +103,7 @@ def test_log_prob_is_the_mean_density_over_the_denoised_statistics() -> None:
     posterior = quick_posterior()
     x, theta = torch.randn(3, 2), torch.randn(4, 3, 2)
     values = posterior.log_prob_batched(theta, x=x, norm_posterior=False)
-    s = mixing_of(posterior).features(x)
+    s = mixing_of(posterior).embed(x)
     for sample in range(4):
         for row in range(3):
             terms = [
@@ -210,14 +210,14 @@ def test_constant_statistics_are_left_out_and_come_back_as_simulated() -> None:
 def test_what_was_denoised_is_kept() -> None:
     posterior = quick_posterior()
     mixing, x = mixing_of(posterior), torch.randn(3, 2)
-    first = mixing.features(x)
+    first = mixing.embed(x)
     # In other company and order, and as -0 for 0.
-    assert torch.equal(mixing.features(x[[2, 0]]), first[[2, 0]])
+    assert torch.equal(mixing.embed(x[[2, 0]]), first[[2, 0]])
     mixed = torch.cat([torch.randn(2, 2), x[1:2]])
-    assert torch.equal(mixing.features(mixed)[2], first[1])
-    zero = mixing.features(torch.zeros(1, 2))
+    assert torch.equal(mixing.embed(mixed)[2], first[1])
+    zero = mixing.embed(torch.zeros(1, 2))
     num_kept = len(mixing._denoised)
-    assert torch.equal(mixing.features(-torch.zeros(1, 2)), zero)
+    assert torch.equal(mixing.embed(-torch.zeros(1, 2)), zero)
     assert len(mixing._denoised) == num_kept
 
 
@@ -234,12 +234,12 @@ def test_two_posteriors_of_one_training_are_the_same_function() -> None:
 def test_denoising_leaves_the_random_numbers_of_the_caller_alone() -> None:
     posterior = quick_posterior()
     state = torch.get_rng_state()
-    mixing_of(posterior).features(torch.randn(1, 2))
+    mixing_of(posterior).embed(torch.randn(1, 2))
     torch.set_rng_state(state)
     expected = torch.randn(1, 2)
     torch.set_rng_state(state)
     torch.randn(1, 2)
-    mixing_of(posterior).features(expected)
+    mixing_of(posterior).embed(expected)
     after = torch.randn(1)
     torch.set_rng_state(state)
     torch.randn(1, 2)
@@ -307,7 +307,7 @@ def test_chains_that_disagree_are_warned_of_and_measured() -> None:
     # Where spike and slab compete, a few draws do not tell their shares.
     x = torch.linspace(3.3, 4.2, 10)[:, None] * torch.tensor([1.0, -1.0])
     with pytest.warns(RoPEWarning, match="R-hat"):
-        mixing_of(posterior).features(x)
+        mixing_of(posterior).embed(x)
     assert (mixing_of(posterior).r_hat(x) > 1.1).any()
 
 
@@ -342,7 +342,7 @@ def test_statistics_that_never_vary_are_refused() -> None:
 def test_an_observation_that_is_not_finite_is_refused() -> None:
     mixing = mixing_of(quick_posterior())
     with pytest.raises(InvalidInputError, match="finite"):
-        mixing.features(torch.tensor([[0.0, math.nan]]))
+        mixing.embed(torch.tensor([[0.0, math.nan]]))
 
 
 def test_vector_fields_are_refused() -> None:
@@ -376,8 +376,6 @@ def test_an_error_model_of_another_type_is_refused() -> None:
 
 def test_far_observations_are_treated_as_at_the_bound() -> None:
     mixing = mixing_of(quick_posterior())
-    far, farther = (
-        mixing.features(torch.tensor([[value, 0.0]])) for value in (1e8, 1e9)
-    )
+    far, farther = (mixing.embed(torch.tensor([[value, 0.0]])) for value in (1e8, 1e9))
     assert torch.isfinite(far).all()
     assert torch.equal(far, farther)

@@ -315,7 +315,7 @@ class TestFinetunedNPE:
         )
         theta, x = simulations(2050)
         method.append_calibration(theta[2000:], x[2000:]).train(**QUIET)
-        assert method.history.best_step == 0
+        assert method.history.best_epoch == 0
         expected = log_probs(npe().build_posterior(), theta[:9], x[:9])
         posterior = method.build_posterior()
         assert torch.equal(log_probs(posterior, theta[:9], x[:9]), expected)
@@ -351,7 +351,7 @@ class TestRoPEsParts:
             if stored
             else {"simulator": TASK.get_simulator()}
         )
-        finetuner = CalibrationFinetuner(learning_rate=1e-2, num_steps=10)
+        finetuner = CalibrationFinetuner(learning_rate=1e-2, max_num_epochs=10)
         posterior = npe().build_posterior()
         rope = RoPE(posterior, finetuner=finetuner, **source)
         rope.append_calibration(*real()).train(**QUIET)
@@ -411,7 +411,7 @@ class TestRoPEsParts:
         method = TuningOnly.from_posterior(
             npe().build_posterior(), simulator=TASK.get_simulator()
         )
-        method.finetuner = CalibrationFinetuner(learning_rate=1e-2, num_steps=10)
+        method.finetuner = CalibrationFinetuner(learning_rate=1e-2, max_num_epochs=10)
         method.append_calibration(*real()).train(**QUIET)
         tuned = method.build_posterior().posterior_estimator
         start = npe().build_posterior().posterior_estimator

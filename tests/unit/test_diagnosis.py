@@ -25,7 +25,7 @@ from sbi_rope.errors import InvalidInputError, InvalidTypeError, NotReadyError
 from sbi_rope.plots import implied_parameters
 from tests import gaussian
 
-FINETUNER = CalibrationFinetuner(learning_rate=1e-2, num_steps=150)
+FINETUNER = CalibrationFinetuner(learning_rate=1e-2, max_num_epochs=150)
 SHIFTS = ("prior shift: theta_1", "prior shift: theta_2")
 
 
@@ -471,7 +471,7 @@ def test_a_real_process_that_folds_a_parameter_alarms() -> None:
 def test_residuals_are_of_pairs_that_g_was_not_trained_on() -> None:
     torch.manual_seed(23)
     theta, x = gaussian.labelled(10)
-    rope = conductor(finetuner=CalibrationFinetuner(num_steps=50))
+    rope = conductor(finetuner=CalibrationFinetuner(max_num_epochs=50))
     rope.append_calibration(theta, x).train(seed=0, show_progress_bars=False)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -47,7 +47,7 @@ SMALL: dict[str, Any] = {
     "num_simulations": 300,
     "num_steps": 4,
     "num_folds": 2,
-    "finetuner": CalibrationFinetuner(num_steps=3, rehearsal=1.0),
+    "finetuner": CalibrationFinetuner(max_num_epochs=3, rehearsal=1.0),
 }
 QUIET: dict[str, Any] = {"seed": 0, "show_progress_bars": False}
 

@@ -56,7 +56,7 @@ def test_a_column_that_only_varies_in_reality_is_named_and_diagnosed(
     rope = RoPE(
         npe_of("independent", net=net),
         simulator=simulator,
-        finetuner=CalibrationFinetuner(num_steps=1),
+        finetuner=CalibrationFinetuner(max_num_epochs=1),
     )
     what = r"1 of the 3 entries of `{}` \(first: \[2\]\) are up to .e\+05 standard"
     with pytest.warns(RoPEWarning, match=what.format("x")):

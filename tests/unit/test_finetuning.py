@@ -11,7 +11,7 @@ from sbi_rope import CalibrationFinetuner
 from sbi_rope._random import seeded
 from sbi_rope.errors import InvalidInputError, InvalidTypeError, RoPEWarning
 from sbi_rope.finetuning import (
-    STEPS_WITHOUT_HOLDOUT,
+    EPOCHS_WITHOUT_HOLDOUT,
     FinetuneResult,
     trainable_copy,
 )
@@ -33,14 +33,14 @@ def finetune(
         result.embedding_net,
         history.training_loss,
         history.validation_loss,
-        history.best_step,
+        history.best_epoch,
     )
 
 
 def test_the_first_losses_are_the_mean_unsquared_distances() -> None:
     x, targets = torch.randn(10, 2), torch.randn(10, 2)
     net = linear()
-    _, training, validation, _ = finetune(net, x, targets, num_steps=1)
+    _, training, validation, _ = finetune(net, x, targets, max_num_epochs=1)
     distances = ((net(x).detach() - targets) ** 2).sum(dim=1).sqrt()
     expected = (8 * training[0] + 2 * validation[0]) / 10
     assert float(distances.mean()) == pytest.approx(expected, rel=1e-6)
@@ -54,7 +54,7 @@ def test_many_pairs_lead_to_the_minimiser_known_in_closed_form() -> None:
     """
     theta, x_o = gaussian.labelled(5000)
     g, *_ = finetune(
-        linear(), x_o, gaussian.GAIN * theta, learning_rate=3e-3, num_steps=600
+        linear(), x_o, gaussian.GAIN * theta, learning_rate=3e-3, max_num_epochs=600
     )
     slope = gaussian.GAIN**2 / gaussian.SCALE
     weight, bias = g.weight.detach(), g.bias.detach()  # type: ignore[union-attr]
@@ -67,7 +67,7 @@ def test_the_net_that_is_kept_is_the_best_on_the_held_out_pairs() -> None:
     x, targets = torch.randn(20, 2), torch.randn(20, 2)
     net = nn.Sequential(nn.Linear(2, 64), nn.Tanh(), nn.Linear(64, 2))
     g, _, validation, best = finetune(net, x, targets, learning_rate=1e-2)
-    assert len(validation) == best + 1 + 200  # stopped by its patience
+    assert len(validation) == best + 1 + 200  # stopped by its stop_after_epochs
     assert validation[best] == min(validation)
     with seeded(0):
         held_out = torch.randperm(20)[:4]
@@ -80,7 +80,7 @@ def test_of_several_learning_rates_the_best_on_the_hold_out_is_kept() -> None:
     x = torch.randn(30, 2)
     losses = {}
     for rate in (1e-5, 1e-2, (1e-5, 1e-2), (1e-2, 1e-5)):
-        finetuner = CalibrationFinetuner(learning_rate=rate, num_steps=300)
+        finetuner = CalibrationFinetuner(learning_rate=rate, max_num_epochs=300)
         result = finetuner.finetune(
             linear(), x, lambda count: 2 * x + 1, seed=0, show_progress_bars=False
         )
@@ -93,7 +93,7 @@ def test_of_several_learning_rates_the_best_on_the_hold_out_is_kept() -> None:
 
 def test_the_history_says_at_a_glance_whether_tuning_helped() -> None:
     x = torch.randn(10, 2)
-    result = CalibrationFinetuner(num_steps=1).finetune(
+    result = CalibrationFinetuner(max_num_epochs=1).finetune(
         linear(), x, lambda count: x, seed=0, show_progress_bars=False
     )
     assert "validation_loss" in repr(result.history)
@@ -115,7 +115,7 @@ def test_the_users_net_is_left_as_it_was() -> None:
     net = nn.Sequential(nn.Linear(2, 2), nn.BatchNorm1d(2), nn.Dropout(0.5)).train()
     net[0].requires_grad_(requires_grad=False)
     before = copy.deepcopy(net.state_dict())
-    g, *_ = finetune(net, x, targets, num_steps=20)
+    g, *_ = finetune(net, x, targets, max_num_epochs=20)
     assert all(torch.equal(before[k], v) for k, v in net.state_dict().items())
     assert net.training
     assert not net[0].weight.requires_grad
@@ -127,7 +127,7 @@ def test_a_net_without_parameters_gets_an_affine_map_that_starts_as_identity() -
     x = torch.randn(50, 3)
     g = trainable_copy(nn.Identity(), x)
     assert torch.equal(g(x), x)
-    tuned, *_ = finetune(nn.Identity(), x, 1.3 * x - 0.2, num_steps=1000)
+    tuned, *_ = finetune(nn.Identity(), x, 1.3 * x - 0.2, max_num_epochs=1000)
     assert (tuned(x) - (1.3 * x - 0.2)).norm(dim=1).mean() < 0.02
 
 
@@ -137,13 +137,13 @@ def test_few_pairs_are_not_held_out_and_get_few_steps(n: int) -> None:
     with pytest.warns(RoPEWarning, match="at least 5 pairs"):
         _, training, validation, best = finetune(linear(), x, x)
     assert validation == []
-    assert best == STEPS_WITHOUT_HOLDOUT
+    assert best == EPOCHS_WITHOUT_HOLDOUT
     assert training[-1] < training[0]
 
 
 def test_five_pairs_are_enough_to_hold_one_out() -> None:
     x = torch.randn(5, 2)
-    *_, validation, _ = finetune(linear(), x, x, num_steps=3)
+    *_, validation, _ = finetune(linear(), x, x, max_num_epochs=3)
     assert len(validation) == 4
 
 
@@ -151,7 +151,7 @@ def test_held_out_targets_stay_when_the_others_are_drawn_anew() -> None:
     x, net = torch.randn(20, 2), linear()
     draws = iter([net(x).detach()] + [1e3 * torch.randn(20, 2) for _ in range(30)])
     result = CalibrationFinetuner(
-        learning_rate=1e-9, num_steps=5, resample_targets=True
+        learning_rate=1e-9, max_num_epochs=5, resample_targets=True
     ).finetune(net, x, lambda count: next(draws), seed=0, show_progress_bars=False)
     assert max(result.history.validation_loss) < 1e-4
     assert min(result.history.training_loss[1:]) > 10
@@ -176,7 +176,7 @@ def test_targets_are_drawn_once_or_before_every_step() -> None:
         calls.append(count)
         return torch.randn(10, 2)
 
-    settings = {"num_steps": 7, "simulations_per_target": 3, "learning_rate": 1e-3}
+    settings = {"max_num_epochs": 7, "simulations_per_target": 3, "learning_rate": 1e-3}
     CalibrationFinetuner(**settings).finetune(  # type: ignore[arg-type]
         linear(), x, draw, show_progress_bars=False
     )
@@ -198,9 +198,9 @@ def test_steps_that_are_too_large_never_leave_nan_behind(n: int) -> None:
 def test_the_same_seed_gives_the_same_net_and_leaves_the_callers_state() -> None:
     x, targets, net = torch.randn(30, 2), torch.randn(30, 2), linear()
     state = torch.get_rng_state()
-    first, *_ = finetune(net, x, targets, num_steps=20)
+    first, *_ = finetune(net, x, targets, max_num_epochs=20)
     assert torch.equal(torch.get_rng_state(), state)
-    second, *_ = finetune(net, x, targets, num_steps=20)
+    second, *_ = finetune(net, x, targets, max_num_epochs=20)
     assert torch.equal(first(x), second(x))
 
 
@@ -211,8 +211,8 @@ def test_the_same_seed_gives_the_same_net_and_leaves_the_callers_state() -> None
         {"learning_rate": math.inf},
         {"learning_rate": ()},
         {"learning_rate": (1e-3, -1.0)},
-        {"num_steps": 0},
-        {"num_steps": 10.0},
+        {"max_num_epochs": 0},
+        {"max_num_epochs": 10.0},
         {"simulations_per_target": 0},
         {"num_neighbors": 0},
         {"validation_fraction": 0.0},
@@ -233,7 +233,7 @@ def test_unusable_pairs_are_refused() -> None:
     # Not only those drawn first.
     later = iter([x, x[:, :1]])
     with pytest.raises(InvalidInputError, match=r"shape \(10, 2\)"):
-        CalibrationFinetuner(num_steps=3, resample_targets=True).finetune(
+        CalibrationFinetuner(max_num_epochs=3, resample_targets=True).finetune(
             linear(), x, lambda count: next(later), show_progress_bars=False
         )
     with pytest.raises(InvalidInputError, match="`x` to be finite"):
@@ -281,7 +281,7 @@ def test_the_loss_of_rehearsal_is_the_weighted_distance_from_where_h_put_them() 
     x, simulations = torch.randn(4, 2), torch.randn(1, 2)
     net = linear()
     result = rehearsed(
-        net, x, x + 3, simulations, rehearsal=0.7, learning_rate=0.1, num_steps=1
+        net, x, x + 3, simulations, rehearsal=0.7, learning_rate=0.1, max_num_epochs=1
     )
     g = result.embedding_net
     distance = (g(x) - x - 3).norm(dim=1).mean()
@@ -295,13 +295,19 @@ def test_the_loss_of_rehearsal_is_the_weighted_distance_from_where_h_put_them() 
 def test_held_out_pairs_are_judged_without_rehearsal() -> None:
     x, simulations = torch.randn(10, 2), torch.randn(50, 2)
     result = rehearsed(
-        linear(), x, x + 3, simulations, rehearsal=0.3, num_steps=20, learning_rate=0.03
+        linear(),
+        x,
+        x + 3,
+        simulations,
+        rehearsal=0.3,
+        max_num_epochs=20,
+        learning_rate=0.03,
     )
     with seeded(0):
         held_out = torch.randperm(10)[:2]
     distance = (result.embedding_net(x) - x - 3).norm(dim=1)[held_out].mean()
-    assert result.history.best_step > 5
-    best = result.history.validation_loss[result.history.best_step]
+    assert result.history.best_epoch > 5
+    best = result.history.validation_loss[result.history.best_epoch]
     assert float(distance) == pytest.approx(best, rel=1e-6)
 
 
@@ -311,7 +317,7 @@ def test_without_rehearsal_nothing_is_simulated() -> None:
     def never(count: int) -> Tensor:
         raise AssertionError
 
-    result = CalibrationFinetuner(num_steps=3).finetune(
+    result = CalibrationFinetuner(max_num_epochs=3).finetune(
         linear(),
         x,
         lambda count: x,
@@ -341,7 +347,7 @@ def test_pairs_of_a_group_are_held_out_together() -> None:
     targets = net(x).detach() + groups[:, None] * torch.tensor([[1.0, 0.0]])
     held_out = set()
     for seed in range(8):
-        result = CalibrationFinetuner(num_steps=1, learning_rate=1e-6).finetune(
+        result = CalibrationFinetuner(max_num_epochs=1, learning_rate=1e-6).finetune(
             net,
             x,
             lambda count: targets,

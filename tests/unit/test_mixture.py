@@ -41,15 +41,15 @@ def flow_posterior(
     x_s = problems.simulate(npe.prior.sample((25,)))
     x_o = problems.simulate(npe.prior.sample((n_o,))) + 0.2
     h = embedding_of(npe.posterior_estimator)
-    contexts = embed(h, x_s)
+    embeddings = embed(h, x_s)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RoPEWarning)
         coupling = SinkhornCoupler(gamma=0.1, tau=0.9, **coupler).couple(
-            embed(h, x_o), contexts
+            embed(h, x_o), embeddings
         )
     estimator = problems.coupled_mixture(
         headless(copy.deepcopy(npe.posterior_estimator)),
-        contexts,
+        embeddings,
         coupling,
         x_o,
         embedding_net=h,
@@ -233,7 +233,7 @@ from tests import problems
 from benchmarks.machine import forget_peak, memory, peak_memory
 
 n, dim = 6000, 2
-simulated = problems.contexts_of(dim, n)
+simulated = problems.embeddings_of(dim, n)
 coupling = Coupling(
     potential=torch.zeros(n, dtype=torch.float64), simulated=simulated.double(),
     real=simulated.double() + 0.01, gamma=0.05, tau=1.0, marginal_error=0.0,
@@ -264,13 +264,13 @@ def test_memory_stays_within_the_number_of_the_docstring() -> None:
 
 def test_components_without_a_draw_inside_still_have_an_error() -> None:
     # Mixtures that lie outside but for a sliver, of 5e-4 or less.
-    contexts = torch.cat([torch.full((40, 1), 2.0), torch.full((40, 1), -1.1)], dim=1)
-    posterior = gaussian_posterior(dim=1, n_o=10, contexts=contexts)
+    embeddings = torch.cat([torch.full((40, 1), 2.0), torch.full((40, 1), -1.1)], dim=1)
+    posterior = gaussian_posterior(dim=1, n_o=10, embeddings=embeddings)
     exact = posterior.weights @ inside_mass(posterior)
     leakage = posterior.leakage(posterior.x_o)
     assert (exact < 2e-3).all()
     assert ((leakage.mass - exact).abs() < 4 * leakage.standard_error).all()
-    none_inside = gaussian_posterior(dim=1, n_o=10, contexts=contexts - 1.2)
+    none_inside = gaussian_posterior(dim=1, n_o=10, embeddings=embeddings - 1.2)
     assert (none_inside.leakage(none_inside.x_o).standard_error > 0).all()
 
 
@@ -326,7 +326,7 @@ def test_a_component_without_a_density_does_not_take_the_others_with_it(
 def test_the_tail_left_out_obeys_the_bound_of_the_docstring(tail_mass: float) -> None:
     torch.manual_seed(5)
     weights = torch.softmax(3 * torch.randn(8, 60), dim=1)
-    posterior = gaussian_posterior(n_o=8, weights=weights, contexts=contexts(60))
+    posterior = gaussian_posterior(n_o=8, weights=weights, embeddings=embeddings(60))
     theta = 2 * torch.rand(50, 8, 2) - 1
     full = log_prob_batched(posterior, theta).double().exp()
     posterior.posterior_estimator.tail_mass = tail_mass
@@ -354,14 +354,14 @@ def test_the_tail_left_out_obeys_the_bound_of_the_docstring(tail_mass: float) ->
     assert (truncated > 0).all(), "nothing was kept"
 
 
-def contexts(n_s: int, dim: int = 2) -> Tensor:
-    return problems.contexts_of(dim, n_s)
+def embeddings(n_s: int, dim: int = 2) -> Tensor:
+    return problems.embeddings_of(dim, n_s)
 
 
 def test_equal_weights_are_kept_even_where_each_is_small() -> None:
     uniform = torch.full((2, 4000), 1 / 4000)
     posterior = gaussian_posterior(
-        dim=1, n_o=2, weights=uniform, contexts=contexts(4000, 1), tail_mass=1e-3
+        dim=1, n_o=2, weights=uniform, embeddings=embeddings(4000, 1), tail_mass=1e-3
     )
     theta = torch.linspace(-1, 1, 5)[:, None, None].expand(5, 2, 1)
     expected = brute_force_log_prob(posterior, theta).float()
@@ -406,7 +406,7 @@ def test_the_density_integrates_to_one(prior: Distribution) -> None:
 def test_weights_of_zero_contribute_nothing(tail_mass: float) -> None:
     weights = torch.tensor([[0.0, 1.0, 0.0], [0.5, 0.0, 0.5]])
     posterior = gaussian_posterior(
-        n_o=2, weights=weights, contexts=contexts(3), tail_mass=tail_mass
+        n_o=2, weights=weights, embeddings=embeddings(3), tail_mass=tail_mass
     )
     theta = 2 * torch.rand(4, 2, 2) - 1
     expected = brute_force_log_prob(posterior, theta).float()
@@ -510,7 +510,7 @@ def test_components_are_drawn_with_their_weights_and_never_with_weight_zero() ->
         dim=1,
         n_o=2,
         weights=weights,
-        contexts=spikes,
+        embeddings=spikes,
         prior=problems.standard_normal(1),
     )
     n = 20_000
@@ -532,7 +532,7 @@ def test_no_random_number_draws_a_component_of_weight_zero(
         dim=1,
         n_o=200,
         weights=weights,
-        contexts=spikes,
+        embeddings=spikes,
         prior=problems.standard_normal(1),
     )
     # The ends of what torch.rand returns in double precision.
@@ -592,7 +592,9 @@ def test_samples_stay_inside_the_prior_unless_asked_otherwise() -> None:
 
 def test_a_posterior_far_outside_the_prior_is_still_sampled() -> None:
     far = torch.tensor([[3.0, 0.0]])  # Z = P(N(3, 1) in [-1, 1]) = 0.023
-    posterior = gaussian_posterior(dim=1, n_o=1, weights=torch.ones(1, 1), contexts=far)
+    posterior = gaussian_posterior(
+        dim=1, n_o=1, weights=torch.ones(1, 1), embeddings=far
+    )
     samples = posterior.sample((2000,), x=posterior.x_o[0], **QUIET)[:, 0].double()
     normal = Normal(3.0, 1.0)
     low, high = normal.cdf(torch.tensor(-1.0)), normal.cdf(torch.tensor(1.0))
@@ -608,7 +610,7 @@ def test_the_last_few_samples_take_few_calls_of_the_flow(
     # is missing would take about log2(1000) = 10 calls.
     edge = torch.tensor([[1.0, -3.0]])
     posterior = gaussian_posterior(
-        dim=1, n_o=1, weights=torch.ones(1, 1), contexts=edge
+        dim=1, n_o=1, weights=torch.ones(1, 1), embeddings=edge
     )
     calls = count_draws(posterior, monkeypatch)
     posterior.sample((1000,), x=posterior.x_o[0], **QUIET)
@@ -620,7 +622,7 @@ def hopeless_posterior(n_o: int = 2) -> MixturePosterior:
     """All mass of the first observation lies far outside the prior."""
     spikes = torch.tensor([[100.0, -3.0], [0.0, -3.0]])
     weights = torch.eye(2)[[0] + [1] * (n_o - 1)]
-    return gaussian_posterior(dim=1, n_o=n_o, weights=weights, contexts=spikes)
+    return gaussian_posterior(dim=1, n_o=n_o, weights=weights, embeddings=spikes)
 
 
 def test_no_mass_inside_the_prior_ends_in_an_error_that_names_the_observation(
@@ -684,7 +686,7 @@ def test_the_mass_inside_the_prior_is_that_of_the_components() -> None:
     # With identity weights the mass of observation j is that of component j.
     n = 200
     posterior = gaussian_posterior(
-        n_o=n, weights=torch.eye(n), contexts=problems.contexts_of(2, n, std=0.5)
+        n_o=n, weights=torch.eye(n), embeddings=problems.embeddings_of(2, n, std=0.5)
     )
     leakage, truth = posterior.leakage(posterior.x_o), inside_mass(posterior)
     error = (truth * (1 - truth) / truncation_module.LEAKAGE_DRAWS).sqrt()
@@ -887,7 +889,7 @@ def test_duplicates_in_the_batch_have_the_same_posterior() -> None:
     x_o[3] = x_o[0]
     weights = torch.softmax(torch.randn(4, 8), dim=1)
     weights[3] = weights[0]
-    posterior = gaussian_posterior(x_o=x_o, weights=weights, contexts=contexts(8))
+    posterior = gaussian_posterior(x_o=x_o, weights=weights, embeddings=embeddings(8))
     theta = 2 * torch.rand(9, 1, 2) - 1
     log_prob = posterior.log_prob_batched(theta, posterior.x_o)
     assert torch.equal(log_prob[:, 0], log_prob[:, 3])
@@ -949,7 +951,7 @@ def test_an_unseen_observation_may_extend_the_coupling_with_a_warning() -> None:
     with pytest.warns(RoPEWarning):
         log_prob = posterior.log_prob(torch.zeros(1, 2), x=new[0], norm_posterior=False)
     extended = gaussian_posterior(
-        n_o=2, weights=expected, contexts=problems.simulated_of(posterior), x_o=new
+        n_o=2, weights=expected, embeddings=problems.simulated_of(posterior), x_o=new
     )
     assert torch.allclose(
         log_prob,

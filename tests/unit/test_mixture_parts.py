@@ -23,11 +23,11 @@ from sbi_rope.errors import (
     UnsupportedPosteriorError,
 )
 from sbi_rope.mixture import (
-    CoupledContexts,
+    CoupledEmbeddings,
     CoupledNet,
     MixtureEstimator,
     MixturePosterior,
-    OwnContexts,
+    OwnEmbeddings,
     Part,
     chunks,
     part_of,
@@ -71,7 +71,7 @@ def gaussian_net() -> nn.Module:
 
 def coupled_part(**options: Any) -> Part:
     """Two nets, the first with two couplings of its embeddings."""
-    simulated = problems.contexts_of(DIM, NUM_SIMULATED)
+    simulated = problems.embeddings_of(DIM, NUM_SIMULATED)
     batch = torch.randn(NUM_BATCH, 3)
     nets = [nn.Linear(3, 2 * DIM) for _ in range(2)]
     first, second = (net(batch) for net in nets)
@@ -83,13 +83,13 @@ def coupled_part(**options: Any) -> Part:
         ),
         CoupledNet(nets[1], [coupling(second, simulated, direct=True)], SHARES[2:]),
     ]
-    mixing = CoupledContexts(simulated, batch, pairs, **options)
+    mixing = CoupledEmbeddings(simulated, batch, pairs, **options)
     return Part(problems.Gaussians(DIM), mixing)
 
 
 def own_part(num_nets: int = 2) -> Part:
     nets = [gaussian_net() for _ in range(num_nets)]
-    return Part(problems.Gaussians(DIM), OwnContexts(nets, (3,)))
+    return Part(problems.Gaussians(DIM), OwnEmbeddings(nets, (3,)))
 
 
 def three_parts(
@@ -121,9 +121,9 @@ def rows_by_hand(posterior: MixturePosterior, x: Tensor) -> list[Tensor]:
     return found
 
 
-def gaussians(theta: Tensor, contexts: Tensor) -> Tensor:
-    """Densities at theta (..., d) given contexts (..., 2 d)."""
-    mean, log_std = contexts.detach().double().chunk(2, dim=-1)
+def gaussians(theta: Tensor, embeddings: Tensor) -> Tensor:
+    """Densities at theta (..., d) given embeddings (..., 2 d)."""
+    mean, log_std = embeddings.detach().double().chunk(2, dim=-1)
     return Normal(mean, log_std.exp()).log_prob(theta.double()).sum(-1).exp()
 
 
@@ -148,8 +148,8 @@ def masses(posterior: MixturePosterior, x: Tensor) -> Tensor:
     """Of each part inside the box, shape (n, 3), in closed form."""
     own: Any = posterior.posterior_estimator.parts[1].mixing
 
-    def inside(contexts: Tensor) -> Tensor:
-        mean, log_std = contexts.detach().double().chunk(2, dim=-1)
+    def inside(embeddings: Tensor) -> Tensor:
+        mean, log_std = embeddings.detach().double().chunk(2, dim=-1)
         law, one = Normal(mean, log_std.exp()), torch.ones_like(mean)
         return (law.cdf(one) - law.cdf(-one)).prod(dim=-1)
 
@@ -252,7 +252,7 @@ def test_parts_of_weight_zero_cost_nothing(
         for target, name in (
             (part.density, "log_prob"),
             (part.density, "sample"),
-            (part.mixing, "features"),
+            (part.mixing, "embed"),
             (part.mixing, "rows"),
         ):
             calls[k].append(counted(target, name, monkeypatch))
@@ -302,7 +302,7 @@ def test_samples_follow_the_density_of_all_parts(
 
 
 def test_samples_come_from_each_part_as_often_as_it_weighs() -> None:
-    # Spikes at different integers: contexts cannot be confused with each other.
+    # Spikes at different integers: embeddings cannot be confused with each other.
     weights = (0.5, 0.3, 0.2)
     parts = []
     for number in range(3):
@@ -310,7 +310,7 @@ def test_samples_come_from_each_part_as_often_as_it_weighs() -> None:
         with torch.no_grad():
             net.weight.zero_()
             net.bias.copy_(torch.tensor([float(number), -9.0]))
-        parts.append(Part(problems.Gaussians(1), OwnContexts([net], (3,))))
+        parts.append(Part(problems.Gaussians(1), OwnEmbeddings([net], (3,))))
     estimator = MixtureEstimator(parts, weights)
     n = 20_000
     samples = estimator.sample(Size((n,)), torch.randn(2, 3))
@@ -361,7 +361,7 @@ def test_a_part_gets_the_draws_its_weight_deserves(
     def draws(of_part: list[Any]) -> int:
         return sum(Size(shape).numel() for shape, *_ in of_part)
 
-    # Given each simulation once; of the own contexts a quarter each time, over two
+    # Given each simulation once; of the own embeddings a quarter each time, over two
     # nets; the prior weighs less than a draw.
     assert draws(calls[0]) == truncation.LEAKAGE_DRAWS
     assert draws(calls[1]) == 2 * 128
@@ -384,7 +384,7 @@ def test_the_prior_is_never_left_out_of_a_density_however_little_it_weighs() -> 
         net.weight.zero_()
         net.bias.copy_(torch.tensor([-0.9, -0.9, -3.0, -3.0]))
     parts = [
-        Part(problems.Gaussians(DIM), OwnContexts([net], (3,))),
+        Part(problems.Gaussians(DIM), OwnEmbeddings([net], (3,))),
         part_of_prior(problems.box(DIM), (3,)),
     ]
     estimator = MixtureEstimator(parts, [0.9999, 0.0001], tail_mass=1e-3)
@@ -437,10 +437,10 @@ def test_distances_are_computed_once_for_all_couplings_of_a_net(
     calls = counted(Distances, "__call__", monkeypatch)
     part = coupled_part()
     mixing: Any = part.mixing
-    features = mixing.features(mixing.x_o)
-    mixing.rows(features)
+    embedded = mixing.embed(mixing.x_o)
+    mixing.rows(embedded)
     assert len(calls) == 2
-    list(mixing.rows_of_each(features))
+    list(mixing.rows_of_each(embedded))
     assert len(calls) == 4
     # Those with and those without a matrix product do not share them.
     first = mixing.nets[0]
@@ -458,7 +458,7 @@ def test_couplings_of_share_zero_cost_nothing(monkeypatch: pytest.MonkeyPatch) -
     mixing: Any = coupled_part().mixing.with_shares([0.0, 1.0, 0.0])  # type: ignore[operator]
     assert mixing.shares == (0.0, 1.0, 0.0)
     calls = counted(Coupling, "rows", monkeypatch)
-    rows = mixing.rows(mixing.features(mixing.x_o)).weights
+    rows = mixing.rows(mixing.embed(mixing.x_o)).weights
     assert [arguments[0] for arguments in calls] == [mixing.couplings[1]]
     assert torch.equal(rows, mixing.couplings[1].weights)
 
@@ -469,7 +469,7 @@ def test_rows_are_the_shares_of_the_couplings() -> None:
     expected = sum(share * row for share, row in pairs)
     assert torch.allclose(posterior.weights, expected, atol=1e-6)
     mixing = posterior.posterior_estimator.coupled[0]
-    of_each = list(mixing.rows_of_each(mixing.features(posterior.x_o)))
+    of_each = list(mixing.rows_of_each(mixing.embed(posterior.x_o)))
     by_hand = rows_by_hand(posterior, posterior.x_o)
     for found, row in zip(of_each, by_hand, strict=True):
         assert torch.allclose(found, row, atol=1e-6)
@@ -501,7 +501,7 @@ def test_what_was_coupled_may_be_more_than_what_is_inferred() -> None:
     assert torch.equal(last.default_x, mixing.batch[4:5])
     # The single coupling of a longer batch has rows for what is inferred alone.
     first = mixing.nets[0]
-    single = CoupledContexts(
+    single = CoupledEmbeddings(
         mixing.simulated,
         mixing.batch,
         [CoupledNet(first.net, first.couplings[:1])],
@@ -755,7 +755,7 @@ def test_bounded_posteriors_are_told_from_those_of_sbi() -> None:
         (lambda: coupled_part(num_observed=99), "num_observed"),
         (lambda: coupled_part(unseen="guess"), "unseen"),
         (lambda: CoupledNet(nn.Identity(), []), "at least one"),
-        (lambda: OwnContexts([], (3,)), "at least one"),
+        (lambda: OwnEmbeddings([], (3,)), "at least one"),
         (
             lambda: coupled_part().mixing.with_shares([0.5, 0.5, 0.5]),  # type: ignore[operator]
             "sum of one",
@@ -770,7 +770,7 @@ def test_bounded_posteriors_are_told_from_those_of_sbi() -> None:
             lambda: amortised().posterior_estimator.component_mass(
                 0, accept=lambda theta: theta[:, 0] > 0, cache={}
             ),
-            "shared contexts",
+            "shared embeddings",
         ),
     ],
 )

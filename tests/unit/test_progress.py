@@ -17,10 +17,10 @@ warnings.simplefilter("ignore")
 rope = RoPE(
     gaussian.posterior(),
     simulator=gaussian.simulator,
-    finetuner=CalibrationFinetuner(num_steps=200, rehearsal=0.5),
+    finetuner=CalibrationFinetuner(max_num_epochs=200, rehearsal=0.5),
 )
 rope.append_calibration(*gaussian.labelled(20)).train()
-assert rope.history.best_step > 0
+assert rope.history.best_epoch > 0
 rope.build_posterior(gaussian.labelled(30)[1])
 """
 

@@ -37,7 +37,7 @@ from sbi_rope.stacking import default_candidates
 from sbi_rope.sweep import sweep
 from tests import gaussian, problems
 
-QUICK = CalibrationFinetuner(num_steps=20)
+QUICK = CalibrationFinetuner(max_num_epochs=20)
 
 
 def rope(**options: object) -> RoPE:
@@ -226,7 +226,7 @@ def test_simulations_with_nan_are_dropped_and_counted() -> None:
 
 def test_calibration_targets_are_the_mean_embedding_of_fresh_simulations() -> None:
     theta, x = gaussian.labelled(12)
-    conductor = rope(finetuner=CalibrationFinetuner(num_steps=1))
+    conductor = rope(finetuner=CalibrationFinetuner(max_num_epochs=1))
     conductor.append_calibration(theta, x).train(seed=0, show_progress_bars=False)
     expected = gaussian.GAIN * (x - theta)  # h(x_o) minus E[h(S(theta))]
     history = conductor.history

@@ -722,7 +722,7 @@ def test_image_files_lead_to_a_posterior(write_data: WriteData, light: bool) -> 
         npe.build_posterior(),
         simulator=simulator,
         coupler=SinkhornCoupler(gamma=0.5, tau=0.9, cost_scale="simulated"),
-        finetuner=CalibrationFinetuner(num_steps=20),
+        finetuner=CalibrationFinetuner(max_num_epochs=20),
     )
     rope.append_calibration(*task.get_calibration_set(6))
     rope.train(seed=0, show_progress_bars=False)

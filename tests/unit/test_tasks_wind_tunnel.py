@@ -652,7 +652,7 @@ def test_rope_repairs_a_posterior_with_recorded_pairs(
     rope = RoPE(
         npe.build_posterior(),
         simulator=task.get_simulator(),
-        finetuner=CalibrationFinetuner(num_steps=50),
+        finetuner=CalibrationFinetuner(max_num_epochs=50),
     )
     rope.append_calibration(*task.get_calibration_set(6))
     rope.train(seed=0, show_progress_bars=False)

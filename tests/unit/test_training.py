@@ -17,8 +17,8 @@ from torch import Tensor, nn
 
 from sbi_rope._sbi.trainer import SimulationTrainer
 from sbi_rope._training import (
+    EPOCHS_WITHOUT_HOLDOUT,
     MIN_PAIRS_FOR_HOLDOUT,
-    STEPS_WITHOUT_HOLDOUT,
     History,
     fit,
     groups_of,
@@ -65,8 +65,8 @@ def run(
 ) -> History:
     settings: dict[str, Any] = {
         "learning_rate": 0.1,
-        "max_num_steps": 30,
-        "patience": 100,
+        "max_num_epochs": 30,
+        "stop_after_epochs": 100,
         "label": "Numbers",
         "show_progress_bars": False,
     }
@@ -83,7 +83,7 @@ class TestFit:
         module = Number()
         history = run(module, towards(module, 2.0), towards(module, 1.0))
         assert len(history.training_loss) == len(history.validation_loss) == 31
-        best = history.best_step
+        best = history.best_epoch
         assert 0 < best < 30
         assert history.validation_loss[best] == min(history.validation_loss)
         assert module.value.item() == pytest.approx(1.0, abs=0.06)
@@ -99,7 +99,7 @@ class TestFit:
 
         history = run(module, towards(module, 3.0), validation_loss)
         assert math.isnan(history.validation_loss[0])
-        assert history.best_step > 0
+        assert history.best_epoch > 0
         assert history.kept_validation_loss < 9.0
         lost = History([1.0], [math.nan], 0, 0.1)
         assert lost.kept_validation_loss == math.inf
@@ -107,25 +107,29 @@ class TestFit:
     def test_the_start_competes(self) -> None:
         module = Number()
         history = run(module, towards(module, 2.0), towards(module, 0.0))
-        assert history.best_step == 0
+        assert history.best_epoch == 0
         assert module.value.item() == 0.0
 
     def test_ties_are_won_by_the_earlier(self) -> None:
         module = Number()
         constant = torch.ones(())
         history = run(module, towards(module, 2.0), lambda: constant)
-        assert history.best_step == 0
+        assert history.best_epoch == 0
 
     def test_it_stops_when_its_patience_is_at_an_end(self) -> None:
         module = Number()
-        history = run(module, towards(module, 2), towards(module, 0.5), patience=4)
-        assert len(history.validation_loss) == history.best_step + 1 + 4
-        assert len(history.training_loss) == history.best_step + 1 + 4
+        history = run(
+            module, towards(module, 2), towards(module, 0.5), stop_after_epochs=4
+        )
+        assert len(history.validation_loss) == history.best_epoch + 1 + 4
+        assert len(history.training_loss) == history.best_epoch + 1 + 4
 
     def test_without_held_out_data_the_last_is_kept(self) -> None:
         module = Number()
-        history = run(module, towards(module, 10), None, max_num_steps=7, patience=2)
-        assert history.best_step == 7
+        history = run(
+            module, towards(module, 10), None, max_num_epochs=7, stop_after_epochs=2
+        )
+        assert history.best_epoch == 7
         assert history.validation_loss == []
         assert module.value.item() == pytest.approx(0.7, rel=1e-2)
         assert history.kept_validation_loss == 0.0
@@ -143,7 +147,7 @@ class TestFit:
                 (lambda: -module.value) if held_out else None,
                 learning_rate=0.3,
             )
-        assert history.best_step == 3
+        assert history.best_epoch == 3
         assert module.value.item() == pytest.approx(0.9, abs=0.1)
         assert not math.isfinite(history.training_loss[-1])
 
@@ -175,7 +179,7 @@ class TestFit:
             None,
             batches=lambda step: [(slope,) for slope in slopes],
             clip_max_norm=clip_max_norm,
-            max_num_steps=1,
+            max_num_epochs=1,
         )
         optimizer = torch.optim.Adam(twin.parameters(), lr=0.1)
         for slope in slopes:
@@ -203,7 +207,7 @@ class TestFit:
             module,
             loss,
             validation_loss,
-            max_num_steps=2,
+            max_num_epochs=2,
             in_training_mode=in_training_mode,
         )
         # The last pass only evaluates.
@@ -218,7 +222,7 @@ class TestFit:
             lambda number: number + 0 * module.value,
             None,
             batches=lambda step: [(float(step),), (step + 3.0,)],
-            max_num_steps=2,
+            max_num_epochs=2,
         )
         assert history.training_loss == [1.5, 2.5, 3.5]
 
@@ -234,7 +238,7 @@ class TestFit:
             lambda x: module(x).mean(),
             lambda: torch.tensor(next(values)),
             batches=batches,
-            max_num_steps=3,
+            max_num_epochs=3,
         )
         # Kept after one step: a tenth of the way from 0 to 10.
         assert module.running_mean is not None
@@ -248,7 +252,7 @@ class TestFit:
         run(module, towards(module, 1), None, show_progress_bars=show)
         printed = terminal.readouterr()
         assert ("Numbers" in printed.err) is show
-        assert ("best_step" in printed.err) is show
+        assert ("best_epoch" in printed.err) is show
         assert printed.out == ""
 
     def test_a_terminal_sees_less_than_every_step(
@@ -261,8 +265,8 @@ class TestFit:
             towards(module, 1),
             None,
             show_progress_bars=True,
-            max_num_steps=1000,
-            patience=1001,
+            max_num_epochs=1000,
+            stop_after_epochs=1001,
         )
         assert terminal.readouterr().err.count("Numbers") < 200
 
@@ -495,7 +499,7 @@ class TestTrainWithSBI:
         estimator, history = with_sbi(learning_rate=0.05, max_num_epochs=40)
         assert len(history.training_loss) == len(history.validation_loss)
         assert history.kept_validation_loss == min(history.validation_loss)
-        assert history.validation_loss[history.best_step] < history.validation_loss[0]
+        assert history.validation_loss[history.best_epoch] < history.validation_loss[0]
         assert history.learning_rate == 0.05
         assert not estimator.training
 
@@ -593,12 +597,12 @@ class TestTrainOnPairs:
         few = MIN_PAIRS_FOR_HOLDOUT - 1
         with pytest.warns(RoPEWarning, match=f"Only {few} calibration pair"):
             _, _, history = on_pairs(few)
-        assert history.best_step == STEPS_WITHOUT_HOLDOUT
+        assert history.best_epoch == EPOCHS_WITHOUT_HOLDOUT
 
     def test_fewer_epochs_than_that_can_be_asked_for(self) -> None:
         with pytest.warns(RoPEWarning):
             _, _, history = on_pairs(2, max_num_epochs=3)
-        assert history.best_step == 3
+        assert history.best_epoch == 3
 
     def test_the_validation_loss_is_the_mean_over_the_held_out_rows(self) -> None:
         theta, x = pairs(20)

@@ -25,7 +25,7 @@ from sbi_rope._validation import (
     check_not_negative,
     check_tensor,
 )
-from sbi_rope.baselines.hvae.contexts import LatentContexts
+from sbi_rope.baselines.hvae.embeddings import LatentEmbeddings
 from sbi_rope.baselines.hvae.model import FrozenNPE, HybridVAE
 from sbi_rope.baselines.hvae.networks import (
     ConditionalUNet,
@@ -240,10 +240,10 @@ class HVAE(Method):
         """Return NPE mixed over draws of z, with the networks of the model."""
         if x_noise is not None:
             x_noise = x_noise[: len(z_noise)]
-        contexts = LatentContexts(
+        embeddings = LatentEmbeddings(
             model, z_noise, x_noise, self._data.observations.shape[1:]
         )
-        part = Part(model.npe.flow, contexts)
+        part = Part(model.npe.flow, embeddings)
         return MixtureEstimator([part], [1.0], tail_mass=0.0).to(self._device)
 
     def _model(self, estimator: Any) -> HybridVAE:

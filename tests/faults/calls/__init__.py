@@ -65,11 +65,11 @@ NOT_CALLED = {
     ),
     **dict.fromkeys(
         (
-            "CoupledContexts",
+            "CoupledEmbeddings",
             "CoupledNet",
             "MixtureEstimator",
             "MixturePosterior",
-            "OwnContexts",
+            "OwnEmbeddings",
             "Part",
             "Rows",
             "StackedPosterior",

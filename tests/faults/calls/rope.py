@@ -124,8 +124,8 @@ CALLS = [
         run=lambda **options: repr(CalibrationFinetuner(**options)),
         options={
             "learning_rate": "rate",
-            "num_steps": "count",
-            "patience": "count",
+            "max_num_epochs": "count",
+            "stop_after_epochs": "count",
             "simulations_per_target": "count",
             "resample_targets": "instance",
             "num_neighbors": "count",
@@ -136,7 +136,7 @@ CALLS = [
     Call(
         name="CalibrationFinetuner.finetune",
         run=lambda x=X, targets=0.8 * THETA, groups=None, simulations=X_S, seed=0: (
-            CalibrationFinetuner(num_steps=2, rehearsal=1.0)
+            CalibrationFinetuner(max_num_epochs=2, rehearsal=1.0)
             .finetune(
                 npe().posterior_estimator.embedding_net,
                 x,
@@ -155,7 +155,7 @@ CALLS = [
     Call(
         name="CalibrationFinetuner.finetune(groups)",
         run=lambda groups: (
-            CalibrationFinetuner(num_steps=2)
+            CalibrationFinetuner(max_num_epochs=2)
             .finetune(
                 npe().posterior_estimator.embedding_net,
                 X,

@@ -6,13 +6,13 @@ from torch import Tensor
 from sbi_rope.baselines.hvae.model import HybridVAE, drawn
 from sbi_rope.mixture import Mixing, Rows, equal_rows
 
-__all__ = ["LatentContexts"]
+__all__ = ["LatentEmbeddings"]
 
 # Most entries of series or images that the U-Net sees at a time.
 MAX_ENTRIES = 2**18
 
 
-class LatentContexts(Mixing):
+class LatentEmbeddings(Mixing):
     r"""Statistics of simulations like an observation, from S draws of the latent.
 
     .. math::
@@ -47,15 +47,15 @@ class LatentContexts(Mixing):
         self.register_buffer("z_noise", z_noise)
         self.register_buffer("x_noise", x_noise)
 
-    def rows(self, features: Tensor) -> Rows:
+    def rows(self, embedded: Tensor) -> Rows:
         """Weigh all draws equally."""
-        return equal_rows(features)
+        return equal_rows(embedded)
 
     @torch.no_grad()
-    def features(self, x: Tensor) -> Tensor:
+    def embed(self, x: Tensor) -> Tensor:
         """Return the statistics, ``(n, *event)`` to ``(n, S, l)``."""
         size = self.event_shape.numel()
-        draws = torch.arange(self.num_contexts, device=self.z_noise.device)
+        draws = torch.arange(self.num_embeddings, device=self.z_noise.device)
         num_rows = max(1, MAX_ENTRIES // (size * len(draws)))
         num_draws = max(1, MAX_ENTRIES // size)
         return torch.cat(
