@@ -65,7 +65,7 @@ def main() -> None:
                 task, seed, args.num_simulations, args.max_num_epochs
             ),
             # Fixed beforehand for all tasks.
-            coupler=SinkhornCoupler(gamma=0.1, tau=1.0, cost_scale="simulated"),
+            coupler=SinkhornCoupler(gamma=0.1, tau=1.0),
             seeds=args.seeds,
             n_calibration=args.n_calibration,
             n_test=args.n_test,

@@ -77,7 +77,7 @@ def main() -> None:
         held_out=lambda task, seed: split_people(task, seed, args.rounds)["held_out"],
         finetuner=CalibrationFinetuner(num_neighbors=args.num_neighbors),
         # Fixed beforehand.
-        coupler=SinkhornCoupler(gamma=0.1, tau=1.0, cost_scale="simulated"),
+        coupler=SinkhornCoupler(gamma=0.1, tau=1.0),
         seeds=args.seeds,
         n_calibration=args.n_calibration,
         n_test=args.n_test,

@@ -52,7 +52,7 @@ def main() -> None:
         task=get_task("light_tunnel_sensors", root=args.root, download=args.download),
         train_npe=lambda task, seed: train_npe(task, seed, args.num_simulations),
         # Chosen on calibration data, see benchmarks/README.md.
-        coupler=SinkhornCoupler(gamma=0.1, tau=1.0, cost_scale="simulated"),
+        coupler=SinkhornCoupler(gamma=0.1, tau=1.0),
         seeds=args.seeds,
         n_calibration=args.n_calibration,
         n_test=args.n_test,

@@ -45,7 +45,7 @@ def main() -> None:
             task, seed, args.num_simulations, args.max_num_epochs
         ),
         # Chosen on calibration data, see benchmarks/README.md.
-        coupler=SinkhornCoupler(gamma=0.2, tau=1.0, cost_scale="simulated"),
+        coupler=SinkhornCoupler(gamma=0.2, tau=1.0),
         seeds=args.seeds,
         n_calibration=args.n_calibration,
         n_test=args.n_test,

@@ -2,9 +2,9 @@
 
 import copy
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -16,6 +16,7 @@ __all__ = [
     "EPOCHS_WITHOUT_HOLDOUT",
     "MIN_PAIRS_FOR_HOLDOUT",
     "History",
+    "best_of_learning_rates",
     "fit",
     "groups_of",
     "groups_to_hold_out",
@@ -25,6 +26,7 @@ __all__ = [
     "warn_without_holdout",
 ]
 
+Trained = TypeVar("Trained")
 # Fewer pairs of different parameters than this leave nothing to hold out.
 MIN_PAIRS_FOR_HOLDOUT = 5
 # Without a hold-out nothing says when to stop, so little is risked.
@@ -130,6 +132,9 @@ def split_groups(groups: Tensor, num_folds: int) -> list[Tensor]:
     Returns:
         The rows of each fold.
     """
+    # Not by scikit-learn: its GroupKFold takes groups of equal size in an order that no
+    # seed decides and refuses fewer groups than folds, and stored results depend on
+    # who was in which fold.
     groups = groups_of(groups)
     order = torch.randperm(_num_groups(groups))
     if len(order) == len(groups):
@@ -284,6 +289,26 @@ def fit(
     module.load_state_dict(best_state)
     module.eval()
     return History(training_loss, held_out_loss, best_epoch, learning_rate)
+
+
+def best_of_learning_rates(
+    train: Callable[[float], tuple[Trained, History]],
+    learning_rates: Sequence[float],
+    *,
+    num_held_out: int,
+    otherwise: float,
+) -> tuple[Trained, History]:
+    """Train from the start with each learning rate; keep the best on the hold-out.
+
+    Args:
+        train: Given a learning rate, returns what it has trained and the losses.
+        learning_rates: What to try.
+        num_held_out: Size of the hold-out; of none, nothing can choose.
+        otherwise: The learning rate to train with then.
+    """
+    rates = learning_rates if num_held_out else (otherwise,)
+    results = [train(rate) for rate in rates]
+    return min(results, key=lambda result: result[1].kept_validation_loss)
 
 
 def _is_below(loss: float, best: float) -> bool:

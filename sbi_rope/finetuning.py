@@ -14,6 +14,7 @@ from sbi_rope._sbi import embed
 from sbi_rope._training import (
     EPOCHS_WITHOUT_HOLDOUT,
     History,
+    best_of_learning_rates,
     fit,
     split_pairs,
     warn_without_holdout,
@@ -192,21 +193,29 @@ class CalibrationFinetuner:
             _check_start(embedded, targets)
             keep = self._rehearsed(embedding_net, draw_simulations)
             train, held_out = self._split(groups)
-            results = [
-                self._optimise(
+
+            def tuned(learning_rate: float) -> tuple[nn.Module, History]:
+                return self._optimise(
                     trainable_copy(embedding_net, targets),
                     x,
                     targets,
                     train.to(x.device),
                     held_out.to(x.device),
-                    learning_rate=rate,
+                    learning_rate=learning_rate,
                     keep=keep,
                     draw_targets=checked_targets if self.resample_targets else None,
                     show_progress_bars=show_progress_bars,
                 )
-                for rate in self._rates_to_try(embedding_net, held_out)
-            ]
-        return min(results, key=lambda result: result.history.kept_validation_loss)
+
+            # The careful rate for a net, the larger for an affine map.
+            is_net = any(True for _ in embedding_net.parameters())
+            net, history = best_of_learning_rates(
+                tuned,
+                self._learning_rates,
+                num_held_out=len(held_out),
+                otherwise=(min if is_net else max)(self._learning_rates),
+            )
+        return FinetuneResult(net, history)
 
     def _rehearsed(
         self, h: nn.Module, draw_simulations: Callable[[int], Tensor] | None
@@ -221,16 +230,6 @@ class CalibrationFinetuner:
             )
         simulations = _checked_inputs("simulations", draw_simulations(NUM_REHEARSED), h)
         return simulations, _embedded("simulations", simulations, h)
-
-    def _rates_to_try(self, net: nn.Module, held_out: Tensor) -> tuple[float, ...]:
-        if len(held_out):
-            return self._learning_rates
-        # Nothing can choose: the careful rate for a net, the larger for an affine map.
-        has_parameters = any(True for _ in net.parameters())
-        rate = (
-            min(self._learning_rates) if has_parameters else max(self._learning_rates)
-        )
-        return (rate,)
 
     def _split(self, groups: Tensor) -> tuple[Tensor, Tensor]:
         train, held_out = split_pairs(groups, self.validation_fraction)
@@ -250,7 +249,7 @@ class CalibrationFinetuner:
         keep: tuple[Tensor, Tensor] | None,
         draw_targets: Callable[[], Tensor] | None,
         show_progress_bars: bool,
-    ) -> FinetuneResult:
+    ) -> tuple[nn.Module, History]:
         has_holdout = held_out.numel() > 0
         max_num_epochs = self.max_num_epochs
         if not has_holdout:
@@ -289,7 +288,7 @@ class CalibrationFinetuner:
             label="Fine-tuning",
             show_progress_bars=show_progress_bars,
         )
-        return FinetuneResult(net.requires_grad_(requires_grad=False), history)
+        return net.requires_grad_(requires_grad=False), history
 
 
 def trainable_copy(embedding_net: nn.Module, embeddings: Tensor) -> nn.Module:

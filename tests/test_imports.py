@@ -25,8 +25,8 @@ DEPENDENCIES = "import ot, numpy, torch, tqdm.auto, sbi.inference, sbi.utils"
 # A module imports from layers below its own, and from its own package. Those of one
 # layer do not know each other.
 LAYERS = [
-    # They know nothing of inference, and everything may raise errors and show progress.
-    {"errors", "_progress", "_processes"},
+    # They know nothing of inference: errors, progress, processes, rows in slices.
+    {"errors", "_progress", "_processes", "_slices"},
     # They raise errors: of seeds and of files.
     {"_random", "_files"},
     # They raise errors and warn: of arguments, and of a training that goes wrong.

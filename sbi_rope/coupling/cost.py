@@ -1,9 +1,9 @@
 """Distances between two sets of embeddings, stored or computed block by block."""
 
-from collections.abc import Iterator
-
 import torch
 from torch import Tensor
+
+from sbi_rope._slices import slices
 
 __all__ = ["Cost", "Distances", "row_blocks", "widest"]
 
@@ -98,7 +98,7 @@ class Cost:
 
     def row_blocks(
         self, num_columns: int | None = None, *, scale: int = 1
-    ) -> Iterator[slice]:
+    ) -> list[slice]:
         """Cut the rows into blocks, ``scale`` times as large as usual."""
         return row_blocks(self.real, num_columns or len(self.simulated), scale=scale)
 
@@ -113,8 +113,7 @@ def widest(device: torch.device) -> torch.dtype:
     return torch.float64 if has_float64(device) else torch.float32
 
 
-def row_blocks(real: Tensor, num_columns: int, *, scale: int = 1) -> Iterator[slice]:
+def row_blocks(real: Tensor, num_columns: int, *, scale: int = 1) -> list[slice]:
     """Cut rows into blocks of a bounded number of entries, at least one row each."""
     limit = CPU_BLOCK if real.device.type == "cpu" else GPU_BLOCK
-    step = max(1, scale * limit // num_columns)
-    return (slice(i, i + step) for i in range(0, len(real), step))
+    return slices(len(real), max(1, scale * limit // num_columns))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from sbi_rope._slices import slices
 from sbi_rope.coupling import Coupling, SinkhornCoupler
 from sbi_rope.diagnosis.report import Finding
 from sbi_rope.diagnosis.residuals import CrossFitted
@@ -179,11 +180,11 @@ def _rows(
     order, where = points
     total = torch.zeros(len(simulations), dtype=torch.float64)
     functions = []
-    for start in range(0, len(real), CHUNK):
-        weights = coupling.rows(real[start : start + CHUNK])
+    for block in slices(len(real), CHUNK):
+        weights = coupling.rows(real[block])
         if own is not None:
             rows = torch.arange(len(weights))
-            weights[rows, own[start : start + CHUNK]] = 0.0
+            weights[rows, own[block]] = 0.0
             weights = weights / weights.sum(dim=1, keepdim=True).clamp_min(1e-300)
         total += weights.sum(dim=0)
         functions.append(

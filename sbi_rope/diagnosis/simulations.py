@@ -6,6 +6,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from sbi_rope._slices import slices
+
 __all__ = ["Simulations", "nearest_distances"]
 
 # Simulations behind a covariance: its errors are then a few per cent.
@@ -92,10 +94,10 @@ def nearest_distances(points: Tensor, among: Tensor, *, others: bool = False) ->
         others: Whether the two sets are the same, and no point is its own neighbour.
     """
     nearest = []
-    for start in range(0, len(points), CHUNK):
-        distance = torch.cdist(points[start : start + CHUNK], among)
+    for block in slices(len(points), CHUNK):
+        distance = torch.cdist(points[block], among)
         if others:
             own = torch.arange(len(distance))
-            distance[own, start + own] = torch.inf
+            distance[own, block.start + own] = torch.inf
         nearest.append(distance.amin(dim=1))
     return torch.cat(nearest)

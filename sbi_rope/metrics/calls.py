@@ -12,7 +12,7 @@ package, is called without these arguments.
 """
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable
 from typing import Any
 
 import torch
@@ -21,6 +21,7 @@ from torch import Tensor
 
 from sbi_rope._progress import progress_bar
 from sbi_rope._sbi import NeuralPosterior, is_bounded
+from sbi_rope._slices import slices
 from sbi_rope._validation import (
     as_float32,
     check_batch,
@@ -291,7 +292,5 @@ def _refuse(what: str, bad: Tensor, *, start: int = 0) -> None:
         )
 
 
-def _chunks(length: int, size: int, text: str, *, show: bool) -> Iterator[slice]:
-    starts = range(0, length, size)
-    for start in progress_bar(starts, show=show, desc=text):
-        yield slice(start, start + size)
+def _chunks(length: int, size: int, text: str, *, show: bool) -> Iterable[slice]:
+    return progress_bar(slices(length, size), show=show, desc=text)

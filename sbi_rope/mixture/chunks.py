@@ -1,10 +1,10 @@
 """How much of a mixture is held, and evaluated, at a time."""
 
-from collections.abc import Iterator
-
 import torch
 
-__all__ = ["blocks", "flow_batch", "flow_slices", "keep_freed_memory", "num_fitting"]
+from sbi_rope._slices import slices
+
+__all__ = ["blocks", "flow_batch", "keep_freed_memory", "num_fitting"]
 
 # Most weights, terms of the density, or proposals held at a time: a block of
 # observations times all simulations, or times some of its samples. With all that is
@@ -21,21 +21,14 @@ def flow_batch(device: torch.device) -> int:
     return CPU_BATCH if device.type == "cpu" else GPU_BATCH
 
 
-def flow_slices(count: int, device: torch.device) -> list[slice]:
-    """Cut so many pairs of parameter and component into batches of the flow."""
-    size = flow_batch(device)
-    return [slice(start, start + size) for start in range(0, count, size)]
-
-
 def num_fitting(num_columns: int) -> int:
     """Return how many rows of so many columns are held at a time, at least one."""
     return max(1, MAX_ENTRIES // max(1, num_columns))
 
 
-def blocks(num_rows: int, num_columns: int) -> Iterator[slice]:
+def blocks(num_rows: int, num_columns: int) -> list[slice]:
     """Cut rows of so many columns into blocks that are held at a time."""
-    step = num_fitting(num_columns)
-    return (slice(i, min(i + step, num_rows)) for i in range(0, num_rows, step))
+    return slices(num_rows, num_fitting(num_columns))
 
 
 def keep_freed_memory(device: torch.device) -> None:

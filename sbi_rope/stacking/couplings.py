@@ -14,7 +14,7 @@ from sbi_rope.batch import parameters_named
 from sbi_rope.coupling import Coupling
 from sbi_rope.errors import CouplingError
 from sbi_rope.mixture import CoupledEmbeddings, CoupledNet, Part
-from sbi_rope.mixture.chunks import flow_slices
+from sbi_rope.mixture.chunks import flow_batch
 from sbi_rope.mixture.density import without_nan
 from sbi_rope.rope import MIN_SIMULATIONS, RoPE
 from sbi_rope.stacking.candidates import CouplingCandidate
@@ -93,12 +93,10 @@ class FittedCouplings:
         r"""Return :math:`\log q(\theta_i \mid h(x_{s,j}))`, shape ``(n, n_s)``."""
         embeddings = self.embeddings.simulated
         n, n_s = len(theta), len(embeddings)
-        index = torch.arange(n * n_s, device=theta.device)
+        pairs = torch.arange(n * n_s, device=theta.device)
         log_q = [
-            self.part.log_prob(
-                theta[index[block] // n_s], embeddings[index[block] % n_s]
-            )
-            for block in flow_slices(n * n_s, theta.device)
+            self.part.log_prob(theta[batch // n_s], embeddings[batch % n_s])
+            for batch in pairs.split(flow_batch(theta.device))
         ]
         return without_nan(torch.cat(log_q)).reshape(n, n_s)
 

@@ -56,7 +56,7 @@ def get_task(
     Args:
         name: One of :func:`list_tasks`.
         variant: A kind of real process, one of the task's ``variants``.
-        root: Folder that holds recorded data; synthetic tasks do not read it.
+        root: Folder that holds recorded data. Synthetic tasks do not read it.
         **options: The task's own options, see the documentation of its class.
 
     Raises:

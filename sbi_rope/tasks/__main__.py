@@ -27,7 +27,7 @@ BUDGET = 0.5
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command with the arguments of the command line; return its status."""
+    """Run the command with the arguments of the command line and return its status."""
     parser = argparse.ArgumentParser(
         prog="python -m sbi_rope.tasks",
         description=__doc__,

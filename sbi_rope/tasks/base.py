@@ -321,7 +321,7 @@ def check_theta(theta: Any, theta_dim: int, *, finite: bool = True) -> Tensor:
     """Return ``theta`` if it is a batch of floating-point parameter vectors.
 
     Args:
-        theta: What a simulator was called with; an empty batch is one too.
+        theta: What a simulator was called with. It may be an empty batch.
         theta_dim: Number of parameters.
         finite: Whether to look at the numbers as well. Functions that torch
             transforms (``torch.func``) must not.

@@ -168,7 +168,7 @@ def check_complete(path: Path, found: int, *, dataset: str) -> None:
     left would be split in another way than those of the whole file.
 
     Args:
-        path: The file that was read; its name is that of the experiment.
+        path: The file that was read. Its name is that of the experiment.
         found: Number of rows in it.
         dataset: Name of the data set.
     """

@@ -55,7 +55,8 @@ class CancerStromaSimulator:
         necrosis_probability: Probability of a parent to be necrotic.
         necrosis_radius: Radius without cells, as a fraction of :math:`r_j`.
         batched: Whether to simulate tissues together on the device of ``theta``,
-            instead of one after the other in NumPy; only off the CPU unless given.
+            instead of one after the other in NumPy. Unless it is given, this is done
+            on other devices than the CPU only.
 
     Example:
         >>> theta = torch.tensor([[400.0, 5.0, 15.0], [1000.0, 10.0, 12.0]])
@@ -228,11 +229,11 @@ class CancerStroma(Task):
         variant: ``None`` or one of ``variants``.
         root: Not used, the task is synthetic.
         label_noise: Noise on the calibration labels, in standard deviations of the
-            prior; 0.2 unless given. Only for ``"noisy_labels"``.
-        necrosis_probability: Probability of a real parent to be necrotic; 0.75 unless
-            given. At 0 the simulator is exact.
-        necrosis_radius: Radius of the necrosis, as a fraction of the tumour's; 0.8
-            unless given.
+            prior. It is 0.2 unless given, and only for ``"noisy_labels"``.
+        necrosis_probability: Probability of a real parent to be necrotic. It is 0.75
+            unless given. At 0 the simulator is exact.
+        necrosis_radius: Radius of the necrosis, as a fraction of the tumour's. It is
+            0.8 unless given.
 
     Example:
         >>> theta, x_o = CancerStroma().get_calibration_set(50)
@@ -283,7 +284,7 @@ class CancerStroma(Task):
         return CancerStromaSimulator()
 
     def get_embedding_net(self, *, light: bool = False) -> nn.Module:
-        """Return the paper's network, which is light already; nine outputs."""
+        """Return the paper's network, which is light already and has nine outputs."""
         check_instance("light", light, bool)
         return fully_connected(len(STATISTICS), (12, 48, 48, 36, 9))
 

@@ -115,7 +115,7 @@ class Arcsine(Distribution):
         return self.icdf(uniform)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log density, finite at the ends; minus infinity outside of the support."""
+        """Return the log density, finite at the ends and minus infinity outside."""
         if self._validate_args:
             self._validate_sample(value)
         outside = (value < 0) | (value > self.width)
@@ -198,7 +198,7 @@ class UniformDistance(Distribution):
         return self.icdf(uniform)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log density; minus infinity outside of the support."""
+        """Return the log density, minus infinity outside of the support."""
         if self._validate_args:
             self._validate_sample(value)
         density = 2 * (self.width - value) / self.width**2

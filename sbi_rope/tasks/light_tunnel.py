@@ -101,7 +101,7 @@ class LightTunnel(Task):
         root: Folder that holds ``lt_camera_v1/``. Only the two data sets need it, and
             they do not with a stand-in.
         label_noise: Noise on the calibration labels, in standard deviations of the
-            prior; 0.2 unless given. Only for ``"noisy_labels"``.
+            prior. It is 0.2 unless given, and only for ``"noisy_labels"``.
         download: Whether to download the data set into ``root`` if it is not there.
         image_size: Height and width of the images in pixels, 64 or 100. Data sets
             from before version 1.4 have no images of size 64.
@@ -113,7 +113,8 @@ class LightTunnel(Task):
         stand_in: Whether model F3 replaces the recorded images. Without effect in
             the variants that need no files, so that it can be passed to all.
         sensor_noise: Standard deviation of the stand-in's noise on each pixel, as a
-            share of full brightness; 2/255 unless given. Only with a stand-in.
+            share of full brightness. It is 2/255 unless given, and only for a
+            stand-in.
 
     Example:
         >>> task = LightTunnel(variant="synthetic", image_size=64)
@@ -207,7 +208,7 @@ class LightTunnel(Task):
         return HexagonSimulator(image_size=self.image_size, dequantise=self.dequantise)
 
     def get_embedding_net(self, *, light: bool = False) -> ImageEmbedding:
-        """Return the paper's convolutional network, or a light one; 20 outputs."""
+        """Return the paper's convolutional network or a light one, with 20 outputs."""
         return ImageEmbedding(image_size=self.image_size, light=light)
 
     @property

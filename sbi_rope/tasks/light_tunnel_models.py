@@ -111,7 +111,7 @@ class CameraSimulator:
     .. math:: \min\left( 1, \; e \, W S \, (R, G, B) / 255
         \odot ((T_p - T_c) \, \alpha + T_c) \right) M.
 
-    The published model ends here; noise and rounding are additions of ours.
+    The published model ends here. Noise and rounding are additions of ours.
 
     References:
         | Causal chambers as a real-world physical testbed for AI methodology
@@ -212,7 +212,7 @@ def as_brightness(
     Args:
         levels: Whole numbers from 0 to 255 in a floating-point dtype.
         dequantise: Whether to spread each level over its interval.
-        generator: Source of the uniform numbers; torch's global one if None.
+        generator: Source of the uniform numbers, torch's global one if None.
 
     Example:
         >>> as_brightness(torch.tensor([0.0, 51.0, 255.0]), dequantise=False)

@@ -78,7 +78,7 @@ class _LastConvolution(nn.Conv2d):
     """A convolution whose biases start, and start again, above zero."""
 
     def reset_parameters(self) -> None:
-        """Draw the weights; set the biases."""
+        """Draw the weights and set the biases."""
         super().reset_parameters()
         nn.init.constant_(self.bias, LAST_BIAS)  # type: ignore[arg-type]
 

@@ -192,7 +192,7 @@ class LightTunnelSensors(Task):
         root: Folder that holds ``lt_interventions_standard_v1/``. Only the two data
             sets need it.
         label_noise: Noise on the calibration labels, in standard deviations of the
-            prior; 0.2 unless given. Only for ``"noisy_labels"``.
+            prior. It is 0.2 unless given, and only for ``"noisy_labels"``.
         download: Whether to download the data set into ``root`` if it is not there.
         experiment: The recorded experiment that both sets come from,
             ``"uniform_reference"`` unless given; not for the variants that choose it

@@ -43,8 +43,8 @@ class LinearGaussianSimulator:
     Args:
         dim: Number :math:`d` of parameters and of entries of x.
         noise_std: The noise :math:`\sigma`.
-        scale: The gain :math:`s`; 1 in the simulator.
-        shift: The offset :math:`m` of all entries; 0 in the simulator.
+        scale: The gain :math:`s`, which is 1 in the simulator.
+        shift: The offset :math:`m` of all entries, which is 0 in the simulator.
 
     Example:
         >>> simulator = LinearGaussianSimulator(dim=2, noise_std=1e-6)
@@ -119,11 +119,11 @@ class LinearGaussian(Task):
         variant: ``None`` or one of ``variants``.
         root: Not used, the task is synthetic.
         label_noise: Noise on the calibration labels, in standard deviations of the
-            prior; 0.2 unless given. Only for ``"noisy_labels"``.
+            prior. It is 0.2 unless given, and only for ``"noisy_labels"``.
         dim: Number of parameters and of entries of x, from 1 to 25.
-        scale: Gain of the real process, not 0; 1.4 unless given.
-        shift: Offset of the real process; 0.7 unless given. With a gain of 1 and an
-            offset of 0 the simulator is exact.
+        scale: Gain of the real process, not 0. It is 1.4 unless given.
+        shift: Offset of the real process. It is 0.7 unless given. With a gain of 1
+            and an offset of 0 the simulator is exact.
         noise_std: Standard deviation of the noise.
 
     Example:

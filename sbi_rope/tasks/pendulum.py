@@ -40,7 +40,7 @@ class PendulumSimulator:
         \quad \alpha \sim \mathcal{U}(0, \alpha_{\max}),
         \quad \varepsilon_t \sim \mathcal{N}(0, \sigma^2).
 
-    The simulator has :math:`\alpha_{\max} = 0`; the real process has friction.
+    The simulator has :math:`\alpha_{\max} = 0`. The real process has friction.
 
     Args:
         noise_std: The sensor's standard deviation :math:`\sigma`, in units of A.
@@ -119,13 +119,13 @@ class Pendulum(Task):
         variant: ``None`` or one of ``variants``.
         root: Not used, the task is synthetic.
         label_noise: Noise on the calibration labels, in standard deviations of the
-            prior; 0.2 unless given. Only for ``"noisy_labels"``.
+            prior. It is 0.2 unless given, and only for ``"noisy_labels"``.
         misspecification_weight: Weight of the tighter distribution in the mixture, in
-            [0, 1]; 0.5 unless given. Only for ``"misspecified_prior"``.
+            [0, 1]. It is 0.5 unless given, and only for ``"misspecified_prior"``.
         noise_std: Standard deviation of the noise on simulated and real positions, in
             units of A.
-        max_damping: Largest damping rate of the real process, in 1/s; 1 unless given.
-            At 0 the simulator is exact.
+        max_damping: Largest damping rate of the real process, in 1/s. It is 1 unless
+            given. At 0 the simulator is exact.
 
     Example:
         >>> theta, x_o = Pendulum().get_calibration_set(50)
@@ -178,7 +178,7 @@ class Pendulum(Task):
         )
 
     def get_prior(self) -> BoxUniform:
-        """Return the uniform prior on [0, 3] x [0.5, 10]; its density is 1 / 28.5."""
+        """Return the uniform prior on [0, 3] x [0.5, 10], whose density is 1 / 28.5."""
         return box((0.0, 0.5), (3.0, 10.0))
 
     def prior_quantiles(self, theta: Tensor) -> Tensor:
@@ -191,7 +191,7 @@ class Pendulum(Task):
         return PendulumSimulator(noise_std=self.noise_std)
 
     def get_embedding_net(self, *, light: bool = False) -> nn.Module:
-        """Return the paper's convolutional network, or a light one; ten outputs."""
+        """Return the paper's convolutional network or a light one, with ten outputs."""
         check_instance("light", light, bool)
         if light:
             return light_series_embedding(num_steps=NUM_STEPS, output_dim=10)

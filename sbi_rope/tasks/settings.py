@@ -7,7 +7,7 @@ __all__ = ["STATISTICS_SETTINGS", "PaperSettings"]
 
 @dataclass(frozen=True, kw_only=True)
 class PaperSettings:
-    """What the paper trained a task's models with; ``None`` where it does not say.
+    """What the paper trained a task's models with, or ``None`` where it does not say.
 
     The estimator is a flow of one unconstrained monotonic autoregressive
     transformation (sbi's ``"zuko_unaf"``) or, in task D, of five affine ones

@@ -69,7 +69,7 @@ class SIRSimulator:
         + \sigma \sqrt{\gamma |b|} \, \mathrm{d}W.
 
     Args:
-        time_step: Step of the scheme, in days; it divides a day.
+        time_step: Step of the scheme, in days. It must divide a day.
         volatility: The factor :math:`\sigma`, in :math:`\mathrm{day}^{-1/2}`.
         reported_fraction: Fraction of the weekend's infections that is reported on
             the day itself, and not on Monday.
@@ -255,9 +255,10 @@ class SIR(Task):
         variant: ``None`` or one of ``variants``.
         root: Not used, the task is synthetic.
         label_noise: Noise on the calibration labels, in standard deviations of the
-            prior; 0.2 unless given. Only for ``"noisy_labels"``.
+            prior. It is 0.2 unless given, and only for ``"noisy_labels"``.
         reported_fraction: Fraction of a real weekend's infections that is reported on
-            the day itself, in [0, 1]; 0.95 unless given. At 1 the simulator is exact.
+            the day itself, in [0, 1]. It is 0.95 unless given. At 1 the simulator is
+            exact.
 
     Example:
         >>> theta, x_o = SIR().get_calibration_set(50)
@@ -304,7 +305,7 @@ class SIR(Task):
         return SIRSimulator()
 
     def get_embedding_net(self, *, light: bool = False) -> nn.Module:
-        """Return the paper's network, which is light already; six outputs."""
+        """Return the paper's network, which is light already and has six outputs."""
         check_instance("light", light, bool)
         return fully_connected(len(STATISTICS), (8, 32, 32, 24, 6))
 

@@ -78,7 +78,7 @@ class DrawnPairs:
             n: Number of pairs.
             seed: Integer from 0 to ``MAX_SEED - 1``.
             part: The part of the task's data that is drawn.
-            keep: Which parameters may stay; all, if it is not given.
+            keep: Which parameters may stay. All may if it is not given.
 
         Raises:
             SimulationError: If the process gives no valid pair in many attempts.
@@ -150,7 +150,7 @@ class RecordedPairs:
             n: Number of pairs.
             seed: The seed by which rows are chosen.
             part: The part to choose from.
-            keep: Which parameters may stay; all, if it is not given.
+            keep: Which parameters may stay. All may if it is not given.
 
         Raises:
             InvalidInputError: If the part has fewer than ``n`` such rows.

@@ -67,7 +67,7 @@ class UniformTriangle(Distribution):
         return torch.stack([larger, larger * uniform[..., 1]], dim=-1)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log density; minus infinity outside of the support."""
+        """Return the log density, minus infinity outside of the support."""
         if self._validate_args:
             self._validate_sample(value)
         inside = self.support.check(value)

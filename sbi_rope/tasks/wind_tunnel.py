@@ -67,7 +67,7 @@ class WindTunnel(Task):
     0.6 between neighbouring samples. To the simulator this looks like a hatch open by
     four (near 45) to eleven (near 0) degrees more, where its posterior has a standard
     deviation of 0.4.
-    A stand-in shows that a method runs; its scores say nothing about the real tunnel.
+    A stand-in shows that a method runs. Its scores say nothing about the real tunnel.
 
     Where this differs from the paper: it calls the time of the impulse unknown to the
     simulator, but gives no law; here it is shifted by :math:`\mathcal{U}(-0.3, 0.3)`
@@ -91,7 +91,7 @@ class WindTunnel(Task):
         root: Folder that holds ``wt_intake_impulse_v1/``. Only the two recorded sets
             need it.
         label_noise: Noise on the calibration labels, in standard deviations of the
-            prior; 0.2 unless given. Only for ``"noisy_labels"``.
+            prior. It is 0.2 unless given, and only for ``"noisy_labels"``.
         download: Whether to download the data set into ``root`` if it is not there.
         experiment: The recorded experiment, ``"load_out_0.5_osr_downwind_4"`` unless
             given. Others have another load of the exhaust fan
@@ -188,7 +188,7 @@ class WindTunnel(Task):
         )
 
     def get_embedding_net(self, *, light: bool = False) -> nn.Module:
-        """Return the convolutional network of task C, or a light one; ten outputs."""
+        """Return the convolutional network of task C or a light one, of ten outputs."""
         check_instance("light", light, bool)
         if light:
             return light_series_embedding(num_steps=NUM_STEPS, output_dim=10)

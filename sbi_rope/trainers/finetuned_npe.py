@@ -18,6 +18,7 @@ from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._training import (
     MIN_PAIRS_FOR_HOLDOUT,
     History,
+    best_of_learning_rates,
     groups_of,
     split_groups,
     split_pairs,
@@ -229,24 +230,28 @@ class FinetunedNPE(Method):
                 "Expected an estimator with a density to tune by; got "
                 f"{type(start).__name__}. Use NPE instead of FMPE or NPSE."
             )
-        theta, x = self._data.calibration
-        has_holdout = len(split[1]) > 0
-        rates = self.learning_rates if has_holdout else (min(self.learning_rates),)
-        results = []
-        for rate in rates:
+
+        def tuned(
+            learning_rate: float,
+        ) -> tuple[ConditionalDensityEstimator, History]:
             estimator = copy.deepcopy(start).requires_grad_()
             history = train_on_pairs(
                 estimator,
-                theta,
-                x,
+                *self._data.calibration,
                 split,
-                training=replace(self.training, learning_rate=rate),
+                training=replace(self.training, learning_rate=learning_rate),
                 in_training_mode=False,
                 label="Fine-tuning NPE",
                 show_progress_bars=show_progress_bars,
             )
-            results.append((estimator, history))
-        return min(results, key=lambda r: r[1].kept_validation_loss)
+            return estimator, history
+
+        return best_of_learning_rates(
+            tuned,
+            self.learning_rates,
+            num_held_out=len(split[1]),
+            otherwise=min(self.learning_rates),
+        )
 
 
 def _averaged(posterior: Any) -> list[ConditionalDensityEstimator]:

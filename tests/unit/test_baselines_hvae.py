@@ -648,22 +648,17 @@ def test_images_are_supported() -> None:
 # --- errors ---
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+def test_bad_options_are_refused(npe: Any) -> None:
+    for options, message in [
         ({"physics": None}, "`physics` to be callable"),
         ({"width": 0}, "width"),
         ({"latent_dim": 0}, "latent_dim"),
         ({"num_latents": 0}, "num_latents"),
         ({"calibration_weight": -1.0}, "calibration_weight"),
         ({"training": 3}, "training"),
-    ],
-)
-def test_bad_options_are_refused(
-    npe: Any, options: dict[str, Any], message: str
-) -> None:
-    with pytest.raises((InvalidInputError, InvalidTypeError), match=message):
-        small(npe, **options)
+    ]:
+        with pytest.raises((InvalidInputError, InvalidTypeError), match=message):
+            small(npe, **options)
 
 
 @pytest.mark.parametrize(

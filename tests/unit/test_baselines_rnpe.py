@@ -11,9 +11,10 @@ from torch import nn
 from torch.distributions import Normal
 
 from sbi_rope._sbi import estimator_of
+from sbi_rope._standardisation import Standardisation
 from sbi_rope.baselines.error_model import SpikeAndSlab
 from sbi_rope.baselines.rnpe import RNPE, DenoisedEmbeddings
-from sbi_rope.baselines.statistics import Standardisation, fit_marginal
+from sbi_rope.baselines.statistics import fit_marginal
 from sbi_rope.errors import (
     InvalidInputError,
     InvalidTypeError,

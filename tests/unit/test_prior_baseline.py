@@ -78,13 +78,13 @@ class OnDisc(Unknown):
         return torch.full(value.shape[:-1], -math.log(math.pi))
 
 
-@pytest.mark.parametrize("sample_shape", [(), (5,), (2, 3)])
-def test_samples_have_sbi_shapes(sample_shape: tuple[int, ...]) -> None:
-    posterior = PriorPosterior(box())
-    x = torch.zeros(4, 3, 7)
-    assert posterior.sample(sample_shape).shape == (*sample_shape, 2)
-    batched = posterior.sample_batched(sample_shape, x=x, show_progress_bars=False)
-    assert batched.shape == (*sample_shape, 4, 2)
+def test_samples_have_sbi_shapes() -> None:
+    for sample_shape in [(), (5,), (2, 3)]:
+        posterior = PriorPosterior(box())
+        x = torch.zeros(4, 3, 7)
+        assert posterior.sample(sample_shape).shape == (*sample_shape, 2)
+        batched = posterior.sample_batched(sample_shape, x=x, show_progress_bars=False)
+        assert batched.shape == (*sample_shape, 4, 2)
 
 
 def test_samples_follow_the_prior_whatever_x() -> None:
@@ -93,15 +93,15 @@ def test_samples_follow_the_prior_whatever_x() -> None:
     assert torch.allclose(samples.std(dim=0), normal().stddev.expand(2, 2), rtol=0.1)
 
 
-@pytest.mark.parametrize("prior", [box(), normal(), positive()])
-def test_log_prob_is_the_prior_density(prior: Distribution) -> None:
-    theta = prior.sample((6,))
-    posterior = PriorPosterior(prior)
-    expected = prior.log_prob(theta)
-    assert torch.equal(posterior.log_prob(theta), expected)
-    batched = posterior.log_prob_batched(theta, torch.zeros(6, 1))
-    assert torch.equal(batched, expected.unsqueeze(0))
-    assert torch.equal(posterior.potential(theta, x=torch.zeros(1, 1)), expected)
+def test_log_prob_is_the_prior_density() -> None:
+    for prior in [box(), normal(), positive()]:
+        theta = prior.sample((6,))
+        posterior = PriorPosterior(prior)
+        expected = prior.log_prob(theta)
+        assert torch.equal(posterior.log_prob(theta), expected)
+        batched = posterior.log_prob_batched(theta, torch.zeros(6, 1))
+        assert torch.equal(batched, expected.unsqueeze(0))
+        assert torch.equal(posterior.potential(theta, x=torch.zeros(1, 1)), expected)
 
 
 def test_log_prob_batched_takes_several_draws_for_each_x() -> None:

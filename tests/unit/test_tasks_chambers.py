@@ -161,7 +161,8 @@ def test_an_image_that_was_cut_anywhere_is_refused_or_read_as_the_whole(
     write_image(path, random_image())
     content, whole = path.read_bytes(), read_images(tmp_path, [path.name], 16)
     refused = 0
-    for length in range(len(content)):
+    lengths = {*range(0, len(content), 4), *range(len(content) - 20, len(content))}
+    for length in lengths:
         path.write_bytes(content[:length])
         try:
             image = read_images(tmp_path, [path.name], 16)
@@ -171,7 +172,7 @@ def test_an_image_that_was_cut_anywhere_is_refused_or_read_as_the_whole(
             refused += 1
         else:
             assert torch.equal(image, whole), length
-    assert refused > 0.9 * len(content)
+    assert refused > 0.9 * len(lengths)
 
 
 def test_an_image_of_another_size_or_mode_is_refused(tmp_path: Path) -> None:

@@ -309,6 +309,7 @@ def distance_from_the_oracle(npe: NPE, task: WindTunnel) -> float:
     return float(Oracle().log_prob(theta, x).mean() - log_prob.double().mean())
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Maximum number of epochs")
 def test_npe_on_the_estimate_of_least_squares_reaches_the_closed_form() -> None:
     task = WindTunnel(variant="well_specified", onset_jitter=0.0)
@@ -591,6 +592,7 @@ def test_a_download_fetches_a_missing_data_set(
 # From a file to a repaired posterior -------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Maximum number of epochs")
 def test_rope_repairs_a_posterior_with_recorded_pairs(
     write_impulses: WriteImpulses,

@@ -279,23 +279,18 @@ class TestFit:
 
 
 class TestSplitPairs:
-    @pytest.mark.parametrize(
-        ("num_pairs", "fraction", "held_out"),
-        [
+    def test_each_pair_is_on_one_side(self) -> None:
+        for num_pairs, fraction, held_out in [
             (1, 0.2, 0),
             (4, 0.5, 0),
             (5, 0.2, 1),
             (5, 0.01, 1),
             (20, 0.2, 4),
             (7, 0.5, 4),
-        ],
-    )
-    def test_each_pair_is_on_one_side(
-        self, num_pairs: int, fraction: float, held_out: int
-    ) -> None:
-        train, other = split_pairs(torch.arange(num_pairs), fraction)
-        assert len(other) == held_out
-        assert sorted([*train.tolist(), *other.tolist()]) == list(range(num_pairs))
+        ]:
+            train, other = split_pairs(torch.arange(num_pairs), fraction)
+            assert len(other) == held_out
+            assert sorted([*train.tolist(), *other.tolist()]) == list(range(num_pairs))
 
     def test_it_is_drawn_at_random(self) -> None:
         torch.manual_seed(0)
@@ -306,32 +301,30 @@ class TestSplitPairs:
         assert not torch.equal(first[1], second[1])
         assert torch.equal(first[1], again[1])
 
-    @pytest.mark.parametrize(("n", "held_out"), [(3, 0), (5, 1), (50, 10), (51, 10)])
-    def test_of_different_parameters_it_is_a_cut_through_a_permutation(
-        self, n: int, held_out: int
-    ) -> None:
-        theta = torch.randn(n, 2)
-        torch.manual_seed(3)
-        train, other = split_pairs(theta, 0.2)
-        after = torch.rand(())
-        torch.manual_seed(3)
-        order = torch.randperm(n)
-        assert torch.equal(other, order[:held_out])
-        assert torch.equal(train, order[held_out:])
-        assert torch.rand(()) == after
+    def test_of_different_parameters_it_is_a_cut_through_a_permutation(self) -> None:
+        for n, held_out in [(3, 0), (5, 1), (50, 10), (51, 10)]:
+            theta = torch.randn(n, 2)
+            torch.manual_seed(3)
+            train, other = split_pairs(theta, 0.2)
+            after = torch.rand(())
+            torch.manual_seed(3)
+            order = torch.randperm(n)
+            assert torch.equal(other, order[:held_out])
+            assert torch.equal(train, order[held_out:])
+            assert torch.rand(()) == after
 
-    @pytest.mark.parametrize("seed", range(5))
-    def test_pairs_of_the_same_parameters_are_on_the_same_side(self, seed: int) -> None:
-        torch.manual_seed(seed)
-        theta = torch.randn(12, 2).repeat(5, 1)[torch.randperm(60)]
-        train, other = split_pairs(theta, 0.25)
-        assert sorted([*train.tolist(), *other.tolist()]) == list(range(60))
-        assert len(other) == 15
-        assert not {*map(tuple, theta[train].tolist())} & {
-            *map(tuple, theta[other].tolist())
-        }
-        by_group = split_pairs(groups_of(theta), 0.25)
-        assert len(by_group[1]) == 15
+    def test_pairs_of_the_same_parameters_are_on_the_same_side(self) -> None:
+        for seed in range(5):
+            torch.manual_seed(seed)
+            theta = torch.randn(12, 2).repeat(5, 1)[torch.randperm(60)]
+            train, other = split_pairs(theta, 0.25)
+            assert sorted([*train.tolist(), *other.tolist()]) == list(range(60))
+            assert len(other) == 15
+            assert not {*map(tuple, theta[train].tolist())} & {
+                *map(tuple, theta[other].tolist())
+            }
+            by_group = split_pairs(groups_of(theta), 0.25)
+            assert len(by_group[1]) == 15
 
     def test_a_group_larger_than_what_is_held_out_is_trained_on(self) -> None:
         groups = torch.tensor([0] * 60 + [1] * 10 + [2] * 10 + [3] * 10 + [4] * 10)
@@ -359,17 +352,15 @@ class TestGroups:
         assert groups_of(torch.randn(30, 3)).tolist() == list(range(30))
         assert groups_of(theta[:0]).tolist() == []
 
-    @pytest.mark.parametrize(("n", "num_folds"), [(10, 3), (11, 5), (4, 6)])
-    def test_folds_of_different_parameters_are_cut_from_a_permutation(
-        self, n: int, num_folds: int
-    ) -> None:
-        torch.manual_seed(1)
-        folds = split_groups(torch.arange(n), num_folds)
-        torch.manual_seed(1)
-        expected = torch.randperm(n).tensor_split(num_folds)
-        assert len(folds) == num_folds
-        for fold, other in zip(folds, expected, strict=True):
-            assert torch.equal(fold, other)
+    def test_folds_of_different_parameters_are_cut_from_a_permutation(self) -> None:
+        for n, num_folds in [(10, 3), (11, 5), (4, 6)]:
+            torch.manual_seed(1)
+            folds = split_groups(torch.arange(n), num_folds)
+            torch.manual_seed(1)
+            expected = torch.randperm(n).tensor_split(num_folds)
+            assert len(folds) == num_folds
+            for fold, other in zip(folds, expected, strict=True):
+                assert torch.equal(fold, other)
 
     def test_folds_keep_groups_whole_and_have_rows_alike(self) -> None:
         sizes = torch.tensor([9, 1, 1, 4, 2, 3, 6, 1, 1, 2])
@@ -388,9 +379,8 @@ class TestGroups:
 
 
 class TestTraining:
-    @pytest.mark.parametrize(
-        ("field", "value"),
-        [
+    def test_values_outside_their_range_are_refused(self) -> None:
+        for field, value in [
             ("training_batch_size", 0),
             ("training_batch_size", 1.5),
             ("learning_rate", 0.0),
@@ -402,13 +392,9 @@ class TestTraining:
             ("max_num_epochs", True),
             ("clip_max_norm", 0.0),
             ("clip_max_norm", "5"),
-        ],
-    )
-    def test_values_outside_their_range_are_refused(
-        self, field: str, value: Any
-    ) -> None:
-        with pytest.raises(InvalidInputError, match=f"`{field}`"):
-            Training(**{field: value})
+        ]:
+            with pytest.raises(InvalidInputError, match=f"`{field}`"):
+                Training(**{field: value})
 
     def test_the_ends_of_the_ranges_are_taken(self) -> None:
         training = Training(
@@ -449,31 +435,33 @@ class TestEstimatorBuilder:
         assert all(torch.equal(before[key], after[key]) for key in before)
         assert norm.training
 
-    @pytest.mark.parametrize("name", ["mdn", "maf", "nsf"])
-    def test_a_name_is_that_of_sbi(self, name: str) -> None:
-        theta, x = torch.randn(20, 2), torch.randn(20, 3)
-        torch.manual_seed(1)
-        ours = estimator_builder(name)(theta, x)
-        torch.manual_seed(1)
-        theirs = posterior_nn(name)(theta, x)
-        assert type(ours) is type(theirs)
-        state = theirs.state_dict()
-        assert all(torch.equal(v, state[k]) for k, v in ours.state_dict().items())
+    def test_a_name_is_that_of_sbi(self) -> None:
+        for name in ["mdn", "maf", "nsf"]:
+            theta, x = torch.randn(20, 2), torch.randn(20, 3)
+            torch.manual_seed(1)
+            ours = estimator_builder(name)(theta, x)
+            torch.manual_seed(1)
+            theirs = posterior_nn(name)(theta, x)
+            assert type(ours) is type(theirs)
+            state = theirs.state_dict()
+            assert all(torch.equal(v, state[k]) for k, v in ours.state_dict().items())
 
     def test_checking_a_name_leaves_no_trace(self) -> None:
         before = torch.get_rng_state()
         estimator_builder("maf")
         assert torch.equal(torch.get_rng_state(), before)
 
-    @pytest.mark.parametrize("name", ["", "fancy", "MAF", "mnpe"])
-    def test_an_unknown_name_is_refused(self, name: str) -> None:
-        with pytest.raises(InvalidInputError, match=f"`density_estimator`.*{name!r}"):
-            estimator_builder(name)
+    def test_an_unknown_name_is_refused(self) -> None:
+        for name in ["", "fancy", "MAF", "mnpe"]:
+            with pytest.raises(
+                InvalidInputError, match=f"`density_estimator`.*{name!r}"
+            ):
+                estimator_builder(name)
 
-    @pytest.mark.parametrize("value", [None, 3, ("maf",)])
-    def test_what_cannot_build_is_refused(self, value: Any) -> None:
-        with pytest.raises(InvalidTypeError, match="`density_estimator`"):
-            estimator_builder(value)
+    def test_what_cannot_build_is_refused(self) -> None:
+        for value in [None, 3, ("maf",)]:
+            with pytest.raises(InvalidTypeError, match="`density_estimator`"):
+                estimator_builder(value)
 
 
 def pairs(n: int) -> tuple[Tensor, Tensor]:
@@ -555,27 +543,25 @@ class TestSimulationTrainer:
         ):
             assert torch.equal(ours, sbis)
 
-    @pytest.mark.parametrize("sizes", [(1, 19), (6, 7, 12), (2, 2, 30)])
-    def test_a_few_people_are_held_out_together_in_smaller_batches(
-        self, sizes: tuple[int, ...]
-    ) -> None:
+    def test_a_few_people_are_held_out_together_in_smaller_batches(self) -> None:
         """Fewer than a batch of 20 are left to train on, or hardly any held out."""
-        people = box(2).sample((len(sizes),))
-        theta = people.repeat_interleave(torch.tensor(sizes), dim=0)
-        for seed in range(6):
-            torch.manual_seed(seed)
-            trainer = SimulationTrainer(prior=box(2), show_progress_bars=False)
-            trainer.append_simulations(theta, simulate(theta))
-            loaders = trainer.get_dataloaders(0, 20, 0.3)
-            rows = trainer.train_indices, trainer.val_indices
-            assert sorted(torch.cat(rows).tolist()) == list(range(len(theta)))
-            train, held_out = (set(map(tuple, theta[r].tolist())) for r in rows)
-            assert train
-            assert held_out
-            assert not train & held_out
-            assert len(rows[0]) >= len(rows[1])
-            for loader in loaders:
-                assert sum(len(batch[0]) for batch in loader) > 0
+        for sizes in [(1, 19), (6, 7, 12), (2, 2, 30)]:
+            people = box(2).sample((len(sizes),))
+            theta = people.repeat_interleave(torch.tensor(sizes), dim=0)
+            for seed in range(6):
+                torch.manual_seed(seed)
+                trainer = SimulationTrainer(prior=box(2), show_progress_bars=False)
+                trainer.append_simulations(theta, simulate(theta))
+                loaders = trainer.get_dataloaders(0, 20, 0.3)
+                rows = trainer.train_indices, trainer.val_indices
+                assert sorted(torch.cat(rows).tolist()) == list(range(len(theta)))
+                train, held_out = (set(map(tuple, theta[r].tolist())) for r in rows)
+                assert train
+                assert held_out
+                assert not train & held_out
+                assert len(rows[0]) >= len(rows[1])
+                for loader in loaders:
+                    assert sum(len(batch[0]) for batch in loader) > 0
 
     def test_a_single_person_is_split_by_recording(self) -> None:
         theta = box(2).sample((1,)).repeat(30, 1)

@@ -31,7 +31,7 @@ NUM_DRAWN = 10  # people in a picture
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command with the arguments of the command line; return its status."""
+    """Run the command with the arguments of the command line and return its status."""
     parser = argparse.ArgumentParser(
         prog="python -m sbi_rope.tasks.hemodynamics",
         description=__doc__,
@@ -159,7 +159,7 @@ def _add_validate(commands: Any) -> None:
 
 
 def _validate(args: argparse.Namespace) -> int:
-    """Print a line a check; return 1 if one fails."""
+    """Print a line for every check, and return 1 if one fails."""
     from sbi_rope.tasks.hemodynamics.validation import validation_table
 
     rows = validation_table(args.reference)

@@ -68,7 +68,7 @@ def run_chunk(work: Work, chunk: range) -> tuple[int, int]:
 
 
 def read_part(file: Path) -> dict[str, np.ndarray] | None:
-    """Return the people of a chunk; None if they are still to be simulated."""
+    """Return the people of a chunk, or None if they are still to be simulated."""
     try:
         arrays = read_arrays(file)
         people = arrays["index"].tolist()

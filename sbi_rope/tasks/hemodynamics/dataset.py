@@ -96,7 +96,7 @@ def load(
 
     Args:
         path: A file that ``python -m sbi_rope.tasks.hemodynamics generate`` made.
-        process: The process that it should be of; any, unless given.
+        process: The process that it should be of. Unless given, any will do.
         population: The population that it should be of; any, unless given. The
             lengths of arteries only matter for the real process.
         physics: The discretisation that it should be made with; any, unless given.

@@ -68,7 +68,7 @@ def generate(
         path: The npz file to write. It must not be there yet.
         n: Number of people.
         process: ``"simulator"`` or ``"real"``.
-        seed: Number of the cohort; people of different cohorts are independent.
+        seed: Number of the cohort. People of different cohorts are independent.
         population: The law that people are drawn from.
         physics: The settings to solve the equations with.
         jobs: Number of jobs of joblib, -1 for as many as there are cores; unless

@@ -40,7 +40,7 @@ def run_cycle(
     weights: np.ndarray,
     record: np.ndarray,
 ) -> float:
-    """Simulate one beat in place; return the volume that left, in m^3.
+    """Simulate one beat in place, and return the volume that left, in m^3.
 
     ``source`` is the inflow at the middle of each step, ``probes`` are points left and
     right of where the pressure is recorded at the start of each step, ``weights``

@@ -62,7 +62,7 @@ class Network:
         inlet_radius: Radius at the reference pressure, in m, linear in between.
         outlet_radius: Radius at the other end, in m.
         stiffness: :math:`k_1, k_2, k_3`, shape ``(3, m)``.
-        wall_viscosity: :math:`b_0, b_1`, shape ``(2, m)``; 0 for elastic walls.
+        wall_viscosity: :math:`b_0, b_1`, shape ``(2, m)``, and 0 for elastic walls.
         reference_pressure: :math:`p_d`, in Pa.
         friction: Wall friction per flow, :math:`2 (\zeta + 2) \pi \mu / \rho`, in
             m^2 s^-1.

@@ -101,7 +101,7 @@ def stroke_volume_law(age: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def heart_rate_mean(age: np.ndarray | float) -> np.ndarray:
-    """Return the mean heart rate, in beats per minute; constant below 32.5 years."""
+    """Return the mean heart rate in beats per minute, constant below 32.5 years."""
     return np.asarray(np.interp(age, HR_AGES, HR_MEANS))
 
 

@@ -118,7 +118,7 @@ class PopulationPrior(Distribution):
             return self._band.theta(shares.clamp(EDGE, 1 - EDGE)).to(torch.float32)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log density; minus infinity outside of the support."""
+        """Return the log density, minus infinity outside of the support."""
         if self._validate_args:
             self._validate_sample(value)
         shares = self._band.shares(value)

@@ -68,7 +68,7 @@ class Recorder:
         Args:
             beat: Pressures over one period in mmHg, end excluded, shape ``(n, m)``.
             period: Lengths of the beats in s, shape ``(n,)``.
-            generator: Source of starts and noise; torch's global one if None.
+            generator: Source of starts and noise, torch's global one if None.
 
         Returns:
             Recordings, shape ``(n, 1000)``, with the dtype of ``beat``.

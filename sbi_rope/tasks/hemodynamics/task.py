@@ -122,14 +122,15 @@ class Hemodynamics(Task):
 
     Args:
         variant: ``None`` or one of ``variants``.
-        root: Not used; data sets are given by ``simulations`` and ``observations``.
+        root: Not used. Data sets are given by ``simulations`` and ``observations``.
         label_noise: Noise on the calibration labels, in standard deviations of the
-            prior; 0.2 unless given. Only for ``"noisy_labels"``.
-        simulations: File of simulated people; the small one of the package unless
+            prior. It is 0.2 unless given, and only for ``"noisy_labels"``.
+        simulations: File of simulated people. It is the small one of the package
+            unless given.
+        observations: File of real people. It is the small one of the package unless
             given.
-        observations: File of real people; the small one of the package unless given.
         prior: The law of the parameters that both files were made with, see
-            :class:`Population`; those of the package have ``"population"``.
+            :class:`Population`. Those of the package have ``"population"``.
         noise_std: Standard deviation of the noise, after normalisation.
         normalisation: ``"per_record"``, to mean 0 and standard deviation 1, or
             ``"global"``, which keeps the level and the height of the pulse.
@@ -202,7 +203,7 @@ class Hemodynamics(Task):
         )
 
     def get_embedding_net(self, *, light: bool = False) -> nn.Module:
-        """Return the paper's convolutional network, or a light one; five outputs."""
+        """Return the paper's convolutional network or a light one, of five outputs."""
         check_instance("light", light, bool)
         if light:
             return light_series_embedding(num_steps=NUM_STEPS, output_dim=5)
