@@ -7,10 +7,10 @@ import pytest
 import torch
 from sbi.inference import NPE
 from sbi.neural_nets import posterior_nn
+from sbi.utils.sbiutils import Standardize
 from torch import Tensor, nn
 
 from sbi_rope import CalibrationFinetuner, RoPE, diagnose
-from sbi_rope._sbi import Standardize
 from sbi_rope._standardisation import FAR, deviations
 from sbi_rope.baselines import CalibrationMLP, FinetunedNPE, Training
 from sbi_rope.discrepancy import DiscrepancyNPE
