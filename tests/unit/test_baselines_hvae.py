@@ -219,36 +219,38 @@ def flow(name: str) -> Any:
 
 
 @pytest.mark.usefixtures("double")
-def test_gradient_of_a_draw_is_that_of_finite_differences_at_fixed_noise() -> None:
-    for name in ["maf", "nsf", "zuko_nsf", "zuko_unaf"]:
-        q = flow(name)
-        s = torch.randn(10, 4).requires_grad_()
-        theta = reparametrised_sample(q, s)
-        direction, weights = torch.randn(10, 4), torch.randn(10, 2)
-        (gradient,) = torch.autograd.grad((theta * weights).sum(), s)
-        noise = q.inverse_transform(theta, s).detach()
+@pytest.mark.parametrize("name", ["maf", "nsf", "zuko_nsf", "zuko_unaf"])
+def test_gradient_of_a_draw_is_that_of_finite_differences_at_fixed_noise(
+    name: str,
+) -> None:
+    q = flow(name)
+    s = torch.randn(10, 4).requires_grad_()
+    theta = reparametrised_sample(q, s)
+    direction, weights = torch.randn(10, 4), torch.randn(10, 2)
+    (gradient,) = torch.autograd.grad((theta * weights).sum(), s)
+    noise = q.inverse_transform(theta, s).detach()
 
-        def at_same_noise(s: Tensor) -> Tensor:
-            # By Newton's method, as some flows are inverted too coarsely for differences.
-            point = theta.detach()
-            for _ in range(10):
-                point = point.clone().requires_grad_()
-                u = q.inverse_transform(point, s)
-                rows = [
-                    torch.autograd.grad(u[:, k].sum(), point, retain_graph=True)[0]
-                    for k in range(2)
-                ]
-                step = torch.linalg.solve(torch.stack(rows, 1), (u - noise)[..., None])
-                point = (point - step[..., 0]).detach()
-            return point
+    def at_same_noise(s: Tensor) -> Tensor:
+        # By Newton's method, as some flows are inverted too coarsely for differences.
+        point = theta.detach()
+        for _ in range(10):
+            point = point.clone().requires_grad_()
+            u = q.inverse_transform(point, s)
+            rows = [
+                torch.autograd.grad(u[:, k].sum(), point, retain_graph=True)[0]
+                for k in range(2)
+            ]
+            step = torch.linalg.solve(torch.stack(rows, 1), (u - noise)[..., None])
+            point = (point - step[..., 0]).detach()
+        return point
 
-        s = s.detach()
-        h = 1e-5
-        difference = at_same_noise(s + h * direction) - at_same_noise(s - h * direction)
-        expected = (difference / (2 * h) * weights).sum(dim=1)
-        torch.testing.assert_close(
-            (gradient * direction).sum(dim=1), expected, atol=1e-5, rtol=1e-4
-        )
+    s = s.detach()
+    h = 1e-5
+    difference = at_same_noise(s + h * direction) - at_same_noise(s - h * direction)
+    expected = (difference / (2 * h) * weights).sum(dim=1)
+    torch.testing.assert_close(
+        (gradient * direction).sum(dim=1), expected, atol=1e-5, rtol=1e-4
+    )
 
 
 def test_draw_is_that_of_the_flow() -> None:
