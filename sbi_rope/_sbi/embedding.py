@@ -73,7 +73,7 @@ def _embedding_of_mixed(estimator: MixedDensityEstimator) -> nn.Module:
 
 
 def headless(estimator: ConditionalEstimator) -> Any:
-    r"""Return :math:`q(\theta \mid s)`: the estimator without its embedding.
+    r"""Return :math:`q(\theta \mid h)`: the estimator without its embedding.
 
     The parameters are shared with ``estimator``, which is left as it was.
     """

@@ -108,7 +108,7 @@ class HybridVAE(nn.Module):
 
         Args:
             x_o: Observations without parameters, shape ``(n, *event)``.
-            theta: Parameters of calibration pairs, shape ``(m, k)``.
+            theta: Parameters of calibration pairs, shape ``(m, d)``.
             x: Their observations, shape ``(m, *event)``.
             weight: Of the calibration pairs' mean log-probability.
         """
