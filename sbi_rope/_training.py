@@ -132,9 +132,9 @@ def split_groups(groups: Tensor, num_folds: int) -> list[Tensor]:
     Returns:
         The rows of each fold.
     """
-    # Not by scikit-learn: its GroupKFold takes groups of equal size in an order that no
-    # seed decides and refuses fewer groups than folds, and stored results depend on
-    # who was in which fold.
+    # Not by scikit-learn's GroupKFold: it refuses fewer groups than folds, and in which
+    # order it takes groups of equal size depends on its version. Stored results depend
+    # on who was in which fold.
     groups = groups_of(groups)
     order = torch.randperm(_num_groups(groups))
     if len(order) == len(groups):

@@ -73,7 +73,7 @@ def _embedding_of_mixed(estimator: MixedDensityEstimator) -> nn.Module:
 
 
 def headless(estimator: ConditionalEstimator) -> Any:
-    r"""Return :math:`q(\theta \mid s)`: the estimator without its embedding.
+    r"""Return :math:`q(\theta \mid h)`: the estimator without its embedding.
 
     The parameters are shared with ``estimator``, which is left as it was.
     """
@@ -84,13 +84,13 @@ def headless(estimator: ConditionalEstimator) -> Any:
         dtype=dtype_of(estimator),
         device=device_of(estimator),
     )
-    statistic_shape = embed(embedding, blank).shape[1:]
-    if len(statistic_shape) != 1:
+    embedded_shape = embed(embedding, blank).shape[1:]
+    if len(embedded_shape) != 1:
         raise UnsupportedPosteriorError(
             "Expected the embedding net to return one vector per observation, shape "
-            f"(n, l); got {('n', *statistic_shape)}."
+            f"(n, l); got {('n', *embedded_shape)}."
         )
-    clone = with_embedding(estimator, nn.Identity(), condition_shape=statistic_shape)
+    clone = with_embedding(estimator, nn.Identity(), condition_shape=embedded_shape)
     return MixedDensity(clone) if isinstance(clone, MixedDensityEstimator) else clone
 
 

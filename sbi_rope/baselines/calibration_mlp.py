@@ -49,7 +49,7 @@ class DiagonalGaussian(ConditionalDensityEstimator):
     the start, see :meth:`set_range`.
 
     Args:
-        net: Maps observations ``(n, *event)`` to means and log-variances ``(n, 2 k)``
+        net: Maps observations ``(n, *event)`` to means and log-variances ``(n, 2 d)``
             of theta in units of ``std`` about ``mean``.
         mean: m, shape ``(d,)``.
         std: s, shape ``(d,)``.
@@ -106,7 +106,7 @@ class DiagonalGaussian(ConditionalDensityEstimator):
         self.floor = FLOOR * (total / (len(x) + PSEUDO_PAIRS)).sqrt()
 
     def _moments(self, condition: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean and log standard deviation of theta, each ``(B, k)``."""
+        """Return mean and log standard deviation of theta, each ``(B, d)``."""
         mean, log_variance = self.net(condition).chunk(2, dim=-1)
         mean = FARTHEST * torch.tanh(mean / FARTHEST)
         log_variance = -torch.logaddexp(
@@ -125,7 +125,7 @@ class DiagonalGaussian(ConditionalDensityEstimator):
     def sample(
         self, sample_shape: torch.Size, condition: Tensor, **kwargs: Any
     ) -> Tensor:
-        """Draw parameters, shape ``(*sample_shape, B, k)``."""
+        """Draw parameters, shape ``(*sample_shape, B, d)``."""
         mean, log_std = self._moments(condition)
         noise = torch.randn(*sample_shape, *mean.shape).to(mean)
         return mean + log_std.exp() * noise

@@ -34,10 +34,10 @@ def embedding_with_head(
     Where the embedding has no parameters, two hidden layers of 64 units stand between.
 
     Args:
-        embedding: Maps observations ``(n, *event)`` to statistics ``(n, l)``; is
+        embedding: Maps observations ``(n, *event)`` to embeddings ``(n, l)``; is
             copied.
         num_outputs: Width of the last layer.
-        x: Some observations, to learn the number of statistics.
+        x: Some observations, to learn the width of an embedding.
     """
     embedding = fresh_copy(embedding)
     width = embed(embedding, x[:1]).flatten(1).shape[1]

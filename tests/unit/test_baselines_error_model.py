@@ -73,13 +73,13 @@ def test_noise_never_exceeds_the_bound_and_reaches_it() -> None:
     assert float(noise.min()) == -2.0
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_noise_has_shape_and_dtype_of_what_it_is_for(dtype: torch.dtype) -> None:
-    x = torch.full((3, 4, 5), torch.nan, dtype=dtype)
-    noise = MODEL.sample_like(x)
-    assert noise.shape == x.shape
-    assert noise.dtype == dtype
-    assert torch.isfinite(noise).all()
+def test_noise_has_shape_and_dtype_of_what_it_is_for() -> None:
+    for dtype in [torch.float32, torch.float64]:
+        x = torch.full((3, 4, 5), torch.nan, dtype=dtype)
+        noise = MODEL.sample_like(x)
+        assert noise.shape == x.shape
+        assert noise.dtype == dtype
+        assert torch.isfinite(noise).all()
 
 
 def test_the_density_is_the_mixture_of_both_laws() -> None:

@@ -261,10 +261,10 @@ def test_draw_is_that_of_the_flow() -> None:
     torch.testing.assert_close(theta.detach(), q.sample(torch.Size((1,)), s)[0])
 
 
-@pytest.mark.parametrize("name", ["mdn", "made"])
-def test_estimators_whose_draws_have_no_gradient_are_refused(name: str) -> None:
-    with pytest.raises(UnsupportedPosteriorError, match="'nsf'"):
-        check_differentiable(flow(name), torch.zeros(2, 4))
+def test_estimators_whose_draws_have_no_gradient_are_refused() -> None:
+    for name in ["mdn", "made"]:
+        with pytest.raises(UnsupportedPosteriorError, match="'nsf'"):
+            check_differentiable(flow(name), torch.zeros(2, 4))
 
 
 # --- the prior, continued ---
@@ -689,15 +689,15 @@ def test_statistics_instead_of_series_are_refused_before_training() -> None:
         method.train(seed=0)
 
 
-@pytest.mark.parametrize("missing", ["calibration", "observations"])
-def test_both_kinds_of_real_data_are_needed(npe: Any, missing: str) -> None:
-    method = small(npe)
-    if missing == "calibration":
-        method.append_observations(real(10, seed=2)[1])
-    else:
-        method.append_calibration(*real(10, seed=1))
-    with pytest.raises(NotReadyError, match=f"append_{missing}"):
-        method.train(seed=0)
+def test_both_kinds_of_real_data_are_needed(npe: Any) -> None:
+    for missing in ["calibration", "observations"]:
+        method = small(npe)
+        if missing == "calibration":
+            method.append_observations(real(10, seed=2)[1])
+        else:
+            method.append_calibration(*real(10, seed=1))
+        with pytest.raises(NotReadyError, match=f"append_{missing}"):
+            method.train(seed=0)
 
 
 def test_mixture_density_networks_are_refused() -> None:

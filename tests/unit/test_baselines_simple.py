@@ -399,15 +399,15 @@ class TestRoPEsParts:
             expected.log_prob_batched(self.THETA[None], x_o[:7]),
         )
 
-    @pytest.mark.parametrize("kind", [TuningOnly, OTOnly])
-    def test_simulations_or_a_simulator_are_needed_beside_npe(self, kind: Any) -> None:
-        method = kind.from_posterior(npe().build_posterior())
-        if kind is TuningOnly:
-            method.append_calibration(*real())
-        else:
-            method.append_observations(TASK.get_test_set(30)[1])
-        with pytest.raises(NotReadyError, match=r"append_simulations\(theta, x\)"):
-            method.train(**QUIET)
+    def test_simulations_or_a_simulator_are_needed_beside_npe(self) -> None:
+        for kind in [TuningOnly, OTOnly]:
+            method = kind.from_posterior(npe().build_posterior())
+            if kind is TuningOnly:
+                method.append_calibration(*real())
+            else:
+                method.append_observations(TASK.get_test_set(30)[1])
+            with pytest.raises(NotReadyError, match=r"append_simulations\(theta, x\)"):
+                method.train(**QUIET)
 
     def test_ot_only_refuses_numbers_of_simulations_that_are_none(self) -> None:
         with pytest.raises(InvalidInputError, match="`num_simulations`"):

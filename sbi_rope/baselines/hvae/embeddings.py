@@ -13,7 +13,7 @@ MAX_ENTRIES = 2**18
 
 
 class LatentEmbeddings(Mixing):
-    r"""Statistics of simulations like an observation, from S draws of the latent.
+    r"""Embeddings of simulations like an observation, from S draws of the latent.
 
     .. math::
         s_k(x_o) = h(\tilde x_k), \quad
@@ -53,7 +53,7 @@ class LatentEmbeddings(Mixing):
 
     @torch.no_grad()
     def embed(self, x: Tensor) -> Tensor:
-        """Return the statistics, ``(n, *event)`` to ``(n, S, l)``."""
+        """Return the embeddings, ``(n, *event)`` to ``(n, S, l)``."""
         size = self.event_shape.numel()
         draws = torch.arange(self.num_embeddings, device=self.z_noise.device)
         num_rows = max(1, MAX_ENTRIES // (size * len(draws)))
@@ -68,7 +68,7 @@ class LatentEmbeddings(Mixing):
         )
 
     def _block(self, x_o: Tensor, draws: Tensor) -> Tensor:
-        """Return the statistics of some draws, ``(b, s, l)``."""
+        """Return the embeddings of some draws, ``(b, s, l)``."""
         mean, log_variance = (moment[:, None] for moment in self.encoder(x_o))
         z = drawn(mean, log_variance, self.z_noise[draws]).flatten(0, 1)
         x_s, log_variance = self.reality_to_physics(x_o, z)

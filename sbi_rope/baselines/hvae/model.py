@@ -17,8 +17,8 @@ class FrozenNPE(NamedTuple):
     """A trained NPE in two halves that are not trained any further.
 
     Attributes:
-        embedding: h, from simulations ``(n, *event)`` to statistics ``(n, l)``.
-        flow: q(theta | s), conditioned on statistics.
+        embedding: h, from simulations ``(n, *event)`` to embeddings ``(n, l)``.
+        flow: q(theta | h), conditioned on embeddings.
     """
 
     embedding: nn.Module
@@ -73,11 +73,11 @@ class HybridVAE(nn.Module):
         self.noisy = noisy
 
     def infer(self, x_o: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Draw z and the statistics of simulations like x_o.
+        """Draw z and the embeddings of simulations like x_o.
 
         Returns:
             Latents ``(n, l_z)``, the KL divergence of their law from the standard
-            normal ``(n,)``, and statistics ``(n, l)``.
+            normal ``(n,)``, and embeddings ``(n, l)``.
         """
         mean, log_variance = self.encoder(x_o)
         z = drawn(mean, log_variance)
@@ -108,7 +108,7 @@ class HybridVAE(nn.Module):
 
         Args:
             x_o: Observations without parameters, shape ``(n, *event)``.
-            theta: Parameters of calibration pairs, shape ``(m, k)``.
+            theta: Parameters of calibration pairs, shape ``(m, d)``.
             x: Their observations, shape ``(m, *event)``.
             weight: Of the calibration pairs' mean log-probability.
         """

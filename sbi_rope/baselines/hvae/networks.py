@@ -152,9 +152,9 @@ class LatentEncoder(nn.Module):
     has no parameters, two hidden layers of 64 units follow it.
 
     Args:
-        embedding: Maps observations ``(n, *event)`` to statistics ``(n, l)``.
+        embedding: Maps observations ``(n, *event)`` to embeddings ``(n, l)``.
         latent_dim: Length of the latent vector.
-        x: Some observations, to learn the number of statistics.
+        x: Some observations, to learn the width of an embedding.
 
     Example:
         >>> encoder = LatentEncoder(torch.nn.Flatten(), 5, torch.randn(2, 20))

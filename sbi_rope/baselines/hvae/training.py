@@ -35,7 +35,7 @@ def train_hybrid(
         model: What is trained.
         posterior: A mixture that shares its networks, to score held-out pairs by.
         x_o: Observations without parameters, shape ``(n, *event)``.
-        theta: Parameters of the calibration pairs, shape ``(m, k)``.
+        theta: Parameters of the calibration pairs, shape ``(m, d)``.
         x: Their observations, shape ``(m, *event)``.
         weight: Of the pairs' mean log-probability in the objective.
         training: Batch size, learning rate and so on.
