@@ -943,7 +943,7 @@ def test_an_unseen_observation_may_extend_the_coupling_with_a_warning() -> None:
     expected = posterior.coupling.rows(embed(net, new))
     smallest = float((1 / expected.square().sum(dim=1)).min())
     mixed = torch.cat([new[:1], posterior.x_o[2:3], new[1:]])
-    with pytest.warns(RoPEWarning, match=rf"2 unseen.*size {smallest:.1f} of 12"):
+    with pytest.warns(RoPEWarning, match=rf"2 unseen.*size is {smallest:.1f} of 12"):
         rows = problems.rows_of(posterior, mixed)
     assert torch.allclose(rows[[0, 2]], expected, atol=1e-12)
     assert torch.equal(rows[1], posterior.weights[2])
