@@ -1,4 +1,4 @@
-"""A trained NPE, taken apart into its embedding and its density."""
+"""A trained NPE, split into its embedding net and its density."""
 
 import copy
 from typing import Any
@@ -35,9 +35,9 @@ __all__ = ["TrainedNPE"]
 class TrainedNPE:
     r"""A copy of a trained estimator :math:`q(\theta \mid h(x))`, in its two parts.
 
-    Neither training nor moving a posterior to another device may touch what belongs to
-    the user, so the estimator and the prior are copied, and what is handed out is a
-    copy again.
+    Training, or moving a posterior to another device, must not change the user's
+    estimator and prior. They are therefore copied, and all that is returned is a copy
+    again.
 
     Args:
         posterior: What ``NPE(...).build_posterior()`` returns, or the posterior of
@@ -84,14 +84,14 @@ class TrainedNPE:
 
     @property
     def enable_transform(self) -> bool:
-        """Whether sbi's ``map`` is to search in an unbounded space."""
+        """Whether sbi's ``map`` searches in an unbounded space."""
         return self._posterior.enable_transform
 
     def posterior(self, embedding_net: nn.Module | None = None) -> Any:
         """Return a copy of the sbi posterior.
 
         Args:
-            embedding_net: What takes the place of h; h itself if None.
+            embedding_net: The embedding net of the copy; h if None.
         """
         estimator = self.estimator
         if embedding_net is not None:
@@ -110,7 +110,7 @@ class TrainedNPE:
         """Return the embeddings of a user's observations, shape ``(n, l)``.
 
         Raises:
-            InvalidInputError: If one of them is not finite, or its length is not.
+            InvalidInputError: If an embedding, or its length, is not finite.
         """
         embedded = embed(embedding_net, x)
         usable = torch.isfinite(torch.linalg.vector_norm(embedded, dim=1))
@@ -141,5 +141,5 @@ class TrainedNPE:
         check_device(name, check_tensor(name, value), self.like.device)
         value = check_batch(name, value, event_shape)
         value = value.detach().to(self.like.dtype, copy=True)
-        check_finite(name, value)  # the estimator's dtype may hold less
+        check_finite(name, value)  # numbers that float32 cannot hold have become Inf
         return value

@@ -1,4 +1,4 @@
-"""Processes that end with the one that started them."""
+"""Worker processes that end when the process that started them ends."""
 
 import multiprocessing
 import os
@@ -7,33 +7,34 @@ import time
 
 __all__ = ["end_with"]
 
-# How often a worker looks for its parent, in seconds.
+# Seconds between two looks of a worker at its parent.
 INTERVAL = 0.5
 _watched: list[int] = []
 
 
 def end_with(parent: int) -> None:
-    """Let this process end when its parent does, however that ends.
+    """End this process when its parent ends, in whatever way.
 
-    A worker whose parent was killed would go on with what it was given, and write where
-    another run may be at work by then. To be called by workers; without effect in the
-    parent itself, in workers that were started by others, such as those of a dask
-    cluster, and on Windows.
+    Otherwise a worker whose parent was killed would finish its work, and might write
+    files that another run is already using. Workers call this function. It has no
+    effect in the parent itself, in workers that another process has started (such as
+    those of a dask cluster), and on Windows.
 
-    Linux could send a signal instead (PR_SET_PDEATHSIG), but does so too when only the
-    thread that started the worker ends.
+    Linux can send a signal instead (PR_SET_PDEATHSIG), but it also sends it when only
+    the thread that started the worker ends.
 
     Args:
-        parent: Number of the process that the worker works for.
+        parent: The ID of the process that the worker works for.
     """
-    # On Windows a process keeps the number of its first parent for ever.
+    # On Windows the ID of the parent does not change when the parent ends.
     if parent == os.getpid() or parent in _watched or os.name != "posix":
         return
     if os.getppid() == parent:
         _watched.append(parent)
         threading.Thread(target=_watch, args=(parent,), daemon=True).start()
     elif type(multiprocessing.current_process()).__name__ == "LokyProcess":
-        # Always a child of the process it works for, which ended while this started.
+        # These workers are always children of the process they work for, so that it
+        # must have ended already.
         os._exit(1)
 
 

@@ -1,4 +1,4 @@
-"""Progress bars, for people who watch."""
+"""Progress bars that are shown in terminals and notebooks only."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -11,14 +11,14 @@ __all__ = ["progress_bar"]
 def progress_bar(
     iterable: Iterable[Any] | None = None, *, show: bool, desc: str, **options: Any
 ) -> Any:
-    """Return a bar of tqdm, silent unless it is asked for and stderr is a terminal.
+    """Return a tqdm bar, which is silent unless ``show`` and stderr is a terminal.
 
-    In a log file every refresh would be a line. Notebooks show bars like terminals.
+    In a log file every refresh would add a line. Notebooks show bars as terminals do.
 
     Args:
-        iterable: What to go through; None for a bar that is updated by hand.
-        show: Whether to show it.
-        desc: What it is called.
-        **options: What else tqdm takes.
+        iterable: What to iterate over; None for a bar that is updated by hand.
+        show: Whether to show the bar.
+        desc: The name of the bar.
+        **options: Other arguments of tqdm.
     """
     return tqdm(iterable, desc=desc, disable=None if show else True, **options)

@@ -1,4 +1,4 @@
-"""Seeds that leave no trace."""
+"""Seeds for a block of code, without effect on the random numbers after it."""
 
 import random
 import threading
@@ -22,12 +22,18 @@ def seeded(seed: int | None) -> Iterator[None]:
     """Run a block with its own random numbers, or with the caller's if seed is None.
 
     sbi's estimators and most simulators draw from the global generators of torch, NumPy
-    or Python, so a generator object cannot be passed down. Their states are put back
-    afterwards.
+    and Python, so that a generator object cannot be passed to them. The states of these
+    generators are restored after the block.
 
     The seeded blocks of a process run one at a time: a thread that enters one waits
     until no other thread is in one. Blocks of one thread can be nested. A seeded block
     must not wait for another thread that enters one.
+
+    Args:
+        seed: A non-negative integer, or None.
+
+    Raises:
+        InvalidInputError: If the seed is something else.
     """
     if seed is None:
         yield
@@ -36,8 +42,8 @@ def seeded(seed: int | None) -> Iterator[None]:
         raise InvalidInputError(
             f"Expected `seed` to be a non-negative integer or None; got {shown(seed)}."
         )
-    # Away from the streams of small seeds: whoever trained NPE after manual_seed(0)
-    # would meet the same parameters again under seed 0.
+    # The seed is changed to a large number. Otherwise seed 0 would draw the same
+    # parameters as a user who has simulated after `torch.manual_seed(0)`.
     stream = (int(seed) * 0x9E3779B1 + 0x7F4A7C15) % 2**32
     with _LOCK:
         numpy_state, python_state = np.random.get_state(), random.getstate()  # noqa: NPY002

@@ -1,4 +1,4 @@
-"""Where simulations come from: a simulator, or a stored set of them."""
+"""Sources of simulations: what RoPE needs of them, and a stored set of pairs."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ __all__ = [
     "warn_of_dropped",
 ]
 
-# Stored simulations around a theta behind the moments there.
+# The number of stored simulations around a theta from which its moments are estimated.
 NUM_AROUND = 50
 
 Embedding = Callable[[Tensor], Tensor]
@@ -61,16 +61,27 @@ class Moments:
 
 
 class SimulationSource(Protocol):
-    """What RoPE needs of simulations, each already reduced to its embedding."""
+    """What RoPE needs of simulations. Each is reduced to its embedding at once.
+
+    Attributes:
+        num_dropped: How many simulations were dropped so far because of NaN or Inf.
+    """
 
     num_dropped: int
 
     def from_prior(
         self, count: int | None, at_least: int, embed: Embedding, *, progress: bool
     ) -> tuple[Tensor, Tensor]:
-        """Return parameters from the prior and the embedding of a simulation of each.
+        """Return parameters from the prior, and the embedding of one simulation each.
 
-        Shapes ``(n_s, d)`` and ``(n_s, l)``.
+        Args:
+            count: The number of simulations.
+            at_least: The number of simulations if ``count`` is None.
+            embed: The embedding h.
+            progress: Whether to show the progress of slow simulations.
+
+        Returns:
+            theta of shape ``(n_s, d)`` and embeddings of shape ``(n_s, l)``.
         """
         ...
 
@@ -85,8 +96,8 @@ class SimulationSource(Protocol):
     ) -> Tensor:
         """Return the mean embedding of simulations at each theta, ``(n, l)``.
 
-        A simulator makes ``simulations_per_target`` at each; stored simulations are
-        those with the ``num_neighbors`` nearest parameters.
+        A simulator makes ``simulations_per_target`` simulations at each theta. Of
+        stored simulations, those with the ``num_neighbors`` nearest parameters count.
         """
         ...
 
@@ -135,8 +146,9 @@ class StoredSimulations:
         check_in_support("simulations[0]", theta[valid], prior)
         self.num_dropped = int((~valid).sum())
         self.theta, self.x = theta[valid], x[valid]
-        # "Nearest" is measured in standard deviations of the stored parameters, from
-        # their mean: far from zero float32 could not tell them apart.
+        # Distances between parameters are in standard deviations of the stored ones.
+        # The mean is subtracted, because float32 cannot tell numbers far from zero
+        # apart.
         self._theta_mean = self.theta.mean(dim=0)
         self._theta_std = self.theta.std(dim=0).clamp_min(1e-12)
 
@@ -178,9 +190,9 @@ class StoredSimulations:
     ) -> Moments:
         """Fit a plane to the embeddings of the stored simulations around each theta.
 
-        Its height is the mean, and the covariance is that of what it leaves over.
-        ``count`` has no effect: how many are around a theta depends on the number of
-        parameters.
+        The mean is the height of the plane at theta, and the covariance is that of the
+        residuals. ``count`` has no effect: the number of stored simulations around a
+        theta depends on the number of parameters.
         """
         number = min(len(self.x), max(NUM_AROUND, 5 * (theta.shape[1] + 1)))
         nearest = self._nearest(theta, number)
@@ -188,7 +200,7 @@ class StoredSimulations:
         embedded = embedded.reshape(*nearest.shape, -1)
         offsets = self._standardised(self.theta[nearest]).double()
         offsets = offsets - self._standardised(theta).double()[:, None]
-        # A ridge keeps the plane level where the parameters around do not vary.
+        # The ridge keeps the plane level if the parameters around theta do not vary.
         design = torch.cat([torch.ones_like(offsets[..., :1]), offsets], dim=-1)
         ridge = torch.full((design.shape[-1],), 1e-6).to(design)
         ridge[0] = 0.0
@@ -199,7 +211,7 @@ class StoredSimulations:
         return Moments(mean=plane[:, 0], covariance=left_over.mT @ left_over / freedom)
 
     def kept(self, count: int, *, progress: bool) -> tuple[Tensor, Tensor]:
-        """Return stored pairs, at random: they may be in some order."""
+        """Return stored pairs, chosen at random because they may be sorted."""
         with seeded(0):
             chosen = torch.randperm(len(self.x))[:count].to(self.x.device)
         return self.theta[chosen], self.x[chosen]
@@ -223,14 +235,15 @@ def draw_targets(
     num_neighbors: int,
     progress: bool,
 ) -> Tensor:
-    r"""Return where tuning moves some pairs, :math:`E_\varepsilon[h(S(\theta_i))]`.
+    r"""Return the targets of the tuning, :math:`E_\varepsilon[h(S(\theta_i))]`.
 
     Args:
-        source: Where simulations come from.
+        source: The source of simulations.
         theta: Parameters of the pairs, shape ``(n, d)``.
         embed: The embedding h.
-        simulations_per_target: Simulations behind each, made by a simulator.
-        num_neighbors: Stored simulations behind each.
+        simulations_per_target: The number of simulations that a simulator makes for
+            each target.
+        num_neighbors: The number of stored simulations for each target.
         progress: Whether to show the progress of slow simulations.
 
     Returns:
@@ -258,7 +271,7 @@ def draw_targets(
 
 
 def warn_of_dropped(dropped: int, total: int, what: str) -> None:
-    """Warn of simulations that are left out, if there are any."""
+    """Warn if simulations were dropped."""
     if dropped:
         warn_user(
             f"Dropped {dropped} of {total} {what} because they contain NaN or Inf."

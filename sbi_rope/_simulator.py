@@ -1,4 +1,4 @@
-"""A user's simulator: what it takes and returns is found out before it is trusted."""
+"""A user's simulator: what it takes and returns is found out before it is used."""
 
 import random
 import time
@@ -29,17 +29,18 @@ from sbi_rope.errors import (
 
 __all__ = ["Simulator", "source_of"]
 
-# Simulations held in memory before they are embedded; few if they come one by one, so
-# that a slow simulator shows its progress.
+# Simulations that are held in memory before they are embedded. If they come one by one
+# there are few, so that a slow simulator shows its progress.
 BATCHED_CHUNK, SINGLE_CHUNK = 1000, 10
-# Seconds of work before it deserves a progress bar.
+# A progress bar appears after this many seconds.
 DELAY = 2.0
-# Entries of simulations kept for training on them; fewer are drawn if each is large.
+# The largest number of entries of simulations kept for training. If each simulation is
+# large, fewer are drawn.
 MAX_KEPT = 2**27
-# Simulations of one theta beside others, and the p-value below which they are not the
-# same as beside these.
+# To find out whether rows depend on each other, a theta is simulated this often beside
+# other rows. Below this p-value the simulations are of different distributions.
 NUM_COMPARED, DIFFERENT = 50, 1e-6
-# Seconds that this may take. A simulator that needs longer is not compared.
+# The comparison may take this many seconds. Slower simulators are not compared.
 LONGEST = 5.0
 
 
@@ -68,7 +69,7 @@ class Simulator:
         self.like = like
         self.num_dropped = 0
         self._kept: dict[int, tuple[Tensor, Tensor]] = {}
-        # The probe has its own random numbers: seeded results do not depend on it.
+        # The probe has a seed of its own, so that no result depends on it.
         with seeded(0):
             self.is_batched = self._probe()
 
@@ -106,7 +107,7 @@ class Simulator:
     def moments(
         self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
     ) -> Moments:
-        """Simulate ``count`` times at each theta; of a single one the variance is 0."""
+        """Simulate ``count`` times at each theta; with one the covariance is zero."""
         embedded, valid = self._repeat_at(theta, count, embed, progress=progress)
         number = valid.sum(dim=1)[:, None]
         embedded = embedded.double().where(valid[..., None], 0.0)
@@ -118,10 +119,10 @@ class Simulator:
         )
 
     def kept(self, count: int, *, progress: bool) -> tuple[Tensor, Tensor]:
-        """Simulate at parameters from the prior once, for all who ask for as many."""
+        """Simulate at parameters from the prior once, and keep the simulations."""
         count = min(count, max(1, MAX_KEPT // self.event_shape.numel()))
         if count not in self._kept:
-            # Under a seed of its own, so that nothing depends on who asked first.
+            # With a seed of their own, they do not depend on who asks first.
             with seeded(0):
                 self._kept[count] = self.from_prior(
                     count, count, lambda x: x, progress=progress
@@ -140,7 +141,7 @@ class Simulator:
         self.num_dropped += dropped
         empty = ~valid.any(dim=1)
         if empty.any():
-            # Not the numbers of rows: these may be a part of the pairs.
+            # Row numbers would mislead, because these may be some of the pairs only.
             first = theta[empty][:5].tolist()
             raise SimulationError(
                 f"All simulations at the calibration parameters {first} contain NaN or "
@@ -160,7 +161,8 @@ class Simulator:
             x = self(part)
             bar.update(len(part))
             ok = torch.isfinite(x).flatten(1).all(dim=1)
-            # Embedding nets may refuse NaN: give them zeros, which are dropped later.
+            # Embedding nets may raise on NaN. They get zeros instead, and these rows
+            # are dropped later.
             ok_shape = (-1,) + (1,) * (x.ndim - 1)
             embedded = embed(x.where(ok.reshape(ok_shape), 0.0))
             statistics.append(embedded)
@@ -171,7 +173,7 @@ class Simulator:
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate, theta ``(n, d)`` to x ``(n, *event)``; x may contain NaN."""
-        # A simulator may change its argument, or hand out the same memory twice.
+        # A simulator may change its argument, or return the same memory twice.
         theta = theta.clone()
         try:
             if self.is_batched:
@@ -212,7 +214,7 @@ class Simulator:
     def _probe(self) -> bool:
         """Find out whether the simulator takes a batch or a single theta."""
         sizes = {*self.prior.event_shape, *self.event_shape}
-        # A number of rows that cannot be mistaken for a number of parameters.
+        # The number of rows differs from the numbers of parameters and of readings.
         count = next(n for n in range(3, 3 + len(sizes) + 1) if n not in sizes)
         draws = self.prior.sample(torch.Size((2 * count - 1,))).to(self.like)
         theta = draws[:1].repeat(count, 1)
@@ -225,16 +227,16 @@ class Simulator:
             one_by_one = self._mixes_rows(x, theta, draws[count - 1 :])
             if one_by_one and not self._is_single(self._attempt(draws[0])):
                 raise SimulationError(
-                    "Expected `simulator` to return x (n, *event) whose rows depend "
-                    "each on the same row of theta (n, d) only; what it returns for a "
-                    "row changes with the other rows."
+                    "Expected `simulator` to return x (n, *event) in which each row "
+                    "depends on the same row of theta (n, d) only; what it returns for "
+                    "a row changes with the other rows."
                 )
             if one_by_one:
                 warn_user(
                     "`simulator` returns something else for a row of a batch than for "
-                    "the same theta alone: its rows depend on each other. It is called "
-                    "with one theta at a time. If it should take batches, let each "
-                    "row of x depend on the same row of theta only."
+                    "the same theta alone: its rows depend on each other. It is "
+                    "therefore called with one theta at a time. If it should take "
+                    "batches, let each row of x depend on the same row of theta only."
                 )
             return not one_by_one
         single, state = self._attempt_under(0, theta[0])
@@ -266,30 +268,31 @@ class Simulator:
             )
 
     def _mixes_rows(self, x: Any, theta: Tensor, others: Tensor) -> bool:
-        """Tell whether a simulator for one theta has survived a batch of them.
+        """Tell whether the rows of simulations of a batch depend on each other.
 
-        Such as ``lambda theta: theta * theta.norm()``, whose rows depend on each other.
+        An example is ``lambda theta: theta * theta.norm()``, which is meant for one
+        theta, but also accepts a batch.
 
         Args:
             x: What the simulator returns for theta under seed 0.
             theta: Parameters, shape ``(n, d)``.
-            others: Other parameters, shape ``(n, d)``, to stand beside a row of theta.
+            others: Other parameters, shape ``(n, d)``.
         """
-        # The first row and the last, each beside others than before.
+        # The first row and the last row, each among other rows than before.
         batches = [theta, torch.cat([theta[:1], others[1:]])]
         batches.append(torch.cat([others[:-1], theta[-1:]]))
         rows = ((0, 1), (-1, 2))
         start = time.perf_counter()
         xs: list[Any] = [x, *(self._attempt_under(0, b)[0] for b in batches[1:])]
         seconds = (time.perf_counter() - start) / len(batches[1:])
-        # What fails here, fails with a clear message when it is called.
+        # A simulator that fails here raises a clear error when it is used.
         if not all(self._is_batch(x, len(theta)) for x in xs):
             return False
         if all(_is_close(xs[0][row], xs[k][row]) for row, k in rows):
             return False
-        # The rows may depend on each other, or only take other random numbers, as where
-        # draws are rejected or the simulator has a generator of its own. Then they are
-        # drawn from the same distribution.
+        # Either the rows depend on each other, or they only get other random numbers,
+        # for example because draws are rejected, or because the simulator has a
+        # generator of its own. In the second case their distribution is the same.
         if 4 * NUM_COMPARED * seconds > LONGEST:
             return False
         many = [[self._attempt(b) for _ in range(NUM_COMPARED)] for b in batches]
@@ -303,7 +306,7 @@ class Simulator:
         return any(_is_different(*pair) for pair in pairs)
 
     def _attempt_under(self, seed: int, theta: Tensor) -> tuple[Any, _State]:
-        """Simulate under a seed; return the state of the random numbers after, too."""
+        """Simulate under a seed; also return the random states afterwards."""
         with seeded(seed):
             x = self._attempt(theta)
             of_numpy: Any = np.random.get_state()  # noqa: NPY002
@@ -318,10 +321,10 @@ class Simulator:
 
         Args:
             theta: Parameters.
-            after_zero: The state of the random numbers after a call under seed 0.
+            after_zero: The random states after a call under seed 0.
         """
         _, after_one = self._attempt_under(1, theta)
-        # Whoever uses no random numbers leaves the states that the seeds set.
+        # A simulator that sets no seed leaves different states after different seeds.
         if any(a == b for a, b in zip(after_zero, after_one, strict=True)):
             warn_user(
                 "`simulator` sets the seed of the random numbers itself, so that every "
@@ -332,7 +335,7 @@ class Simulator:
         """Return a copy of what the simulator returns, or the error it raises."""
         try:
             x = self.function(theta.clone())
-        except Exception as error:  # any error of user code is an answer here
+        except Exception as error:  # any error of the user's code is a result here
             return error
         return x.clone() if _holds_numbers(x) else x
 
@@ -348,7 +351,7 @@ def source_of(
     event_shape: torch.Size,
     like: Tensor,
 ) -> SimulationSource:
-    """Return where simulations come from: a simulator, or stored ones.
+    """Return the source of simulations: a simulator, or stored simulations.
 
     Args:
         prior: The prior, from which parameters are drawn.
@@ -378,7 +381,7 @@ def source_of(
 
 
 def _holds_numbers(x: Any) -> bool:
-    """Tell whether a result is a tensor that can be computed with."""
+    """Tell whether a result is a tensor with plain numbers."""
     return (
         isinstance(x, Tensor)
         and x.layout == torch.strided
@@ -389,7 +392,8 @@ def _holds_numbers(x: Any) -> bool:
 def _is_close(a: Tensor, b: Tensor) -> bool:
     """Tell whether two simulations are about the same.
 
-    Rounding and the steps of an adaptive solver may depend on the other rows.
+    They need not be equal, because rounding, and the steps of an adaptive solver, may
+    depend on the other rows.
     """
     a, b = a.double(), b.double()
     scale = float(a.nan_to_num(0.0, 0.0, 0.0).abs().max())
@@ -397,10 +401,10 @@ def _is_close(a: Tensor, b: Tensor) -> bool:
 
 
 def _is_different(a: Tensor, b: Tensor) -> bool:
-    """Tell whether two sets of simulations are of different distributions.
+    """Tell whether two sets of simulations have different distributions.
 
-    By Kolmogorov and Smirnov's test in each entry, where the medians differ by more
-    than rounding.
+    Each entry whose medians differ by more than rounding is compared by the
+    Kolmogorov-Smirnov test.
     """
     a, b = a.flatten(1).double(), b.flatten(1).double()
     middle_a, middle_b = a.nanmedian(dim=0).values, b.nanmedian(dim=0).values

@@ -24,16 +24,15 @@ __all__ = ["EmbeddedBatch", "check_converged", "parameters_named"]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class EmbeddedBatch:
-    r"""Real observations and simulations, each as its embedding.
+    r"""The embeddings of real observations and of simulations.
 
-    It is what :meth:`RoPE.embed <sbi_rope.RoPE.embed>` returns, and what the coupling
-    sees.
+    :meth:`RoPE.embed <sbi_rope.RoPE.embed>` returns it, and it can be coupled.
 
     Attributes:
         x_o: The observations, shape ``(n_o, *event)``.
         real: Their embeddings :math:`g(x_o)`, shape ``(n_o, l)``.
         theta: The parameters of the simulations, shape ``(n_s, d)``.
-        simulated: The embeddings :math:`h(x_s)` of these, shape ``(n_s, l)``.
+        simulated: The embeddings :math:`h(x_s)` of the simulations, shape ``(n_s, l)``.
         npe: The NPE that the embeddings belong to.
         embedding_net: g, or h if nothing was tuned.
     """
@@ -54,8 +53,8 @@ class EmbeddedBatch:
                 <sbi_rope.SinkhornCoupler.couple>`.
 
         Raises:
-            CouplingError: If the embeddings cannot be coupled; it names the parameters
-                of the simulations concerned.
+            CouplingError: If the embeddings cannot be coupled. It names the parameters
+                of the simulations that are to blame.
         """
         with parameters_named(self.theta):
             return coupler.couple(self.real, self.simulated, seed=seed)
@@ -68,14 +67,14 @@ class EmbeddedBatch:
         taus: Sequence[float],
         seed: int | None = None,
     ) -> Iterator[Coupling]:
-        """Couple at every gamma and every tau, each when it is asked for.
+        """Couple at every gamma and every tau, each coupling when it is needed.
 
         Args:
             coupler: Settings other than gamma and tau.
             gammas: As in :meth:`SinkhornCoupler.sweep
-                <sbi_rope.SinkhornCoupler.sweep>`.
-            taus: As there.
-            seed: As there.
+                <sbi_rope.SinkhornCoupler.sweep>`, and so are the others.
+            taus: Values of tau.
+            seed: Seed of the choice of ``num_fitted`` observations.
 
         Raises:
             InvalidInputError: If a gamma or tau is outside its range, or there is none.
@@ -106,11 +105,11 @@ class EmbeddedBatch:
             coupling: What :meth:`couple` returned.
             unseen: As in :meth:`~sbi_rope.RoPE.build_posterior`.
             tail_mass: As in :meth:`~sbi_rope.RoPE.build_posterior`.
-            shared: What posteriors of the same simulations may share, see
-                :class:`~sbi_rope.MixturePosterior`.
+            shared: A dictionary that posteriors of the same simulations may share, as
+                in :class:`~sbi_rope.MixturePosterior`.
         """
-        # Each posterior has its own net and density: moving one to another device
-        # leaves the others where they are.
+        # Each posterior has copies of its own of net and density. Moving one to another
+        # device then leaves the others where they are.
         net = CoupledNet(copy.deepcopy(self.embedding_net), [coupling])
         mixing = CoupledEmbeddings(self.simulated, self.x_o, [net], unseen=unseen)
         mixture = MixtureEstimator(
@@ -126,9 +125,10 @@ class EmbeddedBatch:
 
 @contextmanager
 def parameters_named(theta: Tensor) -> Iterator[None]:
-    """Say which observations and simulations a coupling failed for, in RoPE's words.
+    """Rephrase errors of a coupling in the terms that a user of RoPE knows.
 
-    The rows of simulations mean nothing to users, for whom they were drawn.
+    Users do not know the rows of the simulations, because RoPE has drawn them. The
+    error names their parameters instead.
 
     Args:
         theta: The parameters of the simulations, shape ``(n_s, d)``.

@@ -35,18 +35,18 @@ from sbi_rope.errors import InvalidInputError
 
 __all__ = ["CalibrationFinetuner", "FinetuneResult", "History"]
 
-# Simulations to rehearse with, and how many of them in each epoch.
+# The number of simulations to rehearse with, and how many of them each epoch uses.
 NUM_REHEARSED = 2000
 REHEARSED_IN_EPOCH = 50
 
 
 @dataclass(frozen=True, eq=False)
 class FinetuneResult:
-    """The fine-tuned embedding net and how it came about.
+    """The fine-tuned embedding net and the course of its training.
 
     Attributes:
         embedding_net: :math:`g`, in evaluation mode.
-        history: Losses and the epoch that was kept.
+        history: The losses, and the epoch that was kept.
     """
 
     embedding_net: nn.Module
@@ -65,17 +65,16 @@ class CalibrationFinetuner:
         \Bigr\rVert_2,
 
     starting from g = h, with Adam on all training pairs at once. A fifth of the pairs
-    is held out, pairs of the same parameters together; the g that does best on them is
-    kept, and the starting point competes, so that tuning never returns something worse
-    than it started from on the hold-out.
+    is held out; pairs of the same parameters are held out together. Of all epochs,
+    including the start, the g with the smallest loss on the held-out pairs is kept. On
+    these pairs, tuning therefore never makes g worse than h.
 
     With ``rehearsal`` :math:`\lambda > 0` it also minimises, over simulations from the
     prior, :math:`\lambda\, \mathbb{E} \lVert g(x_s) - h(x_s) \rVert_2`, which is not in
-    the paper. In the terms of continual learning this is rehearsal with feature
-    distillation: the old net teaches the new one on the old data, so that g does not
-    forget where h puts simulations. It helps where a large net is tuned on few pairs;
-    ``docs/benchmark.md`` says where it helps and where it costs. Held-out pairs are
-    judged by their distance alone.
+    the paper. In continual learning this is called rehearsal with feature distillation:
+    g learns from h on simulations, so that it does not forget how h embeds them. It
+    helps if a large net is tuned on few pairs; ``docs/benchmark.md`` says where it
+    helps and where it does harm. The loss on the held-out pairs does not contain it.
 
     The net is tuned in evaluation mode (no dropout, fixed batch statistics). If h has
     no trainable parameters, because NPE was trained without an embedding net, g is h
@@ -89,24 +88,25 @@ class CalibrationFinetuner:
         | https://arxiv.org/abs/1606.09282
 
     Args:
-        learning_rate: Step size of Adam. Of several, each is tried from the start, and
-            the net that is best on the held-out pairs is kept. Without a hold-out a
-            deep embedding net is tuned with the smallest rate and an affine map with
-            the largest, which is what suits them best.
-        max_num_epochs: Most epochs. Each is one gradient step over all training pairs.
-        stop_after_epochs: Epochs without a new best on the held-out pairs after which
-            to stop.
-        simulations_per_target: Simulations that each expectation is the mean of. With
-            one, as in the paper, g is pulled to the noise of single simulations.
+        learning_rate: The step size of Adam. If there are several, a net is tuned with
+            each of them, and the one with the smallest loss on the held-out pairs is
+            kept. With too few pairs for a hold-out, an embedding net is tuned with the
+            smallest rate and an affine map with the largest, which suits them best.
+        max_num_epochs: The largest number of epochs. Each is one gradient step over all
+            training pairs.
+        stop_after_epochs: Training stops after this many epochs without a smaller loss
+            on the held-out pairs.
+        simulations_per_target: The number of simulations in the mean that estimates
+            each expectation. With 1, as in the paper, g is pulled towards the noise of
+            single simulations.
         resample_targets: Whether to draw new simulations in every epoch, as the paper
-            does, instead of one bank before the first. This costs ``max_num_epochs``
-            times the simulations.
-        num_neighbors: With stored simulations in the place of a simulator, the
-            expectation is the mean over so many simulations with the nearest
+            does, instead of once before the first. This takes ``max_num_epochs`` times
+            as many simulations.
+        num_neighbors: With stored simulations instead of a simulator, the expectation
+            is estimated by the mean over this many simulations with the nearest
             parameters.
-        validation_fraction: Share of the pairs that is held out.
-        rehearsal: :math:`\lambda`, the weight of keeping simulations where they are.
-            The default is 0, as in the paper.
+        validation_fraction: The share of the pairs that is held out, in (0, 0.5].
+        rehearsal: :math:`\lambda`, not negative. The default is 0, as in the paper.
 
     Raises:
         InvalidInputError: If an argument is outside its range.
@@ -156,20 +156,21 @@ class CalibrationFinetuner:
         seed: int | None = None,
         show_progress_bars: bool = True,
     ) -> FinetuneResult:
-        """Tune a copy of the embedding net; the net itself is left as it is.
+        """Tune a copy of the embedding net; the net itself does not change.
 
         Args:
             embedding_net: h, a module from ``(n, *event)`` to ``(n, l)``.
             x: Real observations of the calibration set, shape ``(n_c, *event)``.
-            draw_targets: Given a number of simulations k, returns the mean embedding
-                of k simulations for each pair, shape ``(n_c, l)``.
-            draw_simulations: Given a number of simulations k, returns up to k from
-                the prior, shape ``(k, *event)``; only called for ``rehearsal``.
+            draw_targets: A function of a number k that returns the mean embedding of k
+                simulations for each pair, shape ``(n_c, l)``.
+            draw_simulations: A function of a number k that returns up to k simulations
+                from the prior, shape ``(k, *event)``. It is only called for
+                ``rehearsal``.
             groups: A number for each pair, shape ``(n_c,)``. Pairs with the same
                 number, such as recordings of one person, are held out together. None
-                if all pairs are of different parameters.
+                if all pairs have different parameters.
             seed: Seed of the split and of the simulations; None uses torch's state.
-            show_progress_bars: Whether to show the course of the loss.
+            show_progress_bars: Whether to show the losses during training.
 
         Returns:
             The tuned net and its history.
@@ -220,7 +221,7 @@ class CalibrationFinetuner:
     def _rehearsed(
         self, h: nn.Module, draw_simulations: Callable[[int], Tensor] | None
     ) -> tuple[Tensor, Tensor] | None:
-        """Return simulations and where h puts them; None without rehearsal."""
+        """Return simulations and their embeddings by h; None without rehearsal."""
         if not self.rehearsal:
             return None
         if draw_simulations is None:
@@ -320,7 +321,7 @@ def _checked_inputs(name: str, x: Any, net: nn.Module) -> Tensor:
     known = itertools.chain(net.parameters(), net.buffers())
     dtypes = [values.dtype for values in known if values.is_floating_point()]
     x = x.detach().to(dtypes[0] if dtypes else torch.float32)
-    check_finite(name, x)  # the dtype may hold less
+    check_finite(name, x)  # numbers that this dtype cannot hold have become Inf
     return x
 
 
@@ -329,8 +330,8 @@ def _embedded(name: str, x: Tensor, net: nn.Module) -> Tensor:
         return embed(net, x)
     except RuntimeError as error:
         raise InvalidInputError(
-            f"Expected `{name}` of a shape and on a device that the embedding net can "
-            f"take; it raised for {tuple(x.shape)} on {x.device}: {error}"
+            f"Expected `{name}` of a shape and on a device that the embedding net "
+            f"takes; for {tuple(x.shape)} on {x.device} it raised: {error}"
         ) from error
 
 
@@ -349,7 +350,7 @@ def _checked_groups(groups: Tensor | None, x: Tensor) -> Tensor:
 
 
 def _checked_targets(targets: Tensor, embedded: Tensor) -> Tensor:
-    """Return targets that have the shape of the embeddings, and no other that fits."""
+    """Return targets that have exactly the shape of the embeddings."""
     targets = check_tensor("targets", targets)
     if targets.shape != embedded.shape:
         raise InvalidInputError(

@@ -1,4 +1,4 @@
-"""Robust posterior estimation: the conductor of its three steps."""
+"""Robust posterior estimation: the class that runs its three steps."""
 
 import copy
 from collections.abc import Callable
@@ -34,7 +34,7 @@ from sbi_rope.mixture import MixturePosterior
 
 __all__ = ["RoPE"]
 
-# Simulations to couple with when the batch is smaller than this.
+# The number of simulations to couple with if the batch has fewer observations.
 MIN_SIMULATIONS = 1000
 
 
@@ -43,15 +43,17 @@ class RoPE:
 
     An NPE posterior is :math:`q(\theta \mid h(x))`, trained on simulations. RoPE
 
-    1. tunes a copy g of h so that :math:`g(x_o)` lands where h puts simulations with
-       the same parameters (:meth:`train`; needs calibration pairs);
+    1. tunes a copy g of h so that :math:`g(x_o)` comes close to the embeddings that h
+       gives to simulations with the same parameters (:meth:`train`; needs calibration
+       pairs);
     2. couples a batch of real observations with simulations by optimal transport
        between :math:`g(x_o)` and :math:`h(x_s)`;
     3. returns for each observation the mixture
-       :math:`\sum_j \alpha_{ij}\, q(\theta \mid h(x_{s,j}))` (:meth:`build_posterior`).
+       :math:`\sum_j \alpha_{ij}\, q(\theta \mid h(x_{s,j}))` (:meth:`build_posterior`
+       does steps 2 and 3).
 
-    Without calibration pairs step 1 is skipped, g = h (the paper's "OT-only"). The
-    posterior passed in is copied and never changed.
+    Without calibration pairs step 1 is left out, and g = h (the paper's "OT-only"). The
+    posterior is copied and never changed.
 
     References:
         | Addressing Misspecification in Simulation-based Inference through Data-driven
@@ -60,15 +62,15 @@ class RoPE:
 
     Args:
         posterior: What ``NPE(...).build_posterior()`` returns, or the posterior of
-            MNPE, FMPE or NPSE (the last two have no ``log_prob``). A default x is
-            ignored. The posterior must be amortised: one trained over several rounds
-            fits one observation only, which cannot be recognised here.
+            MNPE, FMPE or NPSE (the last two have no ``log_prob``). Its default x is
+            ignored. It must be amortised. A posterior trained over several rounds fits
+            one observation only; RoPE cannot recognise it, so do not pass one.
         simulator: Maps parameters ``(n, d)`` to simulations ``(n, *event)``, or one
-            ``(d,)`` to one ``(*event)``; simulations with NaN are dropped and counted.
-            A row of x may depend on the same row of theta only, which is tried on some
-            fifteen simulations.
-        simulations: Instead of a simulator, stored pairs (theta, x) drawn from the
-            prior. Fine-tuning then uses those with the nearest parameters.
+            ``(d,)`` to one ``(*event)``. A row of x may depend on the same row of theta
+            only. The simulator is tried on about fifteen parameters to check that.
+            Simulations with NaN or Inf are dropped and counted.
+        simulations: Instead of a simulator, stored pairs (theta, x) with theta drawn
+            from the prior. Fine-tuning then uses those with the nearest parameters.
         finetuner: Settings of step 1; ``CalibrationFinetuner()`` if None.
         coupler: Settings of step 2; ``SinkhornCoupler()`` if None.
 
@@ -123,13 +125,13 @@ class RoPE:
         self.coupler = SinkhornCoupler() if coupler is None else coupler
         self._theta_cal = self._npe.like
         self._x_cal = self._npe.like.new_empty(0, *self._npe.event_shape)
-        # Known beforehand for the folds of a stack, which share their simulations.
+        # The folds of a stack share their simulations, so their targets are known.
         self._targets: Tensor | None = None
         self._g: nn.Module | None = None
         self._history: History | None = None
 
     def append_calibration(self, theta: Tensor, x: Tensor) -> "RoPE":
-        """Add real observations with known parameters; may be called repeatedly.
+        """Add real observations with known parameters to those appended so far.
 
         Args:
             theta: Parameters, shape ``(n, d)``, inside the prior's support.
@@ -140,9 +142,9 @@ class RoPE:
 
         Raises:
             InvalidTypeError: If one of them is not a tensor.
-            InvalidInputError: If shapes, row counts or devices do not fit, a value is
-                not finite, or a theta is outside the prior's support. Nothing is added
-                then.
+            InvalidInputError: If shapes, numbers of rows or devices do not fit, a value
+                is not finite, or a theta is outside the prior's support. Nothing is
+                added then.
         """
         theta, x = self._npe.checked_pairs(theta, x)
         self._npe.embed("x", x, self._npe.h)
@@ -157,18 +159,19 @@ class RoPE:
     ) -> "RoPE":
         """Tune the embedding net on all calibration pairs appended so far.
 
-        Training again starts anew from the embedding net of NPE.
+        Every call starts from the embedding net of NPE.
 
         Args:
             seed: Seed of the simulations and of the hold-out split, for torch, NumPy
                 and Python; None uses their states.
-            show_progress_bars: Whether to show the course of the loss.
+            show_progress_bars: Whether to show the progress of simulations and losses.
 
         Returns:
             Itself, so that calls can be chained.
 
         Raises:
-            NotReadyError: If no calibration pairs were appended, or in inference mode.
+            NotReadyError: If no calibration pairs were appended, or in torch's
+                inference mode.
             SimulationError: If the simulator fails at the calibration parameters.
         """
         check_gradients()
@@ -176,8 +179,8 @@ class RoPE:
         if not len(self._x_cal):
             raise NotReadyError(
                 "No calibration pairs to train on. Call `append_calibration(theta, "
-                "x)` first, or go on to `build_posterior(x_o)`, which then couples "
-                "with the embedding net as NPE left it (OT-only)."
+                "x)` first. Or call `build_posterior(x_o)` without training, which "
+                "then couples with the embedding net of NPE (OT-only)."
             )
         known = None if self.finetuner.resample_targets else self._targets
 
@@ -217,33 +220,33 @@ class RoPE:
     ) -> EmbeddedBatch:
         r"""Return the embeddings of real observations and of simulations.
 
-        Under the same number and seed, the simulations are those that
-        :meth:`build_posterior` couples with.
+        With the same ``num_simulations`` and ``seed``, :meth:`build_posterior` couples
+        with the same simulations.
 
         Args:
             x_o: Real observations, shape ``(n_o, *event)``.
-            num_simulations: n_s; ``max(n_o, 1000)`` if None (or all stored ones, if
-                there are fewer).
+            num_simulations: n_s; ``max(n_o, 1000)`` if None (or all stored
+                simulations, if there are fewer).
             seed: Seed of the simulations, for torch, NumPy and Python; None uses their
                 states.
             show_progress_bars: Whether to show the progress of slow simulations.
 
         Returns:
-            :math:`g(x_o)`, or :math:`h(x_o)` without calibration pairs, and
-            parameters from the prior with :math:`h(x_s)` of a simulation of each.
+            :math:`g(x_o)` (:math:`h(x_o)` without calibration pairs), parameters drawn
+            from the prior, and :math:`h(x_s)` of one simulation at each of them.
             Simulations that are not finite are left out.
 
         Raises:
             NotReadyError: If calibration pairs were appended after the last training.
-            InvalidInputError: If x_o has the wrong shape or device, is empty, or it or
-                its embedding is not finite; or if there are fewer stored simulations
+            InvalidInputError: If x_o has the wrong shape or device or is empty, if it
+                or its embedding is not finite, or if there are fewer stored simulations
                 than asked for.
             SimulationError: If the simulator fails.
         """
         if len(self._x_cal) and self._g is None:
             raise NotReadyError(
-                f"{len(self._x_cal)} calibration pairs were appended but not trained "
-                "on. Call `train()` first."
+                f"{len(self._x_cal)} calibration pairs were appended, and `train()` "
+                "was not called after that. Call `train()` first."
             )
         net = self._npe.h if self._g is None else self._g
         x_o = self._npe.checked_x("x_o", x_o)
@@ -280,21 +283,22 @@ class RoPE:
     ) -> MixturePosterior:
         """Couple a batch of real observations with simulations.
 
-        The trained state is reused: call it for as many batches and couplers as needed.
+        After one training, it can be called for any number of batches and couplers.
         With the same seed the simulations are the same.
 
         Args:
-            x_o: The batch, shape ``(n_o, *event)``. Posteriors depend on the whole
-                batch, and a batch of fewer than 20 earns a warning.
-            coupler: Replaces the coupler of this object for this batch.
-            num_simulations: n_s; ``max(n_o, 1000)`` if None (or all stored ones, if
-                there are fewer).
+            x_o: The batch, shape ``(n_o, *event)``. Each posterior depends on the whole
+                batch. There is a warning if it has fewer than 20 observations.
+            coupler: Settings for this batch; those of this object if None.
+            num_simulations: n_s; ``max(n_o, 1000)`` if None (or all stored
+                simulations, if there are fewer).
             seed: Seed of the simulations, for torch, NumPy and Python; None uses their
                 states.
-            unseen: What the posterior does with an x outside the batch: ``"raise"``,
-                or ``"extend"`` the coupling by one row.
+            unseen: What the posterior does with an x outside the batch: ``"raise"`` an
+                error, or ``"extend"`` the coupling by one row.
             require_convergence: Whether a coupling that has not converged is an error.
-            tail_mass: Share of the weights ``log_prob`` may leave out, in [0, 1].
+            tail_mass: The share of the weights that ``log_prob`` may leave out, in
+                [0, 1].
             show_progress_bars: Whether to show the progress of slow simulations.
 
         Returns:
@@ -326,8 +330,8 @@ class RoPE:
     def tuned_posterior(self) -> Any:
         r"""Return the flow on the tuned embedding, :math:`q(\theta \mid g(x))`.
 
-        The paper's ablation without transport ("tuning-only"), an ordinary sbi
-        posterior for any x.
+        It is the paper's ablation without transport ("tuning-only"), and an ordinary
+        sbi posterior for any x.
 
         Raises:
             NotReadyError: If ``train()`` was not called.
@@ -343,16 +347,16 @@ class RoPE:
         targets: Tensor | None = None,
         finetuner: CalibrationFinetuner | None = None,
     ) -> "RoPE":
-        """Return an untrained RoPE of the same NPE and simulator, with some pairs only.
+        """Return an untrained RoPE with the same NPE and simulator and some pairs only.
 
-        This one is left as it is. The folds of a stack are made in this way.
+        This object does not change. The folds of a stack are made in this way.
 
         Args:
             rows: Numbers of the calibration pairs to keep, shape ``(m,)``.
-            targets: What the embeddings of these pairs are moved to, shape ``(m, l)``,
-                so that :meth:`train` does not simulate again; of no effect if the
-                finetuner draws new ones in every step. Simulated if None.
-            finetuner: Other settings of the tuning; those of this object if None.
+            targets: The targets of the tuning for these pairs, shape ``(m, l)``, so
+                that :meth:`train` does not simulate again. Simulated if None, or if the
+                finetuner draws new targets in every step.
+            finetuner: Settings of the tuning; those of this object if None.
 
         Raises:
             InvalidTypeError: If an argument has the wrong type.
@@ -375,12 +379,12 @@ class RoPE:
 
     @property
     def source(self) -> SimulationSource:
-        """Where simulations come from; copies with other pairs share it."""
+        """The source of simulations; it is shared with :meth:`with_pairs`."""
         return self._source
 
     @property
     def npe(self) -> Any:
-        """A copy of the NPE posterior that is repaired."""
+        """A copy of the NPE posterior that this object repairs."""
         return self._npe.posterior()
 
     @property

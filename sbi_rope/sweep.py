@@ -1,4 +1,4 @@
-"""RoPE at many settings of the coupling."""
+"""Posteriors of RoPE at many settings of the coupling."""
 
 import itertools
 from collections.abc import Iterator, Sequence
@@ -39,16 +39,15 @@ def sweep(
     """Couple a batch at every gamma and every tau, with the same simulations.
 
     The posteriors are those of :meth:`~sbi_rope.RoPE.build_posterior` at each setting,
-    up to the tolerance of the coupler. They take less time: the simulations are drawn
-    and embedded once, their posteriors are normalised once, and each coupling starts
-    from its neighbour (:meth:`SinkhornCoupler.sweep
-    <sbi_rope.SinkhornCoupler.sweep>`).
+    up to the tolerance of the coupler, but take less time. The simulations are drawn
+    and embedded once, the masses of their posteriors inside the prior's support are
+    estimated once, and each coupling starts from its neighbour
+    (:meth:`SinkhornCoupler.sweep <sbi_rope.SinkhornCoupler.sweep>`).
 
     Args:
-        rope: A trained RoPE, or one without calibration pairs; it is left as it is.
-        x_o: As in :meth:`~sbi_rope.RoPE.build_posterior`, and so are the arguments not
-            listed.
-        gammas: Values of gamma; descending ones are handed out soonest.
+        rope: A trained RoPE, or one without calibration pairs. It does not change.
+        x_o: The batch, shape ``(n_o, *event)``.
+        gammas: Values of gamma. If they descend, each posterior is ready at once.
         taus: Values of tau.
         coupler: Settings other than gamma and tau; those of ``rope`` if None.
         num_simulations: As in :meth:`~sbi_rope.RoPE.build_posterior`.
@@ -63,8 +62,8 @@ def sweep(
         second, and so on.
 
     Raises:
-        InvalidInputError: If there is no gamma or tau or one is outside its range, or
-            as in :meth:`~sbi_rope.RoPE.build_posterior`.
+        InvalidInputError: If there is no gamma or tau, one is outside its range, or as
+            in :meth:`~sbi_rope.RoPE.build_posterior`.
         NotReadyError: As in :meth:`~sbi_rope.RoPE.build_posterior`.
         CouplingError: When the iteration reaches a coupling that has not converged.
         SimulationError: If the simulator fails.
@@ -85,7 +84,7 @@ def sweep(
     couplings = batch.sweep(settings, gammas=gammas, taus=taus, seed=seed)
 
     def posteriors() -> Iterator[MixturePosterior]:
-        # In our hands: moving a posterior to a device gives it another.
+        # Moving a posterior to another device gives it a dictionary of its own.
         shared: dict[int, Tensor] = {}
         pairs = itertools.product(gammas, taus)
         for (gamma, tau), coupling in zip(pairs, couplings, strict=True):

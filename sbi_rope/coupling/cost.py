@@ -7,21 +7,22 @@ from sbi_rope._slices import slices
 
 __all__ = ["Cost", "Distances", "row_blocks", "widest"]
 
-# Entries of a block: few enough for the caches of a CPU core, many enough to occupy a
+# Entries of a block: few enough for the caches of a CPU core, and enough to occupy a
 # GPU. Blocks also bound the memory of everything that is not stored.
 CPU_BLOCK, GPU_BLOCK = 2**17, 2**24
 
 
 class Distances:
-    r"""Euclidean distances of any points from fixed ones.
+    r"""Euclidean distances of any points from a fixed set of points.
 
-    By one matrix product, :math:`\lVert a - b \rVert^2 = \lVert a \rVert^2 + \lVert b
-    \rVert^2 - 2 a^\top b` about the centre of the fixed points, in float64. At R from
-    the centre this leaves an error of some 1e-16 R^2 / d in a distance d, and 1e-8 R
-    between points that coincide: less than the rounding of embeddings from a network in
-    float32. Where that is not enough, ``direct`` sums squared differences, which takes
-    1.4 times as long for ten dimensions, and 7 times for 64. On a device without
-    float64 everything is in float32, with errors of 1e-7 R^2 / d and 3e-4 R.
+    They are computed by one matrix product, :math:`\lVert a - b \rVert^2 = \lVert a
+    \rVert^2 + \lVert b \rVert^2 - 2 a^\top b`, relative to the centre of the fixed
+    points and in float64. For points at R from the centre, a distance d then has an
+    error of about 1e-16 R^2 / d, and the distance of equal points one of 1e-8 R. That
+    is less than the rounding of a network's embeddings in float32. Where it is not
+    enough, ``direct`` sums squared differences, which takes 1.4 times as long in ten
+    dimensions and 7 times as long in 64. On a device without float64 everything is in
+    float32, with errors of 1e-7 R^2 / d and 3e-4 R.
 
     Args:
         points: The fixed points, shape ``(n_s, l)``; the distances have their dtype.
@@ -29,7 +30,7 @@ class Distances:
     """
 
     def __init__(self, points: Tensor, *, direct: bool = False) -> None:
-        # The median: a single far point must not move the centre away from the rest.
+        # The median, because a single far point must not move the centre.
         self._wide = widest(points.device)
         self.centre = points.to(self._wide).median(dim=0).values
         self.direct = direct
@@ -37,12 +38,12 @@ class Distances:
         self._dtype = points.dtype
         squares = self._centred.square().sum(dim=1, keepdim=True)
         self._largest_norm = self._centred.norm(dim=1).max()
-        # With rows (-2a, |a|^2, 1), the product is the squared distance.
+        # Their product with rows (-2a, |a|^2, 1) is the squared distance.
         columns = [self._centred, torch.ones_like(squares), squares]
         self._factor = torch.cat(columns, dim=1).T
 
     def __call__(self, points: Tensor, columns: Tensor | None = None) -> Tensor:
-        """Return distances of points ``(n, l)`` from all or some of the fixed ones."""
+        """Return the distances of points ``(n, l)`` from all or some fixed points."""
         centred = points.to(self._wide) - self.centre
         if self.direct:
             fixed = self._centred if columns is None else self._centred[columns]
@@ -54,7 +55,7 @@ class Distances:
         return (rows @ factor).clamp_min_(0).sqrt_().to(self._dtype)
 
     def bound(self, points: Tensor) -> float:
-        """Return a number that no distance from these points exceeds."""
+        """Return an upper bound of the distances of these points."""
         largest = (points.to(self._wide) - self.centre).norm(dim=1).max()
         return float(self._largest_norm + largest)
 
@@ -65,11 +66,11 @@ class Cost:
     Args:
         real: :math:`g(x_o)`, shape ``(n_o, l)``.
         simulated: :math:`h(x_s)`, shape ``(n_s, l)``.
-        stored: Whether to keep the matrix, or compute its blocks whenever asked.
+        stored: Whether to keep the matrix, or compute its blocks at every request.
         direct: Whether to compute distances without a matrix product.
 
     Attributes:
-        bound: No distance is longer.
+        bound: An upper bound of the distances.
     """
 
     def __init__(
@@ -91,7 +92,7 @@ class Cost:
         return len(self.real), len(self.simulated)
 
     def block(self, rows: slice, columns: Tensor | None = None) -> Tensor:
-        """Return some rows, and of these some columns; not to be written to."""
+        """Return some rows, or some columns of these; do not write to them."""
         if self.matrix is None:
             return self._distances(self.real[rows], columns)
         return self.matrix[rows] if columns is None else self.matrix[rows, columns]
@@ -104,7 +105,7 @@ class Cost:
 
 
 def has_float64(device: torch.device) -> bool:
-    """Whether a device can compute in float64; Apple's GPUs cannot."""
+    """Tell whether a device can compute in float64; Apple's GPUs cannot."""
     return device.type != "mps"
 
 

@@ -1,4 +1,4 @@
-"""Semi-balanced entropic optimal transport, as the user sets it up."""
+"""Semi-balanced entropic optimal transport, with its settings."""
 
 import itertools
 from collections.abc import Iterator, Sequence
@@ -27,9 +27,10 @@ from sbi_rope.errors import InvalidInputError, warn_user
 
 __all__ = ["SinkhornCoupler"]
 
-# Below this many observations the balance of the coupling is the balance of a handful.
+# With fewer observations than this, few of them decide how the coupling is balanced.
 SMALL_BATCH = 20
-# Most distances to store: in float64 0.4 GB, and as much again for the kernel.
+# The largest number of distances to store: 0.4 GB in float64, and as much again for the
+# kernel.
 MAX_STORED = 50_000_000
 
 
@@ -46,8 +47,9 @@ class SinkhornCoupler:
         + \gamma\, \langle P, \log P \rangle,
         \qquad \rho = \frac{\gamma \tau}{1 - \tau},
 
-    and returns the rows :math:`\alpha_{ij} = n_o P^\star_{ij}`. Real observations keep
-    their weight exactly; simulations may lose some if ``tau < 1``.
+    and returns the rows :math:`\alpha_{ij} = n_o P^\star_{ij}`. Every real observation
+    has the same weight. With ``tau < 1``, some simulations may have less weight than
+    others.
 
     References:
         | Addressing Misspecification in Simulation-based Inference through Data-driven
@@ -58,29 +60,31 @@ class SinkhornCoupler:
         gamma: Entropic regularisation, positive. A small value gives sharp posteriors,
             and a large one gives the prior. Its unit is that of ``cost_scale``. The
             paper's value is 0.5 with ``cost_scale="none"``.
-        tau: Trust in the prior, in [0, 1]. 1 (the default) uses all simulations
-            equally, as a well-specified prior asks for; 0 lets every observation
-            choose its simulations alone.
+        tau: Trust in the prior, in [0, 1]. With 1 (the default) all simulations are
+            used equally, which is right if the prior is well specified. With 0 every
+            observation chooses its simulations without regard to the others.
         cost_scale: ``"simulated"`` (the default) divides the distances by the median
             distance between simulated embeddings, so that a gamma means the same
             whatever the units of the embedding net. ``"none"`` takes the distances as
             they are, as the paper does.
-        solver: ``"own"`` iterates the simulation-side potential with Anderson
-            acceleration; ``"pot"`` is POT's ``sinkhorn_unbalanced``, with our own
-            solver taking over where its scalings over- or underflow.
-        tolerance: Largest ``marginal_error`` called converged.
-        max_iterations: Iterations after which to stop and say so.
+        solver: ``"own"`` (the default) iterates the simulation-side potential with
+            Anderson acceleration. ``"pot"`` is POT's ``sinkhorn_unbalanced``; our own
+            solver takes over where its scalings over- or underflow.
+        tolerance: The largest ``marginal_error`` that counts as converged.
+        max_iterations: The largest number of iterations. If they are not enough,
+            ``converged`` is False.
         dtype: ``torch.float64`` (the default) or ``torch.float32``, which takes half
             the memory and less time. Devices without float64 (MPS) need
             ``torch.float32``.
-        blocked: Whether to compute the distances anew, block by block, in every
-            iteration, so that no matrix of size n_o x n_s is ever held: slower, but
-            its memory does not grow with n_o n_s. None (the default) does so for more
-            than 50 million distances (7,000 observations and as many simulations).
-        num_fitted: Fit the potential to so many observations, chosen at random; None
-            (the default) fits it to all. ``batch_error`` tells what that costs.
-        anderson_memory: Last steps that Anderson acceleration combines; 0 switches it
-            off.
+        blocked: Whether to compute the distances again in every iteration, block by
+            block. That is slower, but no matrix of size n_o x n_s is ever held. None
+            (the default) does so for more than 50 million distances (7,000 observations
+            and as many simulations).
+        num_fitted: The number of observations, chosen at random, that the potential is
+            fitted to; None (the default) fits it to all. ``batch_error`` of the
+            coupling tells how far off it then is over the whole batch.
+        anderson_memory: The number of last steps that Anderson acceleration combines; 0
+            switches it off.
 
     Raises:
         InvalidInputError: If an argument is outside its range.
@@ -138,18 +142,18 @@ class SinkhornCoupler:
                 state.
 
         Returns:
-            The coupling with the evidence of its convergence, on the device of the
-            embeddings. ``converged`` is False if the tolerance was not met.
+            The coupling, on the device of the embeddings. Its ``converged`` is False if
+            the tolerance was not met.
 
         Raises:
             InvalidInputError: If the shapes do not fit, a set is empty, a value is
                 not finite, or the device of the embeddings has no float64 but
                 ``dtype`` asks for it.
-            CouplingError: If the distances overflow, gamma is too small for their
-                digits, or with ``cost_scale="simulated"`` the median distance between
-                simulations is zero.
+            CouplingError: If the distances overflow, gamma is too small for the digits
+                of the dtype, or with ``cost_scale="simulated"`` the median distance
+                between simulations is zero.
         """
-        # A single solution of our own needs the distances hardly more than once.
+        # Our own solver needs the distances about once for a single solution.
         problem, scale = self._set_up(
             real, simulated, seed, gamma=self.gamma, reused=self.solver == "pot"
         )
@@ -166,26 +170,28 @@ class SinkhornCoupler:
     ) -> Iterator[Coupling]:
         r"""Couple the same embeddings at every gamma and every tau.
 
-        Takes fewer iterations than to couple anew at each: the solutions at one gamma
-        start from those at larger ones, by way of :math:`\gamma w`, the potential in
-        units of the cost. The coupler's own gamma and tau are not used.
+        This takes fewer iterations than separate calls of :meth:`couple`, because the
+        solution at one gamma starts from those at larger ones: :math:`\gamma w`, the
+        potential in units of the cost, changes slowly with gamma. The coupler's own
+        gamma and tau are not used.
 
         Args:
             real: As in :meth:`couple`.
             simulated: As in :meth:`couple`.
             gammas: Values of gamma, in any order.
             taus: Values of tau, in any order.
-            seed: As in :meth:`couple`; all settings are fitted to the same choice.
+            seed: As in :meth:`couple`. All settings are fitted to the same
+                observations.
 
         Returns:
-            An iterator over the couplings in the order asked for: all taus of the first
-            gamma, then of the second, and so on. They are computed as the iteration
-            goes, and from large to small gamma, so that ascending gammas have to wait
-            for the last.
+            An iterator over the couplings in the order of the arguments: all taus of
+            the first gamma, then of the second, and so on. Each coupling is computed
+            when it is needed, and from large to small gamma. If the gammas ascend, the
+            first coupling therefore has to wait for all others.
 
         Raises:
-            InvalidInputError: If a gamma or tau is outside its range, there is none,
-                or as in :meth:`couple`.
+            InvalidInputError: If there is no gamma or tau, one is outside its range, or
+                as in :meth:`couple`.
             CouplingError: As in :meth:`couple`.
         """
         gammas, taus = check_numbers("gammas", gammas), check_numbers("taus", taus)
@@ -201,7 +207,7 @@ class SinkhornCoupler:
     def _sweep(
         self, problem: Problem, scale: float, settings: list[tuple[float, float]]
     ) -> Iterator[Coupling]:
-        # All taus of a gamma in a row: they share the kernel.
+        # All taus of one gamma follow each other, because they share the kernel.
         path = iter(sorted(set(settings), reverse=True))
         start = problem.zero_potential()
         potentials: dict[tuple[float, float], Tensor] = {}
@@ -213,7 +219,8 @@ class SinkhornCoupler:
                     problem, gamma * scale, warm_start(potentials, gamma, tau, start)
                 )
                 potentials[gamma, tau] = waiting[gamma, tau].potential
-            # What was handed out is the caller's to keep, with the weights it may hold.
+            # A coupling may hold its weights. It is not kept here after it was yielded,
+            # unless it is asked for again.
             again = setting in settings[position + 1 :]
             yield waiting[setting] if again else waiting.pop(setting)
 
@@ -258,14 +265,14 @@ class SinkhornCoupler:
         if num_fitted < n_o:
             warn_user(
                 f"The coupling is fitted to num_fitted={num_fitted} of {n_o} real "
-                "observations, and balances the prior over these few. Use a num_fitted "
-                f"of at least {SMALL_BATCH}, or None for all."
+                "observations. These few decide how much weight each simulation gets. "
+                f"Use a num_fitted of at least {SMALL_BATCH}, or None for all."
             )
             return
         consequence = (
             "its row is uniform and the posterior is the prior. "
             if n_o == 1 and self.tau == 1.0
-            else "the coupling balances the prior over these few observations. "
+            else "these few decide how much weight each simulation gets. "
         )
         warn_user(
             f"Coupling a batch of {n_o} real observation(s), tau={self.tau}: "

@@ -1,11 +1,11 @@
 r"""Our own solver of the semi-balanced problem: an accelerated fixed point.
 
-With hard rows the whole state is the simulation-side log-potential w, and its optimum
-is the fixed point of
+The weight of each real observation is fixed, so the simulation-side log-potential w
+determines the whole coupling. The best w is the fixed point of
 
 .. math:: T(w) = \tau (w + \log b - \log q(w)),
 
-up to a constant, which changes no row. T is the Sinkhorn iteration of the problem; for
+up to a constant, which changes no row. T is the Sinkhorn iteration of the problem. For
 tau < 1 it is a contraction in the supremum norm with factor tau.
 """
 
@@ -22,18 +22,18 @@ __all__ = ["Solution", "solve_fixed_point"]
 
 # An accelerated step is taken back if its error exceeds the last one by this factor.
 LARGEST_GROWTH = 2.0
-# Accelerated steps without a new best error before plain ones are made instead, and
-# how many of these the first time.
+# After PATIENCE accelerated steps without a new best error, plain steps are made
+# instead: FIRST_PAUSE of them the first time.
 PATIENCE, FIRST_PAUSE = 100, 50
 # Keeps the least-squares problem of nearly parallel differences solvable.
 RIDGE = 1e-10
-# So many iterations without a new best error, and an error of so many roundings, mean
-# that the digits are exhausted.
+# The digits are exhausted after STALLED iterations without a new best error, if the
+# error is below ROUNDINGS rounding errors.
 STALLED, ROUNDINGS = 500, 100.0
 
 
 class Solution(NamedTuple):
-    """A potential with the evidence for it."""
+    """A potential, its marginal error, and the iterations it took."""
 
     potential: Tensor
     marginal_error: float
@@ -52,22 +52,24 @@ def solve_fixed_point(
 ) -> Solution:
     r"""Iterate w to the fixed point, accelerated by Anderson's method.
 
-    The next iterate is the combination of the images of the last ``memory`` + 1 ones
-    whose residuals T(w) - w, combined alike, are smallest. Where that makes the
-    marginal error grow, the plain step T(w) is made instead and the memory forgotten;
-    where it makes no progress for long, the plain iteration takes over for a while.
+    The next iterate combines the images T(w) of the last ``memory`` + 1 iterates, with
+    the coefficients that make the same combination of the residuals T(w) - w smallest.
+    If that makes the marginal error grow, the plain step T(w) is made instead, and the
+    memory is cleared. If it makes no progress for long, the plain iteration takes over
+    for a while.
 
     Args:
         kernel: Returns log q of a potential.
-        start: The first potential, shape ``(n_s,)``, float64 where the device has it.
-        tau: In (0, 1].
-        tolerance: Marginal error to reach.
-        max_iterations: Most evaluations of the kernel.
-        memory: Differences to remember; 0 for the plain iteration.
-        eps: Relative rounding error of the kernel.
+        start: The first potential, shape ``(n_s,)``, float64 if the device has it.
+        tau: The trust in the prior, in (0, 1].
+        tolerance: The marginal error to reach.
+        max_iterations: The largest number of evaluations of the kernel.
+        memory: The number of differences to remember; 0 for the plain iteration.
+        eps: The relative rounding error of the kernel.
 
     Returns:
-        The best potential seen, with mean zero, its error, and the evaluations made.
+        The potential with the smallest error, shifted to mean zero, its error, and the
+        number of evaluations.
     """
     log_b = -math.log(len(start))
     potential = start - start.mean()
@@ -88,14 +90,14 @@ def solve_fixed_point(
 
 
 class _Steps:
-    """Accelerated steps, with plain ones where acceleration does not help."""
+    """Accelerated steps, and plain steps where acceleration does not help."""
 
     def __init__(self, memory: int, start: Tensor) -> None:
         self._history = _History(memory, start)
         self._best_error = self._last_error = math.inf
         self._without_progress = 0
         self._plain_left, self._pause = 0, FIRST_PAUSE
-        # Where to go if the last step, accelerated, proves bad; None after a plain one.
+        # Where to go if the last, accelerated step proves bad; None after a plain step.
         self._instead: Tensor | None = None
         # Where to go if acceleration makes no progress.
         self._anchor = start
@@ -103,8 +105,8 @@ class _Steps:
     def next(self, potential: Tensor, image: Tensor, error: float) -> Tensor:
         """Return the next potential after one with this image and error."""
         self._without_progress += 1
-        # Plain steps may have to move the potential far before the error falls, so that
-        # the end of a plain phase counts as progress too.
+        # Plain steps may have to move the potential far before the error falls. The end
+        # of a phase of plain steps therefore counts as progress, too.
         if error < self._best_error or self._plain_left == 1:
             self._best_error = min(error, self._best_error)
             self._without_progress, self._anchor = 0, image
@@ -131,7 +133,7 @@ class _History:
     """The last iterates and residuals, and Anderson's combination of them."""
 
     def __init__(self, memory: int, like: Tensor) -> None:
-        # Differences of images and residuals, the oldest overwritten first.
+        # Differences of images and of residuals. The oldest are overwritten first.
         self._image_steps = like.new_zeros(memory, len(like))
         self._residual_steps = like.new_zeros(memory, len(like))
         self.clear()

@@ -1,11 +1,11 @@
-r"""The column marginal of a potential, in scaling form.
+r"""The column marginal of a potential, by products with an exponentiated matrix.
 
 For a simulation-side log-potential :math:`w` the rows of the coupling are
 
 .. math:: \alpha_{ij} = \frac{\kappa_{ij}}{\sum_k \kappa_{ik}}, \qquad
     \kappa_{ij} = e^{w_j - C_{ij} / \gamma - m_i},
 
-whatever :math:`m_i`, and their mean is :math:`q`.
+with any :math:`m_i`. The mean of the rows is the column marginal :math:`q`.
 """
 
 import math
@@ -20,13 +20,14 @@ __all__ = ["Kernel", "marginal_error"]
 
 
 class _Range(NamedTuple):
-    """What a dtype can carry."""
+    """The exponents that a dtype can hold."""
 
-    # Exponents are raised to this: denormal numbers make products ten times slower.
+    # Smaller exponents are raised to this one, because denormal numbers make products
+    # ten times slower.
     lowest: float
-    # Exponents no larger than this need neither shift nor floor, whatever the factors.
+    # If no exponent is larger than this, neither a shift nor a floor is needed.
     free: float
-    # Farthest that w may move from the potential inside of a stored kernel.
+    # How far w may move from the potential that a kernel was computed with.
     reach: float
 
 
@@ -35,22 +36,26 @@ RANGE = {
     torch.float64: _Range(lowest=-660.0, free=450.0, reach=200.0),
 }
 
-# Products of stored blocks need no room for intermediate results: larger ones are best.
+# Products of stored blocks need no memory for intermediate results, so that larger
+# blocks are faster.
 STORED_BLOCK = 8
 
 
 class Kernel:
-    r"""The marginal of a potential by products with an exponentiated matrix.
+    r"""The column marginal of a potential, by products with an exponentiated matrix.
 
-    The matrix is :math:`e^{w^0_j - C_{ij} / \gamma - m_i}` with :math:`w^0` the
-    potential absorbed last. Another potential multiplies its columns by
-    :math:`e^{w - w^0}`; when these factors leave the range of the dtype, w is absorbed
-    anew.
+    The matrix is :math:`e^{w^0_j - C_{ij} / \gamma - m_i}`, where :math:`w^0` is the
+    last potential that was absorbed into it. For another potential w its columns are
+    multiplied by :math:`e^{w - w^0}`. When these factors leave the range of the dtype,
+    w is absorbed.
 
     Args:
         cost: The distances.
         gamma: The entropic regularisation, in units of the cost.
         stored: Whether to keep the matrix, or compute its blocks for every product.
+
+    Attributes:
+        num_absorptions: How often a potential was absorbed so far.
     """
 
     def __init__(self, cost: Cost, gamma: float, *, stored: bool) -> None:
@@ -83,7 +88,7 @@ class Kernel:
 
     def _absorb(self, potential: Tensor) -> Tensor:
         self.num_absorptions += 1
-        # What is absorbed must be known to the last digit.
+        # The absorbed potential is rounded to the dtype of the matrix.
         w = potential.to(self._dtype)
         self._absorbed = w.to(potential.dtype)
         spread = float(w.abs().max()) + self.cost.bound / self.gamma
@@ -106,13 +111,13 @@ class Kernel:
         return block.sub_(shift[:, None]).clamp_min_(lowest).exp_()
 
     def _products(self, scaling: Tensor) -> tuple[Tensor, Tensor]:
-        """Return K v and the product of K^T with its reciprocal, as exact as w."""
+        """Return K v, and the product of K^T with its reciprocal in the dtype of w."""
         assert self._absorbed is not None
         w = self._absorbed.to(self._dtype)
         row_sums = self._shift.new_empty(len(self._shift))
         columns = torch.zeros_like(self._absorbed)
-        # A block is used twice while it is in the cache. Adding up blocks in float64
-        # keeps the rounding errors of float32 small, however many rows there are.
+        # Each block is used twice while it is in the cache. Adding up the blocks in
+        # float64 keeps the rounding errors of float32 small for any number of rows.
         scale = 1 if self._matrix is None else STORED_BLOCK
         for rows in self.cost.row_blocks(scale=scale):
             matrix = self._matrix
@@ -124,7 +129,7 @@ class Kernel:
     def _restore(
         self, log_q: Tensor, lost: Tensor, potential: Tensor, row_log_sums: Tensor
     ) -> None:
-        """Put log-sum-exps in the place of columns that the matrix cannot hold."""
+        """Replace columns that the matrix cannot hold by log-sum-exps."""
         index = lost.nonzero().flatten()
         if not len(index):
             return
@@ -138,15 +143,15 @@ class Kernel:
 
 
 def marginal_error(log_q: Tensor, potential: Tensor, tau: float) -> float:
-    r""":math:`\lVert q - q^*(w) \rVert_1`, blind to a constant added to w."""
+    r"""Return :math:`\lVert q - q^*(w) \rVert_1`; a constant in w has no effect."""
     if tau == 0.0:
-        return 0.0  # nothing is asked of the column marginal
+        return 0.0  # the column marginal has to fulfil no condition
     target = torch.softmax(-potential * (1.0 - tau) / tau, dim=0)
     return float((log_q.exp() - target).abs().sum())
 
 
 def _lost(columns: Tensor, row_sums: Tensor) -> Tensor:
-    """Tell in which columns the entries raised to the floor could matter."""
+    """Tell in which columns the entries that were raised to the floor may matter."""
     eps = torch.finfo(row_sums.dtype).eps
     floor = math.exp(RANGE[row_sums.dtype].lowest)
     return floor * float(row_sums.to(columns.dtype).reciprocal().sum()) > eps * columns

@@ -1,4 +1,4 @@
-"""The same problem handed to POT."""
+"""The same problem, solved by POT."""
 
 import math
 import warnings
@@ -12,7 +12,8 @@ from sbi_rope.coupling.kernel import Kernel, marginal_error
 
 __all__ = ["solve_pot"]
 
-# POT rebuilds its kernel at every call, which costs about ten iterations.
+# Iterations of the first call of POT, and the most of any call. POT rebuilds its kernel
+# at every call, which costs about ten iterations.
 FIRST_BURST, LAST_BURST = 16, 256
 
 
@@ -26,22 +27,31 @@ def solve_pot(
     tolerance: float,
     max_iterations: int,
 ) -> tuple[Solution, bool]:
-    """Run POT's ``sinkhorn_unbalanced`` in bursts until our own error is met.
+    """Call POT's ``sinkhorn_unbalanced`` until our own marginal error is small enough.
 
-    POT's own stopping rule watches the scalings u and v, whose common factor does not
-    affect the rows and converges slowest. Ours sees only what matters.
+    POT's own stopping rule looks at the scalings u and v. Their common factor does not
+    affect the rows, but converges slowest. Our error does not depend on it.
+
+    Args:
+        cost: The distances, stored.
+        gamma: The entropic regularisation, in units of the cost.
+        kernel: Returns log q of a potential.
+        start: The first potential, shape ``(n_s,)``.
+        tau: The trust in the prior, in (0, 1].
+        tolerance: The marginal error to reach.
+        max_iterations: The largest number of iterations, over all calls.
 
     Returns:
-        The best solution seen, and whether POT remained healthy: False asks another
-        solver for help.
+        The best solution, and whether POT's numbers stayed usable. If they did not,
+        another solver has to go on.
     """
     n_o, n_s = cost.shape
-    # A constant added to a row of C changes no softmax of it. With the smallest entry
-    # of every row at zero the kernel exp(-C / gamma) cannot vanish in a row.
+    # A constant added to a row of C does not change the softmax of the row. If the
+    # smallest entry of every row is zero, no row of exp(-C / gamma) vanishes.
     scaled = cost.block(slice(None)) / gamma
     scaled -= scaled.amin(dim=1, keepdim=True)
     a, b = scaled.new_full((n_o,), 1 / n_o), scaled.new_full((n_s,), 1 / n_s)
-    # reg is 1 because the cost is already divided by gamma; rho is in its units.
+    # reg is 1 because the cost is already divided by gamma, and so is rho.
     rho = math.inf if tau == 1.0 else tau / (1.0 - tau)
     potential = start - start.mean()
     best = Solution(potential, math.inf, 0)
@@ -49,7 +59,7 @@ def solve_pot(
     while iterations < max_iterations:
         burst = min(burst, max_iterations - iterations)
         with warnings.catch_warnings():
-            # What POT warns of is caught below, by looking at what it returned.
+            # POT's warnings are not needed: its results are checked below.
             warnings.simplefilter("ignore")
             _, log = ot.unbalanced.sinkhorn_unbalanced(
                 a,
@@ -59,7 +69,7 @@ def solve_pot(
                 reg_m=(math.inf, rho),
                 method="sinkhorn",
                 reg_type="kl",
-                # POT computes u from v first; only the mean of v is free.
+                # POT computes u from v first, so that u may start at zero.
                 warmstart=(scaled.new_zeros(n_o), potential.to(scaled)),
                 numItermax=burst,
                 stopThr=0.0,
@@ -72,9 +82,9 @@ def solve_pot(
         potential = log["logv"].to(start.dtype)
         potential = potential - potential.mean()
         error = marginal_error(kernel(potential), potential, tau)
-        # If the error stays, POT has lost entries of the kernel to underflow, or the
-        # problem is one where iterations hardly help. If POT made fewer iterations
-        # than asked, it met infinities.
+        # If the error does not fall, POT has lost entries of the kernel to underflow,
+        # or iterations hardly help in this problem. If POT stopped before the end, it
+        # met infinite numbers.
         healthy = done == burst and error < 0.999 * best.marginal_error
         if error < best.marginal_error:
             best = Solution(potential, error, iterations)

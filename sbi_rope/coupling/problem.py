@@ -10,14 +10,16 @@ from sbi_rope.errors import CouplingError, InvalidInputError
 
 __all__ = ["Problem", "checked_embeddings", "median_distance"]
 
-# Pairwise distances of so many simulations are enough for their median.
+# The median distance is computed from this many simulations at most.
 MAX_FOR_MEDIAN = 2000
-# Exponents C / gamma beyond this leave no digits for the differences between them.
+# If exponents C / gamma are larger than this, rounding hides the differences between
+# them.
 LARGEST_EXPONENT = {torch.float64: 1e12, torch.float32: 1e5}
-# Above this the rounding of distances by a matrix product would show in the weights.
+# If distances / gamma are larger than this, the rounding of a matrix product would show
+# in the weights.
 LARGEST_BY_PRODUCT = 1e3
-# A row is to blame if it is so many times as far from the centre as the median
-# simulation.
+# An error message names rows that are this many times as far from the centre as the
+# median simulation.
 EXTREME = 1e3
 
 
@@ -27,10 +29,15 @@ class Problem:
     Args:
         real: Embeddings of the observations, shape ``(n_o, l)``.
         simulated: Embeddings of the simulations, shape ``(n_s, l)``.
-        fitted: Indices of the observations to fit to; None for all.
-        blocked: Whether to hold nothing of size n_o x n_s.
-        stored: Whether to store the distances, for more than one use of them.
-        smallest_gamma: The smallest gamma to be asked for, in units of the embeddings.
+        fitted: Numbers of the observations to fit to; None for all.
+        blocked: Whether to hold no matrix of size n_o x n_s.
+        stored: Whether to store the distances, because they are used more than once.
+        smallest_gamma: The smallest gamma to solve for, in units of the embeddings.
+
+    Attributes:
+        cost: The distances of the observations to fit to.
+        all_fitted: Whether these are all observations.
+        direct: Whether distances are computed without a matrix product.
 
     Raises:
         CouplingError: If the distances overflow.
@@ -54,7 +61,7 @@ class Problem:
                 simulated,
                 otherwise="Check the scale of the embedding net's outputs.",
             )
-        # In float32 the rounding of a product always shows.
+        # In float32 the rounding of a matrix product always shows.
         in_float64 = widest(real.device) == torch.float64
         self.direct = not in_float64 or bound > LARGEST_BY_PRODUCT * smallest_gamma
         self.real = real
@@ -71,16 +78,16 @@ class Problem:
 
     @property
     def size(self) -> int:
-        """The number of distances, of all observations from all simulations."""
+        """The number of distances of all observations from all simulations."""
         return len(self.real) * len(self.simulated)
 
     def zero_potential(self) -> Tensor:
-        """Return the potential to start from when nothing is known."""
+        """Return a potential of zeros to start from."""
         dtype = widest(self.simulated.device)
         return self.simulated.new_zeros(len(self.simulated), dtype=dtype)
 
     def check_gamma(self, gamma: float) -> None:
-        """Check that the dtype has digits left for distances / gamma.
+        """Check that gamma is not too small for the digits of the dtype.
 
         Raises:
             CouplingError: If gamma, in units of the embeddings, is too small.
@@ -92,15 +99,15 @@ class Problem:
         if gamma < smallest:
             raise _error(
                 f"Expected a gamma of at least {smallest:.1e} in units of the "
-                f"embeddings, where {self.real.dtype} has digits left for distances / "
-                f"gamma; got {gamma:.1e}.",
+                f"embeddings, below which {self.real.dtype} has too few digits for "
+                f"distances / gamma; got {gamma:.1e}.",
                 self.real,
                 self.simulated,
                 otherwise="Use a larger gamma, or dtype=torch.float64.",
             )
 
     def kernel(self, gamma: float) -> Kernel:
-        """Return the kernel of a gamma in units of the embeddings; the last is kept."""
+        """Return the kernel of a gamma in units of the embeddings, and keep it."""
         if self._kernel is None or self._kernel[0] != gamma:
             self._kernel = None  # frees its memory before the next one is made
             kernel = Kernel(self.cost, gamma, stored=not self.blocked)
@@ -108,7 +115,7 @@ class Problem:
         return self._kernel[1]
 
     def kernel_of_all(self, gamma: float) -> Kernel:
-        """Return a kernel over all observations, fitted to or not."""
+        """Return a kernel over all observations, also those that are not fitted to."""
         cost = Cost(self.real, self.simulated, stored=False, direct=self.direct)
         return Kernel(cost, gamma, stored=False)
 
@@ -116,8 +123,8 @@ class Problem:
 def _error(
     problem: str, real: Tensor, simulated: Tensor, *, otherwise: str
 ) -> CouplingError:
-    """Blame the rows that are far from all others, where there are some."""
-    # float64 holds the squares of all numbers of float32.
+    """Return an error that names the rows far from all others, if there are any."""
+    # float64 holds the squares of all float32 numbers.
     real, simulated = real.cpu().double(), simulated.cpu().double()
     centre = simulated.median(dim=0).values
     distance = torch.linalg.vector_norm(simulated - centre, dim=1)
@@ -167,10 +174,10 @@ def checked_embeddings(real: Tensor, simulated: Tensor) -> tuple[Tensor, Tensor]
 
 
 def median_distance(simulated: Tensor) -> float:
-    """Return the median distance between simulations.
+    """Return the median distance between the embeddings of simulations.
 
     Raises:
-        CouplingError: If it is zero.
+        CouplingError: If it is zero, or there is a single simulation.
     """
     subset = simulated[:MAX_FOR_MEDIAN]
     if widest(subset.device) != torch.float64:

@@ -1,4 +1,4 @@
-"""What a coupling returns: weights on request, and the evidence of convergence."""
+"""The result of a coupling: weights on request, and how well it has converged."""
 
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -16,15 +16,15 @@ __all__ = ["Coupling"]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Coupling:
-    r"""How much of each simulation stands behind each real observation.
+    r"""The weights of the simulations for each real observation.
 
     Row i holds the mixture weights of observation i (RoPE, eq. 5). They are a softmax
     of the simulation-side log-potential :math:`w`,
 
     .. math:: \alpha_{ij} = \operatorname{softmax}_j (w_j - C_{ij} / \gamma),
 
-    so the rows sum to one whatever solver found :math:`w`, and however well. What is
-    kept is :math:`w` and the embeddings; rows are computed when asked for.
+    so the rows always sum to one, also if :math:`w` has not converged. The coupling
+    keeps :math:`w` and the embeddings, and computes rows when they are asked for.
 
     Attributes:
         potential: :math:`w`, shape ``(n_s,)``, float64, with mean zero.
@@ -33,24 +33,23 @@ class Coupling:
         gamma: The entropic regularisation in units of the embeddings, that is after
             ``cost_scale``.
         tau: The trust in the prior.
-        marginal_error: :math:`\lVert q - q^*(w) \rVert_1` with :math:`q` the mean of
-            the rows and :math:`q^*_j \propto b_j e^{-w_j (1 - \tau) / \tau}` what the
-            optimality conditions ask of it; 0 at a solution, at most 2. Over the
-            observations the potential was fitted to.
-        batch_error: The same over all observations: what it costs to fit the potential
-            to some of them only.
+        marginal_error: :math:`\lVert q - q^*(w) \rVert_1`, where :math:`q` is the mean
+            of the rows of the observations that the potential was fitted to, and
+            :math:`q^*_j \propto b_j e^{-w_j (1 - \tau) / \tau}` is what it should be
+            by the optimality conditions. It is 0 at a solution and at most 2.
+        batch_error: The same for the mean over all observations. It shows how far off
+            a potential is that was fitted to some of them only.
         num_fitted: The number of observations the potential was fitted to.
-        num_iterations: Sinkhorn iterations, over all solvers used.
+        num_iterations: Sinkhorn iterations, over all solvers that were used.
         converged: Whether ``marginal_error`` reached the tolerance.
-        solver: The solver that had the last word: ``"own"``, ``"pot"``, or ``"none"``
-            at tau = 0, which needs no iteration. A coupler set to ``"pot"`` that
-            reports ``"own"`` was helped out, where POT over- or underflowed or made no
-            progress.
+        solver: The solver that finished: ``"own"``, ``"pot"``, or ``"none"`` at tau =
+            0, which needs no iteration. A coupler set to ``"pot"`` reports ``"own"`` if
+            POT over- or underflowed or made no progress, and our own solver went on.
         blocked: Whether no matrix of size n_o x n_s is held, so that ``weights`` is
-            computed at every request: after a solution in blocks, and for more than 50
-            million weights.
-        direct: Whether distances are computed without a matrix product, as a gamma
-            needs that is small against them.
+            computed at every request. That is so after a solution in blocks, and for
+            more than 50 million weights.
+        direct: Whether distances are computed without a matrix product. It is needed if
+            gamma is small compared to them.
     """
 
     potential: Tensor = field(repr=False)
@@ -71,8 +70,8 @@ class Coupling:
     def weights(self) -> Tensor:
         r""":math:`\alpha`, shape ``(n_o, n_s)``, in the dtype of the coupling.
 
-        Computed at the first request and kept; a blocked coupling computes it
-        at every request. Rows sum to one. Not to be written to.
+        Rows sum to one. The weights are computed at the first request and kept; a
+        blocked coupling computes them at every request. Do not write to them.
         """
         return self._rows(self.real) if self.blocked else self._kept_weights
 
@@ -89,18 +88,18 @@ class Coupling:
         return sizes
 
     def __getstate__(self) -> dict[str, Any]:
-        # Without weights and distances that were kept, of up to 400 MB.
+        # The weights and distances that are kept would take up to 400 MB.
         return {entry.name: getattr(self, entry.name) for entry in fields(self)}
 
     def distances(self, real: Tensor) -> Tensor:
-        r"""Return :math:`C`, which couplings of the same embeddings share.
+        r"""Return the distances :math:`C` of observations from the simulations.
 
         Args:
             real: Embeddings of the observations, shape ``(n, l)``.
 
         Returns:
-            Shape ``(n, n_s)``. They are the same for another coupling with the same
-            ``simulated`` and ``direct``.
+            Shape ``(n, n_s)``. Another coupling with the same ``simulated`` and
+            ``direct`` has the same distances.
 
         Raises:
             InvalidInputError: If the shape does not fit, or a value is not finite.
@@ -111,21 +110,21 @@ class Coupling:
     def rows(self, real: Tensor, *, distances: Tensor | None = None) -> Tensor:
         r"""Return the weights of other observations under the same potential.
 
-        A good stand-in for coupling again where the effective sample size of the new
-        row is large; at an effective sample size of a few it is another estimator.
-        Rows of the batch itself, ``coupling.rows(coupling.real[10:20])``, are rows of
-        ``weights``.
+        If the effective sample size of a new row is large, the row is nearly what
+        coupling again would give. If it is only a few, it is not. For observations of
+        the batch, as in ``coupling.rows(coupling.real[10:20])``, the result is their
+        rows of ``weights``.
 
         Args:
             real: Embeddings of the observations, shape ``(n, l)``.
-            distances: What :meth:`distances` returns for them, if it is known.
+            distances: The result of :meth:`distances` for them. Computed if None.
 
         Returns:
             Weights of shape ``(n, n_s)``; rows sum to one.
 
         Raises:
             InvalidInputError: If the shape does not fit, a value is not finite, or an
-                observation is so far away that all its distances are the same.
+                observation is so far away that its distances cannot be told apart.
         """
         real = check_batch("real", real, self.simulated.shape[1:]).to(self.simulated)
         if distances is None:
@@ -135,16 +134,16 @@ class Coupling:
         limit = 0.1 * self.gamma / torch.finfo(real.dtype).eps
         if not farthest < limit:
             raise InvalidInputError(
-                f"Expected `real` at most {limit:.1e} away from the simulations, where "
-                f"{real.dtype} still tells their distances apart; got {farthest:.1e}. "
-                "Such an observation is like no simulation: look at its values."
+                f"Expected `real` at most {limit:.1e} away from the simulations, so "
+                f"that {real.dtype} can tell its distances apart; got {farthest:.1e}. "
+                "Such an observation is unlike all simulations. Check its values."
             )
         return self._rows(real) if distances is None else self._softmax(distances)
 
     def restricted_to(self, rows: Tensor) -> "Coupling":
         """Return the coupling of some observations of the batch, by their numbers.
 
-        What it says of its own convergence stays that of the batch.
+        Its errors and ``converged`` remain those of the whole batch.
 
         Raises:
             InvalidInputError: If a row is not the number of an observation.

@@ -1,4 +1,4 @@
-"""Where to start the next solution of a sweep."""
+"""Where the next solution of a sweep starts."""
 
 from collections.abc import Mapping
 
@@ -15,16 +15,16 @@ def warm_start(
 ) -> Tensor:
     r"""Return a potential near the solution at gamma and tau.
 
-    In units of the cost, :math:`\gamma w` changes slowly with gamma. It is continued
-    linearly from the two last, larger gammas at the same tau.
+    In units of the cost, :math:`\gamma w` changes slowly with gamma. It is extrapolated
+    linearly from the two next larger gammas at the same tau.
 
     Args:
         solved: Potentials by (gamma, tau), all at this gamma or larger ones.
-        gamma: As in the keys of ``solved``.
-        tau: As in the keys of ``solved``.
+        gamma: The gamma to solve for, in the units of the keys.
+        tau: The tau to solve for.
         cold: The potential to start from if nothing is solved yet.
     """
-    # At the first gamma there is only another tau to start from.
+    # At the largest gamma, another tau is all there is to start from.
     keys = sorted(key for key in solved if key[1] == tau) or sorted(solved)[:1]
     if not keys:
         return cold

@@ -1,4 +1,4 @@
-"""Mixtures of weighted densities: the posterior of RoPE, and others."""
+"""Mixtures of weighted densities, such as the posterior of RoPE."""
 
 from sbi_rope.mixture.coupled import CoupledEmbeddings
 from sbi_rope.mixture.coupled_net import CoupledNet

@@ -1,4 +1,4 @@
-"""What all parts of a mixture give a block of observations."""
+"""The weighted embeddings of a block of observations, over all parts of a mixture."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,9 +17,9 @@ class Entries:
 
     Attributes:
         part: The part.
-        which: Their places among the entries asked for, shape ``(n,)``.
-        row: Their observations.
-        column: Their numbers among the embeddings of the part.
+        which: The positions of these entries among those asked for, shape ``(n,)``.
+        row: The number of the observation of each entry.
+        column: The number of its embedding among those of the part.
         rows: The weights and embeddings of the part.
     """
 
@@ -35,12 +35,12 @@ class Entries:
 
 
 class Block:
-    r"""The embeddings that all parts give a block of b observations, side by side.
+    r"""The embeddings of all parts for a block of b observations, side by side.
 
     Args:
-        parts: The parts.
-        shares: Their weights :math:`w_k`, none of them zero.
-        rows: What each gives the observations.
+        parts: The parts of the mixture.
+        shares: The weights :math:`w_k` of the parts, none of them zero.
+        rows: The weights and embeddings that each part gives the observations.
 
     Attributes:
         weights: :math:`w_k a^k_{ij}` of all embeddings of all parts, shape ``(b, c)``.
@@ -53,8 +53,9 @@ class Block:
         self.rows = rows
         pairs = zip(shares, rows, strict=True)
         self.weights = torch.cat([share * part.weights for share, part in pairs], dim=1)
-        # Of thousands of simulations some can be left out. A part of a small weight,
-        # such as the prior, may be all there is far from the others.
+        # Some of thousands of simulations can be left out of the density. A part with a
+        # small weight, such as the prior, cannot: far from the other parts it may be
+        # the only one with any density.
         self._is_shared = torch.cat(
             [
                 torch.full_like(of_part.weights[0], _are_shared(part.mixing))
@@ -63,12 +64,12 @@ class Block:
         ).bool()
 
     def without_tail(self, tail_mass: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Return row, column and log weight of the entries that are not left out.
+        """Return row, column and log weight of the entries to evaluate.
 
-        Only simulations that observations share are, with a weight of at most
-        ``tail_mass`` together.
+        The smallest weights of each row are left out, as long as they sum to at most
+        ``tail_mass``. Only embeddings that observations share can be left out.
         """
-        # Summed from the small end, where the digits are.
+        # The sum starts at the smallest weights, so that rounding does not lose them.
         ascending, order = self.weights.where(self._is_shared, torch.inf).sort(dim=1)
         tail = ascending.cumsum(dim=1, dtype=torch.float64)
         weights = self.weights.gather(1, order)
@@ -78,7 +79,7 @@ class Block:
         return row, order[kept], weights[kept].double().log()
 
     def by_part(self, row: Tensor, column: Tensor) -> list[Entries]:
-        """Sort entries of ``weights`` by the parts they belong to."""
+        """Group entries of ``weights`` by the part they belong to."""
         found, start = [], 0
         for part, rows in zip(self.parts, self.rows, strict=True):
             end = start + rows.weights.shape[1]
@@ -92,5 +93,5 @@ class Block:
 
 
 def _are_shared(mixing: Mixing) -> bool:
-    """Whether there are several embeddings, the same for all observations."""
+    """Tell whether all observations share the same several embeddings."""
     return mixing.embeddings is not None and mixing.num_embeddings > 1

@@ -27,21 +27,23 @@ __all__ = ["CoupledEmbeddings"]
 class CoupledEmbeddings(Mixing):
     r"""The simulations that a batch is coupled with, as embeddings of a mixture.
 
-    Row i is :math:`\sum_k w_k \alpha^{(k)}_i` over all couplings of all nets: the
-    mixtures of all couplings have the same components, so that together they need one
-    evaluation of each. RoPE's own posterior has one net and one coupling.
+    The weights of observation i are :math:`\sum_k w_k \alpha^{(k)}_i`, summed over all
+    couplings of all nets. All couplings weight the same simulations, so each
+    :math:`q(\theta \mid h(x_{s,j}))` is evaluated once, however many couplings there
+    are. RoPE's own posterior has one net and one coupling.
 
-    Observations are found by their values. The first row of equal ones stands for all.
+    An observation is found by its values. If several in the batch are equal, the row of
+    the first is used for all of them.
 
     Args:
         embeddings: :math:`h(x_s)`, shape ``(n_s, l)``.
         batch: The real observations that were coupled, shape ``(n, *event)``.
-        nets: Embedding nets with couplings of all of the batch, whose shares sum to one
-            over all nets.
-        num_observed: How many observations at the head of the batch are those to be
-            inferred, ``x_o``; all if None.
-        unseen: What to do with an x outside the batch: ``"raise"``, or ``"extend"`` by
-            the softmax row of the same potential.
+        nets: Embedding nets with couplings of the whole batch. The shares of all
+            couplings of all nets sum to one.
+        num_observed: How many observations at the start of the batch are to be
+            inferred; they become ``x_o``. All if None.
+        unseen: What to do with an x outside the batch: ``"raise"`` an error, or
+            ``"extend"`` the coupling by a softmax row under the same potential.
 
     Raises:
         InvalidInputError: If lengths, shapes or shares do not fit.
@@ -110,7 +112,7 @@ class CoupledEmbeddings(Mixing):
 
     @property
     def weights(self) -> Tensor:
-        """The rows of ``x_o``, shape ``(n_o, n_s)``; not to be written to."""
+        """The weights of ``x_o``, shape ``(n_o, n_s)``; do not write to them."""
         if len(self.couplings) == 1:
             weights = self.couplings[0].weights
             whole = self.num_observed == len(weights)
@@ -124,7 +126,7 @@ class CoupledEmbeddings(Mixing):
         )
 
     def embed(self, x: Tensor) -> Tensor:
-        """Return the embeddings by all nets, ``(n, *event)`` to ``(n, nets, l)``.
+        """Embed observations with all nets, ``(n, *event)`` to ``(n, num_nets, l)``.
 
         Raises:
             UnseenObservationError: If an x is not in the batch and ``unseen="raise"``.
@@ -140,18 +142,18 @@ class CoupledEmbeddings(Mixing):
         return embedded
 
     def rows(self, embedded: Tensor) -> Rows:
-        """Return the rows of a block of observations over the simulations."""
+        """Return the weights of the simulations for a block of observations."""
         pairs = zip(self.nets, embedded.unbind(dim=1), strict=True)
         first, *others = (net.rows(real) for net, real in pairs if any(net.shares))
         return Rows(sum(others, start=first), self.simulated)
 
     def rows_of_each(self, embedded: Tensor) -> Iterator[Tensor]:
-        """Yield the rows of each of :attr:`couplings`, ``(n, n_s)``, unweighted."""
+        """Yield the weights ``(n, n_s)`` by each of :attr:`couplings`."""
         for net, real in zip(self.nets, embedded.unbind(dim=1), strict=True):
             yield from net.rows_of_each(real)
 
     def with_shares(self, shares: Sequence[float]) -> "CoupledEmbeddings":
-        """Return the same couplings with other shares, in the order of these."""
+        """Return the same couplings with other shares, in the same order."""
         check_weights("shares", shares, len(self.couplings))
         nets, start = [], 0
         for net in self.nets:
@@ -167,13 +169,13 @@ class CoupledEmbeddings(Mixing):
         )
 
     def restricted_to(self, index: int) -> "CoupledEmbeddings":
-        """Return the same embeddings for one observation, which holds no other.
+        """Return the same embeddings for one observation alone.
 
         Args:
             index: The number of the observation in ``x_o``.
         """
         row = torch.arange(self.num_observed, device=self.batch.device)[index][None]
-        # Nets are what extends.
+        # The nets are needed only to extend the coupling.
         extends = self.unseen == "extend"
         nets = [
             net.restricted_to(row, net=net.net if extends else nn.Identity())
@@ -184,11 +186,12 @@ class CoupledEmbeddings(Mixing):
         )
 
     def _unseen_embedded(self, x: Tensor) -> Tensor:
-        # log_prob and its normaliser, or the steps of map(), ask for the same ones, and
-        # earn one warning.
+        # log_prob and its normalisation, or the steps of map(), ask for the same x
+        # again. The last answer is kept, so that there is one warning only.
         keys, kept = _keys(x), self._extended
         if kept is None or kept[0] != keys:
-            # In one go, and not read again: another thread may ask for others.
+            # The attribute is set at once and not read again, because another thread
+            # may ask for other observations.
             self._extended = kept = (keys, self._extend(x))
         return kept[1]
 
@@ -196,11 +199,12 @@ class CoupledEmbeddings(Mixing):
         if self.unseen == "raise":
             raise UnseenObservationError(
                 f"{len(x)} observation(s) are not in the batch of "
-                f"{len(self.batch)} this posterior was built for, and a posterior of "
-                "RoPE belongs to its batch; `posterior[i]` knows its own observation "
-                "alone. Either couple the new batch, with "
-                "`rope.build_posterior(x_new)` or `stack(rope, x_new)`, or allow rows "
-                "under the old coupling: both take `unseen='extend'`."
+                f"{len(self.batch)} that this posterior was built for. A posterior of "
+                "RoPE answers for its own batch only, and `posterior[i]` knows its own "
+                "observation alone. Couple the new batch with "
+                "`rope.build_posterior(x_new)` or `stack(rope, x_new)`. Or pass "
+                "`unseen='extend'` to either of them, which then extends the old "
+                "coupling to new observations."
             )
         embedded = torch.stack(
             [embed(net.net, x).to(net.real) for net in self.nets], dim=1
@@ -210,14 +214,14 @@ class CoupledEmbeddings(Mixing):
             for block in blocks(len(embedded), self.num_embeddings)
         )
         warn_user(
-            f"Extended the coupling to {len(x)} unseen observation(s); smallest "
-            f"effective sample size {smallest:.1f} of {self.num_embeddings} "
-            "simulations. Below about 50, couple the new batch instead."
+            f"Extended the coupling to {len(x)} unseen observation(s). The smallest "
+            f"effective sample size is {smallest:.1f} of {self.num_embeddings} "
+            "simulations. If it is below about 50, couple the new batch instead."
         )
         return embedded
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:  # noqa: FBT001, FBT002
-        # What `to` calls for each module: couplings are none.
+        # `to` calls this for each module, but couplings are not modules.
         moved = super()._apply(fn, recurse)
         for net in self.nets:
             net.to_device(self.batch.device)
@@ -227,6 +231,6 @@ class CoupledEmbeddings(Mixing):
 
 def _keys(x: Tensor) -> list[bytes]:
     """Return a fingerprint of each row's values."""
-    # Adding zero makes -0.0 and 0.0, which are equal, equal in their bytes too.
+    # Adding zero turns -0.0 into 0.0. The two are equal, and so should their bytes be.
     rows = (x.detach().cpu().flatten(1) + 0.0).contiguous().numpy()
     return [hashlib.blake2b(row.tobytes(), digest_size=16).digest() for row in rows]

@@ -1,4 +1,4 @@
-"""An embedding net, and couplings of what it embedded."""
+"""An embedding net, and couplings of the observations it embedded."""
 
 from collections.abc import Iterator, Sequence
 
@@ -13,12 +13,13 @@ __all__ = ["CoupledNet"]
 
 
 class CoupledNet(nn.Module):
-    r"""An embedding net g, and couplings of what it embedded.
+    r"""An embedding net g, and couplings of the observations it embedded.
 
     Args:
-        net: g; needed for unseen observations only.
+        net: g. It is needed for unseen observations only.
         couplings: Couplings of :math:`g(x)` of a batch with the same simulations.
-        shares: How much each counts in the rows of a mixture; one by default.
+        shares: How much each coupling counts in the weights of the mixture. The default
+            is one coupling with a share of one.
     """
 
     def __init__(
@@ -46,7 +47,7 @@ class CoupledNet(nn.Module):
         r"""Return :math:`\sum_k w_k \alpha^{(k)}`, ``(n, l)`` to ``(n, n_s)``."""
         used = [k for k, share in enumerate(self.shares) if share]
         total = real.new_zeros(len(real), len(self.couplings[0].simulated))
-        # In blocks that stay in the cache, as couplings compute them themselves.
+        # Blocks of this size stay in the cache. Couplings use the same.
         for block in row_blocks(real, total.shape[1]):
             rows_of_each = self.rows_of_each(real[block], used)
             for k, rows in zip(used, rows_of_each, strict=True):
@@ -56,9 +57,13 @@ class CoupledNet(nn.Module):
     def rows_of_each(
         self, real: Tensor, numbers: Sequence[int] | None = None
     ) -> Iterator[Tensor]:
-        """Yield the rows of some couplings one after the other, all if None.
+        """Yield the weights ``(n, n_s)`` by one coupling after the other.
 
         Distances are computed once for all of them.
+
+        Args:
+            real: Embeddings of observations, shape ``(n, l)``.
+            numbers: The numbers of the couplings; all if None.
         """
         distances: dict[bool, Tensor] = {}
         for k in range(len(self.couplings)) if numbers is None else numbers:
@@ -77,5 +82,5 @@ class CoupledNet(nn.Module):
         return CoupledNet(net, couplings, self.shares)
 
     def to_device(self, device: torch.device) -> None:
-        """Move the couplings."""
+        """Move the couplings to a device."""
         self.couplings = tuple(coupling.to(device) for coupling in self.couplings)

@@ -15,8 +15,8 @@ def block_log_prob(theta: Tensor, block: Block, *, tail_mass: float) -> Tensor:
 
     Args:
         theta: Parameters, S for each of the b observations.
-        block: What all parts give these observations.
-        tail_mass: Weight of the smallest entries of each row that are left out.
+        block: The weighted embeddings of these observations.
+        tail_mass: Weight of the smallest entries of each row that may be left out.
     """
     row, column, log_weights = block.without_tail(tail_mass)
     by_part = block.by_part(row, column)
@@ -43,21 +43,21 @@ def _log_q(theta: Tensor, entries: Entries) -> Tensor:
         sample, k = batch // len(row), batch % len(row)
         points = theta[sample, row[k]]
         if points.requires_grad:
-            # A component without a density at its point has no gradient there.
+            # A component whose density is NaN at its point has no gradient there.
             points.register_hook(lambda grad: grad.nan_to_num(nan=0.0))
         log_q.append(entries.part.log_prob(points, entries.embeddings(k)))
     return torch.cat(log_q).reshape(shape)
 
 
 def without_nan(log_q: Tensor) -> Tensor:
-    """Let components without a density at some theta not take the others with them."""
+    """Count NaN densities of components as zero, so that the sum is not NaN."""
     undefined = torch.isnan(log_q)
     if not undefined.any():
         return log_q
     warn_user(
         f"{int(undefined.sum())} of {undefined.numel()} component densities are NaN "
-        "and counted as zero: the flow fails at these simulations or parameters. Train "
-        "NPE longer, or with another density estimator."
+        "and count as zero, because the flow fails at these simulations or "
+        "parameters. Train NPE longer, or with another density estimator."
     )
     return log_q.where(~undefined, -torch.inf)
 

@@ -35,23 +35,23 @@ __all__ = ["MixtureEstimator"]
 
 
 class MixtureEstimator(MixtureDensity):
-    r"""A mixture of densities that are themselves mixed over embeddings.
+    r"""A mixture of densities, each of which is itself mixed over embeddings.
 
     .. math::
         p(\theta \mid x) = \sum_k w_k \sum_j a^k_j(x)\, q_k(\theta \mid s^k_j(x))
 
-    An estimator in the sense of sbi, whose condition is an observation. The prior's
-    support is not its business; see :class:`MixturePosterior`.
+    It is an estimator in the sense of sbi, and its condition is an observation. It does
+    not know the support of the prior; :class:`MixturePosterior` does.
 
     Args:
         parts: The densities :math:`q_k`, each with its weights :math:`a^k` and
-            embeddings :math:`s^k`. Several may be coupled, if their ``x_o`` are the
-            same.
-        weights: :math:`w`, one for each part, which sum to one. Parts of weight zero
-            cost nothing.
-        tail_mass: Weight of the smallest terms for each observation that ``log_prob``
-            leaves out, among those of embeddings that observations share, such as the
-            simulations of a coupling; 0 evaluates all.
+            embeddings :math:`s^k`. Several of them may belong to a batch if their
+            ``x_o`` are the same.
+        weights: :math:`w`, one for each part, which sum to one. Parts with a weight of
+            zero are not evaluated.
+        tail_mass: ``log_prob`` leaves out the smallest weights of each observation that
+            sum to at most this. Only embeddings that observations share are left out,
+            such as the simulations of a coupling. 0 evaluates all.
 
     Raises:
         InvalidInputError: If there is no part, shapes of theta or x differ between
@@ -98,19 +98,19 @@ class MixtureEstimator(MixtureDensity):
 
     @property
     def parts(self) -> list[Part]:
-        """The parts, whatever they weigh."""
+        """All parts, also those with a weight of zero."""
         return cast("list[Part]", list(self._parts))
 
     @property
     def coupled(self) -> list[CoupledEmbeddings]:
-        """What those parts are mixed over that belong to a batch."""
+        """The coupled embeddings of those parts that belong to a batch."""
         mixings = [part.mixing for part in self.parts]
         return [mixing for mixing in mixings if isinstance(mixing, CoupledEmbeddings)]
 
     def restricted_to(self, index: int) -> "MixtureEstimator":
         """Return the same mixture for one observation of the batch.
 
-        It shares densities with this one, but holds no other observation.
+        It shares its densities with this mixture, and holds no other observation.
 
         Args:
             index: The number of the observation in ``x_o``.
@@ -129,9 +129,11 @@ class MixtureEstimator(MixtureDensity):
         r"""Return :math:`\log p(\theta \mid x)`.
 
         Args:
-            input: theta, shape ``(S, B, d)`` or ``(B, d)``; B or 1 of them.
-            condition: Observations, shape ``(B, *event)``; B or 1 of them.
-            **kwargs: None; kept for sbi's signature.
+            input: theta, shape ``(S, B, d)`` or ``(B, d)``. One row of theta serves
+                all observations.
+            condition: Observations, shape ``(B, *event)``. One observation serves all
+                rows of theta.
+            **kwargs: Not used; they are in sbi's signature.
 
         Returns:
             Shape ``(S, B)``. With ``tail_mass`` = t the density is too small by at most
@@ -139,8 +141,8 @@ class MixtureEstimator(MixtureDensity):
 
         Raises:
             InvalidInputError: If shapes do not fit or theta is NaN.
-            UnseenObservationError: If a part is coupled, an x is not in its batch, and
-                it has ``unseen="raise"``.
+            UnseenObservationError: If an x is not in the batch of a coupled part with
+                ``unseen="raise"``.
         """
         theta, x = self._checked_theta(input), self._checked_x(condition)
         num_rows = max(theta.shape[1], len(x))
@@ -153,7 +155,8 @@ class MixtureEstimator(MixtureDensity):
         shape = (len(theta), num_rows)
         if not theta.numel():
             return theta.new_empty(shape)
-        # One observation serves all theta with one row of weights.
+        # A single observation needs one row of weights only: all theta become samples
+        # of that row.
         theta = theta.expand(-1, num_rows, *self.input_shape)
         theta = theta.reshape(-1, len(x), *self.input_shape)
         parts, shares = self._used
@@ -167,14 +170,14 @@ class MixtureEstimator(MixtureDensity):
     def part_log_probs(
         self, theta: Tensor, x: Tensor, *, numbers: Sequence[int] | None = None
     ) -> Tensor:
-        r"""Return the log density of each part by itself at pairs.
+        r"""Return the log density of each part by itself at pairs of theta and x.
 
-        Nothing is left out, whatever ``tail_mass`` and the weights are.
+        It does not depend on ``tail_mass`` or the weights of the parts.
 
         Args:
             theta: Parameters, shape ``(n, d)``.
             x: Their observations, shape ``(n, *event)``.
-            numbers: Those of the parts to evaluate, K of them; all if None.
+            numbers: The numbers of the K parts to evaluate; all if None.
 
         Returns:
             :math:`\log \sum_j a^k_j(x_i) q_k(\theta_i \mid s^k_j(x_i))`, shape
@@ -196,7 +199,7 @@ class MixtureEstimator(MixtureDensity):
 
     @property
     def _used(self) -> tuple[list[Part], list[float]]:
-        """The parts that have a weight, and their weights."""
+        """The parts with a weight above zero, and these weights."""
         used = [
             (part, share)
             for part, share in zip(self.parts, self.weights.tolist(), strict=True)
@@ -239,16 +242,16 @@ class MixtureEstimator(MixtureDensity):
             sample_shape: Shape of the draws of each observation.
             condition: Observations, shape ``(B, *event)``.
             accept: Tells which draws ``(n, d)`` to keep; None keeps all.
-            batch_size: Most draws the flow makes at a time; if None what is fast on the
-                device.
-            show_progress_bars: Whether to show the draws accepted so far.
-            **kwargs: None; kept for sbi's signature.
+            batch_size: The largest number of draws the flow makes at a time. If None,
+                the number that is fast on the device.
+            show_progress_bars: Whether to show how many draws were accepted so far.
+            **kwargs: Not used; they are in sbi's signature.
 
         Returns:
             Shape ``(*sample_shape, B, d)``.
 
         Raises:
-            SamplingError: If next to nothing is accepted for some observation.
+            SamplingError: If hardly any draw is accepted for some observation.
             UnseenObservationError: As in :meth:`log_prob`.
         """
         x = self._checked_x(condition)
@@ -280,20 +283,20 @@ class MixtureEstimator(MixtureDensity):
         cache: dict[int, Tensor],
         show_progress_bars: bool = False,
     ) -> Leakage:
-        r"""Return the mass of each observation's mixture that is accepted.
+        r"""Return the mass of each observation's mixture inside the prior's support.
 
         .. math:: Z(x) = \sum_k w_k \sum_j a^k_j(x)\, Z_k(s^k_j(x))
 
-        The masses given embeddings that observations share are estimated once, from
-        1024 draws each. Those of an observation's own embeddings are estimated for each
-        x, from as many draws as the weight of the part deserves; parts that weigh less
-        than one draw in 1024 together count as inside.
+        For embeddings that observations share, :math:`Z_k` is estimated once, from 1024
+        draws for each. For embeddings that belong to one observation it is estimated
+        for each x, from 1024 draws times the weight of the part. The smallest parts,
+        which together weigh less than one in 1024, count as inside.
 
         Args:
             x: Observations, shape ``(n, *event)``.
-            accept: Tells which parameters ``(n, d)`` count; None counts all.
-            cache: Keeps what is estimated once, by the number of the part.
-            show_progress_bars: Whether to show progress, if it takes long.
+            accept: Tells which parameters ``(n, d)`` are inside; None means all.
+            cache: Keeps the masses that are estimated once, by the number of the part.
+            show_progress_bars: Whether to show progress if the estimate takes long.
         """
         x = self._checked_x(x)
         mass = torch.zeros(len(x), dtype=torch.double, device=x.device)
@@ -337,19 +340,19 @@ class MixtureEstimator(MixtureDensity):
         cache: dict[int, Tensor],
         show_progress_bars: bool = False,
     ) -> Tensor:
-        """Return the mass that is accepted given each shared embedding of a part.
+        """Return the mass inside the support given each shared embedding of a part.
 
         Args:
-            number: That of the part.
-            accept: Tells which parameters ``(n, d)`` count.
-            cache: Where it is looked up, or left.
-            show_progress_bars: Whether to show progress, if it takes long.
+            number: The number of the part.
+            accept: Tells which parameters ``(n, d)`` are inside.
+            cache: Where the masses are kept after the first call.
+            show_progress_bars: Whether to show progress if the estimate takes long.
 
         Returns:
             Shape ``(c,)``, float64.
 
         Raises:
-            InvalidInputError: If observations have embeddings of their own.
+            InvalidInputError: If the observations of the part share no embeddings.
         """
         part = self.parts[number]
         embeddings = part.mixing.embeddings
@@ -374,7 +377,7 @@ class MixtureEstimator(MixtureDensity):
 def _blocks(
     parts: Sequence[Part], shares: Sequence[float], x: Tensor
 ) -> Iterator[tuple[slice, Block]]:
-    """Yield the weighted embeddings of a block of observations after the other."""
+    """Yield the weighted embeddings of one block of observations after the other."""
     embedded = [part.mixing.embed(x) for part in parts]
     num_columns = sum(part.mixing.num_embeddings for part in parts)
     for rows in blocks(len(x), num_columns):

@@ -1,4 +1,4 @@
-"""The parts of a mixture: a density, and what gives an observation its embeddings."""
+"""The parts of a mixture: a density, and the embeddings it is mixed over."""
 
 import copy
 from abc import ABC, abstractmethod
@@ -27,7 +27,7 @@ __all__ = [
     "part_of",
 ]
 
-# sbi converts every x to it, and its estimators know no other.
+# sbi converts every x to this dtype, and its estimators work in no other.
 DTYPE = torch.float32
 
 
@@ -37,8 +37,8 @@ class Rows:
 
     Attributes:
         weights: Rows that sum to one, shape ``(b, c)``.
-        embeddings: Those of all observations, shape ``(c, l)``, or those of each one,
-            shape ``(b, c, l)``.
+        embeddings: Embeddings that all observations share, shape ``(c, l)``, or those
+            of each observation, shape ``(b, c, l)``.
     """
 
     weights: Tensor
@@ -52,14 +52,14 @@ class Rows:
 
 
 class Mixing(nn.Module, ABC):
-    r"""What gives an observation its embeddings :math:`s_j(x)` and their weights.
+    r"""The embeddings :math:`s_j(x)` of an observation, with weights :math:`a_j(x)`.
 
-    To implement one, call the constructor with the shape of one observation and the
-    number of embeddings, and define the two methods.
+    A subclass calls the constructor with the shape of one observation and the number of
+    embeddings, and defines :meth:`embed` and :meth:`rows`.
 
     Attributes:
         event_shape: Shape of one observation.
-        num_embeddings: Embeddings of each observation, c.
+        num_embeddings: The number of embeddings of each observation, c.
     """
 
     def __init__(self, event_shape: Sequence[int], num_embeddings: int) -> None:
@@ -71,16 +71,13 @@ class Mixing(nn.Module, ABC):
     def embeddings(self) -> Tensor | None:
         """Embeddings that all observations share, ``(c, l)``; None if each has its own.
 
-        The mass of a shared one inside the prior's support is estimated once.
+        Given a shared embedding, the mass inside the prior's support is estimated once.
         """
         return None
 
     @abstractmethod
     def embed(self, x: Tensor) -> Tensor:
-        """Return what is computed once of observations and held for all of them.
-
-        Shapes are ``(n, *event)`` to ``(n, ...)``.
-        """
+        """Compute what is kept of observations, ``(n, *event)`` to ``(n, ...)``."""
 
     @abstractmethod
     def rows(self, embedded: Tensor) -> Rows:
@@ -90,8 +87,8 @@ class Mixing(nn.Module, ABC):
 class OwnEmbeddings(Mixing):
     r"""The embeddings of the observation itself, :math:`h_k(x)`, with equal weights.
 
-    With one net it makes a part of any amortised posterior. With K nets the density is
-    averaged over K embeddings.
+    With one net, any amortised posterior becomes a part in this way. With K nets the
+    density is averaged over K embeddings.
 
     Args:
         nets: The embedding nets, with outputs of one shape ``(n, l)``.
@@ -114,7 +111,7 @@ class OwnEmbeddings(Mixing):
 
 
 def equal_rows(embeddings: Tensor) -> Rows:
-    """Return own embeddings ``(b, c, l)`` with equal weights."""
+    """Return the embeddings ``(b, c, l)`` of each observation with equal weights."""
     shape = embeddings.shape[:2]
     return Rows(
         embeddings.new_full(shape, 1 / shape[1], dtype=torch.double), embeddings
@@ -151,7 +148,8 @@ class Part(nn.Module):
 def part_of(estimator: ConditionalEstimator) -> Part:
     r"""Return a trained estimator of NPE, :math:`q(\theta \mid h(x))`, as a part.
 
-    It is copied: the user may train it on, or put it into training mode.
+    The estimator is copied, because the user may train it further or put it into
+    training mode.
 
     Raises:
         UnsupportedPosteriorError: If it has no density or no embedding of x.

@@ -1,4 +1,4 @@
-"""The mixture as an sbi posterior: prior support, normalisation, the batch."""
+"""The mixture as an sbi posterior: the prior's support, normalisation, the batch."""
 
 import copy
 import operator
@@ -39,8 +39,9 @@ class MixturePosterior(BaseDirectPosterior):
         = \frac{\mathbf{1}[\theta \in \operatorname{supp} p]}{Z(x)}
         \sum_k w_k \sum_j a^k_j(x)\, q_k(\theta \mid s^k_j(x)),
 
-    with Z(x) the mass inside the support of the prior. RoPE's has one part, whose
-    embeddings are simulations and whose weights are rows of a coupling:
+    with Z(x) the mass inside the support of the prior. The posterior of RoPE has one
+    part. Its embeddings are those of simulations, and its weights are rows of a
+    coupling:
 
     .. math::
         p(\theta \mid x_{o,i})
@@ -49,16 +50,16 @@ class MixturePosterior(BaseDirectPosterior):
         \qquad Z_i = \sum_j \alpha_{ij} Z_j .
 
     It has all methods of sbi's :class:`DirectPosterior` and works with sbi's
-    diagnostics. With a coupled part it belongs to a batch of observations, and
-    diagnostics speak about that: simulation-based calibration, coverage and the like
-    are meaningful for the x_o of this posterior with their true parameters only.
-    Without one it is amortised and answers any x.
+    diagnostics. With a coupled part it belongs to a batch of observations. Then
+    simulation-based calibration, coverage and similar diagnostics only make sense for
+    the ``x_o`` of this posterior and their true parameters. Without a coupled part it
+    is amortised and answers any x.
 
-    Memory: beside arguments and result, 100 MB and what the flow needs for 16,384 pairs
-    of parameter and component (131,072 on a GPU); for sbi's NSF this is 50 MB. To that
-    end at most 2^19 weights, terms of the density or proposals are held at a time, or
-    one row of weights where it is longer; no matrix of n_o x n_s ever is. Not counted
-    is what tracking gradients keeps.
+    Memory: apart from arguments and result it needs 100 MB, and what the flow needs for
+    16,384 pairs of a parameter and a component (131,072 on a GPU), which is 50 MB for
+    sbi's NSF. At most 2^19 weights, terms of the density or proposals are held at a
+    time, or one row of weights if that is longer. A matrix of size n_o x n_s is never
+    held. Tracking gradients takes memory of its own.
 
     Accuracy: ``log_prob`` leaves out the smallest weights of each row that sum to at
     most ``tail_mass`` = t, so that the density is too small by at most t times the
@@ -72,10 +73,10 @@ class MixturePosterior(BaseDirectPosterior):
     Args:
         estimator: The mixture.
         prior: The prior NPE was trained with.
-        enable_transform: As in sbi, for ``map()``.
-        shared: What posteriors of the same prior and parts, in the same order, share
-            whatever their weights and couplings are: each leaves there what it has
-            estimated of the simulations that are their embeddings.
+        enable_transform: Whether ``map()`` searches in an unbounded space, as in sbi.
+        shared: A dictionary in which the posterior keeps the masses :math:`Z_j` that it
+            estimates. Posteriors of the same prior and the same parts, in the same
+            order, may share it, whatever their weights and couplings are.
     """
 
     def __init__(
@@ -86,7 +87,7 @@ class MixturePosterior(BaseDirectPosterior):
         enable_transform: bool = True,
         shared: dict[int, Tensor] | None = None,
     ) -> None:
-        with seeded(0):  # sbi draws from the prior to look at it
+        with seeded(0):  # sbi draws from the prior to find out about it
             super().__init__(
                 estimator,
                 prior,
@@ -94,7 +95,7 @@ class MixturePosterior(BaseDirectPosterior):
                 enable_transform=enable_transform,
             )
         self.posterior_estimator: MixtureEstimator = estimator
-        # Shared with the views of single observations, so that it is estimated once.
+        # Posteriors of single observations share it, so that all is estimated once.
         self._cache: dict[int, Tensor] = {} if shared is None else shared
         describe(self, _purpose(estimator))
 
@@ -110,7 +111,8 @@ class MixturePosterior(BaseDirectPosterior):
         """The batch of real observations, shape ``(n_o, *event)``.
 
         Raises:
-            InvalidInputError: If the posterior is amortised, as in all of the batch.
+            InvalidInputError: If the posterior is amortised. The other methods and
+                properties of the batch raise it, too.
         """
         return self._coupled("x_o").x_o
 
@@ -141,7 +143,7 @@ class MixturePosterior(BaseDirectPosterior):
     def weights(self) -> Tensor:
         """Weights of the simulations, shape ``(n_o, n_s)``; rows sum to one.
 
-        Those of a coupled part by itself, whatever the other parts weigh.
+        They are the weights within the coupled part, whatever the other parts weigh.
 
         Raises:
             InvalidInputError: If there are several coupled parts.
@@ -158,7 +160,7 @@ class MixturePosterior(BaseDirectPosterior):
         if self.is_amortised:
             raise InvalidInputError(
                 f"This posterior is amortised: it belongs to no batch and has no "
-                f"`{name}`. Pass the observation, such as `sample((1000,), x=x)`."
+                f"`{name}`. Pass the observation, as in `sample((1000,), x=x)`."
             )
         return self.posterior_estimator.coupled[0]
 
@@ -166,12 +168,12 @@ class MixturePosterior(BaseDirectPosterior):
         return len(self._coupled("len()").x_o)
 
     def __bool__(self) -> bool:
-        return True  # whatever its length
+        return True  # also an amortised one, which has no length
 
     def __getitem__(self, index: int) -> "MixturePosterior":
-        """Return the posterior of one observation, with it as the default x.
+        """Return the posterior of one observation, which is its default x.
 
-        It knows no other observation of the batch.
+        It does not know the other observations of the batch.
         """
         self._coupled("[i]")
         if isinstance(index, bool) or not hasattr(index, "__index__"):
@@ -194,12 +196,12 @@ class MixturePosterior(BaseDirectPosterior):
     def to(self, device: str | torch.device) -> None:
         """Move the posterior, its coupling and its batch to a device.
 
-        Posteriors of single observations taken before share what is moved; take them
-        again afterwards.
+        Posteriors of single observations (``posterior[i]``) share what is moved. Take
+        them again after moving.
 
         Raises:
-            InvalidInputError: If the prior cannot be moved, or there is no such device;
-                nothing is moved then.
+            InvalidInputError: If the prior cannot be moved, or there is no such
+                device. Nothing is moved then.
         """
         device = usable_device(device)
         if not hasattr(self.prior, "to"):
@@ -207,9 +209,10 @@ class MixturePosterior(BaseDirectPosterior):
                 f"Cannot move a posterior whose prior has no method `to`: "
                 f"{type(self.prior).__name__}. Use a prior of sbi, such as BoxUniform."
             )
-        # A new one: posteriors of a sweep share it and stay where they are.
+        # A new dictionary: the posteriors of a sweep share the old one, and stay on
+        # their device.
         self._cache = {k: mass.to(device) for k, mass in self._cache.items()}
-        with seeded(0):  # sbi draws from the prior to look at it
+        with seeded(0):  # sbi draws from the prior to find out about it
             super().to(device)
 
     # --- sampling ---
@@ -226,19 +229,19 @@ class MixturePosterior(BaseDirectPosterior):
 
         Args:
             sample_shape: Shape of the draws.
-            x: An observation, one of the batch if there is one; the default x if None.
-            max_sampling_batch_size: Most draws the flow makes at a time; if None what
-                is fast on the device.
-            show_progress_bars: Whether to show the draws accepted so far.
-            reject_outside_prior: Whether to draw from the truncated mixture, or from
-                the mixture as it is.
+            x: An observation, from the batch if there is one; the default x if None.
+            max_sampling_batch_size: As in :meth:`sample_batched`, and so are the
+                others.
+            show_progress_bars: Whether to show how many draws were accepted so far.
+            reject_outside_prior: Whether to draw from the mixture truncated to the
+                prior's support, or from the whole mixture.
 
         Returns:
             Shape ``(*sample_shape, d)``.
 
         Raises:
             UnseenObservationError: If x is not in the batch and ``unseen="raise"``.
-            SamplingError: If next to nothing lies inside the prior's support.
+            SamplingError: If hardly any mass lies inside the prior's support.
         """
         x = self._one_x(x)
         samples = self.sample_batched(
@@ -264,17 +267,18 @@ class MixturePosterior(BaseDirectPosterior):
         Args:
             sample_shape: Shape of the draws of each observation.
             x: Observations, shape ``(B, *event)``.
-            max_sampling_batch_size: Most draws the flow makes at a time; if None what
-                is fast on the device.
-            show_progress_bars: Whether to show the draws accepted so far.
-            reject_outside_prior: Whether to draw from the truncated mixtures.
+            max_sampling_batch_size: The largest number of draws the flow makes at a
+                time. If None, the number that is fast on the device.
+            show_progress_bars: Whether to show how many draws were accepted so far.
+            reject_outside_prior: Whether to draw from the mixtures truncated to the
+                prior's support, or from the whole mixtures.
 
         Returns:
             Shape ``(*sample_shape, B, d)``.
 
         Raises:
             UnseenObservationError: If an x is not in the batch and ``unseen="raise"``.
-            SamplingError: If next to nothing lies inside the prior's support.
+            SamplingError: If hardly any mass lies inside the prior's support.
         """
         if max_sampling_batch_size is not None:
             check_integer("max_sampling_batch_size", max_sampling_batch_size)
@@ -288,7 +292,7 @@ class MixturePosterior(BaseDirectPosterior):
 
     @property
     def _bound(self) -> Accept | None:
-        """What tells which parameters are inside the support; None if all are."""
+        """A function that tells which parameters are in the support; None if all."""
         return None if is_unbounded(self.prior) else self._inside
 
     def _inside(self, theta: Tensor) -> Tensor:
@@ -304,7 +308,7 @@ class MixturePosterior(BaseDirectPosterior):
             Itself, so that calls can be chained.
 
         Raises:
-            InvalidInputError: If the shape does not fit or a value is not finite.
+            InvalidInputError: If the shape does not fit, or a value is not finite.
         """
         super().set_default_x(self._batch_of_x(x).clone())
         return self
@@ -313,7 +317,7 @@ class MixturePosterior(BaseDirectPosterior):
         x = self.default_x if x is None else x
         if x is None:
             raise InvalidInputError(
-                "Expected `x`, an observation, or a default that was set with "
+                "Expected an observation `x`, or a default x that was set with "
                 "`set_default_x(x)`; got neither."
             )
         return self._batch_of_x(x)
@@ -333,7 +337,7 @@ class MixturePosterior(BaseDirectPosterior):
         if x.shape == event_shape:
             x = x[None]
         if x.shape[1:] != event_shape:
-            # process_x of sbi gives x without a batch dimension a leading one.
+            # sbi's process_x would add a leading dimension instead.
             raise InvalidInputError(
                 f"Expected `x` of shape (n, {', '.join(map(str, event_shape))}); got "
                 f"{tuple(x.shape)}."
@@ -352,10 +356,10 @@ class MixturePosterior(BaseDirectPosterior):
 
         Args:
             theta: Parameters, shape ``(n, d)`` or ``(d,)``.
-            x: An observation, one of the batch if there is one; the default x if None.
+            x: An observation, from the batch if there is one; the default x if None.
             norm_posterior: As in :meth:`log_prob_batched`, and so are the others.
             track_gradients: Whether gradients with respect to theta are needed.
-            leakage_correction_params: Not used here; must be None.
+            leakage_correction_params: Not used; must be None.
 
         Returns:
             Shape ``(n,)``; minus infinity outside the prior's support.
@@ -411,7 +415,7 @@ class MixturePosterior(BaseDirectPosterior):
             x: Observations, shape ``(B, *event)``.
             norm_posterior: Whether to divide by the mass inside the prior's support.
             track_gradients: Whether gradients with respect to theta are needed.
-            leakage_correction_params: Not used here; must be None.
+            leakage_correction_params: Not used; must be None.
 
         Returns:
             Shape ``(1, B)`` or ``(S, B)``; minus infinity outside the prior's support.
@@ -439,14 +443,15 @@ class MixturePosterior(BaseDirectPosterior):
     ) -> Tensor:
         """Return the maximum of the density given the default x, as in sbi.
 
-        Every step evaluates all components for all starting points, so that sbi's
-        defaults (1000 steps from the best 100 of 1000 samples) would take many minutes.
+        Every step evaluates all components for all starting points. sbi's defaults
+        (1000 steps from the best 100 of 1000 samples) would take many minutes.
 
         Args:
-            x: As in sbi not used; set the default x, or take ``posterior[i]``.
-            num_iter: Steps of gradient ascent.
-            num_to_optimize: Starting points, the densest of the samples.
-            num_init_samples: Samples to choose the starting points from.
+            x: Not used, as in sbi. Set the default x, or take ``posterior[i]``.
+            num_iter: Number of steps of gradient ascent.
+            num_to_optimize: Number of starting points: the samples with the highest
+                density.
+            num_init_samples: Number of samples to choose the starting points from.
             **options: The other options of sbi's ``DirectPosterior.map``.
 
         Returns:
@@ -458,7 +463,7 @@ class MixturePosterior(BaseDirectPosterior):
         check_integer("num_iter", num_iter)
         check_integer("num_to_optimize", num_to_optimize)
         check_integer("num_init_samples", num_init_samples)
-        with torch.enable_grad():  # whatever the caller's own setting
+        with torch.enable_grad():  # the caller may have switched gradients off
             return super().map(
                 x=x,
                 num_iter=num_iter,
@@ -472,13 +477,17 @@ class MixturePosterior(BaseDirectPosterior):
     def leakage(self, x: Tensor, *, show_progress_bars: bool = False) -> Leakage:
         r"""Return the mass of each mixture inside the prior's support, with its error.
 
-        The mass of every simulation's posterior, :math:`Z_j`, is estimated once from
-        1024 draws and kept; that of densities of x itself is estimated for each x. The
-        draws have random numbers of their own, so that log_prob is a function.
+        The mass :math:`Z_j` of every simulation's posterior is estimated once, from
+        1024 draws, and kept. The mass of densities of x itself is estimated for each x.
+        The draws have a seed of their own, so that ``log_prob`` always returns the same
+        numbers.
 
         Args:
             x: Observations, shape ``(B, *event)``.
-            show_progress_bars: Whether to show progress, if it takes long.
+            show_progress_bars: Whether to show progress if the estimate takes long.
+
+        Returns:
+            The masses and their standard errors, both of shape ``(B,)``.
         """
         return self.posterior_estimator.mass(
             self._batch_of_x(x),
@@ -490,7 +499,7 @@ class MixturePosterior(BaseDirectPosterior):
     def leakage_correction(  # type: ignore[override]
         self, x: Tensor, **kwargs: Any
     ) -> Tensor:
-        r"""Return :math:`Z_i`, shape ``(B,)``; called by log_prob of the base class."""
+        r"""Return :math:`Z_i`, shape ``(B,)``; sbi calls it in ``log_prob``."""
         if kwargs:
             raise InvalidInputError(
                 f"Expected no `leakage_correction_params`; got {sorted(kwargs)}. The "

@@ -1,4 +1,4 @@
-"""The prior as a part of a mixture: a density that no observation changes."""
+"""The prior as a part of a mixture: a density that does not depend on x."""
 
 import copy
 from collections.abc import Callable, Sequence
@@ -21,12 +21,12 @@ def part_of_prior(prior: Distribution, event_shape: Sequence[int]) -> Part:
     """Return the prior as a part that ignores the observation.
 
     Args:
-        prior: A torch distribution over parameters of shape ``(k,)``; it is copied.
+        prior: A torch distribution over parameters of shape ``(d,)``; it is copied.
         event_shape: Shape of one observation.
 
     Raises:
         InvalidTypeError: If the prior is not a torch distribution.
-        InvalidInputError: If it is not one over vectors.
+        InvalidInputError: If the parameters are not vectors.
     """
     check_prior(prior)
     density = PriorDensity(copy.deepcopy(prior))
@@ -34,11 +34,11 @@ def part_of_prior(prior: Distribution, event_shape: Sequence[int]) -> Part:
 
 
 class NoEmbedding(Mixing):
-    """One embedding for all observations, of width zero.
+    """One embedding of width zero, the same for all observations.
 
     Args:
         event_shape: Shape of one observation.
-        device: Where the density is.
+        device: The device of the density.
     """
 
     empty: Tensor
@@ -53,7 +53,7 @@ class NoEmbedding(Mixing):
         return self.empty
 
     def embed(self, x: Tensor) -> Tensor:
-        """Return nothing for each observation, ``(n, 0)``."""
+        """Return an empty embedding for each observation, ``(n, 0)``."""
         return x.new_empty(len(x), 0)
 
     def rows(self, embedded: Tensor) -> Rows:
@@ -65,7 +65,7 @@ class PriorDensity(ConditionalDensityEstimator):
     r"""The prior :math:`p(\theta)`, in the form of an estimator of sbi.
 
     Args:
-        prior: A torch distribution over parameters of shape ``(k,)``.
+        prior: A torch distribution over parameters of shape ``(d,)``.
     """
 
     placeholder: Tensor
@@ -75,7 +75,7 @@ class PriorDensity(ConditionalDensityEstimator):
         self.prior = prior
         with seeded(0):
             like = prior.sample(torch.Size((1,)))
-        # It says where the prior is.
+        # A distribution has no device. This tensor is on the device of its draws.
         self.register_buffer("placeholder", torch.empty(0, device=like.device))
 
     def log_prob(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
@@ -88,7 +88,7 @@ class PriorDensity(ConditionalDensityEstimator):
     ) -> Tensor:
         """Draw for each condition, ``(*sample_shape, B, d)``."""
         shape = (*sample_shape, len(condition))
-        # sbi's MultipleIndependent knows sample shapes of one dimension only.
+        # sbi's MultipleIndependent takes sample shapes with one dimension only.
         theta = self.prior.sample(torch.Size((torch.Size(shape).numel(),)))
         return theta.to(condition).reshape(*shape, *self.input_shape)
 
@@ -97,7 +97,7 @@ class PriorDensity(ConditionalDensityEstimator):
         return -self.log_prob(input[None], condition)[0]
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:  # noqa: FBT001, FBT002
-        # What `to` calls for each module: a distribution is none.
+        # `to` calls this for each module, but a distribution is not a module.
         moved = super()._apply(fn, recurse)
         device = self.placeholder.device
         self.prior = move_distribution_to_device(self.prior, str(device))
@@ -105,18 +105,19 @@ class PriorDensity(ConditionalDensityEstimator):
 
 
 def prior_log_prob(prior: Distribution, theta: Tensor) -> Tensor:
-    r"""Return the log density, :math:`-\infty` outside the support.
+    r"""Return the log density of the prior, :math:`-\infty` outside its support.
 
     Args:
-        prior: A torch distribution over parameters of shape ``(k,)``.
-        theta: Parameters, shape ``(n, k)``.
+        prior: A torch distribution over parameters of shape ``(d,)``.
+        theta: Parameters, shape ``(n, d)``.
 
     Returns:
-        Shape ``(n,)``, with a graph back to theta even where the density is flat.
+        Shape ``(n,)``. Gradients with respect to theta exist even where the density is
+        flat; they are zero there.
     """
     inside = within_support(prior, theta)
-    # torch's distributions raise outside their support: evaluate them at a prior draw
-    # there, and overwrite the result.
+    # torch's distributions raise an error outside their support. There they are
+    # evaluated at a draw from the prior, and the result is overwritten.
     with seeded(0):
         filler = prior.sample(torch.Size((1,))).to(theta)
     safe = torch.where(inside.unsqueeze(-1), theta, filler)

@@ -1,4 +1,4 @@
-r"""The prior as a posterior: what is known before any observation."""
+"""The prior in the form of an sbi posterior."""
 
 from typing import Any
 
@@ -26,14 +26,15 @@ __all__ = ["PriorPosterior"]
 class PriorPosterior(NeuralPosterior):
     r"""The prior :math:`p(\theta)`, in the form of an sbi posterior that ignores x.
 
-    It is calibrated whenever the prior is right, and its log posterior probability is
-    the bar that an estimate must clear to have learnt anything from x.
+    It is calibrated whenever the prior is right. An estimate that has learnt something
+    from x has a higher log posterior probability.
 
-    ``sample`` and ``log_prob`` need no observation; the batched methods take one sample
-    set or density for each row of ``x``, whose values are never read. ``potential``
-    follows sbi and asks for an ``x`` or a default. ``map`` is the mode of the prior
-    found by sbi's gradient ascent; of a uniform prior, any point. It needs a prior that
-    sbi can transform to an unbounded space; everything else does without.
+    ``sample`` and ``log_prob`` need no observation. The batched methods return one set
+    of samples, or one density, for each row of ``x``, and never read its values.
+    ``potential`` needs an ``x`` or a default x, as in sbi. ``map`` searches the mode of
+    the prior by sbi's gradient ascent; for a uniform prior it returns any point. It
+    needs a prior that sbi can transform to an unbounded space. The other methods do
+    not.
 
     References:
         | Addressing Misspecification in Simulation-based Inference through Data-driven
@@ -76,7 +77,7 @@ class PriorPosterior(NeuralPosterior):
         show_progress_bars: bool = True,  # noqa: FBT001, FBT002
         **kwargs: Any,
     ) -> Tensor:
-        """Draw from the prior, shape ``(*sample_shape, d)``; the rest is ignored."""
+        """Draw from the prior, ``(*sample_shape, d)``; other arguments are ignored."""
         return self._draw(as_shape("sample_shape", sample_shape))
 
     def sample_batched(
@@ -88,14 +89,14 @@ class PriorPosterior(NeuralPosterior):
     ) -> Tensor:
         """Draw from the prior for each row of ``x``, ``(*sample_shape, n, d)``.
 
-        Options of other posteriors' samplers are taken and ignored, as sbi's base class
-        asks.
+        Options of other posteriors' samplers are accepted and ignored, as sbi's base
+        class asks.
         """
         shape = as_shape("sample_shape", sample_shape)
         return self._draw(torch.Size((*shape, _number_of_rows(x))))
 
     def _draw(self, shape: torch.Size) -> Tensor:
-        # sbi's MultipleIndependent knows sample shapes of one dimension only.
+        # sbi's MultipleIndependent takes sample shapes with one dimension only.
         samples = self.prior.sample(torch.Size((shape.numel(),)))
         return samples.reshape(*shape, *samples.shape[1:])
 
@@ -105,7 +106,7 @@ class PriorPosterior(NeuralPosterior):
         x: Tensor | None = None,
         track_gradients: bool = False,  # noqa: FBT001, FBT002
     ) -> Tensor:
-        r"""Log density of the prior, :math:`-\infty` outside it, shape ``(n,)``."""
+        r"""Return the log density, :math:`-\infty` outside the support, ``(n,)``."""
         theta = check_theta(theta, self.prior.event_shape, batched=False)
         return self.potential_fn(
             torch.atleast_2d(theta), track_gradients=track_gradients
@@ -117,16 +118,19 @@ class PriorPosterior(NeuralPosterior):
         x: Tensor,
         track_gradients: bool = False,  # noqa: FBT001, FBT002
     ) -> Tensor:
-        """Log density of the prior for each row of ``x``, as sbi shapes it.
+        """Return the log density of the prior for each row of ``x``.
 
         Args:
-            theta: Parameters, one for each row of ``x``, shape ``(n, d)``, or several,
-                ``(num_samples, n, d)``.
-            x: Observations, shape ``(n, *event_shape)``; only their number counts.
+            theta: Parameters, shape ``(n, d)`` or ``(S, n, d)``. One row of theta
+                serves all rows of ``x``.
+            x: Observations, shape ``(n, *event)``; only their number matters.
             track_gradients: Whether gradients with respect to theta are needed.
 
         Returns:
-            The log density, shape ``(1, n)`` or ``(num_samples, n)``.
+            Shape ``(1, n)`` or ``(S, n)``, as in sbi.
+
+        Raises:
+            InvalidInputError: If the shapes do not fit.
         """
         theta = check_theta(theta, self.prior.event_shape, batched=True)
         count = _number_of_rows(x)
@@ -171,13 +175,13 @@ def _number_of_rows(x: Any) -> int:
 
 
 class _PriorPotential(BasePotential):
-    """Log density of the prior, for any x."""
+    """The log density of the prior, whatever x is."""
 
     prior: Distribution
 
     def __call__(self, theta: Tensor, track_gradients: bool = True) -> Tensor:  # noqa: FBT001, FBT002
         shape = theta.shape[:-1]
         with torch.set_grad_enabled(track_gradients):
-            # sbi's MultipleIndependent takes theta of two dimensions at most.
+            # sbi's MultipleIndependent takes theta with at most two dimensions.
             theta = theta.reshape(-1, theta.shape[-1])
             return prior_log_prob(self.prior, theta).reshape(shape)

@@ -1,4 +1,4 @@
-"""Draws from a block of mixtures, and the rejection of those outside the prior."""
+"""Samples of a block of mixtures, without those outside the support of the prior."""
 
 from collections.abc import Callable
 
@@ -12,13 +12,13 @@ from sbi_rope.mixture.parts import DTYPE
 
 __all__ = ["Accept", "BlockSampler"]
 
-# Rejection sampling gives an observation up if, after so many proposals, less than this
-# share of them lies inside the prior's support.
+# Rejection sampling gives up on an observation if, after MIN_PROPOSALS proposals, less
+# than a share of MIN_ACCEPTANCE of them lies inside the prior's support.
 MIN_PROPOSALS, MIN_ACCEPTANCE = 100_000, 1e-3
-# Observations of which so many proposals were all rejected are counted together: where
-# a whole batch leaks, MIN_PROPOSALS for all of them are enough.
+# Observations for which this many proposals were all rejected are counted together: if
+# a whole batch lies outside the support, MIN_PROPOSALS for all of it are enough.
 MIN_WITHOUT_ANY = 5_000
-# Draws that take a flow about as long as a single one.
+# A flow takes about as long for this many draws as for a single one.
 SMALL_BATCH = 512
 
 Accept = Callable[[Tensor], Tensor]
@@ -30,7 +30,7 @@ class BlockSampler:
     Args:
         block: The weighted embeddings of the observations.
         accept: Tells which proposals ``(n, d)`` to keep; None keeps all.
-        batch_size: Most draws the flow makes at a time.
+        batch_size: The largest number of draws the flow makes at a time.
         first_row: The number of the block's first observation, for messages.
     """
 
@@ -49,13 +49,15 @@ class BlockSampler:
         self.theta_shape = block.parts[0].density.input_shape
         weights = block.weights
         self.num_rows, self.num_components = weights.shape
-        # Inverse transform: row i fills the interval [i, i + 1], so that one search
-        # serves all rows. The offset takes digits, hence in double precision.
+        # Components are drawn by the inverse of the cumulative weights. Those of row i
+        # fill the interval [i, i + 1], so that one search serves all rows. The offset i
+        # costs digits, hence the double precision.
         cumulative = weights.cumsum(dim=1, dtype=torch.float64)
         cumulative /= cumulative[:, -1:].clone()
         cumulative += torch.arange(self.num_rows, device=weights.device)[:, None]
         self._cumulative = cumulative.flatten()
-        # Rounding may carry a draw past the end of its row.
+        # The last component of each row with a weight: rounding may carry a draw past
+        # the end of its row.
         positive = (weights > 0).flip(1).to(torch.int8)
         self._last = self.num_components - 1 - positive.argmax(dim=1)
         self._proposed = torch.zeros_like(self._last)
@@ -65,7 +67,7 @@ class BlockSampler:
         """Draw from every mixture, ``(num_samples, b, d)``.
 
         Raises:
-            SamplingError: If next to nothing is accepted for some observation.
+            SamplingError: If hardly any draw is accepted for some observation.
         """
         slots = torch.arange(self.num_rows, device=self._last.device)
         slots = slots.repeat_interleave(num_samples)
@@ -75,7 +77,7 @@ class BlockSampler:
     def _propose(self, rows: Tensor) -> Tensor:
         """Draw one theta from the mixture of each entry of ``rows``."""
         uniform = torch.rand(len(rows), dtype=torch.float64, device=rows.device)
-        # right=True passes over components of weight zero.
+        # right=True skips components with a weight of zero.
         found = torch.searchsorted(self._cumulative, uniform + rows, right=True)
         found = (found - rows * self.num_components).clamp_min_(0)
         chosen = torch.minimum(found, self._last[rows])
@@ -84,7 +86,7 @@ class BlockSampler:
             places = torch.arange(len(entries.which), device=rows.device)
             for some in places.split(self.batch_size):
                 draws = entries.part.sample(entries.embeddings(some))
-                # Under torch's autocast and default dtypes these may be others.
+                # Under torch's autocast the draws may have another dtype.
                 theta[entries.which[some]] = draws.to(DTYPE)
         return theta
 
@@ -93,7 +95,7 @@ class BlockSampler:
         return torch.empty(shape, dtype=DTYPE, device=self._last.device)
 
     def _fill(self, slots: Tensor) -> Tensor:
-        """Propose for every slot, an index of a row, until one is accepted for it."""
+        """Propose theta for every slot (the number of a row) until one is accepted."""
         assert self.accept is not None
         theta = self._empty(len(slots))
         still_open = torch.ones(len(slots), dtype=torch.bool, device=slots.device)
@@ -128,15 +130,15 @@ class BlockSampler:
             raise SamplingError(
                 f"Less than one in {int(1 / MIN_ACCEPTANCE)} draws lies inside the "
                 f"support of the prior for the observations in rows {numbers} of `x`: "
-                "the densities it is mixed of leak. Train NPE longer, or with "
-                "z_score_theta='transform_to_unconstrained', or pass "
-                "reject_outside_prior=False."
+                "the densities in the mixture have nearly all of their mass outside. "
+                "Train NPE longer, or with z_score_theta='transform_to_unconstrained', "
+                "or pass reject_outside_prior=False."
             )
 
 
 def _repeats(num_open: int, rate: float) -> int:
     """Return how many proposals to make for every open slot."""
-    # As many as will fill most of the slots, and for the last few slots as many as take
-    # no longer than one.
+    # At this rate most slots are filled. For the last few slots, more proposals take no
+    # longer than one.
     wanted = max(int(1 / max(rate, MIN_ACCEPTANCE)), SMALL_BATCH // num_open)
     return max(1, min(wanted, num_fitting(num_open)))

@@ -25,8 +25,8 @@ __all__ = [
     "shared_mass",
 ]
 
-# Draws that the mass inside the prior's support is estimated from: of a shared
-# embedding, or of a density that has all the weight.
+# The number of draws from which the mass inside the prior's support is estimated, given
+# a shared embedding or for a part with a weight of one.
 LEAKAGE_DRAWS = 1024
 
 
@@ -36,7 +36,7 @@ class Leakage:
 
     Attributes:
         mass: :math:`Z_i`, shape ``(n,)``, float64.
-        standard_error: Of ``mass``, from the draws behind it.
+        standard_error: The standard error of ``mass``, shape ``(n,)``, float64.
     """
 
     mass: Tensor
@@ -53,7 +53,7 @@ def component_mass(
 ) -> Tensor:
     """Estimate the mass inside the support given each embedding, ``(c,)``, float64.
 
-    The draws have random numbers of their own.
+    The draws have a seed of their own.
     """
     keep_freed_memory(embeddings.device)
     mass = []
@@ -61,7 +61,7 @@ def component_mass(
         chunks = embeddings.split(
             max(1, flow_batch(embeddings.device) // LEAKAGE_DRAWS)
         )
-        # Some flows need minutes here.
+        # Some flows take minutes here.
         for some in _bar(chunks, show=show_progress_bars):
             mass.append(_share_inside(density, some, accept, LEAKAGE_DRAWS))
     return torch.cat(mass)
@@ -72,8 +72,8 @@ def shared_mass(part: Part, embedded: Tensor, mass: Tensor) -> Leakage:
 
     Args:
         part: The part.
-        embedded: Of the observations, shape ``(n, ...)``.
-        mass: What :func:`component_mass` returns for the embeddings.
+        embedded: The result of its ``embed`` for the observations, shape ``(n, ...)``.
+        mass: The result of :func:`component_mass` for the embeddings, shape ``(c,)``.
     """
     variance = _variance(mass, LEAKAGE_DRAWS)
     means, errors = [], []
@@ -94,20 +94,20 @@ def own_mass(
     seed: int,
     show_progress_bars: bool = False,
 ) -> Leakage:
-    """Estimate the mass of a part whose embeddings are each observation's own.
+    """Estimate the mass of a part in which each observation has its own embeddings.
 
-    The random numbers are the same in every call. Those of an observation depend on its
-    place among those asked for together, and so does its mass, within the standard
-    error.
+    The random numbers are the same in every call. The random numbers of an observation
+    depend on its position among the observations of the call, and so does its mass,
+    within the standard error.
 
     Args:
         part: The part.
-        embedded: Of the observations, shape ``(n, ...)``.
+        embedded: The result of its ``embed`` for the observations, shape ``(n, ...)``.
         accept: Tells which parameters ``(n, d)`` are inside the support.
         num_draws: Draws for each observation, over all its embeddings together.
-        seed: Another one for each part. With the same random numbers, the errors of
-            parts that are nearly the same would add up instead of averaging out.
-        show_progress_bars: Whether to show progress, if it takes long.
+        seed: The seed of the draws. It differs between parts: with the same random
+            numbers, the errors of similar parts would add up instead of averaging out.
+        show_progress_bars: Whether to show progress if the estimate takes long.
     """
     num_embeddings = part.mixing.num_embeddings
     of_each = math.ceil(num_draws / num_embeddings)
@@ -135,8 +135,8 @@ def _share_inside(
 
 
 def _variance(share: Tensor, draws: int) -> Tensor:
-    # Half a draw is added to those inside and to those outside. Otherwise a embedding
-    # whose draws are all inside, or all outside, would seem to have no error.
+    # Half a draw is added to the draws inside and to those outside. Otherwise the mass
+    # would seem to have no error if all draws are inside, or all are outside.
     smoothed = (draws * share + 0.5) / (draws + 1)
     return smoothed * (1.0 - smoothed) / draws
 
@@ -149,7 +149,7 @@ def is_unbounded(prior: Distribution) -> bool:
     """Tell whether a prior says that its support is the whole space."""
     try:
         support: Any = getattr(prior, "support", None)
-    except NotImplementedError:  # torch's way of saying that a law states none
+    except NotImplementedError:  # torch raises it if a distribution states no support
         return False
     while isinstance(support, constraints.independent):
         support = support.base_constraint

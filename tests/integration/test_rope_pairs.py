@@ -1,4 +1,4 @@
-"""Parts of RoPE that folds are made of: some pairs, and their targets."""
+"""RoPE with some of its pairs and given targets, as the folds of a stack use it."""
 
 from dataclasses import replace
 from typing import Any
@@ -73,7 +73,7 @@ def test_targets_of_stored_simulations_are_the_embeddings_of_the_nearest() -> No
     assert torch.allclose(targets_of(rope, rows), expected, atol=1e-6)
 
 
-def test_a_rope_with_some_pairs_tunes_on_these_towards_the_targets_given() -> None:
+def test_a_rope_with_some_pairs_tunes_on_these_towards_the_given_targets() -> None:
     rope = trained()
     theta, x = rope.calibration
     rows = torch.tensor([7, 2, 11, 5, 3, 1])
@@ -90,9 +90,7 @@ def test_a_rope_with_some_pairs_tunes_on_these_towards_the_targets_given() -> No
     assert same(parameters(found), parameters(expected.embedding_net))
 
 
-def test_targets_are_forgotten_when_pairs_are_added_or_drawn_anew_in_every_step() -> (
-    None
-):
+def test_given_targets_are_not_used_if_pairs_are_added_or_targets_resampled() -> None:
     rope = trained()
     theta, x = rope.calibration
     rows = torch.arange(6)
@@ -116,7 +114,7 @@ def test_targets_are_forgotten_when_pairs_are_added_or_drawn_anew_in_every_step(
     assert same(parameters(nets[0]), parameters(nets[1]))
 
 
-def test_a_rope_with_some_pairs_leaves_the_other_as_it_was() -> None:
+def test_a_rope_with_some_pairs_does_not_change_the_other() -> None:
     rope = trained()
     net, (theta, x) = rope.tuned_embedding_net, rope.calibration
     part = rope.with_pairs(torch.arange(4)).train(seed=9, **QUIET)
@@ -162,7 +160,7 @@ def counted() -> tuple[list[int], RoPE]:
     return calls, rope.append_calibration(*problem(NUM_PAIRS, seed=1))
 
 
-def test_rehearsal_keeps_simulations_nearer_to_where_they_were() -> None:
+def test_rehearsal_keeps_the_embeddings_of_simulations_in_place() -> None:
     x = problems.simulate(problems.box(2).sample((500,)))
     moved = []
     for rehearsal in (0.0, 5.0):
@@ -173,7 +171,7 @@ def test_rehearsal_keeps_simulations_nearer_to_where_they_were() -> None:
     assert moved[1] < 0.5 * moved[0]
 
 
-def test_what_is_rehearsed_is_simulated_once_for_all_parts() -> None:
+def test_simulations_for_rehearsal_are_made_once_for_all_folds() -> None:
     calls, rope = counted()
     rope.train(seed=0, **QUIET)
     calls.clear()

@@ -1,6 +1,7 @@
 """The mixture against brute force: its density, its samples, its normalisation."""
 
 import copy
+import itertools
 import math
 import warnings
 from collections.abc import Callable
@@ -9,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from sbi.utils import BoxUniform, MultipleIndependent
+from sbi.utils import MultipleIndependent
 from sbi.utils.metrics import c2st
 from torch import Size, Tensor
-from torch.distributions import Distribution, Gamma, Normal
+from torch.distributions import Distribution, Gamma, Independent, Normal
 
 from sbi_rope._sbi import embed, embedding_of, headless
 from sbi_rope.coupling import SinkhornCoupler
@@ -101,7 +102,8 @@ def test_log_prob_is_the_log_sum_over_all_components() -> None:
         assert torch.allclose(single, expected[:, i], atol=1e-6, rtol=1e-6)
 
 
-@pytest.mark.parametrize("family", problems.FAMILIES)
+# One flow of each library; all families go through tests/contract.
+@pytest.mark.parametrize("family", ["mdn", "nsf", "zuko_unaf"])
 def test_log_prob_of_trained_flows_is_the_log_sum_over_all_components(
     family: str,
 ) -> None:
@@ -114,49 +116,45 @@ def test_log_prob_of_trained_flows_is_the_log_sum_over_all_components(
     )
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize("blocked", [False, True])
-def test_every_kind_of_coupling_gives_the_log_sum_of_its_own_weights(
-    dtype: torch.dtype, blocked: bool
-) -> None:
-    posterior = flow_posterior(dtype=dtype, blocked=blocked)
-    assert posterior.coupling.real.dtype is dtype
-    rows = problems.rows_of(posterior, posterior.x_o)
-    assert torch.equal(rows, posterior.weights)
-    theta = 2 * torch.rand(10, 6, 2) - 1
-    expected = brute_force_log_prob(posterior, theta).float()
-    log_prob = log_prob_batched(posterior, theta)
-    assert log_prob.dtype is torch.float32
-    assert torch.allclose(log_prob, expected, atol=1e-4, rtol=1e-5)
-    leakage = posterior.leakage(posterior.x_o)
-    mass = posterior._cache[0]
-    assert torch.allclose(leakage.mass, posterior.weights.double() @ mass, atol=1e-12)
-    normalised = posterior.log_prob_batched(theta, posterior.x_o)
-    assert torch.allclose(normalised, log_prob - leakage.mass.log().float(), atol=1e-4)
+def test_every_kind_of_coupling_gives_the_log_sum_of_its_own_weights() -> None:
+    for dtype, blocked in itertools.product(
+        (torch.float64, torch.float32), (False, True)
+    ):
+        posterior = flow_posterior(dtype=dtype, blocked=blocked)
+        assert posterior.coupling.real.dtype is dtype
+        rows = problems.rows_of(posterior, posterior.x_o)
+        assert torch.equal(rows, posterior.weights)
+        theta = 2 * torch.rand(10, 6, 2) - 1
+        expected = brute_force_log_prob(posterior, theta).float()
+        log_prob = log_prob_batched(posterior, theta)
+        assert log_prob.dtype is torch.float32
+        assert torch.allclose(log_prob, expected, atol=1e-4, rtol=1e-5)
+        leakage, mass = posterior.leakage(posterior.x_o), posterior._cache[0]
+        expected = posterior.weights.double() @ mass
+        assert torch.allclose(leakage.mass, expected, atol=1e-12)
+        normalised = posterior.log_prob_batched(theta, posterior.x_o)
+        expected = log_prob - leakage.mass.log().float()
+        assert torch.allclose(normalised, expected, atol=1e-4)
 
 
-@pytest.mark.parametrize("entries", [1, 13, 50, 2**19])
-@pytest.mark.parametrize("batch", [1, 7, 50, 2**14])
 @pytest.mark.parametrize("tail_mass", [0.0, 0.05])
-def test_chunking_changes_no_density(
-    entries: int, batch: int, tail_mass: float, monkeypatch: pytest.MonkeyPatch
+def test_the_size_of_blocks_and_batches_changes_no_density(
+    tail_mass: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     posterior = gaussian_posterior(n_o=7, n_s=20, tail_mass=tail_mass, std=0.8)
     theta = 2 * torch.rand(6, 7, 2) - 1
     whole = posterior.log_prob_batched(theta, posterior.x_o)
     one = posterior.log_prob(theta[:, 2], x=posterior.x_o[2])
-    monkeypatch.setattr(chunks, "MAX_ENTRIES", entries)
-    monkeypatch.setattr(chunks, "CPU_BATCH", batch)
-    cut = posterior.log_prob_batched(theta, posterior.x_o)
-    assert torch.allclose(cut, whole, atol=1e-6)
-    assert torch.allclose(
-        posterior.log_prob(theta[:, 2], x=posterior.x_o[2]), one, atol=1e-6
-    )
+    for entries, batch in ((1, 1), (13, 7), (50, 2**14), (2**19, 50)):
+        monkeypatch.setattr(chunks, "MAX_ENTRIES", entries)
+        monkeypatch.setattr(chunks, "CPU_BATCH", batch)
+        cut = posterior.log_prob_batched(theta, posterior.x_o)
+        assert torch.allclose(cut, whole, atol=1e-6), (entries, batch)
+        cut = posterior.log_prob(theta[:, 2], x=posterior.x_o[2])
+        assert torch.allclose(cut, one, atol=1e-6), (entries, batch)
 
 
-@pytest.mark.parametrize("batch", [60, 500])
-def test_the_flow_sees_full_batches_of_pairs_and_never_more(
-    batch: int,
+def test_the_flow_gets_full_batches_of_pairs_and_never_more(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     posterior = gaussian_posterior(n_o=7, n_s=20)
@@ -168,28 +166,17 @@ def test_the_flow_sees_full_batches_of_pairs_and_never_more(
         return original(input, condition, **kwargs)
 
     monkeypatch.setattr(components, "log_prob", log_prob)
-    monkeypatch.setattr(chunks, "CPU_BATCH", batch)
-    log_prob_batched(posterior, torch.zeros(10, 7, 2))
-    full, rest = divmod(10 * 7 * 20, batch)
-    assert pairs == [batch] * full + [rest]
+    for batch in (60, 500):
+        pairs.clear()
+        monkeypatch.setattr(chunks, "CPU_BATCH", batch)
+        log_prob_batched(posterior, torch.zeros(10, 7, 2))
+        full, rest = divmod(10 * 7 * 20, batch)
+        assert pairs == [batch] * full + [rest]
 
 
-@pytest.mark.parametrize(
-    "call",
-    [
-        pytest.param(
-            lambda p: p.log_prob_batched(torch.zeros(9, 30, 2), p.x_o), id="log_prob"
-        ),
-        pytest.param(lambda p: p.sample_batched((20,), p.x_o, **QUIET), id="sample"),
-        pytest.param(lambda p: p.leakage(p.x_o), id="leakage"),
-        pytest.param(
-            lambda p: p.sample_batched((20,), torch.randn(30, 3), **QUIET), id="extend"
-        ),
-    ],
-)
 @pytest.mark.filterwarnings("ignore:Extended")
 def test_weights_and_proposals_stay_within_the_number_of_the_docstring(
-    call: Callable[[MixturePosterior], Any], monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     posterior = gaussian_posterior(n_o=30, n_s=12, std=2.0, unseen="extend")
     entries = []
@@ -218,10 +205,19 @@ def test_weights_and_proposals_stay_within_the_number_of_the_docstring(
     monkeypatch.setattr(posterior, "_inside", accept)
     monkeypatch.setattr(density_module, "_log_q", terms)
     monkeypatch.setattr(chunks, "MAX_ENTRIES", 100)
-    call(posterior)
-    assert max(entries) <= 100
-    # 30 rows of 12 weights, eight at a time.
-    assert entries.count(8 * 12) >= 3
+    x_o = posterior.x_o
+    calls: dict[str, Callable[[], Tensor]] = {
+        "log_prob": lambda: posterior.log_prob_batched(torch.zeros(9, 30, 2), x_o),
+        "sample": lambda: posterior.sample_batched((20,), x_o, **QUIET),
+        "leakage": lambda: posterior.leakage(x_o).mass,
+        "extend": lambda: posterior.sample_batched((20,), torch.randn(30, 3), **QUIET),
+    }
+    for name, call in calls.items():
+        entries.clear()
+        call()
+        assert max(entries) <= 100, name
+        # 30 rows of 12 weights, eight at a time.
+        assert entries.count(8 * 12) >= 3, name
 
 
 MEMORY = """
@@ -274,13 +270,6 @@ def test_components_without_a_draw_inside_still_have_an_error() -> None:
     assert (none_inside.leakage(none_inside.x_o).standard_error > 0).all()
 
 
-@pytest.mark.parametrize("size", [-1, 0, 1.5])
-def test_impossible_batch_sizes_are_refused(size: float) -> None:
-    posterior = gaussian_posterior()
-    with pytest.raises(InvalidInputError, match="max_sampling_batch_size"):
-        posterior.sample_batched((3,), posterior.x_o, max_sampling_batch_size=size)
-
-
 def test_no_theta_has_no_density() -> None:
     posterior = gaussian_posterior(n_o=5)
     empty = torch.zeros(0, 5, 2)
@@ -289,7 +278,7 @@ def test_no_theta_has_no_density() -> None:
     assert posterior.posterior_estimator.log_prob(empty, posterior.x_o).shape == (0, 5)
 
 
-def test_a_component_without_a_density_does_not_take_the_others_with_it(
+def test_components_with_a_density_of_nan_count_as_zero(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     broken = gaussian_posterior(n_o=6, n_s=20)
@@ -322,7 +311,7 @@ def test_a_component_without_a_density_does_not_take_the_others_with_it(
     )
 
 
-@pytest.mark.parametrize("tail_mass", [1e-3, 0.05, 0.5, 0.99, 1.0])
+@pytest.mark.parametrize("tail_mass", [1e-3, 0.5, 1.0])
 def test_the_tail_left_out_obeys_the_bound_of_the_docstring(tail_mass: float) -> None:
     torch.manual_seed(5)
     weights = torch.softmax(3 * torch.randn(8, 60), dim=1)
@@ -358,7 +347,7 @@ def embeddings(n_s: int, dim: int = 2) -> Tensor:
     return problems.embeddings_of(dim, n_s)
 
 
-def test_equal_weights_are_kept_even_where_each_is_small() -> None:
+def test_equal_weights_are_not_left_out_because_each_is_small() -> None:
     uniform = torch.full((2, 4000), 1 / 4000)
     posterior = gaussian_posterior(
         dim=1, n_o=2, weights=uniform, embeddings=embeddings(4000, 1), tail_mass=1e-3
@@ -378,49 +367,36 @@ def test_the_tails_of_the_density_do_not_underflow() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    "prior",
-    [
-        pytest.param(problems.box(2), id="bounded"),
-        pytest.param(problems.standard_normal(2), id="unbounded"),
-    ],
-)
-def test_the_density_integrates_to_one(prior: Distribution) -> None:
-    posterior = gaussian_posterior(prior=prior, n_o=3, std=0.4)
-    bound = 1.0 if isinstance(prior, BoxUniform) else 4.0
-    size = 161
-    step = 2 * bound / size
-    axis = torch.arange(size) * step - bound + step / 2
-    grid = torch.cartesian_prod(axis, axis)
-    integral = (
-        posterior.log_prob_batched(grid[:, None].expand(-1, 3, -1), posterior.x_o)
-        .exp()
-        .sum(dim=0)
-        * step**2
-    )
-    error = posterior.leakage(posterior.x_o).standard_error
-    assert ((integral - 1).abs() < 4 * error + 2e-3).all()
+def test_the_density_integrates_to_one() -> None:
+    for prior, bound in ((problems.box(2), 1.0), (problems.standard_normal(2), 4.0)):
+        posterior = gaussian_posterior(prior=prior, n_o=3, std=0.4)
+        size = 161
+        step = 2 * bound / size
+        axis = torch.arange(size) * step - bound + step / 2
+        grid = torch.cartesian_prod(axis, axis)[:, None].expand(-1, 3, -1)
+        density = posterior.log_prob_batched(grid, posterior.x_o).exp()
+        integral = density.sum(dim=0) * step**2
+        error = posterior.leakage(posterior.x_o).standard_error
+        assert ((integral - 1).abs() < 4 * error + 2e-3).all(), prior
 
 
-@pytest.mark.parametrize("tail_mass", [0.0, 1e-3])
-def test_weights_of_zero_contribute_nothing(tail_mass: float) -> None:
+def test_weights_of_zero_contribute_nothing() -> None:
     weights = torch.tensor([[0.0, 1.0, 0.0], [0.5, 0.0, 0.5]])
-    posterior = gaussian_posterior(
-        n_o=2, weights=weights, embeddings=embeddings(3), tail_mass=tail_mass
-    )
-    theta = 2 * torch.rand(4, 2, 2) - 1
-    expected = brute_force_log_prob(posterior, theta).float()
-    assert torch.allclose(log_prob_batched(posterior, theta), expected, atol=1e-6)
+    for tail_mass in (0.0, 1e-3):
+        posterior = gaussian_posterior(
+            n_o=2, weights=weights, embeddings=embeddings(3), tail_mass=tail_mass
+        )
+        theta = 2 * torch.rand(4, 2, 2) - 1
+        expected = brute_force_log_prob(posterior, theta).float()
+        found = log_prob_batched(posterior, theta)
+        assert torch.allclose(found, expected, atol=1e-6), tail_mass
 
 
-@pytest.mark.parametrize(
-    ("shape", "num_x"),
-    [((3, 2), 5), ((4, 3, 2), 5), ((2, 2), 3), ((1, 4, 2), 5)],
-)
-def test_rows_of_theta_and_x_must_match(shape: tuple, num_x: int) -> None:
+def test_rows_of_theta_and_x_must_match() -> None:
     posterior = gaussian_posterior(n_o=5)
-    with pytest.raises(InvalidInputError, match=r"as many rows of `theta`"):
-        posterior.log_prob_batched(torch.zeros(shape), posterior.x_o[:num_x])
+    for shape, num_x in (((3, 2), 5), ((4, 3, 2), 5), ((2, 2), 3), ((1, 4, 2), 5)):
+        with pytest.raises(InvalidInputError, match=r"as many rows of `theta`"):
+            posterior.log_prob_batched(torch.zeros(shape), posterior.x_o[:num_x])
 
 
 def test_one_row_of_theta_or_one_x_serves_all_of_the_other() -> None:
@@ -437,67 +413,44 @@ def test_one_row_of_theta_or_one_x_serves_all_of_the_other() -> None:
 # --- samples ---
 
 
-@pytest.mark.parametrize("bounded", [True, False])
-def test_samples_follow_the_density(bounded: bool) -> None:
-    prior = problems.box(2) if bounded else problems.standard_normal(2)
-    posterior = gaussian_posterior(prior=prior, n_o=2, n_s=6)
-    size, bound = 400, 1.0 if bounded else 4.0
-    step = 2 * bound / size
-    axis = torch.arange(size) * step - bound + step / 2
+def test_samples_follow_the_density() -> None:
+    posterior = gaussian_posterior(n_o=1, n_s=6)
+    size = 400
+    step = 2 / size
+    axis = torch.arange(size) * step - 1 + step / 2
     grid = torch.cartesian_prod(axis, axis)
-    samples = posterior.sample_batched((1500,), posterior.x_o, **QUIET)
-    for i in range(2):
-        density = posterior.log_prob(grid, x=posterior.x_o[i]).exp().double()
-        chosen = torch.multinomial(density, 1500, replacement=True)
-        drawn = grid[chosen] + step * (torch.rand(1500, 2) - 0.5)
-        probability = density / density.sum()
-        mean = probability @ grid.double()
-        covariance = (grid - mean).T @ (probability[:, None] * (grid - mean))
-        se = (covariance.diagonal() / 1500).sqrt()
-        assert ((samples[:, i].mean(dim=0) - mean).abs() < 4 * se).all()
-        assert (samples[:, i].T.cov() - covariance).abs().max() < 0.15 * float(
-            covariance.diagonal().max()
-        )
-        if i == 0:  # training the classifier takes half a second
-            score = float(c2st(samples[:, i], drawn, n_folds=2))
-            assert abs(score - 0.5) < 0.05
+    samples = posterior.sample((1500,), x=posterior.x_o, **QUIET)
+    density = posterior.log_prob(grid, x=posterior.x_o).exp().double()
+    chosen = torch.multinomial(density, 1500, replacement=True)
+    drawn = grid[chosen] + step * (torch.rand(1500, 2) - 0.5)
+    score = float(c2st(samples, drawn, n_folds=2))
+    assert abs(score - 0.5) < 0.05
 
 
-def test_marginal_samples_have_the_distribution_of_the_density() -> None:
-    posterior = gaussian_posterior(dim=1, n_o=3, n_s=5)
-    size = 4000
-    axis = (torch.arange(size) + 0.5) * 2 / size - 1
-    samples = posterior.sample_batched((4000,), posterior.x_o, **QUIET)
-    for i in range(3):
-        density = posterior.log_prob(axis[:, None], x=posterior.x_o[i]).double().exp()
-        cdf = (density / density.sum()).cumsum(0)
-        u = cdf[((samples[:, i, 0] + 1) / 2 * size).long().clamp(0, size - 1)]
-        uniform = (torch.arange(4000) + 0.5) / 4000
-        distance = (u.sort().values - uniform).abs().max()
-        assert distance < 1.95 / math.sqrt(4000)  # Kolmogorov-Smirnov, level 0.001
-
-
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize(
-    ("entries", "batch"), [(2**19, 2**14), (1, 2**14), (2**19, 50), (70, 33)]
-)
-def test_samples_have_the_cdf_of_the_truncated_mixture_however_they_are_cut(
-    dtype: torch.dtype, entries: int, batch: int, monkeypatch: pytest.MonkeyPatch
+def test_samples_have_the_cdf_of_the_truncated_mixture_in_blocks_of_any_size(
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    posterior = gaussian_posterior(dim=1, n_o=3, n_s=5, std=0.6, dtype=dtype)
-    monkeypatch.setattr(chunks, "MAX_ENTRIES", entries)
-    monkeypatch.setattr(chunks, "CPU_BATCH", batch)
-    n = 2000 if entries > 1 else 500  # one at a time takes its time
-    samples = posterior.sample_batched((n,), posterior.x_o, **QUIET)[..., 0].double()
-    one = posterior.sample((n,), x=posterior.x_o[1], **QUIET)[:, 0].double()
-    mean, log_std = problems.simulated_of(posterior).double().T
-    components = Normal(mean, log_std.exp())
-    for i, draws in [*enumerate(samples.T), (1, one)]:
-        points = torch.cat([torch.tensor([-1.0, 1.0]), draws.sort().values])[:, None]
-        cdf = components.cdf(points) @ posterior.weights[i].double()
-        u = (cdf[2:] - cdf[0]) / (cdf[1] - cdf[0])
-        distance = (u - (torch.arange(n) + 0.5) / n).abs().max()
-        assert distance < 1.95 / math.sqrt(n)  # Kolmogorov-Smirnov, level 0.001
+    for dtype, entries, batch, n in (
+        (torch.float64, 2**19, 2**14, 2000),
+        (torch.float32, 2**19, 2**14, 2000),
+        (torch.float64, 1, 2**14, 500),  # one at a time takes its time
+        (torch.float64, 2**19, 50, 2000),
+        (torch.float64, 70, 33, 2000),
+    ):
+        posterior = gaussian_posterior(dim=1, n_o=3, n_s=5, std=0.6, dtype=dtype)
+        monkeypatch.setattr(chunks, "MAX_ENTRIES", entries)
+        monkeypatch.setattr(chunks, "CPU_BATCH", batch)
+        samples = posterior.sample_batched((n,), posterior.x_o, **QUIET)[..., 0]
+        one = posterior.sample((n,), x=posterior.x_o[1], **QUIET)[:, 0].double()
+        mean, log_std = problems.simulated_of(posterior).double().T
+        components = Normal(mean, log_std.exp())
+        for i, draws in [*enumerate(samples.double().T), (1, one)]:
+            points = torch.cat([torch.tensor([-1.0, 1.0]), draws.sort().values])
+            cdf = components.cdf(points[:, None]) @ posterior.weights[i].double()
+            u = (cdf[2:] - cdf[0]) / (cdf[1] - cdf[0])
+            distance = (u - (torch.arange(n) + 0.5) / n).abs().max()
+            # Kolmogorov-Smirnov, level 0.001.
+            assert distance < 1.95 / math.sqrt(n), (dtype, entries, batch, i)
 
 
 def test_components_are_drawn_with_their_weights_and_never_with_weight_zero() -> None:
@@ -522,9 +475,8 @@ def test_components_are_drawn_with_their_weights_and_never_with_weight_zero() ->
         assert ((found - weights[i]).abs() <= 4 * se).all()
 
 
-@pytest.mark.parametrize("uniform", [0.0, 1 - 2**-53])
 def test_no_random_number_draws_a_component_of_weight_zero(
-    uniform: float, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     spikes = torch.stack([torch.arange(4.0), torch.full((4,), -9.0)], dim=1)
     weights = torch.tensor([[0.0, 0.3, 0.7, 0.0]]).expand(200, -1)
@@ -536,12 +488,14 @@ def test_no_random_number_draws_a_component_of_weight_zero(
         prior=problems.standard_normal(1),
     )
     # The ends of what torch.rand returns in double precision.
-    monkeypatch.setattr(
-        torch, "rand", lambda *size, **kwargs: torch.full(size, uniform, **kwargs)
-    )
-    samples = posterior.sample_batched((2,), posterior.x_o, **QUIET)
-    expected = 1.0 if uniform == 0.0 else 2.0
-    assert torch.equal(samples.round(), torch.full((2, 200, 1), expected))
+    for uniform, expected in ((0.0, 1.0), (1 - 2**-53, 2.0)):
+        monkeypatch.setattr(
+            torch,
+            "rand",
+            lambda *size, value=uniform, **kwargs: torch.full(size, value, **kwargs),
+        )
+        samples = posterior.sample_batched((2,), posterior.x_o, **QUIET)
+        assert torch.equal(samples.round(), torch.full((2, 200, 1), expected))
 
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
@@ -564,18 +518,19 @@ def test_an_accepted_draw_is_kept_whole(device: str) -> None:
     assert torch.equal(samples[..., 0], samples[..., 1])
 
 
-@pytest.mark.parametrize("batch_size", [1, 7, 100_000])
-def test_the_size_of_sampling_batches_does_not_show_in_the_samples(
-    batch_size: int, monkeypatch: pytest.MonkeyPatch
+def test_sampling_batches_are_no_larger_than_asked_for(
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     posterior = gaussian_posterior()
     calls = count_draws(posterior, monkeypatch)
-    samples = posterior.sample_batched(
-        (10,), posterior.x_o, max_sampling_batch_size=batch_size, **QUIET
-    )
-    assert samples.shape == (10, 5, 2)
-    assert max(calls) <= batch_size
-    assert len(samples.flatten().unique()) == samples.numel()
+    for batch_size in (1, 7, 100_000):
+        calls.clear()
+        samples = posterior.sample_batched(
+            (10,), posterior.x_o, max_sampling_batch_size=batch_size, **QUIET
+        )
+        assert samples.shape == (10, 5, 2)
+        assert max(calls) <= batch_size
+        assert len(samples.flatten().unique()) == samples.numel()
 
 
 def test_samples_stay_inside_the_prior_unless_asked_otherwise() -> None:
@@ -625,7 +580,7 @@ def hopeless_posterior(n_o: int = 2) -> MixturePosterior:
     return gaussian_posterior(dim=1, n_o=n_o, weights=weights, embeddings=spikes)
 
 
-def test_no_mass_inside_the_prior_ends_in_an_error_that_names_the_observation(
+def test_sampling_without_mass_inside_the_prior_names_the_observation(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(sampling_module, "MIN_PROPOSALS", 2000)
@@ -641,7 +596,7 @@ def test_no_mass_inside_the_prior_ends_in_an_error_that_names_the_observation(
     assert (free > 90).all()
 
 
-def test_the_error_names_the_observation_however_the_batch_is_cut(
+def test_the_error_names_the_observation_in_blocks_of_any_size(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(chunks, "MAX_ENTRIES", 4)
@@ -708,11 +663,8 @@ def test_the_mass_of_a_mixture_and_its_error_follow_the_weights() -> None:
     assert torch.allclose(leakage.standard_error, error, rtol=0.1)
 
 
-@pytest.mark.parametrize("family", ["maf", "zuko_nsf"])
-def test_the_mass_inside_the_prior_of_flows_is_that_of_their_density(
-    family: str,
-) -> None:
-    posterior = flow_posterior(family, n_o=4)
+def test_the_mass_inside_the_prior_of_flows_is_that_of_their_density() -> None:
+    posterior = flow_posterior(n_o=4)
     axis = (torch.arange(60) + 0.5) / 30 - 1
     grid = torch.cartesian_prod(axis, axis)[:, None].expand(-1, 4, -1)
     integral = log_prob_batched(posterior, grid).exp().sum(dim=0) / 30**2
@@ -720,25 +672,17 @@ def test_the_mass_inside_the_prior_of_flows_is_that_of_their_density(
     assert ((leakage.mass - integral).abs() < 4 * leakage.standard_error + 5e-3).all()
 
 
-@pytest.mark.parametrize(
-    "prior",
-    [
-        pytest.param(problems.standard_normal(2), id="multivariate"),
-        pytest.param(
-            torch.distributions.Independent(Normal(torch.zeros(2), torch.ones(2)), 1),
-            id="independent",
-        ),
-    ],
-)
 def test_an_unbounded_prior_has_mass_one_without_draws(
-    prior: Distribution, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    posterior = gaussian_posterior(prior=prior)
-    calls = count_draws(posterior, monkeypatch)
-    leakage = posterior.leakage(posterior.x_o)
-    assert torch.allclose(leakage.mass, torch.ones(5).double(), atol=1e-14)
-    assert torch.equal(leakage.standard_error, torch.zeros(5).double())
-    assert calls == []
+    normal = Normal(torch.zeros(2), torch.ones(2))
+    for prior in (problems.standard_normal(2), Independent(normal, 1)):
+        posterior = gaussian_posterior(prior=prior)
+        calls = count_draws(posterior, monkeypatch)
+        leakage = posterior.leakage(posterior.x_o)
+        assert torch.allclose(leakage.mass, torch.ones(5).double(), atol=1e-14)
+        assert torch.equal(leakage.standard_error, torch.zeros(5).double())
+        assert calls == []
 
 
 class WithoutSupport(Distribution):
@@ -759,33 +703,31 @@ class WithoutSupport(Distribution):
 
 
 @pytest.mark.parametrize(
-    ("make_prior", "inside"),
+    ("prior", "inside"),
     [
         pytest.param(
-            lambda: MultipleIndependent(
+            MultipleIndependent(
                 [problems.box(1), Normal(torch.zeros(1), torch.ones(1))]
             ),
             lambda theta: theta[..., 0].abs() <= 1,
             id="half bounded",
         ),
         pytest.param(
-            lambda: torch.distributions.Independent(
-                Gamma(torch.ones(2), torch.ones(2)), 1
-            ),
+            Independent(Gamma(torch.ones(2), torch.ones(2)), 1),
             lambda theta: (theta >= 0).all(dim=-1),
             id="half line",
         ),
         pytest.param(
-            WithoutSupport,
+            WithoutSupport(),
             lambda theta: (theta.abs() <= 1).all(dim=-1),
             id="no support property",
         ),
     ],
 )
 def test_support_of_any_shape_bounds_samples_density_and_mass(
-    make_prior: Any, inside: Any
+    prior: Distribution, inside: Callable[[Tensor], Tensor]
 ) -> None:
-    posterior = gaussian_posterior(prior=make_prior(), std=0.8)
+    posterior = gaussian_posterior(prior=prior, std=0.8)
     samples = posterior.sample_batched((200,), posterior.x_o, **QUIET)
     assert inside(samples).all()
     free = posterior.sample_batched(
@@ -799,7 +741,7 @@ def test_support_of_any_shape_bounds_samples_density_and_mass(
     assert ((leakage.mass - share).abs() < 4 * error).all()
 
 
-def test_log_prob_is_minus_infinity_outside_the_prior_alone() -> None:
+def test_log_prob_is_minus_infinity_only_outside_the_prior() -> None:
     posterior = gaussian_posterior(std=0.8)
     theta = 3 * torch.rand(50, 5, 2) - 1.5
     inside = (theta.abs() <= 1).all(dim=-1)
@@ -838,7 +780,7 @@ def test_the_mass_of_components_is_estimated_once_for_all_views(
     assert sum(calls) == 12 * truncation_module.LEAKAGE_DRAWS
 
 
-def test_log_prob_is_a_function_and_leaves_the_random_state_alone() -> None:
+def test_log_prob_always_returns_the_same_and_keeps_the_random_state() -> None:
     posterior = gaussian_posterior(std=0.8)
     again = copy.deepcopy(posterior)
     theta = 2 * torch.rand(3, 5, 2) - 1
@@ -884,17 +826,6 @@ def test_an_observation_is_found_by_its_value() -> None:
     assert torch.equal(found(negative_zero), rows[2:3])
 
 
-def test_duplicates_in_the_batch_have_the_same_posterior() -> None:
-    x_o = torch.randn(4, 3)
-    x_o[3] = x_o[0]
-    weights = torch.softmax(torch.randn(4, 8), dim=1)
-    weights[3] = weights[0]
-    posterior = gaussian_posterior(x_o=x_o, weights=weights, embeddings=embeddings(8))
-    theta = 2 * torch.rand(9, 1, 2) - 1
-    log_prob = posterior.log_prob_batched(theta, posterior.x_o)
-    assert torch.equal(log_prob[:, 0], log_prob[:, 3])
-
-
 def test_double_precision_and_numpy_observations_are_recognised() -> None:
     posterior = gaussian_posterior()
     theta, x = torch.zeros(2, 2), posterior.x_o[3]
@@ -916,7 +847,7 @@ def test_rows_cannot_be_changed_through_what_was_returned() -> None:
     assert torch.equal(posterior.weights, before)
 
 
-def test_an_unseen_observation_raises_and_both_ways_on_are_named() -> None:
+def test_an_unseen_observation_is_an_error_that_says_what_to_do() -> None:
     posterior = gaussian_posterior()
     new = torch.randn(1, 3)
     for call in (
@@ -943,7 +874,7 @@ def test_an_unseen_observation_may_extend_the_coupling_with_a_warning() -> None:
     expected = posterior.coupling.rows(embed(net, new))
     smallest = float((1 / expected.square().sum(dim=1)).min())
     mixed = torch.cat([new[:1], posterior.x_o[2:3], new[1:]])
-    with pytest.warns(RoPEWarning, match=rf"2 unseen.*size {smallest:.1f} of 12"):
+    with pytest.warns(RoPEWarning, match=rf"2 unseen.*size is {smallest:.1f} of 12"):
         rows = problems.rows_of(posterior, mixed)
     assert torch.allclose(rows[[0, 2]], expected, atol=1e-12)
     assert torch.equal(rows[1], posterior.weights[2])
@@ -968,25 +899,15 @@ def test_observations_of_the_batch_do_not_warn_when_extending_is_allowed() -> No
         posterior.log_prob_batched(torch.zeros(5, 2), posterior.x_o)
 
 
-def test_the_warning_of_extending_points_at_the_callers_line() -> None:
+def test_each_call_that_extends_warns_once_at_the_line_of_the_caller() -> None:
     posterior = gaussian_posterior(unseen="extend")
     for call in (
         lambda: posterior.sample_batched((2,), torch.randn(1, 3), **QUIET),
-        lambda: posterior.log_prob(
-            torch.zeros(1, 2), x=torch.randn(3), norm_posterior=False
-        ),
+        lambda: posterior.log_prob(torch.zeros(1, 2), x=torch.randn(3)),
         lambda: posterior.log_prob_batched(
             torch.zeros(1, 2), torch.randn(1, 3), norm_posterior=False
         ),
     ):
         with pytest.warns(RoPEWarning) as caught:
             call()
-        assert caught[0].filename == __file__
-
-
-def test_one_call_extends_the_coupling_with_one_warning() -> None:
-    posterior = gaussian_posterior(unseen="extend")
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        posterior.log_prob(torch.zeros(1, 2), x=torch.randn(3))
-    assert len(caught) == 1
+        assert [warning.filename for warning in caught] == [__file__]

@@ -180,22 +180,22 @@ def counted(target: Any, name: str, monkeypatch: pytest.MonkeyPatch) -> list[Any
 # --- density ---
 
 
-@pytest.mark.parametrize(("entries", "batch"), [(2**19, 2**14), (40, 7), (1, 1)])
-def test_log_prob_is_the_log_sum_over_parts_and_contexts(
-    entries: int, batch: int, monkeypatch: pytest.MonkeyPatch
+def test_log_prob_is_the_log_sum_over_parts_and_embeddings(
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     posterior = three_parts()
-    monkeypatch.setattr(chunks, "MAX_ENTRIES", entries)
-    monkeypatch.setattr(chunks, "CPU_BATCH", batch)
     theta = 3 * torch.rand(6, NUM_BATCH, DIM) - 1.5
     expected = densities(posterior, theta, posterior.x_o) @ torch.tensor(
         WEIGHTS, dtype=torch.double
     )
     estimator = posterior.posterior_estimator
-    found = estimator.log_prob(theta, posterior.x_o)
-    assert torch.allclose(found, expected.log().float(), atol=1e-5)
-    one = estimator.log_prob(theta[:, 2:3], posterior.x_o[2:3])
-    assert torch.allclose(one, expected[:, 2:3].log().float(), atol=1e-5)
+    for entries, batch in ((2**19, 2**14), (40, 7), (1, 1)):
+        monkeypatch.setattr(chunks, "MAX_ENTRIES", entries)
+        monkeypatch.setattr(chunks, "CPU_BATCH", batch)
+        found = estimator.log_prob(theta, posterior.x_o)
+        assert torch.allclose(found, expected.log().float(), atol=1e-5), entries
+        one = estimator.log_prob(theta[:, 2:3], posterior.x_o[2:3])
+        assert torch.allclose(one, expected[:, 2:3].log().float(), atol=1e-5), entries
 
 
 def test_log_probs_of_parts_are_those_of_each_by_itself() -> None:
@@ -240,28 +240,28 @@ def test_the_tail_is_left_out_of_all_parts_together() -> None:
     assert torch.allclose(cut, (terms * rows * ~dropped).sum(-1), rtol=1e-5)
 
 
-@pytest.mark.parametrize("alone", range(3))
-def test_parts_of_weight_zero_cost_nothing(
-    alone: int, monkeypatch: pytest.MonkeyPatch
+def test_parts_of_weight_zero_are_not_evaluated(
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    weights = [float(k == alone) for k in range(3)]
-    posterior = three_parts(weights)
-    calls = []
-    for k, part in enumerate(posterior.posterior_estimator.parts):
-        calls.append([])
-        for target, name in (
-            (part.density, "log_prob"),
-            (part.density, "sample"),
-            (part.mixing, "embed"),
-            (part.mixing, "rows"),
-        ):
-            calls[k].append(counted(target, name, monkeypatch))
-    theta = 2 * torch.rand(NUM_BATCH, DIM) - 1
-    posterior.log_prob_batched(theta, posterior.x_o)
-    posterior.sample_batched((3,), posterior.x_o, **QUIET)
-    for k, of_part in enumerate(calls):
-        assert all(len(call) > 0 for call in of_part) == (k == alone)
-        assert not any(of_part) or k == alone
+    for alone in range(3):
+        posterior = three_parts([float(k == alone) for k in range(3)])
+        calls = [
+            [
+                counted(target, name, monkeypatch)
+                for target, name in (
+                    (part.density, "log_prob"),
+                    (part.density, "sample"),
+                    (part.mixing, "embed"),
+                    (part.mixing, "rows"),
+                )
+            ]
+            for part in posterior.posterior_estimator.parts
+        ]
+        theta = 2 * torch.rand(NUM_BATCH, DIM) - 1
+        posterior.log_prob_batched(theta, posterior.x_o)
+        posterior.sample_batched((3,), posterior.x_o, **QUIET)
+        for k, of_part in enumerate(calls):
+            assert all(of_part) == any(of_part) == (k == alone), (k, alone)
 
 
 def test_gradients_are_those_of_the_sum_of_all_parts() -> None:
@@ -279,26 +279,24 @@ def test_gradients_are_those_of_the_sum_of_all_parts() -> None:
 # --- samples and mass ---
 
 
-@pytest.mark.parametrize("entries", [2**19, 60])
 def test_samples_follow_the_density_of_all_parts(
-    entries: int, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    posterior, draws = three_parts(), 10_000
-    monkeypatch.setattr(chunks, "MAX_ENTRIES", entries)
-    if entries < 100:
-        draws = 1000
+    posterior = three_parts()
     x = posterior.x_o[:3]
-    samples = posterior.sample_batched((draws,), x, **QUIET)
     line = (torch.arange(40) + 0.5) / 20 - 1
     grid = torch.cartesian_prod(line, line)[:, None].expand(-1, 3, -1)
     density = densities(posterior, grid, x) @ torch.tensor(WEIGHTS).double()
     density = density / density.sum(dim=0)
-    for i in range(3):
-        share = density[:, i].reshape(4, 10, 4, 10).sum(dim=(1, 3))
-        edges = [torch.linspace(-1, 1, 5)] * 2
-        counts = torch.histogramdd(samples[:, i], edges).hist / draws
-        error = (share * (1 - share) / draws).sqrt()
-        assert ((counts - share).abs() < 4.5 * error + 2e-3).all()
+    for entries, draws in ((2**19, 10_000), (60, 1000)):
+        monkeypatch.setattr(chunks, "MAX_ENTRIES", entries)
+        samples = posterior.sample_batched((draws,), x, **QUIET)
+        for i in range(3):
+            share = density[:, i].reshape(4, 10, 4, 10).sum(dim=(1, 3))
+            edges = [torch.linspace(-1, 1, 5)] * 2
+            counts = torch.histogramdd(samples[:, i], edges).hist / draws
+            error = (share * (1 - share) / draws).sqrt()
+            assert ((counts - share).abs() < 4.5 * error + 2e-3).all(), entries
 
 
 def test_samples_come_from_each_part_as_often_as_it_weighs() -> None:
@@ -335,18 +333,7 @@ def test_the_mass_is_that_of_all_parts_and_so_is_its_error() -> None:
     assert 0.5 < float(scores.square().mean().sqrt()) < 1.3
 
 
-def test_the_mass_agrees_with_the_share_of_long_sampling() -> None:
-    posterior = three_parts()
-    free = posterior.sample_batched(
-        (20_000,), posterior.x_o, reject_outside_prior=False, **QUIET
-    )
-    share = (free.abs() <= 1).all(dim=-1).double().mean(dim=0)
-    leakage = posterior.leakage(posterior.x_o)
-    error = (leakage.standard_error.square() + share * (1 - share) / 20_000).sqrt()
-    assert ((leakage.mass - share).abs() < 4.5 * error).all()
-
-
-def test_a_part_gets_the_draws_its_weight_deserves(
+def test_the_mass_of_a_part_is_estimated_from_draws_in_proportion_to_its_weight(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     weights = [0.9995 - 0.25, 0.25, 0.0005]
@@ -368,7 +355,7 @@ def test_a_part_gets_the_draws_its_weight_deserves(
     assert draws(calls[2]) == 0
 
 
-def test_parts_that_weigh_a_draw_together_are_not_taken_for_inside() -> None:
+def test_small_parts_with_a_noticeable_sum_do_not_count_as_inside() -> None:
     # Each of a hundred weighs less than a draw; a tenth of them does in sum, too.
     far = part_of_prior(problems.box(DIM, 3.0, 4.0), (3,))
     weights = torch.cat([torch.tensor([0.95]), torch.full((100,), 0.0005)])
@@ -378,7 +365,7 @@ def test_parts_that_weigh_a_draw_together_are_not_taken_for_inside() -> None:
     assert 0.95 <= float(leakage.mass) < 0.952
 
 
-def test_the_prior_is_never_left_out_of_a_density_however_little_it_weighs() -> None:
+def test_the_prior_is_never_left_out_of_a_density_whatever_it_weighs() -> None:
     net = nn.Linear(3, 2 * DIM)
     with torch.no_grad():
         net.weight.zero_()
@@ -404,7 +391,7 @@ def test_the_mass_of_an_observation_is_the_same_beside_others_within_its_error()
         assert ((alone.mass - together.mass[i]).abs() < 4 * error).all()
 
 
-def test_progress_of_normalising_is_shown_if_asked_for_and_never_by_log_prob(
+def test_progress_of_the_mass_is_shown_if_asked_for_and_never_by_log_prob(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     shown: list[bool] = []
@@ -454,7 +441,9 @@ def test_distances_are_computed_once_for_all_couplings_of_a_net(
     assert len(calls) == 2
 
 
-def test_couplings_of_share_zero_cost_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_couplings_with_a_share_of_zero_are_not_evaluated(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     mixing: Any = coupled_part().mixing.with_shares([0.0, 1.0, 0.0])  # type: ignore[operator]
     assert mixing.shares == (0.0, 1.0, 0.0)
     calls = counted(Coupling, "rows", monkeypatch)
@@ -463,7 +452,7 @@ def test_couplings_of_share_zero_cost_nothing(monkeypatch: pytest.MonkeyPatch) -
     assert torch.equal(rows, mixing.couplings[1].weights)
 
 
-def test_rows_are_the_shares_of_the_couplings() -> None:
+def test_weights_are_the_sum_of_all_couplings_times_their_shares() -> None:
     posterior = three_parts()
     pairs = zip(SHARES, rows_by_hand(posterior, posterior.x_o), strict=True)
     expected = sum(share * row for share, row in pairs)
@@ -475,7 +464,7 @@ def test_rows_are_the_shares_of_the_couplings() -> None:
         assert torch.allclose(found, row, atol=1e-6)
 
 
-def test_several_couplings_are_named_and_a_single_one_is_refused() -> None:
+def test_a_posterior_of_several_couplings_has_no_single_one() -> None:
     posterior = three_parts()
     assert len(posterior.couplings) == 3
     with pytest.raises(InvalidInputError, match="Use `couplings`"):
@@ -483,7 +472,7 @@ def test_several_couplings_are_named_and_a_single_one_is_refused() -> None:
     assert problems.gaussian_posterior().couplings[0].gamma == 0.5
 
 
-def test_what_was_coupled_may_be_more_than_what_is_inferred() -> None:
+def test_more_observations_can_be_coupled_than_inferred() -> None:
     posterior = three_parts(num_observed=5)
     mixing = posterior.posterior_estimator.coupled[0]
     assert len(posterior) == 5
@@ -524,7 +513,7 @@ def test_unseen_observations_are_embedded_by_every_net() -> None:
 
 
 @pytest.mark.parametrize("unseen", ["raise", "extend"])
-def test_a_view_holds_one_observation_and_answers_as_the_whole(unseen: str) -> None:
+def test_the_posterior_of_one_observation_answers_as_the_whole(unseen: str) -> None:
     posterior = three_parts(unseen=unseen, num_observed=5)
     theta = 2 * torch.rand(6, DIM) - 1
     for i in (0, 3):
@@ -548,7 +537,7 @@ def test_a_view_holds_one_observation_and_answers_as_the_whole(unseen: str) -> N
         assert torch.allclose(found, posterior.log_prob(theta, x=other), atol=1e-5)
 
 
-def test_a_pickled_view_does_not_grow_with_the_batch() -> None:
+def test_the_pickle_of_one_observation_does_not_grow_with_the_batch() -> None:
     def size(n_o: int) -> tuple[int, int]:
         posterior = problems.gaussian_posterior(x_o=torch.randn(n_o, 1, 16, 16))
         posterior.log_prob_batched(torch.zeros(n_o, 2), posterior.x_o)
@@ -617,9 +606,9 @@ def test_the_part_of_an_npe_is_that_npe() -> None:
     assert all(parameter.requires_grad for parameter in estimator.parameters())
 
 
-@pytest.mark.parametrize(
-    ("call", "name"),
-    [
+def test_an_amortised_posterior_has_no_batch() -> None:
+    posterior = amortised()
+    calls: list[tuple[Callable[[Any], Any], str]] = [
         (lambda p: p.x_o, "x_o"),
         (lambda p: p.coupling, "coupling"),
         (lambda p: p.couplings, "couplings"),
@@ -627,29 +616,21 @@ def test_the_part_of_an_npe_is_that_npe() -> None:
         (len, r"len\(\)"),
         (lambda p: p[0], r"\[i\]"),
         (list, "len"),
-    ],
-)
-def test_an_amortised_posterior_has_no_batch(
-    call: Callable[[MixturePosterior], Any], name: str
-) -> None:
-    posterior = amortised()
-    with pytest.raises(InvalidInputError, match=rf"amortised.*`{name}.*Pass the obs"):
-        call(posterior)
+    ]
+    for call, name in calls:
+        with pytest.raises(InvalidInputError, match=rf"amortised.*`{name}.*Pass the"):
+            call(posterior)
     assert posterior  # although it has no length
 
 
-@pytest.mark.parametrize("make", [amortised, three_parts])
-@pytest.mark.parametrize(
-    "copied", [copy.deepcopy, lambda p: pickle.loads(pickle.dumps(p))]
-)
-def test_a_copy_answers_the_same(
-    make: Callable[[], MixturePosterior], copied: Callable[[Any], MixturePosterior]
-) -> None:
-    posterior = make()
-    x = torch.randn(3, 3) if posterior.is_amortised else posterior.x_o[:3]
-    theta = 2 * torch.rand(4, 3, DIM) - 1
-    expected = posterior.log_prob_batched(theta, x)
-    assert torch.equal(copied(posterior).log_prob_batched(theta, x), expected)
+def test_a_copy_answers_the_same() -> None:
+    for posterior in (amortised(), three_parts()):
+        x = torch.randn(3, 3) if posterior.is_amortised else posterior.x_o[:3]
+        theta = 2 * torch.rand(4, 3, DIM) - 1
+        expected = posterior.log_prob_batched(theta, x)
+        pickled = pickle.loads(pickle.dumps(posterior))
+        for copied in (copy.deepcopy(posterior), pickled):
+            assert torch.equal(copied.log_prob_batched(theta, x), expected)
 
 
 def test_moving_a_mixture_moves_couplings_and_prior() -> None:
@@ -663,16 +644,12 @@ def test_moving_a_mixture_moves_couplings_and_prior() -> None:
     assert not posterior.prior.sample((1,)).is_meta
 
 
-@pytest.mark.parametrize(
-    "make", [problems.box, problems.standard_normal], ids=["of sbi", "of torch"]
-)
-def test_moving_the_density_of_a_prior_moves_the_prior(
-    make: Callable[[int], Distribution],
-) -> None:
-    prior = make(DIM)
-    part: Any = part_of_prior(prior, (3,)).to("meta")
-    assert part.density.prior.sample((1,)).is_meta
-    assert not prior.sample(Size((1,))).is_meta  # ours is a copy
+def test_moving_the_density_of_a_prior_moves_a_copy_of_the_prior() -> None:
+    # One is of sbi, which can move it, and the other of torch.
+    for prior in (problems.box(DIM), problems.standard_normal(DIM)):
+        part: Any = part_of_prior(prior, (3,)).to("meta")
+        assert part.density.prior.sample((1,)).is_meta
+        assert not prior.sample(Size((1,))).is_meta
 
 
 # --- the prior ---
@@ -698,7 +675,7 @@ class Untransformable(Distribution):
         return torch.where(inside, 0.0, -torch.inf)
 
 
-def test_a_prior_that_sbi_cannot_transform_is_a_part_all_the_same() -> None:
+def test_a_prior_that_sbi_cannot_transform_can_be_a_part() -> None:
     part = part_of_prior(Untransformable(), (3,))
     estimator = MixtureEstimator([part], [1.0])
     theta = torch.tensor([[0.5, 0.5], [1.5, 0.5]])
@@ -715,7 +692,7 @@ def test_the_density_of_the_prior_leaves_the_random_state_alone() -> None:
     assert torch.equal(torch.get_rng_state(), state)
 
 
-# --- what others see, and wrong use ---
+# --- what other modules see, and errors ---
 
 
 def test_a_mixture_in_any_posterior_of_sbi_cannot_be_repaired() -> None:
@@ -726,7 +703,7 @@ def test_a_mixture_in_any_posterior_of_sbi_cannot_be_repaired() -> None:
             estimator_of(one)
 
 
-def test_bounded_posteriors_are_told_from_those_of_sbi() -> None:
+def test_only_our_posterior_is_known_to_be_bounded() -> None:
     posterior = amortised()
     assert is_bounded(posterior)
     assert not is_bounded(
@@ -734,54 +711,41 @@ def test_bounded_posteriors_are_told_from_those_of_sbi() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("make", "match"),
-    [
+def test_parts_that_do_not_fit_are_refused_by_name() -> None:
+    own, coupled, other = own_part(), coupled_part(), coupled_part()
+    one_parameter = part_of(gaussian.GaussianEstimator(1))
+    mixing: Any = coupled.mixing
+    estimator = amortised().posterior_estimator
+    calls: list[tuple[Callable[[], Any], str]] = [
         (lambda: MixtureEstimator([], []), "at least one part"),
-        (lambda: MixtureEstimator([own_part()], [0.5]), "sum of one"),
-        (lambda: MixtureEstimator([own_part()] * 2, [1.5, -0.5]), "negative"),
-        (lambda: MixtureEstimator([own_part()], [0.5, 0.5]), "to be 1 numbers"),
-        (lambda: MixtureEstimator([own_part()], [1.0], tail_mass=2.0), "tail_mass"),
-        (
-            lambda: MixtureEstimator(
-                [own_part(), part_of(gaussian.GaussianEstimator(1))], [0.5, 0.5]
-            ),
-            "as the first",
-        ),
-        (
-            lambda: MixtureEstimator([coupled_part(), coupled_part()], [0.5, 0.5]),
-            "same `x_o`",
-        ),
+        (lambda: MixtureEstimator([own], [0.5]), "sum of one"),
+        (lambda: MixtureEstimator([own] * 2, [1.5, -0.5]), "negative"),
+        (lambda: MixtureEstimator([own], [0.5, 0.5]), "to be 1 numbers"),
+        (lambda: MixtureEstimator([own], [1.0], tail_mass=2.0), "tail_mass"),
+        (lambda: MixtureEstimator([own, one_parameter], [0.5, 0.5]), "as the first"),
+        (lambda: MixtureEstimator([coupled, other], [0.5, 0.5]), "same `x_o`"),
         (lambda: coupled_part(num_observed=99), "num_observed"),
         (lambda: coupled_part(unseen="guess"), "unseen"),
         (lambda: CoupledNet(nn.Identity(), []), "at least one"),
         (lambda: OwnEmbeddings([], (3,)), "at least one"),
+        (lambda: mixing.with_shares([0.5, 0.5, 0.5]), "sum of one"),
         (
-            lambda: coupled_part().mixing.with_shares([0.5, 0.5, 0.5]),  # type: ignore[operator]
-            "sum of one",
-        ),
-        (
-            lambda: three_parts().posterior_estimator.part_log_probs(
-                torch.zeros(2, DIM), torch.zeros(3, 3)
-            ),
+            lambda: estimator.part_log_probs(torch.zeros(2, DIM), torch.zeros(3, 3)),
             "same number of rows",
         ),
         (
-            lambda: amortised().posterior_estimator.component_mass(
+            lambda: estimator.component_mass(
                 0, accept=lambda theta: theta[:, 0] > 0, cache={}
             ),
             "shared embeddings",
         ),
-    ],
-)
-def test_parts_that_do_not_fit_are_refused_by_name(
-    make: Callable[[], Any], match: str
-) -> None:
-    with pytest.raises(InvalidInputError, match=match):
-        make()
+    ]
+    for call, match in calls:
+        with pytest.raises(InvalidInputError, match=match):
+            call()
 
 
-def test_an_estimator_without_a_density_is_no_part() -> None:
+def test_an_estimator_without_a_density_cannot_be_a_part() -> None:
     field = problems.vector_field_posterior("fmpe").vector_field_estimator
     with pytest.raises(UnsupportedPosteriorError, match="Train NPE"):
         part_of(field)

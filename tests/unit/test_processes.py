@@ -1,4 +1,4 @@
-"""Workers end with the process that started them, however that ends."""
+"""Workers end when the process that started them ends, in whatever way."""
 
 import multiprocessing
 import os
@@ -45,5 +45,5 @@ def test_a_worker_ends_with_the_parent_it_works_for(of_somebody_else: bool) -> N
             reader.recv()
 
 
-def test_a_process_does_not_wait_for_its_own_end() -> None:
+def test_the_function_has_no_effect_in_the_parent_itself() -> None:
     end_with(os.getpid())

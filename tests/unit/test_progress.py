@@ -1,4 +1,4 @@
-"""Progress is shown to people, and does not fill log files."""
+"""Progress bars are shown in terminals, and do not fill log files."""
 
 import subprocess
 import sys
@@ -39,17 +39,17 @@ def test_training_into_a_log_file_writes_next_to_nothing(tmp_path: Path) -> None
     assert log.stat().st_size < 1000
 
 
-@pytest.mark.parametrize("show", [True, False])
-def test_a_bar_is_for_a_terminal_and_for_who_asks(
-    show: bool, terminal: pytest.CaptureFixture[str]
+def test_a_bar_is_shown_in_a_terminal_if_it_is_asked_for(
+    terminal: pytest.CaptureFixture[str],
 ) -> None:
-    assert list(progress_bar(range(3), show=show, desc="Counting")) == [0, 1, 2]
-    with progress_bar(show=show, desc="By hand", total=2) as bar:
-        bar.update(2)
-    printed = terminal.readouterr()
-    assert ("Counting" in printed.err) is show
-    assert ("By hand: 100%" in printed.err) is show
-    assert printed.out == ""
+    for show in (True, False):
+        assert list(progress_bar(range(3), show=show, desc="Counting")) == [0, 1, 2]
+        with progress_bar(show=show, desc="By hand", total=2) as bar:
+            bar.update(2)
+        printed = terminal.readouterr()
+        assert ("Counting" in printed.err) is show
+        assert ("By hand: 100%" in printed.err) is show
+        assert printed.out == ""
 
 
 def test_without_a_terminal_there_is_no_bar(capsys: pytest.CaptureFixture[str]) -> None:

@@ -42,7 +42,9 @@ def draws() -> list[float]:
     ]
 
 
-def test_blocks_of_two_threads_leave_the_callers_state(seeded: Seeded) -> None:
+def test_blocks_of_two_threads_run_one_after_the_other_and_keep_the_state(
+    seeded: Seeded,
+) -> None:
     """The first block is left while the second thread is in its own, or waits."""
     before = states()
     with seeded(1):
@@ -98,7 +100,7 @@ def test_blocks_of_one_thread_can_be_nested(seeded: Seeded) -> None:
         assert draws() == drawn[1]
 
 
-def test_an_error_in_a_block_lets_others_in_and_leaves_the_state(
+def test_an_error_in_a_block_restores_the_state_and_frees_the_lock(
     seeded: Seeded,
 ) -> None:
     before = states()

@@ -1,4 +1,4 @@
-"""What users call a simulator, and what is found out about it before it is trusted."""
+"""Simulators of users, and what is found out about them before they are used."""
 
 import warnings
 from collections.abc import Callable
@@ -34,19 +34,17 @@ def centres(theta: Tensor) -> Tensor:
     return theta - theta.mean()
 
 
-@pytest.mark.parametrize("function", [mixes, mixes_with_noise_of_its_own, centres])
-def test_a_simulator_of_one_theta_that_survives_a_batch_is_called_one_by_one(
-    function: Callable[[Tensor], Tensor],
-) -> None:
-    with pytest.warns(RoPEWarning, match="rows depend on each other"):
-        simulator = simulator_of(function)
-    assert not simulator.is_batched
-    theta = torch.tensor([[0.3, 0.4], [0.6, -0.8]])
-    # Means of so many that their errors are below a twentieth of what mixing changes.
-    count = 800
-    alone = [sum(function(row) for _ in range(count)) / count for row in theta]
-    means = simulator(theta.repeat(count, 1)).unflatten(0, (count, 2)).mean(dim=0)
-    assert torch.allclose(means, torch.stack(alone), atol=0.02)
+def test_a_simulator_whose_rows_depend_on_each_other_is_called_one_by_one() -> None:
+    for function in (mixes, mixes_with_noise_of_its_own, centres):
+        with pytest.warns(RoPEWarning, match="rows depend on each other"):
+            simulator = simulator_of(function)
+        assert not simulator.is_batched
+        theta = torch.tensor([[0.3, 0.4], [0.6, -0.8]])
+        # The errors of these means are below a twentieth of what mixing changes.
+        count = 800
+        alone = [sum(function(row) for _ in range(count)) / count for row in theta]
+        means = simulator(theta.repeat(count, 1)).unflatten(0, (count, 2)).mean(dim=0)
+        assert torch.allclose(means, torch.stack(alone), atol=0.02), function
 
 
 def has_noise_of_its_own(theta: Tensor) -> Tensor:
@@ -75,23 +73,18 @@ def has_noise_of_a_generator_made_anew(theta: Tensor) -> Tensor:
     return theta + torch.stack(sums)[:, None].flip(0)
 
 
-@pytest.mark.parametrize(
-    "function",
-    [
+def test_simulators_of_batches_are_recognised() -> None:
+    for function in (
         gaussian.simulator,
         has_noise_of_a_generator_made_anew,
         has_noise_of_its_own,
         rejects,
         takes_batches_only,
         lambda theta: theta @ torch.tensor([[1.0, 0.3], [-0.2, 0.7]]),
-    ],
-)
-def test_simulators_of_batches_are_taken_for_what_they_are(
-    function: Callable[[Tensor], Tensor],
-) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert simulator_of(function).is_batched
+    ):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert simulator_of(function).is_batched, function
 
 
 def test_simulations_are_copies_of_a_buffer_that_is_used_again() -> None:
@@ -105,20 +98,21 @@ def test_simulations_are_copies_of_a_buffer_that_is_used_again() -> None:
     assert torch.equal(simulator_of(reuses)(theta), theta)
 
 
-@pytest.mark.parametrize("batched", [True, False])
-def test_a_simulator_that_changes_its_argument_changes_a_copy(batched: bool) -> None:
-    def changes(theta: Tensor) -> Tensor:
-        assert batched or theta.ndim == 1
-        x = theta.clone()
-        theta.mul_(0)
-        return x
+def test_a_simulator_that_changes_its_argument_changes_a_copy() -> None:
+    for batched in (True, False):
 
-    theta = torch.tensor([[0.3, 0.4], [0.6, -0.8]])
-    assert torch.equal(simulator_of(changes)(theta), theta)
-    assert torch.equal(theta[0], torch.tensor([0.3, 0.4]))
+        def changes(theta: Tensor) -> Tensor:
+            assert batched or theta.ndim == 1  # noqa: B023
+            x = theta.clone()
+            theta.mul_(0)
+            return x
+
+        theta = torch.tensor([[0.3, 0.4], [0.6, -0.8]])
+        assert torch.equal(simulator_of(changes)(theta), theta)
+        assert torch.equal(theta[0], torch.tensor([0.3, 0.4]))
 
 
-def test_a_simulator_that_fails_at_its_second_call_is_still_looked_at() -> None:
+def test_a_simulator_that_fails_at_its_second_call_is_still_recognised() -> None:
     calls = 0
 
     def fails_later(theta: Tensor) -> Tensor:
@@ -142,22 +136,16 @@ def flips(theta: Tensor) -> Tensor:
     return theta.flip(0) + 0.1 * torch.randn_like(theta)
 
 
-@pytest.mark.parametrize("function", [adds_up, flips])
-def test_a_simulator_that_mixes_rows_and_takes_no_single_theta_is_refused(
-    function: Callable[[Tensor], Tensor],
-) -> None:
-    with pytest.raises(SimulationError, match="changes with the other rows"):
-        simulator_of(function)
+def test_a_simulator_that_mixes_rows_and_takes_no_single_theta_is_refused() -> None:
+    for function in (adds_up, flips):
+        with pytest.raises(SimulationError, match="changes with the other rows"):
+            simulator_of(function)
 
 
-@pytest.mark.parametrize(
-    "convert", [Tensor.to_sparse, lambda x: x.to("meta")], ids=["sparse", "meta"]
-)
-def test_simulations_that_hold_no_numbers_are_refused(
-    convert: Callable[[Tensor], Tensor],
-) -> None:
-    with pytest.raises(SimulationError, match="got a tensor of shape"):
-        simulator_of(lambda theta: convert(theta))
+def test_simulations_that_hold_no_numbers_are_refused() -> None:
+    for function in (Tensor.to_sparse, lambda theta: theta.to("meta")):
+        with pytest.raises(SimulationError, match="got a tensor of shape"):
+            simulator_of(function)
 
 
 def test_a_simulator_that_sets_the_seed_is_warned_about() -> None:
