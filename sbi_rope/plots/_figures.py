@@ -1,4 +1,4 @@
-"""Figures that belong to no window, and the look that all plots share."""
+"""Empty figures, and the colours and line styles that all plots share."""
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
@@ -7,18 +7,18 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Okabe and Ito's palette without its yellow, which is too light for lines on white.
+# The palette of Okabe and Ito, without yellow, which is too light for lines on white.
 BLUE, VERMILLION, GREEN = "#0072B2", "#D55E00", "#009E73"
 PURPLE, ORANGE, SKY = "#CC79A7", "#E69F00", "#56B4E9"
 COLOURS = [BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY]
 LINE_STYLES = ["-", "--", "-.", ":"]
 GREY, PRIOR = "0.45", "0.93"
-# The same in every picture, whatever else is drawn with them.
+# These two methods look the same in every picture.
 METHOD_STYLES = {"RoPE": (BLUE, "-"), "NPE": (VERMILLION, "--")}
 
 
 def new_figure(width: float, height: float) -> "tuple[Figure, Axes]":
-    """Return a figure with one panel; it belongs to no window and needs no closing."""
+    """Return a figure with one panel. It has no window and need not be closed."""
     figure = empty_figure(width, height)
     axes = figure.subplots()
     hide_frame(axes)
@@ -38,12 +38,12 @@ def empty_figure(width: float, height: float) -> "Figure":
 
 
 def hide_frame(axes: "Axes") -> None:
-    """Leave the two axes that carry ticks."""
+    """Hide the upper and the right edge of a panel."""
     axes.spines[["top", "right"]].set_visible(False)
 
 
 def line_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Return the line style of each method, in the order of the names."""
+    """Return a line style for each method; different methods look different."""
     names = list(names)
     known = {name: METHOD_STYLES[name] for name in names if name in METHOD_STYLES}
     colours = _without(COLOURS, [colour for colour, _ in known.values()])
