@@ -3,6 +3,8 @@
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
+import torch
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -40,6 +42,30 @@ def empty_figure(width: float, height: float) -> "Figure":
 def hide_frame(axes: "Axes") -> None:
     """Hide the upper and the right edge of a panel."""
     axes.spines[["top", "right"]].set_visible(False)
+
+
+def draw_calibrated_band(
+    axes: "Axes", num_observations: int, *, label: str | None = None
+) -> None:
+    r"""Draw the diagonal and the band around it that holds calibrated posteriors.
+
+    At each level :math:`\alpha` the band holds 95 % of the coverage curves of one
+    parameter, :math:`\alpha \pm 1.96 \sqrt{\alpha (1 - \alpha) / n}`.
+    """
+    alpha = torch.linspace(0.0, 1.0, 201)
+    width = 1.96 * (alpha * (1.0 - alpha) / num_observations).sqrt()
+    low, high = (alpha - width).clamp(min=0.0), (alpha + width).clamp(max=1.0)
+    axes.fill_between(alpha, low, high, color="0.85", label=label)
+    axes.plot([0, 1], [0, 1], color=GREY, lw=0.8)
+    axes.set(xlim=(0, 1), ylim=(0, 1), box_aspect=1)
+
+
+def add_legend_above(figure: "Figure", axes: "Axes") -> None:
+    """Add a legend of one row above the figure, with what is in one of its panels."""
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="outside upper center", ncols=len(labels), frameon=False
+    )
 
 
 def line_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:

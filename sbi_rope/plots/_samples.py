@@ -152,15 +152,10 @@ def shade_prior(axes: "Axes", interval: Tensor) -> None:
         axes.fill_between([low[0], high[0]], low[1], high[1], **style)
 
 
-def share_outside(values: Tensor, limits: Tensor) -> float:
-    """Return the share of the samples that are outside the limits."""
-    inside = ((values >= limits[0]) & (values <= limits[1])).all(dim=1)
-    return 1.0 - float(inside.double().mean())
-
-
 def label_with_share(name: str, values: Tensor, limits: Tensor) -> str:
     """Return the name of a method, with the share of samples outside if it is large."""
-    outside = share_outside(values, limits)
+    inside = ((values >= limits[0]) & (values <= limits[1])).all(dim=1)
+    outside = 1.0 - float(inside.double().mean())
     # The axes are made to leave out one sample in a hundred of each parameter.
     if outside <= 0.05 + 0.01 * limits.shape[1]:
         return name
@@ -211,8 +206,6 @@ def draw_contours(
         bounded: Whether the contours end at the outermost values.
         shares: The shares of the samples, the largest first.
     """
-    from matplotlib.patches import Rectangle
-
     low, high = central_interval(values)
     margin = (high - low) / 2
     core = values[((values >= low - margin) & (values <= high + margin)).all(dim=1)]
@@ -243,8 +236,14 @@ def draw_contours(
         ]
     for contours in drawn:
         contours.set_in_layout(False)
-    if not bounded:
-        return
+    if bounded:
+        _cut_at_outermost(axes, drawn, values)
+
+
+def _cut_at_outermost(axes: "Axes", drawn: Sequence[Any], values: Tensor) -> None:
+    """Cut contours off at the outermost values that are inside the axes."""
+    from matplotlib.patches import Rectangle
+
     left, right = _overlap(values[:, 0], axes.get_xlim())
     bottom, top = _overlap(values[:, 1], axes.get_ylim())
     frame = Rectangle(

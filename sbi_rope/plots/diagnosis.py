@@ -7,7 +7,13 @@ from torch import Tensor
 
 from sbi_rope._validation import check_instance
 from sbi_rope.diagnosis import Diagnosis
-from sbi_rope.plots._figures import BLUE, GREY, empty_figure, hide_frame
+from sbi_rope.plots._figures import (
+    BLUE,
+    GREY,
+    add_legend_above,
+    empty_figure,
+    hide_frame,
+)
 from sbi_rope.plots._samples import central_interval, with_margin
 
 if TYPE_CHECKING:
@@ -52,10 +58,7 @@ def implied_parameters(diagnosis: Diagnosis) -> "Figure":
         else:
             axes.set_visible(False)
     panels[0].set_ylabel("density")
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="outside upper center", ncols=len(labels), frameon=False
-    )
+    add_legend_above(figure, panels[0])
     return figure
 
 

@@ -15,6 +15,7 @@ from sbi_rope.plots._figures import (
     GREY,
     SKY,
     VERMILLION,
+    draw_calibrated_band,
     line_styles,
     new_figure,
 )
@@ -57,20 +58,11 @@ def calibration_curves(curves: Mapping[str, CoverageCurve]) -> "Figure":
         check_instance(f"curves[{name!r}]", curve, CoverageCurve)
     figure, axes = new_figure(7.4, 4.2)
     count = min(curve.num_observations for curve in curves.values())
-    alpha = torch.linspace(0.0, 1.0, 201)
-    width = 1.96 * (alpha * (1.0 - alpha) / count).sqrt()
-    axes.fill_between(
-        alpha,
-        (alpha - width).clamp(min=0.0),
-        (alpha + width).clamp(max=1.0),
-        color="0.85",
-        label=f"calibrated, 95 % (n = {count})",
-    )
-    axes.plot([0, 1], [0, 1], color=GREY, lw=0.8)
+    label = f"calibrated, 95 % (n = {count})"
+    draw_calibrated_band(axes, count, label=label)
     styles = line_styles(curves)
     for name, curve in curves.items():
         axes.plot(curve.levels.cpu(), curve.average.cpu(), label=name, **styles[name])
-    axes.set(xlim=(0, 1), ylim=(0, 1), box_aspect=1)
     axes.set_xlabel("credible level")
     axes.set_ylabel("share of true parameters inside")
     note = {"color": GREY, "size": "small", "transform": axes.transAxes}

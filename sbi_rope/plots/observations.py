@@ -13,7 +13,13 @@ from sbi_rope._validation import (
     check_tensor,
 )
 from sbi_rope.errors import InvalidInputError
-from sbi_rope.plots._figures import BLUE, VERMILLION, empty_figure, hide_frame
+from sbi_rope.plots._figures import (
+    BLUE,
+    VERMILLION,
+    add_legend_above,
+    empty_figure,
+    hide_frame,
+)
 from sbi_rope.plots._samples import drawable
 
 if TYPE_CHECKING:
@@ -99,7 +105,7 @@ def _histograms(
     x_o: Tensor, x_s: Tensor, names: Sequence[str], labels: tuple[str, str]
 ) -> "Figure":
     columns = min(len(names), NUM_COLUMNS)
-    panels = _panels(len(names), columns, width=2.6, height=2.2)
+    figure, panels = _panels(len(names), columns, width=2.6, height=2.2)
     for k, (axes, name) in enumerate(zip(panels, names, strict=True)):
         values = torch.cat([x_o[:, k], x_s[:, k]]).double()
         tail = TAIL if len(values) * TAIL > 1 else 0.0
@@ -122,32 +128,20 @@ def _histograms(
             )
         axes.set_xlabel(name)
         axes.set_yticks([])
-    figure = panels[0].figure
-    figure.legend(
-        *panels[0].get_legend_handles_labels(),
-        loc="outside upper center",
-        ncols=2,
-        frameon=False,
-    )
-    return figure  # type: ignore[return-value]
+    add_legend_above(figure, panels[0])
+    return figure
 
 
 def _series(x_o: Tensor, x_s: Tensor, labels: tuple[str, str]) -> "Figure":
     count = min(len(x_o), NUM_SHOWN)
-    panels = _panels(count, min(count, 3), width=3.2, height=2.0)
+    figure, panels = _panels(count, min(count, 3), width=3.2, height=2.0)
     for i, axes in enumerate(panels):
         axes.plot(x_s[i].numpy(), color=VERMILLION, linewidth=1.2, label=labels[1])
         axes.plot(x_o[i].numpy(), color=BLUE, linewidth=1.2, label=labels[0])
     for axes in panels[-min(count, 3) :]:
         axes.set_xlabel("step")
-    figure = panels[0].figure
-    figure.legend(
-        *panels[0].get_legend_handles_labels(),
-        loc="outside upper center",
-        ncols=2,
-        frameon=False,
-    )
-    return figure  # type: ignore[return-value]
+    add_legend_above(figure, panels[0])
+    return figure
 
 
 def _images(x_o: Tensor, x_s: Tensor, labels: tuple[str, str]) -> "Figure":
@@ -163,7 +157,9 @@ def _images(x_o: Tensor, x_s: Tensor, labels: tuple[str, str]) -> "Figure":
     return figure
 
 
-def _panels(count: int, columns: int, *, width: float, height: float) -> "list[Axes]":
+def _panels(
+    count: int, columns: int, *, width: float, height: float
+) -> "tuple[Figure, list[Axes]]":
     rows = -(-count // columns)
     figure = empty_figure(width * columns, height * rows + 0.3)
     grid = list(figure.subplots(rows, columns, squeeze=False).flat)
@@ -171,4 +167,4 @@ def _panels(count: int, columns: int, *, width: float, height: float) -> "list[A
         axes.remove()
     for axes in grid[:count]:
         hide_frame(axes)
-    return grid[:count]
+    return figure, grid[:count]

@@ -17,6 +17,7 @@ from sbi_rope.plots._samples import (
 )
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["pair_plot"]
@@ -57,30 +58,17 @@ def pair_plot(
         None if prior is None else prior_interval(prior, draws[next(iter(draws))])
     )
     limits = robust_limits(list(draws.values()), truth, interval)
-    styles = line_styles(draws)
     for row in range(dim):
         for column in range(row + 1):
             axes = figure.add_subplot(dim, dim, row * dim + column + 1)
-            hide_frame(axes)
-            axes.set_xlim(*limits[:, column].tolist())
-            if row != column:
-                axes.set_ylim(*limits[:, row].tolist())
             pair = [column] if row == column else [column, row]
-            if interval is not None:
-                shade_prior(axes, interval[:, pair])
-            for name, value in draws.items():
-                if row == column:
-                    draw_marginal(axes, value[:, row], styles[name])
-                else:
-                    draw_contours(axes, value[:, pair], styles[name])
-            if row == column:
-                axes.spines["left"].set_visible(False)
-                axes.set_yticks([])
-                axes.set_ylim(bottom=0)
-            if truth is not None and row == column:
-                axes.axvline(float(truth[row]), color="black", lw=1.2)
-            elif truth is not None:
-                axes.plot(*truth[pair].tolist(), "o", color="black", ms=4, zorder=5)
+            _draw_panel(
+                axes,
+                {name: value[:, pair] for name, value in draws.items()},
+                None if truth is None else truth[pair],
+                limits[:, pair],
+                None if interval is None else interval[:, pair],
+            )
             axes.tick_params(labelbottom=row == dim - 1, labelleft=column == 0)
             if row == dim - 1:
                 axes.set_xlabel(names[column])
@@ -88,6 +76,36 @@ def pair_plot(
                 axes.set_ylabel(names[row])
     _add_legend(figure, draws, truth, limits, shaded=interval is not None)
     return figure
+
+
+def _draw_panel(
+    axes: "Axes",
+    draws: Mapping[str, Tensor],
+    truth: Tensor | None,
+    limits: Tensor,
+    interval: Tensor | None,
+) -> None:
+    """Draw one parameter, or a pair of parameters."""
+    hide_frame(axes)
+    is_marginal = limits.shape[1] == 1
+    axes.set_xlim(*limits[:, 0].tolist())
+    if not is_marginal:
+        axes.set_ylim(*limits[:, 1].tolist())
+    if interval is not None:
+        shade_prior(axes, interval)
+    for name, style in line_styles(draws).items():
+        if is_marginal:
+            draw_marginal(axes, draws[name][:, 0], style)
+        else:
+            draw_contours(axes, draws[name], style)
+    if is_marginal:
+        axes.spines["left"].set_visible(False)
+        axes.set_yticks([])
+        axes.set_ylim(bottom=0)
+    if truth is not None and is_marginal:
+        axes.axvline(float(truth[0]), color="black", lw=1.2)
+    elif truth is not None:
+        axes.plot(*truth.tolist(), "o", color="black", ms=4, zorder=5)
 
 
 def _add_legend(

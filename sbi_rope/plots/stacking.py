@@ -3,11 +3,16 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-import torch
-
 from sbi_rope._validation import check_instance
 from sbi_rope.metrics import CoverageCurve
-from sbi_rope.plots._figures import BLUE, GREY, ORANGE, SKY, empty_figure, hide_frame
+from sbi_rope.plots._figures import (
+    BLUE,
+    ORANGE,
+    SKY,
+    draw_calibrated_band,
+    empty_figure,
+    hide_frame,
+)
 from sbi_rope.stacking import LearningCurve, StackingReport
 
 if TYPE_CHECKING:
@@ -89,13 +94,8 @@ def _weights(axes: "Axes", weights: Mapping[str, float]) -> None:
 
 
 def _coverage(axes: "Axes", curve: CoverageCurve) -> None:
-    alpha = torch.linspace(0.0, 1.0, 201)
-    width = 1.96 * (alpha * (1.0 - alpha) / curve.num_observations).sqrt()
-    low, high = (alpha - width).clamp(min=0.0), (alpha + width).clamp(max=1.0)
-    axes.fill_between(alpha, low, high, color="0.85")
-    axes.plot([0, 1], [0, 1], color=GREY, lw=0.8)
+    draw_calibrated_band(axes, curve.num_observations)
     axes.plot(curve.levels.cpu(), curve.average.cpu(), color=BLUE)
-    axes.set(xlim=(0, 1), ylim=(0, 1), box_aspect=1)
     axes.set(xlabel="credible level", ylabel="share of held-out pairs inside")
 
 

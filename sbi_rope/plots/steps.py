@@ -56,6 +56,8 @@ STAR: dict[str, Any] = {
 }
 # The most dots that are drawn. More would run together.
 MAX_SIMULATED, MAX_REAL = 1000, 250
+# The layout is fixed, so that all panels have one size.
+LAYOUT = {"left": 0.03, "right": 0.99, "bottom": 0.23, "top": 0.92, "wspace": 0.16}
 
 
 @dataclass(frozen=True)
@@ -138,19 +140,8 @@ def overview(
         interval = prior_interval(prior, truth.unsqueeze(0))[:, chosen]
 
     figure = empty_figure(12.0, 4.0)
-    # The layout is fixed, so that all panels have one size.
     figure.set_layout_engine("none")
-    tune, couple, mix = figure.subplots(
-        1,
-        3,
-        gridspec_kw={
-            "left": 0.03,
-            "right": 0.99,
-            "bottom": 0.23,
-            "top": 0.92,
-            "wspace": 0.16,
-        },
-    )
+    tune, couple, mix = figure.subplots(1, 3, gridspec_kw=LAYOUT)
     for axes in (tune, couple, mix):
         hide_frame(axes)
     plane = _plane(simulated, before, after)

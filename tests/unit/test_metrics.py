@@ -447,6 +447,8 @@ def test_log_probs_of_an_npe_are_those_of_its_network_inside_the_prior(
         result = metrics.evaluate(posterior, theta, x, num_samples=50)
     raw = posterior.posterior_estimator.log_prob(theta.unsqueeze(0), x)[0]
     assert torch.allclose(result.lpp.log_probs, raw.detach().double(), rtol=1e-5)
+    double = metrics.lpp(posterior, theta.double(), x.double())
+    assert torch.equal(double.log_probs, result.lpp.log_probs)
     outside = metrics.lpp(posterior, torch.cat([theta, theta + 5]), x.repeat(2, 1))
     assert outside.neg_inf_fraction == 0.5
 
