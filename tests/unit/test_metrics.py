@@ -97,7 +97,7 @@ def at_most(seconds: float) -> Iterator[None]:
 # Functions of ranks and levels --------------------------------------------------------
 
 
-def test_mid_ranks_count_equal_samples_half() -> None:
+def test_mid_ranks_count_an_equal_sample_as_half_below() -> None:
     samples = torch.tensor([0.0, 1.0, 1.0, 2.0]).reshape(4, 1, 1)
     ranks = [float(metrics.mid_ranks(samples, torch.tensor([[t]]))) for t in (-1, 1, 3)]
     assert ranks == pytest.approx([0.5 / 5, 2.5 / 5, 4.5 / 5])
@@ -176,7 +176,7 @@ def test_acauc_standard_error_does_not_count_copies_of_a_parameter() -> None:
     )
 
 
-def test_coverage_counts_levels_reached_including_equality() -> None:
+def test_coverage_counts_a_level_that_is_equal_to_the_nominal_one() -> None:
     levels = metrics.central_levels(torch.tensor([[0.785], [0.5]], dtype=torch.float64))
     curve = metrics.coverage_curve_of(levels)
     assert curve.levels[56] == pytest.approx(0.57)

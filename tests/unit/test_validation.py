@@ -53,7 +53,7 @@ CHECKS_OF_NUMBERS = (
 )
 
 
-def test_tensors_of_numbers_are_returned_as_they_came() -> None:
+def test_tensors_of_numbers_are_returned_unchanged() -> None:
     same = (X, X.double(), X.half(), X.bfloat16(), X.long(), X.byte())
     for value in (*same, X.clone().requires_grad_()):
         assert check_tensor("x", value) is value, value.dtype
@@ -109,12 +109,12 @@ def test_numbers_that_are_too_large_for_float32_are_refused() -> None:
     assert_refused(r"`x`.*float32.*1 of 3.*\[1\]", as_float32, "x", large)
 
 
-def test_a_tensor_on_another_device_is_told_what_is_where() -> None:
+def test_the_error_about_a_device_says_where_other_tensors_are() -> None:
     match = "on meta, where `theta` is; got cpu"
     assert_refused(match, check_device, "x", X, torch.device("meta"), where="`theta`")
 
 
-def test_an_empty_batch_is_in_every_support() -> None:
+def test_an_empty_batch_is_inside_any_support() -> None:
     check_in_support("x", X[:0], BoxUniform(torch.zeros(2), torch.ones(2)))
 
 
