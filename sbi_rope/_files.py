@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all, and what to do with those that are not."""
+"""Write files completely or not at all, read arrays, and put damaged files aside."""
 
 import contextlib
 import itertools
@@ -15,7 +15,8 @@ from sbi_rope.errors import NotWritableError
 
 __all__ = ["read_arrays", "set_aside", "write_atomically"]
 
-# What numpy and zipfile raise for files that are no archives of arrays, or cut.
+# What numpy and zipfile raise for a file that is cut off or is no archive of arrays.
+# They raise an AttributeError for a file with a single array.
 BROKEN = (
     *(OSError, ValueError, KeyError, EOFError, AttributeError, NotImplementedError),
     *(RuntimeError, zipfile.BadZipFile, zlib.error),
@@ -23,15 +24,15 @@ BROKEN = (
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Read all arrays of an npz file, up to its last byte; nothing in it is executed.
+    """Read all arrays of an npz file. No code that the file may hold is executed.
 
     Raises:
-        ValueError: If the file is none, or is damaged.
+        ValueError: If the file is no npz file or is damaged.
     """
     try:
         with np.load(path, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
-    except BROKEN as error:  # AttributeError: a single array
+    except BROKEN as error:
         raise ValueError(
             f"expected whole arrays; got {type(error).__name__}: {error}"
         ) from error
@@ -39,15 +40,15 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 @contextlib.contextmanager
 def write_atomically(path: Path) -> Iterator[Path]:
-    """Give a temporary path, and move what was written there to its place.
+    """Yield a temporary path, and move the file written there to ``path`` at the end.
 
-    A reader, another process that writes the same file, an end of this process or a
-    power cut never leave or see half a file.
+    Nobody ever finds half a file under ``path``: not a reader, not another process that
+    writes the same file, and not after this process is killed or the power fails.
 
     Raises:
         NotWritableError: If nothing can be written to the folder.
     """
-    # Not by `mkstemp`, whose files only their owner may read.
+    # Files made by `mkstemp` can be read by their owner only.
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -59,7 +60,7 @@ def write_atomically(path: Path) -> Iterator[Path]:
         ) from error
     try:
         yield temporary
-        # What is renamed before it is on the disk may be empty after a power cut.
+        # If the power fails before the data are on the disk, the file may be empty.
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
         temporary.replace(path)
@@ -69,11 +70,11 @@ def write_atomically(path: Path) -> Iterator[Path]:
 
 
 def set_aside(path: Path) -> Path | None:
-    """Give a file another name, so that it is neither read again nor lost.
+    """Rename a damaged file, so that it is not read again but not lost either.
 
     Returns:
-        The new path, ``<path>.damaged-1`` or the next that is free; None if the file is
-        no longer there.
+        The new path, which is ``<path>.damaged-1`` or the next number that is free, or
+        None if the file is no longer there.
     """
     others = (
         path.with_name(f"{path.name}.damaged-{number}") for number in itertools.count(1)
@@ -81,16 +82,16 @@ def set_aside(path: Path) -> Path | None:
     other = next(other for other in others if not other.exists())
     try:
         path.rename(other)
-    except FileNotFoundError:  # another process was faster
+    except FileNotFoundError:  # another process has renamed it already
         return None
     return other
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make sure that the new name is on the disk, too, where the system can."""
+    """Write the new name of a file to the disk, on systems that can."""
     if os.name != "posix":
         return
-    # Some network file systems do not know how to; the file itself is on the disk.
+    # Some network file systems cannot. The file itself is on the disk already.
     with contextlib.suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:

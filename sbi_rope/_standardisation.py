@@ -1,4 +1,4 @@
-"""Real observations in the units by which NPE standardises simulations."""
+"""Observations and statistics in standard deviations of the simulations."""
 
 import torch
 from torch import Tensor, nn
@@ -15,22 +15,27 @@ __all__ = [
     "warn_of_far_entries",
 ]
 
-# Standard deviations of simulations. No measurement of the tasks is half as far. A
-# column that does not vary in simulations, but by 0.01 in reality, is at 100,000.
+# An entry is far if it is more than so many standard deviations away from simulations.
+# No measurement of the tasks is half as far away. A column that is constant in
+# simulations but varies by 0.01 in reality is 100,000 away.
 FAR = 30.0
-# A standard deviation smaller than this share of the mean is rounding.
+# A standard deviation smaller than this share of the mean is taken for rounding error.
 ROUNDING = 1e-6
 
 
 def deviations(embedding_net: nn.Module, x: Tensor) -> Tensor | None:
-    """Return how far each entry is from simulations, in standard deviations of these.
+    r"""Return how far each entry of x is from the mean of the simulations.
+
+    .. math:: |x - \bar x_s| / \operatorname{sd}(x_s)
 
     Args:
-        embedding_net: That of a trained estimator, with sbi's standardising layer.
-        x: Observations, shape ``(n, *event)``.
+        embedding_net: The embedding net of a trained estimator, which starts with sbi's
+            standardising layer.
+        x: Observations, shape ``(n, *event_shape)``.
 
     Returns:
-        Shape ``(n, *event)``; None where NPE does not standardise x.
+        The distances in standard deviations of the simulations, shape
+        ``(n, *event_shape)``, or None if NPE does not standardise x.
     """
     mean_and_std = standardisation_of(embedding_net)
     if mean_and_std is None:
@@ -43,16 +48,17 @@ def deviations(embedding_net: nn.Module, x: Tensor) -> Tensor | None:
 def leave_out_constants(embedding_net: nn.Module, x: Tensor) -> None:
     """Make a net ignore the entries that are the same in all calibration pairs.
 
-    sbi divides an entry that does not vary by 1e-7, so that the first observation in
-    which it does overwhelms all other entries.
+    sbi divides an entry that does not vary by 1e-7. In an observation where it does
+    vary, it would then be much larger than all other entries.
 
     Args:
         embedding_net: A net with sbi's standardising layer, which is changed.
-        x: The calibration x that it was standardised by, shape ``(n, *event)``.
+        x: The calibration x that gave the layer its mean and standard deviation, shape
+            ``(n, *event_shape)``.
     """
     mean_and_std = standardisation_of(embedding_net)
     if mean_and_std is None or mean_and_std[1].shape != x.shape[1:]:
-        return  # one standard deviation for all entries
+        return  # x is not standardised, or all entries have one standard deviation
     constant = x.std(dim=0) <= ROUNDING * x.abs().amax(dim=0)
     if not constant.any():
         return
@@ -60,13 +66,13 @@ def leave_out_constants(embedding_net: nn.Module, x: Tensor) -> None:
     entries = constant.flatten().nonzero().flatten().tolist()
     warn_user(
         f"{len(entries)} of the {constant.numel()} entries of the calibration `x` are "
-        f"the same in all pairs that are trained on (first: {entries[:5]}). They tell "
+        f"the same in all pairs that are trained on (first: {entries[:5]}). They say "
         "nothing about the parameters and are left out."
     )
 
 
 def warn_of_far_entries(name: str, x: Tensor, embedding_net: nn.Module) -> None:
-    """Warn of entries where NPE meets numbers unlike any that it was trained on."""
+    """Warn of entries of ``x`` that are far from all simulations NPE was trained on."""
     far = deviations(embedding_net, x)
     if far is None or not (far > FAR).any():
         return
@@ -77,18 +83,19 @@ def warn_of_far_entries(name: str, x: Tensor, embedding_net: nn.Module) -> None:
         f"{len(columns)} of the {far.shape[1]} entries of `{name}` (first: "
         f"{columns[:5].tolist()}) are up to {float(far.max()):.1g} standard deviations "
         f"away from simulations, in {len(rows)} of {len(far)} rows (first: "
-        f"{rows[:5].tolist()}). NPE was trained on nothing like it, and its answers "
-        "for these rows cannot be trusted. Check the units. Leave out what does not "
-        "vary in simulations, or train NPE with z_score_x='structured', which has one "
-        "standard deviation for all entries."
+        f"{rows[:5].tolist()}). NPE was not trained on such numbers, so its posteriors "
+        "for these rows cannot be trusted. Check the units. Leave out entries that do "
+        "not vary in simulations, or train NPE with z_score_x='structured', which uses "
+        "one standard deviation for all entries."
     )
 
 
 class Standardisation(nn.Module):
-    """Statistics in units of their standard deviation over simulations, and back.
+    """Divide statistics by their standard deviation over simulations, and undo it.
 
-    Statistics that are the same in all simulations cannot be in these units. They are
-    left out on the way there, and have their simulated value on the way back.
+    Statistics that are the same in all simulations have no such unit. They are left out
+    of the standardised statistics, and get their simulated value back from
+    :meth:`undo`.
 
     Args:
         simulated: Statistics of simulations, shape ``(n, l)``.
@@ -106,7 +113,7 @@ class Standardisation(nn.Module):
         self.register_buffer("varies", std > ROUNDING * mean.abs())
 
     def forward(self, statistics: Tensor) -> Tensor:
-        """Standardise, ``(..., l)`` to ``(..., l')``."""
+        """Standardise statistics of shape ``(..., l)``; the result is ``(..., l')``."""
         return ((statistics - self.mean) / self.std)[..., self.varies]
 
     def undo(self, standardised: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
 """The exceptions and warnings of the package.
 
-Every error derives from :class:`RoPEError` and from the builtin a caller would
-expect, so that both ``except RoPEError`` and ``except ValueError`` work.
+Every error derives from :class:`RoPEError` and from the built-in error that fits, so
+that both ``except RoPEError`` and, for instance, ``except ValueError`` catch it.
 """
 
 import inspect
@@ -28,7 +28,8 @@ __all__ = [
 ]
 
 
-LONGEST_TEXT = 200  # of a value in a message
+# The most characters of a value that a message shows.
+LONGEST_TEXT = 200
 
 
 class RoPEError(Exception):
@@ -59,8 +60,9 @@ class CouplingError(RoPEError, RuntimeError):
     """The optimal transport problem could not be solved as asked.
 
     Attributes:
-        reason: The message without these rows.
-        simulated_rows: Rows of the simulations that are to blame, if some are.
+        reason: The message, without the rows.
+        simulated_rows: Rows of the simulations that caused the error, if it is known
+            that some did.
     """
 
     def __init__(self, reason: str, *, simulated_rows: Sequence[int] = ()) -> None:
@@ -87,7 +89,7 @@ class DataNotFoundError(RoPEError, FileNotFoundError):
 
 
 class NotWritableError(RoPEError, OSError):
-    """Nothing can be written where results are to be kept."""
+    """A folder or file for results cannot be written to."""
 
 
 class RoPEWarning(UserWarning):
@@ -95,10 +97,10 @@ class RoPEWarning(UserWarning):
 
 
 def shown(value: Any) -> str:
-    """Return a value as it is written in code, for a message: short, in any case."""
+    """Return a value as it is written in code, shortened if it is long."""
     try:
         text = repr(value)
-    except Exception:  # whatever a foreign `repr` raises, and that of huge integers
+    except Exception:  # a `repr` may raise anything, and that of huge integers does
         return f"a value of type {type(value).__name__}"
     if len(text) <= LONGEST_TEXT:
         return text
@@ -106,9 +108,9 @@ def shown(value: Any) -> str:
 
 
 def warn_user(message: str) -> None:
-    """Issue a :class:`RoPEWarning` that points at the caller's own line.
+    """Issue a :class:`RoPEWarning` that points at the line of the user's code.
 
-    The line is the first one up the stack outside of this package, sbi and torch.
+    That line is the innermost call from outside of this package, sbi and torch.
     """
     level, frame = 1, inspect.currentframe()
     while frame is not None:

@@ -19,12 +19,12 @@ SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 @pytest.fixture(autouse=True)
 def _seeded() -> Iterator[None]:
-    """Give every test the same random numbers, and leave no trace of it."""
+    """Give every test the same random numbers, and restore their state afterwards."""
     with torch.random.fork_rng():
         if torch.cuda.is_available():
             torch.cuda.manual_seed_all(0)
-        # Without CUDA, `torch.manual_seed` notes for later where it was called, which
-        # takes longer than most tests.
+        # `torch.manual_seed` would take longer than most tests: without CUDA it
+        # remembers where it was called from.
         torch.default_generator.manual_seed(0)
         yield
 
@@ -47,15 +47,15 @@ def _no_network(
 def terminal(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> pytest.CaptureFixture[str]:
-    """``capsys`` of a terminal: without one no progress is shown."""
-    # Of the class: pytest makes another one for each phase of a test.
+    """Return ``capsys`` for a terminal. Progress is shown on a terminal only."""
+    # The class is changed, because pytest makes a new object for each phase of a test.
     monkeypatch.setattr(type(sys.stderr), "isatty", lambda self: True)
     return capsys
 
 
 @pytest.fixture
 def shorter_files(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let files of causal chambers have fewer rows than the published ones."""
+    """Allow files of causal chambers with fewer rows than the published ones."""
     monkeypatch.setattr("sbi_rope.tasks.chambers.PUBLISHED_ROWS", {})
 
 
@@ -71,7 +71,7 @@ def chamber_extract(monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture(scope="session")
 def chamber_root() -> Path:
-    """Folder with the whole causal chamber data sets, or skip."""
+    """Return the folder with the whole causal chamber data sets, or skip."""
     root = SHARED_DATA / "causal_chamber"
     if not root.is_dir():
         pytest.skip("the causal chamber data are not on this machine")

@@ -1,4 +1,4 @@
-"""The package imported anew, within this process: a new interpreter takes seconds."""
+"""Import the package anew in this process, because a new interpreter takes seconds."""
 
 import sys
 from collections.abc import Iterator
@@ -11,12 +11,12 @@ PACKAGE = "sbi_rope"
 
 @contextmanager
 def imported_anew(*, without: tuple[str, ...] = ()) -> Iterator[None]:
-    """Forget the package's modules, and let others be missing, for a while.
+    """Forget the modules of the package inside a ``with`` block.
 
-    What is imported meanwhile is a second copy; afterwards the first is back.
+    Imports in the block make a second copy. After it the first copy is back.
 
     Args:
-        without: Names of modules whose import fails.
+        without: Names of modules whose import fails in the block.
     """
     known = dict(sys.modules)
     for name in list(sys.modules):

@@ -1,4 +1,4 @@
-"""Scripts run in a process of their own, whose memory is then theirs alone."""
+"""Run a script in a process of its own, so that its memory can be measured."""
 
 import subprocess
 import sys
@@ -10,7 +10,7 @@ __all__ = ["run_alone"]
 
 
 def run_alone(script: str, *arguments: str) -> str:
-    """Run a script in a new process; return what it prints."""
+    """Run a script in a new process and return what it prints."""
     if not Path("/proc/self/clear_refs").exists():
         pytest.skip("peak memory is read from /proc")
     run = subprocess.run(

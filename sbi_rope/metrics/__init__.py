@@ -1,15 +1,15 @@
 r"""Scores of a posterior on observations whose true parameters are known.
 
-Any sbi posterior with ``sample_batched`` (calibration) and ``log_prob_batched``
-(density) can be scored, on a test set of ``theta``, shape ``(n, k)``, and ``x``, shape
-``(n, *event_shape)``, both on the device the posterior lives on.
+Any sbi posterior can be scored that has ``sample_batched``, for scores of calibration,
+and ``log_prob_batched``, for scores of the density. The test set consists of ``theta``,
+shape ``(n, d)``, and ``x``, shape ``(n, *event_shape)``, both on the device of the
+posterior.
 
-:func:`evaluate` draws the samples once and returns every score; the other functions
-return one score each. They all rest on the pure functions of
-:mod:`sbi_rope.metrics.calibration`, which know ranks and levels but no posterior.
+:func:`evaluate` draws the samples once and returns all scores. The other functions
+return one score each. All of them use the functions in
+:mod:`sbi_rope.metrics.calibration`, which take ranks and levels and need no posterior.
 
-Neither sampling nor evaluation ever enters sbi's unbounded rejection loops: see
-:mod:`sbi_rope.metrics.calls`.
+No score enters sbi's unbounded rejection loops: see :mod:`sbi_rope.metrics.calls`.
 """
 
 from sbi_rope.metrics.calibration import (

@@ -1,8 +1,9 @@
-r"""Calibration scores as functions of ranks and credible levels alone.
+r"""Scores of calibration as functions of ranks and credible levels.
 
 For nested credible regions, let :math:`a^*` be the level of the smallest region that
-contains the true parameter. A calibrated posterior has :math:`a^* \sim U(0, 1)`, an
-over-confident one has it too large. Every score here is a mean over :math:`a^*`.
+contains the true parameter. For a calibrated posterior :math:`a^*` is uniform on
+[0, 1]. For an over-confident one it is too large. Every score here is a mean of a
+function of :math:`a^*`.
 """
 
 from dataclasses import dataclass
@@ -32,21 +33,23 @@ __all__ = [
     "standard_error_of_mean",
 ]
 
-# Levels and ranks are ratios of integers: equality must survive their rounding.
+# Levels and ranks are ratios of integers. Those that are equal before rounding must
+# still count as equal after it.
 ROUNDING = 1e-9
-# What a level may be beyond 1, such as one that was calculated in float32.
+# How far a level may be above 1. One that was calculated in float32 can be.
 ROUNDING_OF_LEVELS = 1e-6
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ACAUCScore:
-    """Average coverage AUC: positive if over-confident, zero if calibrated.
+    """Average coverage AUC. It is zero if calibrated and positive if over-confident.
 
     Attributes:
-        value: Mean over parameters and observations, in [-1/2, 1/2].
-        standard_error: Of ``value``, over observations (parameters of one observation
-            are not taken as independent); NaN for a single observation.
-        per_parameter: Mean over observations, shape ``(k,)``; ``(1,)`` for joint
+        value: The mean over parameters and observations, in [-1/2, 1/2].
+        standard_error: The standard error of ``value`` over observations. It does not
+            take the parameters of one observation for independent. NaN for a single
+            observation.
+        per_parameter: The mean over observations, shape ``(d,)``, or ``(1,)`` for joint
             regions.
     """
 
@@ -60,10 +63,11 @@ class CoverageCurve:
     """Share of true parameters inside the central credible interval of each level.
 
     Attributes:
-        levels: Nominal levels .01, .02, ..., .99, shape ``(99,)``.
-        per_parameter: Empirical coverage, shape ``(k, 99)``.
-        standard_error: Of ``average``, over observations, shape ``(99,)``.
-        num_observations: Size of the test set.
+        levels: The nominal levels .01, .02, ..., .99, shape ``(99,)``.
+        per_parameter: The coverage of each parameter, shape ``(d, 99)``.
+        standard_error: The standard error of ``average`` over observations, shape
+            ``(99,)``.
+        num_observations: The size of the test set.
     """
 
     levels: Tensor
@@ -73,7 +77,7 @@ class CoverageCurve:
 
     @property
     def average(self) -> Tensor:
-        """Coverage averaged over parameters, shape ``(99,)``."""
+        """The coverage averaged over parameters, shape ``(99,)``."""
         return self.per_parameter.mean(dim=0)
 
 
@@ -82,9 +86,10 @@ class CoverageErrorScore:
     """Mean absolute distance of the coverage curves from the diagonal.
 
     Attributes:
-        value: Mean over parameters and levels, in [0, 1/2].
-        standard_error: Of ``value``, over observations, to first order.
-        per_parameter: Mean over levels, shape ``(k,)``.
+        value: The mean over parameters and levels, in [0, 1/2].
+        standard_error: The standard error of ``value`` over observations, to first
+            order.
+        per_parameter: The mean over levels, shape ``(d,)``.
     """
 
     value: float
@@ -93,25 +98,25 @@ class CoverageErrorScore:
 
 
 def mid_ranks(samples: Tensor, theta: Tensor) -> Tensor:
-    r"""Posterior distribution function at the true parameter, estimated from samples.
+    r"""Estimate the posterior's distribution function at the true parameter.
 
     .. math:: u_{ij} = \frac{1}{M + 1} \Big( \tfrac{1}{2}
         + \#\{m: \theta^m_{ij} < \theta_{ij}\}
         + \tfrac{1}{2} \#\{m: \theta^m_{ij} = \theta_{ij}\} \Big)
 
-    Ties are split, so that neither side of an atom is favoured.
+    A sample that is equal to the true parameter counts half as below it.
 
     Args:
-        samples: Posterior samples, shape ``(M, n, k)``.
-        theta: True parameters, shape ``(n, k)``.
+        samples: Posterior samples, shape ``(M, n, d)``.
+        theta: True parameters, shape ``(n, d)``.
 
     Returns:
-        The ranks, strictly between 0 and 1, float64, shape ``(n, k)``.
+        The ranks, strictly between 0 and 1, float64, shape ``(n, d)``.
 
     Raises:
         InvalidTypeError: If an argument is no tensor of real numbers.
-        InvalidInputError: If a shape does not fit, there is no sample, or there is a
-            NaN, which is neither above nor below anything. Infinite values are.
+        InvalidInputError: If a shape does not fit, there is no sample, or an entry is
+            NaN, which cannot be ranked. Infinite entries can be.
 
     Example:
         >>> mid_ranks(torch.tensor([[[0.0]], [[1.0]], [[1.0]]]), torch.tensor([[1.0]]))
@@ -132,20 +137,22 @@ def mid_ranks(samples: Tensor, theta: Tensor) -> Tensor:
 
 
 def count_ranks(samples: Tensor, theta: Tensor) -> Tensor:
-    """Return :func:`mid_ranks` of arguments that are known to be right."""
+    """Return :func:`mid_ranks` without checking the arguments."""
     below = (samples < theta).sum(dim=0).double()
     equal = (samples == theta).sum(dim=0).double()
     return (below + equal / 2 + 0.5) / (samples.shape[0] + 1)
 
 
 def central_levels(ranks: Tensor) -> Tensor:
-    r"""Level of the smallest central interval containing theta, :math:`|2u - 1|`.
+    r"""Return the level of the smallest central interval that contains theta.
+
+    .. math:: a^* = |2u - 1|
 
     Args:
-        ranks: Posterior distribution function at the true parameters, any shape.
+        ranks: The ranks :math:`u` of the true parameters, in any shape.
 
     Returns:
-        The levels, same shape.
+        The levels, in the same shape.
 
     Raises:
         InvalidTypeError: If the ranks are no tensor of real numbers.
@@ -158,12 +165,12 @@ def central_levels(ranks: Tensor) -> Tensor:
 def acauc_of(levels: Tensor) -> ACAUCScore:
     r"""Average the coverage error over all levels, parameters and observations.
 
-    .. math:: \text{ACAUC} = \frac{1}{k n} \sum_{j=1}^{k} \sum_{i=1}^{n} \int_0^1
+    .. math:: \text{ACAUC} = \frac{1}{d n} \sum_{j=1}^{d} \sum_{i=1}^{n} \int_0^1
         \alpha - \mathbf{1}[\theta_{ij} \in \Theta_{ij}(\alpha)] \,\mathrm{d}\alpha
-        = \frac{1}{k n} \sum_{j, i} a^*_{ij} - \frac{1}{2},
+        = \frac{1}{d n} \sum_{j, i} a^*_{ij} - \frac{1}{2}.
 
-    because the regions :math:`\Theta(\alpha)` are nested and contain theta from the
-    level :math:`a^*` on.
+    The two are equal because the regions :math:`\Theta(\alpha)` are nested: they
+    contain theta at all levels from :math:`a^*` on.
 
     References:
         | Addressing Misspecification in Simulation-based Inference through Data-driven
@@ -171,14 +178,14 @@ def acauc_of(levels: Tensor) -> ACAUCScore:
         | https://arxiv.org/abs/2405.08719
 
     Args:
-        levels: The levels :math:`a^*`, shape ``(n, k)``.
+        levels: The levels :math:`a^*` of the true parameters, shape ``(n, d)``.
 
     Returns:
         The score with its standard error.
 
     Raises:
         InvalidTypeError: If the levels are no tensor of real numbers.
-        InvalidInputError: If their shape is another one, or a level is not in [0, 1].
+        InvalidInputError: If they have another shape, or a level is not in [0, 1].
 
     Example:
         >>> acauc_of(torch.tensor([[0.5], [1.0]])).value
@@ -198,22 +205,22 @@ def coverage_curve_of(levels: Tensor) -> CoverageCurve:
 
     .. math:: c_j(\alpha) = \frac{1}{n} \sum_{i=1}^{n} \mathbf{1}[a^*_{ij} \le \alpha]
 
-    With :math:`M` posterior samples the levels are multiples of :math:`2 / (M + 1)`
-    apart: the curve is exact to about :math:`1 / M`.
+    With :math:`M` posterior samples the levels differ by multiples of
+    :math:`2 / (M + 1)`, so that the curve is exact to about :math:`1 / M`.
 
     Args:
-        levels: The levels :math:`a^*`, shape ``(n, k)``.
+        levels: The levels :math:`a^*` of the true parameters, shape ``(n, d)``.
 
     Returns:
         The curve at .01, .02, ..., .99.
 
     Raises:
         InvalidTypeError: If the levels are no tensor of real numbers.
-        InvalidInputError: If their shape is another one, or a level is not in [0, 1].
+        InvalidInputError: If they have another shape, or a level is not in [0, 1].
     """
     levels = _checked_levels(levels)
     nominal = _nominal_levels(levels)
-    # One level at a time: memory stays that of `levels`, whatever n and k.
+    # One level at a time, so that no tensor is larger than `levels`.
     coverage, errors = [], []
     for alpha in nominal:
         inside = _inside(levels, alpha)
@@ -230,27 +237,28 @@ def coverage_curve_of(levels: Tensor) -> CoverageCurve:
 def expected_coverage_error_of(levels: Tensor) -> CoverageErrorScore:
     r"""Average the distance between empirical coverage and nominal level.
 
-    .. math:: \text{ECE} = \frac{1}{99 k} \sum_{j=1}^{k} \sum_{l=1}^{99}
+    .. math:: \text{ECE} = \frac{1}{99 d} \sum_{j=1}^{d} \sum_{l=1}^{99}
         \big| c_j(l / 100) - l / 100 \big|
 
-    Unlike ACAUC it does not let one parameter's over-confidence cancel another's
-    under-confidence. It is therefore never negative: a calibrated posterior scores
-    about :math:`0.31 / \sqrt{n}`, whatever :math:`k`. The standard error is that of
-    the score linearised at the observed curve (the infinitesimal jackknife over
-    observations, which needs no random numbers):
-    each observation's influence is the mean of
+    Unlike in ACAUC, the over-confidence of one parameter cannot cancel the
+    under-confidence of another. The score is never negative, and a calibrated
+    posterior scores about :math:`0.31 / \sqrt{n}` for any :math:`d`.
+
+    The standard error is that of the score linearised at the observed curve, which is
+    the infinitesimal jackknife over observations and needs no random numbers. The
+    influence of an observation is the mean over parameters and levels of
     :math:`\operatorname{sign}(c_j - \alpha)(\mathbf{1}[a^*_{ij} \le \alpha] - c_j)`.
-    It is too large where the curve is close to the diagonal.
+    The standard error is too large where the curve is close to the diagonal.
 
     Args:
-        levels: The levels :math:`a^*`, shape ``(n, k)``.
+        levels: The levels :math:`a^*` of the true parameters, shape ``(n, d)``.
 
     Returns:
         The score with its standard error.
 
     Raises:
         InvalidTypeError: If the levels are no tensor of real numbers.
-        InvalidInputError: If their shape is another one, or a level is not in [0, 1].
+        InvalidInputError: If they have another shape, or a level is not in [0, 1].
     """
     levels = _checked_levels(levels)
     nominal = _nominal_levels(levels)
@@ -270,7 +278,10 @@ def expected_coverage_error_of(levels: Tensor) -> CoverageErrorScore:
 
 
 def standard_error_of_mean(values: Tensor) -> float:
-    """Standard error of the mean of a vector: NaN for one value, Inf if any is."""
+    """Return the standard error of the mean of a vector.
+
+    It is NaN for a single value, and infinite if a value is infinite.
+    """
     if values.numel() < 2:
         return float("nan")
     if torch.isinf(values).any():
@@ -279,16 +290,16 @@ def standard_error_of_mean(values: Tensor) -> float:
 
 
 def _checked_levels(levels: Tensor) -> Tensor:
-    """Return levels (n, k) without their gradients, which no score has a use for."""
+    """Return levels, shape ``(n, d)``, without gradients and in 32 bits or more."""
     shape = check_tensor("levels", levels).shape
     if levels.ndim != 2:
         raise InvalidInputError(
-            f"Expected `levels` of shape (n, k); got {tuple(shape)}."
+            f"Expected `levels` of shape (n, d); got {tuple(shape)}."
         )
     check_batch("levels", levels, shape[1:], finite=False)
     _check_unit_range("levels", levels)
     levels = levels.detach()
-    # Of 16 bits, they would be compared with levels that have been rounded as coarsely.
+    # In 16 bits, the nominal levels that they are compared with would be rounded too.
     is_coarse = levels.dtype in (torch.float16, torch.bfloat16)
     return levels.float() if is_coarse else levels
 

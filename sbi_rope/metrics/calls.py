@@ -1,14 +1,16 @@
 r"""How the metrics call a posterior: in chunks, and never in an unbounded loop.
 
-sbi's ``DirectPosterior`` rejects samples outside the prior, and normalises its density
-by the share it keeps. Both go on until enough samples are accepted, which is for ever
-once a misspecified observation has pushed the flow's mass out of the prior. The metrics
-therefore score such posteriors as the network states them: samples without rejection,
-``log_prob`` without renormalisation (but still :math:`-\infty` outside the prior).
-Leakage counts as an error of the posterior.
+sbi's ``DirectPosterior`` rejects samples outside the prior, and divides its density by
+the share that it keeps. Both loops go on until enough samples are accepted. If a
+misspecified observation has moved all mass of the flow out of the prior, they never
+end.
 
-A posterior that has replaced sbi's normalisation by a bounded one, as those of this
-package, is called without these arguments.
+The metrics therefore score such a posterior as its network states it. Samples are not
+rejected, and ``log_prob`` is not normalised, although it is still :math:`-\infty`
+outside the prior. Mass outside the prior counts as an error of the posterior.
+
+A posterior that replaces sbi's normalisation by a bounded one, such as those of this
+package, is called as it is.
 """
 
 import warnings
@@ -48,16 +50,19 @@ __all__ = [
     "evaluate_log_probs",
 ]
 
-# Observations treated in one call unless the caller says otherwise.
+# How many observations a posterior is called with at a time, unless the user says.
 CHUNK_SIZE = 100
 
-# Draws of one observation; more fill the memory before they sharpen any score.
+# The most draws for one observation. More would fill the memory without making any
+# score more precise.
 MAX_SAMPLES = 10**8
 
-# Draws whose density is evaluated in one call: some flows embed x once per draw.
+# How many draws of each observation have their density evaluated in one call. It is
+# small because some flows embed x once for every draw.
 DRAWS_PER_CALL = 10
 
-# sbi warns about what is done on purpose here: no rejection, whole chunks at once.
+# sbi warns of samples that are not rejected, and of whole chunks that are sampled at
+# once. Both are done here on purpose.
 EXPECTED_WARNINGS = (
     r".*lie outside the prior support",
     r"Capping max_sampling_batch_size",
@@ -66,14 +71,24 @@ EXPECTED_WARNINGS = (
 
 
 def check_num_samples(num_samples: Any) -> None:
-    """Raise unless a number of draws is one that can be asked for."""
+    """Raise unless the number of draws is an integer from 1 to 10^8."""
     check_integer("num_samples", num_samples, maximum=MAX_SAMPLES)
 
 
 def check_test_set(
     posterior: Any, theta: Tensor, x: Tensor, chunk_size: int
 ) -> tuple[Tensor, Tensor]:
-    """Check theta (n, k) and x (n, ...), and return them in the posterior's dtype."""
+    """Check a test set and return it in the dtype of the posterior.
+
+    Args:
+        posterior: The posterior to be scored.
+        theta: True parameters, shape ``(n, d)``.
+        x: Their observations, shape ``(n, *event_shape)``.
+        chunk_size: How many observations are scored at a time.
+
+    Raises:
+        InvalidInputError: If a shape does not fit or an entry is not finite.
+    """
     check_integer("chunk_size", chunk_size)
     check_batch("theta", theta, check_tensor("theta", theta).shape[-1:])
     check_batch("x", x, check_tensor("x", x).shape[1:])
@@ -82,7 +97,7 @@ def check_test_set(
         estimator = posterior.posterior_estimator
         check_batch("theta", theta, estimator.input_shape, finite=False)
         check_batch("x", x, estimator.condition_shape, finite=False)
-    if isinstance(posterior, NeuralPosterior):  # sbi's estimators know float32 only
+    if isinstance(posterior, NeuralPosterior):  # sbi's estimators use float32
         return as_float32("theta", theta), as_float32("x", x)
     return theta, x
 
@@ -90,7 +105,7 @@ def check_test_set(
 def evaluate_log_probs(
     posterior: Any, theta: Tensor, x: Tensor, *, chunk_size: int, show: bool
 ) -> Tensor:
-    """Log density of each true parameter given its observation, float64, ``(n,)``."""
+    """Return the log density of each true parameter, float64, shape ``(n,)``."""
     _require_log_prob(posterior)
     arguments = {"norm_posterior": False} if _is_unbounded_direct(posterior) else {}
     parts = []
@@ -98,7 +113,7 @@ def evaluate_log_probs(
         with torch.no_grad():
             part = _returned(
                 "log_prob_batched",
-                # A copy: embedding nets may change their argument.
+                # A copy of x, because an embedding net may change its argument.
                 posterior.log_prob_batched(theta[rows], x=x[rows].clone(), **arguments),
             )
         if part.numel() != theta[rows].shape[0]:
@@ -122,7 +137,7 @@ def draw_ranks(
     chunk_size: int,
     show: bool,
 ) -> Tensor:
-    """Mid-rank of each true parameter among posterior samples, shape ``(n, k)``."""
+    """Return the mid-ranks of true parameters among samples, shape ``(n, d)``."""
     parts = []
     for rows in _chunks(theta.shape[0], chunk_size, "Drawing samples", show=show):
         samples = _draw(posterior, theta, x, rows, num_samples)
@@ -139,7 +154,10 @@ def draw_joint_levels(
     chunk_size: int,
     show: bool,
 ) -> Tensor:
-    """Level of the smallest joint HPD region containing theta, shape ``(n, 1)``."""
+    """Return the levels of the smallest joint regions with theta, shape ``(n, 1)``.
+
+    The regions are those of highest posterior density (HPD).
+    """
     _require_log_prob(posterior)
     parts = []
     for rows in _chunks(theta.shape[0], chunk_size, "Drawing samples", show=show):
@@ -153,27 +171,27 @@ def draw_joint_levels(
         )
         bad = torch.isnan(densities).any(dim=0)
         _refuse("NaN log-probabilities", bad, start=rows.start)
-        # Ranking -log p ascending counts the draws that are denser than theta.
+        # The rank of -log p counts the draws whose density is higher than theta's.
         parts.append(count_ranks(-densities[1:, :, None], -densities[0, :, None]))
     return torch.cat(parts)
 
 
 def draw_samples(posterior: Any, x: Tensor, *, num_samples: int) -> Tensor:
-    """Draw as the scores see a posterior, without sbi's unbounded rejection.
+    """Draw posterior samples as the scores do, without sbi's unbounded rejection.
 
     Args:
         posterior: Any posterior with ``sample_batched``.
         x: Observations, shape ``(n, *event_shape)``.
-        num_samples: Draws for each.
+        num_samples: The number of samples for each observation.
 
     Returns:
-        Samples, shape ``(num_samples, n, k)``; those of a leaking posterior of sbi may
+        The samples, shape ``(num_samples, n, d)``. Samples of sbi's own posteriors may
         lie outside the prior.
 
     Raises:
         InvalidTypeError: If the posterior cannot be sampled, or returns no tensor.
-        InvalidInputError: If ``x`` is empty or not finite, or ``num_samples`` out of
-            range.
+        InvalidInputError: If ``x`` is empty or not finite, or ``num_samples`` is not
+            from 1 to 10^8.
     """
     check_num_samples(num_samples)
     check_batch("x", x, _event_shape(posterior, check_tensor("x", x)))
@@ -182,14 +200,14 @@ def draw_samples(posterior: Any, x: Tensor, *, num_samples: int) -> Tensor:
     samples = _sample(posterior, x, num_samples)
     if samples.ndim != 3 or samples.shape[:2] != (num_samples, len(x)):
         raise InvalidInputError(
-            f"Expected samples of shape ({num_samples}, {len(x)}, k); `sample_batched` "
+            f"Expected samples of shape ({num_samples}, {len(x)}, d); `sample_batched` "
             f"returned {tuple(samples.shape)}."
         )
     return samples
 
 
 def _event_shape(posterior: Any, x: Tensor) -> torch.Size:
-    """Return the shape of an observation, that of ``x`` itself where it is unknown."""
+    """Return the shape of an observation that the posterior expects, if it says so."""
     estimator = getattr(posterior, "posterior_estimator", None)
     return getattr(estimator, "condition_shape", x.shape[1:])
 
@@ -231,12 +249,15 @@ def _draw(
 
 
 def _density(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:
-    """Log density of draws, ``(draws, n)``, under the law they were drawn from."""
+    """Return the log density of draws, shape ``(num_draws, n)``.
+
+    It is the density of the distribution that the draws came from.
+    """
     with torch.no_grad():
         if _is_unbounded_direct(posterior):
-            # Unrejected draws can leave the prior, where `log_prob` is -Inf although
-            # the density they come from is not: a leaking posterior would look
-            # under-confident. The estimator states the density of its own draws.
+            # Draws that were not rejected can lie outside the prior, where `log_prob`
+            # is -Inf. A posterior with many such draws would look under-confident. The
+            # estimator gives the density that the draws really have.
             return posterior.posterior_estimator.log_prob(theta, condition=x)
         density = posterior.log_prob_batched(theta, x=x)
     if tuple(_returned("log_prob_batched", density).shape) != tuple(theta.shape[:2]):
@@ -248,7 +269,7 @@ def _density(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:
 
 
 def _returned(method: str, value: Any) -> Tensor:
-    """Return what a posterior returned, if it is a tensor of numbers."""
+    """Return what a method of the posterior returned, if it is a tensor of numbers."""
     if not isinstance(value, Tensor):
         raise InvalidTypeError(
             f"Expected `{method}` of the posterior to return a torch.Tensor; got "
@@ -261,7 +282,7 @@ def _returned(method: str, value: Any) -> Tensor:
 
 
 def _is_unbounded(posterior: Any) -> bool:
-    """Whether sbi would reject without a bound, and can be told not to."""
+    """Say whether sbi would reject without a bound, and can be told not to."""
     if isinstance(posterior, EnsemblePosterior):
         return any(_is_unbounded(member) for member in posterior.posteriors)
     if isinstance(posterior, DirectPosterior):
@@ -277,13 +298,13 @@ def _require_log_prob(posterior: Any) -> None:
     if not callable(getattr(posterior, "log_prob_batched", None)):
         raise LogProbUnavailableError(
             f"Expected `posterior` with a method `log_prob_batched`; got "
-            f"{type(posterior).__name__}. Its calibration can still be scored with "
+            f"{type(posterior).__name__}. You can still score its calibration with "
             f"`acauc` (kinds 'central' and 'rank') and `coverage_curve`."
         )
 
 
 def _refuse(what: str, bad: Tensor, *, start: int = 0) -> None:
-    """Raise if any observation is bad: a score must not hide a broken posterior."""
+    """Raise if the posterior returned something bad for any observation."""
     if bad.any():
         first = (bad.nonzero().flatten()[:5] + start).tolist()
         raise InvalidInputError(

@@ -1,4 +1,4 @@
-r"""How often credible regions contain the true parameters."""
+"""Scores of how often credible regions contain the true parameters."""
 
 from typing import Any, Literal
 
@@ -42,23 +42,25 @@ def acauc(
     chunk_size: int = CHUNK_SIZE,
     show_progress_bars: bool = False,
 ) -> ACAUCScore:
-    r"""Average coverage AUC: the mean of :math:`a^*` minus one half.
+    r"""Return the average coverage AUC: the mean of :math:`a^*` minus one half.
 
-    The kinds differ in what stands for the level :math:`a^*`:
+    The kinds differ in the level :math:`a^*`:
 
-    * ``"central"``: of one-dimensional central intervals, :math:`|2u - 1|` with
-      :math:`u` the mid-rank of the parameter among its posterior samples. Positive if
-      over-confident or biased, negative if under-confident. With :math:`M` samples it
-      cannot fall below about :math:`-1/2 + 0.8 / \sqrt{M}`.
-    * ``"hpd"``: of the joint highest-density region,
+    * ``"central"``: The level of one-dimensional central intervals, :math:`|2u - 1|`,
+      where :math:`u` is the mid-rank of the parameter among its posterior samples. The
+      score is positive if the posterior is over-confident or biased, and negative if it
+      is under-confident. With :math:`M` samples it cannot fall below about
+      :math:`-1/2 + 0.8 / \sqrt{M}`.
+    * ``"hpd"``: The level of the joint region of highest density,
       :math:`P_{\theta' \sim \tilde p}(\tilde p(\theta') > \tilde p(\theta))`, which
-      sees dependencies between parameters. One value for all parameters; with one
-      parameter it is the one-dimensional region of highest density. Same signs.
-    * ``"rank"``: :math:`u` itself, the algorithm printed in the paper's appendix,
-      divided by the number of observations. It measures signed bias: positive if the
-      truth lies above the posterior. Over- and under-confidence without bias give 0.
-      The algorithm compares the sorted ranks with :math:`i / n`; here it is
-      :math:`(i - 1/2) / n`, which sums to one half and gives 0 when calibrated.
+      also depends on how the parameters are correlated. There is one value for all
+      parameters, and its sign means the same as for ``"central"``.
+    * ``"rank"``: The rank :math:`u` itself. This is the algorithm printed in the
+      paper's appendix, divided by the number of observations. It measures signed bias:
+      the score is positive if the truth lies above the posterior, and zero for over- or
+      under-confidence without bias. The algorithm compares the sorted ranks with
+      :math:`i / n`. Here they are compared with :math:`(i - 1/2) / n`, whose mean is
+      one half, so that a calibrated posterior scores 0.
 
     References:
         | Addressing Misspecification in Simulation-based Inference through Data-driven
@@ -66,18 +68,19 @@ def acauc(
         | https://arxiv.org/abs/2405.08719
 
     Args:
-        posterior: Any posterior with ``sample_batched``; ``"hpd"`` also needs
+        posterior: Any posterior with ``sample_batched``. The kind ``"hpd"`` also needs
             ``log_prob_batched``.
-        theta: True parameters, shape ``(n, k)``.
+        theta: True parameters, shape ``(n, d)``.
         x: Their observations, shape ``(n, *event_shape)``.
-        kind: What the regions are.
-        num_samples: Posterior samples for each observation; 1000 by default, 200 for
-            ``"hpd"``, which evaluates the density of every sample. Where that is slow,
-            as for a mixture of many components, 50 cost little accuracy.
-        num_observations: Use only this many observations, evenly spaced over the test
-            set; all by default, at most 200 for ``"hpd"``.
-        seed: Seed of the samples; they also depend on ``chunk_size``.
-        chunk_size: Observations treated at a time.
+        kind: The credible regions, as above.
+        num_samples: The number of posterior samples for each observation. The default
+            is 1000, or 200 for ``"hpd"``, which evaluates the density of every sample.
+            Where that is slow, as for a mixture of many components, 50 samples lose
+            little accuracy.
+        num_observations: How many observations are used. They are evenly spaced over
+            the test set. The default is all, or at most 200 for ``"hpd"``.
+        seed: The seed of the samples, which also depend on ``chunk_size``.
+        chunk_size: How many observations are scored at a time.
         show_progress_bars: Whether to show progress.
 
     Returns:
@@ -86,7 +89,8 @@ def acauc(
     Raises:
         InvalidInputError: If an argument has the wrong shape or is not finite, or the
             posterior returns NaN.
-        LogProbUnavailableError: If ``"hpd"`` is asked of a posterior without density.
+        LogProbUnavailableError: If the kind is ``"hpd"`` and the posterior has no
+            ``log_prob_batched``.
     """
     check_choice("kind", kind, list(DEFAULT_NUM_SAMPLES))
     theta, x = check_test_set(posterior, theta, x, chunk_size)
@@ -120,19 +124,19 @@ def coverage_curve(
     chunk_size: int = CHUNK_SIZE,
     show_progress_bars: bool = False,
 ) -> CoverageCurve:
-    """Coverage of central credible intervals at the levels .01, .02, ..., .99.
+    """Return the coverage of central intervals at the levels .01, .02, ..., .99.
 
     Args:
         posterior: Any posterior with ``sample_batched``.
-        theta: True parameters, shape ``(n, k)``.
+        theta: True parameters, shape ``(n, d)``.
         x: Their observations, shape ``(n, *event_shape)``.
-        num_samples: Posterior samples drawn for each observation.
-        seed: Seed of the samples; they also depend on ``chunk_size``.
-        chunk_size: Observations treated at a time.
+        num_samples: The number of posterior samples for each observation.
+        seed: The seed of the samples, which also depend on ``chunk_size``.
+        chunk_size: How many observations are scored at a time.
         show_progress_bars: Whether to show progress.
 
     Returns:
-        The coverage of each parameter, its average, and the standard error of that.
+        The coverage of each parameter, their average, and its standard error.
 
     Raises:
         InvalidInputError: If an argument has the wrong shape or is not finite, or the
@@ -161,18 +165,19 @@ def expected_coverage_error(
     chunk_size: int = CHUNK_SIZE,
     show_progress_bars: bool = False,
 ) -> CoverageErrorScore:
-    r"""Mean distance between coverage and level, over parameters and levels.
+    r"""Return the mean distance between coverage and level.
 
-    A calibrated posterior scores about :math:`0.31 / \sqrt{n}`, never 0: see
+    The mean is over parameters and levels. A calibrated posterior does not score 0 but
+    about :math:`0.31 / \sqrt{n}`: see
     :func:`sbi_rope.metrics.calibration.expected_coverage_error_of`.
 
     Args:
         posterior: Any posterior with ``sample_batched``.
-        theta: True parameters, shape ``(n, k)``.
+        theta: True parameters, shape ``(n, d)``.
         x: Their observations, shape ``(n, *event_shape)``.
-        num_samples: Posterior samples drawn for each observation.
-        seed: Seed of the samples; they also depend on ``chunk_size``.
-        chunk_size: Observations treated at a time.
+        num_samples: The number of posterior samples for each observation.
+        seed: The seed of the samples, which also depend on ``chunk_size``.
+        chunk_size: How many observations are scored at a time.
         show_progress_bars: Whether to show progress.
 
     Returns:

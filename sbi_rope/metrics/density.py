@@ -1,4 +1,4 @@
-r"""How probable the posterior finds the true parameters."""
+"""The log-probability of the true parameters under the posterior."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -22,11 +22,11 @@ __all__ = ["LPPScore", "check_scales", "check_theta_std", "lpp"]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LPPScore:
-    r"""Log-probabilities of the true parameters under the posterior; higher is better.
+    r"""Log-probabilities of the true parameters under the posterior. Higher is better.
 
     Attributes:
-        log_probs: One value for each observation, in nats, float64, shape ``(n,)``.
-            :math:`-\infty` (a true parameter the posterior excludes) is kept.
+        log_probs: One value for each observation, in nats, float64, shape ``(n,)``. It
+            is :math:`-\infty` where the posterior excludes the true parameter.
     """
 
     log_probs: Tensor
@@ -42,32 +42,32 @@ class LPPScore:
 
     @property
     def mean(self) -> float:
-        r"""The LPP: :math:`-\infty` as soon as one true parameter is excluded."""
+        r"""The LPP. It is :math:`-\infty` if a single true parameter is excluded."""
         return float(self.log_probs.mean())
 
     @property
     def standard_error(self) -> float:
-        """Of the mean, over observations; Inf if the mean is infinite."""
+        """The standard error of the mean; infinite if the mean is infinite."""
         return standard_error_of_mean(self.log_probs)
 
     @property
     def median(self) -> float:
-        """Median over observations, which a few excluded parameters cannot move."""
+        """The median, which a few excluded parameters change little."""
         return float(self.log_probs.quantile(0.5, interpolation="nearest"))
 
     @property
     def neg_inf_fraction(self) -> float:
-        r"""Share of true parameters with a log-probability of :math:`-\infty`."""
+        r"""The share of true parameters with a log-probability of :math:`-\infty`."""
         return float(torch.isneginf(self.log_probs).double().mean())
 
     def standardised(self, theta_std: Tensor) -> "LPPScore":
-        r"""Return the same score for parameters measured in ``theta_std``.
+        r"""Return the score of the same posterior for parameters in other units.
 
         The density of :math:`z_j = \theta_j / s_j` is
         :math:`p(z \mid x) = p(\theta \mid x) \prod_j s_j`.
 
         Args:
-            theta_std: The scales :math:`s`, positive, shape ``(k,)``.
+            theta_std: The units :math:`s`, positive, shape ``(d,)``.
         """
         check_scales(theta_std)
         shift = theta_std.to(self.log_probs).log().sum()
@@ -83,14 +83,15 @@ def lpp(
     chunk_size: int = CHUNK_SIZE,
     show_progress_bars: bool = False,
 ) -> LPPScore:
-    r"""Log posterior probability of the true parameters, averaged over observations.
+    r"""Return the log posterior probability (LPP) of the true parameters.
 
     .. math:: \text{LPP} = \frac{1}{n} \sum_{i=1}^{n}
         \log \tilde p(\theta_i \mid x_i)
 
-    Natural units unless ``theta_std`` is given; for both units from one evaluation,
-    call :meth:`LPPScore.standardised` on the result in natural units. A value of
-    :math:`-\infty` stays in the mean and is counted; NaN raises.
+    Parameters are in their natural units unless ``theta_std`` is given. To have both
+    without evaluating the posterior twice, call :meth:`LPPScore.standardised` on the
+    result in natural units. Values of :math:`-\infty` stay in the mean, and their share
+    is reported.
 
     References:
         | Addressing Misspecification in Simulation-based Inference through Data-driven
@@ -99,15 +100,15 @@ def lpp(
 
     Args:
         posterior: Any posterior with ``log_prob_batched``.
-        theta: True parameters, shape ``(n, k)``.
+        theta: True parameters, shape ``(n, d)``.
         x: Their observations, shape ``(n, *event_shape)``.
-        theta_std: Units of theta, usually the prior's standard deviation, shape
-            ``(k,)``.
-        chunk_size: Observations evaluated at a time.
+        theta_std: The units of theta, usually the prior's standard deviation, shape
+            ``(d,)``.
+        chunk_size: How many observations are scored at a time.
         show_progress_bars: Whether to show progress.
 
     Returns:
-        The log-probabilities, with mean, standard error, median, and share of
+        The log-probabilities, with their mean, standard error, median, and share of
         :math:`-\infty`.
 
     Raises:
@@ -134,13 +135,13 @@ def lpp(
 
 
 def check_theta_std(theta_std: Tensor | None, theta: Tensor) -> None:
-    """Check that the scales are None or positive, one for each parameter."""
+    """Raise unless the units are None, or positive and one for each parameter."""
     if theta_std is not None:
         check_scales(theta_std)
         check_same_length("theta_std", theta_std, "theta.T", theta.T)
 
 
 def check_scales(theta_std: Tensor) -> None:
-    """Check that the scales are positive."""
+    """Raise unless the units are positive."""
     check_batch("theta_std", theta_std, ())
     check_positive("theta_std", float(theta_std.min()))

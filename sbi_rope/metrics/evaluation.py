@@ -1,4 +1,4 @@
-r"""All scores of a posterior from one set of samples."""
+"""All scores of a posterior from one set of samples."""
 
 import math
 from dataclasses import dataclass
@@ -33,13 +33,15 @@ class Evaluation:
     """All scores of one posterior on one test set, from one set of samples.
 
     Attributes:
-        lpp: Log-probabilities in the natural units of theta.
-        lpp_z: The same with theta divided by ``theta_std``; None if that is unknown.
-        ranks: Mid-ranks of the true parameters, shape ``(n, k)``; for instance
-            ``acauc_of(evaluation.ranks)`` is the signed bias, kind ``"rank"``.
-        acauc: Average coverage AUC of central intervals.
-        coverage: Coverage of central intervals.
-        expected_coverage_error: Distance of the coverage from the diagonal.
+        lpp: The log-probabilities in the natural units of theta.
+        lpp_z: The log-probabilities of theta in units of ``theta_std``, or None if that
+            was not given.
+        ranks: The mid-ranks of the true parameters, shape ``(n, d)``. Other scores can
+            be calculated from them: ``acauc_of(evaluation.ranks)`` is the ACAUC of kind
+            ``"rank"``.
+        acauc: The average coverage AUC of central intervals.
+        coverage: The coverage of central intervals.
+        expected_coverage_error: The distance of the coverage from the diagonal.
     """
 
     lpp: LPPScore
@@ -50,7 +52,7 @@ class Evaluation:
     expected_coverage_error: CoverageErrorScore
 
     def as_row(self) -> dict[str, float]:
-        """Return the headline numbers, NaN where one is unknown, as a table row."""
+        """Return the main scores as the row of a table; an unknown one is NaN."""
         return {
             "lpp": self.lpp.mean,
             "lpp_z": math.nan if self.lpp_z is None else self.lpp_z.mean,
@@ -76,12 +78,13 @@ def evaluate(
 
     Args:
         posterior: Any posterior with ``sample_batched`` and ``log_prob_batched``.
-        theta: True parameters, shape ``(n, k)``.
+        theta: True parameters, shape ``(n, d)``.
         x: Their observations, shape ``(n, *event_shape)``.
-        theta_std: Standard deviation of the prior, shape ``(k,)``, for ``lpp_z``.
-        num_samples: Posterior samples drawn for each observation.
-        seed: Seed of the samples; they also depend on ``chunk_size``.
-        chunk_size: Observations treated at a time, which bounds the memory.
+        theta_std: The unit of each parameter for ``lpp_z``, usually the prior's
+            standard deviation, shape ``(d,)``.
+        num_samples: The number of posterior samples for each observation.
+        seed: The seed of the samples, which also depend on ``chunk_size``.
+        chunk_size: How many observations are scored at a time. Fewer need less memory.
         show_progress_bars: Whether to show progress.
 
     Returns:

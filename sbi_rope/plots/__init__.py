@@ -1,7 +1,7 @@
-r"""Pictures of posteriors, of their calibration, and of how RoPE got there.
+"""Pictures of posteriors, of their calibration, and of the steps of RoPE.
 
-Every function returns a matplotlib figure and shows nothing. matplotlib is imported
-when a function is called: ``pip install sbi-rope[benchmarks]``.
+Every function returns a matplotlib figure and does not show it. matplotlib is imported
+when a function is called. Install it with ``pip install sbi-rope[benchmarks]``.
 """
 
 from sbi_rope.plots.diagnosis import implied_parameters

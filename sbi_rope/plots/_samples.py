@@ -1,4 +1,4 @@
-"""Posterior samples in a panel: their checks, the axes, histograms and contours."""
+"""Draw posterior samples in a panel: checks, limits of axes, histograms, contours."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -19,11 +19,14 @@ from sbi_rope.plots._figures import PRIOR
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# How many times its own width the axes may be widened for posteriors far from it.
+# How far beyond their core the axes may reach, in widths of the core.
 REACH = 1.0
-# Shares of the samples that contours enclose.
+# The shares of the samples that contours enclose.
 LEVELS = (0.9, 0.5)
-LARGEST = 1e100  # number that is drawn
+# The largest number that can be drawn. For larger ones matplotlib's own arithmetic
+# overflows or divides by zero, for instance when it computes a margin.
+LARGEST = 1e100
+# The number of grid points on each axis for contours.
 GRID = 100
 
 
@@ -32,12 +35,17 @@ def check_samples(
     theta: Tensor | None,
     parameter_names: Sequence[str] | None,
 ) -> tuple[dict[str, Tensor], Tensor | None, list[str]]:
-    """Return samples and truth on the CPU in float64, and one name a parameter."""
+    """Check samples, the truth and names of parameters.
+
+    Returns:
+        The samples by method and the truth, on the CPU in float64, and a name for each
+        parameter.
+    """
     check_mapping("samples", samples, like="posterior samples")
     first = check_tensor("samples", next(iter(samples.values())))
     if first.ndim != 2:
         raise InvalidInputError(
-            "Expected `samples` of shape (num_samples, k) each; got "
+            "Expected `samples` of shape (num_samples, d) each; got "
             f"{tuple(first.shape)}."
         )
     width = first.shape[1:]
@@ -57,9 +65,8 @@ def check_samples(
 
 
 def drawable(name: str, value: Tensor) -> Tensor:
-    """Return checked numbers on the CPU in float64, if axes can hold them."""
+    """Return a tensor on the CPU in float64; raise if its numbers cannot be drawn."""
     value = value.detach().cpu().double()
-    # matplotlib's own arithmetic, such as a margin, overflows or divides by zero.
     if value.numel() and value.abs().max() > LARGEST:
         raise InvalidInputError(
             f"Expected `{name}` with numbers up to {LARGEST:g} to draw; got "
@@ -69,12 +76,12 @@ def drawable(name: str, value: Tensor) -> Tensor:
 
 
 def central_interval(values: Tensor) -> Tensor:
-    """Ends of the central 99 % of each column, shape ``(2, k)``.
+    """Return the ends of the central 99 % of each column, shape ``(2, d)``.
 
-    Of five rows or more, at least the smallest and the largest are left out.
+    If there are five rows or more, at least the smallest and the largest are left out.
     """
     last = len(values) - 1
-    # Order statistics, not interpolated: a single extreme must not leak in.
+    # The ends are not interpolated, which would let a single extreme value have a say.
     low = min(math.ceil(0.005 * last), last // 4)
     return values.sort(dim=0).values[[low, last - low]]
 
@@ -82,11 +89,12 @@ def central_interval(values: Tensor) -> Tensor:
 def robust_limits(
     draws: Sequence[Tensor], truth: Tensor | None, prior: Tensor | None = None
 ) -> Tensor:
-    """Limits of the axes, shape ``(2, k)``.
+    """Return the limits of the axes, shape ``(2, d)``.
 
-    They hold the core: the prior's interval if given, or else the central 99 % of each
-    posterior that is around the truth; and the truth. Of the other posteriors they hold
-    the central 99 % as far as it is within ``REACH`` times the width of the core.
+    The axes always hold a core. It consists of the truth and of the prior's interval if
+    that is given. Otherwise it consists of the truth and the central 99 % of each
+    posterior that has the truth inside. The axes hold the central 99 % of the other
+    posteriors as far as it is within ``REACH`` times the width of the core.
     """
     spans = torch.stack([central_interval(value) for value in draws])
     low, high = spans[:, 0], spans[:, 1]  # one row a posterior
@@ -96,7 +104,7 @@ def robust_limits(
     elif truth is not None:
         around = (low <= truth) & (truth <= high)
         inf = torch.full_like(low, torch.inf)
-        # Where none is around the truth, none is favoured.
+        # If no posterior has the truth inside, all of them belong to the core.
         some = around.any(dim=0)
         core_low = torch.where(
             some, torch.where(around, low, inf).amin(dim=0), core_low
@@ -115,27 +123,27 @@ def robust_limits(
 
 
 def with_margin(low: Tensor, high: Tensor) -> Tensor:
-    """Limits of axes a little wider than what they hold, shape ``(2, k)``."""
+    """Return limits that are a little wider than an interval, shape ``(2, d)``."""
     margin = 0.06 * _width(low, high)
     return torch.stack([low - margin, high + margin])
 
 
 def _width(low: Tensor, high: Tensor) -> Tensor:
-    """Return the width of an interval, or of a visible one if it is but a point."""
+    """Return the width of an interval; that of a single point is set to be visible."""
     size = torch.maximum(low.abs(), high.abs())
     visible = torch.where(size > 0, size, torch.ones_like(size))
     return torch.where(high - low > 1e-9 * size, high - low, visible)
 
 
 def prior_interval(prior: Any, like: Tensor) -> Tensor:
-    """Check samples of the prior and return their central 99 %, shape ``(2, k)``."""
+    """Check samples of the prior and return their central 99 %, shape ``(2, d)``."""
     return central_interval(
         drawable("prior", check_batch("prior", prior, like.shape[1:]))
     )
 
 
 def shade_prior(axes: "Axes", interval: Tensor) -> None:
-    """Shade the prior's interval, shape ``(2, 1)`` or ``(2, 2)``."""
+    """Shade the prior's interval of one or two parameters, ``(2, 1)`` or ``(2, 2)``."""
     style: dict[str, Any] = {"color": PRIOR, "lw": 0, "zorder": 0}
     low, high = interval.tolist()
     if len(low) == 1:
@@ -144,16 +152,11 @@ def shade_prior(axes: "Axes", interval: Tensor) -> None:
         axes.fill_between([low[0], high[0]], low[1], high[1], **style)
 
 
-def share_outside(values: Tensor, limits: Tensor) -> float:
-    """Share of the samples outside the limits in any parameter."""
-    inside = ((values >= limits[0]) & (values <= limits[1])).all(dim=1)
-    return 1.0 - float(inside.double().mean())
-
-
 def label_with_share(name: str, values: Tensor, limits: Tensor) -> str:
-    """Return the name of a method, saying so if its samples do not fit the axes."""
-    outside = share_outside(values, limits)
-    # Of k parameters, one in a hundred of each is outside by construction.
+    """Return the name of a method, with the share of samples outside if it is large."""
+    inside = ((values >= limits[0]) & (values <= limits[1])).all(dim=1)
+    outside = 1.0 - float(inside.double().mean())
+    # The axes are made to leave out one sample in a hundred of each parameter.
     if outside <= 0.05 + 0.01 * limits.shape[1]:
         return name
     return f"{name} ({100 * outside:.0f} % outside)"
@@ -162,7 +165,8 @@ def label_with_share(name: str, values: Tensor, limits: Tensor) -> str:
 def draw_marginal(axes: "Axes", values: Tensor, style: Mapping[str, Any]) -> None:
     """Draw a histogram of ``values``, shape ``(n,)``, with an area of one.
 
-    The limits of the axes must be set: what is outside sets no height.
+    The limits of the axes must be set before. Nothing is drawn for samples outside, so
+    that they cannot change the height of the panel.
     """
     low, high = central_interval(values.unsqueeze(1)).flatten().tolist()
     left, right = axes.get_xlim()
@@ -171,11 +175,11 @@ def draw_marginal(axes: "Axes", values: Tensor, style: Mapping[str, Any]) -> Non
     if _is_point(low, high):
         axes.axvline(low, **style)
         return
-    # Bins of one width, also beyond: extremes must not widen them, and must count.
+    # Only the central samples set the bins, but the area counts all of them.
     num_bins = min(max(round(len(values) ** 0.5), 5), 30)
     counts, edges = torch.histogram(values, bins=num_bins, range=(low, high))
     density = counts / (len(values) * (edges[1] - edges[0]))
-    # Dashed steps are hard to read.
+    # The lines are solid, because dashed steps are hard to read.
     axes.stairs(density.numpy(), edges.numpy(), color=style["color"], lw=1.6)
 
 
@@ -188,18 +192,25 @@ def draw_contours(
     bounded: bool = True,
     shares: Sequence[float] = LEVELS,
 ) -> None:
-    """Draw contours around shares of ``values``, shape ``(n, 2)``, largest first.
+    """Draw contours that enclose shares of ``values``, shape ``(n, 2)``.
 
-    The limits of the axes must be set. If ``bounded``, nothing is drawn beyond the
-    outermost values: smoothing must not carry a posterior out of the prior's support.
+    The limits of the axes must be set before. If ``bounded``, nothing is drawn beyond
+    the outermost values. Otherwise the smoothing could move the contours of a posterior
+    out of the prior's support.
+
+    Args:
+        axes: The panel.
+        values: The samples.
+        style: The colour and line style.
+        fill: Whether the areas inside the contours are filled.
+        bounded: Whether the contours end at the outermost values.
+        shares: The shares of the samples, the largest first.
     """
-    from matplotlib.patches import Rectangle
-
     low, high = central_interval(values)
     margin = (high - low) / 2
     core = values[((values >= low - margin) & (values <= high + margin)).all(dim=1)]
     colour = style["color"]
-    # Principal axes, so that the smoothing does not widen a narrow ridge.
+    # Along the principal axes, the smoothing does not widen a narrow ridge.
     centre = core.mean(dim=0) if len(core) else values.mean(dim=0)
     scale, directions = torch.linalg.eigh((core - centre).T.cov(correction=0))
     scale = scale.clamp(min=0.0).sqrt()
@@ -225,8 +236,14 @@ def draw_contours(
         ]
     for contours in drawn:
         contours.set_in_layout(False)
-    if not bounded:
-        return
+    if bounded:
+        _cut_at_outermost(axes, drawn, values)
+
+
+def _cut_at_outermost(axes: "Axes", drawn: Sequence[Any], values: Tensor) -> None:
+    """Cut contours off at the outermost values that are inside the axes."""
+    from matplotlib.patches import Rectangle
+
     left, right = _overlap(values[:, 0], axes.get_xlim())
     bottom, top = _overlap(values[:, 1], axes.get_ylim())
     frame = Rectangle(
@@ -246,7 +263,7 @@ def _is_point(low: float, high: float) -> bool:
 
 
 def _smoothed(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Density of whitened ``values`` on a grid: both ``(GRID, GRID, ...)``."""
+    """Return the density of whitened values on a grid, and the points of the grid."""
     bandwidth = len(values) ** (-1 / 6)  # Scott's rule
     low = values.amin(dim=0) - 3 * bandwidth
     high = values.amax(dim=0) + 3 * bandwidth

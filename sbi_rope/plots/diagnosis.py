@@ -1,4 +1,4 @@
-"""Which parameters a batch implies, beside the prior."""
+"""The parameters that a batch implies, and the prior."""
 
 from typing import TYPE_CHECKING
 
@@ -7,7 +7,13 @@ from torch import Tensor
 
 from sbi_rope._validation import check_instance
 from sbi_rope.diagnosis import Diagnosis
-from sbi_rope.plots._figures import BLUE, GREY, empty_figure, hide_frame
+from sbi_rope.plots._figures import (
+    BLUE,
+    GREY,
+    add_legend_above,
+    empty_figure,
+    hide_frame,
+)
 from sbi_rope.plots._samples import central_interval, with_margin
 
 if TYPE_CHECKING:
@@ -21,10 +27,11 @@ MAX_COLUMNS = 4
 
 
 def implied_parameters(diagnosis: Diagnosis) -> "Figure":
-    """Histograms of the prior and of the parameters that a batch implies.
+    """Draw histograms of the prior and of the parameters that a batch implies.
 
-    Beside the weights of simulations that stand for the batch, those for a batch that
-    follows the prior: they differ from the prior by what the coupling blurs.
+    The parameters that the batch implies are those of the simulations that it is
+    coupled with. A dashed histogram shows the same for a batch that follows the prior.
+    It differs from the prior because a coupling blurs.
 
     Args:
         diagnosis: What :func:`sbi_rope.diagnose` returns.
@@ -33,7 +40,7 @@ def implied_parameters(diagnosis: Diagnosis) -> "Figure":
         The figure, with one panel for each parameter.
 
     Raises:
-        InvalidTypeError: If something is no diagnosis.
+        InvalidTypeError: If the argument is no diagnosis.
         ImportError: If matplotlib is not installed.
     """
     check_instance("diagnosis", diagnosis, Diagnosis)
@@ -51,10 +58,7 @@ def implied_parameters(diagnosis: Diagnosis) -> "Figure":
         else:
             axes.set_visible(False)
     panels[0].set_ylabel("density")
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="outside upper center", ncols=len(labels), frameon=False
-    )
+    add_legend_above(figure, panels[0])
     return figure
 
 
@@ -64,7 +68,7 @@ def _draw(axes: "Axes", theta: Tensor, weights: dict[str, Tensor]) -> None:
     low, high = with_margin(*central_interval(theta.unsqueeze(1)))[:, 0].tolist()
     edges = torch.linspace(low, high, NUM_BINS + 1, dtype=theta.dtype).tolist()
     axes.set_xlim(low, high)
-    # Nothing is cut off at the sides: the outermost bins hold the tails.
+    # The outermost bins hold the tails, so that nothing is cut off.
     inside = theta.clamp(low, high).numpy()
     axes.hist(inside, bins=edges, density=True, color="0.85", label="prior")
     styles = {

@@ -1,4 +1,4 @@
-"""How well calibrated posteriors are, and how the steps of RoPE went."""
+"""Pictures of calibration curves, losses of a fine-tuning, and sizes of couplings."""
 
 import math
 from collections.abc import Mapping
@@ -15,6 +15,7 @@ from sbi_rope.plots._figures import (
     GREY,
     SKY,
     VERMILLION,
+    draw_calibrated_band,
     line_styles,
     new_figure,
 )
@@ -30,16 +31,18 @@ __all__ = [
 
 
 def calibration_curves(curves: Mapping[str, CoverageCurve]) -> "Figure":
-    r"""Empirical coverage of central credible intervals against their level.
+    r"""Draw the coverage of central credible intervals against their level.
 
-    Above the diagonal a posterior is under-confident, below it over-confident. The band
-    holds, level by level, 95 % of the curves of calibrated posteriors of one parameter
-    and the smallest test set shown: :math:`\alpha \pm 1.96
-    \sqrt{\alpha (1 - \alpha) / n}`. The average of several parameters varies no more.
+    A posterior is under-confident where its curve is above the diagonal, and
+    over-confident where it is below. At each level the band holds 95 % of the curves of
+    calibrated posteriors of one parameter. For the average of several parameters it is
+    wide enough, too. It is drawn for the smallest test set, whose size is :math:`n`:
+
+    .. math:: \alpha \pm 1.96 \sqrt{\alpha (1 - \alpha) / n}
 
     Args:
         curves: Coverage curves by method name, from
-            :func:`sbi_rope.metrics.coverage_curve`; the average over parameters is
+            :func:`sbi_rope.metrics.coverage_curve`. Their averages over parameters are
             drawn.
 
     Returns:
@@ -47,7 +50,7 @@ def calibration_curves(curves: Mapping[str, CoverageCurve]) -> "Figure":
 
     Raises:
         InvalidInputError: If there is no curve.
-        InvalidTypeError: If the curves are no dictionary, or one is no curve.
+        InvalidTypeError: If the curves are no dictionary of coverage curves.
         ImportError: If matplotlib is not installed.
     """
     check_mapping("curves", curves, like="coverage curves")
@@ -55,42 +58,33 @@ def calibration_curves(curves: Mapping[str, CoverageCurve]) -> "Figure":
         check_instance(f"curves[{name!r}]", curve, CoverageCurve)
     figure, axes = new_figure(7.4, 4.2)
     count = min(curve.num_observations for curve in curves.values())
-    alpha = torch.linspace(0.0, 1.0, 201)
-    width = 1.96 * (alpha * (1.0 - alpha) / count).sqrt()
-    axes.fill_between(
-        alpha,
-        (alpha - width).clamp(min=0.0),
-        (alpha + width).clamp(max=1.0),
-        color="0.85",
-        label=f"calibrated, 95 % (n = {count})",
-    )
-    axes.plot([0, 1], [0, 1], color=GREY, lw=0.8)
+    label = f"calibrated, 95 % (n = {count})"
+    draw_calibrated_band(axes, count, label=label)
     styles = line_styles(curves)
     for name, curve in curves.items():
         axes.plot(curve.levels.cpu(), curve.average.cpu(), label=name, **styles[name])
-    axes.set(xlim=(0, 1), ylim=(0, 1), box_aspect=1)
     axes.set_xlabel("credible level")
     axes.set_ylabel("share of true parameters inside")
     note = {"color": GREY, "size": "small", "transform": axes.transAxes}
     axes.text(0.03, 0.97, "under-confident", va="top", **note)
     axes.text(0.97, 0.03, "over-confident", ha="right", **note)
-    # Beside the axes: inside them every corner can hold a curve.
+    # The legend is beside the axes, because a curve can be in any corner inside.
     axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.02, 1.0))
     return figure
 
 
 def finetuning_history(history: History) -> "Figure":
-    """Losses of a fine-tuning, with the kept step marked.
+    """Draw the losses of a fine-tuning and mark the step that was kept.
 
     Args:
-        history: Losses before each step and after the last, ``rope.history``. Without a
-            hold-out only the training loss is drawn.
+        history: The losses before each step and after the last, ``rope.history``.
+            Without held-out pairs only the training loss is drawn.
 
     Returns:
         The figure.
 
     Raises:
-        InvalidTypeError: If something is no history.
+        InvalidTypeError: If the argument is no history.
         InvalidInputError: If the losses are not finite.
         ImportError: If matplotlib is not installed.
     """
@@ -132,11 +126,12 @@ def finetuning_history(history: History) -> "Figure":
 
 
 def effective_sample_sizes(coupling: Coupling) -> "Figure":
-    r"""How many simulations stand behind each observation's posterior.
+    r"""Draw how many simulations contribute to the posterior of each observation.
 
-    The effective sample size of a row is :math:`1 / \sum_j \alpha_{ij}^2`: 1 if a
-    single simulation carries all the weight, :math:`n_s` (marked) if all weigh the same
-    and the posterior is the average over all simulations.
+    The effective sample size of observation :math:`i` is
+    :math:`1 / \sum_j \alpha_{ij}^2`. It is 1 if a single simulation has all the weight,
+    and the number of simulations :math:`n_s` if all have the same weight. A line marks
+    :math:`n_s`.
 
     Args:
         coupling: A coupling of observations to simulations, ``posterior.coupling``.
@@ -145,7 +140,7 @@ def effective_sample_sizes(coupling: Coupling) -> "Figure":
         The figure: a histogram on a logarithmic axis.
 
     Raises:
-        InvalidTypeError: If something is no coupling.
+        InvalidTypeError: If the argument is no coupling.
         ImportError: If matplotlib is not installed.
     """
     check_instance("coupling", coupling, Coupling)

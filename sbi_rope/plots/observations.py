@@ -1,4 +1,4 @@
-"""What is observed: real beside simulated."""
+"""Pictures of real observations and simulations."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -13,7 +13,13 @@ from sbi_rope._validation import (
     check_tensor,
 )
 from sbi_rope.errors import InvalidInputError
-from sbi_rope.plots._figures import BLUE, VERMILLION, empty_figure, hide_frame
+from sbi_rope.plots._figures import (
+    BLUE,
+    VERMILLION,
+    add_legend_above,
+    empty_figure,
+    hide_frame,
+)
 from sbi_rope.plots._samples import drawable
 
 if TYPE_CHECKING:
@@ -24,7 +30,7 @@ __all__ = ["real_and_simulated"]
 
 NUM_SHOWN = 6
 NUM_COLUMNS = 4
-# Beyond this share of the draws at either end, histograms are cut.
+# The share of the values that a histogram leaves out at either end.
 TAIL = 0.005
 
 
@@ -35,18 +41,19 @@ def real_and_simulated(
     names: Sequence[str] = (),
     labels: tuple[str, str] = ("real", "simulated"),
 ) -> "Figure":
-    """Real observations beside simulations at the same parameters.
+    """Draw real observations beside simulations with the same parameters.
 
-    Statistics are drawn as a histogram each, over all rows; of series and images the
-    first six pairs are drawn.
+    Of statistics, a histogram over all rows is drawn for each. Of series and images,
+    the first six pairs are drawn.
 
     Args:
-        x_o: Real observations: statistics ``(n, d)``, series ``(n, length)`` or
-            images ``(n, 3, height, width)`` with values in [0, 1].
-        x_s: Simulations at the parameters of the real observations, same shape.
-        names: Names of the d statistics. Without them ``(n, length)`` is taken for
-            series.
-        labels: What the legend calls the two.
+        x_o: Real observations. They are statistics, shape ``(n, l)``, series, shape
+            ``(n, length)``, or images, shape ``(n, 3, height, width)``, with values in
+            [0, 1].
+        x_s: Simulations with the parameters of the real observations, same shape.
+        names: A name for each of the l statistics. Without names, a tensor with two
+            dimensions is taken for series.
+        labels: The names of real observations and simulations in the legend.
 
     Returns:
         The figure.
@@ -54,6 +61,7 @@ def real_and_simulated(
     Raises:
         InvalidInputError: If the shapes differ or are none of these, or the number of
             names is not that of the statistics.
+        ImportError: If matplotlib is not installed.
     """
     x_o = check_tensor("x_o", x_o)
     check_batch("x_o", x_o, x_o.shape[1:])
@@ -77,18 +85,19 @@ def real_and_simulated(
         _check_brightness("x_s", x_s)
         return _images(x_o, x_s, labels)
     raise InvalidInputError(
-        "Expected `x_o` of shape (n, d), (n, length) or (n, 3, height, width); got "
+        "Expected `x_o` of shape (n, l), (n, length) or (n, 3, height, width); got "
         f"{tuple(x_o.shape)}."
     )
 
 
 def _check_brightness(name: str, images: Tensor) -> None:
-    # Noise may leave [0, 1], and is cut off. Levels of 8 bit would all be white.
+    # Noisy images may leave [0, 1] a little and are cut off there. Images with integer
+    # values up to 255 would be white.
     if images.min() < -1 or images.max() > 2:
         raise InvalidInputError(
             f"Expected images `{name}` with values in [0, 1]; got "
-            f"{float(images.min()):g} to {float(images.max()):g}. Divide levels of 8 "
-            "bit by 255."
+            f"{float(images.min()):g} to {float(images.max()):g}. Divide 8-bit images "
+            "by 255."
         )
 
 
@@ -96,7 +105,7 @@ def _histograms(
     x_o: Tensor, x_s: Tensor, names: Sequence[str], labels: tuple[str, str]
 ) -> "Figure":
     columns = min(len(names), NUM_COLUMNS)
-    panels = _panels(len(names), columns, width=2.6, height=2.2)
+    figure, panels = _panels(len(names), columns, width=2.6, height=2.2)
     for k, (axes, name) in enumerate(zip(panels, names, strict=True)):
         values = torch.cat([x_o[:, k], x_s[:, k]]).double()
         tail = TAIL if len(values) * TAIL > 1 else 0.0
@@ -119,32 +128,20 @@ def _histograms(
             )
         axes.set_xlabel(name)
         axes.set_yticks([])
-    figure = panels[0].figure
-    figure.legend(
-        *panels[0].get_legend_handles_labels(),
-        loc="outside upper center",
-        ncols=2,
-        frameon=False,
-    )
-    return figure  # type: ignore[return-value]
+    add_legend_above(figure, panels[0])
+    return figure
 
 
 def _series(x_o: Tensor, x_s: Tensor, labels: tuple[str, str]) -> "Figure":
     count = min(len(x_o), NUM_SHOWN)
-    panels = _panels(count, min(count, 3), width=3.2, height=2.0)
+    figure, panels = _panels(count, min(count, 3), width=3.2, height=2.0)
     for i, axes in enumerate(panels):
         axes.plot(x_s[i].numpy(), color=VERMILLION, linewidth=1.2, label=labels[1])
         axes.plot(x_o[i].numpy(), color=BLUE, linewidth=1.2, label=labels[0])
     for axes in panels[-min(count, 3) :]:
         axes.set_xlabel("step")
-    figure = panels[0].figure
-    figure.legend(
-        *panels[0].get_legend_handles_labels(),
-        loc="outside upper center",
-        ncols=2,
-        frameon=False,
-    )
-    return figure  # type: ignore[return-value]
+    add_legend_above(figure, panels[0])
+    return figure
 
 
 def _images(x_o: Tensor, x_s: Tensor, labels: tuple[str, str]) -> "Figure":
@@ -160,7 +157,9 @@ def _images(x_o: Tensor, x_s: Tensor, labels: tuple[str, str]) -> "Figure":
     return figure
 
 
-def _panels(count: int, columns: int, *, width: float, height: float) -> "list[Axes]":
+def _panels(
+    count: int, columns: int, *, width: float, height: float
+) -> "tuple[Figure, list[Axes]]":
     rows = -(-count // columns)
     figure = empty_figure(width * columns, height * rows + 0.3)
     grid = list(figure.subplots(rows, columns, squeeze=False).flat)
@@ -168,4 +167,4 @@ def _panels(count: int, columns: int, *, width: float, height: float) -> "list[A
         axes.remove()
     for axes in grid[:count]:
         hide_frame(axes)
-    return grid[:count]
+    return figure, grid[:count]

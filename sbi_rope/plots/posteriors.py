@@ -1,4 +1,4 @@
-"""Posteriors of one observation, side by side."""
+"""Several posteriors of one observation in one picture."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ from sbi_rope.plots._samples import (
 )
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["pair_plot"]
@@ -29,66 +30,82 @@ def pair_plot(
     parameter_names: Sequence[str] | None = None,
     prior: Tensor | None = None,
 ) -> "Figure":
-    """Marginals and pairs of several posteriors of one observation.
+    """Draw the marginals and pairs of several posteriors of one observation.
 
-    The axes hold the central 99 % of every posterior, and the true parameter: a few
-    extreme samples do not squeeze the picture. Neither does a posterior far from the
-    prior, or from the truth that another one holds: the legend says which share of its
-    samples is outside.
-    Contours enclose 50 % and 90 % of the samples.
+    Contours enclose 50 % and 90 % of the samples. The axes hold the true parameter and
+    the central 99 % of every posterior, so that a few extreme samples do not squeeze
+    the picture. A posterior that is far from the prior may lie outside the axes, and so
+    may one that is far from the truth while another posterior has the truth inside. The
+    legend then says which share of its samples is outside.
 
     Args:
-        samples: Posterior samples by method name, each of shape ``(num_samples, k)``.
-        theta: The true parameter, shape ``(k,)``, marked in black.
-        parameter_names: One label for each parameter, with its unit.
-        prior: Samples of the prior, shape ``(num_samples, k)``; their central 99 % is
-            shaded.
+        samples: Posterior samples by method name, each of shape ``(num_samples, d)``.
+        theta: The true parameter, shape ``(d,)``, which is marked in black.
+        parameter_names: A label for each parameter, with its unit.
+        prior: Samples of the prior, shape ``(n, d)``. Their central 99 % is shaded.
 
     Returns:
-        The figure: k rows and columns, the marginals on the diagonal.
+        The figure, with d rows and columns and the marginals on the diagonal.
 
     Raises:
         InvalidInputError: If the shapes differ, or a sample is not finite.
         ImportError: If matplotlib is not installed.
     """
     draws, truth, names = check_samples(samples, theta, parameter_names)
-    k = len(names)
-    figure = empty_figure(2.0 * k + 0.8, 2.0 * k + 1.0)
+    dim = len(names)
+    figure = empty_figure(2.0 * dim + 0.8, 2.0 * dim + 1.0)
     interval = (
         None if prior is None else prior_interval(prior, draws[next(iter(draws))])
     )
     limits = robust_limits(list(draws.values()), truth, interval)
-    styles = line_styles(draws)
-    for row in range(k):
+    for row in range(dim):
         for column in range(row + 1):
-            axes = figure.add_subplot(k, k, row * k + column + 1)
-            hide_frame(axes)
-            axes.set_xlim(*limits[:, column].tolist())
-            if row != column:
-                axes.set_ylim(*limits[:, row].tolist())
+            axes = figure.add_subplot(dim, dim, row * dim + column + 1)
             pair = [column] if row == column else [column, row]
-            if interval is not None:
-                shade_prior(axes, interval[:, pair])
-            for name, value in draws.items():
-                if row == column:
-                    draw_marginal(axes, value[:, row], styles[name])
-                else:
-                    draw_contours(axes, value[:, pair], styles[name])
-            if row == column:
-                axes.spines["left"].set_visible(False)
-                axes.set_yticks([])
-                axes.set_ylim(bottom=0)
-            if truth is not None and row == column:
-                axes.axvline(float(truth[row]), color="black", lw=1.2)
-            elif truth is not None:
-                axes.plot(*truth[pair].tolist(), "o", color="black", ms=4, zorder=5)
-            axes.tick_params(labelbottom=row == k - 1, labelleft=column == 0)
-            if row == k - 1:
+            _draw_panel(
+                axes,
+                {name: value[:, pair] for name, value in draws.items()},
+                None if truth is None else truth[pair],
+                limits[:, pair],
+                None if interval is None else interval[:, pair],
+            )
+            axes.tick_params(labelbottom=row == dim - 1, labelleft=column == 0)
+            if row == dim - 1:
                 axes.set_xlabel(names[column])
             if column == 0 and row > 0:
                 axes.set_ylabel(names[row])
     _add_legend(figure, draws, truth, limits, shaded=interval is not None)
     return figure
+
+
+def _draw_panel(
+    axes: "Axes",
+    draws: Mapping[str, Tensor],
+    truth: Tensor | None,
+    limits: Tensor,
+    interval: Tensor | None,
+) -> None:
+    """Draw one parameter, or a pair of parameters."""
+    hide_frame(axes)
+    is_marginal = limits.shape[1] == 1
+    axes.set_xlim(*limits[:, 0].tolist())
+    if not is_marginal:
+        axes.set_ylim(*limits[:, 1].tolist())
+    if interval is not None:
+        shade_prior(axes, interval)
+    for name, style in line_styles(draws).items():
+        if is_marginal:
+            draw_marginal(axes, draws[name][:, 0], style)
+        else:
+            draw_contours(axes, draws[name], style)
+    if is_marginal:
+        axes.spines["left"].set_visible(False)
+        axes.set_yticks([])
+        axes.set_ylim(bottom=0)
+    if truth is not None and is_marginal:
+        axes.axvline(float(truth[0]), color="black", lw=1.2)
+    elif truth is not None:
+        axes.plot(*truth.tolist(), "o", color="black", ms=4, zorder=5)
 
 
 def _add_legend(
@@ -113,7 +130,7 @@ def _add_legend(
         )
     if shaded:
         handles.append(Patch(color=PRIOR, label="prior"))
-    # In the empty half of the figure, or above the only panel.
+    # The legend is in the empty half of the figure, or above a single panel.
     if limits.shape[1] > 1:
         figure.legend(handles=handles, loc="upper right", frameon=False)
     else:

@@ -1,13 +1,18 @@
-"""What the calibration pairs say about a stack, in one picture."""
+"""A picture of the report of a stack."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-import torch
-
 from sbi_rope._validation import check_instance
 from sbi_rope.metrics import CoverageCurve
-from sbi_rope.plots._figures import BLUE, GREY, ORANGE, SKY, empty_figure, hide_frame
+from sbi_rope.plots._figures import (
+    BLUE,
+    ORANGE,
+    SKY,
+    draw_calibrated_band,
+    empty_figure,
+    hide_frame,
+)
 from sbi_rope.stacking import LearningCurve, StackingReport
 
 if TYPE_CHECKING:
@@ -16,19 +21,20 @@ if TYPE_CHECKING:
 
 __all__ = ["stacking_report"]
 
-# Most candidates that are named.
+# The most candidates that are drawn.
 MAX_CANDIDATES = 12
 
 
 def stacking_report(report: StackingReport) -> "Figure":
-    """Held-out scores of the candidates, weights, coverage, and the learning curve.
+    """Draw held-out scores of the candidates, weights, coverage and learning curve.
 
-    Left, the mean log score of the best candidates on pairs they were not trained on,
-    one standard error to each side, and that of the stack, none of them corrected for
-    leakage. Middle, the weight of each method. Right, the coverage of the stack on
-    held-out pairs, with the band that holds 95 % of the curves of calibrated
-    posteriors, level by level; and, if it was computed, the score of the stack against
-    the number of pairs it was trained on.
+    The first panel shows the mean log score of the best candidates and of the stack, on
+    pairs that they were not trained on, with one standard error to each side. No score
+    is corrected for mass outside the prior. The second panel shows the weight of each
+    method. The third shows the coverage of the stack on held-out pairs. At each level
+    its band holds 95 % of the curves of calibrated posteriors. If a learning curve was
+    computed, a fourth panel shows the score of the stack against the number of pairs
+    that it was trained on.
 
     Args:
         report: The report of a stack, ``posterior.report``.
@@ -37,7 +43,7 @@ def stacking_report(report: StackingReport) -> "Figure":
         The figure.
 
     Raises:
-        InvalidTypeError: If something is no report.
+        InvalidTypeError: If the argument is no report.
         ImportError: If matplotlib is not installed.
     """
     check_instance("report", report, StackingReport)
@@ -88,13 +94,8 @@ def _weights(axes: "Axes", weights: Mapping[str, float]) -> None:
 
 
 def _coverage(axes: "Axes", curve: CoverageCurve) -> None:
-    alpha = torch.linspace(0.0, 1.0, 201)
-    width = 1.96 * (alpha * (1.0 - alpha) / curve.num_observations).sqrt()
-    low, high = (alpha - width).clamp(min=0.0), (alpha + width).clamp(max=1.0)
-    axes.fill_between(alpha, low, high, color="0.85")
-    axes.plot([0, 1], [0, 1], color=GREY, lw=0.8)
+    draw_calibrated_band(axes, curve.num_observations)
     axes.plot(curve.levels.cpu(), curve.average.cpu(), color=BLUE)
-    axes.set(xlim=(0, 1), ylim=(0, 1), box_aspect=1)
     axes.set(xlabel="credible level", ylabel="share of held-out pairs inside")
 
 

@@ -1,4 +1,4 @@
-"""What RoPE does, in one row of three panels."""
+"""The three steps of RoPE in one picture."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -54,13 +54,19 @@ STAR: dict[str, Any] = {
     "ls": "none",
     "zorder": 6,
 }
-# More dots than these make a blot.
+# The most dots that are drawn. More would run together.
 MAX_SIMULATED, MAX_REAL = 1000, 250
+# The layout is fixed, so that all panels have one size.
+LAYOUT = {"left": 0.03, "right": 0.99, "bottom": 0.23, "top": 0.92, "wspace": 0.16}
 
 
 @dataclass(frozen=True)
 class _Plane:
-    """Embeddings in the plane of the simulations' first two principal components."""
+    """Embeddings in the plane of the simulations' first two principal components.
+
+    ``flat`` says that embeddings have a single dimension. The second coordinate then
+    only spreads them out.
+    """
 
     simulated: Tensor
     before: Tensor
@@ -81,33 +87,36 @@ def overview(
     parameters: Sequence[int] | None = None,
     prior: Tensor | None = None,
 ) -> "Figure":
-    r"""What RoPE does, for one observation: tune, couple, mix.
+    r"""Draw what RoPE does for one observation: tune, couple, mix.
 
-    1. *Tune*: the embeddings of real observations before and after tuning, in the plane
-       of the first two principal components of the simulations' embeddings. Contours
-       enclose 90 % of the observations; the arrow follows observation ``index``.
-    2. *Couple*: the same plane. The larger and darker a simulation, the more it weighs
-       in the posterior of observation ``index``, the star.
-    3. *Mix*: the posterior of that observation. Contours enclose 50 % and 90 % of the
-       samples.
+    1. *Tune* shows the embeddings of real observations before and after tuning, in the
+       plane of the first two principal components of the simulations' embeddings.
+       Contours enclose 90 % of the observations. The arrow shows how far observation
+       ``index`` moves.
+    2. *Couple* shows the simulations in the same plane. The larger and darker a
+       simulation is, the larger is its weight in the posterior of observation
+       ``index``, which is the star.
+    3. *Mix* shows the posterior of that observation. Contours enclose 50 % and 90 % of
+       the samples.
 
-    Axes hold the central 99 % of the embeddings; those of the posteriors are found as
-    in :func:`pair_plot`.
+    The axes hold the central 99 % of the embeddings. Those of the last panel are found
+    as in :func:`pair_plot`.
 
     Args:
-        simulated: :math:`h(x_s)`, shape ``(n_s, l)``; ``posterior.coupling.simulated``.
-        before: :math:`h(x_o)`, shape ``(n_o, l)``.
-        after: :math:`g(x_o)`, shape ``(n_o, l)``.
-        weights: Weights of the simulations for the observation, shape ``(n_s,)``;
-            ``posterior.weights[index]``.
+        simulated: Embeddings of simulations :math:`h(x_s)`, shape ``(n_s, l)``, such as
+            ``posterior.coupling.simulated``.
+        before: Embeddings :math:`h(x_o)` before tuning, shape ``(n_o, l)``.
+        after: Embeddings :math:`g(x_o)` after tuning, shape ``(n_o, l)``.
+        weights: The weights of the simulations for the observation, shape ``(n_s,)``,
+            such as ``posterior.weights[index]``.
         samples: Samples of the observation's posterior by method name, each of shape
-            ``(num_samples, k)``.
-        theta: The observation's true parameter, shape ``(k,)``.
-        parameter_names: One label for each parameter, with its unit.
-        index: Row of the observation in ``before`` and ``after``.
-        parameters: The one or two parameters to show; the first two if None.
-        prior: Samples of the prior, shape ``(num_samples, k)``; their central 99 % is
-            shown in grey.
+            ``(num_samples, d)``.
+        theta: The observation's true parameter, shape ``(d,)``.
+        parameter_names: A label for each parameter, with its unit.
+        index: The row of the observation in ``before`` and ``after``.
+        parameters: The one or two parameters to show. None shows the first two.
+        prior: Samples of the prior, shape ``(n, d)``. Their central 99 % is shown in
+            grey.
 
     Returns:
         The figure, with three panels.
@@ -131,19 +140,8 @@ def overview(
         interval = prior_interval(prior, truth.unsqueeze(0))[:, chosen]
 
     figure = empty_figure(12.0, 4.0)
-    # Panels of one size, whatever the legends hold.
     figure.set_layout_engine("none")
-    tune, couple, mix = figure.subplots(
-        1,
-        3,
-        gridspec_kw={
-            "left": 0.03,
-            "right": 0.99,
-            "bottom": 0.23,
-            "top": 0.92,
-            "wspace": 0.16,
-        },
-    )
+    tune, couple, mix = figure.subplots(1, 3, gridspec_kw=LAYOUT)
     for axes in (tune, couple, mix):
         hide_frame(axes)
     plane = _plane(simulated, before, after)
@@ -290,7 +288,7 @@ def _dot(colour: str, label: str) -> "Line2D":
 
 
 def _legend(axes: "Axes", handles: Sequence[Any]) -> None:
-    # Below the panel: inside it every corner can hold a cloud.
+    # The legend is below the panel, because points can be in any corner inside.
     axes.legend(
         handles=handles,
         frameon=False,
@@ -312,7 +310,7 @@ def _plane(simulated: Tensor, before: Tensor, after: Tensor) -> _Plane:
         return _Plane(*clouds, flat=True)
     centre = simulated.median(dim=0).values
     low, high = central_interval(simulated)
-    # A few extremes must not turn the plane.
+    # A few extreme embeddings must not turn the plane.
     core = torch.minimum(torch.maximum(simulated, low), high) - centre
     basis = torch.linalg.eigh(core.T.cov(correction=0)).eigenvectors[:, [-1, -2]]
     clouds = [(points - centre) @ basis for points in (simulated, before, after)]
@@ -320,7 +318,7 @@ def _plane(simulated: Tensor, before: Tensor, after: Tensor) -> _Plane:
 
 
 def _spread_out(points: Tensor) -> Tensor:
-    """Give one-dimensional embeddings a second coordinate, the same for equal rows."""
+    """Give one-dimensional embeddings a second coordinate that depends on the row."""
     golden = torch.arange(len(points), dtype=points.dtype) * 0.6180339887498949
     return torch.cat([points, golden.frac().unsqueeze(1)], dim=1)
 
@@ -328,7 +326,7 @@ def _spread_out(points: Tensor) -> Tensor:
 def _check_embeddings(
     before: Tensor, after: Tensor, simulated: Tensor, weights: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return all in float64 on the CPU."""
+    """Check embeddings and weights, and return them on the CPU in float64."""
     if check_tensor("simulated", simulated).ndim != 2:
         raise InvalidInputError(
             f"Expected `simulated` of shape (n_s, l); got {tuple(simulated.shape)}."
@@ -358,17 +356,17 @@ def _check_embeddings(
     )
 
 
-def _check_parameters(parameters: Sequence[int] | None, k: int) -> list[int]:
+def _check_parameters(parameters: Sequence[int] | None, dim: int) -> list[int]:
     if parameters is None:
-        return list(range(min(k, 2)))
+        return list(range(min(dim, 2)))
     is_list = isinstance(parameters, Sequence) and not isinstance(parameters, str)
     if not is_list or len(parameters) not in (1, 2):
         raise InvalidInputError(
             f"Expected `parameters` to be one or two different indices from 0 to "
-            f"{k - 1}; got {shown(parameters)}."
+            f"{dim - 1}; got {shown(parameters)}."
         )
     for j in parameters:
-        check_integer("parameters", j, minimum=0, maximum=k - 1)
+        check_integer("parameters", j, minimum=0, maximum=dim - 1)
     if len({*parameters}) != len(parameters):
         raise InvalidInputError(
             f"Expected different `parameters`; got {shown(parameters)}."

@@ -1,4 +1,4 @@
-"""Which summaries a simulator gets wrong, in one picture."""
+"""A picture of the summaries that a simulator gets wrong."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -14,21 +14,23 @@ if TYPE_CHECKING:
 
 __all__ = ["discrepancy"]
 
-# Most summaries that are drawn.
+# The most summaries that are drawn.
 MAX_SUMMARIES = 20
+# The colour of summaries without a sign of a discrepancy.
 NO_SIGN = "0.65"
 
 
 def discrepancy(report: DiscrepancyReport) -> "Figure":
-    r"""How far each summary of real observations is from simulated ones, and how.
+    r"""Draw how each summary of real observations differs from simulated ones.
 
     .. math:: x_o = \bar x + \text{shift} + \text{gain}\,(x_s - \bar x) + \text{error}
 
-    A line for each summary, the one that is most off first, with 95 % intervals. Left,
-    the size of the discrepancy, its error included. Middle, the shift, zero where there
-    is none: every line has a scale of its own, in units of x, and its numbers beside
-    it. Right, the gain, one where there is none. Of the first twenty summaries; those
-    without a sign of a discrepancy are grey.
+    There is a row with 95 % intervals for each of the first twenty summaries of the
+    report. Summaries without a sign of a discrepancy come last and are grey. The first
+    panel shows the size of the discrepancy, with the error included.
+    The second shows the shift in units of x, which is zero without a discrepancy. Its
+    numbers are written beside it, because each row has its own scale. The third shows
+    the gain, which is one without a discrepancy.
 
     Args:
         report: What ``DiscrepancyNPE.report()`` returns.
@@ -37,8 +39,8 @@ def discrepancy(report: DiscrepancyReport) -> "Figure":
         The figure.
 
     Raises:
-        InvalidTypeError: If something is no report.
-        InvalidInputError: If the report is of no summary.
+        InvalidTypeError: If the argument is no report.
+        InvalidInputError: If the report has no summary.
         ImportError: If matplotlib is not installed.
     """
     check_instance("report", report, DiscrepancyReport)
@@ -82,7 +84,7 @@ def _interval(
 
 
 def _own_scale(axes: "Axes", position: int, interval: Interval, colour: str) -> None:
-    # Units differ from summary to summary. What can be compared is on the left.
+    # Each row has its own scale, because the units of summaries differ.
     unit = max(abs(interval.low), abs(interval.high)) or 1.0
     _interval(axes, position, interval, colour, unit)
     axes.annotate(

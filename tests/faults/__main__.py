@@ -1,4 +1,4 @@
-"""Count how all public callables take what is wrong: python -m tests.faults."""
+"""Count what all public callables do with bad inputs: python -m tests.faults."""
 
 import sys
 from collections import Counter

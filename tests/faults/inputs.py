@@ -1,4 +1,4 @@
-"""What can be wrong, or merely unusual, about an argument."""
+"""Arguments that are wrong, extreme or unusual."""
 
 import math
 from collections.abc import Callable
@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-# Must be refused: each entry makes a bad argument of a good tensor (n, ...).
+# These must be refused. Each entry makes a bad argument from a good tensor (n, ...).
 BAD_TENSORS: dict[str, Callable[[Tensor], Any]] = {
     "None": lambda good: None,
     "a number": lambda good: 1.0,
@@ -29,10 +29,10 @@ BAD_TENSORS: dict[str, Callable[[Tensor], Any]] = {
     "without values": lambda good: good.to("meta"),
     "an array of objects": lambda good: np.array([object()] * len(good)),
 }
-# Must be refused or give numbers: what is inferred from them may be of little use.
+# These must be refused or give numbers, although the numbers may be of little use.
 EXTREME_TENSORS: dict[str, Callable[[Tensor], Any]] = {
     "one entry of 1e30": lambda good: spoilt(good, 1e30),
-    # Which float32 does not hold.
+    # This is too large for float32.
     "one entry of 1e39": lambda good: spoilt(good.double(), 1e39),
     "one entry of -1e15": lambda good: spoilt(good, -1e15),
     "all entries of 1e-30": lambda good: torch.full_like(good, 1e-30),
@@ -43,7 +43,7 @@ EXTREME_TENSORS: dict[str, Callable[[Tensor], Any]] = {
     "one row": lambda good: good[:1],
     "twice the same rows": lambda good: good[:1].expand_as(good),
 }
-# Must be refused, or give what the same numbers give as a plain tensor in float32.
+# These must be refused, or give what a plain float32 tensor of the same numbers gives.
 ODD_TENSORS: dict[str, Callable[[Tensor], Any]] = {
     "float64": Tensor.double,
     "half": lambda good: good.half().float().half(),
@@ -56,18 +56,18 @@ ODD_TENSORS: dict[str, Callable[[Tensor], Any]] = {
     "of inference mode": lambda good: _of_inference_mode(good),
 }
 
-# What is no different from good rows.
+# For whole numbers, such as indices of rows, these inputs are good.
 FINE_ROWS = ("one dimension less", "one column more", "one row less")
-# The same for whole numbers, such as those of rows.
+# The unusual tensors of whole numbers.
 ODD_ROWS = {
     label: ODD_TENSORS[label]
     for label in ("small integers", "not contiguous", "of inference mode")
 }
 
-# Must be refused, by the kind of an option.
+# These must be refused, for each kind of an option.
 BAD_OPTIONS: dict[str, list[Any]] = {
     "positive": [0, -1.0, math.nan, math.inf, "x", True, [1.0], torch.ones(2)],
-    # Of Adam, whose steps are no longer numbers then.
+    # With a learning rate of 1e38 the steps of Adam are no longer numbers.
     "rate": [0, -1.0, math.nan, math.inf, 1e38, "x", True, torch.ones(2)],
     "not negative": [-1.0, math.nan, math.inf, "x", True, [1.0], None],
     "share": [-0.1, 1.1, math.nan, "x", True, [0.5]],
@@ -87,7 +87,7 @@ BAD_OPTIONS: dict[str, list[Any]] = {
 
 
 def spoilt(good: Tensor, value: float) -> Tensor:
-    """Replace an entry in the middle."""
+    """Return a copy in which an entry in the middle is replaced."""
     bad = good.clone().contiguous()
     if bad.is_floating_point():
         bad.view(-1)[bad.numel() // 2] = value

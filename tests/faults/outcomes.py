@@ -1,4 +1,4 @@
-"""Calls a function with a bad argument and tells how it took that."""
+"""Call a function with a bad argument and judge what it does."""
 
 import random
 import warnings
@@ -21,13 +21,15 @@ class Call:
     """A public callable with good arguments.
 
     Attributes:
-        name: As users write it.
-        run: Called with the arguments by name; returns what is compared.
-        tensors: Its tensors.
-        options: The kind of each option, a key of ``BAD_OPTIONS``.
-        accepts: Names of bad inputs, as "argument: input", that mean something here.
-        is_random: Whether the global random numbers are drawn from, as users expect of
-            a sampler without a seed.
+        name: The function or method as users write it. A variant follows in
+            parentheses.
+        run: A function that makes the call with the arguments by name. What it returns
+            is compared.
+        tensors: The good tensors by name.
+        options: The kind of each option, which is a key of ``BAD_OPTIONS``.
+        accepts: The bad inputs that mean something here, as "argument: input".
+        is_random: Whether the call draws from the global random numbers, as users
+            expect of a sampler without a seed.
     """
 
     name: str
@@ -36,6 +38,16 @@ class Call:
     options: dict[str, str] = field(default_factory=dict)
     accepts: tuple[str, ...] = ()
     is_random: bool = False
+
+    @property
+    def callable(self) -> str:
+        """The function or method, without the variant."""
+        return self.name.split("(")[0]
+
+    @property
+    def owner(self) -> str:
+        """The function, or the class of the method."""
+        return self.callable.split(".")[0]
 
     def __str__(self) -> str:
         return self.name
@@ -50,7 +62,12 @@ class Call:
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """How a call took an argument."""
+    """What a call did with an argument.
+
+    The verdict is "right" if the result is, "clear" if a named error was raised, "raw"
+    if any other error was raised, and "silent" if the call accepted the argument
+    although it should not, or left a trace.
+    """
 
     call: str
     argument: str
@@ -65,20 +82,20 @@ class Outcome:
 
 
 def refuse(call: Call, argument: str, label: str, value: Any) -> Outcome:
-    """Call with what must be refused by name."""
+    """Call with an argument that must be refused with a named error."""
     accepted = f"{argument}: {label}" in call.accepts
     return _judge(call, argument, label, value, expected="numbers" if accepted else "")
 
 
 def survive(call: Call, argument: str, label: str, value: Any) -> Outcome:
-    """Call with what must be refused, or give numbers."""
+    """Call with an argument that must be refused, or else must not give NaN."""
     accepted = f"{argument}: {label}" in call.accepts
     expected = "anything" if accepted else "numbers"
     return _judge(call, argument, label, value, expected=expected)
 
 
 def agree(call: Call, argument: str, label: str, value: Tensor) -> Outcome:
-    """Call with what must be refused, or give the same as a plain tensor."""
+    """Call with an argument that must be refused or treated as a plain tensor."""
     accepted = f"{argument}: {label}" in call.accepts
     expected = "numbers" if accepted else "the same"
     return _judge(call, argument, label, value, expected=expected)
@@ -127,7 +144,7 @@ def _is_close(a: Tensor, b: Tensor) -> bool:
 
 
 class TraceError(Exception):
-    """A call has left something behind that it should not have."""
+    """A call has changed something that it should not change."""
 
 
 @contextmanager
@@ -163,7 +180,7 @@ def _is_plain(value: Any) -> bool:
 
 
 def state_of_process(*, random_numbers: bool) -> dict[str, Any]:
-    """Return what a library must leave as it found it."""
+    """Return the state of the process that a library must not change."""
     state: dict[str, Any] = {
         "the default dtype": torch.get_default_dtype(),
         "gradient mode": torch.is_grad_enabled(),

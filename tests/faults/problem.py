@@ -1,4 +1,4 @@
-"""The problem of all calls: small, linear and Gaussian, with a bounded prior."""
+"""The small linear Gaussian problem with a bounded prior that all calls share."""
 
 import functools
 from typing import Any
@@ -100,5 +100,5 @@ FROM_LISTS = ("theta: a list", "theta: a NumPy array")
 COUPLED = {"real": X_O, "simulated": X_S}
 PAIRS = {"theta": THETA, "x": X}
 SIMULATIONS = {"theta": THETA_S, "x": X_S}
-# Nothing is paired with these, so that fewer are fine.
+# Nothing is paired with these observations, so one row less is good input.
 FEWER_X_O = ("x_o: one row less",)

@@ -1,4 +1,4 @@
-"""What holds for any numbers, however large, small or many."""
+"""Properties that hold for any numbers, however large, small or many."""
 
 import math
 
@@ -18,7 +18,7 @@ from sbi_rope.stacking import stacking_weights
 from tests.faults.outcomes import state_of_process
 from tests.faults.problem import THETA_O, THETA_S, X_O, posterior
 
-# The same examples every time, and no more of them than take a second or two.
+# The same examples every time, and only as many as take a second or two.
 brief = settings(derandomize=True, max_examples=60, deadline=None, database=None)
 
 
@@ -76,7 +76,7 @@ def test_rows_of_a_coupling_are_probabilities_whatever_the_embeddings(
 
 @brief
 @given(scores=matrices(largest=1e3), pseudo_count=st.floats(0, 10))
-def test_weights_of_a_stack_score_no_worse_than_any_candidate_or_equal_weights(
+def test_no_candidate_and_no_equal_weights_score_better_than_a_stack(
     scores: Tensor, pseudo_count: float
 ) -> None:
     found = stacking_weights(scores, pseudo_count=pseudo_count)
@@ -90,7 +90,7 @@ def test_weights_of_a_stack_score_no_worse_than_any_candidate_or_equal_weights(
 
     equal = torch.full_like(found.weights, 1 / num_candidates)
     best = objective(found.weights)
-    # In rounding of sums of scores.
+    # Sums of scores are rounded.
     slack = found.gap + 1e-9 * float(scores.abs().sum()) + 1e-9
     for other in (equal, *torch.eye(num_candidates).double()):
         assert not objective(other) > best + slack
@@ -98,7 +98,7 @@ def test_weights_of_a_stack_score_no_worse_than_any_candidate_or_equal_weights(
 
 @brief
 @given(samples=matrices(rows=st.integers(2, 20)), repeats=st.integers(1, 3))
-def test_ranks_and_levels_are_shares(samples: Tensor, repeats: int) -> None:
+def test_ranks_and_levels_are_between_0_and_1(samples: Tensor, repeats: int) -> None:
     draws = samples[1:, None].repeat(repeats, 1, 1)
     ranks = mid_ranks(draws, samples[:1])
     levels = central_levels(ranks)
@@ -161,7 +161,7 @@ def test_a_density_is_positive_inside_the_prior_and_zero_outside(
 
 @brief
 @given(seed=st.integers(0, 2**70))
-def test_any_seed_leaves_no_trace(seed: int) -> None:
+def test_a_seed_of_any_size_leaves_the_state_of_the_process_alone(seed: int) -> None:
     before = state_of_process(random_numbers=True)
     with seeded(seed):
         first = torch.rand(2)

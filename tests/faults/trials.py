@@ -1,4 +1,4 @@
-"""Pairs every public callable with everything that may be wrong about its arguments."""
+"""Pair every public callable with all bad inputs for its arguments."""
 
 import functools
 from collections.abc import Callable, Iterator
@@ -18,9 +18,9 @@ Trial = Callable[[], Outcome]
 
 
 def trials(calls: list[Call] = CALLS) -> Iterator[Trial]:
-    """Yield what to try."""
+    """Yield all trials of some calls."""
     for call in calls:
-        call()  # what it shares with others is made here
+        call()  # makes whatever it shares with other calls, outside of the trials
         for name in call.tensors:
             yield from tensor_trials(call, name)
         for name in call.options:
@@ -28,7 +28,7 @@ def trials(calls: list[Call] = CALLS) -> Iterator[Trial]:
 
 
 def tensor_trials(call: Call, name: str) -> Iterator[Trial]:
-    """Yield what to try on a tensor."""
+    """Yield the trials of a tensor."""
     good = call.tensors[name]
     odd = ODD_TENSORS if good.is_floating_point() else ODD_ROWS
     for judge, kinds in (
@@ -43,6 +43,6 @@ def tensor_trials(call: Call, name: str) -> Iterator[Trial]:
 
 
 def option_trials(call: Call, name: str) -> Iterator[Trial]:
-    """Yield what to try on an option."""
+    """Yield the trials of an option."""
     for value in BAD_OPTIONS[call.options[name]]:
         yield functools.partial(refuse, call, name, repr(value), value)

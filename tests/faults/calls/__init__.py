@@ -1,9 +1,9 @@
-"""Every public callable with good arguments, to be spoilt by the tests.
+"""Every public callable with good arguments, which the tests replace by bad ones.
 
 To add a function, add a :class:`~tests.faults.outcomes.Call` to the module of its
-package. ``tensors`` are given each bad input in turn, and ``options`` each bad value of
-their kind; both are listed in ``tests/faults/inputs.py``. What is bad elsewhere but
-means something to this function goes into ``accepts``.
+package. Each of its ``tensors`` is replaced by each bad tensor in turn, and each of its
+``options`` by each bad value of its kind. ``tests/faults/inputs.py`` lists both. Name
+in ``accepts`` what is bad elsewhere but means something to this function.
 """
 
 from tests.faults.calls import (
@@ -30,10 +30,10 @@ CALLS = [
     *tasks.CALLS,
 ]
 
-_RESULT = "what a call returns: users read it and do not make it"
-_FOR_STACK = "called by a stack, with what it has made"
-_PART = "a part of a posterior, which checks what its parts are given"
-# Classes and functions that no bad argument of a user reaches.
+_RESULT = "a result, which users read and do not make"
+_FOR_STACK = "called by a stack, with arguments that the stack has made"
+_PART = "a part of a posterior or method, which checks what its parts are given"
+# Classes and functions that no bad argument of a user can reach.
 NOT_CALLED = {
     **dict.fromkeys(
         (
@@ -67,13 +67,17 @@ NOT_CALLED = {
         (
             "CoupledEmbeddings",
             "CoupledNet",
+            "EmbeddedBatch",
             "MixtureEstimator",
             "MixturePosterior",
             "OwnEmbeddings",
             "Part",
             "Rows",
             "StackedPosterior",
+            "StartingNPE",
+            "check_converged",
             "equal_rows",
+            "parameters_named",
             "part_of",
             "part_of_prior",
         ),

@@ -27,9 +27,9 @@ def appended(method: Any, what: str, *data: Tensor) -> Any:
     return getattr(method._data, what)
 
 
-# No draw and no density is NaN for these.
+# The noise of these inputs has draws and a density that are numbers.
 OF_NOISE = {"log_prob": ("Inf",), "sample_like": ("NaN", "Inf")}
-# Where the values of x are never read.
+# Bad inputs that mean something where the values of x are never read.
 ANY_X = tuple(
     f"x: {what}"
     for what in (
@@ -40,7 +40,7 @@ ANY_X = tuple(
         "without values",
     )
 )
-# What each baseline may be given, and how it is made.
+# The data that can be appended to baselines.
 DATA = {
     "calibration": PAIRS,
     "simulations": SIMULATIONS,
@@ -68,13 +68,13 @@ CALLS = [
         ),
         tensors=tensors,
         accepts=(
-            # Whatever x is like, the first that comes says it.
+            # The first x that is appended sets the shape of an observation.
             "x: one column more",
             "x_o: one column more",
             "x: one dimension more",
             "x_o: one dimension more",
             "x_o: one row less",
-            # These are dropped.
+            # Such simulations are dropped.
             *(("x: NaN", "x: Inf") if what == "simulations" else ()),
         ),
     )

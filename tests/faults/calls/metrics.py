@@ -87,9 +87,9 @@ CALLS = [
             accepts=(
                 "levels: one row less",
                 "levels: one column more",
-                # Which has no standard error.
+                # A single row has no standard error.
                 "levels: one row",
-                # In which levels are others.
+                # In 16 bits the levels are other numbers.
                 "levels: half",
                 "levels: bfloat16",
             ),
@@ -104,7 +104,7 @@ CALLS = [
         name="central_levels",
         run=metrics.central_levels,
         tensors={"ranks": LEVELS},
-        # Each entry by itself.
+        # Each entry has a level of its own, in any shape.
         accepts=tuple(
             f"ranks: {what}"
             for what in (
@@ -122,7 +122,7 @@ CALLS = [
         name="mid_ranks",
         run=lambda samples=SAMPLES, theta=THETA: metrics.mid_ranks(samples, theta),
         tensors={"samples": SAMPLES, "theta": THETA},
-        # Infinite numbers have ranks.
+        # Infinite numbers can be ranked.
         accepts=("samples: one row less", "samples: Inf", "theta: Inf"),
     ),
     Call(

@@ -33,12 +33,12 @@ OVERVIEW: dict[str, Any] = {
 }
 
 
-# Two labels may be the same, and theta may be a column.
+# Two parameters may have the same label, and theta may be a column.
 LABELS = ("theta: one dimension more", "parameter_names: ['a', 'a']")
 
 
 def drawn(plot: Callable[..., Any]) -> Callable[..., None]:
-    """Call a function that draws, and close what it drew."""
+    """Return a function that draws a picture and closes it."""
 
     def run(*given: Any, **arguments: Any) -> None:
         from matplotlib import pyplot

@@ -28,7 +28,7 @@ CALLS = [
             ),
             tensors={"x": x[:1]},
             options={"max_sampling_batch_size": "count"},
-            # One observation may come without the dimension of the batch.
+            # A single observation may have no dimension for the batch.
             accepts=("x: a list", "x: a NumPy array", "x: one dimension less"),
             is_random=True,
         ),

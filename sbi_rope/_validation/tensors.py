@@ -1,0 +1,262 @@
+"""Checks of tensors of data, and of the prior that parameters come from."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from sbi.utils import within_support
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_rope.errors import InvalidInputError, InvalidTypeError
+
+__all__ = [
+    "DTYPES",
+    "as_float32",
+    "as_numbers",
+    "check_batch",
+    "check_device",
+    "check_finite",
+    "check_in_support",
+    "check_not_nan",
+    "check_prior",
+    "check_rows",
+    "check_same_length",
+    "check_tensor",
+    "check_theta",
+    "check_values",
+]
+
+# The dtypes of numbers that torch can compare and add. It can do too little with
+# complex numbers, booleans, and quantised, eight-bit floating-point or wide unsigned
+# numbers.
+DTYPES = {
+    *(torch.float16, torch.bfloat16, torch.float32, torch.float64),
+    *(torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64),
+}
+
+
+def check_tensor(name: str, value: Any) -> Tensor:
+    """Return ``value`` if it is a dense tensor of real numbers.
+
+    Raises:
+        InvalidTypeError: If it is not. The message says how to convert it.
+    """
+    if not isinstance(value, Tensor):
+        raise InvalidTypeError(
+            f"Expected `{name}` to be a torch.Tensor; got {type(value).__name__}. "
+            f"Convert it with `torch.as_tensor({name}, dtype=torch.float32)`."
+        )
+    if value.dtype not in DTYPES:
+        raise InvalidTypeError(
+            f"Expected `{name}` to hold real numbers; got dtype {value.dtype}."
+        )
+    if value.layout != torch.strided or value.is_nested:
+        layout = "a nested tensor" if value.is_nested else f"layout {value.layout}"
+        raise InvalidTypeError(
+            f"Expected `{name}` to be a dense tensor; got {layout}. Convert a sparse "
+            f"one with `{name}.to_dense()`."
+        )
+    return value
+
+
+def as_numbers(name: str, value: Any) -> Tensor:
+    """Return ``value`` as a tensor of numbers; lists and arrays are converted."""
+    if not isinstance(value, Tensor):
+        try:
+            value = torch.as_tensor(value)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise InvalidTypeError(
+                f"Expected `{name}` to be a tensor of numbers, or something that torch "
+                f"can convert to one; got {type(value).__name__}."
+            ) from error
+    return check_tensor(name, value)
+
+
+def as_float32(name: str, value: Tensor) -> Tensor:
+    """Return a finite tensor as float32; raise if a number is too large for that."""
+    converted = value.float()
+    if converted is not value and value.dtype == torch.float64:
+        large = value.abs() > torch.finfo(torch.float32).max
+        if large.any():
+            raise InvalidInputError(
+                f"Expected `{name}` to have numbers that float32 holds, up to 3.4e38; "
+                f"got larger ones in {_rows_with(large)}. Remove or repair these rows, "
+                "or use other units."
+            )
+    return converted
+
+
+def check_values(name: str, value: Tensor) -> None:
+    """Raise if a tensor has a shape but no numbers, as on torch's device ``meta``."""
+    if value.is_meta:
+        raise InvalidInputError(
+            f"Expected `{name}` to hold numbers; got a tensor on the device 'meta', "
+            "which has a shape only."
+        )
+
+
+def check_finite(name: str, value: Tensor) -> None:
+    """Raise if an entry is NaN or infinite; the message lists the first such rows."""
+    check_values(name, value)
+    bad = ~torch.isfinite(value)
+    if bad.any():
+        raise InvalidInputError(
+            f"Expected `{name}` to be finite; got NaN or Inf in {_rows_with(bad)}. "
+            "Remove or repair these rows."
+        )
+
+
+def check_not_nan(name: str, value: Tensor) -> None:
+    """Raise if an entry is NaN. Infinite entries can be compared and are allowed."""
+    check_values(name, value)
+    count = int(torch.isnan(value).sum())
+    if count:
+        raise InvalidInputError(
+            f"Expected `{name}` without NaN; got {count} among {value.numel()} numbers."
+        )
+
+
+def check_batch(
+    name: str,
+    value: Any,
+    event_shape: Sequence[int],
+    *,
+    finite: bool = True,
+    allow_empty: bool = False,
+) -> Tensor:
+    """Return ``value`` if it is a batch of events, shape ``(n, *event_shape)``.
+
+    Args:
+        name: What the argument is called.
+        value: What the user gave.
+        event_shape: The shape of one event.
+        finite: Whether NaN and infinite entries are refused.
+        allow_empty: Whether n may be 0.
+
+    Raises:
+        InvalidTypeError: If it is no tensor of real numbers.
+        InvalidInputError: If the shape does not fit, an event holds no number, or an
+            entry is not finite.
+    """
+    value = check_tensor(name, value)
+    expected = "(n, " + ", ".join(str(size) for size in event_shape) + ")"
+    if tuple(value.shape[1:]) != tuple(event_shape) or value.ndim == 0:
+        raise InvalidInputError(
+            f"Expected `{name}` of shape {expected}; got {tuple(value.shape)}."
+        )
+    if value.shape[0] == 0 and not allow_empty:
+        raise InvalidInputError(
+            f"Expected `{name}` of shape {expected} with n >= 1; got an empty batch."
+        )
+    if 0 in event_shape:
+        raise InvalidInputError(
+            f"Expected `{name}` with at least one number in each row; got shape "
+            f"{tuple(value.shape)}."
+        )
+    if finite:
+        check_finite(name, value)
+    return value
+
+
+def check_device(
+    name: str, value: Tensor, device: torch.device, *, where: str = "the posterior"
+) -> None:
+    """Raise unless a tensor is on a device; ``where`` names what else is there."""
+    if value.device != device:
+        raise InvalidInputError(
+            f"Expected `{name}` on {device}, where {where} is; got "
+            f"{value.device}. Move it with `{name}.to('{device}')`."
+        )
+
+
+def check_same_length(name_a: str, a: Tensor, name_b: str, b: Tensor) -> None:
+    """Raise if two batches have different numbers of rows."""
+    if a.shape[0] != b.shape[0]:
+        raise InvalidInputError(
+            f"Expected `{name_a}` and `{name_b}` to have the same number of rows; got "
+            f"{a.shape[0]} and {b.shape[0]}."
+        )
+
+
+def check_rows(name: str, value: Any, count: int) -> Tensor:
+    """Return indices of rows, shape ``(m,)``, if all are from 0 to ``count`` - 1."""
+    rows = check_tensor(name, value)
+    check_values(name, rows)
+    whole = rows.ndim == 1 and rows.dtype == torch.long
+    if not whole or bool(((rows < 0) | (rows >= count)).any()):
+        got = f"{rows.dtype} of shape {tuple(rows.shape)}"
+        if rows.ndim == 1 and len(rows):
+            got += f" with numbers from {rows.min()} to {rows.max()}"
+        raise InvalidInputError(
+            f"Expected `{name}` to be whole numbers of rows (int64), shape (m,), from "
+            f"0 to {count - 1}; got {got}."
+        )
+    return rows
+
+
+def check_theta(theta: Any, event_shape: torch.Size, *, batched: bool) -> Tensor:
+    """Return the parameters whose density is asked for, as a tensor.
+
+    Args:
+        theta: What the user gave.
+        event_shape: Shape of one theta, ``(d,)``.
+        batched: Whether theta belongs to a batch of B observations. Its shape is then
+            ``(B, d)``, or ``(S, B, d)`` for S parameters of each observation. Otherwise
+            it is ``(n, d)`` or ``(d,)``.
+
+    Raises:
+        InvalidInputError: If the shape does not fit, there is no parameter, or one is
+            NaN.
+    """
+    theta, dim = as_numbers("theta", theta), event_shape[0]
+    expected = f"(B, {dim}) or (S, B, {dim})" if batched else f"(n, {dim})"
+    ndims = (2, 3) if batched else (1, 2)
+    if theta.ndim not in ndims or theta.shape[-1:] != event_shape:
+        raise InvalidInputError(
+            f"Expected `theta` of shape {expected}; got {tuple(theta.shape)}."
+        )
+    if not theta.numel():
+        raise InvalidInputError(
+            f"Expected at least one `theta`; got shape {tuple(theta.shape)}."
+        )
+    check_not_nan("theta", theta)
+    return theta
+
+
+def check_prior(prior: Any) -> None:
+    """Raise unless the prior is a torch distribution over vectors."""
+    if not isinstance(prior, Distribution):
+        raise InvalidTypeError(
+            f"Expected `prior` to be a torch distribution; got "
+            f"{type(prior).__name__}. Wrap it with "
+            f"`sbi.utils.process_prior(prior)[0]`."
+        )
+    if len(prior.event_shape) != 1:
+        raise InvalidInputError(
+            "Expected a `prior` over vectors, event shape (d,); got event shape "
+            f"{tuple(prior.event_shape)}. Wrap several in "
+            "`sbi.utils.MultipleIndependent`, or torch's own in "
+            "`torch.distributions.Independent(prior, 1)`."
+        )
+
+
+def check_in_support(name: str, theta: Tensor, prior: Any) -> None:
+    """Raise if any row of ``theta`` lies outside the prior's support."""
+    if not len(theta):  # sbi cannot check an empty batch
+        return
+    outside = ~within_support(prior, theta)
+    if outside.any():
+        first = outside.nonzero().flatten()[:5].tolist()
+        raise InvalidInputError(
+            f"Expected `{name}` inside the support of the prior; {int(outside.sum())} "
+            f"of {theta.shape[0]} rows are outside (first: {first}). Check the units "
+            f"and the order of the parameters, or train NPE with a wider prior."
+        )
+
+
+def _rows_with(bad: Tensor) -> str:
+    """Say in how many rows an entry is bad, and which are the first."""
+    rows = bad.flatten(1).any(dim=1) if bad.ndim > 1 else bad.reshape(-1)
+    first = rows.nonzero().flatten()[:5].tolist()
+    return f"{int(rows.sum())} of {rows.numel()} rows (first: {first})"
