@@ -328,7 +328,7 @@ def test_simulations_are_corrected_in_parts_as_in_one_go(
     draws = DiscrepancyModel().fit(z, mean, no_noise(3)).sample(50, seed=0)
     torch.manual_seed(1)
     expected = draws.correct(z)
-    monkeypatch.setattr("sbi_rope.discrepancy.model.MAX_ENTRIES", 4 * 9)
+    monkeypatch.setattr("sbi_rope.discrepancy.posterior.MAX_ENTRIES", 4 * 9)
     torch.manual_seed(1)
     assert torch.allclose(draws.correct(z), expected)
 

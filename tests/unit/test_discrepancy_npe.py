@@ -20,7 +20,7 @@ from sbi_rope._simulator import Simulator
 from sbi_rope._standardisation import Standardisation
 from sbi_rope.baselines import Training
 from sbi_rope.discrepancy import DiscrepancyModel, DiscrepancyNPE
-from sbi_rope.discrepancy.model import DiscrepancyDraws
+from sbi_rope.discrepancy.posterior import DiscrepancyDraws
 from sbi_rope.discrepancy.training import train_on_corrected
 from sbi_rope.errors import (
     InvalidInputError,
