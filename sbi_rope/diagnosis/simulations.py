@@ -90,8 +90,7 @@ def nearest_distances(points: Tensor, among: Tensor, *, others: bool = False) ->
     Args:
         points: Shape ``(n, l)``.
         among: Shape ``(m, l)``.
-        others: Whether the two sets are the same, so that a point is not its own
-            neighbour.
+        others: Whether the two sets are the same, and no point is its own neighbour.
     """
     nearest = []
     for start in range(0, len(points), CHUNK):
