@@ -1,4 +1,4 @@
-"""The diagnosis of a batch."""
+"""Diagnose a batch: run all tests and collect their findings."""
 
 from collections.abc import Sequence
 
@@ -24,7 +24,7 @@ from sbi_rope.rope import RoPE
 
 __all__ = ["diagnose"]
 
-# Fewer do not tell what is usual.
+# With fewer simulations the thresholds cannot be estimated.
 FEWEST_SIMULATIONS = 100
 
 
@@ -39,41 +39,44 @@ def diagnose(
     seed: int | None = None,
     show_progress_bars: bool = True,
 ) -> Diagnosis:
-    r"""Tell whether a batch is one that RoPE can be trusted with.
+    r"""Test whether a batch fulfils the assumptions of RoPE.
 
-    1. Is it unlike simulations, before tuning and after? sbi's MMD test on
-       :math:`h(x_o)` and :math:`g(x_o)` against :math:`h(x_s)`.
-    2. Which observations does no simulation match, and on how many simulations does
-       each posterior rest?
-    3. Does it have other parameters than the prior? The parameters of the simulations,
-       weighted by the coupling at tau = 0, against the prior.
-    4. Does :math:`g(x) - E[h(S(\theta))]` of calibration pairs depend on
-       :math:`\theta`? On residuals of pairs that g was not trained on.
-    5. Is an entry of x many standard deviations away from simulations, by which NPE
-       standardised it? Left out where NPE did not.
+    1. Does the batch differ from simulations, before tuning and after? This is sbi's
+       MMD test of :math:`h(x_o)` and of :math:`g(x_o)` against :math:`h(x_s)`.
+    2. Which observations have no simulation near them, and how many simulations are
+       behind each posterior?
+    3. Do the parameters of the batch follow the prior? The parameters of the
+       simulations, weighted by the coupling at tau = 0, are compared with the prior.
+    4. Do the residuals :math:`g(x) - E[h(S(\theta))]` of calibration pairs depend on
+       :math:`\theta`? They are computed on pairs that g was not trained on.
+    5. Is an entry of x many standard deviations away from simulations? This is tested
+       if NPE standardises x.
 
-    Without calibration pairs, g = h, and the second test of 1 and all of 4 are left
-    out. The thresholds of tests (1, 3, distances of 2) are what one batch in a hundred
-    of simulations exceeds; those of effective sample sizes are rules of thumb about the
-    coupler's setting.
+    Without calibration pairs g is h, and the second test of 1 and all of 4 are left
+    out. One batch of simulations in a hundred exceeds the thresholds of 1, 3 and the
+    distances in 2. The thresholds of effective sample sizes are rules of thumb about
+    the setting of the coupler.
 
     Args:
-        rope: A trained RoPE, or one without calibration pairs; it is left as it is.
+        rope: A trained RoPE, or one without calibration pairs; it is not changed.
         x_o: The batch, shape ``(n_o, *event)``.
-        num_simulations: n_s; ``max(n_o, 1000)`` if None (or all stored ones, if there
-            are fewer). At least 100.
-        coupler: What effective sample sizes are those of; that of ``rope`` if None.
-        num_folds: Trainings behind the residuals of 4, each as long as ``rope.train``;
-            None leaves 4 out, and with it the errors of g that 3 allows for.
+        num_simulations: n_s, at least 100. If None, ``max(n_o, 1000)``, or all stored
+            simulations if there are fewer.
+        coupler: The coupler whose effective sample sizes are tested; that of ``rope``
+            if None.
+        num_folds: The number of trainings for the residuals of 4, each of which takes
+            as long as ``rope.train``. None leaves out 4, and the allowance for errors
+            of g in 3.
         parameter_names: One name for each parameter; "theta_1" and so on if None.
         seed: Seed of everything random; None uses the states of torch, NumPy and
-            Python. The simulations are those of ``rope.build_posterior`` under the
-            same seed and number.
-        show_progress_bars: Whether to show the progress of slow simulations and the
-            folds done.
+            Python. The simulations are those of ``rope.build_posterior`` with the same
+            seed and number.
+        show_progress_bars: Whether to show the progress of slow simulations, and how
+            many folds are done.
 
     Returns:
-        The findings; ``print`` it, or draw it with ``plot()``.
+        The findings. Print them, or pass them to
+        :func:`sbi_rope.plots.implied_parameters`.
 
     Raises:
         NotReadyError: If calibration pairs were appended after the last training.
@@ -92,7 +95,8 @@ def diagnose(
         check_integer("num_folds", num_folds, minimum=2)
     tuned = len(rope.calibration[0]) > 0
     with seeded(seed):
-        # First, so that the simulations are those of a posterior under the same seed.
+        # This comes first, so that a posterior with the same seed has these
+        # simulations.
         batch = rope.embed(
             x_o, num_simulations=num_simulations, show_progress_bars=show_progress_bars
         )
@@ -118,7 +122,10 @@ def diagnose(
             findings += _residual_findings(rope, held_out, simulations, notes)
         findings += far_findings(batch.npe.h, batch.x_o)
     if not coupling.converged:
-        notes.append("The coupling has not converged; its sample sizes are rough.")
+        notes.append(
+            "The coupling has not converged, so that its effective sample sizes are "
+            "approximate."
+        )
     return Diagnosis(
         findings=tuple(findings),
         notes=tuple(notes),
@@ -136,20 +143,20 @@ def diagnose(
 def _held_out(
     rope: RoPE, num_folds: int | None, *, show_progress_bars: bool
 ) -> tuple[CrossFitted | None, list[str]]:
-    """Return held-out calibration pairs, or why there are none."""
+    """Return the embeddings of held-out calibration pairs, or why there are none."""
     num_pairs = len(rope.calibration[0])
     if not num_pairs:
         note = (
-            "There are no calibration pairs: nothing was tuned, and what needs labels "
-            "was left out (misspecification after tuning, residuals)."
+            "There are no calibration pairs, so that nothing was tuned. The tests that "
+            "need labels were left out (misspecification after tuning, residuals)."
         )
     elif num_folds is None:
         note = (
-            "Residuals of calibration pairs were left out, as asked. Errors of g are "
-            "not told from a prior shift."
+            "Residuals of calibration pairs were left out, as asked. Errors of g can "
+            "therefore look like a prior shift."
         )
     elif num_pairs < 2:
-        note = "Residuals were left out: there is but one calibration pair."
+        note = "Residuals were left out, because there is only one calibration pair."
     else:
         return cross_fit(
             rope, num_folds=num_folds, show_progress_bars=show_progress_bars
@@ -193,6 +200,7 @@ def _names(names: Sequence[str] | None, dim: int) -> tuple[str, ...]:
 def _check_enough(theta: Tensor) -> None:
     if len(theta) < FEWEST_SIMULATIONS:
         raise InvalidInputError(
-            f"Expected at least {FEWEST_SIMULATIONS} simulations to tell what is "
-            f"usual; got {len(theta)}. Give RoPE a simulator, or more `simulations`."
+            f"Expected at least {FEWEST_SIMULATIONS} simulations, to estimate the "
+            f"thresholds; got {len(theta)}. Give RoPE a simulator, or more "
+            "`simulations`."
         )

@@ -1,4 +1,4 @@
-"""Does NPE meet numbers unlike any that it was trained on?"""
+"""Test whether entries of x are far from all simulations that NPE was trained on."""
 
 from torch import Tensor, nn
 
@@ -9,10 +9,11 @@ __all__ = ["far_findings"]
 
 
 def far_findings(embedding_net: nn.Module, x_o: Tensor) -> list[Finding]:
-    """Judge how far observations are from simulations, entry by entry.
+    """Return a finding about the entry of x that is farthest from simulations.
 
     Args:
-        embedding_net: h, with sbi's standardising layer; without one nothing is found.
+        embedding_net: h with sbi's standardising layer. Without this layer there is no
+            finding.
         x_o: The batch, shape ``(n_o, *event)``.
     """
     far = deviations(embedding_net, x_o)
@@ -33,10 +34,10 @@ def far_findings(embedding_net: nn.Module, x_o: Tensor) -> list[Finding]:
                 "farther."
             ),
             reason=(
-                "Alarming above the threshold, far beyond any error of a simulator: "
-                "the units differ, or the entry does not vary in simulations, and what "
-                "NPE makes of it can be anything. Leave it out, or train NPE with "
-                "z_score_x='structured'."
+                "Alarming above the threshold, which is far beyond any error of a "
+                "simulator. The units may differ, or the entry may not vary in "
+                "simulations, and the answer of NPE is arbitrary. Leave the entry out, "
+                "or train NPE with z_score_x='structured'."
             ),
         )
     ]

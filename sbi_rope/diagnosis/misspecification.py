@@ -1,4 +1,4 @@
-"""Is the batch unlike simulations, before tuning and after?"""
+"""Test whether the batch differs from simulations, before tuning and after."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,8 @@ from sbi_rope.diagnosis.simulations import Simulations
 
 __all__ = ["MMDTest", "misspecification_findings", "mmd_test"]
 
-# Observations and simulations in one MMD: its cost is quadratic.
+# The largest numbers of observations and simulations in one MMD, whose cost is
+# quadratic.
 MAX_OBSERVATIONS, MAX_SIMULATIONS = 200, 400
 NUM_DRAWS = 200
 LEVEL = 0.01
@@ -21,9 +22,9 @@ class MMDTest:
     """The outcome of a test.
 
     Attributes:
-        mmd: Squared MMD of the batch and simulations.
-        usual: Its median for a batch of simulations.
-        p_value: Chance of one as large for a batch of simulations.
+        mmd: Squared MMD between the batch and simulations.
+        usual: The median of the squared MMD for batches of simulations.
+        p_value: The probability that a batch of simulations has an MMD as large.
     """
 
     mmd: float
@@ -34,8 +35,8 @@ class MMDTest:
 def mmd_test(batch: Tensor, simulated: Tensor, *, null: Tensor) -> MMDTest:
     r"""Test whether a batch is like simulations, with sbi's MMD.
 
-    The p-value of sbi compares an MMD of n against m points with MMDs of n against
-    m - n, which are larger on average; here both are of the same numbers.
+    sbi's own p-value compares an MMD of n against m points with MMDs of n against
+    m - n points, which are larger on average. Here the numbers of points are the same.
 
     References:
         | Detecting Model Misspecification in Amortized Bayesian Inference with Neural
@@ -43,10 +44,10 @@ def mmd_test(batch: Tensor, simulated: Tensor, *, null: Tensor) -> MMDTest:
         | https://arxiv.org/abs/2112.08866
 
     Args:
-        batch: Embeddings, shape ``(n_o, l)``; a random 200 of them are used.
+        batch: Embeddings, shape ``(n_o, l)``. At most 200 random rows are used.
         simulated: Embeddings of simulations, shape ``(n_s, l)``.
-        null: What the batch would be drawn from if all were well, row by row another
-            view of ``simulated``, shape ``(n_s, l)``.
+        null: The embeddings that the batch would have under the null hypothesis, one
+            for each row of ``simulated``, shape ``(n_s, l)``.
     """
     num_real = min(len(batch), MAX_OBSERVATIONS, len(simulated) // 3)
     num_simulated = min(MAX_SIMULATIONS, len(simulated) - num_real)
@@ -60,13 +61,13 @@ def mmd_test(batch: Tensor, simulated: Tensor, *, null: Tensor) -> MMDTest:
     return MMDTest(
         mmd=value,
         usual=float(usual.median()),
-        # The batch itself is one of the draws, so that p is never 0.
+        # The batch itself counts as one of the draws, so that p is never 0.
         p_value=(1 + int((usual >= value).sum())) / (1 + NUM_DRAWS),
     )
 
 
 def _mmd(a: Tensor, b: Tensor) -> float:
-    # Imported late: it brings packages that nothing else here needs.
+    # It is imported here because it needs packages that nothing else here needs.
     from sbi.diagnostics import calc_misspecification_mmd
 
     _, (_, mmd) = calc_misspecification_mmd(
@@ -108,8 +109,8 @@ def _after(before: MMDTest, after: MMDTest) -> Finding:
     course = f"{before.mmd:.2g} before tuning, {after.mmd:.2g} after"
     if alarming:
         sentence = (
-            f"After tuning the batch is unlike simulations: {size} ({course}). If a "
-            "prior shift is found as well, that may be all; otherwise there are too "
+            f"After tuning the batch is unlike simulations: {size} ({course}). If "
+            "there is a prior shift, this may be the reason. Otherwise there are too "
             "few calibration pairs, or they are unlike the batch."
         )
     else:

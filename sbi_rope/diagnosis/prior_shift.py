@@ -1,4 +1,4 @@
-"""Which parameters the batch implies, against the prior."""
+"""Compare the parameters that the batch implies with the prior."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,10 +14,11 @@ from sbi_rope.diagnosis.simulations import Simulations
 
 __all__ = ["PriorShift", "prior_shift"]
 
-# Without a potential each observation chooses its simulations alone: no trust in the
-# prior. The smaller gamma, the less the implied distribution is blurred.
+# At tau = 0 each observation is coupled by itself, without trust in the prior. The
+# smaller gamma is, the less the implied distribution is blurred.
 COUPLER = SinkhornCoupler(gamma=0.1, tau=0.0, cost_scale="simulated")
-# Simulations that play the batch, and the number of batches they play.
+# The largest number of simulations that take the place of observations, and the number
+# of batches that are drawn from them.
 MAX_PLAYERS, NUM_DRAWS = 1000, 1000
 # Points at which distribution functions are compared.
 NUM_POINTS = 100
@@ -28,15 +29,16 @@ ERROR_QUANTILE = 0.95
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PriorShift:
-    """The parameters a batch implies.
+    """The parameters that a batch implies.
 
     Attributes:
-        implied: Weights of the simulations, sum one, ``(n_s,)``.
+        implied: Weights of the simulations, which sum to one, ``(n_s,)``.
         unshifted: The same for a batch that follows the prior.
         distance: Kolmogorov-Smirnov distance between the two, ``(d,)``.
-        chance: What a batch of the prior exceeds in one parameter or more in one of a
-            hundred batches, ``(d,)``.
-        error: What errors of g move calibration pairs by, ``(d,)``; None if unknown.
+        chance: The limits that one in a hundred batches from the prior exceeds in at
+            least one parameter, ``(d,)``.
+        error: The distance by which errors of g move calibration pairs, ``(d,)``; None
+            if it is unknown.
     """
 
     implied: Tensor
@@ -47,11 +49,11 @@ class PriorShift:
 
     @property
     def threshold(self) -> Tensor:
-        """The distance that is alarming, ``(d,)``."""
+        """The distance above which a shift is alarming, ``(d,)``."""
         return self.chance if self.error is None else self.chance + self.error
 
     def findings(self, simulations: Simulations, names: Sequence[str]) -> list[Finding]:
-        """Judge each parameter."""
+        """Return a finding for each parameter."""
         theta = simulations.theta
         std = theta.std(dim=0).clamp_min(1e-12)
         mean, spread = _moments(theta, self.implied)
@@ -92,38 +94,40 @@ class PriorShift:
 def prior_shift(
     real: Tensor, simulations: Simulations, *, held_out: CrossFitted | None = None
 ) -> PriorShift:
-    r"""Compare the parameters behind a batch with those behind simulations.
+    r"""Compare the parameters implied by a batch with those implied by simulations.
 
-    Every observation weighs simulations by
-    :math:`\operatorname{softmax}_j(-C_{ij} / \gamma)`; the mean over the batch, as
-    weights of the simulations' parameters, stands for the batch's. It is blurred: by
+    Observation i gives simulation j the weight
+    :math:`\operatorname{softmax}_j(-C_{ij} / \gamma)`. The mean of the weights over the
+    batch estimates the distribution of its parameters. The estimate is blurred by
     gamma, by the posterior of each observation, which is drawn to the prior, and by
-    tuning. So it understates a shift. In the linear-Gaussian problem of the tests its
-    spread for a batch of the prior is 0.98 of the prior's in two dimensions, 0.89 in
-    ten, and 0.84 and 0.86 after tuning; a true mean of 1.14 comes out as 0.81, 0.37,
+    tuning, so that it understates a shift. In the linear-Gaussian problem of the tests,
+    a batch from the prior has 0.98 of the prior's spread in two dimensions and 0.89 in
+    ten, and 0.84 and 0.86 after tuning. A true mean of 1.14 is estimated as 0.81, 0.37,
     0.63 and 0.31.
 
-    It is compared with what simulations give that play the batch, each without itself,
-    as they are and as tuning would leave them. Where a g from few pairs misses its
-    targets, the batch looks shifted too: the same distance for calibration pairs that g
-    has not seen, between where they are and where they should be, is added to the
-    threshold (its bootstrap's 95 % quantile). A strong shift of one parameter moves
-    those that it is confounded with, too.
+    The batch is compared with simulations that take the place of observations, both
+    unchanged and as tuning would move them. None of them is matched with itself. If g
+    was tuned on few pairs and misses its targets, the batch looks shifted too.
+    Therefore the same distance is measured between calibration pairs that g has not
+    seen and their targets, and the 95 % quantile of its bootstrap is added to the
+    threshold. A strong shift of one parameter also moves the parameters that it is
+    confounded with.
 
     Args:
         real: :math:`g(x_o)`, shape ``(n_o, l)``.
-        simulations: What the batch is compared with.
-        held_out: Calibration pairs, to measure the errors of g.
+        simulations: The simulations that the batch is compared with.
+        held_out: Calibration pairs that g has not seen, to measure its errors.
     """
     embedded = simulations.embedded
-    # At tau = 0 the potential is zero, whatever is coupled.
+    # At tau = 0 the potential is zero for any batch, so that a few rows are enough.
     coupling = COUPLER.couple(embedded[:100], embedded)
     points = _points(simulations.theta)
     implied, batch = _rows(coupling, real, simulations, points)
     players = torch.arange(min(len(simulations), MAX_PLAYERS))
     averaged = simulations.averaged[players]
     unshifted, expected = _rows(coupling, averaged, simulations, points, own=players)
-    # A g that was trained little averages less: in between is as good as either end.
+    # A g that was trained little averages less over noise. The threshold allows for the
+    # two ends, full averaging and none.
     ends = [expected]
     if simulations.tuned:
         ends.append(
@@ -151,19 +155,19 @@ def _errors_of_g(
     simulations: Simulations,
     points: tuple[Tensor, Tensor],
 ) -> Tensor:
-    """Return how far g moves the parameters implied by pairs it has not seen, (d,)."""
+    """Return how far errors of g move the parameters of unseen pairs, shape (d,)."""
     wanted = simulations.average(held_out.targets)
     found, expected = (
         _rows(coupling, embeddings, simulations, points)[1]
         for embeddings in (held_out.embedded, wanted)
     )
-    # Few pairs may have been lucky ones.
+    # With few pairs the errors could be small by chance, hence a bootstrap.
     gaps = _resampled(found - expected, len(found)).abs().amax(dim=-1)
     return gaps.quantile(ERROR_QUANTILE, dim=0)
 
 
 def _points(theta: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the order of each parameter, and where in it to compare."""
+    """Return the order of each parameter, and the ranks at which to compare."""
     last = len(theta) - 1
     where = torch.linspace(0, last, min(NUM_POINTS, len(theta))).round().long()
     return theta.argsort(dim=0), where
@@ -198,7 +202,7 @@ def _rows(
 
 def _draws(functions: Tensor, expected: Tensor, *, size: int) -> Tensor:
     """Return distances for batches of simulations, shape ``(draws, d)``."""
-    # The expectation is a mean over simulations too, and as uncertain as that.
+    # The expectation is itself a mean over simulations, with its own uncertainty.
     batch = _resampled(functions, size)
     reference = _resampled(expected, len(expected))
     return _largest_gap(batch, reference)
@@ -236,7 +240,10 @@ def _sentence(
         return f"No sign that the batch has other values of {name}: {where}."
     sentence = f"The batch seems to have other values of {name} than the prior: {where}"
     if not tuned:
-        return f"{sentence}. But g was not tuned, and misspecification looks the same."
+        return (
+            f"{sentence}. But g was not tuned, and then misspecification looks the "
+            "same."
+        )
     return (
         f"{sentence} (understated: observations are drawn to the prior). A smaller "
         "tau trusts the prior less."

@@ -1,4 +1,4 @@
-"""What a diagnosis says: findings in words and numbers, and the arrays behind them."""
+"""A diagnosis: its findings in words and numbers, and the arrays behind them."""
 
 import textwrap
 from dataclasses import asdict, dataclass, field
@@ -11,15 +11,15 @@ __all__ = ["Diagnosis", "Finding"]
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """One number, where it becomes alarming, and what it means.
+    """The result of one test: a number, its threshold and what it means.
 
     Attributes:
-        name: What was looked at.
+        name: The name of the test.
         value: The number.
-        threshold: Where it becomes alarming.
-        alarming: Whether it is beyond the threshold.
-        sentence: What was found, in plain words.
-        reason: On which side of the threshold it is alarming, and why there.
+        threshold: The threshold beyond which the number is alarming.
+        alarming: Whether the number is beyond the threshold.
+        sentence: The finding in plain words.
+        reason: On which side of the threshold the number is alarming, and why.
     """
 
     name: str
@@ -37,19 +37,19 @@ class Diagnosis:
     All tensors are float64 on the CPU unless said otherwise.
 
     Attributes:
-        findings: All that was tested.
-        notes: What was left out, and what else to know.
+        findings: The results of all tests.
+        notes: Which tests were left out, and what else there is to know.
         flags: Indices of the observations that no simulation matches, int64.
         effective_sample_size: Of each observation's row of the coupling, ``(n_o,)``.
-        distance: From :math:`g(x_o)` to the nearest simulation, in units of the median
-            distance from a simulation to its nearest other, ``(n_o,)``.
+        distance: Distance from :math:`g(x_o)` to the nearest simulation, ``(n_o,)``, in
+            units of the median distance from a simulation to its nearest neighbour.
         theta: The parameters of the simulations, ``(n_s, d)``.
-        implied: Weights of ``theta`` that stand for the parameters of the batch, sum
-            one, ``(n_s,)``.
-        unshifted: The same for a batch that follows the prior: the prior, blurred as
-            ``implied`` is.
-        residuals: :math:`g(x) - E[h(S(\theta))]` of each calibration pair, with g
-            trained on others, ``(n_c, l)``; None if they were left out.
+        implied: Weights of ``theta`` that estimate the distribution of the parameters
+            of the batch, ``(n_s,)``. They sum to one.
+        unshifted: The same weights for a batch that follows the prior. They are blurred
+            as ``implied`` is.
+        residuals: :math:`g(x) - E[h(S(\theta))]` of each calibration pair, with a g
+            trained on other pairs, ``(n_c, l)``; None if they were left out.
         parameter_names: One name for each parameter.
     """
 
@@ -91,7 +91,7 @@ class Diagnosis:
                 f"{mark} {finding.name}: {finding.value:.3g} "
                 f"(threshold {finding.threshold:.3g})"
             )
-            # The same for all parameters: once is enough.
+            # All parameters have the same reason, which is printed only once.
             reason = "" if finding.reason == given else finding.reason
             lines.append(_indented(f"{finding.sentence} {reason}"))
             given = finding.reason

@@ -1,4 +1,4 @@
-"""Whether what tuning leaves of a calibration pair depends on its parameters."""
+"""Test whether the residuals of calibration pairs depend on their parameters."""
 
 from dataclasses import dataclass
 
@@ -23,15 +23,15 @@ __all__ = [
 
 NUM_PERMUTATIONS = 1000
 LEVEL = 0.01
-# The most that averaging over the simulator's noise explains; see `dependence`.
+# Averaging over the simulator's noise explains at most this, see `residual_finding`.
 LARGEST_RATIO = 0.5
-# Bias below this share of the embeddings' spread is nothing, if there is no noise.
+# Without noise, a bias is measured in units of this share of the embeddings' spread.
 SMALLEST_SHARE = 0.05
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CrossFitted:
-    r"""Calibration pairs as a g sees them that was not trained on them.
+    r"""Calibration pairs, embedded by nets g that were not trained on them.
 
     Attributes:
         embedded: :math:`g(x)`, ``(n_c, l)``.
@@ -43,7 +43,7 @@ class CrossFitted:
 
     @property
     def residuals(self) -> Tensor:
-        """What is between the two, ``(n_c, l)``."""
+        """The differences between the two, ``(n_c, l)``."""
         return self.embedded - self.targets
 
 
@@ -52,8 +52,8 @@ class Dependence:
     """How much residuals depend on parameters.
 
     Attributes:
-        p_value: Of a permutation test.
-        bias: Root mean square of the part that follows the parameters.
+        p_value: The p-value of a permutation test.
+        bias: Root mean square of the part of the residuals that depends on theta.
         error: Standard error of ``bias``.
     """
 
@@ -63,7 +63,7 @@ class Dependence:
 
 
 def num_features(num_pairs: int, dim: int) -> int:
-    """Return how many features of the parameters so many pairs can carry; 0 is none."""
+    """Return how many features of the parameters to regress on; 0 if pairs are few."""
     for count in (2 * dim, dim):
         if num_pairs >= 2 * (count + 1) + 2:
             return count
@@ -73,13 +73,13 @@ def num_features(num_pairs: int, dim: int) -> int:
 def cross_fit(rope: RoPE, *, num_folds: int, show_progress_bars: bool) -> CrossFitted:
     r"""Embed each calibration pair by a g that was trained on the other folds.
 
-    On the pairs g was trained on, residuals would be too small. Costs as many
-    trainings as there are folds.
+    The residuals of pairs that g was trained on would be too small. There is one
+    training for each fold.
 
     Args:
-        rope: RoPE with its calibration pairs; it is left as it is.
-        num_folds: Folds; as many as there are pairs, if these are fewer.
-        show_progress_bars: Whether to show the folds done.
+        rope: RoPE with its calibration pairs; it is not changed.
+        num_folds: Number of folds, at most the number of pairs.
+        show_progress_bars: Whether to show how many folds are done.
     """
     theta, x = rope.calibration
     h = rope.embedding_net
@@ -103,13 +103,14 @@ def cross_fit(rope: RoPE, *, num_folds: int, show_progress_bars: bool) -> CrossF
 
 
 def dependence(residuals: Tensor, theta: Tensor) -> Dependence:
-    r"""Regress residuals on parameters and their squares, and permute.
+    r"""Regress residuals on parameters and their squares, with a permutation test.
 
-    The statistic is the sum of squares that the regression explains. The bias
-    :math:`b` is its unbiased estimate: with p features and residual variance
-    :math:`s^2`, :math:`b^2 = (\text{explained} - p\, s^2) / n`. With few pairs there
-    are no squares. Its standard error is about
-    :math:`\sqrt{(s^2 + b^2 / 2) / n}`, were all residual variance along the bias.
+    The statistic is the sum of squares that the regression explains. With p features
+    and residual variance :math:`s^2`, the bias b is estimated by
+    :math:`b^2 = (\text{explained} - p\, s^2) / n`, which is unbiased. If pairs are few,
+    the squares of the parameters are left out. The standard error of b is at most about
+    :math:`\sqrt{(s^2 + b^2 / 2) / n}`, its value if all residual variance has the
+    direction of the bias.
 
     Args:
         residuals: Shape ``(n, l)``.
@@ -129,7 +130,7 @@ def dependence(residuals: Tensor, theta: Tensor) -> Dependence:
             for _ in range(NUM_PERMUTATIONS)
         ]
     )
-    # Equal up to rounding counts as reached.
+    # A permutation that is equal up to rounding counts.
     reached = int((permuted >= explained * (1 - 1e-12)).sum())
     n, p = len(centred), basis.shape[1]
     variance = (float(centred.square().sum()) - explained) / (n - 1 - p)
@@ -144,12 +145,13 @@ def dependence(residuals: Tensor, theta: Tensor) -> Dependence:
 def residual_finding(
     residuals: Tensor, theta: Tensor, simulations: Simulations
 ) -> Finding:
-    r"""Judge the bias, its lower 95 % limit, in units of the simulator's noise.
+    r"""Return a finding about the bias, its lower 95 % limit, in units of the noise.
 
-    Residuals depend on parameters even where all is well. With :math:`h` the posterior
-    mean of a linear-Gaussian problem that explains a share R of the variance, the best
-    g leaves :math:`-R (1 - R)\, \theta`, and a simulation has noise of variance
-    :math:`R (1 - R)`: the ratio is :math:`\sqrt{R (1 - R)} \le 1/2`.
+    Residuals depend on the parameters even if nothing is wrong. Let :math:`h` be the
+    posterior mean of a linear-Gaussian problem that explains a share R of the variance.
+    The residuals of the best g are then :math:`-R (1 - R)\, \theta`, and the noise of
+    simulations has the variance :math:`R (1 - R)`. The ratio is
+    :math:`\sqrt{R (1 - R)} \le 1/2`.
     """
     found = dependence(residuals, theta)
     spread = float(simulations.embedded.var(dim=0).sum())
@@ -161,18 +163,19 @@ def residual_finding(
     alarming = significant and value > LARGEST_RATIO
     if alarming:
         sentence = (
-            "What tuning leaves of the calibration pairs depends on their parameters: "
-            f"a bias of at least {value:.2f} times the simulator's noise (p = "
-            f"{found.p_value:.3f}). Tuning has not generalised, for want of pairs or "
-            "of training, or real observations do not follow the parameters as "
-            "simulations do, and the conditional independence RoPE rests on fails."
+            "The residuals of calibration pairs after tuning depend on the parameters: "
+            f"the bias is at least {value:.2f} times the simulator's noise (p = "
+            f"{found.p_value:.3f}). Either tuning has not generalised, because there "
+            "are too few pairs or the training was too short, or real observations do "
+            "not follow the parameters as simulations do. Then the conditional "
+            "independence that RoPE assumes does not hold."
         )
     else:
         sentence = (
-            "What tuning leaves of the calibration pairs depends on their parameters "
-            f"by {found.bias / unit if unit else 0.0:.2f} times the simulator's noise "
-            f"(p = {found.p_value:.3f}), "
-            + ("as it does where all is well." if significant else "if at all.")
+            "The residuals of calibration pairs after tuning have a bias of "
+            f"{found.bias / unit if unit else 0.0:.2f} times the simulator's noise "
+            f"(p = {found.p_value:.3f}), which is "
+            + ("normal." if significant else "not significant.")
         )
     return Finding(
         name="residual depends on parameters",
@@ -181,9 +184,8 @@ def residual_finding(
         alarming=alarming,
         sentence=sentence,
         reason=(
-            "Alarming above the threshold (the lower 95 % limit of the ratio), if p is "
-            "below 0.01: averaging over the "
-            "simulator's noise alone leaves up to half of it in a linear-Gaussian "
-            "problem."
+            "Alarming if the lower 95 % limit of the ratio is above the threshold and "
+            "p is below 0.01: in a linear-Gaussian problem, averaging over the "
+            "simulator's noise alone gives a ratio of up to one half."
         ),
     )

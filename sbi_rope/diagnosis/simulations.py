@@ -1,4 +1,4 @@
-"""The simulations a batch is compared with, and what tuning would make of them."""
+"""The simulations that a batch is compared with, and how tuning would move them."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,7 +10,7 @@ from sbi_rope._slices import slices
 
 __all__ = ["Simulations", "nearest_distances"]
 
-# Simulations behind a covariance: its errors are then a few per cent.
+# So many simulations give a covariance with errors of a few per cent.
 MAX_FOR_NOISE = 2000
 CHUNK = 500
 
@@ -36,9 +36,10 @@ class Simulations:
     def noise(self) -> Tensor:
         r"""Covariance :math:`W` of :math:`h(x_s)` given theta, ``(l, l)``.
 
-        From differences between simulations with neighbouring parameters, after a
-        quadratic trend is taken out. Needs no further simulations. Where parameters are
-        many and simulations few, neighbours are far apart and it is too large.
+        It is estimated from the differences between simulations with neighbouring
+        parameters, after a quadratic trend is subtracted. No further simulations are
+        needed. With many parameters and few simulations, neighbours are far apart and
+        the estimate is too large.
         """
         theta, embedded = self.theta[:MAX_FOR_NOISE], self.embedded[:MAX_FOR_NOISE]
         standard = (theta - theta.mean(dim=0)) / theta.std(dim=0).clamp_min(1e-12)
@@ -51,17 +52,17 @@ class Simulations:
 
     @cached_property
     def averaged(self) -> Tensor:
-        """Embeddings as g would give them if simulations were real, ``(n_s, l)``."""
+        """Embeddings of the simulations as a tuned g would have them, ``(n_s, l)``."""
         return self.average(self.embedded)
 
     def average(self, points: Tensor) -> Tensor:
-        r"""Move embeddings ``(n, l)`` as tuning would if all were well.
+        r"""Move embeddings ``(n, l)`` as tuning does if nothing is wrong.
 
-        Tuning moves :math:`g(x)` to :math:`E[h \mid \theta]`, of which an observation
-        tells no more than its mean given x: the noise of single simulations is
-        averaged out, and what is left is drawn to the centre. To first order that is
-        :math:`\mu + (I - W V^{-1})(h - \mu)`, V the covariance of h. Without tuning h
-        stays as it is.
+        Tuning moves :math:`g(x)` towards :math:`E[h \mid \theta]`. It can reach at best
+        the mean of this given x, which averages out the noise of single simulations
+        and is drawn to the centre. To first order it is
+        :math:`\mu + (I - W V^{-1})(h - \mu)`, with V the covariance of h. Without
+        tuning, h is not changed.
         """
         if not self.tuned:
             return points
@@ -81,12 +82,12 @@ class Simulations:
 
     @cached_property
     def nearest(self) -> Tensor:
-        """Distance from each simulation to the nearest other, ``(n_s,)``."""
+        """Distance from each simulation to its nearest neighbour, ``(n_s,)``."""
         return nearest_distances(self.embedded, self.embedded, others=True)
 
 
 def nearest_distances(points: Tensor, among: Tensor, *, others: bool = False) -> Tensor:
-    """Return the distance from each point to the nearest of some, shape ``(n,)``.
+    """Return the distance from each point to the nearest of others, shape ``(n,)``.
 
     Args:
         points: Shape ``(n, l)``.

@@ -1,4 +1,4 @@
-"""Which observations have simulations to match them, and how many each rests on."""
+"""Test whether observations have simulations near them, and how many."""
 
 from dataclasses import dataclass
 
@@ -11,9 +11,10 @@ from sbi_rope.diagnosis.simulations import Simulations, nearest_distances
 
 __all__ = ["Support", "support_of"]
 
-# Share of simulations whose nearest other is farther than what flags an observation.
+# An observation is flagged if its nearest simulation is farther away than the nearest
+# neighbours of all simulations but this share.
 FLAGGED_SHARE = 0.001
-# As far again as the distance that flags.
+# Twice the distance above which an observation is flagged.
 FAR = 2.0
 FEW, MANY_WITH_FEW = 10.0, 0.05
 INDISTINCT = 0.5
@@ -21,13 +22,13 @@ INDISTINCT = 0.5
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Support:
-    """Distances of observations from simulations, and what flags them.
+    """Distances of observations from simulations, and the limit for flags.
 
     Attributes:
-        distance: To the nearest simulation, in units of the median between
-            simulations, ``(n_o,)``.
+        distance: Distance to the nearest simulation, ``(n_o,)``. The unit is the median
+            distance from a simulation to its nearest neighbour.
         limit: The distance above which an observation is flagged.
-        chance: The chance that a simulation would be.
+        chance: The probability that a simulation would be flagged.
     """
 
     distance: Tensor
@@ -36,11 +37,11 @@ class Support:
 
     @property
     def flags(self) -> Tensor:
-        """Indices of the observations that no simulation matches."""
+        """Indices of the observations that have no simulation near them."""
         return (self.distance > self.limit).nonzero().flatten()
 
     def findings(self, sizes: Tensor, num_simulations: int) -> list[Finding]:
-        """Judge the distances, and the effective sample sizes of the coupling."""
+        """Return findings about the distances and the effective sample sizes."""
         return [
             self._unmatched(),
             self._farthest(),
@@ -54,7 +55,7 @@ class Support:
         sentence = f"{len(flags)} of {count} observations have no simulation near them"
         if flags:
             shown = ", ".join(map(str, flags[:10])) + (", ..." if flags[10:] else "")
-            sentence += f" ({shown}); look at them before trusting their posteriors"
+            sentence += f" ({shown}); look at them before you trust their posteriors"
         return Finding(
             name="observations no simulation matches",
             value=float(len(flags)),
@@ -62,10 +63,10 @@ class Support:
             alarming=len(flags) > allowed,
             sentence=f"{sentence}.",
             reason=(
-                "Observations are flagged that are farther from their nearest "
+                "An observation is flagged if it is farther from its nearest "
                 f"simulation than all but {self.chance:.2%} of the simulations are "
-                "from their nearest other; alarming above the threshold, the number "
-                "flagged by chance in one batch of simulations in a hundred."
+                "from their nearest neighbours. Alarming above the threshold: one "
+                "batch of simulations in a hundred has more flags by chance."
             ),
         )
 
@@ -80,11 +81,11 @@ class Support:
             sentence=(
                 f"Observation {index} is farthest from simulations: "
                 f"{float(self.distance[index]):.2g} times as far as is typical between "
-                f"simulations, {value:.2g} times the distance that flags."
+                f"simulations, and {value:.2g} times the limit for a flag."
             ),
             reason=(
                 "Alarming above the threshold: among many observations some are "
-                "flagged by chance, but none lies in so wide a void."
+                "flagged by chance, but none is so far away by chance."
             ),
         )
 
@@ -92,14 +93,14 @@ class Support:
 def support_of(real: Tensor, simulations: Simulations) -> Support:
     """Compare distances to simulations with those of simulations to one another.
 
-    The simulation itself is left out, so that an observation that is a simulation is
-    flagged as often as any other.
+    The distance of a simulation to itself is left out, so that a simulation that takes
+    the place of an observation is flagged with the stated probability.
     """
     nearest = simulations.nearest
-    # An order statistic: the (k+1)-th of n is exceeded with chance (k + 1) / (n + 1).
+    # A new value exceeds the (k+1)-th largest of n with probability (k + 1) / (n + 1).
     k = int(FLAGGED_SHARE * len(nearest))
     unit = float(nearest.median())
-    if unit == 0.0:  # most simulations have a twin, as with discrete data
+    if unit == 0.0:  # most simulations are the same as another, as with discrete data
         unit = float(nearest.mean()) or 1.0
     limit = float(nearest.sort(descending=True).values[k])
     smallest = torch.finfo(torch.float64).tiny
@@ -118,13 +119,13 @@ def _few(sizes: Tensor) -> Finding:
         threshold=MANY_WITH_FEW,
         alarming=share > MANY_WITH_FEW,
         sentence=(
-            f"{share:.0%} of the posteriors rest on fewer than {FEW:.0f} simulations; "
+            f"{share:.0%} of the posteriors use fewer than {FEW:.0f} simulations; "
             f"the median effective sample size is {float(sizes.median()):.3g}."
         ),
         reason=(
             f"With {FEW:.0f} simulations the centre of a posterior is off by a third "
-            "of their spread; alarming above the threshold, where this is no longer "
-            "an exception. More simulations or a larger gamma help."
+            "of their spread. Alarming above the threshold, because this should be an "
+            "exception. More simulations or a larger gamma help."
         ),
     )
 
@@ -140,8 +141,8 @@ def _indistinct(sizes: Tensor, num_simulations: int) -> Finding:
             f"A typical posterior is spread over {share:.0%} of the simulations."
         ),
         reason=(
-            "Alarming above the threshold: half of all simulations is hardly less "
-            "than the prior. A smaller gamma, or cost_scale='simulated', tells "
-            "observations apart."
+            "Alarming above the threshold: a posterior over half of all simulations is "
+            "almost the prior. A smaller gamma, or cost_scale='simulated', separates "
+            "the observations."
         ),
     )

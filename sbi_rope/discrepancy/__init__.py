@@ -1,8 +1,9 @@
-"""A model of how reality differs from a simulator, and an NPE that knows it."""
+"""A model of how reality differs from a simulator, and an NPE trained with it."""
 
-from sbi_rope.discrepancy.model import Discrepancy, DiscrepancyDraws, DiscrepancyModel
+from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.npe import DiscrepancyNPE
 from sbi_rope.discrepancy.parameters import ParameterDistribution, learn_parameters
+from sbi_rope.discrepancy.posterior import Discrepancy, DiscrepancyDraws
 from sbi_rope.discrepancy.report import (
     DiscrepancyReport,
     Interval,

@@ -1,4 +1,4 @@
-"""From a trained NPE to one that knows how reality differs from its simulator."""
+"""Fit the discrepancy, and train a given NPE further on corrected simulations."""
 
 import copy
 from dataclasses import dataclass
@@ -10,24 +10,25 @@ from sbi_rope._sbi import ConditionalEstimator, embedding_of, headless, with_emb
 from sbi_rope._simulations import Moments
 from sbi_rope._standardisation import Standardisation
 from sbi_rope._training import History
-from sbi_rope.discrepancy.model import Discrepancy, DiscrepancyModel
+from sbi_rope.discrepancy.model import DiscrepancyModel
+from sbi_rope.discrepancy.posterior import Discrepancy
 from sbi_rope.discrepancy.training import train_on_corrected
 from sbi_rope.errors import InvalidInputError
 
 __all__ = ["Correction", "Space", "correct_npe", "fit_discrepancy", "network_of"]
 
-# What of an observation is corrected: h(x), x itself, or g(x) of nets tuned on other
-# pairs. Simulations are represented by h(x) in the last case too, where g puts them.
+# What is corrected: h(x), x itself, or g(x) with nets g tuned on other pairs. In the
+# last case simulations are still represented by h(x), because g is tuned towards h.
 Space = Literal["embedding", "input", "tuned"]
 
-# Draws of the discrepancy behind a training; fewer where there are many entries in
-# each, as with embeddings of a hundred dimensions.
+# The number of draws of the discrepancy for a training, and the limit on the entries of
+# all draws together. Embeddings of a hundred dimensions get fewer draws.
 NUM_DRAWS, MAX_ENTRIES = 2000, 2**24
-# Smallest standard deviation of the error, in standard deviations of simulations. The
-# input of a network can be known better than its output.
+# Smallest standard deviation of the error, in standard deviations of simulations. It is
+# smaller for x, which can be known more precisely than an embedding.
 SMALLEST_ERROR = {"embedding": 0.01, "tuned": 0.01, "input": 0.003}
-# Gradient steps of a course. The density behind an embedding net follows within a
-# hundred; a whole network takes longer. Chosen on calibration data, see
+# Gradient steps of a course. The density behind an embedding net adapts within a
+# hundred steps; a whole network takes longer. Chosen on calibration data, see
 # benchmarks/README.md.
 NUM_STEPS = {"embedding": 150, "tuned": 150, "input": 400}
 LEARNING_RATES = {"embedding": 5e-3, "tuned": 5e-3, "input": 2e-3}
@@ -35,14 +36,14 @@ LEARNING_RATES = {"embedding": 5e-3, "tuned": 5e-3, "input": 2e-3}
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Correction:
-    """An estimator trained on corrected simulations, and what it was corrected by.
+    """An estimator trained on corrected simulations, and the discrepancy it knows.
 
     Attributes:
         estimator: An estimator of sbi for real observations x.
         discrepancy: The posterior of gain, offset and error.
         history: The losses of its training.
-        constants: What to put behind an embedding net, or before the estimator if x
-            itself was corrected; the estimator has it already.
+        constants: A layer that replaces entries without variation in simulations, to
+            put behind an embedding net of real observations. The estimator contains it.
     """
 
     estimator: Any
@@ -52,7 +53,7 @@ class Correction:
 
 
 def network_of(estimator: ConditionalEstimator, space: Space) -> nn.Module:
-    """Return the map from simulations x to what is corrected.
+    """Return the map from x to its representation that is corrected.
 
     Raises:
         InvalidInputError: If the input is to be corrected and is not a vector.
@@ -77,10 +78,11 @@ def fit_discrepancy(
     """Fit the model to calibration pairs, in standard deviations of simulations.
 
     Args:
-        z: What real observations are represented by, shape ``(n, l)``.
-        moments: Of simulations at their parameters.
-        standardisation: Of z over simulations from the prior.
-        model: The model.
+        z: The representations of the real observations, shape ``(n, l)``.
+        moments: The moments of simulations at the parameters of the pairs.
+        standardisation: The mean and standard deviation of z over simulations from the
+            prior.
+        model: The model of the discrepancy.
 
     Raises:
         InvalidInputError: If nothing varies between simulations.
@@ -88,8 +90,8 @@ def fit_discrepancy(
     varies = standardisation.varies
     if not varies.any():
         raise InvalidInputError(
-            "Expected simulations that differ from each other; all entries of what "
-            "they are represented by are constant. Train NPE longer, or with another "
+            "Expected simulations that differ from each other; got the same embedding "
+            "(or the same x) for all of them. Train NPE longer, or with another "
             "embedding net."
         )
     std = standardisation.std[varies]
@@ -117,28 +119,29 @@ def correct_npe(
     """Fit a discrepancy to calibration pairs, and train NPE on corrected simulations.
 
     Args:
-        estimator: The estimator of NPE; it is left as it is.
-        simulations: Parameters from the prior, shape ``(n_s, d)``, and what a
-            simulation of each is represented by, shape ``(n_s, l)``.
-        z: What the real observations of the pairs are represented by, ``(n_c, l)``.
-        moments: Of simulations at the parameters of the pairs.
-        space: What z is.
+        estimator: The estimator of NPE; it is not changed.
+        simulations: Parameters from the prior, shape ``(n_s, d)``, and the
+            representation of a simulation of each, shape ``(n_s, l)``.
+        z: The representations of the real observations of the pairs, ``(n_c, l)``.
+        moments: The moments of simulations at the parameters of the pairs.
+        space: What z is: embeddings h(x), x itself, or embeddings by tuned nets.
         model: The model of the discrepancy.
-        probabilities: With which simulations are drawn; None takes all alike.
-        num_steps: Gradient steps; if None, courses whose length depends on the space
-            until one changes next to nothing.
-        learning_rate: Of Adam; chosen by the space if None.
-        show_progress_bars: Whether to show the course of the loss.
+        probabilities: The probabilities with which simulations are drawn; None makes
+            them equal.
+        num_steps: Gradient steps. If None, courses follow each other, whose length
+            depends on the space, until one changes almost nothing.
+        learning_rate: Learning rate of Adam; it depends on the space if None.
+        show_progress_bars: Whether to show the loss during training.
 
     Returns:
-        The corrected estimator. With ``space="tuned"`` its embedding net is h; replace
-        it by a tuned net and the constants.
+        The corrected estimator. With ``space="tuned"`` its embedding net is h. The
+        caller replaces h by a tuned net and the constants.
     """
     theta, z_s = simulations
     standardisation = Standardisation(z_s.double())
     discrepancy = fit_discrepancy(z, moments, standardisation, model)
     corrected = copy.deepcopy(estimator)
-    # The parameters of the density are those of the whole.
+    # The two share their parameters, so that training one trains the other.
     density: Any = corrected if space == "input" else headless(corrected)
     history = train_on_corrected(
         density,
@@ -170,9 +173,10 @@ def correct_npe(
 
 
 class SimulatedConstants(nn.Module):
-    """Gives entries that are the same in all simulations their simulated value.
+    """Sets entries that are the same in all simulations to their simulated value.
 
-    The density never saw them vary, and would answer a real value by chance.
+    The density has never seen these entries vary, so that its answer to another value
+    would be arbitrary.
     """
 
     varies: Tensor
@@ -184,7 +188,7 @@ class SimulatedConstants(nn.Module):
         self.register_buffer("values", standardisation.mean)
 
     def forward(self, z: Tensor) -> Tensor:
-        """Return z with constants in their place, of the same shape."""
+        """Return z with these entries replaced, in the same shape."""
         return z.where(self.varies, self.values.to(z))
 
 

@@ -3,36 +3,33 @@ r"""A Bayesian linear model of how real observations differ from simulations."""
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.distributions import Chi2, MultivariateNormal
+from torch.distributions import MultivariateNormal
 
-from sbi_rope._random import seeded
 from sbi_rope._validation import (
     check_batch,
-    check_integer,
-    check_not_negative,
     check_positive,
     check_same_length,
     check_tensor,
     check_unit_interval,
 )
+from sbi_rope.discrepancy.posterior import Discrepancy, Term
 from sbi_rope.errors import InvalidInputError, InvalidTypeError
 
-__all__ = ["Discrepancy", "DiscrepancyDraws", "DiscrepancyModel"]
+__all__ = ["DiscrepancyModel"]
 
 # Settings of the hyper-parameters are left out if their evidence is less than this
-# share of that of the best.
+# share of the evidence of the best setting.
 NEGLIGIBLE = 1e-4
-# The prior is less certain of the offset than of the gain, by this factor.
+# The prior precision of the offset is this share of the precision of the gain.
 OFFSET_PRECISION = 1 / 3
-# Entries of the matrices that simulations are corrected by at a time.
-MAX_ENTRIES = 2**22
-# Smallest standard deviation that simulations at one parameter are given, in standard
-# deviations of simulations from the prior: some statistics have no noise at all.
+# This standard deviation is added to the noise of simulations at one parameter, because
+# some statistics have no noise at all. Its unit is the standard deviation of
+# simulations from the prior.
 SMALLEST_NOISE = 0.01
 
 
@@ -40,7 +37,7 @@ SMALLEST_NOISE = 0.01
 class DiscrepancyModel:
     r"""How real observations follow from simulations: a gain, an offset and an error.
 
-    Let z be what an observation is represented by, such as its embedding. With
+    Let z be the representation of an observation, such as its embedding. With
     :math:`m_i` and C the mean and the covariance of simulations :math:`z_s` at the
     parameters of calibration pair i,
 
@@ -50,22 +47,22 @@ class DiscrepancyModel:
         z_i \mid \theta_i \sim \mathcal N(A m_i + b,\; \Sigma), \quad
         \Sigma = \Sigma' + A C A^\top .
 
-    The prior is conjugate and centred on a simulator that is right,
+    The prior is conjugate, and its centre is a simulator that is right,
 
     .. math::
         \Sigma \sim \mathrm{IW}\bigl((\nu - l - 1)\, s^2 I, \nu\bigr), \qquad
         (A, b) \mid \Sigma \sim \mathcal{MN}\bigl((I, 0), K^{-1}, \Sigma\bigr), \quad
         K = \operatorname{diag}(k, \ldots, k, k / 3),
 
-    so that the posterior has the same form and the evidence is known in closed form.
-    The hyper-parameters k, s and :math:`\nu` are averaged over a grid by their
-    evidence, so that a user has nothing to choose.
+    so that the posterior has the same form and the evidence has a closed form. The
+    hyper-parameters k, s and :math:`\nu` are averaged over a grid, weighted by their
+    evidence, so that there is nothing to choose.
 
-    The model :math:`z_i \mid \theta_i \sim \mathcal N(m_i, C)`, in which the simulator
-    is right, takes part in the average. Its share is ``probability_of_none`` before any
-    pair is seen. Where the simulator is right its share goes to one, and nothing is
-    corrected; unless the noise of z varies several times with the parameters, which one
-    C for all does not describe.
+    The average contains the model :math:`z_i \mid \theta_i \sim \mathcal N(m_i, C)`, in
+    which the simulator is right. Before any pair is seen its probability is
+    ``probability_of_none``. If the simulator is right, the probability goes to one with
+    more pairs, and nothing is corrected. An exception are simulators whose noise varies
+    by a factor of several with the parameters, because C is the same for all pairs.
 
     All quantities are in standard deviations of simulations from the prior.
 
@@ -76,9 +73,9 @@ class DiscrepancyModel:
     Args:
         gain_precisions: Values of k.
         error_scales: Values of s.
-        degrees_of_freedom: Values of :math:`\nu - l - 1`, the number of pairs that the
-            prior of the error is worth.
-        probability_of_none: How probable it is beforehand that the simulator is right.
+        degrees_of_freedom: Values of :math:`\nu - l - 1`. The prior of the error counts
+            as much as this number of pairs.
+        probability_of_none: The prior probability that the simulator is right.
 
     Raises:
         InvalidTypeError: If one of the first three is not a list.
@@ -114,13 +111,13 @@ class DiscrepancyModel:
                 check_positive(name, value)
         check_unit_interval("probability_of_none", self.probability_of_none)
 
-    def fit(self, z: Tensor, mean: Tensor, covariance: Tensor) -> "Discrepancy":
+    def fit(self, z: Tensor, mean: Tensor, covariance: Tensor) -> Discrepancy:
         r"""Return the posterior of the discrepancy given calibration pairs.
 
         Args:
-            z: Real observations, shape ``(n, l)``.
-            mean: :math:`m_i`, the mean of simulations at the parameters of each, shape
-                ``(n, l)``.
+            z: Representations of the real observations, shape ``(n, l)``.
+            mean: :math:`m_i`, the mean of simulations at the parameters of each
+                observation, shape ``(n, l)``.
             covariance: C, the covariance of simulations at one parameter, averaged over
                 the pairs, shape ``(l, l)``.
 
@@ -129,7 +126,7 @@ class DiscrepancyModel:
 
         Raises:
             InvalidInputError: If the shapes do not fit, a value is not finite, or
-                ``covariance`` is none.
+                ``covariance`` is not a covariance matrix.
         """
         z, mean, covariance = _checked(z, mean, covariance)
         noise = covariance + SMALLEST_NOISE**2 * torch.eye(z.shape[1]).to(z)
@@ -153,7 +150,7 @@ class DiscrepancyModel:
 
 
 def _checked(z: Any, mean: Any, covariance: Any) -> tuple[Tensor, Tensor, Tensor]:
-    """Return what describes the pairs in float64."""
+    """Check the arguments of ``fit`` and return them in float64."""
     z = check_tensor("z", z).double()
     if z.ndim != 2:
         raise InvalidInputError(
@@ -180,7 +177,7 @@ def _checked(z: Any, mean: Any, covariance: Any) -> tuple[Tensor, Tensor, Tensor
 
 
 def _log_evidence_of_none(residual: Tensor, noise: Tensor) -> Tensor:
-    """Return the log density of z - m, measured as finely as ``_Regression`` takes."""
+    """Return the log density of z - m, rounded as ``_Regression`` assumes."""
     log_density = MultivariateNormal(torch.zeros_like(residual[0]), noise).log_prob
     inexact = len(residual) * SMALLEST_NOISE**2 * torch.linalg.inv(noise).trace()
     return log_density(residual).sum() - inexact / 2
@@ -198,11 +195,12 @@ class _Regression:
 
     Attributes:
         coefficients: Mean of :math:`(A, b)^\top`, shape ``(l + 1, l)``.
-        row_factor: Lower Cholesky factor of the covariance of its rows.
-        variances: Eigenvalues of the squares that are left over, shape ``(l,)``.
-        directions: Their eigenvectors, shape ``(l, l)``.
-        log_volume: What the coefficients add to the log evidence.
-        num_pairs: Pairs behind it.
+        row_factor: Lower Cholesky factor of the covariance of its rows, shape
+            ``(l + 1, l + 1)``.
+        variances: Eigenvalues of the scatter matrix of the residuals, shape ``(l,)``.
+        directions: Its eigenvectors, shape ``(l, l)``.
+        log_volume: The part of the log evidence that comes from the coefficients.
+        num_pairs: The number of calibration pairs.
     """
 
     coefficients: Tensor
@@ -221,14 +219,14 @@ class _Regression:
         prior_mean = torch.cat([identity, torch.zeros_like(identity[:1])])
         precision = torch.full((width + 1,), gain_precision).to(z)
         precision[-1] *= OFFSET_PRECISION
-        # Relative to the prior mean, where squares are small and so is their rounding.
+        # Relative to the prior mean, residuals are small, and so are rounding errors.
         residual = z - design @ prior_mean
         factor = torch.linalg.cholesky(precision.diag() + design.T @ design)
         shift = torch.cholesky_solve(design.T @ residual, factor)
-        # A sum of squares, where the usual difference of two could be negative.
+        # This is a sum of squares. The usual difference of two terms could be negative.
         left_over = residual - design @ shift
         scatter = left_over.T @ left_over + shift.T @ (precision[:, None] * shift)
-        # What is the same to more digits than anything is measured is no better known.
+        # No z is known more precisely than SMALLEST_NOISE, even if pairs agree exactly.
         scatter = scatter + n * SMALLEST_NOISE**2 * identity
         variances, directions = torch.linalg.eigh(scatter)
         log_det = 2 * factor.diagonal().log().sum()
@@ -257,173 +255,12 @@ class _Regression:
             - torch.special.multigammaln(degrees / 2, width)
         )
 
-    def at(self, error_scale: float, strength: float) -> "_Term":
+    def at(self, error_scale: float, strength: float) -> Term:
         """Return the posterior at one error scale and strength."""
         scale = self.variances + strength * error_scale**2
-        return _Term(
+        return Term(
             coefficients=self.coefficients,
             row_factor=self.row_factor,
             error_factor=self.directions * scale.sqrt(),
             degrees=strength + len(scale) + 1 + self.num_pairs,
         )
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Term:
-    r"""The posterior at one setting of the hyper-parameters.
-
-    Attributes:
-        coefficients: Mean of :math:`(A, b)^\top`, shape ``(l + 1, l)``.
-        row_factor: Lower Cholesky factor of the covariance of its rows.
-        error_factor: L, with :math:`L L^\top` the scale of the inverse Wishart
-            distribution of :math:`\Sigma`, shape ``(l, l)``.
-        degrees: Its degrees of freedom.
-    """
-
-    coefficients: Tensor
-    row_factor: Tensor
-    error_factor: Tensor
-    degrees: float
-
-    def sample(self, count: int) -> tuple[Tensor, Tensor, Tensor]:
-        r"""Draw :math:`A`, :math:`b` and :math:`\Sigma`."""
-        width, like = len(self.error_factor), self.error_factor
-        # Bartlett: T T' is Wishart, and with L L' the scale, L (T T')^-1 L' is inverse
-        # Wishart.
-        degrees = self.degrees - torch.arange(width).to(like)
-        triangle = torch.randn(count, width, width).to(like).tril(-1)
-        triangle = triangle + torch.diag_embed(Chi2(degrees).sample((count,)).sqrt())
-        identity = torch.eye(width).to(like).expand_as(triangle)
-        inverse = torch.linalg.solve_triangular(triangle, identity, upper=False)
-        factor = self.error_factor @ inverse.mT
-        noise = torch.randn(count, *self.coefficients.shape).to(like)
-        coefficients = self.coefficients + self.row_factor @ noise @ factor.mT
-        return coefficients[:, :-1].mT, coefficients[:, -1], factor @ factor.mT
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Discrepancy:
-    """The posterior of gain, offset and error, averaged over the hyper-parameters.
-
-    Attributes:
-        terms: The posterior at each setting of the hyper-parameters that matters.
-        shares: Their shares of the evidence, which sum to one.
-        noise: The covariance C of simulations at one parameter, shape ``(l, l)``.
-        probability_of_none: How probable it is that the simulator is right.
-        log_evidence: Log density of the pairs under a discrepancy.
-        log_evidence_of_none: The same under a simulator that is right.
-        num_pairs: Pairs behind it.
-    """
-
-    terms: tuple[_Term, ...] = field(repr=False)
-    shares: Tensor = field(repr=False)
-    noise: Tensor = field(repr=False)
-    probability_of_none: float
-    log_evidence: float
-    log_evidence_of_none: float
-    num_pairs: int
-
-    @torch.no_grad()
-    def sample(
-        self,
-        num_draws: int,
-        *,
-        smallest_error: float = 0.01,
-        seed: int | None = None,
-    ) -> "DiscrepancyDraws":
-        r"""Draw gains, offsets and errors.
-
-        A share ``probability_of_none`` of the draws has gain one, offset zero and no
-        error. Of the others the error is what is left of :math:`\Sigma` without the
-        simulator's own noise, :math:`\Sigma' = \Sigma - A C A^\top`, whose eigenvalues
-        are not allowed to be smaller than ``smallest_error`` squared.
-
-        Args:
-            num_draws: Number of draws.
-            smallest_error: Smallest standard deviation of the error.
-            seed: Seed of the draws; None uses torch's state.
-
-        Returns:
-            The draws.
-
-        Raises:
-            InvalidInputError: If an argument is outside its range.
-        """
-        check_integer("num_draws", num_draws)
-        check_not_negative("smallest_error", smallest_error)
-        none = self.probability_of_none
-        shares = torch.cat([(1 - none) * self.shares, self.shares.new_tensor([none])])
-        with seeded(seed):
-            chosen = torch.multinomial(shares, num_draws, replacement=True)
-            *counts, num_none = chosen.bincount(minlength=len(shares)).tolist()
-            parts = [
-                self._corrections(term, count, smallest_error)
-                for term, count in zip(self.terms, counts, strict=True)
-                if count
-            ]
-        parts.append(self._no_correction(num_none))
-        gain, offset, factor = map(torch.cat, zip(*parts, strict=True))
-        return DiscrepancyDraws(gain=gain, offset=offset, error_factor=factor)
-
-    def _corrections(
-        self, term: _Term, count: int, smallest_error: float
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        gain, offset, covariance = term.sample(count)
-        error = covariance - gain @ self.noise @ gain.mT
-        variance, directions = torch.linalg.eigh(error)
-        std = variance.clamp_min(smallest_error**2).sqrt()
-        return gain, offset, directions * std[:, None, :]
-
-    def _no_correction(self, count: int) -> tuple[Tensor, Tensor, Tensor]:
-        width = len(self.noise)
-        return (
-            torch.eye(width).to(self.noise).expand(count, -1, -1),
-            self.noise.new_zeros(count, width),
-            self.noise.new_zeros(count, width, width),
-        )
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class DiscrepancyDraws:
-    r"""Draws of gain, offset and error.
-
-    Attributes:
-        gain: :math:`A`, shape ``(m, l, l)``.
-        offset: :math:`b`, shape ``(m, l)``.
-        error_factor: F with :math:`\Sigma' = F F^\top`, shape ``(m, l, l)``.
-    """
-
-    gain: Tensor
-    offset: Tensor
-    error_factor: Tensor
-
-    def __len__(self) -> int:
-        return len(self.offset)
-
-    def correct(self, z_s: Tensor) -> Tensor:
-        """Return what would be observed in the place of simulations.
-
-        Each simulation is corrected by a draw chosen at random, with an error of its
-        own, so that together they stand for all that is known of the discrepancy.
-
-        Args:
-            z_s: Simulations, shape ``(n, l)``.
-
-        Returns:
-            Shape ``(n, l)``, float64.
-
-        Raises:
-            InvalidInputError: If the shape does not fit or a value is not finite.
-        """
-        z_s = check_batch("z_s", z_s, self.offset.shape[1:])
-        draw = torch.randint(len(self), (len(z_s),)).to(z_s.device)
-        noise = torch.randn(z_s.shape, dtype=torch.double).to(z_s.device)
-        # A matrix for each simulation takes a lot of memory where z is wide.
-        size = max(1, MAX_ENTRIES // z_s.shape[1] ** 2)
-        parts = zip(*(rows.split(size) for rows in (z_s, draw, noise)), strict=True)
-        return torch.cat([self._corrected(*part) for part in parts])
-
-    def _corrected(self, z_s: Tensor, draw: Tensor, noise: Tensor) -> Tensor:
-        moved = (self.gain[draw] @ z_s.double()[..., None])[..., 0]
-        error = (self.error_factor[draw] @ noise[..., None])[..., 0]
-        return moved + self.offset[draw] + error

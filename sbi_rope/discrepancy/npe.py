@@ -1,4 +1,4 @@
-r"""NPE trained on simulations that were corrected by what calibration pairs tell."""
+r"""NPE trained on corrected simulations, as learned from calibration pairs."""
 
 import copy
 from collections.abc import Callable, Sequence
@@ -33,8 +33,9 @@ from sbi_rope.discrepancy.correction import (
     correct_npe,
     network_of,
 )
-from sbi_rope.discrepancy.model import Discrepancy, DiscrepancyModel
+from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.parameters import learn_parameters
+from sbi_rope.discrepancy.posterior import Discrepancy
 from sbi_rope.discrepancy.report import DiscrepancyReport, report_discrepancy
 from sbi_rope.discrepancy.tuning import TUNING, cross_fitted_nets
 from sbi_rope.errors import (
@@ -54,32 +55,34 @@ if TYPE_CHECKING:
 
 __all__ = ["DiscrepancyNPE"]
 
-# Fewer pairs say nothing about an error.
+# The error of the discrepancy cannot be estimated from fewer pairs.
 MIN_PAIRS = 2
 
 
 class DiscrepancyNPE(Method):
-    r"""NPE for reality: trained on simulations with the discrepancy integrated out.
+    r"""NPE for real observations, with the discrepancy of the simulator integrated out.
 
-    A Bayesian linear model says how real observations follow from simulations
-    (:class:`DiscrepancyModel`). It is fitted to the calibration pairs, and NPE is
-    trained on for some seconds, on simulations that are corrected by draws from its
-    posterior. What results is an ordinary amortised posterior, for any observation.
+    A Bayesian linear model describes how real observations follow from simulations
+    (:class:`DiscrepancyModel`). It is fitted to the calibration pairs. Simulations are
+    then corrected by draws from its posterior, and NPE is trained on them for some more
+    seconds. The result is an ordinary amortised posterior for any observation.
 
     What is corrected depends on ``space``:
 
-    - ``"embedding"``, the embedding h(x) of NPE. Only the density behind it is trained.
-    - ``"input"``, x itself, where it is a vector of a few summaries. All of NPE is
-      trained. Better where h throws away what is needed once the simulator is wrong.
+    - ``"embedding"``: the embedding h(x) of NPE. Only the density behind h is trained.
+    - ``"input"``: x itself, if it is a vector of a few summaries. All of NPE is
+      trained. This is better if h discards information that is needed when the
+      simulator is wrong.
     - ``"tuned"``: copies g of h are tuned as RoPE tunes its own, each without one fold
-      of the pairs, and the discrepancy is fitted to what is left between g of the
-      pairs in that fold and h of simulations. The posterior averages over the copies.
-      For large nets that never saw the effect which the simulator lacks.
+      of the pairs. The discrepancy is fitted to the remaining difference between g of
+      the pairs in that fold and h of simulations. The posterior averages over the
+      copies. This is for large nets that have never seen the effect which the simulator
+      lacks.
 
-    Sees simulations and the calibration set. Assumes that the same linear correction
-    holds for all parameters. To be preferred from a handful of pairs on;
+    It uses simulations and the calibration set, and assumes that one linear correction
+    holds for all parameters. It works from a handful of pairs on;
     ``docs/discrepancy.md`` says when it fails. FMPE and NPSE posteriors can be
-    corrected too, apart from ``space="tuned"``.
+    corrected too, except with ``space="tuned"``.
 
     References:
         | Bayesian Calibration of Computer Models (Kennedy and O'Hagan, 2001)
@@ -89,28 +92,30 @@ class DiscrepancyNPE(Method):
         prior: A torch distribution over parameters of shape ``(d,)``.
         density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns. An
             embedding net inside it is copied, never trained in place.
-        simulator: Maps parameters to simulations, batched or not. Without one, the
-            appended simulations take its place.
+        simulator: Maps parameters to simulations, batched or not. If None, the
+            appended simulations are used instead.
         space: What is corrected, see above.
         learn_prior: Whether to learn the distribution of real parameters from those of
-            the pairs, see :func:`~sbi_rope.discrepancy.learn_parameters`. For pairs
-            that are drawn like the observations to be inferred.
+            the pairs, see :func:`~sbi_rope.discrepancy.learn_parameters`. The pairs
+            must then be drawn like the observations to be inferred.
         model: The model of the discrepancy; ``DiscrepancyModel()`` if None.
         num_simulations: Simulations from the prior to train on, if none were appended.
         simulations_per_pair: Simulations at the parameters of each pair.
-        num_steps: Gradient steps. If None, courses of 150 steps for ``"embedding"``
-            and ``"tuned"`` and of 400 for ``"input"``, until one gains less than .01.
-        learning_rate: Of Adam, at the start; 5e-3 and 2e-3 for these if None.
-        num_folds: Copies g with ``space="tuned"``, at most as many as pairs.
-        finetuner: How they are tuned; with rehearsal, at a learning rate of 3e-3, if
-            None.
+        num_steps: Gradient steps. If None, NPE is trained in courses of 150 steps (400
+            with ``"input"``), until a course lowers the loss by less than 0.01.
+        learning_rate: Learning rate of Adam at the start of a course; 5e-3 if None
+            (2e-3 with ``"input"``).
+        num_folds: The number of copies g with ``space="tuned"``; at most one for each
+            pair.
+        finetuner: How the copies are tuned. If None, with rehearsal and a learning rate
+            of 3e-3.
         npe_training: How NPE is trained; ``Training()`` if None.
         device: Where to train; data on other devices is moved there.
 
     Raises:
         InvalidTypeError: If an argument has the wrong type.
-        InvalidInputError: If an argument is outside its range, or, in ``train``, x is
-            no vector with ``space="input"``.
+        InvalidInputError: If an argument is outside its range. In ``train``, if x is
+            not a vector with ``space="input"``.
         SimulationError: In ``train``, if the simulator fails.
     """
 
@@ -178,13 +183,13 @@ class DiscrepancyNPE(Method):
         Args:
             posterior: What ``NPE(...).build_posterior()`` of sbi returns, or the
                 posterior of MNPE, FMPE or NPSE. It is copied and never changed.
-            simulations: Instead of ``simulator``, or beside it, pairs (theta, x) drawn
-                from the prior to train on.
-            **options: Keyword arguments of the constructor, except for ``device`` and
-                what concerns the training of NPE.
+            simulations: Pairs (theta, x) to train on, with theta drawn from the prior.
+                They can replace ``simulator`` or be given together with it.
+            **options: Keyword arguments of the constructor, except ``device`` and those
+                of the training of NPE.
 
         Raises:
-            UnsupportedPosteriorError: If it is not a plain amortised posterior.
+            UnsupportedPosteriorError: If the posterior is not a plain amortised one.
             InvalidInputError: If an option would have no effect.
         """
         method = super().from_posterior(posterior, **options)
@@ -199,7 +204,7 @@ class DiscrepancyNPE(Method):
 
     @property
     def _ignores_simulations(self) -> bool:
-        return False  # they are trained on, beside a simulator too
+        return False  # with a simulator too, they are what NPE is trained on
 
     @property
     def discrepancy(self) -> Discrepancy:
@@ -219,10 +224,10 @@ class DiscrepancyNPE(Method):
         seed: int | None = 0,
         show_progress_bars: bool = True,
     ) -> DiscrepancyReport:
-        """Say what is wrong with the simulator, summary by summary; print the result.
+        """Compare simulations with real observations, summary by summary.
 
-        Needs no training, and no simulations beside a simulator. It speaks of x itself,
-        whatever ``space`` is.
+        The method need not be trained, and with a simulator it needs no appended
+        simulations. The report is about x itself, whatever ``space`` is. Print it.
 
         Args:
             x_names: Names of the entries of x; numbered if None.
@@ -231,7 +236,8 @@ class DiscrepancyNPE(Method):
             show_progress_bars: Whether to show the progress of slow simulations.
 
         Returns:
-            Gain, shift and error of each summary with 95 % intervals, in units of x.
+            The gain, shift and error of each summary with 95 % intervals, in the units
+            of x.
 
         Raises:
             NotReadyError: If there are fewer than two pairs, or no simulations.
@@ -246,8 +252,8 @@ class DiscrepancyNPE(Method):
         _, x = self._data.calibration
         if x.ndim != 2:
             raise InvalidInputError(
-                "Expected observations of shape (n, l), a summary in each column; got "
-                f"{tuple(x.shape)}. Reduce x to summaries with names first."
+                "Expected observations of shape (n, l), with a summary in each column; "
+                f"got {tuple(x.shape)}. Reduce x to summaries with names first."
             )
         with seeded(seed):
             source = self._source(x)
@@ -338,7 +344,7 @@ class DiscrepancyNPE(Method):
         self._discrepancy = correction.discrepancy
         if self.space != "tuned":
             return posterior_from(npe, correction.estimator), correction.history
-        # Entries that are constant in h need not be so in g.
+        # An entry that is constant in h can vary in g.
         nets = [nn.Sequential(net, correction.constants) for net in nets]
         return self._averaged(correction.estimator, nets), correction.history
 
@@ -347,7 +353,7 @@ class DiscrepancyNPE(Method):
         source: SimulationSource,
         show_progress_bars: bool,  # noqa: FBT001
     ) -> tuple[Tensor, Tensor]:
-        """Return simulations from the prior: those appended, or new ones."""
+        """Return simulations from the prior: the appended ones, or else new ones."""
         if self._data.count("simulations"):
             return self._data.simulations
         return source.kept(self.num_simulations, progress=show_progress_bars)
@@ -361,7 +367,7 @@ class DiscrepancyNPE(Method):
 def _check_density(estimator: Any) -> None:
     if not isinstance(estimator, ConditionalDensityEstimator):
         raise UnsupportedPosteriorError(
-            "Expected an estimator with a density with space='tuned', whose posterior "
-            f"is a mixture; got {type(estimator).__name__}. Use space='embedding', or "
-            "NPE instead of FMPE or NPSE."
+            "Expected an estimator with a density, because the posterior with "
+            f"space='tuned' is a mixture; got {type(estimator).__name__}. Use "
+            "space='embedding', or train NPE instead of FMPE or NPSE."
         )

@@ -12,17 +12,19 @@ from sbi_rope.errors import InvalidInputError
 
 __all__ = ["ParameterDistribution", "learn_parameters"]
 
-# How many pairs the prior's mean and covariance are worth; averaged by evidence.
+# The prior's mean and covariance count as much as this number of pairs. The results are
+# averaged, weighted by their evidence.
 STRENGTHS = (2.0, 5.0, 10.0, 30.0, 100.0)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ParameterDistribution:
-    """Which simulations from the prior have parameters like the real ones.
+    """Probabilities that make simulations from the prior follow the real parameters.
 
     Attributes:
-        probabilities: Of each simulation, shape ``(n,)``; they sum to one.
-        probability_of_prior: How probable it is that the prior is right as it is.
+        probabilities: The probability of each simulation, shape ``(n,)``; they sum to
+            one.
+        probability_of_prior: The probability that real parameters follow the prior.
     """
 
     probabilities: Tensor
@@ -30,39 +32,42 @@ class ParameterDistribution:
 
     @property
     def effective_sample_size(self) -> float:
-        """How many equally probable simulations would be worth as much."""
+        """The number of equally probable simulations with the same precision."""
         return float(1.0 / self.probabilities.square().sum())
 
 
 def learn_parameters(theta_cal: Tensor, theta: Tensor) -> ParameterDistribution:
-    r"""Weigh simulations by where the parameters of the calibration pairs are.
+    r"""Weight simulations so that their parameters are distributed like those of pairs.
 
-    Each parameter is replaced by its normal score u under the prior, so that any prior
-    is a normal distribution :math:`\mathcal N(0, R)` but for how its parameters depend
-    on each other, which R states to first order. Parameters in reality follow
+    Each parameter is replaced by its normal score u under the prior. Any prior is then
+    close to the normal distribution :math:`\mathcal N(0, R)`, with R the correlation of
+    the scores. Real parameters are modelled as
 
     .. math::
         u \sim \mathcal N(\mu, \Lambda), \quad
         \Lambda \sim \mathrm{IW}(c\, R, c + d + 1), \quad
         \mu \mid \Lambda \sim \mathcal N(0, \Lambda / c),
 
-    with the evidence of each c as its share, or the prior as it is, which is one half
-    probable before any pair is seen. The predictive density of the former is a Student
-    t, and simulations from the prior are drawn with probabilities proportional to
+    averaged over values of c by their evidence. The alternative is that real parameters
+    follow the prior, with a probability of one half before any pair is seen and
+    :math:`\pi` afterwards. The predictive density of the model is a mixture t(u) of
+    Student t densities, and simulations from the prior are drawn with probabilities
+    proportional to
 
     .. math::
         \pi + (1 - \pi)\, t(u) / \mathcal N(u; 0, R) .
 
     Args:
-        theta_cal: Parameters of the pairs, shape ``(n_c, d)``. Those that appear more
-            than once count once: several recordings of a person are one draw.
-        theta: Parameters of simulations from the prior, shape ``(n, d)``, two or more.
+        theta_cal: Parameters of the pairs, shape ``(n_c, d)``. Parameters that appear
+            more than once count once, because several recordings of one person are one
+            draw from the distribution.
+        theta: Parameters of at least two simulations from the prior, shape ``(n, d)``.
 
     Returns:
         The probabilities of the simulations.
 
     Raises:
-        InvalidTypeError: If one of them is not a tensor.
+        InvalidTypeError: If an argument is not a tensor.
         InvalidInputError: If the shapes do not fit or a value is not finite.
     """
     theta = check_tensor("theta", theta)
@@ -75,7 +80,7 @@ def learn_parameters(theta_cal: Tensor, theta: Tensor) -> ParameterDistribution:
     theta_cal = check_batch("theta_cal", theta_cal, theta.shape[1:]).unique(dim=0)
     u_cal, u = normal_scores(theta_cal, theta), normal_scores(theta, theta)
     correlation = torch.atleast_2d(u.T.cov())
-    # Parameters that depend on each other exactly, such as those of one category.
+    # The small number keeps R positive definite if a parameter is a function of others.
     correlation = correlation + 1e-6 * torch.eye(len(correlation)).to(u)
     normal = MultivariateNormal(torch.zeros_like(u[0]), correlation)
     fits = [_fit(u_cal, u, correlation, strength) for strength in STRENGTHS]
@@ -93,14 +98,14 @@ def learn_parameters(theta_cal: Tensor, theta: Tensor) -> ParameterDistribution:
 
 
 def normal_scores(theta: Tensor, reference: Tensor) -> Tensor:
-    """Map each parameter to the normal quantile of its rank among those of a reference.
+    """Map each parameter to the normal quantile of its rank in a reference sample.
 
     Args:
         theta: Shape ``(m, d)``.
         reference: Draws from the prior, shape ``(n, d)``.
 
     Returns:
-        Shape ``(m, d)``, float64; equal values share the middle of their ranks.
+        Shape ``(m, d)``, float64. Equal values get the middle of their ranks.
     """
     ordered = reference.double().T.contiguous().sort(dim=1).values
     values = theta.double().T.contiguous()
@@ -113,12 +118,13 @@ def normal_scores(theta: Tensor, reference: Tensor) -> Tensor:
 def _fit(
     u_cal: Tensor, u: Tensor, correlation: Tensor, strength: float
 ) -> tuple[Tensor, Tensor]:
-    """Return the log evidence at one strength, and log predictive densities at u."""
+    """Return the log evidence at one strength, and the log predictive density at u."""
     n, d = u_cal.shape
     degrees, scale = strength + d + 1, strength * correlation
     average = u_cal.mean(dim=0)
     centred = u_cal - average
-    # The conjugate formulas of a normal distribution with unknown mean and covariance.
+    # These are the conjugate formulas for a normal distribution with unknown mean and
+    # covariance.
     total = strength + n
     new_degrees = degrees + n
     new_scale = scale + centred.T @ centred

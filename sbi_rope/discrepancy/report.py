@@ -1,4 +1,4 @@
-"""What calibration pairs say about a simulator, summary by summary."""
+"""The discrepancy between a simulator and reality, summary by summary."""
 
 import math
 from collections.abc import Sequence
@@ -10,17 +10,18 @@ from torch import Tensor
 
 from sbi_rope._simulations import Moments
 from sbi_rope._standardisation import Standardisation
-from sbi_rope.discrepancy.model import Discrepancy, DiscrepancyModel
+from sbi_rope.discrepancy.model import DiscrepancyModel
+from sbi_rope.discrepancy.posterior import Discrepancy
 from sbi_rope.errors import InvalidInputError
 
 __all__ = ["DiscrepancyReport", "Interval", "SummaryDiscrepancy", "report_discrepancy"]
 
 NUM_DRAWS = 4000
-# How often one of the pairs, by chance, seems not to fit a summary of the others.
+# The probability that a summary without outliers is reported to have one.
 FALSE_ALARMS = 0.01
-# A standard deviation from a median distance is worth this share of the pairs.
+# The efficiency of a standard deviation that is estimated from a median distance.
 EFFICIENCY = 0.37
-# With fewer pairs nobody can tell which of them is the odd one.
+# With fewer pairs one cannot tell which of them is the outlier.
 MIN_PAIRS_FOR_OUTLIERS = 10
 
 
@@ -30,8 +31,8 @@ class Interval:
 
     Attributes:
         median: The estimate.
-        low: Lower end.
-        high: Upper end.
+        low: Lower end of the interval.
+        high: Upper end of the interval.
     """
 
     median: float
@@ -62,14 +63,14 @@ class SummaryDiscrepancy:
         name: Name of the summary.
         gain: a, without a unit.
         shift: b, in the units of x.
-        error: s, in the units of x, beside the noise of the simulator.
+        error: s, in the units of x. It comes in addition to the simulator's noise.
         size: Typical difference between a simulation and its correction, the root of
             :math:`E[(b + (a - 1)(x_s - \bar x))^2] + s^2`, in standard deviations of
             simulations from the prior.
-        probability_of_none: How probable it is that the simulator is right about this
-            summary, if that was as probable as not beforehand.
-        outliers: Rows of calibration pairs that lie further from what the others
-            suggest than the furthest would by chance in 99 of 100 summaries.
+        probability_of_none: The probability that the simulator is right about this
+            summary, with one half before any pair is seen.
+        outliers: Rows of calibration pairs that do not fit the others. In 99 of 100
+            summaries without outliers no pair is so far away by chance.
     """
 
     name: str
@@ -88,15 +89,16 @@ class SummaryDiscrepancy:
 
 @dataclass(frozen=True, kw_only=True)
 class DiscrepancyReport:
-    """What calibration pairs say about a simulator, summary by summary.
+    """The discrepancy of each summary, as estimated from calibration pairs.
 
     Print it, or use :meth:`to_dataframe` and :func:`sbi_rope.plots.discrepancy`.
 
     Attributes:
-        summaries: Of each summary, the one that is most off first.
-        num_pairs: Calibration pairs behind it.
-        constant: Names of summaries that are the same in all simulations, so that
-            nothing can be said about them.
+        summaries: The discrepancy of each summary, from the largest to the smallest.
+            Summaries without a sign of discrepancy are last.
+        num_pairs: The number of calibration pairs.
+        constant: The names of summaries that are the same in all simulations. Nothing
+            can be said about them.
     """
 
     summaries: tuple[SummaryDiscrepancy, ...]
@@ -113,7 +115,7 @@ class DiscrepancyReport:
         )
 
     def as_rows(self) -> list[dict[str, Any]]:
-        """Return a row for each summary, the one that is most off first."""
+        """Return a row for each summary, in the order of ``summaries``."""
         rows = []
         for summary in self.summaries:
             row: dict[str, Any] = {"summary": summary.name}
@@ -195,14 +197,14 @@ def report_discrepancy(
     x_names: Sequence[str] | None = None,
     seed: int = 0,
 ) -> DiscrepancyReport:
-    """Fit the discrepancy of each summary by itself.
+    """Fit the discrepancy of each summary separately.
 
-    Summaries that depend on each other, such as two sensors of one light, cannot share
-    one joint gain without ambiguity. Each by itself is a statement one can check.
+    A joint gain of summaries that depend on each other, such as two sensors of one
+    light, is ambiguous. The gain of a single summary is not, and can be checked.
 
     Args:
         x: Real observations of the calibration pairs, shape ``(n, l)``.
-        moments: Of simulations at their parameters.
+        moments: The moments of simulations at their parameters.
         simulated: Simulations from the prior, shape ``(n_s, l)``.
         model: The model of the discrepancy.
         x_names: Names of the summaries; numbered if None.
@@ -255,8 +257,8 @@ def _summary(
     scale: float,
     seed: int,
 ) -> SummaryDiscrepancy:
-    """Return the statement about one summary, z and mean of shape ``(n, 1)``."""
-    # Of the discrepancy if there is one; how probable that is, is said beside it.
+    """Return the discrepancy of one summary, with z and mean of shape ``(n, 1)``."""
+    # The intervals assume that there is a discrepancy. Its probability is reported too.
     draws = replace(discrepancy, probability_of_none=0.0).sample(
         NUM_DRAWS, smallest_error=0.0, seed=seed
     )
@@ -277,21 +279,23 @@ def _summary(
 
 
 def _outliers(residual: Tensor, noise: float) -> tuple[int, ...]:
-    """Return the rows of outliers; ``noise`` is the standard deviation without any."""
+    """Return the rows of outliers; their standard deviation is at least ``noise``."""
     n = len(residual)
     if n < MIN_PAIRS_FOR_OUTLIERS:
         return ()
     distance = (residual - residual.median()).abs()
-    # The median distance of a normal variable from its median is .674 sd.
+    # The median distance of a normal variable from its median is 0.6745 standard
+    # deviations.
     std = (distance.median() / 0.6745).clamp_min(noise)
     return tuple((distance > _furthest(n) * std).nonzero().flatten().tolist())
 
 
 def _furthest(n: int) -> float:
-    """Return how many standard deviations the furthest of n is away, by chance.
+    """Return the distance that the furthest of n values exceeds with 1 % probability.
 
-    The standard deviation is itself an estimate, so that a Student t takes the place of
-    the normal distribution; its quantile is that of Wallace's approximation.
+    The unit is the standard deviation. Because this is an estimate, the distribution is
+    a Student t and not a normal one. Its quantile is computed by Wallace's
+    approximation.
     """
     level = torch.tensor(1 - FALSE_ALARMS / (2 * n), dtype=torch.double)
     freedom = EFFICIENCY * (n - 1)

@@ -1,4 +1,4 @@
-r"""Amortisation: training a density on corrected simulations."""
+r"""Train a density on corrected simulations."""
 
 from collections.abc import Callable
 from typing import Any
@@ -10,16 +10,16 @@ from sbi_rope._progress import progress_bar
 from sbi_rope._random import seeded
 from sbi_rope._standardisation import Standardisation
 from sbi_rope._training import History
-from sbi_rope.discrepancy.model import DiscrepancyDraws
+from sbi_rope.discrepancy.posterior import DiscrepancyDraws
 
 __all__ = ["train_on_corrected"]
 
 BATCH_SIZE = 500
 CLIP_MAX_NORM = 5.0
-# Steps that one point of the history averages over.
+# Each point of the history averages over so many steps.
 STEPS_PER_POINT = 20
-# A course that improves the loss by less than this, in nats, is the last; it is seen
-# on so many corrected simulations, the same after each course.
+# A course that lowers the loss by less than SETTLED nats is the last. The loss is
+# compared on NUM_COMPARED corrected simulations, which are the same for all courses.
 SETTLED, NUM_COMPARED, MAX_COURSES = 0.01, 2000, 12
 
 
@@ -43,26 +43,28 @@ def train_on_corrected(
         \mathbb E_{\theta, z_s} \mathbb E_{e \mid \Sigma'}
         \bigl[-\log q(\theta \mid A z_s + b + e)\bigr]
 
-    The optimum is the posterior with the discrepancy integrated out. Every step sees
-    other simulations, other draws of the discrepancy and other errors, so that nothing
-    is held out: a network of usual size cannot learn them by heart.
+    The optimum is the posterior with the discrepancy integrated out. Every step draws
+    new rows, new corrections and new errors. A network of usual size does not overfit
+    them, so that no simulations are held out.
 
     Args:
-        density: An estimator of sbi that is conditioned on z; trained in place, in
-            evaluation mode.
+        density: An estimator of sbi that is conditioned on z. It is trained in place,
+            in evaluation mode.
         theta: Parameters from the prior, shape ``(n, d)``.
         z: A simulation of each, shape ``(n, l)``.
-        draws: Of the discrepancy, in the units of ``standardisation``.
-        standardisation: Of z.
-        probabilities: With which each simulation is drawn; None takes all alike.
+        draws: Draws of the discrepancy, in the units of ``standardisation``.
+        standardisation: The mean and standard deviation of z.
+        probabilities: The probability of each simulation to be drawn; None makes them
+            equal.
         num_steps: Gradient steps of a course.
-        until_settled: Whether to add courses until one changes next to nothing. A
-            density that is much too narrow takes several.
-        learning_rate: Of Adam, at the start; it falls to zero like a cosine.
-        show_progress_bars: Whether to show the course of the loss.
+        until_settled: Whether to add courses until one changes almost nothing. A
+            density that is much too narrow at the start needs several.
+        learning_rate: Learning rate of Adam at the start of a course. It falls to zero
+            along a cosine.
+        show_progress_bars: Whether to show the loss during training.
 
     Returns:
-        The losses.
+        The losses, averaged over 20 steps each.
     """
     density.requires_grad_().eval()
     z = standardisation(z.double())
@@ -105,7 +107,7 @@ def _one_course(
         loss.backward()
         nn.utils.clip_grad_norm_(density.parameters(), CLIP_MAX_NORM)
         for parameter in density.parameters():
-            if parameter.grad is not None:  # of what the density says nothing about
+            if parameter.grad is not None:  # a parameter may have no part in the loss
                 parameter.grad.nan_to_num_(0.0, 0.0, 0.0)
         optimizer.step()
         schedule.step()
@@ -116,7 +118,7 @@ def _one_course(
 
 @torch.no_grad()
 def _loss(density: Any, theta: Tensor, corrected: Tensor) -> float:
-    with seeded(0):  # the loss of a vector field is at random times
+    with seeded(0):  # the loss of a vector field draws random times
         return float(density.loss(theta, condition=corrected).mean())
 
 

@@ -1,4 +1,4 @@
-"""Tuned copies of an embedding net, and what they say of pairs they have not seen."""
+"""Tuned copies of an embedding net, and the embeddings of pairs they have not seen."""
 
 import torch
 from torch import Tensor, nn
@@ -11,9 +11,9 @@ from sbi_rope.finetuning import CalibrationFinetuner
 
 __all__ = ["TUNING", "cross_fitted_nets"]
 
-# Rehearsal keeps simulations where h puts them, where the density knows them. The rate
-# and the patience take an eighth of the time of the finetuner's defaults and leave no
-# larger distances, see benchmarks/README.md.
+# With rehearsal, g embeds simulations as h does, so that the density can interpret
+# them. The rate and the patience take an eighth of the time of the finetuner's defaults
+# and do not increase the distances, see benchmarks/README.md.
 TUNING = CalibrationFinetuner(rehearsal=1.0, learning_rate=3e-3, stop_after_epochs=50)
 
 
@@ -29,17 +29,17 @@ def cross_fitted_nets(
 ) -> tuple[list[nn.Module], Tensor]:
     """Tune a copy of h without each fold of the pairs, and embed the fold with it.
 
-    A net puts the pairs that it was tuned on too close to their simulations. What is
-    left of a discrepancy can be seen at other pairs only.
+    A net embeds the pairs that it was tuned on too close to their simulations. Only
+    other pairs show the discrepancy that remains.
 
     Args:
         h: The embedding net of NPE.
         pairs: Parameters, shape ``(n, d)``, and real observations, ``(n, *event)``.
-        moments: Of simulations at these parameters, embedded by h.
-        simulations: Simulations from the prior, to keep where h puts them.
+        moments: The moments of simulations at these parameters, embedded by h.
+        simulations: Simulations from the prior, for rehearsal.
         finetuner: How a copy is tuned.
-        num_folds: Number of copies, at most as many as there are different parameters.
-        show_progress_bars: Whether to show the course of the losses.
+        num_folds: Number of copies. There are at most as many as different parameters.
+        show_progress_bars: Whether to show the losses during training.
 
     Returns:
         The copies, and the embedding of each pair by the copy that has not seen it,
@@ -53,12 +53,12 @@ def cross_fitted_nets(
     if int(groups.max()) == 0:
         raise InvalidInputError(
             "Expected calibration pairs of different parameters with space='tuned', "
-            f"to hold some out; all {len(theta)} have the same. Use "
+            f"so that some can be held out; all {len(theta)} have the same. Use "
             "space='embedding'."
         )
     folds = [rows for rows in split_groups(groups, num_folds) if len(rows)]
     targets = moments.mean.to(x)
-    # They may be in some order.
+    # The simulations may be sorted, and rehearsal takes the first ones.
     simulations = simulations[torch.randperm(len(simulations)).to(simulations.device)]
     nets, z = [], torch.empty_like(targets)
     for held_out in folds:

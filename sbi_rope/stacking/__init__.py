@@ -1,4 +1,4 @@
-"""Stacking: weights over candidate posteriors from held-out calibration pairs."""
+"""Stacking: candidate posteriors, weighted by their scores on held-out pairs."""
 
 from sbi_rope.stacking.candidates import (
     AmortisedCandidate,

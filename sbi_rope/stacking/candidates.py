@@ -1,4 +1,4 @@
-"""What a stack can be made of."""
+"""The kinds of candidates that a stack can be made of."""
 
 import copy
 from abc import ABC, abstractmethod
@@ -53,11 +53,12 @@ class CouplingCandidate:
     Args:
         gamma: As in :class:`~sbi_rope.SinkhornCoupler`.
         tau: As in :class:`~sbi_rope.SinkhornCoupler`.
-        tuned: Whether observations are embedded by the tuned net g, or by h.
-        rehearsal: None for RoPE's own g; a number for one tuned with so much of it, see
-            :class:`~sbi_rope.CalibrationFinetuner`.
-        cost_scale: As in :class:`~sbi_rope.SinkhornCoupler`, but in units of the median
-            distance between simulated embeddings by default.
+        tuned: Whether observations are embedded by the tuned net g. Otherwise they
+            are embedded by h.
+        rehearsal: With None, g is tuned with RoPE's own finetuner. A number replaces
+            its ``rehearsal``, see :class:`~sbi_rope.CalibrationFinetuner`.
+        cost_scale: As in :class:`~sbi_rope.SinkhornCoupler`. By default gamma is in
+            units of the median distance between simulated embeddings.
 
     Raises:
         InvalidInputError: If an argument is outside its range.
@@ -90,21 +91,21 @@ class CouplingCandidate:
 
     @property
     def name(self) -> str:
-        """The method with its setting."""
+        """The name of the method and its setting."""
         scale = " of the embedding" if self.cost_scale == "none" else ""
         net = "" if self.rehearsal is None else f", rehearsal {self.rehearsal:g}"
         return f"{self.family} (gamma {self.gamma:g}{scale}, tau {self.tau:g}{net})"
 
 
 class AmortisedCandidate(ABC):
-    """A candidate with a density of any observation.
+    """A candidate whose density is defined for any observation.
 
-    To implement one, give it a name and define :meth:`parts`, which is called with
-    random numbers that follow from the seed of the fold.
+    To implement one, give it a name and define :meth:`parts`. Random numbers that
+    :meth:`parts` draws are seeded by the fold.
 
     Attributes:
-        name: What the report calls it.
-        fixed: Whether it is the same whatever the pairs are.
+        name: Its name in the report.
+        fixed: Whether it does not depend on the calibration pairs.
     """
 
     name: str
@@ -112,16 +113,16 @@ class AmortisedCandidate(ABC):
 
     @property
     def family(self) -> str:
-        """Its name."""
+        """The name of its method; that of the candidate unless overridden."""
         return self.name
 
     def applies_to(self, bench: Workbench) -> bool:
-        """Tell whether these data allow it; if not, the default stack does without."""
+        """Tell whether the data allow it. The default stack leaves it out if not."""
         return True
 
     @abstractmethod
     def parts(self, fold: Fold) -> list[Part]:
-        """Train on the pairs of a fold; return densities that are mixed equally."""
+        """Train on the pairs of a fold; return densities with equal shares."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,13 +130,14 @@ class DensityCandidate(AmortisedCandidate):
     """A posterior of your own, trained on calibration pairs or not.
 
     Args:
-        name: What the report calls it; any but "stack".
-        build: Given RoPE, tuned on the pairs that may be used, and a seed, returns an
-            sbi posterior of NPE. The pairs are ``rope.calibration``, the trained NPE is
-            ``rope.npe``.
-        fixed: Whether the posterior is the same whatever the pairs are, so that it is
-            built once, with a RoPE that has no pairs. Never for one that was trained on
-            the calibration pairs: it has seen the labels that it would be scored by.
+        name: Its name in the report; any name but "stack".
+        build: A function of a RoPE and a seed that returns an sbi posterior of NPE.
+            The RoPE is tuned on the pairs that may be used, ``rope.calibration``. The
+            trained NPE is ``rope.npe``.
+        fixed: Whether the posterior does not depend on the calibration pairs. It is
+            then built once, with a RoPE that has no pairs. Do not use it for a
+            posterior that was trained on the calibration pairs: it would be scored by
+            labels that it has seen.
 
     Example:
         Another trained posterior:
@@ -182,18 +184,21 @@ def _check_name(name: str) -> None:
     if not isinstance(name, str) or not name:
         raise InvalidTypeError(f"Expected a `name` of some letters; got {name!r}.")
     if name == "stack":
-        raise InvalidInputError("Expected another name; 'stack' is that of them all.")
+        raise InvalidInputError(
+            "Expected another name than 'stack', which is the name of the mixture of "
+            "all candidates."
+        )
 
 
 Candidate = CouplingCandidate | AmortisedCandidate
 
 
 def check_candidates(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
-    """Return the candidates of a user.
+    """Check and return the candidates of a user.
 
     Raises:
-        InvalidTypeError: If one is something else.
-        InvalidInputError: If there is none, or two have one name.
+        InvalidTypeError: If one of them is not a candidate.
+        InvalidInputError: If there is none, or two have the same name.
     """
     if not isinstance(candidates, Sequence):
         raise InvalidTypeError(
@@ -224,11 +229,11 @@ def check_candidates(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
 
 
 def _parts_of(name: str, posterior: Any, rope: RoPE) -> list[Part]:
-    """Return the densities of a posterior of NPE, of an average of them, or the prior.
+    """Return the densities of a posterior of NPE, of an average of them, or of a prior.
 
     Raises:
-        UnsupportedPosteriorError: If it has none, or is of other parameters or
-            observations than those of RoPE.
+        UnsupportedPosteriorError: If it has no density, or if its parameters or
+            observations have other shapes than those of RoPE.
     """
     theta, x = rope.calibration
     if isinstance(posterior, PriorPosterior):
@@ -259,8 +264,8 @@ def _equal_parts(name: str, posterior: MixturePosterior) -> list[Part]:
     weights = estimator.weights
     if not posterior.is_amortised or not bool((weights == weights[0]).all()):
         raise UnsupportedPosteriorError(
-            f"Expected the candidate {name!r} to be amortised, and an average of equal "
-            f"weights if it is a mixture; got {type(posterior).__name__}. Couplings "
-            "are CouplingCandidates."
+            f"Expected the candidate {name!r} to be amortised, and a mixture to have "
+            f"equal weights; got {type(posterior).__name__}. For RoPE's coupling, use "
+            "a CouplingCandidate."
         )
     return copy.deepcopy(estimator).parts

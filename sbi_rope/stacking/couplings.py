@@ -1,4 +1,4 @@
-"""RoPE at many settings, each without a fold of the pairs: one part of a mixture."""
+"""RoPE at many settings and in all versions, as one part of a mixture."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -22,8 +22,8 @@ from sbi_rope.stacking.folds import Fold
 
 __all__ = ["FittedCouplings", "fit_couplings"]
 
-# Which net embeds real observations: whether it is tuned, with how much rehearsal, and
-# in which version; None for h, which all versions share.
+# Which net embeds real observations: whether it is tuned, with which rehearsal, and in
+# which version. The version is None for h, which all versions share.
 Net = tuple[bool, float | None, int | None]
 
 
@@ -32,9 +32,9 @@ class FittedCouplings:
     """Couplings of one batch at all settings and in all versions, as one part.
 
     Attributes:
-        part: The part; its shares are equal.
-        settings: Of each coupling, in the order of the part: the name of the candidate,
-            and the version it belongs to; None for all of them.
+        part: The part; the couplings have equal shares.
+        settings: For each coupling, in the order of the part, the name of the candidate
+            and the version it belongs to. The version is None if it belongs to all.
     """
 
     part: Part
@@ -42,7 +42,7 @@ class FittedCouplings:
 
     @property
     def embeddings(self) -> CoupledEmbeddings:
-        """What the part is mixed over."""
+        """The embeddings that the part is a mixture over."""
         return cast("CoupledEmbeddings", self.part.mixing)
 
     def weighted(
@@ -51,8 +51,8 @@ class FittedCouplings:
         """Return the part of some versions, and its weight.
 
         Args:
-            weights: Of each candidate, by name.
-            versions: Numbers of the versions, which count the same.
+            weights: The weight of each candidate, by name.
+            versions: The numbers of the versions; they have equal weights.
         """
         shares = []
         for name, version in self.settings:
@@ -71,16 +71,17 @@ class FittedCouplings:
     def log_probs(
         self, theta: Tensor, x: Tensor, *, log_q: Tensor | None = None
     ) -> Tensor:
-        """Return the log density under each coupling by itself at pairs.
+        """Return the log density of each coupling by itself at pairs.
 
         Args:
             theta: Parameters, shape ``(n, d)``.
             x: Their observations in the batch, shape ``(n, *event)``.
-            log_q: What :meth:`component_log_probs` returns for theta, if it is known.
+            log_q: What :meth:`component_log_probs` returns for theta; it is computed
+                if None.
 
         Returns:
-            Shape ``(n, number of couplings)``, float64, not normalised inside the
-            support of the prior.
+            Shape ``(n, number of couplings)``, float64. It is not normalised inside
+            the support of the prior.
         """
         log_q = self.component_log_probs(theta) if log_q is None else log_q
         rows_of_each = self.embeddings.rows_of_each(self.embeddings.embed(x))
@@ -112,14 +113,14 @@ def fit_couplings(
     require_convergence: bool,
     show_progress_bars: bool,
 ) -> FittedCouplings:
-    """Couple a batch, together with the pairs' observations, at all settings.
+    """Couple a batch, together with the observations of the pairs, at all settings.
 
-    Every observation is coupled in the same way: those to be inferred, and those of the
-    pairs, which say how good each setting is.
+    The observations to be inferred and those of the pairs are coupled together, so that
+    the scores of the pairs hold for the batch.
 
     Args:
         candidates: The settings.
-        versions: What each version may learn from.
+        versions: The folds that each version may learn from.
         x_o: The batch, shape ``(n_o, *event)``.
         num_simulations: As in :meth:`~sbi_rope.RoPE.build_posterior`.
         seed: Seed of the simulations.
@@ -128,10 +129,10 @@ def fit_couplings(
         show_progress_bars: Whether to show the progress of slow simulations.
 
     Raises:
-        CouplingError: If a coupling has not converged and must.
+        CouplingError: If a coupling has not converged, and ``require_convergence``.
     """
     bench = versions[0].bench
-    # Those that RoPE would couple the batch with.
+    # The same number of simulations as RoPE would couple the batch with.
     with seeded(seed):
         theta, simulated = bench.rope.source.from_prior(
             num_simulations,
@@ -189,7 +190,7 @@ def _couple(
     simulated: Tensor,
     rope: RoPE,
 ) -> list[Coupling]:
-    """Couple at every setting; along gamma and tau each starts from its neighbour."""
+    """Couple at every setting; each solution starts from that of its neighbour."""
     found: dict[CouplingCandidate, Coupling] = {}
     for cost_scale in dict.fromkeys(c.cost_scale for c in candidates):
         group = [c for c in candidates if c.cost_scale == cost_scale]

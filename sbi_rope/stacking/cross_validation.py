@@ -1,4 +1,4 @@
-"""Scores of candidates on calibration pairs that they were not trained on."""
+"""The scores of candidates on calibration pairs that they were not trained on."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -38,23 +38,23 @@ class Difference:
 class CrossValidation:
     """The scores of candidates on held-out calibration pairs.
 
-    The candidates have not seen the labels of the fold that they are scored on, and the
+    The candidates have not seen the labels of the fold that they are scored on. The
     weights of the stack that scores a fold are fitted to the scores of the other folds.
-    These come from candidates that have seen the fold: with few pairs the weights
-    depend on its labels by that.
+    The candidates behind those scores have seen the fold, so that with few pairs the
+    weights still depend a little on its labels.
 
     Attributes:
-        names: Of the candidates, K of them.
-        families: The method each is a setting of.
+        names: The names of the K candidates.
+        families: The method of each candidate.
         log_scores: Log density of the true parameters, shape ``(n, K)``, not corrected
             for leakage.
         fold: The fold of each pair, shape ``(n,)``.
-        num_trained_on: Pairs that the candidates were trained on, on average, rounded
-            down.
-        stack_scores: Log density of each pair under the stack, normalised inside the
-            support of the prior as the stack's ``log_prob`` is, shape ``(n,)``.
-        levels: The levels of central intervals of the stack that end at the true
-            parameters, shape ``(n, d)``; uniform if it is calibrated.
+        num_trained_on: The mean number of pairs that the candidates were trained on,
+            rounded down.
+        stack_scores: Log density of each pair under the stack, shape ``(n,)``,
+            normalised inside the support of the prior as the stack's ``log_prob`` is.
+        levels: The levels of the stack's central intervals that end at the true
+            parameters, shape ``(n, d)``. They are uniform if the stack is calibrated.
         pseudo_count: As in :func:`stacking_weights`.
     """
 
@@ -84,7 +84,8 @@ class CrossValidation:
     def comparable_stack_scores(self) -> Tensor:
         """Log density of each pair under the stack, not corrected for leakage.
 
-        As the scores of the candidates are, so that they can be compared.
+        The scores of the candidates are not corrected either, so that the two can be
+        compared.
         """
         weights = fold_weights(self.log_scores, self.fold, self.pseudo_count)
         return torch.logsumexp(self.log_scores + weights[self.fold].log(), dim=1)
@@ -97,7 +98,7 @@ class CrossValidation:
     def scores_of(self, name: str) -> Tensor:
         """Return the log scores of a candidate, or of "stack", shape ``(n,)``.
 
-        None is corrected for leakage, so that they can be compared.
+        They are not corrected for leakage, so that they can be compared.
 
         Raises:
             InvalidInputError: If there is no candidate of that name.
@@ -112,14 +113,14 @@ class CrossValidation:
 
         Args:
             name: A candidate, or "stack".
-            other: Another.
+            other: Another candidate, or "stack".
             seed: Seed of the bootstrap over pairs.
 
         Raises:
             InvalidInputError: If there is no candidate of that name.
         """
         difference = self.scores_of(name) - self.scores_of(other)
-        # Where both are minus infinity, neither is better.
+        # Where both scores are minus infinity, neither candidate is better.
         difference = difference.nan_to_num(nan=0.0, posinf=torch.inf, neginf=-torch.inf)
         with np.errstate(invalid="ignore"):  # of infinite means
             means = bootstrap(
@@ -129,15 +130,15 @@ class CrossValidation:
                 method="percentile",
                 rng=np.random.default_rng(seed),
             ).bootstrap_distribution
-        # Quantiles that are one of the means: scipy's own lie between two of them, of
-        # which one may be infinite.
+        # SciPy's own interval interpolates between two means, of which one may be
+        # infinite. These quantiles are always one of the means.
         low, high = np.quantile(means, [0.025, 0.975], method="inverted_cdf")
         return Difference(
             mean=float(difference.mean()), low=float(low), high=float(high)
         )
 
     def as_rows(self) -> list[dict[str, Any]]:
-        """Return a row for each candidate: name, family, weight, score and error."""
+        """Return a row for each candidate: name, family, weight, score, error."""
         scores = self.log_scores
         errors = scores.std(dim=0, correction=1) / len(self) ** 0.5
         return [
@@ -160,7 +161,7 @@ class CrossValidation:
 
 
 def fold_weights(log_scores: Tensor, fold: Tensor, pseudo_count: float) -> Tensor:
-    """Return the weights that the scores of all other folds give, shape ``(F, K)``."""
+    """Return the weights fitted without each of the F folds, shape ``(F, K)``."""
     numbers: Sequence[int] = range(int(fold.max()) + 1)
     return torch.stack(
         [

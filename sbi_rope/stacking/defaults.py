@@ -1,4 +1,4 @@
-"""What a stack is made of unless its user says otherwise."""
+"""The candidates of a stack, unless the user passes others."""
 
 import itertools
 from collections.abc import Sequence
@@ -38,21 +38,23 @@ def default_candidates(
     """Return the prior, NPE, fine-tuned NPE and the discrepancy models.
 
     Args:
-        rope: RoPE with its calibration pairs; leaves out what these do not allow or
-            need, as :func:`stack` does by itself. All if None.
-        couplings: Whether RoPE and OT-only over a grid of gamma and tau take part, and
-            tuning-only; for a stack of a batch of observations.
-        gammas: In units of the median distance between simulated embeddings.
-        taus: Trust in the prior; 0 lets every observation choose by itself.
-        rehearsal: Of a second RoPE over the same grid, whose tuning keeps simulations
-            where they are, see :class:`~sbi_rope.CalibrationFinetuner`; None leaves it
+        rope: A RoPE with its calibration pairs. Candidates that these data do not
+            allow or need are left out, as in :func:`stack`. None returns all.
+        couplings: Whether to add RoPE and OT-only over a grid of gamma and tau, and
+            tuning-only. They are for the stack of a batch of observations.
+        gammas: Values of gamma, in units of the median distance between simulated
+            embeddings.
+        taus: Values of tau, the trust in the prior. With 0 every observation is
+            coupled by itself.
+        rehearsal: The rehearsal of a second RoPE over the same grid, which is tuned
+            with it, see :class:`~sbi_rope.CalibrationFinetuner`. None leaves this RoPE
             out.
 
     Returns:
         The candidates, couplings first.
 
     Raises:
-        InvalidTypeError: If ``rope`` is something else.
+        InvalidTypeError: If ``rope`` is not a RoPE.
         InvalidInputError: If a gamma, a tau or the rehearsal is outside its range.
     """
     gammas, taus = check_numbers("gammas", gammas), check_numbers("taus", taus)
@@ -82,7 +84,7 @@ def default_candidates(
     return (*coupled, *amortised, tuned)
 
 
-# Functions with a name, so that a stack can be pickled.
+# These are functions and not lambdas, so that a stack can be pickled.
 
 
 def _prior(rope: RoPE, seed: int) -> PriorPosterior:

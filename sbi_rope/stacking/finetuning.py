@@ -1,4 +1,4 @@
-"""Fine-tuning on the pairs of a fold, a net without each part of them."""
+"""Fine-tune NPE on the pairs of a fold, but for a part that is held out."""
 
 import copy
 from collections.abc import Iterator
@@ -20,20 +20,20 @@ CLIP_MAX_NORM = 5.0
 
 
 def finetune_without(start: Any, fold: Fold, part: int, *, learning_rate: float) -> Any:
-    r"""Train an estimator on the pairs of a fold, but for one part that is held out.
+    r"""Train an estimator on the pairs of a fold, except for one held-out part.
 
     .. math::
         \min_q \; \sum_{i \notin \text{part}} -\log q(\theta_i \mid x_i)
         \quad\text{until}\quad \sum_{i \in \text{part}} -\log q(\theta_i \mid x_i)
         \quad\text{does not fall any more}
 
-    All parameters are trained in evaluation mode, and the best epoch on the part is
-    kept, the start included. The nets that a fold gets without each of its parts are
-    mixed: what one of them learned by heart the others contradict.
+    All parameters are trained in evaluation mode. The epoch with the lowest loss on the
+    held-out part is kept; this can be the start. A candidate averages the nets that
+    hold out each part of a fold in turn, which reduces the effect of overfitting.
 
     Args:
-        start: An estimator of sbi with a density; it is left as it is.
-        fold: What may be learned from.
+        start: An estimator of sbi with a density; it is not changed.
+        fold: The pairs that may be learned from.
         part: The number of the part to hold out, one of ``fold.used``.
         learning_rate: Of Adam.
 
@@ -43,7 +43,7 @@ def finetune_without(start: Any, fold: Fold, part: int, *, learning_rate: float)
     bench = fold.bench
     train, held_out = bench.rows_of(fold.used - {part}), bench.folds[part]
     estimator = copy.deepcopy(start).requires_grad_()
-    # Parts of a fold are passed over in the same order, whatever was drawn before.
+    # The order of the batches depends on the fold alone, not on what was drawn before.
     order = torch.Generator().manual_seed(fold.seed)
 
     def loss(rows: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""The folds of the calibration pairs, and what their candidates share."""
+"""The folds of the calibration pairs, and what all candidates share."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -33,30 +33,30 @@ __all__ = ["Corrected", "Fold", "Workbench", "draw_seeds"]
 NUM_SIMULATIONS = 20_000
 # Simulations at the parameters of each pair.
 SIMULATIONS_PER_PAIR = 100
-# A vector x with more entries is no list of summaries.
+# A vector x with more entries is not treated as a list of summaries.
 MAX_SUMMARIES = 20
 # Folds of the calibration pairs.
 NUM_FOLDS = 5
-# Parts that a single fold is cut into, to tune without each.
+# A single fold is divided into so many parts, and a net is tuned without each.
 NUM_INNER_FOLDS = 5
 
 
 def draw_seeds(seed: int | None, count: int) -> list[int]:
-    """Return seeds that follow from one, or from torch's state."""
+    """Return seeds that follow from one seed, or from torch's state if it is None."""
     with seeded(seed):
         return torch.randint(2**31, (count,)).tolist()
 
 
 class Workbench:
-    """What the candidates of all folds share.
+    """What all candidates share: folds, simulations, moments and tuned nets.
 
-    Nothing here depends on the labels of a fold but what is drawn or trained for that
-    fold, under a seed of its own.
+    The labels of a fold only affect what is drawn or trained for that fold. It has a
+    seed of its own, so that nothing drawn for other folds changes with these labels.
 
     Args:
         rope: RoPE with all calibration pairs.
-        num_folds: Number of folds, at most as many as there are different parameters.
-        seed: Seed of all that is random.
+        num_folds: Number of folds. There are at most as many as different parameters.
+        seed: Seed of everything random.
         show_progress_bars: Whether to show the progress of slow simulations.
     """
 
@@ -80,7 +80,7 @@ class Workbench:
         self._nets: dict[frozenset[int], nn.Module] = {}
 
     def seed_of(self, folds: frozenset[int]) -> int:
-        """Return the seed of what is drawn for, or trained on, some folds."""
+        """Return the seed of everything drawn for, or trained on, some folds."""
         sequence = np.random.SeedSequence(self._seed, spawn_key=sorted(folds))
         return int(sequence.generate_state(1)[0])
 
@@ -95,12 +95,12 @@ class Workbench:
 
     @cached_property
     def simulations(self) -> tuple[Tensor, Tensor]:
-        """Parameters from the prior and a simulation of each."""
+        """Parameters from the prior, and a simulation of each."""
         return self.rope.source.kept(NUM_SIMULATIONS, progress=self.show)
 
     @cached_property
     def embedded(self) -> Tensor:
-        """The embeddings h(x) of :attr:`simulations`."""
+        """The embeddings h(x) of :attr:`simulations`, shape ``(n_s, l)``."""
         return embed(self.embedding_net, self.simulations[1])
 
     @cached_property
@@ -110,12 +110,13 @@ class Workbench:
 
     @property
     def has_summaries(self) -> bool:
-        """Whether x is a vector of so few entries that each may matter by itself."""
+        """Whether x is a vector of so few entries that it can be corrected itself."""
         return self.x.ndim == 2 and self.x.shape[1] <= MAX_SUMMARIES
 
     @cached_property
     def _moments(self) -> Moments:
-        # Of embeddings and of summaries x side by side, from the same simulations.
+        # Embeddings and summaries x are put side by side, so that both have moments
+        # from the same simulations.
         h = self.embedding_net
         if not self.has_summaries:
             return self._simulated_moments(lambda x: embed(h, x))
@@ -144,7 +145,7 @@ class Workbench:
         )
 
     def moments(self, space: Space) -> Moments:
-        """Return the moments of simulations at all pairs, as ``space`` has them."""
+        """Return moments at all pairs: of x with "input", of h(x) otherwise."""
         if space == "input" and not self.has_summaries:
             return self._moments_of_x
         width = self.embedded.shape[1]
@@ -174,12 +175,12 @@ class Workbench:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Corrected:
-    """An estimator trained on corrected simulations, and the nets it is asked with.
+    """An estimator trained on corrected simulations, and nets for real observations.
 
     Attributes:
         estimator: The estimator.
-        nets: Embedding nets of real observations, over which its density is averaged;
-            none with ``space="input"``, where the estimator has its own.
+        nets: The nets that embed real observations; the density is averaged over them.
+            There is none with ``space="input"``, where the estimator has its own.
     """
 
     estimator: Any
@@ -187,7 +188,7 @@ class Corrected:
 
 
 class Fold:
-    """The pairs that one version of each candidate may learn from.
+    """The pairs that one version of all candidates may learn from.
 
     Args:
         bench: What all folds share.
@@ -214,8 +215,8 @@ class Fold:
     def tuned(self, finetuner: CalibrationFinetuner) -> RoPE:
         """Return RoPE, tuned on these pairs with the settings of a finetuner."""
         bench, targets = self.bench, None
-        # Stored simulations have targets of their own, the paper's, and so has a tuning
-        # that takes another number of simulations.
+        # The moments already hold the targets of the usual tuning. With stored
+        # simulations, or another number of simulations, RoPE computes its own targets.
         is_usual = finetuner.simulations_per_target == SIMULATIONS_PER_PAIR
         if isinstance(bench.rope.source, Simulator) and is_usual:
             targets = bench.moments("embedding").mean.to(bench.embedded)[self.rows]
@@ -223,7 +224,7 @@ class Fold:
         return part.train(seed=self.seed, show_progress_bars=False)
 
     def corrected(self, space: Space, *, learn_prior: bool) -> Corrected:
-        """Return NPE, trained on simulations corrected by what these pairs tell."""
+        """Return NPE trained on simulations that are corrected as these pairs tell."""
         key = (space, learn_prior)
         if key not in self._corrected:
             with seeded(self.seed):
@@ -237,7 +238,7 @@ class Fold:
         if learn_prior:
             probabilities = learn_parameters(theta, theta_s).probabilities
         estimator = estimator_of(bench.npe)
-        # The versions of all folds share h, which none of them changed.
+        # All versions share the same h, because none of them changes it.
         nets = [] if space == "input" else [bench.embedding_net]
         if space == "tuned":
             nets = []
@@ -256,7 +257,8 @@ class Fold:
             space=space,
             model=DiscrepancyModel(),
             probabilities=probabilities,
-            # One course is enough for what held-out pairs will weigh.
+            # A fixed number of steps saves time. If it is too small, the weights show
+            # it.
             num_steps=NUM_STEPS[space],
         )
         return Corrected(
@@ -265,7 +267,7 @@ class Fold:
         )
 
     def _tuned_without(self) -> Iterator[tuple[nn.Module, Tensor]]:
-        """Yield nets tuned on some of the pairs, and the rows of others."""
+        """Yield nets tuned on some pairs, each with rows that it has not seen."""
         bench = self.bench
         if len(self.used) > 1:
             for number in sorted(self.used):
@@ -273,7 +275,7 @@ class Fold:
             return
         split = split_groups(bench.groups[self.rows.cpu()], NUM_INNER_FOLDS)
         parts = [self.rows[part.to(self.rows.device)] for part in split if len(part)]
-        if len(parts) == 1:  # nothing to tune without
+        if len(parts) == 1:  # one person: there are no other pairs to tune on
             yield bench.embedding_net, self.rows
             return
         for number, rows in enumerate(parts):

@@ -1,4 +1,4 @@
-"""The stack of candidates as an sbi posterior."""
+"""The stack of candidates, as an sbi posterior."""
 
 import copy
 from dataclasses import replace
@@ -25,24 +25,26 @@ class StackedPosterior(MixturePosterior):
         = \frac{\mathbf{1}[\theta \in \operatorname{supp} p]}{Z(x)}
         \sum_k w_k \frac1V \sum_v q_k^{(v)}(\theta \mid x),
 
-    with the weights of :func:`stacking_weights`, the versions :math:`q_k^{(v)}` of
-    candidate k, each trained without one fold of the calibration pairs or on all, and
-    Z(x) the mass inside the support of the prior. With couplings among the candidates
-    it belongs to a batch, as RoPE's posterior does; without, it answers any x. It has
-    all methods of :class:`~sbi_rope.MixturePosterior`.
+    Here :math:`w_k` are the weights of :func:`stacking_weights`, and :math:`q_k^{(v)}`
+    are the V versions of candidate k: one trained without each fold of the calibration
+    pairs, and one trained on all pairs. Z(x) is the mass inside the support of the
+    prior. With couplings among the candidates the posterior belongs to a batch, as
+    RoPE's does. Without couplings it answers any x. It has all methods of
+    :class:`~sbi_rope.MixturePosterior`.
 
-    sbi's ``EnsemblePosterior`` is not used: it has no ``log_prob_batched``, corrects
-    each candidate's leakage by itself, which does not end for NPE on misspecified data,
-    and gives all observations of a batch the same number of draws of each candidate.
+    sbi's ``EnsemblePosterior`` is not used, for three reasons. It has no
+    ``log_prob_batched``. It corrects the leakage of each candidate separately, and for
+    NPE on misspecified data this does not end. It draws the same number of samples
+    from a candidate for all observations of a batch.
 
     References:
         | Using Stacking to Average Bayesian Predictive Distributions (Yao et al., 2018)
         | https://arxiv.org/abs/1704.02030
 
     Args:
-        versions: The candidates.
+        versions: The candidates in all versions.
         prior: The prior NPE was trained with.
-        report: What the calibration pairs say about it.
+        report: The held-out scores of the stack and its candidates.
         enable_transform: As in sbi, for ``map()``.
     """
 
@@ -57,7 +59,8 @@ class StackedPosterior(MixturePosterior):
         weights = report.cross_validation.weights.weights
         estimator = versions.estimator(weights)
         if versions.couplings is not None:
-            # The same object, so that both move to a device together.
+            # The same object as in the estimator, so that both move to a device
+            # together.
             couplings = replace(versions.couplings, part=estimator.parts[0])
             versions = replace(versions, couplings=couplings)
         super().__init__(
@@ -73,10 +76,10 @@ class StackedPosterior(MixturePosterior):
 
     @property
     def versions(self) -> Versions:
-        """The candidates, each as trained without each fold of the pairs.
+        """All versions of the candidates.
 
         Raises:
-            InvalidInputError: If it is the posterior of one observation of a batch.
+            InvalidInputError: If this is the posterior of one observation of a batch.
         """
         if self._versions is None:
             raise InvalidInputError(
@@ -89,7 +92,7 @@ class StackedPosterior(MixturePosterior):
 
     @property
     def candidate_weights(self) -> dict[str, float]:
-        """The weight of each candidate by name; they sum to one."""
+        """The weight of each candidate, by name. The weights sum to one."""
         scores = self.report.cross_validation
         return dict(zip(scores.names, scores.weights.weights.tolist(), strict=True))
 
@@ -97,7 +100,7 @@ class StackedPosterior(MixturePosterior):
     def candidate_log_probs(self, theta: Tensor, x: Tensor) -> Tensor:
         """Return the log density of each candidate by itself at pairs.
 
-        Each is the average of its versions, not corrected for leakage.
+        Each density is the average of the versions, not corrected for leakage.
 
         Args:
             theta: Parameters, shape ``(n, d)``.
@@ -107,17 +110,17 @@ class StackedPosterior(MixturePosterior):
             Shape ``(n, K)``, float64, in the order of ``candidate_weights``.
 
         Raises:
-            InvalidInputError: If shapes do not fit, or it is the posterior of one
+            InvalidInputError: If shapes do not fit, or if this is the posterior of one
                 observation of a batch.
-            UnseenObservationError: If it belongs to a batch, an x is not in it, and
-                ``unseen="raise"``.
+            UnseenObservationError: If the posterior belongs to a batch that does not
+                contain an x, and ``unseen="raise"``.
         """
         return self.versions.log_probs(theta, self._batch_of_x(x))
 
     def __getitem__(self, index: int) -> "StackedPosterior":
-        """Return the posterior of one observation, with it as the default x.
+        """Return the posterior of one observation, which is then the default x.
 
-        It knows no other observation of the batch.
+        It does not contain the other observations of the batch.
         """
         view: Any = super().__getitem__(index)
         view._versions = None

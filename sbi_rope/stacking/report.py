@@ -1,4 +1,4 @@
-"""What the calibration pairs say about a stack: did calibration help?"""
+"""The report of a stack: whether calibration helped, and how well it is calibrated."""
 
 import math
 from collections.abc import Sequence
@@ -20,12 +20,12 @@ from sbi_rope.stacking.cross_validation import CrossValidation, Difference
 
 __all__ = ["LearningCurve", "StackingReport"]
 
-# A family with half of the weight is what the stack mostly is.
+# The text says that a stack is mostly one method if this has half of the weight.
 MOSTLY = 0.5
-# Of the intervals whose coverage the text states.
+# The text states the coverage of intervals at this level.
 LEVEL = 0.9
 
-# What a stack is compared with, by the names of candidates, and as the text calls it.
+# The candidates that a stack is compared with, and how the text calls them.
 REFERENCES = {"prior": "the prior", "NPE": "NPE as it was"}
 
 IN_WORDS = {
@@ -45,10 +45,10 @@ class LearningCurve:
     """The held-out score of the stack when it is trained on fewer pairs.
 
     Attributes:
-        num_pairs: Pairs that the candidates were trained on.
-        scores: Mean held-out log score of the stack.
-        standard_errors: Of the scores, from pair to pair. All scores are of the same
-            pairs, so that their differences are surer than that.
+        num_pairs: The numbers of pairs that the candidates were trained on.
+        scores: The mean held-out log score of the stack at each number.
+        standard_errors: The standard error of each score. All scores are means over
+            the same pairs, so that their differences have smaller errors.
     """
 
     num_pairs: tuple[int, ...]
@@ -57,7 +57,7 @@ class LearningCurve:
 
     @classmethod
     def of(cls, parts: Sequence[CrossValidation]) -> "LearningCurve":
-        """Return the curve of cross-validations that trained on more and more pairs."""
+        """Return the curve of cross-validations with increasing training sets."""
         scores = [part.stack_scores for part in parts]
         return cls(
             num_pairs=tuple(part.num_trained_on for part in parts),
@@ -66,10 +66,11 @@ class LearningCurve:
         )
 
     def gain_of_doubling(self) -> float:
-        r"""Return what twice as many pairs would add, if the curve goes on as it did.
+        r"""Return how much twice as many pairs would add to the score, in nats.
 
-        By the line :math:`s(n) = a - b / n`, fitted to all points; of the largest n,
-        the gain is :math:`b / (2 n)`, or 0 if the curve falls.
+        The curve :math:`s(n) = a - b / n` is fitted to all points and extrapolated. At
+        the largest n the gain is :math:`b / (2 n)`, or 0 if the curve falls. It is NaN
+        if there are fewer than two points or a score is not finite.
         """
         inverse = 1.0 / torch.tensor(self.num_pairs, dtype=torch.double)
         scores = torch.tensor(self.scores, dtype=torch.double)
@@ -82,28 +83,28 @@ class LearningCurve:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StackingReport:
-    """Did calibration help, by what, and how far can the stack be trusted?
+    """How well a stack predicts held-out pairs, which methods it uses, and coverage.
 
-    All numbers are of pairs that the candidates were not trained on. The weights of the
-    stack that scores a pair come from the scores of the other folds. The score of the
-    stack is that of its normalised density. Gains compare densities that are not
-    corrected for leakage.
+    All numbers are computed on pairs that the candidates were not trained on. The
+    weights of the stack that scores a pair are fitted to the scores of the other folds.
 
-    Make one with :meth:`of`, which computes the numbers once. Printing a report
+    Make a report with :meth:`of`, which computes all numbers once. Printing a report
     computes nothing.
 
     Attributes:
-        cross_validation: The scores behind it.
-        learning_curve: Of the stack, if it was asked for.
-        score: Mean held-out log score of the stack, and its standard error.
-        comparable_score: The same, not corrected for leakage, as the scores of the
-            candidates are.
-        gains: What the stack gains over each candidate that does not depend on the
-            pairs, by name ("prior" and "NPE", where these are candidates).
-        family_weights: The weight of each method, summed over its settings, from large
-            to small.
-        acauc: Of the stack's central intervals.
-        coverage_error: Of the stack's central intervals.
+        cross_validation: The scores of all candidates and of the stack.
+        learning_curve: The learning curve of the stack, if it was asked for.
+        score: Mean held-out log score of the stack's normalised density, and its
+            standard error.
+        comparable_score: The same without correction for leakage, so that it can be
+            compared with the scores of the candidates.
+        gains: How much higher the stack scores than the candidates "prior" and "NPE",
+            by name, if these are among the candidates. None of the scores is corrected
+            for leakage.
+        family_weights: The weight of each method, summed over its settings, from the
+            largest to the smallest.
+        acauc: ACAUC of the stack's central intervals.
+        coverage_error: Expected coverage error of the stack's central intervals.
         share_inside: Share of the parameters inside their 90 % intervals.
     """
 
@@ -123,11 +124,11 @@ class StackingReport:
         cross_validation: CrossValidation,
         learning_curve: LearningCurve | None = None,
     ) -> "StackingReport":
-        """Compute what there is to say about a stack.
+        """Compute the report of a stack.
 
         Args:
             cross_validation: The scores of its candidates.
-            learning_curve: Of the stack, if it was asked for.
+            learning_curve: The learning curve of the stack, if it was asked for.
         """
         check_instance("cross_validation", cross_validation, CrossValidation)
         check_instance("learning_curve", learning_curve, LearningCurve, optional=True)
@@ -150,7 +151,7 @@ class StackingReport:
 
     @property
     def levels(self) -> Tensor:
-        """Levels of held-out pairs; see :class:`CrossValidation`."""
+        """The levels of held-out pairs, see :class:`CrossValidation`."""
         return self.cross_validation.levels
 
     @property

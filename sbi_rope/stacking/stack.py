@@ -1,4 +1,4 @@
-"""From a RoPE with calibration pairs to a stack, in one call."""
+"""Make a stack from a RoPE with calibration pairs, in one call."""
 
 from collections.abc import Sequence
 from typing import Literal
@@ -20,7 +20,7 @@ from sbi_rope.stacking.trainer import StackTrainer
 
 __all__ = ["cross_validate", "stack"]
 
-# Shares of the folds to train on for the learning curve, beside all but one.
+# The learning curve trains on these shares of the folds, and on all folds but one.
 SMALLER = (0.25, 0.5)
 
 
@@ -39,55 +39,57 @@ def stack(
     seed: int | None = None,
     show_progress_bars: bool = True,
 ) -> StackedPosterior:
-    r"""Weigh corrected, fine-tuned and unchanged NPE by their scores on held-out pairs.
+    r"""Mix candidate posteriors with the weights that score best on held-out pairs.
 
-    Candidates are trained without each fold of the calibration pairs and scored on it,
-    and the posterior is their mixture with the weights that score best
-    (:func:`stacking_weights`). It is deployed as it was scored: each candidate is the
-    average of its versions, one without each fold, and one on all pairs. The held-out
-    score is that of single versions. Their average is better than that in expectation,
-    by Jensen's inequality, for observations like those of the pairs; the version on all
-    pairs is not scored.
+    The calibration pairs are divided into folds. Every candidate is trained without
+    each fold and scored on that fold, and the posterior is the mixture of the
+    candidates with the weights that score best (:func:`stacking_weights`).
 
-    Without ``x_o`` no candidate depends on a batch, and the result answers any
-    observation. With ``x_o``, RoPE and OT-only at many gammas and taus take part, and
-    the result belongs to that batch.
+    The stack is made of the models that were scored. Each candidate is the average of
+    its versions: one for each fold, trained on the other folds, and one trained on all
+    pairs. The held-out score is that of single versions. By Jensen's inequality their
+    average has a higher expected score, for observations like those of the pairs. The
+    version trained on all pairs is not scored.
+
+    Without ``x_o`` no candidate depends on a batch, and the stack answers any
+    observation. With ``x_o``, RoPE and OT-only at many values of gamma and tau take
+    part, and the stack belongs to that batch.
 
     Args:
-        rope: A RoPE with calibration pairs; it needs no training and is left as it is,
-            but counts the simulations that were dropped.
-        x_o: A batch of real observations, shape ``(n_o, *event)``; None for a posterior
-            of any x.
-        candidates: What to stack; :func:`default_candidates` if None: the prior, NPE,
-            fine-tuned NPE and discrepancy models; with ``x_o`` also tuning-only, and
+        rope: A RoPE with calibration pairs. It need not be trained, and it is not
+            changed, except that it counts the simulations that are dropped.
+        x_o: A batch of real observations, shape ``(n_o, *event)``. With None the
+            posterior answers any x.
+        candidates: What to stack. If None, :func:`default_candidates`: the prior, NPE,
+            fine-tuned NPE and discrepancy models, and with ``x_o`` also tuning-only,
             RoPE, RoPE tuned with rehearsal and OT-only at four gammas and three taus.
-        num_folds: Folds of the calibration pairs, 5 if None, at most as many as there
-            are different parameters. Pairs with the same parameters share a fold.
-        num_simulations: Simulations to couple with, as in
+        num_folds: The number of folds, 5 if None, and at most the number of different
+            parameters. Pairs with the same parameters are in the same fold.
+        num_simulations: The number of simulations to couple with, as in
             :meth:`~sbi_rope.RoPE.build_posterior`.
         pseudo_count: Strength of the Dirichlet prior of the weights, in pairs.
-        learning_curve: Whether to train on fewer folds too, so that the report can say
-            what more labels might add; takes about twice the time.
-        unseen: What the posterior of a batch does with an x outside of it: ``"raise"``,
-            or ``"extend"`` each coupling by one row.
+        learning_curve: Whether to train on fewer folds too, so that the report can
+            estimate what more labels would add. It takes about twice the time.
+        unseen: What the posterior of a batch does with an x outside the batch:
+            ``"raise"`` an error, or ``"extend"`` each coupling by one row.
         tail_mass: As in :meth:`~sbi_rope.RoPE.build_posterior`.
         require_convergence: Whether a coupling that has not converged is an error.
         seed: Seed of everything random; None uses the states of torch, NumPy and
             Python.
-        show_progress_bars: Whether to show the folds done.
+        show_progress_bars: Whether to show how many folds are done.
 
     Returns:
-        The stack, an sbi posterior; ``posterior.report`` says what the pairs say about
-        it.
+        The stack, an sbi posterior. Its ``report`` holds the held-out scores, and
+        compares the stack with the prior and with NPE.
 
     Raises:
         NotReadyError: If there are fewer than two pairs with different parameters.
         InvalidInputError: If an argument is outside its range or has the wrong shape,
-            or there are couplings among the candidates without a batch.
+            or if there are couplings among the candidates but no batch.
         UnsupportedPosteriorError: If NPE or a candidate has no density.
         CouplingError: If a coupling has not converged.
-        SamplingError: If the candidates have next to no mass inside the prior's support
-            at a held-out observation.
+        SamplingError: If the candidates have almost no mass inside the support of the
+            prior at a held-out observation.
         SimulationError: If the simulator fails.
     """
     check_choice("unseen", unseen, ("raise", "extend"))
@@ -139,12 +141,13 @@ def cross_validate(
     """Score candidates on calibration pairs that they were not trained on.
 
     Args:
-        rope: As in :func:`stack`, and so are the arguments not listed.
+        rope: As in :func:`stack`.
         x_o: As in :func:`stack`.
         candidates: As in :func:`stack`.
         num_folds: As in :func:`stack`.
-        num_training_folds: Folds to train on for each held out; all others if None.
-            Fewer tell what fewer pairs would have given.
+        num_training_folds: The number of folds to train on for each held-out fold;
+            all others if None. A smaller number shows how the candidates would score
+            with fewer pairs.
         num_simulations: As in :func:`stack`.
         pseudo_count: As in :func:`stack`.
         require_convergence: As in :func:`stack`.
@@ -152,7 +155,7 @@ def cross_validate(
         show_progress_bars: As in :func:`stack`.
 
     Returns:
-        The scores, pair by candidate.
+        The score of each candidate at each pair.
 
     Raises:
         NotReadyError: As in :func:`stack`.

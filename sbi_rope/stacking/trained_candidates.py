@@ -17,14 +17,15 @@ __all__ = ["DiscrepancyCandidate", "FinetunedCandidate"]
 
 @dataclass(frozen=True, kw_only=True)
 class DiscrepancyCandidate(AmortisedCandidate):
-    """NPE on simulations that were corrected by what the pairs tell.
+    """NPE trained on corrected simulations, as learned from the pairs.
 
     See :class:`~sbi_rope.discrepancy.DiscrepancyNPE`.
 
     Args:
-        space: What is corrected.
+        space: What is corrected: the embedding h(x), the input x, or the embedding
+            by tuned nets.
         learn_prior: Whether the distribution of parameters is learned from the pairs.
-            The scores of a stack assume in any case that these are drawn like the
+            The scores of a stack assume in any case that the pairs are drawn like the
             observations to be inferred.
     """
 
@@ -38,7 +39,7 @@ class DiscrepancyCandidate(AmortisedCandidate):
 
     @property
     def name(self) -> str:  # type: ignore[override]
-        """The method with its setting."""
+        """The name of the method and its setting."""
         space = "" if self.space == "embedding" else f" ({self.space})"
         return f"discrepancy{space}" + ("" if self.learn_prior else ", given prior")
 
@@ -48,13 +49,13 @@ class DiscrepancyCandidate(AmortisedCandidate):
         return "discrepancy"
 
     def applies_to(self, bench: Workbench) -> bool:
-        """Tell whether x is a short vector, or there are folds to tune without."""
+        """Tell whether x is a short vector, or there are enough folds to tune."""
         if self.space == "input":
             return _has_summaries(bench)
         return self.space == "embedding" or len(bench.folds) > 2
 
     def parts(self, fold: Fold) -> list[Part]:
-        """Correct NPE."""
+        """Train NPE on corrected simulations; return its density."""
         corrected = fold.corrected(self.space, learn_prior=self.learn_prior)
         estimator = corrected.estimator
         if self.space == "input":
@@ -64,26 +65,31 @@ class DiscrepancyCandidate(AmortisedCandidate):
 
 
 def _has_summaries(bench: Workbench) -> bool:
-    """Whether x is a short vector that an embedding net could lose something of."""
+    """Tell whether x is a short vector and NPE has an embedding net.
+
+    Without a net to lose information, correcting x adds nothing to correcting h(x).
+    """
     net = embedding_of(estimator_of(bench.npe))
     has_net = any(True for _ in net.parameters())
     return bench.has_summaries and has_net
 
 
-# Of fine-tuning, by what is corrected in the start. Trained on the input, a whole
-# network is nearly right already. Chosen on calibration data, see benchmarks/README.md.
+# Learning rates of fine-tuning, by what was corrected in the net that it starts from.
+# With "input" all parameters were trained already, and a smaller rate is enough.
+# Chosen on calibration data, see benchmarks/README.md.
 LEARNING_RATES = {None: 1e-3, "embedding": 1e-3, "tuned": 1e-3, "input": 3e-4}
 
 
 @dataclass(frozen=True, kw_only=True)
 class FinetunedCandidate(AmortisedCandidate):
-    """NPE, as it is or corrected, with all its parameters trained on the pairs.
+    """NPE, unchanged or corrected, whose parameters are then trained on the pairs.
 
-    It is the average of several nets, each of which holds another part of the pairs
-    out to know when to stop.
+    It is the average of several nets. Each of them holds out another part of the
+    pairs, to know when to stop training.
 
     Args:
-        space: None to start from NPE; else what is corrected in the NPE to start from.
+        space: None starts from the unchanged NPE. Otherwise, what is corrected in the
+            NPE that it starts from.
     """
 
     space: Space | None = None
@@ -94,7 +100,7 @@ class FinetunedCandidate(AmortisedCandidate):
 
     @property
     def name(self) -> str:  # type: ignore[override]
-        """The method with its setting."""
+        """The name of the method and its setting."""
         if self.space is None:
             return "fine-tuned NPE"
         return f"{DiscrepancyCandidate(space=self.space).name}, fine-tuned"
@@ -105,16 +111,16 @@ class FinetunedCandidate(AmortisedCandidate):
         return "fine-tuned NPE" if self.space is None else "discrepancy, fine-tuned"
 
     def applies_to(self, bench: Workbench) -> bool:
-        """Tell whether there are parts to hold out, and the start applies."""
+        """Tell whether there are parts to hold out, and the starting NPE applies."""
         start = self.space is None or DiscrepancyCandidate(space=self.space).applies_to(
             bench
         )
         return start and len(bench.folds) > 2
 
     def parts(self, fold: Fold) -> list[Part]:
-        """Train without each part of the pairs."""
+        """Train one net without each part of the pairs."""
         if len(fold.used) < 2:
-            # Nothing can be held out; the start is what there is.
+            # Nothing can be held out, so that NPE is used as it starts.
             if self.space is None:
                 return [part_of(estimator_of(fold.bench.npe))]
             return DiscrepancyCandidate(space=self.space).parts(fold)
@@ -134,6 +140,6 @@ class FinetunedCandidate(AmortisedCandidate):
         corrected = fold.corrected(self.space, learn_prior=True)
         if self.space != "tuned":
             return corrected.estimator
-        # The net that has not seen the part which is held out.
+        # This net has not seen the part that is held out.
         net = corrected.nets[sorted(fold.used).index(number)]
         return with_embedding(corrected.estimator, copy.deepcopy(net))

@@ -1,4 +1,4 @@
-"""How the candidates of a stack are trained and scored, fold by fold."""
+"""Train the candidates of a stack and score them, fold by fold."""
 
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -50,12 +50,12 @@ __all__ = ["StackTrainer"]
 
 # Fewest pairs: one to train on and one to score.
 MIN_PAIRS = 2
-# Samples of each held-out pair behind the calibration of the stack.
+# Samples at each held-out pair, from which the calibration of the stack is computed.
 NUM_SAMPLES = 500
 
 
 class StackTrainer:
-    """Trains and scores all candidates; its arguments are those of :func:`stack`."""
+    """Trains and scores all candidates. The arguments are those of :func:`stack`."""
 
     def __init__(
         self,
@@ -120,7 +120,7 @@ class StackTrainer:
             if isinstance(candidate, DiscrepancyCandidate | FinetunedCandidate)
         ]
         if any(candidate.space == "input" for candidate in corrected):
-            # Before the others are trained.
+            # Raises for images and series, before any candidate is trained.
             network_of(estimator_of(self.bench.npe), "input")
         coupled = any(isinstance(c, CouplingCandidate) for c in chosen)
         if coupled and self.x_o is None:
@@ -131,21 +131,21 @@ class StackTrainer:
         if not coupled and self.x_o is not None:
             raise InvalidInputError(
                 "Expected couplings among the candidates with `x_o`; got none, so that "
-                "nothing depends on the batch. Leave `x_o` out, or add to "
-                "`default_candidates(couplings=True)`."
+                "nothing depends on the batch. Leave `x_o` out, or add couplings, "
+                "such as those of `default_candidates(couplings=True)`."
             )
         return chosen
 
-    @torch.enable_grad()  # whatever the caller's own setting
+    @torch.enable_grad()  # in case the caller has switched gradients off
     def cross_validate(
         self, *, num_training_folds: int | None = None, with_refit: bool = False
     ) -> tuple[Versions, CrossValidation]:
-        """Train on the folds after each fold, and score on it.
+        """Train on the folds that follow each fold, and score on the fold itself.
 
         Args:
-            num_training_folds: Folds to train on; all others if None.
-            with_refit: Whether to add a version that is trained on all pairs. It is
-                not scored.
+            num_training_folds: The number of folds to train on; all others if None.
+            with_refit: Whether to add a version that is trained on all pairs. This
+                version is not scored.
         """
         bench = self.bench
         num_folds = len(bench.folds)
@@ -202,7 +202,7 @@ class StackTrainer:
         fold = torch.empty(len(theta), dtype=torch.long, device=theta.device)
         log_q = None
         if versions.couplings is not None:
-            # The components are the same in all folds.
+            # All folds share the same simulations, and so the same components.
             log_q = versions.couplings.component_log_probs(theta)
         for number, rows in enumerate(bench.folds):
             fold[rows] = number
@@ -215,7 +215,8 @@ class StackTrainer:
         weights = fold_weights(log_scores, fold, self.pseudo_count)
         stack_scores = log_scores.new_empty(len(theta))
         levels = torch.empty_like(theta)
-        # The first part has the same simulations in all folds. Later parts may differ.
+        # The couplings are the first part, and have the same simulations in all folds.
+        # The mass of the other parts inside the prior can differ from fold to fold.
         masses: dict[int, Tensor] = {}
         for number, rows in enumerate(bench.folds):
             shared = dict(masses)
@@ -251,7 +252,7 @@ class StackTrainer:
     def _normalised(
         self, posterior: MixturePosterior, theta: Tensor, x: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return log densities inside the prior's support, and ranks of theta there."""
+        """Return log densities, normalised inside the prior's support, and ranks."""
         try:
             log_prob = posterior.log_prob_batched(theta[None], x)[0]
             with seeded(self.seeds[2]):
@@ -265,9 +266,9 @@ class StackTrainer:
                 )
         except SamplingError as error:
             raise SamplingError(
-                "A stack of these candidates has next to no mass inside the support of "
+                "A stack of these candidates has almost no mass inside the support of "
                 "the prior at a held-out observation, so that it cannot be sampled. "
-                "Add the prior to the candidates, as `default_candidates()` has it."
+                "Add the prior to the candidates: `default_candidates()` contains it."
             ) from error
         return log_prob, ranks
 
@@ -284,15 +285,15 @@ def _check_pairs(count: int) -> None:
 def _check_density(estimator: Any) -> None:
     if not isinstance(estimator, ConditionalDensityEstimator):
         raise UnsupportedPosteriorError(
-            "Expected a RoPE of a posterior with a density, such as that of NPE: the "
-            "density of held-out parameters is what candidates are scored by. Got "
-            f"{type(estimator).__name__}; train NPE instead of FMPE or NPSE."
+            "Expected a RoPE of a posterior with a density, such as that of NPE, "
+            "because candidates are scored by the density of held-out parameters; got "
+            f"{type(estimator).__name__}. Please train NPE instead of FMPE or NPSE."
         )
 
 
 def _checked_observations(x_o: Tensor, rope: RoPE) -> Tensor:
     _, x = rope.calibration
     x_o = check_batch("x_o", x_o, x.shape[1:]).detach().to(x, copy=True)
-    check_finite("x_o", x_o)  # float32 may hold less
+    check_finite("x_o", x_o)  # a large float64 can overflow in float32
     warn_of_far_entries("x_o", x_o, rope.embedding_net)
     return x_o

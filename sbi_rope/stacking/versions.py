@@ -1,4 +1,4 @@
-"""All candidates of a stack, in a version for each fold."""
+"""All candidates of a stack, in one version for each fold."""
 
 import math
 from collections.abc import Sequence
@@ -25,19 +25,20 @@ def train_version(
     """Return the densities of amortised candidates by name.
 
     Args:
-        candidates: Of which those are trained that are amortised.
+        candidates: All candidates; the amortised ones among them are trained.
         fold: The pairs to train on.
-        fixed: Whether to take those that depend on no pairs, or all others.
+        fixed: Whether to return the candidates that do not depend on the pairs.
+            Otherwise the others are returned.
 
     Raises:
-        InvalidInputError: If a candidate returns none.
+        InvalidInputError: If a candidate returns no density.
     """
     trained: dict[str, list[Part]] = {}
     for candidate in candidates:
         if not isinstance(candidate, AmortisedCandidate) or candidate.fixed != fixed:
             continue
-        # Whoever forgets the seed, or looks at a prior by drawing from it, leaves no
-        # trace.
+        # A candidate that ignores its seed still does not change the caller's random
+        # state.
         with seeded(fold.seed):
             trained[candidate.name] = list(candidate.parts(fold))
         if not trained[candidate.name]:
@@ -49,16 +50,16 @@ def train_version(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Versions:
-    """Every candidate as it was trained without each fold of the pairs.
+    """All candidates in all versions: trained without each fold, and on all pairs.
 
-    A stack is deployed as it was scored: each candidate is the average of its versions,
-    weighted by what held-out pairs say of them.
+    A stack is made of the models that were scored: each candidate is the average of its
+    versions, and the candidates are weighted by their held-out scores.
 
     Attributes:
-        names: Of the candidates, K of them.
-        fixed: The densities of candidates that are the same in all versions.
+        names: The names of the K candidates.
+        fixed: The densities of the candidates that are the same in all versions.
         trained: For each version, the densities of the other amortised candidates.
-        couplings: RoPE and OT-only in all versions; None without.
+        couplings: RoPE and OT-only in all versions; None if there is no batch.
         tail_mass: As in :class:`~sbi_rope.mixture.MixtureEstimator`.
     """
 
@@ -74,8 +75,8 @@ class Versions:
         """Return the mixture of some versions.
 
         Args:
-            weights: Of the candidates, shape ``(K,)``; they sum to one.
-            numbers: Of the versions, which count the same; all if None.
+            weights: The weights of the candidates, shape ``(K,)``; they sum to one.
+            numbers: The numbers of the versions, which have equal weights; all if None.
         """
         numbers = range(len(self.trained)) if numbers is None else numbers
         of_name = dict(zip(self.names, weights.tolist(), strict=True))
@@ -104,7 +105,8 @@ class Versions:
     ) -> tuple[list[Part], list[float]]:
         """Return the densities of a candidate in some versions, and their shares.
 
-        Versions count the same, and so do the densities of each. No coupling has them.
+        Versions have equal shares, and so have the densities within each version.
+        Couplings are not among them.
         """
         if name in self.fixed:
             versions = [self.fixed[name]]
@@ -134,7 +136,7 @@ class Versions:
         Args:
             theta: Parameters, shape ``(n, d)``.
             x: Their observations, shape ``(n, *event)``.
-            numbers: Of the versions to average over; all if None.
+            numbers: The numbers of the versions to average over; all if None.
             log_q: As in :meth:`FittedCouplings.log_probs`.
 
         Returns:
@@ -142,8 +144,8 @@ class Versions:
 
         Raises:
             InvalidInputError: If shapes do not fit or a value is not finite.
-            UnseenObservationError: If there are couplings, and an x is not in their
-                batch, and they do not extend.
+            UnseenObservationError: If there are couplings, an x is not in their batch,
+                and ``unseen="raise"``.
         """
         numbers = range(len(self.trained)) if numbers is None else numbers
         theta = check_batch("theta", theta, self._any.density.input_shape).to(DTYPE)

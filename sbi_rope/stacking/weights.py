@@ -1,4 +1,4 @@
-"""Weights of candidates from the log scores of held-out pairs."""
+"""The weights of candidates, from the log scores of held-out pairs."""
 
 import math
 from dataclasses import dataclass
@@ -20,15 +20,15 @@ __all__ = ["StackingWeights", "stacking_weights"]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StackingWeights:
-    """The weights of candidates, with the evidence that they are the best.
+    """The weights of candidates, and a bound on how far they are from the best.
 
     Attributes:
         weights: On the simplex, shape ``(K,)``, float64.
-        score: The mean log score of the stack over the pairs it was fitted to. It is
-            optimistic: the weights have seen these pairs.
-        gap: The objective is at most this far below its maximum, in nats of the sum
-            over pairs.
-        num_iterations: Iterations of EM.
+        score: The mean log score of the stack over the pairs that the weights were
+            fitted to. It is too high for new pairs.
+        gap: The objective, a sum over pairs, is at most this far below its maximum, in
+            nats.
+        num_iterations: The number of iterations of EM.
         converged: Whether the gap is at most the tolerance.
     """
 
@@ -54,25 +54,25 @@ def stacking_weights(
         \max_{w \in \Delta} \; \sum_{i=1}^{n} \log \sum_{k=1}^{K} w_k e^{\ell_{ik}}
         + \frac{c}{K} \sum_{k=1}^{K} \log w_k ,
 
-    the mode under a Dirichlet prior with all parameters :math:`1 + c / K`. c is worth
-    so many pairs that know nothing: with few pairs it keeps the weights apart from a
-    single candidate, with many it is forgotten. The problem is concave, and for c > 0
-    its answer unique. It is solved by EM,
+    the mode under a Dirichlet prior with all parameters :math:`1 + c / K`. The prior
+    counts as c pairs at which all candidates share the responsibility equally. With few
+    pairs it prevents that a single candidate gets all the weight; with many pairs its
+    effect vanishes. The problem is concave, and for c > 0 the solution is unique. EM
+    starts from equal weights and repeats
     :math:`w_k \leftarrow (\sum_i r_{ik} + c / K) / (n + c)` with the responsibilities
-    :math:`r_{ik} = w_k e^{\ell_{ik}} / \sum_m w_m e^{\ell_{im}}`, which starts from
-    equal weights.
+    :math:`r_{ik} = w_k e^{\ell_{ik}} / \sum_m w_m e^{\ell_{im}}`.
 
     References:
         | Using Stacking to Average Bayesian Predictive Distributions (Yao et al., 2018)
         | https://arxiv.org/abs/1704.02030
 
     Args:
-        log_scores: :math:`\ell`, shape ``(n, K)``; minus infinity is allowed, NaN and
-            plus infinity are not. A pair that no candidate gives a density says nothing
-            about the weights; it earns a warning.
+        log_scores: :math:`\ell`, shape ``(n, K)``. Minus infinity is allowed, NaN and
+            plus infinity are not. A pair that has minus infinity for all candidates is
+            left out, with a warning.
         pseudo_count: c, at least 0.
-        tolerance: Largest ``gap`` called converged.
-        max_iterations: Iterations after which to stop and say so.
+        tolerance: EM has converged when ``gap`` is at most this.
+        max_iterations: EM stops after so many iterations, converged or not.
 
     Returns:
         The weights.
@@ -91,18 +91,19 @@ def stacking_weights(
     check_not_negative("pseudo_count", pseudo_count)
     check_positive("tolerance", tolerance)
     check_integer("max_iterations", max_iterations)
-    # Relative to the best candidate of each pair, so that nothing over- or underflows.
+    # Relative to the best candidate at each pair, so that exp does not over- or
+    # underflow.
     density = (scores - scores.max(dim=1, keepdim=True).values).exp()
     n, num_candidates = density.shape
     share = pseudo_count / num_candidates
     weights = density.new_full((num_candidates,), 1.0 / num_candidates)
     gap, iteration = math.inf, 0
     for iteration in range(max_iterations + 1):
-        # What a candidate adds to the sum of log scores, for each unit of weight.
+        # The derivative of the objective by the weight of each candidate.
         gradient = (density / (density @ weights)[:, None]).sum(dim=0)
         if share:
             gradient = gradient + share / weights
-        # The objective is concave: it lies below its tangent.
+        # The objective is concave, so that it lies below its tangent everywhere.
         gap = float(gradient.max()) - (n + pseudo_count)
         if gap <= tolerance or iteration == max_iterations:
             break
@@ -135,7 +136,7 @@ def _checked_scores(log_scores: Tensor) -> Tensor:
     if not known.all():
         warn_user(
             f"{int((~known).sum())} of {len(scores)} held-out pairs have density zero "
-            "under every candidate and say nothing about their weights. Add the prior "
-            "as a candidate."
+            "under every candidate and are left out of the weights. Add the prior as a "
+            "candidate."
         )
     return scores[known]

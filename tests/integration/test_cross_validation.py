@@ -1,4 +1,4 @@
-"""Scores of candidates that no held-out label has touched."""
+"""Scores of candidates do not depend on the labels that they are scored by."""
 
 import functools
 import math
@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from sbi_rope import CalibrationFinetuner, RoPE
+from sbi_rope._sbi import embed, embedding_of
 from sbi_rope._training import groups_of
 from sbi_rope.metrics import acauc_of
 from sbi_rope.mixture import MixturePosterior
@@ -16,6 +17,7 @@ from sbi_rope.stacking import (
     AmortisedCandidate,
     CrossValidation,
     DensityCandidate,
+    FinetunedCandidate,
     StackedPosterior,
     stacking_weights,
     trained_candidates,
@@ -26,7 +28,6 @@ from tests import problems
 from tests.stacks import (
     CANDIDATES,
     FITTED,
-    NPE,
     NUM_PAIRS,
     PRIOR,
     QUIET,
@@ -54,36 +55,30 @@ def scores_of(posterior: StackedPosterior) -> CrossValidation:
 # --- folds ---
 
 
-@pytest.mark.parametrize(
-    ("num_pairs", "num_folds", "sizes"),
-    [(20, None, [4] * 5), (13, 5, [2, 2, 3, 3, 3]), (4, 5, [1] * 4), (9, 2, [4, 5])],
-)
-def test_every_pair_is_held_out_once_and_trains_all_other_folds(
-    num_pairs: int, num_folds: int | None, sizes: list[int]
-) -> None:
+def test_every_pair_is_held_out_once_and_trains_all_other_folds() -> None:
     seen: list[Tensor] = []
 
     def build(rope: RoPE, seed: int) -> Any:
         seen.append(rope.calibration[0])
         return rope.npe
 
-    pairs = problem(num_pairs, seed=1)
     spy = DensityCandidate(name="spy", build=build)
-    scores = validated(rope_of(pairs), candidates=[spy], num_folds=num_folds)
-    assert sorted(scores.fold.bincount().tolist()) == sizes
-    assert scores.fold.tolist() != sorted(scores.fold.tolist())
-    for number, part in enumerate(seen):
-        expected = pairs[0][scores.fold != number]
-        assert {*map(tuple, part.tolist())} == {*map(tuple, expected.tolist())}
-        assert len(part) == len(expected)
-    assert len(seen) == scores.num_folds
-
-
-def test_there_may_be_as_many_folds_as_pairs() -> None:
-    scores = validated(
-        rope_of(problem(70, seed=1)), candidates=[PRIOR, NPE], num_folds=100
-    )
-    assert scores.num_folds == 70
+    # By default there are five folds, and never more folds than pairs.
+    for num_pairs, num_folds, sizes in (
+        (13, None, [2, 2, 3, 3, 3]),
+        (4, 5, [1] * 4),
+        (9, 2, [4, 5]),
+    ):
+        seen.clear()
+        pairs = problem(num_pairs, seed=1)
+        scores = validated(rope_of(pairs), candidates=[spy], num_folds=num_folds)
+        assert sorted(scores.fold.bincount().tolist()) == sizes
+        assert scores.fold.tolist() != sorted(scores.fold.tolist())
+        for number, part in enumerate(seen):
+            expected = pairs[0][scores.fold != number]
+            assert {*map(tuple, part.tolist())} == {*map(tuple, expected.tolist())}
+            assert len(part) == len(expected)
+        assert len(seen) == scores.num_folds
 
 
 def test_a_fixed_candidate_is_built_once_and_sees_no_pair() -> None:
@@ -105,7 +100,7 @@ def recordings() -> tuple[Tensor, Tensor]:
     return theta.repeat(3, 1)[order], x[order]
 
 
-def test_recordings_of_a_person_are_never_on_both_sides(
+def test_recordings_of_a_person_are_never_both_trained_on_and_held_out(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     theta, x = recordings()
@@ -144,13 +139,13 @@ def test_recordings_of_a_person_are_never_on_both_sides(
         {*range(9)} - {p for p in range(9) if fold_of[p] in folds}
         for folds in [{0}, {1}, {2}, {3}]
     ]
-    # RoPE twice a fold, and once without every two folds for the tuned discrepancy.
+    # RoPE is tuned twice for each fold. The tuned discrepancy leaves out two folds.
     assert sum(known in held_out for known, _ in tuned) == 8
     pairs = [held_out[i] & held_out[j] for i in range(4) for j in range(i)]
     assert sorted(sorted(k) for k, _ in tuned if k not in held_out) == sorted(
         sorted(known) for known in pairs
     )
-    # Each of four versions of a fine-tuned candidate holds each of its parts out once.
+    # Each of the four versions of a fine-tuned candidate holds out each of its parts.
     assert splits
     assert len(splits) % 12 == 0
     assert all(known.isdisjoint(others) and others for known, others in splits)
@@ -182,6 +177,23 @@ def test_a_net_is_not_tuned_on_the_part_that_tells_it_when_to_stop() -> None:
     assert Indifferent.trained == set(bench.x[others, 0].tolist())
 
 
+def test_fine_tuning_of_a_tuned_candidate_starts_with_the_net_without_the_part() -> (
+    None
+):
+    bench = Workbench(
+        rope_of(problem(12, seed=1)), num_folds=4, seed=0, show_progress_bars=False
+    )
+    fold = Fold(bench, [0, 1, 3])
+    with quick():
+        nets = fold.corrected("tuned", learn_prior=True).nets
+        for number, net in zip((0, 1, 3), nets, strict=True):
+            start = FinetunedCandidate(space="tuned")._start(fold, number)
+            found = embed(embedding_of(start), bench.x)
+            assert torch.equal(found, embed(net, bench.x))
+            without = bench.tuned_net(frozenset({0, 1, 3} - {number}))
+            assert torch.equal(found, embed(without, bench.x))
+
+
 # --- labels ---
 
 
@@ -192,8 +204,8 @@ def base(num_pairs: int) -> tuple[StackedPosterior, Tensor, Tensor]:
         return stacked(rope_of((theta, x)), observed(), num_folds=3), theta, x
 
 
-@pytest.mark.parametrize(("num_pairs", "number"), [(6, 0), (6, 1), (6, 2), (15, 1)])
-def test_shuffled_labels_of_a_fold_change_nothing_that_is_scored_on_it(
+@pytest.mark.parametrize(("num_pairs", "number"), [(6, 1), (15, 1)])
+def test_labels_of_a_fold_do_not_change_the_versions_that_are_scored_on_it(
     num_pairs: int, number: int
 ) -> None:
     before, theta, x = base(num_pairs)
@@ -220,73 +232,71 @@ def test_shuffled_labels_of_a_fold_change_nothing_that_is_scored_on_it(
             for name, equal in zip(names, same[version].tolist(), strict=True)
             if not equal
         }
-        # The others have learnt from these labels, all that learns at all. With more
-        # pairs some are held out, by which the start may be the best.
+        # All other versions of candidates that learn have learned from these labels.
+        # With more pairs some are held out, and then the start can be the best.
         assert changed <= {*names} - UNTRAINED
         assert len(changed) > 3
         assert num_pairs > 6 or changed == {*names} - UNTRAINED
-    # Whatever scores the fold but its weights, which come from the other folds.
+    # The scores of the fold itself have changed with its labels.
     changed = scores_of(before).log_scores != scores_of(after).log_scores
     assert changed[rows][:, [k for k, n in enumerate(names) if n != "prior"]].any()
     fixed = [k for k, name in enumerate(names) if name in UNTRAINED]
     assert not changed[~rows][:, fixed].any()
 
 
-def test_observations_of_a_fold_train_nothing_that_is_scored_on_it() -> None:
+def test_observations_of_a_fold_do_not_change_the_versions_scored_on_it() -> None:
     before, theta, x = base(6)
     rows = scores_of(before).fold == 1
     moved = x.clone()
     moved[rows] += 1.0
     amortised = [c for c in CANDIDATES if isinstance(c, AmortisedCandidate)]
-    options: dict[str, Any] = {"candidates": amortised, "num_folds": 3}
-    pair = [stacked(rope_of((theta, one)), **options) for one in (x, moved)]
+    after = stacked(rope_of((theta, moved)), candidates=amortised, num_folds=3)
     points, batch = problems.box(2).sample((25,)), observed()
+    columns = [before.versions.names.index(candidate.name) for candidate in amortised]
     for version in range(4):
-        first, second = (p.versions.log_probs(points, batch, [version]) for p in pair)
+        first = before.versions.log_probs(points, batch, [version])[:, columns]
+        second = after.versions.log_probs(points, batch, [version])
         assert torch.equal(first, second) == (version == 1)
 
 
-@pytest.mark.parametrize("resample", [False, True])
-def test_with_fewer_training_folds_labels_reach_those_that_train_on_them(
-    resample: bool,
-) -> None:
-    # So few train a fold that none of them is held out.
+def test_with_two_training_folds_labels_of_a_fold_affect_two_others() -> None:
+    # With so few pairs in a fold, tuning holds none of them out.
     theta, x = problem(10, seed=1)
-    finetuner = CalibrationFinetuner(
-        max_num_epochs=3, simulations_per_target=2, resample_targets=resample
-    )
     tuned = [c for c in CANDIDATES if c.name == "tuning-only"]
-    options: dict[str, Any] = {"candidates": tuned, "num_training_folds": 2}
-
-    def score(theta: Tensor) -> CrossValidation:
-        return validated(rope_of((theta, x), finetuner=finetuner), **options)
-
-    before = score(theta)
-    assert before.num_trained_on == 4
-    for number in range(2):
-        rows = before.fold == number
-        other = theta.clone()
-        other[rows] *= -1
-        after = score(other)
-        # Scores of pairs whose own label is as it was.
+    for resample in (False, True):
+        finetuner = CalibrationFinetuner(
+            max_num_epochs=3, simulations_per_target=2, resample_targets=resample
+        )
+        before, after = (
+            validated(
+                rope_of((labels, x), finetuner=finetuner),
+                candidates=tuned,
+                num_training_folds=2,
+            )
+            for labels in (theta, changed_in_a_fold(theta, x, finetuner))
+        )
+        assert before.num_trained_on == 4
+        # Folds other than the first whose scores have changed.
         changed = {
             int(f)
             for f, a, b in zip(
                 before.fold, before.log_scores, after.log_scores, strict=True
             )
-            if int(f) != number and not torch.equal(a, b)
+            if int(f) != 0 and not torch.equal(a, b)
         }
         assert len(changed) == 2
+
+
+def changed_in_a_fold(theta: Tensor, x: Tensor, finetuner: Any) -> Tensor:
+    scores = validated(rope_of((theta, x), finetuner=finetuner), candidates=[PRIOR])
+    return torch.where((scores.fold == 0)[:, None], -theta, theta)
 
 
 # --- scores ---
 
 
-@pytest.mark.parametrize("coupled", [False, True])
-def test_scores_are_the_densities_of_the_versions_without_the_fold(
-    coupled: bool,
-) -> None:
-    posterior = the_coupled_stack() if coupled else the_stack()
+def test_scores_are_the_densities_of_the_versions_without_the_fold() -> None:
+    posterior = the_coupled_stack()
     scores, (theta, x) = scores_of(posterior), problem(NUM_PAIRS, seed=1)
     weights = torch.zeros(len(scores.names), dtype=torch.double)
     for k, name in enumerate(scores.names):
@@ -300,9 +310,8 @@ def test_scores_are_the_densities_of_the_versions_without_the_fold(
             assert torch.allclose(found, expected, atol=1e-4), name
 
 
-@pytest.mark.parametrize("coupled", [False, True])
-def test_the_stack_that_scores_a_fold_is_weighted_by_the_others(coupled: bool) -> None:
-    posterior = the_coupled_stack() if coupled else the_stack()
+def test_the_stack_that_scores_a_fold_is_weighted_by_the_others() -> None:
+    posterior = the_coupled_stack()
     scores, (theta, x) = scores_of(posterior), problem(NUM_PAIRS, seed=1)
     for number in range(scores.num_folds):
         rows = scores.fold == number
@@ -325,7 +334,7 @@ def test_the_stack_that_scores_a_fold_is_weighted_by_the_others(coupled: bool) -
         assert ((found >= 0) & (found <= 1)).all()
 
 
-def test_a_density_of_parameters_that_each_fold_fits_is_normalised_by_itself() -> None:
+def test_the_stack_of_each_fold_is_normalised_by_its_own_mass() -> None:
     """Its mass inside the prior differs from fold to fold."""
 
     def build(rope: RoPE, seed: int) -> Any:
@@ -337,7 +346,7 @@ def test_a_density_of_parameters_that_each_fold_fits_is_normalised_by_itself() -
     scores = validated(
         rope_of(), candidates=[DensityCandidate(name="wide", build=build)]
     )
-    # Uniform on the prior's box in the end, whatever was outside.
+    # After normalisation all versions are uniform on the box of the prior.
     box = torch.full((NUM_PAIRS,), math.log(0.25), dtype=torch.double)
     raw = -2 * (2 * torch.tensor(widths)).log().double()[scores.fold]
     assert torch.allclose(scores.log_scores[:, 0], raw, atol=1e-5)
@@ -346,16 +355,13 @@ def test_a_density_of_parameters_that_each_fold_fits_is_normalised_by_itself() -
 
 
 def test_a_cross_validation_is_that_of_the_stack_with_the_same_seed() -> None:
-    for batch, posterior in ((None, the_stack()), (observed(), the_coupled_stack())):
-        scores = validated(rope_of(), batch)
-        assert torch.equal(scores.log_scores, scores_of(posterior).log_scores)
-        assert torch.equal(scores.levels, scores_of(posterior).levels)
-        assert torch.allclose(
-            scores.stack_scores, scores_of(posterior).stack_scores, atol=0.01
-        )
+    scores, expected = validated(rope_of()), scores_of(the_stack())
+    assert torch.equal(scores.log_scores, expected.log_scores)
+    assert torch.equal(scores.levels, expected.levels)
+    assert torch.allclose(scores.stack_scores, expected.stack_scores, atol=0.01)
 
 
-def test_a_trainer_that_ignores_its_seed_is_reproduced_and_leaves_no_trace() -> None:
+def test_a_candidate_that_ignores_its_seed_is_seeded_all_the_same() -> None:
     class Careless(AmortisedCandidate):
         name = "careless"
 
@@ -386,7 +392,7 @@ def test_the_seed_of_folds_does_not_depend_on_their_number() -> None:
 # --- the table ---
 
 
-def test_differences_are_paired_and_their_interval_is_that_of_the_mean() -> None:
+def test_differences_are_means_over_pairs_with_a_bootstrap_interval() -> None:
     scores = scores_of(the_stack())
     for name, other in (("NPE", "prior"), ("stack", "prior"), ("NPE", "NPE")):
         pairs = scores.scores_of(name) - scores.scores_of(other)

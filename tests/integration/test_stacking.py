@@ -1,9 +1,9 @@
-"""Stacks of trained candidates: density, samples, copies, and what they answer."""
+"""Stacks of trained candidates: density, samples, copies and kinds of data."""
 
 import copy
 import math
 import pickle
-from dataclasses import replace
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -11,7 +11,7 @@ import torch
 from sbi.utils import BoxUniform
 from torch import Tensor, nn
 
-from sbi_rope import RoPE, SinkhornCoupler
+from sbi_rope import RoPE, SinkhornCoupler, StackedPosterior
 from sbi_rope._sbi import DirectPosterior, estimator_of
 from sbi_rope.errors import InvalidInputError, RoPEWarning, UnseenObservationError
 from sbi_rope.mixture import MixturePosterior
@@ -25,9 +25,9 @@ from sbi_rope.stacking import (
 )
 from tests import gaussian, problems
 from tests.stacks import (
-    CANDIDATES,
     COUPLINGS,
     FINETUNED,
+    FITTED,
     NPE,
     NUM_OBSERVED,
     NUM_PAIRS,
@@ -50,7 +50,9 @@ from tests.stacks import (
 pytestmark = pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
 
 
-# --- what it is made of ---
+Make = Callable[[], StackedPosterior]
+
+# --- density ---
 
 
 def test_a_stack_of_one_candidate_is_the_average_of_its_versions() -> None:
@@ -73,7 +75,7 @@ def test_a_stack_of_one_candidate_is_the_average_of_its_versions() -> None:
     assert torch.allclose(single[:, 0].float(), found[0], atol=1e-4)
 
 
-def test_couplings_of_a_version_are_those_of_rope_on_its_pairs_and_the_batch() -> None:
+def test_couplings_are_those_of_the_coupler_with_the_net_of_each_version() -> None:
     posterior, x_o = the_coupled_stack(), observed()
     theta_cal, x_cal = problem(NUM_PAIRS, seed=1)
     batch = torch.cat([x_o, x_cal])
@@ -113,9 +115,12 @@ def test_couplings_of_a_version_are_those_of_rope_on_its_pairs_and_the_batch() -
     assert versions.count(None) == 2
 
 
-@pytest.mark.parametrize("coupled", [False, True])
-def test_the_density_is_the_weighted_sum_of_the_candidates(coupled: bool) -> None:
-    posterior = the_coupled_stack() if coupled else the_stack()
+BOTH = (the_stack, the_coupled_stack)
+
+
+@pytest.mark.parametrize("make", BOTH)
+def test_the_density_is_the_weighted_sum_of_the_candidates(make: Make) -> None:
+    posterior = make()
     scores = posterior.report.cross_validation
     expected = stacking_weights(scores.log_scores).weights
     assert list(posterior.candidate_weights.values()) == expected.tolist()
@@ -130,11 +135,9 @@ def test_the_density_is_the_weighted_sum_of_the_candidates(coupled: bool) -> Non
     assert torch.allclose(found, (averaged @ expected).float(), rtol=1e-3, atol=1e-5)
 
 
-@pytest.mark.parametrize("coupled", [False, True])
-def test_the_normalised_density_has_mass_one_and_samples_follow_it(
-    coupled: bool,
-) -> None:
-    posterior = the_coupled_stack() if coupled else the_stack()
+@pytest.mark.parametrize("make", BOTH)
+def test_the_normalised_density_has_mass_one_and_samples_follow_it(make: Make) -> None:
+    posterior = make()
     x, draws = observed()[:3], 1000
     line = (torch.arange(40) + 0.5) / 20 - 1
     theta = torch.cartesian_prod(line, line)[:, None].expand(-1, 3, -1)
@@ -153,7 +156,7 @@ def test_the_normalised_density_has_mass_one_and_samples_follow_it(
         assert ((counts - share).abs() < 4.5 * error + 0.01).all()
 
 
-# --- observations of today and tomorrow ---
+# --- observations inside and outside of a batch ---
 
 
 def test_an_observation_alone_has_the_density_that_it_has_among_others() -> None:
@@ -185,7 +188,7 @@ def test_a_stack_of_a_batch_answers_others_only_if_it_extends() -> None:
             call(theta, x)
 
 
-def test_the_posterior_of_one_observation_forgets_the_others() -> None:
+def test_the_posterior_of_one_observation_does_not_contain_the_others() -> None:
     posterior = the_coupled_stack()
     view = posterior[3]
     theta = problems.box(2).sample((4,))
@@ -199,7 +202,7 @@ def test_the_posterior_of_one_observation_forgets_the_others() -> None:
             one.candidate_log_probs(theta[:1], posterior.x_o[3:4])
         with pytest.raises(InvalidInputError, match=r"posterior\[i\]"):
             _ = one.versions
-    # Asking the one has not taken the candidates from the other.
+    # The posterior of the batch still has its candidates.
     assert posterior.candidate_log_probs(theta[:1], posterior.x_o[:1]).isfinite().all()
     assert len(pickle.dumps(view)) < len(pickle.dumps(posterior))
 
@@ -207,9 +210,11 @@ def test_the_posterior_of_one_observation_forgets_the_others() -> None:
 # --- copies ---
 
 
-@pytest.mark.parametrize("coupled", [False, True])
-def test_copies_answer_the_same_and_stay_where_they_are(coupled: bool) -> None:
-    posterior = the_coupled_stack() if coupled else the_stack()
+@pytest.mark.parametrize("make", BOTH)
+def test_copies_and_small_pickles_have_the_same_densities(make: Make) -> None:
+    posterior = make()
+    assert len(pickle.dumps(posterior)) < 25e6
+    assert len(pickle.dumps(posterior.report)) < 1e6
     x, theta = observed(), problems.box(2).sample((NUM_OBSERVED,))
     expected = posterior.log_prob_batched(theta, x)
     candidates = posterior.candidate_log_probs(theta, x)
@@ -219,7 +224,7 @@ def test_copies_answer_the_same_and_stay_where_they_are(coupled: bool) -> None:
         assert str(other.report) == str(posterior.report)
         other.to("cpu")
         assert torch.equal(other.candidate_log_probs(theta, x), candidates)
-        # What answers and what is asked for its candidates move together.
+        # The density and the candidates share their parts, and so move together.
         estimator = other.posterior_estimator
         couplings = other.versions.couplings
         if couplings is not None:
@@ -229,18 +234,7 @@ def test_copies_answer_the_same_and_stay_where_they_are(coupled: bool) -> None:
             assert {id(part) for parts in version.values() for part in parts} <= shown
 
 
-def test_a_stack_of_fifty_pairs_is_a_small_file() -> None:
-    posterior = stacked(rope_of(problem(50, seed=1)), seed=0)
-    x = observed(300)
-    theta = problems.box(2).sample((300,))
-    expected = posterior.log_prob_batched(theta, x)
-    file = pickle.dumps(posterior)
-    assert len(file) < 25e6
-    assert len(pickle.dumps(posterior.report)) < 1e6
-    assert torch.equal(pickle.loads(file).log_prob_batched(theta, x), expected)
-
-
-def test_a_stack_is_pickled_whatever_made_its_candidates() -> None:
+def test_a_stack_of_candidates_that_lambdas_built_can_be_pickled() -> None:
     candidates = [
         DensityCandidate(name="mine", build=lambda rope, seed: rope.npe),
         DensityCandidate(name="older", build=lambda rope, seed: rope.npe, fixed=True),
@@ -252,9 +246,8 @@ def test_a_stack_is_pickled_whatever_made_its_candidates() -> None:
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("coupled", [False, True])
-def test_a_stack_and_its_candidates_move_to_a_gpu(coupled: bool) -> None:
-    posterior = copy.deepcopy(the_coupled_stack() if coupled else the_stack())
+def test_a_stack_and_its_candidates_move_to_a_gpu() -> None:
+    posterior = copy.deepcopy(the_coupled_stack())
     x, theta = observed(), problems.box(2).sample((NUM_OBSERVED,))
     expected = posterior.candidate_log_probs(theta, x)
     density = unnormalised(posterior, theta, x)
@@ -277,9 +270,9 @@ def test_every_family_can_be_stacked(family: str, embedding: str) -> None:
     theta = prior.sample((30,))
     x = problems.simulate(theta) + 0.4
     rope = rope_of((theta[:8], x[:8]), family=family, embedding=embedding)
-    candidates = [ROPE, OT_ONLY, *CANDIDATES[len(COUPLINGS) :]]
-    if embedding == "none":  # nothing to tune, no summaries that h could lose
-        candidates = [ROPE, *default_candidates()[:4]]
+    # Without an embedding net there is nothing to tune.
+    amortised = default_candidates()[: 4 if embedding == "none" else 6]
+    candidates = [ROPE, OT_ONLY, *amortised]
     posterior = stacked(rope, x[8:], candidates=candidates, num_folds=3)
     assert posterior.report.cross_validation.log_scores.isfinite().all()
     assert posterior.log_prob_batched(theta[8:], x[8:]).isfinite().all()
@@ -287,7 +280,7 @@ def test_every_family_can_be_stacked(family: str, embedding: str) -> None:
     assert samples.shape == (3, 22, theta.shape[1])
 
 
-def test_images_are_stacked_without_what_needs_summaries() -> None:
+def test_images_are_stacked_without_candidates_that_need_summaries() -> None:
     theta = problems.box(2).sample((20,))
     x = problems.simulate_image(theta) + 0.3
     rope = rope_of(
@@ -308,7 +301,7 @@ def test_images_are_stacked_without_what_needs_summaries() -> None:
 
 
 def never(rope: RoPE, seed: int) -> Any:
-    raise AssertionError("What cannot be trained is found before others are.")
+    raise AssertionError("The candidate that cannot be trained was not found first.")
 
 
 def long_series(theta: Tensor) -> Tensor:
@@ -337,19 +330,25 @@ def test_moments_of_a_long_series_are_those_of_its_embedding_alone(
     names = stacked(rope).candidate_weights
     assert set(seen) == {2}
     assert "discrepancy (input)" not in names
-    # Whoever asks for it gets it.
+    # It is trained if the user asks for it.
     stacked(rope, candidates=[DiscrepancyCandidate(space="input")])
     assert 24 in seen
 
 
-@pytest.mark.parametrize("count", [15, 200])
-def test_stored_simulations_serve_as_well(count: int) -> None:
-    theta = problems.box(2).sample((count,))
-    rope = rope_of(simulations=(theta, problems.simulate(theta)))
-    for x_o in (None, observed(10)):
-        posterior = stacked(rope, x_o, num_simulations=None)
-        assert posterior.report.cross_validation.log_scores.isfinite().all()
-        assert posterior.sample_batched((2,), observed(10), **QUIET).isfinite().all()
+def test_a_stack_can_use_stored_simulations() -> None:
+    theta = problems.box(2).sample((200,))
+    x = problems.simulate(theta)
+    cases: list[tuple[int, Any, dict[str, Any]]] = [
+        (15, observed(10), {}),
+        (200, None, {"candidates": [NPE, FINETUNED, DiscrepancyCandidate()]}),
+    ]
+    for count, x_o, options in cases:
+        rope = rope_of(simulations=(theta[:count], x[:count]))
+        posterior = stacked(rope, x_o, num_simulations=None, num_folds=3, **options)
+        scores = posterior.report.cross_validation.log_scores
+        assert scores.isfinite().all(), count
+        samples = posterior.sample_batched((2,), observed(10), **QUIET)
+        assert samples.isfinite().all(), count
 
 
 class Untransformed(BoxUniform):
@@ -360,7 +359,7 @@ class Untransformed(BoxUniform):
         raise NotImplementedError
 
 
-def test_a_prior_that_sbi_cannot_transform_serves_as_well() -> None:
+def test_a_prior_that_sbi_cannot_transform_can_be_used() -> None:
     prior = Untransformed(-torch.ones(2), torch.ones(2))
     npe = DirectPosterior(
         estimator_of(problems.npe_posterior("mdn", "linear")),
@@ -368,31 +367,28 @@ def test_a_prior_that_sbi_cannot_transform_serves_as_well() -> None:
         enable_transform=False,
     )
     rope = RoPE(npe, simulator=uneven).append_calibration(*problem(8, seed=1))
-    posterior = stacked(rope, num_folds=3)
+    posterior = stacked(rope, candidates=[PRIOR, FINETUNED], num_folds=3)
     assert not posterior.enable_transform
     samples = posterior.sample_batched((5,), observed(4), **QUIET)
     assert (samples.abs() <= 1).all()
 
 
-@pytest.mark.parametrize(
-    ("num_pairs", "coupled"), [(2, False), (3, False), (4, True), (2, True)]
-)
-def test_few_pairs_are_left_out_one_by_one(num_pairs: int, coupled: bool) -> None:
-    x_o = observed(1) if coupled else None
-    posterior = stacked(rope_of(problem(num_pairs, seed=1)), x_o, learning_curve=True)
-    scores = posterior.report.cross_validation
-    assert scores.num_folds == num_pairs
-    assert scores.log_scores.isfinite().all()
-    assert scores.stack_scores.isfinite().all()
-    assert math.isclose(sum(posterior.candidate_weights.values()), 1.0)
-    assert posterior.sample((2,), x=observed(1), **QUIET).shape == (2, 2)
-    assert str(posterior.report)
+def test_few_pairs_are_held_out_one_by_one() -> None:
+    for num_pairs, x_o in ((2, observed(1)), (3, None)):
+        posterior = stacked(rope_of(problem(num_pairs, seed=1)), x_o)
+        scores = posterior.report.cross_validation
+        assert scores.num_folds == num_pairs
+        assert scores.log_scores.isfinite().all()
+        assert scores.stack_scores.isfinite().all()
+        assert math.isclose(sum(posterior.candidate_weights.values()), 1.0)
+        assert posterior.sample((2,), x=observed(1), **QUIET).shape == (2, 2)
+        assert str(posterior.report)
 
 
-# --- what the user hands over ---
+# --- what the user passes ---
 
 
-def test_what_is_handed_over_is_left_as_it_was() -> None:
+def test_a_stack_changes_nothing_that_it_is_given_and_follows_from_its_seed() -> None:
     rope, x_o = rope_of(), observed()
     rope.train(seed=0, **QUIET)
     npe = problems.npe_posterior("mdn")
@@ -400,16 +396,21 @@ def test_what_is_handed_over_is_left_as_it_was() -> None:
     before = [copy.deepcopy(net.state_dict()) for net in nets]
     held = [value.clone() for value in (x_o, *rope.calibration)]
     coupler, finetuner = rope.coupler, rope.finetuner
-    trained = stacked(rope, x_o)
+    torch.manual_seed(5)
+    state = torch.get_rng_state()
+    posterior = stacked(rope, x_o, tail_mass=0.0, unseen="extend")
+    assert torch.equal(torch.get_rng_state(), state)
     assert all(map(torch.equal, (x_o, *rope.calibration), held))
     assert (rope.coupler, rope.finetuner) == (coupler, finetuner)
     nets = [npe.posterior_estimator, rope.tuned_embedding_net]
-    for net, state in zip(nets, before, strict=True):
-        assert all(map(torch.equal, net.state_dict().values(), state.values()))
-    # Nor does it matter whether it was trained.
-    scores = trained.report.cross_validation.log_scores
-    other = the_coupled_stack().report.cross_validation.log_scores
-    assert torch.equal(scores, other)
+    for net, old in zip(nets, before, strict=True):
+        assert all(map(torch.equal, net.state_dict().values(), old.values()))
+    # The seed decides, and not whether the RoPE was trained.
+    theta = problems.box(2).sample((NUM_OBSERVED,))
+    found, expected = (
+        p.log_prob_batched(theta, x_o) for p in (posterior, the_coupled_stack())
+    )
+    assert torch.equal(found, expected)
 
 
 def test_a_stack_does_not_change_with_the_posteriors_it_was_made_of() -> None:
@@ -431,7 +432,7 @@ def test_a_stack_does_not_change_with_the_posteriors_it_was_made_of() -> None:
     assert torch.equal(unnormalised(posterior, theta, x), before)
 
 
-def test_a_mixture_of_a_user_counts_as_one_version_however_many_parts_it_has() -> None:
+def test_a_mixture_counts_as_one_version_regardless_of_its_number_of_parts() -> None:
     sizes: list[int] = []
     theirs: list[Any] = []
 
@@ -461,7 +462,7 @@ def test_a_mixture_of_a_user_counts_as_one_version_however_many_parts_it_has() -
     assert torch.allclose(density.double(), expected, atol=1e-4)
 
 
-def test_default_candidates_have_names_and_families_of_their_own() -> None:
+def test_default_candidates_have_different_names() -> None:
     amortised, all_of_them = default_candidates(), default_candidates(couplings=True)
     assert [candidate.name for candidate in amortised] == [
         *("prior", "NPE", "fine-tuned NPE", "discrepancy", "discrepancy (input)"),
@@ -479,34 +480,16 @@ def test_default_candidates_have_names_and_families_of_their_own() -> None:
     assert [candidate.name for candidate in small[:2]] == [
         *("RoPE (gamma 0.1, tau 1)", "OT-only (gamma 0.1, tau 1)"),
     ]
-    assert replace(FinetunedCandidate(), space="embedding").name == (
-        "discrepancy, fine-tuned"
-    )
-
-
-def test_a_seed_reproduces_a_stack_and_leaves_no_trace() -> None:
-    theta = problems.box(2).sample((NUM_OBSERVED,))
-    for batch, first in ((None, the_stack()), (observed(), the_coupled_stack())):
-        torch.manual_seed(5)
-        state = torch.get_rng_state()
-        again = stacked(rope_of(), batch, tail_mass=0.0)
-        assert torch.equal(torch.get_rng_state(), state)
-        found, expected = (
-            p.log_prob_batched(theta, observed()) for p in (again, first)
-        )
-        assert torch.equal(found, expected)
-    scores = [
-        validated(rope_of(), candidates=[FINETUNED], seed=seed).log_scores
-        for seed in (0, 1)
-    ]
-    assert not torch.equal(*scores)
+    assert FinetunedCandidate(space="embedding").name == "discrepancy, fine-tuned"
 
 
 def test_without_a_seed_the_state_of_torch_decides() -> None:
     found = []
-    for seed in (5, 5, 6):
-        torch.manual_seed(seed)
-        scores = validated(rope_of(), candidates=[FINETUNED], seed=None)
-        found.append(scores.log_scores)
-    assert torch.equal(found[0], found[1])
-    assert not torch.equal(found[0], found[2])
+    for state in (5, 5, 6):
+        torch.manual_seed(state)
+        scores = validated(rope_of(), candidates=[FITTED], seed=None)
+        found.append((scores.fold, scores.log_scores))
+    assert torch.equal(found[0][1], found[1][1])
+    assert not torch.equal(found[0][0], found[2][0])
+    seeded = [validated(rope_of(), candidates=[FITTED], seed=s).fold for s in (0, 1)]
+    assert not torch.equal(*seeded)

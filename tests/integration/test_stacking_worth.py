@@ -1,4 +1,4 @@
-"""What a stack is worth where the exact posterior is known."""
+"""The density of a stack, where the exact posterior is known."""
 
 import math
 from collections.abc import Callable
@@ -39,7 +39,7 @@ def gaussian_stack(
     candidates = default_candidates(
         couplings=x_o is not None, gammas=(0.05, 0.2), taus=(1.0, 0.5)
     )
-    # Correcting x is of no use here, h is a bijection, and takes most of the time.
+    # Correcting x would take most of the time, and adds nothing: h is a bijection here.
     candidates = [c for c in candidates if "(input)" not in c.name]
     return stack(
         rope,
@@ -88,7 +88,7 @@ def test_with_more_pairs_a_stack_approaches_the_exact_posterior() -> None:
     assert missing[1] < 0.1
 
 
-def test_where_the_simulator_is_right_a_stack_is_within_a_twentieth_of_npe() -> None:
+def test_where_the_simulator_is_right_a_stack_loses_less_than_a_twentieth_nat() -> None:
     """Which is exact here; on average over observations and two sets of pairs."""
     theta_o, x_o = labelled(300, gaussian.simulator)
     exact = float(gaussian.exact_posterior(x_o).log_prob(theta_o).mean())
@@ -99,7 +99,7 @@ def test_where_the_simulator_is_right_a_stack_is_within_a_twentieth_of_npe() -> 
     assert sum(lost) / 2 < 0.05
 
 
-def test_labels_that_say_nothing_make_a_stack_the_prior() -> None:
+def test_shuffled_labels_make_a_stack_almost_the_prior() -> None:
     theta_o, x_o = labelled(300, gaussian.real_process)
     theta, x = labelled(50, gaussian.real_process)
     posterior = gaussian_stack(theta.roll(1, dims=0), x)
@@ -108,9 +108,7 @@ def test_labels_that_say_nothing_make_a_stack_the_prior() -> None:
     assert lost < 0.1
 
 
-@pytest.mark.parametrize(
-    ("n_o", "coupled"), [(1, True), (20, True), (300, True), (300, False)]
-)
+@pytest.mark.parametrize(("n_o", "coupled"), [(20, True), (300, False)])
 def test_held_out_scores_promise_no_more_than_test_observations_give(
     n_o: int, coupled: bool
 ) -> None:
@@ -122,7 +120,7 @@ def test_held_out_scores_promise_no_more_than_test_observations_give(
         if not coupled:
             posteriors = [(gaussian_stack(theta, x, seed=seed), theta_o, x_o)]
         else:
-            # Of small batches several, or their scores would say little.
+            # Two small batches, because the score of one would be uncertain.
             posteriors = [
                 (
                     gaussian_stack(theta, x, x_o[rows], seed=seed),

@@ -1,0 +1,180 @@
+"""The posterior of gain, offset and error, and draws from it."""
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+from torch.distributions import Chi2
+
+from sbi_rope._random import seeded
+from sbi_rope._validation import check_batch, check_integer, check_not_negative
+
+__all__ = ["Discrepancy", "DiscrepancyDraws", "Term"]
+
+# Entries of the matrices that simulations are corrected by at a time.
+MAX_ENTRIES = 2**22
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Term:
+    r"""The posterior at one setting of the hyper-parameters.
+
+    Attributes:
+        coefficients: Mean of :math:`(A, b)^\top`, shape ``(l + 1, l)``.
+        row_factor: Lower Cholesky factor of the covariance of its rows, shape
+            ``(l + 1, l + 1)``.
+        error_factor: L, with :math:`L L^\top` the scale of the inverse Wishart
+            distribution of :math:`\Sigma`, shape ``(l, l)``.
+        degrees: Its degrees of freedom.
+    """
+
+    coefficients: Tensor
+    row_factor: Tensor
+    error_factor: Tensor
+    degrees: float
+
+    def sample(self, count: int) -> tuple[Tensor, Tensor, Tensor]:
+        r"""Draw :math:`A`, :math:`b` and :math:`\Sigma`."""
+        width, like = len(self.error_factor), self.error_factor
+        # The Bartlett decomposition: T T' follows a Wishart distribution, so that
+        # L (T T')^-1 L' follows an inverse Wishart distribution with scale L L'.
+        degrees = self.degrees - torch.arange(width).to(like)
+        triangle = torch.randn(count, width, width).to(like).tril(-1)
+        triangle = triangle + torch.diag_embed(Chi2(degrees).sample((count,)).sqrt())
+        identity = torch.eye(width).to(like).expand_as(triangle)
+        inverse = torch.linalg.solve_triangular(triangle, identity, upper=False)
+        factor = self.error_factor @ inverse.mT
+        noise = torch.randn(count, *self.coefficients.shape).to(like)
+        coefficients = self.coefficients + self.row_factor @ noise @ factor.mT
+        return coefficients[:, :-1].mT, coefficients[:, -1], factor @ factor.mT
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Discrepancy:
+    """The posterior of gain, offset and error, averaged over the hyper-parameters.
+
+    Attributes:
+        terms: The posterior at each setting of the hyper-parameters whose evidence is
+            not negligible.
+        shares: The shares of the terms in the evidence, which sum to one.
+        noise: The covariance C of simulations at one parameter, shape ``(l, l)``.
+        probability_of_none: The probability that the simulator is right.
+        log_evidence: Log density of the pairs under a discrepancy.
+        log_evidence_of_none: Log density of the pairs if the simulator is right.
+        num_pairs: The number of calibration pairs.
+    """
+
+    terms: tuple[Term, ...] = field(repr=False)
+    shares: Tensor = field(repr=False)
+    noise: Tensor = field(repr=False)
+    probability_of_none: float
+    log_evidence: float
+    log_evidence_of_none: float
+    num_pairs: int
+
+    @torch.no_grad()
+    def sample(
+        self,
+        num_draws: int,
+        *,
+        smallest_error: float = 0.01,
+        seed: int | None = None,
+    ) -> "DiscrepancyDraws":
+        r"""Draw gains, offsets and errors.
+
+        A share ``probability_of_none`` of the draws has gain one, offset zero and no
+        error. In the other draws the error is :math:`\Sigma` without the simulator's
+        own noise, :math:`\Sigma' = \Sigma - A C A^\top`. Its eigenvalues are at least
+        ``smallest_error`` squared.
+
+        Args:
+            num_draws: Number of draws.
+            smallest_error: Smallest standard deviation of the error, in standard
+                deviations of simulations.
+            seed: Seed of the draws; None uses torch's state.
+
+        Returns:
+            The draws.
+
+        Raises:
+            InvalidInputError: If an argument is outside its range.
+        """
+        check_integer("num_draws", num_draws)
+        check_not_negative("smallest_error", smallest_error)
+        none = self.probability_of_none
+        shares = torch.cat([(1 - none) * self.shares, self.shares.new_tensor([none])])
+        with seeded(seed):
+            chosen = torch.multinomial(shares, num_draws, replacement=True)
+            *counts, num_none = chosen.bincount(minlength=len(shares)).tolist()
+            parts = [
+                self._corrections(term, count, smallest_error)
+                for term, count in zip(self.terms, counts, strict=True)
+                if count
+            ]
+        parts.append(self._no_correction(num_none))
+        gain, offset, factor = map(torch.cat, zip(*parts, strict=True))
+        return DiscrepancyDraws(gain=gain, offset=offset, error_factor=factor)
+
+    def _corrections(
+        self, term: Term, count: int, smallest_error: float
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        gain, offset, covariance = term.sample(count)
+        error = covariance - gain @ self.noise @ gain.mT
+        variance, directions = torch.linalg.eigh(error)
+        std = variance.clamp_min(smallest_error**2).sqrt()
+        return gain, offset, directions * std[:, None, :]
+
+    def _no_correction(self, count: int) -> tuple[Tensor, Tensor, Tensor]:
+        width = len(self.noise)
+        return (
+            torch.eye(width).to(self.noise).expand(count, -1, -1),
+            self.noise.new_zeros(count, width),
+            self.noise.new_zeros(count, width, width),
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DiscrepancyDraws:
+    r"""Draws of gain, offset and error.
+
+    Attributes:
+        gain: :math:`A`, shape ``(m, l, l)``.
+        offset: :math:`b`, shape ``(m, l)``.
+        error_factor: F with :math:`\Sigma' = F F^\top`, shape ``(m, l, l)``.
+    """
+
+    gain: Tensor
+    offset: Tensor
+    error_factor: Tensor
+
+    def __len__(self) -> int:
+        return len(self.offset)
+
+    def correct(self, z_s: Tensor) -> Tensor:
+        """Return simulations as they would be observed in reality.
+
+        Each simulation is corrected by a draw that is chosen at random, and gets an
+        error of its own. Together they represent the whole posterior of the
+        discrepancy.
+
+        Args:
+            z_s: Simulations, shape ``(n, l)``.
+
+        Returns:
+            Shape ``(n, l)``, float64.
+
+        Raises:
+            InvalidInputError: If the shape does not fit or a value is not finite.
+        """
+        z_s = check_batch("z_s", z_s, self.offset.shape[1:])
+        draw = torch.randint(len(self), (len(z_s),)).to(z_s.device)
+        noise = torch.randn(z_s.shape, dtype=torch.double).to(z_s.device)
+        # A matrix for each simulation needs a lot of memory if z has many entries.
+        size = max(1, MAX_ENTRIES // z_s.shape[1] ** 2)
+        parts = zip(*(rows.split(size) for rows in (z_s, draw, noise)), strict=True)
+        return torch.cat([self._corrected(*part) for part in parts])
+
+    def _corrected(self, z_s: Tensor, draw: Tensor, noise: Tensor) -> Tensor:
+        moved = (self.gain[draw] @ z_s.double()[..., None])[..., 0]
+        error = (self.error_factor[draw] @ noise[..., None])[..., 0]
+        return moved + self.offset[draw] + error
