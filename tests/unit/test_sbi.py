@@ -220,8 +220,8 @@ def test_embed_does_not_depend_on_the_batch() -> None:
 
 
 def test_posterior_from_wraps_an_estimator_as_its_model_does() -> None:
-    original = problems.npe_posterior()
-    estimator = fresh_estimator()
+    original = problems.npe_posterior("maf")
+    estimator = fresh_estimator("maf")
     posterior = posterior_from(original, estimator)
     assert type(posterior) is DirectPosterior
     assert posterior.posterior_estimator is estimator
