@@ -192,7 +192,9 @@ class CalibrationFinetuner:
             targets = checked_targets()
             _check_start(embedded, targets)
             keep = self._rehearsed(embedding_net, draw_simulations)
-            train, held_out = self._split(groups)
+            train, held_out = split_pairs(groups, self.validation_fraction)
+            if not len(held_out):
+                warn_without_holdout(groups)
             results = [
                 self._optimise(
                     trainable_copy(embedding_net, targets),
@@ -228,16 +230,8 @@ class CalibrationFinetuner:
             return self._learning_rates
         # No pairs are left to choose a rate by.
         has_parameters = any(True for _ in net.parameters())
-        rate = (
-            min(self._learning_rates) if has_parameters else max(self._learning_rates)
-        )
-        return (rate,)
-
-    def _split(self, groups: Tensor) -> tuple[Tensor, Tensor]:
-        train, held_out = split_pairs(groups, self.validation_fraction)
-        if not len(held_out):
-            warn_without_holdout(groups)
-        return train, held_out
+        smallest_or_largest = min if has_parameters else max
+        return (smallest_or_largest(self._learning_rates),)
 
     def _optimise(
         self,

@@ -112,8 +112,8 @@ class Coupling:
 
         If the effective sample size of a new row is large, the row is nearly what
         coupling again would give. If it is only a few, it is not. For observations of
-        the batch, as in ``coupling.rows(coupling.real[10:20])``, the result is their rows
-        of ``weights``.
+        the batch, as in ``coupling.rows(coupling.real[10:20])``, the result is their
+        rows of ``weights``.
 
         Args:
             real: Embeddings of the observations, shape ``(n, l)``.
