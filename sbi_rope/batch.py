@@ -69,11 +69,13 @@ class EmbeddedBatch:
     ) -> Iterator[Coupling]:
         """Couple at every gamma and every tau, each coupling when it is needed.
 
+        The order is that of :meth:`SinkhornCoupler.sweep
+        <sbi_rope.SinkhornCoupler.sweep>`.
+
         Args:
             coupler: Settings other than gamma and tau.
-            gammas: As in :meth:`SinkhornCoupler.sweep
-                <sbi_rope.SinkhornCoupler.sweep>`, and so are the others.
-            taus: Values of tau.
+            gammas: Values of gamma, in any order.
+            taus: Values of tau, in any order.
             seed: Seed of the choice of ``num_fitted`` observations.
 
         Raises:

@@ -193,7 +193,9 @@ class CalibrationFinetuner:
             targets = checked_targets()
             _check_start(embedded, targets)
             keep = self._rehearsed(embedding_net, draw_simulations)
-            train, held_out = self._split(groups)
+            train, held_out = split_pairs(groups, self.validation_fraction)
+            if not len(held_out):
+                warn_without_holdout(groups)
 
             def tuned(learning_rate: float) -> tuple[nn.Module, History]:
                 return self._optimise(
@@ -231,12 +233,6 @@ class CalibrationFinetuner:
             )
         simulations = _checked_inputs("simulations", draw_simulations(NUM_REHEARSED), h)
         return simulations, _embedded("simulations", simulations, h)
-
-    def _split(self, groups: Tensor) -> tuple[Tensor, Tensor]:
-        train, held_out = split_pairs(groups, self.validation_fraction)
-        if not len(held_out):
-            warn_without_holdout(groups)
-        return train, held_out
 
     def _optimise(
         self,

@@ -245,7 +245,7 @@ class RoPE:
         """
         if len(self._x_cal) and self._g is None:
             raise NotReadyError(
-                f"{len(self._x_cal)} calibration pairs were appended, and `train()` "
+                f"{len(self._x_cal)} calibration pairs were appended, but `train()` "
                 "was not called after that. Call `train()` first."
             )
         net = self._npe.h if self._g is None else self._g

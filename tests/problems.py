@@ -157,7 +157,7 @@ class Gaussians(ConditionalDensityEstimator):
 class TableCoupling(Coupling):
     """A coupling with weights chosen by hand, found by the number of the observation.
 
-    What is no row of ``real`` gets the row that any other coupling would give it.
+    Observations that are not among ``real`` get the rows of an ordinary coupling.
     """
 
     table: Tensor = field(repr=False)
@@ -221,7 +221,7 @@ def gaussian_posterior(
     tail_mass: float = 0.0,
     dtype: torch.dtype = torch.float64,
 ) -> MixturePosterior:
-    """A mixture of analytic Gaussians; x_o has three readings, g maps them linearly."""
+    """A mixture of analytic Gaussians with three readings in x_o and a linear g."""
     if embeddings is None:
         embeddings = embeddings_of(dim, n_s, std=std)
     if x_o is None:

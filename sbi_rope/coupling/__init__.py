@@ -1,10 +1,10 @@
 """The coupling of real observations with simulations, by optimal transport.
 
-``coupler`` has the settings and is what a user calls. ``result`` is what comes back.
-The work is done in between by ``problem`` (two checked sets of embeddings), ``cost``
-(their distances, stored or computed in blocks), ``kernel`` (the column marginal of a
-potential), ``fixed_point`` (our own solver), ``pot`` (POT's solver) and ``warm_start``
-(where the solver starts in a sweep).
+A user calls ``coupler``, which has the settings, and gets a ``result``. In between,
+``problem`` holds two checked sets of embeddings, ``cost`` their distances (stored or
+computed in blocks), and ``kernel`` computes the column marginal of a potential.
+``fixed_point`` is our own solver, ``pot`` is POT's, and ``warm_start`` says where they
+start in a sweep.
 """
 
 from sbi_rope.coupling.coupler import SinkhornCoupler

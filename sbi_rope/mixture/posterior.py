@@ -230,11 +230,9 @@ class MixturePosterior(BaseDirectPosterior):
         Args:
             sample_shape: Shape of the draws.
             x: An observation, from the batch if there is one; the default x if None.
-            max_sampling_batch_size: As in :meth:`sample_batched`, and so are the
-                others.
-            show_progress_bars: Whether to show how many draws were accepted so far.
-            reject_outside_prior: Whether to draw from the mixture truncated to the
-                prior's support, or from the whole mixture.
+            max_sampling_batch_size: As in :meth:`sample_batched`.
+            show_progress_bars: As in :meth:`sample_batched`.
+            reject_outside_prior: As in :meth:`sample_batched`.
 
         Returns:
             Shape ``(*sample_shape, d)``.
@@ -313,17 +311,14 @@ class MixturePosterior(BaseDirectPosterior):
         super().set_default_x(self._batch_of_x(x).clone())
         return self
 
-    def _x_or_default(self, x: Any) -> Tensor:
+    def _one_x(self, x: Tensor | None) -> Tensor:
         x = self.default_x if x is None else x
         if x is None:
             raise InvalidInputError(
                 "Expected an observation `x`, or a default x that was set with "
                 "`set_default_x(x)`; got neither."
             )
-        return self._batch_of_x(x)
-
-    def _one_x(self, x: Tensor | None) -> Tensor:
-        batch = self._x_or_default(x)
+        batch = self._batch_of_x(x)
         if len(batch) > 1:
             raise InvalidInputError(
                 f"Expected one observation; got {len(batch)}. Use the `_batched` "
@@ -357,7 +352,7 @@ class MixturePosterior(BaseDirectPosterior):
         Args:
             theta: Parameters, shape ``(n, d)`` or ``(d,)``.
             x: An observation, from the batch if there is one; the default x if None.
-            norm_posterior: As in :meth:`log_prob_batched`, and so are the others.
+            norm_posterior: Whether to divide by the mass inside the prior's support.
             track_gradients: Whether gradients with respect to theta are needed.
             leakage_correction_params: Not used; must be None.
 

@@ -14,7 +14,7 @@ from sbi_rope._sbi import ConditionalDensityEstimator, move_distribution_to_devi
 from sbi_rope._validation import check_prior
 from sbi_rope.mixture.parts import Mixing, Part, Rows
 
-__all__ = ["PriorDensity", "part_of_prior", "prior_log_prob"]
+__all__ = ["PriorDensity", "part_of_prior", "prior_log_prob", "prior_sample"]
 
 
 def part_of_prior(prior: Distribution, event_shape: Sequence[int]) -> Part:
@@ -80,17 +80,14 @@ class PriorDensity(ConditionalDensityEstimator):
 
     def log_prob(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
         """Return the log densities of theta, ``(S, B, d)`` to ``(S, B)``."""
-        flat = input.reshape(-1, *self.input_shape)
-        return prior_log_prob(self.prior, flat).reshape(input.shape[:-1])
+        return prior_log_prob(self.prior, input)
 
     def sample(
         self, sample_shape: torch.Size, condition: Tensor, **kwargs: Any
     ) -> Tensor:
         """Draw for each condition, ``(*sample_shape, B, d)``."""
-        shape = (*sample_shape, len(condition))
-        # sbi's MultipleIndependent takes sample shapes with one dimension only.
-        theta = self.prior.sample(torch.Size((torch.Size(shape).numel(),)))
-        return theta.to(condition).reshape(*shape, *self.input_shape)
+        shape = torch.Size((*sample_shape, len(condition)))
+        return prior_sample(self.prior, shape).to(condition)
 
     def loss(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
         """Return the negative log-probability, shape ``(B,)``."""
@@ -104,17 +101,27 @@ class PriorDensity(ConditionalDensityEstimator):
         return moved
 
 
+def prior_sample(prior: Distribution, sample_shape: torch.Size) -> Tensor:
+    """Draw from a prior over parameters of shape ``(d,)``, ``(*sample_shape, d)``."""
+    # sbi's MultipleIndependent takes sample shapes with one dimension only.
+    theta = prior.sample(torch.Size((sample_shape.numel(),)))
+    return theta.reshape(*sample_shape, *theta.shape[1:])
+
+
 def prior_log_prob(prior: Distribution, theta: Tensor) -> Tensor:
     r"""Return the log density of the prior, :math:`-\infty` outside its support.
 
     Args:
         prior: A torch distribution over parameters of shape ``(d,)``.
-        theta: Parameters, shape ``(n, d)``.
+        theta: Parameters, shape ``(*batch, d)``.
 
     Returns:
-        Shape ``(n,)``. Gradients with respect to theta exist even where the density is
-        flat; they are zero there.
+        Shape ``(*batch)``. Gradients with respect to theta exist even where the density
+        is flat; they are zero there.
     """
+    shape = theta.shape[:-1]
+    # sbi's MultipleIndependent takes theta with at most two dimensions.
+    theta = theta.reshape(-1, theta.shape[-1])
     inside = within_support(prior, theta)
     # torch's distributions raise an error outside their support. There they are
     # evaluated at a draw from the prior, and the result is overwritten.
@@ -122,4 +129,4 @@ def prior_log_prob(prior: Distribution, theta: Tensor) -> Tensor:
         filler = prior.sample(torch.Size((1,))).to(theta)
     safe = torch.where(inside.unsqueeze(-1), theta, filler)
     log_prob = prior.log_prob(safe) + 0.0 * safe.sum(dim=-1)
-    return log_prob.where(inside, -torch.inf)
+    return log_prob.where(inside, -torch.inf).reshape(shape)

@@ -18,7 +18,7 @@ from sbi_rope._validation import (
     usable_device,
 )
 from sbi_rope.errors import InvalidInputError
-from sbi_rope.mixture.prior import prior_log_prob
+from sbi_rope.mixture.prior import prior_log_prob, prior_sample
 
 __all__ = ["PriorPosterior"]
 
@@ -78,7 +78,7 @@ class PriorPosterior(NeuralPosterior):
         **kwargs: Any,
     ) -> Tensor:
         """Draw from the prior, ``(*sample_shape, d)``; other arguments are ignored."""
-        return self._draw(as_shape("sample_shape", sample_shape))
+        return prior_sample(self.prior, as_shape("sample_shape", sample_shape))
 
     def sample_batched(
         self,
@@ -93,12 +93,8 @@ class PriorPosterior(NeuralPosterior):
         class asks.
         """
         shape = as_shape("sample_shape", sample_shape)
-        return self._draw(torch.Size((*shape, _number_of_rows(x))))
-
-    def _draw(self, shape: torch.Size) -> Tensor:
-        # sbi's MultipleIndependent takes sample shapes with one dimension only.
-        samples = self.prior.sample(torch.Size((shape.numel(),)))
-        return samples.reshape(*shape, *samples.shape[1:])
+        shape = torch.Size((*shape, _number_of_rows(x)))
+        return prior_sample(self.prior, shape)
 
     def log_prob(
         self,
@@ -180,8 +176,5 @@ class _PriorPotential(BasePotential):
     prior: Distribution
 
     def __call__(self, theta: Tensor, track_gradients: bool = True) -> Tensor:  # noqa: FBT001, FBT002
-        shape = theta.shape[:-1]
         with torch.set_grad_enabled(track_gradients):
-            # sbi's MultipleIndependent takes theta with at most two dimensions.
-            theta = theta.reshape(-1, theta.shape[-1])
-            return prior_log_prob(self.prior, theta).reshape(shape)
+            return prior_log_prob(self.prior, theta)

@@ -292,7 +292,7 @@ def test_blocked_couplings_make_no_matrix(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.mark.slow
-def test_the_memory_of_blocked_couplings_has_no_room_for_a_matrix() -> None:
+def test_blocked_couplings_take_less_memory_than_a_matrix() -> None:
     # 4000 x 4000 numbers are 122 MB in float64.
     blocked, stored = map(float, run_alone(MEASURE).split())
     assert 0.0 <= blocked <= 40.0

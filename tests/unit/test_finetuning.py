@@ -147,7 +147,7 @@ def test_five_pairs_are_enough_to_hold_one_out() -> None:
     assert len(validation) == 4
 
 
-def test_held_out_targets_stay_when_the_others_are_drawn_anew() -> None:
+def test_the_targets_of_held_out_pairs_stay_the_same_with_resampling() -> None:
     x, net = torch.randn(20, 2), linear()
     draws = iter([net(x).detach()] + [1e3 * torch.randn(20, 2) for _ in range(30)])
     result = CalibrationFinetuner(
@@ -274,7 +274,7 @@ def test_the_loss_of_rehearsal_is_the_weighted_distance_from_the_embeddings_by_h
     assert found == pytest.approx(expected, rel=1e-5)
 
 
-def test_held_out_pairs_are_judged_without_rehearsal() -> None:
+def test_the_validation_loss_does_not_contain_rehearsal() -> None:
     x, simulations = torch.randn(10, 2), torch.randn(50, 2)
     result = rehearsed(
         linear(),

@@ -258,7 +258,7 @@ def test_memory_stays_within_the_number_of_the_docstring() -> None:
     assert float(run_alone(MEMORY)) < 100
 
 
-def test_components_without_a_draw_inside_still_have_an_error() -> None:
+def test_the_mass_has_a_standard_error_even_if_no_draw_is_inside() -> None:
     # Mixtures that lie outside but for a sliver, of 5e-4 or less.
     embeddings = torch.cat([torch.full((40, 1), 2.0), torch.full((40, 1), -1.1)], dim=1)
     posterior = gaussian_posterior(dim=1, n_o=10, embeddings=embeddings)
@@ -840,7 +840,7 @@ def test_double_precision_and_numpy_observations_are_recognised() -> None:
     assert posterior.sample_batched((2,), batch.numpy(), **QUIET).shape == (2, 5, 2)
 
 
-def test_rows_cannot_be_changed_through_what_was_returned() -> None:
+def test_writing_to_returned_rows_does_not_change_the_weights() -> None:
     posterior = gaussian_posterior()
     before = posterior.weights.clone()
     problems.rows_of(posterior, posterior.x_o)[:] = 0

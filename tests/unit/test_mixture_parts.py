@@ -198,7 +198,7 @@ def test_log_prob_is_the_log_sum_over_parts_and_embeddings(
         assert torch.allclose(one, expected[:, 2:3].log().float(), atol=1e-5), entries
 
 
-def test_log_probs_of_parts_are_those_of_each_by_itself() -> None:
+def test_part_log_probs_are_the_log_densities_of_each_part_by_itself() -> None:
     posterior = three_parts(tail_mass=0.5, weights=(1.0, 0.0, 0.0))
     theta = 2 * torch.rand(NUM_BATCH, DIM) - 1
     theta[0] = 1.5  # where the prior has no density
@@ -299,7 +299,7 @@ def test_samples_follow_the_density_of_all_parts(
             assert ((counts - share).abs() < 4.5 * error + 2e-3).all(), entries
 
 
-def test_samples_come_from_each_part_as_often_as_it_weighs() -> None:
+def test_samples_come_from_each_part_in_proportion_to_its_weight() -> None:
     # Spikes at different integers: embeddings cannot be confused with each other.
     weights = (0.5, 0.3, 0.2)
     parts = []
@@ -318,7 +318,7 @@ def test_samples_come_from_each_part_as_often_as_it_weighs() -> None:
             assert abs(share - weight) < 4 * (weight * (1 - weight) / n) ** 0.5
 
 
-def test_the_mass_is_that_of_all_parts_and_so_is_its_error() -> None:
+def test_the_mass_and_its_error_are_those_of_all_parts_together() -> None:
     wrong = []
     for _ in range(10):
         posterior = three_parts()
@@ -583,7 +583,7 @@ def test_an_amortised_posterior_answers_any_x() -> None:
     assert metrics.lpp(posterior, theta[0], x).log_probs.shape == (4,)
 
 
-def test_the_part_of_an_npe_is_that_npe() -> None:
+def test_a_part_made_of_an_npe_has_its_density_and_its_mass() -> None:
     npe = problems.npe_posterior("nsf")
     estimator = copy.deepcopy(estimator_of(npe)).train()
     part = part_of(estimator)

@@ -323,7 +323,7 @@ THETA, X = torch.zeros(10, 2), torch.zeros(10, 2)
 NAN = torch.full((10, 2), torch.nan)
 
 
-def test_of_unusable_calibration_pairs_nothing_is_added() -> None:
+def test_unusable_calibration_pairs_are_not_added() -> None:
     conductor = rope()
     for theta, x in ((THETA, X[:9]), (THETA, NAN), (NAN, X)):
         with pytest.raises(InvalidInputError):
@@ -376,7 +376,7 @@ def test_a_simulator_that_returns_only_nan_is_refused() -> None:
         conductor.train(show_progress_bars=False)
 
 
-def test_a_failure_in_training_loses_nothing() -> None:
+def test_the_last_net_is_kept_if_training_fails() -> None:
     broken = False
 
     def simulator(theta: Tensor) -> Tensor:
@@ -500,7 +500,7 @@ def test_trying_a_simulator_keeps_the_random_state_of_the_caller() -> None:
     assert torch.equal(torch.get_rng_state(), state)
 
 
-def test_noise_that_a_whole_batch_shares_is_warned_about() -> None:
+def test_the_same_noise_in_a_whole_batch_is_warned_about() -> None:
     with pytest.warns(RoPEWarning, match="the same noise"):
         rope(simulator=lambda theta: theta + torch.randn(2))
     with warnings.catch_warnings():
@@ -522,7 +522,7 @@ def test_moving_our_posterior_moves_nothing_else() -> None:
     assert torch.isfinite(conductor.build_posterior(X_O).weights).all()
 
 
-def test_a_posterior_that_cannot_be_moved_stays_whole() -> None:
+def test_a_posterior_that_cannot_be_moved_does_not_change() -> None:
     posterior = rope().build_posterior(X_O)
     with pytest.raises(InvalidInputError, match="no method `to`"):
         posterior.to("meta")
@@ -562,7 +562,7 @@ def test_stored_simulations_must_come_from_the_prior() -> None:
         RoPE(npe, simulations=(THETA, X.to("meta")))
 
 
-def test_a_seed_does_not_repeat_the_draws_of_its_user() -> None:
+def test_a_seed_does_not_repeat_the_draws_after_the_same_seed_of_torch() -> None:
     torch.manual_seed(3)
     theta = gaussian.prior().sample((1000,))
     drawn = []
