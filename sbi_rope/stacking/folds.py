@@ -16,7 +16,6 @@ from sbi_rope._simulator import Simulator
 from sbi_rope._training import groups_of, split_groups
 from sbi_rope.discrepancy.correction import (
     NUM_STEPS,
-    Correction,
     Space,
     correct_npe,
     network_of,
@@ -238,18 +237,13 @@ class Fold:
         if learn_prior:
             probabilities = learn_parameters(theta, theta_s).probabilities
         estimator = estimator_of(bench.npe)
-        # All versions share the same h, because none of them changes it.
-        nets = [] if space == "input" else [bench.embedding_net]
         if space == "tuned":
-            nets = []
-            z = bench.embedded.new_empty(len(bench.x), bench.embedded.shape[1])
-            for net, rows in self._tuned_without():
-                z[rows] = embed(net, bench.x[rows])
-                nets.append(net)
-            z = z[self.rows]
+            nets, z = self._cross_fitted()
         else:
+            # All versions share the same h, because none of them changes it.
+            nets = [] if space == "input" else [bench.embedding_net]
             z = embed(network_of(estimator, space), x)
-        correction: Correction = correct_npe(
+        correction = correct_npe(
             estimator,
             (theta_s, x_s if space == "input" else bench.embedded),
             z,
@@ -257,14 +251,23 @@ class Fold:
             space=space,
             model=DiscrepancyModel(),
             probabilities=probabilities,
-            # A fixed number of steps saves time. If it is too small, the weights show
-            # it.
+            # Without further courses, which take long. If they are needed, the weights
+            # show it.
             num_steps=NUM_STEPS[space],
         )
         return Corrected(
             estimator=correction.estimator,
             nets=tuple(nn.Sequential(net, correction.constants) for net in nets),
         )
+
+    def _cross_fitted(self) -> tuple[list[nn.Module], Tensor]:
+        """Return tuned nets, and the pairs embedded by nets that have not seen them."""
+        bench, nets = self.bench, []
+        z = bench.embedded.new_empty(len(bench.x), bench.embedded.shape[1])
+        for net, rows in self._tuned_without():
+            z[rows] = embed(net, bench.x[rows])
+            nets.append(net)
+        return nets, z[self.rows]
 
     def _tuned_without(self) -> Iterator[tuple[nn.Module, Tensor]]:
         """Yield nets tuned on some pairs, each with rows that it has not seen."""

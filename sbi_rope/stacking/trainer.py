@@ -194,6 +194,30 @@ class StackTrainer:
         )
 
     def _score(self, versions: Versions, num_training_folds: int) -> CrossValidation:
+        log_scores, fold = self._log_scores(versions)
+        weights = fold_weights(log_scores, fold, self.pseudo_count)
+        stack_scores, levels = self._stack_scores(versions, weights)
+        num_folds = len(self.bench.folds)
+        scores = CrossValidation(
+            names=tuple(candidate.name for candidate in self.candidates),
+            families=tuple(candidate.family for candidate in self.candidates),
+            log_scores=log_scores,
+            fold=fold,
+            num_trained_on=len(fold) * num_training_folds // num_folds,
+            stack_scores=stack_scores,
+            levels=levels,
+            pseudo_count=self.pseudo_count,
+        )
+        if not scores.weights.converged:
+            warn_user(
+                "The weights of the stack have not converged: the held-out score could "
+                f"be better by up to {scores.weights.gap / len(fold):.3f} nats a "
+                "pair. Leave out candidates that are nearly the same."
+            )
+        return scores
+
+    def _log_scores(self, versions: Versions) -> tuple[Tensor, Tensor]:
+        """Return the score of each candidate at each pair, and the folds."""
         bench = self.bench
         theta, x = bench.theta, bench.x
         log_scores = theta.new_empty(
@@ -212,8 +236,20 @@ class StackTrainer:
                 [number],
                 log_q=None if log_q is None else log_q[rows],
             )
-        weights = fold_weights(log_scores, fold, self.pseudo_count)
-        stack_scores = log_scores.new_empty(len(theta))
+        return log_scores, fold
+
+    def _stack_scores(
+        self, versions: Versions, weights: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the normalised score of the stack at each pair, and the levels.
+
+        Args:
+            versions: The candidates.
+            weights: The weights of the stack that scores each fold, ``(F, K)``.
+        """
+        bench = self.bench
+        theta, x = bench.theta, bench.x
+        stack_scores = theta.new_empty(len(theta), dtype=torch.double)
         levels = torch.empty_like(theta)
         # The couplings are the first part, and have the same simulations in all folds.
         # The mass of the other parts inside the prior can differ from fold to fold.
@@ -231,23 +267,7 @@ class StackTrainer:
             levels[rows] = central_levels(ranks).to(levels)
             if versions.couplings is not None and 0 in shared:
                 masses[0] = shared[0]
-        scores = CrossValidation(
-            names=tuple(candidate.name for candidate in self.candidates),
-            families=tuple(candidate.family for candidate in self.candidates),
-            log_scores=log_scores,
-            fold=fold,
-            num_trained_on=len(theta) * num_training_folds // len(bench.folds),
-            stack_scores=stack_scores,
-            levels=levels,
-            pseudo_count=self.pseudo_count,
-        )
-        if not scores.weights.converged:
-            warn_user(
-                "The weights of the stack have not converged: the held-out score could "
-                f"be better by up to {scores.weights.gap / len(theta):.3f} nats a "
-                "pair. Leave out candidates that are nearly the same."
-            )
-        return scores
+        return stack_scores, levels
 
     def _normalised(
         self, posterior: MixturePosterior, theta: Tensor, x: Tensor

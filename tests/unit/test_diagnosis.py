@@ -244,7 +244,10 @@ def test_the_mmd_agrees_with_its_definition(monkeypatch: pytest.MonkeyPatch) -> 
     assert test.p_value == pytest.approx(1 / 121 if test.mmd > usual else 1.0)
 
 
-def test_p_values_of_the_mmd_test_are_uniform_for_simulations() -> None:
+def test_p_values_of_the_mmd_test_are_uniform_for_simulations(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("sbi_rope.diagnosis.misspecification.NUM_DRAWS", 200)
     torch.manual_seed(11)
     values = []
     for _ in range(25):

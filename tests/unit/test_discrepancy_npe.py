@@ -120,20 +120,20 @@ def test_every_source_of_simulations_gives_a_posterior_of_sbi(space: str) -> Non
         assert not torch.equal(found, log_probs(problems.npe_posterior())), name
 
 
-@pytest.mark.parametrize(("kind", "space"), [("fmpe", "embedding"), ("npse", "input")])
-def test_vector_fields_are_corrected_and_can_be_sampled(kind: str, space: str) -> None:
-    posterior = problems.vector_field_posterior(kind)
-    made = trained(posterior, space=space).build_posterior()
-    assert isinstance(made, VectorFieldPosterior)
+def test_vector_fields_are_corrected_and_can_be_sampled() -> None:
     x = labelled(1)[1]
-    samples = []
-    for one in (made, posterior):
-        torch.manual_seed(0)
-        samples.append(one.sample((5,), x=x, show_progress_bars=False))
-    assert samples[0].shape == (5, 2)
-    assert not torch.equal(*samples)
-    with pytest.raises(UnsupportedPosteriorError, match="space='embedding'"):
-        trained(posterior, space="tuned")
+    for kind, space in (("fmpe", "embedding"), ("npse", "input")):
+        posterior = problems.vector_field_posterior(kind)
+        made = trained(posterior, space=space).build_posterior()
+        assert isinstance(made, VectorFieldPosterior)
+        samples = []
+        for one in (made, posterior):
+            torch.manual_seed(0)
+            samples.append(one.sample((5,), x=x, show_progress_bars=False))
+        assert samples[0].shape == (5, 2)
+        assert not torch.equal(*samples)
+        with pytest.raises(UnsupportedPosteriorError, match="space='embedding'"):
+            trained(posterior, space="tuned")
 
 
 def test_mixed_parameters_keep_their_categories() -> None:
