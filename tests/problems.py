@@ -3,6 +3,7 @@
 import functools
 import math
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -88,14 +89,16 @@ def npe_posterior(
     or "cnn" for image-shaped x. ``dim`` is the number of continuous parameters, which a
     mixed family has two discrete ones beside.
     """
-    net: nn.Module = {
+    make_net: Callable[[], nn.Module] = {
         "none": nn.Identity,
         "linear": lambda: nn.Sequential(nn.Linear(3, 4), nn.Tanh(), nn.Dropout(0.5)),
         "cnn": SmallCNN,
-    }[embedding]()
+    }[embedding]
     with torch.random.fork_rng(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
+        # Whoever asks first gets the same network as all others.
         torch.manual_seed(1)
+        net = make_net()
         prior = mixed_prior(dim) if family in MIXED_FAMILIES else box(dim)
         theta = prior.sample((200,))
         x = (simulate_image if embedding == "cnn" else simulate)(theta)
