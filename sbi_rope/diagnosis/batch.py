@@ -144,8 +144,8 @@ def _held_out(
     rope: RoPE, num_folds: int | None, *, show_progress_bars: bool
 ) -> tuple[CrossFitted | None, list[str]]:
     """Return the embeddings of held-out calibration pairs, or why there are none."""
-    num_pairs = len(rope.calibration[0])
-    if not num_pairs:
+    theta, _ = rope.calibration
+    if not len(theta):
         note = (
             "There are no calibration pairs, so that nothing was tuned. The tests that "
             "need labels were left out (misspecification after tuning, residuals)."
@@ -155,8 +155,11 @@ def _held_out(
             "Residuals of calibration pairs were left out, as asked. Errors of g can "
             "therefore look like a prior shift."
         )
-    elif num_pairs < 2:
-        note = "Residuals were left out, because there is only one calibration pair."
+    elif len(theta.unique(dim=0)) < 2:
+        note = (
+            "Residuals were left out, because all calibration pairs have the same "
+            "parameters, or there is only one."
+        )
     else:
         return cross_fit(
             rope, num_folds=num_folds, show_progress_bars=show_progress_bars

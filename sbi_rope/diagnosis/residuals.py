@@ -8,6 +8,7 @@ from torch import Tensor
 from sbi_rope._progress import progress_bar
 from sbi_rope._sbi import embed
 from sbi_rope._simulations import draw_targets
+from sbi_rope._training import groups_of, split_groups
 from sbi_rope.diagnosis.report import Finding
 from sbi_rope.diagnosis.simulations import Simulations
 from sbi_rope.rope import RoPE
@@ -78,7 +79,8 @@ def cross_fit(rope: RoPE, *, num_folds: int, show_progress_bars: bool) -> CrossF
 
     Args:
         rope: RoPE with its calibration pairs; it is not changed.
-        num_folds: Number of folds, at most the number of pairs.
+        num_folds: Number of folds, at most the number of different parameters, of
+            which there are two at least.
         show_progress_bars: Whether to show how many folds are done.
     """
     theta, x = rope.calibration
@@ -92,8 +94,9 @@ def cross_fit(rope: RoPE, *, num_folds: int, show_progress_bars: bool) -> CrossF
         progress=False,
     )
     embedded = torch.empty_like(targets)
-    order = torch.randperm(len(theta)).to(theta.device)
-    folds = order.tensor_split(min(num_folds, len(theta)))
+    # Recordings at the same parameters share a fold, as they do in a stack.
+    split = split_groups(groups_of(theta), num_folds)
+    folds = [rows.to(theta.device) for rows in split if len(rows)]
     for held_out in progress_bar(folds, show=show_progress_bars, desc="Folds"):
         others = torch.cat([fold for fold in folds if fold is not held_out])
         part = rope.with_pairs(others, targets=targets[others])

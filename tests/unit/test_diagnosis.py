@@ -498,6 +498,41 @@ def test_residuals_are_of_pairs_that_g_was_not_trained_on() -> None:
     assert not torch.allclose(nets[0][1:], nets[1][1:], atol=1e-5)
 
 
+def test_recordings_at_the_same_parameters_are_held_out_together(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    torch.manual_seed(24)
+    theta = gaussian.labelled(6)[0].repeat(3, 1)
+    rope = conductor(finetuner=CalibrationFinetuner(max_num_epochs=2))
+    rope.append_calibration(theta, gaussian.real_process(theta))
+    rope.train(seed=0, show_progress_bars=False)
+    trained_on = []
+    with_pairs = RoPE.with_pairs
+
+    def spied(self: RoPE, rows: Tensor, **options: object) -> RoPE:
+        trained_on.append(set(rows.tolist()))
+        return with_pairs(self, rows, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(RoPE, "with_pairs", spied)
+    cross_fit(rope, num_folds=4, show_progress_bars=False)
+    assert len(trained_on) == 4
+    for rows in trained_on:
+        held_out = set(range(18)) - rows
+        assert {row % 6 for row in rows}.isdisjoint({row % 6 for row in held_out})
+
+
+@pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
+def test_pairs_of_one_parameter_leave_residuals_out() -> None:
+    torch.manual_seed(25)
+    theta = gaussian.labelled(1)[0].repeat(6, 1)
+    rope = conductor(finetuner=CalibrationFinetuner(max_num_epochs=2))
+    rope.append_calibration(theta, gaussian.real_process(theta))
+    rope.train(seed=0, show_progress_bars=False)
+    diagnosis = look(rope, gaussian.real_process(parameters(40)), num_simulations=200)
+    assert diagnosis.residuals is None
+    assert "the same parameters, or there is only one" in diagnosis.notes[0]
+
+
 # --- what is refused, and the picture ---
 
 
