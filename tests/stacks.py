@@ -1,4 +1,4 @@
-"""Small stacks that tests share, and what they are made of."""
+"""Small stacks that tests share, and their candidates and data."""
 
 import functools
 from collections.abc import Iterator
@@ -29,7 +29,7 @@ NUM_PAIRS, NUM_OBSERVED, NUM_SIMULATED = 20, 25, 60
 
 @contextmanager
 def quick() -> Iterator[None]:
-    """Make all that a stack trains far enough to be another, and no further."""
+    """Train everything in a stack for a few steps only."""
     model = DiscrepancyModel(
         gain_precisions=(1.0,), error_scales=(0.1,), degrees_of_freedom=(3.0,)
     )
@@ -52,7 +52,7 @@ def quick() -> Iterator[None]:
         yield
 
 
-# Moves the net far enough to tell g from h.
+# Tuning moves the net far enough that g differs from h.
 QUICK = CalibrationFinetuner(
     max_num_epochs=6, simulations_per_target=3, learning_rate=0.03
 )
@@ -66,7 +66,7 @@ COUPLINGS = (
     CouplingCandidate(gamma=0.3, tau=0.9, tuned=False, cost_scale="none"),
     CouplingCandidate(gamma=0.2, tau=0.5, rehearsal=20.0),
 )
-# All kinds that a stack has by itself, with couplings at a few settings.
+# All kinds of default candidates, with couplings at a few settings.
 CANDIDATES = (
     *COUPLINGS,
     *(
@@ -88,29 +88,29 @@ def finetuned(rope: RoPE, seed: int) -> Any:
 
 
 def fitted_prior(rope: RoPE, seed: int) -> PriorPosterior:
-    """A box around the parameters of the pairs."""
+    """Return a box around the parameters of the pairs."""
     theta, _ = rope.calibration
     width = theta.abs().max(dim=0).values + 0.1
     box = problems.BoxUniform(-width, width)
     return PriorPosterior(box)
 
 
-# Cheap ones that see the pairs.
+# These candidates depend on the pairs and are quick to train.
 FINETUNED = DensityCandidate(name="mine", build=finetuned)
 FITTED = DensityCandidate(name="fitted prior", build=fitted_prior)
 
 
 def uneven(theta: Tensor) -> Tensor:
-    """Noisy readings that take more random numbers at some theta than at others.
+    """Simulate noisy readings, which take more random numbers at some theta.
 
-    So the simulations of all that come later depend on every theta before.
+    The simulations of later rows then depend on theta of all rows before.
     """
     rate = 10 * (1.5 + theta.sum(dim=1, keepdim=True)).clamp_min(0.1)
     return problems.simulate(theta) + 0.02 * (torch.poisson(rate) - rate)
 
 
 def problem(n: int, *, seed: int, dim: int = 2) -> tuple[Tensor, Tensor]:
-    """Real observations, shifted against the simulations, with their parameters."""
+    """Return parameters, and real observations with a shift against simulations."""
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         theta = problems.box(dim).sample((n,))
@@ -124,7 +124,7 @@ def rope_of(
     embedding: str = "linear",
     **options: Any,
 ) -> RoPE:
-    """A RoPE that was not trained: a stack does without."""
+    """Return a RoPE that is not trained, because a stack does not need that."""
     if "simulations" not in options:
         options.setdefault("simulator", uneven)
     options.setdefault("finetuner", QUICK)
@@ -160,13 +160,14 @@ def _options(x_o: Tensor | None, options: dict[str, Any]) -> dict[str, Any]:
 
 @functools.cache
 def the_stack() -> StackedPosterior:
-    """Of any observation; for reading only, as the next."""
+    """Return a stack for any observation. Tests share it and must not change it."""
     with torch.random.fork_rng():
         return stacked(rope_of(), tail_mass=0.0)
 
 
 @functools.cache
 def the_coupled_stack() -> StackedPosterior:
+    """Return a stack for a batch. Tests share it and must not change it."""
     with torch.random.fork_rng():
         return stacked(rope_of(), observed(), tail_mass=0.0, unseen="extend")
 

@@ -4,11 +4,7 @@ from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.npe import DiscrepancyNPE
 from sbi_rope.discrepancy.parameters import ParameterDistribution, learn_parameters
 from sbi_rope.discrepancy.posterior import Discrepancy, DiscrepancyDraws
-from sbi_rope.discrepancy.report import (
-    DiscrepancyReport,
-    Interval,
-    SummaryDiscrepancy,
-)
+from sbi_rope.discrepancy.report import DiscrepancyReport, Interval, SummaryDiscrepancy
 
 __all__ = [
     "Discrepancy",

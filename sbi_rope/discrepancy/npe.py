@@ -28,11 +28,7 @@ from sbi_rope._validation import (
     check_names,
     check_positive,
 )
-from sbi_rope.discrepancy.correction import (
-    Space,
-    correct_npe,
-    network_of,
-)
+from sbi_rope.discrepancy.correction import Space, correct_npe, network_of
 from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.parameters import learn_parameters
 from sbi_rope.discrepancy.posterior import Discrepancy

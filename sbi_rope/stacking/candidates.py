@@ -8,10 +8,7 @@ from typing import Any, Literal
 
 import torch
 
-from sbi_rope._sbi import (
-    ConditionalDensityEstimator,
-    estimator_of,
-)
+from sbi_rope._sbi import ConditionalDensityEstimator, estimator_of
 from sbi_rope._validation import (
     check_choice,
     check_instance,

@@ -14,12 +14,7 @@ from sbi_rope._sbi import embed, estimator_of
 from sbi_rope._simulations import Moments
 from sbi_rope._simulator import Simulator
 from sbi_rope._training import groups_of, split_groups
-from sbi_rope.discrepancy.correction import (
-    NUM_STEPS,
-    Space,
-    correct_npe,
-    network_of,
-)
+from sbi_rope.discrepancy.correction import NUM_STEPS, Space, correct_npe, network_of
 from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.parameters import learn_parameters
 from sbi_rope.discrepancy.tuning import TUNING

@@ -5,14 +5,9 @@ from typing import Literal
 
 from torch import Tensor
 
-from sbi_rope._validation import (
-    check_choice,
-    check_unit_interval,
-)
+from sbi_rope._validation import check_choice, check_unit_interval
 from sbi_rope.rope import RoPE
-from sbi_rope.stacking.candidates import (
-    Candidate,
-)
+from sbi_rope.stacking.candidates import Candidate
 from sbi_rope.stacking.cross_validation import CrossValidation
 from sbi_rope.stacking.posterior import StackedPosterior
 from sbi_rope.stacking.report import LearningCurve, StackingReport
