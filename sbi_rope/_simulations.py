@@ -182,8 +182,8 @@ class StoredSimulations:
                 f"stored simulations; got {num_neighbors}."
             )
         nearest = self._nearest(theta, num_neighbors)
-        statistics = embed(self.x[nearest.flatten()])
-        return statistics.reshape(*nearest.shape, -1).mean(dim=1)
+        embedded = embed(self.x[nearest.flatten()])
+        return embedded.reshape(*nearest.shape, -1).mean(dim=1)
 
     def moments(
         self, theta: Tensor, count: int, embed: Embedding, *, progress: bool

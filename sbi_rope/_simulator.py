@@ -79,14 +79,14 @@ class Simulator:
         """Simulate at parameters from the prior; drop rows that are not finite."""
         count = at_least if count is None else count
         theta = self.prior.sample(torch.Size((count,))).to(self.like)
-        statistics, valid = self._embed_at(theta, embed, progress=progress)
+        embedded, valid = self._embed_at(theta, embed, progress=progress)
         if not valid.any():
             raise SimulationError(
                 f"All {count} simulations from the prior contain NaN or Inf."
             )
         self.num_dropped += int((~valid).sum())
         warn_of_dropped(int((~valid).sum()), count, "simulations from the prior")
-        return theta[valid], statistics[valid]
+        return theta[valid], embedded[valid]
 
     def targets(
         self,
@@ -98,10 +98,10 @@ class Simulator:
         progress: bool,
     ) -> Tensor:
         """Simulate several times at each theta and average the finite ones."""
-        statistics, valid = self._repeat_at(
+        embedded, valid = self._repeat_at(
             theta, simulations_per_target, embed, progress=progress
         )
-        total = statistics.where(valid[..., None], 0.0).sum(dim=1)
+        total = embedded.where(valid[..., None], 0.0).sum(dim=1)
         return total / valid.sum(dim=1, keepdim=True)
 
     def moments(
@@ -132,12 +132,12 @@ class Simulator:
     def _repeat_at(
         self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
     ) -> tuple[Tensor, Tensor]:
-        """Simulate at each theta, ``(n, count, l)``, and tell what is finite."""
+        """Return embeddings ``(n, count, l)`` at each theta, and which are finite."""
         repeated = theta.repeat_interleave(count, dim=0)
-        statistics, valid = self._embed_at(repeated, embed, progress=progress)
+        embedded, valid = self._embed_at(repeated, embed, progress=progress)
         dropped = int((~valid).sum())
         valid = valid.reshape(-1, count)
-        statistics = statistics.reshape(*valid.shape, -1)
+        embedded = embedded.reshape(*valid.shape, -1)
         self.num_dropped += dropped
         empty = ~valid.any(dim=1)
         if empty.any():
@@ -148,12 +148,12 @@ class Simulator:
                 f"Inf ({int(empty.sum())} pairs in all). Remove these pairs."
             )
         warn_of_dropped(dropped, valid.numel(), "simulations at calibration parameters")
-        return statistics, valid
+        return embedded, valid
 
     def _embed_at(
         self, theta: Tensor, embed: Embedding, *, progress: bool
     ) -> tuple[Tensor, Tensor]:
-        statistics, valid = [], []
+        embeddings, valid = [], []
         bar = progress_bar(
             show=progress, desc="Simulating", total=len(theta), delay=DELAY
         )
@@ -165,11 +165,11 @@ class Simulator:
             # are dropped later.
             ok_shape = (-1,) + (1,) * (x.ndim - 1)
             embedded = embed(x.where(ok.reshape(ok_shape), 0.0))
-            statistics.append(embedded)
+            embeddings.append(embedded)
             # An embedding can overflow where x does not.
             valid.append(ok & torch.isfinite(embedded).flatten(1).all(dim=1))
         bar.close()
-        return torch.cat(statistics), torch.cat(valid)
+        return torch.cat(embeddings), torch.cat(valid)
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate, theta ``(n, d)`` to x ``(n, *event)``; x may contain NaN."""
@@ -214,7 +214,7 @@ class Simulator:
     def _probe(self) -> bool:
         """Find out whether the simulator takes a batch or a single theta."""
         sizes = {*self.prior.event_shape, *self.event_shape}
-        # The number of rows differs from the numbers of parameters and of readings.
+        # A number of rows that is no number of parameters or of readings.
         count = next(n for n in range(3, 3 + len(sizes) + 1) if n not in sizes)
         draws = self.prior.sample(torch.Size((2 * count - 1,))).to(self.like)
         theta = draws[:1].repeat(count, 1)

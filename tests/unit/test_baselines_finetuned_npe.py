@@ -191,7 +191,7 @@ def test_each_network_starts_from_one_of_the_tuned_nets() -> None:
     method = finetuned(start, **options)
     assert method.num_holdouts == 3
     of_each = networks(method)
-    contexts = part.mixing.features(TEST[1])
+    contexts = part.mixing.embed(TEST[1])
     for k in range(3):
         expected = part.density.log_prob(TEST[0][None], contexts[:, k])[0].double()
         assert torch.allclose(of_each[:, k], expected, atol=1e-3)

@@ -186,7 +186,7 @@ def test_a_prior_of_independent_parts_can_be_drawn_and_evaluated_in_batches() ->
 
 def test_a_prior_over_numbers_instead_of_vectors_is_refused() -> None:
     prior = torch.distributions.Uniform(torch.zeros(2), torch.ones(2))
-    with pytest.raises(InvalidInputError, match=r"event shape \(k,\)"):
+    with pytest.raises(InvalidInputError, match=r"event shape \(d,\)"):
         PriorPosterior(prior)
 
 
