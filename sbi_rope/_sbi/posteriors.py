@@ -134,8 +134,8 @@ def describe(posterior: NeuralPosterior, purpose: str) -> None:
 class BaseDirectPosterior(DirectPosterior):
     """sbi's DirectPosterior, for our own posteriors to derive from.
 
-    ``map()`` shows the progress of its draws only if it was asked to, and shallow
-    copies share no state.
+    ``map()`` shows the progress of its draws only if it was asked to, and never returns
+    less than the best of its starting points. Shallow copies share no state.
     """
 
     def __getstate__(self) -> dict[str, Any]:
@@ -155,9 +155,17 @@ class BaseDirectPosterior(DirectPosterior):
             init_method = self.sample(
                 (num_init_samples,), show_progress_bars=show_progress_bars
             )
-        return super()._calculate_map(
+        found = super()._calculate_map(
             init_method=init_method,
             num_init_samples=num_init_samples,
             show_progress_bars=show_progress_bars,
             **options,
         )
+        if not isinstance(init_method, Tensor):
+            return found
+        # Where no step improves on the best start, sbi transforms that start a second
+        # time and returns another point.
+        heights = self.potential_fn(init_method)
+        start = init_method[heights.argmax()].reshape(1, -1)
+        improved = self.potential_fn(found.reshape(1, -1)) >= heights.max()
+        return found.reshape(1, -1) if bool(improved) else start

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_rope._random import seeded
-from sbi_rope._sbi import BaseDirectPosterior, describe
+from sbi_rope._sbi import BaseDirectPosterior, MixedDensity, describe
 from sbi_rope._validation import (
     as_numbers,
     as_shape,
@@ -74,6 +74,7 @@ class MixturePosterior(BaseDirectPosterior):
         estimator: The mixture.
         prior: The prior NPE was trained with.
         enable_transform: Whether ``map()`` searches in an unbounded space, as in sbi.
+            For mixed discrete and continuous parameters it never does.
         shared: A dictionary in which the posterior keeps the masses :math:`Z_j` that it
             estimates. Posteriors of the same prior and the same parts, in the same
             order, may share it, whatever their weights and couplings are.
@@ -87,12 +88,17 @@ class MixturePosterior(BaseDirectPosterior):
         enable_transform: bool = True,
         shared: dict[int, Tensor] | None = None,
     ) -> None:
+        # A category that sbi has standardised and put back may differ by rounding, and
+        # is no category then.
+        is_mixed = any(
+            isinstance(part.density, MixedDensity) for part in estimator.parts
+        )
         with seeded(0):  # sbi draws from the prior to find out about it
             super().__init__(
                 estimator,
                 prior,
                 device=estimator.weights.device,
-                enable_transform=enable_transform,
+                enable_transform=enable_transform and not is_mixed,
             )
         self.posterior_estimator: MixtureEstimator = estimator
         # Posteriors of single observations share it, so that all is estimated once.

@@ -329,8 +329,8 @@ def test_densities_of_the_family_integrate_to_one_inside_the_prior(
     edges = torch.linspace(-1, 1, 101)
     theta = (edges[1:] + edges[:-1])[:, None] / 2
     density = posterior.log_prob(theta).exp()
-    # 1024 draws behind the mass of each component, and steps of 0.02.
-    assert float(density.sum() * 0.02) == pytest.approx(1.0, abs=0.02)
+    # The mass inside is estimated from 1024 draws, and the steps are 0.02 wide.
+    assert float(density.sum() * 0.02) == pytest.approx(1.0, abs=0.04)
 
 
 @pytest.mark.parametrize("method", ["fmpe", "npse"])
@@ -514,8 +514,8 @@ def test_a_prior_that_sbi_cannot_transform_works_without_the_transform() -> None
 
 def test_the_maximum_of_a_mixed_density_has_categories() -> None:
     posterior, _ = mixed_mixture(problems.npe_posterior("mnpe", dim=1))
-    view = posterior[0]
-    best = view.map(num_init_samples=20, num_iter=20, **QUIET)
-    assert within_support(view.prior, best).all()
-    samples = view.sample((200,), **QUIET)
-    assert view.potential(best) >= view.potential(samples).quantile(0.9)
+    for view in (posterior[0], posterior[1]):
+        best = view.map(num_init_samples=20, num_iter=20, **QUIET)
+        assert within_support(view.prior, best).all()
+        samples = view.sample((200,), **QUIET)
+        assert view.potential(best) >= view.potential(samples).quantile(0.9)

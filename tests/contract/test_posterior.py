@@ -185,6 +185,20 @@ def test_map_finds_the_mode() -> None:
         assert view.log_prob(mode) > best - 0.02
 
 
+def test_map_is_the_best_start_where_no_step_improves_on_it() -> None:
+    view = gaussian_posterior()[0]
+    view.map(num_iter=200, num_init_samples=200, show_progress_bars=False)
+    start = view.map(show_progress_bars=False)
+    again = view.map(
+        num_iter=1,
+        init_method=start,
+        learning_rate=10.0,
+        force_update=True,
+        show_progress_bars=False,
+    )
+    assert torch.equal(again, start)
+
+
 # --- the batch ---
 
 
