@@ -172,11 +172,13 @@ def mean(rows: pd.DataFrame, column: str = "lpp_z") -> float | None:
 
 def gap(ours: pd.DataFrame, theirs: pd.DataFrame) -> float | None:
     """Return the mean difference in LPP over the repetitions that both have."""
-    scores = (_finished(rows)[["repetition", "lpp_z"]] for rows in (ours, theirs))
-    pairs = pd.merge(*scores, on="repetition", suffixes=("", "_other"))
+    finished = (_finished(rows) for rows in (ours, theirs))
+    a, b = (
+        dict(zip(rows["repetition"], rows["lpp_z"], strict=True)) for rows in finished
+    )
     # Two that are -inf do not differ.
-    differences = (pairs["lpp_z"] - pairs["lpp_z_other"]).fillna(0.0)
-    return float(differences.mean()) if len(pairs) else None
+    differences = [0.0 if a[k] == b[k] else a[k] - b[k] for k in a if k in b]
+    return sum(differences) / len(differences) if differences else None
 
 
 # Texts ------------------------------------------------------------------------------

@@ -239,7 +239,7 @@ def test_learned_parameters_move_the_posterior_to_those_of_the_pairs() -> None:
     x = problems.simulate(theta) + 3 * torch.randn(100, 3)  # hardly informative
     means = []
     for learn_prior in (False, True):
-        made = method(learn_prior=learn_prior, num_steps=500, num_simulations=2000)
+        made = method(learn_prior=learn_prior, num_steps=400, num_simulations=2000)
         made.append_calibration(theta, x).train(**QUIET)
         samples = made.build_posterior().sample_batched(
             (50,), x[:20], show_progress_bars=False

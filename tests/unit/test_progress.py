@@ -25,6 +25,7 @@ rope.build_posterior(gaussian.labelled(30)[1])
 """
 
 
+@pytest.mark.slow
 def test_training_into_a_log_file_writes_next_to_nothing(tmp_path: Path) -> None:
     log = tmp_path / "log"
     with log.open("wb") as file:
