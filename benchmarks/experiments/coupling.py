@@ -257,7 +257,7 @@ def compare_default(args: argparse.Namespace) -> Iterator[Row]:
     """From embeddings to rows: the coupler with its defaults, and POT as shipped."""
     for n, (gamma, tau) in itertools.product(args.n, SETTINGS):
         points = embeddings(n, torch.float64)
-        coupler = SinkhornCoupler(gamma=gamma, tau=tau)
+        coupler = SinkhornCoupler(gamma=gamma, tau=tau, cost_scale="none")
         by_pot = partial(from_embeddings_by_pot, *points, gamma, tau)
         tasks = {
             "coupler": lambda c=coupler, p=points: c.couple(*p).weights,
@@ -334,7 +334,7 @@ def compare_sweeps(args: argparse.Namespace) -> Iterator[Row]:
     grid = [gammas, [0.5, 0.7, 0.9, 0.99, 1.0]]
     for n, name in itertools.product(args.n, args.dtypes):
         points = embeddings(n, DTYPES[name])
-        coupler = SinkhornCoupler(dtype=DTYPES[name])
+        coupler = SinkhornCoupler(dtype=DTYPES[name], cost_scale="none")
         plain = replace(coupler, anderson_memory=0)
         tasks = {
             "own, warm": partial(warm, coupler, points, grid),
@@ -374,7 +374,11 @@ def measure(n: int, name: str, mode: str) -> None:
     """Couple once and print iterations, error, seconds and peak memory."""
     real, simulated = embeddings(n, DTYPES[name])
     coupler = SinkhornCoupler(
-        gamma=0.5, tau=0.9, dtype=DTYPES[name], blocked=mode == "blocked"
+        gamma=0.5,
+        tau=0.9,
+        cost_scale="none",
+        dtype=DTYPES[name],
+        blocked=mode == "blocked",
     )
     coupler.couple(real[:100], simulated[:100])
     before = peak_memory()
@@ -392,7 +396,7 @@ def compare_subsets(args: argparse.Namespace) -> Iterator[Row]:
     real, simulated = embeddings(10_000, torch.float64)
     simulated = simulated[:2000]
     for gamma, tau in [(0.5, 0.9), (0.1, 0.9)]:
-        coupler = SinkhornCoupler(gamma=gamma, tau=tau)
+        coupler = SinkhornCoupler(gamma=gamma, tau=tau, cost_scale="none")
         full = coupler.couple(real, simulated)
         for count in (500, 1000, 2000, 5000, 10_000):
             start = time.perf_counter()
@@ -422,6 +426,7 @@ def check_extremes(args: argparse.Namespace) -> Iterator[Row]:
             SinkhornCoupler(
                 gamma=ratio * largest,
                 tau=tau,
+                cost_scale="none",
                 solver=solver,
                 blocked=blocked,
                 dtype=DTYPES[name],

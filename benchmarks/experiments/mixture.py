@@ -142,7 +142,9 @@ def measure(settings: dict[str, Any]) -> None:
     rope = RoPE(npe, simulator=simulate)
     posterior = rope.build_posterior(
         x_o,
-        coupler=SinkhornCoupler(gamma=settings["gamma"], tau=settings["tau"]),
+        coupler=SinkhornCoupler(
+            gamma=settings["gamma"], tau=settings["tau"], cost_scale="none"
+        ),
         num_simulations=settings["n_s"],
         seed=0,
         unseen="extend",

@@ -142,7 +142,6 @@ def _indistinct(sizes: Tensor, num_simulations: int) -> Finding:
         ),
         reason=(
             "Alarming above the threshold: a posterior over half of all simulations is "
-            "almost the prior. A smaller gamma, or cost_scale='simulated', separates "
-            "the observations."
+            "almost the prior. A smaller gamma separates the observations."
         ),
     )
