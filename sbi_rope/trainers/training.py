@@ -1,6 +1,7 @@
 """How networks are trained: on simulations by sbi, on calibration pairs by our loop."""
 
 import copy
+import functools
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -85,16 +86,7 @@ def estimator_builder(density_estimator: Any) -> EstimatorBuilder:
         InvalidInputError: If sbi knows no estimator of that name.
     """
     if isinstance(density_estimator, str):
-        name, density_estimator = density_estimator, posterior_nn(density_estimator)
-        try:
-            with seeded(0):
-                some = torch.randn(10, 2)
-                density_estimator(some, some)
-        except Exception as error:
-            raise InvalidInputError(
-                "Expected `density_estimator` to be the name of an estimator for "
-                f"continuous parameters that sbi's `posterior_nn` knows; got {name!r}."
-            ) from error
+        density_estimator = _builder_of_name(density_estimator)
     if not callable(density_estimator):
         raise InvalidTypeError(
             "Expected `density_estimator` to be a name such as 'nsf', or what sbi's "
@@ -121,6 +113,22 @@ def estimator_builder(density_estimator: Any) -> EstimatorBuilder:
         return copy.deepcopy(built)
 
     return build
+
+
+@functools.cache
+def _builder_of_name(name: str) -> EstimatorBuilder:
+    """Return sbi's builder of a name, after it has built something once."""
+    builder = posterior_nn(name)
+    try:
+        with seeded(0):
+            some = torch.randn(10, 2)
+            builder(some, some)
+    except Exception as error:
+        raise InvalidInputError(
+            "Expected `density_estimator` to be the name of an estimator for "
+            f"continuous parameters that sbi's `posterior_nn` knows; got {name!r}."
+        ) from error
+    return builder
 
 
 def train_on_simulations(

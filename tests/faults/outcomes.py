@@ -188,11 +188,12 @@ def state_of_process(*, random_numbers: bool) -> dict[str, Any]:
         "deterministic mode": torch.are_deterministic_algorithms_enabled(),
         "NumPy's error state": tuple(np.geterr().items()),
         "filters of warnings": tuple(warnings.filters),
-        "print options": str(torch.tensor([1 / 3, 1e-9])),
+        "print options": dict(vars(torch._tensor_str.PRINT_OPTS)),
     }
     if random_numbers:
         state["torch's random numbers"] = torch.get_rng_state().numpy().tobytes()
-        state["NumPy's random numbers"] = str(np.random.get_state())  # noqa: NPY002
+        _, numbers, *rest = np.random.get_state()  # noqa: NPY002
+        state["NumPy's random numbers"] = (np.asarray(numbers).tobytes(), *rest)
         state["Python's random numbers"] = random.getstate()
     return state
 
