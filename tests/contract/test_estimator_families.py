@@ -323,14 +323,16 @@ def test_the_tuned_posterior_of_the_family_is_the_flow_on_the_tuned_embedding(
     ],
 )
 def test_densities_of_the_family_integrate_to_one_inside_the_prior(
-    family: str,
+    family: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    # The mass inside the prior is estimated from draws. Usually there are 1024, which
+    # is an error of up to 0.03 here.
+    monkeypatch.setattr("sbi_rope.mixture.truncation.LEAKAGE_DRAWS", 8192)
     posterior = repaired(family, dim=1).posterior[0]
     edges = torch.linspace(-1, 1, 101)
     theta = (edges[1:] + edges[:-1])[:, None] / 2
     density = posterior.log_prob(theta).exp()
-    # The mass inside is estimated from 1024 draws, and the steps are 0.02 wide.
-    assert float(density.sum() * 0.02) == pytest.approx(1.0, abs=0.04)
+    assert float(density.sum() * 0.02) == pytest.approx(1.0, abs=0.02)
 
 
 @pytest.mark.parametrize("method", ["fmpe", "npse"])

@@ -239,14 +239,19 @@ def test_learned_parameters_move_the_posterior_to_those_of_the_pairs() -> None:
     x = problems.simulate(theta) + 3 * torch.randn(100, 3)  # hardly informative
     means = []
     for learn_prior in (False, True):
-        made = method(learn_prior=learn_prior, num_steps=400, num_simulations=2000)
+        made = method(
+            learn_prior=learn_prior,
+            num_steps=300,
+            learning_rate=2e-2,
+            num_simulations=2000,
+        )
         made.append_calibration(theta, x).train(**QUIET)
         samples = made.build_posterior().sample_batched(
             (50,), x[:20], show_progress_bars=False
         )
         means.append(float(samples[..., 0].mean()))
     assert means[0] < 0.3
-    assert 0.5 < means[1] < 0.9
+    assert 0.6 < means[1] < 0.9
 
 
 @pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
