@@ -3,12 +3,14 @@
     python -m benchmarks run smoke
     python -m benchmarks run main --task pendulum --jobs 2 --root FOLDER
     python -m benchmarks status
+    python -m benchmarks restore
     python -m benchmarks report
     python -m benchmarks summary
 
 Cells that are finished are kept, whichever suite asked for them, and are not computed
 again. Cells that failed are kept with their error; `--retry` computes them again. `run`
-ends with status 1 if one of its cells failed or has no result.
+ends with status 1 if one of its cells failed or has no result. `restore` makes cells of
+the committed tables, so that `run` computes only what these do not hold.
 """
 
 import argparse
@@ -22,7 +24,7 @@ from benchmarks.report import write_report
 from benchmarks.runner import run_cells
 from benchmarks.store import Workplace
 from benchmarks.summary import write_summary
-from benchmarks.table import read_table, write_table
+from benchmarks.table import read_table, restore_cells, write_table
 from sbi_rope.errors import InvalidInputError, RoPEError
 
 DEFAULT_OUT = Path("results/benchmark")
@@ -79,6 +81,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     status = commands.add_parser("status", help="count the cells of all suites")
     status.set_defaults(command=_status)
     _add_out(status, DEFAULT_OUT)
+
+    restore = commands.add_parser("restore", help="take over what is committed")
+    restore.set_defaults(command=_restore)
+    restore.add_argument(
+        "--tables", type=Path, default=PUBLISHED, help="folder of tables (%(default)s)"
+    )
+    _add_out(restore, DEFAULT_OUT)
 
     report = commands.add_parser("report", help="write tables and figures again")
     report.set_defaults(command=_report)
@@ -178,15 +187,24 @@ def _status(args: argparse.Namespace) -> int:
     return 0
 
 
-def _report(args: argparse.Namespace) -> int:
-    names = args.suites or [
-        name for name in list_suites() if (args.out / name / "results.csv").exists()
-    ]
+def _restore(args: argparse.Namespace) -> int:
+    results = Workplace(folder=args.out, sources=Sources()).results
+    for name in _with_tables(args.tables):
+        table = read_table(load_suite(name), args.tables / name)
+        print(f"{name}: {restore_cells(table, results)} cells restored")
+    return 0
+
+
+def _with_tables(folder: Path) -> list[str]:
+    """Return the suites that a folder holds tables of."""
+    names = [name for name in list_suites() if (folder / name / "results.csv").exists()]
     if not names:
-        raise SystemExit(
-            f"No results in {args.out}. Use `run` first, or another --out."
-        )
-    for name in names:
+        raise SystemExit(f"No results in {folder}. Use `run` first, or another folder.")
+    return names
+
+
+def _report(args: argparse.Namespace) -> int:
+    for name in args.suites or _with_tables(args.out):
         suite: Suite = load_suite(name)
         folder = args.out / suite.name
         if not (folder / "results.csv").exists():

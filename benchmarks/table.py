@@ -34,6 +34,7 @@ __all__ = [
     "markdown",
     "number_text",
     "read_table",
+    "restore_cells",
     "write_table",
 ]
 
@@ -133,6 +134,24 @@ def read_table(suite: Suite, folder: Path) -> Table:
             "the change."
         ) from error
     return Table.of(rows, arrays)
+
+
+def restore_cells(table: Table, results: Results) -> int:
+    """Write the finished cells of a table as results that a run keeps.
+
+    Results that are there already are not replaced.
+
+    Returns:
+        The number of cells that were written.
+    """
+    written = 0
+    for cell, row in table.rows.iterrows():
+        arrays = table.arrays[cell]
+        if row["status"] != "finished" or not arrays or results.read(cell):
+            continue
+        results.write(cell, row.drop("suite").to_dict(), arrays)
+        written += 1
+    return written
 
 
 # Checks of what was read -------------------------------------------------------------
