@@ -18,6 +18,7 @@ from sbi_rope.baselines import (
     FinetunedNPE,
     JointNPE,
     Method,
+    OTOnly,
     PlainNPE,
     PriorBaseline,
     ReferenceNPE,
@@ -79,8 +80,8 @@ def append_data(method: Method, name: str, case: "Case") -> tuple[int, bool]:
         that methods share.
     """
     if method.needs_simulations:
-        # Without a simulator, tuning-only looks targets up among stored simulations.
-        stored = name == "tuning-only"
+        # Stages of RoPE use the stored simulations where there is no simulator.
+        stored = name in ("OT-only", "tuning-only")
         method.append_simulations(*(case.stored if stored else case.simulations))
     if "calibration" in method.sees:
         method.append_calibration(*case.calibration)
@@ -240,7 +241,11 @@ METHODS: dict[str, Entry] = {
             case.npe, simulator=case.simulator, finetuner=case.settings.finetuner
         ),
     ),
-    "OT-only": Entry(style=("#56B4E9", "--", "s"), couples=True),
+    "OT-only": Entry(
+        style=("#56B4E9", "--", "s"),
+        couples=True,
+        build=lambda case: OTOnly.from_posterior(case.npe, simulator=case.simulator),
+    ),
     "RoPE": Entry(style=("#0072B2", "-", "o"), pairs=True, couples=True),
     STACK: Entry(style=("black", "-", "*"), pairs=True),
     COUPLED_STACK: Entry(style=("black", "--", "*"), pairs=True),

@@ -117,11 +117,8 @@ def _coupled_scores(
     case: Case, cells: Sequence[Cell], group: Sequence[Cell]
 ) -> Iterator[Score | Failure]:
     count = _Count(case)
-    rope = rope_of(case)
     start = time.perf_counter()
-    if METHODS[case.cell.method].pairs:
-        rope.append_calibration(*case.calibration)
-        rope.train(seed=case.seed, show_progress_bars=False)
+    rope = _trained_rope(case)
     train_seconds = time.perf_counter() - start
     wanted = {(cell.gamma, cell.tau): cell for cell in cells}
     # One sweep over all, from large gammas to small: it simulates and normalises once.
@@ -154,6 +151,17 @@ def _coupled_scores(
                 converged=posterior.coupling.converged,
             )
         start = time.perf_counter()
+
+
+def _trained_rope(case: Case) -> RoPE:
+    """Return what couples in RoPE and OT-only, trained as far as it is."""
+    build = METHODS[case.cell.method].build
+    if build is not None:
+        method: Any = build(case)
+        append_data(method, case.cell.method, case)
+        return method.build_rope()
+    rope = rope_of(case).append_calibration(*case.calibration)
+    return rope.train(seed=case.seed, show_progress_bars=False)
 
 
 def rope_of(case: Case) -> RoPE:

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from sbi_rope._validation import check_instance, check_integer
 from sbi_rope.coupling import SinkhornCoupler
+from sbi_rope.errors import NotReadyError
 from sbi_rope.mixture import MixturePosterior
 from sbi_rope.rope import RoPE
 from sbi_rope.trainers.base import Method
@@ -78,15 +79,37 @@ class OTOnly(Method):
         """Whether there is something to train or to look up on simulations."""
         return self._simulator is None or not self._has_npe
 
-    def _fit(self, *, show_progress_bars: bool) -> tuple[MixturePosterior, Any]:
-        npe, history = self._trained_npe(show_progress_bars=show_progress_bars)
-        rope = RoPE(
+    def build_rope(self) -> RoPE:
+        """Return RoPE without calibration pairs, to couple at many settings.
+
+        :func:`~sbi_rope.sweep.sweep` takes it, and couples any batch at every gamma and
+        every tau. The appended observations and ``coupler.gamma`` play no part in it.
+
+        Raises:
+            NotReadyError: If it does not start from a trained posterior, or needs
+                simulations that were not appended.
+        """
+        if not self._has_npe:
+            raise NotReadyError(
+                "OTOnly has no trained NPE to couple with. Start it from one with "
+                "`OTOnly.from_posterior(posterior)`."
+            )
+        if self.needs_simulations:
+            self._check_some("simulations")
+        npe, _ = self._trained_npe(show_progress_bars=False)
+        return self._rope_of(npe)
+
+    def _rope_of(self, npe: Any) -> RoPE:
+        return RoPE(
             npe,
             simulator=self._simulator,
             simulations=self._data.simulations if self._simulator is None else None,
             coupler=self.coupler,
         )
-        posterior = rope.build_posterior(
+
+    def _fit(self, *, show_progress_bars: bool) -> tuple[MixturePosterior, Any]:
+        npe, history = self._trained_npe(show_progress_bars=show_progress_bars)
+        posterior = self._rope_of(npe).build_posterior(
             self._data.observations,
             num_simulations=self.num_simulations,
             show_progress_bars=show_progress_bars,

@@ -409,6 +409,16 @@ class TestRoPEsParts:
             with pytest.raises(NotReadyError, match=r"append_simulations\(theta, x\)"):
                 method.train(**QUIET)
 
+    def test_ot_only_gives_the_rope_that_couples_if_there_is_something_to_couple_with(
+        self,
+    ) -> None:
+        untrained = OTOnly(TASK.get_prior(), simulator=TASK.get_simulator())
+        with pytest.raises(NotReadyError, match="from_posterior"):
+            untrained.build_rope()
+        method = OTOnly.from_posterior(npe().build_posterior())
+        with pytest.raises(NotReadyError, match=r"append_simulations\(theta, x\)"):
+            method.build_rope()
+
     def test_ot_only_refuses_numbers_of_simulations_that_are_none(self) -> None:
         with pytest.raises(InvalidInputError, match="`num_simulations`"):
             OTOnly(TASK.get_prior(), num_simulations=0)
