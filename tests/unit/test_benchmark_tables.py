@@ -15,7 +15,7 @@ from benchmarks.cells import Suite, load_suite
 from benchmarks.report import write_report
 from benchmarks.store import Results
 from benchmarks.summary import write_summary
-from benchmarks.table import read_table, write_table
+from benchmarks.table import read_table, restore_cells, write_table
 from sbi_rope.errors import InvalidInputError
 from tests.results import SUITE, empty, fill_with_garbage, truncate, write_results
 
@@ -52,6 +52,25 @@ def test_a_table_survives_being_written_and_read(suite: Suite, written: Path) ->
     manifest = json.loads((written / "again" / "manifest.json").read_text())
     counts = [manifest[status] for status in ("finished", "failed", "not run")]
     assert counts == [38, 4, 42]
+
+
+def test_restored_cells_are_those_of_the_table_and_replace_nothing(
+    suite: Suite, written: Path, tmp_path: Path
+) -> None:
+    table = read_table(suite, written / suite.name)
+    finished = [*table.finished.index]
+    results = Results(tmp_path / "cells")
+    row, arrays = Results(written / "cells").load(finished[0]) or ({}, {})
+    results.write(finished[0], row | {"git_commit": "mine"}, arrays)
+    assert restore_cells(table, results) == len(finished) - 1
+    again = write_table(suite, results, tmp_path / "again")
+    expected = table.finished.copy()
+    expected.loc[finished[0], "git_commit"] = "mine"
+    # A cell without an error has none in its file, and an empty text in a table.
+    pd.testing.assert_frame_equal(again.finished.fillna(""), expected.fillna(""))
+    for cell in finished:
+        for name, values in table.arrays[cell].items():
+            assert np.array_equal(again.arrays[cell][name], values)
 
 
 Lines = list[list[str]]
