@@ -17,7 +17,14 @@ from sbi_rope import RoPE
 from sbi_rope.errors import warn_user
 from sbi_rope.tasks import Task
 
-__all__ = ["cache_of", "calibration_data", "case_of", "labelled", "trained_npe"]
+__all__ = [
+    "NPE_SETTINGS",
+    "cache_of",
+    "calibration_data",
+    "case_of",
+    "labelled",
+    "trained_npe",
+]
 
 # Labelled calibration rows: the first ones are tuned on, the last ones scored on.
 NUM_LABELLED, NUM_SCORED = 1000, 500
@@ -26,7 +33,7 @@ NUM_OTHERS = 300
 # A few tell the shapes of an estimator; its scales are among its weights.
 NUM_FOR_SHAPES = 10
 # Simulations, options of the estimator, options of the training.
-SETTINGS: dict[str, tuple[int, dict[str, Any], dict[str, Any]]] = {
+NPE_SETTINGS: dict[str, tuple[int, dict[str, Any], dict[str, Any]]] = {
     "light_tunnel_sensors": (
         20_000,
         {"num_transforms": 3},
@@ -85,7 +92,7 @@ def calibration_data(
 
 def trained_npe(task: Task, *, seed: int, cache: Cache) -> Any:
     """Return the posterior of NPE with the task's full embedding net."""
-    num_simulations, estimator, training = SETTINGS[task.name]
+    num_simulations, estimator, training = NPE_SETTINGS[task.name]
     prior = task.get_prior()
 
     def builder() -> Any:

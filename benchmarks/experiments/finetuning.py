@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.experiments.common import Row, add_task, begin, show
-from benchmarks.experiments.data import cache_of, labelled, trained_npe
+from benchmarks.experiments.data import NPE_SETTINGS, cache_of, labelled, trained_npe
 from sbi_rope import CalibrationFinetuner, RoPE, SinkhornCoupler
 from sbi_rope.metrics import lpp
 from sbi_rope.tasks import Task, get_task
@@ -134,4 +134,4 @@ def distance_to_targets(task: Task, rope: RoPE, theta: Tensor, x: Tensor) -> flo
 
 
 if __name__ == "__main__":
-    show(rows(begin(__doc__, add_task(OPTIONS))))
+    show(rows(begin(__doc__, add_task(OPTIONS, choices=[*NPE_SETTINGS]))))

@@ -12,7 +12,7 @@ import itertools
 from collections.abc import Iterator
 
 from benchmarks.experiments.common import Row, add_task, begin, show
-from benchmarks.experiments.data import cache_of, labelled, trained_npe
+from benchmarks.experiments.data import NPE_SETTINGS, cache_of, labelled, trained_npe
 from sbi_rope import RoPE, SinkhornCoupler
 from sbi_rope.metrics import acauc, lpp
 from sbi_rope.tasks import get_task
@@ -51,4 +51,4 @@ def rows(args: argparse.Namespace) -> Iterator[Row]:
 
 
 if __name__ == "__main__":
-    show(rows(begin(__doc__, add_task(OPTIONS))))
+    show(rows(begin(__doc__, add_task(OPTIONS, choices=[*NPE_SETTINGS]))))
