@@ -10,6 +10,8 @@ from torch import Tensor
 
 from sbi_rope._training import History
 from sbi_rope.baselines import (
+    FMCPE,
+    FRISBI,
     HVAE,
     NNPE,
     NPERS,
@@ -42,6 +44,15 @@ MAX_SUMMARIES = 20
 HVAE_WIDTH = 8
 # Networks that a fine-tuned discrepancy averages over.
 NUM_HOLDOUTS = 5
+# Where there is no simulator, they look simulations up among the stored ones.
+LOOK_UP = (
+    "FMCPE",
+    "FMCPE (embedding)",
+    "FRISBI",
+    "FRISBI (distilled)",
+    "OT-only",
+    "tuning-only",
+)
 # Of any observation, and of the test set as a batch, with couplings.
 STACK, COUPLED_STACK = "stack", "stack of a batch"
 
@@ -80,8 +91,7 @@ def append_data(method: Method, name: str, case: "Case") -> tuple[int, bool]:
         that methods share.
     """
     if method.needs_simulations:
-        # Stages of RoPE use the stored simulations where there is no simulator.
-        stored = name in ("OT-only", "tuning-only")
+        stored = name in LOOK_UP
         method.append_simulations(*(case.stored if stored else case.simulations))
     if "calibration" in method.sees:
         method.append_calibration(*case.calibration)
@@ -109,6 +119,10 @@ def _physics(case: "Case") -> Callable[[Tensor], Tensor]:
 
 def _noise_on(case: "Case") -> Any:
     return "input" if case.task.name in STATISTICS else "embedding"
+
+
+def _published_noise(case: "Case") -> float:
+    return 0.5 if case.task.name == "wind_tunnel" else 0.05
 
 
 def _short_space(case: "Case", most: int) -> Space:
@@ -223,6 +237,32 @@ METHODS: dict[str, Entry] = {
         style=("#AA4499", "-", "p"),
         pairs=True,
         build=_discrepancy(kind=_ThenFinetuned),
+    ),
+    "FMCPE": Entry(
+        style=("#E31A1C", "-", "<"),
+        pairs=True,
+        build=lambda case: FMCPE.from_posterior(
+            case.npe, simulator=case.simulator, noise=_published_noise(case)
+        ),
+    ),
+    "FMCPE (embedding)": Entry(
+        style=("#E31A1C", "--", "<"),
+        pairs=True,
+        build=lambda case: FMCPE.from_posterior(
+            case.npe, simulator=case.simulator, space="embedding"
+        ),
+    ),
+    "FRISBI": Entry(
+        style=("#6A3D9A", "-", ">"),
+        pairs=True,
+        build=lambda case: FRISBI.from_posterior(case.npe, simulator=case.simulator),
+    ),
+    "FRISBI (distilled)": Entry(
+        style=("#6A3D9A", "--", ">"),
+        pairs=True,
+        build=lambda case: FRISBI.from_posterior(
+            case.npe, simulator=case.simulator, distilled=True
+        ),
     ),
     # It takes a differentiable simulator.
     "HVAE": Entry(

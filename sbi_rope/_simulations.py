@@ -34,6 +34,8 @@ __all__ = [
 
 # The number of stored simulations around a theta from which its moments are estimated.
 NUM_AROUND = 50
+# The number of stored simulations that count as simulations at a theta.
+NUM_NEAR = 10
 
 Embedding = Callable[[Tensor], Tensor]
 
@@ -105,6 +107,15 @@ class SimulationSource(Protocol):
         self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
     ) -> Moments:
         """Return mean and covariance of the embedding of simulations at each theta."""
+        ...
+
+    def draws(
+        self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
+    ) -> Tensor:
+        """Return embeddings of simulations at each theta, ``(n, count, l)``.
+
+        Of stored simulations, those with the nearest parameters count, at most ten.
+        """
         ...
 
     def kept(self, count: int, *, progress: bool) -> tuple[Tensor, Tensor]:
@@ -209,6 +220,14 @@ class StoredSimulations:
         left_over = embedded - design @ plane
         freedom = max(1, number - design.shape[-1])
         return Moments(mean=plane[:, 0], covariance=left_over.mT @ left_over / freedom)
+
+    def draws(
+        self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
+    ) -> Tensor:
+        """Embed the stored simulations with the nearest parameters."""
+        nearest = self._nearest(theta, min(count, NUM_NEAR, len(self.x)))
+        embedded = embed(self.x[nearest.flatten()])
+        return embedded.reshape(*nearest.shape, -1)
 
     def kept(self, count: int, *, progress: bool) -> tuple[Tensor, Tensor]:
         """Return stored pairs, chosen at random because they may be sorted."""

@@ -118,6 +118,18 @@ class Simulator:
             mean=mean, covariance=squares / (number[..., None] - 1).clamp_min(1)
         )
 
+    def draws(
+        self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
+    ) -> Tensor:
+        """Simulate ``count`` times at each theta, ``(n, count, l)``.
+
+        A simulation that is not finite is replaced by another one of the same theta.
+        """
+        embedded, valid = self._repeat_at(theta, count, embed, progress=progress)
+        first = valid.int().argmax(dim=1)
+        usable = embedded[torch.arange(len(theta)), first][:, None]
+        return embedded.where(valid[..., None], usable)
+
     def kept(self, count: int, *, progress: bool) -> tuple[Tensor, Tensor]:
         """Simulate at parameters from the prior once, and keep the simulations."""
         count = min(count, max(1, MAX_KEPT // self.event_shape.numel()))

@@ -206,6 +206,7 @@ def fit(
     stop_after_epochs: int,
     clip_max_norm: float | None = None,
     in_training_mode: bool = True,
+    decay: bool = False,
     label: str,
     show_progress_bars: bool,
 ) -> History:
@@ -224,6 +225,7 @@ def fit(
         stop_after_epochs: Epochs without a new best after which to stop.
         clip_max_norm: Largest norm of a gradient; None does not clip.
         in_training_mode: Whether dropout and batch statistics are active in training.
+        decay: Whether the step size falls to zero, along a cosine over all epochs.
         label: What the progress bar and warnings call it.
         show_progress_bars: Whether to show the course of the loss.
 
@@ -231,6 +233,11 @@ def fit(
         The losses and the epoch that was kept.
     """
     optimizer = torch.optim.Adam(module.parameters(), lr=learning_rate)
+    scheduler = (
+        torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, max_num_epochs)
+        if decay
+        else None
+    )
     training_loss: list[float] = []
     held_out_loss: list[float] = []
     best_state, best_epoch = copy.deepcopy(module.state_dict()), 0
@@ -248,6 +255,8 @@ def fit(
             if clip_max_norm is not None:
                 nn.utils.clip_grad_norm_(module.parameters(), clip_max_norm)
             optimizer.step()
+        if update and scheduler is not None:
+            scheduler.step()
         module.eval()
         return sum(values) / len(values)
 

@@ -16,8 +16,11 @@ from sbi.neural_nets import posterior_nn
 from torch import Tensor, nn
 
 from sbi_rope import CalibrationFinetuner
+from sbi_rope._random import seeded
 from sbi_rope._sbi import is_bounded
 from sbi_rope.baselines import (
+    FMCPE,
+    FRISBI,
     HVAE,
     NNPE,
     NPERS,
@@ -49,6 +52,13 @@ CHAINS: dict[str, Any] = {
 }
 FINETUNER = CalibrationFinetuner(learning_rate=3e-3, max_num_epochs=5)
 
+# Without a simulator: then they learn the same from a posterior trained beforehand.
+FLOWS: dict[str, Any] = {"npe_training": SHORT, "training": SHORT, "num_draws": 4}
+ALIGNED: dict[str, Any] = {
+    "npe_training": SHORT,
+    "training": SHORT,
+    "num_simulations": 50,
+}
 CORRECTION: dict[str, Any] = {"npe_training": SHORT, "num_steps": 5}
 
 
@@ -92,7 +102,6 @@ METHODS: dict[str, Entry] = {
         FinetunedNPE,
         lambda task: {"npe_training": SHORT, "training": SHORT, "num_holdouts": 3},
     ),
-    # Without a simulator: then they learn the same from a posterior trained beforehand.
     "discrepancy_embedding": Entry(DiscrepancyNPE, lambda task: CORRECTION),
     "discrepancy_input": Entry(
         DiscrepancyNPE, lambda task: {**CORRECTION, "space": "input"}
@@ -105,6 +114,12 @@ METHODS: dict[str, Entry] = {
             "num_folds": 2,
             "finetuner": FINETUNER,
         },
+    ),
+    "fmcpe": Entry(FMCPE, lambda task: FLOWS),
+    "fmcpe_embedding": Entry(FMCPE, lambda task: {**FLOWS, "space": "embedding"}),
+    "frisbi": Entry(FRISBI, lambda task: ALIGNED),
+    "frisbi_distilled": Entry(
+        FRISBI, lambda task: {**ALIGNED, "distilled": True, "num_draws": 5}
     ),
     "npe_rs": Entry(NPERS, lambda task: {"training": SHORT}),
     "nnpe": Entry(NNPE, lambda task: {"npe_training": SHORT, "training": SHORT}),
@@ -159,7 +174,9 @@ def builder(
     task: str, *, net: nn.Module | None = None, family: str | None = None
 ) -> Any:
     """A small density estimator of sbi, with a small embedding net unless given one."""
-    net = flat_net(math.prod(task_of(task).x_shape)) if net is None else net
+    if net is None:
+        with seeded(0):  # the same net, whoever asks first
+            net = flat_net(math.prod(task_of(task).x_shape))
     if family is None:
         family = "mdn" if task == "linear_gaussian" else "maf"
     sizes: dict[str, Any] = {"mdn": {"num_components": 2}}.get(

@@ -2,6 +2,8 @@
 
 from sbi_rope.baselines.calibration_mlp import CalibrationMLP
 from sbi_rope.baselines.error_model import SpikeAndSlab
+from sbi_rope.baselines.fmcpe import FMCPE
+from sbi_rope.baselines.frisbi import FRISBI
 from sbi_rope.baselines.hvae import HVAE
 from sbi_rope.baselines.joint_npe import JointNPE
 from sbi_rope.baselines.nnpe import NNPE
@@ -15,6 +17,8 @@ from sbi_rope.mixture import PriorPosterior
 from sbi_rope.trainers import FinetunedNPE, Method, Training
 
 __all__ = [
+    "FMCPE",
+    "FRISBI",
     "HVAE",
     "NNPE",
     "NPERS",

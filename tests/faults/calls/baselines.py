@@ -55,6 +55,8 @@ METHODS: dict[str, Any] = {
     "JointNPE": baselines.JointNPE,
     "FinetunedNPE": baselines.FinetunedNPE,
     "CalibrationMLP": baselines.CalibrationMLP,
+    "FMCPE": functools.partial(baselines.FMCPE, simulator=gaussian.simulator),
+    "FRISBI": functools.partial(baselines.FRISBI, simulator=gaussian.simulator),
     "OTOnly": functools.partial(baselines.OTOnly, simulator=gaussian.simulator),
     "TuningOnly": functools.partial(baselines.TuningOnly, simulator=gaussian.simulator),
     "HVAE": functools.partial(baselines.HVAE, physics=lambda theta: theta),

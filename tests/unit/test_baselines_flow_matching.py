@@ -1,0 +1,147 @@
+"""FMCPE: its maps and densities belong together, and it learns from pairs."""
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from sbi_rope.baselines import FMCPE, Training
+from sbi_rope.baselines.flow_matching import VelocityField, follow, follow_back
+from tests import gaussian, problems
+
+QUIET: dict[str, Any] = {"seed": 0, "show_progress_bars": False}
+DIM = 2
+
+
+def bent_field() -> VelocityField:
+    """A field of strong and varying velocities."""
+    torch.manual_seed(0)
+    field = VelocityField(DIM, nn.Identity(), 1)
+    nn.init.normal_(field.last.weight, std=0.15)
+    nn.init.normal_(field.last.bias, std=0.5)
+    return field.double().requires_grad_(requires_grad=False)
+
+
+def test_the_way_back_ends_where_the_way_there_began() -> None:
+    field, c = bent_field(), torch.randn(50, 1).double()
+    z = torch.randn(50, DIM).double()
+    end = follow(field, z, c)
+    assert (end - z).norm(dim=1).mean() > 0.4
+    back, _ = follow_back(field, end, c)
+    torch.testing.assert_close(back, z, atol=2e-3, rtol=0)
+
+
+def test_the_divergence_is_the_change_of_volume_of_the_map() -> None:
+    field, c = bent_field(), torch.randn(5, 1).double()
+    z = torch.randn(5, DIM).double()
+    for row in range(5):
+        jacobian = torch.autograd.functional.jacobian(
+            lambda point, row=row: follow(field, point[None], c[row : row + 1])[0],
+            z[row],
+        )
+        end = follow(field, z[row : row + 1], c[row : row + 1])
+        _, divergence = follow_back(field, end, c[row : row + 1])
+        assert abs(float(jacobian.det().log())) > 0.02  # type: ignore[union-attr]
+        expected = jacobian.det().log()  # type: ignore[union-attr]
+        torch.testing.assert_close(divergence[0], expected, atol=5e-3, rtol=0)
+
+
+def trained(n: int, **options: Any) -> Any:
+    torch.manual_seed(0)
+    method = FMCPE.from_posterior(
+        gaussian.posterior(), simulator=gaussian.simulator, num_draws=20, **options
+    )
+    method.append_calibration(*gaussian.labelled(n))
+    return method.train(**QUIET).build_posterior()
+
+
+def mean_log_prob(posterior: Any, theta: Tensor, x: Tensor) -> float:
+    log_prob = posterior.log_prob_batched(theta[None], x, norm_posterior=False)
+    return float(log_prob.mean())
+
+
+@pytest.mark.parametrize("space", ["input", "embedding"])
+def test_with_many_pairs_it_comes_near_the_exact_posterior(space: str) -> None:
+    posterior = trained(
+        500,
+        space=space,
+        training=Training(
+            training_batch_size=250,
+            learning_rate=3e-3,
+            max_num_epochs=60,
+            stop_after_epochs=60,
+            validation_fraction=0.2,
+        ),
+    )
+    torch.manual_seed(1)
+    theta, x = gaussian.labelled(300)
+    exact = gaussian.exact_posterior(gaussian.undo(x)).log_prob(theta).mean()
+    npe = mean_log_prob(gaussian.posterior(), theta, x)
+    found = mean_log_prob(posterior, theta, x)
+    assert npe < float(exact) - 1.0
+    assert found > float(exact) - 0.25
+
+
+def test_with_a_single_epoch_it_is_npe_around_the_observation() -> None:
+    # Fields start at zero, and the start is kept where nothing is learned.
+    posterior = trained(
+        20,
+        noise=1e-3,
+        training=Training(
+            learning_rate=1e-12, max_num_epochs=1, validation_fraction=0.2
+        ),
+    )
+    theta, x = gaussian.labelled(10)
+    found = posterior.log_prob_batched(theta[None], x, norm_posterior=False)
+    expected = gaussian.posterior().log_prob_batched(
+        theta[None], x, norm_posterior=False
+    )
+    torch.testing.assert_close(found, expected, atol=0.05, rtol=0.01)
+
+
+def test_inside_a_box_the_density_has_mass_one_and_samples_follow_it() -> None:
+    torch.manual_seed(0)
+    posterior = problems.npe_posterior("mdn", dim=1)
+    theta = problems.box(1).sample((60,))
+    method = FMCPE.from_posterior(
+        posterior,
+        simulator=problems.simulate,
+        num_draws=10,
+        training=Training(learning_rate=3e-3, max_num_epochs=40, stop_after_epochs=40),
+    )
+    method.append_calibration(theta, problems.simulate(theta) + 0.3)
+    repaired = method.train(**QUIET).build_posterior()
+    x = problems.simulate(torch.tensor([[0.8]])) + 0.3
+    edges = torch.linspace(-1, 1, 2001)
+    middles = 0.5 * (edges[1:] + edges[:-1])
+    density = repaired.log_prob(middles[:, None], x=x, norm_posterior=False).exp()
+    assert float(density.sum() * 0.001) == pytest.approx(1, abs=0.02)
+    samples = repaired.sample((5000,), x=x, show_progress_bars=False).flatten()
+    share = samples.histogram(edges[::200]).hist / 5000
+    torch.testing.assert_close(
+        share, density.reshape(10, 200).sum(dim=1) * 0.001, atol=0.025, rtol=0
+    )
+    outside = repaired.log_prob(torch.tensor([[1.5]]), x=x, norm_posterior=False)
+    assert outside.isneginf().all()
+
+
+def test_what_npe_has_outside_the_prior_is_replaced_by_the_prior() -> None:
+    # NPE has no mass inside for this observation, and there is nothing to learn.
+    torch.manual_seed(0)
+    far = torch.full((1, DIM), 100.0)
+    prior = problems.box(DIM)
+    npe = type(gaussian.posterior())(gaussian.GaussianEstimator(), prior)
+    method = FMCPE.from_posterior(
+        npe,
+        simulator=gaussian.simulator,
+        num_draws=5,
+        training=Training(learning_rate=1e-12, max_num_epochs=1),
+    )
+    theta = prior.sample((20,))
+    method.append_calibration(theta, gaussian.simulator(theta))
+    posterior = method.train(**QUIET).build_posterior()
+    draws = posterior.sample((2000,), x=far, show_progress_bars=False)
+    assert draws.std(dim=0).allclose(torch.tensor(1 / 3**0.5), atol=0.05)
+    log_prob = posterior.log_prob(torch.zeros(1, DIM), x=far, norm_posterior=False)
+    assert float(log_prob) == pytest.approx(float(prior.log_prob(torch.zeros(1, DIM))))

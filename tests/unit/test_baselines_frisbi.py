@@ -1,0 +1,113 @@
+"""FRISBI: its loss and mixture are the stated ones, and it learns from pairs."""
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from sbi_rope.baselines import FRISBI, Training
+from sbi_rope.baselines.frisbi import AlignedEmbeddings
+from sbi_rope.errors import InvalidInputError
+from tests import gaussian
+
+QUIET: dict[str, Any] = {"seed": 0, "show_progress_bars": False}
+TRAINING = Training(
+    training_batch_size=64,
+    learning_rate=1e-2,
+    validation_fraction=0.2,
+    stop_after_epochs=30,
+    max_num_epochs=30,
+)
+
+
+def aligned() -> tuple[nn.Linear, AlignedEmbeddings, Tensor]:
+    torch.manual_seed(0)
+    g = nn.Linear(3, 2).double()
+    mixing = AlignedEmbeddings(g, torch.randn(7, 2).double(), torch.Size((3,)), 0.5)
+    return g, mixing, torch.randn(4, 3).double()
+
+
+def brute_force(g: nn.Module, simulated: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+    """Weights and mean cost, one pair at a time."""
+    rows, costs = [], []
+    for real in g(x):
+        cost = torch.stack([((real - s) ** 2).sum() / 2 for s in simulated])
+        weights = torch.exp(-cost / 0.5) / torch.exp(-cost / 0.5).sum()
+        rows.append(weights)
+        costs.append((weights * cost).sum())
+    return torch.stack(rows), torch.stack(costs).mean()
+
+
+def test_weights_and_cost_are_those_of_the_definition() -> None:
+    g, mixing, x = aligned()
+    rows, cost = brute_force(g, mixing.simulated, x)
+    torch.testing.assert_close(mixing.rows(mixing.embed(x)).weights, rows.detach())
+    torch.testing.assert_close(mixing.transport_cost(x), cost)
+
+
+def test_gradients_pass_through_the_cost_and_through_the_weights() -> None:
+    g, mixing, x = aligned()
+    (found,) = torch.autograd.grad(mixing.transport_cost(x), g.weight)
+    step, moved = 1e-6, torch.zeros_like(found)
+    with torch.no_grad():
+        for index in range(found.numel()):
+            values = []
+            for sign in (1, -1):
+                g.weight.flatten()[index] += sign * step
+                values.append(mixing.transport_cost(x))
+                g.weight.flatten()[index] -= sign * step
+            moved.flatten()[index] = (values[0] - values[1]) / (2 * step)
+    torch.testing.assert_close(found, moved, atol=1e-6, rtol=1e-5)
+
+
+def trained(**options: Any) -> FRISBI:
+    torch.manual_seed(0)
+    method = FRISBI.from_posterior(
+        gaussian.posterior(),
+        simulator=gaussian.simulator,
+        training=TRAINING,
+        **{"gamma": 0.02, **options},
+    )
+    method.append_calibration(*gaussian.labelled(60))
+    method.append_observations(gaussian.labelled(300)[1])
+    return method.train(**QUIET)
+
+
+def mean_log_prob(posterior: Any, theta: Tensor, x: Tensor) -> float:
+    return float(posterior.log_prob_batched(theta[None], x).mean())
+
+
+@pytest.mark.parametrize("distilled", [False, True])
+def test_it_undoes_most_of_a_linear_error_for_observations_it_has_not_seen(
+    distilled: bool,
+) -> None:
+    posterior = trained(distilled=distilled).build_posterior()
+    torch.manual_seed(1)
+    theta, x = gaussian.labelled(300)
+    exact = float(gaussian.exact_posterior(gaussian.undo(x)).log_prob(theta).mean())
+    assert mean_log_prob(gaussian.posterior(), theta, x) < exact - 1.0
+    assert mean_log_prob(posterior, theta, x) > exact - 0.4
+
+
+def test_its_mixture_is_the_stated_sum() -> None:
+    posterior: Any = trained().build_posterior()
+    mixing = posterior.posterior_estimator.parts[0].mixing
+    theta, x = gaussian.labelled(3)
+    weights = mixing.rows(mixing.embed(x)).weights
+    law = gaussian.exact_posterior(mixing.simulated / gaussian.GAIN)
+    log_q = law.log_prob(theta[:, None]).double()
+    expected = (weights.log() + log_q).logsumexp(dim=1)
+    found = posterior.log_prob_batched(theta[None], x)[0]
+    torch.testing.assert_close(found.double(), expected, atol=2e-3, rtol=0)
+
+
+def test_g_is_not_worse_than_h_on_pairs_that_are_held_out() -> None:
+    history = trained().history
+    assert history.kept_validation_loss <= history.validation_loss[0]
+
+
+@pytest.mark.parametrize("name", ["gamma", "num_simulations", "num_draws"])
+def test_settings_outside_their_range_are_refused(name: str) -> None:
+    with pytest.raises(InvalidInputError, match=name):
+        FRISBI.from_posterior(gaussian.posterior(), **{name: 0})
