@@ -231,7 +231,8 @@ def _row(case: Case, score: Score) -> dict[str, Any]:
 
 def _c2st(case: Case, score: Score) -> float | None:
     """Return the mean C2ST to the true posterior of the task, if that is known."""
-    if not hasattr(case.task, "get_true_posterior") or score.cell.method == "SBI":
+    known = getattr(case.task, "has_true_posterior", False)
+    if not known or score.cell.method == "SBI":
         return None
     values = []
     for i in range(min(C2ST_OBSERVATIONS, len(score.test_set[1]))):

@@ -508,9 +508,12 @@ class MixturePosterior(BaseDirectPosterior):
             )
         mass = self.leakage(x).mass.to(DTYPE)
         if not (mass > 0).all():
+            rows = (mass <= 0).nonzero().flatten()
             raise SamplingError(
-                "The mixture of at least one observation has no mass inside the "
-                "support of the prior. Train NPE longer, or pass norm_posterior=False."
+                f"The mixtures of {len(rows)} of {len(mass)} observations (rows "
+                f"{rows[:5].tolist()}) have no mass inside the support of the prior. "
+                "Leave these observations out, train NPE longer, or pass "
+                "norm_posterior=False."
             )
         return mass
 

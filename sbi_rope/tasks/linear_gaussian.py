@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 from torch import Tensor, nn
-from torch.distributions import MultivariateNormal, Normal
+from torch.distributions import MultivariateNormal, Normal, StudentT
 
 from sbi_rope._validation import (
     LARGEST_SETTING,
@@ -22,6 +22,7 @@ from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.base import Task, check_theta
 from sbi_rope.tasks.networks import fully_connected
 from sbi_rope.tasks.splits import DrawnPairs, Part
+from sbi_rope.tasks.variants import COMMON_VARIANTS
 
 __all__ = ["LinearGaussian", "LinearGaussianSimulator"]
 
@@ -30,6 +31,9 @@ NOISE_STD = 0.5
 # Each entry of x also sees the parameter before its own, so that parameters are
 # correlated given x.
 COUPLING = 0.5
+# The errors of the variants in which no gain and offset describe what is wrong.
+BEND = 0.5
+TAILS_STD, TAILS_FREEDOM = 0.3, 1.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,6 +119,11 @@ class LinearGaussian(Task):
     ideal method recovers the posterior of the simulation, :meth:`get_true_posterior`.
     The task is not in the paper.
 
+    Two variants are made for linear models of the discrepancy to fail. In ``"curved"``
+    :math:`(A \theta)_k^2 / 2` is added to each entry, so that two parameters can have
+    the same observation. In ``"heavy_tails"`` each entry has an error of Student's t
+    distribution with 1.5 degrees of freedom, whose variance is infinite, times 0.3.
+
     Args:
         variant: ``None`` or one of ``variants``.
         root: Not used, the task is synthetic.
@@ -135,6 +144,10 @@ class LinearGaussian(Task):
 
     name = "linear_gaussian"
     misspecification = "the real process has another gain and an offset"
+    variants = COMMON_VARIANTS | {
+        "curved": "the error of the simulator is a square of the parameters",
+        "heavy_tails": "the real process has errors of infinite variance",
+    }
     shifted_region = {"theta_1": (0.5, math.inf)}  # noqa: RUF012
 
     def __init__(
@@ -185,6 +198,11 @@ class LinearGaussian(Task):
         check_instance("light", light, bool)
         return fully_connected(self.dim, (64, 64, 2 * self.dim))
 
+    @property
+    def has_true_posterior(self) -> bool:
+        """Whether the variant has a posterior in closed form."""
+        return self.variant not in ("curved", "heavy_tails")
+
     def get_true_posterior(self, x_o: Tensor) -> MultivariateNormal:
         r"""Return :math:`p(\theta \mid x_o)` of the real process under the prior.
 
@@ -196,15 +214,33 @@ class LinearGaussian(Task):
 
         Returns:
             One Gaussian for each row, batch shape ``(n,)``, float64.
+
+        Raises:
+            InvalidInputError: In ``"curved"`` and ``"heavy_tails"``, whose posteriors
+                have no closed form.
         """
+        if not self.has_true_posterior:
+            raise InvalidInputError(
+                "Expected a variant with a posterior in closed form; got "
+                f"{self.variant!r}."
+            )
         return self._real_simulator().posterior(x_o)
 
     def _real_process(self, part: Part) -> DrawnPairs:
         prior = self.get_prior()
         return DrawnPairs(
             draw_theta=lambda n: prior.sample(torch.Size((n,))),
-            observe=self._real_simulator(),
+            observe=self._observe,
         )
+
+    def _observe(self, theta: Tensor) -> Tensor:
+        real = self._real_simulator()
+        x = real(theta)
+        if self.variant == "curved":
+            return x + BEND * (theta @ real.matrix(theta).T).square()
+        if self.variant == "heavy_tails":
+            return x + TAILS_STD * StudentT(TAILS_FREEDOM).sample(x.shape).to(x)
+        return x
 
     def _real_simulator(self) -> LinearGaussianSimulator:
         return LinearGaussianSimulator(

@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch.distributions import MultivariateNormal
 
+from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.linear_gaussian import LinearGaussian, LinearGaussianSimulator
 from tests.tasks import accepted
 
@@ -74,6 +75,33 @@ def test_simulators_posterior_is_wrong_on_the_real_process() -> None:
     wrong = task.get_simulator().posterior(x_o).log_prob(theta).mean()
     right = task.get_true_posterior(x_o).log_prob(theta).mean()
     assert wrong < right - 1.0
+
+
+def test_a_curved_error_gives_two_parameters_the_same_observation() -> None:
+    task = LinearGaussian(variant="curved", noise_std=1e-6, dim=1)
+    theta, x = task.get_test_set(500)
+    expected = 1.4 * theta + 0.7 + 0.5 * theta**2
+    torch.testing.assert_close(x, expected, atol=1e-4, rtol=0)
+    # The parabola turns at -1.4.
+    assert (theta < -1.4).any()
+
+
+def test_heavy_tails_have_outliers_that_a_gaussian_has_not() -> None:
+    task = LinearGaussian(variant="heavy_tails")
+    theta, x = task.get_test_set(2000)
+    real = task._real_simulator()
+    error = x - real.observe(theta, torch.zeros_like(theta))
+    spread = error.flatten().quantile(0.75) - error.flatten().quantile(0.25)
+    share = (error.abs() > 10 * spread / 1.349).double().mean()
+    assert 0.001 < float(share) < 0.02
+
+
+@pytest.mark.parametrize("variant", ["curved", "heavy_tails"])
+def test_variants_without_a_closed_form_say_so(variant: str) -> None:
+    task = LinearGaussian(variant=variant)
+    assert not task.has_true_posterior
+    with pytest.raises(InvalidInputError, match=variant):
+        task.get_true_posterior(torch.zeros(1, 2))
 
 
 def test_gain_1_and_offset_0_make_the_simulator_exact() -> None:
