@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
+from matplotlib.figure import Figure
 
 from benchmarks.cells import Cell, Suite
 from benchmarks.methods import METHODS
@@ -16,7 +17,7 @@ from benchmarks.table import Table
 from sbi_rope import plots
 from sbi_rope._files import write_atomically
 
-__all__ = ["LPPAxis", "draw_all"]
+__all__ = ["LPPAxis", "curves", "draw_all", "save"]
 
 WHERE = ["task", "variant", "options"]
 # With the distances as they are, as in the paper.
@@ -67,32 +68,35 @@ def draw_all(suite: Suite, table: Table, folder: Path) -> list[tuple[str, str]]:
         (
             f"{suite.x_axis}.png",
             f"LPP and ACAUC against {suite.x_axis}",
-            _curves(suite.x_axis, rows),
+            curves(suite.x_axis, rows),
         ),
         ("calibration.png", "Coverage of central intervals", _coverage(table)),
         *_corners(table),
     ):
         if figure is None:
             continue
-        with write_atomically(folder / name) as path:
-            # No metadata: the same table has to give the same bytes.
-            figure.savefig(path, format="png", dpi=90, metadata={"Software": None})
+        save(figure, folder / name)
         drawn.append((name, what))
     return drawn
 
 
-def _grid(count: int) -> tuple[int, int]:
+def _grid(count: int, max_columns: int = MAX_COLUMNS) -> tuple[int, int]:
     """Return rows and columns for so many panels; wide figures are wrapped."""
-    rows = math.ceil(count / MAX_COLUMNS)
+    rows = math.ceil(count / max_columns)
     return rows, math.ceil(count / rows)
 
 
-def _curves(axis: str, rows: pd.DataFrame) -> Any:
-    from matplotlib.figure import Figure
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure without metadata, so that the same table gives the same bytes."""
+    with write_atomically(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=90, metadata={"Software": None})
 
+
+def curves(axis: str, rows: pd.DataFrame, *, max_columns: int = MAX_COLUMNS) -> Figure:
+    """Draw LPP and ACAUC against a column, a panel for each task and variant."""
     panels = ["task"] if _is_option(axis) else WHERE
     groups = rows.groupby(panels, sort=False)
-    bands, columns = _grid(len(groups))
+    bands, columns = _grid(len(groups), max_columns)
     figure = Figure(figsize=(3.1 * columns + 1.9, 5.4 * bands), layout="constrained")
     axes = figure.subplots(2 * bands, columns, squeeze=False, sharex="col")
     # Side by side, as if nothing was wrapped.
@@ -254,8 +258,6 @@ def _distance(cell: Cell) -> tuple[Any, ...]:
 
 
 def _coverage(table: Table) -> Any:
-    from matplotlib.figure import Figure
-
     shown = _shown(table, "coverage")
     if not shown:
         return None

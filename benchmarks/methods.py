@@ -168,7 +168,7 @@ METHODS: dict[str, Entry] = {
         build=lambda case: PriorBaseline(case.task.get_prior(), device=case.device),
     ),
     "SBI": Entry(
-        style=("black", "-", None),
+        style=("0.25", ":", None),
         build=lambda case: ReferenceNPE.from_posterior(case.npe),
     ),
     "NPE": Entry(

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import pandas as pd
 
+from benchmarks.evidence import evidence_lines
 from benchmarks.methods import METHODS, STACK
 from benchmarks.other_suites import other_suites
 from benchmarks.published import (
@@ -73,7 +74,10 @@ def write_summary(folder: Path, readme: Path) -> Path:
     page = folder / "README.md"
     link = Path(os.path.relpath(page, readme.parent)).as_posix()
     text = _with_block(readme, "\n".join(_block(published, link)))
-    for path, content in ((page, "\n".join(_page(published)) + "\n"), (readme, text)):
+    for path, content in (
+        (page, "\n".join(_page(published, folder)) + "\n"),
+        (readme, text),
+    ):
         with write_atomically(path) as temporary:
             temporary.write_text(content)
     return page
@@ -88,7 +92,7 @@ def _with_block(readme: Path, block: str) -> str:
     return f"{before}{BEGIN}\n{block}\n{END}{after}"
 
 
-def _page(published: Published) -> list[str]:
+def _page(published: Published, folder: Path) -> list[str]:
     both = ("OT-only", "RoPE")
     return [
         *("# Results of the benchmark", "", UNITS),
@@ -97,6 +101,12 @@ def _page(published: Published) -> list[str]:
         *(f"## All tasks, {SIZE} calibration pairs", "", SETTINGS),
         *("LPP:", "", *_main(published, lpp_text, with_settings=both), ""),
         *("ACAUC:", "", *_main(published, acauc_text, with_settings=both), ""),
+        *(
+            "## The stack against all others",
+            "",
+            *evidence_lines(published, folder),
+            "",
+        ),
         *("## RoPE with fewer and more calibration pairs", ""),
         *(f"LPP (ACAUC), {FIXED}.", "", *_by_size(published), ""),
         *("## What the paper states", "", *write_statements(published), ""),

@@ -1,6 +1,7 @@
 """Velocity fields that carry one distribution to another, and how they are followed."""
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -98,9 +99,10 @@ def follow_back(field: VelocityField, z: Tensor, c: Tensor) -> tuple[Tensor, Ten
         divergence = torch.zeros_like(time)
         v = torch.zeros_like(z)
         for k, direction in enumerate(directions):
-            v, change = torch.func.jvp(
+            moved: Any = torch.func.jvp(
                 lambda z: field(z, time, c), (z,), (direction.expand_as(z),)
             )
+            v, change = moved
             divergence = divergence + change[:, k : k + 1]
         return torch.cat([v, divergence], dim=1)
 

@@ -527,13 +527,14 @@ class Unbounded(nn.Module):
             self.prior.to(device)
         try:
             with seeded(0):  # sbi draws from the prior to look at it
-                self._transform = mcmc_transform(self.prior, device=str(device))
+                transform = mcmc_transform(self.prior, device=str(device))
         except Exception as error:  # sbi raises all kinds
             raise InvalidInputError(
                 "Expected a prior whose `support` torch's `biject_to` knows, or which "
                 f"has a `mean` and a `stddev`; of this {type(self.prior).__name__} "
                 f"`mcmc_transform` says {type(error).__name__}: {error}"
             ) from error
+        self._transform: Any = transform
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:  # noqa: FBT001, FBT002
         before = self.mean.device

@@ -239,7 +239,8 @@ class LinearGaussian(Task):
         if self.variant == "curved":
             return x + BEND * (theta @ real.matrix(theta).T).square()
         if self.variant == "heavy_tails":
-            return x + TAILS_STD * StudentT(TAILS_FREEDOM).sample(x.shape).to(x)
+            freedom = theta.new_full((), TAILS_FREEDOM)  # torch's default may change
+            return x + TAILS_STD * StudentT(freedom).sample(x.shape)
         return x
 
     def _real_simulator(self) -> LinearGaussianSimulator:

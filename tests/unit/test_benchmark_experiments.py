@@ -84,7 +84,7 @@ def test_npe_of_an_experiment_is_read_back_as_it_was_trained(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     small = (200, {"num_transforms": 1}, {"max_num_epochs": 1})
-    monkeypatch.setitem(data.SETTINGS, "linear_gaussian", small)
+    monkeypatch.setitem(data.NPE_SETTINGS, "linear_gaussian", small)
     task = get_task("linear_gaussian")
     trained = data.trained_npe(task, seed=0, cache=Cache(tmp_path))
     monkeypatch.setattr(data, "NPE", None)

@@ -105,6 +105,73 @@ def line(text: str, start: str, *, after: str = "") -> list[str]:
     return [entry.strip() for entry in found.strip("|").split("|")][1:]
 
 
+# The stack against all others --------------------------------------------------------
+
+
+def with_stack(by_repetition: dict[int, dict[str, float]]) -> Scores:
+    """Scores of methods on cs by repetition; -5 if nothing is said."""
+
+    def scores(cell: Cell) -> tuple[float, float] | None:
+        known = by_repetition.get(cell.repetition)
+        if cell.task != "cs" or known is None:
+            return None
+        return known.get(cell.method, -5.0), 0.02
+
+    return scores
+
+
+def test_the_stack_is_compared_with_the_best_other_on_the_same_repetitions(
+    folder: Path, readme: Path
+) -> None:
+    of_run = {
+        0: {"stack": -1.0, "J-NPE": -1.5},
+        1: {"stack": -1.2, "J-NPE": -1.5},
+        2: {"stack": -1.1, "J-NPE": -1.5},
+    }
+    publish(folder, "main", with_stack(of_run))
+    text = write(folder, readme)
+    row = line(text, "A cs | 50", after="The stack against all others")
+    # 4.303 is Student's quantile of two degrees of freedom.
+    width = 4.303 * 0.1 / 3**0.5
+    assert row[1:4] == ["3", "-1.10", "+0.020"]
+    assert row[4:7] == ["J-NPE", "-1.50", f"+0.40 ± {width:.2f}"]
+    assert (
+        "better than the best other beyond the interval over repetitions: 3 of 3"
+        in (text)
+    )
+
+
+def test_a_stack_below_npe_or_another_method_is_counted_and_named(
+    folder: Path, readme: Path
+) -> None:
+    publish(folder, "main", with_stack({0: {"stack": -2.0, "NPE": -1.5}}))
+    text = write(folder, readme)
+    assert "- best, or within 0.1 nats of the best: 0 of 3" in text
+    assert "- not more than 0.1 nats below the prior or NPE: 0 of 3" in text
+    # Of a single repetition there is no interval.
+    row = line(text, "A cs | 10", after="The stack against all others")
+    assert row[6] == "-0.50"
+
+
+def test_ranks_are_drawn_of_methods_that_were_run_everywhere(
+    folder: Path, readme: Path
+) -> None:
+    publish(folder, "main", with_stack({0: {"stack": -1.0}}))
+    first_bytes = write(folder, readme), (folder / "ranks.png").read_bytes()
+    assert (write(folder, readme), (folder / "ranks.png").read_bytes()) == first_bytes
+
+
+def test_without_a_stack_nothing_is_compared(folder: Path, readme: Path) -> None:
+    publish(
+        folder,
+        "main",
+        first(lambda cell: (-1.0, 0.0) if cell.method == "NPE" else None),
+    )
+    text = write(folder, readme)
+    section = text[text.index("The stack against all others") :]
+    assert section.splitlines()[2] == "Not run."
+
+
 # The README -------------------------------------------------------------------------
 
 

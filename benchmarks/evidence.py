@@ -1,0 +1,285 @@
+"""The stack against all other methods, task by task, from the suite `main`.
+
+Comparisons are between methods on the same data: a repetition counts where both
+methods were run in it.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from scipy.stats import t as student
+
+from benchmarks import figures
+from benchmarks.methods import COUPLED_STACK, METHODS, STACK
+from benchmarks.published import FIXED, LETTERS, MISSING, Published, Setting, table
+from benchmarks.table import Table
+
+__all__ = ["evidence_lines"]
+
+# The methods of the picture: what a user starts from, what is tuned on the pairs, the
+# rivals of 2025 and 2026, the paper's method and the default of this package.
+SHOWN = (
+    "prior",
+    "SBI",
+    "NPE",
+    "fine-tuned NPE",
+    "FMCPE (embedding)",
+    "FRISBI (distilled)",
+    "RoPE",
+    STACK,
+)
+# They are no methods, or need what others do not.
+NO_RIVALS = ("SBI", STACK, COUPLED_STACK)
+# The goals, fixed beforehand: with up to so many pairs, in nats and ACAUC.
+MAX_PAIRS, NEAR, CALIBRATED = 200, 0.1, 0.03
+# Panels side by side, so that they can be read at the width of a page.
+MAX_COLUMNS = 4
+CONFIDENCE, NUM_RESAMPLES = 0.95, 2000
+EXPLANATION = f"""\
+"Best other" is the method with the highest LPP on the test set among all that were run
+there, which no user can know. The difference is the stack's LPP minus its, on the same
+data, with an interval of {CONFIDENCE:.0%} over repetitions (Student's t) where there
+are several. "s" are the seconds of training on one thread, without the NPE that methods
+share, and with other work beside it. "Calls" are simulations beyond those that NPE was
+trained on.
+"""
+
+
+class Comparison(NamedTuple):
+    """The stack on a task with so many pairs, and how far it is above all others."""
+
+    task: str
+    size: int
+    stack: pd.DataFrame
+    gaps: dict[str, np.ndarray]
+
+    @property
+    def best(self) -> str:
+        """The method that the stack is least above."""
+        return min(self.gaps, key=lambda name: self.gaps[name].mean())
+
+    @property
+    def gap(self) -> np.ndarray:
+        """How far the stack is above that method, by repetition."""
+        return self.gaps[self.best]
+
+    def above(self, name: str) -> float:
+        """Return how far the stack is above a method; inf if it was not run."""
+        return float(self.gaps[name].mean()) if name in self.gaps else np.inf
+
+
+def evidence_lines(published: Published, folder: Path) -> list[str]:
+    """Return the section in Markdown, and write its figures into a folder."""
+    rows = _rows(published)
+    compared = _compared(rows)
+    if not compared:
+        return ["Not run."]
+    lines = [*_pictures(rows, compared, folder), "", EXPLANATION]
+    head = ("task", "pairs", "repetitions", "stack", "ACAUC", "best other")
+    head += ("its LPP", "difference", "s", "calls")
+    lines += table(head, [_entries(published, one, rows) for one in compared])
+    return [*lines, "", *_goals(compared), "", *_costs(published, rows)]
+
+
+def _rows(published: Published) -> pd.DataFrame:
+    """Return what was finished, with one setting of the couplings."""
+    rows = published.tables.get("main", Table.of({}, {})).finished
+    fixed = [cell.gamma is None or Setting.of(cell) == FIXED for cell in rows.index]
+    rows = rows.loc[np.array(fixed, dtype=bool)]
+    return rows[rows["task"].isin(LETTERS)]
+
+
+def _compared(rows: pd.DataFrame) -> list[Comparison]:
+    compared = []
+    stacks = rows[rows["method"] == STACK]
+    for task in LETTERS:
+        of_task = rows[rows["task"] == task]
+        for size in sorted(stacks["n_calibration"][stacks["task"] == task].unique()):
+            there = of_task[of_task["n_calibration"].isin([0, size])]
+            by_method = there.pivot_table(
+                index="repetition", columns="method", values="lpp_z", sort=False
+            )
+            gaps = {
+                name: (by_method[STACK] - by_method[name]).dropna().to_numpy()
+                for name in by_method.columns
+                if name not in NO_RIVALS
+            }
+            gaps = {name: gap for name, gap in gaps.items() if len(gap)}
+            if gaps:
+                stack = there[there["method"] == STACK]
+                compared.append(Comparison(task, int(size), stack, gaps))
+    return compared
+
+
+def _entries(published: Published, one: Comparison, rows: pd.DataFrame) -> list[object]:
+    best = rows[
+        (rows["method"] == one.best)
+        & (rows["task"] == one.task)
+        & rows["n_calibration"].isin([0, one.size])
+        & rows["repetition"].isin(one.stack["repetition"])
+    ]
+    return [
+        published.name(one.task),
+        one.size,
+        len(one.stack),
+        f"{one.stack['lpp_z'].mean():.2f}",
+        f"{one.stack['acauc'].mean():+.3f}",
+        one.best,
+        f"{best['lpp_z'].mean():.2f}",
+        _interval(one.gap),
+        f"{_seconds(one.stack):.0f}",
+        f"{_calls(one.stack, rows):,.0f}",
+    ]
+
+
+def _interval(gap: np.ndarray) -> str:
+    """Return the mean over repetitions, and how far its interval reaches."""
+    width = _half_width(gap)
+    return f"{gap.mean():+.2f}" + (f" ± {width:.2f}" if np.isfinite(width) else "")
+
+
+def _half_width(gap: np.ndarray) -> float:
+    if len(gap) < 2 or not np.isfinite(gap).all():
+        return np.inf
+    quantile = student.ppf(0.5 + CONFIDENCE / 2, len(gap) - 1)
+    return float(quantile * gap.std(ddof=1) / len(gap) ** 0.5)
+
+
+def _seconds(rows: pd.DataFrame) -> float:
+    return float((rows["seconds_train"] + rows["seconds_couple"]).mean())
+
+
+def _calls(part: pd.DataFrame, rows: pd.DataFrame) -> float:
+    """Return the simulations beyond those of the NPE that methods share."""
+    shared = rows[(rows["method"] == "NPE") & rows["task"].isin(part["task"])]
+    base = shared["num_simulations"].max() if len(shared) else 0
+    return max(0.0, float(part["num_simulations"].mean()) - float(base))
+
+
+def _goals(compared: Sequence[Comparison]) -> list[str]:
+    """Say how often each goal was met, and where it was not."""
+    few = [one for one in compared if one.size <= MAX_PAIRS]
+    basics = [min(one.above("prior"), one.above("NPE")) for one in few]
+    goals = {
+        f"best, or within {NEAR} nats of the best": [
+            one.gap.mean() >= -NEAR for one in few
+        ],
+        "better than the best other beyond the interval over repetitions": [
+            one.gap.mean() > _half_width(one.gap) for one in few
+        ],
+        f"not more than {NEAR} nats below the prior or NPE": [
+            value >= -NEAR for value in basics
+        ],
+    }
+    lines = [f"With up to {MAX_PAIRS} pairs the stack is"]
+    for goal, met in goals.items():
+        lines.append(f"- {goal}: {sum(met)} of {len(met)}")
+        missed = [
+            f"{one.task} ({one.size})"
+            for one, ok in zip(few, met, strict=True)
+            if not ok
+        ]
+        if missed and len(missed) <= len(met) / 2:
+            lines[-1] += f"; not {', '.join(missed)}"
+    acauc = np.mean([abs(one.stack["acauc"].mean()) for one in few])
+    lines.append(f"- of a mean |ACAUC| of {acauc:.3f} (aimed at {CALIBRATED})")
+    return lines
+
+
+def _costs(published: Published, rows: pd.DataFrame) -> list[str]:
+    """Return seconds and calls of all methods, at 50 pairs."""
+    some = rows[rows["n_calibration"].isin([0, 50])]
+    tasks = [task for task in LETTERS if task in set(some["task"])]
+    lines = []
+    for name in METHODS:
+        of_method = some[some["method"] == name]
+        if name in ("prior", "SBI") or not len(of_method):
+            continue
+        parts = [of_method[of_method["task"] == task] for task in tasks]
+        lines.append(
+            [
+                name,
+                *(
+                    f"{_seconds(part):.0f} / {_calls(part, rows):,.0f}"
+                    if len(part)
+                    else MISSING
+                    for part in parts
+                ),
+            ]
+        )
+    head = ("50 pairs: s / calls", *(published.name(task) for task in tasks))
+    return table(head, lines)
+
+
+# Pictures ---------------------------------------------------------------------------
+
+
+def _pictures(
+    rows: pd.DataFrame, compared: Sequence[Comparison], folder: Path
+) -> list[str]:
+    shown = rows[rows["method"].isin(SHOWN)]
+    order = [*LETTERS]
+    shown = shown.iloc[shown["task"].map(order.index).argsort(kind="stable")]
+    figures.save(
+        figures.curves("n_calibration", shown, max_columns=MAX_COLUMNS),
+        folder / "methods.png",
+    )
+    lines = ["![LPP and ACAUC of six methods against the number of pairs](methods.png)"]
+    ranks = _ranks(rows, compared)
+    if ranks is not None:
+        figures.save(_rank_figure(ranks), folder / "ranks.png")
+        lines += ["", "![Mean ranks of the methods over tasks](ranks.png)"]
+    return lines
+
+
+def _ranks(rows: pd.DataFrame, compared: Sequence[Comparison]) -> pd.DataFrame | None:
+    """Return the rank of each method, by task and (pairs, repetition).
+
+    Only of methods that were run wherever the stack was.
+    """
+    cells: dict[tuple[str, tuple[int, int]], pd.Series] = {}
+    for one in compared:
+        if one.size > MAX_PAIRS:
+            continue
+        for repetition in one.stack["repetition"]:
+            there = rows[
+                (rows["task"] == one.task)
+                & (rows["repetition"] == repetition)
+                & rows["n_calibration"].isin([0, one.size])
+                & ~rows["method"].isin(["SBI", COUPLED_STACK])
+            ]
+            scores = there.set_index("method")["lpp_z"]
+            cells[one.task, (one.size, int(repetition))] = scores
+    if not cells:
+        return None
+    scores = pd.DataFrame(cells).dropna()
+    return scores.rank(ascending=False)
+
+
+def _rank_figure(ranks: pd.DataFrame) -> Figure:
+    """Draw mean ranks with bootstrap intervals over tasks."""
+    by_task = ranks.T.groupby(level=0).mean()
+    mean = by_task.mean().sort_values(ascending=False)
+    draws = np.random.default_rng(0).integers(
+        len(by_task), size=(NUM_RESAMPLES, len(by_task))
+    )
+    resampled = by_task.to_numpy()[draws].mean(axis=1)
+    tail = (1 - CONFIDENCE) / 2
+    low, high = np.quantile(resampled, [tail, 1 - tail], axis=0)
+    bounds = pd.DataFrame({"low": low, "high": high}, index=by_task.columns)
+    figure = Figure(figsize=(7, 0.3 * len(mean) + 1), layout="constrained")
+    axes = figure.subplots()
+    for height, (name, value) in enumerate(mean.items()):
+        colour = METHODS[str(name)].style[0]
+        axes.plot([bounds["low"][name], bounds["high"][name]], [height] * 2, c=colour)
+        axes.plot(value, height, "o", color=colour)
+    axes.set_yticks(range(len(mean)), mean.index)
+    axes.set_xlabel(
+        f"mean rank over {len(by_task)} tasks (1 is best), with a bootstrap interval"
+    )
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure
