@@ -91,8 +91,8 @@ class Published:
     def rows(self) -> dict[str, pd.DataFrame]:
         """Rows by suite, of the repetitions in which a task is complete.
 
-        Of all repetitions where none is: a mean over more of them for one method than
-        for the next would compare data, not methods.
+        Of the fullest repetition where none is: a mean over more of them for one method
+        than for the next would compare data, not methods.
         """
         rows = {}
         for name, suite in self.suites.items():
@@ -101,7 +101,9 @@ class Published:
             kept: list[Cell] = []
             for runs in runs_of(suite).values():
                 whole = [run for run in runs if there.issuperset(run)]
-                kept += [cell for run in whole or runs for cell in run if cell in there]
+                fullest = max(runs, key=lambda run: len(there.intersection(run)))
+                for run in whole or [fullest]:
+                    kept += [cell for cell in run if cell in there]
             rows[name] = known.loc[kept].infer_objects()
         return rows
 
