@@ -128,7 +128,8 @@ class FMCPE(Method):
         space: Where observations are mapped to simulations: as they are
             (``"input"``, as published), or by their embedding.
         noise: :math:`\epsilon`, in standard deviations of the simulations. The paper
-            has .05, and .5 for its wind tunnel.
+            has .05, and .5 for its wind tunnel. With None, as in its Gaussian task, the
+            way to a simulation starts at standard normal noise alone.
         num_draws: K.
         simulations_per_pair: Simulations at the parameters of each pair. Fewer are made
             if they are large.
@@ -171,7 +172,7 @@ class FMCPE(Method):
         *,
         simulator: Callable[[Tensor], Tensor] | None = None,
         space: Space = "input",
-        noise: float = 0.05,
+        noise: float | None = 0.05,
         num_draws: int = 100,
         simulations_per_pair: int = 100,
         npe_training: Training | None = None,
@@ -179,7 +180,8 @@ class FMCPE(Method):
         device: str | torch.device = "cpu",
     ) -> None:
         check_choice("space", space, ("input", "embedding"))
-        check_positive("noise", noise)
+        if noise is not None:
+            check_positive("noise", noise)
         check_integer("num_draws", num_draws)
         check_integer("simulations_per_pair", simulations_per_pair)
         check_instance("training", training, Training, optional=True)
@@ -359,7 +361,7 @@ class ToSimulations(Mixing):
         field: The velocity field of the map.
         then: From what it is mapped to, to the embedding that NPE's density sees.
         event_shape: Shape of one observation.
-        noise: :math:`\epsilon`.
+        noise: :math:`\epsilon`; None leaves the observation out of the start.
         num_draws: K.
     """
 
@@ -373,7 +375,7 @@ class ToSimulations(Mixing):
         then: nn.Module,
         *,
         event_shape: torch.Size,
-        noise: float,
+        noise: float | None,
         num_draws: int,
     ) -> None:
         super().__init__(event_shape, num_draws)
@@ -395,9 +397,10 @@ class ToSimulations(Mixing):
             x_o: Observations, shape ``(n, *event)``.
             simulated: A flat simulation with the same parameters, shape ``(n, m)``.
         """
-        here, c = self._flat(x_o), self.field.condition(x_o)
-        noisy, other = (here + self.noise * torch.randn_like(here) for _ in range(2))
-        loss = matching_loss(self.field, noisy, self.unit(simulated), c)
+        end, c = self.unit(simulated), self.field.condition(x_o)
+        centre, scale = self._start(x_o)
+        start, other = (centre + scale * torch.randn_like(end) for _ in range(2))
+        loss = matching_loss(self.field, start, end, c)
         with torch.no_grad():
             return loss, self._embedded(follow(self.field, other, c))
 
@@ -408,17 +411,23 @@ class ToSimulations(Mixing):
         return torch.cat([self._like(part) for part in x.split(size)])
 
     def _like(self, x: Tensor) -> Tensor:
-        start = self._flat(x)[:, None] + self.noise * self.xi
-        c = self.field.condition(x).repeat_interleave(self.num_embeddings, dim=0)
-        embedded = self._embedded(follow(self.field, start.flatten(0, 1), c))
-        return embedded.unflatten(0, (len(x), self.num_embeddings))
+        count = self.num_embeddings
+        centre, scale = self._start(x)
+        start = (centre[:, None] + scale * self.xi).flatten(0, 1)
+        c = self.field.condition(x).repeat_interleave(count, dim=0)
+        embedded = self._embedded(follow(self.field, start, c))
+        return embedded.unflatten(0, (len(x), count))
+
+    def _start(self, x: Tensor) -> tuple[Tensor, float]:
+        """Return mean ``(n, m)`` and deviation of where ways to simulations start."""
+        flat = self.unit(embed(self.statistics, x).flatten(1))
+        if self.noise is None:
+            return torch.zeros_like(flat), 1.0
+        return flat, self.noise
 
     def rows(self, embedded: Tensor) -> Rows:
         """Weigh all draws equally."""
         return equal_rows(embedded)
-
-    def _flat(self, x: Tensor) -> Tensor:
-        return self.unit(embed(self.statistics, x).flatten(1))
 
     def _embedded(self, z: Tensor) -> Tensor:
         return embed(self.then, self.unit.inverse(z).reshape(len(z), *self.shape))
