@@ -30,7 +30,7 @@ def report(args: argparse.Namespace, variant: str) -> str:
     posterior = stack(rope, seed=case.seed, show_progress_bars=False)
     rope.train(seed=case.seed, show_progress_bars=False)
     found = diagnose(rope, case.test_set[1], seed=case.seed, show_progress_bars=False)
-    alarming = [f"! {one}" for one in found.findings if one.alarming]
+    alarming = [f"! {one.sentence}" for one in found.findings if one.alarming]
     return "\n".join([str(posterior.report), *(alarming or ["nothing alarming"])])
 
 
