@@ -35,7 +35,7 @@ IN_WORDS = {
     "tuning-only": "the tuned embedding is trusted without transport",
     "RoPE": "tuning and transport repair the simulator, as RoPE is meant to",
     "fine-tuned NPE": "the labels themselves train NPE for these data",
-    "discrepancy": "a linear correction of the simulator explains these data",
+    "discrepancy": "a linear correction of the simulator predicts the labels best",
     "discrepancy, fine-tuned": "the corrected simulator is where the labels start from",
 }
 
