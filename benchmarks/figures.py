@@ -111,6 +111,7 @@ def curves(axis: str, rows: pd.DataFrame, *, max_columns: int = MAX_COLUMNS) -> 
         _panel(axes[1, column], axis, group, "acauc", seen)
         axes[1, column].axhline(0, color="0.6", lw=0.8)
         axes[1, column].set_xlabel(axis.replace("_", " "))
+        axes[1, column].tick_params(labelbottom=True)
         for part in axes[:, column]:
             part.spines[["top", "right"]].set_visible(False)
     axes[0, 0].set_ylabel("LPP, in prior sd")

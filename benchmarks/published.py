@@ -91,19 +91,20 @@ class Published:
     def rows(self) -> dict[str, pd.DataFrame]:
         """Rows by suite, of the repetitions in which a task is complete.
 
-        Of the fullest repetition where none is: a mean over more of them for one method
-        than for the next would compare data, not methods.
+        Of the one with the most methods where none is: a mean over more of them for one
+        method than for the next would compare data, not methods.
         """
         rows = {}
         for name, suite in self.suites.items():
             known = self.tables.get(name, Table.of({}, {})).rows
-            there = set(known.index)
+            there: set[Cell] = set(known.index)
             kept: list[Cell] = []
             for runs in runs_of(suite).values():
                 whole = [run for run in runs if there.issuperset(run)]
-                fullest = max(runs, key=lambda run: len(there.intersection(run)))
+                known_runs = [[cell for cell in run if cell in there] for run in runs]
+                fullest = max(known_runs, key=_num_methods)
                 for run in whole or [fullest]:
-                    kept += [cell for cell in run if cell in there]
+                    kept += run
             rows[name] = known.loc[kept].infer_objects()
         return rows
 
@@ -160,6 +161,10 @@ def runs_of(suite: Suite) -> dict[tuple[str, str], list[list[Cell]]]:
         where = runs.setdefault((cell.task, cell.variant), {})
         where.setdefault(cell.repetition, []).append(cell)
     return {where: [*parts.values()] for where, parts in runs.items()}
+
+
+def _num_methods(cells: list[Cell]) -> int:
+    return len({cell.method for cell in cells})
 
 
 def _finished(rows: pd.DataFrame) -> pd.DataFrame:

@@ -52,7 +52,7 @@ several. ACAUC is 0 for calibrated posteriors, positive for over-confident ones.
 NPE on simulations instead of real observations. A to F are the tasks of the paper, G is
 ours; on a stand-in a richer model takes the place of recorded data, and what is found
 there holds for that model. Means are over the repetitions in which a task is complete,
-or of the fullest one where none is. A dash is what was not run.
+or of the one with the most methods where none is. A dash is what was not run.
 """
 SETTINGS = f"""\
 OT-only and RoPE compete in one setting, fixed beforehand: gamma {FIXED.gamma:g} in
