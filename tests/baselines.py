@@ -116,7 +116,6 @@ METHODS: dict[str, Entry] = {
         },
     ),
     "fmcpe": Entry(FMCPE, lambda task: FLOWS),
-    "fmcpe_embedding": Entry(FMCPE, lambda task: {**FLOWS, "space": "embedding"}),
     "frisbi": Entry(FRISBI, lambda task: ALIGNED),
     "frisbi_distilled": Entry(
         FRISBI, lambda task: {**ALIGNED, "distilled": True, "num_draws": 5}

@@ -61,21 +61,19 @@ def mean_log_prob(posterior: Any, theta: Tensor, x: Tensor) -> float:
     return float(log_prob.mean())
 
 
-@pytest.mark.parametrize(
-    ("space", "noise"), [("input", 0.05), ("input", None), ("embedding", 0.05)]
-)
+@pytest.mark.parametrize(("space", "noise"), [("input", None), ("embedding", 0.05)])
 def test_with_many_pairs_it_comes_near_the_exact_posterior(
     space: str, noise: float | None
 ) -> None:
     posterior = trained(
-        500,
+        400,
         space=space,
         noise=noise,
         training=Training(
-            training_batch_size=250,
+            training_batch_size=160,
             learning_rate=3e-3,
-            max_num_epochs=40,
-            stop_after_epochs=40,
+            max_num_epochs=25,
+            stop_after_epochs=25,
             validation_fraction=0.2,
         ),
     )
