@@ -93,8 +93,8 @@ class FMCPE(Method):
     once and is the same for all observations.
 
     Sees simulations and the calibration set, and simulates at the calibration
-    parameters. It assumes little about what is wrong, and learns all of it from the
-    pairs. It is therefore made for hundreds of them.
+    parameters. It assumes little about what is wrong, and has to learn all of it from
+    the pairs, which takes hundreds of them.
 
     Where this differs from the original code:
 
