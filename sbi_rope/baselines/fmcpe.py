@@ -17,8 +17,6 @@ from sbi_rope._sbi import (
     embed,
     estimator_of,
 )
-from sbi_rope._simulations import SimulationSource
-from sbi_rope._simulator import source_of
 from sbi_rope._standardisation import ROUNDING, warn_of_far_entries
 from sbi_rope._training import (
     EPOCHS_WITHOUT_HOLDOUT,
@@ -164,6 +162,7 @@ class FMCPE(Method):
 
     sees = frozenset({"simulations", "calibration"})
     starts_from_npe = True
+    simulates = True
 
     def __init__(
         self,
@@ -186,19 +185,13 @@ class FMCPE(Method):
         check_integer("simulations_per_pair", simulations_per_pair)
         check_instance("training", training, Training, optional=True)
         npe = StartingNPE(density_estimator, npe_training)
-        super().__init__(prior, npe=npe, device=device)
+        super().__init__(prior, npe=npe, simulator=simulator, device=device)
         Unbounded(self._prior)  # early, for its error
-        self._simulator = simulator
         self.space: Space = space
         self.noise = noise
         self.num_draws = num_draws
         self.simulations_per_pair = simulations_per_pair
         self.training = DEFAULT_TRAINING if training is None else training
-
-    @property
-    def needs_simulations(self) -> bool:
-        """Whether there is something to train or to look up on simulations."""
-        return self._simulator is None or not self._has_npe
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
@@ -209,8 +202,7 @@ class FMCPE(Method):
         theta, x = self._data.calibration
         warn_of_far_entries("x", x, h)
         statistics = nn.Identity() if self.space == "input" else h
-        source = self._source(estimator)
-        bank = self._bank(source, statistics, show_progress_bars=show_progress_bars)
+        bank = self._bank(statistics, show_progress_bars=show_progress_bars)
         unit = Standardise(bank.flatten(0, 1))
         to_simulations = ToSimulations(
             statistics,
@@ -230,26 +222,10 @@ class FMCPE(Method):
         )
         return direct_posterior(pushed.eval(), self._prior), history
 
-    def _source(self, estimator: Any) -> SimulationSource:
-        like = torch.empty(0, *estimator.input_shape, device=self._device)
-        return source_of(
-            self._prior,
-            simulator=self._simulator,
-            simulations=None if self._simulator else self._data.simulations,
-            event_shape=estimator.condition_shape,
-            like=like,
-        )
-
-    def _bank(
-        self,
-        source: SimulationSource,
-        statistics: nn.Module,
-        *,
-        show_progress_bars: bool,
-    ) -> Tensor:
+    def _bank(self, statistics: nn.Module, *, show_progress_bars: bool) -> Tensor:
         """Return flat simulations at the calibration parameters, ``(n, c, m)``."""
         theta, x = self._data.calibration
-        return source.draws(
+        return self._source().draws(
             theta,
             max(1, min(self.simulations_per_pair, MAX_KEPT // x.numel())),
             lambda x: embed(statistics, x).flatten(1),

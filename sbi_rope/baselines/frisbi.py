@@ -9,7 +9,6 @@ from torch import Tensor, nn
 
 from sbi_rope._sbi import copy_of_prior, embed, estimator_of
 from sbi_rope._simulations import draw_targets
-from sbi_rope._simulator import source_of
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._training import (
     EPOCHS_WITHOUT_HOLDOUT,
@@ -135,6 +134,7 @@ class FRISBI(Method):
 
     sees = frozenset({"simulations", "calibration", "observations"})
     starts_from_npe = True
+    simulates = True
 
     def __init__(
         self,
@@ -158,19 +158,13 @@ class FRISBI(Method):
         check_integer("num_draws", num_draws)
         check_instance("training", training, Training, optional=True)
         npe = StartingNPE(density_estimator, npe_training)
-        super().__init__(prior, npe=npe, device=device)
-        self._simulator = simulator
+        super().__init__(prior, npe=npe, simulator=simulator, device=device)
         self.gamma = gamma
         self.num_simulations = num_simulations
         self.simulations_per_target = simulations_per_target
         self.distilled = distilled
         self.num_draws = num_draws
         self.training = DEFAULT_TRAINING if training is None else training
-
-    @property
-    def needs_simulations(self) -> bool:
-        """Whether there is something to train or to look up on simulations."""
-        return self._simulator is None or not self._has_npe
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
@@ -179,9 +173,7 @@ class FRISBI(Method):
             estimator.requires_grad_(requires_grad=False), "embedding"
         )
         warn_of_far_entries("x", self._data.calibration[1], h)
-        simulated, targets = self._simulated(
-            estimator, h, show_progress_bars=show_progress_bars
-        )
+        simulated, targets = self._simulated(h, show_progress_bars=show_progress_bars)
         g = trainable_copy(h, targets)
         mixing = AlignedEmbeddings(
             g, torch.cat([simulated, targets]), estimator.condition_shape, self.gamma
@@ -195,16 +187,10 @@ class FRISBI(Method):
         return MixturePosterior(mixture, copy_of_prior(self._prior)), history
 
     def _simulated(
-        self, estimator: Any, h: nn.Module, *, show_progress_bars: bool
+        self, h: nn.Module, *, show_progress_bars: bool
     ) -> tuple[Tensor, Tensor]:
         """Return embeddings of simulations from the prior, and the targets of pairs."""
-        source = source_of(
-            self._prior,
-            simulator=self._simulator,
-            simulations=None if self._simulator else self._data.simulations,
-            event_shape=estimator.condition_shape,
-            like=torch.empty(0, *estimator.input_shape, device=self._device),
-        )
+        source = self._source()
 
         def embedding(x: Tensor) -> Tensor:
             return embed(h, x)

@@ -53,6 +53,7 @@ class OTOnly(Method):
 
     sees = frozenset({"simulations", "observations"})
     starts_from_npe = True
+    simulates = True
 
     def __init__(
         self,
@@ -69,15 +70,9 @@ class OTOnly(Method):
         if num_simulations is not None:
             check_integer("num_simulations", num_simulations)
         npe = StartingNPE(density_estimator, npe_training)
-        super().__init__(prior, npe=npe, device=device)
-        self._simulator = simulator
+        super().__init__(prior, npe=npe, simulator=simulator, device=device)
         self.coupler = coupler
         self.num_simulations = num_simulations
-
-    @property
-    def needs_simulations(self) -> bool:
-        """Whether there is something to train or to look up on simulations."""
-        return self._simulator is None or not self._has_npe
 
     def build_rope(self) -> RoPE:
         """Return RoPE without calibration pairs, to couple at many settings.

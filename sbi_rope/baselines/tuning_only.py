@@ -50,6 +50,7 @@ class TuningOnly(Method):
 
     sees = frozenset({"simulations", "calibration"})
     starts_from_npe = True
+    simulates = True
 
     def __init__(
         self,
@@ -63,14 +64,8 @@ class TuningOnly(Method):
     ) -> None:
         check_instance("finetuner", finetuner, CalibrationFinetuner, optional=True)
         npe = StartingNPE(density_estimator, npe_training)
-        super().__init__(prior, npe=npe, device=device)
-        self._simulator = simulator
+        super().__init__(prior, npe=npe, simulator=simulator, device=device)
         self.finetuner = finetuner
-
-    @property
-    def needs_simulations(self) -> bool:
-        """Whether there is something to train or to look up on simulations."""
-        return self._simulator is None or not self._has_npe
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)

@@ -16,8 +16,7 @@ from sbi_rope._sbi import (
     headless,
     posterior_from,
 )
-from sbi_rope._simulations import Moments, SimulationSource, StoredSimulations
-from sbi_rope._simulator import Simulator
+from sbi_rope._simulations import Moments, SimulationSource
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._training import History
 from sbi_rope._validation import (
@@ -117,6 +116,7 @@ class DiscrepancyNPE(Method):
 
     sees = frozenset({"simulations", "calibration"})
     starts_from_npe = True
+    simulates = True
 
     def __init__(
         self,
@@ -153,7 +153,7 @@ class DiscrepancyNPE(Method):
                 f"*event), or None; got {type(simulator).__name__}."
             )
         npe = StartingNPE(density_estimator, npe_training)
-        super().__init__(prior, npe=npe, device=device)
+        super().__init__(prior, npe=npe, simulator=simulator, device=device)
         self.space: Space = space
         self.learn_prior = learn_prior
         self.model = DiscrepancyModel() if model is None else model
@@ -163,7 +163,6 @@ class DiscrepancyNPE(Method):
         self.learning_rate = learning_rate
         self.num_folds = num_folds
         self.finetuner = TUNING if finetuner is None else finetuner
-        self._simulator = simulator
         self._discrepancy: Discrepancy | None = None
 
     @classmethod
@@ -192,11 +191,6 @@ class DiscrepancyNPE(Method):
         if simulations is not None:
             method.append_simulations(*simulations)
         return method
-
-    @property
-    def needs_simulations(self) -> bool:
-        """Whether there is no simulator, or NPE has still to be trained."""
-        return self._simulator is None or not self._has_npe
 
     @property
     def _ignores_simulations(self) -> bool:
@@ -252,7 +246,7 @@ class DiscrepancyNPE(Method):
                 f"got {tuple(x.shape)}. Reduce x to summaries with names first."
             )
         with seeded(seed):
-            source = self._source(x)
+            source = self._source()
             _, simulated = source.kept(
                 self.num_simulations, progress=show_progress_bars
             )
@@ -272,20 +266,6 @@ class DiscrepancyNPE(Method):
                 f"DiscrepancyNPE needs at least {MIN_PAIRS} calibration pairs; got "
                 f"{count}. Call `append_calibration(theta, x)` first."
             )
-
-    def _source(self, x: Tensor) -> SimulationSource:
-        like, _ = self._data.calibration
-        if self._simulator is not None:
-            return Simulator(
-                self._simulator, self._prior, event_shape=x.shape[1:], like=like
-            )
-        return StoredSimulations(
-            self._data.simulations,
-            self._prior,
-            theta_shape=like.shape[1:],
-            event_shape=x.shape[1:],
-            like=like,
-        )
 
     def _moments(
         self,
@@ -307,7 +287,7 @@ class DiscrepancyNPE(Method):
             _check_density(estimator)
         theta, x = self._data.calibration
         warn_of_far_entries("x", x, embedding_of(estimator))
-        source = self._source(x)
+        source = self._source()
         net = network_of(estimator, self.space)
         moments = self._moments(source, net, show_progress_bars)
         theta_s, x_s = self._bank(source, show_progress_bars)

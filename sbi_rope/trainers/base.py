@@ -2,6 +2,7 @@ r"""What all methods have in common: data goes in, a posterior of sbi comes out.
 
 import copy
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
@@ -10,6 +11,8 @@ from torch.distributions import Distribution
 
 from sbi_rope._random import seeded
 from sbi_rope._sbi import copy_of_prior, device_of, estimator_of
+from sbi_rope._simulations import SimulationSource
+from sbi_rope._simulator import source_of
 from sbi_rope._training import History
 from sbi_rope._validation import (
     check_default_dtype,
@@ -47,10 +50,13 @@ class Method(ABC):
         sees: The kinds of data that can be appended.
         starts_from_npe: Whether it starts from NPE, so that :meth:`from_posterior` can
             take a trained one.
+        simulates: Whether it makes simulations of its own. Without a simulator it looks
+            them up among those that were appended.
 
     Args:
         prior: A torch distribution over parameters of shape ``(d,)``.
         npe: The NPE to start from, of a method that does.
+        simulator: Maps parameters to simulations, of a method that simulates.
         device: Where to train; data on other devices is moved there.
 
     Raises:
@@ -59,12 +65,14 @@ class Method(ABC):
 
     sees: ClassVar[frozenset[Kind]]
     starts_from_npe: ClassVar[bool] = False
+    simulates: ClassVar[bool] = False
 
     def __init__(
         self,
         prior: Any,
         *,
         npe: StartingNPE | None = None,
+        simulator: Callable[[Tensor], Tensor] | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
         check_prior(prior)
@@ -80,6 +88,7 @@ class Method(ABC):
             )
         self._data = Data(self._prior, self._device)
         self._npe = npe
+        self._simulator = simulator
         self._posterior: Any = None
         self._history: History | None = None
 
@@ -233,8 +242,9 @@ class Method(ABC):
 
     @property
     def needs_simulations(self) -> bool:
-        """Whether simulations must be appended before the training."""
-        return "simulations" in self.sees and not self._has_npe
+        """Whether simulations must be appended, to train on or to look up."""
+        looks_up = self.simulates and self._simulator is None
+        return "simulations" in self.sees and (looks_up or not self._has_npe)
 
     @property
     def _ignores_simulations(self) -> bool:
@@ -255,6 +265,18 @@ class Method(ABC):
         assert self._npe is not None
         return self._npe.posterior(
             self._prior, self._data, show_progress_bars=show_progress_bars
+        )
+
+    def _source(self) -> SimulationSource:
+        """Return the simulator, or the appended simulations where there is none."""
+        event_shape = self._data.event_shape
+        assert event_shape is not None
+        return source_of(
+            self._prior,
+            simulator=self._simulator,
+            simulations=self._data.simulations if self._simulator is None else None,
+            event_shape=event_shape,
+            like=torch.empty(0, *self._prior.event_shape, device=self._device),
         )
 
     def _check_data(self) -> None:
