@@ -17,13 +17,13 @@ __all__ = [
     "MIN_PAIRS_FOR_HOLDOUT",
     "History",
     "best_of_learning_rates",
+    "epochs_on_pairs",
     "fit",
     "groups_of",
     "groups_to_hold_out",
     "split_groups",
     "split_pairs",
     "too_few_pairs",
-    "warn_without_holdout",
 ]
 
 Trained = TypeVar("Trained")
@@ -185,14 +185,22 @@ def too_few_pairs(theta_or_groups: Tensor) -> str:
     )
 
 
-def warn_without_holdout(theta_or_groups: Tensor) -> None:
-    """Warn that there are too few pairs to choose a net by."""
+def epochs_on_pairs(
+    theta_or_groups: Tensor, held_out: Tensor, max_num_epochs: int
+) -> int:
+    """Return how many epochs to train on pairs for; few if none are held out.
+
+    Warns then, that nothing chooses the best net.
+    """
+    if len(held_out):
+        return max_num_epochs
     warn_user(
         f"{too_few_pairs(theta_or_groups)}: none is held out, and tuning stops after "
         f"at most {EPOCHS_WITHOUT_HOLDOUT} epochs. Append at least "
         f"{MIN_PAIRS_FOR_HOLDOUT} pairs of different parameters to choose the best net "
         "on a hold-out."
     )
+    return min(max_num_epochs, EPOCHS_WITHOUT_HOLDOUT)
 
 
 def fit(

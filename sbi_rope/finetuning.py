@@ -12,12 +12,11 @@ from torch import Tensor, nn
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed
 from sbi_rope._training import (
-    EPOCHS_WITHOUT_HOLDOUT,
     History,
     best_of_learning_rates,
+    epochs_on_pairs,
     fit,
     split_pairs,
-    warn_without_holdout,
 )
 from sbi_rope._validation import (
     LARGEST_SETTING,
@@ -194,8 +193,7 @@ class CalibrationFinetuner:
             _check_start(embedded, targets)
             keep = self._rehearsed(embedding_net, draw_simulations)
             train, held_out = split_pairs(groups, self.validation_fraction)
-            if not len(held_out):
-                warn_without_holdout(groups)
+            max_num_epochs = epochs_on_pairs(groups, held_out, self.max_num_epochs)
 
             def tuned(learning_rate: float) -> tuple[nn.Module, History]:
                 return self._optimise(
@@ -205,6 +203,7 @@ class CalibrationFinetuner:
                     train.to(x.device),
                     held_out.to(x.device),
                     learning_rate=learning_rate,
+                    max_num_epochs=max_num_epochs,
                     keep=keep,
                     draw_targets=checked_targets if self.resample_targets else None,
                     show_progress_bars=show_progress_bars,
@@ -243,14 +242,12 @@ class CalibrationFinetuner:
         held_out: Tensor,
         *,
         learning_rate: float,
+        max_num_epochs: int,
         keep: tuple[Tensor, Tensor] | None,
         draw_targets: Callable[[], Tensor] | None,
         show_progress_bars: bool,
     ) -> tuple[nn.Module, History]:
         has_holdout = held_out.numel() > 0
-        max_num_epochs = self.max_num_epochs
-        if not has_holdout:
-            max_num_epochs = min(max_num_epochs, EPOCHS_WITHOUT_HOLDOUT)
         newest = targets
 
         def all_pairs(epoch: int) -> list[tuple[Tensor, Tensor]]:

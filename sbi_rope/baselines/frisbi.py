@@ -11,11 +11,10 @@ from sbi_rope._sbi import copy_of_prior, embed, estimator_of
 from sbi_rope._simulations import draw_targets
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._training import (
-    EPOCHS_WITHOUT_HOLDOUT,
     History,
+    epochs_on_pairs,
     fit,
     split_pairs,
-    warn_without_holdout,
 )
 from sbi_rope._validation import check_instance, check_integer, check_positive
 from sbi_rope.baselines.statistics import split_at_statistics
@@ -215,10 +214,7 @@ class FRISBI(Method):
         x_o = self._data.observations
         train, held_out = split_pairs(theta, self.training.validation_fraction)
         train, held_out = train.to(x.device), held_out.to(x.device)
-        max_num_epochs = self.training.max_num_epochs
-        if not len(held_out):
-            warn_without_holdout(theta)
-            max_num_epochs = min(max_num_epochs, EPOCHS_WITHOUT_HOLDOUT)
+        max_num_epochs = epochs_on_pairs(theta, held_out, self.training.max_num_epochs)
 
         def error(rows: Tensor) -> Tensor:
             return (mixing.g(x[rows]) - targets[rows]).square().mean()

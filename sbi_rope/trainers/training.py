@@ -13,10 +13,9 @@ from torch import Tensor
 from sbi_rope._random import seeded
 from sbi_rope._sbi import ConditionalDensityEstimator, train_npe
 from sbi_rope._training import (
-    EPOCHS_WITHOUT_HOLDOUT,
     History,
+    epochs_on_pairs,
     fit,
-    warn_without_holdout,
 )
 from sbi_rope._validation import LARGEST_SETTING, check_integer, check_positive
 from sbi_rope.errors import InvalidInputError, InvalidTypeError
@@ -206,10 +205,7 @@ def train_on_pairs(
         The losses and the epoch that was kept.
     """
     train, held_out = split
-    max_num_epochs = training.max_num_epochs
-    if not len(held_out):
-        warn_without_holdout(theta)
-        max_num_epochs = min(max_num_epochs, EPOCHS_WITHOUT_HOLDOUT)
+    max_num_epochs = epochs_on_pairs(theta, held_out, training.max_num_epochs)
 
     def batches(step: int) -> Iterator[tuple[Tensor, Tensor]]:
         order = train[torch.randperm(len(train))]

@@ -20,11 +20,11 @@ from sbi_rope._training import (
     EPOCHS_WITHOUT_HOLDOUT,
     MIN_PAIRS_FOR_HOLDOUT,
     History,
+    epochs_on_pairs,
     fit,
     groups_of,
     split_groups,
     split_pairs,
-    warn_without_holdout,
 )
 from sbi_rope.baselines import Training
 from sbi_rope.errors import InvalidInputError, InvalidTypeError, RoPEWarning
@@ -339,9 +339,10 @@ class TestSplitPairs:
         train, other = split_pairs(theta, 0.2)
         assert (len(train), len(other)) == (40, 0)
         with pytest.warns(RoPEWarning, match="Only 4 different parameters among 40"):
-            warn_without_holdout(theta)
+            assert epochs_on_pairs(theta, other, 80) == EPOCHS_WITHOUT_HOLDOUT
         with pytest.warns(RoPEWarning, match=r"Only 4 calibration pair\(s\)"):
-            warn_without_holdout(theta[:4])
+            assert epochs_on_pairs(theta[:4], other, 30) == 30
+        assert epochs_on_pairs(theta, train, 80) == 80
 
 
 class TestGroups:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from sbi_rope.baselines import FMCPE, Training
-from sbi_rope.baselines.flow_matching import VelocityField, follow, follow_back
+from sbi_rope.baselines.fmcpe.velocity import VelocityField, follow, follow_back
 from tests import gaussian, problems
 
 QUIET: dict[str, Any] = {"seed": 0, "show_progress_bars": False}

@@ -1,0 +1,103 @@
+"""Parameters as vectors without bounds."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from sbi.utils import mcmc_transform
+from torch import Tensor, nn
+from torch.distributions import Distribution
+
+from sbi_rope._random import seeded
+from sbi_rope._sbi import copy_of_prior
+from sbi_rope.baselines.fmcpe.standardise import Standardise
+from sbi_rope.errors import InvalidInputError
+
+__all__ = ["Unbounded"]
+
+# Draws of the prior behind its moments.
+NUM_DRAWS = 10_000
+
+
+class Unbounded(nn.Module):
+    r"""Parameters without bounds, in standard deviations of the prior.
+
+    Args:
+        prior: A torch distribution over parameters of shape ``(d,)``.
+
+    Raises:
+        InvalidInputError: If sbi knows no transform of its support.
+    """
+
+    def __init__(self, prior: Distribution) -> None:
+        super().__init__()
+        self.prior = copy_of_prior(prior)
+        with seeded(0):
+            draws = self.prior.sample(torch.Size((NUM_DRAWS,))).float()
+        self._set_transform(draws.device)
+        self.unit = Standardise(self._transform(draws))
+
+    def _set_transform(self, device: torch.device) -> None:
+        if hasattr(self.prior, "to"):
+            self.prior.to(device)
+        try:
+            with seeded(0):  # sbi draws from the prior to look at it
+                transform = mcmc_transform(self.prior, device=str(device))
+        except Exception as error:  # sbi raises all kinds
+            raise InvalidInputError(
+                "Expected a prior whose `support` torch's `biject_to` knows, or which "
+                f"has a `mean` and a `stddev`; of this {type(self.prior).__name__} "
+                f"`mcmc_transform` says {type(error).__name__}: {error}"
+            ) from error
+        self._transform: Any = transform
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:  # noqa: FBT001, FBT002
+        before = self.unit.mean.device
+        moved = super()._apply(fn, recurse)
+        if self.unit.mean.device != before:
+            self._set_transform(self.unit.mean.device)
+        return moved
+
+    def transformed(self, theta: Tensor) -> Tensor:
+        """Return parameters without bounds, ``(n, d)``."""
+        return self.unit(self._transform(theta))
+
+    def inverse(self, u: Tensor) -> Tensor:
+        """Return the parameters of transformed ones, ``(n, d)``."""
+        return self._transform.inv(self.unit.inverse(u))
+
+    def contains(self, theta: Tensor) -> Tensor:
+        """Tell which parameters ``(n, d)`` can be transformed."""
+        return self.checked(theta)[2]
+
+    def replaced(self, theta: Tensor) -> Tensor:
+        """Replace parameters outside the prior's support by draws of the prior."""
+        prior = self.prior.sample(torch.Size((len(theta),))).to(theta)
+        return torch.where(self.contains(theta)[:, None], theta, prior)
+
+    def checked(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Transform parameters that may be outside the prior's support.
+
+        Returns:
+            Transformed parameters ``(n, d)``, the logarithm of the volume that the
+            transform multiplies by, ``(n,)``, and which rows are inside. The others
+            have zeros.
+        """
+        try:
+            inside = self.prior.support.check(theta)
+        except (AttributeError, NotImplementedError):
+            inside = torch.ones_like(theta[:, 0], dtype=torch.bool)
+        if inside.ndim == 2:
+            inside = inside.all(dim=1)
+        some = self._transform.inv(self.unit.mean.expand_as(theta))
+        safe = torch.where(inside[:, None], theta, some)
+        u = self._transform(safe)
+        log_scale = self._transform.log_abs_det_jacobian(safe, u)
+        if log_scale.ndim == 2:
+            log_scale = log_scale.sum(dim=1)
+        inside = inside & torch.isfinite(u).all(dim=1) & torch.isfinite(log_scale)
+        return (
+            self.unit(u).where(inside[:, None], 0.0),
+            log_scale.where(inside, 0.0) - self.unit.std.log().sum(),
+            inside,
+        )
