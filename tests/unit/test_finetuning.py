@@ -9,9 +9,9 @@ from torch import Tensor, nn
 
 from sbi_rope import CalibrationFinetuner
 from sbi_rope._random import seeded
+from sbi_rope._training import EPOCHS_WITHOUT_HOLDOUT
 from sbi_rope.errors import InvalidInputError, RoPEWarning
 from sbi_rope.finetuning import (
-    EPOCHS_WITHOUT_HOLDOUT,
     FinetuneResult,
     trainable_copy,
 )
