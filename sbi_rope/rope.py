@@ -68,7 +68,7 @@ class RoPE:
         simulator: Maps parameters ``(n, d)`` to simulations ``(n, *event)``, or one
             ``(d,)`` to one ``(*event)``. It may take tensors or NumPy arrays (of
             float64), and return either, lists, or numbers. A row of x may depend on the
-            same row of theta only. The simulator is tried on about fifteen parameters
+            same row of theta only. The simulator is tried on about thirty parameters
             to find that out. Simulations with NaN or Inf, and those for which the
             simulator raises, are dropped and counted. :func:`~sbi_rope.parallel` calls
             it in several processes.
@@ -431,7 +431,7 @@ class RoPE:
     def num_simulator_calls(self) -> int:
         """How many rows of theta the simulator has simulated so far.
 
-        Up to about fifteen are simulated when RoPE is constructed, to find out how the
+        About thirty are simulated when RoPE is constructed, to find out how the
         simulator is called. :meth:`train` simulates 100 for each label (and 2000 with
         rehearsal), :meth:`build_posterior` ``max(n_o, 1000)`` for each batch, and
         :func:`~sbi_rope.stack` 100 for each label, 20,000 from the prior, and with a

@@ -211,7 +211,9 @@ def describe(result: Any) -> str:
         return f"{type(result).__name__}: {result}"
     if isinstance(result, Tensor | np.ndarray):
         kind = "a tensor" if isinstance(result, Tensor) else "an array"
-        return f"{kind} of shape {tuple(result.shape)} and dtype {result.dtype}"
+        special = "" if _holds_numbers(result) else " that does not hold plain numbers"
+        shape, dtype = tuple(result.shape), result.dtype
+        return f"{kind} of shape {shape} and dtype {dtype}{special}"
     if isinstance(result, list | tuple):
         return f"a {type(result).__name__} of length {len(result)}, {shown(result)}"
     return f"an object of type {type(result).__name__}"
@@ -225,16 +227,20 @@ def _as_numbers(result: Any) -> Tensor | None:
         except (TypeError, ValueError, RuntimeError):
             return None
     if isinstance(result, Tensor):
-        special = result.is_nested or result.is_quantized or result.is_meta
-        plain = result.layout == torch.strided and not special
-        return result.detach().clone() if plain and not result.is_complex() else None
+        return result.detach().clone() if _holds_numbers(result) else None
     try:
         array = np.asarray(result)
     except (TypeError, ValueError, RuntimeError):  # such as lists of unequal length
         return None
-    if array.dtype.kind not in "biuf":
-        return None
-    return torch.from_numpy(array.astype(np.float64))
+    return torch.from_numpy(array.astype(float)) if _holds_numbers(array) else None
+
+
+def _holds_numbers(result: Tensor | np.ndarray) -> bool:
+    """Tell whether a tensor or array holds plain real numbers."""
+    if isinstance(result, np.ndarray):
+        return result.dtype.kind in "biuf"
+    special = result.is_nested or result.is_quantized or result.is_meta
+    return result.layout == torch.strided and not special and not result.is_complex()
 
 
 def _as_text(theta: Tensor) -> str:

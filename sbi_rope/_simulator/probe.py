@@ -1,6 +1,7 @@
 """Try a simulator on a few parameters, to find out how it is called."""
 
 import random
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NoReturn
@@ -27,6 +28,12 @@ FORMS = [
 # A simulator may fail at some parameters. It is tried at so many.
 TRIES = 5
 
+SAME_NOISE = "`simulator` adds the same noise to all simulations of a batch"
+MIXED_ROWS = (
+    "`simulator` returns something else for a row of a batch than for the same theta "
+    "alone: its rows depend on each other"
+)
+
 _State = tuple[bytes, tuple[Any, ...], Any]
 
 
@@ -50,7 +57,7 @@ class _Trial:
 
     def __str__(self) -> str:
         kind = "an array" if self.caller.form.arrays else "a tensor"
-        return f"{kind} {tuple(self.theta.shape)}: {describe(self.result)}"
+        return f"for {kind} {tuple(self.theta.shape)}: {describe(self.result)}"
 
 
 class Probe:
@@ -95,13 +102,25 @@ class Probe:
                 does not work in worker processes.
         """
         trial = self._working_trial()
-        self._caller = caller = trial.caller
+        caller = self._caller = trial.caller
         if num_workers is not None:
             self._check_workers(trial.theta, num_workers)
         if not caller.form.batched:
             self._check_seeds(trial)
             return caller
-        self._check_noise(trial)
+        return self._caller_of_batches(trial)
+
+    def _caller_of_batches(self, trial: _Trial) -> Caller:
+        """Return the simulator with batches, or without if it mixes up their rows."""
+        caller = trial.caller
+        if self._shares_noise(trial):
+            if caller.form.arrays and self._attempt(self._draws[0]) is not None:
+                return self._alone(caller, SAME_NOISE)
+            warn_user(
+                f"{SAME_NOISE}. Draw noise of the shape of the batch, or simulate row "
+                "by row with `lambda theta: torch.stack([simulator(row) for row in "
+                "theta])`."
+            )
         trial = self._try(caller.form, self._draws[: self._count])
         self._check_seeds(trial)
         if not rows_depend_on_each_other(
@@ -112,7 +131,13 @@ class Probe:
             self._draws[self._count - 1 :],
         ):
             return caller
-        return self._one_by_one(caller)
+        if self._attempt(self._draws[0]) is None:
+            raise SimulationError(
+                "Expected `simulator` to return x (n, *event) in which each row "
+                "depends on the same row of theta (n, d) only; what it returns for "
+                "a row changes with the other rows."
+            )
+        return self._alone(caller, MIXED_ROWS)
 
     def _working_trial(self) -> _Trial:
         """Return a trial in the form in which the simulator returns simulations.
@@ -145,7 +170,9 @@ class Probe:
         batch, single = trials[0], trials[1]
         event = tuple(batch.caller.event_shape)
         outcomes = {describe(trial.result) for trial in trials}
-        got = outcomes.pop() if len(outcomes) == 1 else "\n  ".join(map(str, trials))
+        got = f"it gave {outcomes.pop()}."
+        if outcomes:
+            got = "it gave\n  " + "\n  ".join(map(str, trials))
         errors = [t.result for t in trials if isinstance(t.result, Exception)]
         # Other errors than these tell more than that the form is not the right one.
         telling = [e for e in errors if not isinstance(e, AttributeError | TypeError)]
@@ -153,39 +180,27 @@ class Probe:
             f"Expected `simulator` to map theta {tuple(batch.theta.shape)} to x "
             f"{(self._count, *event)}, or theta {tuple(single.theta.shape)} to x "
             f"{event}, as tensors, NumPy arrays or lists of numbers. At theta "
-            f"{shown(single.theta.tolist())} it gave\n  {got}\n"
-            "Let it return one of these, with NaN where a simulation cannot be made."
+            f"{shown(single.theta.tolist())} {got}\nLet it return one of these, with "
+            "NaN where a simulation cannot be made."
         ) from next(iter(telling[::-1] or errors), None)
 
-    def _one_by_one(self, caller: Caller) -> Caller:
-        """Return the caller of a simulator that mixes up the rows of batches."""
-        if self._attempt(self._draws[0]) is None:
-            raise SimulationError(
-                "Expected `simulator` to return x (n, *event) in which each row "
-                "depends on the same row of theta (n, d) only; what it returns for "
-                "a row changes with the other rows."
-            )
+    def _alone(self, caller: Caller, reason: str) -> Caller:
+        """Return a caller of one theta at a time, and warn why."""
         warn_user(
-            "`simulator` returns something else for a row of a batch than for the same "
-            "theta alone: its rows depend on each other. It is therefore called with "
-            "one theta at a time. If it should take batches, let each row of x depend "
-            "on the same row of theta only."
+            f"{reason}. It is therefore called with one theta at a time. If it should "
+            "take batches, let each row of x depend on the same row of theta only, and "
+            "have noise of its own."
         )
         return replace(caller, form=replace(caller.form, batched=False))
 
-    def _check_noise(self, trial: _Trial) -> None:
-        """Warn if all rows of a batch with the same parameters get the same noise."""
+    def _shares_noise(self, trial: _Trial) -> bool:
+        """Tell whether all rows of a batch with the same parameters get one noise."""
         x = trial.x
         assert x is not None
         if not bool((x == x[:1]).all()):
-            return
-        again = self._attempt(trial.theta)
-        if again is not None and not torch.equal(again, x):
-            warn_user(
-                "`simulator` adds the same noise to all simulations of a batch. Draw "
-                "noise of the shape of the batch, or simulate row by row with "
-                "`lambda theta: torch.stack([simulator(row) for row in theta])`."
-            )
+            return False
+        again = self._try(trial.caller.form, trial.theta, seed=1).x
+        return again is not None and not torch.equal(again, x)
 
     def _check_seeds(self, trial: _Trial) -> None:
         """Warn if the simulator sets a seed, and so repeats its noise at every call."""
@@ -241,7 +256,9 @@ class Probe:
         """Simulate in some form under a seed."""
         caller = replace(caller or self._caller, form=form)
         self.num_calls += 1 if theta.ndim == 1 else len(theta)
-        with seeded(seed):
+        with seeded(seed), warnings.catch_warnings():
+            # NumPy and others warn of tensors, which may not be the right form.
+            warnings.simplefilter("ignore")
             x, result = caller.attempt(theta)
             of_numpy: Any = np.random.get_state()  # noqa: NPY002
             state = (

@@ -135,9 +135,8 @@ def simulate_in_workers(
     pieces = theta.split(ROWS if caller.form.batched else 1)
     seeds = torch.randint(2**31, (len(pieces),)).tolist()
     # A seeded block waits for those of other threads, so that threads do not do.
-    run: Any = joblib.Parallel(
-        n_jobs=num_workers, backend="loky", return_as="generator"
-    )
+    options: dict[str, Any] = {"backend": "loky", "return_as": "generator"}
+    run: Any = joblib.Parallel(n_jobs=num_workers, **options)
     simulated = []
     try:
         for part in run(
@@ -146,10 +145,13 @@ def simulate_in_workers(
         ):
             simulated.append(part)
             advance(len(part.x))
+    except SimulationError as error:
+        # Without the traceback of the worker, which says the same.
+        raise SimulationError(*error.args) from None
     except (BrokenExecutor, pickle.PicklingError) as error:
         raise SimulationError(
             f"Expected a simulator that works in {num_workers} worker processes; got "
-            f"{describe(error)} {REPAIR}"
+            f"{describe(error)}\n{REPAIR}"
         ) from error
     return Simulated.joined(simulated)
 
