@@ -431,12 +431,12 @@ class RoPE:
     def num_simulator_calls(self) -> int:
         """How many rows of theta the simulator has simulated so far.
 
-        About thirty are simulated when RoPE is constructed, to find out how the
+        Up to thirty are simulated when RoPE is constructed, to find out how the
         simulator is called. :meth:`train` simulates 100 for each label (and 2000 with
         rehearsal), :meth:`build_posterior` ``max(n_o, 1000)`` for each batch, and
-        :func:`~sbi_rope.stack` 100 for each label, 20,000 from the prior, and with a
-        batch ``max(n_o, 1000)`` more. The argument ``num_simulations`` of this class
-        sets a number for all of these together.
+        :func:`~sbi_rope.stack` 20,000 from the prior and 100 for each label, and with a
+        batch 2000 and ``max(n_o, 1000)`` more. The argument ``num_simulations`` of this
+        class sets a number for all of these together.
         """
         return self._source.num_calls
 

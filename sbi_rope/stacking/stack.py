@@ -64,7 +64,7 @@ def stack(
         num_simulations: The number of simulations to couple with, as in
             :meth:`~sbi_rope.RoPE.build_posterior`. Candidates are trained on others:
             the simulator makes 20,000 from the prior and 100 for each label. To have
-            fewer, give RoPE itself ``num_simulations``.
+            fewer, give RoPE itself a number, ``RoPE(..., num_simulations=2000)``.
         pseudo_count: Strength of the Dirichlet prior of the weights, in pairs.
         learning_curve: Whether to train on fewer folds too, so that the report can
             estimate what more labels would add. It takes about twice the time.
