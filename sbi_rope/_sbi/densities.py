@@ -27,6 +27,9 @@ __all__ = [
     "gaussians_of",
 ]
 
+# What sbi adds to the precision of each Gaussian that it mixes.
+SMALLEST_PRECISION = 1e-4
+
 
 class MixtureDensity(ConditionalDensityEstimator):
     """A density that mixes others given several contexts of an observation.
@@ -153,13 +156,15 @@ def gaussians_of(
 
     Returns:
         The logarithms of their weights up to a constant, shape ``(n, c)``, their means,
-        ``(n, c, l)``, and covariances, ``(n, c, l, l)``.
+        ``(n, c, l)``, and covariances, ``(n, c, l, l)``, all in float64.
     """
     mixture = estimator.get_uncorrected_mog(condition)
     assert not estimator.has_input_transform
     factors = mixture.precision_factors
     assert factors is not None
-    # The precision is A^T A with A upper triangular.
-    identity = torch.eye(factors.shape[-1]).to(factors).expand_as(factors)
-    inverse = torch.linalg.solve_triangular(factors, identity, upper=True)
-    return mixture.logits, mixture.means, inverse @ inverse.mT
+    # In float32 a narrow covariance would not be positive definite after rounding.
+    factors = factors.double()
+    identity = torch.eye(factors.shape[-1]).to(factors)
+    precision = factors.mT @ factors + SMALLEST_PRECISION * identity
+    covariances = torch.cholesky_inverse(torch.linalg.cholesky(precision))
+    return mixture.logits.double(), mixture.means.double(), covariances

@@ -63,8 +63,8 @@ def test_the_surrogate_is_near_the_simulator() -> None:
     mean = (weights * means).sum(dim=1)
     scatter = covariances + (means - mean)[..., None] * (means - mean)[:, :, None]
     covariance = (weights[..., None] * scatter).sum(dim=1)
-    torch.testing.assert_close(mean, theta, atol=0.1, rtol=0)
-    expected = gaussian.NOISE_STD**2 * torch.eye(2)[None]
+    torch.testing.assert_close(mean, theta.double(), atol=0.1, rtol=0)
+    expected = gaussian.NOISE_STD**2 * torch.eye(2).double()[None]
     torch.testing.assert_close(covariance, expected, atol=0.06, rtol=0)
 
 
@@ -121,6 +121,13 @@ def test_draws_outside_the_prior_have_no_weight_and_leave_the_bound_finite() -> 
     assert terms.log_evidence.isfinite().all()
     terms.cross_entropy.sum().backward()
     assert all(p.grad.isfinite().all() for p in bound.q.parameters())
+
+
+def test_parameters_far_from_simulations_have_a_likelihood() -> None:
+    theta = torch.tensor([[1e3, -1e3], [1e6, 1e6]])
+    found, _ = log_likelihood(surrogate(), bent_errors(), torch.zeros(2, 2), theta)
+    assert found.isfinite().all()
+    assert (found < -100).all()
 
 
 @pytest.mark.parametrize("shift", [True, False])

@@ -157,13 +157,13 @@ def log_likelihood(
     """
     logits, means, covariances = gaussians_of(surrogate, theta)
     mean, of_mean, covariance = errors(theta)
-    # In float64, because a sum of a wide and a narrow covariance is decomposed.
-    total = covariances.double() + covariance[:, None].double()
+    # Errors that are no numbers any more make the loss no number, and training stops.
+    factor, _ = torch.linalg.cholesky_ex(covariances + covariance[:, None].double())
     law = MixtureSameFamily(
-        Categorical(logits=logits.double(), validate_args=False),
+        Categorical(logits=logits, validate_args=False),
         MultivariateNormal(
-            (means + mean[:, None]).double(),
-            scale_tril=torch.linalg.cholesky(total),
+            means + mean[:, None],
+            scale_tril=factor,
             validate_args=False,
         ),
         validate_args=False,
