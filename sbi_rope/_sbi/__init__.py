@@ -12,7 +12,13 @@ from sbi.neural_nets.net_builders.flow import build_zuko_unconditional_flow
 from sbi.samplers.mcmc import SliceSamplerVectorized
 from sbi.utils.user_input_checks_utils import move_distribution_to_device
 
-from sbi_rope._sbi.densities import MixedDensity, MixtureDensity, VectorFieldDensity
+from sbi_rope._sbi.densities import (
+    MixedDensity,
+    MixtureDensity,
+    MixtureDensityEstimator,
+    VectorFieldDensity,
+    gaussians_of,
+)
 from sbi_rope._sbi.embedding import (
     device_of,
     dtype_of,
@@ -41,6 +47,7 @@ __all__ = [
     "DirectPosterior",
     "MixedDensity",
     "MixtureDensity",
+    "MixtureDensityEstimator",
     "NeuralPosterior",
     "SliceSamplerVectorized",
     "UnconditionalDensityEstimator",
@@ -54,6 +61,7 @@ __all__ = [
     "embed",
     "embedding_of",
     "estimator_of",
+    "gaussians_of",
     "headless",
     "is_bounded",
     "move_distribution_to_device",
