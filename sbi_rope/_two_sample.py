@@ -107,9 +107,7 @@ def two_sample_test(first: Tensor, second: Tensor) -> TwoSampleTest | None:
     )
 
 
-def _mean_distances(
-    distances: Tensor, member: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+def _mean_distances(distances: Tensor, member: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return mean distances within the first set, across, and within the second."""
     rest = 1.0 - member
     n, m = member[0].sum(), rest[0].sum()

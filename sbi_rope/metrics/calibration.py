@@ -66,11 +66,15 @@ class ACAUCScore:
 
     @property
     def verdict(self) -> str:
-        """What the interval shows: over-confident, too wide, or neither."""
+        """One of "over-confident", "too wide" and "calibrated".
+
+        It is "calibrated" unless the interval leaves 0 out, and means that the
+        observations show nothing else.
+        """
         low, high = self.interval
         if low > 0:
             return "over-confident"
-        return "too wide" if high < 0 else "neither over-confident nor too wide"
+        return "too wide" if high < 0 else "calibrated"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -67,32 +67,31 @@ class Evaluation:
 
     def __str__(self) -> str:
         n, d = self.ranks.shape
-        acauc, error, inside = self.acauc, self.expected_coverage_error, self._inside
-        return "\n".join(
-            [
-                f"Scores on {n} observations with {d} known parameters each",
-                "  log probability of the true parameters (LPP), in nats an observation;"
-                " higher is better:",
-                *self._densities(),
-                f"  true parameters that the posterior excludes: "
-                f"{self.lpp.neg_inf_fraction:.1%}",
-                f"  ACAUC {acauc.value:+.3f}, 95 % interval {acauc.interval[0]:+.3f} to "
-                f"{acauc.interval[1]:+.3f}: {acauc.verdict}, as far as these "
-                "observations can tell",
-                f"    ({ACAUC_IN_WORDS})",
-                f"  coverage error {error.value:.3f}; a calibrated posterior has about "
-                f"{0.31 / n**0.5:.3f} with so many observations",
-                f"  50 % intervals hold {inside(0.5):.0%} of the true parameters, and 90 "
-                f"% intervals hold {inside(0.9):.0%}",
-                "  each value is in the attributes: .lpp, .lpp_z, .ranks, .acauc, "
-                ".coverage, .expected_coverage_error",
-            ]
-        )
+        error, (low, high) = self.expected_coverage_error.value, self.acauc.interval
+        verdict = self.acauc.verdict
+        if verdict == "calibrated":
+            verdict += " as far as these observations can tell"
+        lines = [
+            f"Scores on {n} observations, with {d} true parameters each",
+            "  log probability of the true parameters (LPP), in nats an observation:",
+            *self._densities(),
+            f"  {verdict}: ACAUC {self.acauc.value:+.3f}, 95 % interval {low:+.3f} to "
+            f"{high:+.3f}",
+            f"    ({ACAUC_IN_WORDS})",
+            f"  coverage error {error:.3f}; a calibrated posterior has about "
+            f"{0.31 / n**0.5:.3f} with {n} observations",
+            f"  50% intervals hold {self._inside(0.5):.0%} of the true parameters, 90% "
+            f"intervals {self._inside(0.9):.0%}",
+            "  all values: .lpp, .lpp_z, .ranks, .acauc, .coverage, "
+            ".expected_coverage_error",
+        ]
+        return "\n".join(lines)
 
     def _densities(self) -> list[str]:
         scores = {"theta in its own units": self.lpp}
         if self.lpp_z is not None:
-            # This is what `theta_std` should be, and evaluate() cannot check it.
+            # Usually these are the standard deviations of the prior, which
+            # evaluate() does not know.
             scores["theta in units of `theta_std`"] = self.lpp_z
         lines = [
             f"    {unit}: {score.mean:.2f} +- {score.standard_error:.2f}, "
@@ -104,6 +103,9 @@ class Evaluation:
                 "    pass theta_std=prior.stddev for theta in standard deviations of "
                 "the prior"
             )
+        if self.lpp.neg_inf_fraction:
+            excluded = self.lpp.neg_inf_fraction
+            lines.append(f"    {excluded:.1%} of the true parameters have density zero")
         return lines
 
     def _inside(self, level: float) -> float:
