@@ -34,7 +34,8 @@ LAYERS = [
     # sbi's trainer is told by `_training` which simulations to hold out together.
     {"_sbi"},
     # Each works on embeddings or posteriors, which `_sbi` takes out of an estimator.
-    {"coupling", "finetuning", "metrics", "_npe", "_simulations", "_standardisation"},
+    {"coupling", "finetuning", "metrics", "_npe", "_simulations", "_standardisation"}
+    | {"_two_sample"},
     # A mixture has the couplings of a batch as weights. A simulator is a source of
     # simulations like stored ones.
     {"mixture", "_simulator"},

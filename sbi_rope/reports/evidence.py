@@ -7,7 +7,7 @@ from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.metrics import CoverageCurve, acauc_of
 from sbi_rope.plots import calibration_curves, discrepancy, implied_parameters
 from sbi_rope.reports.numbers import number, percent
-from sbi_rope.reports.page import paragraph, picture, section, table
+from sbi_rope.reports.page import finding, paragraph, picture, section, table
 from sbi_rope.stacking import StackingReport
 
 __all__ = ["calibration_section", "diagnosis_section", "discrepancy_section"]
@@ -28,7 +28,8 @@ def calibration_section(report: StackingReport, names: Sequence[str]) -> str:
             curves[name] = own
     if len(names) > MAX_CURVES:
         curves = {"all parameters": curve}
-    n = len(levels)
+    n, drawn = len(levels), calibration_curves(curves)
+    drawn.set_size_inches(5.8, 3.4)  # so that its text can be read on a narrow screen
     return section(
         "Are the uncertainties right?",
         table(
@@ -52,7 +53,7 @@ def calibration_section(report: StackingReport, names: Sequence[str]) -> str:
             kind="note",
         ),
         picture(
-            calibration_curves(curves),
+            drawn,
             caption="The share of known parameters inside intervals of each level. "
             "Below the diagonal intervals are too narrow, above it too wide. The band "
             "holds 95 % of the curves of calibrated posteriors.",
@@ -132,30 +133,23 @@ def discrepancy_section(report: DiscrepancyReport) -> str:
 
 def diagnosis_section(diagnosis: Diagnosis) -> str:
     """Return the findings about a batch."""
-    order = sorted(diagnosis.findings, key=lambda finding: not finding.alarming)
-    rows = [
-        (
-            "alarming" if finding.alarming else "",
-            finding.name,
-            f"{finding.value:.3g}",
-            f"{finding.threshold:.3g}",
-            finding.sentence,
-        )
-        for finding in order
-    ]
-    alarms = len(diagnosis.alarming)
+    order = sorted(diagnosis.findings, key=lambda result: not result.alarming)
+    alarms = len(diagnosis.alarming) or "none"
     return section(
         "Diagnosis of the batch",
         paragraph(
             f"{len(diagnosis.distance)} measurements were compared with "
-            f"{len(diagnosis.theta)} simulations. {alarms} of {len(order)} findings "
-            f"{'is' if alarms == 1 else 'are'} alarming."
+            f"{len(diagnosis.theta)} simulations. Of {len(order)} findings "
+            f"{alarms} {'is' if alarms in (1, 'none') else 'are'} alarming."
         ),
-        table(
-            ("", "finding", "number", "threshold", "in words"),
-            rows,
-            numbers=(2, 3),
-            alarming=range(alarms),
+        *(
+            finding(
+                result.name,
+                f"{result.value:.3g} (threshold {result.threshold:.3g})",
+                result.sentence,
+                alarming=result.alarming,
+            )
+            for result in order
         ),
         *(paragraph(note, kind="note") for note in diagnosis.notes),
         picture(

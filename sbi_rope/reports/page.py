@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 __all__ = [
     "check_target",
     "definitions",
+    "finding",
     "list_of",
     "page",
     "paragraph",
@@ -39,6 +40,7 @@ h1 { font-size: 1.7rem; line-height: 1.25; margin: .4rem 0 .2rem; }
 h2 { font-size: 1.25rem; margin: 2.2rem 0 .6rem; padding-top: .7rem;
   border-top: 1px solid #d5dbe4; }
 p, ul, dl { margin: .6rem 0; }
+ul { padding-left: 1.3rem; }
 .note { color: #566070; font-size: .9rem; }
 .verdict { border-left: 4px solid #0072b2; background: #f1f6fa; padding: .5rem 1rem; }
 .verdict li.alarm, p.alarm { color: #a03c00; font-weight: 600; }
@@ -51,6 +53,10 @@ th { font-weight: 600; border-bottom-color: #9aa5b4; }
 td.number, th.number { text-align: right; white-space: nowrap; }
 tr.strong td { font-weight: 600; background: #f1f6fa; }
 tr.alarm td { background: #fdf1e8; }
+.finding { border-left: 4px solid #d5dbe4; padding: .1rem .9rem; margin: .7rem 0; }
+.finding.alarm { border-left-color: #d55e00; background: #fdf1e8; }
+.finding span { color: #566070; font-size: .9rem; white-space: nowrap; }
+.finding p { margin: .2rem 0 .4rem; }
 img { display: block; max-width: 100%; height: auto; }
 .wide img { max-width: none; width: 46rem; }
 figure { margin: .8rem 0; }
@@ -68,7 +74,7 @@ def paragraph(text: str, *, kind: str = "") -> str:
         text: Its text, which is escaped.
         kind: Its class in the style sheet, if it has one.
     """
-    return f"<p{_class(kind)}>{escape(text)}</p>"
+    return f"<p{_class(kind)}>{_text(text)}</p>"
 
 
 def list_of(texts: Iterable[tuple[str, bool]], *, kind: str = "") -> str:
@@ -79,7 +85,7 @@ def list_of(texts: Iterable[tuple[str, bool]], *, kind: str = "") -> str:
         kind: The class of the list in the style sheet, if it has one.
     """
     lines = [
-        f"<li{_class('alarm' if alarming else '')}>{escape(text)}</li>"
+        f"<li{_class('alarm' if alarming else '')}>{_text(text)}</li>"
         for text, alarming in texts
     ]
     return "\n".join([f"<div{_class(kind)}>", "<ul>", *lines, "</ul>", "</div>"])
@@ -88,14 +94,13 @@ def list_of(texts: Iterable[tuple[str, bool]], *, kind: str = "") -> str:
 def definitions(words: Mapping[str, str]) -> str:
     """Return a list of words with what they mean; all are escaped."""
     lines = [
-        f"<dt>{escape(word)}</dt><dd>{escape(text)}</dd>"
-        for word, text in words.items()
+        f"<dt>{_text(word)}</dt><dd>{_text(text)}</dd>" for word, text in words.items()
     ]
     return "\n".join(["<dl>", *lines, "</dl>"])
 
 
 def table(
-    heads: Sequence[str],
+    heads: Sequence[str] | None,
     rows: Iterable[Sequence[str]],
     *,
     numbers: Iterable[int] = (),
@@ -105,7 +110,8 @@ def table(
     """Return a table that scrolls by itself on a narrow screen.
 
     Args:
-        heads: The heads of its columns, which are escaped, as all cells are.
+        heads: The heads of its columns, which are escaped, as all cells are. None for a
+            table without heads.
         rows: The cells of each row.
         numbers: The columns that hold numbers, which are set to the right.
         strong: The rows to be set in bold.
@@ -116,17 +122,14 @@ def table(
     def cells(tag: str, values: Sequence[str]) -> str:
         kinds = [_class("number" if k in right else "") for k in range(len(values))]
         return "".join(
-            f"<{tag}{kind}>{escape(value)}</{tag}>"
+            f"<{tag}{kind}>{_text(value)}</{tag}>"
             for kind, value in zip(kinds, values, strict=True)
         )
 
-    lines = [
-        '<div class="wide">',
-        "<table>",
-        "<thead>",
-        f"<tr>{cells('th', heads)}</tr>",
-    ]
-    lines += ["</thead>", "<tbody>"]
+    lines = ['<div class="wide">', "<table>"]
+    if heads is not None:
+        lines += ["<thead>", f"<tr>{cells('th', heads)}</tr>", "</thead>"]
+    lines.append("<tbody>")
     for k, row in enumerate(rows):
         kind = "strong" if k in bold else "alarm" if k in marked else ""
         lines.append(f"<tr{_class(kind)}>{cells('td', row)}</tr>")
@@ -146,16 +149,33 @@ def picture(figure: "Figure", *, caption: str, wide: bool = False) -> str:
     # By default matplotlib would write a link to its own site into the file.
     figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
     data = base64.b64encode(buffer.getvalue()).decode("ascii")
-    text = escape(caption)
+    text = _text(caption)
     image = f'<img alt="{text}" src="data:image/png;base64,{data}">'
     if wide:
         image = f'<div class="wide">{image}</div>'
     return f"<figure>{image}<figcaption>{text}</figcaption></figure>"
 
 
+def finding(name: str, value: str, text: str, *, alarming: bool) -> str:
+    """Return the result of a test: its name and number, and what it says.
+
+    Args:
+        name: The name of the test, which is escaped as all texts are.
+        value: The number and its threshold.
+        text: What it says.
+        alarming: Whether it is marked.
+    """
+    mark = "Alarming: " if alarming else ""
+    return (
+        f"<div{_class('finding alarm' if alarming else 'finding')}>"
+        f"<strong>{mark}{_text(name)}</strong> <span>{_text(value)}</span>"
+        f"<p>{_text(text)}</p></div>"
+    )
+
+
 def section(title: str, *parts: str) -> str:
     """Return a section with a title, which is escaped."""
-    return "\n".join(["<section>", f"<h2>{escape(title)}</h2>", *parts, "</section>"])
+    return "\n".join(["<section>", f"<h2>{_text(title)}</h2>", *parts, "</section>"])
 
 
 def page(title: str, *parts: str) -> str:
@@ -168,11 +188,11 @@ def page(title: str, *parts: str) -> str:
         '<meta charset="utf-8">',
         f'{GENERATOR} {version}">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        f"<title>{escape(title)}</title>",
+        f"<title>{_text(title)}</title>",
         f"<style>{STYLE}</style>",
         "</head>",
         "<body>",
-        f"<h1>{escape(title)}</h1>",
+        f"<h1>{_text(title)}</h1>",
     ]
     return "\n".join([*head, *parts, "</body>", "</html>", ""])
 
@@ -203,6 +223,11 @@ def write_page(path: Path, text: str) -> None:
     """
     with write_atomically(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def _text(text: str) -> str:
+    """Return text for a page; a number and its per cent sign stay on one line."""
+    return escape(text).replace(" %", "&nbsp;%")
 
 
 def _class(kind: str) -> str:

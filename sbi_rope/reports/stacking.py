@@ -72,8 +72,10 @@ def write_stacking_report(
     assert target is not None
     names = _parameter_names(report, diagnosis, parameter_names)
     discrepancy = report.discrepancy
-    if x_names is not None and discrepancy is not None:
-        discrepancy = discrepancy.renamed(x_names)
+    if x_names is not None:
+        check_names("x_names", x_names)
+        if discrepancy is not None:
+            discrepancy = discrepancy.renamed(x_names)
     check_target(target)
     parts = [
         paragraph(_what_was_done(report)),
@@ -136,13 +138,13 @@ def _verdict(
     ]
     lines += [_calibrated(report), _assumption(report)]
     if diagnosis is not None:
-        alarms = len(diagnosis.alarming)
+        alarms = len(diagnosis.alarming) or "none"
         lines.append(
             (
                 f"The diagnosis of a batch of {len(diagnosis.distance)} measurements "
                 f"has {len(diagnosis.findings)} findings, of which {alarms} "
-                f"{'is' if alarms == 1 else 'are'} alarming.",
-                alarms > 0,
+                f"{'is' if alarms in (1, 'none') else 'are'} alarming.",
+                bool(diagnosis.alarming),
             )
         )
     return lines
@@ -194,12 +196,14 @@ def _score_section(report: StackingReport) -> str:
         )
         for row in shown
     ]
-    figure, axes = new_figure(7.0, 1.4 + 0.3 * len(shown))
+    figure, axes = new_figure(5.4, 1.4 + 0.3 * len(shown))
     draw_scores(axes, report)
     notes = [
         "Mean log density of the known parameters, in nats a measurement; higher is "
-        "better. The two units differ by a constant. Densities outside the range of "
-        "the prior are counted here for all candidates and for the stack."
+        "better. In the first column parameters have their own units, in the second "
+        "they are in standard deviations of the prior, which adds a constant. The "
+        "scores of this table are not corrected for what a posterior puts outside the "
+        "range of the prior."
     ]
     if len(rows) > len(shown):
         notes.append(
@@ -207,7 +211,7 @@ def _score_section(report: StackingReport) -> str:
         )
     score, score_error = report.score
     notes.append(
-        "Normalised inside the range of the prior, the stack scores "
+        "With this correction the stack scores "
         f"{number(score)} ± {number(score_error)} in the parameters' own units, and "
         f"{number(report.score_z[0])} in standard deviations of the prior."
     )
@@ -217,8 +221,8 @@ def _score_section(report: StackingReport) -> str:
             (
                 "posterior",
                 "weight",
-                "own units",
-                "prior sd units",
+                "nats, own units",
+                "nats, prior sd",
                 "± standard error",
             ),
             cells,
@@ -236,7 +240,7 @@ def _score_section(report: StackingReport) -> str:
 
 def _weight_section(report: StackingReport) -> str:
     weights = report.family_weights
-    figure, axes = new_figure(7.0, 1.2 + 0.32 * len(weights))
+    figure, axes = new_figure(5.4, 1.2 + 0.32 * len(weights))
     draw_weights(axes, weights)
     parts = [
         table(
@@ -248,7 +252,7 @@ def _weight_section(report: StackingReport) -> str:
     ]
     curve = report.learning_curve
     if curve is not None:
-        figure, axes = new_figure(6.0, 3.6)
+        figure, axes = new_figure(5.4, 3.2)
         draw_learning_curve(axes, curve)
         parts.append(
             picture(
@@ -279,7 +283,7 @@ def _provenance_section(report: StackingReport) -> str:
             ("finished", made.finished),
             ("versions", ", ".join(f"{k} {v}" for k, v in made.versions.items())),
         ]
-    return section("How it was made", table(("", ""), rows))
+    return section("How it was made", table(None, rows))
 
 
 def _glossary() -> str:

@@ -8,8 +8,15 @@ from importlib import import_module
 
 __all__ = ["Provenance", "Stopwatch"]
 
-# All are loaded already, and know their version.
-PACKAGES = ("sbi_rope", "sbi", "torch", "numpy", "scipy", "ot")
+# Modules, which all know their version, and the names of their packages.
+PACKAGES = {
+    "sbi_rope": "sbi-rope",
+    "sbi": "sbi",
+    "torch": "torch",
+    "numpy": "numpy",
+    "scipy": "scipy",
+    "ot": "POT",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +55,9 @@ class Stopwatch:
             finished=datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
             versions={
                 "Python": platform.python_version(),
-                **{name: import_module(name).__version__ for name in PACKAGES},
+                **{
+                    package: import_module(module).__version__
+                    for module, package in PACKAGES.items()
+                },
             },
         )
