@@ -5,7 +5,8 @@ from typing import Any
 
 from sbi_rope._validation import check_instance, check_names, check_path
 from sbi_rope.diagnosis import Diagnosis
-from sbi_rope.errors import InvalidInputError
+from sbi_rope.discrepancy import DiscrepancyReport
+from sbi_rope.errors import InvalidInputError, shown
 from sbi_rope.plots._figures import new_figure
 from sbi_rope.plots.stacking import draw_learning_curve, draw_scores, draw_weights
 from sbi_rope.reports.evidence import (
@@ -71,11 +72,7 @@ def write_stacking_report(
     target = check_path("path", path)
     assert target is not None
     names = _parameter_names(report, diagnosis, parameter_names)
-    discrepancy = report.discrepancy
-    if x_names is not None:
-        check_names("x_names", x_names)
-        if discrepancy is not None:
-            discrepancy = discrepancy.renamed(x_names)
+    discrepancy = _named(report.discrepancy, x_names)
     check_target(target)
     parts = [
         paragraph(_what_was_done(report)),
@@ -108,6 +105,21 @@ def _parameter_names(
             f"has; got {len(diagnosis.parameter_names)}."
         )
     return list(diagnosis.parameter_names)
+
+
+def _named(
+    discrepancy: DiscrepancyReport | None, names: Sequence[str] | None
+) -> DiscrepancyReport | None:
+    if names is None:
+        return discrepancy
+    names = check_names("x_names", names)
+    if discrepancy is None:
+        raise InvalidInputError(
+            "Expected no `x_names`, because this report does not compare the entries "
+            f"of x; got {shown(names)}. Only a stack with a discrepancy among its "
+            "candidates, and with x a short vector, does."
+        )
+    return discrepancy.renamed(names)
 
 
 def _what_was_done(report: StackingReport) -> str:

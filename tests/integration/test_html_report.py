@@ -212,6 +212,8 @@ def test_names_and_a_diagnosis_that_do_not_fit_are_refused(
         report.to_html(path, parameter_names=("a",))
     with pytest.raises(InvalidInputError, match="different names"):
         report.to_html(path, x_names=("a", "b"))
+    with pytest.raises(InvalidInputError, match="Expected no `x_names`"):
+        replace(report, discrepancy=None).to_html(path, x_names=("a", "b", "c"))
     with pytest.raises(InvalidTypeError, match="`diagnosis` to be a Diagnosis"):
         report.to_html(path, diagnosis=SimpleNamespace())
     with pytest.raises(InvalidTypeError, match="`path` to be a path"):
