@@ -115,7 +115,7 @@ def _assumption(report: "StackingReport") -> list[str]:
     if test is None:
         return [
             "    this holds for observations like those of the pairs; "
-            "`diagnose(rope, x_o)` tests whether a batch is like them"
+            "`diagnose(rope.train(), x_o)` tests whether a batch is"
         ]
     if test.is_different:
         return [

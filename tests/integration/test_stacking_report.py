@@ -178,7 +178,7 @@ def test_the_text_says_whether_the_stack_is_over_or_under_confident() -> None:
 def test_the_text_names_what_calibration_assumes_about_a_batch() -> None:
     report = made_up()
     assert "holds for observations like those of the pairs" in str(report)
-    assert "`diagnose(rope, x_o)` tests" in str(report)
+    assert "`diagnose(rope.train(), x_o)` tests" in str(report)
     like, unlike = (
         str(replace(report, batch=TwoSampleTest(p_value=p, spread=0.4)))
         for p in (0.32, 0.002)
