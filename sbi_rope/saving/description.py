@@ -34,6 +34,8 @@ __all__ = ["Description"]
 
 SEQUENCES = {list: "list", tuple: "tuple", set: "set", torch.Size: "size"}
 MAPPINGS = {dict: "dict", OrderedDict: "odict"}
+# Attributes that hold the device of an object.
+DEVICES = ("device", "_device")
 
 
 class Description:
@@ -74,11 +76,11 @@ class Description:
             items = self._items(value, where)
             return [SEQUENCES[kind], *items]
         if kind in MAPPINGS:
-            items = (
-                [self._value(key, where), self._value(entry, _inside(where, key))]
+            pairs = (
+                [self._value(key, where), self._entry(key, entry, where)]
                 for key, entry in value.items()
             )
-            return [MAPPINGS[kind], *items]
+            return [MAPPINGS[kind], *pairs]
         if isinstance(value, Tensor):
             return self._tensor(value, where)
         if kind is np.ndarray and value.dtype.kind in "biufc":
@@ -92,6 +94,12 @@ class Description:
         if isinstance(value, type) or inspect.isroutine(value):
             return ["name", _checked_name(value, where)]
         return _simple(value) or ["object", self._object(value, where)]
+
+    def _entry(self, key: Any, value: Any, where: str) -> Any:
+        # Tensors are stored on the CPU, and sbi keeps the names of their devices.
+        if key in DEVICES and isinstance(value, str | torch.device):
+            value = type(value)("cpu")
+        return self._value(value, _inside(where, key))
 
     def _items(self, values: Any, where: str) -> list[Any]:
         return [

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from sbi_rope._files import read_arrays, write_atomically
 from sbi_rope._sbi import NeuralPosterior
@@ -55,7 +54,7 @@ def save(posterior: Any, path: str | Path, *, overwrite: bool = False) -> None:
         NotWritableError: If the file exists, or cannot be written.
 
     Example:
-        >>> import tempfile
+        >>> import tempfile, torch
         >>> from sbi.utils import BoxUniform
         >>> from sbi_rope.mixture import PriorPosterior
         >>> posterior = PriorPosterior(BoxUniform(torch.zeros(2), torch.ones(2)))
@@ -136,7 +135,6 @@ def load(path: str | Path, *, trusted: Sequence[type | Callable[..., Any]] = ())
         posterior = restored(description["objects"], tensors, names)
         if not isinstance(posterior, NeuralPosterior):
             raise TypeError(f"a {type(posterior).__name__} is not a posterior")
-        _move_to_cpu(posterior)
     except RoPEError:
         raise
     except Exception as error:  # a damaged description may lead to any
@@ -208,9 +206,3 @@ def _series(version: str) -> str:
     """Return the part of a version that changes when attributes may change."""
     major, minor = version.split(".")[:2]
     return f"{major}.{minor}" if major == "0" else major
-
-
-def _move_to_cpu(posterior: Any) -> None:
-    # Tensors are on the CPU already; sbi also keeps the name of the device.
-    if torch.device(posterior.potential_fn.device).type != "cpu":
-        posterior.to("cpu")

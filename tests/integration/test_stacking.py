@@ -236,7 +236,7 @@ def test_a_stack_holds_equal_tensors_once() -> None:
     estimator = posterior.posterior_estimator
     # Of NPE itself and of what was tuned without changing it.
     for tensors in (list(estimator.parameters()), list(estimator.buffers())):
-        assert len(tensors) > 20
+        assert len(tensors) > 5
         for i, one in enumerate(tensors):
             for other in tensors[:i]:
                 assert one.shape != other.shape or not torch.equal(one, other)

@@ -300,6 +300,29 @@ def test_equal_tensors_are_stored_once_and_loaded_apart(tmp_path: Path) -> None:
     assert half.any()
 
 
+def test_a_posterior_of_a_gpu_is_loaded_on_the_cpu(tmp_path: Path) -> None:
+    posterior = rope_posterior()
+    expected = numbers(posterior, posterior.x_o[:2])
+    # What sbi keeps of the device of a posterior.
+    posterior.device, posterior._device = torch.device("cuda:0"), "cuda:0"
+    posterior.potential_fn.device = "cuda:0"
+    loaded = saved_and_loaded(posterior, tmp_path)
+    found = numbers(loaded, posterior.x_o[:2])
+    assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
+    devices = (loaded.device, loaded._device, loaded.potential_fn.device)
+    assert {str(device) for device in devices} == {"cpu"}
+
+
+@pytest.mark.gpu
+def test_a_posterior_on_a_gpu_is_saved_and_loaded_on_the_cpu(tmp_path: Path) -> None:
+    posterior = rope_posterior()
+    expected = posterior.log_prob(torch.zeros(2, 2), x=posterior.x_o[0])
+    posterior.to("cuda")
+    loaded = saved_and_loaded(posterior, tmp_path)
+    found = loaded.log_prob(torch.zeros(2, 2), x=loaded.x_o[0])
+    assert torch.allclose(found, expected, atol=1e-5)
+
+
 # --- one observation ---
 
 
