@@ -129,8 +129,8 @@ def load(path: str | Path, *, trusted: Sequence[type | Callable[..., Any]] = ())
     if not source.is_file():
         raise DataNotFoundError(f"Expected a file at {source}; got none. Check `path`.")
     description, memory = _read(source)
-    _check_versions(source, description["versions"])
     try:
+        _check_versions(source, description["versions"])
         tensors = list(unpacked(memory, description["tensors"]))
         posterior = restored(description["objects"], tensors, names)
         if not isinstance(posterior, NeuralPosterior):
@@ -155,8 +155,10 @@ def _read(path: Path) -> tuple[dict[str, Any], np.ndarray]:
     """Return the description in a file, and the memory of its tensors."""
     try:
         arrays = read_arrays(path)
+        memory = arrays["memory"]
         description = json.loads(arrays["description"].tobytes())
-        is_ours = description["format"] == FORMAT
+        found = (description["format"], description["format_version"])
+        author = description["versions"]["sbi_rope"]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise FileFormatError(
             f"Expected a whole file of `save`; {path} is none, or is damaged "
@@ -164,13 +166,12 @@ def _read(path: Path) -> tuple[dict[str, Any], np.ndarray]:
             "posterior that was pickled, load it as it was written, if you trust its "
             "author, and write it again with `save`."
         ) from error
-    if not is_ours or description["format_version"] != FORMAT_VERSION:
+    if found != (FORMAT, FORMAT_VERSION):
         raise FileFormatError(
-            f"Expected a file of format {FORMAT_VERSION}; {path} has format "
-            f"{description.get('format_version')}. Use sbi_rope "
-            f"{description.get('versions', {}).get('sbi_rope')}, which wrote it."
+            f"Expected a file of format {FORMAT_VERSION}; {path} has format {found[1]}."
+            f" Use sbi_rope {author}, which wrote it."
         )
-    return description, arrays["memory"]
+    return description, memory
 
 
 def _versions(packages: set[str]) -> dict[str, str]:

@@ -19,9 +19,9 @@ Both are closed by what may be named:
   network whose attributes hold its source code.
 - Of functions and methods, those in :data:`FUNCTIONS`, :data:`METHODS` and
   :data:`MAKERS` only, which compute with tensors. Other methods are not allowed,
-  because posteriors of this package have one that writes a file. A class as
-  the value of an attribute is called by a method of zuko to make a distribution or a
-  transform. It has to be such a class, of torch or zuko.
+  because posteriors of this package have one that writes a file. A class as the value
+  of an attribute is called by a method of zuko to make a distribution or a transform.
+  It has to be such a class, of torch or zuko.
 
 A module is imported only if it is one of these rooms, all of which come with this
 package and its dependencies. SciPy's distributions are not among them: their

@@ -446,7 +446,9 @@ def test_a_value_may_only_be_a_class_that_makes_distributions() -> None:
     name = "torch.distributions.normal.Normal"
     assert find_value(name, {}) is Normal
     assert find_value("torch.tanh", {}) is torch.tanh
-    for other in ("torch.nn.modules.linear.Linear", "torch.load", "builtins.eval"):
+    others = ("torch.nn.modules.linear.Linear", "torch.load", "builtins.eval")
+    of_the_same_rooms = ("torch.distributions.kl.kl_divergence", "zuko.nn.MLP")
+    for other in (*others, *of_the_same_rooms):
         assert find_value(other, {}) is None
 
 
@@ -603,6 +605,9 @@ def test_damaged_files_are_refused(tmp_path: Path) -> None:
         lambda found: found["objects"][0].__setitem__(1, ["unknown"]),
         lambda found: found["tensors"][0].__setitem__(1, [10**6]),
         lambda found: found["tensors"][0].__setitem__(0, "load"),
+        lambda found: found.pop("versions"),
+        lambda found: found["versions"].update(sbi=3),
+        lambda found: found.pop("format_version"),
     ],
 )
 def test_descriptions_that_make_no_sense_are_refused(
