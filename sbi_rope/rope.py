@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from sbi_rope._npe import TrainedNPE
+from sbi_rope._pickling import picklable
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed
 from sbi_rope._simulations import SimulationSource, draw_targets
@@ -123,6 +124,7 @@ class RoPE:
         check_instance("finetuner", finetuner, CalibrationFinetuner, optional=True)
         check_instance("coupler", coupler, SinkhornCoupler, optional=True)
         check_default_dtype()
+        simulator = picklable(simulator)
         self._npe = TrainedNPE(posterior)
         self._source = source_of(
             self._npe.prior,

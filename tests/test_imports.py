@@ -27,15 +27,24 @@ DEPENDENCIES = "import ot, numpy, torch, tqdm.auto, sbi.inference, sbi.utils"
 LAYERS = [
     # They know nothing of inference: errors, progress, processes, rows in slices.
     {"errors", "_progress", "_processes", "_slices"},
-    # They raise errors: of seeds and of files.
-    {"_random", "_files"},
+    # They raise errors: of seeds, of files and of functions that cannot be pickled.
+    {"_random", "_files", "_pickling"},
     # They raise errors and warn: of arguments, and of a training that goes wrong.
     {"_validation", "_training"},
     # sbi's trainer is told by `_training` which simulations to hold out together.
     {"_sbi"},
     # Each works on embeddings or posteriors, which `_sbi` takes out of an estimator.
-    {"coupling", "finetuning", "metrics", "_npe", "_simulations", "_standardisation"}
-    | {"_two_sample"},
+    # Posteriors are saved, whatever they are made of.
+    {
+        "saving",
+        "coupling",
+        "finetuning",
+        "metrics",
+        "_npe",
+        "_simulations",
+        "_standardisation",
+        "_two_sample",
+    },
     # A mixture has the couplings of a batch as weights. A simulator is a source of
     # simulations like stored ones.
     {"mixture", "_simulator"},

@@ -2,6 +2,7 @@
 
 from sbi.inference.posteriors.base_posterior import NeuralPosterior
 from sbi.inference.posteriors.direct_posterior import DirectPosterior
+from sbi.inference.posteriors.vector_field_posterior import VectorFieldPosterior
 from sbi.inference.potentials.base_potential import BasePotential
 from sbi.neural_nets.estimators.base import (
     ConditionalDensityEstimator,
@@ -52,6 +53,7 @@ __all__ = [
     "SliceSamplerVectorized",
     "UnconditionalDensityEstimator",
     "VectorFieldDensity",
+    "VectorFieldPosterior",
     "build_zuko_unconditional_flow",
     "copy_of_prior",
     "describe",

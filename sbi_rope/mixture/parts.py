@@ -19,6 +19,7 @@ from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError
 
 __all__ = [
     "DTYPE",
+    "KeptEmbeddings",
     "Mixing",
     "OwnEmbeddings",
     "Part",
@@ -107,6 +108,33 @@ class OwnEmbeddings(Mixing):
 
     def rows(self, embedded: Tensor) -> Rows:
         """Weigh all embeddings of an observation equally."""
+        return equal_rows(embedded)
+
+    def restricted_to(self, x: Tensor) -> "KeptEmbeddings":
+        """Return the embeddings of one observation ``(1, *event)``, without nets."""
+        return KeptEmbeddings(self.embed(x), self.event_shape)
+
+
+class KeptEmbeddings(Mixing):
+    """The embeddings of a single observation, whose nets are no longer needed.
+
+    Args:
+        kept: The embeddings of the observation, shape ``(1, K, l)``.
+        event_shape: Shape of one observation.
+    """
+
+    kept: Tensor
+
+    def __init__(self, kept: Tensor, event_shape: Sequence[int]) -> None:
+        super().__init__(event_shape, kept.shape[1])
+        self.register_buffer("kept", kept)
+
+    def embed(self, x: Tensor) -> Tensor:
+        """Return the embeddings of the one observation for each x, ``(n, K, l)``."""
+        return self.kept.expand(len(x), -1, -1)
+
+    def rows(self, embedded: Tensor) -> Rows:
+        """Weigh all embeddings equally."""
         return equal_rows(embedded)
 
 

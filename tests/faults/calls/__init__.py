@@ -13,6 +13,7 @@ from tests.faults.calls import (
     plots,
     posteriors,
     rope,
+    saving,
     stacking,
     tasks,
 )
@@ -27,6 +28,7 @@ CALLS = [
     *baselines.CALLS,
     *metrics.CALLS,
     *plots.CALLS,
+    *saving.CALLS,
     *tasks.CALLS,
 ]
 
