@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed
 from sbi_rope._training import (
@@ -153,7 +154,7 @@ class CalibrationFinetuner:
         draw_simulations: Callable[[int], Tensor] | None = None,
         groups: Tensor | None = None,
         seed: int | None = None,
-        show_progress_bars: bool = True,
+        show_progress_bars: bool | None = None,
     ) -> FinetuneResult:
         """Tune a copy of the embedding net; the net itself does not change.
 
@@ -169,7 +170,8 @@ class CalibrationFinetuner:
                 number, such as recordings of one person, are held out together. None
                 if all pairs have different parameters.
             seed: Seed of the split and of the simulations; None uses torch's state.
-            show_progress_bars: Whether to show the losses during training.
+            show_progress_bars: Whether to show the losses during training. None does so
+                in a terminal or a notebook, but not in a file.
 
         Returns:
             The tuned net and its history.
@@ -182,6 +184,7 @@ class CalibrationFinetuner:
         check_instance("embedding_net", embedding_net, nn.Module)
         x = _checked_inputs("x", x, embedding_net)
         groups = _checked_groups(groups, x)
+        show = is_shown(show_progress_bars)
         with seeded(seed):
             embedded = _embedded("x", x, embedding_net)
 
@@ -206,7 +209,7 @@ class CalibrationFinetuner:
                     max_num_epochs=max_num_epochs,
                     keep=keep,
                     draw_targets=checked_targets if self.resample_targets else None,
-                    show_progress_bars=show_progress_bars,
+                    show_progress_bars=show,
                 )
 
             # The careful rate for a net, the larger for an affine map.

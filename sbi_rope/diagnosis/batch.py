@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
+from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._validation import check_instance, check_integer
 from sbi_rope.coupling import SinkhornCoupler
@@ -37,7 +38,7 @@ def diagnose(
     num_folds: int | None = 5,
     parameter_names: Sequence[str] | None = None,
     seed: int | None = None,
-    show_progress_bars: bool = True,
+    show_progress_bars: bool | None = None,
 ) -> Diagnosis:
     r"""Test whether a batch fulfils the assumptions of RoPE.
 
@@ -72,7 +73,8 @@ def diagnose(
             Python. The simulations are those of ``rope.build_posterior`` with the same
             seed and number.
         show_progress_bars: Whether to show the progress of slow simulations, and how
-            many folds are done.
+            many folds are done. None does so in a terminal or a notebook, but not in a
+            file.
 
     Returns:
         The findings. Print them, or pass them to
@@ -114,7 +116,7 @@ def diagnose(
         support = support_of(real, simulations)
         findings += support.findings(sizes, len(simulations))
         held_out, notes = _held_out(
-            rope, num_folds, show_progress_bars=show_progress_bars
+            rope, num_folds, show_progress_bars=is_shown(show_progress_bars)
         )
         shift = prior_shift(real, simulations, held_out=held_out)
         findings += shift.findings(simulations, names)

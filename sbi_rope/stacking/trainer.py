@@ -6,7 +6,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from sbi_rope._progress import progress_bar
+from sbi_rope._progress import is_shown, progress_bar
 from sbi_rope._random import seeded
 from sbi_rope._sbi import ConditionalDensityEstimator, estimator_of
 from sbi_rope._standardisation import warn_of_far_entries
@@ -68,7 +68,7 @@ class StackTrainer:
         pseudo_count: float,
         require_convergence: bool,
         seed: int | None,
-        show_progress_bars: bool,
+        show_progress_bars: bool | None,
         unseen: Literal["raise", "extend"] = "raise",
         tail_mass: float = 1e-3,
     ) -> None:
@@ -82,12 +82,13 @@ class StackTrainer:
         check_instance("require_convergence", require_convergence, bool)
         _check_pairs(len(rope.calibration[0]))
         self.x_o = None if x_o is None else _checked_observations(x_o, rope)
+        self.show = is_shown(show_progress_bars)
         self.seeds = draw_seeds(seed, 3)
         self.bench = Workbench(
             rope,
             num_folds=NUM_FOLDS if num_folds is None else num_folds,
             seed=self.seeds[0],
-            show_progress_bars=show_progress_bars,
+            show_progress_bars=self.show,
         )
         _check_pairs(len(self.bench.folds))
         _check_density(estimator_of(self.bench.npe))
@@ -97,7 +98,6 @@ class StackTrainer:
         self.require_convergence = require_convergence
         self.unseen: Literal["raise", "extend"] = unseen
         self.tail_mass = tail_mass
-        self.show = show_progress_bars
 
     @property
     def prior(self) -> Any:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import copy_of_prior, device_of, estimator_of
 from sbi_rope._simulations import SimulationSource
@@ -195,14 +196,15 @@ class Method(ABC):
         return self._untrained()
 
     def train(
-        self, *, seed: int | None = None, show_progress_bars: bool = True
+        self, *, seed: int | None = None, show_progress_bars: bool | None = None
     ) -> "Self":
         """Train on all data appended so far, from the start.
 
         Args:
             seed: Seed of everything random, for torch, NumPy and Python; None uses
                 their states.
-            show_progress_bars: Whether to show the course of the training.
+            show_progress_bars: Whether to show the course of the training. None does so
+                in a terminal or a notebook, but not in a file.
 
         Returns:
             Itself, so that calls can be chained.
@@ -216,7 +218,7 @@ class Method(ABC):
         # Whatever the caller's own setting of gradients.
         with torch.enable_grad(), seeded(seed):
             self._posterior, self._history = self._fit(
-                show_progress_bars=show_progress_bars
+                show_progress_bars=is_shown(show_progress_bars)
             )
         return self
 
