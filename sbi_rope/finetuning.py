@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
-from sbi_rope._sbi import embed
+from sbi_rope._sbi import embed, readable
 from sbi_rope._training import (
     History,
     best_of_learning_rates,
@@ -28,8 +28,10 @@ from sbi_rope._validation import (
     check_integer,
     check_not_negative,
     check_positive,
+    check_readable,
     check_same_length,
     check_tensor,
+    check_values,
 )
 from sbi_rope.errors import InvalidInputError
 
@@ -313,11 +315,13 @@ def _checked_inputs(name: str, x: Any, net: nn.Module) -> Tensor:
         raise InvalidInputError(
             f"Expected `{name}` of shape (n, *event); got {tuple(x.shape)}."
         )
-    check_batch(name, x, x.shape[1:])
+    check_batch(name, x, x.shape[1:], finite=False)
+    check_values(name, x)
     known = itertools.chain(net.parameters(), net.buffers())
     dtypes = [values.dtype for values in known if values.is_floating_point()]
     x = x.detach().to(dtypes[0] if dtypes else torch.float32)
-    check_finite(name, x)  # numbers that this dtype cannot hold have become Inf
+    # Numbers that this dtype cannot hold have become Inf.
+    check_readable(name, x, readable(net, x))
     return x
 
 

@@ -19,6 +19,7 @@ from sbi_rope._sbi.embedding import (
     embed,
     embedding_of,
     headless,
+    readable,
     standardisation_of,
     with_embedding,
 )
@@ -58,6 +59,7 @@ __all__ = [
     "is_bounded",
     "move_distribution_to_device",
     "posterior_from",
+    "readable",
     "standardisation_of",
     "train_npe",
     "with_embedding",

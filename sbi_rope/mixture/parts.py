@@ -14,6 +14,7 @@ from sbi_rope._sbi import (
     embed,
     embedding_of,
     headless,
+    readable,
 )
 from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError
 
@@ -83,6 +84,13 @@ class Mixing(nn.Module, ABC):
     def rows(self, embedded: Tensor) -> Rows:
         """Return the weighted embeddings of a block of observations."""
 
+    def readable(self, x: Tensor) -> Tensor:
+        """Tell which observations can be embedded, ``(n, *event)`` to ``(n,)``.
+
+        Those that are finite, unless a subclass can do with missing entries (NaN).
+        """
+        return torch.isfinite(x).flatten(1).all(dim=1)
+
 
 class OwnEmbeddings(Mixing):
     r"""The embeddings of the observation itself, :math:`h_k(x)`, with equal weights.
@@ -108,6 +116,10 @@ class OwnEmbeddings(Mixing):
     def rows(self, embedded: Tensor) -> Rows:
         """Weigh all embeddings of an observation equally."""
         return equal_rows(embedded)
+
+    def readable(self, x: Tensor) -> Tensor:
+        """Tell which observations all nets can read."""
+        return torch.stack([readable(net, x) for net in self.nets]).all(dim=0)
 
 
 def equal_rows(embeddings: Tensor) -> Rows:

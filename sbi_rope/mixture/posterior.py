@@ -16,7 +16,6 @@ from sbi_rope._sbi import BaseDirectPosterior, MixedDensity, describe
 from sbi_rope._validation import (
     as_numbers,
     as_shape,
-    check_batch,
     check_integer,
     check_theta,
     usable_device,
@@ -316,7 +315,8 @@ class MixturePosterior(BaseDirectPosterior):
         Raises:
             InvalidInputError: If the shape does not fit, or a value is not finite.
         """
-        super().set_default_x(self._batch_of_x(x).clone())
+        # sbi's own method refuses any NaN, which some embedding nets can read.
+        self._x, self._map = self._batch_of_x(x).clone().to(self._device), None
         return self
 
     def _one_x(self, x: Tensor | None) -> Tensor:
@@ -339,13 +339,11 @@ class MixturePosterior(BaseDirectPosterior):
         x = as_numbers("x", x).to(torch.float32)
         if x.shape == event_shape:
             x = x[None]
-        if x.shape[1:] != event_shape:
-            # sbi's process_x would add a leading dimension instead.
-            raise InvalidInputError(
-                f"Expected `x` of shape (n, {', '.join(map(str, event_shape))}); got "
-                f"{tuple(x.shape)}."
-            )
-        return check_batch("x", x, event_shape)
+        return self.posterior_estimator.checked_x(x).to(x.device)
+
+    def _x_else_default_x(self, x: Any) -> Tensor:
+        # sbi refuses any NaN, which some embedding nets can read.
+        return self._one_x(x)
 
     def log_prob(
         self,

@@ -60,6 +60,11 @@ class NoEmbedding(Mixing):
         """Return a weight of one for each observation."""
         return Rows(embedded.new_ones(len(embedded), 1, dtype=torch.double), self.empty)
 
+    def readable(self, x: Tensor) -> Tensor:
+        """Tell which observations have no entry that is infinite, and are not empty."""
+        x = x.flatten(1)
+        return ~torch.isinf(x).any(dim=1) & torch.isfinite(x).any(dim=1)
+
 
 class PriorDensity(ConditionalDensityEstimator):
     r"""The prior :math:`p(\theta)`, in the form of an estimator of sbi.

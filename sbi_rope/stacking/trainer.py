@@ -8,15 +8,16 @@ from torch import Tensor
 
 from sbi_rope._progress import is_shown, progress_bar
 from sbi_rope._random import seeded
-from sbi_rope._sbi import ConditionalDensityEstimator, estimator_of
+from sbi_rope._sbi import ConditionalDensityEstimator, estimator_of, readable
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._validation import (
     check_batch,
-    check_finite,
     check_gradients,
     check_instance,
     check_integer,
     check_not_negative,
+    check_readable,
+    check_values,
 )
 from sbi_rope.discrepancy.correction import network_of
 from sbi_rope.errors import (
@@ -313,7 +314,9 @@ def _check_density(estimator: Any) -> None:
 
 def _checked_observations(x_o: Tensor, rope: RoPE) -> Tensor:
     _, x = rope.calibration
-    x_o = check_batch("x_o", x_o, x.shape[1:]).detach().to(x, copy=True)
-    check_finite("x_o", x_o)  # a large float64 can overflow in float32
+    x_o = check_batch("x_o", x_o, x.shape[1:], finite=False)
+    check_values("x_o", x_o)
+    x_o = x_o.detach().to(x, copy=True)  # a large float64 can overflow in float32
+    check_readable("x_o", x_o, readable(rope.embedding_net, x_o))
     warn_of_far_entries("x_o", x_o, rope.embedding_net)
     return x_o

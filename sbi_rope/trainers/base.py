@@ -11,7 +11,7 @@ from torch.distributions import Distribution
 
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
-from sbi_rope._sbi import copy_of_prior, device_of, estimator_of
+from sbi_rope._sbi import copy_of_prior, device_of, embedding_of, estimator_of
 from sbi_rope._simulations import SimulationSource
 from sbi_rope._simulator import source_of
 from sbi_rope._training import History
@@ -128,6 +128,7 @@ class Method(ABC):
         assert method._npe is not None
         method._npe.replace_by(posterior)
         method._data.event_shape = estimator.condition_shape
+        method._data.embedding_net = copy.deepcopy(embedding_of(estimator))
         return method
 
     def append_simulations(self, theta: Tensor, x: Tensor) -> "Self":

@@ -7,14 +7,14 @@ from typing import Any
 
 import pytest
 
-from sbi_rope import CalibrationFinetuner, RoPE, diagnose, stack
+from sbi_rope import CalibrationFinetuner, RoPE, stack
 from sbi_rope._progress import is_shown, progress_bar
 from tests import baselines, gaussian
 from tests.stacks import NPE, PRIOR, quick
 
 TRAIN = """
 import warnings
-from sbi_rope import CalibrationFinetuner, RoPE
+from sbi_rope import CalibrationFinetuner, RoPE, diagnose
 from tests import gaussian
 
 warnings.simplefilter("ignore")
@@ -26,6 +26,7 @@ rope = RoPE(
 rope.append_calibration(*gaussian.labelled(20)).train()
 assert rope.history.best_epoch > 0
 rope.build_posterior(gaussian.labelled(30)[1])
+diagnose(rope, gaussian.labelled(30)[1])
 """
 
 
@@ -83,7 +84,6 @@ def work(**show: bool) -> None:
     posterior.sample_batched((10,), x=x_o, **show)
     posterior[0].sample((10,), **show)
     posterior.log_prob_batched(theta, x=x_o)
-    diagnose(trained, x_o, num_folds=2, num_simulations=200, **show)
     with quick():
         stack(trained, candidates=(PRIOR, NPE), num_folds=2, **show)
     method = baselines.make("tuning_only", "linear_gaussian")
