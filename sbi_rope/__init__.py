@@ -1,5 +1,6 @@
 """Robust posterior estimation for misspecified simulators, on top of sbi."""
 
+from sbi_rope._simulator import parallel
 from sbi_rope.coupling import Coupling, SinkhornCoupler
 from sbi_rope.diagnosis import Diagnosis, diagnose
 from sbi_rope.finetuning import CalibrationFinetuner
@@ -16,6 +17,7 @@ __all__ = [
     "SinkhornCoupler",
     "StackedPosterior",
     "diagnose",
+    "parallel",
     "stack",
 ]
 

@@ -63,13 +63,17 @@ class Moments:
 
 
 class SimulationSource(Protocol):
-    """What RoPE needs of simulations. Each is reduced to its embedding at once.
+    """What RoPE needs of simulations. Each is reduced to its embedding at once."""
 
-    Attributes:
-        num_dropped: How many simulations were dropped so far because of NaN or Inf.
-    """
+    @property
+    def num_dropped(self) -> int:
+        """How many simulations were dropped so far because of NaN or Inf."""
+        ...
 
-    num_dropped: int
+    @property
+    def num_calls(self) -> int:
+        """How many rows a simulator has simulated so far."""
+        ...
 
     def from_prior(
         self, count: int | None, at_least: int, embed: Embedding, *, progress: bool
@@ -125,6 +129,8 @@ class SimulationSource(Protocol):
 
 class StoredSimulations:
     """Pairs (theta, x) simulated beforehand; pairs that are not finite are dropped."""
+
+    num_calls = 0
 
     def __init__(
         self,

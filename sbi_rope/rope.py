@@ -67,18 +67,27 @@ class RoPE:
             ignored. It must be amortised. A posterior trained over several rounds fits
             one observation only; RoPE cannot recognise it, so do not pass one.
         simulator: Maps parameters ``(n, d)`` to simulations ``(n, *event)``, or one
-            ``(d,)`` to one ``(*event)``. A row of x may depend on the same row of theta
-            only. The simulator is tried on about fifteen parameters to check that.
-            Simulations with NaN or Inf are dropped and counted.
+            ``(d,)`` to one ``(*event)``. It may take tensors or NumPy arrays (of
+            float64), and return either, lists, or numbers. A row of x may depend on the
+            same row of theta only. The simulator is tried on about thirty parameters
+            to find that out. Simulations with NaN or Inf, and those for which the
+            simulator raises, are dropped and counted. :func:`~sbi_rope.parallel` calls
+            it in several processes.
         simulations: Instead of a simulator, stored pairs (theta, x) with theta drawn
             from the prior. Fine-tuning then uses those with the nearest parameters.
+            There is a warning if there are fewer than 1000.
+        num_simulations: For a simulator that takes long: how many simulations it makes
+            in all, at draws of the prior, when they are first needed. They are then
+            used as stored simulations are. If None, the simulator is called as often as
+            the steps ask for it, see :attr:`num_simulator_calls`.
         finetuner: Settings of step 1; ``CalibrationFinetuner()`` if None.
         coupler: Settings of step 2; ``SinkhornCoupler()`` if None.
 
     Raises:
         UnsupportedPosteriorError: If the posterior has no embedding to work with.
-        InvalidInputError: If both or none of simulator and simulations are given, or
-            their shapes do not fit the posterior.
+        InvalidInputError: If both or none of simulator and simulations are given,
+            their shapes do not fit the posterior, or ``num_simulations`` is given
+            without a simulator.
         NotReadyError: If torch's default dtype is not float32.
         SimulationError: If the simulator raises or returns something unusable.
 
@@ -106,8 +115,9 @@ class RoPE:
         self,
         posterior: Any,
         *,
-        simulator: Callable[[Tensor], Tensor] | None = None,
+        simulator: Callable[[Any], Any] | None = None,
         simulations: tuple[Tensor, Tensor] | None = None,
+        num_simulations: int | None = None,
         finetuner: CalibrationFinetuner | None = None,
         coupler: SinkhornCoupler | None = None,
     ) -> None:
@@ -119,6 +129,7 @@ class RoPE:
             self._npe.prior,
             simulator=simulator,
             simulations=simulations,
+            num_simulations=num_simulations,
             event_shape=self._npe.event_shape,
             like=self._npe.like,
         )
@@ -418,6 +429,19 @@ class RoPE:
     def num_dropped_simulations(self) -> int:
         """Number of simulations dropped so far because of NaN or Inf."""
         return self._source.num_dropped
+
+    @property
+    def num_simulator_calls(self) -> int:
+        """How many rows of theta the simulator has simulated so far.
+
+        About thirty are simulated when RoPE is constructed, to find out how the
+        simulator is called. :meth:`train` simulates 100 for each label (and 2000 with
+        rehearsal), :meth:`build_posterior` ``max(n_o, 1000)`` for each batch, and
+        :func:`~sbi_rope.stack` 100 for each label, 20,000 from the prior, and with a
+        batch ``max(n_o, 1000)`` more. The argument ``num_simulations`` of this class
+        sets a number for all of these together.
+        """
+        return self._source.num_calls
 
     def __repr__(self) -> str:
         name = type(self._npe.estimator).__name__

@@ -124,7 +124,7 @@ class DiscrepancyNPE(Method):
         prior: Any,
         density_estimator: str | EstimatorBuilder = "nsf",
         *,
-        simulator: Callable[[Tensor], Tensor] | None = None,
+        simulator: Callable[[Any], Any] | None = None,
         space: Space = "embedding",
         learn_prior: bool = False,
         model: DiscrepancyModel | None = None,

@@ -106,6 +106,8 @@ class StackingReport:
         acauc: ACAUC of the stack's central intervals.
         coverage_error: Expected coverage error of the stack's central intervals.
         share_inside: Share of the parameters inside their 90 % intervals.
+        num_simulator_calls: How many simulations the simulator made for this stack; 0
+            if all were there already.
     """
 
     cross_validation: CrossValidation
@@ -117,18 +119,22 @@ class StackingReport:
     acauc: ACAUCScore
     coverage_error: CoverageErrorScore
     share_inside: float
+    num_simulator_calls: int = 0
 
     @classmethod
     def of(
         cls,
         cross_validation: CrossValidation,
         learning_curve: LearningCurve | None = None,
+        *,
+        num_simulator_calls: int = 0,
     ) -> "StackingReport":
         """Compute the report of a stack.
 
         Args:
             cross_validation: The scores of its candidates.
             learning_curve: The learning curve of the stack, if it was asked for.
+            num_simulator_calls: How many simulations were made for it.
         """
         check_instance("cross_validation", cross_validation, CrossValidation)
         check_instance("learning_curve", learning_curve, LearningCurve, optional=True)
@@ -147,6 +153,7 @@ class StackingReport:
             acauc=acauc_of(levels),
             coverage_error=expected_coverage_error_of(levels),
             share_inside=float((levels <= LEVEL).double().mean()),
+            num_simulator_calls=num_simulator_calls,
         )
 
     @property
@@ -189,6 +196,7 @@ class StackingReport:
             *self._weights(),
             *self._calibration(),
             *self._more_labels(),
+            *self._simulator_calls(),
         ]
         return "\n".join(lines)
 
@@ -244,6 +252,11 @@ class StackingReport:
         if math.isfinite(gain):
             lines.append(f"  twice as many labels might add {gain:.2f} nats")
         return lines
+
+    def _simulator_calls(self) -> list[str]:
+        if not self.num_simulator_calls:
+            return []
+        return [f"  simulator calls: {self.num_simulator_calls:,}"]
 
 
 def _mean_and_error(scores: Tensor) -> tuple[float, float]:

@@ -5,7 +5,7 @@ from typing import Literal
 
 from torch import Tensor
 
-from sbi_rope._validation import check_choice, check_unit_interval
+from sbi_rope._validation import check_choice, check_instance, check_unit_interval
 from sbi_rope.rope import RoPE
 from sbi_rope.stacking.candidates import Candidate
 from sbi_rope.stacking.cross_validation import CrossValidation
@@ -52,7 +52,8 @@ def stack(
 
     Args:
         rope: A RoPE with calibration pairs. It need not be trained, and it is not
-            changed, except that it counts the simulations that are dropped.
+            changed, except that it counts calls of the simulator, and the simulations
+            that are dropped.
         x_o: A batch of real observations, shape ``(n_o, *event)``. With None the
             posterior answers any x.
         candidates: What to stack. If None, :func:`default_candidates`: the prior, NPE,
@@ -61,7 +62,9 @@ def stack(
         num_folds: The number of folds, 5 if None, and at most the number of different
             parameters. Pairs with the same parameters are in the same fold.
         num_simulations: The number of simulations to couple with, as in
-            :meth:`~sbi_rope.RoPE.build_posterior`.
+            :meth:`~sbi_rope.RoPE.build_posterior`. Candidates are trained on others:
+            the simulator makes 20,000 from the prior and 100 for each label. To have
+            fewer, give RoPE itself ``num_simulations``.
         pseudo_count: Strength of the Dirichlet prior of the weights, in pairs.
         learning_curve: Whether to train on fewer folds too, so that the report can
             estimate what more labels would add. It takes about twice the time.
@@ -90,6 +93,8 @@ def stack(
     """
     check_choice("unseen", unseen, ("raise", "extend"))
     check_unit_interval("tail_mass", tail_mass)
+    check_instance("rope", rope, RoPE)
+    num_calls = rope.num_simulator_calls
     trainer = StackTrainer(
         rope,
         x_o,
@@ -116,7 +121,9 @@ def stack(
     return StackedPosterior(
         versions,
         trainer.prior,
-        report=StackingReport.of(scores, curve),
+        report=StackingReport.of(
+            scores, curve, num_simulator_calls=rope.num_simulator_calls - num_calls
+        ),
         enable_transform=trainer.bench.npe.enable_transform,
     )
 

@@ -73,7 +73,7 @@ class Method(ABC):
         prior: Any,
         *,
         npe: StartingNPE | None = None,
-        simulator: Callable[[Tensor], Tensor] | None = None,
+        simulator: Callable[[Any], Any] | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
         check_prior(prior)

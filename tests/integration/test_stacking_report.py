@@ -13,9 +13,11 @@ from sbi_rope.metrics import acauc_of
 from sbi_rope.stacking import (
     CrossValidation,
     Difference,
+    DiscrepancyCandidate,
     LearningCurve,
     StackingReport,
 )
+from tests import problems
 from tests.stacks import (
     FITTED,
     OT_ONLY,
@@ -30,6 +32,7 @@ from tests.stacks import (
 # Batches and calibration sets are small here on purpose.
 pytestmark = pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
 
+DISCREPANCY = DiscrepancyCandidate(space="embedding")
 NAMES = ("prior", "NPE", "RoPE (gamma 0.1, tau 1)", "RoPE (gamma 0.1, tau 0)")
 
 
@@ -201,3 +204,22 @@ def test_a_cross_validation_holds_only_numbers_and_names() -> None:
         assert isinstance(value, torch.Tensor | tuple | int | float) or (
             type(value).__name__ == "StackingWeights"
         )
+
+
+def test_a_report_says_how_often_the_simulator_was_called_for_the_stack() -> None:
+    rope = rope_of()
+    before = rope.num_simulator_calls
+    report = stacked(rope, candidates=[PRIOR, DISCREPANCY]).report
+    # 300 from the prior and 5 at the parameters of each of 20 pairs.
+    assert report.num_simulator_calls == rope.num_simulator_calls - before == 400
+    assert "simulator calls: 400" in str(report)
+    # Those from the prior are kept for the next stack.
+    again = stacked(rope, candidates=[PRIOR, DISCREPANCY]).report
+    assert again.num_simulator_calls == 100
+    many = replace(report, num_simulator_calls=7421)
+    assert "simulator calls: 7,421" in str(many)
+    theta = problems.box(2).sample((1000,))
+    stored = rope_of(simulations=(theta, problems.simulate(theta)))
+    report = stacked(stored, candidates=[PRIOR, DISCREPANCY]).report
+    assert report.num_simulator_calls == 0
+    assert "simulator calls" not in str(report)

@@ -358,7 +358,7 @@ def test_unusable_simulators_are_refused_at_once() -> None:
         (3, InvalidTypeError, "`simulator` to be callable"),
         (_raises, SimulationError, "KeyError: 'no such file'"),
         (lambda theta: theta[:, :1], SimulationError, r"\(2,\)"),
-        (lambda theta: theta.numpy(), SimulationError, "torch.as_tensor"),
+        (lambda theta: theta.numpy() + 1j, SimulationError, "NumPy arrays or lists"),
         (_returns(None), SimulationError, "NoneType"),
         (_returns(torch.zeros(7)), SimulationError, r"shape \(7,\)"),
     ]
