@@ -132,6 +132,7 @@ class RoPE:
             num_simulations=num_simulations,
             event_shape=self._npe.event_shape,
             like=self._npe.like,
+            readable=self._npe.readable,
         )
         self.finetuner = CalibrationFinetuner() if finetuner is None else finetuner
         self.coupler = SinkhornCoupler() if coupler is None else coupler

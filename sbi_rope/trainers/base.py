@@ -280,6 +280,7 @@ class Method(ABC):
             simulations=self._data.simulations if self._simulator is None else None,
             event_shape=event_shape,
             like=torch.empty(0, *self._prior.event_shape, device=self._device),
+            readable=self._data.readable,
         )
 
     def _check_data(self) -> None:
