@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from sbi_rope._npe import TrainedNPE
 from sbi_rope._pickling import picklable
+from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed
 from sbi_rope._simulations import SimulationSource, draw_targets
@@ -133,6 +134,7 @@ class RoPE:
             num_simulations=num_simulations,
             event_shape=self._npe.event_shape,
             like=self._npe.like,
+            readable=self._npe.readable,
         )
         self.finetuner = CalibrationFinetuner() if finetuner is None else finetuner
         self.coupler = SinkhornCoupler() if coupler is None else coupler
@@ -168,7 +170,7 @@ class RoPE:
         return self
 
     def train(
-        self, *, seed: int | None = None, show_progress_bars: bool = True
+        self, *, seed: int | None = None, show_progress_bars: bool | None = None
     ) -> "RoPE":
         """Tune the embedding net on all calibration pairs appended so far.
 
@@ -178,6 +180,7 @@ class RoPE:
             seed: Seed of the simulations and of the hold-out split, for torch, NumPy
                 and Python; None uses their states.
             show_progress_bars: Whether to show the progress of simulations and losses.
+                None does so in a terminal or a notebook, but not in a file.
 
         Returns:
             Itself, so that calls can be chained.
@@ -196,6 +199,7 @@ class RoPE:
                 "then couples with the embedding net of NPE (OT-only)."
             )
         known = None if self.finetuner.resample_targets else self._targets
+        show = is_shown(show_progress_bars)
 
         def targets(count: int) -> Tensor:
             if known is not None:
@@ -206,19 +210,17 @@ class RoPE:
                 self._embed_simulations,
                 simulations_per_target=count,
                 num_neighbors=self.finetuner.num_neighbors,
-                progress=show_progress_bars,
+                progress=show,
             )
 
         result = self.finetuner.finetune(
             self._npe.h,
             self._x_cal,
             targets,
-            draw_simulations=lambda count: self._source.kept(
-                count, progress=show_progress_bars
-            )[1],
+            draw_simulations=lambda count: self._source.kept(count, progress=show)[1],
             groups=groups_of(self._theta_cal),
             seed=seed,
-            show_progress_bars=show_progress_bars,
+            show_progress_bars=show,
         )
         self._g, self._history = result.embedding_net, result.history
         return self
@@ -229,7 +231,7 @@ class RoPE:
         *,
         num_simulations: int | None = None,
         seed: int | None = None,
-        show_progress_bars: bool = True,
+        show_progress_bars: bool | None = None,
     ) -> EmbeddedBatch:
         r"""Return the embeddings of real observations and of simulations.
 
@@ -242,7 +244,8 @@ class RoPE:
                 simulations, if there are fewer).
             seed: Seed of the simulations, for torch, NumPy and Python; None uses their
                 states.
-            show_progress_bars: Whether to show the progress of slow simulations.
+            show_progress_bars: Whether to show the progress of slow simulations, as in
+                :meth:`train`.
 
         Returns:
             :math:`g(x_o)` (:math:`h(x_o)` without calibration pairs), parameters drawn
@@ -271,7 +274,7 @@ class RoPE:
                 num_simulations,
                 max(len(x_o), MIN_SIMULATIONS),
                 self._embed_simulations,
-                progress=show_progress_bars,
+                progress=is_shown(show_progress_bars),
             )
         return EmbeddedBatch(
             x_o=x_o,
@@ -292,7 +295,7 @@ class RoPE:
         unseen: Literal["raise", "extend"] = "raise",
         require_convergence: bool = True,
         tail_mass: float = 1e-3,
-        show_progress_bars: bool = True,
+        show_progress_bars: bool | None = None,
     ) -> MixturePosterior:
         """Couple a batch of real observations with simulations.
 
@@ -312,7 +315,8 @@ class RoPE:
             require_convergence: Whether a coupling that has not converged is an error.
             tail_mass: The share of the weights that ``log_prob`` may leave out, in
                 [0, 1].
-            show_progress_bars: Whether to show the progress of slow simulations.
+            show_progress_bars: Whether to show the progress of slow simulations, as in
+                :meth:`train`.
 
         Returns:
             The posteriors of the batch.

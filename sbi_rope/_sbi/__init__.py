@@ -26,6 +26,7 @@ from sbi_rope._sbi.embedding import (
     embed,
     embedding_of,
     headless,
+    readable,
     standardisation_of,
     with_embedding,
 )
@@ -68,6 +69,7 @@ __all__ = [
     "is_bounded",
     "move_distribution_to_device",
     "posterior_from",
+    "readable",
     "standardisation_of",
     "train_npe",
     "with_embedding",

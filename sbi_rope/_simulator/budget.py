@@ -8,8 +8,10 @@ from sbi_rope._random import seeded
 from sbi_rope._simulations import (
     Embedding,
     Moments,
+    Readable,
     SimulationSource,
     StoredSimulations,
+    all_finite,
 )
 
 __all__ = ["LimitedSimulator"]
@@ -26,6 +28,7 @@ class LimitedSimulator:
         prior: The prior.
         event_shape: Shape of one simulation.
         like: Parameters whose shape, dtype and device simulations have to fit.
+        readable: As in :class:`Simulator`.
     """
 
     def __init__(
@@ -36,7 +39,9 @@ class LimitedSimulator:
         *,
         event_shape: torch.Size,
         like: Tensor,
+        readable: Readable = all_finite,
     ) -> None:
+        self._readable = readable
         self.num_simulations = num_simulations
         self._simulator = simulator
         self._prior = prior
@@ -113,5 +118,6 @@ class LimitedSimulator:
                 theta_shape=self._like.shape[1:],
                 event_shape=self._event_shape,
                 like=self._like,
+                readable=self._readable,
             )
         return self._stored

@@ -12,8 +12,10 @@ from sbi_rope._random import seeded
 from sbi_rope._simulations import (
     Embedding,
     Moments,
+    Readable,
     SimulationSource,
     StoredSimulations,
+    all_finite,
 )
 from sbi_rope._simulator.budget import LimitedSimulator
 from sbi_rope._simulator.calls import check_callable
@@ -43,6 +45,7 @@ class Simulator:
         prior: The prior, from which parameters are drawn.
         event_shape: Shape of one simulation.
         like: A tensor with the dtype and device of parameters and simulations.
+        readable: Tells which simulations are of use. The others are dropped.
 
     Attributes:
         num_dropped: How many simulations were dropped because of NaN or Inf.
@@ -59,6 +62,7 @@ class Simulator:
         *,
         event_shape: torch.Size,
         like: Tensor,
+        readable: Readable = all_finite,
     ) -> None:
         check_callable(function)
         self._num_workers = None
@@ -67,6 +71,7 @@ class Simulator:
         self.prior = prior
         self.event_shape = event_shape
         self.like = like
+        self._readable = readable
         self.num_dropped = 0
         self._kept: dict[int, tuple[Tensor, Tensor]] = {}
         # The probe has a seed of its own, so that no result depends on it.
@@ -192,14 +197,15 @@ class Simulator:
             for part in theta.split(self._chunk):
                 x = self._simulate(part, failures, start, advance=bar.update)
                 start += len(part)
-                ok = torch.isfinite(x).flatten(1).all(dim=1)
+                ok = self._readable(x)
                 # Embedding nets may raise on NaN. They get zeros instead, and these
                 # rows are dropped later.
                 ok_shape = (-1,) + (1,) * (x.ndim - 1)
                 embedded = embed(x.where(ok.reshape(ok_shape), 0.0))
                 embeddings.append(embedded)
-                # An embedding can overflow where x does not.
-                valid.append(ok & torch.isfinite(embedded).flatten(1).all(dim=1))
+                # An embedding can overflow where x does not. Simulations with missing
+                # entries were embedded when it was found out that they can be read.
+                valid.append(ok & (all_finite(embedded) | ~all_finite(x)))
         return torch.cat(embeddings), torch.cat(valid)
 
     @property
@@ -237,6 +243,7 @@ def source_of(
     num_simulations: int | None = None,
     event_shape: torch.Size,
     like: Tensor,
+    readable: Readable = all_finite,
 ) -> SimulationSource:
     """Return the source of simulations: a simulator, or stored simulations.
 
@@ -248,6 +255,7 @@ def source_of(
             None.
         event_shape: Shape of one observation.
         like: Parameters whose shape, dtype and device simulations have to fit.
+        readable: As in :class:`Simulator`.
 
     Raises:
         InvalidInputError: If both or none of simulator and simulations are given, or
@@ -272,14 +280,22 @@ def source_of(
             theta_shape=like.shape[1:],
             event_shape=event_shape,
             like=like,
+            readable=readable,
         )
         warn_of_few(len(stored.x))
         return stored
     assert simulator is not None
-    source = Simulator(simulator, prior, event_shape=event_shape, like=like)
+    source = Simulator(
+        simulator, prior, event_shape=event_shape, like=like, readable=readable
+    )
     if num_simulations is None:
         return source
     warn_of_few(num_simulations)
     return LimitedSimulator(
-        source, num_simulations, prior, event_shape=event_shape, like=like
+        source,
+        num_simulations,
+        prior,
+        event_shape=event_shape,
+        like=like,
+        readable=readable,
     )

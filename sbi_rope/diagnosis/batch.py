@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from sbi_rope._npe import TrainedNPE
+from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._training import groups_of
 from sbi_rope._two_sample import compare_with_pairs
@@ -42,7 +43,7 @@ def diagnose(
     num_folds: int | None = 5,
     parameter_names: Sequence[str] | None = None,
     seed: int | None = None,
-    show_progress_bars: bool = True,
+    show_progress_bars: bool | None = None,
 ) -> Diagnosis:
     r"""Test whether a batch fulfils the assumptions of RoPE.
 
@@ -83,7 +84,8 @@ def diagnose(
             Python. The simulations are those of ``rope.build_posterior`` with the same
             seed and number.
         show_progress_bars: Whether to show the progress of slow simulations, and how
-            many folds are done.
+            many folds are done. None does so in a terminal or a notebook, but not in a
+            file.
 
     Returns:
         The findings. Print them, or pass them to
@@ -125,7 +127,7 @@ def diagnose(
         support = support_of(real, simulations)
         findings += support.findings(sizes, len(simulations))
         held_out, notes = _held_out(
-            rope, num_folds, show_progress_bars=show_progress_bars
+            rope, num_folds, show_progress_bars=is_shown(show_progress_bars)
         )
         shift = prior_shift(real, simulations, held_out=held_out)
         findings += shift.findings(simulations, names)

@@ -76,7 +76,7 @@ class PriorPosterior(NeuralPosterior):
         self,
         sample_shape: Any = (),
         x: Tensor | None = None,
-        show_progress_bars: bool = True,  # noqa: FBT001, FBT002
+        show_progress_bars: bool | None = None,  # noqa: FBT001
         **kwargs: Any,
     ) -> Tensor:
         """Draw from the prior, ``(*sample_shape, d)``; other arguments are ignored."""
@@ -86,7 +86,7 @@ class PriorPosterior(NeuralPosterior):
         self,
         sample_shape: Any,
         x: Tensor,
-        show_progress_bars: bool = True,  # noqa: FBT001, FBT002
+        show_progress_bars: bool | None = None,  # noqa: FBT001
         **kwargs: Any,
     ) -> Tensor:
         """Draw from the prior for each row of ``x``, ``(*sample_shape, n, d)``.

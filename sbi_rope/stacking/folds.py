@@ -103,10 +103,12 @@ class Workbench:
         """The embedding net h of NPE."""
         return self.rope.embedding_net
 
-    @property
+    @cached_property
     def has_summaries(self) -> bool:
         """Whether x is a vector of so few entries that it can be corrected itself."""
-        return self.x.ndim == 2 and self.x.shape[1] <= MAX_SUMMARIES
+        short = self.x.ndim == 2 and self.x.shape[1] <= MAX_SUMMARIES
+        # Missing entries (NaN) can be embedded, but not corrected.
+        return short and bool(torch.isfinite(self.x).all())
 
     @cached_property
     def _moments(self) -> Moments:

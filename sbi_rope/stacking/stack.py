@@ -35,7 +35,7 @@ def stack(
     tail_mass: float = 1e-3,
     require_convergence: bool = True,
     seed: int | None = None,
-    show_progress_bars: bool = True,
+    show_progress_bars: bool | None = None,
 ) -> StackedPosterior:
     r"""Mix candidate posteriors with the weights that score best on held-out pairs.
 
@@ -82,7 +82,8 @@ def stack(
         require_convergence: Whether a coupling that has not converged is an error.
         seed: Seed of everything random; None uses the states of torch, NumPy and
             Python.
-        show_progress_bars: Whether to show how many folds are done.
+        show_progress_bars: Whether to show how many folds are done. None does so in a
+            terminal or a notebook, but not in a file.
 
     Returns:
         The stack, an sbi posterior. Its ``report`` holds the held-out scores, and
@@ -152,7 +153,7 @@ def cross_validate(
     pseudo_count: float = 1.0,
     require_convergence: bool = True,
     seed: int | None = None,
-    show_progress_bars: bool = True,
+    show_progress_bars: bool | None = None,
 ) -> CrossValidation:
     """Score candidates on calibration pairs that they were not trained on.
 

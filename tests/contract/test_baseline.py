@@ -287,8 +287,8 @@ def test_the_seed_alone_decides_and_training_leaves_no_trace(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", LEARNERS)
-def test_training_changes_nothing_that_is_passed_in_and_says_nothing(
-    name: str, capsys: pytest.CaptureFixture[str]
+def test_training_changes_nothing_that_is_passed_in_and_says_nothing_if_asked_not_to(
+    name: str, terminal: pytest.CaptureFixture[str]
 ) -> None:
     task = first_task(name)
     data = data_of(task).map(torch.clone)
@@ -298,10 +298,10 @@ def test_training_changes_nothing_that_is_passed_in_and_says_nothing(
     weights, law = copy.deepcopy(net.state_dict()), pickle.dumps(prior)
     method = make(name, task, prior=prior, density_estimator=density_estimator)
     feed(method, data)
-    capsys.readouterr()
+    terminal.readouterr()
     assert method.train(seed=0, show_progress_bars=False) is method
     method.build_posterior()
-    printed = capsys.readouterr()
+    printed = terminal.readouterr()
     assert printed.out == printed.err == ""
     assert all(torch.equal(weights[k], v) for k, v in net.state_dict().items())
     assert net.training

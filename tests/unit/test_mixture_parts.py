@@ -391,7 +391,7 @@ def test_the_mass_of_an_observation_is_the_same_beside_others_within_its_error()
         assert ((alone.mass - together.mass[i]).abs() < 4 * error).all()
 
 
-def test_progress_of_the_mass_is_shown_if_asked_for_and_never_by_log_prob(
+def test_progress_of_the_mass_is_shown_if_asked_for(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     shown: list[bool] = []
@@ -413,6 +413,12 @@ def test_progress_of_the_mass_is_shown_if_asked_for_and_never_by_log_prob(
     again.leakage(again.x_o, show_progress_bars=True)
     assert all(shown)
     assert len(shown) == 3
+    shown.clear()
+    again.log_prob_batched(
+        theta, again.x_o, leakage_correction_params={"show_progress_bars": True}
+    )
+    assert all(shown)
+    assert shown
 
 
 # --- couplings ---
