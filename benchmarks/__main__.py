@@ -29,7 +29,7 @@ from sbi_rope.errors import InvalidInputError, RoPEError
 
 DEFAULT_OUT = Path("results/benchmark")
 PUBLISHED = Path(__file__).parent / "results"
-README = Path(__file__).parents[1] / "README.md"
+DOCS_PAGE = Path(__file__).parents[1] / "docs/background/results.md"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -97,9 +97,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     summary = commands.add_parser("summary", help="write what all suites say together")
     summary.set_defaults(command=_summary)
     summary.add_argument(
-        "--readme",
+        "--docs-page",
         type=Path,
-        default=README,
+        default=DOCS_PAGE,
         help="file with a place for a block of results (%(default)s)",
     )
     _add_out(summary, PUBLISHED)
@@ -214,7 +214,7 @@ def _report(args: argparse.Namespace) -> int:
 
 
 def _summary(args: argparse.Namespace) -> int:
-    print(f"Written: {write_summary(args.out, args.readme)}, {args.readme}")
+    print(f"Written: {write_summary(args.out, args.docs_page)}, {args.docs_page}")
     return 0
 
 

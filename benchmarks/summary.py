@@ -1,4 +1,4 @@
-"""What all suites say together: a page beside the tables, a block for the README."""
+"""What all suites say together: a page beside the tables, a block for the docs."""
 
 import math
 import os
@@ -62,33 +62,35 @@ and do not compete. **Bold** is the best LPP of those that do.
 """
 
 
-def write_summary(folder: Path, readme: Path) -> Path:
-    """Write `README.md` into a folder of suites, and a block of it into `readme`.
+def write_summary(folder: Path, docs_page: Path) -> Path:
+    """Write `README.md` into a folder of suites, and a block of it into `docs_page`.
 
     The same tables give the same bytes.
 
     Raises:
-        SystemExit: If there are no results, or `readme` has no place for the block.
+        SystemExit: If there are no results, or `docs_page` has no place for the block.
     """
     published = Published.read(folder)
     page = folder / "README.md"
-    link = Path(os.path.relpath(page, readme.parent)).as_posix()
-    text = _with_block(readme, "\n".join(_block(published, link)))
+    link = Path(os.path.relpath(page, docs_page.parent)).as_posix()
+    text = _with_block(docs_page, "\n".join(_block(published, link)))
     for path, content in (
         (page, "\n".join(_page(published, folder)) + "\n"),
-        (readme, text),
+        (docs_page, text),
     ):
         with write_atomically(path) as temporary:
             temporary.write_text(content)
     return page
 
 
-def _with_block(readme: Path, block: str) -> str:
-    text = readme.read_text()
+def _with_block(docs_page: Path, block: str) -> str:
+    text = docs_page.read_text()
     before, begin, rest = text.partition(BEGIN)
     old, end, after = rest.partition(END)
     if not begin or not end or any(m in before + old + after for m in (BEGIN, END)):
-        raise SystemExit(f"{readme} needs one line {BEGIN} and, below it, one {END}.")
+        raise SystemExit(
+            f"{docs_page} needs one line {BEGIN} and, below it, one {END}."
+        )
     return f"{before}{BEGIN}\n{block}\n{END}{after}"
 
 
@@ -126,7 +128,8 @@ def _block(published: Published, link: str) -> list[str]:
         *(_in_words(_compared(published)), ""),
         *_stack_in_words(published),
         f"Of {len(STATEMENTS)} statements of the paper: {verdicts}.",
-        f"All results, and the rules behind these counts: [{link}]({link}).",
+        "All results, and the rules behind these counts: [results of the "
+        f"benchmark]({link}).",
     ]
 
 
@@ -280,7 +283,7 @@ def _stack_in_words(published: Published) -> list[str]:
     if not results:
         return []
     return [
-        f"The [stack](docs/stacking.md) has the best LPP of all methods in "
+        f"The [stack](stacking.md) has the best LPP of all methods in "
         f"{sum(results)} of the {len(results)} cells that it was run in.",
         "",
     ]
