@@ -22,7 +22,6 @@ version = release = sbi_rope.__version__
 extensions = [
     "myst_nb",
     "sphinx.ext.autodoc",
-    "sphinx.ext.autosummary",
     "sphinx.ext.napoleon",
     "sphinx_copybutton",
 ]
@@ -49,16 +48,23 @@ autodoc_typehints_description_target = "documented_params"
 autodoc_typehints_format = "short"
 # What sbi documents is not said again.
 autodoc_inherit_docstrings = False
-autosummary_generate = False
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
 python_use_unqualified_type_names = True
+toc_object_entries_show_parents = "hide"
+
+copybutton_prompt_text = r">>> |\.\.\. "
+copybutton_prompt_is_regexp = True
 
 html_theme = "sphinx_book_theme"
 html_title = "sbi_rope"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
-html_theme_options = {"show_toc_level": 2, "use_download_button": False}
+html_theme_options = {
+    "show_toc_level": 2,
+    "use_download_button": False,
+    "navbar_persistent": [],  # the search is in the sidebar
+}
 if REPOSITORY:
     html_theme_options |= {
         "repository_url": f"{SERVER}/{REPOSITORY}",
@@ -74,7 +80,7 @@ def link_to_repository(app: Sphinx, docname: str, source: list[str]) -> None:
     """Let links to files outside of ``docs`` lead to the repository.
 
     On GitHub they work as they are written. Where no repository is known, as on a
-    developer's machine, they lead to the file itself.
+    developer's machine, Sphinx copies the file and links to the copy.
     """
     here = Path(app.env.doc2path(docname)).parent
 
@@ -84,7 +90,7 @@ def link_to_repository(app: Sphinx, docname: str, source: list[str]) -> None:
         if not target.exists() or target.is_relative_to(DOCS):
             return match[0]
         if not REPOSITORY:
-            return f"]({target.as_uri()}{anchor})"
+            return f"](path:{path})"
         file = target.relative_to(ROOT).as_posix()
         return f"]({SERVER}/{REPOSITORY}/blob/main/{file}{anchor})"
 

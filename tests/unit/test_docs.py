@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+import sbi_rope
+
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted(
     path
@@ -75,3 +77,9 @@ def test_pages_that_the_code_names_exist() -> None:
     }
     assert named
     assert [name for name in sorted(named) if not (ROOT / name).exists()] == []
+
+
+def test_the_reference_describes_all_that_the_package_exports() -> None:
+    page = (ROOT / "docs/reference/sbi_rope.md").read_text()
+    described = re.findall(r"^\.\. auto\w+:: (\w+)$", page, flags=re.MULTILINE)
+    assert sorted(described) == sorted(sbi_rope.__all__)
