@@ -150,7 +150,7 @@ def _goals(found: list[Comparison]) -> list[str]:
 
 def _rehearsal(found: list[Comparison]) -> list[str]:
     """Compare RoPE with and without rehearsal, where both were candidates."""
-    # What docs/benchmark.md says of rehearsal stands on this table.
+    # What docs/background/benchmark.md says of rehearsal stands on this table.
     both = [one for one in found if ONE_SETTING in one.test and REHEARSED in one.test]
     if not both:
         return []

@@ -1,4 +1,4 @@
-"""What all suites say together: a page beside the tables, a block for the README."""
+"""What all suites say together: a page beside the tables, blocks of docs and README."""
 
 import math
 import os
@@ -27,7 +27,13 @@ from benchmarks.published import (
     table,
 )
 from benchmarks.readme import readme_lines
-from benchmarks.statements import TOLERANCE, write_statements
+from benchmarks.statements import (
+    STATEMENTS,
+    TOLERANCE,
+    VERDICTS,
+    verdict,
+    write_statements,
+)
 from benchmarks.table import Table
 from sbi_rope._files import write_atomically
 
@@ -57,33 +63,32 @@ and do not compete. **Bold** is the best LPP of those that do.
 """
 
 
-def write_summary(folder: Path, readme: Path) -> Path:
-    """Write `README.md` into a folder of suites, and a block of it into `readme`.
+def write_summary(folder: Path, *, docs_page: Path, readme: Path) -> Path:
+    """Write `README.md` into a folder of suites, and a block of it into two others.
 
     The same tables give the same bytes.
 
     Raises:
-        SystemExit: If there are no results, or `readme` has no place for the block.
+        SystemExit: If there are no results, or one of the two has no place for a block.
     """
     published = Published.read(folder)
     page = folder / "README.md"
-    link = Path(os.path.relpath(page, readme.parent)).as_posix()
-    text = _with_block(readme, "\n".join(readme_lines(published, link)))
-    for path, content in (
-        (page, "\n".join(_page(published, folder)) + "\n"),
-        (readme, text),
-    ):
+    texts = {page: "\n".join(_page(published, folder)) + "\n"}
+    for other, lines_of in ((docs_page, _block), (readme, readme_lines)):
+        link = Path(os.path.relpath(page, other.parent)).as_posix()
+        texts[other] = _with_block(other, "\n".join(lines_of(published, link)))
+    for path, text in texts.items():
         with write_atomically(path) as temporary:
-            temporary.write_text(content)
+            temporary.write_text(text)
     return page
 
 
-def _with_block(readme: Path, block: str) -> str:
-    text = readme.read_text()
+def _with_block(path: Path, block: str) -> str:
+    text = path.read_text()
     before, begin, rest = text.partition(BEGIN)
     old, end, after = rest.partition(END)
     if not begin or not end or any(m in before + old + after for m in (BEGIN, END)):
-        raise SystemExit(f"{readme} needs one line {BEGIN} and, below it, one {END}.")
+        raise SystemExit(f"{path} needs one line {BEGIN} and, below it, one {END}.")
     return f"{before}{BEGIN}\n{block}\n{END}{after}"
 
 
@@ -107,6 +112,22 @@ def _page(published: Published, folder: Path) -> list[str]:
         *("## What the paper states", "", *write_statements(published), ""),
         *("## Where RoPE loses", "", *_losses(published), ""),
         *("## What the other suites say", *other_suites(published)),
+    ]
+
+
+def _block(published: Published, link: str) -> list[str]:
+    counts = Counter(verdict(s.check(published)) for s in STATEMENTS)
+    verdicts = ", ".join(f"{counts[what]} {what}" for what in VERDICTS if counts[what])
+    return [
+        f"LPP with {SIZE} calibration pairs, in standard deviations of the prior. Bold",
+        "is the best; RoPE and OT-only compete in one setting, fixed beforehand (gamma",
+        f"{FIXED.gamma:g} in units of the median distance, tau {FIXED.tau:g}).",
+        *("", *_main(published, lpp_text, with_settings=("RoPE",)), ""),
+        *(_in_words(_compared(published)), ""),
+        *_stack_in_words(published),
+        f"Of {len(STATEMENTS)} statements of the paper: {verdicts}.",
+        "All results, and the rules behind these counts: [results of the "
+        f"benchmark]({link}).",
     ]
 
 
@@ -245,6 +266,25 @@ def _in_words(compared: Sequence[Compared]) -> str:
         f"({FIXED}) has the best LPP in {best} of {len(compared)} cells. It is "
         f"{parts[0]}, and {parts[1]}."
     )
+
+
+def _stack_in_words(published: Published) -> list[str]:
+    """Say how often the stack, which is tuned by nobody, is the best of all."""
+    results = []
+    for task in _tasks(published):
+        for size in published.sizes(task):
+            rows = {
+                name: published.select(name, task=task, size=size) for name in METHODS
+            }
+            if len(rows[STACK]):
+                results.append(_best(rows) == STACK)
+    if not results:
+        return []
+    return [
+        f"The [stack](stacking.md) has the best LPP of all methods in "
+        f"{sum(results)} of the {len(results)} cells that it was run in.",
+        "",
+    ]
 
 
 def _losses(published: Published) -> list[str]:

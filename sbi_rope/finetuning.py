@@ -75,8 +75,9 @@ class CalibrationFinetuner:
     prior, :math:`\lambda\, \mathbb{E} \lVert g(x_s) - h(x_s) \rVert_2`, which is not in
     the paper. In continual learning this is called rehearsal with feature distillation:
     g learns from h on simulations, so that it does not forget how h embeds them. It
-    helps if a large net is tuned on few pairs; ``docs/benchmark.md`` says where it
-    helps and where it does harm. The loss on the held-out pairs does not contain it.
+    helps if a large net is tuned on few pairs; ``docs/background/benchmark.md`` says
+    where it helps and where it does harm. The loss on the held-out pairs does not
+    contain it.
 
     The net is tuned in evaluation mode (no dropout, fixed batch statistics). If h has
     no trainable parameters, because NPE was trained without an embedding net, g is h

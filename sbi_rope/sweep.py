@@ -58,8 +58,8 @@ def sweep(
         show_progress_bars: As in :meth:`~sbi_rope.RoPE.build_posterior`.
 
     Returns:
-        An iterator over the posteriors: all taus of the first gamma, then of the
-        second, and so on.
+        An iterator over the posteriors. It returns all taus of the first gamma, then of
+        the second, and so on.
 
     Raises:
         InvalidInputError: If there is no gamma or tau, one is outside its range, or as

@@ -1,4 +1,6 @@
-"""Where does RoPE lose? Its score on a task, taken apart, as in `docs/benchmark.md`.
+"""Where does RoPE lose? Its score on a task, taken apart.
+
+The table of "Where RoPE loses, and why" in `docs/background/benchmark.md`.
 
     python -m benchmarks.experiments.losses --task pendulum --n-calibration 10
     python -m benchmarks.experiments.losses --task sir --n-calibration 50

@@ -115,7 +115,7 @@ class NNPE(Method):
 
     @property
     def needs_simulations(self) -> bool:
-        """Always: it trains on their statistics."""
+        """Whether simulations are needed. They are, because it trains on statistics."""
         return True
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:

@@ -77,7 +77,7 @@ class NPERS(Method):
         \min_{q, h}\; \mathbb{E}_{p(\theta, x_s)}\bigl[-\log q(\theta \mid h(x_s))\bigr]
         + \beta \, \mathrm{MMD}^2\bigl(\{h(x_s)\}, \{h(x_o)\}\bigr)
 
-    with the discrepancy :func:`squared_mmd`. Each gradient step draws anew, without
+    with the discrepancy ``squared_mmd``. Each gradient step draws anew, without
     replacement, some of all simulations and some of all observations for it, and
     embeds them in evaluation mode: batch statistics are those of the simulations. When
     to stop and which network to keep is decided by the first term alone, on held-out

@@ -184,10 +184,10 @@ class SinkhornCoupler:
                 observations.
 
         Returns:
-            An iterator over the couplings in the order of the arguments: all taus of
-            the first gamma, then of the second, and so on. Each coupling is computed
-            when it is needed, and from large to small gamma. If the gammas ascend, the
-            first coupling therefore has to wait for all others.
+            An iterator over the couplings. It returns all taus of the first gamma, then
+            of the second, and so on. Each coupling is computed when it is needed, and
+            from large to small gamma. If the gammas ascend, the first coupling
+            therefore has to wait for all others.
 
         Raises:
             InvalidInputError: If there is no gamma or tau, one is outside its range, or

@@ -77,8 +77,8 @@ class DiscrepancyNPE(Method):
 
     It uses simulations and the calibration set, and assumes that one linear correction
     holds for all parameters. It works from a handful of pairs on;
-    ``docs/discrepancy.md`` says when it fails. FMPE and NPSE posteriors can be
-    corrected too, except with ``space="tuned"``.
+    ``docs/background/discrepancy.md`` says when it fails. FMPE and NPSE posteriors can
+    be corrected too, except with ``space="tuned"``.
 
     References:
         | Bayesian Calibration of Computer Models (Kennedy and O'Hagan, 2001)

@@ -7,9 +7,9 @@ posterior.
 
 :func:`evaluate` draws the samples once and returns all scores. The other functions
 return one score each. All of them use the functions in
-:mod:`sbi_rope.metrics.calibration`, which take ranks and levels and need no posterior.
+``sbi_rope.metrics.calibration``, which take ranks and levels and need no posterior.
 
-No score enters sbi's unbounded rejection loops: see :mod:`sbi_rope.metrics.calls`.
+No score enters sbi's unbounded rejection loops: see ``sbi_rope.metrics.calls``.
 """
 
 from sbi_rope.metrics.calibration import (

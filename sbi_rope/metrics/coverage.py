@@ -169,7 +169,7 @@ def expected_coverage_error(
 
     The mean is over parameters and levels. A calibrated posterior does not score 0 but
     about :math:`0.31 / \sqrt{n}`: see
-    :func:`sbi_rope.metrics.calibration.expected_coverage_error_of`.
+    :func:`sbi_rope.metrics.expected_coverage_error_of`.
 
     Args:
         posterior: Any posterior with ``sample_batched``.

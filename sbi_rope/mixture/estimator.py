@@ -42,7 +42,7 @@ class MixtureEstimator(MixtureDensity):
         p(\theta \mid x) = \sum_k w_k \sum_j a^k_j(x)\, q_k(\theta \mid s^k_j(x))
 
     It is an estimator in the sense of sbi, and its condition is an observation. It does
-    not know the support of the prior; :class:`MixturePosterior` does.
+    not know the support of the prior; :class:`~sbi_rope.MixturePosterior` does.
 
     Args:
         parts: The densities :math:`q_k`, each with its weights :math:`a^k` and

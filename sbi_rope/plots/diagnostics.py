@@ -137,7 +137,7 @@ def effective_sample_sizes(coupling: Coupling) -> "Figure":
         coupling: A coupling of observations to simulations, ``posterior.coupling``.
 
     Returns:
-        The figure: a histogram on a logarithmic axis.
+        The figure, a histogram on a logarithmic axis.
 
     Raises:
         InvalidTypeError: If the argument is no coupling.

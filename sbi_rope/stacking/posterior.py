@@ -26,11 +26,11 @@ class StackedPosterior(MixturePosterior):
         = \frac{\mathbf{1}[\theta \in \operatorname{supp} p]}{Z(x)}
         \sum_k w_k \frac1V \sum_v q_k^{(v)}(\theta \mid x),
 
-    Here :math:`w_k` are the weights of :func:`stacking_weights`, and :math:`q_k^{(v)}`
-    are the V versions of candidate k: one trained without each fold of the calibration
-    pairs, and one trained on all pairs. Z(x) is the mass inside the support of the
-    prior. With couplings among the candidates the posterior belongs to a batch, as
-    RoPE's does. Without couplings it answers any x. It has all methods of
+    Here :math:`w_k` are the weights of :func:`~sbi_rope.stacking.stacking_weights`, and
+    :math:`q_k^{(v)}` are the V versions of candidate k: one trained without each fold
+    of the calibration pairs, and one trained on all pairs. Z(x) is the mass inside the
+    support of the prior. With couplings among the candidates the posterior belongs to a
+    batch, as RoPE's does. Without couplings it answers any x. It has all methods of
     :class:`~sbi_rope.MixturePosterior`.
 
     sbi's ``EnsemblePosterior`` is not used, for three reasons. It has no

@@ -41,7 +41,8 @@ def stack(
 
     The calibration pairs are divided into folds. Every candidate is trained without
     each fold and scored on that fold, and the posterior is the mixture of the
-    candidates with the weights that score best (:func:`stacking_weights`).
+    candidates with the weights that score best
+    (:func:`~sbi_rope.stacking.stacking_weights`).
 
     The stack is made of the models that were scored. Each candidate is the average of
     its versions: one for each fold, trained on the other folds, and one trained on all
@@ -64,9 +65,10 @@ def stack(
             that are dropped.
         x_o: A batch of real observations, shape ``(n_o, *event)``. With None the
             posterior answers any x.
-        candidates: What to stack. If None, :func:`default_candidates`: the prior, NPE,
-            fine-tuned NPE and discrepancy models, and with ``x_o`` also tuning-only,
-            RoPE, RoPE tuned with rehearsal and OT-only at four gammas and three taus.
+        candidates: What to stack. If None,
+            :func:`~sbi_rope.stacking.default_candidates`: the prior, NPE, fine-tuned
+            NPE and discrepancy models, and with ``x_o`` also tuning-only, RoPE, RoPE
+            tuned with rehearsal and OT-only at four gammas and three taus.
         num_folds: The number of folds, 5 if None, and at most the number of different
             parameters. Pairs with the same parameters are in the same fold.
         num_simulations: The number of simulations to couple with, as in

@@ -57,11 +57,11 @@ class Task(ABC):
        :meth:`prior_quantiles` too;
     3. implement :meth:`get_simulator`: an instance of a class defined at the top of
        a module (so that it can be pickled) whose ``__call__`` passes its input
-       through :func:`check_theta`, draws from torch's global generator, and keeps
+       through ``check_theta``, draws from torch's global generator, and keeps
        the dtype and device of ``theta``;
     4. implement :meth:`get_embedding_net`: a new, untrained network;
-    5. implement :meth:`_real_process`: the pairs of the real process, drawn or
-       recorded. Read its options with :meth:`_option`, which refuses those that have
+    5. implement ``_real_process``: the pairs of the real process, drawn or
+       recorded. Read its options with ``_option``, which refuses those that have
        no effect. The variants common to all tasks need nothing else;
     6. add the class to ``TASKS`` in ``sbi_rope/tasks/__init__.py``. The tests in
        ``tests/contract/test_task*.py`` then apply to it.
@@ -80,8 +80,7 @@ class Task(ABC):
             for every entry, ``"structured"`` for all entries together, ``"none"``.
         misspecification: In a sentence, what the simulator gets wrong.
         variants: The kinds of real process besides the standard one, with a sentence
-            each. :data:`~sbi_rope.tasks.variants.COMMON_VARIANTS` belong to all
-            tasks.
+            each. ``COMMON_VARIANTS`` belong to all tasks.
         shifted_region: The intervals that parameters come from in the variant
             ``"prior_shift"``.
         paper_settings: The hyper-parameters the paper states, ``None`` for tasks that
@@ -192,7 +191,7 @@ class Task(ABC):
         """Return the labelled pairs of the real process for one part."""
 
     def _recorded_files(self) -> tuple[Path, ...]:
-        """Return the files behind :meth:`_real_process`, relative to ``root``."""
+        """Return the files behind ``_real_process``, relative to ``root``."""
         return ()
 
     def get_calibration_set(self, n: int, *, seed: int = 0) -> tuple[Tensor, Tensor]:

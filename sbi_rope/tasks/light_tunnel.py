@@ -54,7 +54,7 @@ class LightTunnel(Task):
     A camera looks through two polarisers at a light source. The parameters are the
     source's red, green and blue settings, and the share of light
     :math:`\alpha = \cos^2(\varphi_1 - \varphi_2)` that the angles of the polarisers
-    let through (Malus' law). The simulator (:class:`HexagonSimulator`, model F1)
+    let through (Malus' law). The simulator (``HexagonSimulator``, model F1)
     paints a hexagon in the colour :math:`\alpha (R, G, B)`: it knows nothing of the
     background, the response of the camera, over-exposure, or of polarisers that
     treat colours differently and let light through when crossed.
@@ -76,7 +76,7 @@ class LightTunnel(Task):
     the middle of their ranges; in ``"biased_calibration"`` the calibration set alone
     does, as in the paper. In ``"flipped"`` the test images, but not those of the
     calibration set, stand on their heads. In ``"synthetic"`` model F3 with noise
-    (:class:`CameraSimulator`) stands in for the camera, so that no files are needed;
+    (``CameraSimulator``) stands in for the camera, so that no files are needed;
     ``stand_in=True`` does this in any other variant. The hexagon is nearly symmetric,
     so that flipping a stand-in only moves it by one row.
 

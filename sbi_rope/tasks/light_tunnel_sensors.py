@@ -161,9 +161,10 @@ class LightTunnelSensors(Task):
 
     The prior follows the experiment's protocol: colours are uniform integers from 0 to
     85, hence uniform on [-0.5, 85.5] here, and each polariser has independent uniform
-    positions on a range of 40 degrees, hence :class:`UniformDistance`. The recorded
-    angles are 5 % smaller on average (12.7 instead of 13.3 degrees), so that this
-    prior, too, is only nearly right.
+    positions on a range of 40 degrees, hence
+    :class:`~sbi_rope.tasks.distributions.UniformDistance`. The recorded angles are 5 %
+    smaller on average (12.7 instead of 13.3 degrees), so that this prior, too, is only
+    nearly right.
 
     An observation is :math:`\log(r + 1)` of ``ir_1, vis_1, ir_2, vis_2, ir_3, vis_3``,
     and the raw ``current``. A fixed third of the recorded rows (2000 of 6000) is for

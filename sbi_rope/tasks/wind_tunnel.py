@@ -55,7 +55,7 @@ class WindTunnel(Task):
     The parameter is the position :math:`H` of a hatch in the wall of a tunnel with a
     fan at each end, with prior :math:`\mathcal{U}[0, 45]` degrees. An observation is
     the pressure inside minus the ambient pressure, at 50 times around an impulse of
-    the intake fan. The simulator (:class:`WindTunnelSimulator`) knows neither the
+    the intake fan. The simulator (``WindTunnelSimulator``) knows neither the
     inertia of the air nor turbulence, and reduces the fans to a straight line between
     pressure and flow.
 

@@ -72,7 +72,7 @@ class FinetunedNPE(Method):
 
     Networks that few pairs have led astray are not astray in the same way, so that an
     average of five is better than each of them, and better calibrated.
-    It is a :class:`~sbi_rope.mixture.MixturePosterior`, which is divided by its mass
+    It is a :class:`~sbi_rope.MixturePosterior`, which is divided by its mass
     inside the prior's support, and says so with an error where there is none.
 
     Sees simulations and the calibration set. Assumes that what NPE has learnt is a good

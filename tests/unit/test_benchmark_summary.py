@@ -1,4 +1,4 @@
-"""The page of all suites and the README's block, from tables that are made up."""
+"""The page of all suites and the block of the docs, from tables that are made up."""
 
 import csv
 import math
@@ -87,14 +87,21 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def readme(tmp_path: Path) -> Path:
-    path = tmp_path / "README.md"
-    path.write_text("before\n<!-- results -->\nreplaced\n<!-- /results -->\nafter\n")
+def docs_page(tmp_path: Path) -> Path:
+    for path in (readme_beside(tmp_path / "results.md"), tmp_path / "results.md"):
+        path.write_text(
+            "before\n<!-- results -->\nreplaced\n<!-- /results -->\nafter\n"
+        )
     return path
 
 
-def write(folder: Path, readme: Path) -> str:
-    return write_summary(folder, readme).read_text()
+def readme_beside(docs_page: Path) -> Path:
+    return docs_page.with_name("README.md")
+
+
+def write(folder: Path, docs_page: Path) -> str:
+    readme = readme_beside(docs_page)
+    return write_summary(folder, docs_page=docs_page, readme=readme).read_text()
 
 
 def line(text: str, start: str, *, after: str = "") -> list[str]:
@@ -120,7 +127,7 @@ def with_stack(by_repetition: dict[int, dict[str, float]]) -> Scores:
 
 
 def test_the_stack_is_compared_with_the_best_other_on_the_same_repetitions(
-    folder: Path, readme: Path
+    folder: Path, docs_page: Path
 ) -> None:
     of_run = {
         0: {"stack": -1.0, "J-NPE": -1.5},
@@ -128,7 +135,7 @@ def test_the_stack_is_compared_with_the_best_other_on_the_same_repetitions(
         2: {"stack": -1.1, "J-NPE": -1.5},
     }
     publish(folder, "main", with_stack(of_run))
-    text = write(folder, readme)
+    text = write(folder, docs_page)
     row = line(text, "A cs | 50", after="The stack against all others")
     # 4.303 is Student's quantile of two degrees of freedom.
     width = 4.303 * 0.1 / 3**0.5
@@ -141,10 +148,10 @@ def test_the_stack_is_compared_with_the_best_other_on_the_same_repetitions(
 
 
 def test_a_stack_below_npe_or_another_method_is_counted_and_named(
-    folder: Path, readme: Path
+    folder: Path, docs_page: Path
 ) -> None:
     publish(folder, "main", with_stack({0: {"stack": -2.0, "NPE": -1.5}}))
-    text = write(folder, readme)
+    text = write(folder, docs_page)
     assert "- best, or within 0.1 nats of the best: 0 of 3" in text
     assert "- not more than 0.1 nats below the prior or NPE: 0 of 3" in text
     # Of a single repetition there is no interval.
@@ -153,46 +160,50 @@ def test_a_stack_below_npe_or_another_method_is_counted_and_named(
 
 
 def test_ranks_are_drawn_of_methods_that_were_run_everywhere(
-    folder: Path, readme: Path
+    folder: Path, docs_page: Path
 ) -> None:
     publish(folder, "main", with_stack({0: {"stack": -1.0}}))
-    first_bytes = write(folder, readme), (folder / "ranks.png").read_bytes()
-    assert (write(folder, readme), (folder / "ranks.png").read_bytes()) == first_bytes
+    first_bytes = write(folder, docs_page), (folder / "ranks.png").read_bytes()
+    assert (
+        write(folder, docs_page),
+        (folder / "ranks.png").read_bytes(),
+    ) == first_bytes
 
 
-def test_without_a_stack_nothing_is_compared(folder: Path, readme: Path) -> None:
+def test_without_a_stack_nothing_is_compared(folder: Path, docs_page: Path) -> None:
     publish(
         folder,
         "main",
         first(lambda cell: (-1.0, 0.0) if cell.method == "NPE" else None),
     )
-    text = write(folder, readme)
+    text = write(folder, docs_page)
     section = text[text.index("The stack against all others") :]
     assert section.splitlines()[2] == "Not run."
 
 
-# The README -------------------------------------------------------------------------
+# The docs ---------------------------------------------------------------------------
 
 
 def test_the_block_replaces_what_is_between_the_markers_and_nothing_else(
-    folder: Path, readme: Path
+    folder: Path, docs_page: Path
 ) -> None:
     publish(folder, "main", by_method(RoPE=0.0))
-    assert main(["summary", "--out", str(folder), "--readme", str(readme)]) == 0
-    text = readme.read_text()
+    command = ["summary", "--out", str(folder), "--docs-page", str(docs_page)]
+    assert main([*command, "--readme", str(readme_beside(docs_page))]) == 0
+    text = docs_page.read_text()
     page = (folder / "README.md").read_bytes()
-    write(folder, readme)
+    write(folder, docs_page)
     # The same tables give the same bytes.
-    assert (readme.read_text(), (folder / "README.md").read_bytes()) == (text, page)
+    assert (docs_page.read_text(), (folder / "README.md").read_bytes()) == (text, page)
     assert text.startswith("before\n<!-- results -->\n")
     assert text.endswith("\n<!-- /results -->\nafter\n")
     assert "replaced" not in text
     assert "(results/README.md)" in text
-    assert len(text.splitlines()) < 46
+    assert len(text.splitlines()) < 45
 
 
-def test_the_block_shows_scores_on_real_measurements_with_their_intervals(
-    folder: Path, readme: Path
+def test_readme_shows_scores_on_real_measurements_with_their_intervals(
+    folder: Path, docs_page: Path
 ) -> None:
     lpp = {"stack": (-1.0, -1.2, -1.1), "NPE": (-30.0, -30.0, -30.0), "RoPE": (-3.0,)}
 
@@ -204,8 +215,10 @@ def test_the_block_shows_scores_on_real_measurements_with_their_intervals(
         return of_run[cell.repetition], 0.02
 
     publish(folder, "main", scores)
-    write(folder, readme)
-    text = readme.read_text()
+    write(folder, docs_page)
+    text = readme_beside(docs_page).read_text()
+    assert text.startswith("before\n<!-- results -->\n")
+    assert "(results/README.md)" in text
     stack = "-1.10 ± 0.25 (3)"  # 4.303 * 0.1 / sqrt(3)
     assert line(text, "**`stack`**") == [stack, stack, stack, "+0.020"]
     assert line(text, "NPE as it was")[0] == "-30.00 ± 0.00 (3)"
@@ -214,8 +227,8 @@ def test_the_block_shows_scores_on_real_measurements_with_their_intervals(
     assert line(text, "FRISBI") == ["-"] * 4
 
 
-def test_a_readme_without_a_place_for_the_block_is_refused_and_nothing_written(
-    folder: Path, readme: Path
+def test_a_page_without_a_place_for_the_block_is_refused_and_nothing_written(
+    folder: Path, docs_page: Path
 ) -> None:
     publish(folder, "main", by_method())
     for text in (
@@ -224,48 +237,48 @@ def test_a_readme_without_a_place_for_the_block_is_refused_and_nothing_written(
         "<!-- /results --> <!-- results -->",
         "<!-- results --><!-- results --><!-- /results -->",
     ):
-        readme.write_text(text)
-        with pytest.raises(SystemExit, match=r"README\.md needs one line <!-- results"):
-            write(folder, readme)
-        assert readme.read_text() == text
+        docs_page.write_text(text)
+        with pytest.raises(SystemExit, match=r"results\.md needs one line <!--"):
+            write(folder, docs_page)
+        assert docs_page.read_text() == text
         assert not (folder / "README.md").exists()
 
 
-def test_a_folder_without_results_is_refused(folder: Path, readme: Path) -> None:
+def test_a_folder_without_results_is_refused(folder: Path, docs_page: Path) -> None:
     with pytest.raises(SystemExit, match="No results in"):
-        write(folder, readme)
+        write(folder, docs_page)
 
 
 # The suite main ---------------------------------------------------------------------
 
 
 def test_neither_sbi_nor_another_setting_of_rope_competes(
-    folder: Path, readme: Path
+    folder: Path, docs_page: Path
 ) -> None:
     publish(
         folder, "main", by_method(SBI=3.0, RoPE_other=2.0, OT_only_other=2.0, NPE=1.0)
     )
-    text = write(folder, readme)
+    text = write(folder, docs_page)
     assert line(text, "NPE") == ["**1.00**", "**1.00**"]
     assert line(text, "SBI") == ["3.00", "3.00"]
     assert line(text, "RoPE (gamma 0.1, tau 0.9)") == ["2.00", "2.00"]
 
 
 def test_of_several_complete_repetitions_mean_and_spread_are_shown(
-    folder: Path, readme: Path
+    folder: Path, docs_page: Path
 ) -> None:
     def scores(cell: Cell) -> tuple[float, float] | None:
         return (float(cell.repetition), 0.0) if cell.task == "cs" else None
 
     publish(folder, "main", scores)
-    text = write(folder, readme)
+    text = write(folder, docs_page)
     # Of 0, 1 and 2.
     assert line(text, "NPE") == ["1.00 ± 1.00"]
     assert "cs 3/3" in text
 
 
 def test_an_incomplete_repetition_does_not_enter_the_means(
-    folder: Path, readme: Path
+    folder: Path, docs_page: Path
 ) -> None:
     def scores(cell: Cell) -> tuple[float, float] | None:
         late = cell.repetition == 1 and cell.method == "RoPE"
@@ -274,14 +287,14 @@ def test_an_incomplete_repetition_does_not_enter_the_means(
         return (9.0 if late else 1.0 + (cell.method == "NPE")), 0.0
 
     publish(folder, "main", scores)
-    text = write(folder, readme)
+    text = write(folder, docs_page)
     assert line(text, "RoPE") == ["1.00"]
     assert line(text, "repetitions") == ["1"]
     assert "cs 1/3" in text
 
 
 def test_what_failed_what_is_infinite_and_what_was_not_run_is_shown(
-    folder: Path, readme: Path
+    folder: Path, docs_page: Path
 ) -> None:
     def scores(cell: Cell) -> tuple[float, float] | str | None:
         if cell.task != "cs" or cell.repetition:
@@ -290,7 +303,7 @@ def test_what_failed_what_is_infinite_and_what_was_not_run_is_shown(
         return special.get(cell.method, (-1.0, 0.0))
 
     publish(folder, "main", scores)
-    text = write(folder, readme)
+    text = write(folder, docs_page)
     assert line(text, "MLP") == ["failed"]
     assert line(text, "NPE") == ["-inf"]
     assert "| J-NPE |" not in text
@@ -300,15 +313,16 @@ def test_what_failed_what_is_infinite_and_what_was_not_run_is_shown(
 
 
 def test_stand_ins_are_named_wherever_their_numbers_are(
-    folder: Path, readme: Path
+    folder: Path, docs_page: Path
 ) -> None:
     def scores(cell: Cell) -> tuple[float, float] | None:
         return (0.0, 0.0) if cell.task == "wind_tunnel" else None
 
     publish(folder, "main", first(scores))
-    text = write(folder, readme)
+    text = write(folder, docs_page)
     assert line(text, "[main](main/report.md)")[-1] == "wind_tunnel synthetic"
     assert "F wind_tunnel (stand-in)" in text
+    assert "F wind_tunnel (stand-in)" in docs_page.read_text()
     assert "reproduced so far (stand-in: F)" in text
 
 
@@ -316,7 +330,7 @@ def test_stand_ins_are_named_wherever_their_numbers_are(
 
 
 def test_losses_of_rope_are_counted_and_listed_with_their_gap(
-    folder: Path, readme: Path
+    folder: Path, docs_page: Path
 ) -> None:
     def scores(cell: Cell) -> tuple[float, float] | None:
         if cell.task != "cs":
@@ -327,10 +341,11 @@ def test_losses_of_rope_are_counted_and_listed_with_their_gap(
         return fixed.get(cell.method) or -3.0 * (cell.method != "OT-only"), 0.0
 
     publish(folder, "main", first(scores))
-    text = write(folder, readme)
+    text = write(folder, docs_page)
     assert "best LPP in 1 of 4 cells" in text
     assert "below OT-only in 3 of 4 (in 2 by more than 0.3 nat)" in text
     assert "below the prior in 1 of 4 (in 1 by more than 0.3 nat)" in text
+    assert "best LPP in 1 of 4 cells" in docs_page.read_text()
     losses = text[text.index("## Where RoPE loses") :]
     assert "| A cs | 10 |" not in losses
     assert "| A cs | 200 | -1.00 |  | -1.00 | -1.00 OT-only |" in losses
@@ -444,7 +459,7 @@ def test_a_statement_on_all_sizes_waits_for_the_last(folder: Path) -> None:
 
 
 def test_the_other_suites_have_a_column_for_each_value_that_was_run(
-    folder: Path, readme: Path
+    folder: Path, docs_page: Path
 ) -> None:
     def scores(cell: Cell) -> tuple[float, float] | None:
         noise = cell.options != "{}" and cell.variant == "noisy_labels"
@@ -453,7 +468,7 @@ def test_the_other_suites_have_a_column_for_each_value_that_was_run(
 
     for suite in ("labels", "wellspecified"):
         publish(folder, suite, first(scores))
-    text = write(folder, readme)
+    text = write(folder, docs_page)
     assert line(text, "", after="### Noisy labels") == ["0", "1", "5", "10"]
     name = "G light_tunnel_sensors, MLP"
     assert line(text, name) == ["0.05", "-0.95", "-0.95", "-0.95"]

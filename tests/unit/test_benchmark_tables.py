@@ -193,8 +193,8 @@ def test_the_committed_reports_are_those_of_the_tables(
 
 @pytest.mark.slow
 def test_the_committed_page_of_all_suites_is_that_of_the_tables(tmp_path: Path) -> None:
-    readme = tmp_path / "README.md"
-    readme.write_text("<!-- results -->\n<!-- /results -->\n")
+    docs_page = tmp_path / "page.md"
+    docs_page.write_text("<!-- results -->\n<!-- /results -->\n")
     folder = Path(shutil.copytree(COMMITTED, tmp_path / "results"))
-    page = write_summary(folder, readme)
+    page = write_summary(folder, docs_page=docs_page, readme=docs_page)
     assert page.read_bytes() == (COMMITTED / "README.md").read_bytes()

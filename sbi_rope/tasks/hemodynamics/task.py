@@ -89,9 +89,9 @@ class Hemodynamics(Task):
     beat, and the left ventricular ejection time. An observation is the normalised
     pressure in the left radial artery, 1000 samples at 125 Hz from a random moment on,
     with white noise. Heart rate, blood pressure, stiffness and size of the arteries
-    and more are nuisances of a healthy population (:class:`Population`), whose law of
-    the two parameters is the prior (:class:`PopulationPrior`). Blood flow in 116
-    arteries is simulated by :func:`simulate_beat`.
+    and more are nuisances of a healthy population (``Population``), whose law of
+    the two parameters is the prior (``PopulationPrior``). Blood flow in 116 arteries is
+    simulated by ``simulate_beat``.
 
     In the simulator, all people have arteries of the same lengths. In the real process
     lengths follow the height of a person, and scatter from segment to segment.
@@ -105,7 +105,7 @@ class Hemodynamics(Task):
     simulate.
 
     The solver, its validation and the data sets are described in
-    ``docs/hemodynamics.md``.
+    ``docs/background/hemodynamics.md``.
 
     Where this differs from the paper: its simulator, prior, noise and normalisation
     are unpublished. Ours follow a published population and geometry; noise and
@@ -130,7 +130,7 @@ class Hemodynamics(Task):
         observations: File of real people. It is the small one of the package unless
             given.
         prior: The law of the parameters that both files were made with, see
-            :class:`Population`. Those of the package have ``"population"``.
+            ``Population``. Those of the package have ``"population"``.
         noise_std: Standard deviation of the noise, after normalisation.
         normalisation: ``"per_record"``, to mean 0 and standard deviation 1, or
             ``"global"``, which keeps the level and the height of the pulse.

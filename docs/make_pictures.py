@@ -1,0 +1,165 @@
+"""Make the pictures of the how-to pages from fifty labelled measurements.
+
+    python docs/make_pictures.py
+
+The measurements are the extract of the light tunnel's sensors that the tests use. It
+takes about five minutes on two cores, and writes PNG files into ``docs/pictures``.
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+import torch
+from sbi.inference import NPE
+from sbi.neural_nets import posterior_nn
+from torch import Tensor
+
+from sbi_rope import RoPE, SinkhornCoupler, diagnose, plots, stack
+from sbi_rope.metrics import draw_samples, evaluate
+from sbi_rope.sweep import sweep
+from sbi_rope.tasks import get_task
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+DOCS = Path(__file__).parent
+EXTRACT = DOCS.parent / "tests/data/causal_chamber"
+TABLE = EXTRACT / "lt_interventions_standard_v1/uniform_reference.csv"
+QUIET: dict[str, Any] = {"show_progress_bars": False}
+NUM_LABELLED = 50
+# The parameters that pair plots show, and the observation that they show them of.
+SHOWN, NAMES = [0, 3], ["red", "polariser angle [degree]"]
+OBSERVED = 2
+
+
+def measurements() -> tuple[Tensor, Tensor]:
+    """Return parameters and sensor readings of the light tunnel."""
+    table = pd.read_csv(TABLE)
+    theta = table[["red", "green", "blue"]]
+    theta = theta.assign(angle=(table["pol_1"] - table["pol_2"]).abs())
+    light = table[["ir_1", "vis_1", "ir_2", "vis_2", "ir_3", "vis_3"]]
+    x = torch.cat([_tensor(light).log1p(), _tensor(table[["current"]])], dim=1)
+    return _tensor(theta), x
+
+
+def _tensor(table: pd.DataFrame) -> Tensor:
+    return torch.tensor(table.to_numpy(), dtype=torch.float32)
+
+
+def trained_npe() -> tuple[Any, Any]:
+    """Return NPE that was trained on the published simulator, and this simulator."""
+    task = get_task("light_tunnel_sensors")
+    prior, simulator = task.get_prior(), task.get_simulator()
+    theta = prior.sample((20_000,))
+    npe = NPE(
+        prior,
+        density_estimator=posterior_nn(
+            "nsf",
+            embedding_net=task.get_embedding_net(),
+            num_transforms=3,
+            hidden_features=50,
+        ),
+        **QUIET,
+    )
+    npe.append_simulations(theta, simulator(theta))
+    npe.train(training_batch_size=200, learning_rate=1e-3, max_num_epochs=30)
+    return npe.build_posterior(), simulator
+
+
+def overconfident(npe: Any, posterior: Any, theta_o: Tensor, x_o: Tensor) -> "Figure":
+    """Draw the coverage of NPE and of the stack."""
+    curves = {
+        name: evaluate(one, theta_o, x_o, num_samples=500, seed=0).coverage
+        for name, one in {"NPE": npe, "stack": posterior}.items()
+    }
+    return plots.calibration_curves(curves)
+
+
+def one_observation(npe: Any, posterior: Any, theta: Tensor, x: Tensor) -> "Figure":
+    """Draw the posteriors of a single observation."""
+    samples = {
+        name: draw_samples(one, x, num_samples=2000)[:, 0, SHOWN]
+        for name, one in {"NPE": npe, "stack": posterior}.items()
+    }
+    return plots.pair_plot(samples, theta[SHOWN], parameter_names=NAMES)
+
+
+def gammas(rope: RoPE, theta: Tensor, x_o: Tensor) -> "Figure":
+    """Draw posteriors of one observation at several gammas."""
+    values = (1.0, 0.1, 0.02)
+    samples = {}
+    batches = sweep(rope, x_o, gammas=values, taus=[1.0], seed=0, **QUIET)
+    for gamma, posterior in zip(values, batches, strict=True):
+        draws = posterior[OBSERVED].sample((2000,), **QUIET)
+        samples[f"gamma {gamma:g}"] = draws[:, SHOWN]
+    return plots.pair_plot(samples, theta[SHOWN], parameter_names=NAMES)
+
+
+def other_prior(rope: RoPE, theta_o: Tensor, x_o: Tensor) -> "Figure":
+    """Draw the parameters that a batch with much red implies."""
+    names = ("red", "green", "blue", "angle")
+    bright = x_o[theta_o[:, 0] > 45]
+    diagnosis = diagnose(rope, bright, parameter_names=names, seed=0, **QUIET)
+    return arranged(plots.implied_parameters(diagnosis), columns=2, size=(7.0, 5.0))
+
+
+def steps(rope: RoPE, x_o: Tensor) -> dict[str, "Figure"]:
+    """Draw what the first two steps of RoPE return."""
+    coupling = rope.build_posterior(x_o, seed=0, **QUIET).coupling
+    return {
+        "finetuning": plots.finetuning_history(rope.history),
+        "effective_sample_sizes": plots.effective_sample_sizes(coupling),
+    }
+
+
+def learning_curve(report: Any) -> "Figure":
+    """Draw the panel of the learning curve alone."""
+    figure = plots.stacking_report(report)
+    *others, last = figure.axes
+    for axes in others:
+        axes.remove()
+    last.set_box_aspect(None)
+    return arranged(figure, columns=1, size=(5.5, 3.4))
+
+
+def arranged(figure: "Figure", *, columns: int, size: tuple[float, float]) -> "Figure":
+    """Put the panels of a wide figure into a grid, which is readable on a page."""
+    grid = figure.add_gridspec(-(-len(figure.axes) // columns), columns)
+    for axes, place in zip(figure.axes, grid, strict=True):
+        axes.set_subplotspec(place)
+    figure.set_size_inches(size)
+    return figure
+
+
+def save(figure: "Figure", name: str) -> None:
+    """Write a picture and say how large it is."""
+    path = DOCS / "pictures" / f"{name}.png"
+    figure.savefig(path, dpi=110, bbox_inches="tight")
+    print(f"{path.name}: {path.stat().st_size / 1000:.0f} kB", flush=True)
+
+
+def main() -> None:
+    """Make all pictures."""
+    torch.manual_seed(0)
+    theta, x = measurements()
+    theta_cal, x_cal = theta[:NUM_LABELLED], x[:NUM_LABELLED]
+    theta_o, x_o = theta[NUM_LABELLED:], x[NUM_LABELLED:]
+    npe, simulator = trained_npe()
+    rope = RoPE(npe, simulator=simulator, coupler=SinkhornCoupler(gamma=0.1))
+    rope.append_calibration(theta_cal, x_cal).train(seed=0, **QUIET)
+
+    save(gammas(rope, theta_o[OBSERVED], x_o), "gammas")
+    save(other_prior(rope, theta_o, x_o), "other_prior")
+    for name, figure in steps(rope, x_o).items():
+        save(figure, name)
+    posterior = stack(rope, learning_curve=True, seed=0, **QUIET)
+    print(posterior.report)
+    save(learning_curve(posterior.report), "learning_curve")
+    save(overconfident(npe, posterior, theta_o, x_o), "overconfident")
+    pair = (theta_o[OBSERVED], x_o[OBSERVED : OBSERVED + 1])
+    save(one_observation(npe, posterior, *pair), "one_observation")
+
+
+if __name__ == "__main__":
+    main()
