@@ -96,10 +96,18 @@ def spread_of(
     have. If the 1 % quantile of its bootstrap (divided among the parameters, too) is
     below that of simulations, the threshold is lowered by the same factor.
 
-    In the linear-Gaussian problem, with 20 to 50 pairs and batches of 100 and 1000
-    observations, a quarter of the prior's spread is always found, and at most one batch
-    from the prior in twenty is taken for a narrow one, most of them because of a g that
-    was tuned on 20 pairs.
+    In the linear-Gaussian problem, with a new g for each batch, this many of 50 batches
+    of the prior and of 10 batches with a quarter or half of its spread are alarming in
+    at least one parameter:
+
+    ========== ===== ============ === ======= ====
+    parameters pairs observations all quarter half
+    ========== ===== ============ === ======= ====
+    2          50    1000         0   10      10
+    2          50    100          0   10      10
+    2          20    1000         2   10      7
+    10         50    1000         0   10      10
+    ========== ===== ============ === ======= ====
 
     Args:
         shift: What the batch, simulations and held-out pairs imply.
