@@ -12,7 +12,6 @@ from sbi_rope._random import seeded
 from sbi_rope._sbi import embed, estimator_of, headless
 from sbi_rope.batch import parameters_named
 from sbi_rope.coupling import Coupling
-from sbi_rope.coupling.cost import widest
 from sbi_rope.errors import CouplingError
 from sbi_rope.mixture import CoupledEmbeddings, CoupledNet, Part
 from sbi_rope.mixture.chunks import flow_batch
@@ -143,20 +142,25 @@ def fit_couplings(
         )
     batch = torch.cat([x_o, bench.x])
     nets, settings = [], []
-    # The coupler would otherwise convert, and so copy, them for each net.
-    has_float64 = widest(simulated.device) == torch.float64
-    converted = simulated.to(bench.rope.coupler.dtype) if has_float64 else simulated
     for key, net in _nets(candidates, versions).items():
         of_net = [c for c in candidates if (c.tuned, c.rehearsal) == key[:2]]
         with parameters_named(theta):
-            couplings = _couple(of_net, embed(net, batch), converted, bench.rope)
+            couplings = _couple(of_net, embed(net, batch), simulated, bench.rope)
         share = 1.0 / len(couplings)
         nets.append(CoupledNet(net, couplings, [share] * len(couplings)))
         settings += [(candidate.name, key[2]) for candidate in of_net]
     if require_convergence:
         _check_converged([c for net in nets for c in net.couplings], settings)
+    # The coupler has converted the simulations for each net. All couplings get the same
+    # tensor, so that memory and pickles hold it once.
+    kept = nets[0].couplings[0].simulated
     nets = [
-        net.with_shares([share / len(nets) for share in net.shares]) for net in nets
+        CoupledNet(
+            net.net,
+            [replace(coupling, simulated=kept) for coupling in net.couplings],
+            [share / len(nets) for share in net.shares],
+        )
+        for net in nets
     ]
     embeddings = CoupledEmbeddings(
         simulated, batch, nets, num_observed=len(x_o), unseen=unseen
