@@ -41,6 +41,8 @@ myst_heading_anchors = 3
 nb_execution_mode = "cache"
 nb_execution_timeout = 900
 nb_execution_raise_on_error = True
+# Warnings of other packages name folders of the machine that built the site.
+nb_output_stderr = "remove"
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
@@ -55,6 +57,10 @@ toc_object_entries_show_parents = "hide"
 
 copybutton_prompt_text = r">>> |\.\.\. "
 copybutton_prompt_is_regexp = True
+
+# Publishers refuse programs, and GitHub makes its anchors in the browser.
+linkcheck_ignore = [r"https://doi\.org/.*"]
+linkcheck_anchors_ignore_for_url = [r"https://github\.com/.*"]
 
 html_theme = "sphinx_book_theme"
 html_title = "sbi_rope"
