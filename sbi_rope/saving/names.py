@@ -77,6 +77,7 @@ ROOMS: dict[str, tuple[type, ...]] = {
     "sbi.utils": _KINDS,
     "sbi_rope._sbi": (*_KINDS, *_POSTERIORS),
     "sbi_rope._standardisation": (nn.Module,),
+    "sbi_rope._two_sample": (),
     "sbi_rope.baselines": (*_KINDS, *_POSTERIORS),
     "sbi_rope.coupling": (),
     "sbi_rope.discrepancy": (*_KINDS, *_POSTERIORS),
@@ -87,7 +88,11 @@ ROOMS: dict[str, tuple[type, ...]] = {
 }
 # Dataclasses of these rooms are results, which hold numbers, tensors and networks.
 RESULTS = tuple(
-    f"sbi_rope.{room}" for room in ("baselines", "coupling", "metrics", "stacking")
+    f"sbi_rope.{room}"
+    for room in (
+        *("_two_sample", "baselines", "coupling", "discrepancy", "metrics"),
+        "stacking",
+    )
 )
 # It derives from none of these, and holds tensors.
 OTHER_CLASSES = {"nflows.transforms.linear.LinearCache"}

@@ -64,7 +64,7 @@ class Stopwatch:
             versions={
                 "Python": platform.python_version(),
                 **{
-                    package: import_module(module).__version__
+                    package: str(import_module(module).__version__)
                     for module, package in PACKAGES.items()
                 },
             },
