@@ -30,6 +30,7 @@ from sbi_rope.errors import InvalidInputError, RoPEError
 DEFAULT_OUT = Path("results/benchmark")
 PUBLISHED = Path(__file__).parent / "results"
 DOCS_PAGE = Path(__file__).parents[1] / "docs/background/results.md"
+README = Path(__file__).parents[1] / "README.md"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -96,12 +97,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     summary = commands.add_parser("summary", help="write what all suites say together")
     summary.set_defaults(command=_summary)
-    summary.add_argument(
-        "--docs-page",
-        type=Path,
-        default=DOCS_PAGE,
-        help="file with a place for a block of results (%(default)s)",
-    )
+    for option, path in (("--docs-page", DOCS_PAGE), ("--readme", README)):
+        summary.add_argument(
+            option,
+            type=Path,
+            default=path,
+            help="file with a place for a block of results (%(default)s)",
+        )
     _add_out(summary, PUBLISHED)
     args = parser.parse_args(arguments)
     try:
@@ -214,7 +216,8 @@ def _report(args: argparse.Namespace) -> int:
 
 
 def _summary(args: argparse.Namespace) -> int:
-    print(f"Written: {write_summary(args.out, args.docs_page)}, {args.docs_page}")
+    page = write_summary(args.out, docs_page=args.docs_page, readme=args.readme)
+    print(f"Written: {page}, {args.docs_page}, {args.readme}")
     return 0
 
 

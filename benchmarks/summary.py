@@ -1,4 +1,4 @@
-"""What all suites say together: a page beside the tables, a block for the docs."""
+"""What all suites say together: a page beside the tables, blocks of docs and README."""
 
 import math
 import os
@@ -26,6 +26,7 @@ from benchmarks.published import (
     runs_of,
     table,
 )
+from benchmarks.readme import readme_lines
 from benchmarks.statements import (
     STATEMENTS,
     TOLERANCE,
@@ -62,35 +63,32 @@ and do not compete. **Bold** is the best LPP of those that do.
 """
 
 
-def write_summary(folder: Path, docs_page: Path) -> Path:
-    """Write `README.md` into a folder of suites, and a block of it into `docs_page`.
+def write_summary(folder: Path, *, docs_page: Path, readme: Path) -> Path:
+    """Write `README.md` into a folder of suites, and a block of it into two others.
 
     The same tables give the same bytes.
 
     Raises:
-        SystemExit: If there are no results, or `docs_page` has no place for the block.
+        SystemExit: If there are no results, or one of the two has no place for a block.
     """
     published = Published.read(folder)
     page = folder / "README.md"
-    link = Path(os.path.relpath(page, docs_page.parent)).as_posix()
-    text = _with_block(docs_page, "\n".join(_block(published, link)))
-    for path, content in (
-        (page, "\n".join(_page(published, folder)) + "\n"),
-        (docs_page, text),
-    ):
+    texts = {page: "\n".join(_page(published, folder)) + "\n"}
+    for other, lines_of in ((docs_page, _block), (readme, readme_lines)):
+        link = Path(os.path.relpath(page, other.parent)).as_posix()
+        texts[other] = _with_block(other, "\n".join(lines_of(published, link)))
+    for path, text in texts.items():
         with write_atomically(path) as temporary:
-            temporary.write_text(content)
+            temporary.write_text(text)
     return page
 
 
-def _with_block(docs_page: Path, block: str) -> str:
-    text = docs_page.read_text()
+def _with_block(path: Path, block: str) -> str:
+    text = path.read_text()
     before, begin, rest = text.partition(BEGIN)
     old, end, after = rest.partition(END)
     if not begin or not end or any(m in before + old + after for m in (BEGIN, END)):
-        raise SystemExit(
-            f"{docs_page} needs one line {BEGIN} and, below it, one {END}."
-        )
+        raise SystemExit(f"{path} needs one line {BEGIN} and, below it, one {END}.")
     return f"{before}{BEGIN}\n{block}\n{END}{after}"
 
 

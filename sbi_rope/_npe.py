@@ -17,6 +17,7 @@ from sbi_rope._sbi import (
     estimator_of,
     headless,
     posterior_from,
+    readable,
     with_embedding,
 )
 from sbi_rope._validation import (
@@ -24,8 +25,10 @@ from sbi_rope._validation import (
     check_device,
     check_finite,
     check_in_support,
+    check_readable,
     check_same_length,
     check_tensor,
+    check_values,
 )
 from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError
 
@@ -128,6 +131,7 @@ class TrainedNPE:
     def checked_pairs(self, theta: Any, x: Any) -> tuple[Tensor, Tensor]:
         """Return a copy of a user's labelled observations, in the estimator's dtype."""
         theta = self._checked("theta", theta, self.estimator.input_shape)
+        check_finite("theta", theta)
         x = self.checked_x("x", x)
         check_same_length("theta", theta, "x", x)
         check_in_support("theta", theta, self.prior)
@@ -135,11 +139,17 @@ class TrainedNPE:
 
     def checked_x(self, name: str, x: Any) -> Tensor:
         """Return a copy of a user's observations, in the estimator's dtype."""
-        return self._checked(name, x, self.event_shape)
+        x = self._checked(name, x, self.event_shape)
+        check_readable(name, x, self.readable(x))
+        return x
+
+    def readable(self, x: Tensor) -> Tensor:
+        """Tell which observations h can read, ``(n,)``; some nets can read NaN."""
+        return readable(self.h, x)
 
     def _checked(self, name: str, value: Any, event_shape: torch.Size) -> Tensor:
         check_device(name, check_tensor(name, value), self.like.device)
-        value = check_batch(name, value, event_shape)
-        value = value.detach().to(self.like.dtype, copy=True)
-        check_finite(name, value)  # numbers that float32 cannot hold have become Inf
-        return value
+        value = check_batch(name, value, event_shape, finite=False)
+        check_values(name, value)
+        # Numbers that float32 cannot hold become Inf.
+        return value.detach().to(self.like.dtype, copy=True)

@@ -26,8 +26,10 @@ from sbi_rope.errors import (
 __all__ = [
     "Embedding",
     "Moments",
+    "Readable",
     "SimulationSource",
     "StoredSimulations",
+    "all_finite",
     "draw_targets",
     "warn_of_dropped",
 ]
@@ -38,6 +40,13 @@ NUM_AROUND = 50
 NUM_NEAR = 10
 
 Embedding = Callable[[Tensor], Tensor]
+# Tells which simulations an embedding net can read, ``(n, *event)`` to ``(n,)``.
+Readable = Callable[[Tensor], Tensor]
+
+
+def all_finite(x: Tensor) -> Tensor:
+    """Tell which rows are finite, which is what most embedding nets can read."""
+    return torch.isfinite(x).flatten(1).all(dim=1)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -63,13 +72,17 @@ class Moments:
 
 
 class SimulationSource(Protocol):
-    """What RoPE needs of simulations. Each is reduced to its embedding at once.
+    """What RoPE needs of simulations. Each is reduced to its embedding at once."""
 
-    Attributes:
-        num_dropped: How many simulations were dropped so far because of NaN or Inf.
-    """
+    @property
+    def num_dropped(self) -> int:
+        """How many simulations were dropped so far because of NaN or Inf."""
+        ...
 
-    num_dropped: int
+    @property
+    def num_calls(self) -> int:
+        """How many rows a simulator has simulated so far."""
+        ...
 
     def from_prior(
         self, count: int | None, at_least: int, embed: Embedding, *, progress: bool
@@ -124,7 +137,12 @@ class SimulationSource(Protocol):
 
 
 class StoredSimulations:
-    """Pairs (theta, x) simulated beforehand; pairs that are not finite are dropped."""
+    """Pairs (theta, x) simulated beforehand; pairs that are not finite are dropped.
+
+    Pairs with an x that has missing entries (NaN) are kept if it is ``readable``.
+    """
+
+    num_calls = 0
 
     def __init__(
         self,
@@ -134,6 +152,7 @@ class StoredSimulations:
         theta_shape: torch.Size,
         event_shape: torch.Size,
         like: Tensor,
+        readable: Readable = all_finite,
     ) -> None:
         if not isinstance(simulations, tuple | list) or len(simulations) != 2:
             raise InvalidTypeError(
@@ -150,7 +169,7 @@ class StoredSimulations:
         check_same_length("simulations[0]", theta, "simulations[1]", x)
         theta, x = theta.detach().to(like), x.detach().to(like)
         valid = torch.isfinite(theta).all(dim=1)
-        valid &= torch.isfinite(x).flatten(1).all(dim=1)
+        valid &= readable(x)
         if not valid.any():
             raise SimulationError("All stored simulations contain NaN or Inf.")
         warn_of_dropped(int((~valid).sum()), len(valid), "stored simulations")

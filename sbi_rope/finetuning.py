@@ -9,8 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
-from sbi_rope._sbi import embed
+from sbi_rope._sbi import embed, readable
 from sbi_rope._training import (
     History,
     best_of_learning_rates,
@@ -27,8 +28,10 @@ from sbi_rope._validation import (
     check_integer,
     check_not_negative,
     check_positive,
+    check_readable,
     check_same_length,
     check_tensor,
+    check_values,
 )
 from sbi_rope.errors import InvalidInputError
 
@@ -154,7 +157,7 @@ class CalibrationFinetuner:
         draw_simulations: Callable[[int], Tensor] | None = None,
         groups: Tensor | None = None,
         seed: int | None = None,
-        show_progress_bars: bool = True,
+        show_progress_bars: bool | None = None,
     ) -> FinetuneResult:
         """Tune a copy of the embedding net; the net itself does not change.
 
@@ -170,7 +173,8 @@ class CalibrationFinetuner:
                 number, such as recordings of one person, are held out together. None
                 if all pairs have different parameters.
             seed: Seed of the split and of the simulations; None uses torch's state.
-            show_progress_bars: Whether to show the losses during training.
+            show_progress_bars: Whether to show the losses during training. None does so
+                in a terminal or a notebook, but not in a file.
 
         Returns:
             The tuned net and its history.
@@ -183,6 +187,7 @@ class CalibrationFinetuner:
         check_instance("embedding_net", embedding_net, nn.Module)
         x = _checked_inputs("x", x, embedding_net)
         groups = _checked_groups(groups, x)
+        show = is_shown(show_progress_bars)
         with seeded(seed):
             embedded = _embedded("x", x, embedding_net)
 
@@ -207,7 +212,7 @@ class CalibrationFinetuner:
                     max_num_epochs=max_num_epochs,
                     keep=keep,
                     draw_targets=checked_targets if self.resample_targets else None,
-                    show_progress_bars=show_progress_bars,
+                    show_progress_bars=show,
                 )
 
             # The careful rate for a net, the larger for an affine map.
@@ -311,11 +316,13 @@ def _checked_inputs(name: str, x: Any, net: nn.Module) -> Tensor:
         raise InvalidInputError(
             f"Expected `{name}` of shape (n, *event); got {tuple(x.shape)}."
         )
-    check_batch(name, x, x.shape[1:])
+    check_batch(name, x, x.shape[1:], finite=False)
+    check_values(name, x)
     known = itertools.chain(net.parameters(), net.buffers())
     dtypes = [values.dtype for values in known if values.is_floating_point()]
     x = x.detach().to(dtypes[0] if dtypes else torch.float32)
-    check_finite(name, x)  # numbers that this dtype cannot hold have become Inf
+    # Numbers that this dtype cannot hold have become Inf.
+    check_readable(name, x, readable(net, x))
     return x
 
 

@@ -8,6 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from sbi_rope._npe import TrainedNPE
+from sbi_rope._pickling import picklable
+from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed
 from sbi_rope._simulations import SimulationSource, draw_targets
@@ -66,18 +68,27 @@ class RoPE:
             ignored. It must be amortised. A posterior trained over several rounds fits
             one observation only; RoPE cannot recognise it, so do not pass one.
         simulator: Maps parameters ``(n, d)`` to simulations ``(n, *event)``, or one
-            ``(d,)`` to one ``(*event)``. A row of x may depend on the same row of theta
-            only. The simulator is tried on about fifteen parameters to check that.
-            Simulations with NaN or Inf are dropped and counted.
+            ``(d,)`` to one ``(*event)``. It may take tensors or NumPy arrays (of
+            float64), and return either, lists, or numbers. A row of x may depend on the
+            same row of theta only. The simulator is tried on about thirty parameters
+            to find that out. Simulations with NaN or Inf, and those for which the
+            simulator raises, are dropped and counted. :func:`~sbi_rope.parallel` calls
+            it in several processes.
         simulations: Instead of a simulator, stored pairs (theta, x) with theta drawn
             from the prior. Fine-tuning then uses those with the nearest parameters.
+            There is a warning if there are fewer than 1000.
+        num_simulations: For a simulator that takes long: how many simulations it makes
+            in all, at draws of the prior, when they are first needed. They are then
+            used as stored simulations are. If None, the simulator is called as often as
+            the steps ask for it, see :attr:`num_simulator_calls`.
         finetuner: Settings of step 1; ``CalibrationFinetuner()`` if None.
         coupler: Settings of step 2; ``SinkhornCoupler()`` if None.
 
     Raises:
         UnsupportedPosteriorError: If the posterior has no embedding to work with.
-        InvalidInputError: If both or none of simulator and simulations are given, or
-            their shapes do not fit the posterior.
+        InvalidInputError: If both or none of simulator and simulations are given,
+            their shapes do not fit the posterior, or ``num_simulations`` is given
+            without a simulator.
         NotReadyError: If torch's default dtype is not float32.
         SimulationError: If the simulator raises or returns something unusable.
 
@@ -105,21 +116,25 @@ class RoPE:
         self,
         posterior: Any,
         *,
-        simulator: Callable[[Tensor], Tensor] | None = None,
+        simulator: Callable[[Any], Any] | None = None,
         simulations: tuple[Tensor, Tensor] | None = None,
+        num_simulations: int | None = None,
         finetuner: CalibrationFinetuner | None = None,
         coupler: SinkhornCoupler | None = None,
     ) -> None:
         check_instance("finetuner", finetuner, CalibrationFinetuner, optional=True)
         check_instance("coupler", coupler, SinkhornCoupler, optional=True)
         check_default_dtype()
+        simulator = picklable(simulator)
         self._npe = TrainedNPE(posterior)
         self._source = source_of(
             self._npe.prior,
             simulator=simulator,
             simulations=simulations,
+            num_simulations=num_simulations,
             event_shape=self._npe.event_shape,
             like=self._npe.like,
+            readable=self._npe.readable,
         )
         self.finetuner = CalibrationFinetuner() if finetuner is None else finetuner
         self.coupler = SinkhornCoupler() if coupler is None else coupler
@@ -155,7 +170,7 @@ class RoPE:
         return self
 
     def train(
-        self, *, seed: int | None = None, show_progress_bars: bool = True
+        self, *, seed: int | None = None, show_progress_bars: bool | None = None
     ) -> "RoPE":
         """Tune the embedding net on all calibration pairs appended so far.
 
@@ -165,6 +180,7 @@ class RoPE:
             seed: Seed of the simulations and of the hold-out split, for torch, NumPy
                 and Python; None uses their states.
             show_progress_bars: Whether to show the progress of simulations and losses.
+                None does so in a terminal or a notebook, but not in a file.
 
         Returns:
             Itself, so that calls can be chained.
@@ -183,6 +199,7 @@ class RoPE:
                 "then couples with the embedding net of NPE (OT-only)."
             )
         known = None if self.finetuner.resample_targets else self._targets
+        show = is_shown(show_progress_bars)
 
         def targets(count: int) -> Tensor:
             if known is not None:
@@ -193,19 +210,17 @@ class RoPE:
                 self._embed_simulations,
                 simulations_per_target=count,
                 num_neighbors=self.finetuner.num_neighbors,
-                progress=show_progress_bars,
+                progress=show,
             )
 
         result = self.finetuner.finetune(
             self._npe.h,
             self._x_cal,
             targets,
-            draw_simulations=lambda count: self._source.kept(
-                count, progress=show_progress_bars
-            )[1],
+            draw_simulations=lambda count: self._source.kept(count, progress=show)[1],
             groups=groups_of(self._theta_cal),
             seed=seed,
-            show_progress_bars=show_progress_bars,
+            show_progress_bars=show,
         )
         self._g, self._history = result.embedding_net, result.history
         return self
@@ -216,7 +231,7 @@ class RoPE:
         *,
         num_simulations: int | None = None,
         seed: int | None = None,
-        show_progress_bars: bool = True,
+        show_progress_bars: bool | None = None,
     ) -> EmbeddedBatch:
         r"""Return the embeddings of real observations and of simulations.
 
@@ -229,7 +244,8 @@ class RoPE:
                 simulations, if there are fewer).
             seed: Seed of the simulations, for torch, NumPy and Python; None uses their
                 states.
-            show_progress_bars: Whether to show the progress of slow simulations.
+            show_progress_bars: Whether to show the progress of slow simulations, as in
+                :meth:`train`.
 
         Returns:
             :math:`g(x_o)` (:math:`h(x_o)` without calibration pairs), parameters drawn
@@ -258,7 +274,7 @@ class RoPE:
                 num_simulations,
                 max(len(x_o), MIN_SIMULATIONS),
                 self._embed_simulations,
-                progress=show_progress_bars,
+                progress=is_shown(show_progress_bars),
             )
         return EmbeddedBatch(
             x_o=x_o,
@@ -279,7 +295,7 @@ class RoPE:
         unseen: Literal["raise", "extend"] = "raise",
         require_convergence: bool = True,
         tail_mass: float = 1e-3,
-        show_progress_bars: bool = True,
+        show_progress_bars: bool | None = None,
     ) -> MixturePosterior:
         """Couple a batch of real observations with simulations.
 
@@ -299,7 +315,8 @@ class RoPE:
             require_convergence: Whether a coupling that has not converged is an error.
             tail_mass: The share of the weights that ``log_prob`` may leave out, in
                 [0, 1].
-            show_progress_bars: Whether to show the progress of slow simulations.
+            show_progress_bars: Whether to show the progress of slow simulations, as in
+                :meth:`train`.
 
         Returns:
             The posteriors of the batch.
@@ -415,6 +432,19 @@ class RoPE:
     def num_dropped_simulations(self) -> int:
         """Number of simulations dropped so far because of NaN or Inf."""
         return self._source.num_dropped
+
+    @property
+    def num_simulator_calls(self) -> int:
+        """How many rows of theta the simulator has simulated so far.
+
+        Up to thirty are simulated when RoPE is constructed, to find out how the
+        simulator is called. :meth:`train` simulates 100 for each label (and 2000 with
+        rehearsal), :meth:`build_posterior` ``max(n_o, 1000)`` for each batch, and
+        :func:`~sbi_rope.stack` 20,000 from the prior and 100 for each label, and with a
+        batch 2000 and ``max(n_o, 1000)`` more. The argument ``num_simulations`` of this
+        class sets a number for all of these together.
+        """
+        return self._source.num_calls
 
     def __repr__(self) -> str:
         name = type(self._npe.estimator).__name__

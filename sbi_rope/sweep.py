@@ -34,7 +34,7 @@ def sweep(
     unseen: Literal["raise", "extend"] = "raise",
     require_convergence: bool = True,
     tail_mass: float = 1e-3,
-    show_progress_bars: bool = True,
+    show_progress_bars: bool | None = None,
 ) -> Iterator[MixturePosterior]:
     """Couple a batch at every gamma and every tau, with the same simulations.
 

@@ -1,6 +1,7 @@
 """Small problems shared by the tests: trained estimators, and mixtures of Gaussians."""
 
 import functools
+import logging
 import math
 import warnings
 from collections.abc import Callable
@@ -10,6 +11,7 @@ from typing import Any
 import torch
 from sbi.inference import FMPE, MNPE, NPE, NPSE
 from sbi.neural_nets import posterior_flow_nn, posterior_nn, posterior_score_nn
+from sbi.neural_nets.embedding_nets import PermutationInvariantEmbedding
 from sbi.neural_nets.estimators import ConditionalDensityEstimator
 from sbi.utils import BoxUniform, MultipleIndependent
 from torch import Size, Tensor, nn
@@ -113,6 +115,35 @@ def npe_posterior(
         npe = trainer(prior, density_estimator=builder, show_progress_bars=False)
         npe.append_simulations(theta, x)
         npe.train(max_num_epochs=num_epochs, training_batch_size=50)
+        return npe.build_posterior()
+
+
+def simulate_trials(theta: Tensor) -> Tensor:
+    """Up to four noisy readings of theta, (n, 4, 2); those that are missing are NaN."""
+    trials = theta[:, None] + 0.3 * torch.randn(len(theta), 4, 2)
+    number = torch.randint(1, 5, (len(theta), 1))
+    return trials.where((torch.arange(4) < number)[..., None], torch.nan)
+
+
+@functools.cache
+def trials_posterior() -> Any:
+    """Train a small NPE on trials some of which are missing; for reading only."""
+    with torch.random.fork_rng(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        torch.manual_seed(1)
+        net = PermutationInvariantEmbedding(
+            nn.Linear(2, 4), 4, num_hiddens=8, output_dim=3, aggregation_fn="mean"
+        )
+        builder = posterior_nn(
+            "mdn", embedding_net=net, z_score_x="none", hidden_features=10
+        )
+        theta = box(2).sample((200,))
+        npe = NPE(box(2), density_estimator=builder, show_progress_bars=False)
+        # sbi warns by its logger that NaN is kept, which is meant here.
+        logging.disable()
+        npe.append_simulations(theta, simulate_trials(theta), exclude_invalid_x=False)
+        logging.disable(logging.NOTSET)
+        npe.train(max_num_epochs=5, training_batch_size=50)
         return npe.build_posterior()
 
 

@@ -1,7 +1,5 @@
 """sbi's trainer of NPE, which is told what to hold out and what to add to its loss."""
 
-import contextlib
-import io
 from collections.abc import Callable
 from typing import Any
 
@@ -11,6 +9,7 @@ from sbi.neural_nets.estimators.base import ConditionalDensityEstimator
 from torch import Tensor
 from torch.utils.data import DataLoader, SubsetRandomSampler
 
+from sbi_rope._progress import progress_bar
 from sbi_rope._training import History, groups_to_hold_out
 
 __all__ = ["SimulationTrainer", "train_npe"]
@@ -39,7 +38,7 @@ def train_npe(
         change_x: Applied to the x of every batch before its loss is taken.
         penalty: Of the estimator, a term that is added to the loss of every training
             batch; None adds nothing.
-        show_progress_bars: Whether sbi shows the number of epochs.
+        show_progress_bars: Whether to show the number of epochs.
         learning_rate: Step size of Adam.
         max_num_epochs: Most passes over the training data; two at least are made.
         **options: The other options of sbi's ``train``.
@@ -56,20 +55,13 @@ def train_npe(
         tracker=_NoTracker(),
         show_progress_bars=show_progress_bars,
     )
-    # sbi prints that it has converged whether or not it was asked to be quiet.
-    quiet = (
-        contextlib.nullcontext()
-        if show_progress_bars
-        else contextlib.redirect_stdout(io.StringIO())
+    trainer.append_simulations(theta, x)
+    estimator = trainer.train(
+        learning_rate=learning_rate,
+        # sbi trains one epoch more than it is told, and at least two.
+        max_num_epochs=max(1, max_num_epochs - 1),
+        **options,
     )
-    with quiet:
-        trainer.append_simulations(theta, x)
-        estimator = trainer.train(
-            learning_rate=learning_rate,
-            # sbi trains one epoch more than it is told, and at least two.
-            max_num_epochs=max(1, max_num_epochs - 1),
-            **options,
-        )
     losses = trainer.summary["validation_loss"]
     best = min(range(len(losses)), key=losses.__getitem__)
     history = History(trainer.summary["training_loss"], losses, best, learning_rate)
@@ -82,6 +74,10 @@ class SimulationTrainer(NPE):
     Where a few stored people are recorded many times, a network can learn them by
     heart; only people it has not met say when to stop. Recordings of a single person
     are split one by one.
+
+    It shows a progress bar on stderr, or nothing. sbi prints to stdout, a line for each
+    epoch in a log file, and prints that it has converged even if it was asked to be
+    quiet.
     """
 
     def __init__(
@@ -94,6 +90,7 @@ class SimulationTrainer(NPE):
         super().__init__(**options)
         self._change_x = change_x
         self._penalty = penalty
+        self._bar: Any = None
 
     def get_dataloaders(
         self,
@@ -127,6 +124,16 @@ class SimulationTrainer(NPE):
                 sampler=SubsetRandomSampler(rows.tolist()),
             )
         return train, held_out
+
+    def _maybe_show_progress(self, show: bool, epoch: int) -> None:  # type: ignore[override]  # noqa: FBT001
+        if self._bar is None:
+            self._bar = progress_bar(show=show, desc="Training NPE", unit=" epochs")
+        self._bar.update()
+
+    def _report_convergence_at_end(self, epoch: int, max_num_epochs: int) -> None:
+        self._bar.close()
+        if epoch > max_num_epochs:  # sbi warns of that, and prints otherwise
+            super()._report_convergence_at_end(epoch, max_num_epochs)
 
     def _loss(self, theta: Tensor, x: Tensor, *args: Any, **kwargs: Any) -> Tensor:
         if self._change_x is not None:

@@ -20,6 +20,7 @@ __all__ = [
     "check_in_support",
     "check_not_nan",
     "check_prior",
+    "check_readable",
     "check_rows",
     "check_same_length",
     "check_tensor",
@@ -107,6 +108,29 @@ def check_finite(name: str, value: Tensor) -> None:
         )
 
 
+def check_readable(name: str, value: Tensor, can_read: Tensor) -> None:
+    """Raise if there are observations that the embedding net cannot read.
+
+    Args:
+        name: What the argument is called.
+        value: Observations, shape ``(n, *event)``.
+        can_read: Which of them can be read, shape ``(n,)``.
+    """
+    if can_read.all():
+        return
+    hint = ""
+    if torch.isnan(value[~can_read]).any():
+        hint = (
+            " NaN may stand for missing trials if the embedding net leaves these out, "
+            "as sbi's PermutationInvariantEmbedding does; here it does not, or all "
+            "trials are missing."
+        )
+    raise InvalidInputError(
+        f"Expected `{name}` to be finite; got NaN or Inf in {_rows_with(~can_read)}. "
+        f"Remove or repair these rows.{hint}"
+    )
+
+
 def check_not_nan(name: str, value: Tensor) -> None:
     """Raise if an entry is NaN. Infinite entries can be compared and are allowed."""
     check_values(name, value)
@@ -144,6 +168,7 @@ def check_batch(
     if tuple(value.shape[1:]) != tuple(event_shape) or value.ndim == 0:
         raise InvalidInputError(
             f"Expected `{name}` of shape {expected}; got {tuple(value.shape)}."
+            f"{_hint(name, value.shape, event_shape)}"
         )
     if value.shape[0] == 0 and not allow_empty:
         raise InvalidInputError(
@@ -215,6 +240,7 @@ def check_theta(theta: Any, event_shape: torch.Size, *, batched: bool) -> Tensor
     if theta.ndim not in ndims or theta.shape[-1:] != event_shape:
         raise InvalidInputError(
             f"Expected `theta` of shape {expected}; got {tuple(theta.shape)}."
+            f"{_hint('theta', theta.shape, event_shape)}"
         )
     if not theta.numel():
         raise InvalidInputError(
@@ -253,6 +279,15 @@ def check_in_support(name: str, theta: Tensor, prior: Any) -> None:
             f"of {theta.shape[0]} rows are outside (first: {first}). Check the units "
             f"and the order of the parameters, or train NPE with a wider prior."
         )
+
+
+def _hint(name: str, shape: Sequence[int], event_shape: Sequence[int]) -> str:
+    """Say how to add the dimension that a tensor lacks; nothing if that is not it."""
+    if tuple(shape) == tuple(event_shape):
+        return f" For a single one pass `{name}[None]`."
+    if len(shape) == 1 and tuple(event_shape) == (1,):
+        return f" For one number in each row pass `{name}[:, None]`."
+    return ""
 
 
 def _rows_with(bad: Tensor) -> str:

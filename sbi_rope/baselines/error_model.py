@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sbi_rope._progress import progress_bar
 from sbi_rope._sbi import SliceSamplerVectorized
 from sbi_rope._validation import (
     check_not_nan,
@@ -134,7 +133,6 @@ def denoise(
     simulated: Tensor,
     error_model: SpikeAndSlab,
     settings: ChainSettings,
-    show_progress_bars: bool = True,
 ) -> tuple[Tensor, Tensor]:
     r"""Draw the statistics that a simulator may have had behind real ones.
 
@@ -152,7 +150,6 @@ def denoise(
         simulated: Standardised simulated statistics, shape ``(n_s, l)``.
         error_model: :math:`p(y \mid s)`, with :math:`\sigma` its ``spike_std``.
         settings: Number of draws, chains and so on.
-        show_progress_bars: Whether to show a bar once it takes longer.
 
     Returns:
         Draws of s, shape ``(n, num_draws, l)``, and the largest split-R-hat of the
@@ -161,25 +158,17 @@ def denoise(
     sigma = error_model.spike_std
     kept = math.ceil(settings.num_draws / settings.num_chains)
     draws, r_hats = [], []
-    with progress_bar(
-        show=show_progress_bars,
-        desc="Denoising",
-        total=len(y),
-        delay=5.0,
-        leave=False,
-    ) as bar:
-        for part in y.split(GROUP_SIZE):
-            start = _starts(part, simulated, error_model, settings.num_chains)
-            z = _slice_sample(part, start, log_density, error_model, settings, kept)
-            r_hats.append(split_r_hat(z).amax(dim=-1))
-            s = (
-                part[:, None, None]
-                - sigma * torch.sinh(z)[:, :, settings.thin - 1 :: settings.thin]
-            )
-            # Alternating between the chains, so that dropping the last ones of an
-            # uneven number takes from all alike.
-            draws.append(s.transpose(1, 2).flatten(1, 2)[:, : settings.num_draws])
-            bar.update(len(part))
+    for part in y.split(GROUP_SIZE):
+        start = _starts(part, simulated, error_model, settings.num_chains)
+        z = _slice_sample(part, start, log_density, error_model, settings, kept)
+        r_hats.append(split_r_hat(z).amax(dim=-1))
+        s = (
+            part[:, None, None]
+            - sigma * torch.sinh(z)[:, :, settings.thin - 1 :: settings.thin]
+        )
+        # Alternating between the chains, so that dropping the last ones of an uneven
+        # number takes from all alike.
+        draws.append(s.transpose(1, 2).flatten(1, 2)[:, : settings.num_draws])
     return torch.cat(draws).to(y), torch.cat(r_hats).to(y)
 
 

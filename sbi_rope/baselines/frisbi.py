@@ -140,7 +140,7 @@ class FRISBI(Method):
         prior: Any,
         density_estimator: str | EstimatorBuilder = "nsf",
         *,
-        simulator: Callable[[Tensor], Tensor] | None = None,
+        simulator: Callable[[Any], Any] | None = None,
         gamma: float = 0.5,
         num_simulations: int = 1000,
         simulations_per_target: int = 100,

@@ -122,7 +122,7 @@ class ReferenceNPE(Method):
     def simulated_test_set(
         self,
         theta: Tensor,
-        simulator: Callable[[Tensor], Tensor],
+        simulator: Callable[[Any], Any],
         *,
         seed: int | None = None,
     ) -> tuple[Tensor, Tensor]:

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from sbi_rope._validation import check_instance, check_integer
 from sbi_rope.coupling import SinkhornCoupler
@@ -60,7 +59,7 @@ class OTOnly(Method):
         prior: Any,
         density_estimator: str | EstimatorBuilder = "nsf",
         *,
-        simulator: Callable[[Tensor], Tensor] | None = None,
+        simulator: Callable[[Any], Any] | None = None,
         coupler: SinkhornCoupler | None = None,
         num_simulations: int | None = None,
         npe_training: Training | None = None,

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from sbi_rope._training import History
 from sbi_rope._validation import check_instance
@@ -57,7 +56,7 @@ class TuningOnly(Method):
         prior: Any,
         density_estimator: str | EstimatorBuilder = "nsf",
         *,
-        simulator: Callable[[Tensor], Tensor] | None = None,
+        simulator: Callable[[Any], Any] | None = None,
         finetuner: CalibrationFinetuner | None = None,
         npe_training: Training | None = None,
         device: str | torch.device = "cpu",

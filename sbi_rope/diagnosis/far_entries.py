@@ -35,9 +35,9 @@ def far_findings(embedding_net: nn.Module, x_o: Tensor) -> list[Finding]:
             ),
             reason=(
                 "Alarming above the threshold, which is far beyond any error of a "
-                "simulator. The units may differ, or the entry may not vary in "
-                "simulations, and the answer of NPE is arbitrary. Leave the entry out, "
-                "or train NPE with z_score_x='structured'."
+                "simulator. Above it, the units may differ, or the entry may not vary "
+                "in simulations, and the answer of NPE is arbitrary. Then leave the "
+                "entry out, or train NPE with z_score_x='structured'."
             ),
         )
     ]

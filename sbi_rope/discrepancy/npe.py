@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
+from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import (
     ConditionalDensityEstimator,
@@ -123,7 +124,7 @@ class DiscrepancyNPE(Method):
         prior: Any,
         density_estimator: str | EstimatorBuilder = "nsf",
         *,
-        simulator: Callable[[Tensor], Tensor] | None = None,
+        simulator: Callable[[Any], Any] | None = None,
         space: Space = "embedding",
         learn_prior: bool = False,
         model: DiscrepancyModel | None = None,
@@ -212,7 +213,7 @@ class DiscrepancyNPE(Method):
         *,
         x_names: Sequence[str] | None = None,
         seed: int | None = 0,
-        show_progress_bars: bool = True,
+        show_progress_bars: bool | None = None,
     ) -> DiscrepancyReport:
         """Compare simulations with real observations, summary by summary.
 
@@ -223,7 +224,8 @@ class DiscrepancyNPE(Method):
             x_names: Names of the entries of x; numbered if None.
             seed: Seed of the simulations; None uses the states of torch, NumPy and
                 Python.
-            show_progress_bars: Whether to show the progress of slow simulations.
+            show_progress_bars: Whether to show the progress of slow simulations, as in
+                :meth:`train`.
 
         Returns:
             The gain, shift and error of each summary with 95 % intervals, in the units
@@ -245,12 +247,11 @@ class DiscrepancyNPE(Method):
                 "Expected observations of shape (n, l), with a summary in each column; "
                 f"got {tuple(x.shape)}. Reduce x to summaries with names first."
             )
+        show = is_shown(show_progress_bars)
         with seeded(seed):
             source = self._source()
-            _, simulated = source.kept(
-                self.num_simulations, progress=show_progress_bars
-            )
-            moments = self._moments(source, nn.Identity(), show_progress_bars)
+            _, simulated = source.kept(self.num_simulations, progress=show)
+            moments = self._moments(source, nn.Identity(), show)
         return report_discrepancy(
             x, moments, simulated, model=self.model, x_names=x_names
         )

@@ -19,16 +19,17 @@ from typing import Any
 
 import torch
 from sbi.inference import DirectPosterior, EnsemblePosterior, VectorFieldPosterior
-from torch import Tensor
+from torch import Tensor, nn
 
 from sbi_rope._progress import progress_bar
-from sbi_rope._sbi import NeuralPosterior, is_bounded
+from sbi_rope._sbi import MixtureDensity, NeuralPosterior, is_bounded, readable
 from sbi_rope._slices import slices
 from sbi_rope._validation import (
     as_float32,
     check_batch,
     check_device,
     check_integer,
+    check_readable,
     check_same_length,
     check_tensor,
     check_values,
@@ -90,13 +91,17 @@ def check_test_set(
         InvalidInputError: If a shape does not fit or an entry is not finite.
     """
     check_integer("chunk_size", chunk_size)
-    check_batch("theta", theta, check_tensor("theta", theta).shape[-1:])
-    check_batch("x", x, check_tensor("x", x).shape[1:])
-    check_same_length("theta", theta, "x", x)
+    theta_shape = check_tensor("theta", theta).shape[1:]
     if isinstance(posterior, DirectPosterior):
-        estimator = posterior.posterior_estimator
-        check_batch("theta", theta, estimator.input_shape, finite=False)
-        check_batch("x", x, estimator.condition_shape, finite=False)
+        theta_shape = posterior.posterior_estimator.input_shape
+    if len(theta_shape) != 1:
+        raise InvalidInputError(
+            f"Expected `theta` of shape (n, d); got {tuple(theta.shape)}. For one "
+            "parameter pass `theta[:, None]`."
+        )
+    check_batch("theta", theta, theta_shape)
+    _check_x(posterior, x)
+    check_same_length("theta", theta, "x", x)
     if isinstance(posterior, NeuralPosterior):  # sbi's estimators use float32
         return as_float32("theta", theta), as_float32("x", x)
     return theta, x
@@ -194,7 +199,7 @@ def draw_samples(posterior: Any, x: Tensor, *, num_samples: int) -> Tensor:
             from 1 to 10^8.
     """
     check_num_samples(num_samples)
-    check_batch("x", x, _event_shape(posterior, check_tensor("x", x)))
+    _check_x(posterior, x)
     if isinstance(posterior, NeuralPosterior):
         x = as_float32("x", x)
     samples = _sample(posterior, x, num_samples)
@@ -206,10 +211,18 @@ def draw_samples(posterior: Any, x: Tensor, *, num_samples: int) -> Tensor:
     return samples
 
 
-def _event_shape(posterior: Any, x: Tensor) -> torch.Size:
-    """Return the shape of an observation that the posterior expects, if it says so."""
+def _check_x(posterior: Any, x: Any) -> None:
+    """Raise if observations do not fit, or are not finite and cannot be read so."""
     estimator = getattr(posterior, "posterior_estimator", None)
-    return getattr(estimator, "condition_shape", x.shape[1:])
+    event_shape = getattr(estimator, "condition_shape", check_tensor("x", x).shape[1:])
+    check_batch("x", x, event_shape, finite=False)
+    check_values("x", x)
+    if isinstance(estimator, MixtureDensity):
+        return  # it checks that itself
+    net = getattr(estimator, "embedding_net", None)
+    if not isinstance(net, nn.Module) or torch.isfinite(x).all():
+        net = nn.Identity()
+    check_readable("x", x, readable(net, x))
 
 
 def _sample(posterior: Any, x: Tensor, num_samples: int) -> Tensor:

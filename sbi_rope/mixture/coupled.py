@@ -7,7 +7,7 @@ from typing import Any, Literal, cast
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._sbi import embed
+from sbi_rope._sbi import embed, readable
 from sbi_rope._validation import (
     check_batch,
     check_choice,
@@ -141,6 +141,12 @@ class CoupledEmbeddings(Mixing):
             embedded[new] = self._unseen_embedded(x[new])
         return embedded
 
+    def readable(self, x: Tensor) -> Tensor:
+        """Tell which observations are in the batch, or can be read by all nets."""
+        known = [key in self._index for key in _keys(x.to(self.batch))]
+        new = torch.stack([readable(net.net, x) for net in self.nets]).all(dim=0)
+        return torch.tensor(known, device=x.device) | new
+
     def rows(self, embedded: Tensor) -> Rows:
         """Return the weights of the simulations for a block of observations."""
         pairs = zip(self.nets, embedded.unbind(dim=1), strict=True)
@@ -184,6 +190,10 @@ class CoupledEmbeddings(Mixing):
         return CoupledEmbeddings(
             self.simulated, self.batch[row], nets, unseen=self.unseen
         )
+
+    def __getstate__(self) -> dict[str, Any]:
+        # The observations that were asked for last are no part of the posterior.
+        return {**super().__getstate__(), "_extended": None}
 
     def _unseen_embedded(self, x: Tensor) -> Tensor:
         # log_prob and its normalisation, or the steps of map(), ask for the same x
@@ -232,5 +242,7 @@ class CoupledEmbeddings(Mixing):
 def _keys(x: Tensor) -> list[bytes]:
     """Return a fingerprint of each row's values."""
     # Adding zero turns -0.0 into 0.0. The two are equal, and so should their bytes be.
-    rows = (x.detach().cpu().flatten(1) + 0.0).contiguous().numpy()
+    # The same holds for the NaN of missing entries, whose bits may differ.
+    rows = x.detach().cpu().flatten(1) + 0.0
+    rows = rows.where(~rows.isnan(), torch.nan).contiguous().numpy()
     return [hashlib.blake2b(row.tobytes(), digest_size=16).digest() for row in rows]

@@ -12,6 +12,7 @@ from sbi_rope._progress import progress_bar
 from sbi_rope._sbi import MixtureDensity
 from sbi_rope._validation import (
     check_batch,
+    check_readable,
     check_same_length,
     check_unit_interval,
     check_weights,
@@ -21,7 +22,7 @@ from sbi_rope.mixture.block import Block
 from sbi_rope.mixture.chunks import blocks, flow_batch, keep_freed_memory
 from sbi_rope.mixture.coupled import CoupledEmbeddings
 from sbi_rope.mixture.density import block_log_prob
-from sbi_rope.mixture.parts import DTYPE, Part
+from sbi_rope.mixture.parts import DTYPE, OwnEmbeddings, Part
 from sbi_rope.mixture.sampling import Accept, BlockSampler
 from sbi_rope.mixture.truncation import (
     LEAKAGE_DRAWS,
@@ -111,16 +112,21 @@ class MixtureEstimator(MixtureDensity):
         """Return the same mixture for one observation of the batch.
 
         It shares its densities with this mixture, and holds no other observation.
+        Embedding nets are left out, unless the coupling can be extended to others.
 
         Args:
             index: The number of the observation in ``x_o``.
         """
-        parts = [
-            Part(part.density, part.mixing.restricted_to(index))
-            if isinstance(part.mixing, CoupledEmbeddings)
-            else part
-            for part in self.parts
-        ]
+        extends = any(mixing.unseen == "extend" for mixing in self.coupled)
+        parts = []
+        for part in self.parts:
+            mixing = part.mixing
+            if isinstance(mixing, CoupledEmbeddings):
+                part = Part(part.density, mixing.restricted_to(index))
+            elif isinstance(mixing, OwnEmbeddings) and not extends:
+                x = self.coupled[0].x_o[[index]]
+                part = Part(part.density, mixing.restricted_to(x))
+            parts.append(part)
         return MixtureEstimator(parts, self.weights, tail_mass=self.tail_mass)
 
     # --- density ---
@@ -144,7 +150,7 @@ class MixtureEstimator(MixtureDensity):
             UnseenObservationError: If an x is not in the batch of a coupled part with
                 ``unseen="raise"``.
         """
-        theta, x = self._checked_theta(input), self._checked_x(condition)
+        theta, x = self._checked_theta(input), self.checked_x(condition)
         num_rows = max(theta.shape[1], len(x))
         if {theta.shape[1], len(x)} - {1, num_rows}:
             raise InvalidInputError(
@@ -187,7 +193,7 @@ class MixtureEstimator(MixtureDensity):
             InvalidInputError: If shapes do not fit or theta is NaN.
             UnseenObservationError: As in :meth:`log_prob`.
         """
-        pairs, x = self._checked_theta(theta), self._checked_x(x)
+        pairs, x = self._checked_theta(theta), self.checked_x(x)
         check_same_length("theta", pairs[0], "x", x)
         numbers = range(len(self.parts)) if numbers is None else numbers
         log_probs = pairs.new_empty(len(x), len(numbers), dtype=torch.double)
@@ -220,8 +226,19 @@ class MixtureEstimator(MixtureDensity):
             theta = theta[None]
         return theta.to(self.weights.device, DTYPE)
 
-    def _checked_x(self, x: Tensor) -> Tensor:
-        return check_batch("x", x, self.condition_shape).to(self.weights.device, DTYPE)
+    def checked_x(self, x: Tensor) -> Tensor:
+        """Return observations ``(n, *event)`` if all parts can read them.
+
+        Raises:
+            InvalidInputError: If a shape does not fit, or a value is not finite. Some
+                embedding nets can do with missing values (NaN).
+        """
+        x = check_batch("x", x, self.condition_shape, finite=False)
+        x = x.to(self.weights.device, DTYPE)
+        if not torch.isfinite(x).all():
+            can_read = torch.stack([part.mixing.readable(x) for part in self._used[0]])
+            check_readable("x", x, can_read.all(dim=0))
+        return x
 
     # --- samples ---
 
@@ -254,7 +271,7 @@ class MixtureEstimator(MixtureDensity):
             SamplingError: If hardly any draw is accepted for some observation.
             UnseenObservationError: As in :meth:`log_prob`.
         """
-        x = self._checked_x(condition)
+        x = self.checked_x(condition)
         keep_freed_memory(x.device)
         num_samples = torch.Size(sample_shape).numel()
         shape = (num_samples, len(x), *self.input_shape)
@@ -298,7 +315,7 @@ class MixtureEstimator(MixtureDensity):
             cache: Keeps the masses that are estimated once, by the number of the part.
             show_progress_bars: Whether to show progress if the estimate takes long.
         """
-        x = self._checked_x(x)
+        x = self.checked_x(x)
         mass = torch.zeros(len(x), dtype=torch.double, device=x.device)
         variance = torch.zeros_like(mass)
         ascending, order = self.weights.sort()

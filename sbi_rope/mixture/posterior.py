@@ -3,6 +3,7 @@
 import copy
 import operator
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -10,12 +11,12 @@ from sbi.utils import within_support
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import BaseDirectPosterior, MixedDensity, describe
 from sbi_rope._validation import (
     as_numbers,
     as_shape,
-    check_batch,
     check_integer,
     check_theta,
     usable_device,
@@ -27,6 +28,7 @@ from sbi_rope.mixture.estimator import MixtureEstimator
 from sbi_rope.mixture.parts import DTYPE
 from sbi_rope.mixture.sampling import Accept
 from sbi_rope.mixture.truncation import Leakage, is_unbounded
+from sbi_rope.saving import save
 
 __all__ = ["MixturePosterior"]
 
@@ -192,6 +194,7 @@ class MixturePosterior(BaseDirectPosterior):
         view.posterior_estimator = estimator
         potential_fn: Any = copy.copy(self.potential_fn)
         potential_fn.posterior_estimator = estimator
+        potential_fn.set_x(None)  # another observation may have been asked for last
         view.potential_fn = potential_fn
         view.set_default_x(view.x_o)
         return view
@@ -221,6 +224,24 @@ class MixturePosterior(BaseDirectPosterior):
         with seeded(0):  # sbi draws from the prior to find out about it
             super().to(device)
 
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write this posterior to a file that :func:`sbi_rope.load` reads.
+
+        No code is executed when the file is loaded. The posterior of one observation,
+        ``posterior[i].save(path)``, holds no other observation.
+
+        Args:
+            path: The file. Its folder is made if there is none.
+            overwrite: Whether to replace a file that exists.
+
+        Raises:
+            InvalidTypeError: If an argument has the wrong type.
+            InvalidInputError: If the posterior holds something that cannot be
+                described, such as a lambda.
+            NotWritableError: If the file exists, or cannot be written.
+        """
+        save(self, path, overwrite=overwrite)
+
     # --- sampling ---
 
     def sample(  # type: ignore[override]
@@ -228,7 +249,7 @@ class MixturePosterior(BaseDirectPosterior):
         sample_shape: Any = (),
         x: Tensor | None = None,
         max_sampling_batch_size: int | None = None,
-        show_progress_bars: bool = True,  # noqa: FBT001, FBT002
+        show_progress_bars: bool | None = None,  # noqa: FBT001
         reject_outside_prior: bool = True,  # noqa: FBT001, FBT002
     ) -> Tensor:
         r"""Draw from :math:`p(\theta \mid x)` of one observation.
@@ -263,7 +284,7 @@ class MixturePosterior(BaseDirectPosterior):
         sample_shape: Any,
         x: Tensor,
         max_sampling_batch_size: int | None = None,
-        show_progress_bars: bool = True,  # noqa: FBT001, FBT002
+        show_progress_bars: bool | None = None,  # noqa: FBT001
         reject_outside_prior: bool = True,  # noqa: FBT001, FBT002
     ) -> Tensor:
         r"""Draw from :math:`p(\theta \mid x_b)` of every observation of a batch.
@@ -274,6 +295,7 @@ class MixturePosterior(BaseDirectPosterior):
             max_sampling_batch_size: The largest number of draws the flow makes at a
                 time. If None, the number that is fast on the device.
             show_progress_bars: Whether to show how many draws were accepted so far.
+                None does so in a terminal or a notebook, but not in a file.
             reject_outside_prior: Whether to draw from the mixtures truncated to the
                 prior's support, or from the whole mixtures.
 
@@ -291,7 +313,7 @@ class MixturePosterior(BaseDirectPosterior):
             self._batch_of_x(x),
             accept=self._inside if reject_outside_prior else None,
             batch_size=max_sampling_batch_size,
-            show_progress_bars=show_progress_bars,
+            show_progress_bars=is_shown(show_progress_bars),
         )
 
     @property
@@ -314,7 +336,8 @@ class MixturePosterior(BaseDirectPosterior):
         Raises:
             InvalidInputError: If the shape does not fit, or a value is not finite.
         """
-        super().set_default_x(self._batch_of_x(x).clone())
+        # sbi's own method refuses any NaN, which some embedding nets can read.
+        self._x, self._map = self._batch_of_x(x).clone().to(self._device), None
         return self
 
     def _one_x(self, x: Tensor | None) -> Tensor:
@@ -337,13 +360,11 @@ class MixturePosterior(BaseDirectPosterior):
         x = as_numbers("x", x).to(torch.float32)
         if x.shape == event_shape:
             x = x[None]
-        if x.shape[1:] != event_shape:
-            # sbi's process_x would add a leading dimension instead.
-            raise InvalidInputError(
-                f"Expected `x` of shape (n, {', '.join(map(str, event_shape))}); got "
-                f"{tuple(x.shape)}."
-            )
-        return check_batch("x", x, event_shape)
+        return self.posterior_estimator.checked_x(x).to(x.device)
+
+    def _x_else_default_x(self, x: Any) -> Tensor:
+        # sbi refuses any NaN, which some embedding nets can read.
+        return self._one_x(x)
 
     def log_prob(
         self,
@@ -360,7 +381,8 @@ class MixturePosterior(BaseDirectPosterior):
             x: An observation, from the batch if there is one; the default x if None.
             norm_posterior: Whether to divide by the mass inside the prior's support.
             track_gradients: Whether gradients with respect to theta are needed.
-            leakage_correction_params: Not used; must be None.
+            leakage_correction_params: None, or ``{"show_progress_bars": True}`` to show
+                the progress of the normalisation if it takes more than five seconds.
 
         Returns:
             Shape ``(n,)``; minus infinity outside the prior's support.
@@ -416,7 +438,8 @@ class MixturePosterior(BaseDirectPosterior):
             x: Observations, shape ``(B, *event)``.
             norm_posterior: Whether to divide by the mass inside the prior's support.
             track_gradients: Whether gradients with respect to theta are needed.
-            leakage_correction_params: Not used; must be None.
+            leakage_correction_params: None, or ``{"show_progress_bars": True}`` to show
+                the progress of the normalisation if it takes more than five seconds.
 
         Returns:
             Shape ``(1, B)`` or ``(S, B)``; minus infinity outside the prior's support.
@@ -498,15 +521,21 @@ class MixturePosterior(BaseDirectPosterior):
         )
 
     def leakage_correction(  # type: ignore[override]
-        self, x: Tensor, **kwargs: Any
+        self,
+        x: Tensor,
+        *,
+        show_progress_bars: bool = False,
+        **kwargs: Any,
     ) -> Tensor:
         r"""Return :math:`Z_i`, shape ``(B,)``; sbi calls it in ``log_prob``."""
         if kwargs:
             raise InvalidInputError(
-                f"Expected no `leakage_correction_params`; got {sorted(kwargs)}. The "
-                "mass inside the prior's support is estimated from 1024 draws."
+                "Expected no `leakage_correction_params` but `show_progress_bars`; got "
+                f"{sorted(kwargs)}. The mass inside the prior's support is estimated "
+                "from 1024 draws."
             )
-        mass = self.leakage(x).mass.to(DTYPE)
+        leakage = self.leakage(x, show_progress_bars=show_progress_bars)
+        mass = leakage.mass.to(DTYPE)
         if not (mass > 0).all():
             rows = (mass <= 0).nonzero().flatten()
             raise SamplingError(

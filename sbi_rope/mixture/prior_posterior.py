@@ -1,5 +1,6 @@
 """The prior in the form of an sbi posterior."""
 
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -19,6 +20,7 @@ from sbi_rope._validation import (
 )
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture.prior import prior_log_prob, prior_sample
+from sbi_rope.saving import save
 
 __all__ = ["PriorPosterior"]
 
@@ -74,7 +76,7 @@ class PriorPosterior(NeuralPosterior):
         self,
         sample_shape: Any = (),
         x: Tensor | None = None,
-        show_progress_bars: bool = True,  # noqa: FBT001, FBT002
+        show_progress_bars: bool | None = None,  # noqa: FBT001
         **kwargs: Any,
     ) -> Tensor:
         """Draw from the prior, ``(*sample_shape, d)``; other arguments are ignored."""
@@ -84,7 +86,7 @@ class PriorPosterior(NeuralPosterior):
         self,
         sample_shape: Any,
         x: Tensor,
-        show_progress_bars: bool = True,  # noqa: FBT001, FBT002
+        show_progress_bars: bool | None = None,  # noqa: FBT001
         **kwargs: Any,
     ) -> Tensor:
         """Draw from the prior for each row of ``x``, ``(*sample_shape, n, d)``.
@@ -154,6 +156,23 @@ class PriorPosterior(NeuralPosterior):
                 "or look for the mode among samples by their `log_prob`."
             )
         return super().map(*args, **kwargs)
+
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write this posterior to a file that :func:`sbi_rope.load` reads.
+
+        No code is executed when the file is loaded.
+
+        Args:
+            path: The file. Its folder is made if there is none.
+            overwrite: Whether to replace a file that exists.
+
+        Raises:
+            InvalidTypeError: If an argument has the wrong type.
+            InvalidInputError: If the posterior holds something that cannot be
+                described, such as a lambda.
+            NotWritableError: If the file exists, or cannot be written.
+        """
+        save(self, path, overwrite=overwrite)
 
     def to(self, device: str | torch.device) -> None:
         """Move the prior and the default x to a device."""

@@ -151,8 +151,16 @@ def fit_couplings(
         settings += [(candidate.name, key[2]) for candidate in of_net]
     if require_convergence:
         _check_converged([c for net in nets for c in net.couplings], settings)
+    # The coupler has converted the simulations for each net. All couplings get the same
+    # tensor, so that memory and pickles hold it once.
+    kept = nets[0].couplings[0].simulated
     nets = [
-        net.with_shares([share / len(nets) for share in net.shares]) for net in nets
+        CoupledNet(
+            net.net,
+            [replace(coupling, simulated=kept) for coupling in net.couplings],
+            [share / len(nets) for share in net.shares],
+        )
+        for net in nets
     ]
     embeddings = CoupledEmbeddings(
         simulated, batch, nets, num_observed=len(x_o), unseen=unseen

@@ -5,12 +5,15 @@ from typing import Literal
 
 from torch import Tensor
 
-from sbi_rope._validation import check_choice, check_unit_interval
+from sbi_rope._validation import check_choice, check_instance, check_unit_interval
 from sbi_rope.rope import RoPE
+from sbi_rope.stacking.batch import compare_batch
 from sbi_rope.stacking.candidates import Candidate
 from sbi_rope.stacking.cross_validation import CrossValidation
+from sbi_rope.stacking.learning_curve import LearningCurve
 from sbi_rope.stacking.posterior import StackedPosterior
-from sbi_rope.stacking.report import LearningCurve, StackingReport
+from sbi_rope.stacking.provenance import Stopwatch
+from sbi_rope.stacking.report import StackingReport
 from sbi_rope.stacking.trainer import StackTrainer
 
 __all__ = ["cross_validate", "stack"]
@@ -32,7 +35,7 @@ def stack(
     tail_mass: float = 1e-3,
     require_convergence: bool = True,
     seed: int | None = None,
-    show_progress_bars: bool = True,
+    show_progress_bars: bool | None = None,
 ) -> StackedPosterior:
     r"""Mix candidate posteriors with the weights that score best on held-out pairs.
 
@@ -51,9 +54,15 @@ def stack(
     observation. With ``x_o``, RoPE and OT-only at many values of gamma and tau take
     part, and the stack belongs to that batch.
 
+    The weights, the scores and the calibration in the report hold for observations like
+    those of the pairs. With ``x_o`` the two are compared by an energy test of their
+    embeddings, and a p-value below 0.01 gives a warning. Without it,
+    :func:`~sbi_rope.diagnose` makes the same comparison.
+
     Args:
         rope: A RoPE with calibration pairs. It need not be trained, and it is not
-            changed, except that it counts the simulations that are dropped.
+            changed, except that it counts calls of the simulator, and the simulations
+            that are dropped.
         x_o: A batch of real observations, shape ``(n_o, *event)``. With None the
             posterior answers any x.
         candidates: What to stack. If None,
@@ -63,7 +72,9 @@ def stack(
         num_folds: The number of folds, 5 if None, and at most the number of different
             parameters. Pairs with the same parameters are in the same fold.
         num_simulations: The number of simulations to couple with, as in
-            :meth:`~sbi_rope.RoPE.build_posterior`.
+            :meth:`~sbi_rope.RoPE.build_posterior`. Candidates are trained on others:
+            the simulator makes 20,000 from the prior and 100 for each label. To have
+            fewer, give RoPE itself a number, ``RoPE(..., num_simulations=2000)``.
         pseudo_count: Strength of the Dirichlet prior of the weights, in pairs.
         learning_curve: Whether to train on fewer folds too, so that the report can
             estimate what more labels would add. It takes about twice the time.
@@ -73,7 +84,8 @@ def stack(
         require_convergence: Whether a coupling that has not converged is an error.
         seed: Seed of everything random; None uses the states of torch, NumPy and
             Python.
-        show_progress_bars: Whether to show how many folds are done.
+        show_progress_bars: Whether to show how many folds are done. None does so in a
+            terminal or a notebook, but not in a file.
 
     Returns:
         The stack, an sbi posterior. Its ``report`` holds the held-out scores, and
@@ -91,6 +103,8 @@ def stack(
     """
     check_choice("unseen", unseen, ("raise", "extend"))
     check_unit_interval("tail_mass", tail_mass)
+    check_instance("rope", rope, RoPE)
+    stopwatch = Stopwatch(rope)
     trainer = StackTrainer(
         rope,
         x_o,
@@ -104,6 +118,8 @@ def stack(
         seed=seed,
         show_progress_bars=show_progress_bars,
     )
+    # This comes first, so that nobody waits for the training to hear of it.
+    batch = None if trainer.x_o is None else compare_batch(trainer.bench, trainer.x_o)
     versions, scores = trainer.cross_validate(with_refit=True)
     curve = None
     if learning_curve:
@@ -117,7 +133,13 @@ def stack(
     return StackedPosterior(
         versions,
         trainer.prior,
-        report=StackingReport.of(scores, curve),
+        report=StackingReport.of(
+            scores,
+            curve,
+            batch=batch,
+            discrepancy=trainer.discrepancy(),
+            provenance=stopwatch.provenance(seed),
+        ),
         enable_transform=trainer.bench.npe.enable_transform,
     )
 
@@ -133,7 +155,7 @@ def cross_validate(
     pseudo_count: float = 1.0,
     require_convergence: bool = True,
     seed: int | None = None,
-    show_progress_bars: bool = True,
+    show_progress_bars: bool | None = None,
 ) -> CrossValidation:
     """Score candidates on calibration pairs that they were not trained on.
 

@@ -4,6 +4,8 @@ import copy
 from dataclasses import dataclass
 from typing import Any
 
+import torch
+
 from sbi_rope._sbi import embedding_of, estimator_of, headless, with_embedding
 from sbi_rope._validation import check_choice, check_instance
 from sbi_rope.discrepancy.correction import Space
@@ -68,10 +70,13 @@ def _has_summaries(bench: Workbench) -> bool:
     """Tell whether x is a short vector and NPE has an embedding net.
 
     Without a net to lose information, correcting x adds nothing to correcting h(x).
+    Where simulations have missing entries (NaN), only h(x) can be corrected.
     """
     net = embedding_of(estimator_of(bench.npe))
     has_net = any(True for _ in net.parameters())
-    return bench.has_summaries and has_net
+    if not bench.has_summaries or not has_net:
+        return False
+    return bool(torch.isfinite(bench.simulations[1]).all())
 
 
 # Learning rates of fine-tuning, by what was corrected in the net that it starts from.

@@ -6,18 +6,20 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from sbi_rope._progress import progress_bar
+from sbi_rope._progress import is_shown, progress_bar
 from sbi_rope._random import seeded
-from sbi_rope._sbi import ConditionalDensityEstimator, estimator_of
+from sbi_rope._sbi import ConditionalDensityEstimator, estimator_of, readable
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._validation import (
     check_batch,
-    check_finite,
     check_gradients,
     check_instance,
     check_integer,
     check_not_negative,
+    check_readable,
+    check_values,
 )
+from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.discrepancy.correction import network_of
 from sbi_rope.errors import (
     InvalidInputError,
@@ -44,6 +46,7 @@ from sbi_rope.stacking.trained_candidates import (
     DiscrepancyCandidate,
     FinetunedCandidate,
 )
+from sbi_rope.stacking.units import log_unit_of
 from sbi_rope.stacking.versions import Versions, train_version
 
 __all__ = ["StackTrainer"]
@@ -68,7 +71,7 @@ class StackTrainer:
         pseudo_count: float,
         require_convergence: bool,
         seed: int | None,
-        show_progress_bars: bool,
+        show_progress_bars: bool | None,
         unseen: Literal["raise", "extend"] = "raise",
         tail_mass: float = 1e-3,
     ) -> None:
@@ -82,12 +85,13 @@ class StackTrainer:
         check_instance("require_convergence", require_convergence, bool)
         _check_pairs(len(rope.calibration[0]))
         self.x_o = None if x_o is None else _checked_observations(x_o, rope)
+        self.show = is_shown(show_progress_bars)
         self.seeds = draw_seeds(seed, 3)
         self.bench = Workbench(
             rope,
             num_folds=NUM_FOLDS if num_folds is None else num_folds,
             seed=self.seeds[0],
-            show_progress_bars=show_progress_bars,
+            show_progress_bars=self.show,
         )
         _check_pairs(len(self.bench.folds))
         _check_density(estimator_of(self.bench.npe))
@@ -97,7 +101,6 @@ class StackTrainer:
         self.require_convergence = require_convergence
         self.unseen: Literal["raise", "extend"] = unseen
         self.tail_mass = tail_mass
-        self.show = show_progress_bars
 
     @property
     def prior(self) -> Any:
@@ -167,6 +170,14 @@ class StackTrainer:
         scores = self._score(versions, num_training_folds)
         return versions, scores
 
+    def discrepancy(self) -> DiscrepancyReport | None:
+        """Return what the pairs say about each entry of x, if a candidate uses it."""
+        corrected = (DiscrepancyCandidate, FinetunedCandidate)
+        spaces = (c.space for c in self.candidates if isinstance(c, corrected))
+        if self.bench.has_summaries and any(space is not None for space in spaces):
+            return self.bench.discrepancy()
+        return None
+
     def _train(self, folds: Sequence[Fold]) -> Versions:
         chosen = self.candidates
         bar = progress_bar(folds, show=self.show, desc="Folds")
@@ -207,6 +218,7 @@ class StackTrainer:
             stack_scores=stack_scores,
             levels=levels,
             pseudo_count=self.pseudo_count,
+            log_unit=log_unit_of(self.prior),
         )
         if not scores.weights.converged:
             warn_user(
@@ -313,7 +325,9 @@ def _check_density(estimator: Any) -> None:
 
 def _checked_observations(x_o: Tensor, rope: RoPE) -> Tensor:
     _, x = rope.calibration
-    x_o = check_batch("x_o", x_o, x.shape[1:]).detach().to(x, copy=True)
-    check_finite("x_o", x_o)  # a large float64 can overflow in float32
+    x_o = check_batch("x_o", x_o, x.shape[1:], finite=False)
+    check_values("x_o", x_o)
+    x_o = x_o.detach().to(x, copy=True)  # a large float64 can overflow in float32
+    check_readable("x_o", x_o, readable(rope.embedding_net, x_o))
     warn_of_far_entries("x_o", x_o, rope.embedding_net)
     return x_o

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
-from sbi_rope._sbi import copy_of_prior, device_of, estimator_of
+from sbi_rope._sbi import copy_of_prior, device_of, embedding_of, estimator_of
 from sbi_rope._simulations import SimulationSource
 from sbi_rope._simulator import source_of
 from sbi_rope._training import History
@@ -72,7 +73,7 @@ class Method(ABC):
         prior: Any,
         *,
         npe: StartingNPE | None = None,
-        simulator: Callable[[Tensor], Tensor] | None = None,
+        simulator: Callable[[Any], Any] | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
         check_prior(prior)
@@ -127,6 +128,7 @@ class Method(ABC):
         assert method._npe is not None
         method._npe.replace_by(posterior)
         method._data.event_shape = estimator.condition_shape
+        method._data.embedding_net = copy.deepcopy(embedding_of(estimator))
         return method
 
     def append_simulations(self, theta: Tensor, x: Tensor) -> "Self":
@@ -195,14 +197,15 @@ class Method(ABC):
         return self._untrained()
 
     def train(
-        self, *, seed: int | None = None, show_progress_bars: bool = True
+        self, *, seed: int | None = None, show_progress_bars: bool | None = None
     ) -> "Self":
         """Train on all data appended so far, from the start.
 
         Args:
             seed: Seed of everything random, for torch, NumPy and Python; None uses
                 their states.
-            show_progress_bars: Whether to show the course of the training.
+            show_progress_bars: Whether to show the course of the training. None does so
+                in a terminal or a notebook, but not in a file.
 
         Returns:
             Itself, so that calls can be chained.
@@ -216,7 +219,7 @@ class Method(ABC):
         # Whatever the caller's own setting of gradients.
         with torch.enable_grad(), seeded(seed):
             self._posterior, self._history = self._fit(
-                show_progress_bars=show_progress_bars
+                show_progress_bars=is_shown(show_progress_bars)
             )
         return self
 
@@ -277,6 +280,7 @@ class Method(ABC):
             simulations=self._data.simulations if self._simulator is None else None,
             event_shape=event_shape,
             like=torch.empty(0, *self._prior.event_shape, device=self._device),
+            readable=self._data.readable,
         )
 
     def _check_data(self) -> None:

@@ -3,13 +3,15 @@
 from typing import Any, Literal
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.distributions import Distribution
 
+from sbi_rope._sbi import readable
 from sbi_rope._validation import (
     check_batch,
     check_finite,
     check_in_support,
+    check_readable,
     check_same_length,
     check_tensor,
     check_values,
@@ -56,12 +58,15 @@ class Data:
 
     Attributes:
         event_shape: Shape of one x, that of the first which was appended; None before.
+        embedding_net: The net that is to read x, if it was trained beforehand. Missing
+            entries (NaN) are accepted if it can read them.
     """
 
     def __init__(self, prior: Distribution, device: torch.device) -> None:
         self._prior = prior
         self._device = device
         self.event_shape: torch.Size | None = None
+        self.embedding_net: nn.Module = nn.Identity()
         self._simulations, self._calibration = Pairs(), Pairs()
         self._x_o: Tensor | None = None
 
@@ -93,7 +98,7 @@ class Data:
         check_in_support("theta", theta, self._prior)
         x = self._checked_x("x", x)
         check_same_length("theta", theta, "x", x)
-        valid = torch.isfinite(x).flatten(1).all(dim=1)
+        valid = self.readable(x)
         if not valid.any():
             raise InvalidInputError(
                 "Expected simulations `x` that are finite; all contain NaN or Inf."
@@ -111,7 +116,7 @@ class Data:
         theta = self.checked_theta("theta", theta)
         check_in_support("theta", theta, self._prior)
         x = self._checked_x("x", x)
-        check_finite("x", x)
+        check_readable("x", x, self.readable(x))
         check_same_length("theta", theta, "x", x)
         self._calibration.append(theta, x)
         self.event_shape = x.shape[1:]
@@ -119,9 +124,13 @@ class Data:
     def append_observations(self, x_o: Any) -> None:
         """Add observations without parameters."""
         x_o = self._checked_x("x_o", x_o)
-        check_finite("x_o", x_o)
+        check_readable("x_o", x_o, self.readable(x_o))
         self._x_o = _joined(self._x_o, x_o)
         self.event_shape = x_o.shape[1:]
+
+    def readable(self, x: Tensor) -> Tensor:
+        """Tell which x are finite, or can be read by the net in spite of NaN."""
+        return readable(self.embedding_net, x)
 
     def checked_theta(self, name: str, theta: Any) -> Tensor:
         """Return a copy of parameters ``(n, d)``, which have to be finite."""
@@ -134,7 +143,9 @@ class Data:
         x = check_tensor(name, x)
         if self.event_shape is None and x.ndim < 2:
             raise InvalidInputError(
-                f"Expected `{name}` of shape (n, *event); got {tuple(x.shape)}."
+                f"Expected `{name}` of shape (n, *event); got {tuple(x.shape)}. Pass "
+                f"`{name}[None]` for one observation of several numbers, and "
+                f"`{name}[:, None]` for observations of one number each."
             )
         shape = x.shape[1:] if self.event_shape is None else self.event_shape
         x = check_batch(name, x, shape, finite=False)

@@ -149,7 +149,7 @@ def train_on_simulations(
         theta: Parameters, shape ``(n, d)``.
         x: Simulations, shape ``(n, *event)``, on the device to train on.
         training: Batch size, learning rate and so on.
-        show_progress_bars: Whether sbi shows the number of epochs.
+        show_progress_bars: Whether to show the number of epochs.
         change_x: Applied to the x of every batch before its loss is taken.
         penalty: Of the estimator, a term that is added to the loss of every training
             batch; None adds nothing.

@@ -7,6 +7,7 @@ import pickle
 import random
 import warnings
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from sbi.utils import within_support
 from torch import Tensor, nn
 
 import sbi_rope.baselines
+from sbi_rope import load, save
 from sbi_rope._random import seeded
 from sbi_rope.baselines import (
     CalibrationMLP,
@@ -219,6 +221,25 @@ def test_a_copy_of_the_posterior_has_the_same_density(name: str) -> None:
         assert torch.equal(densities(copied, name), expected)
 
 
+@pytest.mark.parametrize("name", [*ONE_OF_A_KIND, "fmcpe", "frisbi", "hvae"])
+def test_the_posterior_can_be_saved(name: str, tmp_path: Path) -> None:
+    posterior, expected = result(name), expected_densities(name)
+    save(posterior, tmp_path / "posterior.pt")
+    loaded = load(tmp_path / "posterior.pt")
+    assert type(loaded) is type(posterior)
+    assert torch.equal(densities(loaded, name), expected)
+
+
+@pytest.mark.parametrize("name", ["npe", "joint_npe", "npe_rs", "nnpe", "frisbi"])
+def test_training_leaves_no_file_in_the_working_folder(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task = first_task(name)
+    monkeypatch.chdir(tmp_path)
+    train(feed(make(name, task), data_of(task))).build_posterior()
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("name", [*ONE_OF_A_KIND, "hvae"])
 def test_the_posterior_can_be_moved(name: str) -> None:
     # Not on the first task: sbi moves no posterior whose prior is torch's own.
@@ -266,8 +287,8 @@ def test_the_seed_alone_decides_and_training_leaves_no_trace(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", LEARNERS)
-def test_training_changes_nothing_that_is_passed_in_and_says_nothing(
-    name: str, capsys: pytest.CaptureFixture[str]
+def test_training_changes_nothing_that_is_passed_in_and_says_nothing_if_asked_not_to(
+    name: str, terminal: pytest.CaptureFixture[str]
 ) -> None:
     task = first_task(name)
     data = data_of(task).map(torch.clone)
@@ -277,10 +298,10 @@ def test_training_changes_nothing_that_is_passed_in_and_says_nothing(
     weights, law = copy.deepcopy(net.state_dict()), pickle.dumps(prior)
     method = make(name, task, prior=prior, density_estimator=density_estimator)
     feed(method, data)
-    capsys.readouterr()
+    terminal.readouterr()
     assert method.train(seed=0, show_progress_bars=False) is method
     method.build_posterior()
-    printed = capsys.readouterr()
+    printed = terminal.readouterr()
     assert printed.out == printed.err == ""
     assert all(torch.equal(weights[k], v) for k, v in net.state_dict().items())
     assert net.training
@@ -494,6 +515,7 @@ SEES = {
     "PlainNPE": {"simulations"},
     "PriorBaseline": set(),
     "RNPE": {"simulations"},
+    "RVNP": {"simulations", "observations"},
     "ReferenceNPE": {"simulations"},
     "TuningOnly": {"simulations", "calibration"},
 }
@@ -587,7 +609,7 @@ def test_a_posterior_trained_beforehand_fixes_the_shape_of_x() -> None:
 
 def test_simulations_that_are_not_needed_earn_a_warning() -> None:
     of_use = {name for name in BUILDERS if METHODS[name].kind is DiscrepancyNPE}
-    of_use |= {"nnpe", "rnpe"}
+    of_use |= {"nnpe", "rnpe", "rvnp"}
     # These look simulations up, because they have no simulator here.
     of_use |= {name for name in BUILDERS if name.startswith(("fmcpe", "frisbi"))}
     of_use |= {"tuning_only"}

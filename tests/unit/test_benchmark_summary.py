@@ -30,9 +30,8 @@ UNIMPORTANT = dict.fromkeys(("lpp", "lpp_median"), "-1.0") | {
     "n_test": "1000",
     "num_simulations": "0",
 }
-UNIMPORTANT |= dict.fromkeys(
-    ("lpp_standard_error", "neg_inf_fraction", "acauc_standard_error"), "0.0"
-)
+UNIMPORTANT |= dict.fromkeys(("neg_inf_fraction", "acauc_standard_error"), "0.0")
+UNIMPORTANT["lpp_standard_error"] = "0.1"
 UNIMPORTANT |= dict.fromkeys(("expected_coverage_error", "peak_memory_mb"), "0.0")
 UNIMPORTANT |= dict.fromkeys(
     (f"seconds_{what}" for what in ("npe", "train", "couple", "test")), "0.0"
@@ -89,13 +88,20 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def docs_page(tmp_path: Path) -> Path:
-    path = tmp_path / "results.md"
-    path.write_text("before\n<!-- results -->\nreplaced\n<!-- /results -->\nafter\n")
+    for path in (readme_beside(tmp_path / "results.md"), tmp_path / "results.md"):
+        path.write_text(
+            "before\n<!-- results -->\nreplaced\n<!-- /results -->\nafter\n"
+        )
     return path
 
 
+def readme_beside(docs_page: Path) -> Path:
+    return docs_page.with_name("README.md")
+
+
 def write(folder: Path, docs_page: Path) -> str:
-    return write_summary(folder, docs_page).read_text()
+    readme = readme_beside(docs_page)
+    return write_summary(folder, docs_page=docs_page, readme=readme).read_text()
 
 
 def line(text: str, start: str, *, after: str = "") -> list[str]:
@@ -182,7 +188,8 @@ def test_the_block_replaces_what_is_between_the_markers_and_nothing_else(
     folder: Path, docs_page: Path
 ) -> None:
     publish(folder, "main", by_method(RoPE=0.0))
-    assert main(["summary", "--out", str(folder), "--docs-page", str(docs_page)]) == 0
+    command = ["summary", "--out", str(folder), "--docs-page", str(docs_page)]
+    assert main([*command, "--readme", str(readme_beside(docs_page))]) == 0
     text = docs_page.read_text()
     page = (folder / "README.md").read_bytes()
     write(folder, docs_page)
@@ -192,7 +199,32 @@ def test_the_block_replaces_what_is_between_the_markers_and_nothing_else(
     assert text.endswith("\n<!-- /results -->\nafter\n")
     assert "replaced" not in text
     assert "(results/README.md)" in text
-    assert len(text.splitlines()) < 45
+    assert len(text.splitlines()) < 60
+
+
+def test_readme_shows_scores_on_real_measurements_with_their_intervals(
+    folder: Path, docs_page: Path
+) -> None:
+    lpp = {"stack": (-1.0, -1.2, -1.1), "NPE": (-30.0, -30.0, -30.0), "RoPE": (-3.0,)}
+
+    def scores(cell: Cell) -> tuple[float, float] | None:
+        of_run = lpp.get(cell.method, ())
+        right = cell.task == "light_tunnel_sensors" and cell.gamma in (None, 0.1)
+        if not right or cell.tau not in (None, 1.0) or len(of_run) <= cell.repetition:
+            return None
+        return of_run[cell.repetition], 0.02
+
+    publish(folder, "main", scores)
+    write(folder, docs_page)
+    text = readme_beside(docs_page).read_text()
+    assert text.startswith("before\n<!-- results -->\n")
+    assert "(results/README.md)" in text
+    stack = "-1.10 ± 0.25 (3)"  # 4.303 * 0.1 / sqrt(3)
+    assert line(text, "**`stack`**") == [stack, stack, stack, "+0.020"]
+    assert line(text, "NPE as it was")[0] == "-30.00 ± 0.00 (3)"
+    # Of one repetition the interval is over its test observations.
+    assert line(text, "RoPE")[:2] == ["-3.00 ± 0.20 (1)"] * 2
+    assert line(text, "FRISBI") == ["-"] * 4
 
 
 def test_a_page_without_a_place_for_the_block_is_refused_and_nothing_written(

@@ -196,5 +196,5 @@ def test_the_committed_page_of_all_suites_is_that_of_the_tables(tmp_path: Path) 
     docs_page = tmp_path / "page.md"
     docs_page.write_text("<!-- results -->\n<!-- /results -->\n")
     folder = Path(shutil.copytree(COMMITTED, tmp_path / "results"))
-    page = write_summary(folder, docs_page)
+    page = write_summary(folder, docs_page=docs_page, readme=docs_page)
     assert page.read_bytes() == (COMMITTED / "README.md").read_bytes()

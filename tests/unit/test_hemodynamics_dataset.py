@@ -379,8 +379,8 @@ def test_a_file_with_other_settings_than_asked_for_is_refused(made: Path) -> Non
         load(made, physics=Physics(courant=0.5))
 
 
-def test_stored_beats_load_without_numba_and_joblib(made: Path) -> None:
-    with imported_anew(without=("numba", "joblib")):
+def test_stored_beats_load_without_numba(made: Path) -> None:
+    with imported_anew(without=("numba",)):
         dataset = importlib.import_module("sbi_rope.tasks.hemodynamics.dataset")
         command = importlib.import_module("sbi_rope.tasks.hemodynamics.__main__")
         assert dataset.load is not load

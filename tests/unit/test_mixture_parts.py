@@ -391,7 +391,7 @@ def test_the_mass_of_an_observation_is_the_same_beside_others_within_its_error()
         assert ((alone.mass - together.mass[i]).abs() < 4 * error).all()
 
 
-def test_progress_of_the_mass_is_shown_if_asked_for_and_never_by_log_prob(
+def test_progress_of_the_mass_is_shown_if_asked_for(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     shown: list[bool] = []
@@ -413,6 +413,12 @@ def test_progress_of_the_mass_is_shown_if_asked_for_and_never_by_log_prob(
     again.leakage(again.x_o, show_progress_bars=True)
     assert all(shown)
     assert len(shown) == 3
+    shown.clear()
+    again.log_prob_batched(
+        theta, again.x_o, leakage_correction_params={"show_progress_bars": True}
+    )
+    assert all(shown)
+    assert shown
 
 
 # --- couplings ---
@@ -535,6 +541,30 @@ def test_the_posterior_of_one_observation_answers_as_the_whole(unseen: str) -> N
         with pytest.warns(RoPEWarning, match="1 unseen"):
             found = view.log_prob(theta, x=other)
         assert torch.allclose(found, posterior.log_prob(theta, x=other), atol=1e-5)
+
+
+def test_the_posterior_of_one_observation_needs_no_nets_unless_it_is_extended() -> None:
+    kept, extended = (
+        three_parts(unseen=unseen)[2].posterior_estimator
+        for unseen in ("raise", "extend")
+    )
+    assert not [module for module in kept.modules() if isinstance(module, nn.Linear)]
+    nets = [module for module in extended.modules() if isinstance(module, nn.Linear)]
+    assert len(nets) == 4  # two of each part
+
+
+def test_the_posterior_of_one_observation_forgets_who_was_asked_for_before() -> None:
+    posterior = three_parts(unseen="extend")
+    posterior.potential(torch.zeros(1, DIM), posterior.x_o[0])
+    with pytest.warns(RoPEWarning, match="Extended"):
+        posterior.log_prob(torch.zeros(1, DIM), x=torch.ones(1, 3))
+    one = posterior[2]
+    assert one.potential_fn.return_x_o() is None
+    (coupled,) = one.posterior_estimator.coupled
+    assert torch.equal(coupled.batch, posterior.x_o[2:3])
+    copied = pickle.loads(pickle.dumps(posterior))
+    with pytest.warns(RoPEWarning, match="Extended"):  # its answer was not kept
+        copied.log_prob(torch.zeros(1, DIM), x=torch.ones(1, 3))
 
 
 def test_the_pickle_of_one_observation_does_not_grow_with_the_batch() -> None:

@@ -3,14 +3,18 @@
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from sbi_rope._progress import progress_bar
+from sbi_rope import CalibrationFinetuner, RoPE, stack
+from sbi_rope._progress import is_shown, progress_bar
+from tests import baselines, gaussian
+from tests.stacks import NPE, PRIOR, quick
 
 TRAIN = """
 import warnings
-from sbi_rope import CalibrationFinetuner, RoPE
+from sbi_rope import CalibrationFinetuner, RoPE, diagnose
 from tests import gaussian
 
 warnings.simplefilter("ignore")
@@ -22,6 +26,7 @@ rope = RoPE(
 rope.append_calibration(*gaussian.labelled(20)).train()
 assert rope.history.best_epoch > 0
 rope.build_posterior(gaussian.labelled(30)[1])
+diagnose(rope, gaussian.labelled(30)[1])
 """
 
 
@@ -40,19 +45,74 @@ def test_training_into_a_log_file_writes_next_to_nothing(tmp_path: Path) -> None
     assert log.stat().st_size < 1000
 
 
-def test_a_bar_is_shown_in_a_terminal_if_it_is_asked_for(
-    terminal: pytest.CaptureFixture[str],
+def test_bars_are_shown_by_default_where_they_can_be_redrawn(
+    terminal: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert is_shown(None)
+    monkeypatch.setattr(type(sys.stderr), "isatty", lambda self: False)
+    assert not is_shown(None)
+    assert is_shown(True)
+    monkeypatch.setattr("sys.stderr", None)  # as of a program without a console
+    assert not is_shown(None)
+
+
+def test_a_bar_is_shown_if_it_is_asked_for(
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     for show in (True, False):
         assert list(progress_bar(range(3), show=show, desc="Counting")) == [0, 1, 2]
         with progress_bar(show=show, desc="By hand", total=2) as bar:
             bar.update(2)
-        printed = terminal.readouterr()
+        printed = capsys.readouterr()
         assert ("Counting" in printed.err) is show
         assert ("By hand: 100%" in printed.err) is show
         assert printed.out == ""
 
 
-def test_without_a_terminal_there_is_no_bar(capsys: pytest.CaptureFixture[str]) -> None:
-    assert list(progress_bar(range(3), show=True, desc="Counting")) == [0, 1, 2]
+def rope() -> RoPE:
+    finetuner = CalibrationFinetuner(max_num_epochs=3)
+    options: dict[str, Any] = {"simulator": gaussian.simulator, "finetuner": finetuner}
+    rope = RoPE(gaussian.posterior(), **options)
+    return rope.append_calibration(*gaussian.labelled(10))
+
+
+def work(**show: bool) -> None:
+    """Call what a user calls."""
+    theta, x_o = gaussian.labelled(30)
+    trained = rope().train(**show)
+    posterior = trained.build_posterior(x_o, **show)
+    posterior.sample_batched((10,), x=x_o, **show)
+    posterior[0].sample((10,), **show)
+    posterior.log_prob_batched(theta, x=x_o)
+    with quick():
+        stack(trained, candidates=(PRIOR, NPE), num_folds=2, **show)
+    method = baselines.make("tuning_only", "linear_gaussian")
+    data = baselines.data_of("linear_gaussian")
+    baselines.feed(method, data).train(**show).build_posterior()
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_without_a_terminal_no_call_shows_a_bar_by_default(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    work()
     assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_no_call_shows_a_bar_in_a_terminal_if_it_is_asked_not_to(
+    terminal: pytest.CaptureFixture[str],
+) -> None:
+    work(show_progress_bars=False)
+    assert terminal.readouterr() == ("", "")
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_bars_that_are_asked_for_are_shown_without_a_terminal_and_on_stderr(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    work(show_progress_bars=True)
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    bars = ("Fine-tuning", "Sampling", "Folds", "Training NPE: 3 epochs")
+    assert [bar for bar in bars if bar not in printed.err] == []

@@ -159,7 +159,7 @@ class FMCPE(Method):
         prior: Any,
         density_estimator: str | EstimatorBuilder = "nsf",
         *,
-        simulator: Callable[[Tensor], Tensor] | None = None,
+        simulator: Callable[[Any], Any] | None = None,
         space: Space = "input",
         noise: float | None = 0.05,
         num_draws: int = 100,

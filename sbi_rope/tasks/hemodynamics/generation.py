@@ -86,7 +86,7 @@ def generate(
         InvalidInputError: If the file is there, work in progress has other settings,
             or an argument is out of range.
         SimulationError: If nearly nobody can be simulated.
-        ImportError: If numba or joblib is not installed.
+        ImportError: If numba is not installed.
     """
     path = Path(str(check_path("path", path)))
     _check_free(path)
@@ -132,12 +132,11 @@ def generate(
 
 
 def _default_simulate() -> Simulate:
-    for module in ("numba", "joblib"):  # before any work begins
-        if find_spec(module) is None:
-            raise ImportError(
-                f"Simulating blood flow needs {module}. Install it with "
-                '`pip install "sbi-rope[hemodynamics]"`.'
-            )
+    if find_spec("numba") is None:  # before any work begins
+        raise ImportError(
+            "Simulating blood flow needs numba. Install it with "
+            '`pip install "sbi-rope[hemodynamics]"`.'
+        )
     from sbi_rope.tasks.hemodynamics.waveforms import simulate_beat
 
     return simulate_beat

@@ -2,8 +2,9 @@
 
 import torch
 
-from sbi_rope import CalibrationFinetuner, SinkhornCoupler
+from sbi_rope import CalibrationFinetuner, SinkhornCoupler, parallel
 from sbi_rope.sweep import sweep
+from tests import gaussian
 from tests.faults.outcomes import Call
 from tests.faults.problem import (
     COUPLED,
@@ -36,7 +37,18 @@ CALLS = [
     Call(
         name="RoPE",
         run=lambda **options: repr(untrained(**options)),
-        options={"finetuner": "instance", "coupler": "instance"},
+        options={
+            "finetuner": "instance",
+            "coupler": "instance",
+            "num_simulations": "count",
+        },
+    ),
+    Call(
+        name="parallel",
+        run=lambda simulator=gaussian.simulator, **options: type(
+            parallel(simulator, **options)
+        ),
+        options={"simulator": "choice", "num_workers": "count"},
     ),
     Call(
         name="RoPE.append_calibration",

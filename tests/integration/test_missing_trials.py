@@ -1,0 +1,167 @@
+"""Missing trials (NaN) are accepted where the embedding net leaves them out."""
+
+import warnings
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from sbi_rope import RoPE, diagnose
+from sbi_rope._sbi import embedding_of, posterior_from, with_embedding
+from sbi_rope.discrepancy import DiscrepancyNPE
+from sbi_rope.errors import InvalidInputError, SimulationError
+from sbi_rope.metrics import draw_samples, evaluate
+from sbi_rope.trainers import FinetunedNPE
+from sbi_rope.trainers.training import Training
+from tests import problems
+from tests.stacks import COUPLINGS, QUICK, QUIET, stacked
+
+
+def labelled(n: int) -> tuple[Tensor, Tensor]:
+    """Return parameters and real trials, which differ from simulated ones."""
+    theta = problems.box(2).sample((n,))
+    return theta, problems.simulate_trials(theta) + 0.3
+
+
+def rope() -> RoPE:
+    rope = RoPE(
+        problems.trials_posterior(),
+        simulator=problems.simulate_trials,
+        finetuner=QUICK,
+    )
+    return rope.append_calibration(*labelled(12))
+
+
+def is_finite(posterior: object, theta: Tensor, x: Tensor) -> bool:
+    scores = evaluate(posterior, theta, x, num_samples=20)
+    samples = draw_samples(posterior, x, num_samples=5)
+    return bool(scores.lpp.log_probs.isfinite().all() and samples.isfinite().all())
+
+
+def test_rope_repairs_a_posterior_of_trials_some_of_which_are_missing() -> None:
+    theta_o, x_o = labelled(25)
+    assert torch.isnan(x_o).any()
+    trained = rope().train(seed=0, **QUIET)
+    assert torch.isfinite(torch.tensor(trained.history.training_loss)).all()
+    posterior = trained.build_posterior(x_o, num_simulations=60, seed=0, **QUIET)
+    assert trained.num_dropped_simulations == 0
+    assert is_finite(posterior, theta_o, x_o)
+    # The observation is known again by its values, those missing included.
+    alone = posterior[3]
+    assert torch.equal(alone.weights[0], posterior.weights[3])
+    assert alone.sample((5,), **QUIET).isfinite().all()
+    expected = posterior.log_prob_batched(theta_o[3:4], x=x_o[3:4])[0]
+    assert torch.allclose(alone.log_prob(theta_o[3:4]), expected)
+    assert torch.allclose(posterior.log_prob(theta_o[3:4], x=x_o[3]), expected)
+
+
+def test_a_stack_takes_trials_some_of_which_are_missing() -> None:
+    theta_o, x_o = labelled(20)
+    posterior = stacked(rope())
+    assert is_finite(posterior, theta_o, x_o)
+    names = posterior.report.cross_validation.names
+    assert {"NPE", "fine-tuned NPE", "discrepancy", "discrepancy (tuned)"} <= set(names)
+    coupled = stacked(rope(), x_o, candidates=COUPLINGS[:3])
+    assert is_finite(coupled, theta_o, x_o)
+
+
+@pytest.mark.slow
+def test_diagnosis_takes_trials_some_of_which_are_missing() -> None:
+    diagnosis = diagnose(rope().train(**QUIET), labelled(40)[1], **QUIET)
+    assert "batch" in str(diagnosis)
+
+
+def test_trainers_that_start_from_a_posterior_take_missing_trials() -> None:
+    theta_o, x_o = labelled(20)
+    npe = problems.trials_posterior()
+    tuned = FinetunedNPE.from_posterior(npe, training=Training(max_num_epochs=2))
+    corrected = DiscrepancyNPE.from_posterior(
+        npe, simulator=problems.simulate_trials, num_steps=4, num_simulations=100
+    )
+    for method in (tuned, corrected):
+        method.append_calibration(*labelled(12)).train(seed=0, **QUIET)
+        assert is_finite(method.build_posterior(), theta_o, x_o)
+
+
+def test_stored_simulations_with_missing_trials_are_kept() -> None:
+    theta = problems.box(2).sample((1002,))
+    x = problems.simulate_trials(theta)
+    x[0] = torch.nan  # a simulation that failed
+    x[1, 0, 0] = torch.inf
+    with pytest.warns(match="Dropped 2 of 1002 stored simulations"):
+        rope = RoPE(problems.trials_posterior(), simulations=(theta, x))
+    assert rope.num_dropped_simulations == 2
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rope.append_calibration(*labelled(12)).train(**QUIET)
+
+
+def test_simulations_all_of_which_are_missing_have_failed() -> None:
+    def fails(theta: Tensor) -> Tensor:
+        x = problems.simulate_trials(theta)
+        return x.where((theta[:, 0] < 0)[:, None, None], torch.nan)
+
+    rope = RoPE(problems.trials_posterior(), simulator=fails)
+    with pytest.warns(match=r"Dropped \d+ of 200 simulations from the prior"):
+        embedded = rope.embed(labelled(20)[1], num_simulations=200, **QUIET)
+    assert (embedded.theta[:, 0] < 0).all()
+    assert rope.num_dropped_simulations == 200 - len(embedded.theta)
+    rope.append_calibration(torch.full((5, 2), 0.5), labelled(5)[1])
+    with pytest.raises(SimulationError, match="All simulations at the calibration"):
+        rope.train(**QUIET)
+
+
+def test_what_the_net_cannot_read_is_refused_with_a_reason() -> None:
+    theta, x = labelled(10)
+    x[2] = torch.nan
+    message = r"NaN or Inf in 1 of 10 rows \(first: \[2\]\).*all trials are missing"
+    with pytest.raises(InvalidInputError, match=message):
+        rope().append_calibration(theta, x)
+    x[2] = 0.0
+    x[4, 0, 0] = torch.inf
+    with pytest.raises(InvalidInputError, match=r"first: \[4\]\)\. Remove or repair"):
+        rope().append_calibration(theta, x)
+    posterior = rope().train(**QUIET).build_posterior(labelled(20)[1], **QUIET)
+    for call in (posterior.set_default_x, lambda x: posterior.sample((3,), x=x)):
+        with pytest.raises(InvalidInputError, match="`x` to be finite"):
+            call(x[4])
+    with pytest.raises(InvalidInputError, match="`x` to be finite"):
+        evaluate(posterior, theta, x)
+
+
+def test_an_ordinary_net_refuses_missing_values() -> None:
+    theta = problems.box(2).sample((5,))
+    x = problems.simulate(theta)
+    x[1, 0] = torch.nan
+    rope = RoPE(problems.npe_posterior(), simulator=problems.simulate)
+    with pytest.raises(InvalidInputError, match="missing trials"):
+        rope.append_calibration(theta, x)
+    for posterior in (problems.npe_posterior(), problems.gaussian_posterior()):
+        with pytest.raises(InvalidInputError, match="missing trials"):
+            draw_samples(posterior, x, num_samples=3)
+
+
+class Filled(nn.Module):
+    """Puts zeros where numbers are missing."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x.nan_to_num(0.0)
+
+
+def test_missing_numbers_of_a_vector_are_embedded_but_not_corrected() -> None:
+    npe = problems.npe_posterior()
+    net = nn.Sequential(Filled(), *embedding_of(npe.posterior_estimator))
+    estimator = with_embedding(npe.posterior_estimator, net)
+    rope = RoPE(posterior_from(npe, estimator), simulator=problems.simulate)
+    theta = problems.box(2).sample((12,))
+    x = problems.simulate(theta)
+    x[0, 1] = torch.nan
+    posterior = stacked(rope.append_calibration(theta, x))
+    assert "discrepancy" in posterior.candidate_weights
+    assert "discrepancy (input)" not in posterior.candidate_weights
+    assert is_finite(posterior, theta, x)
+    method = DiscrepancyNPE.from_posterior(
+        posterior_from(npe, estimator), simulator=problems.simulate, space="input"
+    )
+    with pytest.raises(InvalidInputError, match="finite"):
+        method.append_calibration(theta, x).train(**QUIET)
