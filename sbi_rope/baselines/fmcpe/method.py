@@ -118,7 +118,7 @@ class FMCPE(Method):
         noise: :math:`\epsilon`, in standard deviations of the simulations. The paper
             has .05, and .5 for its wind tunnel. With None, as in its Gaussian task, the
             way to a simulation starts at standard normal noise alone.
-        num_draws: K.
+        num_draws: The number K of draws that the density averages over.
         simulations_per_pair: Simulations at the parameters of each pair. Fewer are made
             if they are large.
         npe_training: How NPE is trained; ``Training()`` if None.
