@@ -18,7 +18,7 @@ from benchmarks.methods import COUPLED_STACK, METHODS, STACK
 from benchmarks.published import FIXED, LETTERS, MISSING, Published, Setting, table
 from benchmarks.table import Table
 
-__all__ = ["evidence_lines"]
+__all__ = ["evidence_lines", "finished_rows", "half_width"]
 
 # The methods of the picture: what a user starts from, what is tuned on the pairs, the
 # rivals of 2025 and 2026, the paper's method and the default of this package.
@@ -74,7 +74,7 @@ class Comparison(NamedTuple):
 
 def evidence_lines(published: Published, folder: Path) -> list[str]:
     """Return the section in Markdown, and write its figures into a folder."""
-    rows = _rows(published)
+    rows = finished_rows(published)
     compared = _compared(rows)
     if not compared:
         return ["Not run."]
@@ -85,7 +85,7 @@ def evidence_lines(published: Published, folder: Path) -> list[str]:
     return [*lines, "", *_goals(compared), "", *_costs(published, rows)]
 
 
-def _rows(published: Published) -> pd.DataFrame:
+def finished_rows(published: Published) -> pd.DataFrame:
     """Return what was finished, with one setting of the couplings."""
     rows = published.tables.get("main", Table.of({}, {})).finished
     fixed = [cell.gamma is None or Setting.of(cell) == FIXED for cell in rows.index]
@@ -138,11 +138,12 @@ def _entries(published: Published, one: Comparison, rows: pd.DataFrame) -> list[
 
 def _interval(gap: np.ndarray) -> str:
     """Return the mean over repetitions, and how far its interval reaches."""
-    width = _half_width(gap)
+    width = half_width(gap)
     return f"{gap.mean():+.2f}" + (f" ± {width:.2f}" if np.isfinite(width) else "")
 
 
-def _half_width(gap: np.ndarray) -> float:
+def half_width(gap: np.ndarray) -> float:
+    """Return how far an interval over repetitions reaches; inf of a single one."""
     if len(gap) < 2 or not np.isfinite(gap).all():
         return np.inf
     quantile = student.ppf(0.5 + CONFIDENCE / 2, len(gap) - 1)
@@ -169,7 +170,7 @@ def _goals(compared: Sequence[Comparison]) -> list[str]:
             one.gap.mean() >= -NEAR for one in few
         ],
         "better than the best other beyond the interval over repetitions": [
-            one.gap.mean() > _half_width(one.gap) for one in few
+            one.gap.mean() > half_width(one.gap) for one in few
         ],
         f"not more than {NEAR} nats below the prior or NPE": [
             value >= -NEAR for value in basics

@@ -16,6 +16,7 @@ from sbi_rope.baselines import (
     NNPE,
     NPERS,
     RNPE,
+    RVNP,
     CalibrationMLP,
     FinetunedNPE,
     JointNPE,
@@ -194,6 +195,14 @@ METHODS: dict[str, Entry] = {
         style=("#7F3C8D", ":", None),
         build=lambda case: NPERS(
             *_from_scratch(case), training=case.settings.training, device=case.device
+        ),
+    ),
+    "RVNP": Entry(
+        style=("#999933", "-.", None),
+        build=lambda case: RVNP.from_posterior(
+            case.npe,
+            noise_on=_noise_on(case),
+            surrogate_training=case.settings.training,
         ),
     ),
     "J-NPE": Entry(

@@ -26,13 +26,8 @@ from benchmarks.published import (
     runs_of,
     table,
 )
-from benchmarks.statements import (
-    STATEMENTS,
-    TOLERANCE,
-    VERDICTS,
-    verdict,
-    write_statements,
-)
+from benchmarks.readme import readme_lines
+from benchmarks.statements import TOLERANCE, write_statements
 from benchmarks.table import Table
 from sbi_rope._files import write_atomically
 
@@ -73,7 +68,7 @@ def write_summary(folder: Path, readme: Path) -> Path:
     published = Published.read(folder)
     page = folder / "README.md"
     link = Path(os.path.relpath(page, readme.parent)).as_posix()
-    text = _with_block(readme, "\n".join(_block(published, link)))
+    text = _with_block(readme, "\n".join(readme_lines(published, link)))
     for path, content in (
         (page, "\n".join(_page(published, folder)) + "\n"),
         (readme, text),
@@ -112,21 +107,6 @@ def _page(published: Published, folder: Path) -> list[str]:
         *("## What the paper states", "", *write_statements(published), ""),
         *("## Where RoPE loses", "", *_losses(published), ""),
         *("## What the other suites say", *other_suites(published)),
-    ]
-
-
-def _block(published: Published, link: str) -> list[str]:
-    counts = Counter(verdict(s.check(published)) for s in STATEMENTS)
-    verdicts = ", ".join(f"{counts[what]} {what}" for what in VERDICTS if counts[what])
-    return [
-        f"LPP with {SIZE} calibration pairs, in standard deviations of the prior. Bold",
-        "is the best; RoPE and OT-only compete in one setting, fixed beforehand (gamma",
-        f"{FIXED.gamma:g} in units of the median distance, tau {FIXED.tau:g}).",
-        *("", *_main(published, lpp_text, with_settings=("RoPE",)), ""),
-        *(_in_words(_compared(published)), ""),
-        *_stack_in_words(published),
-        f"Of {len(STATEMENTS)} statements of the paper: {verdicts}.",
-        f"All results, and the rules behind these counts: [{link}]({link}).",
     ]
 
 
@@ -265,25 +245,6 @@ def _in_words(compared: Sequence[Compared]) -> str:
         f"({FIXED}) has the best LPP in {best} of {len(compared)} cells. It is "
         f"{parts[0]}, and {parts[1]}."
     )
-
-
-def _stack_in_words(published: Published) -> list[str]:
-    """Say how often the stack, which is tuned by nobody, is the best of all."""
-    results = []
-    for task in _tasks(published):
-        for size in published.sizes(task):
-            rows = {
-                name: published.select(name, task=task, size=size) for name in METHODS
-            }
-            if len(rows[STACK]):
-                results.append(_best(rows) == STACK)
-    if not results:
-        return []
-    return [
-        f"The [stack](docs/stacking.md) has the best LPP of all methods in "
-        f"{sum(results)} of the {len(results)} cells that it was run in.",
-        "",
-    ]
 
 
 def _losses(published: Published) -> list[str]:

@@ -6,6 +6,7 @@ from sbi_rope.diagnosis import Diagnosis, diagnose
 from sbi_rope.finetuning import CalibrationFinetuner
 from sbi_rope.mixture import MixturePosterior
 from sbi_rope.rope import RoPE
+from sbi_rope.saving import load, save
 from sbi_rope.stacking import StackedPosterior, stack
 
 __all__ = [
@@ -17,7 +18,9 @@ __all__ = [
     "SinkhornCoupler",
     "StackedPosterior",
     "diagnose",
+    "load",
     "parallel",
+    "save",
     "stack",
 ]
 

@@ -12,6 +12,7 @@ from typing import Any
 __all__ = [
     "CouplingError",
     "DataNotFoundError",
+    "FileFormatError",
     "InvalidInputError",
     "InvalidTypeError",
     "LogProbUnavailableError",
@@ -23,6 +24,7 @@ __all__ = [
     "SimulationError",
     "UnseenObservationError",
     "UnsupportedPosteriorError",
+    "UntrustedError",
     "shown",
     "warn_user",
 ]
@@ -90,6 +92,14 @@ class DataNotFoundError(RoPEError, FileNotFoundError):
 
 class NotWritableError(RoPEError, OSError):
     """A folder or file for results cannot be written to."""
+
+
+class FileFormatError(RoPEError, ValueError):
+    """A file is no saved posterior, is damaged, or is of other versions."""
+
+
+class UntrustedError(RoPEError, ValueError):
+    """A file needs a class or function that is not known to be harmless."""
 
 
 class RoPEWarning(UserWarning):

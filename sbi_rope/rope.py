@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from sbi_rope._npe import TrainedNPE
+from sbi_rope._pickling import picklable
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed
@@ -124,6 +125,7 @@ class RoPE:
         check_instance("finetuner", finetuner, CalibrationFinetuner, optional=True)
         check_instance("coupler", coupler, SinkhornCoupler, optional=True)
         check_default_dtype()
+        simulator = picklable(simulator)
         self._npe = TrainedNPE(posterior)
         self._source = source_of(
             self._npe.prior,
@@ -435,12 +437,12 @@ class RoPE:
     def num_simulator_calls(self) -> int:
         """How many rows of theta the simulator has simulated so far.
 
-        About thirty are simulated when RoPE is constructed, to find out how the
+        Up to thirty are simulated when RoPE is constructed, to find out how the
         simulator is called. :meth:`train` simulates 100 for each label (and 2000 with
         rehearsal), :meth:`build_posterior` ``max(n_o, 1000)`` for each batch, and
-        :func:`~sbi_rope.stack` 100 for each label, 20,000 from the prior, and with a
-        batch ``max(n_o, 1000)`` more. The argument ``num_simulations`` of this class
-        sets a number for all of these together.
+        :func:`~sbi_rope.stack` 20,000 from the prior and 100 for each label, and with a
+        batch 2000 and ``max(n_o, 1000)`` more. The argument ``num_simulations`` of this
+        class sets a number for all of these together.
         """
         return self._source.num_calls
 

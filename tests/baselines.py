@@ -25,6 +25,7 @@ from sbi_rope.baselines import (
     NNPE,
     NPERS,
     RNPE,
+    RVNP,
     CalibrationMLP,
     FinetunedNPE,
     JointNPE,
@@ -132,6 +133,15 @@ METHODS: dict[str, Entry] = {
             "num_latents": 8,
         },
         ("pendulum",),
+    ),
+    "rvnp": Entry(
+        RVNP,
+        lambda task: {
+            "npe_training": SHORT,
+            "surrogate_training": SHORT,
+            "training": SHORT,
+            "num_draws": 8,
+        },
     ),
     "rnpe": Entry(RNPE, lambda task: {"npe_training": SHORT, **CHAINS}),
 }

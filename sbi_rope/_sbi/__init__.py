@@ -2,6 +2,7 @@
 
 from sbi.inference.posteriors.base_posterior import NeuralPosterior
 from sbi.inference.posteriors.direct_posterior import DirectPosterior
+from sbi.inference.posteriors.vector_field_posterior import VectorFieldPosterior
 from sbi.inference.potentials.base_potential import BasePotential
 from sbi.neural_nets.estimators.base import (
     ConditionalDensityEstimator,
@@ -12,7 +13,13 @@ from sbi.neural_nets.net_builders.flow import build_zuko_unconditional_flow
 from sbi.samplers.mcmc import SliceSamplerVectorized
 from sbi.utils.user_input_checks_utils import move_distribution_to_device
 
-from sbi_rope._sbi.densities import MixedDensity, MixtureDensity, VectorFieldDensity
+from sbi_rope._sbi.densities import (
+    MixedDensity,
+    MixtureDensity,
+    MixtureDensityEstimator,
+    VectorFieldDensity,
+    gaussians_of,
+)
 from sbi_rope._sbi.embedding import (
     device_of,
     dtype_of,
@@ -42,10 +49,12 @@ __all__ = [
     "DirectPosterior",
     "MixedDensity",
     "MixtureDensity",
+    "MixtureDensityEstimator",
     "NeuralPosterior",
     "SliceSamplerVectorized",
     "UnconditionalDensityEstimator",
     "VectorFieldDensity",
+    "VectorFieldPosterior",
     "build_zuko_unconditional_flow",
     "copy_of_prior",
     "describe",
@@ -55,6 +64,7 @@ __all__ = [
     "embed",
     "embedding_of",
     "estimator_of",
+    "gaussians_of",
     "headless",
     "is_bounded",
     "move_distribution_to_device",

@@ -10,13 +10,25 @@ from sbi.neural_nets.estimators.base import (
     ConditionalVectorFieldEstimator,
 )
 from sbi.neural_nets.estimators.mixed_density_estimator import MixedDensityEstimator
+from sbi.neural_nets.estimators.mixture_density_estimator import (
+    MixtureDensityEstimator,
+)
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
 from sbi_rope._random import seeded
 from sbi_rope.errors import LogProbUnavailableError
 
-__all__ = ["MixedDensity", "MixtureDensity", "VectorFieldDensity"]
+__all__ = [
+    "MixedDensity",
+    "MixtureDensity",
+    "MixtureDensityEstimator",
+    "VectorFieldDensity",
+    "gaussians_of",
+]
+
+# What sbi adds to the precision of each Gaussian that it mixes.
+SMALLEST_PRECISION = 1e-4
 
 
 class MixtureDensity(ConditionalDensityEstimator):
@@ -130,3 +142,29 @@ class VectorFieldDensity(ConditionalDensityEstimator):
     def loss(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
         """Return the loss of the vector field."""
         return self.vector_field.loss(input, condition, **kwargs)
+
+
+def gaussians_of(
+    estimator: MixtureDensityEstimator, condition: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the Gaussians that a mixture density network mixes.
+
+    Args:
+        estimator: The network, which was built with ``z_score_x="none"``, so that the
+            Gaussians have the units of what it is a density of.
+        condition: Conditions, shape ``(n, k)``.
+
+    Returns:
+        The logarithms of their weights up to a constant, shape ``(n, c)``, their means,
+        ``(n, c, l)``, and covariances, ``(n, c, l, l)``, all in float64.
+    """
+    mixture = estimator.get_uncorrected_mog(condition)
+    assert not estimator.has_input_transform
+    factors = mixture.precision_factors
+    assert factors is not None
+    # In float32 a narrow covariance would not be positive definite after rounding.
+    factors = factors.double()
+    identity = torch.eye(factors.shape[-1]).to(factors)
+    precision = factors.mT @ factors + SMALLEST_PRECISION * identity
+    covariances = torch.cholesky_inverse(torch.linalg.cholesky(precision))
+    return mixture.logits.double(), mixture.means.double(), covariances

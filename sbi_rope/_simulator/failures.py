@@ -82,9 +82,9 @@ def warn_of_few(count: int) -> None:
     """Warn if there are few stored simulations, and say what that costs."""
     if count < FEW:
         warn_user(
-            f"Only {count} simulations are stored. For each label RoPE looks up the "
-            "simulations with the nearest parameters, and with so few of them these "
-            "are far from the label's own. The tuned embedding and the discrepancy "
-            f"model are then less accurate, and a batch is coupled with only {count} "
-            f"simulations. Store {FEW} or more, or pass the simulator."
+            f"Only {count} simulations are stored. For each label those with the "
+            "nearest parameters are looked up, and among so few these are far from the "
+            "label's own. The tuned embedding and the discrepancy model are then less "
+            f"accurate, and RoPE couples a batch with {count} simulations at most. "
+            f"Store {FEW} or more, or pass the simulator."
         )

@@ -12,6 +12,7 @@ from sbi_rope.baselines.npe_rs import NPERS
 from sbi_rope.baselines.ot_only import OTOnly
 from sbi_rope.baselines.prior import PriorBaseline
 from sbi_rope.baselines.rnpe import RNPE
+from sbi_rope.baselines.rvnp import RVNP
 from sbi_rope.baselines.tuning_only import TuningOnly
 from sbi_rope.mixture import PriorPosterior
 from sbi_rope.trainers import FinetunedNPE, Method, Training
@@ -23,6 +24,7 @@ __all__ = [
     "NNPE",
     "NPERS",
     "RNPE",
+    "RVNP",
     "CalibrationMLP",
     "FinetunedNPE",
     "JointNPE",

@@ -20,8 +20,9 @@ from sbi_rope.baselines.statistics import (
     NoiseOn,
     fit_marginal,
     split_at_statistics,
+    standardisation_of_statistics,
 )
-from sbi_rope.errors import InvalidInputError, warn_user
+from sbi_rope.errors import warn_user
 from sbi_rope.mixture import Mixing, MixtureEstimator, Part, Rows, equal_rows
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
@@ -222,7 +223,7 @@ class RNPE(Method):
         net, density = split_at_statistics(estimator_of(npe), self.noise_on)
         _, x = self._data.simulations
         statistics = embed(net, x)
-        s = self._standardised(statistics)
+        s = standardisation_of_statistics(statistics)(statistics)
         marginal, history = fit_marginal(
             s,
             jitter=self.error_model.spike_std,
@@ -240,19 +241,3 @@ class RNPE(Method):
         )
         estimator = MixtureEstimator([Part(density, denoised)], [1.0], tail_mass=0.0)
         return direct_posterior(estimator.eval(), self._prior), history
-
-    def _standardised(self, statistics: Tensor) -> Tensor:
-        if statistics.ndim != 2:
-            raise InvalidInputError(
-                "Expected one vector of statistics for each simulation with "
-                f"noise_on='input'; got x of shape {tuple(statistics.shape)}. Use "
-                "noise_on='embedding'."
-            )
-        s = Standardisation(statistics)(statistics)
-        if not s.shape[1]:
-            raise InvalidInputError(
-                "Expected statistics that differ between simulations; all of "
-                f"{statistics.shape[1]} are constant. Train NPE longer, or with "
-                "another embedding net."
-            )
-        return s

@@ -1,4 +1,4 @@
-r"""The statistics that NNPE and RNPE put errors on, standardised by simulations."""
+r"""The statistics that NNPE, RNPE and RVNP put errors on."""
 
 from typing import Any, Literal
 
@@ -12,8 +12,9 @@ from sbi_rope._sbi import (
     embedding_of,
     headless,
 )
+from sbi_rope._standardisation import Standardisation
 from sbi_rope._training import History, fit, split_pairs
-from sbi_rope.errors import UnsupportedPosteriorError
+from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError
 from sbi_rope.trainers.training import Training
 
 __all__ = [
@@ -21,6 +22,7 @@ __all__ = [
     "SoftClip",
     "fit_marginal",
     "split_at_statistics",
+    "standardisation_of_statistics",
 ]
 
 NoiseOn = Literal["embedding", "input"]
@@ -53,6 +55,31 @@ def split_at_statistics(
     if noise_on == "input":
         return nn.Identity(), estimator
     return embedding_of(estimator), headless(estimator)
+
+
+def standardisation_of_statistics(statistics: Tensor) -> Standardisation:
+    """Return the map from statistics to standard deviations of simulated ones.
+
+    Args:
+        statistics: Statistics of simulations, shape ``(n, l)``.
+
+    Raises:
+        InvalidInputError: If they are no vectors, or all of them are constant.
+    """
+    if statistics.ndim != 2:
+        raise InvalidInputError(
+            "Expected one vector of statistics for each simulation with "
+            f"noise_on='input'; got x of shape {tuple(statistics.shape)}. Use "
+            "noise_on='embedding'."
+        )
+    standardisation = Standardisation(statistics)
+    if not standardisation.varies.any():
+        raise InvalidInputError(
+            "Expected statistics that differ between simulations; all of "
+            f"{statistics.shape[1]} are constant. Train NPE longer, or with "
+            "another embedding net."
+        )
+    return standardisation
 
 
 class SoftClip(nn.Module):

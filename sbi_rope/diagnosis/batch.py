@@ -4,13 +4,17 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
+from sbi_rope._npe import TrainedNPE
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
+from sbi_rope._training import groups_of
+from sbi_rope._two_sample import compare_with_pairs
 from sbi_rope._validation import check_instance, check_integer
 from sbi_rope.coupling import SinkhornCoupler
 from sbi_rope.diagnosis.far_entries import far_findings
+from sbi_rope.diagnosis.labelled import labelled_finding
 from sbi_rope.diagnosis.misspecification import misspecification_findings
-from sbi_rope.diagnosis.prior_shift import prior_shift
+from sbi_rope.diagnosis.prior_shift import PriorShift, prior_shift
 from sbi_rope.diagnosis.report import Diagnosis, Finding
 from sbi_rope.diagnosis.residuals import (
     CrossFitted,
@@ -19,6 +23,7 @@ from sbi_rope.diagnosis.residuals import (
     residual_finding,
 )
 from sbi_rope.diagnosis.simulations import Simulations
+from sbi_rope.diagnosis.spread import FEWEST, spread_of
 from sbi_rope.diagnosis.support import support_of
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.rope import RoPE
@@ -48,15 +53,21 @@ def diagnose(
        behind each posterior?
     3. Do the parameters of the batch follow the prior? The parameters of the
        simulations, weighted by the coupling at tau = 0, are compared with the prior.
+       A test of their spread finds a batch that holds a narrower range.
     4. Do the residuals :math:`g(x) - E[h(S(\theta))]` of calibration pairs depend on
        :math:`\theta`? They are computed on pairs that g was not trained on.
     5. Is an entry of x many standard deviations away from simulations? This is tested
        if NPE standardises x.
+    6. Is the batch like the observations of the calibration pairs? This is an energy
+       test of :math:`h(x_o)` against h of the pairs. The held-out scores of a stack,
+       and what they say about calibration, hold for observations like those of the
+       pairs.
 
-    Without calibration pairs g is h, and the second test of 1 and all of 4 are left
-    out. One batch of simulations in a hundred exceeds the thresholds of 1, 3 and the
-    distances in 2. The thresholds of effective sample sizes are rules of thumb about
-    the setting of the coupler.
+    Without calibration pairs g is h, and the second test of 1 and all of 4 and 6 are
+    left out. One batch of simulations in a hundred exceeds the thresholds of 1, each of
+    the two tests of 3 and the distances in 2. One batch in a hundred that is drawn like
+    the pairs has a p-value below the threshold of 6, which is 0.01. The thresholds of
+    effective sample sizes are rules of thumb about the setting of the coupler.
 
     Args:
         rope: A trained RoPE, or one without calibration pairs; it is not changed.
@@ -67,7 +78,7 @@ def diagnose(
             if None.
         num_folds: The number of trainings for the residuals of 4, each of which takes
             as long as ``rope.train``. None leaves out 4, and the allowance for errors
-            of g in 3.
+            of g in both tests of 3.
         parameter_names: One name for each parameter; "theta_1" and so on if None.
         seed: Seed of everything random; None uses the states of torch, NumPy and
             Python. The simulations are those of ``rope.build_posterior`` with the same
@@ -120,9 +131,13 @@ def diagnose(
         )
         shift = prior_shift(real, simulations, held_out=held_out)
         findings += shift.findings(simulations, names)
+        residual = []
         if held_out is not None:
-            findings += _residual_findings(rope, held_out, simulations, notes)
+            residual = _residual_findings(rope, held_out, simulations, notes)
+        findings += _spread_findings(rope, shift, simulations, names, notes)
+        findings += residual
         findings += far_findings(batch.npe.h, batch.x_o)
+        findings += _labelled_findings(rope, before, batch.npe, notes)
     if not coupling.converged:
         notes.append(
             "The coupling has not converged, so that its effective sample sizes are "
@@ -150,12 +165,14 @@ def _held_out(
     if not len(theta):
         note = (
             "There are no calibration pairs, so that nothing was tuned. The tests that "
-            "need labels were left out (misspecification after tuning, residuals)."
+            "need labels were left out (misspecification after tuning, residuals, "
+            "comparison with the pairs)."
         )
     elif num_folds is None:
         note = (
             "Residuals of calibration pairs were left out, as asked. Errors of g can "
-            "therefore look like a prior shift."
+            "therefore look like a prior shift, or like a batch that is narrower than "
+            "the prior."
         )
     elif len(theta.unique(dim=0)) < 2:
         note = (
@@ -180,6 +197,45 @@ def _residual_findings(
         f"calibration pairs are too few for {theta.shape[1]} parameters."
     )
     return []
+
+
+def _spread_findings(
+    rope: RoPE,
+    shift: PriorShift,
+    simulations: Simulations,
+    names: Sequence[str],
+    notes: list[str],
+) -> list[Finding]:
+    theta = _moved(rope.calibration[0])
+    counts = [len(shift.batch.means)]
+    if shift.held_out is not None:
+        counts.append(len(theta))
+    if min(counts) < FEWEST:
+        notes.append(
+            "Whether the batch has a narrower range of parameters than the prior was "
+            f"not tested, which needs at least {FEWEST} observations and {FEWEST} "
+            "calibration pairs."
+        )
+        return []
+    spread = spread_of(shift, simulations.theta, theta_cal=theta)
+    return spread.findings(names, tuned=simulations.tuned)
+
+
+def _labelled_findings(
+    rope: RoPE, batch: Tensor, npe: TrainedNPE, notes: list[str]
+) -> list[Finding]:
+    """Compare h(x_o) with h of the calibration pairs, if there are any."""
+    theta, x = rope.calibration
+    if not len(theta):
+        return []
+    test = compare_with_pairs(npe.embed("x", x, npe.h), groups_of(theta), batch)
+    if test is None:
+        notes.append(
+            "Whether the batch is like the calibration pairs was not tested, which "
+            "needs at least five observations and five pairs with different parameters."
+        )
+        return []
+    return [labelled_finding(test)]
 
 
 def _moved(values: Tensor) -> Tensor:

@@ -99,7 +99,7 @@ def _before(test: MMDTest) -> Finding:
             "test cannot tell which."
         )
     else:
-        sentence = f"As NPE sees it, the batch is like simulations: {size}."
+        sentence = f"No sign that NPE sees the batch as unlike simulations: {size}."
     return _finding("misspecification before tuning", test, alarming, sentence)
 
 
@@ -109,14 +109,15 @@ def _after(before: MMDTest, after: MMDTest) -> Finding:
     course = f"{before.mmd:.2g} before tuning, {after.mmd:.2g} after"
     if alarming:
         sentence = (
-            f"After tuning the batch is unlike simulations: {size} ({course}). If "
-            "there is a prior shift, this may be the reason. Otherwise there are too "
-            "few calibration pairs, or they are unlike the batch."
+            f"After tuning the batch is unlike simulations: {size} ({course}). If the "
+            "batch is shifted or narrower than the prior, this may be the reason. "
+            "Otherwise there may be too few calibration pairs, or they are unlike the "
+            "batch."
         )
     else:
         sentence = (
-            f"After tuning the batch is no less like simulations than averaging over "
-            f"the simulator's noise explains: {size} ({course})."
+            "No sign that the batch is less like simulations after tuning than "
+            f"averaging over the simulator's noise explains: {size} ({course})."
         )
     return _finding("misspecification after tuning", after, alarming, sentence)
 

@@ -6,23 +6,22 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sbi_rope._slices import slices
-from sbi_rope.coupling import Coupling, SinkhornCoupler
+from sbi_rope.coupling import Coupling
+from sbi_rope.diagnosis.implied import (
+    Implied,
+    couple_by_itself,
+    implied_by,
+    resampled,
+)
 from sbi_rope.diagnosis.report import Finding
 from sbi_rope.diagnosis.residuals import CrossFitted
 from sbi_rope.diagnosis.simulations import Simulations
 
 __all__ = ["PriorShift", "prior_shift"]
 
-# At tau = 0 each observation is coupled by itself, without trust in the prior. The
-# smaller gamma is, the less the implied distribution is blurred.
-COUPLER = SinkhornCoupler(gamma=0.1, tau=0.0, cost_scale="simulated")
 # The largest number of simulations that take the place of observations, and the number
 # of batches that are drawn from them.
 MAX_PLAYERS, NUM_DRAWS = 1000, 1000
-# Points at which distribution functions are compared.
-NUM_POINTS = 100
-CHUNK = 500
 LEVEL = 0.01
 ERROR_QUANTILE = 0.95
 
@@ -39,6 +38,11 @@ class PriorShift:
             least one parameter, ``(d,)``.
         error: The distance by which errors of g move calibration pairs, ``(d,)``; None
             if it is unknown.
+        batch: What each observation of the batch implies.
+        expected: What simulations imply that take the place of observations: as tuning
+            would move them, and unchanged. Without tuning the two are the same, and
+            there is only one.
+        held_out: What held-out calibration pairs imply, if there are any.
     """
 
     implied: Tensor
@@ -46,6 +50,9 @@ class PriorShift:
     distance: Tensor
     chance: Tensor
     error: Tensor | None
+    batch: Implied
+    expected: tuple[Implied, ...]
+    held_out: Implied | None
 
     @property
     def threshold(self) -> Tensor:
@@ -119,104 +126,56 @@ def prior_shift(
         held_out: Calibration pairs that g has not seen, to measure its errors.
     """
     embedded = simulations.embedded
-    # At tau = 0 the potential is zero for any batch, so that a few rows are enough.
-    coupling = COUPLER.couple(embedded[:100], embedded)
-    points = _points(simulations.theta)
-    implied, batch = _rows(coupling, real, simulations, points)
+    coupling = couple_by_itself(simulations)
+    batch = implied_by(coupling, real, simulations)
     players = torch.arange(min(len(simulations), MAX_PLAYERS))
     averaged = simulations.averaged[players]
-    unshifted, expected = _rows(coupling, averaged, simulations, points, own=players)
+    expected = implied_by(coupling, averaged, simulations, own=players)
     # A g that was trained little averages less over noise. The threshold allows for the
     # two ends, full averaging and none.
     ends = [expected]
     if simulations.tuned:
-        ends.append(
-            _rows(coupling, embedded[players], simulations, points, own=players)[1]
-        )
+        ends.append(implied_by(coupling, embedded[players], simulations, own=players))
     level = 1.0 - LEVEL / simulations.theta.shape[1]
     chances = [
-        _draws(end, expected, size=len(real)).quantile(level, dim=0) for end in ends
+        _draws(end.functions, expected.functions, size=len(real)).quantile(level, dim=0)
+        for end in ends
     ]
-    error = None
+    pairs, error = None, None
     if held_out is not None:
-        error = _errors_of_g(coupling, held_out, simulations, points)
+        pairs = implied_by(coupling, held_out.embedded, simulations)
+        error = _errors_of_g(coupling, pairs, held_out.targets, simulations)
     return PriorShift(
-        implied=implied,
-        unshifted=unshifted,
-        distance=_largest_gap(batch.mean(dim=0), expected.mean(dim=0)),
+        implied=batch.weights,
+        unshifted=expected.weights,
+        distance=_largest_gap(
+            batch.functions.mean(dim=0), expected.functions.mean(dim=0)
+        ),
         chance=torch.stack(chances).amax(dim=0),
         error=error,
+        batch=batch,
+        expected=tuple(ends),
+        held_out=pairs,
     )
 
 
 def _errors_of_g(
-    coupling: Coupling,
-    held_out: CrossFitted,
-    simulations: Simulations,
-    points: tuple[Tensor, Tensor],
+    coupling: Coupling, found: Implied, targets: Tensor, simulations: Simulations
 ) -> Tensor:
     """Return how far errors of g move the parameters of unseen pairs, shape (d,)."""
-    wanted = simulations.average(held_out.targets)
-    found, expected = (
-        _rows(coupling, embeddings, simulations, points)[1]
-        for embeddings in (held_out.embedded, wanted)
-    )
+    wanted = implied_by(coupling, simulations.average(targets), simulations)
     # With few pairs the errors could be small by chance, hence a bootstrap.
-    gaps = _resampled(found - expected, len(found)).abs().amax(dim=-1)
-    return gaps.quantile(ERROR_QUANTILE, dim=0)
-
-
-def _points(theta: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the order of each parameter, and the ranks at which to compare."""
-    last = len(theta) - 1
-    where = torch.linspace(0, last, min(NUM_POINTS, len(theta))).round().long()
-    return theta.argsort(dim=0), where
-
-
-def _rows(
-    coupling: Coupling,
-    real: Tensor,
-    simulations: Simulations,
-    points: tuple[Tensor, Tensor],
-    own: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:
-    """Return mean weights ``(n_s,)``, and distribution functions ``(n, d, points)``."""
-    order, where = points
-    total = torch.zeros(len(simulations), dtype=torch.float64)
-    functions = []
-    for block in slices(len(real), CHUNK):
-        weights = coupling.rows(real[block])
-        if own is not None:
-            rows = torch.arange(len(weights))
-            weights[rows, own[block]] = 0.0
-            weights = weights / weights.sum(dim=1, keepdim=True).clamp_min(1e-300)
-        total += weights.sum(dim=0)
-        functions.append(
-            torch.stack(
-                [weights[:, column].cumsum(dim=1)[:, where] for column in order.T],
-                dim=1,
-            )
-        )
-    return total / len(real), torch.cat(functions)
+    difference = found.functions - wanted.functions
+    gaps = resampled(difference, len(difference), num_draws=NUM_DRAWS)
+    return gaps.abs().amax(dim=-1).quantile(ERROR_QUANTILE, dim=0)
 
 
 def _draws(functions: Tensor, expected: Tensor, *, size: int) -> Tensor:
     """Return distances for batches of simulations, shape ``(draws, d)``."""
     # The expectation is itself a mean over simulations, with its own uncertainty.
-    batch = _resampled(functions, size)
-    reference = _resampled(expected, len(expected))
+    batch = resampled(functions, size, num_draws=NUM_DRAWS)
+    reference = resampled(expected, len(expected), num_draws=NUM_DRAWS)
     return _largest_gap(batch, reference)
-
-
-def _resampled(functions: Tensor, size: int) -> Tensor:
-    """Return means over rows drawn with replacement, ``(draws, d, points)``."""
-    count = len(functions)
-    rows = torch.randint(count, (NUM_DRAWS, size))
-    rows += count * torch.arange(NUM_DRAWS).unsqueeze(1)
-    times = torch.bincount(rows.flatten(), minlength=NUM_DRAWS * count)
-    draws = times.reshape(NUM_DRAWS, count).to(functions)
-    mean = draws @ functions.reshape(count, -1) / size
-    return mean.reshape(NUM_DRAWS, *functions.shape[1:])
 
 
 def _largest_gap(a: Tensor, b: Tensor) -> Tensor:
@@ -237,7 +196,7 @@ def _sentence(
         "batch of the prior would give"
     )
     if not shifted:
-        return f"No sign that the batch has other values of {name}: {where}."
+        return f"No sign that {name} is shifted against the prior: {where}."
     sentence = f"The batch seems to have other values of {name} than the prior: {where}"
     if not tuned:
         return (

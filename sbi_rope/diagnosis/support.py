@@ -85,7 +85,7 @@ class Support:
             ),
             reason=(
                 "Alarming above the threshold: among many observations some are "
-                "flagged by chance, but none is so far away by chance."
+                "flagged by chance, but hardly one is so far away by chance."
             ),
         )
 

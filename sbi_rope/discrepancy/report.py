@@ -10,9 +10,10 @@ from torch import Tensor
 
 from sbi_rope._simulations import Moments
 from sbi_rope._standardisation import Standardisation
+from sbi_rope._validation import check_names
 from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.posterior import Discrepancy
-from sbi_rope.errors import InvalidInputError
+from sbi_rope.errors import InvalidInputError, shown
 
 __all__ = ["DiscrepancyReport", "Interval", "SummaryDiscrepancy", "report_discrepancy"]
 
@@ -112,6 +113,35 @@ class DiscrepancyReport:
         raise InvalidInputError(
             f"Expected the name of a summary; got {name!r}. There are "
             f"{sorted(summary.name for summary in self.summaries)}."
+        )
+
+    def renamed(self, names: Sequence[str]) -> "DiscrepancyReport":
+        """Return the same report with other names of the summaries.
+
+        Args:
+            names: A name for each entry of x, in the order of x.
+
+        Raises:
+            InvalidTypeError: If the names are no list of strings.
+            InvalidInputError: If they are not one for each entry of x, or the report
+                has names already.
+        """
+        of_entry = {
+            f"x[{j}]": name for j, name in enumerate(check_names("names", names))
+        }
+        known = {*(summary.name for summary in self.summaries), *self.constant}
+        if known != set(of_entry) or len(set(names)) < len(names):
+            raise InvalidInputError(
+                f"Expected `names` to be different names of {sorted(known)}; got "
+                f"{shown(names)}."
+            )
+        return replace(
+            self,
+            summaries=tuple(
+                replace(summary, name=of_entry[summary.name])
+                for summary in self.summaries
+            ),
+            constant=tuple(of_entry[name] for name in self.constant),
         )
 
     def as_rows(self) -> list[dict[str, Any]]:

@@ -1,6 +1,6 @@
 """The log-probability of the true parameters under the posterior."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -29,7 +29,7 @@ class LPPScore:
             is :math:`-\infty` where the posterior excludes the true parameter.
     """
 
-    log_probs: Tensor
+    log_probs: Tensor = field(repr=False)
 
     def __post_init__(self) -> None:
         check_tensor("log_probs", self.log_probs)

@@ -1,13 +1,14 @@
 """All scores of a posterior from one set of samples."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from torch import Tensor
 
 from sbi_rope._random import seeded
 from sbi_rope.metrics.calibration import (
+    ACAUC_IN_WORDS,
     ACAUCScore,
     CoverageCurve,
     CoverageErrorScore,
@@ -32,6 +33,8 @@ __all__ = ["Evaluation", "evaluate"]
 class Evaluation:
     """All scores of one posterior on one test set, from one set of samples.
 
+    Print it for a summary. The attributes hold the scores with all their details.
+
     Attributes:
         lpp: The log-probabilities in the natural units of theta.
         lpp_z: The log-probabilities of theta in units of ``theta_std``, or None if that
@@ -46,7 +49,7 @@ class Evaluation:
 
     lpp: LPPScore
     lpp_z: LPPScore | None
-    ranks: Tensor
+    ranks: Tensor = field(repr=False)
     acauc: ACAUCScore
     coverage: CoverageCurve
     expected_coverage_error: CoverageErrorScore
@@ -61,6 +64,53 @@ class Evaluation:
             "acauc": self.acauc.value,
             "expected_coverage_error": self.expected_coverage_error.value,
         }
+
+    def __str__(self) -> str:
+        n, d = self.ranks.shape
+        error, (low, high) = self.expected_coverage_error.value, self.acauc.interval
+        verdict = self.acauc.verdict
+        if verdict == "calibrated":
+            verdict += " as far as these observations can tell"
+        lines = [
+            f"Scores on {n} observations, with {d} true parameters each",
+            "  log probability of the true parameters (LPP), in nats an observation:",
+            *self._densities(),
+            f"  {verdict}: ACAUC {self.acauc.value:+.3f}, 95 % interval {low:+.3f} to "
+            f"{high:+.3f}",
+            f"    ({ACAUC_IN_WORDS})",
+            f"  coverage error {error:.3f}; a calibrated posterior has about "
+            f"{0.31 / n**0.5:.3f} with {n} observations",
+            f"  50% intervals hold {self._inside(0.5):.0%} of the true parameters, 90% "
+            f"intervals {self._inside(0.9):.0%}",
+            "  all values: .lpp, .lpp_z, .ranks, .acauc, .coverage, "
+            ".expected_coverage_error",
+        ]
+        return "\n".join(lines)
+
+    def _densities(self) -> list[str]:
+        scores = {"theta in its own units": self.lpp}
+        if self.lpp_z is not None:
+            # Usually these are the standard deviations of the prior, which
+            # evaluate() does not know.
+            scores["theta in units of `theta_std`"] = self.lpp_z
+        lines = [
+            f"    {unit}: {score.mean:.2f} +- {score.standard_error:.2f}, "
+            f"median {score.median:.2f}"
+            for unit, score in scores.items()
+        ]
+        if self.lpp_z is None:
+            lines.append(
+                "    pass theta_std=prior.stddev for theta in standard deviations of "
+                "the prior"
+            )
+        if self.lpp.neg_inf_fraction:
+            excluded = self.lpp.neg_inf_fraction
+            lines.append(f"    {excluded:.1%} of the true parameters have density zero")
+        return lines
+
+    def _inside(self, level: float) -> float:
+        """Return the share of true parameters in the central intervals of a level."""
+        return float(self.coverage.average[round(100 * level) - 1])
 
 
 def evaluate(

@@ -191,6 +191,10 @@ class CoupledEmbeddings(Mixing):
             self.simulated, self.batch[row], nets, unseen=self.unseen
         )
 
+    def __getstate__(self) -> dict[str, Any]:
+        # The observations that were asked for last are no part of the posterior.
+        return {**super().__getstate__(), "_extended": None}
+
     def _unseen_embedded(self, x: Tensor) -> Tensor:
         # log_prob and its normalisation, or the steps of map(), ask for the same x
         # again. The last answer is kept, so that there is one warning only.

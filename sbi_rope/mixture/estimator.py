@@ -22,7 +22,7 @@ from sbi_rope.mixture.block import Block
 from sbi_rope.mixture.chunks import blocks, flow_batch, keep_freed_memory
 from sbi_rope.mixture.coupled import CoupledEmbeddings
 from sbi_rope.mixture.density import block_log_prob
-from sbi_rope.mixture.parts import DTYPE, Part
+from sbi_rope.mixture.parts import DTYPE, OwnEmbeddings, Part
 from sbi_rope.mixture.sampling import Accept, BlockSampler
 from sbi_rope.mixture.truncation import (
     LEAKAGE_DRAWS,
@@ -112,16 +112,21 @@ class MixtureEstimator(MixtureDensity):
         """Return the same mixture for one observation of the batch.
 
         It shares its densities with this mixture, and holds no other observation.
+        Embedding nets are left out, unless the coupling can be extended to others.
 
         Args:
             index: The number of the observation in ``x_o``.
         """
-        parts = [
-            Part(part.density, part.mixing.restricted_to(index))
-            if isinstance(part.mixing, CoupledEmbeddings)
-            else part
-            for part in self.parts
-        ]
+        extends = any(mixing.unseen == "extend" for mixing in self.coupled)
+        parts = []
+        for part in self.parts:
+            mixing = part.mixing
+            if isinstance(mixing, CoupledEmbeddings):
+                part = Part(part.density, mixing.restricted_to(index))
+            elif isinstance(mixing, OwnEmbeddings) and not extends:
+                x = self.coupled[0].x_o[[index]]
+                part = Part(part.density, mixing.restricted_to(x))
+            parts.append(part)
         return MixtureEstimator(parts, self.weights, tail_mass=self.tail_mass)
 
     # --- density ---

@@ -3,6 +3,7 @@
 import copy
 import operator
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -27,6 +28,7 @@ from sbi_rope.mixture.estimator import MixtureEstimator
 from sbi_rope.mixture.parts import DTYPE
 from sbi_rope.mixture.sampling import Accept
 from sbi_rope.mixture.truncation import Leakage, is_unbounded
+from sbi_rope.saving import save
 
 __all__ = ["MixturePosterior"]
 
@@ -192,6 +194,7 @@ class MixturePosterior(BaseDirectPosterior):
         view.posterior_estimator = estimator
         potential_fn: Any = copy.copy(self.potential_fn)
         potential_fn.posterior_estimator = estimator
+        potential_fn.set_x(None)  # another observation may have been asked for last
         view.potential_fn = potential_fn
         view.set_default_x(view.x_o)
         return view
@@ -220,6 +223,24 @@ class MixturePosterior(BaseDirectPosterior):
         self._cache = {k: mass.to(device) for k, mass in self._cache.items()}
         with seeded(0):  # sbi draws from the prior to find out about it
             super().to(device)
+
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write this posterior to a file that :func:`sbi_rope.load` reads.
+
+        No code is executed when the file is loaded. The posterior of one observation,
+        ``posterior[i].save(path)``, holds no other observation.
+
+        Args:
+            path: The file. Its folder is made if there is none.
+            overwrite: Whether to replace a file that exists.
+
+        Raises:
+            InvalidTypeError: If an argument has the wrong type.
+            InvalidInputError: If the posterior holds something that cannot be
+                described, such as a lambda.
+            NotWritableError: If the file exists, or cannot be written.
+        """
+        save(self, path, overwrite=overwrite)
 
     # --- sampling ---
 

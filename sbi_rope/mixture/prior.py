@@ -12,7 +12,7 @@ from torch.distributions import Distribution
 from sbi_rope._random import seeded
 from sbi_rope._sbi import ConditionalDensityEstimator, move_distribution_to_device
 from sbi_rope._validation import check_prior
-from sbi_rope.mixture.parts import Mixing, Part, Rows
+from sbi_rope.mixture.parts import Mixing, Part, Rows, has_entries
 
 __all__ = ["PriorDensity", "part_of_prior", "prior_log_prob", "prior_sample"]
 
@@ -62,8 +62,7 @@ class NoEmbedding(Mixing):
 
     def readable(self, x: Tensor) -> Tensor:
         """Tell which observations have no entry that is infinite, and are not empty."""
-        x = x.flatten(1)
-        return ~torch.isinf(x).any(dim=1) & torch.isfinite(x).any(dim=1)
+        return has_entries(x)
 
 
 class PriorDensity(ConditionalDensityEstimator):

@@ -1,5 +1,6 @@
 """The prior in the form of an sbi posterior."""
 
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -19,6 +20,7 @@ from sbi_rope._validation import (
 )
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture.prior import prior_log_prob, prior_sample
+from sbi_rope.saving import save
 
 __all__ = ["PriorPosterior"]
 
@@ -154,6 +156,23 @@ class PriorPosterior(NeuralPosterior):
                 "or look for the mode among samples by their `log_prob`."
             )
         return super().map(*args, **kwargs)
+
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write this posterior to a file that :func:`sbi_rope.load` reads.
+
+        No code is executed when the file is loaded.
+
+        Args:
+            path: The file. Its folder is made if there is none.
+            overwrite: Whether to replace a file that exists.
+
+        Raises:
+            InvalidTypeError: If an argument has the wrong type.
+            InvalidInputError: If the posterior holds something that cannot be
+                described, such as a lambda.
+            NotWritableError: If the file exists, or cannot be written.
+        """
+        save(self, path, overwrite=overwrite)
 
     def to(self, device: str | torch.device) -> None:
         """Move the prior and the default x to a device."""

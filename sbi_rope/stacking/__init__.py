@@ -7,8 +7,10 @@ from sbi_rope.stacking.candidates import (
 )
 from sbi_rope.stacking.cross_validation import CrossValidation, Difference
 from sbi_rope.stacking.defaults import default_candidates
+from sbi_rope.stacking.learning_curve import LearningCurve
 from sbi_rope.stacking.posterior import StackedPosterior
-from sbi_rope.stacking.report import LearningCurve, StackingReport
+from sbi_rope.stacking.provenance import Provenance
+from sbi_rope.stacking.report import StackingReport
 from sbi_rope.stacking.stack import cross_validate, stack
 from sbi_rope.stacking.trained_candidates import (
     DiscrepancyCandidate,
@@ -25,6 +27,7 @@ __all__ = [
     "DiscrepancyCandidate",
     "FinetunedCandidate",
     "LearningCurve",
+    "Provenance",
     "StackedPosterior",
     "StackingReport",
     "StackingWeights",

@@ -12,6 +12,7 @@ from sbi_rope._random import seeded
 from sbi_rope._sbi import embed, estimator_of, headless
 from sbi_rope.batch import parameters_named
 from sbi_rope.coupling import Coupling
+from sbi_rope.coupling.cost import widest
 from sbi_rope.errors import CouplingError
 from sbi_rope.mixture import CoupledEmbeddings, CoupledNet, Part
 from sbi_rope.mixture.chunks import flow_batch
@@ -142,10 +143,13 @@ def fit_couplings(
         )
     batch = torch.cat([x_o, bench.x])
     nets, settings = [], []
+    # The coupler would otherwise convert, and so copy, them for each net.
+    has_float64 = widest(simulated.device) == torch.float64
+    converted = simulated.to(bench.rope.coupler.dtype) if has_float64 else simulated
     for key, net in _nets(candidates, versions).items():
         of_net = [c for c in candidates if (c.tuned, c.rehearsal) == key[:2]]
         with parameters_named(theta):
-            couplings = _couple(of_net, embed(net, batch), simulated, bench.rope)
+            couplings = _couple(of_net, embed(net, batch), converted, bench.rope)
         share = 1.0 / len(couplings)
         nets.append(CoupledNet(net, couplings, [share] * len(couplings)))
         settings += [(candidate.name, key[2]) for candidate in of_net]

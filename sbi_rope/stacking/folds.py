@@ -17,6 +17,7 @@ from sbi_rope._training import groups_of, split_groups
 from sbi_rope.discrepancy.correction import NUM_STEPS, Space, correct_npe, network_of
 from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.parameters import learn_parameters
+from sbi_rope.discrepancy.report import DiscrepancyReport, report_discrepancy
 from sbi_rope.discrepancy.tuning import TUNING
 from sbi_rope.finetuning import CalibrationFinetuner
 from sbi_rope.rope import RoPE
@@ -147,6 +148,18 @@ class Workbench:
         width = self.embedded.shape[1]
         columns = slice(width, None) if space == "input" else slice(0, width)
         return self._moments.columns(columns)
+
+    def discrepancy(self) -> DiscrepancyReport:
+        """Return what all pairs say about each entry of x, which is a short vector.
+
+        It needs no simulations beyond those of the candidates.
+        """
+        return report_discrepancy(
+            self.x,
+            self.moments("input"),
+            self.simulations[1],
+            model=DiscrepancyModel(),
+        )
 
     def tuned_net(self, folds: frozenset[int]) -> nn.Module:
         """Return an embedding net tuned on some folds, with rehearsal."""

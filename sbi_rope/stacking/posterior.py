@@ -11,6 +11,7 @@ from torch.distributions import Distribution
 from sbi_rope._sbi import describe
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture import MixturePosterior
+from sbi_rope.mixture.sharing import share_equal_tensors
 from sbi_rope.stacking.report import StackingReport
 from sbi_rope.stacking.versions import Versions
 
@@ -58,6 +59,7 @@ class StackedPosterior(MixturePosterior):
     ) -> None:
         weights = report.cross_validation.weights.weights
         estimator = versions.estimator(weights)
+        share_equal_tensors(estimator)
         if versions.couplings is not None:
             # The same object as in the estimator, so that both move to a device
             # together.

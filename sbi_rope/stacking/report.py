@@ -1,14 +1,15 @@
 """The report of a stack: whether calibration helped, and how well it is calibrated."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from os import PathLike
 from typing import Any
 
-import torch
 from torch import Tensor
 
+from sbi_rope._two_sample import TwoSampleTest
 from sbi_rope._validation import check_instance
+from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.metrics import (
     ACAUCScore,
     CoverageCurve,
@@ -17,68 +18,11 @@ from sbi_rope.metrics import (
     expected_coverage_error_of,
 )
 from sbi_rope.stacking.cross_validation import CrossValidation, Difference
+from sbi_rope.stacking.learning_curve import LearningCurve
+from sbi_rope.stacking.provenance import Provenance
+from sbi_rope.stacking.words import LEVEL, REFERENCES, lines_of
 
-__all__ = ["LearningCurve", "StackingReport"]
-
-# The text says that a stack is mostly one method if this has half of the weight.
-MOSTLY = 0.5
-# The text states the coverage of intervals at this level.
-LEVEL = 0.9
-
-# The candidates that a stack is compared with, and how the text calls them.
-REFERENCES = {"prior": "the prior", "NPE": "NPE as it was"}
-
-IN_WORDS = {
-    "prior": "your labels do not support anything sharper than the prior",
-    "NPE": "the simulator serves these data as it is, and calibration changes little",
-    "OT-only": "transport without tuning does the work, and labels add little to it",
-    "tuning-only": "the tuned embedding is trusted without transport",
-    "RoPE": "tuning and transport repair the simulator, as RoPE is meant to",
-    "fine-tuned NPE": "the labels themselves train NPE for these data",
-    "discrepancy": "a linear correction of the simulator predicts the labels best",
-    "discrepancy, fine-tuned": "the corrected simulator is where the labels start from",
-}
-
-
-@dataclass(frozen=True, kw_only=True)
-class LearningCurve:
-    """The held-out score of the stack when it is trained on fewer pairs.
-
-    Attributes:
-        num_pairs: The numbers of pairs that the candidates were trained on.
-        scores: The mean held-out log score of the stack at each number.
-        standard_errors: The standard error of each score. All scores are means over
-            the same pairs, so that their differences have smaller errors.
-    """
-
-    num_pairs: tuple[int, ...]
-    scores: tuple[float, ...]
-    standard_errors: tuple[float, ...]
-
-    @classmethod
-    def of(cls, parts: Sequence[CrossValidation]) -> "LearningCurve":
-        """Return the curve of cross-validations with increasing training sets."""
-        scores = [part.stack_scores for part in parts]
-        return cls(
-            num_pairs=tuple(part.num_trained_on for part in parts),
-            scores=tuple(float(s.mean()) for s in scores),
-            standard_errors=tuple(float(s.std() / len(s) ** 0.5) for s in scores),
-        )
-
-    def gain_of_doubling(self) -> float:
-        r"""Return how much twice as many pairs would add to the score, in nats.
-
-        The curve :math:`s(n) = a - b / n` is fitted to all points and extrapolated. At
-        the largest n the gain is :math:`b / (2 n)`, or 0 if the curve falls. It is NaN
-        if there are fewer than two points or a score is not finite.
-        """
-        inverse = 1.0 / torch.tensor(self.num_pairs, dtype=torch.double)
-        scores = torch.tensor(self.scores, dtype=torch.double)
-        if len(scores) < 2 or not torch.isfinite(scores).all():
-            return float("nan")
-        centred = inverse - inverse.mean()
-        slope = float((centred * scores).sum() / centred.square().sum())
-        return max(0.0, -slope) / (2 * self.num_pairs[-1])
+__all__ = ["StackingReport"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -94,8 +38,11 @@ class StackingReport:
     Attributes:
         cross_validation: The scores of all candidates and of the stack.
         learning_curve: The learning curve of the stack, if it was asked for.
-        score: Mean held-out log score of the stack's normalised density, and its
-            standard error.
+        score: Mean held-out log score of the stack's normalised density, in nats a
+            pair with theta in its own units, and its standard error.
+        score_z: The same with theta in standard deviations of the prior. The two differ
+            by a constant, the sum of the logs of these standard deviations. NaN if the
+            prior has none.
         comparable_score: The same without correction for leakage, so that it can be
             compared with the scores of the candidates.
         gains: How much higher the stack scores than the candidates "prior" and "NPE",
@@ -106,8 +53,11 @@ class StackingReport:
         acauc: ACAUC of the stack's central intervals.
         coverage_error: Expected coverage error of the stack's central intervals.
         share_inside: Share of the parameters inside their 90 % intervals.
-        num_simulator_calls: How many simulations the simulator made for this stack; 0
-            if all were there already.
+        batch: How the batch of the stack compares with the observations of the pairs;
+            None without a batch, or with fewer than five of either.
+        discrepancy: What the pairs say about each entry of x. None if the stack has no
+            discrepancy among its candidates, or x is not a short vector.
+        provenance: The seed, the seconds and the versions, if they are known.
     """
 
     cross_validation: CrossValidation
@@ -119,7 +69,10 @@ class StackingReport:
     acauc: ACAUCScore
     coverage_error: CoverageErrorScore
     share_inside: float
-    num_simulator_calls: int = 0
+    score_z: tuple[float, float]
+    batch: TwoSampleTest | None = None
+    discrepancy: DiscrepancyReport | None = None
+    provenance: Provenance | None = None
 
     @classmethod
     def of(
@@ -127,22 +80,28 @@ class StackingReport:
         cross_validation: CrossValidation,
         learning_curve: LearningCurve | None = None,
         *,
-        num_simulator_calls: int = 0,
+        batch: TwoSampleTest | None = None,
+        discrepancy: DiscrepancyReport | None = None,
+        provenance: Provenance | None = None,
     ) -> "StackingReport":
         """Compute the report of a stack.
 
         Args:
             cross_validation: The scores of its candidates.
             learning_curve: The learning curve of the stack, if it was asked for.
-            num_simulator_calls: How many simulations were made for it.
+            batch: How its batch compares with the pairs.
+            discrepancy: What the pairs say about each entry of x.
+            provenance: How the stack was made.
         """
         check_instance("cross_validation", cross_validation, CrossValidation)
         check_instance("learning_curve", learning_curve, LearningCurve, optional=True)
         scores, levels = cross_validation, cross_validation.levels
+        score, error = _mean_and_error(scores.stack_scores)
         return cls(
             cross_validation=scores,
             learning_curve=learning_curve,
-            score=_mean_and_error(scores.stack_scores),
+            score=(score, error),
+            score_z=(score + scores.log_unit, error),
             comparable_score=_mean_and_error(scores.scores_of("stack")),
             gains={
                 name: scores.difference("stack", name)
@@ -153,7 +112,9 @@ class StackingReport:
             acauc=acauc_of(levels),
             coverage_error=expected_coverage_error_of(levels),
             share_inside=float((levels <= LEVEL).double().mean()),
-            num_simulator_calls=num_simulator_calls,
+            batch=batch,
+            discrepancy=discrepancy,
+            provenance=provenance,
         )
 
     @property
@@ -167,7 +128,11 @@ class StackingReport:
         return self.cross_validation.coverage
 
     def as_rows(self) -> list[dict[str, Any]]:
-        """Return a row for each candidate, the best held-out score first."""
+        """Return a row for each candidate, the best held-out score first.
+
+        The key "score" is the score with theta in its own units, and "score_z" that
+        with theta in standard deviations of the prior. Both are in nats a pair.
+        """
         rows = self.cross_validation.as_rows()
         return sorted(rows, key=lambda row: -row["score"])
 
@@ -185,78 +150,49 @@ class StackingReport:
             ) from error
         return pandas.DataFrame(self.as_rows())
 
+    def to_html(
+        self,
+        path: str | PathLike[str],
+        *,
+        diagnosis: Any = None,
+        parameter_names: Sequence[str] | None = None,
+        x_names: Sequence[str] | None = None,
+    ) -> None:
+        """Write the report as one HTML file that can be sent to somebody.
+
+        It is for readers who do not know this package. It holds the scores, weights,
+        coverage and discrepancies with pictures, and how the stack was made. It needs
+        no other file, no script and no network.
+
+        Args:
+            path: The file. Its folder is made if there is none. A report of this
+                package that is there already is replaced, and no other file.
+            diagnosis: What :func:`sbi_rope.diagnose` says about the batch, if the
+                report should hold it.
+            parameter_names: A name for each parameter. If None, those of the diagnosis,
+                or "theta_1" and so on.
+            x_names: A name for each entry of x; "x[0]" and so on if None.
+
+        Raises:
+            InvalidTypeError: If an argument has the wrong type.
+            InvalidInputError: If the path is a folder or a file of something else, or
+                the names do not fit.
+            NotWritableError: If the folder cannot be written to.
+            ImportError: If matplotlib is not installed.
+        """
+        # This room draws with `plots`, which draws this report: it is above both.
+        from sbi_rope.reports import write_stacking_report
+
+        write_stacking_report(
+            self,
+            path,
+            diagnosis=diagnosis,
+            parameter_names=parameter_names,
+            x_names=x_names,
+        )
+
     def __str__(self) -> str:
-        n = len(self.cross_validation)
-        score, error = self.score
-        lines = [
-            f"Stack of {len(self.cross_validation.names)} candidates, scored on {n} "
-            "held-out calibration pairs",
-            f"  log score of the stack: {score:.2f} +- {error:.2f} a pair",
-            *self._gains(),
-            *self._weights(),
-            *self._calibration(),
-            *self._more_labels(),
-            *self._simulator_calls(),
-        ]
-        return "\n".join(lines)
-
-    def _gains(self) -> list[str]:
-        lines = []
-        for name, gain in self.gains.items():
-            if gain.low > 0:
-                verdict = f"better than {REFERENCES[name]}"
-            elif gain.high < 0:
-                verdict = f"WORSE than {REFERENCES[name]}"
-            else:
-                verdict = f"not shown to differ from {REFERENCES[name]}"
-            lines.append(
-                f"  {verdict}: {gain.mean:+.2f} nats a pair, 95 % interval "
-                f"{gain.low:+.2f} to {gain.high:+.2f}"
-            )
-        return lines
-
-    def _weights(self) -> list[str]:
-        (family, weight), *_ = self.family_weights.items()
-        shares = ", ".join(
-            f"{name} {share:.0%}" for name, share in self.family_weights.items()
-        )
-        if weight < MOSTLY:
-            return [f"  no method has half of the weight: {shares}"]
-        line = f"  mostly {family}"
-        if family in IN_WORDS:
-            line += f": {IN_WORDS[family]}"
-        return [line, f"  weights: {shares}"]
-
-    def _calibration(self) -> list[str]:
-        acauc, error = self.acauc, self.coverage_error
-        if abs(acauc.value) <= 2 * acauc.standard_error:
-            verdict = "calibrated as far as these pairs can tell"
-        else:
-            verdict = "over-confident" if acauc.value > 0 else "under-confident"
-        return [
-            f"  {verdict}: ACAUC {acauc.value:+.3f} +- {acauc.standard_error:.3f}, "
-            f"coverage error {error.value:.3f}; {LEVEL:.0%} intervals hold "
-            f"{self.share_inside:.0%} of the parameters"
-        ]
-
-    def _more_labels(self) -> list[str]:
-        curve = self.learning_curve
-        if curve is None:
-            return []
-        points = ", ".join(
-            f"{n}: {score:.2f}"
-            for n, score in zip(curve.num_pairs, curve.scores, strict=True)
-        )
-        lines = [f"  score when trained on so many pairs: {points}"]
-        gain = curve.gain_of_doubling()
-        if math.isfinite(gain):
-            lines.append(f"  twice as many labels might add {gain:.2f} nats")
-        return lines
-
-    def _simulator_calls(self) -> list[str]:
-        if not self.num_simulator_calls:
-            return []
-        return [f"  simulator calls: {self.num_simulator_calls:,}"]
+        return "\n".join(lines_of(self))
 
 
 def _mean_and_error(scores: Tensor) -> tuple[float, float]:

@@ -7,10 +7,13 @@ from torch import Tensor
 
 from sbi_rope._validation import check_choice, check_instance, check_unit_interval
 from sbi_rope.rope import RoPE
+from sbi_rope.stacking.batch import compare_batch
 from sbi_rope.stacking.candidates import Candidate
 from sbi_rope.stacking.cross_validation import CrossValidation
+from sbi_rope.stacking.learning_curve import LearningCurve
 from sbi_rope.stacking.posterior import StackedPosterior
-from sbi_rope.stacking.report import LearningCurve, StackingReport
+from sbi_rope.stacking.provenance import Stopwatch
+from sbi_rope.stacking.report import StackingReport
 from sbi_rope.stacking.trainer import StackTrainer
 
 __all__ = ["cross_validate", "stack"]
@@ -50,6 +53,11 @@ def stack(
     observation. With ``x_o``, RoPE and OT-only at many values of gamma and tau take
     part, and the stack belongs to that batch.
 
+    The weights, the scores and the calibration in the report hold for observations like
+    those of the pairs. With ``x_o`` the two are compared by an energy test of their
+    embeddings, and a p-value below 0.01 gives a warning. Without it,
+    :func:`~sbi_rope.diagnose` makes the same comparison.
+
     Args:
         rope: A RoPE with calibration pairs. It need not be trained, and it is not
             changed, except that it counts calls of the simulator, and the simulations
@@ -64,7 +72,7 @@ def stack(
         num_simulations: The number of simulations to couple with, as in
             :meth:`~sbi_rope.RoPE.build_posterior`. Candidates are trained on others:
             the simulator makes 20,000 from the prior and 100 for each label. To have
-            fewer, give RoPE itself ``num_simulations``.
+            fewer, give RoPE itself a number, ``RoPE(..., num_simulations=2000)``.
         pseudo_count: Strength of the Dirichlet prior of the weights, in pairs.
         learning_curve: Whether to train on fewer folds too, so that the report can
             estimate what more labels would add. It takes about twice the time.
@@ -94,7 +102,7 @@ def stack(
     check_choice("unseen", unseen, ("raise", "extend"))
     check_unit_interval("tail_mass", tail_mass)
     check_instance("rope", rope, RoPE)
-    num_calls = rope.num_simulator_calls
+    stopwatch = Stopwatch(rope)
     trainer = StackTrainer(
         rope,
         x_o,
@@ -108,6 +116,8 @@ def stack(
         seed=seed,
         show_progress_bars=show_progress_bars,
     )
+    # This comes first, so that nobody waits for the training to hear of it.
+    batch = None if trainer.x_o is None else compare_batch(trainer.bench, trainer.x_o)
     versions, scores = trainer.cross_validate(with_refit=True)
     curve = None
     if learning_curve:
@@ -122,7 +132,11 @@ def stack(
         versions,
         trainer.prior,
         report=StackingReport.of(
-            scores, curve, num_simulator_calls=rope.num_simulator_calls - num_calls
+            scores,
+            curve,
+            batch=batch,
+            discrepancy=trainer.discrepancy(),
+            provenance=stopwatch.provenance(seed),
         ),
         enable_transform=trainer.bench.npe.enable_transform,
     )

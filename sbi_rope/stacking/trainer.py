@@ -19,6 +19,7 @@ from sbi_rope._validation import (
     check_readable,
     check_values,
 )
+from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.discrepancy.correction import network_of
 from sbi_rope.errors import (
     InvalidInputError,
@@ -45,6 +46,7 @@ from sbi_rope.stacking.trained_candidates import (
     DiscrepancyCandidate,
     FinetunedCandidate,
 )
+from sbi_rope.stacking.units import log_unit_of
 from sbi_rope.stacking.versions import Versions, train_version
 
 __all__ = ["StackTrainer"]
@@ -168,6 +170,14 @@ class StackTrainer:
         scores = self._score(versions, num_training_folds)
         return versions, scores
 
+    def discrepancy(self) -> DiscrepancyReport | None:
+        """Return what the pairs say about each entry of x, if a candidate uses it."""
+        corrected = (DiscrepancyCandidate, FinetunedCandidate)
+        spaces = (c.space for c in self.candidates if isinstance(c, corrected))
+        if self.bench.has_summaries and any(space is not None for space in spaces):
+            return self.bench.discrepancy()
+        return None
+
     def _train(self, folds: Sequence[Fold]) -> Versions:
         chosen = self.candidates
         bar = progress_bar(folds, show=self.show, desc="Folds")
@@ -208,6 +218,7 @@ class StackTrainer:
             stack_scores=stack_scores,
             levels=levels,
             pseudo_count=self.pseudo_count,
+            log_unit=log_unit_of(self.prior),
         )
         if not scores.weights.converged:
             warn_user(

@@ -7,6 +7,7 @@ import pickle
 import random
 import warnings
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from sbi.utils import within_support
 from torch import Tensor, nn
 
 import sbi_rope.baselines
+from sbi_rope import load, save
 from sbi_rope._random import seeded
 from sbi_rope.baselines import (
     CalibrationMLP,
@@ -217,6 +219,25 @@ def test_a_copy_of_the_posterior_has_the_same_density(name: str) -> None:
     posterior, expected = result(name), expected_densities(name)
     for copied in (copy.deepcopy(posterior), pickle.loads(pickle.dumps(posterior))):
         assert torch.equal(densities(copied, name), expected)
+
+
+@pytest.mark.parametrize("name", [*ONE_OF_A_KIND, "fmcpe", "frisbi", "hvae"])
+def test_the_posterior_can_be_saved(name: str, tmp_path: Path) -> None:
+    posterior, expected = result(name), expected_densities(name)
+    save(posterior, tmp_path / "posterior.pt")
+    loaded = load(tmp_path / "posterior.pt")
+    assert type(loaded) is type(posterior)
+    assert torch.equal(densities(loaded, name), expected)
+
+
+@pytest.mark.parametrize("name", ["npe", "joint_npe", "npe_rs", "nnpe", "frisbi"])
+def test_training_leaves_no_file_in_the_working_folder(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task = first_task(name)
+    monkeypatch.chdir(tmp_path)
+    train(feed(make(name, task), data_of(task))).build_posterior()
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", [*ONE_OF_A_KIND, "hvae"])
@@ -494,6 +515,7 @@ SEES = {
     "PlainNPE": {"simulations"},
     "PriorBaseline": set(),
     "RNPE": {"simulations"},
+    "RVNP": {"simulations", "observations"},
     "ReferenceNPE": {"simulations"},
     "TuningOnly": {"simulations", "calibration"},
 }
@@ -587,7 +609,7 @@ def test_a_posterior_trained_beforehand_fixes_the_shape_of_x() -> None:
 
 def test_simulations_that_are_not_needed_earn_a_warning() -> None:
     of_use = {name for name in BUILDERS if METHODS[name].kind is DiscrepancyNPE}
-    of_use |= {"nnpe", "rnpe"}
+    of_use |= {"nnpe", "rnpe", "rvnp"}
     # These look simulations up, because they have no simulator here.
     of_use |= {name for name in BUILDERS if name.startswith(("fmcpe", "frisbi"))}
     of_use |= {"tuning_only"}

@@ -2,14 +2,18 @@
 
 import math
 import sys
+import warnings
 from dataclasses import replace
 
 import pytest
 import torch
 from torch import nn
+from torch.distributions import Cauchy, Independent, MultivariateNormal
 
 from sbi_rope import plots
-from sbi_rope.metrics import acauc_of
+from sbi_rope._two_sample import TwoSampleTest
+from sbi_rope.errors import RoPEWarning
+from sbi_rope.metrics import LPPScore, acauc_of
 from sbi_rope.stacking import (
     CrossValidation,
     Difference,
@@ -17,6 +21,7 @@ from sbi_rope.stacking import (
     LearningCurve,
     StackingReport,
 )
+from sbi_rope.stacking.units import log_unit_of
 from tests import problems
 from tests.stacks import (
     FITTED,
@@ -27,6 +32,7 @@ from tests.stacks import (
     rope_of,
     stacked,
     the_coupled_stack,
+    the_stack,
 )
 
 # Batches and calibration sets are small here on purpose.
@@ -65,8 +71,22 @@ def test_gains_are_mean_differences_of_comparable_scores() -> None:
         assert gain.low < gain.mean < gain.high
         assert f"{gain.mean:+.2f} nats a pair" in str(report)
     assert "better than the prior" in str(report)
-    assert "WORSE than the prior" in with_gain(report, low=-0.3, high=-0.1)
+    assert "  worse than the prior" in with_gain(report, low=-0.3, high=-0.1)
+    assert "slightly worse than the prior" in with_gain(report, low=-0.03, high=-0.01)
+    assert "slightly better than the prior" in with_gain(report, low=0.01, high=0.03)
     assert "not shown to differ from the prior" in with_gain(report, low=-1, high=1)
+
+
+def test_intervals_of_differences_of_few_pairs_hold_the_true_difference() -> None:
+    generator = torch.Generator().manual_seed(0)
+    report, held = made_up(n=10).cross_validation, 0
+    for _ in range(300):
+        difference = torch.randn(10, generator=generator).double()
+        columns = [difference, *[torch.zeros(10).double()] * 3]
+        scores = replace(report, log_scores=torch.stack(columns, dim=1))
+        found = scores.difference("prior", "NPE")
+        held += found.low <= 0.0 <= found.high
+    assert 0.93 <= held / 300 <= 0.985
 
 
 def with_gain(report: StackingReport, *, low: float, high: float) -> str:
@@ -80,9 +100,50 @@ def test_the_stated_score_is_that_of_the_normalised_density() -> None:
     mean, error = report.score
     assert math.isclose(mean, float(scores.mean()))
     assert math.isclose(error, float(scores.std()) / 12**0.5)
-    assert f"log score of the stack: {mean:.2f} +- {error:.2f} a pair" in str(report)
+    assert f"{mean:.2f} +- {error:.2f} with theta in its own units" in str(report)
+    # Without the prior's standard deviations there is one unit only.
+    assert "standard deviations of the prior" not in str(report)
     comparable = report.cross_validation.scores_of("stack")
     assert math.isclose(report.comparable_score[0], float(comparable.mean()))
+
+
+def test_scores_are_stated_in_standard_deviations_of_the_prior_too() -> None:
+    posterior = the_stack()
+    report = posterior.report
+    # The standard deviation of a uniform distribution on [-1, 1].
+    unit = 2 * math.log(1 / 3**0.5)
+    assert math.isclose(report.score_z[0], report.score[0] + unit, rel_tol=1e-6)
+    assert report.score_z[1] == report.score[1]
+    stated = (
+        f"{report.score_z[0]:.2f} +- {report.score_z[1]:.2f} with theta in standard"
+    )
+    assert stated in str(report)
+    for row in report.as_rows():
+        assert math.isclose(row["score_z"], row["score"] + unit, rel_tol=1e-6)
+    # It is the score of the density of the standardised parameters.
+    scores = LPPScore(log_probs=report.cross_validation.stack_scores)
+    std = torch.full((2,), 1 / 3**0.5)
+    assert math.isclose(report.score_z[0], scores.standardised(std).mean, rel_tol=1e-6)
+
+
+class Unstated(MultivariateNormal):
+    """A prior that does not state its standard deviation."""
+
+    @property
+    def stddev(self) -> torch.Tensor:
+        raise NotImplementedError
+
+
+def test_the_unit_of_a_prior_is_estimated_from_draws_or_unknown() -> None:
+    covariance = torch.diag(torch.tensor([4.0, 0.01]))
+    stated = log_unit_of(MultivariateNormal(torch.zeros(2), covariance))
+    assert math.isclose(stated, math.log(2.0) + math.log(0.1), abs_tol=1e-6)
+    state = torch.get_rng_state()
+    estimated = log_unit_of(Unstated(torch.zeros(2), covariance))
+    assert math.isclose(estimated, stated, abs_tol=0.05)
+    assert torch.equal(torch.get_rng_state(), state)
+    heavy = Independent(Cauchy(torch.zeros(2), torch.ones(2)), 1)
+    assert math.isnan(log_unit_of(heavy))
 
 
 def test_weights_of_families_are_summed_and_explained() -> None:
@@ -94,7 +155,7 @@ def test_weights_of_families_are_summed_and_explained() -> None:
     assert weights["RoPE"] == pytest.approx(float(found[2:].sum()))
     assert math.isclose(sum(weights.values()), 1.0, rel_tol=1e-9)
     assert list(weights.values()) == sorted(weights.values(), reverse=True)
-    assert "mostly RoPE: tuning and transport repair the simulator" in str(report)
+    assert "mostly RoPE: the embedding net was tuned on the labels" in str(report)
     assert f"RoPE {weights['RoPE']:.0%}" in str(report)
     torn = replace(report, family_weights={"prior": 0.4, "NPE": 0.3, "RoPE": 0.3})
     assert "no method has half of the weight: prior 40%" in str(torn)
@@ -105,11 +166,64 @@ def test_the_text_says_whether_the_stack_is_over_or_under_confident() -> None:
     levels = report.levels
     for found, verdict in (
         (levels, "calibrated as far as these pairs can tell"),
-        (levels.sqrt(), "over-confident"),
-        (levels.square(), "under-confident"),
+        (levels.sqrt(), "over-confident on held-out pairs"),
+        (levels.square(), "too wide on held-out pairs"),
     ):
         scores = replace(report.cross_validation, levels=found)
-        assert f"\n  {verdict}: ACAUC" in str(StackingReport.of(scores))
+        text = str(StackingReport.of(scores))
+        assert f"\n  {verdict}: ACAUC" in text
+        assert (
+            "(0 is calibrated, positive is over-confident, negative is too wide)"
+            in text
+        )
+
+
+def test_the_text_names_what_calibration_assumes_about_a_batch() -> None:
+    report = made_up()
+    assert "holds for observations like those of the pairs" in str(report)
+    assert "`diagnose(rope.train(), x_o)` tests" in str(report)
+    like, unlike = (
+        str(replace(report, batch=TwoSampleTest(p_value=p, spread=0.4)))
+        for p in (0.32, 0.002)
+    )
+    assert "no sign of a difference (p = 0.32)" in like
+    assert "this need NOT hold for the batch" in unlike
+    assert "diagnose(rope.train(), x_o)" in unlike
+
+
+def test_a_batch_unlike_the_pairs_gives_a_warning() -> None:
+    options = {"candidates": [OT_ONLY, PRIOR]}
+    corner = observed() + 1.0
+    with pytest.warns(RoPEWarning, match="differs from the observations of the cal"):
+        report = stacked(rope_of(), corner, **options).report
+    assert report.batch is not None
+    assert report.batch.is_different
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="The batch `x_o` differs")
+        like = stacked(rope_of(), observed(), **options).report
+    assert like.batch is not None
+    assert not like.batch.is_different
+    assert the_stack().report.batch is None
+
+
+def test_a_stack_with_a_discrepancy_says_what_the_pairs_say_about_each_entry() -> None:
+    found = the_stack().report.discrepancy
+    assert found is not None
+    assert {summary.name for summary in found.summaries} == {"x[0]", "x[1]", "x[2]"}
+    assert found.num_pairs == 20
+    # Real observations are 0.4 higher.
+    assert all(0.2 < summary.shift.median < 0.6 for summary in found.summaries)
+    without = stacked(rope_of(), candidates=[PRIOR, FITTED]).report
+    assert without.discrepancy is None
+
+
+def test_a_report_knows_how_it_was_made() -> None:
+    made = the_stack().report.provenance
+    assert made is not None
+    assert made.seed == 0
+    assert made.seconds > 0
+    assert made.versions["torch"] == torch.__version__
+    assert {"Python", "sbi-rope", "sbi", "POT"} <= set(made.versions)
 
 
 def test_calibration_is_that_of_held_out_pairs() -> None:
@@ -153,7 +267,7 @@ def test_the_learning_curve_has_a_point_for_one_two_and_four_folds() -> None:
     assert torch.equal(report.cross_validation.log_scores, found)
     assert without.learning_curve is None
     assert len(set(curve.scores)) == 3
-    assert f"on so many pairs: 4: {curve.scores[0]:.2f}, 8: " in str(report)
+    assert f"in its own units: 4 pairs: {curve.scores[0]:.2f}, 8 " in str(report)
 
 
 def test_the_gain_of_twice_as_many_labels_is_extrapolated_from_the_curve() -> None:
@@ -211,15 +325,15 @@ def test_a_report_says_how_often_the_simulator_was_called_for_the_stack() -> Non
     before = rope.num_simulator_calls
     report = stacked(rope, candidates=[PRIOR, DISCREPANCY]).report
     # 300 from the prior and 5 at the parameters of each of 20 pairs.
-    assert report.num_simulator_calls == rope.num_simulator_calls - before == 400
-    assert "simulator calls: 400" in str(report)
+    assert calls_of(report) == rope.num_simulator_calls - before == 400
+    assert "with 400 calls of the simulator" in str(report)
     # Those from the prior are kept for the next stack.
-    again = stacked(rope, candidates=[PRIOR, DISCREPANCY]).report
-    assert again.num_simulator_calls == 100
-    many = replace(report, num_simulator_calls=7421)
-    assert "simulator calls: 7,421" in str(many)
+    assert calls_of(stacked(rope, candidates=[PRIOR, DISCREPANCY]).report) == 100
     theta = problems.box(2).sample((1000,))
     stored = rope_of(simulations=(theta, problems.simulate(theta)))
-    report = stacked(stored, candidates=[PRIOR, DISCREPANCY]).report
-    assert report.num_simulator_calls == 0
-    assert "simulator calls" not in str(report)
+    assert calls_of(stacked(stored, candidates=[PRIOR, DISCREPANCY]).report) == 0
+
+
+def calls_of(report: StackingReport) -> int:
+    assert report.provenance is not None
+    return report.provenance.num_simulator_calls

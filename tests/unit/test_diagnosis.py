@@ -1,5 +1,6 @@
 """Each finding of a diagnosis fires where it should, and is quiet where it should."""
 
+import itertools
 import warnings
 from collections.abc import Iterator
 from dataclasses import replace
@@ -10,6 +11,7 @@ from scipy.stats import kstest
 from torch import Tensor
 
 from sbi_rope import CalibrationFinetuner, RoPE, SinkhornCoupler
+from sbi_rope._two_sample import compare_with_pairs, two_sample_test
 from sbi_rope.diagnosis import Diagnosis, diagnose
 from sbi_rope.diagnosis.misspecification import mmd_test
 from sbi_rope.diagnosis.prior_shift import prior_shift
@@ -21,6 +23,7 @@ from sbi_rope.diagnosis.residuals import (
     residual_finding,
 )
 from sbi_rope.diagnosis.simulations import Simulations
+from sbi_rope.diagnosis.spread import spread_of
 from sbi_rope.diagnosis.support import support_of
 from sbi_rope.errors import InvalidInputError, NotReadyError
 from sbi_rope.plots import implied_parameters
@@ -29,6 +32,8 @@ from tests import gaussian
 NUM_DRAWS = 120
 FINETUNER = CalibrationFinetuner(learning_rate=1e-2, max_num_epochs=150)
 SHIFTS = ("prior shift: theta_1", "prior shift: theta_2")
+NARROW = ("narrower than the prior: theta_1", "narrower than the prior: theta_2")
+UNLIKE = "batch unlike the calibration pairs"
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -84,11 +89,15 @@ def test_nothing_alarms_where_the_simulator_is_right() -> None:
     torch.manual_seed(2)
     diagnosis = look(conductor(), gaussian.simulator(parameters(200)))
     assert alarms(diagnosis) == set()
-    # Without calibration pairs, the two tests that need labels are left out.
+    # Without calibration pairs, the three tests that need labels are left out.
     names = {finding.name for finding in diagnosis.findings}
-    assert len(names) == 7
+    assert len(names) == 9
     assert names.isdisjoint(
-        {"misspecification after tuning", "residual depends on parameters"}
+        {
+            "misspecification after tuning",
+            "residual depends on parameters",
+            "batch unlike the calibration pairs",
+        }
     )
     assert diagnosis.residuals is None
     assert "no calibration pairs" in str(diagnosis)
@@ -124,6 +133,45 @@ def test_a_prior_shift_is_found_in_the_parameter_that_shifts(tuned: RoPE) -> Non
     assert diagnosis[SHIFTS[0]].alarming
     assert "higher" in diagnosis[SHIFTS[0]].sentence
     assert not diagnosis[SHIFTS[1]].alarming
+
+
+def test_a_batch_of_a_quarter_of_the_prior_is_found_to_be_narrow(tuned: RoPE) -> None:
+    torch.manual_seed(27)
+    x_o = gaussian.real_process(0.25 * parameters(100))
+    diagnosis = look(tuned, x_o)
+    for name in NARROW:
+        assert diagnosis[name].alarming
+        assert "narrower range" in diagnosis[name].sentence
+    # The pairs come from the whole prior.
+    assert diagnosis[UNLIKE].alarming
+    # A narrow batch around the mean of the prior is not shifted, and the text says so.
+    assert not diagnosis[SHIFTS[0]].alarming
+    assert "No sign that theta_1 is shifted" in diagnosis[SHIFTS[0]].sentence
+
+
+def test_a_narrow_batch_like_its_pairs_is_narrower_than_the_prior_only() -> None:
+    torch.manual_seed(38)
+    theta = 0.25 * parameters(60)
+    rope = conductor().append_calibration(theta, gaussian.real_process(theta))
+    rope.train(seed=0, show_progress_bars=False)
+    x_o = gaussian.real_process(0.25 * parameters(100))
+    diagnosis = look(rope, x_o, num_folds=None)
+    assert diagnosis[NARROW[0]].alarming
+    assert not diagnosis[UNLIKE].alarming
+    assert "No sign that the batch differs" in diagnosis[UNLIKE].sentence
+
+
+@pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
+def test_too_few_observations_or_pairs_leave_comparisons_of_them_out() -> None:
+    torch.manual_seed(29)
+    rope = conductor(finetuner=CalibrationFinetuner(max_num_epochs=2))
+    rope.append_calibration(*gaussian.labelled(3)).train(
+        seed=0, show_progress_bars=False
+    )
+    diagnosis = look(rope, gaussian.real_process(parameters(30)), num_simulations=200)
+    names = {finding.name for finding in diagnosis.findings}
+    assert names.isdisjoint({*NARROW, UNLIKE})
+    assert sum("was not tested" in note for note in diagnosis.notes) == 3
 
 
 def test_a_single_outlier_is_flagged(tuned: RoPE) -> None:
@@ -204,7 +252,7 @@ def test_the_text_holds_every_finding_and_rows_their_numbers(
     for finding, row in zip(misspecified.findings, misspecified.as_rows(), strict=True):
         assert f"{finding.name}: {finding.value:.3g}" in text
         assert row["value"] == finding.value
-    assert "1 of 9 findings is alarming" in text
+    assert "1 of 12 findings is alarming" in text
     assert text.count("\n! ") == 1
 
 
@@ -396,6 +444,127 @@ def test_errors_of_g_on_calibration_pairs_raise_the_threshold_of_a_shift() -> No
     off = CrossFitted(embedded=exact.embedded + wrong, targets=targets)
     told = prior_shift(real + wrong, known, held_out=off)
     assert not (told.distance > told.threshold).any()
+
+
+# --- spread ---
+
+
+def test_narrow_batches_alarm_and_batches_from_the_prior_do_not() -> None:
+    torch.manual_seed(30)
+    quiet, loud = 0, 0
+    for _ in range(20):
+        known = simulations(500)
+        for factor in (1.0, 0.25):
+            x = gaussian.simulator(factor * parameters(100)).double()
+            spread = spread_of(prior_shift(gaussian.GAIN * x, known), known.theta)
+            narrow = spread.ratio < spread.threshold
+            loud += int(narrow.all()) if factor < 1 else 0
+            quiet += int(narrow.any()) if factor == 1 else 0
+    assert loud == 20
+    assert quiet <= 1
+
+
+def test_the_spread_is_that_of_mean_parameters_of_single_observations() -> None:
+    torch.manual_seed(31)
+    known = simulations(200)
+    real = 0.3 * torch.randn(30, 2).double()
+    coupler = SinkhornCoupler(gamma=0.1, tau=0.0, cost_scale="simulated")
+    coupling = coupler.couple(real, known.embedded)
+    cost = torch.cdist(known.embedded, known.embedded).fill_diagonal_(torch.inf)
+    usual = ((-cost / coupling.gamma).softmax(dim=1) @ known.theta).std(dim=0)
+    expected = (coupling.weights @ known.theta).std(dim=0) / usual
+    found = spread_of(prior_shift(real, known), known.theta).ratio
+    assert torch.allclose(found, expected, rtol=1e-6)
+
+
+def test_a_g_that_squeezes_unseen_pairs_lowers_the_limit_of_the_spread() -> None:
+    torch.manual_seed(32)
+    known = simulations(800, is_tuned=True)
+    theta = parameters(200).double()
+    targets = gaussian.GAIN * theta
+    squeeze = torch.tensor([0.5, 1.0]).double()
+    seen = CrossFitted(embedded=targets * squeeze, targets=targets)
+    fair = CrossFitted(embedded=gaussian.simulator(targets), targets=targets)
+    real = gaussian.GAIN**2 * gaussian.simulator(parameters(200)).double() * squeeze
+    blind = spread_of(prior_shift(real, known), known.theta)
+    assert (blind.ratio < blind.threshold).tolist() == [True, False]
+    told, other = (
+        spread_of(
+            prior_shift(real, known, held_out=pairs), known.theta, theta_cal=theta
+        )
+        for pairs in (seen, fair)
+    )
+    assert told.error is not None
+    assert other.error is not None
+    assert not (told.ratio < told.threshold).any()
+    assert float(told.error[0]) < 0.75
+    assert torch.equal(other.error, torch.ones(2).double())
+
+
+def test_the_spread_of_pairs_is_carried_over_to_the_range_of_the_prior() -> None:
+    torch.manual_seed(33)
+    known = simulations(800, is_tuned=True)
+    # Pairs from a quarter of the prior say nothing against g.
+    theta = 0.25 * parameters(200).double()
+    targets = gaussian.GAIN * theta
+    pairs = CrossFitted(embedded=known.average(targets), targets=targets)
+    shift = prior_shift(targets, known, held_out=pairs)
+    spread = spread_of(shift, known.theta, theta_cal=theta)
+    assert spread.error is not None
+    assert float(spread.error.min()) > 0.6
+
+
+# --- the calibration pairs ---
+
+
+def energy(a: Tensor, b: Tensor) -> float:
+    """By the definition, in units of the standard deviation of all rows."""
+    std = torch.cat([a, b]).std(dim=0)
+
+    def apart(x: Tensor, y: Tensor) -> float:
+        return float(((x[:, None] - y[None]) / std).norm(dim=2).mean())
+
+    return 2 * apart(a, b) - apart(a, a) - apart(b, b)
+
+
+def test_the_p_value_is_the_share_of_divisions_as_far_apart() -> None:
+    torch.manual_seed(34)
+    a, b = torch.randn(5, 2).double(), torch.randn(6, 2).double() + 1.0
+    rows, found = torch.cat([a, b]), energy(a, b)
+    divisions = list(itertools.combinations(range(11), 5))
+    reached = 0
+    for chosen in divisions:
+        member = torch.zeros(11, dtype=torch.bool)
+        member[list(chosen)] = True
+        reached += energy(rows[member], rows[~member]) >= found - 1e-12
+    test = two_sample_test(a, b)
+    assert test is not None
+    assert test.p_value == pytest.approx(reached / len(divisions), abs=0.04)
+
+
+def test_sets_of_one_distribution_seldom_differ_and_a_narrow_one_does() -> None:
+    torch.manual_seed(35)
+    tests = [
+        two_sample_test(torch.randn(20, 3), factor * torch.randn(40, 3))
+        for factor in (1.0, 0.3)
+        for _ in range(20)
+    ]
+    different = [test is not None and test.is_different for test in tests]
+    assert sum(different[:20]) <= 2
+    assert all(different[20:])
+    spreads = [test.spread for test in tests if test is not None]
+    assert sum(spreads[20:]) / 20 == pytest.approx(0.3, abs=0.03)
+
+
+def test_pairs_with_the_same_parameters_count_once() -> None:
+    torch.manual_seed(36)
+    # Six people with ten recordings each, all of them alike.
+    people = torch.randn(6, 2).repeat(10, 1) + 1e-3 * torch.randn(60, 2)
+    groups, batch = torch.arange(6).repeat(10), torch.randn(50, 2)
+    test = compare_with_pairs(people, groups, batch)
+    assert test is not None
+    assert test == two_sample_test(people[:6], batch)
+    assert compare_with_pairs(people[:4], groups[:4], batch) is None
 
 
 # --- residuals ---

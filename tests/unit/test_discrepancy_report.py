@@ -225,6 +225,22 @@ def test_wrong_names_of_summaries_are_refused() -> None:
     assert {s.name for s in found.summaries} == {f"x[{j}]" for j in range(4)}
 
 
+def test_a_report_can_be_given_other_names_of_summaries() -> None:
+    x, moments = pairs(20)
+    constant = simulated(500)
+    constant[:, 0] = 3.0
+    found = report_discrepancy(x, moments, constant, model=ONE_SETTING)
+    named = found.renamed(NAMES)
+    assert named.constant == ("light",)
+    assert named["shade"].gain == found["x[1]"].gain
+    assert [s.size for s in named.summaries] == [s.size for s in found.summaries]
+    for names in (NAMES[:3], ["light"] * 4):
+        with pytest.raises(InvalidInputError, match="different names"):
+            found.renamed(names)
+    with pytest.raises(InvalidInputError, match="different names"):
+        named.renamed(NAMES)
+
+
 def method(**options: Any) -> DiscrepancyNPE:
     return DiscrepancyNPE(problems.box(2), num_simulations=2000, **options)
 

@@ -140,7 +140,7 @@ def test_the_density_integrates_to_the_marginal_cdf_and_to_one(
         theta = grid[row, row].float().unsqueeze(0)
         below = [mass[:row].sum() + mass[row].sum() / 2]
         below.append(mass[:, :row].sum() + mass[:, row].sum() / 2)
-        expected = torch.tensor([below]).float()
+        expected = torch.stack(below)[None].float()
         found = prior.marginal_cdf(theta)
         torch.testing.assert_close(found, expected, rtol=0.0, atol=2e-3)
     far = torch.tensor([[0.0, 0.0], [1000.0, 1000.0]])

@@ -212,7 +212,32 @@ def test_coverage_error_standard_error_matches_its_spread() -> None:
 
 
 def test_one_observation_has_no_standard_error() -> None:
-    assert math.isnan(metrics.acauc_of(torch.rand(1, 2)).standard_error)
+    score = metrics.acauc_of(torch.rand(1, 2))
+    assert math.isnan(score.standard_error)
+    assert all(math.isnan(end) for end in score.interval)
+    assert score.verdict == "calibrated"
+
+
+@pytest.mark.parametrize(("n", "d", "copies"), [(10, 1, 1), (10, 3, 1), (10, 1, 3)])
+def test_calibrated_levels_of_ten_seldom_have_an_interval_without_zero(
+    n: int, d: int, copies: int
+) -> None:
+    generator = torch.Generator().manual_seed(1)
+    wrong = 0
+    for _ in range(1000):
+        levels = torch.rand(n, d, generator=generator).repeat(1, copies)
+        wrong += metrics.acauc_of(levels).verdict != "calibrated"
+    # In many more draws it is 4 to 5 %; with two standard errors it would be 8 %.
+    assert 0.02 < wrong / 1000 < 0.06
+
+
+def test_levels_too_large_are_over_confident_and_too_small_too_wide() -> None:
+    levels = torch.rand(60, 2)
+    assert metrics.acauc_of(levels.sqrt()).verdict == "over-confident"
+    score = metrics.acauc_of(levels.square())
+    assert score.verdict == "too wide"
+    low, high = score.interval
+    assert low < score.value < high < 0.0
 
 
 # Gaussian posteriors with known scores ------------------------------------------------
@@ -384,6 +409,29 @@ def test_a_seed_fixes_the_samples_and_leaves_the_global_random_state_alone() -> 
     other = metrics.evaluate(GaussianPosterior(), theta, x, num_samples=20, seed=2)
     assert torch.equal(first.ranks, again.ranks)
     assert not torch.equal(first.ranks, other.ranks)
+
+
+def test_a_printed_evaluation_is_a_dozen_lines_that_name_their_units() -> None:
+    theta, x = gaussian_pairs(300)
+    std = torch.tensor([2.0])
+    result = metrics.evaluate(
+        GaussianPosterior(0.0, 0.3), theta, x, theta_std=std, num_samples=100, seed=0
+    )
+    text = str(result)
+    assert 8 <= len(text.splitlines()) <= 12
+    assert len(repr(result)) < 500
+    assert result.lpp_z is not None
+    for unit, score in (("its own units", result.lpp), ("units of", result.lpp_z)):
+        line = next(line for line in text.splitlines() if f"theta in {unit}" in line)
+        assert f"{score.mean:.2f} +- {score.standard_error:.2f}" in line
+    assert f"over-confident: ACAUC {result.acauc.value:+.3f}" in text
+    assert "0 is calibrated, positive is over-confident, negative is too wide" in text
+    inside = (metrics.central_levels(result.ranks) <= 0.9).double().mean()
+    assert f"90% intervals {inside:.0%}" in text
+    assert "density zero" not in text
+    without = metrics.evaluate(GaussianPosterior(), theta, x, num_samples=50, seed=0)
+    assert "pass theta_std=prior.stddev" in str(without)
+    assert "calibrated as far as these observations can tell" in str(without)
 
 
 def test_joint_acauc_uses_at_most_200_observations_from_the_whole_test_set() -> None:

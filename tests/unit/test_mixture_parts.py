@@ -543,6 +543,30 @@ def test_the_posterior_of_one_observation_answers_as_the_whole(unseen: str) -> N
         assert torch.allclose(found, posterior.log_prob(theta, x=other), atol=1e-5)
 
 
+def test_the_posterior_of_one_observation_needs_no_nets_unless_it_is_extended() -> None:
+    kept, extended = (
+        three_parts(unseen=unseen)[2].posterior_estimator
+        for unseen in ("raise", "extend")
+    )
+    assert not [module for module in kept.modules() if isinstance(module, nn.Linear)]
+    nets = [module for module in extended.modules() if isinstance(module, nn.Linear)]
+    assert len(nets) == 4  # two of each part
+
+
+def test_the_posterior_of_one_observation_forgets_who_was_asked_for_before() -> None:
+    posterior = three_parts(unseen="extend")
+    posterior.potential(torch.zeros(1, DIM), posterior.x_o[0])
+    with pytest.warns(RoPEWarning, match="Extended"):
+        posterior.log_prob(torch.zeros(1, DIM), x=torch.ones(1, 3))
+    one = posterior[2]
+    assert one.potential_fn.return_x_o() is None
+    (coupled,) = one.posterior_estimator.coupled
+    assert torch.equal(coupled.batch, posterior.x_o[2:3])
+    copied = pickle.loads(pickle.dumps(posterior))
+    with pytest.warns(RoPEWarning, match="Extended"):  # its answer was not kept
+        copied.log_prob(torch.zeros(1, DIM), x=torch.ones(1, 3))
+
+
 def test_the_pickle_of_one_observation_does_not_grow_with_the_batch() -> None:
     def size(n_o: int) -> tuple[int, int]:
         posterior = problems.gaussian_posterior(x_o=torch.randn(n_o, 1, 16, 16))

@@ -1,6 +1,7 @@
 """RoPE: the order of its steps, what is used again, and what is refused."""
 
 import copy
+import io
 import itertools
 import pickle
 import sys
@@ -774,3 +775,52 @@ def test_a_prior_that_cannot_be_copied_is_named() -> None:
 def test_a_trainer_is_refused_in_place_of_its_posterior() -> None:
     with pytest.raises(UnsupportedPosteriorError, match="has still to build it"):
         RoPE(NPE(gaussian.prior()), simulator=gaussian.simulator)
+
+
+# --- pickles ---
+
+
+def through_pickle(conductor: RoPE) -> RoPE:
+    return pickle.loads(pickle.dumps(conductor))
+
+
+def through_torch(conductor: RoPE) -> RoPE:
+    buffer = io.BytesIO()
+    torch.save(conductor, buffer)
+    buffer.seek(0)
+    return torch.load(buffer, weights_only=False)
+
+
+def through_joblib(conductor: RoPE) -> RoPE:
+    # What joblib pickles for its workers with; older versions have a copy of their own.
+    cloudpickle = pytest.importorskip("cloudpickle")
+    return pickle.loads(cloudpickle.dumps(conductor))
+
+
+@pytest.mark.parametrize(
+    "copied", [through_pickle, through_torch, through_joblib, copy.deepcopy]
+)
+def test_a_rope_of_a_lambda_can_be_pickled_and_simulates_as_before(
+    copied: Callable[[RoPE], RoPE],
+) -> None:
+    noise = gaussian.NOISE_STD
+    conductor = trained(simulator=lambda theta: theta + noise * torch.randn_like(theta))
+    expected = conductor.build_posterior(X_O, seed=3, num_simulations=100).weights
+    # A copy can be copied again.
+    for other in (copied(conductor), copied(copied(conductor))):
+        found = other.build_posterior(X_O, seed=3, num_simulations=100).weights
+        assert torch.equal(found, expected)
+
+
+def test_a_simulator_that_cannot_be_pickled_is_named_and_can_be_copied() -> None:
+    lock = threading.Lock()
+
+    def locked(theta: Tensor) -> Tensor:
+        with lock:
+            return gaussian.simulator(theta)
+
+    conductor = rope(simulator=locked)
+    with pytest.raises(InvalidInputError, match=r"locked refers to .*in a module"):
+        pickle.dumps(conductor)
+    # A copy in the same process needs no pickle, and calls the same function.
+    assert len(copy.deepcopy(conductor).build_posterior(X_O).x_o) == len(X_O)

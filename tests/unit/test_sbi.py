@@ -19,10 +19,11 @@ from sbi.inference import (
 )
 from sbi.inference.posteriors import NPE_A_Posterior
 from sbi.inference.posteriors.filtered_direct_posterior import FilteredDirectPosterior
-from sbi.neural_nets import posterior_nn
+from sbi.neural_nets import likelihood_nn, posterior_nn
 from sbi.neural_nets.estimators.tabpfn_flow import TabPFNFlow
 from sbi.utils import RestrictedPrior, get_density_thresholder
 from torch import Tensor, nn
+from torch.distributions import Categorical, MixtureSameFamily, MultivariateNormal
 
 from sbi_rope import RoPE
 from sbi_rope._sbi import (
@@ -30,6 +31,7 @@ from sbi_rope._sbi import (
     embed,
     embedding_of,
     estimator_of,
+    gaussians_of,
     headless,
     posterior_from,
     with_embedding,
@@ -301,3 +303,19 @@ def test_posterior_from_keeps_how_a_vector_field_is_sampled(sample_with: str) ->
     posterior = posterior_from(original, original.vector_field_estimator)
     assert type(posterior) is VectorFieldPosterior
     assert posterior.sample_with == sample_with
+
+
+def test_the_gaussians_of_a_mixture_density_network_have_its_density() -> None:
+    torch.manual_seed(0)
+    theta, x = torch.randn(50, 2), torch.randn(50, 3)
+    network = likelihood_nn("mdn", z_score_x="none", num_components=3)(theta, x)
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=0.2)
+    logits, means, covariances = gaussians_of(network, theta)
+    correlated = covariances - torch.diag_embed(covariances.diagonal(dim1=-2, dim2=-1))
+    assert correlated.abs().mean() > 0.1
+    law = MixtureSameFamily(
+        Categorical(logits=logits), MultivariateNormal(means, covariances)
+    )
+    expected = network.log_prob(x[None], theta)[0].double()
+    torch.testing.assert_close(law.log_prob(x), expected, atol=0.02, rtol=0.01)

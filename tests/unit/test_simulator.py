@@ -1,6 +1,7 @@
 """Simulators of users, and what is found out about them before they are used."""
 
 import itertools
+import pickle
 import threading
 import traceback
 import warnings
@@ -350,6 +351,9 @@ def test_a_theta_for_which_the_simulator_always_raises_is_refused() -> None:
     with pytest.raises(SimulationError, match=expected) as caught:
         simulator.moments(THETA, 4, lambda x: x, progress=False)
     assert is_told_once(caught.value)
+    many = torch.cat([THETA[:1].repeat(17, 1), THETA])
+    with pytest.raises(SimulationError, match="raised, first in row 18, theta"):
+        simulator.moments(many, 1, lambda x: x, progress=False)
 
 
 def never_works(theta: Any) -> Any:
@@ -408,8 +412,8 @@ def test_a_seed_gives_the_same_simulations_with_any_number_of_workers() -> None:
     theta, x = drawn[0]
     assert len((x - theta)[:, 0].unique()) == len(theta) < 60
     # The error of a worker comes with its traceback, as text.
-    bad = torch.tensor([[0.95, 0.1]]).repeat(4, 1)
-    expected = r"4 of 4, first in row 0.*no solution"
+    bad = torch.cat([THETA, torch.tensor([[0.95, 0.1]]).repeat(4, 1)])
+    expected = r"4 of 7, first in row 3, .*no solution"
     with pytest.raises(SimulationError, match=expected) as found:
         simulator(bad)
     assert 'raise ArithmeticError("no solution")' in str(found.value.__cause__)
@@ -467,7 +471,9 @@ def test_methods_take_a_simulator_that_runs_in_parallel() -> None:
     ).append_calibration(theta, x)
     report = method.report(show_progress_bars=False)
     assert len(report.summaries) == 2
-    assert parallel(decays)(np.zeros(2)).shape == (2,)
+    sent = pickle.loads(pickle.dumps(parallel(gaussian.simulator, num_workers=3)))
+    assert sent.num_workers == 3
+    assert sent(theta).shape == theta.shape
 
 
 # --- how often the simulator is called ---

@@ -252,7 +252,7 @@ class TestFit:
         run(module, towards(module, 1), None, show_progress_bars=show)
         printed = terminal.readouterr()
         assert ("Numbers" in printed.err) is show
-        assert ("best_epoch" in printed.err) is show
+        assert ("best" in printed.err) is show
         assert printed.out == ""
 
     def test_a_terminal_sees_less_than_every_step(

@@ -13,6 +13,7 @@ from tests.faults.calls import (
     plots,
     posteriors,
     rope,
+    saving,
     stacking,
     tasks,
 )
@@ -27,6 +28,7 @@ CALLS = [
     *baselines.CALLS,
     *metrics.CALLS,
     *plots.CALLS,
+    *saving.CALLS,
     *tasks.CALLS,
 ]
 
@@ -56,6 +58,7 @@ NOT_CALLED = {
             "Leakage",
             "LearningCurve",
             "ParameterDistribution",
+            "Provenance",
             "StackingReport",
             "StackingReport.of",
             "StackingWeights",
@@ -99,4 +102,5 @@ NOT_CALLED = {
     "PriorPosterior.map": "sbi's own",
     "shown": "shows anything",
     "warn_user": "says what it is told",
+    "write_stacking_report": "called by StackingReport.to_html, which is in the table",
 }

@@ -51,6 +51,7 @@ METHODS: dict[str, Any] = {
     "ReferenceNPE": baselines.ReferenceNPE,
     "NNPE": baselines.NNPE,
     "RNPE": baselines.RNPE,
+    "RVNP": baselines.RVNP,
     "NPERS": baselines.NPERS,
     "JointNPE": baselines.JointNPE,
     "FinetunedNPE": baselines.FinetunedNPE,

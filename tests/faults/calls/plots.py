@@ -1,6 +1,7 @@
 """Pictures."""
 
 from collections.abc import Callable
+from tempfile import TemporaryDirectory
 from typing import Any
 from unittest.mock import patch
 
@@ -53,6 +54,13 @@ def drawn(plot: Callable[..., Any]) -> Callable[..., None]:
 
 def report_of(name: str) -> Any:
     return stacked().report if name == "stacking_report" else discrepancy_report()
+
+
+def written(path: Any, **options: Any) -> None:
+    """Write a report into a folder that is removed again."""
+    with TemporaryDirectory() as folder:
+        target = f"{folder}/{path}" if isinstance(path, str) else path
+        stacked().report.to_html(target, **options)
 
 
 CALLS = [
@@ -127,5 +135,16 @@ CALLS = [
             options={"report": "instance"},
         )
         for name in ("discrepancy", "stacking_report")
+    ),
+    Call(
+        name="StackingReport.to_html",
+        run=lambda path="report.html", **options: written(path, **options),
+        options={
+            "path": "path",
+            "diagnosis": "instance",
+            "parameter_names": "names",
+            "x_names": "names",
+        },
+        accepts=LABELS,
     ),
 ]

@@ -1,0 +1,70 @@
+"""The table that README shows: a few methods on real measurements."""
+
+import numpy as np
+import pandas as pd
+
+from benchmarks.evidence import finished_rows, half_width
+from benchmarks.methods import STACK
+from benchmarks.published import MISSING, Published, table
+
+__all__ = ["readme_lines"]
+
+TASK, SIZES, OF_ACAUC = "light_tunnel_sensors", (10, 50, 200), 50
+# Where a user starts, what is tuned on the labels, the rivals of 2025 and 2026 in their
+# better form, the paper's method, and the default of this package.
+METHODS = {
+    "prior": "prior",
+    "NPE": "NPE as it was",
+    "fine-tuned NPE": "fine-tuned NPE",
+    "FMCPE (embedding)": "FMCPE",
+    "FRISBI (distilled)": "FRISBI",
+    "RoPE": "RoPE",
+    STACK: "**`stack`**",
+}
+
+
+def readme_lines(published: Published, link: str) -> list[str]:
+    """Return the block of README in Markdown.
+
+    Args:
+        published: All tables.
+        link: From README to the page of all results.
+    """
+    rows = finished_rows(published)
+    rows = rows[(rows["task"] == TASK) & rows["method"].isin(METHODS)]
+    lines = [
+        [
+            name,
+            *(_lpp(_of(rows, method, size)) for size in SIZES),
+            _acauc(_of(rows, method, OF_ACAUC)),
+        ]
+        for method, name in METHODS.items()
+    ]
+    head = ("", *(f"{size} labels" for size in SIZES), f"ACAUC, {OF_ACAUC} labels")
+    return [
+        "LPP is the mean log density of the true parameters, in standard deviations of",
+        "the prior: higher is better. ± is its 95 % interval over the repetitions in",
+        "brackets, or over test observations where there is one. ACAUC is 0 for",
+        "calibrated posteriors, positive for over-confident and negative for too wide",
+        "ones.",
+        *("", *table(head, lines), ""),
+        f"[All tasks, all methods]({link}), also where another method is better.",
+    ]
+
+
+def _of(rows: pd.DataFrame, method: str, size: int) -> pd.DataFrame:
+    return rows[(rows["method"] == method) & rows["n_calibration"].isin([0, size])]
+
+
+def _lpp(rows: pd.DataFrame) -> str:
+    if not len(rows):
+        return MISSING
+    scores = rows["lpp_z"].to_numpy(dtype=float)
+    width = half_width(scores)
+    if np.isinf(width):
+        width = 1.96 * float(rows["lpp_standard_error"].mean())
+    return f"{scores.mean():.2f} ± {width:.2f} ({len(rows)})"
+
+
+def _acauc(rows: pd.DataFrame) -> str:
+    return f"{rows['acauc'].mean():+.3f}" if len(rows) else MISSING

@@ -1,0 +1,37 @@
+"""Say whether a batch is like the observations of the calibration pairs."""
+
+from sbi_rope._two_sample import LEVEL, TwoSampleTest
+from sbi_rope.diagnosis.report import Finding
+
+__all__ = ["labelled_finding"]
+
+
+def labelled_finding(test: TwoSampleTest) -> Finding:
+    """Return the finding of a test whose first set are the pairs."""
+    size = (
+        f"its observations are {test.spread:.2f} times as far apart as those of the "
+        "pairs"
+    )
+    if test.is_different:
+        sentence = (
+            f"As NPE sees it, the batch differs from the calibration pairs: {size}. "
+            "The weights of a stack, its scores and its calibration were found on the "
+            "pairs, and need not hold for this batch. Label some observations like "
+            "those of the batch."
+        )
+    else:
+        sentence = (
+            "No sign that the batch differs from the calibration pairs, as NPE sees "
+            f"them: {size}."
+        )
+    return Finding(
+        name="batch unlike the calibration pairs",
+        value=test.p_value,
+        threshold=LEVEL,
+        alarming=test.is_different,
+        sentence=sentence,
+        reason=(
+            "Alarming below the threshold (a p-value of an energy test): one batch in "
+            "a hundred that is drawn like the pairs falls there."
+        ),
+    )

@@ -1,0 +1,160 @@
+"""Sections of a page about calibration, discrepancies and a diagnosis."""
+
+from collections.abc import Sequence
+
+from sbi_rope.diagnosis import Diagnosis
+from sbi_rope.discrepancy import DiscrepancyReport
+from sbi_rope.metrics import CoverageCurve, acauc_of
+from sbi_rope.plots import calibration_curves, discrepancy, implied_parameters
+from sbi_rope.reports.numbers import number, percent
+from sbi_rope.reports.page import finding, paragraph, picture, section, table
+from sbi_rope.stacking import StackingReport
+
+__all__ = ["calibration_section", "diagnosis_section", "discrepancy_section"]
+
+# With more parameters their curves cannot be told apart.
+MAX_CURVES = 5
+
+
+def calibration_section(report: StackingReport, names: Sequence[str]) -> str:
+    """Return what held-out pairs say about the intervals of each parameter."""
+    levels, curve = report.levels, report.coverage
+    rows = [_row("all parameters", report.acauc.value, report.acauc.interval, curve)]
+    curves = {"all parameters": curve}
+    for k, name in enumerate(names):
+        score, own = acauc_of(levels[:, [k]]), _of_parameter(curve, k)
+        if len(names) > 1:
+            rows.append(_row(name, score.value, score.interval, own))
+            curves[name] = own
+    if len(names) > MAX_CURVES:
+        curves = {"all parameters": curve}
+    n, drawn = len(levels), calibration_curves(curves)
+    drawn.set_size_inches(5.8, 3.4)  # so that its text can be read on a narrow screen
+    return section(
+        "Are the uncertainties right?",
+        table(
+            (
+                "parameter",
+                "in 50 % intervals",
+                "in 90 % intervals",
+                "ACAUC",
+                "95 % interval",
+            ),
+            rows,
+            numbers=(1, 2, 3, 4),
+            strong=(0,),
+        ),
+        paragraph(
+            "ACAUC: 0 is calibrated, positive is over-confident, negative is too wide. "
+            "There is a sign of either only if the interval leaves 0 out; among many "
+            f"parameters, one in twenty does so by chance. The coverage error is "
+            f"{number(report.coverage_error.value, digits=3)}; a calibrated posterior "
+            f"has about {number(0.31 / n**0.5, digits=3)} with {n} pairs.",
+            kind="note",
+        ),
+        picture(
+            drawn,
+            caption="The share of known parameters inside intervals of each level. "
+            "Below the diagonal intervals are too narrow, above it too wide. The band "
+            "holds 95 % of the curves of calibrated posteriors.",
+        ),
+    )
+
+
+def _row(
+    name: str, value: float, interval: tuple[float, float], curve: CoverageCurve
+) -> tuple[str, ...]:
+    low, high = (number(end, sign=True, digits=3) for end in interval)
+    half, most = (percent(float(curve.average[level - 1])) for level in (50, 90))
+    return name, half, most, number(value, sign=True, digits=3), f"{low} to {high}"
+
+
+def _of_parameter(curve: CoverageCurve, k: int) -> CoverageCurve:
+    return CoverageCurve(
+        levels=curve.levels,
+        per_parameter=curve.per_parameter[[k]],
+        standard_error=curve.standard_error,
+        num_observations=curve.num_observations,
+    )
+
+
+def discrepancy_section(report: DiscrepancyReport) -> str:
+    """Return how each entry of x differs between reality and simulations."""
+    rows = [
+        (
+            summary.name,
+            str(summary.size),
+            str(summary.shift),
+            str(summary.gain),
+            str(summary.error),
+            percent(summary.probability_of_none),
+        )
+        for summary in report.summaries
+    ]
+    off = [summary.name for summary in report.summaries if summary.is_off]
+    listed = (
+        f"more probable than not for: {', '.join(off)}" if off else "probable for none"
+    )
+    parts = [
+        paragraph(
+            "Each entry of the measurements was compared with simulations at the known "
+            "parameters, by itself: measured = mean + shift + gain (simulated - "
+            f"mean) + error. A discrepancy is {listed}."
+        ),
+        table(
+            ("entry", "size", "shift", "gain", "error", "no discrepancy"),
+            rows,
+            alarming=[k for k, s in enumerate(report.summaries) if s.is_off],
+        ),
+        paragraph(
+            "Estimates with 95 % intervals, which assume that there is a discrepancy. "
+            "The size is in standard deviations of simulations, shift and error are in "
+            "units of the entry. The last column is the probability that the "
+            "simulator is right about the entry.",
+            kind="note",
+        ),
+        picture(discrepancy(report), caption="The same as a picture.", wide=True),
+    ]
+    outliers = sorted({row for summary in report.summaries for row in summary.outliers})
+    if outliers:
+        parts.append(
+            paragraph(
+                "These calibration pairs do not fit the others, and their labels and "
+                f"measurements should be checked (rows, from 0): "
+                f"{', '.join(map(str, outliers))}."
+            )
+        )
+    if report.constant:
+        parts.append(
+            paragraph(f"The same in all simulations: {', '.join(report.constant)}.")
+        )
+    return section("Where the simulator differs from reality", *parts)
+
+
+def diagnosis_section(diagnosis: Diagnosis) -> str:
+    """Return the findings about a batch."""
+    order = sorted(diagnosis.findings, key=lambda result: not result.alarming)
+    alarms = len(diagnosis.alarming) or "none"
+    return section(
+        "Diagnosis of the batch",
+        paragraph(
+            f"{len(diagnosis.distance)} measurements were compared with "
+            f"{len(diagnosis.theta)} simulations. Of {len(order)} findings "
+            f"{alarms} {'is' if alarms in (1, 'none') else 'are'} alarming."
+        ),
+        *(
+            finding(
+                result.name,
+                f"{result.value:.3g} (threshold {result.threshold:.3g})",
+                result.sentence,
+                alarming=result.alarming,
+            )
+            for result in order
+        ),
+        *(paragraph(note, kind="note") for note in diagnosis.notes),
+        picture(
+            implied_parameters(diagnosis),
+            caption="The parameters that the batch implies, beside the prior.",
+            wide=len(diagnosis.parameter_names) > 2,
+        ),
+    )

@@ -1,0 +1,299 @@
+"""The report of a stack as an HTML page, for readers who do not know this package."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from sbi_rope._validation import check_instance, check_names, check_path
+from sbi_rope.diagnosis import Diagnosis
+from sbi_rope.discrepancy import DiscrepancyReport
+from sbi_rope.errors import InvalidInputError, shown
+from sbi_rope.plots._figures import new_figure
+from sbi_rope.plots.stacking import draw_learning_curve, draw_scores, draw_weights
+from sbi_rope.reports.evidence import (
+    calibration_section,
+    diagnosis_section,
+    discrepancy_section,
+)
+from sbi_rope.reports.numbers import number, percent
+from sbi_rope.reports.page import (
+    check_target,
+    definitions,
+    list_of,
+    page,
+    paragraph,
+    picture,
+    section,
+    table,
+    write_page,
+)
+from sbi_rope.stacking import StackingReport
+from sbi_rope.stacking.words import IN_WORDS, LEVEL, compared
+
+__all__ = ["write_stacking_report"]
+
+TITLE = "Repaired posterior: report"
+# The most candidates in the table of scores.
+MAX_ROWS = 12
+
+GLOSSARY = {
+    "Simulator, posterior, NPE": "The simulator predicts measurements from parameters. "
+    "The posterior says which parameters explain a measurement, and how well. Neural "
+    "posterior estimation (NPE) learns it from simulations, and is wrong where the "
+    "simulator is.",
+    "Calibration pairs": "Real measurements whose parameters are known from elsewhere.",
+    "Nat": "The unit of log scores. One nat more means that the known parameters have "
+    "2.7 times the probability density, in the geometric mean over pairs. Differences "
+    "are the same in all units of the parameters.",
+    "95 % interval": "The range that, in 95 of 100 repetitions, holds the value that "
+    "very many pairs would give.",
+    "Coverage": "How many known parameters lie inside the intervals that claim a "
+    "certain probability. For a calibrated posterior the two agree at every level.",
+    "ACAUC": "The average difference between the probability that intervals claim and "
+    "the share of known parameters inside them. 0 is calibrated, positive is "
+    "over-confident (intervals too narrow), negative is too wide.",
+}
+
+
+def write_stacking_report(
+    report: StackingReport,
+    path: Any,
+    *,
+    diagnosis: Diagnosis | None = None,
+    parameter_names: Sequence[str] | None = None,
+    x_names: Sequence[str] | None = None,
+) -> None:
+    """Write the report of a stack as one HTML file.
+
+    The arguments are those of :meth:`StackingReport.to_html
+    <sbi_rope.stacking.StackingReport.to_html>`.
+    """
+    check_instance("report", report, StackingReport)
+    check_instance("diagnosis", diagnosis, Diagnosis, optional=True)
+    target = check_path("path", path)
+    assert target is not None
+    names = _parameter_names(report, diagnosis, parameter_names)
+    discrepancy = _named(report.discrepancy, x_names)
+    check_target(target)
+    parts = [
+        paragraph(_what_was_done(report)),
+        list_of(_verdict(report, diagnosis), kind="verdict"),
+        _score_section(report),
+        _weight_section(report),
+        calibration_section(report, names),
+    ]
+    if discrepancy is not None:
+        parts.append(discrepancy_section(discrepancy))
+    if diagnosis is not None:
+        parts.append(diagnosis_section(diagnosis))
+    parts += [_provenance_section(report), _glossary()]
+    write_page(target, page(TITLE, *parts))
+
+
+def _parameter_names(
+    report: StackingReport,
+    diagnosis: Diagnosis | None,
+    names: Sequence[str] | None,
+) -> list[str]:
+    count = report.levels.shape[1]
+    if names is not None:
+        return check_names("parameter_names", names, count)
+    if diagnosis is None:
+        return [f"theta_{k + 1}" for k in range(count)]
+    if len(diagnosis.parameter_names) != count:
+        raise InvalidInputError(
+            f"Expected `diagnosis` of a batch with {count} parameters, as the report "
+            f"has; got {len(diagnosis.parameter_names)}."
+        )
+    return list(diagnosis.parameter_names)
+
+
+def _named(
+    discrepancy: DiscrepancyReport | None, names: Sequence[str] | None
+) -> DiscrepancyReport | None:
+    if names is None:
+        return discrepancy
+    names = check_names("x_names", names)
+    if discrepancy is None:
+        raise InvalidInputError(
+            "Expected no `x_names`, because this report does not compare the entries "
+            f"of x; got {shown(names)}. Only a stack with a discrepancy among its "
+            "candidates, and with x a short vector, does."
+        )
+    return discrepancy.renamed(names)
+
+
+def _what_was_done(report: StackingReport) -> str:
+    scores = report.cross_validation
+    n, d = report.levels.shape
+    return (
+        "A neural posterior estimate (NPE) was trained on simulations, and the "
+        "simulator may be wrong about the real measurements. It was repaired with "
+        f"{n} real measurements whose {d} parameters are known: {len(scores.names)} "
+        "candidate posteriors learned from a part of them and were scored by the "
+        "probability density that they give to the known parameters of the others. "
+        "The result is the average of the candidates, weighted by these scores, and "
+        "is called the stack."
+    )
+
+
+def _verdict(
+    report: StackingReport, diagnosis: Diagnosis | None
+) -> list[tuple[str, bool]]:
+    lines = [
+        (
+            f"The stack is {compared(gain, name)}: {number(gain.mean, sign=True)} nats "
+            f"a measurement, 95 % interval {number(gain.low, sign=True)} to "
+            f"{number(gain.high, sign=True)}.",
+            gain.high < 0,
+        )
+        for name, gain in report.gains.items()
+    ]
+    lines += [_calibrated(report), _assumption(report)]
+    if diagnosis is not None:
+        alarms = len(diagnosis.alarming) or "none"
+        lines.append(
+            (
+                f"The diagnosis of a batch of {len(diagnosis.distance)} measurements "
+                f"has {len(diagnosis.findings)} findings, of which {alarms} "
+                f"{'is' if alarms in (1, 'none') else 'are'} alarming.",
+                bool(diagnosis.alarming),
+            )
+        )
+    return lines
+
+
+def _calibrated(report: StackingReport) -> tuple[str, bool]:
+    verdict = report.acauc.verdict
+    inside = (
+        f"{percent(LEVEL)} intervals held {percent(report.share_inside)} of the known "
+        "parameters."
+    )
+    if verdict == "calibrated":
+        start = "Its uncertainties are calibrated as far as these pairs can tell"
+        return f"{start}: {inside}", False
+    return f"On held-out pairs its uncertainties are {verdict}: {inside}", True
+
+
+def _assumption(report: StackingReport) -> tuple[str, bool]:
+    test = report.batch
+    start = "All this holds for measurements like those of the calibration pairs"
+    if test is None:
+        return f"{start}. This report does not compare others with them.", False
+    if test.is_different:
+        return (
+            f"{start}. The batch that the stack was made for differs from them "
+            f"(p = {test.p_value:.3f}), so that it need not hold there.",
+            True,
+        )
+    return (
+        f"{start}. The batch that the stack was made for shows no sign of a difference "
+        f"(p = {test.p_value:.2f}).",
+        False,
+    )
+
+
+def _score_section(report: StackingReport) -> str:
+    rows = report.as_rows()
+    shown = rows[:MAX_ROWS]
+    unit = report.cross_validation.log_unit
+    mean, error = report.comparable_score
+    cells = [("the stack", "", number(mean), number(mean + unit), number(error))]
+    cells += [
+        (
+            row["candidate"],
+            percent(row["weight"]),
+            number(row["score"]),
+            number(row["score_z"]),
+            number(row["standard_error"]),
+        )
+        for row in shown
+    ]
+    figure, axes = new_figure(5.4, 1.4 + 0.3 * len(shown))
+    draw_scores(axes, report)
+    notes = [
+        "Mean log density of the known parameters, in nats a measurement; higher is "
+        "better. In the first column parameters have their own units, in the second "
+        "they are in standard deviations of the prior, which adds a constant. The "
+        "scores of this table are not corrected for what a posterior puts outside the "
+        "range of the prior."
+    ]
+    if len(rows) > len(shown):
+        notes.append(
+            f"{len(rows) - len(shown)} candidates with lower scores are left out."
+        )
+    score, score_error = report.score
+    notes.append(
+        "With this correction the stack scores "
+        f"{number(score)} ± {number(score_error)} in the parameters' own units, and "
+        f"{number(report.score_z[0])} in standard deviations of the prior."
+    )
+    return section(
+        "Scores on measurements that a posterior had not seen",
+        table(
+            (
+                "posterior",
+                "weight",
+                "nats, own units",
+                "nats, prior sd",
+                "± standard error",
+            ),
+            cells,
+            numbers=(1, 2, 3, 4),
+            strong=(0,),
+        ),
+        *(paragraph(note, kind="note") for note in notes),
+        picture(
+            figure,
+            caption="Held-out scores of the best candidates and of the stack, with one "
+            "standard error to each side.",
+        ),
+    )
+
+
+def _weight_section(report: StackingReport) -> str:
+    weights = report.family_weights
+    figure, axes = new_figure(5.4, 1.2 + 0.32 * len(weights))
+    draw_weights(axes, weights)
+    parts = [
+        table(
+            ("method", "weight", "what it is"),
+            [(name, percent(w), IN_WORDS.get(name, "")) for name, w in weights.items()],
+            numbers=(1,),
+        ),
+        picture(figure, caption="The weight of each method in the stack."),
+    ]
+    curve = report.learning_curve
+    if curve is not None:
+        figure, axes = new_figure(5.4, 3.2)
+        draw_learning_curve(axes, curve)
+        parts.append(
+            picture(
+                figure,
+                caption="Held-out score of the stack when it is trained on fewer "
+                "pairs, with one standard error to each side.",
+            )
+        )
+    return section("What the stack is made of", *parts)
+
+
+def _provenance_section(report: StackingReport) -> str:
+    scores, made = report.cross_validation, report.provenance
+    rows = [
+        ("calibration pairs", str(len(scores))),
+        ("folds", str(scores.num_folds)),
+        ("candidates", str(len(scores.names))),
+    ]
+    if made is not None:
+        seed = "none, so that a repetition differs" if made.seed is None else made.seed
+        rows += [
+            ("seed", str(seed)),
+            ("seconds", f"{made.seconds:.0f}"),
+            ("simulator calls", f"{made.num_simulator_calls:,}"),
+            ("finished", made.finished),
+            ("versions", ", ".join(f"{k} {v}" for k, v in made.versions.items())),
+        ]
+    return section("How it was made", table(None, rows))
+
+
+def _glossary() -> str:
+    return section("Words", definitions(GLOSSARY))

@@ -1,0 +1,31 @@
+"""The difference between log scores in the units of theta and of the prior."""
+
+from typing import Any
+
+import torch
+
+from sbi_rope._random import seeded
+
+__all__ = ["log_unit_of"]
+
+# Draws that the standard deviation is estimated from if the prior does not state it.
+NUM_DRAWS = 10_000
+
+
+def log_unit_of(prior: Any) -> float:
+    r"""Return :math:`\sum_j \log s_j`, with s the standard deviations of the prior.
+
+    The density of :math:`z_j = \theta_j / s_j` is
+    :math:`p(z \mid x) = p(\theta \mid x) \prod_j s_j`, so that a log score with theta
+    in standard deviations of the prior is higher by this number. It is NaN if the prior
+    has no finite standard deviation.
+    """
+    try:
+        std = prior.stddev
+    except Exception:  # priors of users and of sbi raise all kinds
+        with seeded(0):
+            std = prior.sample(torch.Size((NUM_DRAWS,))).std(dim=0)
+    std = torch.as_tensor(std).detach().double()
+    if not bool(((std > 0) & torch.isfinite(std)).all()):
+        return float("nan")
+    return float(std.log().sum())

@@ -1,0 +1,158 @@
+"""What a printed report of a stack says, and how candidates are called in words."""
+
+import math
+from typing import TYPE_CHECKING
+
+from sbi_rope.metrics.calibration import ACAUC_IN_WORDS
+from sbi_rope.stacking.cross_validation import Difference
+
+if TYPE_CHECKING:
+    from sbi_rope.stacking.report import StackingReport
+
+__all__ = ["IN_WORDS", "LEVEL", "REFERENCES", "compared", "lines_of"]
+
+# The text says that a stack is mostly one method if this has half of the weight.
+MOSTLY = 0.5
+# The share of parameters inside intervals is stated at this level.
+LEVEL = 0.9
+# A difference of less than this, in nats a pair, is called slight: 10 % of the density.
+SLIGHT = 0.1
+
+# The candidates that a stack is compared with, and how the text calls them.
+REFERENCES = {"prior": "the prior", "NPE": "NPE as it was"}
+
+# What each method is. Whether it is better than others is for the scores to say.
+IN_WORDS = {
+    "prior": "the prior, which learns nothing from x",
+    "NPE": "NPE as it was trained on simulations",
+    "OT-only": "observations are coupled with simulations, without tuning",
+    "tuning-only": "the embedding net was tuned on the labels, without coupling",
+    "RoPE": "the embedding net was tuned on the labels, and observations are coupled "
+    "with simulations",
+    "fine-tuned NPE": "the labels train NPE further",
+    "discrepancy": "NPE of simulations that a linear model, learnt from the labels, "
+    "has corrected",
+    "discrepancy, fine-tuned": "NPE of simulations that a linear model has corrected, "
+    "trained further by the labels",
+}
+
+
+def compared(gain: Difference, name: str) -> str:
+    """Say how the stack compares with a reference, no more than the interval shows."""
+    if gain.low <= 0 <= gain.high:
+        return f"not shown to differ from {REFERENCES[name]}"
+    slightly = "slightly " if abs(gain.mean) < SLIGHT else ""
+    return f"{slightly}{'better' if gain.low > 0 else 'worse'} than {REFERENCES[name]}"
+
+
+def lines_of(report: "StackingReport") -> list[str]:
+    """Return the lines of a printed report."""
+    n = len(report.cross_validation)
+    return [
+        f"Stack of {len(report.cross_validation.names)} candidates, scored on {n} "
+        "held-out calibration pairs",
+        *_scores(report),
+        *_gains(report),
+        *_weights(report),
+        *_calibration(report),
+        *_more_labels(report),
+        *_what_it_took(report),
+    ]
+
+
+def _scores(report: "StackingReport") -> list[str]:
+    lines = ["  log score of the stack, in nats a pair (higher is better):"]
+    for (score, error), unit in (
+        (report.score, "its own units"),
+        (report.score_z, "standard deviations of the prior"),
+    ):
+        if not math.isnan(score):
+            lines.append(f"    {score:.2f} +- {error:.2f} with theta in {unit}")
+    return lines
+
+
+def _gains(report: "StackingReport") -> list[str]:
+    return [
+        f"  {compared(gain, name)}: {gain.mean:+.2f} nats a pair in any unit, "
+        f"95 % interval {gain.low:+.2f} to {gain.high:+.2f}"
+        for name, gain in report.gains.items()
+    ]
+
+
+def _weights(report: "StackingReport") -> list[str]:
+    (family, weight), *_ = report.family_weights.items()
+    shares = ", ".join(
+        f"{name} {share:.0%}" for name, share in report.family_weights.items()
+    )
+    if weight < MOSTLY:
+        return [f"  no method has half of the weight: {shares}"]
+    line = f"  mostly {family}"
+    if family in IN_WORDS:
+        line += f": {IN_WORDS[family]}"
+    return [line, f"  weights: {shares}"]
+
+
+def _calibration(report: "StackingReport") -> list[str]:
+    n, acauc, (low, high) = len(report.levels), report.acauc, report.acauc.interval
+    verdict = acauc.verdict
+    verdict += (
+        " as far as these pairs can tell"
+        if verdict == "calibrated"
+        else " on held-out pairs"
+    )
+    return [
+        f"  {verdict}: ACAUC {acauc.value:+.3f}, 95 % interval {low:+.3f} to "
+        f"{high:+.3f}",
+        f"    ({ACAUC_IN_WORDS})",
+        f"    coverage error {report.coverage_error.value:.3f}; a calibrated posterior "
+        f"has about {0.31 / n**0.5:.3f} with {n} pairs",
+        f"    {LEVEL:.0%} intervals hold {report.share_inside:.0%} of the parameters",
+        *_assumption(report),
+    ]
+
+
+def _assumption(report: "StackingReport") -> list[str]:
+    test = report.batch
+    if test is None:
+        return [
+            "    this holds for observations like those of the pairs; "
+            "`diagnose(rope.train(), x_o)` tests whether a batch is"
+        ]
+    if test.is_different:
+        return [
+            "    this need NOT hold for the batch, which differs from the pairs "
+            f"(p = {test.p_value:.3f}):",
+            "    look at `diagnose(rope.train(), x_o)`",
+        ]
+    return [
+        "    this holds for observations like those of the pairs; the batch shows "
+        f"no sign of a difference (p = {test.p_value:.2f})"
+    ]
+
+
+def _more_labels(report: "StackingReport") -> list[str]:
+    curve = report.learning_curve
+    if curve is None:
+        return []
+    points = ", ".join(
+        f"{n} pairs: {score:.2f}"
+        for n, score in zip(curve.num_pairs, curve.scores, strict=True)
+    )
+    lines = [f"  log score by training pairs, theta in its own units: {points}"]
+    gain = curve.gain_of_doubling()
+    if math.isfinite(gain):
+        lines.append(
+            f"  twice as many labels might add {gain:.2f} nats a pair, if this "
+            "curve goes on like a - b / n"
+        )
+    return lines
+
+
+def _what_it_took(report: "StackingReport") -> list[str]:
+    made = report.provenance
+    if made is None:
+        return []
+    return [
+        f"  made in {made.seconds:.0f} seconds with {made.num_simulator_calls:,} calls "
+        "of the simulator"
+    ]

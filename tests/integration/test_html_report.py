@@ -1,0 +1,224 @@
+"""The report of a stack as an HTML page: whole, valid, alone, and about its numbers."""
+
+import base64
+import re
+import stat
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from sbi_rope import diagnose
+from sbi_rope._two_sample import TwoSampleTest
+from sbi_rope.diagnosis import Diagnosis
+from sbi_rope.errors import InvalidInputError, InvalidTypeError, NotWritableError
+from sbi_rope.reports.numbers import number, percent
+from sbi_rope.stacking import LearningCurve, StackingReport
+from tests.stacks import QUIET, observed, the_stack, trained
+
+pytest.importorskip("matplotlib")
+# Batches and calibration sets are small here on purpose.
+pytestmark = pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
+
+NAMES = ("mass <kg> & more", 'the "length"')
+# Elements without an end.
+VOID = {"meta", "img", "br"}
+
+
+class Page(HTMLParser):
+    """Reads a page, and fails where an element is not closed as it was opened."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[str] = []
+        self.links: list[str] = []
+        self.words: list[str] = []
+        self.feed(text)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.links += [v or "" for name, v in attrs if name in ("src", "href")]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] != "style":
+            self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return re.sub(r"\s+", " ", " ".join(self.words))
+
+
+def written(report: StackingReport, folder: Path, **options: object) -> str:
+    report.to_html(folder / "report.html", **options)  # type: ignore[arg-type]
+    return (folder / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def diagnosis() -> Diagnosis:
+    torch.manual_seed(0)
+    return diagnose(
+        trained(), observed(), num_simulations=100, num_folds=None, seed=0, **QUIET
+    )
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory, diagnosis: Diagnosis) -> str:
+    """A page with everything that a page can hold."""
+    curve = LearningCurve(
+        num_pairs=(4, 8), scores=(0.3, 0.4), standard_errors=(0.1, 0.1)
+    )
+    report = replace(
+        the_stack().report,
+        learning_curve=curve,
+        batch=TwoSampleTest(p_value=0.002, spread=0.3),
+    )
+    return written(
+        report,
+        tmp_path_factory.mktemp("page"),
+        diagnosis=diagnosis,
+        parameter_names=NAMES,
+        x_names=("left", "right", "<top>"),
+    )
+
+
+def test_the_page_is_valid_and_needs_nothing_else(source: str) -> None:
+    page = Page(source)
+    assert source.startswith("<!DOCTYPE html>\n<html lang=")
+    assert {"title", "style", "table", "section", "img"} <= set(page.tags)
+    assert not {"script", "link", "iframe"} & set(page.tags)
+    # Pictures are part of the page, and neither they nor the style load anything.
+    assert page.links
+    assert all(link.startswith("data:image/png;base64,") for link in page.links)
+    for link in page.links:
+        data = base64.b64decode(link.partition(",")[2], validate=True)
+        assert data.startswith(b"\x89PNG")
+        assert b"http" not in data
+    assert "http" not in re.sub(r"base64,[^\"]*", "", source)
+    assert "url(" not in source
+    assert "@import" not in source
+
+
+def test_names_are_text_and_not_elements(source: str) -> None:
+    assert "<kg>" not in source
+    assert "<top>" not in source
+    text = Page(source).text
+    for name in (*NAMES, "left", "<top>"):
+        assert name in text
+
+
+def test_the_page_holds_the_numbers_of_the_report(source: str) -> None:
+    report, text = the_stack().report, Page(source).text
+    for name in ("prior", "NPE"):
+        gain = report.gains[name]
+        assert f"{number(gain.mean, sign=True)} nats a measurement" in text
+        assert (
+            f"{number(gain.low, sign=True)} to {number(gain.high, sign=True)}" in text
+        )
+    for row in report.as_rows():
+        assert row["candidate"] in text
+        assert number(row["score"]) in text
+        assert number(row["score_z"]) in text
+    low, high = (number(end, sign=True, digits=3) for end in report.acauc.interval)
+    assert f"{low} to {high}" in text
+    for name, weight in report.family_weights.items():
+        assert f"{name} {percent(weight)}" in text.replace("\N{NO-BREAK SPACE}", " ")
+    discrepancy = report.discrepancy
+    assert discrepancy is not None
+    for summary in discrepancy.summaries:
+        assert str(summary.gain) in text
+        assert str(summary.shift) in text
+
+
+def test_the_page_says_what_a_diagnosis_found(
+    source: str, diagnosis: Diagnosis
+) -> None:
+    text = Page(source).text
+    assert "Diagnosis of the batch" in text
+    for finding in diagnosis.findings:
+        sentence = finding.sentence.replace(" %", "\N{NO-BREAK SPACE}%")
+        assert sentence in text
+        assert f"{finding.value:.3g} (threshold {finding.threshold:.3g})" in text
+    assert text.count("Alarming: ") == len(diagnosis.alarming)
+    assert all(note.split(".")[0] in text for note in diagnosis.notes)
+
+
+def test_the_verdict_names_a_batch_that_differs_from_the_pairs(source: str) -> None:
+    assert "differs from them (p = 0.002), so that it need not hold there" in source
+
+
+def test_a_page_without_batch_and_curve_says_what_it_assumes(tmp_path: Path) -> None:
+    report = replace(the_stack().report, discrepancy=None, provenance=None)
+    text = Page(written(report, tmp_path)).text
+    assert "This report does not compare others with them" in text
+    for title in ("Diagnosis of the batch", "Where the simulator differs", "seconds"):
+        assert title not in text
+    assert "theta_1" in text
+
+
+def test_the_page_says_how_the_stack_was_made(source: str) -> None:
+    report, text = the_stack().report, Page(source).text
+    assert report.provenance is not None
+    assert "seed 0 " in text
+    assert report.provenance.finished in text
+    assert f"torch {torch.__version__}" in text
+    assert "simulator calls" not in text
+
+
+def test_simulator_calls_are_shown_where_they_are_known(tmp_path: Path) -> None:
+    report = replace(the_stack().report)
+    object.__setattr__(report, "num_simulator_calls", 7421)
+    assert "simulator calls 7,421" in Page(written(report, tmp_path)).text
+
+
+def test_an_own_report_is_replaced_and_nothing_else(tmp_path: Path) -> None:
+    report = the_stack().report
+    first = written(report, tmp_path)
+    assert written(report, tmp_path, parameter_names=("a", "b")) != first
+    other = tmp_path / "thesis.html"
+    other.write_text("<html>years of work</html>")
+    for path in (other, tmp_path):
+        with pytest.raises(InvalidInputError, match="something else"):
+            report.to_html(path)
+    assert other.read_text() == "<html>years of work</html>"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["report.html", "thesis.html"]
+
+
+def test_a_folder_is_made_and_one_without_permission_is_named(tmp_path: Path) -> None:
+    report = the_stack().report
+    report.to_html(str(tmp_path / "new" / "report.html"))
+    assert (tmp_path / "new" / "report.html").is_file()
+    (tmp_path / "file").touch()
+    with pytest.raises(NotWritableError):
+        report.to_html(tmp_path / "file" / "report.html")
+    assert stat.S_ISREG((tmp_path / "file").stat().st_mode)
+
+
+def test_names_and_a_diagnosis_that_do_not_fit_are_refused(
+    tmp_path: Path, diagnosis: Diagnosis
+) -> None:
+    report, path = the_stack().report, tmp_path / "report.html"
+    with pytest.raises(InvalidInputError, match="`parameter_names` of length 2"):
+        report.to_html(path, parameter_names=("a",))
+    with pytest.raises(InvalidInputError, match="different names"):
+        report.to_html(path, x_names=("a", "b"))
+    with pytest.raises(InvalidInputError, match="Expected no `x_names`"):
+        replace(report, discrepancy=None).to_html(path, x_names=("a", "b", "c"))
+    with pytest.raises(InvalidTypeError, match="`diagnosis` to be a Diagnosis"):
+        report.to_html(path, diagnosis=SimpleNamespace())
+    with pytest.raises(InvalidTypeError, match="`path` to be a path"):
+        report.to_html(3)  # type: ignore[arg-type]
+    three = replace(diagnosis, parameter_names=("a", "b", "c"))
+    with pytest.raises(InvalidInputError, match="a batch with 2 parameters"):
+        report.to_html(path, diagnosis=three)
+    assert not path.exists()

@@ -1,0 +1,253 @@
+"""RVNP: its densities are the stated ones, and it learns errors without labels."""
+
+import functools
+from typing import Any
+
+import pytest
+import torch
+from sbi.neural_nets import posterior_nn
+from sbi.utils import BoxUniform
+from torch import Tensor, nn
+from torch.distributions import Independent, MultivariateNormal, Normal
+
+from sbi_rope._sbi import estimator_of, gaussians_of
+from sbi_rope.baselines import RVNP, Training
+from sbi_rope.baselines.rvnp.bound import Bound
+from sbi_rope.baselines.rvnp.likelihood import (
+    ErrorModel,
+    fit_surrogate,
+    log_likelihood,
+)
+from sbi_rope.errors import InvalidInputError
+from tests import gaussian
+from tests.baselines import flat_net
+
+QUIET: dict[str, Any] = {"seed": 0, "show_progress_bars": False}
+pytestmark = pytest.mark.filterwarnings("ignore:Maximum number of epochs")
+OFFSET, EXTRA_STD = 0.7, 0.7
+ONCE = Training(max_num_epochs=1)
+OF_SURROGATE = Training(training_batch_size=100, learning_rate=5e-3, max_num_epochs=8)
+
+
+@functools.cache
+def simulations() -> tuple[Tensor, Tensor]:
+    torch.manual_seed(0)
+    theta = gaussian.prior().sample((2000,))
+    return theta, gaussian.simulator(theta)
+
+
+@functools.cache
+def surrogate() -> Any:
+    theta, x = simulations()
+    torch.manual_seed(0)
+    return fit_surrogate(theta, x, training=OF_SURROGATE, show_progress_bars=False)
+
+
+def bent_errors() -> ErrorModel:
+    """Errors that vary with theta, as they may after training."""
+    torch.manual_seed(0)
+    theta, _ = simulations()
+    errors = ErrorModel(theta, 2, shift=True, depends_on_theta=True)
+    for parameter in (errors.offset, errors.below, *errors.net[-1].parameters()):  # type: ignore[index,union-attr]
+        nn.init.normal_(parameter, std=0.2)
+    return errors.requires_grad_(requires_grad=False)
+
+
+# Densities.
+
+
+def test_the_surrogate_is_near_the_simulator() -> None:
+    theta = torch.tensor([[0.5, -1.0]])
+    logits, means, covariances = gaussians_of(surrogate(), theta)
+    weights = logits.softmax(dim=1)[..., None]
+    mean = (weights * means).sum(dim=1)
+    scatter = covariances + (means - mean)[..., None] * (means - mean)[:, :, None]
+    covariance = (weights[..., None] * scatter).sum(dim=1)
+    torch.testing.assert_close(mean, theta.double(), atol=0.1, rtol=0)
+    expected = gaussian.NOISE_STD**2 * torch.eye(2).double()[None]
+    torch.testing.assert_close(covariance, expected, atol=0.06, rtol=0)
+
+
+def test_the_likelihood_is_the_average_of_the_errors_over_simulations() -> None:
+    errors = bent_errors()
+    theta, y = torch.tensor([[0.4, -0.8]]), torch.tensor([[1.0, 0.3]])
+    found, of_mean = log_likelihood(surrogate(), errors, y, theta)
+    torch.manual_seed(0)
+    s = surrogate().sample(torch.Size((100_000,)), theta)[:, 0]
+    mean, _, covariance = errors(theta)
+    assert of_mean.norm() > 0.1
+    law = MultivariateNormal(s + mean, covariance)
+    expected = law.log_prob(y).exp().mean().log()
+    assert float(found[0]) == pytest.approx(float(expected), abs=0.02)
+
+
+def exact_bound(num_draws: int) -> Bound:
+    """The bound of an untrained error model, with NPE in the place of q."""
+    theta, _ = simulations()
+    errors = ErrorModel(theta, 2, shift=True, depends_on_theta=False)
+    q: Any = estimator_of(gaussian.posterior())
+    return Bound(q, errors, surrogate(), gaussian.prior(), num_draws)
+
+
+def test_the_bound_is_the_evidence_and_its_weights_the_posterior_with_many_draws() -> (
+    None
+):
+    bound, y = exact_bound(20_000), torch.tensor([[0.5, -0.3], [2.5, 0.0]])
+    steps = torch.linspace(-5, 5, 201)
+    theta = torch.cartesian_prod(steps, steps)
+    for row in y:
+        log_lik, _ = log_likelihood(
+            surrogate(), bound.errors, row.expand(len(theta), 2), theta
+        )
+        joint = log_lik + gaussian.prior().log_prob(theta)
+        evidence = joint.logsumexp(dim=0) + 2 * torch.tensor(0.05).log()
+        log_q = bound.q.log_prob(theta, row.expand(len(theta), 2))
+        cross_entropy = -(joint.softmax(dim=0) * log_q).sum()
+        torch.manual_seed(0)
+        terms = bound(row[None], row[None])
+        for found, expected in (
+            (terms.log_evidence, evidence),
+            (terms.cross_entropy, cross_entropy),
+        ):
+            assert found.item() == pytest.approx(expected.item(), abs=0.03)
+
+
+def test_draws_outside_the_prior_have_no_weight_and_leave_the_bound_finite() -> None:
+    # Nearly all of q is far outside the box, and a few draws are inside.
+    bound = exact_bound(40)
+    bound.prior = BoxUniform(torch.full((2,), 0.2), torch.full((2,), 0.4))
+    y = torch.full((3, 2), 30.0)
+    terms = bound(y, y)
+    assert terms.log_evidence.isfinite().all()
+    terms.cross_entropy.sum().backward()
+    assert all(p.grad.isfinite().all() for p in bound.q.parameters())
+
+
+def test_parameters_far_from_simulations_have_a_likelihood() -> None:
+    theta = torch.tensor([[1e3, -1e3], [1e6, 1e6]])
+    found, _ = log_likelihood(surrogate(), bent_errors(), torch.zeros(2, 2), theta)
+    assert found.isfinite().all()
+    assert (found < -100).all()
+
+
+@pytest.mark.parametrize("shift", [True, False])
+@pytest.mark.parametrize("depends_on_theta", [True, False])
+def test_errors_have_the_parts_that_are_asked_for(
+    shift: bool, depends_on_theta: bool
+) -> None:
+    theta, _ = simulations()
+    errors = ErrorModel(theta, 2, shift=shift, depends_on_theta=depends_on_theta)
+    optimizer = torch.optim.Adam(errors.parameters(), lr=0.1)
+    for _ in range(5):
+        optimizer.zero_grad()
+        mean, _, covariance = errors(theta[:50])
+        law = MultivariateNormal(mean, covariance)
+        (-law.log_prob(theta[:50].sin() + 1)).mean().backward()
+        optimizer.step()
+    mean, of_mean, covariance = errors(theta[:50])
+    assert bool(mean.any()) is shift
+    assert bool(of_mean.any()) is (shift and depends_on_theta)
+    assert bool(covariance.std(dim=0).amax() > 1e-4) is depends_on_theta
+    assert covariance[:, 0, 1].all()
+
+
+# Without labels.
+
+
+@functools.cache
+def trained(offset: float, extra_std: float, *, shift: bool = True) -> Any:
+    method = RVNP.from_posterior(
+        gaussian.posterior(),
+        noise_on="input",  # without its embedding, this NPE has no mean to be trained
+        shift=shift,
+        depends_on_theta=False,
+        surrogate_training=OF_SURROGATE,
+        training=Training(
+            training_batch_size=50, learning_rate=2e-2, max_num_epochs=12
+        ),
+    )
+    method.append_simulations(*simulations())
+    torch.manual_seed(0)
+    method.append_observations(real(600, offset, extra_std)[1])
+    return method.train(**QUIET).build_posterior()
+
+
+def real(n: int, offset: float, extra_std: float) -> tuple[Tensor, Tensor]:
+    """Parameters, and observations with an offset and more noise than simulations."""
+    theta = gaussian.prior().sample((n,))
+    x = gaussian.simulator(theta) + offset
+    return theta, x + extra_std * torch.randn_like(x)
+
+
+def scores(posterior: Any, offset: float, extra_std: float) -> tuple[float, float]:
+    """Mean log posterior of the parameters, and that of the exact posterior."""
+    torch.manual_seed(1)
+    theta, x = real(1000, offset, extra_std)
+    variance = gaussian.NOISE_STD**2 + extra_std**2
+    std = torch.tensor((variance / (1 + variance)) ** 0.5)
+    exact = Independent(Normal((x - offset) / (1 + variance), std), 1)
+    found = posterior.log_prob_batched(theta[None], x, norm_posterior=False)
+    return float(found.mean()), float(exact.log_prob(theta).mean())
+
+
+@pytest.mark.parametrize("extra_std", [0.0, EXTRA_STD])
+def test_it_undoes_most_of_an_offset_and_learns_the_noise(extra_std: float) -> None:
+    posterior = trained(OFFSET, extra_std)
+    npe, exact = scores(gaussian.posterior(), OFFSET, extra_std)
+    assert npe < exact - 1.0
+    assert scores(posterior, OFFSET, extra_std)[0] > exact - 0.3
+
+
+def test_with_a_right_simulator_it_stays_near_npe() -> None:
+    found, exact = scores(trained(0.0, 0.0), 0.0, 0.0)
+    assert exact - 0.25 < found < exact + 0.01
+
+
+def test_without_an_offset_in_the_errors_it_does_not_undo_one() -> None:
+    found, exact = scores(trained(OFFSET, 0.0, shift=False), OFFSET, 0.0)
+    assert found < exact - 0.4
+
+
+def test_a_strong_penalty_leaves_no_offset_that_varies() -> None:
+    theta, _ = simulations()
+    y = 1.6 * theta[:200]
+    sizes = []
+    for shrinkage in (0.0, 100.0):
+        torch.manual_seed(0)
+        errors = ErrorModel(theta, 2, shift=True, depends_on_theta=True)
+        q: Any = estimator_of(gaussian.posterior())
+        bound = Bound(q, errors, surrogate(), gaussian.prior(), 16)
+        method = RVNP.from_posterior(
+            gaussian.posterior(),
+            shrinkage=shrinkage,
+            training=Training(learning_rate=1e-2, max_num_epochs=10),
+        )
+        method._train(bound, y, y, show_progress_bars=False)
+        sizes.append(float(errors(theta)[1].square().sum(dim=1).mean()))
+    assert sizes[0] > 0.1
+    assert sizes[1] < 0.1 * sizes[0]
+
+
+# What is refused.
+
+
+def test_an_input_that_is_no_vector_is_refused_by_name() -> None:
+    theta = simulations()[0][:100]
+    method = RVNP(
+        gaussian.prior(),
+        posterior_nn("mdn", embedding_net=flat_net(6)),
+        noise_on="input",
+        npe_training=ONCE,
+    )
+    method.append_simulations(theta, torch.randn(100, 2, 3))
+    method.append_observations(torch.randn(5, 2, 3))
+    with pytest.raises(InvalidInputError, match="noise_on='embedding'"):
+        method.train(**QUIET)
+
+
+@pytest.mark.parametrize(
+    "options", [{"num_draws": 1}, {"shrinkage": -1.0}, {"noise_on": "both"}]
+)
+def test_settings_outside_their_range_are_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(InvalidInputError, match=next(iter(options))):
+        RVNP.from_posterior(gaussian.posterior(), **options)
