@@ -225,7 +225,7 @@ class DiscrepancyNPE(Method):
             seed: Seed of the simulations; None uses the states of torch, NumPy and
                 Python.
             show_progress_bars: Whether to show the progress of slow simulations, as in
-                :meth:`train`.
+                ``train``.
 
         Returns:
             The gain, shift and error of each summary with 95 % intervals, in the units

@@ -184,7 +184,7 @@ class RVNP(Method):
 
     @property
     def needs_simulations(self) -> bool:
-        """Always: it learns the density of their statistics."""
+        """Whether simulations are needed. They are, because it trains on statistics."""
         return True
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
