@@ -120,8 +120,21 @@ class BaseDirectPosterior(DirectPosterior):
     """sbi's DirectPosterior, for our own posteriors to derive from.
 
     ``map()`` shows the progress of its draws only if it was asked to, and never returns
-    less than the best of its starting points. Shallow copies share no state.
+    less than the best of its starting points. Shallow copies share no state. What
+    checks an observation is :meth:`_one_x`: sbi itself refuses any NaN, which some
+    embedding nets can read.
     """
+
+    def _one_x(self, x: Any) -> Tensor:
+        """Return a checked observation; the default x if it is None."""
+        return super()._x_else_default_x(x)
+
+    def _x_else_default_x(self, x: Any) -> Tensor:
+        return self._one_x(x)
+
+    def _keep_default_x(self, x: Tensor) -> None:
+        """Set the default x to a copy of an observation that was checked."""
+        self._x, self._map = x.clone().to(self._device), None
 
     def __getstate__(self) -> dict[str, Any]:
         # sbi hands out its own __dict__, which a shallow copy would then share.
