@@ -39,7 +39,7 @@ myst_enable_extensions = ["dollarmath", "colon_fence"]
 myst_heading_anchors = 3
 
 nb_execution_mode = "cache"
-nb_execution_timeout = 900
+nb_execution_timeout = 3600
 nb_execution_raise_on_error = True
 # Warnings of other packages name folders of the machine that built the site.
 nb_output_stderr = "remove"

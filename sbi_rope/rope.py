@@ -7,6 +7,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
+from sbi_rope._focus import warn_if_focused
 from sbi_rope._npe import TrainedNPE
 from sbi_rope._pickling import picklable
 from sbi_rope._progress import is_shown
@@ -66,7 +67,9 @@ class RoPE:
         posterior: What ``NPE(...).build_posterior()`` returns, or the posterior of
             MNPE, FMPE or NPSE (the last two have no ``log_prob``). Its default x is
             ignored. It must be amortised. A posterior trained over several rounds fits
-            one observation only; RoPE cannot recognise it, so do not pass one.
+            one observation only, and sbi keeps no trace of the rounds in it. There is a
+            warning if it does not fit simulations from the prior, and one whose prior
+            was truncated (TSNPE) is refused.
         simulator: Maps parameters ``(n, d)`` to simulations ``(n, *event)``, or one
             ``(d,)`` to one ``(*event)``. It may take tensors or NumPy arrays (of
             float64), and return either, lists, or numbers. A row of x may depend on the
@@ -144,6 +147,7 @@ class RoPE:
         self._targets: Tensor | None = None
         self._g: nn.Module | None = None
         self._history: History | None = None
+        self._was_looked_at = False
 
     def append_calibration(self, theta: Tensor, x: Tensor) -> "RoPE":
         """Add real observations with known parameters to those appended so far.
@@ -276,6 +280,9 @@ class RoPE:
                 self._embed_simulations,
                 progress=is_shown(show_progress_bars),
             )
+        if not self._was_looked_at:
+            self._was_looked_at = True
+            warn_if_focused(self._npe.density(), self._npe.prior, theta, simulated)
         return EmbeddedBatch(
             x_o=x_o,
             real=real,

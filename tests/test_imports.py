@@ -40,6 +40,7 @@ LAYERS = [
         "coupling",
         "finetuning",
         "metrics",
+        "_focus",
         "_npe",
         "_simulations",
         "_standardisation",

@@ -19,7 +19,8 @@ from torch.distributions import Distribution
 from sbi_rope._random import seeded
 from sbi_rope._sbi.densities import MixtureDensity
 from sbi_rope._sbi.embedding import device_of
-from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError
+from sbi_rope._sbi.refusals import check_prior_of, refuse
+from sbi_rope.errors import InvalidInputError
 
 __all__ = [
     "BaseDirectPosterior",
@@ -39,30 +40,14 @@ def estimator_of(posterior: Any) -> ConditionalEstimator:
         UnsupportedPosteriorError: If the posterior is not a plain amortised posterior
             of NPE, FMPE or NPSE.
     """
+    check_prior_of(posterior)
     if isinstance(posterior, VectorFieldPosterior):
         return posterior.vector_field_estimator
     plain = isinstance(posterior, DirectPosterior) and not isinstance(
         posterior, FilteredDirectPosterior | NPE_A_Posterior
     )
-    if plain and isinstance(posterior.posterior_estimator, MixtureDensity):
-        raise UnsupportedPosteriorError(
-            "Expected `posterior` to be what `NPE(...).build_posterior()` returns; got "
-            f"{type(posterior).__name__} around a mixture of such posteriors, which "
-            "has no single embedding of x. What RoPE, a stack or a baseline has "
-            "repaired cannot be repaired again: pass the posterior it was built from."
-        )
-    if not plain and hasattr(posterior, "build_posterior"):
-        raise UnsupportedPosteriorError(
-            "Expected `posterior` to be what `NPE(...).build_posterior()` returns; got "
-            f"{type(posterior).__name__}, which has still to build it."
-        )
-    if not plain:
-        raise UnsupportedPosteriorError(
-            "Expected `posterior` to be what `NPE(...).build_posterior()` returns "
-            "with sample_with='direct' (a DirectPosterior), or the posterior of FMPE "
-            f"or NPSE; got {type(posterior).__name__}. RoPE needs an amortised "
-            "posterior whose estimator has an embedding of x."
-        )
+    if not plain or isinstance(posterior.posterior_estimator, MixtureDensity):
+        raise refuse(posterior)
     return posterior.posterior_estimator
 
 
@@ -135,8 +120,21 @@ class BaseDirectPosterior(DirectPosterior):
     """sbi's DirectPosterior, for our own posteriors to derive from.
 
     ``map()`` shows the progress of its draws only if it was asked to, and never returns
-    less than the best of its starting points. Shallow copies share no state.
+    less than the best of its starting points. Shallow copies share no state. What
+    checks an observation is :meth:`_one_x`: sbi itself refuses any NaN, which some
+    embedding nets can read.
     """
+
+    def _one_x(self, x: Any) -> Tensor:
+        """Return a checked observation; the default x if it is None."""
+        return super()._x_else_default_x(x)
+
+    def _x_else_default_x(self, x: Any) -> Tensor:
+        return self._one_x(x)
+
+    def _keep_default_x(self, x: Tensor) -> None:
+        """Set the default x to a copy of an observation that was checked."""
+        self._x, self._map = x.clone().to(self._device), None
 
     def __getstate__(self) -> dict[str, Any]:
         # sbi hands out its own __dict__, which a shallow copy would then share.

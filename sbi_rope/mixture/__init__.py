@@ -1,5 +1,6 @@
 """Mixtures of weighted densities, such as the posterior of RoPE."""
 
+from sbi_rope.mixture.average import average
 from sbi_rope.mixture.coupled import CoupledEmbeddings
 from sbi_rope.mixture.coupled_net import CoupledNet
 from sbi_rope.mixture.estimator import MixtureEstimator
@@ -27,6 +28,7 @@ __all__ = [
     "Part",
     "PriorPosterior",
     "Rows",
+    "average",
     "equal_rows",
     "part_of",
     "part_of_prior",

@@ -336,8 +336,7 @@ class MixturePosterior(BaseDirectPosterior):
         Raises:
             InvalidInputError: If the shape does not fit, or a value is not finite.
         """
-        # sbi's own method refuses any NaN, which some embedding nets can read.
-        self._x, self._map = self._batch_of_x(x).clone().to(self._device), None
+        self._keep_default_x(self._batch_of_x(x))
         return self
 
     def _one_x(self, x: Tensor | None) -> Tensor:
@@ -361,10 +360,6 @@ class MixturePosterior(BaseDirectPosterior):
         if x.shape == event_shape:
             x = x[None]
         return self.posterior_estimator.checked_x(x).to(x.device)
-
-    def _x_else_default_x(self, x: Any) -> Tensor:
-        # sbi refuses any NaN, which some embedding nets can read.
-        return self._one_x(x)
 
     def log_prob(
         self,

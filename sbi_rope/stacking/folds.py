@@ -9,8 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from sbi_rope._focus import warn_if_focused
 from sbi_rope._random import seeded
-from sbi_rope._sbi import embed, estimator_of
+from sbi_rope._sbi import embed, estimator_of, headless
 from sbi_rope._simulations import Moments
 from sbi_rope._simulator import Simulator
 from sbi_rope._training import groups_of, split_groups
@@ -96,7 +97,11 @@ class Workbench:
     @cached_property
     def embedded(self) -> Tensor:
         """The embeddings h(x) of :attr:`simulations`, shape ``(n_s, l)``."""
-        return embed(self.embedding_net, self.simulations[1])
+        theta, x = self.simulations
+        embedded = embed(self.embedding_net, x)
+        density = headless(estimator_of(self.npe))
+        warn_if_focused(density, self.npe.prior, theta, embedded)
+        return embedded
 
     @cached_property
     def embedding_net(self) -> nn.Module:

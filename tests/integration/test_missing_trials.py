@@ -11,6 +11,8 @@ from sbi_rope._sbi import embedding_of, posterior_from, with_embedding
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import InvalidInputError, SimulationError
 from sbi_rope.metrics import draw_samples, evaluate
+from sbi_rope.stacking import DiscrepancyCandidate, default_candidates
+from sbi_rope.stacking.folds import Workbench
 from sbi_rope.trainers import FinetunedNPE
 from sbi_rope.trainers.training import Training
 from tests import problems
@@ -57,11 +59,12 @@ def test_rope_repairs_a_posterior_of_trials_some_of_which_are_missing() -> None:
 
 def test_a_stack_takes_trials_some_of_which_are_missing() -> None:
     theta_o, x_o = labelled(20)
-    posterior = stacked(rope())
+    names = ("NPE", "fine-tuned NPE", "discrepancy (tuned)")
+    chosen = [c for c in default_candidates() if c.name in names]
+    assert len(chosen) == len(names)
+    posterior = stacked(rope(), candidates=chosen, num_folds=3)
     assert is_finite(posterior, theta_o, x_o)
-    names = posterior.report.cross_validation.names
-    assert {"NPE", "fine-tuned NPE", "discrepancy", "discrepancy (tuned)"} <= set(names)
-    coupled = stacked(rope(), x_o, candidates=COUPLINGS[:3])
+    coupled = stacked(rope(), x_o, candidates=COUPLINGS[:3], num_folds=2)
     assert is_finite(coupled, theta_o, x_o)
 
 
@@ -89,7 +92,9 @@ def test_stored_simulations_with_missing_trials_are_kept() -> None:
     x[0] = torch.nan  # a simulation that failed
     x[1, 0, 0] = torch.inf
     with pytest.warns(match="Dropped 2 of 1002 stored simulations"):
-        rope = RoPE(problems.trials_posterior(), simulations=(theta, x))
+        rope = RoPE(
+            problems.trials_posterior(), simulations=(theta, x), finetuner=QUICK
+        )
     assert rope.num_dropped_simulations == 2
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -156,10 +161,10 @@ def test_missing_numbers_of_a_vector_are_embedded_but_not_corrected() -> None:
     theta = problems.box(2).sample((12,))
     x = problems.simulate(theta)
     x[0, 1] = torch.nan
-    posterior = stacked(rope.append_calibration(theta, x))
-    assert "discrepancy" in posterior.candidate_weights
-    assert "discrepancy (input)" not in posterior.candidate_weights
-    assert is_finite(posterior, theta, x)
+    rope.append_calibration(theta, x)
+    bench = Workbench(rope, num_folds=2, seed=0, **QUIET)
+    for space, applies in (("embedding", True), ("input", False)):
+        assert DiscrepancyCandidate(space=space).applies_to(bench) is applies
     method = DiscrepancyNPE.from_posterior(
         posterior_from(npe, estimator), simulator=problems.simulate, space="input"
     )

@@ -1,0 +1,92 @@
+"""The average of posteriors, such as those repaired from the members of an ensemble."""
+
+import copy
+from collections.abc import Sequence
+from typing import Any
+
+from sbi_rope._sbi import estimator_of
+from sbi_rope._validation import check_weights
+from sbi_rope.errors import InvalidInputError, InvalidTypeError
+from sbi_rope.mixture.estimator import MixtureEstimator
+from sbi_rope.mixture.parts import part_of
+from sbi_rope.mixture.posterior import MixturePosterior
+
+__all__ = ["average"]
+
+
+def average(
+    posteriors: Sequence[Any], *, weights: Sequence[float] | None = None
+) -> MixturePosterior:
+    r"""Return the weighted average of posteriors that belong to the same prior.
+
+    .. math::
+        p(\theta \mid x) \propto \mathbf{1}[\theta \in \operatorname{supp} p]
+        \sum_m w_m\, q_m(\theta \mid x)
+
+    An ensemble of NPEs is repaired in this way: every member is repaired by itself,
+    because each has an embedding net of its own. The average is normalised as a whole,
+    so that a member with much of its mass outside the prior counts for less.
+
+    Args:
+        posteriors: What ``stack``, ``RoPE.build_posterior`` or a trainer returns, or
+            posteriors of NPE. They are copied. Those that belong to a batch have to
+            belong to the same batch.
+        weights: One for each posterior, with a sum of one; equal if None.
+
+    Returns:
+        The average. It belongs to a batch if one of the posteriors does.
+
+    Raises:
+        InvalidTypeError: If it is no list of posteriors.
+        InvalidInputError: If there is no posterior, shapes or batches differ, or the
+            weights do not fit.
+        UnsupportedPosteriorError: If one of them has no density or no embedding of x.
+
+    Example:
+        >>> import torch
+        >>> from sbi.inference import NPE
+        >>> from sbi.utils import BoxUniform
+        >>> _ = torch.manual_seed(0)
+        >>> prior = BoxUniform(torch.zeros(1), torch.ones(1))
+        >>> members = []
+        >>> for _ in range(2):
+        ...     npe = NPE(prior, density_estimator="mdn", show_progress_bars=False)
+        ...     theta = prior.sample((100,))
+        ...     npe = npe.append_simulations(theta, theta + torch.randn(100, 1))
+        ...     _ = npe.train(max_num_epochs=1)
+        ...     members.append(npe.build_posterior())
+        >>> posterior = average(members, weights=[0.3, 0.7])
+        >>> posterior.sample((5,), x=torch.ones(1)).shape
+        torch.Size([5, 1])
+    """
+    if not isinstance(posteriors, list | tuple):
+        raise InvalidTypeError(
+            "Expected `posteriors` to be a list of posteriors; got "
+            f"{type(posteriors).__name__}."
+        )
+    if not len(posteriors):
+        raise InvalidInputError("Expected at least one of `posteriors`; got none.")
+    if weights is None:
+        weights = [1.0 / len(posteriors)] * len(posteriors)
+    shares = check_weights("weights", weights, len(posteriors))
+    estimators = [_mixture_of(posterior) for posterior in posteriors]
+    mixture = MixtureEstimator(
+        [part for estimator in estimators for part in estimator.parts],
+        [
+            share * weight
+            for share, estimator in zip(shares, estimators, strict=True)
+            for weight in estimator.weights.tolist()
+        ],
+        tail_mass=min(estimator.tail_mass for estimator in estimators),
+    )
+    first = posteriors[0]
+    return MixturePosterior(
+        mixture, copy.deepcopy(first.prior), enable_transform=first.enable_transform
+    )
+
+
+def _mixture_of(posterior: Any) -> MixtureEstimator:
+    """Return a copy of a posterior's mixture, which may have a single part."""
+    if isinstance(posterior, MixturePosterior):
+        return copy.deepcopy(posterior.posterior_estimator)
+    return MixtureEstimator([part_of(estimator_of(posterior))], [1.0])

@@ -1,0 +1,96 @@
+"""The average of posteriors is the mixture of their densities."""
+
+import copy
+
+import pytest
+import torch
+from sbi.inference import EnsemblePosterior
+from torch import Tensor
+
+from sbi_rope import MixturePosterior, RoPE
+from sbi_rope.errors import (
+    InvalidInputError,
+    InvalidTypeError,
+    UnsupportedPosteriorError,
+)
+from sbi_rope.mixture import average
+from tests import problems
+from tests.stacks import QUIET, unnormalised
+
+WEIGHTS = torch.tensor([0.7, 0.3])
+
+
+def ensemble() -> EnsemblePosterior:
+    members = [problems.npe_posterior(family) for family in ("mdn", "maf")]
+    return EnsemblePosterior(copy.deepcopy(members), WEIGHTS.tolist())
+
+
+def pairs(n: int) -> tuple[Tensor, Tensor]:
+    theta = problems.box(2).sample((n,))
+    return theta, problems.simulate(theta)
+
+
+def mixed(log_probs: list[Tensor]) -> Tensor:
+    return torch.stack(log_probs).add(WEIGHTS.log()[:, None, None]).logsumexp(dim=0)
+
+
+def test_an_average_of_npes_is_the_ensemble_of_sbi() -> None:
+    npes = ensemble()
+    posterior = average(npes.posteriors, weights=npes.weights)
+    theta, x = pairs(6)
+    expected = mixed([unnormalised(npe, theta, x) for npe in npes.posteriors])
+    assert torch.allclose(unnormalised(posterior, theta, x), expected, atol=1e-5)
+    assert posterior.is_amortised
+    assert posterior.sample((5,), x=x[0], **QUIET).shape == (5, 2)
+
+
+def test_the_members_of_an_ensemble_are_repaired_one_by_one() -> None:
+    x_o = pairs(25)[1] + 0.3
+    theta = pairs(25)[0]
+
+    def repaired(member: object) -> MixturePosterior:
+        rope = RoPE(member, simulator=problems.simulate)
+        return rope.build_posterior(x_o, num_simulations=50, seed=0, **QUIET)
+
+    npes = ensemble()
+    members = [repaired(member) for member in npes.posteriors]
+    posterior = average(members, weights=npes.weights)
+    expected = mixed([unnormalised(member, theta, x_o) for member in members])
+    # Each leaves out the smallest weights, up to 0.001 of all.
+    assert torch.allclose(unnormalised(posterior, theta, x_o), expected, atol=0.05)
+    assert torch.equal(posterior.x_o, x_o)
+    samples = posterior[2].sample((2000,), **QUIET)
+    share = (samples[:, 0] < 0).float().mean()
+    alone = torch.stack(
+        [(m[2].sample((2000,), **QUIET)[:, 0] < 0).float().mean() for m in members]
+    )
+    assert float(share) == pytest.approx(float(alone @ WEIGHTS), abs=0.05)
+
+
+def test_an_average_is_a_copy_and_has_equal_weights_by_default() -> None:
+    member = problems.gaussian_posterior()
+    posterior = average([member, member])
+    assert posterior.posterior_estimator.weights.tolist() == [0.5, 0.5]
+    density = posterior.posterior_estimator.parts[0].density
+    assert density is not member.posterior_estimator.parts[0].density
+    # The members of an average may be averages.
+    nested = average([posterior, member], weights=[0.2, 0.8])
+    assert nested.posterior_estimator.weights.tolist() == pytest.approx([0.1, 0.1, 0.8])
+
+
+def test_what_cannot_be_averaged_is_refused() -> None:
+    member = problems.gaussian_posterior()
+    with pytest.raises(InvalidInputError, match="at least one"):
+        average([])
+    with pytest.raises(InvalidTypeError, match="a list of posteriors"):
+        average(ensemble())  # type: ignore[arg-type]
+    with pytest.raises(UnsupportedPosteriorError, match="got NoneType"):
+        average([member, None])
+    with pytest.raises(UnsupportedPosteriorError, match="density"):
+        average([problems.vector_field_posterior("fmpe")])
+    with pytest.raises(InvalidInputError, match="`weights` to be 1 numbers"):
+        average([member], weights=[0.5, 0.5])
+    with pytest.raises(InvalidInputError, match="same `x_o`"):
+        average([member, problems.gaussian_posterior()])
+    with pytest.raises(InvalidInputError, match="as the first"):
+        average([member, problems.gaussian_posterior(dim=3)])
