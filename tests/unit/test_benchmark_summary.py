@@ -189,7 +189,7 @@ def test_the_block_replaces_what_is_between_the_markers_and_nothing_else(
     assert text.endswith("\n<!-- /results -->\nafter\n")
     assert "replaced" not in text
     assert "(results/README.md)" in text
-    assert len(text.splitlines()) < 46
+    assert len(text.splitlines()) < 47
 
 
 def test_a_readme_without_a_place_for_the_block_is_refused_and_nothing_written(
