@@ -26,6 +26,8 @@ types: $(VENV)/.installed
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
 # A warning is an error: a link or a reference that leads nowhere, a cell that fails.
+# Notebooks are executed again if their cells have changed. Remove docs/_build to execute
+# them with a package that has changed.
 docs: $(VENV)/.docs
 	$(BIN)/sphinx-build -W --keep-going -b html docs docs/_build/html
 
