@@ -60,6 +60,12 @@ ALIGNED: dict[str, Any] = {
     "training": SHORT,
     "num_simulations": 50,
 }
+ERRORS: dict[str, Any] = {
+    "npe_training": SHORT,
+    "surrogate_training": SHORT,
+    "training": SHORT,
+    "num_draws": 8,
+}
 CORRECTION: dict[str, Any] = {"npe_training": SHORT, "num_steps": 5}
 
 
@@ -134,15 +140,8 @@ METHODS: dict[str, Entry] = {
         },
         ("pendulum",),
     ),
-    "rvnp": Entry(
-        RVNP,
-        lambda task: {
-            "npe_training": SHORT,
-            "surrogate_training": SHORT,
-            "training": SHORT,
-            "num_draws": 8,
-        },
-    ),
+    "rvnp": Entry(RVNP, lambda task: ERRORS),
+    "rvnp_offset": Entry(RVNP, lambda task: {**ERRORS, "shift": True}),
     "rnpe": Entry(RNPE, lambda task: {"npe_training": SHORT, **CHAINS}),
 }
 CASES = [(name, task) for name, entry in METHODS.items() for task in entry.tasks]

@@ -609,7 +609,7 @@ def test_a_posterior_trained_beforehand_fixes_the_shape_of_x() -> None:
 
 def test_simulations_that_are_not_needed_earn_a_warning() -> None:
     of_use = {name for name in BUILDERS if METHODS[name].kind is DiscrepancyNPE}
-    of_use |= {"nnpe", "rnpe", "rvnp"}
+    of_use |= {"nnpe", "rnpe", "rvnp", "rvnp_offset"}
     # These look simulations up, because they have no simulator here.
     of_use |= {name for name in BUILDERS if name.startswith(("fmcpe", "frisbi"))}
     of_use |= {"tuning_only"}

@@ -219,6 +219,7 @@ def test_a_strong_penalty_leaves_no_offset_that_varies() -> None:
         bound = Bound(q, errors, surrogate(), gaussian.prior(), 16)
         method = RVNP.from_posterior(
             gaussian.posterior(),
+            shift=True,
             shrinkage=shrinkage,
             training=Training(learning_rate=1e-2, max_num_epochs=10),
         )

@@ -53,9 +53,10 @@ class RVNP(Method):
         L(\theta) = \Lambda + \operatorname{diag} \sigma(\theta)
 
     is the density of a real statistic y whose simulation is s, in units of the standard
-    deviation over the simulations. The density of s is learned from simulations. The
-    errors are learned without labels, by maximising over all observations the
-    importance-weighted bound on their evidence
+    deviation over the simulations. As published, there is no offset :math:`\mu +
+    \mu(\theta)`; with ``shift=True`` there is one. The density of s is learned from
+    simulations. The errors are learned without labels, by maximising over all
+    observations the importance-weighted bound on their evidence
 
     .. math::
         \log \tfrac1K \sum_k v_k - \lambda\, \mathbb{E} \lVert \mu(\theta) \rVert^2,
@@ -95,9 +96,10 @@ class RVNP(Method):
     - Statistics are the embedding of NPE, instead of one that is trained to maximise
       its mutual information with the parameters.
 
-    The paper describes errors without an offset, which are ``shift=False`` and, as
-    RVNP-G, ``depends_on_theta=False``. An offset is part of the primary method of the
-    code.
+    The paper has two error models, the default here and RVNP-G, which is
+    ``depends_on_theta=False``. The offset, ``shift=True``, is part of what the code
+    calls its primary method. Whatever its penalty, an offset can be taken for other
+    parameters, so that it helps only where the prior tells the two apart.
 
     References:
         | Robust Variational Neural Posterior Estimation for Simulation-Based Inference
@@ -113,7 +115,7 @@ class RVNP(Method):
         shift: Whether errors have an offset, :math:`\mu + \mu(\theta)`.
         depends_on_theta: Whether :math:`\mu(\theta)` and :math:`\sigma(\theta)` are
             networks; otherwise :math:`\mu(\theta)` is zero and :math:`\sigma` constant.
-        shrinkage: :math:`\lambda`.
+        shrinkage: :math:`\lambda`, of no effect without an offset.
         num_draws: K, two or more.
         npe_training: How NPE is trained; ``Training()`` if None.
         surrogate_training: How :math:`p(s \mid \theta)` is trained; ``Training()`` if
@@ -152,7 +154,7 @@ class RVNP(Method):
         density_estimator: str | EstimatorBuilder = "nsf",
         *,
         noise_on: NoiseOn = "embedding",
-        shift: bool = True,
+        shift: bool = False,
         depends_on_theta: bool = True,
         shrinkage: float = 0.1,
         num_draws: int = 32,
