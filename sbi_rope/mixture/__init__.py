@@ -13,7 +13,7 @@ from sbi_rope.mixture.parts import (
     part_of,
 )
 from sbi_rope.mixture.posterior import MixturePosterior
-from sbi_rope.mixture.prior import part_of_prior, prior_log_prob, prior_sample
+from sbi_rope.mixture.prior import part_of_prior
 from sbi_rope.mixture.prior_posterior import PriorPosterior
 from sbi_rope.mixture.truncation import Leakage
 
@@ -32,6 +32,4 @@ __all__ = [
     "equal_rows",
     "part_of",
     "part_of_prior",
-    "prior_log_prob",
-    "prior_sample",
 ]

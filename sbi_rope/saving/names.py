@@ -116,7 +116,8 @@ FUNCTIONS = {
 }
 # Methods that sbi's vector fields keep as attributes.
 METHODS = {
-    *("ode_fn", "_identity_weight_fn", "_max_likelihood_weight_fn"),
+    *("ode_fn", "_f_condition_last"),
+    *("_identity_weight_fn", "_max_likelihood_weight_fn"),
     "_variance_weight_fn",
 }
 # Functions of zuko that make transforms. They are found when they are needed.

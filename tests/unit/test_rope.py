@@ -773,7 +773,9 @@ def test_a_prior_that_cannot_be_copied_is_named() -> None:
 
 
 def test_a_trainer_is_refused_in_place_of_its_posterior() -> None:
-    with pytest.raises(UnsupportedPosteriorError, match="has still to build it"):
+    with pytest.raises(
+        UnsupportedPosteriorError, match=r"call `\.train\(\)`, then pass"
+    ):
         RoPE(NPE(gaussian.prior()), simulator=gaussian.simulator)
 
 

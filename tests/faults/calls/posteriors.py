@@ -2,6 +2,7 @@
 
 import copy
 
+from sbi_rope.mixture import average
 from tests.faults.outcomes import Call
 from tests.faults.problem import (
     QUIET,
@@ -14,6 +15,16 @@ from tests.faults.problem import (
 )
 
 CALLS = [
+    Call(
+        name="average",
+        run=lambda posteriors=None, **options: average(
+            [stacked(), stacked()] if posteriors is None else posteriors, **options
+        ).sample_batched((5,), x=X_O, **QUIET),
+        options={"posteriors": "instance", "weights": "instance"},
+        is_random=True,
+    ),
+]
+CALLS += [
     call
     for kind, make, x in (
         ("MixturePosterior", posterior, X_O),
