@@ -179,7 +179,6 @@ def check_batch(
             f"Expected `{name}` with at least one number in each row; got shape "
             f"{tuple(value.shape)}."
         )
-    check_values(name, value)
     if finite:
         check_finite(name, value)
     return value

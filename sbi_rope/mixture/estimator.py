@@ -15,6 +15,7 @@ from sbi_rope._validation import (
     check_readable,
     check_same_length,
     check_unit_interval,
+    check_values,
     check_weights,
 )
 from sbi_rope.errors import InvalidInputError
@@ -234,6 +235,7 @@ class MixtureEstimator(MixtureDensity):
                 embedding nets can do with missing values (NaN).
         """
         x = check_batch("x", x, self.condition_shape, finite=False)
+        check_values("x", x)
         x = x.to(self.weights.device, DTYPE)
         if not torch.isfinite(x).all():
             can_read = torch.stack([part.mixing.readable(x) for part in self._used[0]])
