@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from sbi_rope._sbi import (
     ConditionalDensityEstimator,
+    MixedDensity,
     VectorFieldDensity,
     copy_of_prior,
     device_of,
@@ -23,10 +24,7 @@ from sbi_rope._sbi import (
 from sbi_rope._validation import (
     check_batch,
     check_device,
-    check_finite,
-    check_in_support,
     check_readable,
-    check_same_length,
     check_tensor,
     check_values,
 )
@@ -86,6 +84,11 @@ class TrainedNPE:
         return self.estimator.condition_shape
 
     @property
+    def is_mixed(self) -> bool:
+        """Whether some parameters are discrete."""
+        return isinstance(self._q, MixedDensity)
+
+    @property
     def enable_transform(self) -> bool:
         """Whether sbi's ``map`` searches in an unbounded space."""
         return self._posterior.enable_transform
@@ -127,15 +130,6 @@ class TrainedNPE:
                 "repair these rows."
             )
         return embedded
-
-    def checked_pairs(self, theta: Any, x: Any) -> tuple[Tensor, Tensor]:
-        """Return a copy of a user's labelled observations, in the estimator's dtype."""
-        theta = self._checked("theta", theta, self.estimator.input_shape)
-        check_finite("theta", theta)
-        x = self.checked_x("x", x)
-        check_same_length("theta", theta, "x", x)
-        check_in_support("theta", theta, self.prior)
-        return theta, x
 
     def checked_x(self, name: str, x: Any) -> Tensor:
         """Return a copy of a user's observations, in the estimator's dtype."""

@@ -1,6 +1,6 @@
 """Sources of simulations: what RoPE needs of them, and a stored set of pairs."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -30,6 +30,7 @@ __all__ = [
     "SimulationSource",
     "StoredSimulations",
     "all_finite",
+    "check_targets",
     "draw_targets",
     "warn_of_dropped",
 ]
@@ -56,19 +57,45 @@ class Moments:
     Attributes:
         mean: Shape ``(n, l)``, float64.
         covariance: Shape ``(n, l, l)``, float64.
+        possible: Where labels are not exact, means at R parameters that each of them
+            leaves possible, shape ``(n, R, l)``; ``mean`` is their average. None for
+            exact labels.
     """
 
     mean: Tensor
     covariance: Tensor
+    possible: Tensor | None = None
 
     def __getitem__(self, rows: Tensor) -> "Moments":
-        return Moments(mean=self.mean[rows], covariance=self.covariance[rows])
+        return Moments(
+            mean=self.mean[rows],
+            covariance=self.covariance[rows],
+            possible=None if self.possible is None else self.possible[rows],
+        )
+
+    @classmethod
+    def joined(cls, parts: Sequence["Moments"]) -> "Moments":
+        """Return the moments of several sets of parameters, one after the other."""
+        possible = [part.possible for part in parts if part.possible is not None]
+        return cls(
+            mean=torch.cat([part.mean for part in parts]),
+            covariance=torch.cat([part.covariance for part in parts]),
+            possible=torch.cat(possible) if possible else None,
+        )
 
     def columns(self, columns: slice) -> "Moments":
         """Return the moments of some entries of the embeddings."""
+        possible = self.possible
         return Moments(
-            mean=self.mean[:, columns], covariance=self.covariance[:, columns, columns]
+            mean=self.mean[:, columns],
+            covariance=self.covariance[:, columns, columns],
+            possible=None if possible is None else possible[..., columns],
         )
+
+    @property
+    def means(self) -> Tensor:
+        """The possible means, or the only one: ``(n, R, l)`` or ``(n, l)``."""
+        return self.mean if self.possible is None else self.possible
 
 
 class SimulationSource(Protocol):
@@ -297,6 +324,15 @@ def draw_targets(
         num_neighbors=num_neighbors,
         progress=progress,
     )
+    return check_targets(targets, theta)
+
+
+def check_targets(targets: Tensor, theta: Tensor) -> Tensor:
+    """Return the targets of the tuning if they are finite.
+
+    Raises:
+        SimulationError: If they are not.
+    """
     usable = torch.isfinite(torch.linalg.vector_norm(targets, dim=1))
     if not usable.all():
         raise SimulationError(

@@ -156,6 +156,7 @@ class CalibrationFinetuner:
         *,
         draw_simulations: Callable[[int], Tensor] | None = None,
         groups: Tensor | None = None,
+        weights: Tensor | None = None,
         seed: int | None = None,
         show_progress_bars: bool | None = None,
     ) -> FinetuneResult:
@@ -172,6 +173,7 @@ class CalibrationFinetuner:
             groups: A number for each pair, shape ``(n_c,)``. Pairs with the same
                 number, such as recordings of one person, are held out together. None
                 if all pairs have different parameters.
+            weights: How many pairs each pair counts as, shape ``(n_c,)``; one if None.
             seed: Seed of the split and of the simulations; None uses torch's state.
             show_progress_bars: Whether to show the losses during training. None does so
                 in a terminal or a notebook, but not in a file.
@@ -187,6 +189,9 @@ class CalibrationFinetuner:
         check_instance("embedding_net", embedding_net, nn.Module)
         x = _checked_inputs("x", x, embedding_net)
         groups = _checked_groups(groups, x)
+        if weights is not None:
+            weights = check_batch("weights", weights, ()).to(x)
+            check_same_length("x", x, "weights", weights)
         show = is_shown(show_progress_bars)
         with seeded(seed):
             embedded = _embedded("x", x, embedding_net)
@@ -208,6 +213,7 @@ class CalibrationFinetuner:
                     targets,
                     train.to(x.device),
                     held_out.to(x.device),
+                    weights=weights,
                     learning_rate=learning_rate,
                     max_num_epochs=max_num_epochs,
                     keep=keep,
@@ -247,6 +253,7 @@ class CalibrationFinetuner:
         train: Tensor,
         held_out: Tensor,
         *,
+        weights: Tensor | None,
         learning_rate: float,
         max_num_epochs: int,
         keep: tuple[Tensor, Tensor] | None,
@@ -256,30 +263,29 @@ class CalibrationFinetuner:
         has_holdout = held_out.numel() > 0
         newest = targets
 
-        def all_pairs(epoch: int) -> list[tuple[Tensor, Tensor]]:
+        def all_pairs(epoch: int) -> list[tuple[Tensor]]:
             nonlocal newest
             if draw_targets is not None and 0 < epoch < max_num_epochs:
                 newest = draw_targets()
-            return [(x[train], newest[train])]
+            return [(train,)]
 
-        def distance(x: Tensor, targets: Tensor) -> Tensor:
-            return _mean_distance(net(x), targets)
+        def distance(rows: Tensor, targets: Tensor) -> Tensor:
+            of_rows = None if weights is None else weights[rows]
+            return _mean_distance(net(x[rows]), targets[rows], of_rows)
 
-        def loss(x: Tensor, targets: Tensor) -> Tensor:
+        def loss(rows: Tensor) -> Tensor:
             if keep is None:
-                return distance(x, targets)
+                return distance(rows, newest)
             some = torch.randint(len(keep[0]), (REHEARSED_IN_EPOCH,)).to(x.device)
-            kept = distance(keep[0][some], keep[1][some])
-            return distance(x, targets) + self.rehearsal * kept
+            kept = _mean_distance(net(keep[0][some]), keep[1][some])
+            return distance(rows, newest) + self.rehearsal * kept
 
         history = fit(
             net,
             all_pairs,
             loss,
             validation_loss=(
-                (lambda: distance(x[held_out], targets[held_out]))
-                if has_holdout
-                else None
+                (lambda: distance(held_out, targets)) if has_holdout else None
             ),
             learning_rate=learning_rate,
             max_num_epochs=max_num_epochs,
@@ -373,5 +379,10 @@ def _check_start(embedded: Tensor, targets: Tensor) -> None:
         )
 
 
-def _mean_distance(embeddings: Tensor, targets: Tensor) -> Tensor:
-    return torch.linalg.vector_norm(embeddings - targets, dim=1).mean()
+def _mean_distance(
+    embeddings: Tensor, targets: Tensor, weights: Tensor | None = None
+) -> Tensor:
+    distances = torch.linalg.vector_norm(embeddings - targets, dim=1)
+    if weights is None:
+        return distances.mean()
+    return (weights * distances).sum() / weights.sum()

@@ -13,10 +13,9 @@ from sbi_rope._pickling import picklable
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed
-from sbi_rope._simulations import SimulationSource, draw_targets
+from sbi_rope._simulations import SimulationSource
 from sbi_rope._simulator import source_of
 from sbi_rope._standardisation import warn_of_far_entries
-from sbi_rope._training import groups_of
 from sbi_rope._validation import (
     check_batch,
     check_choice,
@@ -31,8 +30,20 @@ from sbi_rope._validation import (
 )
 from sbi_rope.batch import EmbeddedBatch, check_converged
 from sbi_rope.coupling import SinkhornCoupler
-from sbi_rope.errors import NotReadyError
+from sbi_rope.errors import (
+    InvalidInputError,
+    NotReadyError,
+    UnsupportedPosteriorError,
+    warn_user,
+)
 from sbi_rope.finetuning import CalibrationFinetuner, History
+from sbi_rope.labels import (
+    LabelledParameters,
+    Labels,
+    labelled_targets,
+    parameters_of,
+)
+from sbi_rope.labels.checks import checked_labels
 from sbi_rope.mixture import MixturePosterior
 
 __all__ = ["RoPE"]
@@ -141,7 +152,8 @@ class RoPE:
         )
         self.finetuner = CalibrationFinetuner() if finetuner is None else finetuner
         self.coupler = SinkhornCoupler() if coupler is None else coupler
-        self._theta_cal = self._npe.like
+        self._labels = Labels.exact(self._npe.like)
+        self._parameters = parameters_of(self._labels, self._npe.prior)
         self._x_cal = self._npe.like.new_empty(0, *self._npe.event_shape)
         # The folds of a stack share their simulations, so their targets are known.
         self._targets: Tensor | None = None
@@ -149,27 +161,75 @@ class RoPE:
         self._history: History | None = None
         self._was_looked_at = False
 
-    def append_calibration(self, theta: Tensor, x: Tensor) -> "RoPE":
-        """Add real observations with known parameters to those appended so far.
+    def append_calibration(
+        self,
+        theta: Tensor,
+        x: Tensor,
+        *,
+        theta_std: Tensor | float | None = None,
+        theta_cov: Tensor | None = None,
+        weights: Tensor | None = None,
+    ) -> "RoPE":
+        r"""Add real observations with known parameters to those appended so far.
+
+        Labels need not be exact. A label is then a measurement
+        :math:`y \sim \mathcal N(\theta, R)` of some or all of the parameters, and what
+        needs the parameters averages over :math:`p(\theta \mid y)` under the prior.
 
         Args:
-            theta: Parameters, shape ``(n, d)``, inside the prior's support.
+            theta: Parameters, shape ``(n, d)``, inside the prior's support. NaN stands
+                for a parameter that was not measured. More general labels are draws
+                from :math:`p(\theta \mid y)` under the prior, shape ``(n, S, d)``.
             x: Real observations, shape ``(n, *event)``.
+            theta_std: The standard deviations of the measurements, in the units of
+                theta: a number, or shape ``(d,)`` or ``(n, d)``. Zero is exact. A label
+                with noise may be outside the prior's support. None if all are exact.
+            theta_cov: Instead of ``theta_std``, the covariance of the measurements,
+                shape ``(d, d)`` or ``(n, d, d)``.
+            weights: How many pairs each pair counts as, shape ``(n,)``; one if None.
 
         Returns:
             Itself, so that calls can be chained.
 
         Raises:
-            InvalidTypeError: If one of them is not a tensor.
+            InvalidTypeError: If an argument is not a tensor.
             InvalidInputError: If shapes, numbers of rows or devices do not fit, a value
-                is not finite, or a theta is outside the prior's support. Nothing is
-                added then.
+                is not finite, an exact theta is outside the prior's support, or no
+                parameters inside it fit a label. Nothing is added then.
+            UnsupportedPosteriorError: If labels are not exact and some parameters are
+                discrete.
         """
-        theta, x = self._npe.checked_pairs(theta, x)
+        labels = checked_labels(
+            theta,
+            theta_std=theta_std,
+            theta_cov=theta_cov,
+            weights=weights,
+            like=self._npe.like,
+            prior=self._npe.prior,
+        )
+        x = self._npe.checked_x("x", x)
+        check_same_length("theta", labels.theta, "x", x)
+        if self._npe.is_mixed and not labels.are_exact:
+            raise UnsupportedPosteriorError(
+                "Expected exact labels, because some parameters are discrete (MNPE); "
+                f"got {labels}. Leave out pairs whose parameters are not all known."
+            )
         self._npe.embed("x", x, self._npe.h)
         warn_of_far_entries("x", x, self._npe.h)
-        self._theta_cal = torch.cat([self._theta_cal, theta])
-        self._x_cal = torch.cat([self._x_cal, x])
+        known = labels.says_something
+        if not known.any():
+            raise InvalidInputError(
+                "Expected labels of at least one parameter in one pair; got NaN only."
+            )
+        if not known.all():
+            warn_user(
+                f"{int((~known).sum())} of {len(known)} labels say nothing about any "
+                "parameter, and are left out."
+            )
+            labels, x = labels[known], x[known]
+        labels = self._labels.appended(labels) if len(self._labels) else labels
+        self._parameters = parameters_of(labels, self._npe.prior)
+        self._labels, self._x_cal = labels, torch.cat([self._x_cal, x])
         self._g, self._history, self._targets = None, None, None
         return self
 
@@ -208,26 +268,46 @@ class RoPE:
         def targets(count: int) -> Tensor:
             if known is not None:
                 return known
-            return draw_targets(
-                self._source,
-                self._theta_cal,
-                self._embed_simulations,
-                simulations_per_target=count,
-                num_neighbors=self.finetuner.num_neighbors,
-                progress=show,
-            )
+            return self.draw_targets(count, show_progress_bars=show)
 
         result = self.finetuner.finetune(
             self._npe.h,
             self._x_cal,
             targets,
             draw_simulations=lambda count: self._source.kept(count, progress=show)[1],
-            groups=groups_of(self._theta_cal),
+            groups=self._labels.groups,
+            weights=self._labels.weights if self._labels.are_weighted else None,
             seed=seed,
             show_progress_bars=show,
         )
         self._g, self._history = result.embedding_net, result.history
         return self
+
+    def draw_targets(
+        self, simulations_per_target: int, *, show_progress_bars: bool | None = None
+    ) -> Tensor:
+        r"""Return the targets of the tuning, the mean embeddings of simulations.
+
+        Args:
+            simulations_per_target: The number of simulations for each pair.
+            show_progress_bars: Whether to show the progress of slow simulations, as in
+                :meth:`train`.
+
+        Returns:
+            :math:`E[h(S(\theta)) \mid y_i]`, shape ``(n_c, l)``. Over labels that are
+            not exact it averages the parameters, too.
+
+        Raises:
+            SimulationError: If the simulator fails, or an embedding is not finite.
+        """
+        return labelled_targets(
+            self._source,
+            self._parameters,
+            self._embed_simulations,
+            simulations_per_target=simulations_per_target,
+            num_neighbors=self.finetuner.num_neighbors,
+            progress=is_shown(show_progress_bars),
+        )
 
     def embed(
         self,
@@ -396,7 +476,8 @@ class RoPE:
             targets = targets.clone()
         part = copy.copy(self)
         part.finetuner = self.finetuner if finetuner is None else finetuner
-        part._theta_cal, part._x_cal = self._theta_cal[rows], self._x_cal[rows]
+        part._labels, part._parameters = self._labels[rows], self._parameters[rows]
+        part._x_cal = self._x_cal[rows]
         part._targets = targets
         part._g, part._history = None, None
         return part
@@ -413,8 +494,21 @@ class RoPE:
 
     @property
     def calibration(self) -> tuple[Tensor, Tensor]:
-        """The calibration pairs appended so far, theta and x."""
-        return self._theta_cal.clone(), self._x_cal.clone()
+        """The calibration pairs appended so far, theta and x.
+
+        Of labels that are not exact, theta is the mean given the label.
+        """
+        return self._parameters.mean.clone(), self._x_cal.clone()
+
+    @property
+    def labels(self) -> Labels:
+        """What is known about the parameters of the calibration pairs."""
+        return self._labels
+
+    @property
+    def labelled_parameters(self) -> LabelledParameters:
+        """Draws of the parameters of the calibration pairs, given their labels."""
+        return self._parameters
 
     @property
     def embedding_net(self) -> nn.Module:

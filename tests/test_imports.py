@@ -50,8 +50,9 @@ LAYERS = [
     # simulations like stored ones.
     {"mixture", "_simulator"},
     # A batch is coupled, and its couplings make a mixture. Trainers train networks, and
-    # average them in a mixture. Tasks have simulators.
-    {"batch", "trainers", "tasks"},
+    # average them in a mixture. Tasks have simulators. Labels have a density under a
+    # posterior and its prior.
+    {"batch", "labels", "trainers", "tasks"},
     # RoPE conducts fine-tuning, coupling and mixture.
     {"rope"},
     # A sweep asks RoPE for many mixtures. The NPE that knows the discrepancy is a

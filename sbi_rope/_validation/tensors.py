@@ -267,11 +267,25 @@ def check_prior(prior: Any) -> None:
         )
 
 
-def check_in_support(name: str, theta: Tensor, prior: Any) -> None:
-    """Raise if any row of ``theta`` lies outside the prior's support."""
+def check_in_support(
+    name: str, theta: Tensor, prior: Any, *, rows: Tensor | None = None
+) -> None:
+    """Raise if any row of ``theta`` lies outside the prior's support.
+
+    Args:
+        name: What the user calls it.
+        theta: Parameters, shape ``(n, d)``.
+        prior: The prior.
+        rows: Which rows are checked, shape ``(n,)``; all if None.
+    """
     if not len(theta):  # sbi cannot check an empty batch
         return
-    outside = ~within_support(prior, theta)
+    if rows is None:
+        outside = ~within_support(prior, theta)
+    else:
+        outside = torch.zeros_like(rows)
+        if rows.any():
+            outside[rows] = ~within_support(prior, theta[rows])
     if outside.any():
         first = outside.nonzero().flatten()[:5].tolist()
         raise InvalidInputError(

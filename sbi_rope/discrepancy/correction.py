@@ -74,6 +74,8 @@ def fit_discrepancy(
     moments: Moments,
     standardisation: Standardisation,
     model: DiscrepancyModel,
+    *,
+    weights: Tensor | None = None,
 ) -> Discrepancy:
     """Fit the model to calibration pairs, in standard deviations of simulations.
 
@@ -83,6 +85,7 @@ def fit_discrepancy(
         standardisation: The mean and standard deviation of z over simulations from the
             prior.
         model: The model of the discrepancy.
+        weights: How many pairs each pair counts as, shape ``(n,)``; one if None.
 
     Raises:
         InvalidInputError: If nothing varies between simulations.
@@ -98,8 +101,9 @@ def fit_discrepancy(
     covariance = moments.covariance.mean(dim=0)[varies][:, varies]
     return model.fit(
         standardisation(z.double()),
-        standardisation(moments.mean),
+        standardisation(moments.means),
         covariance / std / std[:, None],
+        weights=weights,
     )
 
 
@@ -111,6 +115,7 @@ def correct_npe(
     *,
     space: Space,
     model: DiscrepancyModel,
+    weights: Tensor | None = None,
     probabilities: Tensor | None = None,
     num_steps: int | None = None,
     learning_rate: float | None = None,
@@ -126,6 +131,7 @@ def correct_npe(
         moments: The moments of simulations at the parameters of the pairs.
         space: What z is: embeddings h(x), x itself, or embeddings by tuned nets.
         model: The model of the discrepancy.
+        weights: How many pairs each pair counts as, shape ``(n_c,)``; one if None.
         probabilities: The probabilities with which simulations are drawn; None makes
             them equal.
         num_steps: Gradient steps. If None, courses follow each other, whose length
@@ -139,7 +145,7 @@ def correct_npe(
     """
     theta, z_s = simulations
     standardisation = Standardisation(z_s.double())
-    discrepancy = fit_discrepancy(z, moments, standardisation, model)
+    discrepancy = fit_discrepancy(z, moments, standardisation, model, weights=weights)
     corrected = copy.deepcopy(estimator)
     # The two share their parameters, so that training one trains the other.
     density: Any = corrected if space == "input" else headless(corrected)

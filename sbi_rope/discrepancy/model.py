@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
+from sbi_rope._random import seeded
 from sbi_rope._validation import (
     check_batch,
     check_positive,
@@ -17,6 +18,7 @@ from sbi_rope._validation import (
     check_tensor,
     check_unit_interval,
 )
+from sbi_rope.discrepancy.imputation import impute
 from sbi_rope.discrepancy.posterior import Discrepancy, Term
 from sbi_rope.errors import InvalidInputError, InvalidTypeError
 
@@ -111,15 +113,35 @@ class DiscrepancyModel:
                 check_positive(name, value)
         check_unit_interval("probability_of_none", self.probability_of_none)
 
-    def fit(self, z: Tensor, mean: Tensor, covariance: Tensor) -> Discrepancy:
+    def fit(
+        self,
+        z: Tensor,
+        mean: Tensor,
+        covariance: Tensor,
+        *,
+        weights: Tensor | None = None,
+        seed: int = 0,
+    ) -> Discrepancy:
         r"""Return the posterior of the discrepancy given calibration pairs.
+
+        If parameters are not known exactly, ``mean`` holds the means at R parameters
+        that are equally probable before the observation is seen. The parameters are
+        then imputed and the discrepancy is drawn in turn (data augmentation, a Gibbs
+        sampler), and the posterior is the average over 20 imputations.
+
+        References:
+            | The Calculation of Posterior Distributions by Data Augmentation (Tanner
+              and Wong, 1987)
+            | https://doi.org/10.1080/01621459.1987.10478458
 
         Args:
             z: Representations of the real observations, shape ``(n, l)``.
             mean: :math:`m_i`, the mean of simulations at the parameters of each
-                observation, shape ``(n, l)``.
+                observation, shape ``(n, l)``, or its possible values, ``(n, R, l)``.
             covariance: C, the covariance of simulations at one parameter, averaged over
                 the pairs, shape ``(l, l)``.
+            weights: How many pairs each pair counts as, shape ``(n,)``; one if None.
+            seed: Seed of the imputations.
 
         Returns:
             The posterior, in float64.
@@ -130,11 +152,26 @@ class DiscrepancyModel:
         """
         z, mean, covariance = _checked(z, mean, covariance)
         noise = covariance + SMALLEST_NOISE**2 * torch.eye(z.shape[1]).to(z)
+        if weights is not None:
+            weights = check_batch("weights", weights, ()).to(z)
+            check_same_length("z", z, "weights", weights)
+        if mean.ndim == 2:
+            return self._fit(z, mean, noise, weights)
+        with seeded(seed):
+            return impute(
+                z, mean, lambda mean: self._fit(z, mean, noise, weights), noise=noise
+            )
+
+    def _fit(
+        self, z: Tensor, mean: Tensor, noise: Tensor, weights: Tensor | None
+    ) -> Discrepancy:
         settings = list(itertools.product(self.error_scales, self.degrees_of_freedom))
-        regressions = [_Regression.of(z, mean, k) for k in self.gain_precisions]
+        regressions = [
+            _Regression.of(z, mean, k, weights=weights) for k in self.gain_precisions
+        ]
         evidence = torch.stack([r.log_evidence(settings) for r in regressions])
         average = evidence.logsumexp(dim=(0, 1)) - math.log(evidence.numel())
-        right = _log_evidence_of_none(z - mean, noise)
+        right = _log_evidence_of_none(z - mean, noise, weights)
         probability = _posterior_probability(self.probability_of_none, right - average)
         kept = evidence > evidence.max() + math.log(NEGLIGIBLE)
         terms = [regressions[i].at(*settings[j]) for i, j in kept.nonzero().tolist()]
@@ -158,7 +195,8 @@ def _checked(z: Any, mean: Any, covariance: Any) -> tuple[Tensor, Tensor, Tensor
         )
     width = z.shape[1]
     z = check_batch("z", z, (width,))
-    mean = check_batch("mean", mean, (width,)).to(z)
+    possible = check_tensor("mean", mean).shape[1:-1]
+    mean = check_batch("mean", mean, (*possible[:1], width)).to(z)
     check_same_length("z", z, "mean", mean)
     covariance = check_batch("covariance", covariance, (width,)).to(z)
     if len(covariance) != width:
@@ -176,11 +214,17 @@ def _checked(z: Any, mean: Any, covariance: Any) -> tuple[Tensor, Tensor, Tensor
     return z, mean, covariance
 
 
-def _log_evidence_of_none(residual: Tensor, noise: Tensor) -> Tensor:
+def _log_evidence_of_none(
+    residual: Tensor, noise: Tensor, weights: Tensor | None
+) -> Tensor:
     """Return the log density of z - m, rounded as ``_Regression`` assumes."""
     log_density = MultivariateNormal(torch.zeros_like(residual[0]), noise).log_prob
-    inexact = len(residual) * SMALLEST_NOISE**2 * torch.linalg.inv(noise).trace()
-    return log_density(residual).sum() - inexact / 2
+    n = len(residual) if weights is None else weights.sum()
+    inexact = n * SMALLEST_NOISE**2 * torch.linalg.inv(noise).trace()
+    log_densities = log_density(residual)
+    if weights is not None:
+        log_densities = weights * log_densities
+    return log_densities.sum() - inexact / 2
 
 
 def _posterior_probability(prior: float, log_bayes_factor: Tensor) -> float:
@@ -200,7 +244,7 @@ class _Regression:
         variances: Eigenvalues of the scatter matrix of the residuals, shape ``(l,)``.
         directions: Its eigenvectors, shape ``(l, l)``.
         log_volume: The part of the log evidence that comes from the coefficients.
-        num_pairs: The number of calibration pairs.
+        num_pairs: The number of calibration pairs, or the sum of their weights.
     """
 
     coefficients: Tensor
@@ -208,10 +252,17 @@ class _Regression:
     variances: Tensor
     directions: Tensor
     log_volume: Tensor
-    num_pairs: int
+    num_pairs: float
 
     @classmethod
-    def of(cls, z: Tensor, mean: Tensor, gain_precision: float) -> "_Regression":
+    def of(
+        cls,
+        z: Tensor,
+        mean: Tensor,
+        gain_precision: float,
+        *,
+        weights: Tensor | None = None,
+    ) -> "_Regression":
         """Return the conjugate posterior of the coefficients."""
         n, width = z.shape
         identity = torch.eye(width).to(z)
@@ -221,6 +272,10 @@ class _Regression:
         precision[-1] *= OFFSET_PRECISION
         # Relative to the prior mean, residuals are small, and so are rounding errors.
         residual = z - design @ prior_mean
+        if weights is not None:
+            n = float(weights.sum())
+            residual = residual * weights.sqrt()[:, None]
+            design = design * weights.sqrt()[:, None]
         factor = torch.linalg.cholesky(precision.diag() + design.T @ design)
         shift = torch.cholesky_solve(design.T @ residual, factor)
         # This is a sum of squares. The usual difference of two terms could be negative.

@@ -1,6 +1,7 @@
 r"""The distribution of parameters, learned from those of the calibration pairs."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -14,6 +15,8 @@ __all__ = ["ParameterDistribution", "learn_parameters"]
 
 # The prior's mean and covariance count as much as this number of pairs. The results are
 # averaged, weighted by their evidence.
+# Draws of each label that is not exact.
+NUM_SETS = 10
 STRENGTHS = (2.0, 5.0, 10.0, 30.0, 100.0)
 
 
@@ -60,7 +63,9 @@ def learn_parameters(theta_cal: Tensor, theta: Tensor) -> ParameterDistribution:
     Args:
         theta_cal: Parameters of the pairs, shape ``(n_c, d)``. Parameters that appear
             more than once count once, because several recordings of one person are one
-            draw from the distribution.
+            draw from the distribution. Of labels that are not exact, R draws of the
+            parameters of each, shape ``(n_c, R, d)``. The probabilities are then
+            averages over up to ten sets of draws.
         theta: Parameters of at least two simulations from the prior, shape ``(n, d)``.
 
     Returns:
@@ -77,7 +82,26 @@ def learn_parameters(theta_cal: Tensor, theta: Tensor) -> ParameterDistribution:
             f"{tuple(theta.shape)}."
         )
     theta = check_batch("theta", theta, theta.shape[1:])
-    theta_cal = check_batch("theta_cal", theta_cal, theta.shape[1:]).unique(dim=0)
+    several = check_tensor("theta_cal", theta_cal).shape[1:-1][:1]
+    theta_cal = check_batch("theta_cal", theta_cal, (*several, theta.shape[1]))
+    if theta_cal.ndim == 3:
+        return _average(
+            [_learn(draws, theta) for draws in theta_cal.unbind(dim=1)[:NUM_SETS]]
+        )
+    return _learn(theta_cal, theta)
+
+
+def _average(parts: Sequence[ParameterDistribution]) -> ParameterDistribution:
+    probabilities = torch.stack([part.probabilities for part in parts])
+    of_prior = [part.probability_of_prior for part in parts]
+    return ParameterDistribution(
+        probabilities=probabilities.mean(dim=0),
+        probability_of_prior=sum(of_prior) / len(of_prior),
+    )
+
+
+def _learn(theta_cal: Tensor, theta: Tensor) -> ParameterDistribution:
+    theta_cal = theta_cal.unique(dim=0)
     u_cal, u = normal_scores(theta_cal, theta), normal_scores(theta, theta)
     correlation = torch.atleast_2d(u.T.cov())
     # The small number keeps R positive definite if a parameter is a function of others.

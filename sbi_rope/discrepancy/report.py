@@ -224,6 +224,7 @@ def report_discrepancy(
     simulated: Tensor,
     *,
     model: DiscrepancyModel,
+    weights: Tensor | None = None,
     x_names: Sequence[str] | None = None,
     seed: int = 0,
 ) -> DiscrepancyReport:
@@ -237,6 +238,7 @@ def report_discrepancy(
         moments: The moments of simulations at their parameters.
         simulated: Simulations from the prior, shape ``(n_s, l)``.
         model: The model of the discrepancy.
+        weights: How many pairs each pair counts as, shape ``(n,)``; one if None.
         x_names: Names of the summaries; numbered if None.
         seed: Seed of the draws behind the intervals.
 
@@ -258,9 +260,9 @@ def report_discrepancy(
             continue
         mean, std = standardisation.mean[j], standardisation.std[j]
         z = ((x[:, j].double() - mean) / std)[:, None]
-        m = ((moments.mean[:, j] - mean) / std)[:, None]
+        m = ((moments.means[..., j] - mean) / std)[..., None]
         noise = moments.covariance[:, j, j].mean() / std.square()
-        discrepancy = model.fit(z, m, noise.reshape(1, 1))
+        discrepancy = model.fit(z, m, noise.reshape(1, 1), weights=weights)
         summaries.append(
             _summary(names[j], discrepancy, z, m, scale=float(std), seed=seed)
         )
@@ -287,7 +289,11 @@ def _summary(
     scale: float,
     seed: int,
 ) -> SummaryDiscrepancy:
-    """Return the discrepancy of one summary, with z and mean of shape ``(n, 1)``."""
+    """Return the discrepancy of one summary, with z and mean of shape ``(n, 1)``.
+
+    Where labels are not exact, mean has the shape ``(n, R, 1)``, and there are no
+    outliers: a residual may come from the label.
+    """
     # The intervals assume that there is a discrepancy. Its probability is reported too.
     draws = replace(discrepancy, probability_of_none=0.0).sample(
         NUM_DRAWS, smallest_error=0.0, seed=seed
@@ -295,8 +301,11 @@ def _summary(
     gain, shift = draws.gain[:, 0, 0], draws.offset[:, 0]
     error = draws.error_factor[:, 0, 0].abs()
     size = ((gain - 1).square() + shift.square() + error.square()).sqrt()
-    residual = (z - gain.median() * mean - shift.median())[:, 0]
-    noise = float(gain.median().abs() * discrepancy.noise[0, 0].sqrt())
+    outliers: tuple[int, ...] = ()
+    if mean.ndim == 2:
+        residual = (z - gain.median() * mean - shift.median())[:, 0]
+        noise = float(gain.median().abs() * discrepancy.noise[0, 0].sqrt())
+        outliers = _outliers(residual, noise)
     return SummaryDiscrepancy(
         name=name,
         gain=Interval.of(gain),
@@ -304,7 +313,7 @@ def _summary(
         error=Interval.of(error * scale),
         size=Interval.of(size),
         probability_of_none=discrepancy.probability_of_none,
-        outliers=_outliers(residual, noise),
+        outliers=outliers,
     )
 
 

@@ -181,7 +181,7 @@ def central_levels(ranks: Tensor) -> Tensor:
     return (2.0 * ranks - 1.0).abs()
 
 
-def acauc_of(levels: Tensor) -> ACAUCScore:
+def acauc_of(levels: Tensor, *, allow_missing: bool = False) -> ACAUCScore:
     r"""Average the coverage error over all levels, parameters and observations.
 
     .. math:: \text{ACAUC} = \frac{1}{d n} \sum_{j=1}^{d} \sum_{i=1}^{n} \int_0^1
@@ -206,6 +206,8 @@ def acauc_of(levels: Tensor) -> ACAUCScore:
 
     Args:
         levels: The levels :math:`a^*` of the true parameters, shape ``(n, d)``.
+        allow_missing: Whether levels may be NaN, where the parameter is not known.
+            Means are then over the others.
 
     Returns:
         The score with its standard error.
@@ -218,8 +220,9 @@ def acauc_of(levels: Tensor) -> ACAUCScore:
         >>> acauc_of(torch.tensor([[0.5], [1.0]])).value
         0.25
     """
-    levels = _checked_levels(levels).double()
-    per_observation = levels.mean(dim=1)
+    levels = _checked_levels(levels, allow_missing=allow_missing).double()
+    per_observation = _mean(levels, dim=1)
+    per_observation = per_observation[~torch.isnan(per_observation)]
     value = float(per_observation.mean() - 0.5)
     error, n = standard_error_of_mean(per_observation), len(per_observation)
     width = float("nan")
@@ -229,11 +232,11 @@ def acauc_of(levels: Tensor) -> ACAUCScore:
         value=value,
         standard_error=error,
         interval=(value - width, value + width),
-        per_parameter=levels.mean(dim=0) - 0.5,
+        per_parameter=_mean(levels, dim=0) - 0.5,
     )
 
 
-def coverage_curve_of(levels: Tensor) -> CoverageCurve:
+def coverage_curve_of(levels: Tensor, *, allow_missing: bool = False) -> CoverageCurve:
     r"""Count the true parameters inside the interval of each nominal level.
 
     .. math:: c_j(\alpha) = \frac{1}{n} \sum_{i=1}^{n} \mathbf{1}[a^*_{ij} \le \alpha]
@@ -243,6 +246,7 @@ def coverage_curve_of(levels: Tensor) -> CoverageCurve:
 
     Args:
         levels: The levels :math:`a^*` of the true parameters, shape ``(n, d)``.
+        allow_missing: As in :func:`acauc_of`.
 
     Returns:
         The curve at .01, .02, ..., .99.
@@ -251,14 +255,15 @@ def coverage_curve_of(levels: Tensor) -> CoverageCurve:
         InvalidTypeError: If the levels are no tensor of real numbers.
         InvalidInputError: If they have another shape, or a level is not in [0, 1].
     """
-    levels = _checked_levels(levels)
+    levels = _checked_levels(levels, allow_missing=allow_missing)
     nominal = _nominal_levels(levels)
     # One level at a time, so that no tensor is larger than `levels`.
     coverage, errors = [], []
     for alpha in nominal:
         inside = _inside(levels, alpha)
-        coverage.append(inside.mean(dim=0))
-        errors.append(standard_error_of_mean(inside.mean(dim=1)))
+        coverage.append(_mean(inside, dim=0))
+        of_rows = _mean(inside, dim=1)
+        errors.append(standard_error_of_mean(of_rows[~torch.isnan(of_rows)]))
     return CoverageCurve(
         levels=nominal,
         per_parameter=torch.stack(coverage, dim=1),
@@ -267,7 +272,9 @@ def coverage_curve_of(levels: Tensor) -> CoverageCurve:
     )
 
 
-def expected_coverage_error_of(levels: Tensor) -> CoverageErrorScore:
+def expected_coverage_error_of(
+    levels: Tensor, *, allow_missing: bool = False
+) -> CoverageErrorScore:
     r"""Average the distance between empirical coverage and nominal level.
 
     .. math:: \text{ECE} = \frac{1}{99 d} \sum_{j=1}^{d} \sum_{l=1}^{99}
@@ -285,6 +292,7 @@ def expected_coverage_error_of(levels: Tensor) -> CoverageErrorScore:
 
     Args:
         levels: The levels :math:`a^*` of the true parameters, shape ``(n, d)``.
+        allow_missing: As in :func:`acauc_of`.
 
     Returns:
         The score with its standard error.
@@ -293,18 +301,19 @@ def expected_coverage_error_of(levels: Tensor) -> CoverageErrorScore:
         InvalidTypeError: If the levels are no tensor of real numbers.
         InvalidInputError: If they have another shape, or a level is not in [0, 1].
     """
-    levels = _checked_levels(levels)
+    levels = _checked_levels(levels, allow_missing=allow_missing)
     nominal = _nominal_levels(levels)
     distance = levels.new_zeros(levels.shape[1], dtype=torch.float64)
     influence = levels.new_zeros(levels.shape[0], dtype=torch.float64)
     for alpha in nominal:
         inside = _inside(levels, alpha)
-        gap = inside.mean(dim=0) - alpha
+        gap = _mean(inside, dim=0) - alpha
         distance += gap.abs()
-        influence += (gap.sign() * inside).mean(dim=1)
+        influence += _mean(gap.sign() * inside, dim=1)
     per_parameter = distance / nominal.numel()
+    influence = influence[~torch.isnan(influence)]
     return CoverageErrorScore(
-        value=float(per_parameter.mean()),
+        value=float(_mean(per_parameter, dim=0)),
         standard_error=standard_error_of_mean(influence / nominal.numel()),
         per_parameter=per_parameter,
     )
@@ -322,7 +331,12 @@ def standard_error_of_mean(values: Tensor) -> float:
     return float(values.double().std() / values.numel() ** 0.5)
 
 
-def _checked_levels(levels: Tensor) -> Tensor:
+def _mean(values: Tensor, dim: int) -> Tensor:
+    """Return the mean of those that are not NaN; NaN if there are none."""
+    return values.nanmean(dim=dim) if values.isnan().any() else values.mean(dim=dim)
+
+
+def _checked_levels(levels: Tensor, *, allow_missing: bool) -> Tensor:
     """Return levels, shape ``(n, d)``, without gradients and in 32 bits or more."""
     shape = check_tensor("levels", levels).shape
     if levels.ndim != 2:
@@ -330,7 +344,8 @@ def _checked_levels(levels: Tensor) -> Tensor:
             f"Expected `levels` of shape (n, d); got {tuple(shape)}."
         )
     check_batch("levels", levels, shape[1:], finite=False)
-    _check_unit_range("levels", levels)
+    known = ~torch.isnan(levels) if allow_missing else torch.ones_like(levels) > 0
+    _check_unit_range("levels", levels[known])
     levels = levels.detach()
     # In 16 bits, the nominal levels that they are compared with would be rounded too.
     is_coarse = levels.dtype in (torch.float16, torch.bfloat16)
@@ -353,4 +368,5 @@ def _nominal_levels(like: Tensor) -> Tensor:
 
 
 def _inside(levels: Tensor, alpha: Tensor) -> Tensor:
-    return (levels <= alpha + ROUNDING).double()
+    inside = (levels <= alpha + ROUNDING).double()
+    return inside.where(~torch.isnan(levels), torch.nan)

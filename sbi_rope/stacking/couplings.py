@@ -90,6 +90,34 @@ class FittedCouplings:
         ).double()
 
     @torch.no_grad()
+    def node_log_probs(self, theta: Tensor, x: Tensor) -> Tensor:
+        """Return the log density of each coupling at several parameters of each pair.
+
+        Args:
+            theta: S parameters of each pair, shape ``(n, S, d)``.
+            x: Their observations in the batch, shape ``(n, *event)``.
+
+        Returns:
+            Shape ``(n, S, number of couplings)``, float64.
+        """
+        of_each = []
+        for of_one, one in zip(theta, x, strict=True):
+            log_q = self.component_log_probs(of_one)
+            rows_of_each = self.embeddings.rows_of_each(
+                self.embeddings.embed(one[None])
+            )
+            of_each.append(
+                torch.stack(
+                    [
+                        torch.logsumexp(rows.log() + log_q, dim=1)
+                        for rows in rows_of_each
+                    ],
+                    dim=1,
+                )
+            )
+        return torch.stack(of_each).double()
+
+    @torch.no_grad()
     def component_log_probs(self, theta: Tensor) -> Tensor:
         r"""Return :math:`\log q(\theta_i \mid h(x_{s,j}))`, shape ``(n, n_s)``."""
         embeddings = self.embeddings.simulated

@@ -66,7 +66,17 @@ class CrossValidation:
             parameters, shape ``(n, d)``. They are uniform if the stack is calibrated.
         pseudo_count: As in :func:`stacking_weights`.
         log_unit: The sum of the logs of the prior's standard deviations; NaN if it is
-            unknown. Scores with theta in these units are higher by this number.
+            unknown. Scores with theta in these units are higher by this number. With
+            partial labels, the mean over pairs of the sum over measured parameters.
+        pair_weights: How many pairs each pair counts as, shape ``(n,)``; None if all
+            count as one.
+        score_errors: The Monte-Carlo errors of ``stack_scores``, if labels are not
+            exact.
+        labels: What is known of labels that are not exact, or weighted, in words.
+
+    With labels that are not exact, scores are log densities of the labels, and levels
+    are those of the labels, NaN where a parameter was not measured. Scores of labels
+    given as draws are relative to the prior, and their levels are unknown.
     """
 
     names: tuple[str, ...]
@@ -78,6 +88,9 @@ class CrossValidation:
     levels: Tensor = field(repr=False)
     pseudo_count: float = 1.0
     log_unit: float = float("nan")
+    pair_weights: Tensor | None = field(default=None, repr=False)
+    score_errors: Tensor | None = field(default=None, repr=False)
+    labels: str = ""
 
     def __len__(self) -> int:
         return len(self.fold)
@@ -90,7 +103,39 @@ class CrossValidation:
     @cached_property
     def weights(self) -> StackingWeights:
         """The weights of the candidates, fitted to all pairs."""
-        return stacking_weights(self.log_scores, pseudo_count=self.pseudo_count)
+        return stacking_weights(
+            self.log_scores,
+            pair_weights=self.pair_weights,
+            pseudo_count=self.pseudo_count,
+        )
+
+    @property
+    def effective_number(self) -> float:
+        """The number of pairs of equal weight with the same precision."""
+        if self.pair_weights is None:
+            return float(len(self))
+        weights = self.pair_weights
+        return float(weights.sum().square() / weights.square().sum())
+
+    @property
+    def monte_carlo_error(self) -> float:
+        """The error of the mean stack score that comes from labels not being exact."""
+        if self.score_errors is None:
+            return 0.0
+        weights = torch.ones_like(self.score_errors)
+        if self.pair_weights is not None:
+            weights = self.pair_weights.to(weights)
+        return float((weights * self.score_errors).norm() / weights.sum())
+
+    def mean_and_error(self, scores: Tensor) -> tuple[float, float]:
+        """Return the weighted mean of a score of each pair, and its standard error."""
+        if self.pair_weights is None:
+            return float(scores.mean()), float(scores.std() / len(scores) ** 0.5)
+        weights = self.pair_weights.to(scores)
+        mean = (weights * scores).sum() / weights.sum()
+        square = (weights * (scores - mean)).square().sum() / weights.sum().square()
+        n = len(scores)
+        return float(mean), float((square * n / max(1, n - 1)).sqrt())
 
     @cached_property
     def comparable_stack_scores(self) -> Tensor:
@@ -99,13 +144,18 @@ class CrossValidation:
         The scores of the candidates are not corrected either, so that the two can be
         compared.
         """
-        weights = fold_weights(self.log_scores, self.fold, self.pseudo_count)
+        weights = fold_weights(
+            self.log_scores,
+            self.fold,
+            self.pseudo_count,
+            pair_weights=self.pair_weights,
+        )
         return torch.logsumexp(self.log_scores + weights[self.fold].log(), dim=1)
 
     @property
     def coverage(self) -> CoverageCurve:
         """Coverage of the stack's central intervals on held-out pairs."""
-        return coverage_curve_of(self.levels)
+        return coverage_curve_of(self.levels, allow_missing=bool(self.labels))
 
     def scores_of(self, name: str) -> Tensor:
         """Return the log scores of a candidate, or of "stack", shape ``(n,)``.
@@ -134,21 +184,25 @@ class CrossValidation:
         difference = self.scores_of(name) - self.scores_of(other)
         # Where both scores are minus infinity, neither candidate is better.
         difference = difference.nan_to_num(nan=0.0, posinf=torch.inf, neginf=-torch.inf)
+        data: tuple[Any, ...] = (difference.cpu().numpy(),)
+        statistic: Any = np.mean
+        if self.pair_weights is not None:
+            data, statistic = (*data, self.pair_weights.cpu().numpy()), _weighted_mean
         with np.errstate(invalid="ignore"):  # of infinite means
             means = bootstrap(
-                (difference.cpu().numpy(),),
-                np.mean,
+                data,
+                statistic,
                 n_resamples=NUM_BOOTSTRAP,
+                paired=len(data) > 1,
                 method="percentile",
                 rng=np.random.default_rng(seed),
             ).bootstrap_distribution
         # SciPy's own interval interpolates between two means, of which one may be
         # infinite. These quantiles are always one of the means.
-        tail = _expanded_tail(len(difference))
+        tail = _expanded_tail(self.effective_number)
         low, high = np.quantile(means, [tail, 1 - tail], method="inverted_cdf")
-        return Difference(
-            mean=float(difference.mean()), low=float(low), high=float(high)
-        )
+        mean, _ = self.mean_and_error(difference)
+        return Difference(mean=mean, low=float(low), high=float(high))
 
     def as_rows(self) -> list[dict[str, Any]]:
         """Return a row for each candidate: name, family, weight, scores, error.
@@ -156,8 +210,10 @@ class CrossValidation:
         The key "score" is the mean score with theta in its own units, and "score_z"
         that with theta in standard deviations of the prior. Both are in nats a pair.
         """
-        scores = self.log_scores
-        errors = scores.std(dim=0, correction=1) / len(self) ** 0.5
+        means, errors = zip(
+            *(self.mean_and_error(column) for column in self.log_scores.unbind(dim=1)),
+            strict=True,
+        )
         return [
             {
                 "candidate": name,
@@ -171,29 +227,44 @@ class CrossValidation:
                 self.names,
                 self.families,
                 self.weights.weights.tolist(),
-                scores.mean(dim=0).tolist(),
-                errors.tolist(),
+                means,
+                errors,
                 strict=True,
             )
         ]
 
 
-def _expanded_tail(n: int) -> float:
+def _weighted_mean(values: Any, weights: Any, axis: int = -1) -> Any:
+    return (weights * values).sum(axis=axis) / weights.sum(axis=axis)
+
+
+def _expanded_tail(n: float) -> float:
     """Return the tail of a percentile interval that is as wide as one of Student's t.
 
     The bootstrap's standard error lacks the factor of n / (n - 1), and percentiles do
     not know that it is an estimate.
     """
+    n = max(n, 2.0)  # of weights of which one is far above the others
     return float(norm.sf((n / (n - 1)) ** 0.5 * student.ppf(0.975, n - 1)))
 
 
-def fold_weights(log_scores: Tensor, fold: Tensor, pseudo_count: float) -> Tensor:
+def fold_weights(
+    log_scores: Tensor,
+    fold: Tensor,
+    pseudo_count: float,
+    *,
+    pair_weights: Tensor | None = None,
+) -> Tensor:
     """Return the weights fitted without each of the F folds, shape ``(F, K)``."""
     numbers: Sequence[int] = range(int(fold.max()) + 1)
     return torch.stack(
         [
             stacking_weights(
-                log_scores[fold != number], pseudo_count=pseudo_count
+                log_scores[fold != number],
+                pair_weights=(
+                    None if pair_weights is None else pair_weights[fold != number]
+                ),
+                pseudo_count=pseudo_count,
             ).weights.to(log_scores)
             for number in numbers
         ]

@@ -27,6 +27,9 @@ def finetune_without(start: Any, fold: Fold, part: int, *, learning_rate: float)
         \quad\text{until}\quad \sum_{i \in \text{part}} -\log q(\theta_i \mid x_i)
         \quad\text{does not fall any more}
 
+    The density of a label that is not exact is an average over the parameters that it
+    leaves possible (:mod:`sbi_rope.labels.nodes`), and a weight multiplies its term.
+
     All parameters are trained in evaluation mode. The epoch with the lowest loss on the
     held-out part is kept; this can be the start. A candidate averages the nets that
     hold out each part of a fold in turn, which reduces the effect of overfitting.
@@ -46,8 +49,23 @@ def finetune_without(start: Any, fold: Fold, part: int, *, learning_rate: float)
     # The order of the batches depends on the fold alone, not on what was drawn before.
     order = torch.Generator().manual_seed(fold.seed)
 
+    nodes = None if bench.labels.are_exact else fold.nodes(start)
+    weights = bench.pair_weights
+    place = torch.empty_like(bench.groups, device=fold.rows.device)
+    place[fold.rows] = torch.arange(len(fold.rows), device=fold.rows.device)
+
+    def losses(rows: Tensor) -> Tensor:
+        if nodes is None:
+            return estimator.loss(bench.theta[rows], condition=bench.x[rows])
+        of_rows = nodes[place[rows]]
+        theta = of_rows.theta.movedim(1, 0)
+        return -of_rows.log_mean(estimator.log_prob(theta, bench.x[rows]).T)
+
     def loss(rows: Tensor) -> Tensor:
-        return estimator.loss(bench.theta[rows], condition=bench.x[rows]).mean()
+        if weights is None:
+            return losses(rows).mean()
+        shares = weights[rows] / weights[rows].sum()
+        return (shares.to(bench.theta) * losses(rows)).sum()
 
     def batches(epoch: int) -> Iterator[tuple[Tensor]]:
         shuffled = train[torch.randperm(len(train), generator=order).to(train.device)]

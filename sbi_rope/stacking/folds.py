@@ -14,13 +14,14 @@ from sbi_rope._random import seeded
 from sbi_rope._sbi import embed, estimator_of, headless
 from sbi_rope._simulations import Moments
 from sbi_rope._simulator import Simulator
-from sbi_rope._training import groups_of, split_groups
+from sbi_rope._training import split_groups
 from sbi_rope.discrepancy.correction import NUM_STEPS, Space, correct_npe, network_of
 from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.parameters import learn_parameters
 from sbi_rope.discrepancy.report import DiscrepancyReport, report_discrepancy
 from sbi_rope.discrepancy.tuning import TUNING
 from sbi_rope.finetuning import CalibrationFinetuner
+from sbi_rope.labels import Nodes, labelled_moments, nodes_of, reference_of
 from sbi_rope.rope import RoPE
 
 __all__ = ["Corrected", "Fold", "Workbench", "draw_seeds"]
@@ -33,6 +34,9 @@ SIMULATIONS_PER_PAIR = 100
 MAX_SUMMARIES = 20
 # Folds of the calibration pairs.
 NUM_FOLDS = 5
+# Samples of an estimator that is trained on labels that are not exact, and the nodes at
+# which their density is computed.
+NUM_SAMPLES, NUM_NODES = 200, 64
 # A single fold is divided into so many parts, and a net is tuned without each.
 NUM_INNER_FOLDS = 5
 
@@ -67,7 +71,8 @@ class Workbench:
         self.rope = rope
         self.show = show_progress_bars
         self.theta, self.x = rope.calibration
-        self.groups = groups_of(self.theta)
+        self.labels = rope.labels
+        self.groups = self.labels.groups
         seeds = draw_seeds(seed, 2)
         with seeded(seeds[0]):
             split = split_groups(self.groups, num_folds)
@@ -133,18 +138,15 @@ class Workbench:
         for number, rows in enumerate(self.folds):
             with seeded(self.seed_of(frozenset([number]))):
                 parts.append(
-                    self.rope.source.moments(
-                        self.theta[rows],
+                    labelled_moments(
+                        self.rope.source,
+                        self.rope.labelled_parameters[rows],
                         SIMULATIONS_PER_PAIR,
                         represent,
                         progress=self.show,
                     )
                 )
-        order = torch.cat(self.folds).argsort()
-        return Moments(
-            mean=torch.cat([part.mean for part in parts])[order],
-            covariance=torch.cat([part.covariance for part in parts])[order],
-        )
+        return Moments.joined(parts)[torch.cat(self.folds).argsort()]
 
     def moments(self, space: Space) -> Moments:
         """Return moments at all pairs: of x with "input", of h(x) otherwise."""
@@ -164,7 +166,13 @@ class Workbench:
             self.moments("input"),
             self.simulations[1],
             model=DiscrepancyModel(),
+            weights=self.pair_weights,
         )
+
+    @property
+    def pair_weights(self) -> Tensor | None:
+        """How many pairs each pair counts as, shape ``(n,)``; None if all are one."""
+        return self.labels.weights if self.labels.are_weighted else None
 
     def tuned_net(self, folds: frozenset[int]) -> nn.Module:
         """Return an embedding net tuned on some folds, with rehearsal."""
@@ -182,6 +190,7 @@ class Workbench:
             lambda count: targets,
             draw_simulations=lambda count: simulated[:count],
             groups=self.groups[rows.cpu()],
+            weights=_of_rows(self.pair_weights, rows),
             seed=seed,
             show_progress_bars=False,
         ).embedding_net
@@ -216,11 +225,6 @@ class Fold:
         self.seed = bench.seed_of(self.used)
         self._corrected: dict[tuple[Space, bool], Corrected] = {}
 
-    @property
-    def pairs(self) -> tuple[Tensor, Tensor]:
-        """Parameters and observations to learn from."""
-        return self.bench.theta[self.rows], self.bench.x[self.rows]
-
     @cached_property
     def rope(self) -> RoPE:
         """RoPE, tuned on these pairs."""
@@ -237,6 +241,26 @@ class Fold:
         part = bench.rope.with_pairs(self.rows, targets=targets, finetuner=finetuner)
         return part.train(seed=self.seed, show_progress_bars=False)
 
+    @torch.no_grad()
+    def nodes(self, start: Any) -> Nodes:
+        """Return nodes to compute the density of the labels of these pairs at.
+
+        An estimator that is trained may move away from where it starts, so that the
+        nodes spread as far as the prior does.
+
+        Args:
+            start: The estimator that the training starts from.
+        """
+        bench = self.bench
+        with seeded(self.seed):
+            samples = start.sample(torch.Size((NUM_SAMPLES,)), bench.x[self.rows])
+            return nodes_of(
+                bench.labels[self.rows],
+                [reference_of(samples)],
+                bench.npe.prior,
+                num_nodes=NUM_NODES,
+            )
+
     def corrected(self, space: Space, *, learn_prior: bool) -> Corrected:
         """Return NPE trained on simulations that are corrected as these pairs tell."""
         key = (space, learn_prior)
@@ -246,11 +270,12 @@ class Fold:
         return self._corrected[key]
 
     def _correct(self, space: Space, *, learn_prior: bool) -> Corrected:
-        bench, (theta, x) = self.bench, self.pairs
+        bench, x = self.bench, self.bench.x[self.rows]
         theta_s, x_s = bench.simulations
         probabilities = None
         if learn_prior:
-            probabilities = learn_parameters(theta, theta_s).probabilities
+            draws = bench.rope.labelled_parameters[self.rows].draws
+            probabilities = learn_parameters(draws, theta_s).probabilities
         estimator = estimator_of(bench.npe)
         if space == "tuned":
             nets, z = self._cross_fitted()
@@ -265,6 +290,7 @@ class Fold:
             bench.moments(space)[self.rows],
             space=space,
             model=DiscrepancyModel(),
+            weights=_of_rows(bench.pair_weights, self.rows),
             probabilities=probabilities,
             # Without further courses, which take long. If they are needed, the weights
             # show it.
@@ -299,3 +325,7 @@ class Fold:
         for number, rows in enumerate(parts):
             others = torch.cat([part for k, part in enumerate(parts) if k != number])
             yield bench.tune(others, self.seed), rows
+
+
+def _of_rows(weights: Tensor | None, rows: Tensor) -> Tensor | None:
+    return None if weights is None else weights[rows]

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from os import PathLike
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from sbi_rope._two_sample import TwoSampleTest
@@ -96,22 +97,24 @@ class StackingReport:
         check_instance("cross_validation", cross_validation, CrossValidation)
         check_instance("learning_curve", learning_curve, LearningCurve, optional=True)
         scores, levels = cross_validation, cross_validation.levels
-        score, error = _mean_and_error(scores.stack_scores)
+        score, error = scores.mean_and_error(scores.stack_scores)
+        partial = bool(scores.labels)
+        known = levels[~torch.isnan(levels)]
         return cls(
             cross_validation=scores,
             learning_curve=learning_curve,
             score=(score, error),
             score_z=(score + scores.log_unit, error),
-            comparable_score=_mean_and_error(scores.scores_of("stack")),
+            comparable_score=scores.mean_and_error(scores.scores_of("stack")),
             gains={
                 name: scores.difference("stack", name)
                 for name in REFERENCES
                 if name in scores.names
             },
             family_weights=_family_weights(scores),
-            acauc=acauc_of(levels),
-            coverage_error=expected_coverage_error_of(levels),
-            share_inside=float((levels <= LEVEL).double().mean()),
+            acauc=acauc_of(levels, allow_missing=partial),
+            coverage_error=expected_coverage_error_of(levels, allow_missing=partial),
+            share_inside=float((known <= LEVEL).double().mean()),
             batch=batch,
             discrepancy=discrepancy,
             provenance=provenance,
@@ -193,10 +196,6 @@ class StackingReport:
 
     def __str__(self) -> str:
         return "\n".join(lines_of(self))
-
-
-def _mean_and_error(scores: Tensor) -> tuple[float, float]:
-    return float(scores.mean()), float(scores.std() / len(scores) ** 0.5)
 
 
 def _family_weights(scores: CrossValidation) -> dict[str, float]:

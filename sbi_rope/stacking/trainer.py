@@ -1,6 +1,7 @@
 """Train the candidates of a stack and score them, fold by fold."""
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from typing import Any, Literal
 
 import torch
@@ -42,11 +43,12 @@ from sbi_rope.stacking.couplings import FittedCouplings, fit_couplings
 from sbi_rope.stacking.cross_validation import CrossValidation, fold_weights
 from sbi_rope.stacking.defaults import default_candidates
 from sbi_rope.stacking.folds import NUM_FOLDS, Fold, Workbench, draw_seeds
+from sbi_rope.stacking.label_scores import LabelScores, label_levels, score_labels
 from sbi_rope.stacking.trained_candidates import (
     DiscrepancyCandidate,
     FinetunedCandidate,
 )
-from sbi_rope.stacking.units import log_unit_of
+from sbi_rope.stacking.units import log_units_of
 from sbi_rope.stacking.versions import Versions, train_version
 
 __all__ = ["StackTrainer"]
@@ -205,9 +207,18 @@ class StackTrainer:
         )
 
     def _score(self, versions: Versions, num_training_folds: int) -> CrossValidation:
-        log_scores, fold = self._log_scores(versions)
-        weights = fold_weights(log_scores, fold, self.pseudo_count)
-        stack_scores, levels = self._stack_scores(versions, weights)
+        bench = self.bench
+        of_labels = None
+        if not bench.labels.are_exact:
+            of_labels = [
+                score_labels(bench, versions, number)
+                for number in range(len(bench.folds))
+            ]
+        log_scores, fold = self._log_scores(versions, of_labels)
+        weights = fold_weights(
+            log_scores, fold, self.pseudo_count, pair_weights=bench.pair_weights
+        )
+        stack_scores, errors, levels = self._stack_scores(versions, weights, of_labels)
         num_folds = len(self.bench.folds)
         scores = CrossValidation(
             names=tuple(candidate.name for candidate in self.candidates),
@@ -218,7 +229,10 @@ class StackTrainer:
             stack_scores=stack_scores,
             levels=levels,
             pseudo_count=self.pseudo_count,
-            log_unit=log_unit_of(self.prior),
+            log_unit=self._log_unit(),
+            pair_weights=bench.pair_weights,
+            score_errors=errors,
+            labels="" if bench.labels.are_simple else str(bench.labels),
         )
         if not scores.weights.converged:
             warn_user(
@@ -228,7 +242,21 @@ class StackTrainer:
             )
         return scores
 
-    def _log_scores(self, versions: Versions) -> tuple[Tensor, Tensor]:
+    def _log_unit(self) -> float:
+        """Return by how much scores are higher in the prior's standard deviations."""
+        labels = self.bench.labels
+        if labels.samples is not None:
+            return 0.0  # these scores are relative to the prior
+        units = log_units_of(self.prior)
+        if labels.are_exact:
+            return float(units.sum())
+        known = labels.is_measured.to(units)
+        shares = labels.weights.to(units) / labels.weights.sum().to(units)
+        return float((shares @ known) @ units)
+
+    def _log_scores(
+        self, versions: Versions, of_labels: Sequence[LabelScores] | None
+    ) -> tuple[Tensor, Tensor]:
         """Return the score of each candidate at each pair, and the folds."""
         bench = self.bench
         theta, x = bench.theta, bench.x
@@ -237,11 +265,14 @@ class StackTrainer:
         )
         fold = torch.empty(len(theta), dtype=torch.long, device=theta.device)
         log_q = None
-        if versions.couplings is not None:
+        if versions.couplings is not None and of_labels is None:
             # All folds share the same simulations, and so the same components.
             log_q = versions.couplings.component_log_probs(theta)
         for number, rows in enumerate(bench.folds):
             fold[rows] = number
+            if of_labels is not None:
+                log_scores[rows] = of_labels[number].of_candidates
+                continue
             log_scores[rows] = versions.log_probs(
                 theta[rows],
                 x[rows],
@@ -251,17 +282,26 @@ class StackTrainer:
         return log_scores, fold
 
     def _stack_scores(
-        self, versions: Versions, weights: Tensor
-    ) -> tuple[Tensor, Tensor]:
+        self,
+        versions: Versions,
+        weights: Tensor,
+        of_labels: Sequence[LabelScores] | None,
+    ) -> tuple[Tensor, Tensor | None, Tensor]:
         """Return the normalised score of the stack at each pair, and the levels.
 
         Args:
             versions: The candidates.
             weights: The weights of the stack that scores each fold, ``(F, K)``.
+            of_labels: The densities at labels that are not exact; None if all are.
+
+        Returns:
+            The scores, their Monte-Carlo errors (None for exact labels), and the
+            levels of the central intervals that end at the labels.
         """
         bench = self.bench
         theta, x = bench.theta, bench.x
         stack_scores = theta.new_empty(len(theta), dtype=torch.double)
+        errors = None if of_labels is None else torch.empty_like(stack_scores)
         levels = torch.empty_like(theta)
         # The couplings are the first part, and have the same simulations in all folds.
         # The mass of the other parts inside the prior can differ from fold to fold.
@@ -274,18 +314,35 @@ class StackTrainer:
                 enable_transform=False,
                 shared=shared,
             )
-            log_prob, ranks = self._normalised(posterior, theta[rows], x[rows])
-            stack_scores[rows] = log_prob.double()
-            levels[rows] = central_levels(ranks).to(levels)
+            if of_labels is None or errors is None:
+                log_prob, ranks = self._normalised(posterior, theta[rows], x[rows])
+                stack_scores[rows] = log_prob.double()
+                levels[rows] = central_levels(ranks).to(levels)
+            else:
+                score, errors[rows] = of_labels[number].of_stack(weights[number])
+                log_mass, levels[rows] = self._at_labels(posterior, rows)
+                stack_scores[rows] = score - log_mass
             if versions.couplings is not None and 0 in shared:
                 masses[0] = shared[0]
-        return stack_scores, levels
+        return stack_scores, errors, levels
+
+    def _at_labels(
+        self, posterior: MixturePosterior, rows: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the log mass inside the prior's support, and the levels of labels."""
+        bench = self.bench
+        with _explained(), seeded(self.seeds[2]):
+            log_mass = posterior.leakage_correction(bench.x[rows]).double().log()
+            levels = label_levels(
+                posterior, bench.labels[rows], bench.x[rows], num_samples=NUM_SAMPLES
+            )
+        return log_mass, levels
 
     def _normalised(
         self, posterior: MixturePosterior, theta: Tensor, x: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return log densities, normalised inside the prior's support, and ranks."""
-        try:
+        with _explained():
             log_prob = posterior.log_prob_batched(theta[None], x)[0]
             with seeded(self.seeds[2]):
                 ranks = draw_ranks(
@@ -296,13 +353,20 @@ class StackTrainer:
                     chunk_size=NUM_SAMPLES,
                     show=False,
                 )
-        except SamplingError as error:
-            raise SamplingError(
-                "A stack of these candidates has almost no mass inside the support of "
-                "the prior at a held-out observation, so that it cannot be sampled. "
-                "Add the prior to the candidates: `default_candidates()` contains it."
-            ) from error
         return log_prob, ranks
+
+
+@contextlib.contextmanager
+def _explained() -> Iterator[None]:
+    """Say what to do if a stack has hardly any mass inside the prior's support."""
+    try:
+        yield
+    except SamplingError as error:
+        raise SamplingError(
+            "A stack of these candidates has almost no mass inside the support of "
+            "the prior at a held-out observation, so that it cannot be sampled. "
+            "Add the prior to the candidates: `default_candidates()` contains it."
+        ) from error
 
 
 def _check_pairs(count: int) -> None:

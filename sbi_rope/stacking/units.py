@@ -3,22 +3,23 @@
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from sbi_rope._random import seeded
 
-__all__ = ["log_unit_of"]
+__all__ = ["log_units_of"]
 
 # Draws that the standard deviation is estimated from if the prior does not state it.
 NUM_DRAWS = 10_000
 
 
-def log_unit_of(prior: Any) -> float:
-    r"""Return :math:`\sum_j \log s_j`, with s the standard deviations of the prior.
+def log_units_of(prior: Any) -> Tensor:
+    r"""Return :math:`\log s_j`, with s the standard deviations of the prior, ``(d,)``.
 
     The density of :math:`z_j = \theta_j / s_j` is
     :math:`p(z \mid x) = p(\theta \mid x) \prod_j s_j`, so that a log score with theta
-    in standard deviations of the prior is higher by this number. It is NaN if the prior
-    has no finite standard deviation.
+    in standard deviations of the prior is higher by their sum. It is NaN where the
+    prior has no finite standard deviation.
     """
     try:
         std = prior.stddev
@@ -26,6 +27,4 @@ def log_unit_of(prior: Any) -> float:
         with seeded(0):
             std = prior.sample(torch.Size((NUM_DRAWS,))).std(dim=0)
     std = torch.as_tensor(std).detach().double()
-    if not bool(((std > 0) & torch.isfinite(std)).all()):
-        return float("nan")
-    return float(std.log().sum())
+    return std.log().where((std > 0) & torch.isfinite(std), torch.nan)

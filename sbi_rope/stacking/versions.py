@@ -161,6 +161,37 @@ class Versions:
             scores[name] = (of_each + log_shares).logsumexp(dim=1)
         return torch.stack([scores[name] for name in self.names], dim=1)
 
+    @torch.no_grad()
+    def node_log_probs(self, theta: Tensor, x: Tensor, number: int) -> Tensor:
+        """Return the log density of each candidate at several parameters of each pair.
+
+        Args:
+            theta: S parameters of each pair, shape ``(n, S, d)``.
+            x: The observations, shape ``(n, *event)``.
+            number: The number of the version.
+
+        Returns:
+            Shape ``(n, S, K)``, float64, not corrected for leakage.
+        """
+        scores: dict[str, Tensor] = {}
+        if self.couplings is not None:
+            of_each = self.couplings.node_log_probs(theta, x).unbind(dim=2)
+            settings = self.couplings.settings
+            for (name, version), column in zip(settings, of_each, strict=True):
+                if version is None or version == number:
+                    scores[name] = column
+        for name, estimator in self.estimators(number).items():
+            scores[name] = estimator.log_prob(theta.movedim(1, 0), x).double().T
+        return torch.stack([scores[name] for name in self.names], dim=2)
+
+    def estimators(self, number: int) -> dict[str, MixtureEstimator]:
+        """Return the density of each amortised candidate in one version, by name."""
+        names = [name for name in self.names if not self._is_coupled(name)]
+        return {
+            name: MixtureEstimator(*self.parts_of(name, [number]), tail_mass=0.0)
+            for name in names
+        }
+
     @property
     def _any(self) -> Part:
         if self.couplings is not None:

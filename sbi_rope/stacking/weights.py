@@ -7,9 +7,11 @@ import torch
 from torch import Tensor
 
 from sbi_rope._validation import (
+    check_batch,
     check_integer,
     check_not_negative,
     check_positive,
+    check_same_length,
     check_tensor,
     check_values,
 )
@@ -42,6 +44,7 @@ class StackingWeights:
 def stacking_weights(
     log_scores: Tensor,
     *,
+    pair_weights: Tensor | None = None,
     pseudo_count: float = 1.0,
     tolerance: float = 1e-3,
     max_iterations: int = 20_000,
@@ -70,6 +73,8 @@ def stacking_weights(
         log_scores: :math:`\ell`, shape ``(n, K)``. Minus infinity is allowed, NaN and
             plus infinity are not. A pair that has minus infinity for all candidates is
             left out, with a warning.
+        pair_weights: How many pairs each pair counts as, shape ``(n,)``: a factor of
+            its term in the sum over i. One if None.
         pseudo_count: c, at least 0.
         tolerance: EM has converged when ``gap`` is at most this.
         max_iterations: EM stops after so many iterations, converged or not.
@@ -87,20 +92,24 @@ def stacking_weights(
         >>> stacking_weights(log_scores, pseudo_count=0.0).weights.round(decimals=3)
         tensor([0.6670, 0.3330], dtype=torch.float64)
     """
-    scores = _checked_scores(log_scores)
+    scores, of_pairs = _checked_scores(log_scores, pair_weights)
     check_not_negative("pseudo_count", pseudo_count)
     check_positive("tolerance", tolerance)
     check_integer("max_iterations", max_iterations)
     # Relative to the best candidate at each pair, so that exp does not over- or
     # underflow.
     density = (scores - scores.max(dim=1, keepdim=True).values).exp()
-    n, num_candidates = density.shape
+    num_candidates = density.shape[1]
+    n = float(of_pairs.sum())
     share = pseudo_count / num_candidates
     weights = density.new_full((num_candidates,), 1.0 / num_candidates)
     gap, iteration = math.inf, 0
     for iteration in range(max_iterations + 1):
         # The derivative of the objective by the weight of each candidate.
-        gradient = (density / (density @ weights)[:, None]).sum(dim=0)
+        ratio = density / (density @ weights)[:, None]
+        gradient = (ratio if pair_weights is None else ratio * of_pairs[:, None]).sum(
+            dim=0
+        )
         if share:
             gradient = gradient + share / weights
         # The objective is concave, so that it lies below its tangent everywhere.
@@ -112,14 +121,25 @@ def stacking_weights(
     mixed = torch.logsumexp(scores + weights.log(), dim=1)
     return StackingWeights(
         weights=weights,
-        score=float(mixed.mean()) if n else math.nan,
+        score=_weighted_mean(mixed, pair_weights, of_pairs),
         gap=max(gap, 0.0),
         num_iterations=iteration,
         converged=gap <= tolerance,
     )
 
 
-def _checked_scores(log_scores: Tensor) -> Tensor:
+def _weighted_mean(
+    scores: Tensor, pair_weights: Tensor | None, of_pairs: Tensor
+) -> float:
+    if pair_weights is None:
+        return float(scores.mean())  # NaN of none
+    return float((of_pairs * scores).sum() / of_pairs.sum())
+
+
+def _checked_scores(
+    log_scores: Tensor, pair_weights: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Return the scores and weights of the pairs that a candidate does not exclude."""
     check_values("log_scores", check_tensor("log_scores", log_scores))
     scores = log_scores.detach().double()
     if scores.ndim != 2 or not scores.shape[1]:
@@ -139,4 +159,8 @@ def _checked_scores(log_scores: Tensor) -> Tensor:
             "under every candidate and are left out of the weights. Add the prior as a "
             "candidate."
         )
-    return scores[known]
+    if pair_weights is None:
+        return scores[known], scores.new_ones(int(known.sum()))
+    check_same_length("log_scores", scores, "pair_weights", pair_weights)
+    of_pairs = check_batch("pair_weights", pair_weights, ()).to(scores)
+    return scores[known], of_pairs[known]

@@ -51,6 +51,7 @@ def lines_of(report: "StackingReport") -> list[str]:
     return [
         f"Stack of {len(report.cross_validation.names)} candidates, scored on {n} "
         "held-out calibration pairs",
+        *_labels(report),
         *_scores(report),
         *_gains(report),
         *_weights(report),
@@ -58,6 +59,20 @@ def lines_of(report: "StackingReport") -> list[str]:
         *_more_labels(report),
         *_what_it_took(report),
     ]
+
+
+def _labels(report: "StackingReport") -> list[str]:
+    scores = report.cross_validation
+    if not scores.labels:
+        return []
+    lines = [f"  {scores.labels}"]
+    if scores.score_errors is not None:
+        lines += [
+            "    scores and coverage are those of the measured values, with the noise "
+            "of their labels",
+            f"    Monte-Carlo error of the score: {scores.monte_carlo_error:.3f} nats",
+        ]
+    return lines
 
 
 def _scores(report: "StackingReport") -> list[str]:
@@ -94,6 +109,8 @@ def _weights(report: "StackingReport") -> list[str]:
 
 def _calibration(report: "StackingReport") -> list[str]:
     n, acauc, (low, high) = len(report.levels), report.acauc, report.acauc.interval
+    if math.isnan(acauc.value):
+        return ["  coverage is not known for labels that are given as draws"]
     verdict = acauc.verdict
     verdict += (
         " as far as these pairs can tell"

@@ -432,8 +432,8 @@ def test_wide_embeddings_have_fewer_draws_of_the_discrepancy(
     counts = []
 
     class Counting(DiscrepancyModel):
-        def fit(self, *arguments: Any) -> Any:
-            discrepancy = super().fit(*arguments)
+        def fit(self, *arguments: Any, **options: Any) -> Any:
+            discrepancy = super().fit(*arguments, **options)
             sample = type(discrepancy).sample
 
             def counted(self: Any, count: int, **options: Any) -> Any:

@@ -1,0 +1,89 @@
+"""The discrepancy of pairs whose parameters are not known exactly."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+from torch.distributions import MultivariateNormal
+
+from sbi_rope.discrepancy.posterior import Discrepancy
+
+__all__ = ["impute"]
+
+# Imputations that are left out, because they depend on where they started, and those
+# that the posterior is averaged over.
+NUM_WARM_UP, NUM_KEPT = 10, 20
+
+
+def impute(
+    z: Tensor,
+    possible: Tensor,
+    fit: Callable[[Tensor], Discrepancy],
+    *,
+    noise: Tensor,
+) -> Discrepancy:
+    r"""Average the posterior over imputed parameters, by Gibbs sampling.
+
+    Given a gain, an offset and an error, the possible means :math:`m_{ir}` of an
+    observation have the probabilities
+
+    .. math:: p_{ir} \propto \mathcal N(z_i; A m_{ir} + b, \Sigma).
+
+    One of them is drawn for each observation. Given these means the posterior of the
+    discrepancy has a closed form, of which the next gain, offset and error are drawn.
+    Random numbers come from torch's random state.
+
+    Args:
+        z: Representations of the real observations, shape ``(n, l)``.
+        possible: :math:`m_{ir}`, shape ``(n, R, l)``, equally probable before.
+        fit: Returns the posterior given one mean of each observation, ``(n, l)``.
+        noise: The covariance of simulations at one parameter, shape ``(l, l)``.
+
+    Returns:
+        The posterior. Its two evidences and ``probability_of_none`` are averages over
+        the imputations.
+    """
+    discrepancy = fit(possible.mean(dim=1))
+    kept: list[Discrepancy] = []
+    for number in range(NUM_WARM_UP + NUM_KEPT):
+        mean = _imputed(z, possible, *_drawn(discrepancy, noise))
+        discrepancy = fit(mean)
+        if number >= NUM_WARM_UP:
+            kept.append(discrepancy)
+    shares = torch.cat([(1 - one.probability_of_none) * one.shares for one in kept])
+    total = shares.sum()
+    if not total > 0:  # the simulator is right in all of them
+        shares, total = torch.cat([one.shares for one in kept]), float(NUM_KEPT)
+    return Discrepancy(
+        terms=tuple(term for one in kept for term in one.terms),
+        shares=shares / total,
+        noise=noise,
+        probability_of_none=_mean([one.probability_of_none for one in kept]),
+        log_evidence=_mean([one.log_evidence for one in kept]),
+        log_evidence_of_none=_mean([one.log_evidence_of_none for one in kept]),
+        num_pairs=len(z),
+    )
+
+
+def _drawn(discrepancy: Discrepancy, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Draw a gain, an offset and the covariance of observations at one parameter."""
+    width = len(noise)
+    if float(torch.rand(())) < discrepancy.probability_of_none:
+        return torch.eye(width).to(noise), noise.new_zeros(width), noise
+    chosen = int(torch.multinomial(discrepancy.shares, 1))
+    gain, offset, covariance = discrepancy.terms[chosen].sample(1)
+    return gain[0], offset[0], covariance[0]
+
+
+def _imputed(
+    z: Tensor, possible: Tensor, gain: Tensor, offset: Tensor, covariance: Tensor
+) -> Tensor:
+    """Draw one of the possible means of each observation, shape ``(n, l)``."""
+    residual = z[:, None] - possible @ gain.mT - offset
+    normal = MultivariateNormal(torch.zeros_like(offset), covariance)
+    chosen = torch.multinomial(torch.softmax(normal.log_prob(residual), dim=1), 1)
+    return possible[torch.arange(len(z)), chosen[:, 0]]
+
+
+def _mean(values: list[float]) -> float:
+    return sum(values) / len(values)

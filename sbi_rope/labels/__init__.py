@@ -1,0 +1,18 @@
+"""What is known about the parameters of calibration pairs: exactly, or not."""
+
+from sbi_rope.labels.labels import Labels
+from sbi_rope.labels.moments import labelled_moments, labelled_targets
+from sbi_rope.labels.nodes import Nodes, Reference, reference_of
+from sbi_rope.labels.parameters import LabelledParameters, nodes_of, parameters_of
+
+__all__ = [
+    "LabelledParameters",
+    "Labels",
+    "Nodes",
+    "Reference",
+    "labelled_moments",
+    "labelled_targets",
+    "nodes_of",
+    "parameters_of",
+    "reference_of",
+]

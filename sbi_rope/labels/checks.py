@@ -1,0 +1,210 @@
+"""Checks of the labels that users pass, and their conversion."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sbi_rope._validation import (
+    check_batch,
+    check_device,
+    check_in_support,
+    check_same_length,
+    check_tensor,
+    check_values,
+)
+from sbi_rope.errors import InvalidInputError
+from sbi_rope.labels.labels import Labels
+
+__all__ = ["checked_labels"]
+
+# A covariance may be this much asymmetric, or below zero, relative to its diagonal.
+ROUNDING = 1e-6
+
+
+def checked_labels(
+    theta: Any,
+    *,
+    theta_std: Any,
+    theta_cov: Any,
+    weights: Any,
+    like: Tensor,
+    prior: Any,
+) -> Labels:
+    """Return labels from what a user passes to ``append_calibration``.
+
+    Args:
+        theta: Measured parameters ``(n, d)``, NaN where missing, or draws
+            ``(n, S, d)``.
+        theta_std: Standard deviations of the measurements, or None.
+        theta_cov: Their covariance, or None.
+        weights: How many pairs each label counts as, or None.
+        like: A tensor of shape ``(0, d)`` with the dtype and device to convert to.
+        prior: The prior of NPE.
+
+    Raises:
+        InvalidTypeError: If an argument is no tensor of numbers.
+        InvalidInputError: If a shape or a value does not fit.
+    """
+    dim = like.shape[1]
+    theta = check_tensor("theta", theta)
+    check_device("theta", theta, like.device)
+    is_draws = theta.ndim == 3
+    if is_draws and theta.shape[1] < 2:
+        raise InvalidInputError(
+            "Expected `theta` of shape (n, d), or (n, S, d) with two draws of each "
+            f"label at least; got {tuple(theta.shape)}."
+        )
+    event_shape = (theta.shape[1], dim) if is_draws else (dim,)
+    theta = check_batch("theta", theta, event_shape, finite=False)
+    check_values("theta", theta)
+    # Numbers that float32 cannot hold become Inf.
+    theta = theta.detach().to(like.dtype, copy=True)
+    _check_not_infinite("theta", theta)
+    if is_draws:
+        labels = _from_draws(theta, theta_std, theta_cov, prior)
+    else:
+        labels = Labels(
+            theta=theta,
+            covariance=_covariance(theta, theta_std, theta_cov),
+            weights=torch.ones(len(theta), dtype=torch.double, device=theta.device),
+        )
+        # Noise may move a label out of the prior, but an exact one must be inside.
+        known = labels.is_measured.all(dim=1) & ~labels.is_noisy.any(dim=1)
+        check_in_support("theta", theta, prior, rows=known)
+    if weights is not None:
+        labels = labels.weighted(_checked_weights(weights, theta))
+    return labels
+
+
+def _from_draws(theta: Tensor, theta_std: Any, theta_cov: Any, prior: Any) -> Labels:
+    if theta_std is not None or theta_cov is not None:
+        raise InvalidInputError(
+            "Expected neither `theta_std` nor `theta_cov` with labels that are given "
+            f"as draws, `theta` of shape {tuple(theta.shape)}. The draws already say "
+            "how well the parameters are known."
+        )
+    if torch.isnan(theta).any():
+        raise InvalidInputError(
+            "Expected draws of all parameters; got NaN. Draw a parameter that was not "
+            "measured from the prior, given the others."
+        )
+    n, _, dim = theta.shape
+    check_in_support("theta", theta.reshape(-1, dim), prior)
+    return Labels(
+        theta=theta.double().mean(dim=1).to(theta),
+        covariance=theta.new_zeros(n, dim, dim, dtype=torch.double),
+        weights=theta.new_ones(n, dtype=torch.double),
+        samples=theta,
+    )
+
+
+def _covariance(theta: Tensor, theta_std: Any, theta_cov: Any) -> Tensor:
+    """Return the covariance of each label, zero for what was not measured."""
+    n, dim = theta.shape
+    if theta_std is not None and theta_cov is not None:
+        raise InvalidInputError(
+            "Expected `theta_std` or `theta_cov`; got both. The covariance has the "
+            "squares of the standard deviations on its diagonal."
+        )
+    if theta_cov is not None:
+        covariance = _checked_covariance(theta_cov, theta)
+    elif theta_std is not None:
+        std = _checked_std(theta_std, theta)
+        covariance = torch.diag_embed(std.square())
+    else:
+        return theta.new_zeros(n, dim, dim, dtype=torch.double)
+    measured = ~torch.isnan(theta)
+    both = measured[:, :, None] & measured[:, None, :]
+    return torch.where(both, covariance, 0.0)
+
+
+def _checked_std(theta_std: Any, theta: Tensor) -> Tensor:
+    n, dim = theta.shape
+    if isinstance(theta_std, int | float) and not isinstance(theta_std, bool):
+        theta_std = torch.tensor(float(theta_std))
+    std = check_tensor("theta_std", theta_std)
+    check_values("theta_std", std)
+    if tuple(std.shape) not in ((), (dim,), (n, dim)):
+        raise InvalidInputError(
+            f"Expected `theta_std` as a number, or of shape ({dim},) or ({n}, {dim}); "
+            f"got {tuple(std.shape)}."
+        )
+    std = std.detach().to(theta.device, torch.double).expand(n, dim)
+    # What was not measured needs no standard deviation.
+    std = std.where(~torch.isnan(theta), torch.zeros_like(std))
+    if not bool((torch.isfinite(std) & (std >= 0)).all()):
+        raise InvalidInputError(
+            "Expected `theta_std` to be finite and not negative; got "
+            f"{float(std[~(torch.isfinite(std) & (std >= 0))][0])}. Use zero for exact "
+            "parameters, and NaN in `theta` for those that were not measured."
+        )
+    return std
+
+
+def _checked_covariance(theta_cov: Any, theta: Tensor) -> Tensor:
+    n, dim = theta.shape
+    covariance = check_tensor("theta_cov", theta_cov)
+    check_values("theta_cov", covariance)
+    if tuple(covariance.shape) not in ((dim, dim), (n, dim, dim)):
+        raise InvalidInputError(
+            f"Expected `theta_cov` of shape ({dim}, {dim}) or ({n}, {dim}, {dim}); got "
+            f"{tuple(covariance.shape)}."
+        )
+    covariance = covariance.detach().to(theta.device, torch.double)
+    covariance = covariance.expand(n, dim, dim)
+    if not torch.isfinite(covariance).all():
+        raise InvalidInputError(
+            "Expected `theta_cov` to be finite; got NaN or Inf. Put NaN into `theta` "
+            "for parameters that were not measured."
+        )
+    scale = covariance.diagonal(dim1=1, dim2=2).abs().amax(dim=1)
+    asymmetry = (covariance - covariance.mT).abs().amax(dim=(1, 2))
+    smallest = torch.linalg.eigvalsh((covariance + covariance.mT) / 2)[:, 0]
+    bad = (asymmetry > ROUNDING * scale) | (smallest < -ROUNDING * scale)
+    if bad.any():
+        rows = bad.nonzero().flatten()[:5].tolist()
+        raise InvalidInputError(
+            "Expected `theta_cov` to be symmetric without negative eigenvalues; it is "
+            f"not for {int(bad.sum())} labels (first: {rows})."
+        )
+    noisy = covariance.diagonal(dim1=1, dim2=2) > 0
+    # Noisy parameters may have no direction without noise, which has no density.
+    regular = covariance + torch.diag_embed((~noisy).to(covariance))
+    flat = torch.linalg.eigvalsh(regular)[:, 0] <= 1e-12 * scale
+    if flat.any():
+        rows = flat.nonzero().flatten()[:5].tolist()
+        raise InvalidInputError(
+            "Expected `theta_cov` in which noisy parameters are not functions of each "
+            f"other; it is singular for {int(flat.sum())} labels (first: {rows}). Add "
+            "a small number to its diagonal."
+        )
+    return (covariance + covariance.mT) / 2
+
+
+def _checked_weights(weights: Any, theta: Tensor) -> Tensor:
+    weights = check_tensor("weights", weights)
+    if weights.ndim != 1:
+        raise InvalidInputError(
+            "Expected `weights` with one number for each pair, shape (n,); got "
+            f"{tuple(weights.shape)}."
+        )
+    check_values("weights", weights)
+    check_same_length("theta", theta, "weights", weights)
+    weights = weights.detach().to(theta.device, torch.double)
+    if not bool((torch.isfinite(weights) & (weights > 0)).all()):
+        raise InvalidInputError(
+            "Expected `weights` to be finite and positive. Leave out pairs that should "
+            "not count."
+        )
+    return weights
+
+
+def _check_not_infinite(name: str, theta: Tensor) -> None:
+    infinite = torch.isinf(theta).flatten(1).any(dim=1)
+    if infinite.any():
+        rows = infinite.nonzero().flatten()[:5].tolist()
+        raise InvalidInputError(
+            f"Expected `{name}` without Inf; {int(infinite.sum())} of {len(theta)} "
+            f"rows have it (first: {rows})."
+        )

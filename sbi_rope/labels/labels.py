@@ -1,0 +1,159 @@
+"""Labels: the measured parameters of calibration pairs, and how well they are known."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from sbi_rope._training import groups_of
+from sbi_rope.errors import InvalidInputError
+
+__all__ = ["Labels"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Labels:
+    r"""Measured parameters, each exact, noisy or missing, or draws of all parameters.
+
+    A label :math:`y` of a pair is a measurement of its parameters,
+
+    .. math:: y_m \sim \mathcal N(\theta_m, R),
+
+    for the parameters m that were measured. An exact label has R = 0. A label may also
+    be given as draws from :math:`p(\theta \mid y)`, under the prior of NPE.
+
+    Attributes:
+        theta: The measured parameters, NaN where they were not measured, shape
+            ``(n, d)``. Of a label given as draws, their mean.
+        covariance: R of each label, float64, shape ``(n, d, d)``. Rows and columns of
+            exact and of missing parameters are zero.
+        weights: How many pairs each label counts as, shape ``(n,)``.
+        samples: The draws of labels that were given as draws, shape ``(n, S, d)``; None
+            otherwise.
+    """
+
+    theta: Tensor
+    covariance: Tensor
+    weights: Tensor
+    samples: Tensor | None = None
+
+    @classmethod
+    def exact(cls, theta: Tensor) -> "Labels":
+        """Return labels that are the true parameters, shape ``(n, d)``."""
+        n, d = theta.shape
+        return cls(
+            theta=theta,
+            covariance=theta.new_zeros(n, d, d, dtype=torch.double),
+            weights=theta.new_ones(n, dtype=torch.double),
+        )
+
+    def __len__(self) -> int:
+        return len(self.theta)
+
+    def __getitem__(self, rows: Tensor) -> "Labels":
+        return Labels(
+            theta=self.theta[rows],
+            covariance=self.covariance[rows],
+            weights=self.weights[rows],
+            samples=None if self.samples is None else self.samples[rows],
+        )
+
+    def appended(self, others: "Labels") -> "Labels":
+        """Return these labels followed by others of the same kind.
+
+        Raises:
+            InvalidInputError: If some are given as draws and others are not, or the
+                numbers of draws differ.
+        """
+        counts = [
+            0 if labels.samples is None else labels.samples.shape[1]
+            for labels in (self, others)
+        ]
+        if counts[0] != counts[1]:
+            raise InvalidInputError(
+                "Expected labels with as many draws as those appended before, "
+                f"{counts[0]}; got {counts[1]}. Repeat an exact label as often as "
+                "there are draws of the others."
+            )
+        samples = self.samples
+        if samples is not None and others.samples is not None:
+            samples = torch.cat([samples, others.samples])
+        return Labels(
+            theta=torch.cat([self.theta, others.theta]),
+            covariance=torch.cat([self.covariance, others.covariance]),
+            weights=torch.cat([self.weights, others.weights]),
+            samples=samples,
+        )
+
+    def weighted(self, weights: Tensor) -> "Labels":
+        """Return the same labels with other weights, shape ``(n,)``."""
+        return replace(self, weights=weights)
+
+    @property
+    def is_measured(self) -> Tensor:
+        """Which parameters were measured, exactly or with noise, shape ``(n, d)``."""
+        return ~torch.isnan(self.theta)
+
+    @property
+    def is_noisy(self) -> Tensor:
+        """Which parameters were measured with noise, shape ``(n, d)``."""
+        return self.covariance.diagonal(dim1=1, dim2=2) > 0
+
+    @property
+    def says_something(self) -> Tensor:
+        """Which labels measure at least one parameter, shape ``(n,)``."""
+        return self.is_measured.any(dim=1)
+
+    @property
+    def are_exact(self) -> bool:
+        """Whether all parameters of all labels are known exactly."""
+        if self.samples is not None:
+            return False
+        return bool(self.is_measured.all()) and not bool(self.is_noisy.any())
+
+    @property
+    def are_weighted(self) -> bool:
+        """Whether some labels count as another number of pairs than one."""
+        return bool((self.weights != 1).any())
+
+    @property
+    def are_simple(self) -> bool:
+        """Whether all labels are exact and count as one pair."""
+        return self.are_exact and not self.are_weighted
+
+    @property
+    def effective_number(self) -> float:
+        r"""The number of labels of equal weight with the same precision.
+
+        .. math:: \Bigl(\sum_i w_i\Bigr)^2 \Big/ \sum_i w_i^2
+        """
+        if not len(self):
+            return 0.0
+        return float(self.weights.sum().square() / self.weights.square().sum())
+
+    @property
+    def groups(self) -> Tensor:
+        """A number for each label; equal labels have the same, shape ``(n,)``."""
+        if self.are_exact:
+            return groups_of(self.theta)
+        # NaN is not equal to itself, and the covariance tells labels apart, too.
+        known = [self.theta.double().nan_to_num(), self.is_measured.double()]
+        known.append(self.covariance.flatten(1))
+        if self.samples is not None:
+            known.append(self.samples.double().flatten(1))
+        return groups_of(torch.cat(known, dim=1))
+
+    def __str__(self) -> str:
+        """Say in one sentence what is known about the parameters."""
+        n = len(self)
+        if self.samples is not None:
+            text = f"{n} labels, each given as {self.samples.shape[1]} draws"
+        elif self.are_exact:
+            text = f"{n} exact labels"
+        else:
+            num_noisy = int(self.is_noisy.any(dim=1).sum())
+            num_partial = int((~self.is_measured).any(dim=1).sum())
+            text = f"{n} labels, {num_noisy} with noise and {num_partial} partial"
+        if self.are_weighted:
+            text += f", weighted like {self.effective_number:.1f} of equal weight"
+        return text

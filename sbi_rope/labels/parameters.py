@@ -1,0 +1,173 @@
+"""Draws of the parameters that labels leave possible, under the prior."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sbi_rope._random import seeded
+from sbi_rope.errors import InvalidInputError, warn_user
+from sbi_rope.labels.labels import Labels
+from sbi_rope.labels.nodes import Nodes, Reference, place_nodes, reference_of
+from sbi_rope.mixture.prior import prior_log_prob, prior_sample
+
+__all__ = ["LabelledParameters", "nodes_of", "parameters_of", "prior_reference"]
+
+# Draws from the prior, for its moments.
+NUM_PRIOR_DRAWS = 5000
+# Proposals for each label, from which the draws are chosen, and the draws.
+NUM_PROPOSALS, NUM_DRAWS = 2000, 100
+# With fewer effective proposals the draws repeat each other, and there is a warning.
+SMALLEST_SIZE = 20.0
+# The number of labels that are treated at a time.
+CHUNK_SIZE = 100
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LabelledParameters:
+    r"""Draws from :math:`p(\theta \mid y) \propto p(\theta)\, p(y \mid \theta)`.
+
+    Attributes:
+        draws: Shape ``(n, R, d)``. For exact labels R is 1.
+        effective_sample_size: Of the proposals behind the draws of each label, shape
+            ``(n,)``; infinite for exact labels and those given as draws.
+    """
+
+    draws: Tensor
+    effective_sample_size: Tensor = field(repr=False)
+
+    def __getitem__(self, rows: Tensor) -> "LabelledParameters":
+        return LabelledParameters(
+            draws=self.draws[rows],
+            effective_sample_size=self.effective_sample_size[rows],
+        )
+
+    @property
+    def are_exact(self) -> bool:
+        """Whether all parameters are known exactly."""
+        return self.draws.shape[1] == 1
+
+    @property
+    def mean(self) -> Tensor:
+        """The mean of each label's parameters, shape ``(n, d)``."""
+        if self.are_exact:
+            return self.draws[:, 0]
+        return self.draws.double().mean(dim=1).to(self.draws)
+
+
+def parameters_of(labels: Labels, prior: Any, *, seed: int = 0) -> LabelledParameters:
+    """Draw the parameters of labels, by importance sampling.
+
+    Args:
+        labels: The labels.
+        prior: The prior of NPE.
+        seed: Seed of the draws. The draws of a label depend on no other label.
+
+    Raises:
+        InvalidInputError: If no parameters inside the prior's support fit a label.
+    """
+    if labels.samples is not None:
+        n = len(labels)
+        return LabelledParameters(
+            draws=labels.samples,
+            effective_sample_size=labels.covariance.new_full((n,), torch.inf),
+        )
+    if labels.are_exact:
+        n = len(labels)
+        return LabelledParameters(
+            draws=labels.theta[:, None],
+            effective_sample_size=labels.covariance.new_full((n,), torch.inf),
+        )
+    reference = prior_reference(prior, labels.theta)
+    parts = []
+    for rows in torch.arange(len(labels)).split(CHUNK_SIZE):
+        with seeded(seed):
+            parts.append(_draw(labels[rows], prior, reference, first=int(rows[0])))
+    return LabelledParameters(
+        draws=torch.cat([part.draws for part in parts]),
+        effective_sample_size=torch.cat([part.effective_sample_size for part in parts]),
+    )
+
+
+def nodes_of(
+    labels: Labels, references: list[Reference], prior: Any, *, num_nodes: int
+) -> Nodes:
+    r"""Return the nodes at which the densities of labels are computed.
+
+    Of labels given as draws, these are the draws, weighted by
+    :math:`1 / p(\theta)`, so that scores are relative to those of the prior.
+
+    Args:
+        labels: The labels.
+        references: As in :func:`~sbi_rope.labels.nodes.place_nodes`. The prior is added
+            to them, and takes the place of what is not finite.
+        prior: The prior of NPE.
+        num_nodes: The number of nodes of each label, at least.
+    """
+    if labels.samples is not None:
+        log_prior = prior_log_prob(prior, labels.samples).double()
+        return Nodes(theta=labels.samples, log_weights=-log_prior)
+    n = len(labels)
+    one = prior_reference(prior, labels.theta)
+    wide = Reference(
+        mean=one.mean.expand(n, -1), covariance=one.covariance.expand(n, -1, -1)
+    )
+    usable = [reference.or_else(wide) for reference in references]
+    return place_nodes(labels, [*usable, wide], prior, num_nodes=num_nodes)
+
+
+def prior_reference(prior: Any, like: Tensor) -> Reference:
+    """Return the mean and the covariance of the prior, for one label."""
+    with seeded(0):
+        samples = prior_sample(prior, torch.Size((NUM_PRIOR_DRAWS,))).to(like)
+    return reference_of(samples[:, None])
+
+
+def _draw(
+    labels: Labels, prior: Any, reference: Reference, *, first: int
+) -> LabelledParameters:
+    n = len(labels)
+    wide = Reference(
+        mean=reference.mean.expand(n, -1),
+        covariance=reference.covariance.expand(n, -1, -1),
+    )
+    nodes = place_nodes(labels, [wide], prior, num_nodes=NUM_PROPOSALS)
+    log_prior = prior_log_prob(prior, nodes.theta).double()
+    log_weights = nodes.log_weights + log_prior
+    lost = torch.isneginf(log_weights).all(dim=1)
+    if lost.any():
+        rows = (lost.nonzero().flatten()[:5] + first).tolist()
+        raise InvalidInputError(
+            "Expected labels that some parameters inside the support of the prior "
+            f"fit; found none for {int(lost.sum())} labels (first: {rows}). Check "
+            "their units and their standard deviations, or train NPE with a wider "
+            "prior."
+        )
+    shares = torch.softmax(log_weights, dim=1)
+    size = 1.0 / shares.square().sum(dim=1)
+    known = ~(~labels.is_measured | labels.is_noisy).any(dim=1)
+    size = size.where(~known, torch.full_like(size, torch.inf))
+    if bool((size < SMALLEST_SIZE).any()):
+        rows = ((size < SMALLEST_SIZE).nonzero().flatten()[:5] + first).tolist()
+        warn_user(
+            f"The parameters that fit the labels {rows} are known from fewer than "
+            f"{SMALLEST_SIZE:.0f} effective draws. Check whether these labels are "
+            "plausible under the prior."
+        )
+    chosen = _systematic(shares, NUM_DRAWS)
+    draws = nodes.theta.gather(
+        1, chosen[..., None].expand(-1, -1, labels.theta.shape[1])
+    )
+    return LabelledParameters(draws=draws, effective_sample_size=size)
+
+
+def _systematic(shares: Tensor, count: int) -> Tensor:
+    """Choose columns of each row by their shares, evenly; shape ``(n, count)``."""
+    steps = (torch.arange(count).to(shares) + 0.5) / count
+    upper = shares.cumsum(dim=1)
+    upper = upper / upper[:, -1:]
+    order = torch.searchsorted(upper, steps.expand(len(shares), -1).contiguous())
+    # In random order, so that any part of the draws represents all of them.
+    shuffled = torch.rand(len(shares), count).argsort(dim=1).to(shares.device)
+    return order.gather(1, shuffled).clamp_max(shares.shape[1] - 1)

@@ -1,0 +1,115 @@
+"""The scores of candidates at labels that are not exact."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from sbi_rope._random import seeded
+from sbi_rope.labels import Labels, Nodes, Reference, nodes_of, reference_of
+from sbi_rope.metrics.calibration import central_levels, count_ranks
+from sbi_rope.metrics.calls import draw_samples
+from sbi_rope.mixture import MixtureEstimator, MixturePosterior
+from sbi_rope.stacking.folds import Workbench
+from sbi_rope.stacking.versions import Versions
+
+__all__ = ["LabelScores", "label_levels", "score_labels"]
+
+# Samples of each candidate at each observation, from which nodes are placed.
+NUM_SAMPLES = 200
+# Nodes of each label. Couplings have a density for each simulation at each node.
+NUM_NODES, NUM_NODES_OF_COUPLINGS = 512, 128
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LabelScores:
+    """The densities of candidates at the nodes of the labels of one fold.
+
+    Attributes:
+        nodes: The nodes.
+        log_q: The log density of each candidate at the nodes, shape ``(n, S, K)``.
+    """
+
+    nodes: Nodes
+    log_q: Tensor
+
+    @property
+    def of_candidates(self) -> Tensor:
+        """The log density of each label under each candidate, shape ``(n, K)``."""
+        return self.nodes.log_mean(self.log_q)
+
+    def of_stack(self, weights: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the log density of each label under a mixture, and its error.
+
+        Args:
+            weights: The weights of the candidates, shape ``(K,)``.
+
+        Returns:
+            The log densities, not corrected for leakage, and their Monte-Carlo errors,
+            both of shape ``(n,)``.
+        """
+        log_q = (self.log_q + weights.to(self.log_q).log()).logsumexp(dim=2)
+        return self.nodes.log_mean(log_q), self.nodes.standard_error(log_q)
+
+
+def score_labels(bench: Workbench, versions: Versions, number: int) -> LabelScores:
+    """Score all candidates on the labels of a fold that they were not trained on.
+
+    Nodes come from the samples of each candidate, so that none is scored at parameters
+    that only others consider plausible.
+
+    Args:
+        bench: What all candidates share.
+        versions: The candidates.
+        number: The number of the fold, and of the version.
+    """
+    rows = bench.folds[number]
+    x, prior = bench.x[rows], bench.npe.prior
+    coupled = versions.couplings is not None
+    with seeded(bench.seed_of(frozenset([number]))):
+        references = _references(versions, x, number)
+        nodes = nodes_of(
+            bench.labels[rows],
+            references,
+            prior,
+            num_nodes=NUM_NODES_OF_COUPLINGS if coupled else NUM_NODES,
+        )
+    return LabelScores(
+        nodes=nodes, log_q=versions.node_log_probs(nodes.theta, x, number)
+    )
+
+
+def _references(versions: Versions, x: Tensor, number: int) -> list[Reference]:
+    estimators = list(versions.estimators(number).values())
+    if versions.couplings is not None:
+        estimators.append(MixtureEstimator([versions.couplings.part], [1.0]))
+    size = torch.Size((NUM_SAMPLES,))
+    return [reference_of(estimator.sample(size, x)) for estimator in estimators]
+
+
+def label_levels(
+    posterior: MixturePosterior, labels: Labels, x: Tensor, *, num_samples: int
+) -> Tensor:
+    r"""Return the levels of the central intervals of labels that end at them.
+
+    For a noisy label this is the interval of the measurement, not of the parameter:
+    draws of the posterior get the noise of the label. The levels are uniform if the
+    posterior is calibrated, and their test of it is weaker the larger the noise is.
+
+    Args:
+        posterior: The posterior.
+        labels: The labels.
+        x: Their observations, shape ``(n, *event)``.
+        num_samples: The number of draws for each observation.
+
+    Returns:
+        Shape ``(n, d)``, NaN for parameters that were not measured, and for labels
+        given as draws.
+    """
+    if labels.samples is not None:
+        return torch.full_like(labels.theta, torch.nan)
+    samples = draw_samples(posterior, x, num_samples=num_samples)
+    std = labels.covariance.diagonal(dim1=1, dim2=2).sqrt().to(samples)
+    measured = samples + std * torch.randn_like(samples)
+    levels = central_levels(count_ranks(measured, labels.theta)).to(labels.theta)
+    return levels.where(labels.is_measured, torch.nan)

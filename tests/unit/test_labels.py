@@ -1,0 +1,317 @@
+"""Labels that are noisy, partial, weighted, or given as draws."""
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from sbi.utils import BoxUniform
+from torch import Tensor
+from torch.distributions import MultivariateNormal
+
+from sbi_rope import RoPE
+from sbi_rope.discrepancy import DiscrepancyModel, learn_parameters
+from sbi_rope.errors import InvalidInputError, RoPEWarning
+from sbi_rope.labels import (
+    Labels,
+    labelled_moments,
+    nodes_of,
+    parameters_of,
+    reference_of,
+)
+from sbi_rope.metrics import acauc_of, coverage_curve_of, expected_coverage_error_of
+from sbi_rope.stacking import stacking_weights
+from tests import gaussian
+
+NAN = math.nan
+PRIOR = MultivariateNormal(
+    torch.zeros(3), torch.tensor([[1.0, 0.5, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, 2.0]])
+)
+THETA = torch.tensor([[0.5, -0.3, 1.0], [NAN, 0.4, -1.0], [0.2, NAN, NAN], [0.1, 0, 0]])
+
+
+def labels() -> Labels:
+    """Return a noisy, a noisy partial, a partial and an exact label."""
+    covariance = torch.zeros(4, 3, 3, dtype=torch.double)
+    covariance[0] = torch.tensor([[0.3, 0.1, 0.0], [0.1, 0.2, 0.0], [0.0, 0.0, 0.5]])
+    covariance[1, 1, 1] = 0.2
+    return Labels(
+        theta=THETA, covariance=covariance, weights=torch.ones(4, dtype=torch.double)
+    )
+
+
+def conditioned(mean: Tensor, covariance: Tensor, i: int) -> tuple[Tensor, Tensor]:
+    """Return the normal distribution of theta given label i, in closed form."""
+    measured = labels().is_measured[i].nonzero().flatten()
+    select = torch.eye(3, dtype=torch.double)[measured]
+    noise = labels().covariance[i][measured][:, measured]
+    gain = (
+        covariance @ select.T @ torch.linalg.inv(select @ covariance @ select.T + noise)
+    )
+    surprise = THETA[i, measured].double() - select @ mean
+    return mean + gain @ surprise, covariance - gain @ select @ covariance
+
+
+def test_draws_of_parameters_follow_the_prior_given_the_label() -> None:
+    found = parameters_of(labels(), PRIOR).draws.double()
+    assert found.shape == (4, 100, 3)
+    covariance = PRIOR.covariance_matrix.double()
+    for i in range(4):
+        mean, expected = conditioned(torch.zeros(3).double(), covariance, i)
+        std = expected.diagonal().clamp_min(0.0).sqrt()
+        assert ((found[i].mean(dim=0) - mean).abs() <= 0.35 * std + 1e-6).all()
+        assert torch.allclose(found[i].T.cov(), expected, atol=0.35)
+        fixed = std < 1e-6
+        assert torch.allclose(found[i][:, fixed], mean[fixed], atol=1e-6)
+
+
+def test_draws_stay_inside_a_box() -> None:
+    box = BoxUniform(torch.zeros(2), torch.ones(2))
+    one = Labels.exact(torch.tensor([[1.2, 0.5]]))  # noise has moved it out of the box
+    covariance = 0.04 * torch.eye(2, dtype=torch.double)[None]
+    noisy = Labels(theta=one.theta, covariance=covariance, weights=one.weights)
+    draws = parameters_of(noisy, box).draws[0]
+    assert bool(((draws >= 0) & (draws <= 1)).all())
+    # The mean of N(1.2, 0.2) below 1, with its lower tail cut at 0.
+    below = torch.distributions.Normal(1.2, 0.2)
+    grid = torch.linspace(0, 1, 2001)
+    density = below.log_prob(grid).exp()
+    assert (
+        abs(float(draws[:, 0].mean() - (grid * density).sum() / density.sum())) < 0.02
+    )
+
+
+def test_the_density_of_a_label_is_that_of_the_posterior_with_its_noise() -> None:
+    torch.manual_seed(0)
+    mean = torch.tensor([0.3, -0.2, 0.8], dtype=torch.double)
+    covariance = 0.01 * torch.eye(3).double() + 0.004
+    q = MultivariateNormal(mean, covariance)
+    samples = q.sample(torch.Size((200, 1))).expand(-1, 4, -1)
+    nodes = nodes_of(labels(), [reference_of(samples)], PRIOR, num_nodes=2000)
+    log_q = q.log_prob(nodes.theta.double())
+    found, error = nodes.log_mean(log_q), nodes.standard_error(log_q)
+    for i in range(4):
+        measured = labels().is_measured[i].nonzero().flatten()
+        noise = labels().covariance[i]
+        exact = MultivariateNormal(
+            mean[measured], (covariance + noise)[measured][:, measured]
+        ).log_prob(THETA[i, measured].double())
+        assert abs(float(found[i] - exact)) < 4 * float(error[i]) + 1e-6
+        assert float(error[i]) < 0.1
+    assert float(error[3]) == 0.0  # of an exact label there is nothing to estimate
+
+
+def test_the_density_of_draws_is_relative_to_that_of_the_prior() -> None:
+    draws = PRIOR.sample(torch.Size((4, 50)))
+    given = Labels(
+        theta=draws.mean(dim=1),
+        covariance=torch.zeros(4, 3, 3, dtype=torch.double),
+        weights=torch.ones(4, dtype=torch.double),
+        samples=draws,
+    )
+    nodes = nodes_of(given, [], PRIOR, num_nodes=7)
+    score = nodes.log_mean(PRIOR.log_prob(draws))
+    assert torch.allclose(score, torch.zeros(4).double(), atol=1e-6)
+
+
+# Learning -----------------------------------------------------------------------------
+
+
+def line(theta: Tensor) -> Tensor:
+    return torch.stack([theta[:, 0] + theta[:, 1], theta[:, 1].square()], dim=1)
+
+
+def test_moments_of_a_label_average_over_its_parameters() -> None:
+    box = BoxUniform(-torch.ones(2), torch.ones(2))
+    conductor = RoPE(gaussian.posterior(), simulator=gaussian.simulator)
+    known = parameters_of(
+        Labels.exact(torch.zeros(1, 2))[torch.tensor([0])].appended(
+            Labels(
+                theta=torch.tensor([[0.5, NAN]]),
+                covariance=torch.zeros(1, 2, 2, dtype=torch.double),
+                weights=torch.ones(1, dtype=torch.double),
+            )
+        ),
+        box,
+    )
+    torch.manual_seed(0)
+    moments = labelled_moments(
+        conductor.source, known, 100, lambda x: line(x), progress=False
+    )
+    assert moments.possible is not None
+    draws = known.draws[1].double()
+    # Simulations have noise of 0.5, whose square adds 0.25 to the second entry.
+    exact = line(draws) + torch.tensor([0.0, 0.25])
+    assert torch.allclose(moments.mean[1], exact.mean(dim=0), atol=0.25)
+    residual = moments.possible[1] - exact
+    assert float(residual[:, 0].abs().mean()) < 0.2
+    # The surface of the first label is a point.
+    assert float(moments.possible[0].std(dim=0).max()) < 1e-6
+    assert torch.allclose(
+        moments.covariance[0, 0, 0], torch.tensor(0.5).double(), atol=0.2
+    )
+
+
+def test_the_discrepancy_of_possible_means_is_that_of_the_right_ones() -> None:
+    torch.manual_seed(0)
+    m = torch.randn(60, 1, dtype=torch.double)
+    z = 0.5 * m + 2.0 + 0.05 * torch.randn(60, 1).double()
+    noise = torch.tensor([[1e-4]]).double()
+    # The right mean is one of two, and the observation tells which.
+    possible = torch.stack([m, torch.randn(60, 1).double()], dim=1)
+    model = DiscrepancyModel()
+    exact = model.fit(z, m, noise).sample(500, seed=0)
+    found = model.fit(z, possible, noise).sample(500, seed=0)
+    naive = model.fit(z, possible.mean(dim=1), noise).sample(500, seed=0)
+    assert abs(float(exact.gain.mean()) - 0.5) < 0.02
+    assert abs(float(found.gain.mean()) - 0.5) < 0.05
+    assert abs(float(found.offset.mean()) - 2.0) < 0.05
+    error = [float(one.error_factor.square().mean().sqrt()) for one in (found, naive)]
+    assert error[0] < 0.5 * error[1]
+
+
+def test_a_weight_of_two_counts_as_two_pairs() -> None:
+    torch.manual_seed(1)
+    m = torch.randn(6, 2, dtype=torch.double)
+    z, noise = 1.3 * m + 0.2, 0.01 * torch.eye(2).double()
+    weights = torch.tensor([1.0, 2, 1, 2, 1, 1])
+    twice = torch.tensor([0, 1, 1, 2, 3, 3, 4, 5])
+    a = DiscrepancyModel().fit(z, m, noise, weights=weights)
+    b = DiscrepancyModel().fit(z[twice], m[twice], noise)
+    assert math.isclose(a.log_evidence, b.log_evidence, rel_tol=1e-9)
+    assert math.isclose(a.log_evidence_of_none, b.log_evidence_of_none, rel_tol=1e-9)
+    log_scores = torch.randn(6, 3)
+    one = stacking_weights(log_scores, pair_weights=weights)
+    other = stacking_weights(log_scores[twice])
+    assert torch.allclose(one.weights, other.weights, atol=1e-6)
+    assert math.isclose(one.score, other.score, rel_tol=1e-6)
+
+
+def test_the_distribution_of_parameters_is_learned_from_draws_of_labels() -> None:
+    torch.manual_seed(0)
+    theta = torch.rand(2000, 1)
+    exact = 0.2 * torch.rand(40, 1)
+    noisy = (exact[:, None] + 0.01 * torch.randn(40, 12, 1)).clamp(0, 1)
+    found = learn_parameters(noisy, theta).probabilities
+    wanted = learn_parameters(exact, theta).probabilities
+    assert (
+        abs(float(found[theta[:, 0] < 0.25].sum() - wanted[theta[:, 0] < 0.25].sum()))
+        < 0.05
+    )
+
+
+# Calibration --------------------------------------------------------------------------
+
+
+def test_levels_that_are_not_known_are_left_out() -> None:
+    levels = torch.tensor([[0.2, NAN], [0.6, 0.9], [NAN, NAN], [1.0, 0.1]])
+    score = acauc_of(levels, allow_missing=True)
+    assert math.isclose(score.value, (0.2 + 0.75 + 0.55) / 3 - 0.5, abs_tol=1e-6)
+    expected = torch.tensor([0.1, 0.0]).double()
+    assert torch.allclose(score.per_parameter, expected, atol=1e-6)
+    curve = coverage_curve_of(levels, allow_missing=True)
+    half = torch.tensor([1 / 3, 0.5]).double()
+    assert torch.allclose(curve.per_parameter[:, 49], half)
+    assert 0 < expected_coverage_error_of(levels, allow_missing=True).value < 0.5
+    for score_of in (acauc_of, coverage_curve_of, expected_coverage_error_of):
+        with pytest.raises(InvalidInputError, match="NaN"):
+            score_of(levels)
+
+
+# The border ---------------------------------------------------------------------------
+
+
+def rope() -> RoPE:
+    return RoPE(gaussian.posterior(), simulator=gaussian.simulator)
+
+
+def test_labels_that_say_nothing_are_left_out() -> None:
+    theta, x = gaussian.labelled(6)
+    theta[2:4] = NAN
+    with pytest.warns(RoPEWarning, match="2 of 6 labels say nothing"):
+        conductor = rope().append_calibration(theta, x)
+    keep = torch.tensor([0, 1, 4, 5])
+    assert torch.equal(conductor.calibration[0], theta[keep])
+    assert torch.equal(conductor.calibration[1], x[keep])
+    assert conductor.labels.are_exact
+
+
+def test_exact_and_noisy_labels_may_be_appended_one_after_the_other() -> None:
+    theta, x = gaussian.labelled(6)
+    conductor = rope().append_calibration(theta[:4], x[:4])
+    conductor.append_calibration(theta[4:], x[4:], theta_std=0.3)
+    assert str(conductor.labels) == "6 labels, 2 with noise and 0 partial"
+    known, _ = conductor.calibration
+    assert torch.allclose(known[:4], theta[:4])
+    # The posterior mean of a noisy label is nearer to the mean of the prior.
+    assert torch.allclose(known[4:], theta[4:] / 1.09, atol=0.1)
+    conductor.train(seed=0, show_progress_bars=False)
+    with pytest.raises(InvalidInputError, match="as many draws"):
+        conductor.append_calibration(theta[:, None].repeat(1, 3, 1), x)
+
+
+STD = torch.tensor([0.1, 0.1])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"theta_std": -0.1}, "not negative"),
+        ({"theta_std": torch.ones(3)}, r"shape \(2,\) or \(10, 2\)"),
+        ({"theta_std": STD, "theta_cov": torch.eye(2)}, "got both"),
+        ({"theta_std": torch.tensor([0.1, NAN])}, "finite and not negative"),
+        ({"theta_cov": torch.eye(3)}, r"\(2, 2\) or \(10, 2, 2\)"),
+        ({"theta_cov": -torch.eye(2)}, "without negative eigenvalues"),
+        ({"theta_cov": torch.tensor([[1.0, 0.5], [0.0, 1.0]])}, "symmetric"),
+        ({"theta_cov": torch.ones(2, 2)}, "singular"),
+        ({"weights": torch.zeros(10)}, "positive"),
+        ({"weights": torch.ones(9)}, "same number of rows"),
+        ({"weights": torch.ones(10, 2)}, r"shape \(n,\)"),
+    ],
+)
+def test_labels_that_make_no_sense_are_refused(
+    options: dict[str, Any], message: str
+) -> None:
+    conductor = rope()
+    with pytest.raises(InvalidInputError, match=message):
+        conductor.append_calibration(*gaussian.labelled(10), **options)
+    assert not len(conductor.labels)
+
+
+def test_draws_of_labels_are_checked() -> None:
+    theta, x = gaussian.labelled(4)
+    draws = theta[:, None] + 0.1 * torch.randn(4, 20, 2)
+    conductor = rope().append_calibration(draws, x)
+    assert torch.allclose(conductor.calibration[0], draws.mean(dim=1), atol=1e-5)
+    assert str(conductor.labels) == "4 labels, each given as 20 draws"
+    with pytest.raises(InvalidInputError, match="neither `theta_std` nor"):
+        rope().append_calibration(draws, x, theta_std=0.1)
+    with pytest.raises(InvalidInputError, match="got NaN"):
+        rope().append_calibration(draws.where(draws > 0, NAN), x)
+    with pytest.raises(InvalidInputError, match="two draws"):
+        rope().append_calibration(draws[:, :1], x)
+
+
+def test_a_label_that_fits_no_parameters_of_the_prior_is_named() -> None:
+    from sbi.inference import DirectPosterior
+
+    box = BoxUniform(-torch.ones(2), torch.ones(2))
+    npe = DirectPosterior(gaussian.GaussianEstimator(), box)
+    theta = torch.tensor([[0.0, 0.0], [0.5, 90.0]])
+    with pytest.raises(InvalidInputError, match=r"found none for 1 labels.*\[1\]"):
+        RoPE(npe, simulator=gaussian.simulator).append_calibration(
+            theta, theta, theta_std=0.1
+        )
+
+
+def test_groups_of_labels_that_are_equal() -> None:
+    theta = torch.tensor([[0.0, NAN], [1.0, 2.0], [0.0, NAN], [0.0, 3.0]])
+    covariance = torch.zeros(4, 2, 2, dtype=torch.double)
+    some = Labels(theta=theta, covariance=covariance, weights=torch.ones(4).double())
+    assert some.groups.tolist() == [0, 1, 0, 2]
+    other = Labels(
+        theta=theta,
+        covariance=covariance + torch.tensor([0.0, 0, 1, 0])[:, None, None],
+        weights=torch.ones(4).double(),
+    )
+    assert other.groups.tolist() == [0, 1, 2, 3]
