@@ -13,6 +13,7 @@ from torch import Tensor
 
 from sbi_rope._validation import check_choice
 from sbi_rope.metrics import CoverageCurve, coverage_curve_of
+from sbi_rope.stacking.held_out import SetScores
 from sbi_rope.stacking.weights import StackingWeights, stacking_weights
 
 __all__ = ["CrossValidation", "Difference"]
@@ -67,6 +68,8 @@ class CrossValidation:
         pseudo_count: As in :func:`stacking_weights`.
         log_unit: The sum of the logs of the prior's standard deviations; NaN if it is
             unknown. Scores with theta in these units are higher by this number.
+        set_scores: The scores that sets with a guarantee are made from; None in files
+            of earlier versions.
     """
 
     names: tuple[str, ...]
@@ -78,6 +81,7 @@ class CrossValidation:
     levels: Tensor = field(repr=False)
     pseudo_count: float = 1.0
     log_unit: float = float("nan")
+    set_scores: SetScores | None = field(default=None, repr=False)
 
     def __len__(self) -> int:
         return len(self.fold)

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from sbi_rope._progress import is_shown, progress_bar
-from sbi_rope._random import seeded
 from sbi_rope._sbi import ConditionalDensityEstimator, estimator_of, readable
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._validation import (
@@ -24,12 +23,9 @@ from sbi_rope.discrepancy.correction import network_of
 from sbi_rope.errors import (
     InvalidInputError,
     NotReadyError,
-    SamplingError,
     UnsupportedPosteriorError,
     warn_user,
 )
-from sbi_rope.metrics.calibration import central_levels
-from sbi_rope.metrics.calls import draw_ranks
 from sbi_rope.mixture import MixturePosterior
 from sbi_rope.rope import RoPE
 from sbi_rope.stacking.candidates import (
@@ -42,11 +38,18 @@ from sbi_rope.stacking.couplings import FittedCouplings, fit_couplings
 from sbi_rope.stacking.cross_validation import CrossValidation, fold_weights
 from sbi_rope.stacking.defaults import default_candidates
 from sbi_rope.stacking.folds import NUM_FOLDS, Fold, Workbench, draw_seeds
+from sbi_rope.stacking.held_out import (
+    FoldScores,
+    SetScores,
+    joined,
+    one_of_each_group,
+    score_fold,
+)
 from sbi_rope.stacking.trained_candidates import (
     DiscrepancyCandidate,
     FinetunedCandidate,
 )
-from sbi_rope.stacking.units import log_unit_of
+from sbi_rope._units import log_unit_of
 from sbi_rope.stacking.versions import Versions, train_version
 
 __all__ = ["StackTrainer"]
@@ -207,7 +210,7 @@ class StackTrainer:
     def _score(self, versions: Versions, num_training_folds: int) -> CrossValidation:
         log_scores, fold = self._log_scores(versions)
         weights = fold_weights(log_scores, fold, self.pseudo_count)
-        stack_scores, levels = self._stack_scores(versions, weights)
+        of_stack = self._stack_scores(versions, weights)
         num_folds = len(self.bench.folds)
         scores = CrossValidation(
             names=tuple(candidate.name for candidate in self.candidates),
@@ -215,8 +218,14 @@ class StackTrainer:
             log_scores=log_scores,
             fold=fold,
             num_trained_on=len(fold) * num_training_folds // num_folds,
-            stack_scores=stack_scores,
-            levels=levels,
+            stack_scores=of_stack.log_prob,
+            levels=of_stack.levels,
+            set_scores=SetScores(
+                joint=of_stack.joint,
+                marginal=of_stack.marginal,
+                is_counted=one_of_each_group(self.bench.groups, seed=self.seeds[2]),
+                num_draws=NUM_SAMPLES,
+            ),
             pseudo_count=self.pseudo_count,
             log_unit=log_unit_of(self.prior),
         )
@@ -250,10 +259,8 @@ class StackTrainer:
             )
         return log_scores, fold
 
-    def _stack_scores(
-        self, versions: Versions, weights: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return the normalised score of the stack at each pair, and the levels.
+    def _stack_scores(self, versions: Versions, weights: Tensor) -> FoldScores:
+        """Return the scores of the stack at each pair, normalised in the support.
 
         Args:
             versions: The candidates.
@@ -261,11 +268,10 @@ class StackTrainer:
         """
         bench = self.bench
         theta, x = bench.theta, bench.x
-        stack_scores = theta.new_empty(len(theta), dtype=torch.double)
-        levels = torch.empty_like(theta)
         # The couplings are the first part, and have the same simulations in all folds.
         # The mass of the other parts inside the prior can differ from fold to fold.
         masses: dict[int, Tensor] = {}
+        of_folds = []
         for number, rows in enumerate(bench.folds):
             shared = dict(masses)
             posterior = MixturePosterior(
@@ -274,35 +280,18 @@ class StackTrainer:
                 enable_transform=False,
                 shared=shared,
             )
-            log_prob, ranks = self._normalised(posterior, theta[rows], x[rows])
-            stack_scores[rows] = log_prob.double()
-            levels[rows] = central_levels(ranks).to(levels)
+            of_folds.append(
+                score_fold(
+                    posterior,
+                    theta[rows],
+                    x[rows],
+                    num_samples=NUM_SAMPLES,
+                    seed=self.seeds[2],
+                )
+            )
             if versions.couplings is not None and 0 in shared:
                 masses[0] = shared[0]
-        return stack_scores, levels
-
-    def _normalised(
-        self, posterior: MixturePosterior, theta: Tensor, x: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return log densities, normalised inside the prior's support, and ranks."""
-        try:
-            log_prob = posterior.log_prob_batched(theta[None], x)[0]
-            with seeded(self.seeds[2]):
-                ranks = draw_ranks(
-                    posterior,
-                    theta,
-                    x,
-                    num_samples=NUM_SAMPLES,
-                    chunk_size=NUM_SAMPLES,
-                    show=False,
-                )
-        except SamplingError as error:
-            raise SamplingError(
-                "A stack of these candidates has almost no mass inside the support of "
-                "the prior at a held-out observation, so that it cannot be sampled. "
-                "Add the prior to the candidates: `default_candidates()` contains it."
-            ) from error
-        return log_prob, ranks
+        return joined(of_folds, bench.folds)
 
 
 def _check_pairs(count: int) -> None:

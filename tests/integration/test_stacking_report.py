@@ -21,7 +21,7 @@ from sbi_rope.stacking import (
     LearningCurve,
     StackingReport,
 )
-from sbi_rope.stacking.units import log_unit_of
+from sbi_rope._units import log_unit_of
 from tests import problems
 from tests.stacks import (
     FITTED,
