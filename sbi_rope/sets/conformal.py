@@ -83,8 +83,8 @@ def promised_coverage(level: float, n: int, num_folds: int) -> float:
     """Return the bound of the coverage in theory, at least 0; see this module.
 
     Example:
-        >>> round(promised_coverage(0.9, 50, 5), 3), round(promised_coverage(0.9, 50, 50), 3)
-        (0.655, 0.8)
+        >>> [round(promised_coverage(0.9, 50, folds), 3) for folds in (5, 50)]
+        [0.655, 0.8]
     """
     share = 1 / num_folds
     of_folds = 2 * (1 - share) / (n * share + 1)
@@ -121,7 +121,7 @@ def joint_scores(log_prob: Tensor, draws: Tensor) -> Tensor:
         >>> joint_scores(torch.tensor([0.0, -2.5, -5.0, -torch.inf]), draws)
         tensor([0.1250, 0.6250, 3.0000,    inf], dtype=torch.float64)
     """
-    log_prob, draws = log_prob.double().contiguous(), draws.double().sort().values
+    log_prob, draws = log_prob.double().contiguous(), _ordered(draws)
     num_draws = draws.shape[-1]
     below = torch.searchsorted(draws, log_prob)
     not_above = torch.searchsorted(draws, log_prob, right=True)
@@ -158,7 +158,7 @@ def marginal_scores(theta: Tensor, draws: Tensor) -> Tensor:
         >>> marginal_scores(torch.tensor([1.0, 1.5, 4.0]), draws)
         tensor([0.0000, 0.2500, 2.5000], dtype=torch.float64)
     """
-    theta, draws = theta.double().contiguous(), draws.double().sort().values
+    theta, draws = theta.double().contiguous(), _ordered(draws)
     last = draws.shape[-1] - 1
     left = torch.searchsorted(draws, theta)
     right = torch.searchsorted(draws, theta, right=True)
@@ -194,10 +194,15 @@ def marginal_ends(scores: Tensor, draws: Tensor) -> tuple[Tensor, Tensor]:
         (tensor([ 0.5000, -2.0000], dtype=torch.float64),
          tensor([1.5000, 4.0000], dtype=torch.float64))
     """
-    draws = draws.double().sort().values
+    draws = _ordered(draws)
     return _quantile(draws, (1 - scores.double()) / 2), _quantile(
         draws, (1 + scores.double()) / 2
     )
+
+
+def _ordered(draws: Tensor) -> Tensor:
+    """Return draws in order; torch searches rows that are contiguous without a copy."""
+    return draws.double().contiguous().sort().values
 
 
 def _quantile(draws: Tensor, probability: Tensor) -> Tensor:
@@ -215,9 +220,7 @@ def _quantile(draws: Tensor, probability: Tensor) -> Tensor:
     return inside + torch.where(beyond.isinf(), beyond, beyond * reach)
 
 
-def is_held(
-    scores: Tensor, fold: Tensor, at_theta: Tensor, *, level: float
-) -> Tensor:
+def is_held(scores: Tensor, fold: Tensor, at_theta: Tensor, *, level: float) -> Tensor:
     """Tell which parameters are in a set with a guarantee; see this module.
 
     Args:

@@ -11,7 +11,12 @@ from sbi_rope.errors import SamplingError
 from sbi_rope.metrics.calibration import central_levels, count_ranks
 from sbi_rope.metrics.calls import draw_chunks
 from sbi_rope.mixture import MixturePosterior
-from sbi_rope.sets.conformal import joint_scores, marginal_scores
+from sbi_rope.sets.conformal import (
+    check_enough,
+    joint_scores,
+    marginal_scores,
+    rank_needed,
+)
 
 __all__ = ["FoldScores", "SetScores", "joined", "one_of_each_group", "score_fold"]
 
@@ -39,6 +44,23 @@ class SetScores:
 
     def __len__(self) -> int:
         return int(self.is_counted.sum())
+
+    def share_held(self, level: float) -> float:
+        """Return the share of pairs in their sets of highest density of a level."""
+        return float((self.joint[self.is_counted] <= level).double().mean())
+
+    def level_needed(self, level: float) -> float:
+        """Return the level of the sets of highest density that a guarantee needs.
+
+        A set with a guarantee is about as large as a set of highest density of this
+        level. Above 1 it reaches further than all draws.
+
+        Raises:
+            InvalidInputError: If there are too few pairs for the level.
+        """
+        check_enough(level, len(self))
+        rank = rank_needed(level, len(self))
+        return float(self.joint[self.is_counted].kthvalue(rank).values)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -9,6 +9,7 @@ from torch import Tensor
 from sbi_rope._progress import is_shown, progress_bar
 from sbi_rope._sbi import ConditionalDensityEstimator, estimator_of, readable
 from sbi_rope._standardisation import warn_of_far_entries
+from sbi_rope._units import log_unit_of
 from sbi_rope._validation import (
     check_batch,
     check_gradients,
@@ -49,7 +50,6 @@ from sbi_rope.stacking.trained_candidates import (
     DiscrepancyCandidate,
     FinetunedCandidate,
 )
-from sbi_rope._units import log_unit_of
 from sbi_rope.stacking.versions import Versions, train_version
 
 __all__ = ["StackTrainer"]
