@@ -166,6 +166,13 @@ def the_stack() -> StackedPosterior:
 
 
 @functools.cache
+def small_stack() -> StackedPosterior:
+    """Return a stack of two candidates that need no training, to be read only."""
+    with torch.random.fork_rng():
+        return stacked(rope_of(), candidates=[PRIOR, NPE])
+
+
+@functools.cache
 def the_coupled_stack() -> StackedPosterior:
     """Return a stack for a batch. Tests share it and must not change it."""
     with torch.random.fork_rng():

@@ -109,7 +109,7 @@ class CredibleSet:
         """
         shape = check_tensor("theta", theta).shape[:-1]
         width = self.draws.shape[1:]
-        rows = theta[None] if theta.ndim == 1 else theta.flatten(0, -2)
+        rows = theta[None] if theta.ndim < 2 else theta.flatten(0, -2)
         rows = check_batch("theta", rows, width).detach().to(self.draws)
         return self.rule.contains(rows).reshape(shape)
 

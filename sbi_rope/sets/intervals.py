@@ -123,8 +123,9 @@ def _bounds(support: Any, like: Tensor) -> tuple[Tensor, Tensor]:
         ends = [_bounds(*one) for one in zip(support.cseq, columns, strict=True)]
         low, high = (torch.cat(some) for some in zip(*ends, strict=True))
         return low, high
+    unknown = (0.0, 1.0) if support is constraints.boolean else (-torch.inf, torch.inf)
     low, high = (
         torch.as_tensor(getattr(support, name, end)).to(like).expand_as(like)
-        for name, end in (("lower_bound", -torch.inf), ("upper_bound", torch.inf))
+        for name, end in zip(("lower_bound", "upper_bound"), unknown, strict=True)
     )
     return low, high
