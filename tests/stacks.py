@@ -167,9 +167,12 @@ def the_stack() -> StackedPosterior:
 
 @functools.cache
 def small_stack() -> StackedPosterior:
-    """Return a stack of two candidates that need no training, to be read only."""
+    """Return a stack of three candidates, the last of which depends on the pairs.
+
+    Tests share it and must not change it.
+    """
     with torch.random.fork_rng():
-        return stacked(rope_of(), candidates=[PRIOR, NPE])
+        return stacked(rope_of(), candidates=[PRIOR, NPE, FITTED])
 
 
 @functools.cache

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from sbi.utils import within_support
 from torch import Tensor
 
 from sbi_rope._sbi import MixedDensity
@@ -23,7 +22,7 @@ from sbi_rope.sets.conformal import (
     rank_needed,
 )
 from sbi_rope.sets.intervals import bounds_of
-from sbi_rope.stacking.cross_validation import CrossValidation, fold_weights
+from sbi_rope.stacking.cross_validation import CrossValidation
 from sbi_rope.stacking.held_out import SetScores
 from sbi_rope.stacking.versions import Versions
 
@@ -54,13 +53,15 @@ class HeldOutRule:
     level: float
 
     def contains(self, theta: Tensor) -> Tensor:
-        """Return whether parameters ``(n, d)`` are in the set, shape ``(n,)``."""
+        """Return whether parameters ``(n, d)`` are in the set, shape ``(n,)``.
+
+        Those outside the prior's support have infinite scores, and are not.
+        """
         log_probs = [
             posterior.log_prob(theta, x=self.x) for posterior in self.posteriors
         ]
         at_theta = joint_scores(torch.stack(log_probs), self.draws)
-        held = is_held(self.scores, self.fold, at_theta, level=self.level)
-        return held & within_support(self.posteriors[0].prior, theta).reshape(-1)
+        return is_held(self.scores, self.fold, at_theta, level=self.level)
 
 
 class HeldOutSets:
@@ -93,9 +94,11 @@ class HeldOutSets:
         scores, guarantee = self._scores(level)
         counted = scores.is_counted
         _check_finite(scores.joint[counted], level)
-        posteriors = self._posteriors()
+        # First, because the stack keeps the masses that the stacks without a fold need.
+        theta, log_density = self._spread(x, num_samples)
+        posteriors = self._posteriors(scores)
         draws = [
-            posterior.log_prob(self._sample(posterior, x), x=x)
+            posterior.log_prob(_sample(posterior, x, scores), x=x)
             for posterior in posteriors
         ]
         rule = HeldOutRule(
@@ -106,7 +109,6 @@ class HeldOutSets:
             fold=self._validation.fold[counted].to(x.device),
             level=level,
         )
-        theta, log_density = self._spread(x, num_samples)
         return CredibleSet.of(
             rule,
             theta,
@@ -127,9 +129,9 @@ class HeldOutSets:
         """
         scores, guarantee = self._scores(level)
         low, high = [], []
-        for number, posterior in enumerate(self._posteriors()):
+        for number, posterior in enumerate(self._posteriors(scores)):
             rows = scores.is_counted & (self._validation.fold == number)
-            draws = self._sample(posterior, x)
+            draws = _sample(posterior, x, scores)
             ends = marginal_ends(scores.marginal[rows].T.to(draws.device), draws.T)
             low.append(ends[0].T)
             high.append(ends[1].T)
@@ -158,27 +160,20 @@ class HeldOutSets:
         )
         return scores, guarantee
 
-    def _posteriors(self) -> tuple[MixturePosterior, ...]:
+    def _posteriors(self, scores: SetScores) -> tuple[MixturePosterior, ...]:
         """Return the stack that has not seen each fold."""
-        known, versions = self._validation, self._versions
-        weights = fold_weights(known.log_scores, known.fold, known.pseudo_count)
+        versions = self._versions
         # The first part is that of the couplings, and the same in all folds.
         is_shared = versions.couplings is not None and 0 in self._masses
         return tuple(
             MixturePosterior(
-                versions.estimator(weights[number], [number]),
+                versions.estimator(weights, [number]),
                 self._posterior.prior,
                 enable_transform=False,
                 shared={0: self._masses[0]} if is_shared else None,
             )
-            for number in range(known.num_folds)
+            for number, weights in enumerate(scores.weights)
         )
-
-    def _sample(self, posterior: MixturePosterior, x: Tensor) -> Tensor:
-        """Draw as often as for the scores of the pairs."""
-        scores = self._validation.set_scores
-        assert scores is not None
-        return posterior.sample((scores.num_draws,), x=x, show_progress_bars=False)
 
     def _spread(self, x: Tensor, num_samples: int) -> tuple[Tensor, Tensor]:
         r"""Return draws that reach further than the stack, and their log density.
@@ -213,6 +208,11 @@ class HeldOutSets:
             ]
         )
         return theta, terms.logsumexp(dim=0) - math.log(len(terms))
+
+
+def _sample(posterior: MixturePosterior, x: Tensor, scores: SetScores) -> Tensor:
+    """Draw as often as for the scores of the pairs."""
+    return posterior.sample((scores.num_draws,), x=x, show_progress_bars=False)
 
 
 def _stretched(theta: Tensor, centre: Tensor, *, by: float) -> Tensor:

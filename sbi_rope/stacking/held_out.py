@@ -34,12 +34,14 @@ class SetScores:
             :func:`sbi_rope.sets.conformal.marginal_scores`.
         is_counted: The pairs that count, shape ``(n,)``. Those with the same parameters
             are not exchangeable one by one. One of them counts, chosen at random.
+        weights: The weights of the stack that scored each fold, shape ``(F, K)``.
         num_draws: The number of draws that the scores were computed from.
     """
 
     joint: Tensor
     marginal: Tensor
     is_counted: Tensor
+    weights: Tensor
     num_draws: int
 
     def __len__(self) -> int:

@@ -224,6 +224,7 @@ class StackTrainer:
                 joint=of_stack.joint,
                 marginal=of_stack.marginal,
                 is_counted=one_of_each_group(self.bench.groups, seed=self.seeds[2]),
+                weights=weights,
                 num_draws=NUM_SAMPLES,
             ),
             pseudo_count=self.pseudo_count,

@@ -93,7 +93,7 @@ def test_weights_that_have_seen_the_labels_cost_no_coverage(n: int) -> None:
     mixing = torch.randn(NUM_READINGS, DIM).double()
     found = torch.tensor([holds(n, mixing) for _ in range(2000)]).double()
     stack, equal, plain = found.mean(dim=0).tolist()
-    print(f"n={n}: stack {stack:.3f}, equal weights {equal:.3f}, plain {plain:.3f}")
-    assert stack > 0.9
-    assert abs(stack - equal) < 0.02
-    assert plain < 0.88
+    # `docs/howto/guaranteed_sets.md` states these numbers.
+    assert 0.905 < stack < 0.945
+    assert abs(stack - equal) < 0.01
+    assert 0.78 < plain < 0.88

@@ -312,10 +312,18 @@ def test_a_guaranteed_set_is_that_of_counting_the_held_out_scores(
     log_prob = torch.stack([one.log_prob(theta, x=x) for one in rule.posteriors])
     at_theta = joint_scores(log_prob, rule.draws)
     assert rule.draws.shape == (5, 40)
+    known = stack.report.cross_validation
+    weights = fold_weights(known.log_scores, known.fold, known.pseudo_count)
+    near = (theta.abs() <= 1).all(dim=1)
+    for number in range(5):
+        each = stack.versions.log_probs(theta, x.expand(200, -1), [number])
+        expected = (each + weights[number].log()).logsumexp(dim=1)
+        # The posterior of a fold is normalised inside the prior's support.
+        difference = (log_prob[number] - expected)[near]
+        assert difference.std() < 1e-4
     held = held_by_counting(rule.scores, rule.fold, at_theta, 0.8)
-    inside = (theta.abs() <= 1).all(dim=1)
     assert 0 < sum(held) < len(held)
-    assert found.contains(theta).tolist() == (torch.tensor(held) & inside).tolist()
+    assert found.contains(theta).tolist() == (torch.tensor(held) & near).tolist()
     box = float(found.contains(theta).double().mean()) * 2.2**2
     assert abs(found.volume - box) < 4 * found.volume_error + 0.5
 
