@@ -4,7 +4,6 @@ import math
 from typing import TYPE_CHECKING
 
 from sbi_rope.metrics.calibration import ACAUC_IN_WORDS
-from sbi_rope.sets.conformal import rank_needed
 from sbi_rope.stacking.cross_validation import Difference
 
 if TYPE_CHECKING:
@@ -132,14 +131,13 @@ def sets_held(report: "StackingReport") -> tuple[float, str] | None:
 
     It is None if there are too few pairs for a guarantee at :data:`LEVEL`.
     """
-    scores = report.cross_validation.set_scores
-    if scores is None or rank_needed(LEVEL, len(scores)) > len(scores):
+    if report.joint_sets is None:
         return None
-    needed = scores.level_needed(LEVEL)
+    share, needed = report.joint_sets
     size = f"about as large as {needed:.0%} sets"
     if needed > ALL:
         size = "larger than what almost all draws of the stack fill"
-    return scores.share_held(LEVEL), size
+    return share, size
 
 
 def _assumption(report: "StackingReport") -> list[str]:

@@ -26,6 +26,7 @@ from sbi_rope.sets.conformal import (
     rank_needed,
 )
 from sbi_rope.sets.intervals import bounds_of
+from sbi_rope.stacking import StackingReport
 from sbi_rope.stacking.cross_validation import fold_weights
 from tests import gaussian, problems, stacks
 
@@ -405,7 +406,7 @@ def with_impossible_labels(stack: StackedPosterior, count: int) -> StackedPoster
 def with_scores(stack: StackedPosterior, scores: Any) -> StackedPosterior:
     known = replace(stack.report.cross_validation, set_scores=scores)
     changed = pickle.loads(pickle.dumps(stack))
-    changed.report = replace(stack.report, cross_validation=known)
+    changed.report = StackingReport.of(known)
     return changed
 
 
