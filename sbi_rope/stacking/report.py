@@ -55,9 +55,9 @@ class StackingReport:
         acauc: ACAUC of the stack's central intervals.
         coverage_error: Expected coverage error of the stack's central intervals.
         share_inside: Share of the parameters inside their 90 % intervals.
-        joint_sets: Share of the pairs whose parameters are in their 90 % sets of highest
-            density, and the level of the sets of highest density that are as large as
-            those of 90 % with a guarantee. None if there are too few pairs for it.
+        joint_sets: Share of the pairs that are in their 90 % sets of highest density,
+            and the level of such sets that are as large as those of 90 % with a
+            guarantee. None if there are too few pairs for it.
         batch: How the batch of the stack compares with the observations of the pairs;
             None without a batch, or with fewer than five of either.
         discrepancy: What the pairs say about each entry of x. None if the stack has no
