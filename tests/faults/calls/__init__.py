@@ -62,6 +62,7 @@ NOT_CALLED = {
             "LearningCurve",
             "ParameterDistribution",
             "Provenance",
+            "SetScores",
             "StackingReport",
             "StackingReport.of",
             "StackingWeights",
