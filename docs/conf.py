@@ -32,7 +32,9 @@ exclude_patterns = ["_build", "**/sbi-logs"]
 nitpicky = True
 OTHERS = r"(abc|collections|os|pathlib|sbi|torch)\..*|Figure|DirectPosterior"
 # What signatures name and users never make themselves.
-INSIDE = r"sbi_rope\.(_.*|.*\.(KeptEmbeddings|StartingNPE|Term|Versions)|tasks\..*)"
+INSIDE = (
+    r"sbi_rope\.(_.*|.*\.(KeptEmbeddings|Rule|StartingNPE|Term|Versions)|tasks\..*)"
+)
 nitpick_ignore_regex = [("py:.*", f"{OTHERS}|{INSIDE}")]
 
 myst_enable_extensions = ["dollarmath", "colon_fence"]

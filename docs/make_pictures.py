@@ -85,6 +85,12 @@ def one_observation(npe: Any, posterior: Any, theta: Tensor, x: Tensor) -> "Figu
     return plots.pair_plot(samples, theta[SHOWN], parameter_names=NAMES)
 
 
+def guaranteed_sets(posterior: Any, theta: Tensor, x: Tensor) -> "Figure":
+    """Draw the credible set of an observation, and that with a guarantee."""
+    names = ("red", "green", "blue", "angle")
+    return plots.credible_set(posterior, x, theta, parameter_names=names)
+
+
 def gammas(rope: RoPE, theta: Tensor, x_o: Tensor) -> "Figure":
     """Draw posteriors of one observation at several gammas."""
     values = (1.0, 0.1, 0.02)
@@ -159,6 +165,7 @@ def main() -> None:
     save(overconfident(npe, posterior, theta_o, x_o), "overconfident")
     pair = (theta_o[OBSERVED], x_o[OBSERVED : OBSERVED + 1])
     save(one_observation(npe, posterior, *pair), "one_observation")
+    save(guaranteed_sets(posterior, *pair), "guaranteed_sets")
 
 
 if __name__ == "__main__":

@@ -166,6 +166,16 @@ def the_stack() -> StackedPosterior:
 
 
 @functools.cache
+def small_stack() -> StackedPosterior:
+    """Return a stack of three candidates, the last of which depends on the pairs.
+
+    Tests share it and must not change it.
+    """
+    with torch.random.fork_rng():
+        return stacked(rope_of(), candidates=[PRIOR, NPE, FITTED])
+
+
+@functools.cache
 def the_coupled_stack() -> StackedPosterior:
     """Return a stack for a batch. Tests share it and must not change it."""
     with torch.random.fork_rng():

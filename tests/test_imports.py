@@ -29,8 +29,9 @@ LAYERS = [
     {"errors", "_progress", "_processes", "_slices"},
     # They raise errors: of seeds, of files and of functions that cannot be pickled.
     {"_random", "_files", "_pickling"},
-    # They raise errors and warn: of arguments, and of a training that goes wrong.
-    {"_validation", "_training"},
+    # They raise errors and warn: of arguments, and of a training that goes wrong. Units
+    # are estimated from draws with a seed.
+    {"_validation", "_training", "_units"},
     # sbi's trainer is told by `_training` which simulations to hold out together.
     {"_sbi"},
     # Each works on embeddings or posteriors, which `_sbi` takes out of an estimator.
@@ -45,6 +46,7 @@ LAYERS = [
         "_simulations",
         "_standardisation",
         "_two_sample",
+        "sets",
     },
     # A mixture has the couplings of a batch as weights. A simulator is a source of
     # simulations like stored ones.

@@ -21,6 +21,7 @@ __all__ = [
     "check_gradients",
     "check_instance",
     "check_integer",
+    "check_level",
     "check_mapping",
     "check_names",
     "check_not_negative",
@@ -141,6 +142,14 @@ def check_unit_interval(name: str, value: Any) -> None:
     """Raise unless ``value`` is a number in [0, 1]."""
     if not _is_number(value) or not 0.0 <= value <= 1.0:
         raise InvalidInputError(f"Expected `{name}` in [0, 1]; got {shown(value)}.")
+
+
+def check_level(name: str, value: Any) -> None:
+    """Raise unless ``value`` is a number between 0 and 1, which it must not be."""
+    if not _is_number(value) or not 0.0 < value < 1.0:
+        raise InvalidInputError(
+            f"Expected `{name}` above 0 and below 1, such as 0.9; got {shown(value)}."
+        )
 
 
 def check_integer(

@@ -14,7 +14,7 @@ package, is called as it is.
 """
 
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import torch
@@ -45,6 +45,7 @@ __all__ = [
     "CHUNK_SIZE",
     "check_num_samples",
     "check_test_set",
+    "draw_chunks",
     "draw_joint_levels",
     "draw_ranks",
     "draw_samples",
@@ -143,11 +144,24 @@ def draw_ranks(
     show: bool,
 ) -> Tensor:
     """Return the mid-ranks of true parameters among samples, shape ``(n, d)``."""
-    parts = []
+    chunks = draw_chunks(
+        posterior, theta, x, num_samples=num_samples, chunk_size=chunk_size, show=show
+    )
+    return torch.cat([count_ranks(samples, theta[rows]) for rows, samples in chunks])
+
+
+def draw_chunks(
+    posterior: Any,
+    theta: Tensor,
+    x: Tensor,
+    *,
+    num_samples: int,
+    chunk_size: int,
+    show: bool,
+) -> Iterator[tuple[slice, Tensor]]:
+    """Yield samples of some observations at a time, ``(num_samples, rows, d)``."""
     for rows in _chunks(theta.shape[0], chunk_size, "Drawing samples", show=show):
-        samples = _draw(posterior, theta, x, rows, num_samples)
-        parts.append(count_ranks(samples, theta[rows]))
-    return torch.cat(parts)
+        yield rows, _draw(posterior, theta, x, rows, num_samples)
 
 
 def draw_joint_levels(
@@ -165,8 +179,10 @@ def draw_joint_levels(
     """
     _require_log_prob(posterior)
     parts = []
-    for rows in _chunks(theta.shape[0], chunk_size, "Drawing samples", show=show):
-        samples = _draw(posterior, theta, x, rows, num_samples)
+    chunks = draw_chunks(
+        posterior, theta, x, num_samples=num_samples, chunk_size=chunk_size, show=show
+    )
+    for rows, samples in chunks:
         draws = torch.cat([theta[rows].unsqueeze(0).to(samples), samples])
         densities = torch.cat(
             [

@@ -12,12 +12,14 @@ from sbi_rope.plots.diagnostics import (
 )
 from sbi_rope.plots.observations import real_and_simulated
 from sbi_rope.plots.posteriors import pair_plot
+from sbi_rope.plots.sets import credible_set
 from sbi_rope.plots.stacking import stacking_report
 from sbi_rope.plots.steps import overview
 from sbi_rope.plots.summaries import discrepancy
 
 __all__ = [
     "calibration_curves",
+    "credible_set",
     "discrepancy",
     "effective_sample_sizes",
     "finetuning_history",

@@ -9,6 +9,7 @@ from sbi_rope.plots import calibration_curves, discrepancy, implied_parameters
 from sbi_rope.reports.numbers import number, percent
 from sbi_rope.reports.page import finding, paragraph, picture, section, table
 from sbi_rope.stacking import StackingReport
+from sbi_rope.stacking.words import LEVEL, sets_held
 
 __all__ = ["calibration_section", "diagnosis_section", "discrepancy_section"]
 
@@ -52,6 +53,7 @@ def calibration_section(report: StackingReport, names: Sequence[str]) -> str:
             f"has about {number(0.31 / n**0.5, digits=3)} with {n} pairs.",
             kind="note",
         ),
+        *_sets(report),
         picture(
             drawn,
             caption="The share of known parameters inside intervals of each level. "
@@ -59,6 +61,21 @@ def calibration_section(report: StackingReport, names: Sequence[str]) -> str:
             "holds 95 % of the curves of calibrated posteriors.",
         ),
     )
+
+
+def _sets(report: StackingReport) -> list[str]:
+    held = sets_held(report)
+    if held is None:
+        return []
+    share, size = held
+    return [
+        paragraph(
+            f"{percent(LEVEL)} sets of all parameters together held those of "
+            f"{percent(share)} of the measurements. Sets that are guaranteed to hold "
+            f"about {percent(LEVEL)} are {size}.",
+            kind="note",
+        )
+    ]
 
 
 def _row(

@@ -7,6 +7,7 @@ from sbi_rope.stacking.candidates import (
 )
 from sbi_rope.stacking.cross_validation import CrossValidation, Difference
 from sbi_rope.stacking.defaults import default_candidates
+from sbi_rope.stacking.held_out import SetScores
 from sbi_rope.stacking.learning_curve import LearningCurve
 from sbi_rope.stacking.posterior import StackedPosterior
 from sbi_rope.stacking.provenance import Provenance
@@ -28,6 +29,7 @@ __all__ = [
     "FinetunedCandidate",
     "LearningCurve",
     "Provenance",
+    "SetScores",
     "StackedPosterior",
     "StackingReport",
     "StackingWeights",

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from sbi_rope._validation import check_choice
 from sbi_rope.metrics import CoverageCurve, coverage_curve_of
+from sbi_rope.stacking.held_out import SetScores
 from sbi_rope.stacking.weights import StackingWeights, stacking_weights
 
 __all__ = ["CrossValidation", "Difference"]
@@ -68,6 +69,8 @@ class CrossValidation:
         log_unit: The sum of the logs of the prior's standard deviations; NaN if it is
             unknown. Scores with theta in these units are higher by this number. With
             partial labels, the mean over pairs of the sum over measured parameters.
+        set_scores: The scores that sets with a guarantee are made from; None in files
+            of earlier versions, and if labels are not exact.
         pair_weights: How many pairs each pair counts as, shape ``(n,)``; None if all
             count as one.
         score_errors: The Monte-Carlo errors of ``stack_scores``, if labels are not
@@ -91,6 +94,7 @@ class CrossValidation:
     pair_weights: Tensor | None = field(default=None, repr=False)
     score_errors: Tensor | None = field(default=None, repr=False)
     labels: str = ""
+    set_scores: SetScores | None = field(default=None, repr=False)
 
     def __len__(self) -> int:
         return len(self.fold)

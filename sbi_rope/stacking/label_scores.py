@@ -11,9 +11,10 @@ from sbi_rope.metrics.calibration import central_levels, count_ranks
 from sbi_rope.metrics.calls import draw_samples
 from sbi_rope.mixture import MixtureEstimator, MixturePosterior
 from sbi_rope.stacking.folds import Workbench
+from sbi_rope.stacking.held_out import FoldScores, explained
 from sbi_rope.stacking.versions import Versions
 
-__all__ = ["LabelScores", "label_levels", "score_labels"]
+__all__ = ["LabelScores", "label_levels", "score_labelled_fold", "score_labels"]
 
 # Samples of each candidate at each observation, from which nodes are placed.
 NUM_SAMPLES = 200
@@ -85,6 +86,49 @@ def _references(versions: Versions, x: Tensor, number: int) -> list[Reference]:
         estimators.append(MixtureEstimator([versions.couplings.part], [1.0]))
     size = torch.Size((NUM_SAMPLES,))
     return [reference_of(estimator.sample(size, x)) for estimator in estimators]
+
+
+@torch.no_grad()
+def score_labelled_fold(
+    posterior: MixturePosterior,
+    scores: LabelScores,
+    weights: Tensor,
+    labels: Labels,
+    x: Tensor,
+    *,
+    num_samples: int,
+    seed: int,
+) -> FoldScores:
+    """Score the posterior of a fold at labels that are not exact.
+
+    Args:
+        posterior: A posterior that has not seen the labels.
+        scores: The densities of its candidates at the labels.
+        weights: The weights of the candidates, shape ``(K,)``.
+        labels: The labels.
+        x: Their observations, shape ``(n, *event)``.
+        num_samples: The number of draws for each label.
+        seed: Seed of the draws.
+
+    Returns:
+        The scores. Those of sets are NaN: a set that holds a label need not hold the
+        parameters.
+
+    Raises:
+        SamplingError: If the posterior has almost no mass inside the prior's support.
+    """
+    log_prob, errors = scores.of_stack(weights)
+    with explained(), seeded(seed):
+        log_mass = posterior.leakage_correction(x).double().log()
+        levels = label_levels(posterior, labels, x, num_samples=num_samples)
+    unknown = torch.full_like(labels.theta, torch.nan)
+    return FoldScores(
+        log_prob=log_prob - log_mass,
+        levels=levels,
+        joint=unknown[:, 0],
+        marginal=unknown,
+        errors=errors,
+    )
 
 
 def label_levels(

@@ -12,6 +12,7 @@ from sbi_rope._sbi import describe
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture import MixturePosterior
 from sbi_rope.mixture.sharing import share_equal_tensors
+from sbi_rope.stacking.guaranteed import HeldOutSets
 from sbi_rope.stacking.report import StackingReport
 from sbi_rope.stacking.versions import Versions
 
@@ -118,6 +119,17 @@ class StackedPosterior(MixturePosterior):
                 contain an x, and ``unseen="raise"``.
         """
         return self.versions.log_probs(theta, self._batch_of_x(x))
+
+    def _held_out_sets(self) -> HeldOutSets:
+        if self._versions is None:
+            raise InvalidInputError(
+                "Expected the posterior of the whole batch for a set with a guarantee, "
+                "because it needs the candidates one by one; got that of a single "
+                "observation. Use `posterior.credible_set(x=x_o[i], guaranteed=True)` "
+                "instead of `posterior[i].credible_set(guaranteed=True)`, and the same "
+                "for `credible_intervals`."
+            )
+        return HeldOutSets(self, self._versions, self._cache)
 
     def __getitem__(self, index: int) -> "StackedPosterior":
         """Return the posterior of one observation, which is then the default x.

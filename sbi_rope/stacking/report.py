@@ -18,7 +18,9 @@ from sbi_rope.metrics import (
     acauc_of,
     expected_coverage_error_of,
 )
+from sbi_rope.sets.conformal import rank_needed
 from sbi_rope.stacking.cross_validation import CrossValidation, Difference
+from sbi_rope.stacking.held_out import SetScores
 from sbi_rope.stacking.learning_curve import LearningCurve
 from sbi_rope.stacking.provenance import Provenance
 from sbi_rope.stacking.words import LEVEL, REFERENCES, lines_of
@@ -54,6 +56,9 @@ class StackingReport:
         acauc: ACAUC of the stack's central intervals.
         coverage_error: Expected coverage error of the stack's central intervals.
         share_inside: Share of the parameters inside their 90 % intervals.
+        joint_sets: Share of the pairs that are in their 90 % sets of highest density,
+            and the level of such sets that are as large as those of 90 % with a
+            guarantee. None if there are too few pairs for it.
         batch: How the batch of the stack compares with the observations of the pairs;
             None without a batch, or with fewer than five of either.
         discrepancy: What the pairs say about each entry of x. None if the stack has no
@@ -71,6 +76,7 @@ class StackingReport:
     coverage_error: CoverageErrorScore
     share_inside: float
     score_z: tuple[float, float]
+    joint_sets: tuple[float, float] | None = None
     batch: TwoSampleTest | None = None
     discrepancy: DiscrepancyReport | None = None
     provenance: Provenance | None = None
@@ -115,6 +121,7 @@ class StackingReport:
             acauc=acauc_of(levels, allow_missing=partial),
             coverage_error=expected_coverage_error_of(levels, allow_missing=partial),
             share_inside=float((known <= LEVEL).double().mean()),
+            joint_sets=_joint_sets(scores.set_scores),
             batch=batch,
             discrepancy=discrepancy,
             provenance=provenance,
@@ -196,6 +203,12 @@ class StackingReport:
 
     def __str__(self) -> str:
         return "\n".join(lines_of(self))
+
+
+def _joint_sets(scores: SetScores | None) -> tuple[float, float] | None:
+    if scores is None or rank_needed(LEVEL, len(scores)) > len(scores):
+        return None
+    return scores.share_held(LEVEL), scores.level_needed(LEVEL)
 
 
 def _family_weights(scores: CrossValidation) -> dict[str, float]:

@@ -1,16 +1,15 @@
 """Train the candidates of a stack and score them, fold by fold."""
 
-import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from sbi_rope._progress import is_shown, progress_bar
-from sbi_rope._random import seeded
 from sbi_rope._sbi import ConditionalDensityEstimator, estimator_of, readable
 from sbi_rope._standardisation import warn_of_far_entries
+from sbi_rope._units import log_units_of
 from sbi_rope._validation import (
     check_batch,
     check_gradients,
@@ -25,12 +24,9 @@ from sbi_rope.discrepancy.correction import network_of
 from sbi_rope.errors import (
     InvalidInputError,
     NotReadyError,
-    SamplingError,
     UnsupportedPosteriorError,
     warn_user,
 )
-from sbi_rope.metrics.calibration import central_levels
-from sbi_rope.metrics.calls import draw_ranks
 from sbi_rope.mixture import MixturePosterior
 from sbi_rope.rope import RoPE
 from sbi_rope.stacking.candidates import (
@@ -43,12 +39,22 @@ from sbi_rope.stacking.couplings import FittedCouplings, fit_couplings
 from sbi_rope.stacking.cross_validation import CrossValidation, fold_weights
 from sbi_rope.stacking.defaults import default_candidates
 from sbi_rope.stacking.folds import NUM_FOLDS, Fold, Workbench, draw_seeds
-from sbi_rope.stacking.label_scores import LabelScores, label_levels, score_labels
+from sbi_rope.stacking.held_out import (
+    FoldScores,
+    SetScores,
+    joined,
+    one_of_each_group,
+    score_fold,
+)
+from sbi_rope.stacking.label_scores import (
+    LabelScores,
+    score_labelled_fold,
+    score_labels,
+)
 from sbi_rope.stacking.trained_candidates import (
     DiscrepancyCandidate,
     FinetunedCandidate,
 )
-from sbi_rope.stacking.units import log_units_of
 from sbi_rope.stacking.versions import Versions, train_version
 
 __all__ = ["StackTrainer"]
@@ -218,7 +224,7 @@ class StackTrainer:
         weights = fold_weights(
             log_scores, fold, self.pseudo_count, pair_weights=bench.pair_weights
         )
-        stack_scores, errors, levels = self._stack_scores(versions, weights, of_labels)
+        of_stack = self._stack_scores(versions, weights, of_labels)
         num_folds = len(self.bench.folds)
         scores = CrossValidation(
             names=tuple(candidate.name for candidate in self.candidates),
@@ -226,12 +232,13 @@ class StackTrainer:
             log_scores=log_scores,
             fold=fold,
             num_trained_on=len(fold) * num_training_folds // num_folds,
-            stack_scores=stack_scores,
-            levels=levels,
+            stack_scores=of_stack.log_prob,
+            levels=of_stack.levels,
+            set_scores=self._set_scores(of_stack, weights),
             pseudo_count=self.pseudo_count,
             log_unit=self._log_unit(),
             pair_weights=bench.pair_weights,
-            score_errors=errors,
+            score_errors=None if bench.labels.are_exact else of_stack.errors,
             labels="" if bench.labels.are_simple else str(bench.labels),
         )
         if not scores.weights.converged:
@@ -241,6 +248,21 @@ class StackTrainer:
                 "pair. Leave out candidates that are nearly the same."
             )
         return scores
+
+    def _set_scores(self, of_stack: FoldScores, weights: Tensor) -> SetScores | None:
+        """Return what sets with a guarantee are made from; None without exact labels.
+
+        A set that holds a noisy label need not hold the parameters.
+        """
+        if not self.bench.labels.are_exact:
+            return None
+        return SetScores(
+            joint=of_stack.joint,
+            marginal=of_stack.marginal,
+            is_counted=one_of_each_group(self.bench.groups, seed=self.seeds[2]),
+            weights=weights,
+            num_draws=NUM_SAMPLES,
+        )
 
     def _log_unit(self) -> float:
         """Return by how much scores are higher in the prior's standard deviations."""
@@ -286,8 +308,8 @@ class StackTrainer:
         versions: Versions,
         weights: Tensor,
         of_labels: Sequence[LabelScores] | None,
-    ) -> tuple[Tensor, Tensor | None, Tensor]:
-        """Return the normalised score of the stack at each pair, and the levels.
+    ) -> FoldScores:
+        """Return the scores of the stack at each pair, normalised in the support.
 
         Args:
             versions: The candidates.
@@ -300,12 +322,10 @@ class StackTrainer:
         """
         bench = self.bench
         theta, x = bench.theta, bench.x
-        stack_scores = theta.new_empty(len(theta), dtype=torch.double)
-        errors = None if of_labels is None else torch.empty_like(stack_scores)
-        levels = torch.empty_like(theta)
         # The couplings are the first part, and have the same simulations in all folds.
         # The mass of the other parts inside the prior can differ from fold to fold.
         masses: dict[int, Tensor] = {}
+        of_folds = []
         for number, rows in enumerate(bench.folds):
             shared = dict(masses)
             posterior = MixturePosterior(
@@ -314,59 +334,28 @@ class StackTrainer:
                 enable_transform=False,
                 shared=shared,
             )
-            if of_labels is None or errors is None:
-                log_prob, ranks = self._normalised(posterior, theta[rows], x[rows])
-                stack_scores[rows] = log_prob.double()
-                levels[rows] = central_levels(ranks).to(levels)
+            if of_labels is None:
+                scores = score_fold(
+                    posterior,
+                    theta[rows],
+                    x[rows],
+                    num_samples=NUM_SAMPLES,
+                    seed=self.seeds[2],
+                )
             else:
-                score, errors[rows] = of_labels[number].of_stack(weights[number])
-                log_mass, levels[rows] = self._at_labels(posterior, rows)
-                stack_scores[rows] = score - log_mass
+                scores = score_labelled_fold(
+                    posterior,
+                    of_labels[number],
+                    weights[number],
+                    bench.labels[rows],
+                    x[rows],
+                    num_samples=NUM_SAMPLES,
+                    seed=self.seeds[2],
+                )
+            of_folds.append(scores)
             if versions.couplings is not None and 0 in shared:
                 masses[0] = shared[0]
-        return stack_scores, errors, levels
-
-    def _at_labels(
-        self, posterior: MixturePosterior, rows: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return the log mass inside the prior's support, and the levels of labels."""
-        bench = self.bench
-        with _explained(), seeded(self.seeds[2]):
-            log_mass = posterior.leakage_correction(bench.x[rows]).double().log()
-            levels = label_levels(
-                posterior, bench.labels[rows], bench.x[rows], num_samples=NUM_SAMPLES
-            )
-        return log_mass, levels
-
-    def _normalised(
-        self, posterior: MixturePosterior, theta: Tensor, x: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return log densities, normalised inside the prior's support, and ranks."""
-        with _explained():
-            log_prob = posterior.log_prob_batched(theta[None], x)[0]
-            with seeded(self.seeds[2]):
-                ranks = draw_ranks(
-                    posterior,
-                    theta,
-                    x,
-                    num_samples=NUM_SAMPLES,
-                    chunk_size=NUM_SAMPLES,
-                    show=False,
-                )
-        return log_prob, ranks
-
-
-@contextlib.contextmanager
-def _explained() -> Iterator[None]:
-    """Say what to do if a stack has hardly any mass inside the prior's support."""
-    try:
-        yield
-    except SamplingError as error:
-        raise SamplingError(
-            "A stack of these candidates has almost no mass inside the support of "
-            "the prior at a held-out observation, so that it cannot be sampled. "
-            "Add the prior to the candidates: `default_candidates()` contains it."
-        ) from error
+        return joined(of_folds, bench.folds)
 
 
 def _check_pairs(count: int) -> None:

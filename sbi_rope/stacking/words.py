@@ -9,12 +9,14 @@ from sbi_rope.stacking.cross_validation import Difference
 if TYPE_CHECKING:
     from sbi_rope.stacking.report import StackingReport
 
-__all__ = ["IN_WORDS", "LEVEL", "REFERENCES", "compared", "lines_of"]
+__all__ = ["IN_WORDS", "LEVEL", "REFERENCES", "compared", "lines_of", "sets_held"]
 
 # The text says that a stack is mostly one method if this has half of the weight.
 MOSTLY = 0.5
 # The share of parameters inside intervals is stated at this level.
 LEVEL = 0.9
+# Sets of a higher level are not told apart from those that hold all draws.
+ALL = 0.995
 # A difference of less than this, in nats a pair, is called slight: 10 % of the density.
 SLIGHT = 0.1
 
@@ -124,8 +126,35 @@ def _calibration(report: "StackingReport") -> list[str]:
         f"    coverage error {report.coverage_error.value:.3f}; a calibrated posterior "
         f"has about {0.31 / n**0.5:.3f} with {n} pairs",
         f"    {LEVEL:.0%} intervals hold {report.share_inside:.0%} of the parameters",
+        *_sets(report),
         *_assumption(report),
     ]
+
+
+def _sets(report: "StackingReport") -> list[str]:
+    held = sets_held(report)
+    if held is None:
+        return []
+    share, size = held
+    return [
+        f"    {LEVEL:.0%} sets of all parameters hold {share:.0%} of the pairs; with a "
+        "guarantee,",
+        f"    `posterior.credible_set({LEVEL}, x, guaranteed=True)`, they are {size}",
+    ]
+
+
+def sets_held(report: "StackingReport") -> tuple[float, str] | None:
+    """Return the share of pairs in their sets, and the size of those with a guarantee.
+
+    It is None if there are too few pairs for a guarantee at :data:`LEVEL`.
+    """
+    if report.joint_sets is None:
+        return None
+    share, needed = report.joint_sets
+    size = f"about as large as {needed:.0%} sets"
+    if needed > ALL:
+        size = "larger than what almost all draws of the stack fill"
+    return share, size
 
 
 def _assumption(report: "StackingReport") -> list[str]:

@@ -140,6 +140,15 @@ def test_the_page_holds_the_numbers_of_the_report(source: str) -> None:
         assert str(summary.shift) in text
 
 
+def test_the_page_says_how_large_sets_with_a_guarantee_are(source: str) -> None:
+    scores = the_stack().report.cross_validation.set_scores
+    assert scores is not None
+    text = Page(source).text
+    share = percent(scores.share_held(0.9))
+    assert f"90 % sets of all parameters together held those of {share}" in text
+    assert "Sets that are guaranteed to hold about 90 %" in text
+
+
 def test_the_page_says_what_a_diagnosis_found(
     source: str, diagnosis: Diagnosis
 ) -> None:

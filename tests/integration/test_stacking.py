@@ -184,6 +184,16 @@ def test_a_stack_of_a_batch_answers_others_only_if_it_extends() -> None:
             call(theta, x)
 
 
+def test_a_stack_of_a_batch_gives_sets_with_a_guarantee() -> None:
+    posterior, x = the_coupled_stack(), observed()[0]
+    found = posterior.credible_set(0.9, x, guaranteed=True, num_samples=40, seed=0)
+    assert found.is_guaranteed
+    assert found.inside.any()
+    with pytest.raises(InvalidInputError, match=r"x=x_o\[i\], guaranteed=True"):
+        posterior[0].credible_set(guaranteed=True)
+    assert posterior[0].credible_set(seed=0).inside.any()
+
+
 def test_the_posterior_of_one_observation_does_not_contain_the_others() -> None:
     posterior = the_coupled_stack()
     view = posterior[3]

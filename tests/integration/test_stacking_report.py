@@ -12,6 +12,7 @@ from torch.distributions import Cauchy, Independent, MultivariateNormal
 
 from sbi_rope import plots
 from sbi_rope._two_sample import TwoSampleTest
+from sbi_rope._units import log_unit_of
 from sbi_rope.errors import RoPEWarning
 from sbi_rope.metrics import LPPScore, acauc_of
 from sbi_rope.stacking import (
@@ -21,7 +22,6 @@ from sbi_rope.stacking import (
     LearningCurve,
     StackingReport,
 )
-from sbi_rope.stacking.units import log_unit_of
 from tests import problems
 from tests.stacks import (
     FITTED,
@@ -314,9 +314,11 @@ def test_printing_a_report_computes_nothing(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_a_cross_validation_holds_only_numbers_and_names() -> None:
-    for value in vars(the_coupled_stack().report.cross_validation).values():
-        assert isinstance(value, torch.Tensor | tuple | int | float) or (
-            type(value).__name__ == "StackingWeights"
+    held = dict(vars(the_coupled_stack().report.cross_validation))
+    held |= vars(held.pop("set_scores"))
+    for value in held.values():
+        assert isinstance(value, torch.Tensor | tuple | int | float | str) or (
+            value is None or type(value).__name__ == "StackingWeights"
         )
 
 

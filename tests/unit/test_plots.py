@@ -11,6 +11,7 @@ from sbi_rope import SinkhornCoupler, plots
 from sbi_rope.discrepancy import DiscrepancyReport, Interval, SummaryDiscrepancy
 from sbi_rope.finetuning import History
 from sbi_rope.metrics import CoverageCurve, coverage_curve_of
+from tests import problems, stacks
 from tests.refusals import assert_refused
 
 pytest.importorskip("matplotlib")
@@ -32,6 +33,30 @@ def ends_of(patch: Any) -> tuple[float, float]:
 
 def two_posteriors() -> dict[str, Tensor]:
     return {"NPE": torch.randn(200, 2), "RoPE": torch.randn(300, 2) + 1.0}
+
+
+def test_a_stack_has_a_credible_set_and_one_with_a_guarantee() -> None:
+    stack, x = stacks.small_stack(), stacks.observed()[0]
+    figure = plots.credible_set(stack, x, torch.zeros(2), num_samples=40)
+    assert len(figure.axes) == 3
+    texts = ["90 %, highest density", "90 %, guaranteed", "truth"]
+    assert legend_texts(figure.legends[0]) == texts
+    intervals = stack.credible_intervals(
+        0.9, x, guaranteed=True, num_samples=40, seed=0
+    )
+    ends = [line.get_xdata()[0] for line in figure.axes[0].lines[2:4]]
+    assert ends == pytest.approx([float(intervals.low[0]), float(intervals.high[0])])
+    # The larger set lies below the other.
+    large, small = (len(one.get_offsets()) for one in figure.axes[1].collections)
+    assert large > small > 0
+
+
+def test_a_posterior_that_is_no_stack_has_the_set_of_highest_density_only() -> None:
+    posterior = problems.gaussian_posterior(dim=1)[0]
+    figure = plots.credible_set(posterior, level=0.5, num_samples=40)
+    assert legend_texts(figure.legends[0]) == ["50 %, highest density"]
+    assert len(figure.axes) == 1
+    assert_refused("MixturePosterior", plots.credible_set, problems.box(2))
 
 
 def test_pair_plot_has_a_panel_for_each_parameter_and_pair() -> None:

@@ -91,6 +91,32 @@ CALLS = [
         accepts=("samples: one row less", "theta: None", *LABELS),
     ),
     Call(
+        name="credible_set",
+        run=lambda x=X_O[0], theta=THETA[0], posterior=None, **options: drawn(
+            plots.credible_set
+        )(
+            stacked() if posterior is None else posterior,
+            x,
+            theta,
+            **{"num_samples": 20, **options},
+        ),
+        tensors={"x": X_O[:1], "theta": THETA[0]},
+        options={
+            "posterior": "instance",
+            "level": "share",
+            "parameter_names": "names",
+            "num_samples": "count",
+            "seed": "seed",
+        },
+        accepts=(
+            "x: a list",
+            "x: a NumPy array",
+            "x: one dimension less",
+            "theta: None",
+            *LABELS,
+        ),
+    ),
+    Call(
         name="implied_parameters",
         run=lambda diagnosis=None: drawn(plots.implied_parameters)(
             diagnosed() if diagnosis is None else diagnosis

@@ -25,6 +25,33 @@ CALLS = [
     ),
 ]
 CALLS += [
+    Call(
+        name="CredibleIntervals.as_rows",
+        run=lambda **options: (
+            stacked().credible_intervals(0.9, X_O[0], seed=0).as_rows(**options)
+        ),
+        options={"parameter_names": "names"},
+        accepts=("parameter_names: ['a', 'a']",),
+    ),
+]
+CALLS += [
+    Call(
+        name=name,
+        run=lambda theta=THETA, guaranteed=guaranteed: (
+            stacked()
+            .credible_set(0.9, X_O[0], guaranteed=guaranteed, num_samples=20, seed=0)
+            .contains(theta)
+            .double()
+        ),
+        tensors={"theta": THETA},
+        accepts=("theta: one row less", "theta: no rows"),
+    )
+    for name, guaranteed in (
+        ("CredibleSet.contains", False),
+        ("CredibleSet.contains(guaranteed)", True),
+    )
+]
+CALLS += [
     call
     for kind, make, x in (
         ("MixturePosterior", posterior, X_O),
@@ -52,6 +79,23 @@ CALLS += [
             options={"max_sampling_batch_size": "count"},
             accepts=("x: a list", "x: a NumPy array", "x: one row less"),
             is_random=True,
+        ),
+        *(
+            Call(
+                name=f"{kind}.{method}",
+                run=lambda x=x[:1], make=make, method=method, **options: getattr(
+                    make(), method
+                )(x=x, **{"num_samples": 20, "seed": 0, **options}),
+                tensors={"x": x[:1]},
+                options={
+                    "level": "share",
+                    "guaranteed": "instance",
+                    "num_samples": "count",
+                    "seed": "seed",
+                },
+                accepts=("x: a list", "x: a NumPy array", "x: one dimension less"),
+            )
+            for method in ("credible_set", "credible_intervals")
         ),
         Call(
             name=f"{kind}.log_prob",

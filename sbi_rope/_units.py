@@ -7,10 +7,15 @@ from torch import Tensor
 
 from sbi_rope._random import seeded
 
-__all__ = ["log_units_of"]
+__all__ = ["log_unit_of", "log_units_of"]
 
 # Draws that the standard deviation is estimated from if the prior does not state it.
 NUM_DRAWS = 10_000
+
+
+def log_unit_of(prior: Any) -> float:
+    """Return the sum of :func:`log_units_of`; NaN if one of them is unknown."""
+    return float(log_units_of(prior).sum())
 
 
 def log_units_of(prior: Any) -> Tensor:

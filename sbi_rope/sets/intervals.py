@@ -1,0 +1,131 @@
+"""An interval for each parameter given one observation."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributions import constraints
+
+from sbi_rope._validation import check_names
+from sbi_rope.sets.guarantee import Guarantee
+
+__all__ = ["CredibleIntervals", "bounds_of", "central_intervals"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CredibleIntervals:
+    """An interval for each parameter given one observation.
+
+    ``posterior.credible_intervals`` makes it. Each interval has the level by itself.
+    All parameters together are inside less often.
+
+    Attributes:
+        low: The lower ends, shape ``(d,)``.
+        high: The upper ends, shape ``(d,)``.
+        level: The level of each interval.
+        guarantee: The guarantee of each interval; None if there is none.
+    """
+
+    low: Tensor = field(repr=False)
+    high: Tensor = field(repr=False)
+    level: float
+    guarantee: Guarantee | None
+
+    @property
+    def is_guaranteed(self) -> bool:
+        """Whether there is a guarantee."""
+        return self.guarantee is not None
+
+    def as_rows(
+        self, parameter_names: Sequence[str] | None = None
+    ) -> list[dict[str, Any]]:
+        """Return a row for each parameter: its name, and the ends of its interval.
+
+        Args:
+            parameter_names: A name for each parameter; "theta_1" and so on if None.
+
+        Raises:
+            InvalidInputError: If the names do not fit.
+        """
+        count = len(self.low)
+        names = [f"theta_{k + 1}" for k in range(count)]
+        if parameter_names is not None:
+            names = check_names("parameter_names", parameter_names, count)
+        ends = zip(names, self.low.tolist(), self.high.tolist(), strict=True)
+        return [{"parameter": name, "low": a, "high": b} for name, a, b in ends]
+
+    def __str__(self) -> str:
+        lines = [
+            f"  {row['parameter']}: {row['low']:.4g} to {row['high']:.4g}"
+            for row in self.as_rows()
+        ]
+        promise = self.guarantee or (
+            "They have no guarantee: they hold the true parameters as often as the "
+            "posterior is calibrated."
+        )
+        return "\n".join(
+            [f"{100 * self.level:.4g} % intervals, one by one:", *lines, str(promise)]
+        )
+
+
+@torch.no_grad()
+def central_intervals(
+    posterior: Any, x: Tensor, *, level: float, num_samples: int
+) -> CredibleIntervals:
+    """Return the central interval of each parameter given one observation.
+
+    Args:
+        posterior: A posterior with ``sample``.
+        x: The observation.
+        level: The probability of each interval under the posterior.
+        num_samples: The number of draws.
+    """
+    draws = posterior.sample((num_samples,), x=x, show_progress_bars=False)
+    ordered = draws.sort(dim=0).values.double()
+    last = num_samples - 1
+    ends = []
+    for probability in ((1 - level) / 2, (1 + level) / 2):
+        # Not by torch.quantile, which refuses more than 16 million draws.
+        start = min(int(probability * last), last - 1)
+        share = probability * last - start
+        ends.append(torch.lerp(ordered[start], ordered[start + 1], share))
+    low, high = (end.to(draws) for end in ends)
+    return CredibleIntervals(low=low, high=high, level=level, guarantee=None)
+
+
+def bounds_of(prior: Any, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the ends of the prior's support, infinite where they are not known.
+
+    Args:
+        prior: A torch distribution over parameters of shape ``(d,)``.
+        like: A tensor of shape ``(d,)``, whose dtype and device the ends get.
+
+    Example:
+        >>> from torch.distributions import Independent, Uniform
+        >>> box = Independent(Uniform(torch.zeros(2), torch.ones(2)), 1)
+        >>> bounds_of(box, torch.zeros(2))
+        (tensor([0., 0.]), tensor([1., 1.]))
+    """
+    try:
+        support = getattr(prior, "support", None)
+    except NotImplementedError:  # torch raises it if a distribution states no support
+        support = None
+    return _bounds(support, like)
+
+
+def _bounds(support: Any, like: Tensor) -> tuple[Tensor, Tensor]:
+    while isinstance(support, constraints.independent):
+        support = support.base_constraint
+    if isinstance(support, constraints.cat):  # of sbi's MultipleIndependent
+        columns = like.split(support.lengths)
+        ends = [_bounds(*one) for one in zip(support.cseq, columns, strict=True)]
+        low, high = (torch.cat(some) for some in zip(*ends, strict=True))
+        return low, high
+    unknown = (0.0, 1.0) if support is constraints.boolean else (-torch.inf, torch.inf)
+    low, high = (
+        torch.as_tensor(getattr(support, name, end)).to(like).expand_as(like)
+        for name, end in zip(("lower_bound", "upper_bound"), unknown, strict=True)
+    )
+    return low, high

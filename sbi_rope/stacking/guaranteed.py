@@ -1,0 +1,238 @@
+"""Sets and intervals of a stack with a guarantee."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sbi_rope._sbi import MixedDensity
+from sbi_rope._units import log_unit_of
+from sbi_rope.errors import InvalidInputError
+from sbi_rope.mixture import MixturePosterior
+from sbi_rope.mixture.prior import prior_log_prob, prior_sample
+from sbi_rope.sets import CredibleIntervals, CredibleSet, Guarantee
+from sbi_rope.sets.conformal import (
+    check_enough,
+    interval_of,
+    is_held,
+    joint_scores,
+    marginal_ends,
+    rank_needed,
+)
+from sbi_rope.sets.intervals import bounds_of
+from sbi_rope.stacking.cross_validation import CrossValidation
+from sbi_rope.stacking.held_out import SetScores
+from sbi_rope.stacking.versions import Versions
+
+__all__ = ["HeldOutSets"]
+
+# How far the draws that a volume is estimated from are moved from their mean.
+STRETCHES = (1.0, 2.0, 4.0)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class HeldOutRule:
+    """The parameters whose scores are not higher than those of most pairs.
+
+    Attributes:
+        posteriors: The stack that has not seen each fold.
+        x: The observation.
+        draws: Log densities of draws of each posterior at x, shape ``(K, M)``.
+        scores: The scores of the pairs that count, shape ``(n,)``.
+        fold: The fold of each of them, shape ``(n,)``.
+        level: The level that was asked for.
+    """
+
+    posteriors: tuple[MixturePosterior, ...]
+    x: Tensor
+    draws: Tensor
+    scores: Tensor
+    fold: Tensor
+    level: float
+
+    def contains(self, theta: Tensor) -> Tensor:
+        """Return whether parameters ``(n, d)`` are in the set, shape ``(n,)``.
+
+        Those outside the prior's support have infinite scores, and are not.
+        """
+        log_probs = [
+            posterior.log_prob(theta, x=self.x) for posterior in self.posteriors
+        ]
+        at_theta = joint_scores(torch.stack(log_probs), self.draws)
+        return is_held(self.scores, self.fold, at_theta, level=self.level)
+
+
+class HeldOutSets:
+    """Makes sets with a guarantee from the held-out scores of a stack.
+
+    The scores are those of the stacks that have not seen a fold, and a new observation
+    is scored by the same stacks, with as many draws.
+
+    Args:
+        posterior: The stack.
+        versions: Its candidates in all versions.
+        masses: The masses inside the prior's support that the stack has estimated.
+    """
+
+    def __init__(
+        self, posterior: Any, versions: Versions, masses: dict[int, Tensor]
+    ) -> None:
+        self._posterior, self._versions, self._masses = posterior, versions, masses
+        self._validation: CrossValidation = posterior.report.cross_validation
+
+    @torch.no_grad()
+    def credible_set(self, level: float, x: Tensor, num_samples: int) -> CredibleSet:
+        """Return a set with a guarantee, see ``MixturePosterior.credible_set``.
+
+        If the stack is too narrow, the set reaches further than its draws. A quarter of
+        the draws that the volume is estimated from are therefore those of the stack,
+        two quarters the same at two and at four times their distance from the mean,
+        and a quarter those of the prior.
+        """
+        scores, guarantee = self._scores(level)
+        counted = scores.is_counted
+        _check_finite(scores.joint[counted], level)
+        # First, because the stack keeps the masses that the stacks without a fold need.
+        theta, log_density = self._spread(x, num_samples)
+        posteriors = self._posteriors(scores)
+        draws = [
+            posterior.log_prob(_sample(posterior, x, scores), x=x)
+            for posterior in posteriors
+        ]
+        rule = HeldOutRule(
+            posteriors=posteriors,
+            x=x,
+            draws=torch.stack(draws),
+            scores=scores.joint[counted].to(x.device),
+            fold=self._validation.fold[counted].to(x.device),
+            level=level,
+        )
+        return CredibleSet.of(
+            rule,
+            theta,
+            log_density,
+            level=level,
+            log_unit=log_unit_of(self._posterior.prior),
+            guarantee=guarantee,
+        )
+
+    @torch.no_grad()
+    def credible_intervals(self, level: float, x: Tensor) -> CredibleIntervals:
+        """Return intervals with a guarantee, each by itself.
+
+        The score of a pair is the level of the smallest central interval that contains
+        its parameter. At x this score gives an interval under the posterior of its
+        fold. The interval with a guarantee ends at quantiles of the ends of these n
+        intervals, and at the end of the prior's support.
+        """
+        scores, guarantee = self._scores(level)
+        low, high = [], []
+        for number, posterior in enumerate(self._posteriors(scores)):
+            rows = scores.is_counted & (self._validation.fold == number)
+            draws = _sample(posterior, x, scores)
+            ends = marginal_ends(scores.marginal[rows].T.to(draws.device), draws.T)
+            low.append(ends[0].T)
+            high.append(ends[1].T)
+        ends = interval_of(torch.cat(low), torch.cat(high), level=level)
+        least, most = bounds_of(self._posterior.prior, ends[0])
+        return CredibleIntervals(
+            low=ends[0].clamp(least, most).to(x),
+            high=ends[1].clamp(least, most).to(x),
+            level=level,
+            guarantee=guarantee,
+        )
+
+    def _scores(self, level: float) -> tuple[SetScores, Guarantee]:
+        """Return the scores and what they promise; raise if there are too few."""
+        scores = self._validation.set_scores
+        if self._validation.score_errors is not None:
+            raise InvalidInputError(
+                "Expected a stack of exact labels for a set with a guarantee; got "
+                f"{self._validation.labels}. A set that holds a measurement need not "
+                "hold the parameters. Use guaranteed=False, or stack the exact labels "
+                "alone."
+            )
+        if scores is None:
+            raise InvalidInputError(
+                "Expected a stack with scores for sets with a guarantee; got one "
+                "without, as files of earlier versions hold. Make the stack again."
+            )
+        check_enough(level, len(scores))
+        guarantee = Guarantee(
+            level=level,
+            num_pairs=len(scores),
+            num_folds=self._validation.num_folds,
+        )
+        return scores, guarantee
+
+    def _posteriors(self, scores: SetScores) -> tuple[MixturePosterior, ...]:
+        """Return the stack that has not seen each fold."""
+        versions = self._versions
+        # The first part is that of the couplings, and the same in all folds.
+        is_shared = versions.couplings is not None and 0 in self._masses
+        return tuple(
+            MixturePosterior(
+                versions.estimator(weights, [number]),
+                self._posterior.prior,
+                enable_transform=False,
+                shared={0: self._masses[0]} if is_shared else None,
+            )
+            for number, weights in enumerate(scores.weights)
+        )
+
+    def _spread(self, x: Tensor, num_samples: int) -> tuple[Tensor, Tensor]:
+        r"""Return draws that reach further than the stack, and their log density.
+
+        .. math:: q(\theta) = \frac14 \Big( p(\theta) + \sum_{s \in \{1, 2, 4\}}
+            s^{-d}\, p\big(\mu + (\theta - \mu) / s \mid x\big) \Big)
+
+        Here :math:`\mu` is the mean of the draws. Mixed discrete and continuous
+        parameters are not stretched, because they would be between the categories.
+        """
+        posterior, prior = self._posterior, self._posterior.prior
+        parts = posterior.posterior_estimator.parts
+        is_mixed = any(isinstance(part.density, MixedDensity) for part in parts)
+        stretches = STRETCHES[:1] if is_mixed else STRETCHES
+        count = math.ceil(num_samples / (1 + len(stretches)))
+        draws = posterior.sample((count,), x=x, show_progress_bars=False)
+        mean = draws.mean(dim=0)
+        theta = torch.cat(
+            [
+                prior_sample(prior, torch.Size((count,))).to(draws),
+                *(_stretched(draws, mean, by=stretch) for stretch in stretches),
+            ]
+        )
+        shrunk = [_stretched(theta, mean, by=1 / stretch) for stretch in stretches]
+        # In one call, because the mass inside the support is estimated in each.
+        log_prob = posterior.log_prob(torch.cat(shrunk), x=x).double()
+        scales = torch.tensor(stretches).to(log_prob).log() * theta.shape[1]
+        terms = torch.cat(
+            [
+                prior_log_prob(prior, theta).to(log_prob)[None],
+                log_prob.reshape(len(stretches), -1) - scales[:, None],
+            ]
+        )
+        return theta, terms.logsumexp(dim=0) - math.log(len(terms))
+
+
+def _sample(posterior: MixturePosterior, x: Tensor, scores: SetScores) -> Tensor:
+    """Draw as often as for the scores of the pairs."""
+    return posterior.sample((scores.num_draws,), x=x, show_progress_bars=False)
+
+
+def _stretched(theta: Tensor, centre: Tensor, *, by: float) -> Tensor:
+    return theta if by == 1 else centre + by * (theta - centre)
+
+
+def _check_finite(scores: Tensor, level: float) -> None:
+    """Raise if so many labels are impossible that a set would hold everything."""
+    impossible = int(torch.isinf(scores).sum())
+    if impossible > len(scores) - rank_needed(level, len(scores)):
+        raise InvalidInputError(
+            "Expected labels that the held-out stack gives a density above zero; got "
+            f"{impossible} of {len(scores)} without, so that a set of level {level:g} "
+            "would hold every parameter. Leave out labels outside the prior's support, "
+            "ask for a smaller level, or add the prior to the candidates."
+        )
