@@ -7,7 +7,6 @@ from torch import Tensor
 from sbi_rope._npe import TrainedNPE
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
-from sbi_rope._training import groups_of
 from sbi_rope._two_sample import compare_with_pairs
 from sbi_rope._validation import check_instance, check_integer
 from sbi_rope.coupling import SinkhornCoupler
@@ -206,7 +205,8 @@ def _spread_findings(
     names: Sequence[str],
     notes: list[str],
 ) -> list[Finding]:
-    theta = _moved(rope.calibration[0])
+    # The means of labels that are not exact are narrower than their parameters.
+    theta = _moved(rope.labelled_parameters.draws[:, 0])
     counts = [len(shift.batch.means)]
     if shift.held_out is not None:
         counts.append(len(theta))
@@ -225,10 +225,10 @@ def _labelled_findings(
     rope: RoPE, batch: Tensor, npe: TrainedNPE, notes: list[str]
 ) -> list[Finding]:
     """Compare h(x_o) with h of the calibration pairs, if there are any."""
-    theta, x = rope.calibration
-    if not len(theta):
+    _, x = rope.calibration
+    if not len(x):
         return []
-    test = compare_with_pairs(npe.embed("x", x, npe.h), groups_of(theta), batch)
+    test = compare_with_pairs(npe.embed("x", x, npe.h), rope.labels.groups, batch)
     if test is None:
         notes.append(
             "Whether the batch is like the calibration pairs was not tested, which "

@@ -7,8 +7,7 @@ from torch import Tensor
 
 from sbi_rope._progress import progress_bar
 from sbi_rope._sbi import embed
-from sbi_rope._simulations import draw_targets
-from sbi_rope._training import groups_of, split_groups
+from sbi_rope._training import split_groups
 from sbi_rope.diagnosis.report import Finding
 from sbi_rope.diagnosis.simulations import Simulations
 from sbi_rope.rope import RoPE
@@ -84,18 +83,12 @@ def cross_fit(rope: RoPE, *, num_folds: int, show_progress_bars: bool) -> CrossF
         show_progress_bars: Whether to show how many folds are done.
     """
     theta, x = rope.calibration
-    h = rope.embedding_net
-    targets = draw_targets(
-        rope.source,
-        theta,
-        lambda x: embed(h, x),
-        simulations_per_target=rope.finetuner.simulations_per_target,
-        num_neighbors=rope.finetuner.num_neighbors,
-        progress=False,
+    targets = rope.draw_targets(
+        rope.finetuner.simulations_per_target, show_progress_bars=False
     )
     embedded = torch.empty_like(targets)
     # Recordings at the same parameters share a fold, as they do in a stack.
-    split = split_groups(groups_of(theta), num_folds)
+    split = split_groups(rope.labels.groups, num_folds)
     folds = [rows.to(theta.device) for rows in split if len(rows)]
     for held_out in progress_bar(folds, show=show_progress_bars, desc="Folds"):
         others = torch.cat([fold for fold in folds if fold is not held_out])
