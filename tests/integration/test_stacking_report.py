@@ -105,6 +105,11 @@ def test_the_stated_score_is_that_of_the_normalised_density() -> None:
     assert "standard deviations of the prior" not in str(report)
     comparable = report.cross_validation.scores_of("stack")
     assert math.isclose(report.comparable_score[0], float(comparable.mean()))
+    # The score that the differences start from is named beside it, with the reason.
+    other = f"it is {report.comparable_score[0]:.2f}, which the differences below"
+    assert other in str(report)
+    same = str(replace(report, comparable_score=report.score))
+    assert "corrected for mass outside the prior" not in same
 
 
 def test_scores_are_stated_in_standard_deviations_of_the_prior_too() -> None:
@@ -176,19 +181,21 @@ def test_the_text_says_whether_the_stack_is_over_or_under_confident() -> None:
             "(0 is calibrated, positive is over-confident, negative is too wide)"
             in text
         )
+        assert ("More labels help most." in text) == (verdict[:4] == "over")
 
 
 def test_the_text_names_what_calibration_assumes_about_a_batch() -> None:
     report = made_up()
     assert "holds for observations like those of the pairs" in str(report)
-    assert "`diagnose(rope.train(), x_o)` tests" in str(report)
+    tests = "`diagnose(rope, x_o)` tests whether a batch is like them\n"
+    assert tests in f"{report}\n"
     like, unlike = (
         str(replace(report, batch=TwoSampleTest(p_value=p, spread=0.4)))
         for p in (0.32, 0.002)
     )
     assert "no sign of a difference (p = 0.32)" in like
     assert "this need NOT hold for the batch" in unlike
-    assert "diagnose(rope.train(), x_o)" in unlike
+    assert "look at `diagnose(rope, x_o)`" in unlike
 
 
 def test_a_batch_unlike_the_pairs_gives_a_warning() -> None:
