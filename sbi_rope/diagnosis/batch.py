@@ -33,6 +33,8 @@ __all__ = ["diagnose"]
 
 # With fewer simulations the thresholds cannot be estimated.
 FEWEST_SIMULATIONS = 100
+# So many draws of the prior make a smooth histogram.
+NUM_DRAWN = 20_000
 NO_STANDARDISATION = (
     "Whether an entry of x is far from all simulations was not tested, because NPE "
     "does not standardise x entry by entry (as for sets of trials)."
@@ -150,6 +152,7 @@ def diagnose(
             notes.append(NO_STANDARDISATION)
         findings += far
         findings += _labelled_findings(rope, before, batch.npe, notes)
+        prior = _moved(batch.npe.prior.sample(torch.Size((NUM_DRAWN,))))
     if not coupling.converged:
         notes.append(
             "The coupling has not converged, so that its effective sample sizes are "
@@ -166,6 +169,7 @@ def diagnose(
         unshifted=shift.unshifted,
         residuals=None if held_out is None else held_out.residuals,
         parameter_names=names,
+        prior=prior,
     )
 
 

@@ -86,6 +86,7 @@ class Diagnosis:
         residuals: :math:`g(x) - E[h(S(\theta))]` of each calibration pair, with a g
             trained on other pairs, ``(n_c, l)``; None if they were left out.
         parameter_names: One name for each parameter.
+        prior: Draws of the prior, ``(n, d)``, for pictures.
     """
 
     findings: tuple[Finding, ...]
@@ -98,6 +99,7 @@ class Diagnosis:
     unshifted: Tensor = field(repr=False)
     residuals: Tensor | None = field(repr=False)
     parameter_names: tuple[str, ...]
+    prior: Tensor = field(repr=False)
 
     @property
     def alarming(self) -> tuple[Finding, ...]:

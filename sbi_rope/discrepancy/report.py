@@ -80,6 +80,8 @@ class SummaryDiscrepancy:
             summary, with one half before any pair is seen.
         outliers: Rows of calibration pairs that do not fit the others. In 99 of 100
             summaries without outliers no pair is so far away by chance.
+        std: The standard deviation of simulations from the prior, in the units of x;
+            one if it is not known.
     """
 
     name: str
@@ -89,6 +91,7 @@ class SummaryDiscrepancy:
     size: Interval
     probability_of_none: float
     outliers: tuple[int, ...] = ()
+    std: float = 1.0
 
     @property
     def is_off(self) -> bool:
@@ -326,6 +329,7 @@ def _summary(
         size=Interval.of(size),
         probability_of_none=discrepancy.probability_of_none,
         outliers=_outliers(residual, noise),
+        std=scale,
     )
 
 

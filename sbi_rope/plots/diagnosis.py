@@ -27,7 +27,7 @@ MAX_COLUMNS = 4
 
 
 def implied_parameters(diagnosis: Diagnosis) -> "Figure":
-    """Draw histograms of the prior and of the parameters that a batch implies.
+    """Draw the prior, and histograms of the parameters that a batch implies.
 
     The parameters that the batch implies are those of the simulations that it is
     coupled with. A dashed histogram shows the same for a batch that follows the prior.
@@ -53,7 +53,7 @@ def implied_parameters(diagnosis: Diagnosis) -> "Figure":
     panels = figure.subplots(rows, columns, squeeze=False).flatten()
     for k, axes in enumerate(panels):
         if k < size:
-            _draw(axes, theta[:, k], weights)
+            _draw(axes, theta[:, k], diagnosis.prior[:, k], weights)
             axes.set_xlabel(names[k])
         else:
             axes.set_visible(False)
@@ -62,7 +62,9 @@ def implied_parameters(diagnosis: Diagnosis) -> "Figure":
     return figure
 
 
-def _draw(axes: "Axes", theta: Tensor, weights: dict[str, Tensor]) -> None:
+def _draw(
+    axes: "Axes", theta: Tensor, prior: Tensor, weights: dict[str, Tensor]
+) -> None:
     hide_frame(axes)
     axes.set_yticks([])
     low, high = with_margin(*central_interval(theta.unsqueeze(1)))[:, 0].tolist()
@@ -70,7 +72,14 @@ def _draw(axes: "Axes", theta: Tensor, weights: dict[str, Tensor]) -> None:
     axes.set_xlim(low, high)
     # The outermost bins hold the tails, so that nothing is cut off.
     inside = theta.clamp(low, high).numpy()
-    axes.hist(inside, bins=edges, density=True, color="0.85", label="prior")
+    # There are many draws of the prior, so that a flat one looks flat.
+    axes.hist(
+        prior.clamp(low, high).numpy(),
+        bins=edges,
+        density=True,
+        color="0.85",
+        label="prior",
+    )
     styles = {
         "unshifted": (GREY, "--", "implied by a batch of the prior"),
         "implied": (BLUE, "-", "implied by this batch"),

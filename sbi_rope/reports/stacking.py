@@ -204,14 +204,17 @@ def _score_section(report: StackingReport) -> str:
 
 
 def _weight_section(report: StackingReport) -> str:
-    weights = report.family_weights
+    weights, families = report.family_weights, report.cross_validation.families
     figure, axes = new_figure(5.4, 1.2 + 0.32 * len(weights))
     draw_weights(axes, weights)
     parts = [
         table(
-            ("method", "weight", "what it is"),
-            [(name, percent(w), IN_WORDS.get(name, "")) for name, w in weights.items()],
-            numbers=(1,),
+            ("method", "candidates", "weight", "what it is"),
+            [
+                (name, str(families.count(name)), percent(w), IN_WORDS.get(name, ""))
+                for name, w in weights.items()
+            ],
+            numbers=(1, 2),
         ),
         picture(figure, caption="The weight of each method in the stack."),
     ]

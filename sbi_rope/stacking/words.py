@@ -88,10 +88,9 @@ def _scores(report: "StackingReport") -> list[str]:
             lines.append(f"    {score:.2f} +- {error:.2f} with theta in {unit}")
     if differs(report):
         lines += [
-            "    these are corrected for mass outside the prior; without, as the "
-            "candidates are scored,",
-            f"    and with theta in its own units, it is "
-            f"{report.comparable_score[0]:.2f}, which the differences below start from",
+            f"    {report.comparable_score[0]:.2f} in its own units without the "
+            "correction for mass outside the prior, which",
+            "    candidates do not get either; the differences below start from it",
         ]
     return lines
 
@@ -107,7 +106,8 @@ def _gains(report: "StackingReport") -> list[str]:
 def _weights(report: "StackingReport") -> list[str]:
     (family, weight), *_ = report.family_weights.items()
     shares = ", ".join(
-        f"{name} {share:.0%}" for name, share in report.family_weights.items()
+        f"{name} {share:.0%}{_how_many(report, name)}"
+        for name, share in report.family_weights.items()
     )
     if weight < MOSTLY:
         return [f"  no method has half of the weight: {shares}"]
@@ -115,6 +115,11 @@ def _weights(report: "StackingReport") -> list[str]:
     if family in IN_WORDS:
         line += f": {IN_WORDS[family]}"
     return [line, f"  weights: {shares}"]
+
+
+def _how_many(report: "StackingReport", family: str) -> str:
+    count = report.cross_validation.families.count(family)
+    return f" ({count} candidates)" if count > 1 else ""
 
 
 def _calibration(report: "StackingReport") -> list[str]:

@@ -796,6 +796,9 @@ def test_the_picture_shows_the_weights_of_each_parameter(
         )
     )
     assert [axes.get_xlabel() for axes in figure.axes] == ["a"]
+    # The prior is drawn from many draws of its own, so that it is smooth.
+    assert misspecified.prior.shape == (20_000, 2)
+    assert misspecified.prior.std(dim=0).tolist() == pytest.approx([1, 1], abs=0.03)
     texts = {text.get_text() for text in figure.legends[0].get_texts()}
     assert {"prior", "implied by this batch"} <= texts
     figure.draw_without_rendering()
