@@ -125,7 +125,8 @@ class Diagnosis:
             f"{'is' if count < 2 else 'are'} alarming."
         )
         if self.expected:
-            verdict += " Another is as expected where the simulator is wrong."
+            one = "Another" if count else "One"
+            verdict += f" {one} is as expected where the simulator is wrong."
         return verdict
 
     def __contains__(self, name: str) -> bool:

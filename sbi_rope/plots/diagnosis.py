@@ -62,14 +62,23 @@ def implied_parameters(diagnosis: Diagnosis) -> "Figure":
     return figure
 
 
+def _ends(prior: Tensor) -> Tensor:
+    """Return the range of the prior, or its central 99 % if that is much narrower."""
+    whole = torch.stack([prior.min(), prior.max()])
+    centre = central_interval(prior.unsqueeze(1))[:, 0]
+    is_bounded = whole[1] - whole[0] < 1.1 * (centre[1] - centre[0])
+    return whole if is_bounded else centre
+
+
 def _draw(
     axes: "Axes", theta: Tensor, prior: Tensor, weights: dict[str, Tensor]
 ) -> None:
     hide_frame(axes)
     axes.set_yticks([])
-    low, high = with_margin(*central_interval(theta.unsqueeze(1)))[:, 0].tolist()
+    ends = _ends(prior)
+    low, high = ends.tolist()
     edges = torch.linspace(low, high, NUM_BINS + 1, dtype=theta.dtype).tolist()
-    axes.set_xlim(low, high)
+    axes.set_xlim(*with_margin(ends[:1], ends[1:])[:, 0].tolist())
     # The outermost bins hold the tails, so that nothing is cut off.
     inside = theta.clamp(low, high).numpy()
     # There are many draws of the prior, so that a flat one looks flat.

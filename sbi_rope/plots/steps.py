@@ -297,9 +297,9 @@ def _legend(axes: "Axes", handles: Sequence[Any]) -> None:
         bbox_to_anchor=(0.5, -0.14),
         fontsize=10,
         ncols=2,
-        handletextpad=0.3,
-        handlelength=1.4,
-        columnspacing=0.9,
+        handletextpad=0.2,
+        handlelength=1.2,
+        columnspacing=0.5,
     )
 
 

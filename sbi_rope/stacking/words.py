@@ -88,9 +88,9 @@ def _scores(report: "StackingReport") -> list[str]:
             lines.append(f"    {score:.2f} +- {error:.2f} with theta in {unit}")
     if differs(report):
         lines += [
-            f"    {report.comparable_score[0]:.2f} in its own units without the "
-            "correction for mass outside the prior, which",
-            "    candidates do not get either; the differences below start from it",
+            f"    {report.comparable_score[0]:.2f} before correction for mass outside "
+            "the prior (own units); candidates are not",
+            "    corrected, so that the differences below start from this number",
         ]
     return lines
 

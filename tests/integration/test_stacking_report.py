@@ -106,9 +106,9 @@ def test_the_stated_score_is_that_of_the_normalised_density() -> None:
     comparable = report.cross_validation.scores_of("stack")
     assert math.isclose(report.comparable_score[0], float(comparable.mean()))
     # The score that the differences start from is named beside it, with the reason.
-    other = f"{report.comparable_score[0]:.2f} in its own units without the correction"
+    other = f"{report.comparable_score[0]:.2f} before correction for mass outside"
     assert other in str(report)
-    assert "the differences below start from it" in str(report)
+    assert "the differences below start from this number" in str(report)
     same = str(replace(report, comparable_score=report.score))
     assert "correction for mass outside the prior" not in same
 

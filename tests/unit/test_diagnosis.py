@@ -262,7 +262,7 @@ def test_the_text_has_a_line_for_each_finding_and_rows_their_numbers(
         assert row["value"] == finding.value
         # Without an alarm nobody needs the thresholds explained.
         assert finding.reason not in " ".join(text.split())
-    verdict = "none of 12 findings is alarming. Another is as expected"
+    verdict = "none of 12 findings is alarming. One is as expected"
     assert verdict in " ".join(text.split())
     assert "\n! " not in text
     assert len(text.splitlines()) < 30
@@ -278,6 +278,7 @@ def test_alarms_come_first_and_say_whom_they_concern_and_why(
     text = str(replace(misspecified, findings=tuple(loud)))
     shown = " ".join(text.split())
     assert "3 of 12 findings are alarming." in shown
+    assert "is as expected" not in shown
     assert text.index("! prior shift: theta_2") < text.index("no alarm")
     for finding in loud:
         assert (finding.sentence in shown) == finding.alarming
