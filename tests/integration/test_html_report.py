@@ -132,8 +132,10 @@ def test_the_page_holds_the_numbers_of_the_report(source: str) -> None:
         assert number(row["score_z"]) in text
     low, high = (number(end, sign=True, digits=3) for end in report.acauc.interval)
     assert f"{low} to {high}" in text
+    families = report.cross_validation.families
     for name, weight in report.family_weights.items():
-        assert f"{name} {percent(weight)}" in text.replace("\N{NO-BREAK SPACE}", " ")
+        row = f"{name} {families.count(name)} {percent(weight)}"
+        assert row in text.replace("\N{NO-BREAK SPACE}", " ")
     discrepancy = report.discrepancy
     assert discrepancy is not None
     for summary in discrepancy.summaries:

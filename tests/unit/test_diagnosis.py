@@ -793,6 +793,7 @@ def test_the_picture_shows_the_weights_of_each_parameter(
             theta=theta,
             implied=half,
             unshifted=torch.ones(200).double(),
+            prior=theta,
             parameter_names=("a",),
         )
     )
