@@ -1,4 +1,4 @@
-"""Make the pictures of the how-to pages from fifty labelled measurements.
+"""Make the pictures of the documentation from fifty labelled measurements.
 
     python docs/make_pictures.py
 
@@ -6,6 +6,7 @@ The measurements are the extract of the light tunnel's sensors that the tests us
 takes about five minutes on two cores, and writes PNG files into ``docs/pictures``.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ from sbi.neural_nets import posterior_nn
 from torch import Tensor
 
 from sbi_rope import RoPE, SinkhornCoupler, diagnose, plots, stack
+from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.metrics import draw_samples, evaluate
 from sbi_rope.sweep import sweep
 from sbi_rope.tasks import get_task
@@ -82,7 +84,41 @@ def one_observation(npe: Any, posterior: Any, theta: Tensor, x: Tensor) -> "Figu
         name: draw_samples(one, x, num_samples=2000)[:, 0, SHOWN]
         for name, one in {"NPE": npe, "stack": posterior}.items()
     }
-    return plots.pair_plot(samples, theta[SHOWN], parameter_names=NAMES)
+    prior = npe.prior.sample((2000,))[:, SHOWN]
+    return plots.pair_plot(samples, theta[SHOWN], parameter_names=NAMES, prior=prior)
+
+
+def overview(rope: RoPE, npe: Any, theta: Tensor, x_o: Tensor) -> "Figure":
+    """Draw the three steps of RoPE for the first observation."""
+    posterior = rope.build_posterior(x_o, seed=0, **QUIET)
+    with torch.no_grad():
+        before, after = (
+            net(x_o) for net in (rope.embedding_net, rope.tuned_embedding_net)
+        )
+    samples = {
+        "NPE": draw_samples(npe, x_o[:1], num_samples=2000)[:, 0],
+        "RoPE": posterior[0].sample((2000,), **QUIET),
+    }
+    return plots.overview(
+        simulated=posterior.coupling.simulated,
+        before=before,
+        after=after,
+        weights=posterior.weights[0],
+        samples=samples,
+        theta=theta,
+        parameter_names=["red", "green", "blue", "polariser angle [degree]"],
+        parameters=SHOWN,
+        prior=npe.prior.sample((2000,)),
+    )
+
+
+def discrepancy(npe: Any, simulator: Any, theta: Tensor, x: Tensor) -> "Figure":
+    """Draw what the labelled measurements say about each sensor."""
+    method = DiscrepancyNPE.from_posterior(npe, simulator=simulator)
+    names = get_task("light_tunnel_sensors").x_names
+    report = method.append_calibration(theta, x).report(x_names=names, seed=0)
+    print(report)
+    return plots.discrepancy(report)
 
 
 def guaranteed_sets(posterior: Any, theta: Tensor, x: Tensor) -> "Figure":
@@ -155,6 +191,8 @@ def main() -> None:
     rope = RoPE(npe, simulator=simulator, coupler=SinkhornCoupler(gamma=0.1))
     rope.append_calibration(theta_cal, x_cal).train(seed=0, **QUIET)
 
+    save(overview(rope, npe, theta_o[0], x_o), "overview")
+    save(discrepancy(npe, simulator, theta_cal, x_cal), "discrepancy")
     save(gammas(rope, theta_o[OBSERVED], x_o), "gammas")
     save(other_prior(rope, theta_o, x_o), "other_prior")
     for name, figure in steps(rope, x_o).items():
@@ -162,6 +200,8 @@ def main() -> None:
     posterior = stack(rope, learning_curve=True, seed=0, **QUIET)
     print(posterior.report)
     save(learning_curve(posterior.report), "learning_curve")
+    without = replace(posterior.report, learning_curve=None)
+    save(plots.stacking_report(without), "stacking")
     save(overconfident(npe, posterior, theta_o, x_o), "overconfident")
     pair = (theta_o[OBSERVED], x_o[OBSERVED : OBSERVED + 1])
     save(one_observation(npe, posterior, *pair), "one_observation")

@@ -523,6 +523,11 @@ class RoPE:
         return copy.deepcopy(self._g)
 
     @property
+    def is_trained(self) -> bool:
+        """Whether the net is tuned on all calibration pairs appended so far."""
+        return self._g is not None
+
+    @property
     def history(self) -> History:
         """The losses of the last training."""
         if self._history is None:
@@ -549,10 +554,10 @@ class RoPE:
 
     def __repr__(self) -> str:
         name = type(self._npe.estimator).__name__
-        state = "trained" if self._g is not None else "not trained"
+        state = "trained" if self.is_trained else "not trained"
         return (
             f"RoPE({name}, {len(self._x_cal)} calibration pairs, {state}, "
-            f"{self.coupler})"
+            f"gamma {self.coupler.gamma:g}, tau {self.coupler.tau:g})"
         )
 
     def _embed_simulations(self, x: Tensor) -> Tensor:

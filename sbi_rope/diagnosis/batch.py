@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import torch
 from torch import Tensor
 
 from sbi_rope._npe import TrainedNPE
@@ -31,6 +32,12 @@ __all__ = ["diagnose"]
 
 # With fewer simulations the thresholds cannot be estimated.
 FEWEST_SIMULATIONS = 100
+# So many draws of the prior make a smooth histogram.
+NUM_DRAWN = 20_000
+NO_STANDARDISATION = (
+    "Whether an entry of x is far from all simulations was not tested, because NPE "
+    "does not standardise x entry by entry (as for sets of trials)."
+)
 
 
 def diagnose(
@@ -69,7 +76,8 @@ def diagnose(
     effective sample sizes are rules of thumb about the setting of the coupler.
 
     Args:
-        rope: A trained RoPE, or one without calibration pairs; it is not changed.
+        rope: A RoPE, which is not changed. If calibration pairs were appended but not
+            trained on, a copy is trained first, with ``seed``.
         x_o: The batch, shape ``(n_o, *event)``.
         num_simulations: n_s, at least 100. If None, ``max(n_o, 1000)``, or all stored
             simulations if there are fewer.
@@ -91,7 +99,6 @@ def diagnose(
         :func:`sbi_rope.plots.implied_parameters`.
 
     Raises:
-        NotReadyError: If calibration pairs were appended after the last training.
         InvalidTypeError: If an argument has the wrong type.
         InvalidInputError: If x_o has the wrong shape or device, is empty, or not
             finite; if an argument is out of range; or if there are fewer than 100
@@ -106,6 +113,9 @@ def diagnose(
     if num_folds is not None:
         check_integer("num_folds", num_folds, minimum=2)
     tuned = len(rope.calibration[0]) > 0
+    if tuned and not rope.is_trained:
+        rope = rope.with_pairs(torch.arange(len(rope.calibration[0])))
+        rope.train(seed=seed, show_progress_bars=show_progress_bars)
     with seeded(seed):
         # This comes first, so that a posterior with the same seed has these
         # simulations.
@@ -130,13 +140,18 @@ def diagnose(
         )
         shift = prior_shift(real, simulations, held_out=held_out)
         findings += shift.findings(simulations, names)
+        notes += _shift_notes(shift, names)
         residual = []
         if held_out is not None:
             residual = _residual_findings(rope, held_out, simulations, notes)
         findings += _spread_findings(rope, shift, simulations, names, notes)
         findings += residual
-        findings += far_findings(batch.npe.h, batch.x_o)
+        far = far_findings(batch.npe.h, batch.x_o)
+        if not far:
+            notes.append(NO_STANDARDISATION)
+        findings += far
         findings += _labelled_findings(rope, before, batch.npe, notes)
+        prior = _moved(batch.npe.prior.sample(torch.Size((NUM_DRAWN,))))
     if not coupling.converged:
         notes.append(
             "The coupling has not converged, so that its effective sample sizes are "
@@ -153,6 +168,7 @@ def diagnose(
         unshifted=shift.unshifted,
         residuals=None if held_out is None else held_out.residuals,
         parameter_names=names,
+        prior=prior,
     )
 
 
@@ -219,6 +235,18 @@ def _spread_findings(
         return []
     spread = spread_of(shift, simulations.theta, theta_cal=theta)
     return spread.findings(names, tuned=simulations.tuned)
+
+
+def _shift_notes(shift: PriorShift, names: Sequence[str]) -> list[str]:
+    left_out = [name for k, name in enumerate(names) if not shift.is_testable(k)]
+    if not left_out:
+        return []
+    verb = "is" if len(left_out) == 1 else "are"
+    return [
+        f"Whether {', '.join(left_out)} {verb} shifted against the prior was not "
+        "tested: with so few observations or calibration pairs, even the largest "
+        "distance would be no sign of it."
+    ]
 
 
 def _labelled_findings(

@@ -28,6 +28,7 @@ def far_findings(embedding_net: nn.Module, x_o: Tensor) -> list[Finding]:
             value=value,
             threshold=FAR,
             alarming=value > FAR,
+            concerns="stack and RoPE",
             sentence=(
                 f"Entry {column} of observation {row} is {value:.2g} standard "
                 "deviations of the simulations away from their mean, and none is "

@@ -3,7 +3,9 @@
 from sbi_rope._two_sample import LEVEL, TwoSampleTest
 from sbi_rope.diagnosis.report import Finding
 
-__all__ = ["labelled_finding"]
+__all__ = ["UNLIKE_PAIRS", "labelled_finding"]
+
+UNLIKE_PAIRS = "batch unlike the calibration pairs"
 
 
 def labelled_finding(test: TwoSampleTest) -> Finding:
@@ -25,13 +27,15 @@ def labelled_finding(test: TwoSampleTest) -> Finding:
             f"them: {size}."
         )
     return Finding(
-        name="batch unlike the calibration pairs",
+        name=UNLIKE_PAIRS,
         value=test.p_value,
         threshold=LEVEL,
         alarming=test.is_different,
+        is_p_value=True,
+        concerns="stack and RoPE",
         sentence=sentence,
         reason=(
-            "Alarming below the threshold (a p-value of an energy test): one batch in "
-            "a hundred that is drawn like the pairs falls there."
+            "Alarming below the threshold (the p-value of an energy test): one batch "
+            "in a hundred that is drawn like the pairs falls there."
         ),
     )

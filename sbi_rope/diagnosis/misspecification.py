@@ -15,6 +15,9 @@ __all__ = ["MMDTest", "misspecification_findings", "mmd_test"]
 MAX_OBSERVATIONS, MAX_SIMULATIONS = 200, 400
 NUM_DRAWS = 200
 LEVEL = 0.01
+REASON = (
+    "Alarming below the threshold: one batch of simulations in a hundred falls there."
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,60 +85,72 @@ def misspecification_findings(
     """Test h(x_o), and g(x_o) if there is a tuned g, against h(x_s)."""
     simulated = simulations.embedded
     first = mmd_test(before, simulated, null=simulated)
-    findings = [_before(first)]
+    findings = [_before(first, tuned=after is not None)]
     if after is not None:
         second = mmd_test(after, simulated, null=simulations.averaged)
         findings.append(_after(first, second))
     return findings
 
 
-def _before(test: MMDTest) -> Finding:
+def _before(test: MMDTest, *, tuned: bool) -> Finding:
     alarming = test.p_value < LEVEL
-    size = f"its squared MMD is {_ratio(test)} that of a batch of simulations"
     if alarming:
         sentence = (
-            f"As NPE sees it, the batch is unlike simulations: {size}. The simulator "
-            "is misspecified, or the batch has other parameters than the prior; this "
+            "As NPE sees it, the batch is unlike simulations: its squared MMD is "
+            f"{_ratio(test)} that of a batch of simulations. The simulator is "
+            "misspecified, or the batch has other parameters than the prior; this "
             "test cannot tell which."
         )
+        if tuned:
+            sentence += " The calibration pairs are there to repair this."
     else:
-        sentence = f"No sign that NPE sees the batch as unlike simulations: {size}."
-    return _finding("misspecification before tuning", test, alarming, sentence)
+        sentence = (
+            "No sign that NPE sees the batch as unlike simulations: "
+            f"{test.p_value:.0%} of batches of simulations differ from others as much."
+        )
+    return Finding(
+        name="misspecification before tuning",
+        value=test.p_value,
+        threshold=LEVEL,
+        alarming=alarming,
+        is_p_value=True,
+        is_expected=alarming and tuned,
+        concerns="NPE",
+        sentence=sentence,
+        reason=REASON,
+    )
 
 
 def _after(before: MMDTest, after: MMDTest) -> Finding:
     alarming = after.p_value < LEVEL
-    size = f"its squared MMD is {_ratio(after)} what is usual"
     course = f"{before.mmd:.2g} before tuning, {after.mmd:.2g} after"
     if alarming:
         sentence = (
-            f"After tuning the batch is unlike simulations: {size} ({course}). If the "
-            "batch is shifted or narrower than the prior, this may be the reason. "
+            "After tuning the batch is unlike simulations: its squared MMD is "
+            f"{_ratio(after)} what is usual ({course}). If the batch is shifted or "
+            "narrower than the prior, this may be the reason. "
             "Otherwise there may be too few calibration pairs, or they are unlike the "
             "batch."
         )
     else:
         sentence = (
             "No sign that the batch is less like simulations after tuning than "
-            f"averaging over the simulator's noise explains: {size} ({course})."
+            "averaging over the simulator's noise explains: "
+            f"{after.p_value:.0%} of batches of simulations differ as much (squared "
+            f"MMD {course})."
         )
-    return _finding("misspecification after tuning", after, alarming, sentence)
+    return Finding(
+        name="misspecification after tuning",
+        value=after.p_value,
+        threshold=LEVEL,
+        alarming=alarming,
+        is_p_value=True,
+        concerns="RoPE",
+        sentence=sentence,
+        reason=REASON,
+    )
 
 
 def _ratio(test: MMDTest) -> str:
     ratio = test.mmd / max(test.usual, 1e-300)
     return f"{ratio:.0f} times" if ratio >= 10 else f"{ratio:.1f} times"
-
-
-def _finding(name: str, test: MMDTest, alarming: bool, sentence: str) -> Finding:  # noqa: FBT001
-    return Finding(
-        name=name,
-        value=test.p_value,
-        threshold=LEVEL,
-        alarming=alarming,
-        sentence=sentence,
-        reason=(
-            "Alarming below the threshold (a p-value): one batch of simulations in a "
-            "hundred falls there."
-        ),
-    )

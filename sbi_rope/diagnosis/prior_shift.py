@@ -60,7 +60,7 @@ class PriorShift:
         return self.chance if self.error is None else self.chance + self.error
 
     def findings(self, simulations: Simulations, names: Sequence[str]) -> list[Finding]:
-        """Return a finding for each parameter."""
+        """Return a finding for each parameter whose threshold can be exceeded."""
         theta = simulations.theta
         std = theta.std(dim=0).clamp_min(1e-12)
         mean, spread = _moments(theta, self.implied)
@@ -73,6 +73,7 @@ class PriorShift:
                 value=float(self.distance[k]),
                 threshold=float(self.threshold[k]),
                 alarming=bool(self.distance[k] > self.threshold[k]),
+                concerns="stack and RoPE",
                 sentence=_sentence(
                     name,
                     shifted=bool(self.distance[k] > self.threshold[k]),
@@ -83,7 +84,12 @@ class PriorShift:
                 reason=self._reason(k),
             )
             for k, name in enumerate(names)
+            if self.is_testable(k)
         ]
+
+    def is_testable(self, k: int) -> bool:
+        """Tell whether a distance, which is at most one, can exceed the threshold."""
+        return float(self.threshold[k]) < 1.0
 
     def _reason(self, k: int) -> str:
         reason = (

@@ -1,12 +1,22 @@
 """A diagnosis: its findings in words and numbers, and the arrays behind them."""
 
 import textwrap
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from torch import Tensor
 
 __all__ = ["Diagnosis", "Finding"]
+
+Concerned = Literal["NPE", "RoPE", "stack and RoPE"]
+
+# Whom an alarm concerns, in words.
+IN_WORDS: dict[Concerned, str] = {
+    "NPE": "NPE as it was trained, before any repair",
+    "RoPE": "RoPE, and not a stack without couplings among its candidates",
+    "stack and RoPE": "the posterior of `stack` and that of RoPE",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,6 +30,11 @@ class Finding:
         alarming: Whether the number is beyond the threshold.
         sentence: The finding in plain words.
         reason: On which side of the threshold the number is alarming, and why.
+        concerns: Whose posterior an alarm is about: "NPE" as it was, that of "RoPE"
+            only, or those of "stack and RoPE".
+        is_p_value: Whether the number is a p-value.
+        is_expected: Whether the number is alarming, but expected where the simulator is
+            wrong, and no reason to distrust a repaired posterior.
     """
 
     name: str
@@ -28,13 +43,33 @@ class Finding:
     alarming: bool
     sentence: str
     reason: str
+    concerns: Concerned
+    is_p_value: bool = False
+    is_expected: bool = False
+
+    @property
+    def number(self) -> str:
+        """The number and its threshold as they are printed."""
+        value = f"{self.value:.3g}"
+        return f"{'p = ' * self.is_p_value}{value} (threshold {self.threshold:.3g})"
+
+    def __str__(self) -> str:
+        mark = "!" if self.alarming and not self.is_expected else "-"
+        whom = f"This is about {IN_WORDS[self.concerns]}."
+        return "\n".join(
+            [
+                f"{mark} {self.name}: {self.number}",
+                _indented(f"{self.sentence} {whom} {self.reason}"),
+            ]
+        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Diagnosis:
     r"""Findings about a batch of real observations, and the arrays behind them.
 
-    All tensors are float64 on the CPU unless said otherwise.
+    All tensors are float64 on the CPU unless said otherwise. Print it: alarms come
+    first and in full, and the other findings have a line each.
 
     Attributes:
         findings: The results of all tests.
@@ -51,6 +86,7 @@ class Diagnosis:
         residuals: :math:`g(x) - E[h(S(\theta))]` of each calibration pair, with a g
             trained on other pairs, ``(n_c, l)``; None if they were left out.
         parameter_names: One name for each parameter.
+        prior: Draws of the prior, ``(n, d)``, for pictures.
     """
 
     findings: tuple[Finding, ...]
@@ -63,11 +99,39 @@ class Diagnosis:
     unshifted: Tensor = field(repr=False)
     residuals: Tensor | None = field(repr=False)
     parameter_names: tuple[str, ...]
+    prior: Tensor = field(repr=False)
 
     @property
     def alarming(self) -> tuple[Finding, ...]:
-        """The findings beyond their thresholds."""
+        """The findings beyond their thresholds, the expected ones included."""
         return tuple(finding for finding in self.findings if finding.alarming)
+
+    @property
+    def unexpected(self) -> tuple[Finding, ...]:
+        """The findings that call for action: beyond their thresholds, not expected."""
+        return tuple(one for one in self.alarming if not one.is_expected)
+
+    @property
+    def expected(self) -> tuple[Finding, ...]:
+        """The findings that only say that the simulator is wrong, as expected."""
+        return tuple(one for one in self.alarming if one.is_expected)
+
+    @property
+    def verdict(self) -> str:
+        """How many findings are alarming, in a sentence."""
+        count = len(self.unexpected)
+        verdict = (
+            f"{count or 'none'} of {len(self.findings)} findings "
+            f"{'is' if count < 2 else 'are'} alarming."
+        )
+        if self.expected:
+            one = "Another" if count else "One"
+            verdict += f" {one} is as expected where the simulator is wrong."
+        return verdict
+
+    def __contains__(self, name: str) -> bool:
+        """Tell whether there is a finding of a name."""
+        return any(finding.name == name for finding in self.findings)
 
     def __getitem__(self, name: str) -> Finding:
         """Return the finding of a name."""
@@ -78,25 +142,38 @@ class Diagnosis:
         return [asdict(finding) for finding in self.findings]
 
     def __str__(self) -> str:
-        count = len(self.alarming)
+        quiet = [finding for finding in self.findings if not finding.alarming]
+        count = len(self.distance)
         lines = [
-            f"Diagnosis of {len(self.distance)} observations against {len(self.theta)} "
-            f"simulations: {count} of {len(self.findings)} findings "
-            f"{'is' if count == 1 else 'are'} alarming."
+            _indented(
+                f"Diagnosis of {count} observation{'s' * (count > 1)} against "
+                f"{len(self.theta)} simulations: {self.verdict}",
+                first="",
+            ),
+            *_in_full(self.unexpected),
         ]
-        given = ""
-        for finding in self.findings:
-            mark = "!" if finding.alarming else "-"
-            lines.append(
-                f"{mark} {finding.name}: {finding.value:.3g} "
-                f"(threshold {finding.threshold:.3g})"
-            )
-            # All parameters have the same reason, which is printed only once.
-            reason = "" if finding.reason == given else finding.reason
-            lines.append(_indented(f"{finding.sentence} {reason}"))
-            given = finding.reason
+        if self.expected:
+            lines.append("as expected where the simulator is wrong:")
+        for one in self.expected:
+            lines += [f"  {one.name}: {one.number}", _indented(one.sentence)]
+        if quiet:
+            lines.append("no alarm (in brackets whose posterior one would be about):")
+        lines += [f"  {one.name}: {one.number} [{one.concerns}]" for one in quiet]
         lines += [_indented(note, first="* ") for note in self.notes]
         return "\n".join(lines)
+
+
+def _in_full(findings: Iterable[Finding]) -> list[str]:
+    """Return the text of each finding; a reason that follows itself is left out."""
+    lines, given = [], ""
+    for one in findings:
+        text = str(one)
+        if one.reason == given:
+            head, _, _ = text.partition("\n")
+            text = f"{head}\n{_indented(one.sentence)}"
+        lines.append(text)
+        given = one.reason
+    return lines
 
 
 def _indented(text: str, *, first: str = "  ") -> str:

@@ -178,6 +178,7 @@ def residual_finding(
         value=value,
         threshold=LARGEST_RATIO,
         alarming=alarming,
+        concerns="RoPE",
         sentence=sentence,
         reason=(
             "Alarming if the lower 95 % limit of the ratio is above the threshold and "

@@ -50,6 +50,7 @@ class Spread:
                 value=float(self.ratio[k]),
                 threshold=float(threshold[k]),
                 alarming=bool(self.ratio[k] < threshold[k]),
+                concerns="stack and RoPE",
                 sentence=_sentence(
                     name,
                     float(self.ratio[k]),

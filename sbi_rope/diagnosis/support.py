@@ -61,6 +61,7 @@ class Support:
             value=float(len(flags)),
             threshold=allowed,
             alarming=len(flags) > allowed,
+            concerns="RoPE",
             sentence=f"{sentence}.",
             reason=(
                 "An observation is flagged if it is farther from its nearest "
@@ -78,6 +79,7 @@ class Support:
             value=value,
             threshold=FAR,
             alarming=value > FAR,
+            concerns="RoPE",
             sentence=(
                 f"Observation {index} is farthest from simulations: "
                 f"{float(self.distance[index]):.2g} times as far as is typical between "
@@ -118,6 +120,7 @@ def _few(sizes: Tensor) -> Finding:
         value=share,
         threshold=MANY_WITH_FEW,
         alarming=share > MANY_WITH_FEW,
+        concerns="RoPE",
         sentence=(
             f"{share:.0%} of the posteriors use fewer than {FEW:.0f} simulations; "
             f"the median effective sample size is {float(sizes.median()):.3g}."
@@ -137,6 +140,7 @@ def _indistinct(sizes: Tensor, num_simulations: int) -> Finding:
         value=share,
         threshold=INDISTINCT,
         alarming=share > INDISTINCT,
+        concerns="RoPE",
         sentence=(
             f"A typical posterior is spread over {share:.0%} of the simulations."
         ),

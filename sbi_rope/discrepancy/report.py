@@ -15,7 +15,13 @@ from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.posterior import Discrepancy
 from sbi_rope.errors import InvalidInputError, shown
 
-__all__ = ["DiscrepancyReport", "Interval", "SummaryDiscrepancy", "report_discrepancy"]
+__all__ = [
+    "DiscrepancyReport",
+    "Interval",
+    "SummaryDiscrepancy",
+    "report_discrepancy",
+    "what_outliers_mean",
+]
 
 NUM_DRAWS = 4000
 # The probability that a summary without outliers is reported to have one.
@@ -24,6 +30,8 @@ FALSE_ALARMS = 0.01
 EFFICIENCY = 0.37
 # With fewer pairs one cannot tell which of them is the outlier.
 MIN_PAIRS_FOR_OUTLIERS = 10
+# If this share of the pairs are outliers, they are hardly all mistakes of labelling.
+MANY_OUTLIERS = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,6 +80,8 @@ class SummaryDiscrepancy:
             summary, with one half before any pair is seen.
         outliers: Rows of calibration pairs that do not fit the others. In 99 of 100
             summaries without outliers no pair is so far away by chance.
+        std: The standard deviation of simulations from the prior, in the units of x;
+            one if it is not known.
     """
 
     name: str
@@ -81,6 +91,7 @@ class SummaryDiscrepancy:
     size: Interval
     probability_of_none: float
     outliers: tuple[int, ...] = ()
+    std: float = 1.0
 
     @property
     def is_off(self) -> bool:
@@ -199,10 +210,23 @@ class DiscrepancyReport:
         if outliers:
             listed = (f"row {row} ({', '.join(n)})" for row, n in outliers.items())
             lines.append(
-                f"  pairs that do not fit the others: {'; '.join(listed)}. Check these "
-                "labels and measurements."
+                f"  pairs that do not fit the others: {'; '.join(listed)}. "
+                f"{what_outliers_mean(len(outliers), self.num_pairs)}"
             )
         return "\n".join(lines)
+
+
+def what_outliers_mean(count: int, num_pairs: int) -> str:
+    """Say what pairs that do not fit the others may be a sign of."""
+    if count > max(2.0, MANY_OUTLIERS * num_pairs):
+        return (
+            "So many suggest that reality is not linear in the simulation there, "
+            "rather than that labels are wrong."
+        )
+    return (
+        "Look whether a label or a measurement is wrong, or whether reality is not "
+        "linear in the simulation there."
+    )
 
 
 def _table(summaries: Sequence[SummaryDiscrepancy]) -> list[str]:
@@ -314,6 +338,7 @@ def _summary(
         size=Interval.of(size),
         probability_of_none=discrepancy.probability_of_none,
         outliers=outliers,
+        std=scale,
     )
 
 

@@ -50,6 +50,7 @@ __all__ = [
     "draw_ranks",
     "draw_samples",
     "evaluate_log_probs",
+    "is_normalised",
 ]
 
 # How many observations a posterior is called with at a time, unless the user says.
@@ -317,6 +318,16 @@ def _is_unbounded(posterior: Any) -> bool:
     if isinstance(posterior, DirectPosterior):
         return not is_bounded(posterior)
     return isinstance(posterior, VectorFieldPosterior)
+
+
+def is_normalised(posterior: Any) -> bool | None:
+    """Tell whether scored densities are corrected for mass outside the prior.
+
+    It is None for ensembles, and for posteriors that are not of sbi or of this package.
+    """
+    if not isinstance(posterior, DirectPosterior):
+        return None
+    return not _is_unbounded(posterior)
 
 
 def _is_unbounded_direct(posterior: Any) -> bool:

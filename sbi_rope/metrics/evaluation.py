@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from sbi_rope._random import seeded
@@ -23,10 +24,16 @@ from sbi_rope.metrics.calls import (
     check_test_set,
     draw_ranks,
     evaluate_log_probs,
+    is_normalised,
 )
 from sbi_rope.metrics.density import LPPScore, check_theta_std
 
 __all__ = ["Evaluation", "evaluate"]
+
+GIVEN_UNITS = "units of `theta_std`"
+PRIOR_UNITS = "standard deviations of the prior"
+# With fewer observations the interval of ACAUC is as wide as all that it can be.
+FEWEST = 5
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -37,14 +44,17 @@ class Evaluation:
 
     Attributes:
         lpp: The log-probabilities in the natural units of theta.
-        lpp_z: The log-probabilities of theta in units of ``theta_std``, or None if that
-            was not given.
+        lpp_z: The log-probabilities of theta in units of ``theta_std``, which are those
+            of the prior if the posterior knows it; None if there are no units.
         ranks: The mid-ranks of the true parameters, shape ``(n, d)``. Other scores can
             be calculated from them: ``acauc_of(evaluation.ranks)`` is the ACAUC of kind
             ``"rank"``.
         acauc: The average coverage AUC of central intervals.
         coverage: The coverage of central intervals.
         expected_coverage_error: The distance of the coverage from the diagonal.
+        unit_z: The units of ``lpp_z`` in words.
+        is_normalised: Whether the density is corrected for mass outside the prior; None
+            if that is not known.
     """
 
     lpp: LPPScore
@@ -53,6 +63,8 @@ class Evaluation:
     acauc: ACAUCScore
     coverage: CoverageCurve
     expected_coverage_error: CoverageErrorScore
+    unit_z: str = GIVEN_UNITS
+    is_normalised: bool | None = None
 
     def as_row(self) -> dict[str, float]:
         """Return the main scores as the row of a table; an unknown one is NaN."""
@@ -67,16 +79,12 @@ class Evaluation:
 
     def __str__(self) -> str:
         n, d = self.ranks.shape
-        error, (low, high) = self.expected_coverage_error.value, self.acauc.interval
-        verdict = self.acauc.verdict
-        if verdict == "calibrated":
-            verdict += " as far as these observations can tell"
+        error = self.expected_coverage_error.value
         lines = [
             f"Scores on {n} observations, with {d} true parameters each",
             "  log probability of the true parameters (LPP), in nats an observation:",
             *self._densities(),
-            f"  {verdict}: ACAUC {self.acauc.value:+.3f}, 95 % interval {low:+.3f} to "
-            f"{high:+.3f}",
+            f"  {self._verdict()}",
             f"    ({ACAUC_IN_WORDS})",
             f"  coverage error {error:.3f}; a calibrated posterior has about "
             f"{0.31 / n**0.5:.3f} with {n} observations",
@@ -87,12 +95,19 @@ class Evaluation:
         ]
         return "\n".join(lines)
 
+    def _verdict(self) -> str:
+        value, (low, high) = f"ACAUC {self.acauc.value:+.3f}", self.acauc.interval
+        if len(self.ranks) < FEWEST:
+            return f"{value}, of too few observations to say what it means"
+        verdict = self.acauc.verdict
+        if verdict == "calibrated":
+            verdict += " as far as these observations can tell"
+        return f"{verdict}: {value}, 95 % interval {low:+.3f} to {high:+.3f}"
+
     def _densities(self) -> list[str]:
         scores = {"theta in its own units": self.lpp}
         if self.lpp_z is not None:
-            # Usually these are the standard deviations of the prior, which
-            # evaluate() does not know.
-            scores["theta in units of `theta_std`"] = self.lpp_z
+            scores[f"theta in {self.unit_z}"] = self.lpp_z
         lines = [
             f"    {unit}: {score.mean:.2f} +- {score.standard_error:.2f}, "
             f"median {score.median:.2f}"
@@ -102,6 +117,13 @@ class Evaluation:
             lines.append(
                 "    pass theta_std=prior.stddev for theta in standard deviations of "
                 "the prior"
+            )
+        if self.is_normalised is not None:
+            lines.append(
+                "    corrected for mass outside the prior"
+                if self.is_normalised
+                else "    not corrected for mass outside the prior, which counts as an "
+                "error"
             )
         if self.lpp.neg_inf_fraction:
             excluded = self.lpp.neg_inf_fraction
@@ -130,8 +152,8 @@ def evaluate(
         posterior: Any posterior with ``sample_batched`` and ``log_prob_batched``.
         theta: True parameters, shape ``(n, d)``.
         x: Their observations, shape ``(n, *event_shape)``.
-        theta_std: The unit of each parameter for ``lpp_z``, usually the prior's
-            standard deviation, shape ``(d,)``.
+        theta_std: The unit of each parameter for ``lpp_z``, shape ``(d,)``. If None,
+            the standard deviations that the prior of the posterior states, if it does.
         num_samples: The number of posterior samples for each observation.
         seed: The seed of the samples, which also depend on ``chunk_size``.
         chunk_size: How many observations are scored at a time. Fewer need less memory.
@@ -148,6 +170,9 @@ def evaluate(
     theta, x = check_test_set(posterior, theta, x, chunk_size)
     check_num_samples(num_samples)
     check_theta_std(theta_std, theta)
+    unit_z = GIVEN_UNITS
+    if theta_std is None:
+        unit_z, theta_std = PRIOR_UNITS, _std_of_prior(posterior, theta)
     with seeded(seed):
         natural = LPPScore(
             log_probs=evaluate_log_probs(
@@ -170,4 +195,16 @@ def evaluate(
         acauc=acauc_of(levels),
         coverage=coverage_curve_of(levels),
         expected_coverage_error=expected_coverage_error_of(levels),
+        unit_z=unit_z,
+        is_normalised=is_normalised(posterior),
     )
+
+
+def _std_of_prior(posterior: Any, theta: Tensor) -> Tensor | None:
+    """Return the standard deviations of a posterior's prior, if it states them."""
+    try:
+        std = torch.as_tensor(posterior.prior.stddev).detach().double().cpu()
+        check_theta_std(std, theta)
+    except Exception:  # priors of users and of sbi raise all kinds
+        return None
+    return std

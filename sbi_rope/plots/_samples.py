@@ -14,7 +14,7 @@ from sbi_rope._validation import (
     check_tensor,
 )
 from sbi_rope.errors import InvalidInputError
-from sbi_rope.plots._figures import PRIOR
+from sbi_rope.plots._figures import GREY, PRIOR
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,6 +28,8 @@ LEVELS = (0.9, 0.5)
 LARGEST = 1e100
 # The number of grid points on each axis for contours.
 GRID = 100
+# The edge of the prior is drawn if this share of a posterior is beyond it.
+CROSSED = 0.01
 
 
 def check_samples(
@@ -150,6 +152,34 @@ def shade_prior(axes: "Axes", interval: Tensor) -> None:
         axes.axvspan(low[0], high[0], **style)
     else:
         axes.fill_between([low[0], high[0]], low[1], high[1], **style)
+
+
+def edges_crossed(prior: Any, draws: Sequence[Tensor]) -> Tensor:
+    """Return the ends of the prior's draws that samples are beyond, shape ``(2, d)``.
+
+    An end is NaN unless one in a hundred samples of a posterior is beyond it.
+    """
+    values = drawable("prior", prior)
+    low, high = values.amin(dim=0), values.amax(dim=0)
+    below, above = (
+        torch.stack([beyond(value).double().mean(dim=0) for value in draws]).amax(dim=0)
+        for beyond in (lambda value: value < low, lambda value: value > high)
+    )
+    return torch.stack(
+        [
+            low.where(below >= CROSSED, torch.nan),
+            high.where(above >= CROSSED, torch.nan),
+        ]
+    )
+
+
+def draw_edges(axes: "Axes", edges: Tensor) -> None:
+    """Draw ends of the prior in a panel of one or two parameters, unless NaN."""
+    style: dict[str, Any] = {"color": GREY, "lw": 1.0, "ls": ":", "zorder": 1}
+    for draw, ends in zip((axes.axvline, axes.axhline), edges.T.tolist(), strict=False):
+        for end in ends:
+            if not math.isnan(end):
+                draw(end, **style)
 
 
 def label_with_share(name: str, values: Tensor, limits: Tensor) -> str:

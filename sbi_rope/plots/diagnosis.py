@@ -27,7 +27,7 @@ MAX_COLUMNS = 4
 
 
 def implied_parameters(diagnosis: Diagnosis) -> "Figure":
-    """Draw histograms of the prior and of the parameters that a batch implies.
+    """Draw the prior, and histograms of the parameters that a batch implies.
 
     The parameters that the batch implies are those of the simulations that it is
     coupled with. A dashed histogram shows the same for a batch that follows the prior.
@@ -53,7 +53,7 @@ def implied_parameters(diagnosis: Diagnosis) -> "Figure":
     panels = figure.subplots(rows, columns, squeeze=False).flatten()
     for k, axes in enumerate(panels):
         if k < size:
-            _draw(axes, theta[:, k], weights)
+            _draw(axes, theta[:, k], diagnosis.prior[:, k], weights)
             axes.set_xlabel(names[k])
         else:
             axes.set_visible(False)
@@ -62,15 +62,33 @@ def implied_parameters(diagnosis: Diagnosis) -> "Figure":
     return figure
 
 
-def _draw(axes: "Axes", theta: Tensor, weights: dict[str, Tensor]) -> None:
+def _ends(prior: Tensor) -> Tensor:
+    """Return the range of the prior, or its central 99 % if that is much narrower."""
+    whole = torch.stack([prior.min(), prior.max()])
+    centre = central_interval(prior.unsqueeze(1))[:, 0]
+    is_bounded = whole[1] - whole[0] < 1.1 * (centre[1] - centre[0])
+    return whole if is_bounded else centre
+
+
+def _draw(
+    axes: "Axes", theta: Tensor, prior: Tensor, weights: dict[str, Tensor]
+) -> None:
     hide_frame(axes)
     axes.set_yticks([])
-    low, high = with_margin(*central_interval(theta.unsqueeze(1)))[:, 0].tolist()
+    ends = _ends(prior)
+    low, high = ends.tolist()
     edges = torch.linspace(low, high, NUM_BINS + 1, dtype=theta.dtype).tolist()
-    axes.set_xlim(low, high)
+    axes.set_xlim(*with_margin(ends[:1], ends[1:])[:, 0].tolist())
     # The outermost bins hold the tails, so that nothing is cut off.
     inside = theta.clamp(low, high).numpy()
-    axes.hist(inside, bins=edges, density=True, color="0.85", label="prior")
+    # There are many draws of the prior, so that a flat one looks flat.
+    axes.hist(
+        prior.clamp(low, high).numpy(),
+        bins=edges,
+        density=True,
+        color="0.85",
+        label="prior",
+    )
     styles = {
         "unshifted": (GREY, "--", "implied by a batch of the prior"),
         "implied": (BLUE, "-", "implied by this batch"),

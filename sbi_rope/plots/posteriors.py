@@ -9,7 +9,9 @@ from sbi_rope.plots._figures import PRIOR, empty_figure, hide_frame, line_styles
 from sbi_rope.plots._samples import (
     check_samples,
     draw_contours,
+    draw_edges,
     draw_marginal,
+    edges_crossed,
     label_with_share,
     prior_interval,
     robust_limits,
@@ -43,6 +45,7 @@ def pair_plot(
         theta: The true parameter, shape ``(d,)``, which is marked in black.
         parameter_names: A label for each parameter, with its unit.
         prior: Samples of the prior, shape ``(n, d)``. Their central 99 % is shaded.
+            Where posterior samples are beyond all of them, a dotted line marks the end.
 
     Returns:
         The figure, with d rows and columns and the marginals on the diagonal.
@@ -57,6 +60,7 @@ def pair_plot(
     interval = (
         None if prior is None else prior_interval(prior, draws[next(iter(draws))])
     )
+    edges = None if prior is None else edges_crossed(prior, list(draws.values()))
     limits = robust_limits(list(draws.values()), truth, interval)
     for row in range(dim):
         for column in range(row + 1):
@@ -69,6 +73,8 @@ def pair_plot(
                 limits[:, pair],
                 None if interval is None else interval[:, pair],
             )
+            if edges is not None:
+                draw_edges(axes, edges[:, pair])
             axes.tick_params(labelbottom=row == dim - 1, labelleft=column == 0)
             if row == dim - 1:
                 axes.set_xlabel(names[column])

@@ -57,7 +57,8 @@ STAR: dict[str, Any] = {
 # The most dots that are drawn. More would run together.
 MAX_SIMULATED, MAX_REAL = 1000, 250
 # The layout is fixed, so that all panels have one size.
-LAYOUT = {"left": 0.03, "right": 0.99, "bottom": 0.23, "top": 0.92, "wspace": 0.16}
+TITLE: dict[str, Any] = {"loc": "left", "fontsize": 11}
+LAYOUT = {"left": 0.04, "right": 0.99, "bottom": 0.28, "top": 0.88, "wspace": 0.2}
 
 
 @dataclass(frozen=True)
@@ -139,7 +140,7 @@ def overview(
     if prior is not None:
         interval = prior_interval(prior, truth.unsqueeze(0))[:, chosen]
 
-    figure = empty_figure(12.0, 4.0)
+    figure = empty_figure(9.6, 3.9)
     figure.set_layout_engine("none")
     tune, couple, mix = figure.subplots(1, 3, gridspec_kw=LAYOUT)
     for axes in (tune, couple, mix):
@@ -185,7 +186,7 @@ def _draw_tuning(axes: "Axes", plane: _Plane, index: int) -> None:
         _dot(BLUE, "real, after tuning"),
     ]
     _legend(axes, handles)
-    axes.set_title("1.  Tune: real data move onto simulations", loc="left")
+    axes.set_title("1.  Tune: real data move\n     onto simulations", **TITLE)
 
 
 def _draw_coupling(axes: "Axes", plane: _Plane, weights: Tensor, index: int) -> None:
@@ -214,7 +215,7 @@ def _draw_coupling(axes: "Axes", plane: _Plane, weights: Tensor, index: int) -> 
         _dot(BLUE, f"its {count:.0f} or so simulations"),
     ]
     _legend(axes, handles)
-    axes.set_title("2.  Couple: weigh simulations for each", loc="left")
+    axes.set_title("2.  Couple: weigh simulations\n     for each", **TITLE)
 
 
 def _draw_posteriors(
@@ -256,7 +257,7 @@ def _draw_posteriors(
         axes.set_ylabel(names[1])
     mark.set_label("truth")
     _legend(axes, [*handles, mark])
-    axes.set_title("3.  Mix: average their posteriors", loc="left")
+    axes.set_title("3.  Mix: average\n     their posteriors", **TITLE)
 
 
 def _scatter(
@@ -293,12 +294,12 @@ def _legend(axes: "Axes", handles: Sequence[Any]) -> None:
         handles=handles,
         frameon=False,
         loc="upper center",
-        bbox_to_anchor=(0.5, -0.16),
-        fontsize=9,
-        ncols=4,
-        handletextpad=0.3,
-        handlelength=1.4,
-        columnspacing=0.9,
+        bbox_to_anchor=(0.5, -0.14),
+        fontsize=10,
+        ncols=2,
+        handletextpad=0.2,
+        handlelength=1.2,
+        columnspacing=0.5,
     )
 
 

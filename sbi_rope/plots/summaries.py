@@ -18,6 +18,7 @@ __all__ = ["discrepancy"]
 MAX_SUMMARIES = 20
 # The colour of summaries without a sign of a discrepancy.
 NO_SIGN = "0.65"
+SMALL = 10
 
 
 def discrepancy(report: DiscrepancyReport) -> "Figure":
@@ -26,11 +27,11 @@ def discrepancy(report: DiscrepancyReport) -> "Figure":
     .. math:: x_o = \bar x + \text{shift} + \text{gain}\,(x_s - \bar x) + \text{error}
 
     There is a row with 95 % intervals for each of the first twenty summaries of the
-    report. Summaries without a sign of a discrepancy come last and are grey. The first
-    panel shows the size of the discrepancy, with the error included.
-    The second shows the shift in units of x, which is zero without a discrepancy. Its
-    numbers are written beside it, because each row has its own scale. The third shows
-    the gain, which is one without a discrepancy.
+    report, sorted by size. Summaries without a sign of a discrepancy come last and are
+    grey. The first panel shows the size of the discrepancy, with the error included.
+    The second shows the shift, which is zero without a discrepancy. All rows have one
+    scale, the standard deviations of simulations, and the numbers in units of x are
+    written beside them. The third shows the gain, which is one without a discrepancy.
 
     Args:
         report: What ``DiscrepancyNPE.report()`` returns.
@@ -47,26 +48,29 @@ def discrepancy(report: DiscrepancyReport) -> "Figure":
     if not report.summaries:
         raise InvalidInputError("Expected `report` of at least one summary; got none.")
     shown = list(report.summaries[:MAX_SUMMARIES])
-    figure = empty_figure(10.0, 1.4 + 0.3 * len(shown))
-    panels = figure.subplots(1, 3, width_ratios=[1.3, 1.7, 1.0], sharey=True)
-    size, shift, gain = panels
+    figure = empty_figure(8.6, 1.5 + 0.3 * len(shown))
+    widths = [1.0, 1.1, 0.95, 0.8]
+    panels = figure.subplots(1, 4, width_ratios=widths, sharey=True)
+    size, shift, numbers, gain = panels
     for position, summary in enumerate(shown):
         colour = BLUE if summary.is_off else NO_SIGN
         _interval(size, position, summary.size, colour)
         _interval(gain, position, summary.gain, colour)
-        _own_scale(shift, position, summary.shift, colour)
-    for axes, neutral in zip(panels, (0.0, 0.0, 1.0), strict=True):
+        _interval(shift, position, summary.shift, colour, summary.std)
+        _write(numbers, position, summary.shift, colour)
+    numbers.set_axis_off()
+    for axes, neutral in ((size, 0.0), (shift, 0.0), (gain, 1.0)):
         hide_frame(axes)
         axes.axvline(neutral, color=GREY, lw=0.8, zorder=0)
     for axes in (shift, gain):
         axes.tick_params(axis="y", length=0)
         axes.spines["left"].set_visible(False)
-    size.set_yticks(range(len(shown)), [summary.name for summary in shown], fontsize=9)
+    names = [summary.name for summary in shown]
+    size.set_yticks(range(len(shown)), names, fontsize=SMALL)
     size.set_ylim(len(shown) - 0.4, -0.6)
     size.set_xlim(left=0.0)
-    size.set_xlabel("size, in sd of simulations")
-    shift.set_xticks([0.0], ["0"])
-    shift.set_xlabel("shift, in units of x (a scale for each)")
+    size.set_xlabel("size, in sd\nof simulations")
+    shift.set_xlabel("shift, in sd of simulations\n(beside it, in units of x)")
     gain.set_xlabel("gain")
     _legend(figure, shown)
     _note(figure, report)
@@ -83,20 +87,15 @@ def _interval(
     axes.plot(median, position, "o", color=colour, markersize=5)
 
 
-def _own_scale(axes: "Axes", position: int, interval: Interval, colour: str) -> None:
-    # Each row has its own scale, because the units of summaries differ.
-    unit = max(abs(interval.low), abs(interval.high)) or 1.0
-    _interval(axes, position, interval, colour, unit)
+def _write(axes: "Axes", position: int, interval: Interval, colour: str) -> None:
     axes.annotate(
-        f"{interval.median:.3g} [{interval.low:.3g}, {interval.high:.3g}]",
-        (1.0, position),
+        str(interval),
+        (0.0, position),
         xycoords=axes.get_yaxis_transform(),
         va="center",
-        ha="right",
-        fontsize=8,
+        fontsize=SMALL,
         color=GREY if colour == NO_SIGN else "black",
     )
-    axes.set_xlim(-1.1, 3.2)
 
 
 def _legend(figure: "Figure", shown: Sequence[SummaryDiscrepancy]) -> None:
@@ -113,15 +112,19 @@ def _legend(figure: "Figure", shown: Sequence[SummaryDiscrepancy]) -> None:
         if colour in found
     ]
     figure.legend(
-        handles=handles, loc="outside upper center", ncols=2, frameon=False, fontsize=9
+        handles=handles,
+        loc="outside upper center",
+        ncols=2,
+        frameon=False,
+        fontsize=SMALL,
     )
 
 
 def _note(figure: "Figure", report: DiscrepancyReport) -> None:
-    parts = [f"{report.num_pairs} calibration pairs, 95 % intervals"]
+    parts = [f"{report.num_pairs} calibration pairs, 95 % intervals, sorted by size"]
     left_out = len(report.summaries) - MAX_SUMMARIES
     if left_out > 0:
         parts.append(f"{left_out} summaries that are less off not shown")
     if report.constant:
         parts.append(f"{len(report.constant)} the same in all simulations")
-    figure.supxlabel("; ".join(parts), fontsize=9, color=GREY)
+    figure.supxlabel("; ".join(parts), fontsize=SMALL, color=GREY)

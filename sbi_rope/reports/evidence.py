@@ -2,8 +2,10 @@
 
 from collections.abc import Sequence
 
-from sbi_rope.diagnosis import Diagnosis
+from sbi_rope.diagnosis import Diagnosis, Finding
+from sbi_rope.diagnosis.report import IN_WORDS
 from sbi_rope.discrepancy import DiscrepancyReport
+from sbi_rope.discrepancy.report import what_outliers_mean
 from sbi_rope.metrics import CoverageCurve, acauc_of
 from sbi_rope.plots import calibration_curves, discrepancy, implied_parameters
 from sbi_rope.reports.numbers import number, percent
@@ -11,7 +13,12 @@ from sbi_rope.reports.page import finding, paragraph, picture, section, table
 from sbi_rope.stacking import StackingReport
 from sbi_rope.stacking.words import LEVEL, sets_held
 
-__all__ = ["calibration_section", "diagnosis_section", "discrepancy_section"]
+__all__ = [
+    "calibration_section",
+    "diagnosis_section",
+    "discrepancy_section",
+    "no_discrepancy_section",
+]
 
 # With more parameters their curves cannot be told apart.
 MAX_CURVES = 5
@@ -134,11 +141,11 @@ def discrepancy_section(report: DiscrepancyReport) -> str:
     ]
     outliers = sorted({row for summary in report.summaries for row in summary.outliers})
     if outliers:
+        meaning = what_outliers_mean(len(outliers), report.num_pairs)
         parts.append(
             paragraph(
-                "These calibration pairs do not fit the others, and their labels and "
-                f"measurements should be checked (rows, from 0): "
-                f"{', '.join(map(str, outliers))}."
+                "These calibration pairs do not fit the others (rows, from 0): "
+                f"{', '.join(map(str, outliers))}. {meaning}"
             )
         )
     if report.constant:
@@ -148,26 +155,43 @@ def discrepancy_section(report: DiscrepancyReport) -> str:
     return section("Where the simulator differs from reality", *parts)
 
 
+def no_discrepancy_section(report: StackingReport) -> str:
+    """Return why the entries of x are not compared with simulations."""
+    candidates = report.cross_validation.families
+    why = "no candidate of this stack models how reality differs from the simulator"
+    if any("discrepancy" in family for family in candidates):
+        why = (
+            "a measurement is no short vector here, but an image, a long series or a "
+            "set of trials, say"
+        )
+    return section(
+        "Where the simulator differs from reality",
+        paragraph(
+            f"Entries of the measurements were not compared one by one, because {why}."
+        ),
+    )
+
+
 def diagnosis_section(diagnosis: Diagnosis) -> str:
     """Return the findings about a batch."""
-    order = sorted(diagnosis.findings, key=lambda result: not result.alarming)
-    alarms = len(diagnosis.alarming) or "none"
+    shown = (*diagnosis.unexpected, *diagnosis.expected)
+    quiet = [result for result in diagnosis.findings if not result.alarming]
     return section(
         "Diagnosis of the batch",
         paragraph(
             f"{len(diagnosis.distance)} measurements were compared with "
-            f"{len(diagnosis.theta)} simulations. Of {len(order)} findings "
-            f"{alarms} {'is' if alarms in (1, 'none') else 'are'} alarming."
+            f"{len(diagnosis.theta)} simulations: {diagnosis.verdict}"
         ),
         *(
             finding(
                 result.name,
-                f"{result.value:.3g} (threshold {result.threshold:.3g})",
-                result.sentence,
-                alarming=result.alarming,
+                result.number,
+                _in_words(result),
+                alarming=not result.is_expected,
             )
-            for result in order
+            for result in shown
         ),
+        *_no_alarm(quiet),
         *(paragraph(note, kind="note") for note in diagnosis.notes),
         picture(
             implied_parameters(diagnosis),
@@ -175,3 +199,21 @@ def diagnosis_section(diagnosis: Diagnosis) -> str:
             wide=len(diagnosis.parameter_names) > 2,
         ),
     )
+
+
+def _in_words(result: Finding) -> str:
+    if result.is_expected:
+        return f"{result.sentence} It is as expected where the simulator is wrong."
+    return f"{result.sentence} This is about {IN_WORDS[result.concerns]}."
+
+
+def _no_alarm(quiet: Sequence[Finding]) -> list[str]:
+    if not quiet:
+        return []
+    return [
+        paragraph("No alarm:"),
+        table(
+            ("finding", "number", "whose posterior it would be about"),
+            [(result.name, result.number, result.concerns) for result in quiet],
+        ),
+    ]

@@ -13,6 +13,7 @@ from sbi_rope.reports.evidence import (
     calibration_section,
     diagnosis_section,
     discrepancy_section,
+    no_discrepancy_section,
 )
 from sbi_rope.reports.numbers import number, percent
 from sbi_rope.reports.page import (
@@ -26,8 +27,9 @@ from sbi_rope.reports.page import (
     table,
     write_page,
 )
+from sbi_rope.reports.verdict import verdict_of
 from sbi_rope.stacking import StackingReport
-from sbi_rope.stacking.words import IN_WORDS, LEVEL, compared
+from sbi_rope.stacking.words import IN_WORDS, differs
 
 __all__ = ["write_stacking_report"]
 
@@ -76,13 +78,16 @@ def write_stacking_report(
     check_target(target)
     parts = [
         paragraph(_what_was_done(report)),
-        list_of(_verdict(report, diagnosis), kind="verdict"),
+        list_of(verdict_of(report, diagnosis), kind="verdict"),
         _score_section(report),
         _weight_section(report),
         calibration_section(report, names),
     ]
-    if discrepancy is not None:
-        parts.append(discrepancy_section(discrepancy))
+    parts.append(
+        no_discrepancy_section(report)
+        if discrepancy is None
+        else discrepancy_section(discrepancy)
+    )
     if diagnosis is not None:
         parts.append(diagnosis_section(diagnosis))
     parts += [_provenance_section(report), _glossary()]
@@ -136,68 +141,17 @@ def _what_was_done(report: StackingReport) -> str:
     )
 
 
-def _verdict(
-    report: StackingReport, diagnosis: Diagnosis | None
-) -> list[tuple[str, bool]]:
-    lines = [
-        (
-            f"The stack is {compared(gain, name)}: {number(gain.mean, sign=True)} nats "
-            f"a measurement, 95 % interval {number(gain.low, sign=True)} to "
-            f"{number(gain.high, sign=True)}.",
-            gain.high < 0,
-        )
-        for name, gain in report.gains.items()
-    ]
-    lines += [_calibrated(report), _assumption(report)]
-    if diagnosis is not None:
-        alarms = len(diagnosis.alarming) or "none"
-        lines.append(
-            (
-                f"The diagnosis of a batch of {len(diagnosis.distance)} measurements "
-                f"has {len(diagnosis.findings)} findings, of which {alarms} "
-                f"{'is' if alarms in (1, 'none') else 'are'} alarming.",
-                bool(diagnosis.alarming),
-            )
-        )
-    return lines
-
-
-def _calibrated(report: StackingReport) -> tuple[str, bool]:
-    verdict = report.acauc.verdict
-    inside = (
-        f"{percent(LEVEL)} intervals held {percent(report.share_inside)} of the known "
-        "parameters."
-    )
-    if verdict == "calibrated":
-        start = "Its uncertainties are calibrated as far as these pairs can tell"
-        return f"{start}: {inside}", False
-    return f"On held-out pairs its uncertainties are {verdict}: {inside}", True
-
-
-def _assumption(report: StackingReport) -> tuple[str, bool]:
-    test = report.batch
-    start = "All this holds for measurements like those of the calibration pairs"
-    if test is None:
-        return f"{start}. This report does not compare others with them.", False
-    if test.is_different:
-        return (
-            f"{start}. The batch that the stack was made for differs from them "
-            f"(p = {test.p_value:.3f}), so that it need not hold there.",
-            True,
-        )
-    return (
-        f"{start}. The batch that the stack was made for shows no sign of a difference "
-        f"(p = {test.p_value:.2f}).",
-        False,
-    )
-
-
 def _score_section(report: StackingReport) -> str:
     rows = report.as_rows()
     shown = rows[:MAX_ROWS]
     unit = report.cross_validation.log_unit
-    mean, error = report.comparable_score
-    cells = [("the stack", "", number(mean), number(mean + unit), number(error))]
+    scores = {"the stack": report.score}
+    if differs(report):
+        scores["the stack, uncorrected"] = report.comparable_score
+    cells = [
+        (name, "", number(mean), number(mean + unit), number(error))
+        for name, (mean, error) in scores.items()
+    ]
     cells += [
         (
             row["candidate"],
@@ -213,20 +167,19 @@ def _score_section(report: StackingReport) -> str:
     notes = [
         "Mean log density of the known parameters, in nats a measurement; higher is "
         "better. In the first column parameters have their own units, in the second "
-        "they are in standard deviations of the prior, which adds a constant. The "
-        "scores of this table are not corrected for what a posterior puts outside the "
-        "range of the prior."
+        "they are in standard deviations of the prior, which adds a constant."
     ]
+    if differs(report):
+        notes.append(
+            "The stack is corrected for what it puts outside the range of the prior. "
+            "The candidates are not, because the correction of a single one can have "
+            "no end. Compare them with the uncorrected stack, as the differences above "
+            "do."
+        )
     if len(rows) > len(shown):
         notes.append(
             f"{len(rows) - len(shown)} candidates with lower scores are left out."
         )
-    score, score_error = report.score
-    notes.append(
-        "With this correction the stack scores "
-        f"{number(score)} ± {number(score_error)} in the parameters' own units, and "
-        f"{number(report.score_z[0])} in standard deviations of the prior."
-    )
     return section(
         "Scores on measurements that a posterior had not seen",
         table(
@@ -251,14 +204,17 @@ def _score_section(report: StackingReport) -> str:
 
 
 def _weight_section(report: StackingReport) -> str:
-    weights = report.family_weights
+    weights, families = report.family_weights, report.cross_validation.families
     figure, axes = new_figure(5.4, 1.2 + 0.32 * len(weights))
     draw_weights(axes, weights)
     parts = [
         table(
-            ("method", "weight", "what it is"),
-            [(name, percent(w), IN_WORDS.get(name, "")) for name, w in weights.items()],
-            numbers=(1,),
+            ("method", "candidates", "weight", "what it is"),
+            [
+                (name, str(families.count(name)), percent(w), IN_WORDS.get(name, ""))
+                for name, w in weights.items()
+            ],
+            numbers=(1, 2),
         ),
         picture(figure, caption="The weight of each method in the stack."),
     ]

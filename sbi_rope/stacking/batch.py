@@ -29,7 +29,7 @@ def compare_batch(bench: Workbench, x_o: Tensor) -> TwoSampleTest | None:
             f"(p = {test.p_value:.3f}; its observations are {test.spread:.2f} times as "
             "far apart). The weights, the scores and the calibration of the stack hold "
             "for observations like those of the pairs, and need not hold for this "
-            "batch. Look at `diagnose(rope.train(), x_o)`, and label some observations "
-            "like those of the batch."
+            "batch. Look at `diagnose(rope, x_o)`, and label some observations like "
+            "those of the batch."
         )
     return test

@@ -9,7 +9,16 @@ from sbi_rope.stacking.cross_validation import Difference
 if TYPE_CHECKING:
     from sbi_rope.stacking.report import StackingReport
 
-__all__ = ["IN_WORDS", "LEVEL", "REFERENCES", "compared", "lines_of", "sets_held"]
+__all__ = [
+    "IN_WORDS",
+    "LEVEL",
+    "OVER_CONFIDENT",
+    "REFERENCES",
+    "compared",
+    "differs",
+    "lines_of",
+    "sets_held",
+]
 
 # The text says that a stack is mostly one method if this has half of the weight.
 MOSTLY = 0.5
@@ -22,6 +31,11 @@ SLIGHT = 0.1
 
 # The candidates that a stack is compared with, and how the text calls them.
 REFERENCES = {"prior": "the prior", "NPE": "NPE as it was"}
+
+# What to do about a stack whose intervals are too narrow.
+OVER_CONFIDENT = (
+    "More labels help most. Until then, take intervals of a higher level than you need."
+)
 
 # What each method is. Whether it is better than others is for the scores to say.
 IN_WORDS = {
@@ -45,6 +59,11 @@ def compared(gain: Difference, name: str) -> str:
         return f"not shown to differ from {REFERENCES[name]}"
     slightly = "slightly " if abs(gain.mean) < SLIGHT else ""
     return f"{slightly}{'better' if gain.low > 0 else 'worse'} than {REFERENCES[name]}"
+
+
+def differs(report: "StackingReport") -> bool:
+    """Tell whether the correction for mass outside the prior changes the score."""
+    return f"{report.score[0]:.2f}" != f"{report.comparable_score[0]:.2f}"
 
 
 def lines_of(report: "StackingReport") -> list[str]:
@@ -85,6 +104,12 @@ def _scores(report: "StackingReport") -> list[str]:
     ):
         if not math.isnan(score):
             lines.append(f"    {score:.2f} +- {error:.2f} with theta in {unit}")
+    if differs(report):
+        lines += [
+            f"    {report.comparable_score[0]:.2f} before correction for mass outside "
+            "the prior (own units); candidates are not",
+            "    corrected, so that the differences below start from this number",
+        ]
     return lines
 
 
@@ -99,7 +124,8 @@ def _gains(report: "StackingReport") -> list[str]:
 def _weights(report: "StackingReport") -> list[str]:
     (family, weight), *_ = report.family_weights.items()
     shares = ", ".join(
-        f"{name} {share:.0%}" for name, share in report.family_weights.items()
+        f"{name} {share:.0%}{_how_many(report, name)}"
+        for name, share in report.family_weights.items()
     )
     if weight < MOSTLY:
         return [f"  no method has half of the weight: {shares}"]
@@ -109,11 +135,17 @@ def _weights(report: "StackingReport") -> list[str]:
     return [line, f"  weights: {shares}"]
 
 
+def _how_many(report: "StackingReport", family: str) -> str:
+    count = report.cross_validation.families.count(family)
+    return f" ({count} candidates)" if count > 1 else ""
+
+
 def _calibration(report: "StackingReport") -> list[str]:
     n, acauc, (low, high) = len(report.levels), report.acauc, report.acauc.interval
     if math.isnan(acauc.value):
         return ["  coverage is not known for labels that are given as draws"]
     verdict = acauc.verdict
+    advice = [f"    {OVER_CONFIDENT}"] if verdict == "over-confident" else []
     verdict += (
         " as far as these pairs can tell"
         if verdict == "calibrated"
@@ -126,6 +158,7 @@ def _calibration(report: "StackingReport") -> list[str]:
         f"    coverage error {report.coverage_error.value:.3f}; a calibrated posterior "
         f"has about {0.31 / n**0.5:.3f} with {n} pairs",
         f"    {LEVEL:.0%} intervals hold {report.share_inside:.0%} of the parameters",
+        *advice,
         *_sets(report),
         *_assumption(report),
     ]
@@ -162,13 +195,13 @@ def _assumption(report: "StackingReport") -> list[str]:
     if test is None:
         return [
             "    this holds for observations like those of the pairs; "
-            "`diagnose(rope.train(), x_o)` tests whether a batch is"
+            "`diagnose(rope, x_o)` tests whether a batch is like them"
         ]
     if test.is_different:
         return [
             "    this need NOT hold for the batch, which differs from the pairs "
             f"(p = {test.p_value:.3f}):",
-            "    look at `diagnose(rope.train(), x_o)`",
+            "    look at `diagnose(rope, x_o)`",
         ]
     return [
         "    this holds for observations like those of the pairs; the batch shows "

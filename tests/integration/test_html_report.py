@@ -13,7 +13,8 @@ import torch
 
 from sbi_rope import diagnose
 from sbi_rope._two_sample import TwoSampleTest
-from sbi_rope.diagnosis import Diagnosis
+from sbi_rope.diagnosis import Diagnosis, Finding
+from sbi_rope.diagnosis.labelled import UNLIKE_PAIRS
 from sbi_rope.errors import InvalidInputError, InvalidTypeError, NotWritableError
 from sbi_rope.reports.numbers import number, percent
 from sbi_rope.stacking import LearningCurve, StackingReport
@@ -131,8 +132,10 @@ def test_the_page_holds_the_numbers_of_the_report(source: str) -> None:
         assert number(row["score_z"]) in text
     low, high = (number(end, sign=True, digits=3) for end in report.acauc.interval)
     assert f"{low} to {high}" in text
+    families = report.cross_validation.families
     for name, weight in report.family_weights.items():
-        assert f"{name} {percent(weight)}" in text.replace("\N{NO-BREAK SPACE}", " ")
+        row = f"{name} {families.count(name)} {percent(weight)}"
+        assert row in text.replace("\N{NO-BREAK SPACE}", " ")
     discrepancy = report.discrepancy
     assert discrepancy is not None
     for summary in discrepancy.summaries:
@@ -156,9 +159,10 @@ def test_the_page_says_what_a_diagnosis_found(
     assert "Diagnosis of the batch" in text
     for finding in diagnosis.findings:
         sentence = finding.sentence.replace(" %", "\N{NO-BREAK SPACE}%")
-        assert sentence in text
-        assert f"{finding.value:.3g} (threshold {finding.threshold:.3g})" in text
-    assert text.count("Alarming: ") == len(diagnosis.alarming)
+        assert (sentence in text) == finding.alarming
+        assert finding.number in text
+    assert text.count("Alarming: ") == len(diagnosis.unexpected)
+    assert diagnosis.verdict in text
     assert all(note.split(".")[0] in text for note in diagnosis.notes)
 
 
@@ -166,13 +170,82 @@ def test_the_verdict_names_a_batch_that_differs_from_the_pairs(source: str) -> N
     assert "differs from them (p = 0.002), so that it need not hold there" in source
 
 
+def test_the_verdict_holds_the_comparison_of_a_diagnosis(
+    tmp_path: Path, diagnosis: Diagnosis
+) -> None:
+    def verdict(findings: tuple[Finding, ...]) -> str:
+        found = replace(diagnosis, findings=findings)
+        return Page(written(the_stack().report, tmp_path, diagnosis=found)).text
+
+    others = tuple(f for f in diagnosis.findings if f.name != UNLIKE_PAIRS)
+    unlike = replace(diagnosis[UNLIKE_PAIRS], alarming=True, value=0.003)
+    text = verdict((*others, unlike))
+    assert "The batch of the diagnosis differs from them (p = 0.003)" in text
+    text = verdict((*others, replace(unlike, alarming=False, value=0.4)))
+    assert "The batch of the diagnosis shows no sign of a difference (p = 0.40)" in text
+    text = verdict(others)
+    assert "Whether the batch of the diagnosis is like them was not tested" in text
+    assert "This report does not compare" not in text
+
+
+def test_an_expected_finding_does_not_look_like_an_alarm(
+    tmp_path: Path, diagnosis: Diagnosis
+) -> None:
+    first, *others = diagnosis.findings
+    quiet = [replace(finding, alarming=False) for finding in others]
+    expected = replace(first, alarming=True, is_expected=True)
+    found = replace(diagnosis, findings=(expected, *quiet))
+    source = written(the_stack().report, tmp_path, diagnosis=found)
+    assert "It is as expected where the simulator is wrong." in source
+    assert "Alarming" not in source
+    assert 'class="finding alarm"' not in source
+
+
 def test_a_page_without_batch_and_curve_says_what_it_assumes(tmp_path: Path) -> None:
     report = replace(the_stack().report, discrepancy=None, provenance=None)
     text = Page(written(report, tmp_path)).text
     assert "This report does not compare others with them" in text
-    for title in ("Diagnosis of the batch", "Where the simulator differs", "seconds"):
+    for title in ("Diagnosis of the batch", "seconds"):
         assert title not in text
     assert "theta_1" in text
+
+
+def test_a_page_without_discrepancies_says_why(tmp_path: Path) -> None:
+    report = replace(the_stack().report, discrepancy=None)
+    text = Page(written(report, tmp_path)).text
+    assert "because a measurement is no short vector here" in text
+    scores = replace(
+        report.cross_validation,
+        families=("prior",) * len(report.cross_validation.families),
+    )
+    without = replace(report, cross_validation=scores)
+    text = Page(written(without, tmp_path)).text
+    assert "because no candidate of this stack models" in text
+
+
+def test_the_score_of_the_stack_is_one_number_and_the_other_is_explained(
+    tmp_path: Path,
+) -> None:
+    report = replace(
+        the_stack().report,
+        score=(10.74, 0.5),
+        score_z=(9.74, 0.5),
+        comparable_score=(10.31, 0.5),
+    )
+    text = Page(written(report, tmp_path)).text
+    assert re.search(r"the stack 10\.74", text)
+    assert re.search(r"the stack, uncorrected 10\.31", text)
+    assert "Compare them with the uncorrected stack" in text
+    same = Page(written(replace(report, comparable_score=report.score), tmp_path)).text
+    assert "uncorrected" not in same
+
+
+def test_an_over_confident_stack_says_what_to_do(tmp_path: Path) -> None:
+    report = the_stack().report
+    acauc = replace(report.acauc, interval=(0.01, 0.2))
+    text = Page(written(replace(report, acauc=acauc), tmp_path)).text
+    assert "over-confident: " in text
+    assert "More labels help most." in text
 
 
 def test_the_page_says_how_the_stack_was_made(source: str) -> None:

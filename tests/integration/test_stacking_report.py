@@ -105,6 +105,12 @@ def test_the_stated_score_is_that_of_the_normalised_density() -> None:
     assert "standard deviations of the prior" not in str(report)
     comparable = report.cross_validation.scores_of("stack")
     assert math.isclose(report.comparable_score[0], float(comparable.mean()))
+    # The score that the differences start from is named beside it, with the reason.
+    other = f"{report.comparable_score[0]:.2f} before correction for mass outside"
+    assert other in str(report)
+    assert "the differences below start from this number" in str(report)
+    same = str(replace(report, comparable_score=report.score))
+    assert "correction for mass outside the prior" not in same
 
 
 def test_scores_are_stated_in_standard_deviations_of_the_prior_too() -> None:
@@ -156,7 +162,8 @@ def test_weights_of_families_are_summed_and_explained() -> None:
     assert math.isclose(sum(weights.values()), 1.0, rel_tol=1e-9)
     assert list(weights.values()) == sorted(weights.values(), reverse=True)
     assert "mostly RoPE: the embedding net was tuned on the labels" in str(report)
-    assert f"RoPE {weights['RoPE']:.0%}" in str(report)
+    # Two settings of RoPE are candidates, so that the counts agree with each other.
+    assert f"RoPE {weights['RoPE']:.0%} (2 candidates)" in str(report)
     torn = replace(report, family_weights={"prior": 0.4, "NPE": 0.3, "RoPE": 0.3})
     assert "no method has half of the weight: prior 40%" in str(torn)
 
@@ -176,19 +183,21 @@ def test_the_text_says_whether_the_stack_is_over_or_under_confident() -> None:
             "(0 is calibrated, positive is over-confident, negative is too wide)"
             in text
         )
+        assert ("More labels help most." in text) == (verdict[:4] == "over")
 
 
 def test_the_text_names_what_calibration_assumes_about_a_batch() -> None:
     report = made_up()
     assert "holds for observations like those of the pairs" in str(report)
-    assert "`diagnose(rope.train(), x_o)` tests" in str(report)
+    tests = "`diagnose(rope, x_o)` tests whether a batch is like them\n"
+    assert tests in f"{report}\n"
     like, unlike = (
         str(replace(report, batch=TwoSampleTest(p_value=p, spread=0.4)))
         for p in (0.32, 0.002)
     )
     assert "no sign of a difference (p = 0.32)" in like
     assert "this need NOT hold for the batch" in unlike
-    assert "diagnose(rope.train(), x_o)" in unlike
+    assert "look at `diagnose(rope, x_o)`" in unlike
 
 
 def test_a_batch_unlike_the_pairs_gives_a_warning() -> None:
@@ -293,7 +302,32 @@ def test_the_picture_names_candidates_and_has_a_panel_for_the_learning_curve() -
         figure = plots.stacking_report(replace(made_up(), learning_curve=shown))
         assert len(figure.axes) == num_panels
         labels = [label.get_text() for label in figure.axes[0].get_yticklabels()]
-        assert {*labels} == {"stack", *NAMES}
+        assert {*labels} == {"stack", "stack, uncorrected", *NAMES}
+
+
+def test_the_picture_draws_the_weights_of_candidates_beside_their_scores() -> None:
+    report = made_up()
+    scores, weights, coverage = plots.stacking_report(report).axes
+    names = [label.get_text() for label in scores.get_yticklabels()]
+    found = {row["candidate"]: row["weight"] for row in report.as_rows()}
+    for bar in weights.patches:
+        name = names[round(bar.get_y() + bar.get_height() / 2)]
+        assert bar.get_width() == pytest.approx(found.pop(name))
+    assert found == {}
+    assert scores.get_ylim() == weights.get_ylim()
+    assert coverage.get_box_aspect() is None
+
+
+def test_a_score_far_below_the_others_is_an_arrow_with_its_number() -> None:
+    for npe, text in ((-382.0, "-382"), (-math.inf, "zero density")):
+        scores = plots.stacking_report(made_up(npe=npe)).axes[0]
+        low, high = scores.get_xlim()
+        assert high - low < 12
+        (note,) = scores.texts
+        assert note.get_text() == text
+        names = [label.get_text() for label in scores.get_yticklabels()]
+        assert names[note.xy[1]] == "NPE"
+    assert not plots.stacking_report(made_up()).axes[0].texts
 
 
 def test_printing_a_report_computes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -25,7 +25,7 @@ from sbi_rope.diagnosis.residuals import (
 from sbi_rope.diagnosis.simulations import Simulations
 from sbi_rope.diagnosis.spread import spread_of
 from sbi_rope.diagnosis.support import support_of
-from sbi_rope.errors import InvalidInputError, NotReadyError
+from sbi_rope.errors import InvalidInputError
 from sbi_rope.plots import implied_parameters
 from tests import gaussian
 
@@ -101,12 +101,16 @@ def test_nothing_alarms_where_the_simulator_is_right() -> None:
     )
     assert diagnosis.residuals is None
     assert "no calibration pairs" in str(diagnosis)
+    assert "far from all simulations was not tested" in diagnosis.notes[-1]
 
 
 def test_misspecification_that_tuning_repairs_is_found_before_tuning_only(
     misspecified: Diagnosis,
 ) -> None:
     assert alarms(misspecified) == {"misspecification before tuning"}
+    # This is what calibration pairs are for, and not a bad result.
+    assert misspecified.expected == misspecified.alarming
+    assert misspecified.unexpected == ()
 
 
 def test_a_batch_unlike_the_calibration_pairs_is_found_after_tuning(
@@ -122,6 +126,8 @@ def test_misspecification_is_found_in_a_rope_without_pairs() -> None:
     torch.manual_seed(3)
     diagnosis = look(conductor(), gaussian.real_process(parameters(200)))
     assert "misspecification before tuning" in alarms(diagnosis)
+    # Nothing repairs it without pairs.
+    assert diagnosis.expected == ()
     assert "observations no simulation matches" in alarms(diagnosis)
     assert "g was not tuned" in diagnosis[SHIFTS[0]].sentence
 
@@ -171,7 +177,9 @@ def test_too_few_observations_or_pairs_leave_comparisons_of_them_out() -> None:
     diagnosis = look(rope, gaussian.real_process(parameters(30)), num_simulations=200)
     names = {finding.name for finding in diagnosis.findings}
     assert names.isdisjoint({*NARROW, UNLIKE})
-    assert sum("was not tested" in note for note in diagnosis.notes) == 3
+    left_out = ("residuals depend", "narrower range", "like the calibration pairs")
+    for what in left_out:
+        assert any(what in n and "was not tested" in n for n in diagnosis.notes)
 
 
 def test_a_single_outlier_is_flagged(tuned: RoPE) -> None:
@@ -245,15 +253,63 @@ def test_the_same_seed_gives_the_same_diagnosis_and_keeps_the_random_state(
     assert first.as_rows() == second.as_rows()
 
 
-def test_the_text_holds_every_finding_and_rows_their_numbers(
+def test_the_text_has_a_line_for_each_finding_and_rows_their_numbers(
     misspecified: Diagnosis,
 ) -> None:
     text = str(misspecified)
     for finding, row in zip(misspecified.findings, misspecified.as_rows(), strict=True):
-        assert f"{finding.name}: {finding.value:.3g}" in text
+        assert f"{finding.name}: {finding.number}" in text
         assert row["value"] == finding.value
-    assert "1 of 12 findings is alarming" in text
-    assert text.count("\n! ") == 1
+        # Without an alarm nobody needs the thresholds explained.
+        assert finding.reason not in " ".join(text.split())
+    verdict = "none of 12 findings is alarming. One is as expected"
+    assert verdict in " ".join(text.split())
+    assert "\n! " not in text
+    assert len(text.splitlines()) < 30
+
+
+def test_alarms_come_first_and_say_whom_they_concern_and_why(
+    misspecified: Diagnosis,
+) -> None:
+    loud = [
+        replace(finding, alarming="shift" in finding.name or "farthest" in finding.name)
+        for finding in misspecified.findings
+    ]
+    text = str(replace(misspecified, findings=tuple(loud)))
+    shown = " ".join(text.split())
+    assert "3 of 12 findings are alarming." in shown
+    assert "is as expected" not in shown
+    assert text.index("! prior shift: theta_2") < text.index("no alarm")
+    for finding in loud:
+        assert (finding.sentence in shown) == finding.alarming
+    assert "This is about RoPE, and not a stack without couplings" in shown
+    assert "This is about the posterior of `stack` and that of RoPE." in shown
+    assert "farthest observation" not in text[text.index("no alarm") :]
+
+
+def test_a_finding_prints_as_sentences_and_p_values_as_such(
+    misspecified: Diagnosis,
+) -> None:
+    unlike = misspecified[UNLIKE]
+    first, *rest = str(unlike).splitlines()
+    assert first == f"- {UNLIKE}: p = {unlike.value:.3g} (threshold 0.01)"
+    whole = " ".join(" ".join(rest).split())
+    assert whole.startswith(unlike.sentence)
+    assert whole.endswith(unlike.reason)
+    assert "p = " not in misspecified["farthest observation"].number
+
+
+def test_a_rope_whose_pairs_were_not_trained_on_is_trained_as_a_copy() -> None:
+    torch.manual_seed(39)
+    rope = conductor(finetuner=CalibrationFinetuner(max_num_epochs=20))
+    rope.append_calibration(*gaussian.labelled(20))
+    x_o = gaussian.real_process(parameters(30))
+    options = {"num_simulations": 200, "num_folds": None}
+    found = look(rope, x_o, **options)
+    assert not rope.is_trained
+    rope.train(seed=0, show_progress_bars=False)
+    assert found.as_rows() == look(rope, x_o, **options).as_rows()
+    assert "misspecification after tuning" in found
 
 
 def test_a_diagnosis_can_use_stored_simulations() -> None:
@@ -691,6 +747,18 @@ def test_recordings_at_the_same_parameters_are_held_out_together(
 
 
 @pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
+def test_a_shift_that_no_distance_could_show_is_not_tested() -> None:
+    torch.manual_seed(40)
+    rope = conductor(finetuner=CalibrationFinetuner(max_num_epochs=2))
+    rope.append_calibration(*gaussian.labelled(4))
+    diagnosis = look(rope, gaussian.real_process(parameters(1)), num_simulations=200)
+    assert SHIFTS[0] not in diagnosis
+    assert "theta_1, theta_2 are shifted against the prior was not tested" in str(
+        diagnosis
+    ).replace("\n  ", " ")
+
+
+@pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
 def test_pairs_of_one_parameter_leave_residuals_out() -> None:
     torch.manual_seed(25)
     theta = gaussian.labelled(1)[0].repeat(6, 1)
@@ -705,14 +773,12 @@ def test_pairs_of_one_parameter_leave_residuals_out() -> None:
 # --- what is refused, and the picture ---
 
 
-def test_too_few_simulations_and_a_rope_that_was_not_trained_are_refused() -> None:
+def test_too_few_simulations_are_refused() -> None:
     x_o = torch.zeros(30, 2)
     theta = gaussian.prior().sample((50,))
     few = conductor(simulator=None, simulations=(theta, gaussian.simulator(theta)))
     with pytest.raises(InvalidInputError, match="at least 100 simulations"):
         look(few, x_o)
-    with pytest.raises(NotReadyError, match=r"`train\(\)` first"):
-        look(conductor().append_calibration(*gaussian.labelled(10)), x_o)
 
 
 def test_the_picture_shows_the_weights_of_each_parameter(
@@ -727,10 +793,14 @@ def test_the_picture_shows_the_weights_of_each_parameter(
             theta=theta,
             implied=half,
             unshifted=torch.ones(200).double(),
+            prior=theta,
             parameter_names=("a",),
         )
     )
     assert [axes.get_xlabel() for axes in figure.axes] == ["a"]
+    # The prior is drawn from many draws of its own, so that it is smooth.
+    assert misspecified.prior.shape == (20_000, 2)
+    assert misspecified.prior.std(dim=0).tolist() == pytest.approx([1, 1], abs=0.03)
     texts = {text.get_text() for text in figure.legends[0].get_texts()}
     assert {"prior", "implied by this batch"} <= texts
     figure.draw_without_rendering()

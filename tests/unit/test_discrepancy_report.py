@@ -145,6 +145,15 @@ def test_a_pair_that_does_not_fit_the_others_is_named() -> None:
         assert "pairs that do not fit the others" in text
         assert "row 3 (heat)" in text
         assert "row 5 (dust)" in text
+        assert "Look whether a label or a measurement is wrong" in text
+
+
+def test_many_pairs_that_do_not_fit_are_taken_for_a_bent_reality() -> None:
+    x, moments = pairs(40)
+    x[:5, 2] += 8.0
+    text = str(report_discrepancy(x, moments, simulated(5000), model=MODEL))
+    assert "reality is not linear in the simulation there, rather than" in text
+    assert "Look whether a label" not in text
 
 
 def test_pairs_that_fit_the_others_are_rarely_named() -> None:

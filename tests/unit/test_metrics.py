@@ -21,6 +21,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from sbi_rope import metrics
 from sbi_rope.errors import InvalidInputError, LogProbUnavailableError
+from sbi_rope.mixture import PriorPosterior
 from tests.refusals import assert_refused
 
 KINDS: tuple[Any, ...] = ("central", "hpd", "rank")
@@ -432,6 +433,37 @@ def test_a_printed_evaluation_is_a_dozen_lines_that_name_their_units() -> None:
     without = metrics.evaluate(GaussianPosterior(), theta, x, num_samples=50, seed=0)
     assert "pass theta_std=prior.stddev" in str(without)
     assert "calibrated as far as these observations can tell" in str(without)
+    # Nobody knows whether this posterior has a prior that its mass could be outside of.
+    assert "outside the prior" not in str(without)
+
+
+def test_an_evaluation_of_four_observations_does_not_say_what_acauc_means() -> None:
+    theta, x = gaussian_pairs(5)
+    few, enough = (
+        str(metrics.evaluate(GaussianPosterior(), theta[:n], x[:n], num_samples=20))
+        for n in (4, 5)
+    )
+    assert "of too few observations to say what it means" in few
+    assert "95 % interval" not in few
+    assert "95 % interval" in enough
+
+
+def test_an_evaluation_uses_the_units_of_a_prior_that_the_posterior_knows() -> None:
+    prior = BoxUniform(torch.zeros(2), torch.tensor([1.0, 10.0]))
+    theta = prior.sample((6,))
+    posterior = PriorPosterior(prior)
+    result = metrics.evaluate(posterior, theta, theta, num_samples=20)
+    # Of a uniform distribution, whatever its width: log(1 / sqrt(12)) each.
+    assert result.lpp_z is not None
+    assert result.lpp_z.mean == pytest.approx(-math.log(12), abs=1e-4)
+    line = next(n for n in str(result).splitlines() if "of the prior:" in n)
+    assert f"{result.lpp_z.mean:.2f} +- " in line
+    given = metrics.evaluate(
+        posterior, theta, theta, num_samples=20, theta_std=torch.ones(2)
+    )
+    assert given.lpp_z is not None
+    assert given.lpp_z.mean == pytest.approx(given.lpp.mean)
+    assert "units of `theta_std`" in str(given)
 
 
 def test_joint_acauc_uses_at_most_200_observations_from_the_whole_test_set() -> None:
@@ -493,6 +525,7 @@ def test_log_probs_of_an_npe_are_those_of_its_network_inside_the_prior(
     posterior, theta, x = bounded_npe
     with at_most(10):
         result = metrics.evaluate(posterior, theta, x, num_samples=50)
+    assert "not corrected for mass outside the prior" in str(result)
     raw = posterior.posterior_estimator.log_prob(theta.unsqueeze(0), x)[0]
     assert torch.allclose(result.lpp.log_probs, raw.detach().double(), rtol=1e-5)
     double = metrics.lpp(posterior, theta.double(), x.double())
@@ -518,7 +551,9 @@ def test_a_posterior_with_bounded_rejection_is_called_as_it_is(
 
     npe, theta, x = bounded_npe
     posterior = Bounded(npe.posterior_estimator, npe.prior)
-    assert metrics.evaluate(posterior, theta, x, num_samples=5).lpp.mean == 0.0
+    result = metrics.evaluate(posterior, theta, x, num_samples=5)
+    assert result.lpp.mean == 0.0
+    assert "    corrected for mass outside the prior" in str(result)
     score = metrics.acauc(posterior, theta, x, kind="hpd", num_samples=5)
     assert score.value == 0.0
 

@@ -138,6 +138,16 @@ def test_axes_of_a_pair_plot_reach_at_most_one_width_of_the_prior_beyond_it() ->
     assert ends_of(figure.axes[0].patches[0]) == pytest.approx((0.0, 1.0), abs=0.05)
 
 
+def test_pair_plot_draws_the_edge_of_the_prior_where_samples_leave_it() -> None:
+    prior, inside = torch.rand(500, 2), 0.4 * torch.rand(400, 2) + 0.3
+    leaving = inside + torch.tensor([0.6, 0.0])
+    low, high = prior.amin(dim=0), prior.amax(dim=0)
+    for samples, edges in ((inside, []), (leaving, [high[0]]), (-leaving, [low[0]])):
+        marginal = plots.pair_plot({"a": samples}, prior=prior).axes[0]
+        drawn = [line.get_xdata()[0] for line in marginal.lines]
+        assert drawn == pytest.approx([float(edge) for edge in edges])
+
+
 def test_pair_plot_draws_samples_without_an_area_as_a_point_or_a_line() -> None:
     for count in (1, 2, 200):
         same = torch.tensor([[1.0, 2.0]]).repeat(count, 1)
@@ -483,7 +493,7 @@ def test_discrepancy_draws_a_row_with_intervals_for_each_summary() -> None:
     second = summary("b", size=interval(0.0, 0.125, 0.25), gain=interval(1.0, 2.0, 3.0))
     report = DiscrepancyReport(summaries=(summary("a"), second), num_pairs=7)
     figure = plots.discrepancy(report)
-    size, _, gain = figure.axes
+    size, _, _, gain = figure.axes
     assert [label.get_text() for label in size.get_yticklabels()] == ["a", "b"]
     assert size.get_ylim()[0] > size.get_ylim()[1]
     for position, shown in enumerate(report.summaries):
@@ -495,26 +505,25 @@ def test_discrepancy_draws_a_row_with_intervals_for_each_summary() -> None:
     figure.draw_without_rendering()
 
 
-def test_discrepancy_draws_each_shift_on_its_own_scale_and_writes_its_numbers() -> None:
+def test_discrepancy_draws_shifts_on_one_scale_and_writes_their_numbers() -> None:
     small = interval(0.001, 0.0015, 0.002)
     report = DiscrepancyReport(
-        summaries=(summary("a"), summary("b", shift=small)), num_pairs=7
+        summaries=(summary("a", std=400.0), summary("b", shift=small, std=0.01)),
+        num_pairs=7,
     )
-    shift = plots.discrepancy(report).axes[1]
+    _, shift, numbers, _ = plots.discrepancy(report).axes
     drawn = [list(lines_at(shift, k)[0].get_xdata()) for k in range(2)]
-    assert drawn == [[-1.0, 0.5], [0.5, 1.0]]
-    texts = [(text.get_text(), text.xy[1]) for text in shift.texts]
+    # In standard deviations of simulations, so that rows can be compared.
+    assert drawn[0] == [-0.5, 0.25]
+    assert drawn[1] == pytest.approx([0.1, 0.2])
+    texts = [(text.get_text(), text.xy[1]) for text in numbers.texts]
     assert texts == [("-150 [-200, 100]", 0), ("0.0015 [0.001, 0.002]", 1)]
-    exact = DiscrepancyReport(
-        summaries=(summary("a", shift=interval(0.0, 0.0, 0.0)),), num_pairs=7
-    )
-    line, _ = lines_at(plots.discrepancy(exact).axes[1], 0)
-    assert list(line.get_xdata()) == [0.0, 0.0]
 
 
 def test_discrepancy_marks_the_values_that_mean_no_discrepancy() -> None:
     report = DiscrepancyReport(summaries=(summary("a"),), num_pairs=7)
-    marks = [axes.lines[-1].get_xdata()[0] for axes in plots.discrepancy(report).axes]
+    size, shift, _, gain = plots.discrepancy(report).axes
+    marks = [axes.lines[-1].get_xdata()[0] for axes in (size, shift, gain)]
     assert marks == [0.0, 0.0, 1.0]
 
 
@@ -523,7 +532,7 @@ def test_summaries_without_a_sign_of_a_discrepancy_have_another_colour() -> None
     figure = plots.discrepancy(
         DiscrepancyReport(summaries=(summary("a"), fine), num_pairs=7)
     )
-    for axes in figure.axes:
+    for axes in (figure.axes[0], figure.axes[1], figure.axes[3]):
         colours = [lines_at(axes, position)[0].get_color() for position in range(2)]
         assert colours[0] != colours[1]
     texts = legend_texts(figure.legends[0])

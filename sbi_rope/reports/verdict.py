@@ -1,0 +1,82 @@
+"""The verdict of a page: the box with what matters most."""
+
+from sbi_rope.diagnosis import Diagnosis
+from sbi_rope.diagnosis.labelled import UNLIKE_PAIRS
+from sbi_rope.reports.numbers import number, percent
+from sbi_rope.stacking import StackingReport
+from sbi_rope.stacking.words import LEVEL, OVER_CONFIDENT, compared
+
+__all__ = ["verdict_of"]
+
+
+def verdict_of(
+    report: StackingReport, diagnosis: Diagnosis | None
+) -> list[tuple[str, bool]]:
+    """Return the sentences of the verdict, and whether each is alarming."""
+    lines = [
+        (
+            f"The stack is {compared(gain, name)}: {number(gain.mean, sign=True)} nats "
+            f"a measurement, 95 % interval {number(gain.low, sign=True)} to "
+            f"{number(gain.high, sign=True)}.",
+            gain.high < 0,
+        )
+        for name, gain in report.gains.items()
+    ]
+    lines += [_calibrated(report), _assumption(report, diagnosis)]
+    if diagnosis is not None:
+        lines.append(
+            (
+                f"The diagnosis of a batch of {len(diagnosis.distance)} measurements: "
+                f"{diagnosis.verdict}",
+                bool(diagnosis.unexpected),
+            )
+        )
+    return lines
+
+
+def _calibrated(report: StackingReport) -> tuple[str, bool]:
+    verdict = report.acauc.verdict
+    inside = (
+        f"{percent(LEVEL)} intervals held {percent(report.share_inside)} of the known "
+        "parameters."
+    )
+    if verdict == "calibrated":
+        start = "Its uncertainties are calibrated as far as these pairs can tell"
+        return f"{start}: {inside}", False
+    text = f"On held-out pairs its uncertainties are {verdict}: {inside}"
+    return f"{text} {OVER_CONFIDENT}" if verdict == "over-confident" else text, True
+
+
+def _assumption(
+    report: StackingReport, diagnosis: Diagnosis | None
+) -> tuple[str, bool]:
+    start = "All this holds for measurements like those of the calibration pairs."
+    batches = _compared_batches(report, diagnosis)
+    for whose, p_value, is_different in batches:
+        if is_different:
+            text = f"{whose} differs from them (p = {p_value:.3f}), so that it need not"
+            return f"{start} {text} hold there.", True
+    if batches:
+        whose, p_value, _ = batches[0]
+        text = f"{whose} shows no sign of a difference (p = {p_value:.2f})."
+    elif diagnosis is not None:
+        text = "Whether the batch of the diagnosis is like them was not tested."
+    else:
+        text = "This report does not compare others with them."
+    return f"{start} {text}", False
+
+
+def _compared_batches(
+    report: StackingReport, diagnosis: Diagnosis | None
+) -> list[tuple[str, float, bool]]:
+    """Return which batches were compared with the pairs, p-values and verdicts."""
+    found = []
+    if report.batch is not None:
+        test = report.batch
+        found.append(
+            ("The batch that the stack was made for", test.p_value, test.is_different)
+        )
+    if diagnosis is not None and UNLIKE_PAIRS in diagnosis:
+        finding = diagnosis[UNLIKE_PAIRS]
+        found.append(("The batch of the diagnosis", finding.value, finding.alarming))
+    return found
