@@ -24,6 +24,7 @@ from sbi_rope._validation import (
     check_gradients,
     check_instance,
     check_integer,
+    check_not_swapped,
     check_rows,
     check_same_length,
     check_tensor,
@@ -37,6 +38,11 @@ from sbi_rope.mixture import MixturePosterior
 
 __all__ = ["RoPE"]
 
+# How to make the RoPE that functions ask for.
+HOW_TO_MAKE = (
+    "Make one from the posterior of NPE with `rope = RoPE(posterior, "
+    "simulator=simulator)` and `rope.append_calibration(theta_cal, x_cal)`."
+)
 # The number of simulations to couple with if the batch has fewer observations.
 MIN_SIMULATIONS = 1000
 
@@ -165,6 +171,7 @@ class RoPE:
                 is not finite, or a theta is outside the prior's support. Nothing is
                 added then.
         """
+        check_not_swapped(theta, x, self._npe.like.shape[1:], self._npe.event_shape)
         theta, x = self._npe.checked_pairs(theta, x)
         self._npe.embed("x", x, self._npe.h)
         warn_of_far_entries("x", x, self._npe.h)
@@ -363,6 +370,18 @@ class RoPE:
         if self._g is None:
             raise NotReadyError("No tuned embedding net yet. Call `train()` first.")
         return self._npe.posterior(self._g)
+
+    def checked_observations(self, x_o: Tensor) -> Tensor:
+        """Return a copy of a batch, in the dtype of NPE, if it can be embedded.
+
+        Args:
+            x_o: Real observations, shape ``(n_o, *event)``.
+
+        Raises:
+            InvalidInputError: If x_o has the wrong shape or device, is empty, or not
+                finite.
+        """
+        return self._npe.checked_x("x_o", x_o)
 
     def with_pairs(
         self,

@@ -8,16 +8,13 @@ from torch import Tensor
 
 from sbi_rope._progress import is_shown, progress_bar
 from sbi_rope._random import seeded
-from sbi_rope._sbi import ConditionalDensityEstimator, estimator_of, readable
+from sbi_rope._sbi import ConditionalDensityEstimator, estimator_of
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._validation import (
-    check_batch,
     check_gradients,
     check_instance,
     check_integer,
     check_not_negative,
-    check_readable,
-    check_values,
 )
 from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.discrepancy.correction import network_of
@@ -31,7 +28,7 @@ from sbi_rope.errors import (
 from sbi_rope.metrics.calibration import central_levels
 from sbi_rope.metrics.calls import draw_ranks
 from sbi_rope.mixture import MixturePosterior
-from sbi_rope.rope import RoPE
+from sbi_rope.rope import HOW_TO_MAKE, RoPE
 from sbi_rope.stacking.candidates import (
     AmortisedCandidate,
     Candidate,
@@ -76,7 +73,7 @@ class StackTrainer:
         tail_mass: float = 1e-3,
     ) -> None:
         check_gradients()
-        check_instance("rope", rope, RoPE)
+        check_instance("rope", rope, RoPE, hint=HOW_TO_MAKE)
         if num_folds is not None:
             check_integer("num_folds", num_folds, minimum=2)
         if num_simulations is not None:
@@ -324,10 +321,6 @@ def _check_density(estimator: Any) -> None:
 
 
 def _checked_observations(x_o: Tensor, rope: RoPE) -> Tensor:
-    _, x = rope.calibration
-    x_o = check_batch("x_o", x_o, x.shape[1:], finite=False)
-    check_values("x_o", x_o)
-    x_o = x_o.detach().to(x, copy=True)  # a large float64 can overflow in float32
-    check_readable("x_o", x_o, readable(rope.embedding_net, x_o))
+    x_o = rope.checked_observations(x_o)
     warn_of_far_entries("x_o", x_o, rope.embedding_net)
     return x_o
