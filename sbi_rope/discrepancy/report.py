@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sbi_rope._progress import progress_bar
 from sbi_rope._simulations import Moments
 from sbi_rope._standardisation import Standardisation
 from sbi_rope._validation import check_names
@@ -18,6 +19,8 @@ from sbi_rope.errors import InvalidInputError, shown
 __all__ = ["DiscrepancyReport", "Interval", "SummaryDiscrepancy", "report_discrepancy"]
 
 NUM_DRAWS = 4000
+# A progress bar appears after this many seconds.
+DELAY = 2.0
 # The probability that a summary without outliers is reported to have one.
 FALSE_ALARMS = 0.01
 # The efficiency of a standard deviation that is estimated from a median distance.
@@ -226,6 +229,7 @@ def report_discrepancy(
     model: DiscrepancyModel,
     x_names: Sequence[str] | None = None,
     seed: int = 0,
+    show_progress_bars: bool = False,
 ) -> DiscrepancyReport:
     """Fit the discrepancy of each summary separately.
 
@@ -239,6 +243,7 @@ def report_discrepancy(
         model: The model of the discrepancy.
         x_names: Names of the summaries; numbered if None.
         seed: Seed of the draws behind the intervals.
+        show_progress_bars: Whether to show the progress if there are many summaries.
 
     Raises:
         InvalidInputError: If there are not as many names as summaries.
@@ -253,7 +258,10 @@ def report_discrepancy(
     standardisation = Standardisation(simulated.double())
     varies = standardisation.varies.tolist()
     summaries = []
-    for j in range(width):
+    numbers = range(width)
+    for j in progress_bar(
+        numbers, show=show_progress_bars, desc="Summaries", delay=DELAY
+    ):
         if not varies[j]:
             continue
         mean, std = standardisation.mean[j], standardisation.std[j]

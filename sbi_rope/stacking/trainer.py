@@ -177,8 +177,15 @@ class StackTrainer:
 
     def _train(self, folds: Sequence[Fold]) -> Versions:
         chosen = self.candidates
-        bar = progress_bar(folds, show=self.show, desc="Folds")
-        trained = tuple(train_version(chosen, fold) for fold in bar)
+        count = sum(isinstance(c, AmortisedCandidate) and not c.fixed for c in chosen)
+        with progress_bar(
+            show=self.show,
+            desc=f"Training {count} candidates in {len(folds)} folds",
+            total=count * len(folds),
+        ) as bar:
+            trained = tuple(
+                train_version(chosen, fold, advance=bar.update) for fold in folds
+            )
         couplings: FittedCouplings | None = None
         coupled = [c for c in chosen if isinstance(c, CouplingCandidate)]
         if coupled:
