@@ -10,6 +10,7 @@ from sbi_rope._sbi import (
     ConditionalDensityEstimator,
     MixedDensity,
     VectorFieldDensity,
+    check_rows_apart,
     copy_of_prior,
     device_of,
     dtype_of,
@@ -19,13 +20,13 @@ from sbi_rope._sbi import (
     headless,
     posterior_from,
     readable,
+    reads_missing,
     with_embedding,
 )
 from sbi_rope._validation import (
+    as_numbers_on,
     check_batch,
-    check_device,
     check_readable,
-    check_tensor,
     check_values,
 )
 from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError
@@ -52,8 +53,8 @@ class TrainedNPE:
             estimator.
 
     Raises:
-        UnsupportedPosteriorError: If the posterior has no embedding to work with, or is
-            not in float32.
+        UnsupportedPosteriorError: If the posterior has no embedding to work with, is
+            not in float32, or embeds a row of a batch differently among other rows.
     """
 
     def __init__(self, posterior: Any) -> None:
@@ -71,6 +72,7 @@ class TrainedNPE:
         self.prior = copy_of_prior(posterior.prior)
         self.h = embedding_of(self.estimator)
         self._q = headless(self.estimator)
+        check_rows_apart(self.h, self.event_shape, device_of(estimator))
         self.like = torch.empty(
             0,
             *estimator.input_shape,
@@ -142,8 +144,13 @@ class TrainedNPE:
         return readable(self.h, x)
 
     def _checked(self, name: str, value: Any, event_shape: torch.Size) -> Tensor:
-        check_device(name, check_tensor(name, value), self.like.device)
-        value = check_batch(name, value, event_shape, finite=False)
+        value = check_batch(
+            name,
+            as_numbers_on(name, value, self.like.device),
+            event_shape,
+            finite=False,
+            reads_missing=reads_missing(self.h, self.event_shape, self.like.device),
+        )
         check_values(name, value)
         # Numbers that float32 cannot hold become Inf.
         return value.detach().to(self.like.dtype, copy=True)

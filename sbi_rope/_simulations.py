@@ -10,16 +10,17 @@ from torch.distributions import Distribution
 
 from sbi_rope._random import seeded
 from sbi_rope._validation import (
+    as_numbers_on,
     check_batch,
-    check_device,
     check_in_support,
+    check_not_swapped,
     check_same_length,
-    check_tensor,
 )
 from sbi_rope.errors import (
     InvalidInputError,
     InvalidTypeError,
     SimulationError,
+    in_digits,
     warn_user,
 )
 
@@ -187,10 +188,9 @@ class StoredSimulations:
                 f"{type(simulations).__name__}."
             )
         theta, x = simulations
-        check_device(
-            "simulations[0]", check_tensor("simulations[0]", theta), like.device
-        )
-        check_device("simulations[1]", check_tensor("simulations[1]", x), like.device)
+        check_not_swapped(theta, x, theta_shape, event_shape)
+        theta = as_numbers_on("simulations[0]", theta, like.device)
+        x = as_numbers_on("simulations[1]", x, like.device)
         theta = check_batch("simulations[0]", theta, theta_shape, finite=False)
         x = check_batch("simulations[1]", x, event_shape, finite=False)
         check_same_length("simulations[0]", theta, "simulations[1]", x)
@@ -338,8 +338,8 @@ def check_targets(targets: Tensor, theta: Tensor) -> Tensor:
         raise SimulationError(
             "Expected simulations with a finite embedding; got NaN, Inf or numbers "
             f"too large to compare at the calibration parameters "
-            f"{theta[~usable][:5].tolist()}. Check what the simulator returns "
-            "there, or remove these pairs."
+            f"{in_digits(theta[~usable])}. Check what the simulator returns there, "
+            "or remove these pairs."
         )
     return targets
 

@@ -25,6 +25,7 @@ __all__ = [
     "UnseenObservationError",
     "UnsupportedPosteriorError",
     "UntrustedError",
+    "in_digits",
     "shown",
     "warn_user",
 ]
@@ -32,6 +33,8 @@ __all__ = [
 
 # The most characters of a value that a message shows.
 LONGEST_TEXT = 200
+# The most rows of a matrix.
+NUM_ROWS = 5
 
 
 class RoPEError(Exception):
@@ -115,6 +118,13 @@ def shown(value: Any) -> str:
     if len(text) <= LONGEST_TEXT:
         return text
     return f"{text[:LONGEST_TEXT]}... (of type {type(value).__name__})"
+
+
+def in_digits(rows: Any) -> str:
+    """Return the first rows of a matrix as text, with four digits of each number."""
+    first = [", ".join(f"{float(v):.4g}" for v in row) for row in rows[:NUM_ROWS]]
+    more = ", ..." if len(rows) > len(first) else ""
+    return f"[{', '.join(f'[{row}]' for row in first)}{more}]"
 
 
 def warn_user(message: str) -> None:

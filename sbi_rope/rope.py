@@ -23,6 +23,7 @@ from sbi_rope._validation import (
     check_gradients,
     check_instance,
     check_integer,
+    check_not_swapped,
     check_rows,
     check_same_length,
     check_tensor,
@@ -48,6 +49,11 @@ from sbi_rope.mixture import MixturePosterior
 
 __all__ = ["RoPE"]
 
+# How to make the RoPE that functions ask for.
+HOW_TO_MAKE = (
+    "Make one from the posterior of NPE with `rope = RoPE(posterior, "
+    "simulator=simulator)` and `rope.append_calibration(theta_cal, x_cal)`."
+)
 # The number of simulations to couple with if the batch has fewer observations.
 MIN_SIMULATIONS = 1000
 
@@ -199,6 +205,7 @@ class RoPE:
             UnsupportedPosteriorError: If labels are not exact and some parameters are
                 discrete.
         """
+        check_not_swapped(theta, x, self._npe.like.shape[1:], self._npe.event_shape)
         labels = checked_labels(
             theta,
             theta_std=theta_std,
@@ -443,6 +450,18 @@ class RoPE:
         if self._g is None:
             raise NotReadyError("No tuned embedding net yet. Call `train()` first.")
         return self._npe.posterior(self._g)
+
+    def checked_observations(self, x_o: Tensor) -> Tensor:
+        """Return a copy of a batch, in the dtype of NPE, if it can be embedded.
+
+        Args:
+            x_o: Real observations, shape ``(n_o, *event)``.
+
+        Raises:
+            InvalidInputError: If x_o has the wrong shape or device, is empty, or not
+                finite.
+        """
+        return self._npe.checked_x("x_o", x_o)
 
     def with_pairs(
         self,

@@ -17,7 +17,7 @@ from sbi_rope._validation import (
 from sbi_rope.batch import check_converged
 from sbi_rope.coupling import SinkhornCoupler
 from sbi_rope.mixture import MixturePosterior
-from sbi_rope.rope import RoPE
+from sbi_rope.rope import HOW_TO_MAKE, RoPE
 
 __all__ = ["sweep"]
 
@@ -68,7 +68,7 @@ def sweep(
         CouplingError: When the iteration reaches a coupling that has not converged.
         SimulationError: If the simulator fails.
     """
-    check_instance("rope", rope, RoPE)
+    check_instance("rope", rope, RoPE, hint=HOW_TO_MAKE)
     settings = rope.coupler if coupler is None else coupler
     check_instance("coupler", settings, SinkhornCoupler)
     gammas, taus = check_numbers("gammas", gammas), check_numbers("taus", taus)

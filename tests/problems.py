@@ -125,17 +125,35 @@ def simulate_trials(theta: Tensor) -> Tensor:
     return trials.where((torch.arange(4) < number)[..., None], torch.nan)
 
 
+class TrialsNet(nn.Module):
+    """An embedding of sets of trials, which leaves out those that are missing."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.of_trial, self.of_set = nn.Linear(2, 4), nn.Linear(5, 3)
+
+    def forward(self, x: Tensor) -> Tensor:
+        known = ~x.isnan().any(dim=-1, keepdim=True)
+        features = self.of_trial(x.nan_to_num()).tanh() * known
+        count = known.sum(dim=1)
+        return self.of_set(torch.cat([features.sum(dim=1) / count, count], dim=1))
+
+
+def trials_net_of_sbi() -> nn.Module:
+    """Sbi's net, which mixes up the numbers of trials if they have several columns."""
+    return PermutationInvariantEmbedding(
+        nn.Linear(2, 4), 4, num_hiddens=8, output_dim=3, aggregation_fn="mean"
+    )
+
+
 @functools.cache
-def trials_posterior() -> Any:
+def trials_posterior(make_net: Callable[[], nn.Module] = TrialsNet) -> Any:
     """Train a small NPE on trials some of which are missing; for reading only."""
     with torch.random.fork_rng(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         torch.manual_seed(1)
-        net = PermutationInvariantEmbedding(
-            nn.Linear(2, 4), 4, num_hiddens=8, output_dim=3, aggregation_fn="mean"
-        )
         builder = posterior_nn(
-            "mdn", embedding_net=net, z_score_x="none", hidden_features=10
+            "mdn", embedding_net=make_net(), z_score_x="none", hidden_features=10
         )
         theta = box(2).sample((200,))
         npe = NPE(box(2), density_estimator=builder, show_progress_bars=False)

@@ -26,7 +26,6 @@ from sbi_rope._sbi.embedding import (
     embed,
     embedding_of,
     headless,
-    readable,
     standardisation_of,
     with_embedding,
 )
@@ -39,6 +38,7 @@ from sbi_rope._sbi.posteriors import (
     is_bounded,
     posterior_from,
 )
+from sbi_rope._sbi.reading import check_rows_apart, readable, reads_missing
 from sbi_rope._sbi.trainer import train_npe
 
 __all__ = [
@@ -56,6 +56,7 @@ __all__ = [
     "VectorFieldDensity",
     "VectorFieldPosterior",
     "build_zuko_unconditional_flow",
+    "check_rows_apart",
     "copy_of_prior",
     "describe",
     "device_of",
@@ -70,6 +71,7 @@ __all__ = [
     "move_distribution_to_device",
     "posterior_from",
     "readable",
+    "reads_missing",
     "standardisation_of",
     "train_npe",
     "with_embedding",

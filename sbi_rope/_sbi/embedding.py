@@ -27,7 +27,6 @@ __all__ = [
     "embed",
     "embedding_of",
     "headless",
-    "readable",
     "standardisation_of",
     "with_embedding",
 ]
@@ -138,26 +137,6 @@ def embed(net: nn.Module, x: Tensor, *, batch_size: int = 1000) -> Tensor:
     finally:
         for module, training in modes.items():
             module.training = training
-
-
-def readable(net: nn.Module, x: Tensor) -> Tensor:
-    """Tell which observations an embedding net can read, ``(n, *event)`` to ``(n,)``.
-
-    It can read what is finite. Where some entries are missing (NaN), it depends on the
-    net: sbi's ``PermutationInvariantEmbedding`` leaves out trials that are missing, and
-    most other nets return NaN. Nothing can be read from Inf, or if all is missing.
-    """
-    rows = x.flatten(1)
-    finite, missing = torch.isfinite(rows), torch.isnan(rows)
-    can_read = finite.all(dim=1)
-    partial = finite.any(dim=1) & missing.any(dim=1) & (finite | missing).all(dim=1)
-    if partial.any():
-        try:
-            embedded = embed(net, x[partial])
-        except Exception:  # nets refuse NaN with errors of any kind
-            return can_read
-        can_read[partial] = torch.isfinite(embedded).flatten(1).all(dim=1)
-    return can_read
 
 
 def standardisation_of(embedding_net: nn.Module) -> tuple[Tensor, Tensor] | None:

@@ -23,7 +23,7 @@ from sbi_rope._simulator.failures import Failures, warn_of_few
 from sbi_rope._simulator.probe import Probe
 from sbi_rope._simulator.workers import ParallelSimulator, simulate_in_workers
 from sbi_rope._validation import check_integer
-from sbi_rope.errors import InvalidInputError, SimulationError
+from sbi_rope.errors import InvalidInputError, SimulationError, in_digits
 
 __all__ = ["Simulator", "source_of"]
 
@@ -175,10 +175,10 @@ class Simulator:
         empty = ~valid.any(dim=1)
         if empty.any():
             # Row numbers would mislead, because these may be some of the pairs only.
-            first = theta[empty][:5].tolist()
             raise SimulationError(
-                f"All simulations at the calibration parameters {first} contain NaN or "
-                f"Inf ({int(empty.sum())} pairs in all). Remove these pairs.{failures}"
+                "All simulations at the calibration parameters "
+                f"{in_digits(theta[empty])} contain NaN or Inf ({int(empty.sum())} "
+                f"pairs in all). Remove these pairs.{failures}"
             ) from failures.cause
         failures.warn_of_dropped(dropped, "simulations at calibration parameters")
         return embedded, valid
@@ -264,7 +264,9 @@ def source_of(
     if (simulator is None) == (simulations is None):
         raise InvalidInputError(
             "Expected exactly one of `simulator` and `simulations`; got "
-            f"{'none' if simulator is None else 'both'}."
+            f"{'none' if simulator is None else 'both'}. Write `RoPE(posterior, "
+            "simulator=simulator)`, or `RoPE(posterior, simulations=(theta, x))` with "
+            "simulations from the prior."
         )
     if num_simulations is not None:
         check_integer("num_simulations", num_simulations)

@@ -25,9 +25,11 @@ from sbi_rope._validation.settings import (
     check_weights,
     usable_device,
 )
+from sbi_rope._validation.shapes import check_not_swapped
 from sbi_rope._validation.tensors import (
     as_float32,
     as_numbers,
+    as_numbers_on,
     check_batch,
     check_device,
     check_finite,
@@ -46,6 +48,7 @@ __all__ = [
     "LARGEST_SETTING",
     "as_float32",
     "as_numbers",
+    "as_numbers_on",
     "as_shape",
     "check_batch",
     "check_choice",
@@ -61,6 +64,7 @@ __all__ = [
     "check_names",
     "check_not_nan",
     "check_not_negative",
+    "check_not_swapped",
     "check_number",
     "check_numbers",
     "check_path",

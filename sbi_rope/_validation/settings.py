@@ -43,13 +43,21 @@ LARGEST_SETTING = 1e30
 
 
 def check_instance(
-    name: str, value: Any, expected: type, *, optional: bool = False
+    name: str, value: Any, expected: type, *, optional: bool = False, hint: str = ""
 ) -> None:
-    """Raise unless ``value`` is an instance of a class, or None where allowed."""
+    """Raise unless ``value`` is an instance of a class, or None where allowed.
+
+    Args:
+        name: What the argument is called.
+        value: What the user gave.
+        expected: The class.
+        optional: Whether None is allowed.
+        hint: A sentence that says how to make such an instance.
+    """
     if not isinstance(value, expected) and not (optional and value is None):
         raise InvalidTypeError(
             f"Expected `{name}` to be a {expected.__name__}; got "
-            f"{type(value).__name__}."
+            f"{type(value).__name__}.{hint and ' '}{hint}"
         )
 
 

@@ -3,17 +3,20 @@
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from sbi.utils import within_support
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_rope._validation.shapes import shape_hint
 from sbi_rope.errors import InvalidInputError, InvalidTypeError
 
 __all__ = [
     "DTYPES",
     "as_float32",
     "as_numbers",
+    "as_numbers_on",
     "check_batch",
     "check_device",
     "check_finite",
@@ -62,16 +65,39 @@ def check_tensor(name: str, value: Any) -> Tensor:
 
 
 def as_numbers(name: str, value: Any) -> Tensor:
-    """Return ``value`` as a tensor of numbers; lists and arrays are converted."""
-    if not isinstance(value, Tensor):
-        try:
-            value = torch.as_tensor(value)
-        except (TypeError, ValueError, RuntimeError) as error:
-            raise InvalidTypeError(
-                f"Expected `{name}` to be a tensor of numbers, or something that torch "
-                f"can convert to one; got {type(value).__name__}."
-            ) from error
-    return check_tensor(name, value)
+    """Return ``value`` as a tensor of numbers; lists and arrays are converted.
+
+    They are copied, in float64, which holds the numbers of all of them.
+
+    Raises:
+        InvalidTypeError: If it holds no real numbers, or its rows differ in length.
+    """
+    if isinstance(value, Tensor):
+        return check_tensor(name, value)
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InvalidTypeError(_no_numbers(name, value)) from error
+    if array.dtype.kind not in "iuf":
+        raise InvalidTypeError(_no_numbers(name, value))
+    return torch.from_numpy(array.astype(np.float64))
+
+
+def as_numbers_on(name: str, value: Any, device: torch.device) -> Tensor:
+    """Return ``value`` as a tensor of numbers on a device.
+
+    Lists and arrays, which have no device of their own, are moved there.
+
+    Raises:
+        InvalidTypeError: As :func:`as_numbers`.
+        InvalidInputError: If it is a tensor on another device.
+    """
+    numbers = as_numbers(name, value)
+    if isinstance(value, Tensor):
+        check_device(name, numbers, device)
+        return numbers
+    # Not every device holds float64.
+    return numbers if device.type == "cpu" else numbers.float().to(device)
 
 
 def as_float32(name: str, value: Tensor) -> Tensor:
@@ -118,16 +144,30 @@ def check_readable(name: str, value: Tensor, can_read: Tensor) -> None:
     """
     if can_read.all():
         return
-    hint = ""
-    if torch.isnan(value[~can_read]).any():
-        hint = (
+    rows, unread = value.flatten(1), ~can_read
+    infinite = unread & torch.isinf(rows).any(dim=1)
+    empty = unread & torch.isnan(rows).all(dim=1)
+    causes = (
+        (infinite, "to be finite; got Inf", ""),
+        (
+            empty,
+            "with a number in each row; got NaN only",
+            " If x is a set of trials, all of them are missing there.",
+        ),
+        (
+            unread & ~infinite & ~empty,
+            "to be finite; got NaN",
             " NaN may stand for missing trials if the embedding net leaves these out, "
-            "as sbi's PermutationInvariantEmbedding does; here it does not, or all "
-            "trials are missing."
-        )
+            "as sbi's PermutationInvariantEmbedding does. This net does not.",
+        ),
+    )
     raise InvalidInputError(
-        f"Expected `{name}` to be finite; got NaN or Inf in {_rows_with(~can_read)}. "
-        f"Remove or repair these rows.{hint}"
+        " ".join(
+            f"Expected `{name}` {what} in {_rows_with(found)}. Remove or repair these "
+            f"rows.{hint}"
+            for found, what, hint in causes
+            if found.any()
+        )
     )
 
 
@@ -148,6 +188,7 @@ def check_batch(
     *,
     finite: bool = True,
     allow_empty: bool = False,
+    reads_missing: bool = False,
 ) -> Tensor:
     """Return ``value`` if it is a batch of events, shape ``(n, *event_shape)``.
 
@@ -157,6 +198,7 @@ def check_batch(
         event_shape: The shape of one event.
         finite: Whether NaN and infinite entries are refused.
         allow_empty: Whether n may be 0.
+        reads_missing: Whether missing trials (NaN) can be read, for a hint.
 
     Raises:
         InvalidTypeError: If it is no tensor of real numbers.
@@ -168,7 +210,7 @@ def check_batch(
     if tuple(value.shape[1:]) != tuple(event_shape) or value.ndim == 0:
         raise InvalidInputError(
             f"Expected `{name}` of shape {expected}; got {tuple(value.shape)}."
-            f"{_hint(name, value.shape, event_shape)}"
+            + shape_hint(name, value.shape, event_shape, reads_missing=reads_missing)
         )
     if value.shape[0] == 0 and not allow_empty:
         raise InvalidInputError(
@@ -240,7 +282,7 @@ def check_theta(theta: Any, event_shape: torch.Size, *, batched: bool) -> Tensor
     if theta.ndim not in ndims or theta.shape[-1:] != event_shape:
         raise InvalidInputError(
             f"Expected `theta` of shape {expected}; got {tuple(theta.shape)}."
-            f"{_hint('theta', theta.shape, event_shape)}"
+            + shape_hint("theta", theta.shape, event_shape)
         )
     if not theta.numel():
         raise InvalidInputError(
@@ -295,13 +337,28 @@ def check_in_support(
         )
 
 
-def _hint(name: str, shape: Sequence[int], event_shape: Sequence[int]) -> str:
-    """Say how to add the dimension that a tensor lacks; nothing if that is not it."""
-    if tuple(shape) == tuple(event_shape):
-        return f" For a single one pass `{name}[None]`."
-    if len(shape) == 1 and tuple(event_shape) == (1,):
-        return f" For one number in each row pass `{name}[:, None]`."
-    return ""
+def _no_numbers(name: str, value: Any) -> str:
+    """Say why something cannot be converted to a tensor."""
+    message = (
+        f"Expected `{name}` to be a tensor, an array or a list of numbers; got "
+        f"{type(value).__name__}"
+    )
+    if len(lengths := _lengths(value)) > 1:
+        return (
+            f"{message} with rows of {min(lengths)} to {max(lengths)} entries. If "
+            "these are sets of trials, pad them with NaN to the longest. An embedding "
+            "net can read that if it leaves NaN out, as sbi's "
+            "PermutationInvariantEmbedding does."
+        )
+    return f"{message} that holds something else."
+
+
+def _lengths(value: Any) -> set[int]:
+    """Return the lengths of the rows of a list or an array of them."""
+    if not isinstance(value, list | tuple | np.ndarray):
+        return set()
+    rows = (row for row in value if isinstance(row, list | tuple | np.ndarray | Tensor))
+    return {len(row) for row in rows if getattr(row, "ndim", 1)}
 
 
 def _rows_with(bad: Tensor) -> str:

@@ -26,7 +26,7 @@ from sbi_rope.diagnosis.simulations import Simulations
 from sbi_rope.diagnosis.spread import FEWEST, spread_of
 from sbi_rope.diagnosis.support import support_of
 from sbi_rope.errors import InvalidInputError
-from sbi_rope.rope import RoPE
+from sbi_rope.rope import HOW_TO_MAKE, RoPE
 
 __all__ = ["diagnose"]
 
@@ -106,7 +106,7 @@ def diagnose(
         CouplingError: If the embeddings cannot be coupled.
         SimulationError: If the simulator fails.
     """
-    check_instance("rope", rope, RoPE)
+    check_instance("rope", rope, RoPE, hint=HOW_TO_MAKE)
     check_instance("coupler", coupler, SinkhornCoupler, optional=True)
     if num_simulations is not None:
         check_integer("num_simulations", num_simulations, minimum=FEWEST_SIMULATIONS)

@@ -33,6 +33,7 @@ from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.parameters import learn_parameters
 from sbi_rope.discrepancy.posterior import Discrepancy
 from sbi_rope.discrepancy.report import DiscrepancyReport, report_discrepancy
+from sbi_rope.discrepancy.summaries import Summaries
 from sbi_rope.discrepancy.tuning import TUNING, cross_fitted_nets
 from sbi_rope.errors import (
     InvalidInputError,
@@ -211,6 +212,7 @@ class DiscrepancyNPE(Method):
     def report(
         self,
         *,
+        summaries: Callable[[Tensor], Any] | None = None,
         x_names: Sequence[str] | None = None,
         seed: int | None = 0,
         show_progress_bars: bool | None = None,
@@ -221,19 +223,25 @@ class DiscrepancyNPE(Method):
         simulations. The report is about x itself, whatever ``space`` is. Print it.
 
         Args:
-            x_names: Names of the entries of x; numbered if None.
+            summaries: A function from observations ``(n, *event)`` to a few summaries
+                of each, ``(n, k)``, such as the means of parts of an image, or mean and
+                spread of a set of trials. It may return a NumPy array. If None, the
+                summaries are the entries of x, which has to be a vector.
+            x_names: Names of the summaries; numbered if None.
             seed: Seed of the simulations; None uses the states of torch, NumPy and
                 Python.
-            show_progress_bars: Whether to show the progress of slow simulations, as in
-                ``train``.
+            show_progress_bars: Whether to show the progress of slow simulations, and of
+                many summaries, as in ``train``. A summary takes about 0.03 seconds.
 
         Returns:
             The gain, shift and error of each summary with 95 % intervals, in the units
-            of x.
+            of x or of the summaries.
 
         Raises:
             NotReadyError: If there are fewer than two pairs, or no simulations.
-            InvalidInputError: If x is not a vector, or the names do not fit.
+            InvalidTypeError: If ``summaries`` is no function, or returns no numbers.
+            InvalidInputError: If x is not a vector and no summaries are given, if these
+                have another shape or are not finite, or the names do not fit.
             SimulationError: If the simulator fails.
         """
         if x_names is not None:
@@ -242,18 +250,30 @@ class DiscrepancyNPE(Method):
             self._check_some("simulations")
         self._check_pairs()
         _, x = self._data.calibration
-        if x.ndim != 2:
+        if x.ndim != 2 and summaries is None:
             raise InvalidInputError(
                 "Expected observations of shape (n, l), with a summary in each column; "
-                f"got {tuple(x.shape)}. Reduce x to summaries with names first."
+                f"got {tuple(x.shape)}. Pass `summaries=`, a function from x to a few "
+                "numbers for each observation, shape (n, k)."
             )
         show = is_shown(show_progress_bars)
+        net = nn.Identity() if summaries is None else Summaries(summaries)
         with seeded(seed):
             source = self._source()
             _, simulated = source.kept(self.num_simulations, progress=show)
-            moments = self._moments(source, nn.Identity(), show)
+            if isinstance(net, Summaries):
+                x = net.checked("the pairs", embed(net, x))
+                simulated = net.checked("simulations", embed(net, simulated))
+            moments = self._moments(source, net, show)
+        if isinstance(net, Summaries):
+            net.checked("simulations at the pairs", moments.mean)
         return report_discrepancy(
-            x, moments, simulated, model=self.model, x_names=x_names
+            x,
+            moments,
+            simulated,
+            model=self.model,
+            x_names=x_names,
+            show_progress_bars=show,
         )
 
     def _check_data(self) -> None:

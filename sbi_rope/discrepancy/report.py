@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sbi_rope._progress import progress_bar
 from sbi_rope._simulations import Moments
 from sbi_rope._standardisation import Standardisation
 from sbi_rope._validation import check_names
@@ -24,6 +25,8 @@ __all__ = [
 ]
 
 NUM_DRAWS = 4000
+# A progress bar appears after this many seconds.
+DELAY = 2.0
 # The probability that a summary without outliers is reported to have one.
 FALSE_ALARMS = 0.01
 # The efficiency of a standard deviation that is estimated from a median distance.
@@ -251,6 +254,7 @@ def report_discrepancy(
     weights: Tensor | None = None,
     x_names: Sequence[str] | None = None,
     seed: int = 0,
+    show_progress_bars: bool = False,
 ) -> DiscrepancyReport:
     """Fit the discrepancy of each summary separately.
 
@@ -265,6 +269,7 @@ def report_discrepancy(
         weights: How many pairs each pair counts as, shape ``(n,)``; one if None.
         x_names: Names of the summaries; numbered if None.
         seed: Seed of the draws behind the intervals.
+        show_progress_bars: Whether to show the progress if there are many summaries.
 
     Raises:
         InvalidInputError: If there are not as many names as summaries.
@@ -279,7 +284,10 @@ def report_discrepancy(
     standardisation = Standardisation(simulated.double())
     varies = standardisation.varies.tolist()
     summaries = []
-    for j in range(width):
+    numbers = range(width)
+    for j in progress_bar(
+        numbers, show=show_progress_bars, desc="Summaries", delay=DELAY
+    ):
         if not varies[j]:
             continue
         mean, std = standardisation.mean[j], standardisation.std[j]

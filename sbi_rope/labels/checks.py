@@ -6,11 +6,10 @@ import torch
 from torch import Tensor
 
 from sbi_rope._validation import (
+    as_numbers_on,
     check_batch,
-    check_device,
     check_in_support,
     check_same_length,
-    check_tensor,
     check_values,
 )
 from sbi_rope.errors import InvalidInputError
@@ -43,12 +42,11 @@ def checked_labels(
         prior: The prior of NPE.
 
     Raises:
-        InvalidTypeError: If an argument is no tensor of numbers.
+        InvalidTypeError: If an argument holds no numbers.
         InvalidInputError: If a shape or a value does not fit.
     """
     dim = like.shape[1]
-    theta = check_tensor("theta", theta)
-    check_device("theta", theta, like.device)
+    theta = as_numbers_on("theta", theta, like.device)
     is_draws = theta.ndim == 3
     if is_draws and theta.shape[1] < 2:
         raise InvalidInputError(
@@ -121,9 +119,7 @@ def _covariance(theta: Tensor, theta_std: Any, theta_cov: Any) -> Tensor:
 
 def _checked_std(theta_std: Any, theta: Tensor) -> Tensor:
     n, dim = theta.shape
-    if isinstance(theta_std, int | float) and not isinstance(theta_std, bool):
-        theta_std = torch.tensor(float(theta_std))
-    std = check_tensor("theta_std", theta_std)
+    std = as_numbers_on("theta_std", theta_std, theta.device)
     check_values("theta_std", std)
     if tuple(std.shape) not in ((), (dim,), (n, dim)):
         raise InvalidInputError(
@@ -144,7 +140,7 @@ def _checked_std(theta_std: Any, theta: Tensor) -> Tensor:
 
 def _checked_covariance(theta_cov: Any, theta: Tensor) -> Tensor:
     n, dim = theta.shape
-    covariance = check_tensor("theta_cov", theta_cov)
+    covariance = as_numbers_on("theta_cov", theta_cov, theta.device)
     check_values("theta_cov", covariance)
     if tuple(covariance.shape) not in ((dim, dim), (n, dim, dim)):
         raise InvalidInputError(
@@ -183,7 +179,7 @@ def _checked_covariance(theta_cov: Any, theta: Tensor) -> Tensor:
 
 
 def _checked_weights(weights: Any, theta: Tensor) -> Tensor:
-    weights = check_tensor("weights", weights)
+    weights = as_numbers_on("weights", weights, theta.device)
     if weights.ndim != 1:
         raise InvalidInputError(
             "Expected `weights` with one number for each pair, shape (n,); got "

@@ -26,9 +26,11 @@ from sbi_rope._sbi import MixtureDensity, NeuralPosterior, is_bounded, readable
 from sbi_rope._slices import slices
 from sbi_rope._validation import (
     as_float32,
+    as_numbers,
     check_batch,
     check_device,
     check_integer,
+    check_not_swapped,
     check_readable,
     check_same_length,
     check_tensor,
@@ -93,9 +95,12 @@ def check_test_set(
         InvalidInputError: If a shape does not fit or an entry is not finite.
     """
     check_integer("chunk_size", chunk_size)
-    theta_shape = check_tensor("theta", theta).shape[1:]
+    theta, x = _as_tensor("theta", theta), _as_tensor("x", x)
+    theta_shape = theta.shape[1:]
     if isinstance(posterior, DirectPosterior):
-        theta_shape = posterior.posterior_estimator.input_shape
+        estimator = posterior.posterior_estimator
+        theta_shape = estimator.input_shape
+        check_not_swapped(theta, x, theta_shape, estimator.condition_shape)
     if len(theta_shape) != 1:
         raise InvalidInputError(
             f"Expected `theta` of shape (n, d); got {tuple(theta.shape)}. For one "
@@ -216,6 +221,7 @@ def draw_samples(posterior: Any, x: Tensor, *, num_samples: int) -> Tensor:
             from 1 to 10^8.
     """
     check_num_samples(num_samples)
+    x = _as_tensor("x", x)
     _check_x(posterior, x)
     if isinstance(posterior, NeuralPosterior):
         x = as_float32("x", x)
@@ -228,10 +234,16 @@ def draw_samples(posterior: Any, x: Tensor, *, num_samples: int) -> Tensor:
     return samples
 
 
-def _check_x(posterior: Any, x: Any) -> None:
+def _as_tensor(name: str, value: Any) -> Tensor:
+    """Return a tensor as it is; arrays and lists of numbers become float32."""
+    numbers = as_numbers(name, value)
+    return numbers if numbers is value else as_float32(name, numbers)
+
+
+def _check_x(posterior: Any, x: Tensor) -> None:
     """Raise if observations do not fit, or are not finite and cannot be read so."""
     estimator = getattr(posterior, "posterior_estimator", None)
-    event_shape = getattr(estimator, "condition_shape", check_tensor("x", x).shape[1:])
+    event_shape = getattr(estimator, "condition_shape", x.shape[1:])
     check_batch("x", x, event_shape, finite=False)
     check_values("x", x)
     if isinstance(estimator, MixtureDensity):

@@ -11,10 +11,10 @@ from torch.distributions import Distribution
 from sbi_rope._random import seeded
 from sbi_rope._sbi import BasePotential, NeuralPosterior, describe
 from sbi_rope._validation import (
+    as_numbers,
     as_shape,
     check_batch,
     check_prior,
-    check_tensor,
     check_theta,
     usable_device,
 )
@@ -185,7 +185,7 @@ class PriorPosterior(NeuralPosterior):
 
 
 def _number_of_rows(x: Any) -> int:
-    x = check_tensor("x", x)
+    x = as_numbers("x", x)
     return len(check_batch("x", x, x.shape[1:], finite=False))
 
 

@@ -6,7 +6,7 @@ from typing import Literal
 from torch import Tensor
 
 from sbi_rope._validation import check_choice, check_instance, check_unit_interval
-from sbi_rope.rope import RoPE
+from sbi_rope.rope import HOW_TO_MAKE, RoPE
 from sbi_rope.stacking.batch import compare_batch
 from sbi_rope.stacking.candidates import Candidate
 from sbi_rope.stacking.cross_validation import CrossValidation
@@ -103,7 +103,7 @@ def stack(
     """
     check_choice("unseen", unseen, ("raise", "extend"))
     check_unit_interval("tail_mass", tail_mass)
-    check_instance("rope", rope, RoPE)
+    check_instance("rope", rope, RoPE, hint=HOW_TO_MAKE)
     stopwatch = Stopwatch(rope)
     trainer = StackTrainer(
         rope,

@@ -7,17 +7,14 @@ import torch
 from torch import Tensor
 
 from sbi_rope._progress import is_shown, progress_bar
-from sbi_rope._sbi import ConditionalDensityEstimator, estimator_of, readable
+from sbi_rope._sbi import ConditionalDensityEstimator, estimator_of
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._units import log_units_of
 from sbi_rope._validation import (
-    check_batch,
     check_gradients,
     check_instance,
     check_integer,
     check_not_negative,
-    check_readable,
-    check_values,
 )
 from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.discrepancy.correction import network_of
@@ -28,7 +25,7 @@ from sbi_rope.errors import (
     warn_user,
 )
 from sbi_rope.mixture import MixturePosterior
-from sbi_rope.rope import RoPE
+from sbi_rope.rope import HOW_TO_MAKE, RoPE
 from sbi_rope.stacking.candidates import (
     AmortisedCandidate,
     Candidate,
@@ -84,7 +81,7 @@ class StackTrainer:
         tail_mass: float = 1e-3,
     ) -> None:
         check_gradients()
-        check_instance("rope", rope, RoPE)
+        check_instance("rope", rope, RoPE, hint=HOW_TO_MAKE)
         if num_folds is not None:
             check_integer("num_folds", num_folds, minimum=2)
         if num_simulations is not None:
@@ -188,8 +185,15 @@ class StackTrainer:
 
     def _train(self, folds: Sequence[Fold]) -> Versions:
         chosen = self.candidates
-        bar = progress_bar(folds, show=self.show, desc="Folds")
-        trained = tuple(train_version(chosen, fold) for fold in bar)
+        count = sum(isinstance(c, AmortisedCandidate) and not c.fixed for c in chosen)
+        with progress_bar(
+            show=self.show,
+            desc=f"Training {count} candidates in {len(folds)} folds",
+            total=count * len(folds),
+        ) as bar:
+            trained = tuple(
+                train_version(chosen, fold, advance=bar.update) for fold in folds
+            )
         couplings: FittedCouplings | None = None
         coupled = [c for c in chosen if isinstance(c, CouplingCandidate)]
         if coupled:
@@ -377,10 +381,6 @@ def _check_density(estimator: Any) -> None:
 
 
 def _checked_observations(x_o: Tensor, rope: RoPE) -> Tensor:
-    _, x = rope.calibration
-    x_o = check_batch("x_o", x_o, x.shape[1:], finite=False)
-    check_values("x_o", x_o)
-    x_o = x_o.detach().to(x, copy=True)  # a large float64 can overflow in float32
-    check_readable("x_o", x_o, readable(rope.embedding_net, x_o))
+    x_o = rope.checked_observations(x_o)
     warn_of_far_entries("x_o", x_o, rope.embedding_net)
     return x_o

@@ -1,7 +1,7 @@
 """All candidates of a stack, in one version for each fold."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -20,7 +20,11 @@ __all__ = ["Versions", "train_version"]
 
 
 def train_version(
-    candidates: Sequence[Candidate], fold: Fold, *, fixed: bool = False
+    candidates: Sequence[Candidate],
+    fold: Fold,
+    *,
+    fixed: bool = False,
+    advance: Callable[[], object] = lambda: None,
 ) -> dict[str, list[Part]]:
     """Return the densities of amortised candidates by name.
 
@@ -29,6 +33,7 @@ def train_version(
         fold: The pairs to train on.
         fixed: Whether to return the candidates that do not depend on the pairs.
             Otherwise the others are returned.
+        advance: Called after each candidate, for a progress bar.
 
     Raises:
         InvalidInputError: If a candidate returns no density.
@@ -45,6 +50,7 @@ def train_version(
             raise InvalidInputError(
                 f"Expected at least one density of {candidate.name!r}; got none."
             )
+        advance()
     return trained
 
 

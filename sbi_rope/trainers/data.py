@@ -8,12 +8,13 @@ from torch.distributions import Distribution
 
 from sbi_rope._sbi import readable
 from sbi_rope._validation import (
+    as_numbers,
     check_batch,
     check_finite,
     check_in_support,
+    check_not_swapped,
     check_readable,
     check_same_length,
-    check_tensor,
     check_values,
 )
 from sbi_rope.errors import InvalidInputError, warn_user
@@ -94,6 +95,7 @@ class Data:
 
     def append_simulations(self, theta: Any, x: Any) -> None:
         """Add simulations; those with NaN or Inf are dropped with a warning."""
+        self._check_order(theta, x)
         theta = self.checked_theta("theta", theta)
         check_in_support("theta", theta, self._prior)
         x = self._checked_x("x", x)
@@ -113,6 +115,7 @@ class Data:
 
     def append_calibration(self, theta: Any, x: Any) -> None:
         """Add calibration pairs."""
+        self._check_order(theta, x)
         theta = self.checked_theta("theta", theta)
         check_in_support("theta", theta, self._prior)
         x = self._checked_x("x", x)
@@ -134,13 +137,18 @@ class Data:
 
     def checked_theta(self, name: str, theta: Any) -> Tensor:
         """Return a copy of parameters ``(n, d)``, which have to be finite."""
+        theta = as_numbers(name, theta)
         theta = check_batch(name, theta, self._prior.event_shape)
         theta = self._copied(theta)
         check_finite(name, theta)  # float32 may hold less
         return theta
 
+    def _check_order(self, theta: Any, x: Any) -> None:
+        if self.event_shape is not None:
+            check_not_swapped(theta, x, self._prior.event_shape, self.event_shape)
+
     def _checked_x(self, name: str, x: Any) -> Tensor:
-        x = check_tensor(name, x)
+        x = as_numbers(name, x)
         if self.event_shape is None and x.ndim < 2:
             raise InvalidInputError(
                 f"Expected `{name}` of shape (n, *event); got {tuple(x.shape)}. Pass "

@@ -13,8 +13,6 @@ BAD_TENSORS: dict[str, Callable[[Tensor], Any]] = {
     "None": lambda good: None,
     "a number": lambda good: 1.0,
     "text": lambda good: "x",
-    "a list": lambda good: good.tolist(),
-    "a NumPy array": lambda good: good.numpy(),
     "no dimension": lambda good: good.new_ones(()),
     "one dimension more": lambda good: good[..., None],
     "one dimension less": lambda good: good.reshape(-1)[:3],
@@ -45,6 +43,9 @@ EXTREME_TENSORS: dict[str, Callable[[Tensor], Any]] = {
 }
 # These must be refused, or give what a plain float32 tensor of the same numbers gives.
 ODD_TENSORS: dict[str, Callable[[Tensor], Any]] = {
+    "a list": lambda good: good.tolist(),
+    "a NumPy array": lambda good: good.numpy(),
+    "a NumPy array of float64": lambda good: good.double().numpy(),
     "float64": Tensor.double,
     "half": lambda good: good.half().float().half(),
     "bfloat16": lambda good: good.bfloat16(),

@@ -94,7 +94,7 @@ def survive(call: Call, argument: str, label: str, value: Any) -> Outcome:
     return _judge(call, argument, label, value, expected=expected)
 
 
-def agree(call: Call, argument: str, label: str, value: Tensor) -> Outcome:
+def agree(call: Call, argument: str, label: str, value: Any) -> Outcome:
     """Call with an argument that must be refused or treated as a plain tensor."""
     accepted = f"{argument}: {label}" in call.accepts
     expected = "numbers" if accepted else "the same"
@@ -128,9 +128,9 @@ def _judge(
     if expected != "anything" and any(tensor.isnan().any() for tensor in numbers):
         return outcome("silent", "NaN")
     if expected == "the same":
-        plain = value.detach().float() if value.is_floating_point() else value.float()
+        plain = torch.as_tensor(value).detach().float()
         if not call.tensors[argument].is_floating_point():
-            plain = value.long()
+            plain = plain.long()
         same = call(**{argument: plain.clone().contiguous()})
         if len(same) != len(found) or not all(map(_is_close, same, found)):
             return outcome("silent", "differs from a plain tensor of float32")

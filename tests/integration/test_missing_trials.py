@@ -4,12 +4,18 @@ import warnings
 
 import pytest
 import torch
+from sbi.neural_nets.embedding_nets import PermutationInvariantEmbedding
 from torch import Tensor, nn
 
 from sbi_rope import RoPE, diagnose
-from sbi_rope._sbi import embedding_of, posterior_from, with_embedding
+from sbi_rope._sbi import embedding_of, posterior_from, readable, with_embedding
 from sbi_rope.discrepancy import DiscrepancyNPE
-from sbi_rope.errors import InvalidInputError, SimulationError
+from sbi_rope.errors import (
+    InvalidInputError,
+    InvalidTypeError,
+    SimulationError,
+    UnsupportedPosteriorError,
+)
 from sbi_rope.metrics import draw_samples, evaluate
 from sbi_rope.stacking import DiscrepancyCandidate, default_candidates
 from sbi_rope.stacking.folds import Workbench
@@ -119,13 +125,16 @@ def test_simulations_all_of_which_are_missing_have_failed() -> None:
 def test_what_the_net_cannot_read_is_refused_with_a_reason() -> None:
     theta, x = labelled(10)
     x[2] = torch.nan
-    message = r"NaN or Inf in 1 of 10 rows \(first: \[2\]\).*all trials are missing"
-    with pytest.raises(InvalidInputError, match=message):
+    message = r"got NaN only in 1 of 10 rows \(first: \[2\]\).*all of them are missing"
+    with pytest.raises(InvalidInputError, match=message) as refusal:
         rope().append_calibration(theta, x)
+    assert "Inf" not in str(refusal.value)
     x[2] = 0.0
     x[4, 0, 0] = torch.inf
-    with pytest.raises(InvalidInputError, match=r"first: \[4\]\)\. Remove or repair"):
+    message = r"got Inf in 1 of 10 rows \(first: \[4\]\)\. Remove or repair"
+    with pytest.raises(InvalidInputError, match=message) as refusal:
         rope().append_calibration(theta, x)
+    assert "NaN" not in str(refusal.value)
     posterior = rope().train(**QUIET).build_posterior(labelled(20)[1], **QUIET)
     for call in (posterior.set_default_x, lambda x: posterior.sample((3,), x=x)):
         with pytest.raises(InvalidInputError, match="`x` to be finite"):
@@ -139,11 +148,45 @@ def test_an_ordinary_net_refuses_missing_values() -> None:
     x = problems.simulate(theta)
     x[1, 0] = torch.nan
     rope = RoPE(problems.npe_posterior(), simulator=problems.simulate)
-    with pytest.raises(InvalidInputError, match="missing trials"):
+    message = r"got NaN in 1 of 5 rows \(first: \[1\]\).*This net does not"
+    with pytest.raises(InvalidInputError, match=message):
         rope.append_calibration(theta, x)
     for posterior in (problems.npe_posterior(), problems.gaussian_posterior()):
         with pytest.raises(InvalidInputError, match="missing trials"):
             draw_samples(posterior, x, num_samples=3)
+
+
+def test_a_net_that_counts_the_trials_of_another_row_is_refused() -> None:
+    npe = problems.trials_posterior(problems.trials_net_of_sbi)
+    rope = RoPE(npe, simulator=problems.simulate_trials)
+    theta, x = labelled(10)
+    # With no trial missing, its embeddings are right.
+    rope.append_calibration(theta, x.nan_to_num(0.5))
+    for call in (
+        lambda: rope.append_calibration(theta, x),
+        lambda: rope.checked_observations(x),
+        lambda: evaluate(npe, theta, x),
+        lambda: FinetunedNPE.from_posterior(npe).append_calibration(theta, x),
+    ):
+        match = "PermutationInvariantEmbedding .* more than one column"
+        with pytest.raises(UnsupportedPosteriorError, match=match):
+            call()
+
+
+def test_sbis_net_is_accepted_with_one_column_for_each_trial() -> None:
+    net = PermutationInvariantEmbedding(nn.Linear(1, 4), 4, num_hiddens=8, output_dim=3)
+    x = labelled(10)[1][..., :1]
+    assert readable(net, x).all()
+
+
+def test_the_number_of_trials_is_mended_with_nan() -> None:
+    x = labelled(10)[1]
+    few, many = x[:, :3], torch.cat([x, x], dim=1)
+    for trials, match in ((few, "Pad with NaN to 4 trials"), (many, "on 4 trials")):
+        with pytest.raises(InvalidInputError, match=match):
+            rope().checked_observations(trials)
+    with pytest.raises(InvalidTypeError, match=r"rows of 2 to 4 entries.*pad them"):
+        rope().checked_observations([x[0, :2].tolist(), x[1].tolist()])  # type: ignore[arg-type]
 
 
 class Filled(nn.Module):

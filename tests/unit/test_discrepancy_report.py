@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 import torch
 from scipy import stats
-from torch import Tensor
+from torch import Tensor, nn
 
 from sbi_rope._simulations import Moments
 from sbi_rope.discrepancy import (
@@ -18,6 +18,7 @@ from sbi_rope.discrepancy.report import report_discrepancy
 from sbi_rope.errors import InvalidInputError, NotReadyError
 from sbi_rope.tasks import get_task
 from tests import problems
+from tests.refusals import assert_refused
 
 # Mean, spread over the prior and noise of four simulated summaries, in their units.
 CENTRE = torch.tensor([100.0, -5.0, 0.0, 2e-6]).double()
@@ -283,8 +284,78 @@ def test_a_report_asks_for_the_data_that_it_lacks() -> None:
     images = method(simulator=problems.simulate_image)
     theta = problems.box(2).sample((5,))
     images.append_calibration(theta, problems.simulate_image(theta))
-    with pytest.raises(InvalidInputError, match=r"shape \(n, l\).*\(5, 1, 8, 8\)"):
+    match = r"shape \(n, l\).*\(5, 1, 8, 8\)\. Pass `summaries=`"
+    with pytest.raises(InvalidInputError, match=match):
         images.report()
+
+
+def blocks(x: Tensor) -> Tensor:
+    """Return the mean brightness of four blocks of an image of 8 x 8 pixels."""
+    return nn.functional.avg_pool2d(x, 4).flatten(1)
+
+
+def test_the_discrepancy_of_an_image_is_that_of_its_summaries() -> None:
+    theta = problems.box(2).sample((30,))
+    x = problems.simulate_image(theta)
+    x[..., :4, 4:] += 0.5  # the light of one quarter
+    stored = problems.box(2).sample((2000,))
+    for asked in (
+        method(simulator=problems.simulate_image),
+        method().append_simulations(stored, problems.simulate_image(stored)),
+    ):
+        asked.append_calibration(theta, x)
+        names = ["NW", "NE", "SW", "SE"]
+        found = asked.report(summaries=blocks, x_names=names)
+        assert [s.name for s in found.summaries if s.is_off] == ["NE"]
+        assert inside(0.5, found["NE"].shift)
+        arrays = asked.report(summaries=lambda x: blocks(x).numpy(), x_names=names)
+        assert arrays.as_rows() == found.as_rows()
+
+
+def test_summaries_may_leave_out_missing_trials() -> None:
+    theta = problems.box(2).sample((30,))
+    x = problems.simulate_trials(theta)
+    x[..., 1] += 0.5
+    npe = problems.trials_posterior()
+    asked = DiscrepancyNPE.from_posterior(npe, simulator=problems.simulate_trials)
+    asked.append_calibration(theta, x)
+    found = asked.report(summaries=lambda x: x.nanmean(dim=1), x_names=["a", "b"])
+    assert [s.name for s in found.summaries if s.is_off] == ["b"]
+    assert inside(0.5, found["b"].shift)
+    with pytest.raises(InvalidInputError, match="summaries of the pairs` to be finite"):
+        asked.report(summaries=lambda x: x.mean(dim=1))
+
+
+def test_a_vector_that_is_its_own_summary_gives_the_same_report() -> None:
+    asked = method(simulator=problems.simulate).append_calibration(*shifted())
+    found = asked.report(summaries=lambda x: x, show_progress_bars=False)
+    assert found.as_rows() == asked.report(show_progress_bars=False).as_rows()
+
+
+def test_summaries_that_are_no_rows_of_numbers_are_refused() -> None:
+    asked = method(simulator=problems.simulate).append_calibration(*shifted())
+    for summaries, match in (
+        (3, "`summaries` to be callable"),
+        (lambda x: None, "list of numbers; got NoneType"),
+        (lambda x: x[:, 0], r"shape \(\d+, k\)"),
+        (lambda x: x[:-1], r"shape \(\d+, k\)"),
+        (lambda x: x[:, :0], "at least one number"),
+        (lambda x: x.where(x > 0, torch.nan), "to be finite"),
+    ):
+        assert_refused(match, asked.report, summaries=summaries)
+    with pytest.raises(InvalidInputError, match="1 different names"):
+        asked.report(summaries=lambda x: x[:, :1], x_names=["a", "b"])
+
+
+def test_many_summaries_show_their_progress(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = method(simulator=problems.simulate).append_calibration(*shifted())
+    monkeypatch.setattr("sbi_rope.discrepancy.report.DELAY", 0.0)
+    asked.report(show_progress_bars=True)
+    assert "Summaries: 100%" in capsys.readouterr().err
+    asked.report()
+    assert capsys.readouterr().err == ""
 
 
 def tunnel(root: Any, n: int) -> DiscrepancyReport:

@@ -10,7 +10,7 @@ import pytest
 from sbi_rope import CalibrationFinetuner, RoPE, stack
 from sbi_rope._progress import is_shown, progress_bar
 from tests import baselines, gaussian
-from tests.stacks import NPE, PRIOR, quick
+from tests.stacks import FITTED, NPE, PRIOR, quick
 
 TRAIN = """
 import warnings
@@ -85,7 +85,8 @@ def work(**show: bool) -> None:
     posterior[0].sample((10,), **show)
     posterior.log_prob_batched(theta, x=x_o)
     with quick():
-        stack(trained, candidates=(PRIOR, NPE), num_folds=2, **show)
+        chosen = (PRIOR, NPE, FITTED)
+        stack(trained, candidates=chosen, num_folds=2, **show)
     method = baselines.make("tuning_only", "linear_gaussian")
     data = baselines.data_of("linear_gaussian")
     baselines.feed(method, data).train(**show).build_posterior()
@@ -114,5 +115,6 @@ def test_bars_that_are_asked_for_are_shown_without_a_terminal_and_on_stderr(
     work(show_progress_bars=True)
     printed = capsys.readouterr()
     assert printed.out == ""
-    bars = ("Fine-tuning", "Sampling", "Folds", "Training NPE: 3 epochs")
+    of_stack = "Training 1 candidates in 3 folds: 100%"
+    bars = ("Fine-tuning", "Sampling", of_stack, "Training NPE: 3 epochs")
     assert [bar for bar in bars if bar not in printed.err] == []

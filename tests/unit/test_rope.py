@@ -401,7 +401,8 @@ def test_unusable_stored_simulations_are_refused() -> None:
         (THETA, "pair"),
         ((THETA, X[:9]), "same number of rows"),
         ((THETA[:, :1], X), r"simulations\[0\]"),
-        ((THETA, X.numpy()), r"simulations\[1\]"),
+        ((THETA, X.numpy().astype(str)), r"simulations\[1\]"),
+        ((THETA[:, [0, 1, 1]], X), r"simulations\[0\]"),
         ((THETA, NAN), "All stored simulations"),
     ]
     for simulations, match in cases:
@@ -412,6 +413,9 @@ def test_unusable_stored_simulations_are_refused() -> None:
 def test_a_simulator_and_stored_simulations_exclude_each_other() -> None:
     with pytest.raises(InvalidInputError, match=r"exactly one.*both"):
         rope(simulations=(THETA, X))
+    spellings = r"none\. Write .*simulator=simulator.*simulations=\(theta, x\)"
+    with pytest.raises(InvalidInputError, match=spellings):
+        rope(simulator=None)
 
 
 def test_later_changes_of_the_users_posterior_have_no_effect() -> None:

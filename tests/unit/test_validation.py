@@ -1,5 +1,6 @@
 """Each check accepts good input and refuses bad input with a helpful message."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from sbi.utils import BoxUniform
 from sbi_rope._validation import (
     LARGEST_SETTING,
     as_float32,
+    as_numbers,
     check_batch,
     check_choice,
     check_device,
@@ -21,6 +23,7 @@ from sbi_rope._validation import (
     check_names,
     check_not_nan,
     check_not_negative,
+    check_not_swapped,
     check_number,
     check_path,
     check_positive,
@@ -112,6 +115,68 @@ def test_numbers_that_are_too_large_for_float32_are_refused() -> None:
 def test_the_error_about_a_device_says_where_other_tensors_are() -> None:
     match = "on meta, where `theta` is; got cpu"
     assert_refused(match, check_device, "x", X, torch.device("meta"), where="`theta`")
+
+
+def test_arrays_and_lists_of_numbers_are_converted_without_loss() -> None:
+    values = X.double().numpy()
+    locked = values.copy()
+    locked.flags.writeable = False
+    for value in (values, locked, values[::-1], values.astype(">f8"), values.tolist()):
+        converted = as_numbers("x", value)
+        assert converted.dtype == torch.float64
+        assert np.array_equal(converted.numpy(), np.asarray(value))
+    converted = as_numbers("x", values)
+    converted.zero_()
+    assert values.all()  # the user's array is not changed
+    assert as_numbers("x", [1, 2]).tolist() == [1.0, 2.0]
+    assert as_numbers("x", list(X)).shape == X.shape
+    bad = (None, "1", ["a"], [None], [True], np.array([1j]), np.array([THING]), {})
+    for value in bad:
+        match = "`x` to be a tensor, an array or a list of numbers; got"
+        assert_refused(match, as_numbers, "x", value, error=InvalidTypeError)
+    for value in ([[1.0], [1.0, 2.0]], [np.ones(1), np.ones(2)], [X, X[:2]]):
+        match = "rows of . to . entries.*pad them with NaN"
+        assert_refused(match, as_numbers, "x", value, error=InvalidTypeError)
+
+
+def test_a_shape_that_does_not_fit_is_mended_by_the_hint() -> None:
+    image, series = (1, 8, 6), (40,)
+    for shape, event, hint in (
+        ((8, 6), (8, 6), "x[None]"),
+        ((5,), (1,), "x[:, None]"),
+        ((5, 8, 6), image, "x[:, None]"),
+        ((5, 8, 6, 3), (3, 8, 6), "x.movedim(-1, 1)"),
+        ((5, 48), image, "x.reshape(-1, 1, 8, 6)"),
+        ((5, 40, 1), series, "x.reshape(-1, 40)"),
+    ):
+        x = torch.zeros(shape)
+        assert_refused(re.escape(f"pass `{hint}`"), check_batch, "x", x, event)
+        check_batch("x", eval(hint, {"x": x}), event)
+    no_hint = ((5, 30), series), ((5, 8, 7), image), ((), series), ((5, 7, 3), (4, 2))
+    for shape, event in no_hint:
+        assert_refused(
+            r"\(\d*(, \d+)*,?\)\.$", check_batch, "x", torch.zeros(shape), event
+        )
+
+
+def test_trials_of_another_number_are_padded_if_the_net_reads_nan() -> None:
+    x = torch.zeros(5, 3, 2)
+    for count, reads, hint in (
+        (4, True, "Pad with NaN to 4 trials"),
+        (2, True, "trained on 2 trials"),
+        (4, False, "one number of trials only"),
+    ):
+        assert_refused(hint, check_batch, "x", x, (count, 2), reads_missing=reads)
+
+
+def test_theta_and_x_that_were_swapped_are_told_from_other_shapes() -> None:
+    theta, x = torch.zeros(5, 2), np.zeros((5, 3))
+    check_not_swapped(theta, x, (2,), (3,))
+    check_not_swapped(x, x, (2,), (3,))
+    check_not_swapped(theta, theta, (2,), (2,))
+    check_not_swapped(theta.tolist(), None, (2,), (3,))
+    match = r"`theta` of shape \(n, 2\) and `x` of shape \(n, 3\); got \(5, 3\).*swap"
+    assert_refused(match, check_not_swapped, x, theta, (2,), (3,))
 
 
 def test_an_empty_batch_is_inside_any_support() -> None:

@@ -104,6 +104,7 @@ NOT_CALLED = {
         _FOR_STACK,
     ),
     "PriorPosterior.map": "sbi's own",
+    "in_digits": "called with parameters that were checked",
     "shown": "shows anything",
     "warn_user": "says what it is told",
     "write_stacking_report": "called by StackingReport.to_html, which is in the table",

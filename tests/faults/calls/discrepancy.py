@@ -112,4 +112,13 @@ CALLS = [
         ),
         options={"x_names": "names", "seed": "seed"},
     ),
+    Call(
+        name="DiscrepancyNPE.report(summaries)",
+        run=lambda summaries=lambda x: x[:, :1]: (
+            DiscrepancyNPE.from_posterior(npe(), simulations=(THETA_S, X_S))
+            .append_calibration(THETA, X)
+            .report(summaries=summaries, **QUIET)
+        ),
+        options={"summaries": "function"},
+    ),
 ]

@@ -86,6 +86,12 @@ CALLS = [
         accepts=("targets: None",),
     ),
     Call(
+        name="RoPE.checked_observations",
+        run=lambda x_o: untrained().checked_observations(x_o),
+        tensors={"x_o": X_O},
+        accepts=FEWER_X_O,
+    ),
+    Call(
         name="RoPE.embed",
         run=lambda x_o=X_O, **options: (
             trained().embed(x_o, **{"seed": 0, "num_simulations": 30, **options}).real

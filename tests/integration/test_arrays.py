@@ -1,0 +1,105 @@
+"""NumPy arrays and lists of numbers are taken wherever users pass data."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from sbi_rope import RoPE, diagnose
+from sbi_rope.errors import InvalidInputError
+from sbi_rope.metrics import draw_samples, evaluate
+from sbi_rope.sweep import sweep
+from sbi_rope.trainers import FinetunedNPE
+from sbi_rope.trainers.training import Training
+from tests import gaussian, problems
+from tests.stacks import QUICK, QUIET, problem, stacked
+
+PAIRS, OBSERVED = problem(12, seed=1), problem(25, seed=2)
+QUICKLY: dict[str, Any] = {"num_simulations": 60, "seed": 0, **QUIET}
+
+
+def array(tensor: Tensor) -> Any:
+    """Return an array of float64, as NumPy makes them."""
+    return tensor.double().numpy()
+
+
+def rope(pairs: Any) -> RoPE:
+    rope = RoPE(
+        problems.npe_posterior("mdn"), simulator=problems.simulate, finetuner=QUICK
+    )
+    return rope.append_calibration(*pairs)
+
+
+@pytest.mark.parametrize("convert", [array, Tensor.tolist], ids=["arrays", "lists"])
+def test_pairs_and_observations_are_those_of_tensors(convert: Any) -> None:
+    theta_o, x_o = map(convert, OBSERVED)
+    given = rope(map(convert, PAIRS))
+    for ours, tensor in zip(given.calibration, PAIRS, strict=True):
+        assert ours.dtype == torch.float32
+        assert torch.equal(ours, tensor)
+    given.train(seed=0, **QUIET)
+    posterior = given.build_posterior(x_o, **QUICKLY)
+    assert torch.equal(posterior.x_o, OBSERVED[1])
+    assert (
+        next(iter(sweep(given, x_o, gammas=[0.5], taus=[1.0], **QUICKLY))) is not None
+    )
+    # The posterior knows an observation again, in whatever form it comes.
+    log_prob = posterior.log_prob_batched(theta_o, x=x_o)
+    assert torch.allclose(log_prob.float(), posterior.log_prob_batched(*OBSERVED))
+    assert posterior.sample((3,), x=x_o[1]).shape == (3, 2)
+    assert posterior.sample_batched((3,), x=x_o, **QUIET).shape == (3, 25, 2)
+    for scored in (posterior, problems.npe_posterior("mdn")):
+        scores = evaluate(scored, theta_o, x_o, num_samples=20, seed=0, **QUIET)
+        expected = evaluate(scored, *OBSERVED, num_samples=20, seed=0, **QUIET)
+        assert scores.as_row() == pytest.approx(expected.as_row(), nan_ok=True)
+        assert draw_samples(scored, x_o, num_samples=3).shape == (3, 25, 2)
+
+
+def test_a_stack_and_its_diagnosis_take_arrays() -> None:
+    x_o = array(OBSERVED[1])
+    posterior = stacked(rope(map(array, PAIRS)), x_o, num_folds=2)
+    assert posterior.sample_batched((2,), x=x_o, **QUIET).shape == (2, 25, 2)
+    trained = rope(PAIRS).train(seed=0, **QUIET)
+    options = {"num_simulations": 100, "num_folds": None, "seed": 0, **QUIET}
+    assert str(diagnose(trained, x_o, **options)) == str(
+        diagnose(trained, OBSERVED[1], **options)
+    )
+
+
+def test_stored_simulations_and_trainers_take_arrays() -> None:
+    theta = problems.box(2).sample((1000,))
+    x = problems.simulate(theta)
+    npe = problems.npe_posterior("mdn")
+    theta_s, x_s = RoPE(npe, simulations=(array(theta), array(x))).source.kept(
+        2000, progress=False
+    )
+    assert torch.equal(theta_s.sort(dim=0).values, theta.sort(dim=0).values)
+    assert torch.equal(x_s.sort(dim=0).values, x.sort(dim=0).values)
+    method = FinetunedNPE.from_posterior(npe, training=Training(max_num_epochs=1))
+    method.append_calibration(*map(array, PAIRS)).train(seed=0, **QUIET)
+    assert method.build_posterior().sample((2,), x=PAIRS[1][0], **QUIET).shape == (2, 2)
+
+
+def test_the_array_of_a_user_is_not_changed_or_shared() -> None:
+    theta, x = (tensor.numpy().copy() for tensor in gaussian.labelled(20))
+    rope = RoPE(gaussian.posterior(), simulator=gaussian.simulator, finetuner=QUICK)
+    rope.append_calibration(theta, x)
+    x[:] = np.nan
+    assert rope.calibration[1].isfinite().all()
+
+
+def test_swapped_arguments_are_named_where_shapes_tell() -> None:
+    theta, x = map(array, PAIRS)
+    npe = problems.npe_posterior("mdn")
+    method = FinetunedNPE.from_posterior(npe)
+    method.append_calibration(theta, x)
+    for call in (
+        lambda: rope((x, theta)),
+        lambda: RoPE(npe, simulations=(x, theta)),
+        lambda: method.append_calibration(x, theta),
+        lambda: evaluate(npe, x, theta),
+    ):
+        with pytest.raises(InvalidInputError, match="Did you swap them"):
+            call()
