@@ -92,8 +92,21 @@ def draw_scores(axes: "Axes", report: StackingReport) -> None:
     rows = report.as_rows()
     shown = rows[:MAX_CANDIDATES][::-1]
     floor = _floor([row["score"] for row in shown])
+    # Arrows are at the edge: no error bar of the others reaches beyond them.
+    near = [row for row in shown if row["score"] >= floor]
+    edge = min([floor, *(row["score"] - row["standard_error"] for row in near)])
     for position, row in enumerate(shown):
-        _draw_score(axes, position, row["score"], row["standard_error"], floor)
+        if row["score"] >= floor:
+            axes.errorbar(
+                row["score"],
+                position,
+                xerr=row["standard_error"],
+                fmt="o",
+                color=SKY,
+                markersize=5,
+            )
+        else:
+            _draw_arrow(axes, position, row["score"], edge)
     names = [row["candidate"] for row in shown]
     stacks = {"stack": report.score}
     if differs(report):
@@ -130,19 +143,13 @@ def _floor(scores: Sequence[float]) -> float:
     return best - max(REACH * (best - middle), 1.0)
 
 
-def _draw_score(
-    axes: "Axes", position: int, score: float, error: float, floor: float
-) -> None:
-    if score >= floor:
-        axes.errorbar(
-            score, position, xerr=error, fmt="o", color=SKY, markersize=5, zorder=2
-        )
-        return
-    axes.plot(floor, position, "<", color=SKY, markersize=7)
+def _draw_arrow(axes: "Axes", position: int, score: float, edge: float) -> None:
+    """Draw an arrow for a score that is far to the left, with its number."""
+    axes.plot(edge, position, "<", color=SKY, markersize=7)
     text = f"{score:.0f}" if math.isfinite(score) else "zero density"
     axes.annotate(
         text,
-        (floor, position),
+        (edge, position),
         xytext=(8, 0),
         textcoords="offset points",
         va="center",
