@@ -8,6 +8,13 @@ import torch
 from torch import Tensor, nn
 
 from sbi_rope._focus import warn_if_focused
+from sbi_rope._labels import (
+    LabelledParameters,
+    Labels,
+    labelled_targets,
+    parameters_of,
+)
+from sbi_rope._labels.checks import checked_labels
 from sbi_rope._npe import TrainedNPE
 from sbi_rope._pickling import picklable
 from sbi_rope._progress import is_shown
@@ -38,13 +45,6 @@ from sbi_rope.errors import (
     warn_user,
 )
 from sbi_rope.finetuning import CalibrationFinetuner, History
-from sbi_rope.labels import (
-    LabelledParameters,
-    Labels,
-    labelled_targets,
-    parameters_of,
-)
-from sbi_rope.labels.checks import checked_labels
 from sbi_rope.mixture import MixturePosterior
 
 __all__ = ["RoPE"]
@@ -307,6 +307,7 @@ class RoPE:
         Raises:
             SimulationError: If the simulator fails, or an embedding is not finite.
         """
+        check_integer("simulations_per_target", simulations_per_target)
         return labelled_targets(
             self._source,
             self._parameters,

@@ -54,7 +54,7 @@ LAYERS = [
     # A batch is coupled, and its couplings make a mixture. Trainers train networks, and
     # average them in a mixture. Tasks have simulators. Labels have a density under a
     # posterior and its prior.
-    {"batch", "labels", "trainers", "tasks"},
+    {"_labels", "batch", "trainers", "tasks"},
     # RoPE conducts fine-tuning, coupling and mixture.
     {"rope"},
     # A sweep asks RoPE for many mixtures. The NPE that knows the discrepancy is a

@@ -344,8 +344,9 @@ def _checked_levels(levels: Tensor, *, allow_missing: bool) -> Tensor:
             f"Expected `levels` of shape (n, d); got {tuple(shape)}."
         )
     check_batch("levels", levels, shape[1:], finite=False)
-    known = ~torch.isnan(levels) if allow_missing else torch.ones_like(levels) > 0
-    _check_unit_range("levels", levels[known])
+    check_values("levels", levels)
+    known = levels[~torch.isnan(levels)] if allow_missing else levels
+    _check_unit_range("levels", known)
     levels = levels.detach()
     # In 16 bits, the nominal levels that they are compared with would be rounded too.
     is_coarse = levels.dtype in (torch.float16, torch.bfloat16)

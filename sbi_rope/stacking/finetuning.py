@@ -28,7 +28,7 @@ def finetune_without(start: Any, fold: Fold, part: int, *, learning_rate: float)
         \quad\text{does not fall any more}
 
     The density of a label that is not exact is an average over the parameters that it
-    leaves possible (:mod:`sbi_rope.labels.nodes`), and a weight multiplies its term.
+    leaves possible (:mod:`sbi_rope._labels.nodes`), and a weight multiplies its term.
 
     All parameters are trained in evaluation mode. The epoch with the lowest loss on the
     held-out part is kept; this can be the start. A candidate averages the nets that

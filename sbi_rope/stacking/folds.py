@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from sbi_rope._focus import warn_if_focused
+from sbi_rope._labels import Nodes, labelled_moments, nodes_of, reference_of
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed, estimator_of, headless
 from sbi_rope._simulations import Moments
@@ -21,7 +22,6 @@ from sbi_rope.discrepancy.parameters import learn_parameters
 from sbi_rope.discrepancy.report import DiscrepancyReport, report_discrepancy
 from sbi_rope.discrepancy.tuning import TUNING
 from sbi_rope.finetuning import CalibrationFinetuner
-from sbi_rope.labels import Nodes, labelled_moments, nodes_of, reference_of
 from sbi_rope.rope import RoPE
 
 __all__ = ["Corrected", "Fold", "Workbench", "draw_seeds"]

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from sbi_rope._labels import Labels, Nodes, Reference, nodes_of, reference_of
 from sbi_rope._random import seeded
-from sbi_rope.labels import Labels, Nodes, Reference, nodes_of, reference_of
 from sbi_rope.metrics.calibration import central_levels, count_ranks
 from sbi_rope.metrics.calls import draw_samples
 from sbi_rope.mixture import MixtureEstimator, MixturePosterior

@@ -10,15 +10,15 @@ from torch import Tensor
 from torch.distributions import MultivariateNormal
 
 from sbi_rope import RoPE
-from sbi_rope.discrepancy import DiscrepancyModel, learn_parameters
-from sbi_rope.errors import InvalidInputError, RoPEWarning
-from sbi_rope.labels import (
+from sbi_rope._labels import (
     Labels,
     labelled_moments,
     nodes_of,
     parameters_of,
     reference_of,
 )
+from sbi_rope.discrepancy import DiscrepancyModel, learn_parameters
+from sbi_rope.errors import InvalidInputError, RoPEWarning
 from sbi_rope.metrics import acauc_of, coverage_curve_of, expected_coverage_error_of
 from sbi_rope.stacking import stacking_weights
 from tests import gaussian

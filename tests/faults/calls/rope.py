@@ -56,6 +56,41 @@ CALLS = [
             untrained().append_calibration(theta, x).calibration
         ),
         tensors=PAIRS,
+        accepts=("theta: NaN",),  # a parameter that was not measured
+    ),
+    Call(
+        name="RoPE.append_calibration(noise)",
+        run=lambda **noise: (
+            untrained().append_calibration(THETA, X, **noise).labels.covariance
+        ),
+        tensors={
+            "theta_std": torch.full_like(THETA, 0.1),
+            "weights": torch.ones(len(THETA)),
+        },
+        accepts=(
+            "theta_std: None",
+            "theta_std: a number",
+            "theta_std: no dimension",
+            "weights: None",
+        ),
+    ),
+    Call(
+        name="RoPE.append_calibration(covariance)",
+        run=lambda theta_cov: (
+            untrained()
+            .append_calibration(THETA, X, theta_cov=theta_cov)
+            .labels.covariance
+        ),
+        tensors={"theta_cov": 0.1 * torch.eye(THETA.shape[1])},
+        accepts=("theta_cov: None",),
+    ),
+    Call(
+        name="RoPE.draw_targets",
+        run=lambda **options: trained().draw_targets(
+            **{"simulations_per_target": 3, **QUIET} | options
+        ),
+        options={"simulations_per_target": "count"},
+        is_random=True,
     ),
     Call(
         name="RoPE.train",

@@ -1,9 +1,9 @@
 """What is known about the parameters of calibration pairs: exactly, or not."""
 
-from sbi_rope.labels.labels import Labels
-from sbi_rope.labels.moments import labelled_moments, labelled_targets
-from sbi_rope.labels.nodes import Nodes, Reference, reference_of
-from sbi_rope.labels.parameters import LabelledParameters, nodes_of, parameters_of
+from sbi_rope._labels.labels import Labels
+from sbi_rope._labels.moments import labelled_moments, labelled_targets
+from sbi_rope._labels.nodes import Nodes, Reference, reference_of
+from sbi_rope._labels.parameters import LabelledParameters, nodes_of, parameters_of
 
 __all__ = [
     "LabelledParameters",

@@ -5,6 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sbi_rope._labels.labels import Labels
 from sbi_rope._validation import (
     as_numbers_on,
     check_batch,
@@ -13,7 +14,6 @@ from sbi_rope._validation import (
     check_values,
 )
 from sbi_rope.errors import InvalidInputError
-from sbi_rope.labels.labels import Labels
 
 __all__ = ["checked_labels"]
 

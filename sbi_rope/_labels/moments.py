@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from sbi_rope._labels.parameters import LabelledParameters
 from sbi_rope._simulations import (
     Embedding,
     Moments,
@@ -10,7 +11,6 @@ from sbi_rope._simulations import (
     check_targets,
     draw_targets,
 )
-from sbi_rope.labels.parameters import LabelledParameters
 
 __all__ = ["labelled_moments", "labelled_targets"]
 

@@ -6,10 +6,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sbi_rope._labels.labels import Labels
+from sbi_rope._labels.nodes import Nodes, Reference, place_nodes, reference_of
 from sbi_rope._random import seeded
 from sbi_rope.errors import InvalidInputError, warn_user
-from sbi_rope.labels.labels import Labels
-from sbi_rope.labels.nodes import Nodes, Reference, place_nodes, reference_of
 from sbi_rope.mixture.prior import prior_log_prob, prior_sample
 
 __all__ = ["LabelledParameters", "nodes_of", "parameters_of", "prior_reference"]
@@ -100,8 +100,7 @@ def nodes_of(
 
     Args:
         labels: The labels.
-        references: As in :func:`~sbi_rope.labels.nodes.place_nodes`. The prior is added
-            to them, and takes the place of what is not finite.
+        references: As in :func:`place_nodes`. The prior is added to them, and takes the place of what is not finite.
         prior: The prior of NPE.
         num_nodes: The number of nodes of each label, at least.
     """

@@ -21,7 +21,7 @@ from sbi.utils import within_support
 from torch import Tensor
 from torch.distributions import Chi2
 
-from sbi_rope.labels.labels import Labels
+from sbi_rope._labels.labels import Labels
 
 __all__ = ["Nodes", "Reference", "place_nodes", "reference_of"]
 
