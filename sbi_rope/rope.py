@@ -94,7 +94,8 @@ class RoPE:
         coupler: Settings of step 2; ``SinkhornCoupler()`` if None.
 
     Raises:
-        UnsupportedPosteriorError: If the posterior has no embedding to work with.
+        UnsupportedPosteriorError: If the posterior has no embedding to work with, or
+            one that embeds a row of a batch differently among other rows.
         InvalidInputError: If both or none of simulator and simulations are given,
             their shapes do not fit the posterior, or ``num_simulations`` is given
             without a simulator.
@@ -158,6 +159,9 @@ class RoPE:
     def append_calibration(self, theta: Tensor, x: Tensor) -> "RoPE":
         """Add real observations with known parameters to those appended so far.
 
+        Tensors, NumPy arrays and lists of numbers are taken here and wherever data are
+        passed. They are copied to the dtype of NPE, and arrays and lists to its device.
+
         Args:
             theta: Parameters, shape ``(n, d)``, inside the prior's support.
             x: Real observations, shape ``(n, *event)``.
@@ -166,7 +170,9 @@ class RoPE:
             Itself, so that calls can be chained.
 
         Raises:
-            InvalidTypeError: If one of them is not a tensor.
+            InvalidTypeError: If one of them does not hold numbers.
+            UnsupportedPosteriorError: If values of x are missing (NaN), and the
+                embedding net takes their number from another row.
             InvalidInputError: If shapes, numbers of rows or devices do not fit, a value
                 is not finite, or a theta is outside the prior's support. Nothing is
                 added then.
