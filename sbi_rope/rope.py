@@ -105,7 +105,8 @@ class RoPE:
         coupler: Settings of step 2; ``SinkhornCoupler()`` if None.
 
     Raises:
-        UnsupportedPosteriorError: If the posterior has no embedding to work with.
+        UnsupportedPosteriorError: If the posterior has no embedding to work with, or
+            one that embeds a row of a batch differently among other rows.
         InvalidInputError: If both or none of simulator and simulations are given,
             their shapes do not fit the posterior, or ``num_simulations`` is given
             without a simulator.
@@ -182,6 +183,9 @@ class RoPE:
         :math:`y \sim \mathcal N(\theta, R)` of some or all of the parameters, and what
         needs the parameters averages over :math:`p(\theta \mid y)` under the prior.
 
+        Tensors, NumPy arrays and lists of numbers are taken here and wherever data are
+        passed. They are copied to the dtype of NPE, and arrays and lists to its device.
+
         Args:
             theta: Parameters, shape ``(n, d)``, inside the prior's support. NaN stands
                 for a parameter that was not measured. More general labels are draws
@@ -198,12 +202,13 @@ class RoPE:
             Itself, so that calls can be chained.
 
         Raises:
-            InvalidTypeError: If an argument is not a tensor.
+            InvalidTypeError: If an argument does not hold numbers.
             InvalidInputError: If shapes, numbers of rows or devices do not fit, a value
                 is not finite, an exact theta is outside the prior's support, or no
                 parameters inside it fit a label. Nothing is added then.
             UnsupportedPosteriorError: If labels are not exact and some parameters are
-                discrete.
+                discrete, or if values of x are missing (NaN) and the embedding net
+                takes their number from another row.
         """
         check_not_swapped(theta, x, self._npe.like.shape[1:], self._npe.event_shape)
         labels = checked_labels(

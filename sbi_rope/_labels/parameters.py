@@ -100,7 +100,8 @@ def nodes_of(
 
     Args:
         labels: The labels.
-        references: As in :func:`place_nodes`. The prior is added to them, and takes the place of what is not finite.
+        references: As in :func:`place_nodes`. The prior is added to them, and takes
+            the place of what is not finite.
         prior: The prior of NPE.
         num_nodes: The number of nodes of each label, at least.
     """

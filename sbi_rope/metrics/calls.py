@@ -206,6 +206,12 @@ def draw_joint_levels(
 def draw_samples(posterior: Any, x: Tensor, *, num_samples: int) -> Tensor:
     """Draw posterior samples as the scores do, without sbi's unbounded rejection.
 
+    ``sample`` and ``sample_batched`` of an sbi posterior reject samples outside the
+    prior until enough lie inside. On real observations all may lie outside, and the
+    call does not return unless ``max_sampling_time`` bounds it. ``log_prob`` estimates
+    the share inside by the same loop, except with ``norm_posterior=False``. This
+    function returns what the network draws.
+
     Args:
         posterior: Any posterior with ``sample_batched``.
         x: Observations, shape ``(n, *event_shape)``.

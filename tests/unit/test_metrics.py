@@ -22,6 +22,7 @@ from torch.utils.tensorboard import SummaryWriter
 from sbi_rope import metrics
 from sbi_rope.errors import InvalidInputError, LogProbUnavailableError
 from sbi_rope.mixture import PriorPosterior
+from tests import gaussian
 from tests.refusals import assert_refused
 
 KINDS: tuple[Any, ...] = ("central", "hpd", "rank")
@@ -517,6 +518,25 @@ def test_calibration_does_not_hang_where_no_sample_is_accepted(
     with at_most(10):
         joint = metrics.acauc(npe, theta, x, kind="hpd", num_samples=50)
     assert joint.value > 0.4
+
+
+def test_samples_are_drawn_where_the_rejection_of_sbi_would_not_end() -> None:
+    x = torch.tensor([[0.5, -1.0], [2.0, 0.0]])
+    far = BoxUniform(torch.full((2,), 100.0), torch.full((2,), 101.0))
+    posterior = DirectPosterior(gaussian.GaussianEstimator(), far)
+    for call in (
+        lambda: posterior.sample((10,), x=x[0], max_sampling_time=0.1),
+        lambda: posterior.sample_batched((10,), x=x, max_sampling_time=0.1),
+    ):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with at_most(10), pytest.raises(RuntimeError, match="max_sampling_time"):
+                call()
+    with at_most(10):
+        samples = metrics.draw_samples(posterior, x, num_samples=4000)
+    mean, std = gaussian.GAIN * x, torch.tensor(gaussian.POSTERIOR_STD)
+    assert torch.allclose(samples.mean(dim=0), mean, atol=5 * float(std) / 4000**0.5)
+    assert torch.allclose(samples.std(dim=0), std.expand(2, 2), rtol=0.1)
 
 
 def test_log_probs_of_an_npe_are_those_of_its_network_inside_the_prior(

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from sbi.inference import NPE, DirectPosterior
-from torch import Tensor
+from torch import Tensor, nn
 
 from sbi_rope import (
     CalibrationFinetuner,
@@ -416,6 +416,31 @@ def test_a_simulator_and_stored_simulations_exclude_each_other() -> None:
     spellings = r"none\. Write .*simulator=simulator.*simulations=\(theta, x\)"
     with pytest.raises(InvalidInputError, match=spellings):
         rope(simulator=None)
+
+
+class Centred(nn.Module):
+    """Subtracts the mean of a batch."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x - x.mean(dim=0)
+
+
+class Noisy(nn.Module):
+    """Adds noise of its own to every embedding."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + torch.randn_like(x)
+
+
+def test_a_net_whose_embedding_depends_on_other_rows_is_refused() -> None:
+    posterior = gaussian.posterior()
+    estimator: Any = posterior.posterior_estimator
+    for extra in (Noisy(), nn.BatchNorm1d(2), nn.LayerNorm(2)):
+        estimator.net = nn.Sequential(nn.Linear(2, 2), extra)
+        RoPE(posterior, simulator=gaussian.simulator)
+    estimator.net = nn.Sequential(nn.Linear(2, 2), Centred())
+    with pytest.raises(UnsupportedPosteriorError, match="reads each observation by"):
+        RoPE(posterior, simulator=gaussian.simulator)
 
 
 def test_later_changes_of_the_users_posterior_have_no_effect() -> None:
