@@ -1,0 +1,121 @@
+"""Stacks of pairs whose labels are noisy, partial, weighted, or draws."""
+
+import math
+from typing import Any
+
+import pytest
+import torch
+
+from sbi_rope import RoPE, load, stack
+from sbi_rope.errors import InvalidInputError
+from sbi_rope.metrics import lpp
+from tests import gaussian
+from tests.stacks import (
+    COUPLINGS,
+    NPE,
+    NUM_PAIRS,
+    PRIOR,
+    QUIET,
+    observed,
+    problem,
+    rope_of,
+    stacked,
+    validated,
+)
+
+
+def labelled(theta: Any, **options: Any) -> RoPE:
+    empty = problem(0, seed=1)
+    return rope_of(empty).append_calibration(
+        theta, problem(NUM_PAIRS, seed=1)[1], **options
+    )
+
+
+THETA = problem(NUM_PAIRS, seed=1)[0]
+PARTIAL = THETA.clone()
+PARTIAL[::2, 0] = math.nan
+
+
+def test_a_stack_is_scored_on_what_was_measured(tmp_path: Any) -> None:
+    posterior = stacked(labelled(PARTIAL, theta_std=0.1))
+    scores = posterior.report.cross_validation
+    assert torch.isfinite(scores.log_scores).all()
+    assert torch.equal(torch.isnan(scores.levels), torch.isnan(PARTIAL))
+    assert 0 < scores.monte_carlo_error < 0.2
+    text = str(posterior.report)
+    assert "20 labels, 20 with noise and 10 partial" in text
+    assert math.isfinite(posterior.report.acauc.value)
+    with pytest.raises(InvalidInputError, match="exact labels"):
+        posterior.credible_set(0.8, x=observed()[:1], guaranteed=True)
+    posterior.save(tmp_path / "stack")
+    loaded = load(tmp_path / "stack")
+    assert loaded.report.cross_validation.labels == scores.labels
+
+
+def test_couplings_are_scored_on_labels_that_are_not_exact() -> None:
+    scores = validated(
+        labelled(PARTIAL), observed(), candidates=[*COUPLINGS[:2], PRIOR, NPE]
+    )
+    exact = validated(
+        labelled(THETA), observed(), candidates=[*COUPLINGS[:2], PRIOR, NPE]
+    )
+    assert torch.isfinite(scores.log_scores).all()
+    # Labels of all parameters are scored as exact ones are, but for the tuned nets.
+    known = torch.isfinite(PARTIAL).all(dim=1)
+    difference = scores.log_scores[known, 2:] - exact.log_scores[known, 2:]
+    assert float(difference.abs().max()) < 1e-5
+
+
+def test_labels_of_vanishing_noise_are_scored_like_exact_ones() -> None:
+    exact = validated(labelled(THETA), candidates=[PRIOR, NPE])
+    noisy = validated(labelled(THETA, theta_std=1e-5), candidates=[PRIOR, NPE])
+    assert torch.allclose(noisy.log_scores, exact.log_scores, atol=0.05)
+    assert torch.allclose(noisy.levels, exact.levels, atol=0.01)
+    assert torch.allclose(noisy.stack_scores, exact.stack_scores, atol=0.1)
+
+
+def test_labels_given_as_draws_are_scored_relative_to_the_prior() -> None:
+    draws = (THETA[:, None] + 0.05 * torch.randn(NUM_PAIRS, 30, 2)).clamp(-0.99, 0.99)
+    posterior = stacked(labelled(draws), candidates=[PRIOR, NPE])
+    scores = posterior.report.cross_validation
+    assert torch.allclose(scores.scores_of("prior"), torch.zeros(1).double(), atol=1e-5)
+    assert torch.isnan(scores.levels).all()
+    assert "coverage is not known" in str(posterior.report)
+
+
+def test_the_weights_of_pairs_decide_for_the_candidate_that_they_favour() -> None:
+    # NPE is right about the first half, and the prior about the others.
+    theta, x = problem(NUM_PAIRS, seed=1)
+    x = x - 0.4
+    x[10:] = x[10:].flip(0) + 0.5
+    weights = torch.ones(NUM_PAIRS)
+    found = []
+    for factor in (20.0, 0.05):
+        weights[:10] = factor
+        conductor = rope_of(problem(0, seed=1))
+        conductor.append_calibration(theta, x, weights=weights)
+        scores = validated(conductor, candidates=[PRIOR, NPE])
+        found.append(float(scores.weights.weights[1]))
+        mean, _ = scores.mean_and_error(scores.scores_of("NPE"))
+        expected = (weights * scores.scores_of("NPE")).sum() / weights.sum()
+        assert math.isclose(mean, float(expected), rel_tol=1e-6)
+    assert found[0] > found[1] + 0.2
+
+
+@pytest.mark.slow
+def test_noise_that_is_told_costs_little_and_less_than_noise_that_is_not() -> None:
+    torch.manual_seed(0)
+    theta, x = gaussian.labelled(50)
+    test = gaussian.labelled(500)
+    noisy = theta + 0.5 * torch.randn_like(theta)
+    partial = theta.where(torch.rand_like(theta) > 0.5, torch.nan)
+
+    def score(theta: torch.Tensor, **options: Any) -> float:
+        rope = RoPE(gaussian.posterior(), simulator=gaussian.simulator)
+        rope.append_calibration(theta, x, **options)
+        return lpp(stack(rope, seed=0, **QUIET), *test, **QUIET).mean
+
+    exact = score(theta)
+    assert score(noisy, theta_std=0.5) > exact - 0.1
+    assert score(noisy) < exact - 0.1
+    assert score(partial) > exact - 0.1
