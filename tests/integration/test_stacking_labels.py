@@ -72,6 +72,13 @@ def test_labels_of_vanishing_noise_are_scored_like_exact_ones() -> None:
     assert torch.allclose(noisy.log_scores, exact.log_scores, atol=0.05)
     assert torch.allclose(noisy.levels, exact.levels, atol=0.01)
     assert torch.allclose(noisy.stack_scores, exact.stack_scores, atol=0.1)
+    # What the stack is normalised by depends on no label.
+    mass = [
+        scores.stack_scores - scores.comparable_stack_scores
+        for scores in (exact, noisy)
+    ]
+    assert float(mass[0].max()) > 0.01
+    assert torch.allclose(mass[1], mass[0], atol=0.01)
 
 
 def test_labels_given_as_draws_are_scored_relative_to_the_prior() -> None:

@@ -21,6 +21,7 @@ from sbi_rope.discrepancy import DiscrepancyModel, learn_parameters
 from sbi_rope.errors import InvalidInputError, RoPEWarning
 from sbi_rope.metrics import acauc_of, coverage_curve_of, expected_coverage_error_of
 from sbi_rope.stacking import stacking_weights
+from sbi_rope.stacking.label_scores import label_levels
 from tests import gaussian
 
 NAN = math.nan
@@ -99,6 +100,39 @@ def test_the_density_of_a_label_is_that_of_the_posterior_with_its_noise() -> Non
         assert abs(float(found[i] - exact)) < 4 * float(error[i]) + 1e-6
         assert float(error[i]) < 0.1
     assert float(error[3]) == 0.0  # of an exact label there is nothing to estimate
+
+
+def test_only_parameters_inside_the_prior_count_in_the_density_of_a_label() -> None:
+    box = BoxUniform(torch.zeros(1), torch.ones(1))
+    one = Labels(
+        theta=torch.tensor([[0.9]]),
+        covariance=torch.full((1, 1, 1), 0.04, dtype=torch.double),
+        weights=torch.ones(1, dtype=torch.double),
+    )
+    torch.manual_seed(0)
+    q = torch.distributions.Normal(torch.tensor(1.0).double(), 0.3)
+    nodes = nodes_of(
+        one, [reference_of(q.sample(torch.Size((500, 1, 1))))], box, num_nodes=20_000
+    )
+    found = nodes.log_mean(q.log_prob(nodes.theta.double()[..., 0]))
+    grid = torch.linspace(0, 1, 20_001, dtype=torch.double)
+    noise = torch.distributions.Normal(grid, 0.2).log_prob(torch.tensor(0.9).double())
+    exact = (q.log_prob(grid) + noise).exp().mean().log()
+    assert abs(float(found[0] - exact)) < 0.03
+
+
+def test_levels_of_noisy_labels_are_uniform_if_the_posterior_is_right() -> None:
+    torch.manual_seed(0)
+    theta = gaussian.prior().sample((300,))
+    noise = torch.tensor([0.0, 0.8])
+    noisy = Labels(
+        theta=theta + noise * torch.randn_like(theta),
+        covariance=torch.diag(noise.double().square()).expand(300, 2, 2),
+        weights=torch.ones(300, dtype=torch.double),
+    )
+    posterior: Any = gaussian.posterior()
+    levels = label_levels(posterior, noisy, gaussian.simulator(theta), num_samples=200)
+    assert torch.allclose(levels.mean(dim=0), torch.tensor(0.5), atol=0.05)
 
 
 def test_the_density_of_draws_is_relative_to_that_of_the_prior() -> None:
