@@ -71,7 +71,7 @@ def score(
     posterior = stack(rope, seed=case.seed, show_progress_bars=False)
     found = evaluate(posterior, *case.test_set, theta_std=std, show_progress_bars=False)
     return {
-        "lpp": f"{found.lpp.mean:.3f}",
+        "lpp": f"{found.lpp.standardised(std).mean:.3f}",
         "error": f"{found.lpp.standard_error:.3f}",
         "acauc": f"{found.acauc.value:+.3f}",
     }
