@@ -108,7 +108,7 @@ class Diagnosis:
 
     @property
     def unexpected(self) -> tuple[Finding, ...]:
-        """The findings that call for action: beyond their thresholds, not expected."""
+        """The alarming findings that nobody expected, and that call for action."""
         return tuple(one for one in self.alarming if not one.is_expected)
 
     @property
