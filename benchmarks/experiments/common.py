@@ -1,7 +1,8 @@
 """What the experiments share: options, data, and how a table is printed."""
 
 import argparse
-from collections.abc import Iterable, Mapping
+import csv
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from benchmarks.machine import describe_machine
 # Nothing of the package is imported here: `mixture.py` chooses later which version of
 # it is measured.
 
-__all__ = ["Options", "Row", "add_task", "begin", "show"]
+__all__ = ["Options", "Row", "add_task", "begin", "kept_rows", "show"]
 
 # Options of the command line, with what argparse is to know of them.
 Options = dict[str, Mapping[str, Any]]
@@ -54,6 +55,38 @@ def add_task(options: Options, **task: Any) -> Options:
         "--out": {"type": Path, "default": Path("results/experiments")},
         **options,
     }
+
+
+def kept_rows(
+    path: Path,
+    columns: Sequence[str],
+    rows: Iterable[tuple[tuple[str, ...], Callable[[], Row]]],
+) -> Iterator[Row]:
+    """Yield rows of a table; those of an earlier run are read from a file.
+
+    Args:
+        path: The file.
+        columns: The names of all columns.
+        rows: The first columns of each row, and a function that returns the others.
+    """
+    done: dict[tuple[str, ...], Row] = {}
+    if path.exists():
+        with path.open(newline="", encoding="utf-8") as file:
+            done = {tuple(row.values()): row for row in csv.DictReader(file)}
+    for head, compute in rows:
+        known = [row for key, row in done.items() if key[: len(head)] == head]
+        if known:
+            yield known[0]
+            continue
+        row = {**dict(zip(columns, head, strict=False)), **compute()}
+        path.parent.mkdir(parents=True, exist_ok=True)
+        is_new = not path.exists()
+        with path.open("a", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, columns)
+            if is_new:
+                writer.writeheader()
+            writer.writerow(row)
+        yield row
 
 
 def show(rows: Iterable[Row]) -> None:

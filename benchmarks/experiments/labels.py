@@ -9,15 +9,14 @@ interrupted run goes on where it was.
 """
 
 import argparse
-import csv
 import math
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import torch
 
-from benchmarks.experiments.common import Row, add_task, begin, show
+from benchmarks.experiments.common import Row, add_task, begin, kept_rows, show
 from benchmarks.experiments.data import case_of
 from benchmarks.scoring import rope_of
 from sbi_rope import stack
@@ -42,7 +41,7 @@ def settings_of(args: argparse.Namespace) -> Iterator[tuple[str, bool, dict[str,
             yield f"noise {noise:g}", told, {"noise": noise}
     if args.partial:
         yield "half of the pairs, exact", True, {"share": 0.5}
-        yield "each parameter in half of the pairs", True, {"partial": True}
+        yield "each parameter in half of the pairs", True, {"is_partial": True}
 
 
 def score(
@@ -51,7 +50,7 @@ def score(
     told: bool,
     noise: float = 0.0,
     share: float = 1.0,
-    partial: bool = False,
+    is_partial: bool = False,
 ) -> dict[str, str]:
     """Return the test scores of a stack, with theta in the prior's deviations."""
     theta, x = case.calibration
@@ -61,7 +60,7 @@ def score(
         prior = case.task.get_prior()
         theta = with_label_noise(theta, noise * std, prior, seed=case.seed)
         options = {"theta_std": noise * std} if told else {}
-    if partial:
+    if is_partial:
         # Half of the pairs miss each parameter, whichever they are.
         generator = torch.Generator().manual_seed(case.seed)
         order = torch.rand(theta.shape, generator=generator).argsort(dim=0)
@@ -77,41 +76,23 @@ def score(
     }
 
 
-def rows_of(args: argparse.Namespace, path: Path) -> Iterator[Row]:
-    """Yield a row for each setting; those of an earlier run are read from the file."""
-    done: dict[tuple[str, ...], Row] = {}
-    if path.exists():
-        with path.open(newline="", encoding="utf-8") as file:
-            for row in csv.DictReader(file):
-                done[tuple(row[name] for name in COLUMNS[:5])] = row
+def rows_of(
+    args: argparse.Namespace,
+) -> Iterator[tuple[tuple[str, ...], Callable[[], Row]]]:
+    """Yield the head of each row, and a function that computes the rest."""
     case = case_of(args, n_calibration=args.n_calibration, repetition=args.repetition)
     for labels, told, setting in settings_of(args):
-        head = (
-            args.task,
-            str(args.repetition),
-            str(args.n_calibration),
-            labels,
-            "yes" if told else "no",
+        head = args.task, args.repetition, args.n_calibration, labels
+        yield (
+            (*map(str, head), "yes" if told else "no"),
+            partial(score, case, told=told, **setting),
         )
-        if head not in done:
-            row = dict(zip(COLUMNS, head, strict=False)) | score(
-                case, told=told, **setting
-            )
-            path.parent.mkdir(parents=True, exist_ok=True)
-            is_new = not path.exists()
-            with path.open("a", newline="", encoding="utf-8") as file:
-                writer = csv.DictWriter(file, COLUMNS)
-                if is_new:
-                    writer.writeheader()
-                writer.writerow(row)
-            done[head] = row
-        yield done[head]
 
 
 def main() -> None:
     """Print the table."""
     args = begin(__doc__, add_task(OPTIONS), threads=1)
-    show(rows_of(args, args.out / "labels" / "rows.csv"))
+    show(kept_rows(args.out / "labels" / "rows.csv", COLUMNS, rows_of(args)))
 
 
 if __name__ == "__main__":

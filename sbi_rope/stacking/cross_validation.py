@@ -16,7 +16,7 @@ from sbi_rope.metrics import CoverageCurve, coverage_curve_of
 from sbi_rope.stacking.held_out import SetScores
 from sbi_rope.stacking.weights import StackingWeights, stacking_weights
 
-__all__ = ["CrossValidation", "Difference"]
+__all__ = ["CrossValidation", "Difference", "mean_and_error"]
 
 NUM_BOOTSTRAP = 2000
 
@@ -133,13 +133,7 @@ class CrossValidation:
 
     def mean_and_error(self, scores: Tensor) -> tuple[float, float]:
         """Return the weighted mean of a score of each pair, and its standard error."""
-        if self.pair_weights is None:
-            return float(scores.mean()), float(scores.std() / len(scores) ** 0.5)
-        weights = self.pair_weights.to(scores)
-        mean = (weights * scores).sum() / weights.sum()
-        square = (weights * (scores - mean)).square().sum() / weights.sum().square()
-        n = len(scores)
-        return float(mean), float((square * n / max(1, n - 1)).sqrt())
+        return mean_and_error(scores, self.pair_weights)
 
     @cached_property
     def comparable_stack_scores(self) -> Tensor:
@@ -236,6 +230,22 @@ class CrossValidation:
                 strict=True,
             )
         ]
+
+
+def mean_and_error(scores: Tensor, weights: Tensor | None) -> tuple[float, float]:
+    """Return the mean of a score of each pair, and its standard error.
+
+    Args:
+        scores: The scores, shape ``(n,)``.
+        weights: How many pairs each pair counts as, shape ``(n,)``; None for one each.
+    """
+    n = len(scores)
+    if weights is None:
+        return float(scores.mean()), float(scores.std() / n**0.5)
+    weights = weights.to(scores)
+    mean = (weights * scores).sum() / weights.sum()
+    square = (weights * (scores - mean)).square().sum() / weights.sum().square()
+    return float(mean), float((square * n / max(1, n - 1)).sqrt())
 
 
 def _weighted_mean(values: Any, weights: Any, axis: int = -1) -> Any:

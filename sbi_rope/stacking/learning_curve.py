@@ -1,52 +1,97 @@
 """The learning curve of a stack: its held-out score against the number of pairs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
+from scipy.stats import t as student
+from torch import Tensor
 
-from sbi_rope.stacking.cross_validation import CrossValidation
+from sbi_rope._validation import check_integer
+from sbi_rope.stacking.cross_validation import (
+    CrossValidation,
+    Difference,
+    mean_and_error,
+)
 
 __all__ = ["LearningCurve"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class LearningCurve:
     """The held-out score of the stack when it is trained on fewer pairs.
 
     Attributes:
-        num_pairs: The numbers of pairs that the candidates were trained on.
-        scores: The mean held-out log score of the stack at each number, with theta in
-            its own units.
-        standard_errors: The standard error of each score. All scores are means over
-            the same pairs, so that their differences have smaller errors.
+        num_pairs: The numbers of pairs that the candidates were trained on, ascending.
+        pair_scores: The log score of the stack at each of n held-out pairs, for each
+            number of pairs, with theta in its own units, shape ``(P, n)``.
+        pair_weights: How many pairs each held-out pair counts as, shape ``(n,)``; None
+            if all count as one.
     """
 
     num_pairs: tuple[int, ...]
-    scores: tuple[float, ...]
-    standard_errors: tuple[float, ...]
+    pair_scores: Tensor = field(repr=False)
+    pair_weights: Tensor | None = field(default=None, repr=False)
 
     @classmethod
     def of(cls, parts: Sequence[CrossValidation]) -> "LearningCurve":
         """Return the curve of cross-validations with increasing training sets."""
-        scores = [part.stack_scores for part in parts]
         return cls(
             num_pairs=tuple(part.num_trained_on for part in parts),
-            scores=tuple(float(s.mean()) for s in scores),
-            standard_errors=tuple(float(s.std() / len(s) ** 0.5) for s in scores),
+            pair_scores=torch.stack([part.stack_scores.double() for part in parts]),
+            pair_weights=parts[0].pair_weights,
         )
 
-    def gain_of_doubling(self) -> float:
-        r"""Return how much twice as many pairs would add to the score, in nats.
+    @property
+    def scores(self) -> tuple[float, ...]:
+        """The mean held-out score at each number of pairs."""
+        return tuple(mean for mean, _ in map(self._mean_and_error, self.pair_scores))
 
-        The curve :math:`s(n) = a - b / n` is fitted to all points and extrapolated. At
-        the largest n the gain is :math:`b / (2 n)`, or 0 if the curve falls. It is NaN
-        if there are fewer than two points or a score is not finite.
+    @property
+    def standard_errors(self) -> tuple[float, ...]:
+        """The standard error of each mean score.
+
+        All scores are means over the same pairs, so that their differences have smaller
+        errors.
         """
-        inverse = 1.0 / torch.tensor(self.num_pairs, dtype=torch.double)
-        scores = torch.tensor(self.scores, dtype=torch.double)
-        if len(scores) < 2 or not torch.isfinite(scores).all():
-            return float("nan")
+        return tuple(error for _, error in map(self._mean_and_error, self.pair_scores))
+
+    def gain(self, num_more: int) -> Difference:
+        r"""Return how much more labels would add to the mean score, with an interval.
+
+        The curve :math:`s_i(n) = a_i - b_i / n` is fitted to the scores of each
+        held-out pair i. The gain from N pairs, on which the last point was trained, to
+        N + m is
+
+        .. math:: \bar b \left( \frac{1}{N} - \frac{1}{N + m} \right) .
+
+        The 95 % interval is that of Student's t for the mean slope :math:`\bar b`. It
+        takes the pairs that were trained on as given, and the form of the curve as
+        right.
+
+        Args:
+            num_more: m, the number of labels to add.
+
+        Returns:
+            The gain in nats a pair; NaN if the curve has a single point or a score is
+            not finite.
+
+        Raises:
+            InvalidInputError: If the number is below 1.
+        """
+        check_integer("num_more", num_more)
+        if len(self.num_pairs) < 2 or not torch.isfinite(self.pair_scores).all():
+            return Difference(mean=float("nan"), low=float("nan"), high=float("nan"))
+        inverse = torch.tensor(self.num_pairs).to(self.pair_scores).reciprocal()
         centred = inverse - inverse.mean()
-        slope = float((centred * scores).sum() / centred.square().sum())
-        return max(0.0, -slope) / (2 * self.num_pairs[-1])
+        slopes = -(centred @ self.pair_scores) / centred.square().sum()
+        mean, error = self._mean_and_error(slopes)
+        last = self.num_pairs[-1]
+        scale = 1 / last - 1 / (last + num_more)
+        half = float(student.ppf(0.975, max(1, len(slopes) - 1))) * error
+        return Difference(
+            mean=scale * mean, low=scale * (mean - half), high=scale * (mean + half)
+        )
+
+    def _mean_and_error(self, values: Tensor) -> tuple[float, float]:
+        return mean_and_error(values, self.pair_weights)

@@ -26,6 +26,8 @@ MOSTLY = 0.5
 LEVEL = 0.9
 # Sets of a higher level are not told apart from those that hold all draws.
 ALL = 0.995
+# The text says what so many more labels would add, and what twice as many would.
+FEW_MORE = 10
 # A difference of less than this, in nats a pair, is called slight: 10 % of the density.
 SLIGHT = 0.1
 
@@ -218,12 +220,15 @@ def _more_labels(report: "StackingReport") -> list[str]:
         for n, score in zip(curve.num_pairs, curve.scores, strict=True)
     )
     lines = [f"  log score by training pairs, theta in its own units: {points}"]
-    gain = curve.gain_of_doubling()
-    if math.isfinite(gain):
-        lines.append(
-            f"  twice as many labels might add {gain:.2f} nats a pair, if this "
-            "curve goes on like a - b / n"
-        )
+    for more in dict.fromkeys((FEW_MORE, curve.num_pairs[-1])):
+        gain = curve.gain(more)
+        if math.isfinite(gain.mean):
+            lines.append(
+                f"  {more} more labels might add {gain.mean:.2f} nats a pair "
+                f"({gain.low:.2f} to {gain.high:.2f})"
+            )
+    if len(lines) > 1:
+        lines.append("    if the curve goes on like a - b / n")
     return lines
 
 

@@ -77,7 +77,7 @@ def diagnosis() -> Diagnosis:
 def source(tmp_path_factory: pytest.TempPathFactory, diagnosis: Diagnosis) -> str:
     """A page with everything that a page can hold."""
     curve = LearningCurve(
-        num_pairs=(4, 8), scores=(0.3, 0.4), standard_errors=(0.1, 0.1)
+        num_pairs=(4, 8), pair_scores=torch.tensor([[0.2, 0.4], [0.3, 0.5]])
     )
     report = replace(
         the_stack().report,

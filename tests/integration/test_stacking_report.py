@@ -6,6 +6,7 @@ import warnings
 from dataclasses import replace
 
 import pytest
+import scipy.stats
 import torch
 from torch import nn
 from torch.distributions import Cauchy, Independent, MultivariateNormal
@@ -13,7 +14,7 @@ from torch.distributions import Cauchy, Independent, MultivariateNormal
 from sbi_rope import plots
 from sbi_rope._two_sample import TwoSampleTest
 from sbi_rope._units import log_unit_of
-from sbi_rope.errors import RoPEWarning
+from sbi_rope.errors import InvalidInputError, RoPEWarning
 from sbi_rope.metrics import LPPScore, acauc_of
 from sbi_rope.stacking import (
     CrossValidation,
@@ -279,25 +280,40 @@ def test_the_learning_curve_has_a_point_for_one_two_and_four_folds() -> None:
     assert f"in its own units: 4 pairs: {curve.scores[0]:.2f}, 8 " in str(report)
 
 
-def test_the_gain_of_twice_as_many_labels_is_extrapolated_from_the_curve() -> None:
-    # s(n) = 1 - 3 / n, so that from 20 to 40 it is 3 / 40.
-    curve = LearningCurve(
-        num_pairs=(5, 10, 20), scores=(0.4, 0.7, 0.85), standard_errors=(0.1,) * 3
+def curve_of(num_pairs: tuple[int, ...], *scores: list[float]) -> LearningCurve:
+    """A curve with a column of scores for each number of pairs."""
+    return LearningCurve(
+        num_pairs=num_pairs, pair_scores=torch.tensor(scores, dtype=torch.double)
     )
-    assert math.isclose(curve.gain_of_doubling(), 3 / 40)
-    falling = LearningCurve(
-        num_pairs=(5, 10), scores=(0.4, 0.3), standard_errors=(0.1, 0.1)
+
+
+def test_the_gain_of_more_labels_is_extrapolated_from_the_curve() -> None:
+    # The slopes b of three pairs, s(n) = 1 - b / n, and what their mean adds.
+    slopes = torch.tensor([2.0, 3.0, 7.0]).double()
+    curve = curve_of((5, 10, 20), *((1 - slopes / n).tolist() for n in (5, 10, 20)))
+    gain = curve.gain(20)
+    interval = scipy.stats.t.interval(
+        0.95, df=2, loc=4, scale=scipy.stats.sem(slopes.numpy())
     )
-    assert falling.gain_of_doubling() == 0.0
-    single = LearningCurve(num_pairs=(5,), scores=(0.4,), standard_errors=(0.1,))
-    assert math.isnan(single.gain_of_doubling())
+    for found, expected in zip(
+        (gain.mean, gain.low, gain.high), (4, *interval), strict=True
+    ):
+        assert math.isclose(found, expected * (1 / 20 - 1 / 40))
+    assert curve.gain(5).mean == pytest.approx(4 * (1 / 20 - 1 / 25))
+    weighted = replace(curve, pair_weights=torch.tensor([1.0, 1.0, 0.0]))
+    assert weighted.gain(20).mean == pytest.approx(2.5 / 40)
+    with pytest.raises(InvalidInputError, match="`num_more`"):
+        curve.gain(0)
+    assert f"20 more labels might add {gain.mean:.2f} nats a pair" in str(
+        replace(made_up(), learning_curve=curve)
+    )
+    single = curve_of((5,), [0.4, 0.3])
+    assert math.isnan(single.gain(10).mean)
     assert "nan" not in str(replace(made_up(), learning_curve=single))
 
 
 def test_the_picture_names_candidates_and_has_a_panel_for_the_learning_curve() -> None:
-    curve = LearningCurve(
-        num_pairs=(4, 8), scores=(0.3, 0.4), standard_errors=(0.1, 0.1)
-    )
+    curve = curve_of((4, 8), [0.2, 0.4], [0.3, 0.5])
     for shown, num_panels in ((curve, 4), (None, 3)):
         figure = plots.stacking_report(replace(made_up(), learning_curve=shown))
         assert len(figure.axes) == num_panels
