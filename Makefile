@@ -25,10 +25,12 @@ lint: $(VENV)/.installed
 types: $(VENV)/.installed
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-# A warning is an error: a link or a reference that leads nowhere, a cell that fails.
+# The code on the pages runs. A warning is an error: a link or a reference that leads
+# nowhere, a cell that fails.
 # Notebooks are executed again if their cells have changed. Remove docs/_build to execute
 # them with a package that has changed.
 docs: $(VENV)/.docs
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -m docs -n auto --dist worksteal
 	$(BIN)/sphinx-build -W --keep-going -b html docs docs/_build/html
 
 # Asks for every address of other sites, and needs the network.

@@ -25,8 +25,8 @@ DEPENDENCIES = "import ot, numpy, torch, tqdm.auto, sbi.inference, sbi.utils"
 # A module imports from layers below its own, and from its own package. Those of one
 # layer do not know each other.
 LAYERS = [
-    # They know nothing of inference: errors, progress, processes, rows in slices.
-    {"errors", "_progress", "_processes", "_slices"},
+    # They know nothing of inference: errors, means, progress, processes, slices.
+    {"errors", "_means", "_progress", "_processes", "_slices"},
     # They raise errors: of seeds, of files and of functions that cannot be pickled.
     {"_random", "_files", "_pickling"},
     # They raise errors and warn: of arguments, and of a training that goes wrong. Units
@@ -53,8 +53,8 @@ LAYERS = [
     {"mixture", "_simulator"},
     # A batch is coupled, and its couplings make a mixture. Trainers train networks, and
     # average them in a mixture. Tasks have simulators. Labels have a density under a
-    # posterior and its prior.
-    {"_labels", "batch", "trainers", "tasks"},
+    # posterior and its prior. A mixture is recalibrated by its density.
+    {"_labels", "batch", "trainers", "tasks", "recalibration"},
     # RoPE conducts fine-tuning, coupling and mixture.
     {"rope"},
     # A sweep asks RoPE for many mixtures. The NPE that knows the discrepancy is a

@@ -83,6 +83,7 @@ ROOMS: dict[str, tuple[type, ...]] = {
     "sbi_rope.discrepancy": (*_KINDS, *_POSTERIORS),
     "sbi_rope.metrics": (),
     "sbi_rope.mixture": (*_KINDS, *_POSTERIORS),
+    "sbi_rope.recalibration": (nn.Module,),
     "sbi_rope.stacking": _POSTERIORS,
     "sbi_rope.tasks": (nn.Module, Distribution),
 }
@@ -91,7 +92,7 @@ RESULTS = tuple(
     f"sbi_rope.{room}"
     for room in (
         *("_two_sample", "baselines", "coupling", "discrepancy", "metrics"),
-        "stacking",
+        *("recalibration", "stacking"),
     )
 )
 # It derives from none of these, and holds tensors.

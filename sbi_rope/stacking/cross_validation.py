@@ -11,12 +11,13 @@ from scipy.stats import bootstrap, norm
 from scipy.stats import t as student
 from torch import Tensor
 
+from sbi_rope._means import mean_and_error
 from sbi_rope._validation import check_choice
 from sbi_rope.metrics import CoverageCurve, coverage_curve_of
 from sbi_rope.stacking.held_out import SetScores
 from sbi_rope.stacking.weights import StackingWeights, stacking_weights
 
-__all__ = ["CrossValidation", "Difference", "mean_and_error"]
+__all__ = ["CrossValidation", "Difference"]
 
 NUM_BOOTSTRAP = 2000
 
@@ -230,22 +231,6 @@ class CrossValidation:
                 strict=True,
             )
         ]
-
-
-def mean_and_error(scores: Tensor, weights: Tensor | None) -> tuple[float, float]:
-    """Return the mean of a score of each pair, and its standard error.
-
-    Args:
-        scores: The scores, shape ``(n,)``.
-        weights: How many pairs each pair counts as, shape ``(n,)``; None for one each.
-    """
-    n = len(scores)
-    if weights is None:
-        return float(scores.mean()), float(scores.std() / n**0.5)
-    weights = weights.to(scores)
-    mean = (weights * scores).sum() / weights.sum()
-    square = (weights * (scores - mean)).square().sum() / weights.sum().square()
-    return float(mean), float((square * n / max(1, n - 1)).sqrt())
 
 
 def _weighted_mean(values: Any, weights: Any, axis: int = -1) -> Any:

@@ -4,15 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
-from scipy.stats import t as student
 from torch import Tensor
 
+from sbi_rope._means import interval_of_mean, mean_and_error
 from sbi_rope._validation import check_integer
-from sbi_rope.stacking.cross_validation import (
-    CrossValidation,
-    Difference,
-    mean_and_error,
-)
+from sbi_rope.stacking.cross_validation import CrossValidation, Difference
 
 __all__ = ["LearningCurve"]
 
@@ -85,13 +81,10 @@ class LearningCurve:
         inverse = torch.tensor(self.num_pairs).to(self.pair_scores).reciprocal()
         centred = inverse - inverse.mean()
         slopes = -(centred @ self.pair_scores) / centred.square().sum()
-        mean, error = self._mean_and_error(slopes)
         last = self.num_pairs[-1]
         scale = 1 / last - 1 / (last + num_more)
-        half = float(student.ppf(0.975, max(1, len(slopes) - 1))) * error
-        return Difference(
-            mean=scale * mean, low=scale * (mean - half), high=scale * (mean + half)
-        )
+        mean, low, high = interval_of_mean(scale * slopes, self.pair_weights)
+        return Difference(mean=mean, low=low, high=high)
 
     def _mean_and_error(self, values: Tensor) -> tuple[float, float]:
         return mean_and_error(values, self.pair_weights)

@@ -13,6 +13,7 @@ from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture import MixturePosterior
 from sbi_rope.mixture.sharing import share_equal_tensors
 from sbi_rope.stacking.guaranteed import HeldOutSets
+from sbi_rope.stacking.recalibrating import recalibrated
 from sbi_rope.stacking.report import StackingReport
 from sbi_rope.stacking.versions import Versions
 
@@ -59,7 +60,9 @@ class StackedPosterior(MixturePosterior):
         enable_transform: bool = True,
     ) -> None:
         weights = report.cross_validation.weights.weights
-        estimator = versions.estimator(weights)
+        estimator = recalibrated(
+            versions.estimator(weights), report.recalibration, prior
+        )
         share_equal_tensors(estimator)
         if versions.couplings is not None:
             # The same object as in the estimator, so that both move to a device

@@ -18,6 +18,7 @@ from sbi_rope.metrics import (
     acauc_of,
     expected_coverage_error_of,
 )
+from sbi_rope.recalibration import Recalibration
 from sbi_rope.sets.conformal import rank_needed
 from sbi_rope.stacking.cross_validation import CrossValidation, Difference
 from sbi_rope.stacking.held_out import SetScores
@@ -64,6 +65,8 @@ class StackingReport:
         discrepancy: What the pairs say about each entry of x. None if the stack has no
             discrepancy among its candidates, or x is not a short vector.
         provenance: The seed, the seconds and the versions, if they are known.
+        recalibration: By which factors the stack was made narrower or wider, if it was
+            asked for. The other numbers are those of the stack before it.
     """
 
     cross_validation: CrossValidation
@@ -80,6 +83,7 @@ class StackingReport:
     batch: TwoSampleTest | None = None
     discrepancy: DiscrepancyReport | None = None
     provenance: Provenance | None = None
+    recalibration: Recalibration | None = None
 
     @classmethod
     def of(
@@ -90,6 +94,7 @@ class StackingReport:
         batch: TwoSampleTest | None = None,
         discrepancy: DiscrepancyReport | None = None,
         provenance: Provenance | None = None,
+        recalibration: Recalibration | None = None,
     ) -> "StackingReport":
         """Compute the report of a stack.
 
@@ -99,6 +104,7 @@ class StackingReport:
             batch: How its batch compares with the pairs.
             discrepancy: What the pairs say about each entry of x.
             provenance: How the stack was made.
+            recalibration: By which factors it was made narrower or wider.
         """
         check_instance("cross_validation", cross_validation, CrossValidation)
         check_instance("learning_curve", learning_curve, LearningCurve, optional=True)
@@ -125,6 +131,7 @@ class StackingReport:
             batch=batch,
             discrepancy=discrepancy,
             provenance=provenance,
+            recalibration=recalibration,
         )
 
     @property

@@ -25,6 +25,7 @@ from sbi_rope.errors import (
     warn_user,
 )
 from sbi_rope.mixture import MixturePosterior
+from sbi_rope.recalibration import Recalibration
 from sbi_rope.rope import HOW_TO_MAKE, RoPE
 from sbi_rope.stacking.candidates import (
     AmortisedCandidate,
@@ -48,6 +49,7 @@ from sbi_rope.stacking.label_scores import (
     score_labelled_fold,
     score_labels,
 )
+from sbi_rope.stacking.recalibrating import pairs_of_folds, recalibration_of
 from sbi_rope.stacking.trained_candidates import (
     DiscrepancyCandidate,
     FinetunedCandidate,
@@ -174,6 +176,25 @@ class StackTrainer:
         versions = self._train(folds)
         scores = self._score(versions, num_training_folds)
         return versions, scores
+
+    @torch.enable_grad()  # in case the caller has switched gradients off
+    def recalibration(self, scores: CrossValidation) -> Recalibration:
+        """Train without pairs of folds, and tell how wide the stack should be.
+
+        Args:
+            scores: The result of :meth:`cross_validate`.
+        """
+        bench = self.bench
+        pairs = pairs_of_folds(len(bench.folds))
+        numbers = set(range(len(bench.folds)))
+        versions = self._train([Fold(bench, sorted(numbers - pair)) for pair in pairs])
+        weights = fold_weights(
+            scores.log_scores,
+            scores.fold,
+            self.pseudo_count,
+            pair_weights=bench.pair_weights,
+        )
+        return recalibration_of(bench, versions, pairs, weights, seed=self.seeds[2])
 
     def discrepancy(self) -> DiscrepancyReport | None:
         """Return what the pairs say about each entry of x, if a candidate uses it."""

@@ -1,6 +1,7 @@
 """What a printed report of a stack says, and how candidates are called in words."""
 
 import math
+import textwrap
 from typing import TYPE_CHECKING
 
 from sbi_rope.metrics.calibration import ACAUC_IN_WORDS
@@ -79,6 +80,7 @@ def lines_of(report: "StackingReport") -> list[str]:
         *_gains(report),
         *_weights(report),
         *_calibration(report),
+        *_recalibration(report),
         *_more_labels(report),
         *_what_it_took(report),
     ]
@@ -164,6 +166,14 @@ def _calibration(report: "StackingReport") -> list[str]:
         *_sets(report),
         *_assumption(report),
     ]
+
+
+def _recalibration(report: "StackingReport") -> list[str]:
+    if report.recalibration is None:
+        return []
+    return textwrap.wrap(
+        str(report.recalibration), 88, initial_indent="  ", subsequent_indent="    "
+    )
 
 
 def _sets(report: "StackingReport") -> list[str]:

@@ -51,6 +51,7 @@ def known() -> dict[str, Any]:
     return {**names, "RoPE": RoPE, "stack": stack, "plots": plots}
 
 
+@pytest.mark.docs
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_the_code_of_a_page_runs(
     page: Path,

@@ -1,0 +1,157 @@
+r"""How much narrower or wider posteriors have to be, from held-out pairs.
+
+The factors maximise the log density of held-out pairs, with a prior around 1:
+
+.. math:: \log s_j = c + \delta_j, \qquad c \sim N(0, 0.3^2), \qquad
+    \delta_j \sim N(0, 0.15^2)
+
+So few pairs choose one factor for all parameters, and one near 1. Many pairs choose one
+for each. The density is computed on a grid of c, and then on a grid of each
+:math:`\delta_j` at the best c. What several :math:`\delta_j` change is taken to add up.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from sbi_rope.metrics.calibration import central_levels, count_ranks
+from sbi_rope.recalibration.estimator import RecalibratedEstimator
+from sbi_rope.recalibration.spread import Spread
+
+__all__ = ["Choice", "HeldOutGrid", "HeldOutMixture"]
+
+# The grids of c and of each delta, and the standard deviations of their priors.
+COMMON = torch.linspace(-1.2, 1.2, 49, dtype=torch.double)
+OWN = torch.linspace(-0.6, 0.6, 25, dtype=torch.double)
+COMMON_STD, OWN_STD = 0.3, 0.15
+# Draws at each pair, from which the calibration is computed.
+NUM_DRAWS = 500
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class HeldOutMixture:
+    """A mixture, and pairs that it has not seen.
+
+    Attributes:
+        estimator: The mixture, with factors of 1.
+        theta: Parameters inside the support, shape ``(n, d)``.
+        x: Their observations, shape ``(n, *event)``.
+    """
+
+    estimator: RecalibratedEstimator
+    theta: Tensor
+    x: Tensor
+
+    @cached_property
+    def spread(self) -> Spread:
+        """The map of the observations, with factors of 1."""
+        return self.estimator.spread(self.x)
+
+    @torch.no_grad()
+    def log_prob(self, factors: Tensor) -> Tensor:
+        """Return the log density of each pair with some factors.
+
+        Args:
+            factors: Shape ``(S, d)``.
+
+        Returns:
+            Shape ``(n, S)``, float64, not corrected for leakage.
+        """
+        spread = self.spread.with_factors(factors[:, None])
+        moved, slope = spread.inverse(self.theta.expand(len(factors), -1, -1))
+        log_prob = self.estimator.log_prob_before(moved, self.x)
+        return (log_prob.double() + slope).T
+
+    @torch.no_grad()
+    def levels(self, factors: Tensor) -> Tensor:
+        """Return the level of the central interval that ends at each parameter.
+
+        Args:
+            factors: Shape ``(d,)``.
+
+        Returns:
+            Shape ``(n, d)``.
+        """
+        draws = self.estimator.sample(torch.Size((NUM_DRAWS,)), self.x)
+        moved, _ = self.spread.with_factors(factors).inverse(self.theta[None])
+        return central_levels(count_ranks(draws, moved[0]))
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A place on the grids: the numbers of c and of the delta of each parameter."""
+
+    common: int
+    own: tuple[int, ...]
+
+    @property
+    def factors(self) -> Tensor:
+        """The factor of each parameter, shape ``(d,)``."""
+        return (COMMON[self.common] + OWN[list(self.own)]).exp()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class HeldOutGrid:
+    """The log densities of held-out pairs on the grids.
+
+    Attributes:
+        common: With one factor for all parameters, shape ``(n, 49)``.
+        own: What a factor of one parameter adds, shape ``(n, d, 25)``.
+        weights: How many pairs each pair counts as, shape ``(n,)``.
+    """
+
+    common: Tensor
+    own: Tensor
+    weights: Tensor
+
+    @classmethod
+    def of(cls, folds: Sequence[HeldOutMixture], weights: Tensor) -> "HeldOutGrid":
+        """Compute the densities, fold by fold.
+
+        Args:
+            folds: The mixture of each fold, with the pairs of the fold.
+            weights: How many pairs each pair counts as, in the order of the folds.
+        """
+        d = folds[0].theta.shape[1]
+        device = folds[0].theta.device
+        ones = torch.ones(d, dtype=torch.double, device=device)
+        factors = COMMON.to(device).exp()[:, None] * ones
+        common = torch.cat([fold.log_prob(factors) for fold in folds])
+        best = factors[_best_common(common, weights)]
+        own = []
+        for j in range(d):
+            of_one = best.repeat(len(OWN), 1)
+            of_one[:, j] *= OWN.to(device).exp()
+            own.append(torch.cat([fold.log_prob(of_one) for fold in folds]))
+        grid = torch.stack(own, dim=1)
+        middle = len(OWN) // 2
+        return cls(common=common, own=grid - grid[..., [middle]], weights=weights)
+
+    def best(self, rows: Tensor) -> Choice:
+        """Return the best factors for some of the pairs, given by a mask ``(n,)``."""
+        weights = self.weights[rows]
+        added = torch.einsum("n,ndk->dk", weights, self.own[rows])
+        added = added - 0.5 * (OWN.to(added) / OWN_STD).square()
+        return Choice(
+            _best_common(self.common[rows], weights),
+            tuple(added.argmax(dim=1).tolist()),
+        )
+
+    def log_prob(self, choice: Choice) -> Tensor:
+        """Return the log density of each pair with some factors, shape ``(n,)``."""
+        parameters = torch.arange(self.own.shape[1])
+        added = self.own[:, parameters, list(choice.own)].sum(dim=1)
+        return self.common[:, choice.common] + added
+
+    @property
+    def unchanged(self) -> Tensor:
+        """The log density of each pair with factors of 1, shape ``(n,)``."""
+        return self.common[:, len(COMMON) // 2]
+
+
+def _best_common(log_prob: Tensor, weights: Tensor) -> int:
+    penalty = 0.5 * (COMMON.to(log_prob) / COMMON_STD).square()
+    return int((weights @ log_prob - penalty).argmax())

@@ -1,0 +1,124 @@
+"""Recalibrate a stack by mixtures of versions that have not seen a fold.
+
+The stack mixes several versions of each candidate, and a mixture is wider than its
+members. So a single version that has not seen a fold does not tell how wide the stack
+should be. Versions are therefore trained without two folds each. All those that have
+not seen a fold are mixed, and this mixture is scored on the fold.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sbi_rope._sbi import MixedDensity, estimator_of, headless
+from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError
+from sbi_rope.mixture import MixtureEstimator
+from sbi_rope.recalibration import RecalibratedEstimator, Recalibration
+from sbi_rope.recalibration.factors import HeldOutMixture
+from sbi_rope.recalibration.recalibration import recalibrate
+from sbi_rope.recalibration.support import box_of
+from sbi_rope.stacking.folds import Workbench
+from sbi_rope.stacking.versions import Versions
+
+__all__ = ["check_recalibration", "pairs_of_folds", "recalibrated", "recalibration_of"]
+
+# Fewer folds cannot be left out in pairs.
+MIN_FOLDS = 3
+# A fold is left out together with the folds that are so many places after it.
+DISTANCES = (1, 2)
+
+
+def check_recalibration(bench: Workbench) -> None:
+    """Raise if the posterior of these pairs cannot be recalibrated."""
+    if not bench.labels.are_exact:
+        raise InvalidInputError(
+            f"Expected exact labels to recalibrate; got {bench.labels}. Leave "
+            "`recalibrate` out, or stack the exact labels alone."
+        )
+    if len(bench.folds) < MIN_FOLDS:
+        raise InvalidInputError(
+            f"Expected at least {MIN_FOLDS} folds to recalibrate; got "
+            f"{len(bench.folds)}. Add calibration pairs, or leave `recalibrate` out."
+        )
+    if isinstance(headless(estimator_of(bench.npe)), MixedDensity):
+        raise UnsupportedPosteriorError(
+            "Expected continuous parameters to recalibrate; got some that are "
+            "categories. Leave `recalibrate` out."
+        )
+    box_of(bench.npe.prior)
+
+
+def pairs_of_folds(num_folds: int) -> list[frozenset[int]]:
+    """Return the pairs of folds that are left out together.
+
+    With up to five folds these are all pairs. With more folds each is left out with
+    four others.
+
+    Example:
+        >>> [sorted(pair) for pair in pairs_of_folds(3)]
+        [[0, 1], [0, 2], [1, 2]]
+    """
+    pairs = {
+        frozenset((k, (k + distance) % num_folds))
+        for k in range(num_folds)
+        for distance in DISTANCES
+    }
+    return sorted(pairs, key=sorted)
+
+
+def recalibration_of(
+    bench: Workbench,
+    versions: Versions,
+    pairs: Sequence[frozenset[int]],
+    weights: Tensor,
+    *,
+    seed: int,
+) -> Recalibration:
+    """Choose how much narrower or wider a stack has to be.
+
+    Args:
+        bench: The calibration pairs and their folds.
+        versions: The candidates, in a version without each pair of folds.
+        pairs: The pairs of folds.
+        weights: The weights of the stack that scores each fold, shape ``(F, K)``.
+        seed: Seed of the draws.
+    """
+    low, high = box_of(bench.npe.prior)
+    folds, counts = [], []
+    for number, rows in enumerate(bench.folds):
+        theta = bench.theta[rows]
+        # The spread says nothing about labels outside the prior's support.
+        inside = ((theta >= low.to(theta)) & (theta <= high.to(theta))).all(dim=1)
+        if not inside.any():
+            continue
+        unseen = [k for k, pair in enumerate(pairs) if number in pair]
+        mixture = versions.estimator(weights[number], unseen)
+        folds.append(
+            HeldOutMixture(
+                estimator=RecalibratedEstimator(
+                    mixture, torch.ones_like(low), low, high
+                ),
+                theta=theta[inside],
+                x=bench.x[rows][inside],
+            )
+        )
+        counts.append(_counts(bench)[rows][inside])
+    return recalibrate(folds, torch.cat(counts), seed=seed)
+
+
+def recalibrated(
+    mixture: MixtureEstimator, recalibration: Recalibration | None, prior: Any
+) -> MixtureEstimator:
+    """Return a mixture with the factors of a recalibration, if there are any."""
+    if recalibration is None or not recalibration.is_used:
+        return mixture
+    return RecalibratedEstimator(mixture, recalibration.factors, *box_of(prior))
+
+
+def _counts(bench: Workbench) -> Tensor:
+    weights = bench.pair_weights
+    if weights is None:
+        return torch.ones(len(bench.theta), dtype=torch.double, device=bench.x.device)
+    return weights.double()

@@ -1,0 +1,137 @@
+"""A stack that is recalibrated by versions that have not seen a fold."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+import sbi_rope
+from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError
+from sbi_rope.recalibration import RecalibratedEstimator, Recalibration
+from sbi_rope.stacking import StackedPosterior
+from sbi_rope.stacking.recalibrating import pairs_of_folds
+from tests import problems
+from tests.stacks import (
+    NPE,
+    PRIOR,
+    ROPE,
+    problem,
+    rope_of,
+    stacked,
+)
+
+pytestmark = pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
+
+
+def near_zero(n: int = 20) -> tuple[Tensor, Tensor]:
+    """Pairs of parameters near zero, for which the prior is too wide."""
+    theta = 0.3 * problems.box(2).sample((n,))
+    return theta, problems.simulate(theta) + 0.4
+
+
+@pytest.fixture(scope="module")
+def stacks() -> tuple[StackedPosterior, StackedPosterior]:
+    """A stack of candidates that are too wide, and the same recalibrated."""
+    torch.manual_seed(0)
+    rope = rope_of(near_zero())
+    plain, recalibrated = (
+        stacked(rope, candidates=[PRIOR, NPE], recalibrate=flag)
+        for flag in (False, True)
+    )
+    return plain, recalibrated
+
+
+@pytest.fixture
+def recalibrated(
+    stacks: tuple[StackedPosterior, StackedPosterior],
+) -> StackedPosterior:
+    return stacks[1]
+
+
+def recalibration_of(posterior: StackedPosterior) -> Recalibration:
+    found = posterior.report.recalibration
+    assert found is not None
+    return found
+
+
+def test_the_scores_and_weights_are_those_of_the_stack_without(
+    stacks: tuple[StackedPosterior, StackedPosterior],
+) -> None:
+    plain, recalibrated = stacks
+    assert plain.report.recalibration is None
+    assert recalibrated.candidate_weights == plain.candidate_weights
+    assert recalibrated.report.score == plain.report.score
+    theta, x = problem(4, seed=9)
+    assert torch.equal(
+        recalibrated.candidate_log_probs(theta, x), plain.candidate_log_probs(theta, x)
+    )
+    assert f"{recalibration_of(recalibrated).gain:+.2f} nats" in str(
+        recalibrated.report
+    )
+
+
+def test_draws_are_moved_by_the_factors_and_keep_their_order(
+    stacks: tuple[StackedPosterior, StackedPosterior],
+) -> None:
+    plain, recalibrated = stacks
+    found = recalibration_of(recalibrated)
+    assert found.is_used
+    assert isinstance(recalibrated.posterior_estimator, RecalibratedEstimator)
+    _, x = problem(3, seed=9)
+    draws = []
+    for posterior in (plain, recalibrated):
+        torch.manual_seed(0)
+        draws.append(posterior.sample_batched((500,), x, show_progress_bars=False))
+    assert torch.equal(draws[0].argsort(dim=0), draws[1].argsort(dim=0))
+    assert (draws[1].abs() < 1).all()
+    # The logits of parameters between -1 and 1.
+    width = [(2 * some.double().atanh()).std(dim=0) for some in draws]
+    ratio = (width[1] / width[0]).mean(dim=0)
+    torch.testing.assert_close(ratio, found.factors, rtol=1e-3, atol=0.0)
+
+
+def test_it_is_saved_and_answers_sets_as_any_other_stack(
+    recalibrated: StackedPosterior, tmp_path: Path
+) -> None:
+    theta, x = problem(4, seed=9)
+    recalibrated.save(tmp_path / "stack.npz")
+    loaded = sbi_rope.load(tmp_path / "stack.npz")
+    expected = recalibrated.log_prob_batched(theta, x)
+    assert torch.equal(loaded.log_prob_batched(theta, x), expected)
+    assert str(loaded.report) == str(recalibrated.report)
+    for guaranteed in (False, True):
+        found = recalibrated.credible_set(0.8, x[0], guaranteed=guaranteed, seed=0)
+        assert found.volume > 0
+
+
+def test_the_posterior_of_one_observation_of_a_batch_is_recalibrated_too() -> None:
+    torch.manual_seed(0)
+    rope, (_, x_o) = rope_of(near_zero()), near_zero(25)
+    posterior = stacked(rope, x_o, candidates=[ROPE, PRIOR], recalibrate=True)
+    assert recalibration_of(posterior).is_used
+    theta, _ = problem(5, seed=9)
+    one = posterior[2].log_prob(theta)
+    torch.testing.assert_close(one, posterior.log_prob(theta, x=x_o[2]))
+
+
+def test_each_fold_is_left_out_with_four_others_at_most() -> None:
+    for count, expected in ((3, 3), (4, 6), (5, 10), (8, 16)):
+        pairs = pairs_of_folds(count)
+        assert len(pairs) == expected
+        for number in range(count):
+            assert sum(number in pair for pair in pairs) == min(4, count - 1)
+
+
+def test_what_cannot_be_recalibrated_is_refused_before_any_training() -> None:
+    theta, x = problem(20, seed=1)
+    noisy = rope_of((theta[:0], x[:0])).append_calibration(theta, x, theta_std=0.1)
+    with pytest.raises(InvalidInputError, match="exact labels to recalibrate"):
+        stacked(noisy, recalibrate=True)
+    with pytest.raises(InvalidInputError, match="at least 3 folds to recalibrate"):
+        stacked(rope_of(), num_folds=2, recalibrate=True)
+    mixed = rope_of(problem(0, seed=1), family="mnpe")
+    parameters = problems.mixed_prior(2).sample((10,))
+    mixed.append_calibration(parameters, problems.simulate(parameters))
+    with pytest.raises(UnsupportedPosteriorError, match="continuous parameters"):
+        stacked(mixed, recalibrate=True)

@@ -1,0 +1,186 @@
+"""Posteriors that are made narrower or wider, against closed forms."""
+
+import math
+from typing import Any
+
+import pytest
+import scipy.interpolate
+import scipy.optimize
+import scipy.stats
+import torch
+from torch import Tensor, nn
+from torch.distributions import Dirichlet, Exponential, Independent
+
+from sbi_rope import MixturePosterior
+from sbi_rope.errors import UnsupportedPosteriorError
+from sbi_rope.mixture import MixtureEstimator, OwnEmbeddings, Part
+from sbi_rope.recalibration import RecalibratedEstimator, Recalibration
+from sbi_rope.recalibration.factors import HeldOutMixture
+from sbi_rope.recalibration.recalibration import recalibrate
+from sbi_rope.recalibration.spread import Spread
+from sbi_rope.recalibration.support import box_of
+from tests import problems
+
+INF = math.inf
+FACTORS = torch.tensor([0.5, 1.5])
+# One parameter without bounds, two with one bound, and one with both.
+LOW = torch.tensor([-INF, 0.0, -INF, -2.0]).double()
+HIGH = torch.tensor([INF, INF, 1.0, 3.0]).double()
+
+
+def gaussians(
+    dim: int = 2, *, factors: Tensor = FACTORS, bound: float = INF
+) -> RecalibratedEstimator:
+    """The posterior N(x_1, exp(x_2)^2) with other spreads."""
+    part = Part(
+        problems.Gaussians(dim), OwnEmbeddings([nn.Identity()], torch.Size((2 * dim,)))
+    )
+    bounds = torch.full((dim,), bound)
+    return RecalibratedEstimator(
+        MixtureEstimator([part], [1.0]), factors, -bounds, bounds
+    )
+
+
+def observations(n: int, *, dim: int = 2, std: float = 0.3) -> Tensor:
+    """Observations whose posteriors have means in a box, and one deviation."""
+    mean = 2 * torch.rand(n, dim) - 1
+    return torch.cat([mean, torch.full((n, dim), math.log(std))], dim=1)
+
+
+def folds_of(
+    n: int, *, too_wide: Tensor, num_folds: int = 2, seed: int = 0
+) -> list[HeldOutMixture]:
+    """Pairs from posteriors that are narrower than those that are recalibrated."""
+    torch.manual_seed(seed)
+    x = observations(n, dim=len(too_wide))
+    mean, log_std = x.chunk(2, dim=1)
+    theta = mean + log_std.exp() / too_wide * torch.randn(mean.shape)
+    estimator = gaussians(len(too_wide), factors=torch.ones(len(too_wide)))
+    return [
+        HeldOutMixture(estimator=estimator, theta=theta[rows], x=x[rows])
+        for rows in torch.arange(n).chunk(num_folds)
+    ]
+
+
+def recalibration(folds: list[HeldOutMixture]) -> Recalibration:
+    count = sum(len(fold.theta) for fold in folds)
+    return recalibrate(folds, torch.ones(count).double(), seed=0)
+
+
+def test_a_map_and_its_inverse_undo_each_other_and_stay_inside_the_bounds() -> None:
+    theta = torch.tensor([[1000.0, 2.0, -5.0, 0.3], [-3.0, 1e-3, 0.9, 2.99]]).double()
+    spread = Spread(
+        torch.tensor([1.0, -1.0, 0.5, 0.2]).double(),
+        torch.tensor([0.5, 2.0, 0.7, 1.3]).double(),
+        LOW,
+        HIGH,
+    )
+    moved = spread.forward(theta)
+    assert ((moved > LOW) & (moved < HIGH)).all()
+    torch.testing.assert_close(spread.inverse(moved)[0], theta)
+    torch.testing.assert_close(moved[0, 0], torch.tensor(500.5).double())
+
+
+def test_the_slope_of_the_inverse_is_that_of_automatic_differentiation() -> None:
+    theta = torch.tensor([1000.0, 2.0, -5.0, 0.3]).double()
+    spread = Spread(torch.zeros(4).double(), 0.5 + torch.rand(4).double(), LOW, HIGH)
+    slopes = torch.autograd.functional.jacobian(lambda t: spread.inverse(t)[0], theta)
+    _, slope = spread.inverse(theta)
+    assert isinstance(slopes, Tensor)
+    torch.testing.assert_close(slope, slopes.diagonal().log().sum())
+
+
+def test_a_gaussian_stays_a_gaussian_with_another_deviation() -> None:
+    torch.manual_seed(0)
+    estimator, x = gaussians(), observations(3)
+    mean, log_std = x.chunk(2, dim=1)
+    std = log_std.exp() * FACTORS
+    theta = mean + std * torch.randn(50, 3, 2)
+    exact = torch.distributions.Normal(mean, std).log_prob(theta).sum(dim=2)
+    # The centre is the mean of 256 draws, which is off by a sixteenth of a deviation.
+    assert float((estimator.log_prob(theta, x) - exact).abs().max()) < 0.3
+    assert float((estimator.log_prob(theta, x) - exact).mean().abs()) < 0.02
+    draws = estimator.sample(torch.Size((20_000,)), x)
+    torch.testing.assert_close(draws.std(dim=0), std, rtol=0.03, atol=0.0)
+
+
+@pytest.mark.parametrize("factors", [(0.5, 0.5), (1.6, 0.8)])
+def test_the_density_integrates_to_one_in_a_box_and_is_that_of_the_draws(
+    factors: tuple[float, float],
+) -> None:
+    torch.manual_seed(0)
+    estimator = gaussians(factors=torch.tensor(factors), bound=1.0)
+    posterior = MixturePosterior(estimator, problems.box(2))
+    x = observations(1, std=0.7)
+    # Midpoints of 200 x 200 cells.
+    middle = (torch.arange(200) + 0.5) / 100 - 1
+    grid = torch.cartesian_prod(middle, middle)
+    mass = posterior.log_prob(grid, x=x).double().exp().reshape(200, 200) / 100**2
+    assert float(mass.sum()) == pytest.approx(1.0, abs=0.03)
+    draws = posterior.sample((4000,), x=x)
+    ends = torch.linspace(-1, 1, 201)
+    for j in range(2):
+        cdf = torch.cat([torch.zeros(1), mass.sum(dim=1 - j).cumsum(dim=0)])
+        exact = scipy.interpolate.interp1d(ends.numpy(), (cdf / cdf[-1]).numpy())
+        assert scipy.stats.kstest(draws[:, j].numpy(), exact).pvalue > 0.01
+    outside = posterior.log_prob(torch.tensor([[1.1, 0.0]]), x=x)
+    assert outside.item() == -INF
+
+
+def test_many_pairs_find_a_factor_for_each_parameter() -> None:
+    found = recalibration(folds_of(1000, too_wide=torch.tensor([2.0, 0.8])))
+    torch.testing.assert_close(
+        found.factors, torch.tensor([0.5, 1.25]).double(), rtol=0.08, atol=0.0
+    )
+    # The mean gain in closed form, with posteriors too wide by w.
+    gain = sum(math.log(w) - 0.5 + 0.5 / w**2 for w in (2.0, 0.8))
+    assert found.interval[0] < gain < found.interval[1]
+    assert found.before.verdict == "too wide"
+    assert found.after.verdict == "calibrated"
+
+
+def test_a_few_pairs_choose_what_the_prior_of_the_factors_says() -> None:
+    folds = folds_of(8, too_wide=torch.tensor([2.0, 0.8]), seed=3)
+    found = recalibration(folds)
+    z = torch.cat(
+        [(fold.theta - fold.spread.centre) / fold.x[:, 2:].exp() for fold in folds]
+    ).double()
+
+    def loss(values: Any) -> float:
+        common, own = values[0], torch.as_tensor(values[1:])
+        log_s = common + own
+        fit = (-0.5 * (z * (-log_s).exp()).square() - log_s).sum()
+        prior = (common / 0.3) ** 2 / 2 + (own / 0.15).square().sum() / 2
+        return float(prior - fit)
+
+    exact = scipy.optimize.minimize(loss, [0.0, 0.0, 0.0]).x
+    expected = torch.as_tensor(exact[0] + exact[1:]).exp()
+    if found.is_used:
+        torch.testing.assert_close(found.factors, expected, rtol=0.1, atol=0.0)
+    # The prior keeps them nearer to 1 than the pairs alone would.
+    assert float(expected.log().abs().max()) < 0.8
+
+
+def test_a_calibrated_posterior_is_left_as_it_is_or_hardly_changed() -> None:
+    gains = []
+    for seed in range(20):
+        folds = folds_of(40, too_wide=torch.ones(2), num_folds=5, seed=seed)
+        found = recalibration(folds)
+        assert found.is_used == (found.gain > 0)
+        if not found.is_used:
+            assert torch.equal(found.factors, torch.ones(2).double())
+        assert float(found.factors.log().abs().max()) < 0.4
+        gains.append(found.gain)
+    # What two numbers that are fitted to 32 pairs cost.
+    assert -0.08 < sum(gains) / 20 < 0.02
+
+
+def test_a_support_that_is_no_box_is_refused() -> None:
+    low, high = box_of(problems.box(2))
+    assert torch.equal(low, -torch.ones(2).double())
+    assert torch.equal(high, torch.ones(2).double())
+    low, high = box_of(Independent(Exponential(torch.ones(2)), 1))
+    assert torch.equal(low, torch.zeros(2).double())
+    assert torch.isinf(high).all()
+    with pytest.raises(UnsupportedPosteriorError, match="Leave `recalibrate` out"):
+        box_of(Dirichlet(torch.ones(3)))
