@@ -30,7 +30,9 @@ def calibration_section(report: StackingReport, names: Sequence[str]) -> str:
     rows = [_row("all parameters", report.acauc.value, report.acauc.interval, curve)]
     curves = {"all parameters": curve}
     for k, name in enumerate(names):
-        score, own = acauc_of(levels[:, [k]]), _of_parameter(curve, k)
+        partial = bool(report.cross_validation.labels)
+        score = acauc_of(levels[:, [k]], allow_missing=partial)
+        own = _of_parameter(curve, k)
         if len(names) > 1:
             rows.append(_row(name, score.value, score.interval, own))
             curves[name] = own
@@ -61,6 +63,7 @@ def calibration_section(report: StackingReport, names: Sequence[str]) -> str:
             kind="note",
         ),
         *_sets(report),
+        *_recalibration(report),
         picture(
             drawn,
             caption="The share of known parameters inside intervals of each level. "
@@ -68,6 +71,17 @@ def calibration_section(report: StackingReport, names: Sequence[str]) -> str:
             "holds 95 % of the curves of calibrated posteriors.",
         ),
     )
+
+
+def _recalibration(report: StackingReport) -> list[str]:
+    if report.recalibration is None:
+        return []
+    return [
+        paragraph(
+            f"{report.recalibration} The table above is about the stack before it.",
+            kind="note",
+        )
+    ]
 
 
 def _sets(report: StackingReport) -> list[str]:

@@ -29,7 +29,7 @@ from sbi_rope.reports.page import (
 )
 from sbi_rope.reports.verdict import verdict_of
 from sbi_rope.stacking import StackingReport
-from sbi_rope.stacking.words import IN_WORDS, differs
+from sbi_rope.stacking.words import IN_WORDS, differs, gains_of
 
 __all__ = ["write_stacking_report"]
 
@@ -229,6 +229,7 @@ def _weight_section(report: StackingReport) -> str:
                 "pairs, with one standard error to each side.",
             )
         )
+        parts += [paragraph(line, kind="note") for line in gains_of(curve)]
     return section("What the stack is made of", *parts)
 
 
@@ -236,6 +237,7 @@ def _provenance_section(report: StackingReport) -> str:
     scores, made = report.cross_validation, report.provenance
     rows = [
         ("calibration pairs", str(len(scores))),
+        *([("labels", scores.labels)] if scores.labels else []),
         ("folds", str(scores.num_folds)),
         ("candidates", str(len(scores.names))),
     ]

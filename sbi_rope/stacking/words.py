@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from sbi_rope.metrics.calibration import ACAUC_IN_WORDS
 from sbi_rope.stacking.cross_validation import Difference
+from sbi_rope.stacking.learning_curve import LearningCurve
 
 if TYPE_CHECKING:
     from sbi_rope.stacking.report import StackingReport
@@ -17,6 +18,7 @@ __all__ = [
     "REFERENCES",
     "compared",
     "differs",
+    "gains_of",
     "lines_of",
     "sets_held",
 ]
@@ -230,16 +232,22 @@ def _more_labels(report: "StackingReport") -> list[str]:
         for n, score in zip(curve.num_pairs, curve.scores, strict=True)
     )
     lines = [f"  log score by training pairs, theta in its own units: {points}"]
-    for more in dict.fromkeys((FEW_MORE, curve.num_pairs[-1])):
-        gain = curve.gain(more)
-        if math.isfinite(gain.mean):
-            lines.append(
-                f"  {more} more labels might add {gain.mean:.2f} nats a pair "
-                f"({gain.low:.2f} to {gain.high:.2f})"
-            )
-    if len(lines) > 1:
-        lines.append("    if the curve goes on like a - b / n")
-    return lines
+    return [*lines, *(f"  {line}" for line in gains_of(curve))]
+
+
+def gains_of(curve: LearningCurve) -> list[str]:
+    """Say what a few more labels would add, and what twice as many would."""
+    gains = {
+        more: curve.gain(more)
+        for more in dict.fromkeys((FEW_MORE, curve.num_pairs[-1]))
+    }
+    lines = [
+        f"{more} more labels might add {gain.mean:.2f} nats a pair (95 % interval "
+        f"{gain.low:.2f} to {gain.high:.2f})"
+        for more, gain in gains.items()
+        if math.isfinite(gain.mean)
+    ]
+    return [*lines, "if the curve goes on like a - b / n"] if lines else []
 
 
 def _what_it_took(report: "StackingReport") -> list[str]:

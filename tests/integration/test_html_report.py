@@ -16,6 +16,7 @@ from sbi_rope._two_sample import TwoSampleTest
 from sbi_rope.diagnosis import Diagnosis, Finding
 from sbi_rope.diagnosis.labelled import UNLIKE_PAIRS
 from sbi_rope.errors import InvalidInputError, InvalidTypeError, NotWritableError
+from sbi_rope.recalibration import Recalibration
 from sbi_rope.reports.numbers import number, percent
 from sbi_rope.stacking import LearningCurve, StackingReport
 from tests.stacks import QUIET, observed, the_stack, trained
@@ -150,6 +151,25 @@ def test_the_page_says_how_large_sets_with_a_guarantee_are(source: str) -> None:
     share = percent(scores.share_held(0.9))
     assert f"90 % sets of all parameters together held those of {share}" in text
     assert "Sets that are guaranteed to hold about 90 %" in text
+
+
+def test_the_page_says_what_more_labels_and_a_recalibration_add(
+    source: str, tmp_path: Path
+) -> None:
+    assert "10 more labels might add" in Page(source).text
+    assert "Recalibration" not in source
+    levels = torch.rand(20, 2, generator=torch.Generator().manual_seed(0))
+    recalibration = Recalibration(
+        factors=torch.tensor([0.71, 1.24]),
+        gain=0.09,
+        interval=(0.02, 0.16),
+        levels_before=0.5 * levels,
+        levels_after=levels,
+    )
+    report = replace(the_stack().report, recalibration=recalibration)
+    text = Page(written(report, tmp_path)).text
+    assert "the spread of the parameters by 0.71, 1.24: +0.09 nats" in text
+    assert f"ACAUC {recalibration.before.value:+.3f} before" in text
 
 
 def test_the_page_says_what_a_diagnosis_found(

@@ -50,6 +50,10 @@ def test_a_stack_is_scored_on_what_was_measured(tmp_path: Any) -> None:
     posterior.save(tmp_path / "stack")
     loaded = load(tmp_path / "stack")
     assert loaded.report.cross_validation.labels == scores.labels
+    loaded.report.to_html(tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "20 labels, 20 with noise and 10 partial" in page
+    assert ">nan<" not in page
 
 
 def test_couplings_are_scored_on_labels_that_are_not_exact() -> None:
