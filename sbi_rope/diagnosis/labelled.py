@@ -18,8 +18,8 @@ def labelled_finding(test: TwoSampleTest) -> Finding:
         sentence = (
             f"As NPE sees it, the batch differs from the calibration pairs: {size}. "
             "The weights of a stack, its scores and its calibration were found on the "
-            "pairs, and need not hold for this batch. Label some observations like "
-            "those of the batch."
+            "pairs, and need not hold for this batch. The same is true of what sets "
+            "with a guarantee promise. Label some observations like those of the batch."
         )
     else:
         sentence = (

@@ -4,6 +4,7 @@ import itertools
 import warnings
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -27,6 +28,7 @@ from sbi_rope.diagnosis.spread import spread_of
 from sbi_rope.diagnosis.support import support_of
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.plots import implied_parameters
+from sbi_rope.sets import Guarantee
 from tests import gaussian
 
 NUM_DRAWS = 120
@@ -120,6 +122,23 @@ def test_a_batch_unlike_the_calibration_pairs_is_found_after_tuning(
     x_o = gaussian.real_process(parameters(200)) + 0.7
     diagnosis = look(tuned, x_o, num_folds=None)
     assert diagnosis["misspecification after tuning"].alarming
+
+
+def test_a_batch_for_which_no_guarantee_holds_gives_an_alarm_and_a_page_says_so(
+    tuned: RoPE,
+) -> None:
+    torch.manual_seed(26)
+    shifted = gaussian.real_process(parameters(200) + 1.0)
+    finding = look(tuned, shifted, num_folds=None)[UNLIKE]
+    assert finding.alarming
+    assert "what sets with a guarantee promise" in finding.sentence
+    like_pairs = gaussian.real_process(parameters(200))
+    assert not look(tuned, like_pairs, num_folds=None)[UNLIKE].alarming
+    page = Path(__file__).parents[2] / "docs/howto/guaranteed_sets.md"
+    text = " ".join(page.read_text(encoding="utf-8").split())
+    assert "nothing is promised. `diagnose(rope, x_o)` tests" in text
+    promise = str(Guarantee(level=0.9, num_pairs=50, num_folds=5))
+    assert promise.startswith("For observations drawn as the 50 calibration pairs were")
 
 
 def test_misspecification_is_found_in_a_rope_without_pairs() -> None:
