@@ -120,12 +120,16 @@ class HeldOutGrid:
         ones = torch.ones(d, dtype=torch.double, device=device)
         factors = COMMON.to(device).exp()[:, None] * ones
         common = torch.cat([fold.log_prob(factors) for fold in folds])
+        # A pair with a density of zero says nothing about the spread.
+        says_nothing = torch.isinf(common[:, [len(COMMON) // 2]])
+        common = common.where(~says_nothing, 0.0)
         best = factors[_best_common(common, weights)]
         own = []
         for j in range(d):
             of_one = best.repeat(len(OWN), 1)
             of_one[:, j] *= OWN.to(device).exp()
             own.append(torch.cat([fold.log_prob(of_one) for fold in folds]))
+            own[-1] = own[-1].where(~says_nothing, 0.0)
         grid = torch.stack(own, dim=1)
         middle = len(OWN) // 2
         return cls(common=common, own=grid - grid[..., [middle]], weights=weights)

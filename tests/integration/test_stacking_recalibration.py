@@ -1,6 +1,8 @@
 """A stack that is recalibrated by versions that have not seen a fold."""
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -9,10 +11,13 @@ from torch import Tensor
 import sbi_rope
 from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError
 from sbi_rope.recalibration import RecalibratedEstimator, Recalibration
+from sbi_rope.recalibration.factors import HeldOutMixture
+from sbi_rope.recalibration.recalibration import recalibrate
 from sbi_rope.stacking import StackedPosterior
 from sbi_rope.stacking.recalibrating import pairs_of_folds
 from tests import problems
 from tests.stacks import (
+    FITTED,
     NPE,
     PRIOR,
     ROPE,
@@ -135,3 +140,31 @@ def test_what_cannot_be_recalibrated_is_refused_before_any_training() -> None:
     mixed.append_calibration(parameters, problems.simulate(parameters))
     with pytest.raises(UnsupportedPosteriorError, match="continuous parameters"):
         stacked(mixed, recalibrate=True)
+
+
+def test_the_mixture_that_is_scored_on_a_fold_has_not_seen_its_labels(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    torch.manual_seed(0)
+    theta, x = near_zero()
+    changed = theta.clone()
+    changed[7] = 0.9  # far from the others, so that the box around them is larger
+    kept: list[list[HeldOutMixture]] = []
+
+    def keep(folds: list[HeldOutMixture], *args: Any, **options: Any) -> Recalibration:
+        kept.append(folds)
+        return recalibrate(folds, *args, **options)
+
+    monkeypatch.setattr("sbi_rope.stacking.recalibrating.recalibrate", keep)
+    for labels in (theta, changed):
+        stacked(rope_of((labels, x)), candidates=[FITTED], recalibrate=True)
+    ones = torch.ones(1, 2)
+    for first, second in zip(*kept, strict=True):
+        holds = bool((first.theta == theta[7]).all(dim=1).any())
+        # At the same parameters, which are outside the smaller boxes. With a single
+        # candidate the weights of the stack do not depend on the labels.
+        somewhere = torch.full_like(first.theta, 0.6)
+        found = [
+            replace(fold, theta=somewhere).log_prob(ones) for fold in (first, second)
+        ]
+        assert torch.allclose(*found) == holds

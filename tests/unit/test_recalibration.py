@@ -1,6 +1,7 @@
 """Posteriors that are made narrower or wider, against closed forms."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -173,6 +174,17 @@ def test_a_calibrated_posterior_is_left_as_it_is_or_hardly_changed() -> None:
         gains.append(found.gain)
     # What two numbers that are fitted to 32 pairs cost.
     assert -0.08 < sum(gains) / 20 < 0.02
+
+
+def test_a_pair_with_a_density_of_zero_says_nothing_about_the_spread() -> None:
+    folds = folds_of(40, too_wide=torch.tensor([2.0, 2.0]), num_folds=5)
+    expected = recalibration(folds)
+    far = folds[0].theta.clone()
+    far[0] = 1e30  # the density underflows
+    folds[0] = replace(folds[0], theta=far)
+    found = recalibration(folds)
+    assert math.isfinite(found.gain)
+    torch.testing.assert_close(found.factors, expected.factors, rtol=0.11, atol=0.0)
 
 
 def test_a_support_that_is_no_box_is_refused() -> None:
