@@ -26,7 +26,8 @@ class Recalibration:
 
     Attributes:
         factors: By how much the distance from the centre is multiplied, for each
-            parameter, shape ``(d,)``. All are 1 if the held-out score did not rise.
+            parameter, shape ``(d,)``. All are 1 if they lowered the held-out score
+            beyond doubt.
         gain: By how much the factors raised the mean log score of held-out pairs.
         interval: The 95 % interval of ``gain``.
         levels_before: The levels of the central intervals that end at the true
@@ -42,8 +43,8 @@ class Recalibration:
 
     @property
     def is_used(self) -> bool:
-        """Whether the factors raised the held-out score."""
-        return self.gain > 0
+        """Whether the factors are used: unless all of ``interval`` is below zero."""
+        return self.interval[1] >= 0
 
     @property
     def before(self) -> ACAUCScore:
@@ -96,7 +97,7 @@ def recalibrate(
     gain, low, high = interval_of_mean(scores - grid.unchanged, weights)
     factors = grid.best(torch.ones_like(weights, dtype=torch.bool)).factors
     return Recalibration(
-        factors=factors if gain > 0 else torch.ones_like(factors),
+        factors=factors if high >= 0 else torch.ones_like(factors),
         gain=gain,
         interval=(low, high),
         levels_before=torch.cat(before),

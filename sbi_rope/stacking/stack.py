@@ -80,10 +80,10 @@ def stack(
         pseudo_count: Strength of the Dirichlet prior of the weights, in pairs.
         learning_curve: Whether to train on fewer folds too, so that the report can
             estimate what more labels would add. It takes about twice the time.
-        recalibrate: Whether to make the stack narrower or wider around its centre, if
-            this raises the held-out score (:class:`~sbi_rope.recalibration.
-            Recalibration`). The average of several versions is often too wide. For
-            this, ten more versions are trained, which takes about three times as long.
+        recalibrate: Whether to make the stack narrower or wider around its centre, as
+            held-out pairs say; ``report.recalibration`` tells by how much. The average
+            of several versions is often too wide. Ten more versions are trained for
+            this, which takes up to three times as long.
         unseen: What the posterior of a batch does with an x outside the batch:
             ``"raise"`` an error, or ``"extend"`` each coupling by one row.
         tail_mass: As in :meth:`~sbi_rope.RoPE.build_posterior`.

@@ -60,6 +60,8 @@ __all__ = ["StackTrainer"]
 
 # Fewest pairs: one to train on and one to score.
 MIN_PAIRS = 2
+# A recalibration leaves out candidates with a smaller weight in all folds.
+MIN_WEIGHT = 0.01
 # Samples at each held-out pair, from which the calibration of the stack is computed.
 NUM_SAMPLES = 500
 
@@ -173,7 +175,7 @@ class StackTrainer:
         ]
         if with_refit:
             folds.append(Fold(bench, range(num_folds)))
-        versions = self._train(folds)
+        versions = self._train(folds, self.candidates)
         scores = self._score(versions, num_training_folds)
         return versions, scores
 
@@ -187,13 +189,19 @@ class StackTrainer:
         bench = self.bench
         pairs = pairs_of_folds(len(bench.folds))
         numbers = set(range(len(bench.folds)))
-        versions = self._train([Fold(bench, sorted(numbers - pair)) for pair in pairs])
         weights = fold_weights(
             scores.log_scores,
             scores.fold,
             self.pseudo_count,
             pair_weights=bench.pair_weights,
         )
+        # The others take as long to train, and hardly change how wide the stack is.
+        kept = (weights >= MIN_WEIGHT).any(dim=0).nonzero().flatten()
+        versions = self._train(
+            [Fold(bench, sorted(numbers - pair)) for pair in pairs],
+            [self.candidates[number] for number in kept],
+        )
+        weights = weights[:, kept] / weights[:, kept].sum(dim=1, keepdim=True)
         return recalibration_of(bench, versions, pairs, weights, seed=self.seeds[2])
 
     def discrepancy(self) -> DiscrepancyReport | None:
@@ -204,8 +212,7 @@ class StackTrainer:
             return self.bench.discrepancy()
         return None
 
-    def _train(self, folds: Sequence[Fold]) -> Versions:
-        chosen = self.candidates
+    def _train(self, folds: Sequence[Fold], chosen: Sequence[Candidate]) -> Versions:
         count = sum(isinstance(c, AmortisedCandidate) and not c.fixed for c in chosen)
         with progress_bar(
             show=self.show,

@@ -156,8 +156,7 @@ def test_a_few_pairs_choose_what_the_prior_of_the_factors_says() -> None:
 
     exact = scipy.optimize.minimize(loss, [0.0, 0.0, 0.0]).x
     expected = torch.as_tensor(exact[0] + exact[1:]).exp()
-    if found.is_used:
-        torch.testing.assert_close(found.factors, expected, rtol=0.1, atol=0.0)
+    torch.testing.assert_close(found.factors, expected, rtol=0.1, atol=0.0)
     # The prior keeps them nearer to 1 than the pairs alone would.
     assert float(expected.log().abs().max()) < 0.8
 
@@ -167,13 +166,23 @@ def test_a_calibrated_posterior_is_left_as_it_is_or_hardly_changed() -> None:
     for seed in range(20):
         folds = folds_of(40, too_wide=torch.ones(2), num_folds=5, seed=seed)
         found = recalibration(folds)
-        assert found.is_used == (found.gain > 0)
-        if not found.is_used:
-            assert torch.equal(found.factors, torch.ones(2).double())
+        assert found.is_used == (found.interval[1] >= 0)
         assert float(found.factors.log().abs().max()) < 0.4
         gains.append(found.gain)
     # What two numbers that are fitted to 32 pairs cost.
     assert -0.08 < sum(gains) / 20 < 0.02
+
+
+def test_factors_that_lower_the_score_beyond_doubt_are_not_used() -> None:
+    # The pairs of each fold ask for the opposite of what the others ask for.
+    folds = []
+    for k, too_wide in enumerate((0.5, 2.0)):
+        folds += folds_of(100, too_wide=torch.full((2,), too_wide), num_folds=1, seed=k)
+    found = recalibration(folds)
+    assert found.interval[1] < 0
+    assert not found.is_used
+    assert torch.equal(found.factors, torch.ones(2).double())
+    assert "was not used, because it would add -" in str(found)
 
 
 def test_a_pair_with_a_density_of_zero_says_nothing_about_the_spread() -> None:
