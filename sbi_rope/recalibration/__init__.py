@@ -1,6 +1,5 @@
 """Make posteriors narrower or wider, as held-out pairs say."""
 
-from sbi_rope.recalibration.estimator import RecalibratedEstimator
 from sbi_rope.recalibration.recalibration import Recalibration
 
-__all__ = ["RecalibratedEstimator", "Recalibration"]
+__all__ = ["Recalibration"]

@@ -15,7 +15,8 @@ from torch import Tensor
 from sbi_rope._sbi import MixedDensity, estimator_of, headless
 from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError
 from sbi_rope.mixture import MixtureEstimator
-from sbi_rope.recalibration import RecalibratedEstimator, Recalibration
+from sbi_rope.recalibration import Recalibration
+from sbi_rope.recalibration.estimator import RecalibratedEstimator
 from sbi_rope.recalibration.factors import HeldOutMixture
 from sbi_rope.recalibration.recalibration import recalibrate
 from sbi_rope.recalibration.support import box_of

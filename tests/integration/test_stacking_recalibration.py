@@ -10,7 +10,8 @@ from torch import Tensor
 
 import sbi_rope
 from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError
-from sbi_rope.recalibration import RecalibratedEstimator, Recalibration
+from sbi_rope.recalibration import Recalibration
+from sbi_rope.recalibration.estimator import RecalibratedEstimator
 from sbi_rope.recalibration.factors import HeldOutMixture
 from sbi_rope.recalibration.recalibration import recalibrate
 from sbi_rope.stacking import StackedPosterior

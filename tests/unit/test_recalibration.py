@@ -15,7 +15,8 @@ from torch.distributions import Dirichlet, Exponential, Independent
 from sbi_rope import MixturePosterior
 from sbi_rope.errors import UnsupportedPosteriorError
 from sbi_rope.mixture import MixtureEstimator, OwnEmbeddings, Part
-from sbi_rope.recalibration import RecalibratedEstimator, Recalibration
+from sbi_rope.recalibration import Recalibration
+from sbi_rope.recalibration.estimator import RecalibratedEstimator
 from sbi_rope.recalibration.factors import HeldOutMixture
 from sbi_rope.recalibration.recalibration import recalibrate
 from sbi_rope.recalibration.spread import Spread

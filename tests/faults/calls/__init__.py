@@ -62,6 +62,7 @@ NOT_CALLED = {
             "LearningCurve",
             "ParameterDistribution",
             "Provenance",
+            "Recalibration",
             "SetScores",
             "StackingReport",
             "StackingReport.of",
