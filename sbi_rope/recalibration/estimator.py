@@ -6,15 +6,20 @@ import torch
 from torch import Tensor
 
 from sbi_rope._random import seeded
+from sbi_rope.errors import SamplingError
 from sbi_rope.mixture import MixtureEstimator
 from sbi_rope.mixture.sampling import Accept
+from sbi_rope.mixture.truncation import LEAKAGE_DRAWS, Leakage
 from sbi_rope.recalibration.spread import Spread, to_box, to_line
+from sbi_rope.recalibration.support import Bounds
 
 __all__ = ["RecalibratedEstimator"]
 
 # The centre of each observation is the mean of so many draws. With factors near 1 an
 # error of the centre hardly matters.
 NUM_DRAWS = 256
+# So often draws outside a support that is no box are drawn again.
+MAX_ROUNDS = 100
 
 
 class RecalibratedEstimator(MixtureEstimator):
@@ -29,12 +34,13 @@ class RecalibratedEstimator(MixtureEstimator):
     :math:`\phi(\theta)` under the mixture inside the support. It is estimated from 256
     draws, whose random numbers are the same in every call.
 
+    If the support is no box, :math:`\phi` knows nothing of its other edges. A mixture
+    that became wider is cut off there, as every mixture is.
+
     Args:
         mixture: The mixture.
         factors: s, shape ``(d,)``.
-        low: The lower ends of the prior's support, shape ``(d,)``, minus infinity where
-            there is none.
-        high: The upper ends, shape ``(d,)``, infinity where there is none.
+        bounds: The bounds of the parameters.
     """
 
     factors: Tensor
@@ -42,17 +48,24 @@ class RecalibratedEstimator(MixtureEstimator):
     high: Tensor
 
     def __init__(
-        self, mixture: MixtureEstimator, factors: Tensor, low: Tensor, high: Tensor
+        self, mixture: MixtureEstimator, factors: Tensor, bounds: Bounds
     ) -> None:
         super().__init__(mixture.parts, mixture.weights, tail_mass=mixture.tail_mass)
-        buffers = {"factors": factors, "low": low, "high": high}
+        buffers = {"factors": factors, "low": bounds.low, "high": bounds.high}
         for name, value in buffers.items():
             self.register_buffer(name, value.to(mixture.weights))
+        self.is_box = bounds.are_all
+
+    def with_factors(self, factors: Tensor) -> "RecalibratedEstimator":
+        """Return the same mixture with other factors."""
+        bounds = Bounds(self.low, self.high, self.is_box)
+        return RecalibratedEstimator(self, factors, bounds)
 
     def restricted_to(self, index: int) -> "RecalibratedEstimator":
         """Return the same for one observation of the batch."""
         mixture = super().restricted_to(index)
-        return RecalibratedEstimator(mixture, self.factors, self.low, self.high)
+        bounds = Bounds(self.low, self.high, self.is_box)
+        return RecalibratedEstimator(mixture, self.factors, bounds)
 
     def log_prob(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
         r"""Return :math:`\log p'(\theta \mid x)`, minus infinity outside the bounds.
@@ -98,8 +111,8 @@ class RecalibratedEstimator(MixtureEstimator):
         Args:
             sample_shape: Shape of the draws of each observation.
             condition: Observations, shape ``(B, *event)``.
-            accept: Tells which draws ``(n, d)`` of the mixture to keep, before they are
-                moved. None keeps those inside the bounds.
+            accept: Tells which draws ``(n, d)`` are inside the support; None keeps all
+                inside the bounds.
             **options: As in :meth:`MixtureEstimator.sample`.
 
         Returns:
@@ -109,10 +122,58 @@ class RecalibratedEstimator(MixtureEstimator):
             SamplingError: If hardly any draw is accepted for some observation.
             UnseenObservationError: As in :meth:`MixtureEstimator.log_prob`.
         """
-        accept = self._inside if accept is None else accept
-        draws = super().sample(sample_shape, condition, accept=accept, **options)
-        theta = draws.reshape(-1, *draws.shape[len(sample_shape) :])
-        return self.spread(condition).forward(theta).reshape(draws.shape)
+        x, count = self.checked_x(condition), torch.Size(sample_shape).numel()
+        spread = self.spread(x)
+        theta = self._moved(count, x, spread, **options)
+        if accept is not None and not self.is_box:
+            self._refill(theta, x, spread, accept)
+        return theta.reshape(*sample_shape, *theta.shape[1:])
+
+    def _moved(self, count: int, x: Tensor, spread: Spread, **options: Any) -> Tensor:
+        draws = super().sample(torch.Size((count,)), x, accept=self._inside, **options)
+        return spread.forward(draws)
+
+    def _refill(self, theta: Tensor, x: Tensor, spread: Spread, accept: Accept) -> None:
+        """Draw those ``(S, B, d)`` again that a support which is no box leaves out."""
+        for _ in range(MAX_ROUNDS):
+            outside = ~accept(theta.flatten(0, 1)).reshape(theta.shape[:2])
+            counts = outside.sum(dim=0)
+            rows = counts.nonzero().flatten()
+            if not len(rows):
+                return
+            fresh = self._moved(int(counts.max()), x[rows], spread.of_rows(rows))
+            for column, row in enumerate(rows):
+                theta[outside[:, row], row] = fresh[: counts[row], column]
+        raise SamplingError(
+            "Hardly any draw of the recalibrated mixture lies inside the support of "
+            "the prior. Leave `recalibrate` out, or pass reject_outside_prior=False."
+        )
+
+    def mass(
+        self,
+        x: Tensor,
+        *,
+        accept: Accept | None,
+        cache: dict[int, Tensor],
+        show_progress_bars: bool = False,
+    ) -> Leakage:
+        """Return the mass of each observation's mixture inside the prior's support.
+
+        The arguments are those of :meth:`MixtureEstimator.mass`.
+        """
+        if accept is None or self.is_box:
+            # What is inside the bounds before it is moved is inside them after.
+            return super().mass(
+                x, accept=accept, cache=cache, show_progress_bars=show_progress_bars
+            )
+        bounded = bool(torch.isfinite(torch.cat([self.low, self.high])).any())
+        inside = super().mass(x, accept=self._inside if bounded else None, cache={})
+        with seeded(0):
+            draws = self.sample(torch.Size((LEAKAGE_DRAWS,)), x)
+        kept = accept(draws.flatten(0, 1)).reshape(draws.shape[:2]).double()
+        share = kept.mean(dim=0)
+        error = (share * (1 - share) / LEAKAGE_DRAWS).sqrt()
+        return Leakage(inside.mass * share, inside.standard_error + error)
 
     @torch.no_grad()
     def spread(self, x: Tensor) -> Spread:

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from sbi_rope.metrics.calibration import central_levels, count_ranks
+from sbi_rope.mixture.sampling import Accept
 from sbi_rope.recalibration.estimator import RecalibratedEstimator
 from sbi_rope.recalibration.spread import Spread
 
@@ -39,11 +40,14 @@ class HeldOutMixture:
         estimator: The mixture, with factors of 1.
         theta: Parameters inside the support, shape ``(n, d)``.
         x: Their observations, shape ``(n, *event)``.
+        accept: Tells which parameters ``(n, d)`` are inside the support; None if all
+            inside the bounds are.
     """
 
     estimator: RecalibratedEstimator
     theta: Tensor
     x: Tensor
+    accept: Accept | None = None
 
     @cached_property
     def spread(self) -> Spread:
@@ -58,12 +62,30 @@ class HeldOutMixture:
             factors: Shape ``(S, d)``.
 
         Returns:
-            Shape ``(n, S)``, float64, not corrected for leakage.
+            Shape ``(n, S)``, float64. It is corrected for what is moved out of a
+            support that is no box, and not for leakage over the bounds.
         """
         spread = self.spread.with_factors(factors[:, None])
         moved, slope = spread.inverse(self.theta.expand(len(factors), -1, -1))
-        log_prob = self.estimator.log_prob_before(moved, self.x)
-        return (log_prob.double() + slope).T
+        log_prob = self.estimator.log_prob_before(moved, self.x).double() + slope
+        if self.accept is not None:
+            log_prob = log_prob - self._share_inside(factors).log()
+        return log_prob.T
+
+    def _share_inside(self, factors: Tensor) -> Tensor:
+        """Return the share of draws that stay inside the support, ``(S, n)``."""
+        assert self.accept is not None
+        shares = []
+        for of_one in factors:
+            theta = self.spread.with_factors(of_one).forward(self._draws)
+            kept = self.accept(theta.flatten(0, 1)).reshape(theta.shape[:2])
+            # Half a draw more, so that no share is zero.
+            shares.append((kept.double().sum(dim=0) + 0.5) / (len(kept) + 0.5))
+        return torch.stack(shares)
+
+    @cached_property
+    def _draws(self) -> Tensor:
+        return self.estimator.sample(torch.Size((NUM_DRAWS,)), self.x)
 
     @torch.no_grad()
     def levels(self, factors: Tensor) -> Tensor:
@@ -75,9 +97,9 @@ class HeldOutMixture:
         Returns:
             Shape ``(n, d)``.
         """
-        draws = self.estimator.sample(torch.Size((NUM_DRAWS,)), self.x)
-        moved, _ = self.spread.with_factors(factors).inverse(self.theta[None])
-        return central_levels(count_ranks(draws, moved[0]))
+        estimator = self.estimator.with_factors(factors)
+        draws = estimator.sample(torch.Size((NUM_DRAWS,)), self.x, accept=self.accept)
+        return central_levels(count_ranks(draws, self.theta))
 
 
 @dataclass(frozen=True)

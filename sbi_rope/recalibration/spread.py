@@ -41,6 +41,10 @@ class Spread:
         """Return the map with other factors, of a shape that fits ``(S, B, d)``."""
         return replace(self, factors=factors.to(self.centre))
 
+    def of_rows(self, rows: Tensor) -> "Spread":
+        """Return the map of some observations."""
+        return replace(self, centre=self.centre[rows])
+
     def forward(self, theta: Tensor) -> Tensor:
         """Return what parameters ``(S, B, d)`` inside the bounds are mapped to."""
         line = to_line(theta.double(), self.low, self.high)

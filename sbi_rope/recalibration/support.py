@@ -1,5 +1,6 @@
-"""The bounds of parameters whose distribution can be made narrower or wider."""
+"""The bounds of parameters whose distribution is made narrower or wider."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -7,39 +8,37 @@ from sbi.utils import within_support
 from torch import Tensor
 
 from sbi_rope._random import seeded
-from sbi_rope.errors import UnsupportedPosteriorError
 from sbi_rope.recalibration.spread import Spread, to_line
 from sbi_rope.sets.intervals import bounds_of
 
-__all__ = ["box_of"]
+__all__ = ["Bounds", "bounds_of_prior"]
 
 # So many draws of the prior are moved apart to see whether its support is a box.
 NUM_DRAWS = 256
 
 
-def box_of(prior: Any) -> tuple[Tensor, Tensor]:
-    """Return the bounds of each parameter, infinite where there is none.
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """The bounds of each parameter.
 
-    Args:
-        prior: A prior with the support of a box, such as ``BoxUniform``, or of the
-            whole space.
-
-    Returns:
-        The lower and the upper bounds, both of shape ``(d,)``, float64.
-
-    Raises:
-        UnsupportedPosteriorError: If the support is something else, so that a wider
-            distribution would leave it.
+    Attributes:
+        low: The lower bounds, minus infinity where there is none, shape ``(d,)``.
+        high: The upper bounds, infinity where there is none, shape ``(d,)``.
+        are_all: Whether the support holds everything inside the bounds. Otherwise a
+            wider distribution reaches beyond it, and has to be cut off there.
     """
+
+    low: Tensor
+    high: Tensor
+    are_all: bool
+
+
+def bounds_of_prior(prior: Any) -> Bounds:
+    """Return the bounds of a prior's support, float64."""
     with seeded(0):
         theta = prior.sample((NUM_DRAWS,)).double()
     low, high = bounds_of(prior, theta[0])
     line = to_line(theta, low, high)
     wider = Spread(line.mean(dim=0), torch.full_like(low, 2.0), low, high)
-    if not within_support(prior, wider.forward(theta)).all():
-        raise UnsupportedPosteriorError(
-            "Expected a prior whose support has bounds for each parameter by itself, "
-            f"such as BoxUniform, to recalibrate; got {type(prior).__name__}. Leave "
-            "`recalibrate` out."
-        )
-    return low, high
+    inside = within_support(prior, wider.forward(theta))
+    return Bounds(low, high, are_all=bool(inside.all()))

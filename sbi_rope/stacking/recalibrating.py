@@ -7,9 +7,11 @@ not seen a fold are mixed, and this mixture is scored on the fold.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import torch
+from sbi.utils import within_support
 from torch import Tensor
 
 from sbi_rope._sbi import MixedDensity, estimator_of, headless
@@ -19,7 +21,7 @@ from sbi_rope.recalibration import Recalibration
 from sbi_rope.recalibration.estimator import RecalibratedEstimator
 from sbi_rope.recalibration.factors import HeldOutMixture
 from sbi_rope.recalibration.recalibration import recalibrate
-from sbi_rope.recalibration.support import box_of
+from sbi_rope.recalibration.support import bounds_of_prior
 from sbi_rope.stacking.folds import Workbench
 from sbi_rope.stacking.versions import Versions
 
@@ -48,7 +50,6 @@ def check_recalibration(bench: Workbench) -> None:
             "Expected continuous parameters to recalibrate; got some that are "
             "categories. Leave `recalibrate` out."
         )
-    box_of(bench.npe.prior)
 
 
 def pairs_of_folds(num_folds: int) -> list[frozenset[int]]:
@@ -86,12 +87,13 @@ def recalibration_of(
         weights: The weights of the stack that scores each fold, shape ``(F, K)``.
         seed: Seed of the draws.
     """
-    low, high = box_of(bench.npe.prior)
+    prior = bench.npe.prior
+    bounds = bounds_of_prior(prior)
     folds, counts = [], []
     for number, rows in enumerate(bench.folds):
         theta = bench.theta[rows]
         # The spread says nothing about labels outside the prior's support.
-        inside = ((theta >= low.to(theta)) & (theta <= high.to(theta))).all(dim=1)
+        inside = within_support(prior, theta)
         if not inside.any():
             continue
         unseen = [k for k, pair in enumerate(pairs) if number in pair]
@@ -99,10 +101,11 @@ def recalibration_of(
         folds.append(
             HeldOutMixture(
                 estimator=RecalibratedEstimator(
-                    mixture, torch.ones_like(low), low, high
+                    mixture, torch.ones_like(bounds.low), bounds
                 ),
                 theta=theta[inside],
                 x=bench.x[rows][inside],
+                accept=None if bounds.are_all else partial(within_support, prior),
             )
         )
         counts.append(_counts(bench)[rows][inside])
@@ -115,7 +118,7 @@ def recalibrated(
     """Return a mixture with the factors of a recalibration, if there are any."""
     if recalibration is None or not recalibration.is_used:
         return mixture
-    return RecalibratedEstimator(mixture, recalibration.factors, *box_of(prior))
+    return RecalibratedEstimator(mixture, recalibration.factors, bounds_of_prior(prior))
 
 
 def _counts(bench: Workbench) -> Tensor:

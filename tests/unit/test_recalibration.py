@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import pytest
@@ -9,18 +10,19 @@ import scipy.interpolate
 import scipy.optimize
 import scipy.stats
 import torch
+from sbi.utils import within_support
 from torch import Tensor, nn
-from torch.distributions import Dirichlet, Exponential, Independent
+from torch.distributions import Exponential, Independent
 
 from sbi_rope import MixturePosterior
-from sbi_rope.errors import UnsupportedPosteriorError
 from sbi_rope.mixture import MixtureEstimator, OwnEmbeddings, Part
 from sbi_rope.recalibration import Recalibration
 from sbi_rope.recalibration.estimator import RecalibratedEstimator
 from sbi_rope.recalibration.factors import HeldOutMixture
 from sbi_rope.recalibration.recalibration import recalibrate
 from sbi_rope.recalibration.spread import Spread
-from sbi_rope.recalibration.support import box_of
+from sbi_rope.recalibration.support import Bounds, bounds_of_prior
+from sbi_rope.tasks.triangle import UniformTriangle
 from tests import problems
 
 INF = math.inf
@@ -39,7 +41,7 @@ def gaussians(
     )
     bounds = torch.full((dim,), bound)
     return RecalibratedEstimator(
-        MixtureEstimator([part], [1.0]), factors, -bounds, bounds
+        MixtureEstimator([part], [1.0]), factors, Bounds(-bounds, bounds, are_all=True)
     )
 
 
@@ -197,12 +199,65 @@ def test_a_pair_with_a_density_of_zero_says_nothing_about_the_spread() -> None:
     torch.testing.assert_close(found.factors, expected.factors, rtol=0.11, atol=0.0)
 
 
-def test_a_support_that_is_no_box_is_refused() -> None:
-    low, high = box_of(problems.box(2))
-    assert torch.equal(low, -torch.ones(2).double())
-    assert torch.equal(high, torch.ones(2).double())
-    low, high = box_of(Independent(Exponential(torch.ones(2)), 1))
-    assert torch.equal(low, torch.zeros(2).double())
-    assert torch.isinf(high).all()
-    with pytest.raises(UnsupportedPosteriorError, match="Leave `recalibrate` out"):
-        box_of(Dirichlet(torch.ones(3)))
+def test_the_bounds_of_a_prior_are_found_and_whether_they_are_all() -> None:
+    found = bounds_of_prior(problems.box(2))
+    assert torch.equal(found.low, -torch.ones(2).double())
+    assert torch.equal(found.high, torch.ones(2).double())
+    assert found.are_all
+    found = bounds_of_prior(Independent(Exponential(torch.ones(2)), 1))
+    assert torch.equal(found.low, torch.zeros(2).double())
+    assert torch.isinf(found.high).all()
+    assert found.are_all
+    assert bounds_of_prior(problems.standard_normal(2)).are_all
+    assert not bounds_of_prior(UniformTriangle(torch.tensor(1.0))).are_all
+
+
+@pytest.mark.parametrize("factors", [(0.6, 0.6), (1.5, 1.5)])
+def test_in_a_triangle_the_density_has_mass_one_and_is_that_of_the_draws(
+    factors: tuple[float, float],
+) -> None:
+    torch.manual_seed(1)
+    triangle = UniformTriangle(torch.tensor(1.0))
+    estimator = RecalibratedEstimator(
+        gaussians(), torch.tensor(factors), bounds_of_prior(triangle)
+    )
+    posterior = MixturePosterior(estimator, triangle)
+    x = torch.tensor([[0.6, 0.4, math.log(0.2), math.log(0.2)]])
+    middle = (torch.arange(300) + 0.5) / 300
+    grid = torch.cartesian_prod(middle, middle)
+    mass = posterior.log_prob(grid, x=x).double().exp().reshape(300, 300) / 300**2
+    assert float(mass.sum()) == pytest.approx(1.0, abs=0.04)
+    draws = posterior.sample((4000,), x=x)
+    assert (draws[:, 0] >= draws[:, 1]).all()
+    ends = torch.linspace(0, 1, 301)
+    for j in range(2):
+        cdf = torch.cat([torch.zeros(1), mass.sum(dim=1 - j).cumsum(dim=0)])
+        exact = scipy.interpolate.interp1d(ends.numpy(), (cdf / cdf[-1]).numpy())
+        assert scipy.stats.kstest(draws[:, j].numpy(), exact).pvalue > 0.01
+    # In the other order of dimensions, and for several observations.
+    both = posterior.sample_batched((20,), torch.cat([x, x]), show_progress_bars=False)
+    assert both.shape == (20, 2, 2)
+    assert (both[..., 0] >= both[..., 1]).all()
+
+
+def test_what_is_moved_out_of_a_triangle_counts_when_factors_are_chosen() -> None:
+    torch.manual_seed(0)
+    triangle = UniformTriangle(torch.tensor(1.0))
+    x = torch.cat([triangle.sample((400,)), torch.full((400, 2), math.log(0.3))], dim=1)
+    estimator = RecalibratedEstimator(
+        gaussians(), torch.ones(2), bounds_of_prior(triangle)
+    )
+    # The parameters are draws of the posterior, which is cut off by the triangle.
+    theta = MixturePosterior(estimator, triangle).sample_batched((1,), x)[0]
+    folds = [
+        HeldOutMixture(
+            estimator=estimator,
+            theta=theta[rows],
+            x=x[rows],
+            accept=partial(within_support, triangle),
+        )
+        for rows in torch.arange(400).chunk(4)
+    ]
+    found = recalibration(folds)
+    assert float(found.factors.log().abs().max()) < 0.16
+    assert found.before.verdict == "calibrated"
