@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from sbi_rope._means import interval_of_mean
+from sbi_rope._means import interval_of_mean, mean_and_error
 from sbi_rope._random import seeded
 from sbi_rope.metrics.calibration import (
     ACAUC_IN_WORDS,
@@ -26,10 +26,11 @@ class Recalibration:
 
     Attributes:
         factors: By how much the distance from the centre is multiplied, for each
-            parameter, shape ``(d,)``. All are 1 if they lowered the held-out score
-            beyond doubt.
+            parameter, shape ``(d,)``; all 1 if they are not used.
         gain: By how much the factors raised the mean log score of held-out pairs.
         interval: The 95 % interval of ``gain``.
+        is_used: Whether the factors are used: unless they lowered the score by more
+            than its standard error.
         levels_before: The levels of the central intervals that end at the true
             parameters without the factors, shape ``(n, d)``.
         levels_after: The same with the factors of the other folds.
@@ -38,13 +39,9 @@ class Recalibration:
     factors: Tensor
     gain: float
     interval: tuple[float, float]
+    is_used: bool
     levels_before: Tensor = field(repr=False)
     levels_after: Tensor = field(repr=False)
-
-    @property
-    def is_used(self) -> bool:
-        """Whether the factors are used: unless all of ``interval`` is below zero."""
-        return self.interval[1] >= 0
 
     @property
     def before(self) -> ACAUCScore:
@@ -94,12 +91,15 @@ def recalibrate(
         with seeded(seed):
             before.append(fold.levels(torch.ones_like(choice.factors)))
             after.append(fold.levels(choice.factors))
-    gain, low, high = interval_of_mean(scores - grid.unchanged, weights)
+    gains = scores - grid.unchanged
+    gain, low, high = interval_of_mean(gains, weights)
+    is_used = gain >= -mean_and_error(gains, weights)[1]
     factors = grid.best(torch.ones_like(weights, dtype=torch.bool)).factors
     return Recalibration(
-        factors=factors if high >= 0 else torch.ones_like(factors),
+        factors=factors if is_used else torch.ones_like(factors),
         gain=gain,
         interval=(low, high),
+        is_used=is_used,
         levels_before=torch.cat(before),
         levels_after=torch.cat(after),
     )

@@ -27,8 +27,8 @@ from sbi_rope.stacking.versions import Versions
 
 __all__ = ["check_recalibration", "pairs_of_folds", "recalibrated", "recalibration_of"]
 
-# Fewer folds cannot be left out in pairs.
-MIN_FOLDS = 3
+# Fewer folds cannot be left out in pairs, and fewer pairs say nothing about a spread.
+MIN_FOLDS, MIN_PAIRS = 3, 10
 # A fold is left out together with the folds that are so many places after it.
 DISTANCES = (1, 2)
 
@@ -40,10 +40,16 @@ def check_recalibration(bench: Workbench) -> None:
             f"Expected exact labels to recalibrate; got {bench.labels}. Leave "
             "`recalibrate` out, or stack the exact labels alone."
         )
+    if (count := len(bench.groups.unique())) < MIN_PAIRS:
+        raise InvalidInputError(
+            f"Expected at least {MIN_PAIRS} calibration pairs with different "
+            f"parameters to recalibrate; got {count}. Add pairs, or leave "
+            "`recalibrate` out."
+        )
     if len(bench.folds) < MIN_FOLDS:
         raise InvalidInputError(
             f"Expected at least {MIN_FOLDS} folds to recalibrate; got "
-            f"{len(bench.folds)}. Add calibration pairs, or leave `recalibrate` out."
+            f"{len(bench.folds)}. Pass a larger `num_folds`."
         )
     if isinstance(headless(estimator_of(bench.npe)), MixedDensity):
         raise UnsupportedPosteriorError(

@@ -163,6 +163,7 @@ def test_the_page_says_what_more_labels_and_a_recalibration_add(
         factors=torch.tensor([0.71, 1.24]),
         gain=0.09,
         interval=(0.02, 0.16),
+        is_used=True,
         levels_before=0.5 * levels,
         levels_after=levels,
     )

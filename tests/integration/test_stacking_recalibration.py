@@ -134,6 +134,8 @@ def test_what_cannot_be_recalibrated_is_refused_before_any_training() -> None:
     noisy = rope_of((theta[:0], x[:0])).append_calibration(theta, x, theta_std=0.1)
     with pytest.raises(InvalidInputError, match="exact labels to recalibrate"):
         stacked(noisy, recalibrate=True)
+    with pytest.raises(InvalidInputError, match="at least 10 calibration pairs"):
+        stacked(rope_of((theta[:9], x[:9])), recalibrate=True)
     with pytest.raises(InvalidInputError, match="at least 3 folds to recalibrate"):
         stacked(rope_of(), num_folds=2, recalibrate=True)
     mixed = rope_of(problem(0, seed=1), family="mnpe")
