@@ -95,7 +95,7 @@ class Moments:
 
     @property
     def means(self) -> Tensor:
-        """The possible means, or the only one: ``(n, R, l)`` or ``(n, l)``."""
+        """The possible means, ``(n, R, l)``, or the only ones, ``(n, l)``."""
         return self.mean if self.possible is None else self.possible
 
 

@@ -29,8 +29,8 @@ class Recalibration:
             parameter, shape ``(d,)``; all 1 if they are not used.
         gain: By how much the factors raised the mean log score of held-out pairs.
         interval: The 95 % interval of ``gain``.
-        is_used: Whether the factors are used: unless they lowered the score by more
-            than its standard error.
+        is_used: Whether the factors are used. They are not if they lowered the score by
+            more than its standard error.
         levels_before: The levels of the central intervals that end at the true
             parameters without the factors, shape ``(n, d)``.
         levels_after: The same with the factors of the other folds.

@@ -1,5 +1,6 @@
 """Links of the README, of the documentation, and of what the code says of them."""
 
+import ast
 import re
 from collections import Counter
 from pathlib import Path
@@ -83,3 +84,18 @@ def test_the_reference_describes_all_that_the_package_exports() -> None:
     page = (ROOT / "docs/reference/sbi_rope.md").read_text()
     described = re.findall(r"^\.\. auto\w+:: (\w+)$", page, flags=re.MULTILINE)
     assert sorted(described) == sorted(sbi_rope.__all__)
+
+
+def test_no_docstring_of_a_property_starts_with_a_type() -> None:
+    """Napoleon takes what stands before a colon in it for the type of the property."""
+    wrong = []
+    for path in sorted((ROOT / "sbi_rope").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.FunctionDef):
+                continue
+            names = {ast.unparse(decorator) for decorator in node.decorator_list}
+            first = (ast.get_docstring(node) or "").split("\n")[0]
+            # The colon of a role, such as :meth:`of`, is followed by no space.
+            if names & {"property", "cached_property"} and ": " in first:
+                wrong.append(f"{path.name}: {node.name}: {first}")
+    assert wrong == []
