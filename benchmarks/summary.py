@@ -72,24 +72,28 @@ def write_summary(folder: Path, *, docs_page: Path, readme: Path) -> Path:
         SystemExit: If there are no results, or one of the two has no place for a block.
     """
     published = Published.read(folder)
+    # Before the work, because a page without a place is refused.
+    around = {path: _around_block(path) for path in (docs_page, readme)}
     page = folder / "README.md"
     texts = {page: "\n".join(_page(published, folder)) + "\n"}
     for other, lines_of in ((docs_page, _block), (readme, readme_lines)):
         link = Path(os.path.relpath(page, other.parent)).as_posix()
-        texts[other] = _with_block(other, "\n".join(lines_of(published, link)))
+        before, after = around[other]
+        texts[other] = "\n".join([before, *lines_of(published, link), after])
     for path, text in texts.items():
         with write_atomically(path) as temporary:
             temporary.write_text(text)
     return page
 
 
-def _with_block(path: Path, block: str) -> str:
+def _around_block(path: Path) -> tuple[str, str]:
+    """Return the text up to the first marker and from the second."""
     text = path.read_text()
     before, begin, rest = text.partition(BEGIN)
     old, end, after = rest.partition(END)
     if not begin or not end or any(m in before + old + after for m in (BEGIN, END)):
         raise SystemExit(f"{path} needs one line {BEGIN} and, below it, one {END}.")
-    return f"{before}{BEGIN}\n{block}\n{END}{after}"
+    return before + BEGIN, END + after
 
 
 def _page(published: Published, folder: Path) -> list[str]:

@@ -48,7 +48,7 @@ def seeded(seed: int | None) -> Iterator[None]:
     with _LOCK:
         numpy_state, python_state = np.random.get_state(), random.getstate()  # noqa: NPY002
         with torch.random.fork_rng(devices=list(range(torch.cuda.device_count()))):
-            torch.manual_seed(stream)
+            _seed_torch(stream)
             np.random.seed(stream)  # noqa: NPY002
             random.seed(stream)
             try:
@@ -56,3 +56,12 @@ def seeded(seed: int | None) -> Iterator[None]:
             finally:
                 np.random.set_state(numpy_state)  # noqa: NPY002
                 random.setstate(python_state)
+
+
+def _seed_torch(seed: int) -> None:
+    # Without a device of its own, `torch.manual_seed` remembers for later where it was
+    # called from. That takes milliseconds where calls are deep.
+    if torch.cuda.is_available() or torch.backends.mps.is_available():
+        torch.manual_seed(seed)
+    else:
+        torch.default_generator.manual_seed(seed)

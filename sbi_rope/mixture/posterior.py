@@ -88,6 +88,9 @@ class MixturePosterior(BaseDirectPosterior):
             order, may share it, whatever their weights and couplings are.
     """
 
+    # The observation that the mass was last estimated for, and this mass.
+    _latest: tuple[Tensor, Leakage] | None = None
+
     def __init__(
         self,
         estimator: MixtureEstimator,
@@ -198,6 +201,7 @@ class MixturePosterior(BaseDirectPosterior):
         estimator = self.posterior_estimator.restricted_to(operator.index(index))
         view = copy.copy(self)
         view.posterior_estimator = estimator
+        view._latest = None
         potential_fn: Any = copy.copy(self.potential_fn)
         potential_fn.posterior_estimator = estimator
         potential_fn.set_x(None)  # another observation may have been asked for last
@@ -601,9 +605,9 @@ class MixturePosterior(BaseDirectPosterior):
         r"""Return the mass of each mixture inside the prior's support, with its error.
 
         The mass :math:`Z_j` of every simulation's posterior is estimated once, from
-        1024 draws, and kept. The mass of densities of x itself is estimated for each x.
-        The draws have a seed of their own, so that ``log_prob`` always returns the same
-        numbers.
+        1024 draws, and kept. The mass of densities of x itself is estimated for each x,
+        and kept until another x is asked for. The draws have a seed of their own, so
+        that ``log_prob`` always returns the same numbers.
 
         Args:
             x: Observations, shape ``(B, *event)``.
@@ -612,12 +616,20 @@ class MixturePosterior(BaseDirectPosterior):
         Returns:
             The masses and their standard errors, both of shape ``(B,)``.
         """
-        return self.posterior_estimator.mass(
-            self._batch_of_x(x),
+        x = self._batch_of_x(x)
+        if self._latest is not None:
+            known, leakage = self._latest
+            if known.device == x.device and torch.equal(known, x):
+                return leakage
+        leakage = self.posterior_estimator.mass(
+            x,
             accept=self._bound,
             cache=self._cache,
             show_progress_bars=show_progress_bars,
         )
+        if len(x) == 1:
+            self._latest = x.clone(), leakage
+        return leakage
 
     def leakage_correction(  # type: ignore[override]
         self,

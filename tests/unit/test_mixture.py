@@ -23,7 +23,7 @@ from sbi_rope.errors import (
     SamplingError,
     UnseenObservationError,
 )
-from sbi_rope.mixture import MixturePosterior, chunks
+from sbi_rope.mixture import MixturePosterior, average, chunks
 from sbi_rope.mixture import density as density_module
 from sbi_rope.mixture import sampling as sampling_module
 from sbi_rope.mixture import truncation as truncation_module
@@ -683,6 +683,21 @@ def test_an_unbounded_prior_has_mass_one_without_draws(
         assert torch.allclose(leakage.mass, torch.ones(5).double(), atol=1e-14)
         assert torch.equal(leakage.standard_error, torch.zeros(5).double())
         assert calls == []
+
+
+def test_the_mass_of_an_observation_is_kept_until_another_is_asked_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    posterior = average([problems.npe_posterior("maf")])
+    first, second = problems.simulate(posterior.prior.sample((2,)))
+    theta = posterior.sample((5,), x=first, show_progress_bars=False)
+    expected = posterior.log_prob(theta, x=first)
+    calls = count_draws(posterior, monkeypatch)
+    assert torch.equal(posterior.log_prob(theta, x=first), expected)
+    assert not calls
+    posterior.log_prob(theta, x=second)
+    assert calls
+    assert torch.equal(posterior.log_prob(theta, x=first), expected)
 
 
 class WithoutSupport(Distribution):
