@@ -71,9 +71,12 @@ def mmd_test(batch: Tensor, simulated: Tensor, *, null: Tensor) -> MMDTest:
 
 def _mmd(a: Tensor, b: Tensor) -> float:
     # It is imported here because it needs packages that nothing else here needs.
-    from sbi.diagnostics.misspecification import compute_rbf_mmd_median_heuristic
+    from sbi.diagnostics import calc_misspecification_mmd
 
-    return float(compute_rbf_mmd_median_heuristic(a, b))
+    _, (_, mmd) = calc_misspecification_mmd(
+        a, b, mode="x_space", n_shuffle=1, max_samples=len(b)
+    )
+    return float(mmd)
 
 
 def misspecification_findings(

@@ -116,6 +116,10 @@ class MixturePosterior(BaseDirectPosterior):
         self._cache: dict[int, Tensor] = {} if shared is None else shared
         describe(self, _purpose(estimator))
 
+    def __getstate__(self) -> dict[str, Any]:
+        # Copies, files and posteriors of single observations do without it.
+        return {**super().__getstate__(), "_latest": None}
+
     @property
     def is_amortised(self) -> bool:
         """Whether it answers any x, and belongs to no batch."""
@@ -201,7 +205,6 @@ class MixturePosterior(BaseDirectPosterior):
         estimator = self.posterior_estimator.restricted_to(operator.index(index))
         view = copy.copy(self)
         view.posterior_estimator = estimator
-        view._latest = None
         potential_fn: Any = copy.copy(self.potential_fn)
         potential_fn.posterior_estimator = estimator
         potential_fn.set_x(None)  # another observation may have been asked for last

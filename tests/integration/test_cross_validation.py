@@ -208,7 +208,9 @@ def base(num_pairs: int) -> tuple[StackedPosterior, Tensor, Tensor]:
         return stacked(rope_of((theta, x)), observed(), num_folds=3), theta, x
 
 
-@pytest.mark.parametrize(("num_pairs", "number"), [(6, 1), (15, 1)])
+@pytest.mark.parametrize(
+    ("num_pairs", "number"), [pytest.param(6, 1, marks=pytest.mark.slow), (15, 1)]
+)
 def test_labels_of_a_fold_do_not_change_the_versions_that_are_scored_on_it(
     num_pairs: int, number: int
 ) -> None:

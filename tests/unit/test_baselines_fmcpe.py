@@ -62,6 +62,7 @@ def mean_log_prob(posterior: Any, theta: Tensor, x: Tensor) -> float:
 
 
 @pytest.mark.parametrize(("space", "noise"), [("input", None), ("embedding", 0.05)])
+@pytest.mark.slow
 def test_with_many_pairs_it_comes_near_the_exact_posterior(
     space: str, noise: float | None
 ) -> None:

@@ -482,6 +482,7 @@ def scores(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:
     return posterior.log_prob_batched(theta[None], x=x, norm_posterior=False)[0]
 
 
+@pytest.mark.slow
 def test_training_improves_on_npe_for_held_out_real_data(npe: Any) -> None:
     training = Training(
         training_batch_size=50,

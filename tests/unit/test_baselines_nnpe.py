@@ -108,6 +108,7 @@ class Recording(SpikeAndSlab):
 
 
 @pytest.mark.parametrize("noise_on", ["embedding", "input"])
+@pytest.mark.slow
 def test_with_a_right_simulator_it_stays_near_npe(noise_on: str) -> None:
     theta = prior().sample(torch.Size((500,)))
     x = simulate(theta)

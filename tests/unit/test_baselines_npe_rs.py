@@ -190,6 +190,7 @@ class TestWhatItLearns:
         gap = (real.mean(0) - simulated.mean(0)).abs() / simulated.std(0)
         return float(log_prob.mean()), float(exact.mean()), float(gap.max())
 
+    @pytest.mark.slow
     def test_where_the_simulator_is_right_it_stays_near_npe(self) -> None:
         """Within 0.1 nats of NPE and of the exact posterior; of the prior it is 1."""
         npe = trained(1000, kind=PlainNPE, training=CONVERGED)

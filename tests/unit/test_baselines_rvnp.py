@@ -190,7 +190,9 @@ def scores(posterior: Any, offset: float, extra_std: float) -> tuple[float, floa
     return float(found.mean()), float(exact.log_prob(theta).mean())
 
 
-@pytest.mark.parametrize("extra_std", [0.0, EXTRA_STD])
+@pytest.mark.parametrize(
+    "extra_std", [pytest.param(0.0, marks=pytest.mark.slow), EXTRA_STD]
+)
 def test_it_undoes_most_of_an_offset_and_learns_the_noise(extra_std: float) -> None:
     posterior = trained(OFFSET, extra_std)
     npe, exact = scores(gaussian.posterior(), OFFSET, extra_std)
@@ -198,11 +200,13 @@ def test_it_undoes_most_of_an_offset_and_learns_the_noise(extra_std: float) -> N
     assert scores(posterior, OFFSET, extra_std)[0] > exact - 0.3
 
 
+@pytest.mark.slow
 def test_with_a_right_simulator_it_stays_near_npe() -> None:
     found, exact = scores(trained(0.0, 0.0), 0.0, 0.0)
     assert exact - 0.25 < found < exact + 0.01
 
 
+@pytest.mark.slow
 def test_without_an_offset_in_the_errors_it_does_not_undo_one() -> None:
     found, exact = scores(trained(OFFSET, 0.0, shift=False), OFFSET, 0.0)
     assert found < exact - 0.4

@@ -367,6 +367,7 @@ def test_the_mmd_agrees_with_its_definition(monkeypatch: pytest.MonkeyPatch) -> 
     assert test.p_value == pytest.approx(1 / 121 if test.mmd > usual else 1.0)
 
 
+@pytest.mark.slow
 def test_p_values_of_the_mmd_test_are_uniform_for_simulations(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -1,5 +1,10 @@
 """Stacks, their candidates and the diagnosis of a batch."""
 
+from typing import Any
+from unittest.mock import patch
+
+from torch import Tensor
+
 from sbi_rope import diagnose, stack
 from sbi_rope.stacking import (
     CouplingCandidate,
@@ -23,6 +28,14 @@ from tests.faults.problem import (
     stacked,
     trained,
 )
+
+
+def distances_of(x_o: Any = X_O, **options: Any) -> Tensor:
+    """Diagnose a batch, with few draws of the MMD of simulations."""
+    given = {"num_simulations": 100, "num_folds": None, "seed": 0} | QUIET | options
+    with patch("sbi_rope.diagnosis.misspecification.NUM_DRAWS", 10):
+        return diagnose(trained(), x_o, **given).distance
+
 
 CALLS = [
     Call(
@@ -135,19 +148,7 @@ CALLS = [
     ),
     Call(
         name="diagnose",
-        run=lambda x_o=X_O, **options: (
-            diagnose(
-                trained(),
-                x_o,
-                **{
-                    "num_simulations": 100,
-                    "num_folds": None,
-                    "seed": 0,
-                    **QUIET,
-                    **options,
-                },
-            ).distance
-        ),
+        run=distances_of,
         tensors={"x_o": X_O},
         options={
             "num_simulations": "count",
