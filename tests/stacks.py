@@ -25,6 +25,7 @@ from tests import problems
 
 QUIET: dict[str, Any] = {"show_progress_bars": False}
 NUM_PAIRS, NUM_OBSERVED, NUM_SIMULATED = 20, 25, 60
+NUM_FOLDS = 3  # more would take longer, and are no different
 
 
 @contextmanager
@@ -152,7 +153,12 @@ def validated(rope: RoPE, x_o: Tensor | None = None, **options: Any) -> CrossVal
 
 
 def _options(x_o: Tensor | None, options: dict[str, Any]) -> dict[str, Any]:
-    defaults = {"num_simulations": NUM_SIMULATED, "seed": 0, **QUIET}
+    defaults = {
+        "num_simulations": NUM_SIMULATED,
+        "num_folds": NUM_FOLDS,
+        "seed": 0,
+        **QUIET,
+    }
     if x_o is not None:
         defaults["candidates"] = CANDIDATES
     return {**defaults, **options}
@@ -172,7 +178,7 @@ def small_stack() -> StackedPosterior:
     Tests share it and must not change it.
     """
     with torch.random.fork_rng():
-        return stacked(rope_of(), candidates=[PRIOR, NPE, FITTED])
+        return stacked(rope_of(), candidates=[PRIOR, NPE, FITTED], num_folds=5)
 
 
 @functools.cache

@@ -277,6 +277,7 @@ def test_with_two_training_folds_labels_of_a_fold_affect_two_others() -> None:
             validated(
                 rope_of((labels, x), finetuner=finetuner),
                 candidates=tuned,
+                num_folds=5,
                 num_training_folds=2,
             )
             for labels in (theta, changed_in_a_fold(theta, x, finetuner))
@@ -294,7 +295,8 @@ def test_with_two_training_folds_labels_of_a_fold_affect_two_others() -> None:
 
 
 def changed_in_a_fold(theta: Tensor, x: Tensor, finetuner: Any) -> Tensor:
-    scores = validated(rope_of((theta, x), finetuner=finetuner), candidates=[PRIOR])
+    rope = rope_of((theta, x), finetuner=finetuner)
+    scores = validated(rope, candidates=[PRIOR], num_folds=5)
     return torch.where((scores.fold == 0)[:, None], -theta, theta)
 
 

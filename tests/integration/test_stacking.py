@@ -28,6 +28,7 @@ from tests.stacks import (
     FINETUNED,
     FITTED,
     NPE,
+    NUM_FOLDS,
     NUM_OBSERVED,
     NUM_PAIRS,
     OT_ONLY,
@@ -61,13 +62,13 @@ def test_a_stack_of_one_candidate_is_the_average_of_its_versions() -> None:
 
     candidate = DensityCandidate(name="one", build=build)
     posterior = stacked(rope_of(), candidates=[candidate], tail_mass=0.0)
-    assert len(built) == 6  # without each of five folds, and on all
+    assert len(built) == 4  # without each of three folds, and on all
     x = observed()
     theta = 3 * torch.rand(4, NUM_OBSERVED, 2) - 1.5
     found = posterior.posterior_estimator.log_prob(theta, x)
     with torch.no_grad():
         versions = [p.posterior_estimator.log_prob(theta, x).exp() for p in built]
-    assert torch.allclose(found.exp(), sum(versions) / 6, atol=1e-5)
+    assert torch.allclose(found.exp(), sum(versions) / 4, atol=1e-5)
     single = posterior.candidate_log_probs(theta[0], x)
     assert torch.allclose(single[:, 0].float(), found[0], atol=1e-4)
 
@@ -106,9 +107,11 @@ def test_couplings_are_those_of_the_coupler_with_the_net_of_each_version() -> No
         )
         expected = estimator.log_prob(theta[None], batch)[0].double()
         assert torch.allclose(found[:, column], expected, atol=1e-3), name
-    # Five folds and all pairs, with three tuned settings; h is shared by all.
+    # The folds and all pairs, with three tuned settings; h is shared by all.
     versions = [version for _, version in couplings.settings]
-    assert sorted(v for v in versions if v is not None) == sorted([*range(6)] * 3)
+    assert sorted(v for v in versions if v is not None) == sorted(
+        [*range(NUM_FOLDS + 1)] * 3
+    )
     assert versions.count(None) == 2
 
 
@@ -457,7 +460,7 @@ def test_a_mixture_counts_as_one_version_regardless_of_its_number_of_parts() -> 
 
     def build(rope: RoPE, seed: int) -> Any:
         # One density in the first versions, three in the last, of the prior in part.
-        sizes.append(1 if len(sizes) < 5 else 3)
+        sizes.append(1 if len(sizes) < NUM_FOLDS else 3)
         own = stacked(rope_of(), candidates=[NPE]).posterior_estimator.parts
         prior = stacked(rope_of(), candidates=[PRIOR]).posterior_estimator.parts
         parts = own if sizes[-1] == 1 else [*prior, *prior, *own]
@@ -470,11 +473,11 @@ def test_a_mixture_counts_as_one_version_regardless_of_its_number_of_parts() -> 
     posterior = stacked(
         rope_of(), candidates=[DensityCandidate(name="mixed", build=build)]
     )
-    assert sizes == [1] * 5 + [3]
+    assert sizes == [1] * NUM_FOLDS + [3]
     assert not {*map(id, posterior.posterior_estimator.parts)} & {*map(id, theirs)}
     x, theta = observed(), problems.box(2).sample((NUM_OBSERVED,))
     npe = the_stack().candidate_log_probs(theta, x)[:, 1].exp()
-    expected = (5 * npe + (2 * 0.25 + npe) / 3) / 6
+    expected = (NUM_FOLDS * npe + (2 * 0.25 + npe) / 3) / (NUM_FOLDS + 1)
     found = posterior.candidate_log_probs(theta, x)[:, 0].exp()
     assert torch.allclose(found, expected, atol=1e-5)
     density = unnormalised(posterior, theta, x)[0].exp()

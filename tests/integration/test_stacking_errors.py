@@ -174,8 +174,8 @@ def test_pairs_that_cannot_be_simulated_are_named_by_their_parameters() -> None:
 
 
 def test_the_folds_to_train_on_must_be_fewer_than_all() -> None:
-    with pytest.raises(InvalidInputError, match="below the number of folds, 5; got 5"):
-        validated(rope_of(), candidates=[NPE], num_training_folds=5)
+    with pytest.raises(InvalidInputError, match="below the number of folds, 3; got 3"):
+        validated(rope_of(), candidates=[NPE], num_training_folds=3)
 
 
 def test_rehearsal_without_tuning_is_refused() -> None:

@@ -263,7 +263,11 @@ def test_the_learning_curve_has_a_point_for_one_two_and_four_folds() -> None:
     candidates = [ROPE, OT_ONLY, PRIOR, FITTED]
     report, without = (
         stacked(
-            rope_of(), observed(), candidates=candidates, learning_curve=curve
+            rope_of(),
+            observed(),
+            candidates=candidates,
+            num_folds=5,
+            learning_curve=curve,
         ).report
         for curve in (True, False)
     )
