@@ -30,8 +30,8 @@ LAYERS = [
     # They raise errors: of seeds, of files and of functions that cannot be pickled.
     {"_random", "_files", "_pickling"},
     # They raise errors and warn: of arguments, and of a training that goes wrong. Units
-    # are estimated from draws with a seed.
-    {"_validation", "_training", "_units"},
+    # and bounds of parameters are found by draws of the prior with a seed.
+    {"_validation", "_training", "_units", "_bounds"},
     # sbi's trainer is told by `_training` which simulations to hold out together.
     {"_sbi"},
     # Each works on embeddings or posteriors, which `_sbi` takes out of an estimator.

@@ -5,13 +5,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sbi_rope._bounds import Bounds, to_box, to_line
 from sbi_rope._random import seeded
 from sbi_rope.errors import SamplingError
 from sbi_rope.mixture import MixtureEstimator
 from sbi_rope.mixture.sampling import Accept
 from sbi_rope.mixture.truncation import LEAKAGE_DRAWS, Leakage
-from sbi_rope.recalibration.spread import Spread, to_box, to_line
-from sbi_rope.recalibration.support import Bounds
+from sbi_rope.recalibration.spread import Spread
 
 __all__ = ["RecalibratedEstimator"]
 
@@ -30,7 +30,7 @@ class RecalibratedEstimator(MixtureEstimator):
         \phi(\theta') = \mu(x) + s\, (\phi(\theta) - \mu(x))
 
     :math:`\phi` maps the support of the prior to the whole space, see
-    :mod:`sbi_rope.recalibration.spread`, and :math:`\mu(x)` is the mean of
+    :mod:`sbi_rope._bounds`, and :math:`\mu(x)` is the mean of
     :math:`\phi(\theta)` under the mixture inside the support. It is estimated from 256
     draws, whose random numbers are the same in every call.
 

@@ -6,12 +6,11 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.distributions import constraints
 
 from sbi_rope._validation import check_names
 from sbi_rope.sets.guarantee import Guarantee
 
-__all__ = ["CredibleIntervals", "bounds_of", "central_intervals"]
+__all__ = ["CredibleIntervals", "central_intervals"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -93,39 +92,3 @@ def central_intervals(
         ends.append(torch.lerp(ordered[start], ordered[start + 1], share))
     low, high = (end.to(draws) for end in ends)
     return CredibleIntervals(low=low, high=high, level=level, guarantee=None)
-
-
-def bounds_of(prior: Any, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the ends of the prior's support, infinite where they are not known.
-
-    Args:
-        prior: A torch distribution over parameters of shape ``(d,)``.
-        like: A tensor of shape ``(d,)``, whose dtype and device the ends get.
-
-    Example:
-        >>> from torch.distributions import Independent, Uniform
-        >>> box = Independent(Uniform(torch.zeros(2), torch.ones(2)), 1)
-        >>> bounds_of(box, torch.zeros(2))
-        (tensor([0., 0.]), tensor([1., 1.]))
-    """
-    try:
-        support = getattr(prior, "support", None)
-    except NotImplementedError:  # torch raises it if a distribution states no support
-        support = None
-    return _bounds(support, like)
-
-
-def _bounds(support: Any, like: Tensor) -> tuple[Tensor, Tensor]:
-    while isinstance(support, constraints.independent):
-        support = support.base_constraint
-    if isinstance(support, constraints.cat):  # of sbi's MultipleIndependent
-        columns = like.split(support.lengths)
-        ends = [_bounds(*one) for one in zip(support.cseq, columns, strict=True)]
-        low, high = (torch.cat(some) for some in zip(*ends, strict=True))
-        return low, high
-    unknown = (0.0, 1.0) if support is constraints.boolean else (-torch.inf, torch.inf)
-    low, high = (
-        torch.as_tensor(getattr(support, name, end)).to(like).expand_as(like)
-        for name, end in zip(("lower_bound", "upper_bound"), unknown, strict=True)
-    )
-    return low, high

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sbi_rope._bounds import bounds_of
 from sbi_rope._sbi import MixedDensity
 from sbi_rope._units import log_unit_of
 from sbi_rope.errors import InvalidInputError
@@ -21,7 +22,6 @@ from sbi_rope.sets.conformal import (
     marginal_ends,
     rank_needed,
 )
-from sbi_rope.sets.intervals import bounds_of
 from sbi_rope.stacking.cross_validation import CrossValidation
 from sbi_rope.stacking.held_out import SetScores
 from sbi_rope.stacking.versions import Versions

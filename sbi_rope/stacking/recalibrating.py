@@ -14,6 +14,7 @@ import torch
 from sbi.utils import within_support
 from torch import Tensor
 
+from sbi_rope._bounds import bounds_of_prior
 from sbi_rope._sbi import MixedDensity, estimator_of, headless
 from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError
 from sbi_rope.mixture import MixtureEstimator
@@ -21,7 +22,6 @@ from sbi_rope.recalibration import Recalibration
 from sbi_rope.recalibration.estimator import RecalibratedEstimator
 from sbi_rope.recalibration.factors import HeldOutMixture
 from sbi_rope.recalibration.recalibration import recalibrate
-from sbi_rope.recalibration.support import bounds_of_prior
 from sbi_rope.stacking.folds import Workbench
 from sbi_rope.stacking.versions import Versions
 

@@ -15,13 +15,13 @@ from torch import Tensor, nn
 from torch.distributions import Exponential, Independent
 
 from sbi_rope import MixturePosterior
+from sbi_rope._bounds import Bounds, bounds_of_prior
 from sbi_rope.mixture import MixtureEstimator, OwnEmbeddings, Part
 from sbi_rope.recalibration import Recalibration
 from sbi_rope.recalibration.estimator import RecalibratedEstimator
 from sbi_rope.recalibration.factors import HeldOutMixture
 from sbi_rope.recalibration.recalibration import recalibrate
 from sbi_rope.recalibration.spread import Spread
-from sbi_rope.recalibration.support import Bounds, bounds_of_prior
 from sbi_rope.tasks.triangle import UniformTriangle
 from tests import problems
 

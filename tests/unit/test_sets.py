@@ -13,6 +13,7 @@ from scipy.stats import chi2
 from torch import Tensor
 
 from sbi_rope import MixturePosterior, StackedPosterior, load
+from sbi_rope._bounds import bounds_of
 from sbi_rope.errors import InvalidInputError, InvalidTypeError
 from sbi_rope.metrics import coverage_curve_of
 from sbi_rope.mixture import MixtureEstimator, part_of
@@ -25,7 +26,6 @@ from sbi_rope.sets.conformal import (
     marginal_scores,
     rank_needed,
 )
-from sbi_rope.sets.intervals import bounds_of
 from sbi_rope.stacking import StackingReport
 from sbi_rope.stacking.cross_validation import fold_weights
 from tests import gaussian, problems, stacks

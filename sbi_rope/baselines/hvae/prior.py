@@ -1,11 +1,10 @@
 """The prior as the ELBO needs it: finite everywhere, with a gradient back inside."""
 
-from typing import Any
-
 import torch
 from torch import Tensor
-from torch.distributions import Distribution, constraints
+from torch.distributions import Distribution
 
+from sbi_rope._bounds import bounds_of_prior
 from sbi_rope._random import seeded
 from sbi_rope.errors import InvalidInputError
 
@@ -18,13 +17,6 @@ FLANK = 0.1
 MARGIN = 1e-3
 # Draws that tell the standard deviations.
 NUM_DRAWS = 10_000
-
-INTERVALS = (constraints.interval, constraints.half_open_interval)
-HALF_LINES = (
-    constraints.greater_than,
-    constraints.greater_than_eq,
-    constraints.less_than,
-)
 
 
 class ContinuedPrior:
@@ -62,10 +54,16 @@ class ContinuedPrior:
         self._prior = prior
         with seeded(0):
             std = prior.sample(torch.Size((NUM_DRAWS,))).std(dim=0)
-        low, high = _ends(prior.support, len(std))
+        bounds = bounds_of_prior(prior)
+        if not bounds.are_all:
+            raise InvalidInputError(
+                "Expected a prior whose support is a box, so that parameters outside "
+                f"of it can be brought back; got the {type(prior).__name__} {prior}. "
+                "HVAE does not apply to this prior."
+            )
         self.std = std.to(device, torch.float32)
-        self.low = low.to(device) + MARGIN * self.std
-        self.high = high.to(device) - MARGIN * self.std
+        self.low = bounds.low.to(self.std) + MARGIN * self.std
+        self.high = bounds.high.to(self.std) - MARGIN * self.std
 
     def nearest(self, theta: Tensor) -> Tensor:
         """Return the nearest points in the box, ``(n, d)``."""
@@ -76,30 +74,3 @@ class ContinuedPrior:
         inside = self.nearest(theta)
         distance = ((theta - inside).abs() / (FLANK * self.std)).sum(dim=1)
         return self._prior.log_prob(inside) - distance
-
-
-def _ends(support: Any, num_parameters: int) -> tuple[Tensor, Tensor]:
-    """Return the lower and upper ends of a box, each ``(d,)``."""
-    while isinstance(support, constraints.independent):
-        support = support.base_constraint
-    if isinstance(support, constraints.cat):
-        parts = [
-            _ends(part, length)
-            for part, length in zip(support.cseq, support.lengths, strict=True)
-        ]
-        low, high = (torch.cat(ends) for ends in zip(*parts, strict=True))
-        return low, high
-    if not isinstance(support, (*INTERVALS, *HALF_LINES, type(constraints.real))):
-        raise InvalidInputError(
-            "Expected a prior whose support is a box, so that parameters outside of it "
-            f"can be brought back; got {support}. HVAE does not apply to this prior."
-        )
-    ends = (
-        torch.as_tensor(end, dtype=torch.float32).expand(num_parameters)
-        for end in (
-            getattr(support, "lower_bound", -torch.inf),
-            getattr(support, "upper_bound", torch.inf),
-        )
-    )
-    low, high = ends
-    return low, high

@@ -1,0 +1,136 @@
+r"""The bounds of parameters, and the map of what is inside to the whole line.
+
+The map is
+
+.. math:: \phi_j(\theta) = \theta_j,\quad \log(\theta_j - a_j),\quad
+    -\log(b_j - \theta_j) \quad\text{or}\quad
+    \log\frac{\theta_j - a_j}{b_j - \theta_j},
+
+if parameter j has no bound, the lower bound a, the upper bound b, or both.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from sbi.utils import within_support
+from torch import Tensor
+from torch.distributions import constraints
+from torch.nn.functional import softplus
+
+from sbi_rope._random import seeded
+
+__all__ = ["Bounds", "bounds_of", "bounds_of_prior", "log_slope", "to_box", "to_line"]
+
+# So many draws of the prior are moved apart to see whether its support is a box.
+NUM_DRAWS = 256
+
+
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """The bounds of each parameter.
+
+    Attributes:
+        low: The lower bounds, minus infinity where there is none, shape ``(d,)``.
+        high: The upper bounds, infinity where there is none, shape ``(d,)``.
+        are_all: Whether the support holds everything inside the bounds, so that it is a
+            box.
+    """
+
+    low: Tensor
+    high: Tensor
+    are_all: bool
+
+
+def bounds_of_prior(prior: Any) -> Bounds:
+    """Return the bounds of a prior's support, float64."""
+    with seeded(0):
+        theta = prior.sample((NUM_DRAWS,)).double()
+    low, high = bounds_of(prior, theta[0])
+    line = to_line(theta, low, high)
+    wider = 2.0 * line - line.mean(dim=0)
+    inside = within_support(prior, to_box(wider, low, high))
+    return Bounds(low, high, are_all=bool(inside.all()))
+
+
+def bounds_of(prior: Any, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the ends of the prior's support, infinite where they are not known.
+
+    Args:
+        prior: A torch distribution over parameters of shape ``(d,)``.
+        like: A tensor of shape ``(d,)``, whose dtype and device the ends get.
+
+    Example:
+        >>> from torch.distributions import Independent, Uniform
+        >>> box = Independent(Uniform(torch.zeros(2), torch.ones(2)), 1)
+        >>> bounds_of(box, torch.zeros(2))
+        (tensor([0., 0.]), tensor([1., 1.]))
+    """
+    try:
+        support = getattr(prior, "support", None)
+    except NotImplementedError:  # torch raises it if a distribution states no support
+        support = None
+    return _bounds(support, like)
+
+
+def _bounds(support: Any, like: Tensor) -> tuple[Tensor, Tensor]:
+    while isinstance(support, constraints.independent):
+        support = support.base_constraint
+    if isinstance(support, constraints.cat):  # of sbi's MultipleIndependent
+        columns = like.split(support.lengths)
+        ends = [_bounds(*one) for one in zip(support.cseq, columns, strict=True)]
+        low, high = (torch.cat(some) for some in zip(*ends, strict=True))
+        return low, high
+    unknown = (0.0, 1.0) if support is constraints.boolean else (-torch.inf, torch.inf)
+    low, high = (
+        torch.as_tensor(getattr(support, name, end)).to(like).expand_as(like)
+        for name, end in zip(("lower_bound", "upper_bound"), unknown, strict=True)
+    )
+    return low, high
+
+
+def to_line(theta: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    r"""Return :math:`\phi(\theta)` of parameters ``(..., d)`` inside the bounds.
+
+    Parameters on a bound are taken for the nearest number inside.
+
+    Example:
+        >>> low, high = torch.tensor([0.0, 0.0]), torch.tensor([torch.inf, 1.0])
+        >>> to_line(torch.tensor([1.0, 0.5]), low, high)
+        tensor([0., 0.])
+    """
+    has_low, has_high = torch.isfinite(low), torch.isfinite(high)
+    tiny = torch.finfo(theta.dtype).tiny
+    # Infinite bounds are replaced first, because gradients go through both branches.
+    above = (theta - low.where(has_low, 0.0)).clamp_min(tiny).log()
+    below = (high.where(has_high, 0.0) - theta).clamp_min(tiny).log()
+    line = above.where(has_low, 0.0) - below.where(has_high, 0.0)
+    return line.where(has_low | has_high, theta)
+
+
+def to_box(line: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """Return the parameters inside the bounds that :func:`to_line` maps to a line.
+
+    Example:
+        >>> low, high = torch.tensor([0.0, 0.0]), torch.tensor([torch.inf, 1.0])
+        >>> to_box(torch.tensor([0.0, 0.0]), low, high)
+        tensor([1.0000, 0.5000])
+    """
+    has_low, has_high = torch.isfinite(low), torch.isfinite(high)
+    a, b = low.where(has_low, 0.0), high.where(has_high, 0.0)
+    above = a + line.where(has_low & ~has_high, 0.0).exp()
+    below = b - (-line).where(has_high & ~has_low, 0.0).exp()
+    inside = a + (b - a) * line.sigmoid()
+    one_sided = above.where(has_low, below)
+    bounded = inside.where(has_low & has_high, one_sided)
+    return bounded.where(has_low | has_high, line)
+
+
+def log_slope(line: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    r"""Return :math:`\log |d \theta_j / d \phi_j|` of each parameter, ``(..., d)``."""
+    has_low, has_high = torch.isfinite(low), torch.isfinite(high)
+    width = (high - low).where(has_low & has_high, 1.0)
+    inside = width.log() - softplus(line) - softplus(-line)
+    slope = inside.where(has_high, line)
+    slope = slope.where(has_low, -line)
+    return slope.where(has_low | has_high, 0.0)
