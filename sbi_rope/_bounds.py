@@ -22,6 +22,8 @@ from sbi_rope._random import seeded
 
 __all__ = ["Bounds", "bounds_of", "bounds_of_prior", "log_slope", "to_box", "to_line"]
 
+# Parameters that are nearer to a bound than float32 rounds are taken for on the bound.
+ROUNDING = torch.finfo(torch.float32).eps
 # So many draws of the prior are moved apart to see whether its support is a box.
 NUM_DRAWS = 256
 
@@ -40,6 +42,19 @@ class Bounds:
     low: Tensor
     high: Tensor
     are_all: bool
+
+    def hold(self, theta: Tensor) -> Tensor:
+        """Return whether parameters ``(n, d)`` are inside, and not on a bound.
+
+        Example:
+            >>> bounds = Bounds(torch.zeros(1), torch.ones(1), are_all=True)
+            >>> bounds.hold(torch.tensor([[0.0], [0.5]]))
+            tensor([False,  True])
+        """
+        margin = _margin(self.low, self.high)
+        theta = theta.to(self.low)
+        inside = (theta - self.low > margin) & (self.high - theta > margin)
+        return inside.all(dim=-1)
 
 
 def bounds_of_prior(prior: Any) -> Bounds:
@@ -92,7 +107,8 @@ def _bounds(support: Any, like: Tensor) -> tuple[Tensor, Tensor]:
 def to_line(theta: Tensor, low: Tensor, high: Tensor) -> Tensor:
     r"""Return :math:`\phi(\theta)` of parameters ``(..., d)`` inside the bounds.
 
-    Parameters on a bound are taken for the nearest number inside.
+    Parameters on a bound are taken for some next to it, in a box for those that float32
+    can tell from the bound.
 
     Example:
         >>> low, high = torch.tensor([0.0, 0.0]), torch.tensor([torch.inf, 1.0])
@@ -100,10 +116,10 @@ def to_line(theta: Tensor, low: Tensor, high: Tensor) -> Tensor:
         tensor([0., 0.])
     """
     has_low, has_high = torch.isfinite(low), torch.isfinite(high)
-    tiny = torch.finfo(theta.dtype).tiny
+    least = _margin(low, high).clamp_min(torch.finfo(theta.dtype).tiny)
     # Infinite bounds are replaced first, because gradients go through both branches.
-    above = (theta - low.where(has_low, 0.0)).clamp_min(tiny).log()
-    below = (high.where(has_high, 0.0) - theta).clamp_min(tiny).log()
+    above = (theta - low.where(has_low, 0.0)).maximum(least).log()
+    below = (high.where(has_high, 0.0) - theta).maximum(least).log()
     line = above.where(has_low, 0.0) - below.where(has_high, 0.0)
     return line.where(has_low | has_high, theta)
 
@@ -134,3 +150,9 @@ def log_slope(line: Tensor, low: Tensor, high: Tensor) -> Tensor:
     slope = inside.where(has_high, line)
     slope = slope.where(has_low, -line)
     return slope.where(has_low | has_high, 0.0)
+
+
+def _margin(low: Tensor, high: Tensor) -> Tensor:
+    """Return how near to one of two bounds is on it, ``(d,)``; zero otherwise."""
+    width = high - low
+    return (ROUNDING * width).where(torch.isfinite(width), 0.0)

@@ -1,29 +1,81 @@
-"""Weighted means, with their errors and intervals."""
+"""Weighted means over calibration pairs, with their errors and intervals."""
+
+from dataclasses import dataclass
 
 from scipy.stats import t as student
 from torch import Tensor
 
-__all__ = ["interval_of_mean", "mean_and_error"]
+__all__ = ["Counts", "counts_of", "interval_of_mean", "mean_and_error"]
 
 
-def mean_and_error(values: Tensor, weights: Tensor | None) -> tuple[float, float]:
+@dataclass(frozen=True, eq=False)
+class Counts:
+    """How many pairs each pair counts as, and which of them belong together.
+
+    Attributes:
+        weights: How many pairs each counts as, shape ``(n,)``.
+        groups: A number for each pair, shape ``(n,)``. Pairs with the same number are
+            not independent, so that errors are those of means of groups. None if all
+            pairs are independent.
+    """
+
+    weights: Tensor
+    groups: Tensor | None = None
+
+    def __getitem__(self, rows: Tensor) -> "Counts":
+        groups = None if self.groups is None else self.groups[rows]
+        return Counts(self.weights[rows], groups)
+
+    def of_groups(self, values: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the weighted mean of each group, and the weight of the group.
+
+        Args:
+            values: A number for each pair, shape ``(n,)``.
+
+        Example:
+            >>> import torch
+            >>> counts = Counts(torch.tensor([0.5, 0.5, 1.0]), torch.tensor([0, 0, 1]))
+            >>> counts.of_groups(torch.tensor([1.0, 3.0, 5.0]))
+            (tensor([2., 5.]), tensor([1., 1.]))
+        """
+        weights = self.weights.to(values)
+        if self.groups is None:
+            return values, weights
+        numbers, place = self.groups.to(values.device).unique(return_inverse=True)
+        nothing = values.new_zeros(len(numbers))
+        total = nothing.index_add(0, place, weights)
+        return nothing.index_add(0, place, weights * values) / total, total
+
+    @property
+    def effective_number(self) -> float:
+        """The number of independent pairs of equal weight with the same precision."""
+        _, weights = self.of_groups(self.weights.double())
+        return float(weights.sum().square() / weights.square().sum())
+
+
+def counts_of(weights: Tensor | None, groups: Tensor | None) -> Counts | None:
+    """Return the counts of pairs; None if all are independent and count as one."""
+    return None if weights is None else Counts(weights, groups)
+
+
+def mean_and_error(values: Tensor, counts: Counts | None) -> tuple[float, float]:
     """Return a mean over pairs and its standard error.
 
     Args:
         values: A number for each pair, shape ``(n,)``.
-        weights: How many pairs each pair counts as, shape ``(n,)``; None for one each.
+        counts: How many pairs each counts as; None for one each.
     """
+    if counts is None:
+        return float(values.mean()), float(values.std() / len(values) ** 0.5)
+    values, weights = counts.of_groups(values)
     n = len(values)
-    if weights is None:
-        return float(values.mean()), float(values.std() / n**0.5)
-    weights = weights.to(values)
     mean = (weights * values).sum() / weights.sum()
     square = (weights * (values - mean)).square().sum() / weights.sum().square()
     return float(mean), float((square * n / max(1, n - 1)).sqrt())
 
 
 def interval_of_mean(
-    values: Tensor, weights: Tensor | None
+    values: Tensor, counts: Counts | None
 ) -> tuple[float, float, float]:
     """Return a mean over pairs and the ends of its 95 % interval of Student's t.
 
@@ -33,6 +85,7 @@ def interval_of_mean(
         >>> print(f"{mean:.2f}, from {low:.2f} to {high:.2f}")
         2.00, from -0.48 to 4.48
     """
-    mean, error = mean_and_error(values, weights)
-    half = float(student.ppf(0.975, max(1, len(values) - 1))) * error
+    mean, error = mean_and_error(values, counts)
+    n = len(values) if counts is None else len(counts.of_groups(values)[0])
+    half = float(student.ppf(0.975, max(1, n - 1))) * error
     return mean, mean - half, mean + half

@@ -19,6 +19,8 @@ __all__ = ["checked_labels"]
 
 # A covariance may be this much asymmetric, or below zero, relative to its diagonal.
 ROUNDING = 1e-6
+# A correlation whose smallest eigenvalue is below this is singular.
+SINGULAR = 1e-12
 
 
 def checked_labels(
@@ -154,10 +156,14 @@ def _checked_covariance(theta_cov: Any, theta: Tensor) -> Tensor:
             "Expected `theta_cov` to be finite; got NaN or Inf. Put NaN into `theta` "
             "for parameters that were not measured."
         )
-    scale = covariance.diagonal(dim1=1, dim2=2).abs().amax(dim=1)
-    asymmetry = (covariance - covariance.mT).abs().amax(dim=(1, 2))
-    smallest = torch.linalg.eigvalsh((covariance + covariance.mT) / 2)[:, 0]
-    bad = (asymmetry > ROUNDING * scale) | (smallest < -ROUNDING * scale)
+    # Relative to the standard deviations, because parameters may have different units.
+    std = covariance.diagonal(dim1=1, dim2=2).abs().sqrt()
+    std = std.where(std > 0, std.amax(dim=1, keepdim=True))
+    std = std.where(std > 0, 1.0)
+    correlation = covariance / (std[:, :, None] * std[:, None, :])
+    asymmetry = (correlation - correlation.mT).abs().amax(dim=(1, 2))
+    smallest = torch.linalg.eigvalsh((correlation + correlation.mT) / 2)[:, 0]
+    bad = (asymmetry > ROUNDING) | (smallest < -ROUNDING)
     if bad.any():
         rows = bad.nonzero().flatten()[:5].tolist()
         raise InvalidInputError(
@@ -166,8 +172,8 @@ def _checked_covariance(theta_cov: Any, theta: Tensor) -> Tensor:
         )
     noisy = covariance.diagonal(dim1=1, dim2=2) > 0
     # Noisy parameters may have no direction without noise, which has no density.
-    regular = covariance + torch.diag_embed((~noisy).to(covariance))
-    flat = torch.linalg.eigvalsh(regular)[:, 0] <= 1e-12 * scale
+    regular = correlation + torch.diag_embed((~noisy).to(correlation))
+    flat = torch.linalg.eigvalsh(regular)[:, 0] <= SINGULAR
     if flat.any():
         rows = flat.nonzero().flatten()[:5].tolist()
         raise InvalidInputError(

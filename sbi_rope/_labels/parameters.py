@@ -62,7 +62,8 @@ def parameters_of(labels: Labels, prior: Any, *, seed: int = 0) -> LabelledParam
     Args:
         labels: The labels.
         prior: The prior of NPE.
-        seed: Seed of the draws. The draws of a label depend on no other label.
+        seed: Seed of the draws. The draws of a label do not depend on the values of
+            other labels.
 
     Raises:
         InvalidInputError: If no parameters inside the prior's support fit a label.
@@ -70,7 +71,7 @@ def parameters_of(labels: Labels, prior: Any, *, seed: int = 0) -> LabelledParam
     if labels.samples is not None:
         n = len(labels)
         return LabelledParameters(
-            draws=labels.samples,
+            draws=_shuffled(labels.samples, seed=seed),
             effective_sample_size=labels.covariance.new_full((n,), torch.inf),
         )
     if labels.are_exact:
@@ -160,6 +161,19 @@ def _draw(
         1, chosen[..., None].expand(-1, -1, labels.theta.shape[1])
     )
     return LabelledParameters(draws=draws, effective_sample_size=size)
+
+
+def _shuffled(samples: Tensor, *, seed: int) -> Tensor:
+    """Return draws in random order, a few of them repeatedly, ``(n, R, d)``.
+
+    Any part of the draws represents all of them then, also if they were sorted. With
+    repetitions there are enough simulations for each label to tell what is noise.
+    """
+    count = samples.shape[1]
+    with seeded(seed):
+        rounds = [torch.randperm(count) for _ in range(-(-NUM_DRAWS // count))]
+    order = torch.cat(rounds)[: max(count, NUM_DRAWS)]
+    return samples[:, order.to(samples.device)]
 
 
 def _systematic(shares: Tensor, count: int) -> Tensor:

@@ -8,15 +8,15 @@ import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
-from sbi_rope._validation import check_batch, check_tensor
+from sbi_rope._validation import check_batch, check_same_length, check_tensor
 from sbi_rope.errors import InvalidInputError
 
 __all__ = ["ParameterDistribution", "learn_parameters"]
 
-# The prior's mean and covariance count as much as this number of pairs. The results are
-# averaged, weighted by their evidence.
 # Draws of each label that is not exact.
 NUM_SETS = 10
+# The prior's mean and covariance count as much as this number of pairs. The results are
+# averaged, weighted by their evidence.
 STRENGTHS = (2.0, 5.0, 10.0, 30.0, 100.0)
 
 
@@ -39,7 +39,9 @@ class ParameterDistribution:
         return float(1.0 / self.probabilities.square().sum())
 
 
-def learn_parameters(theta_cal: Tensor, theta: Tensor) -> ParameterDistribution:
+def learn_parameters(
+    theta_cal: Tensor, theta: Tensor, *, weights: Tensor | None = None
+) -> ParameterDistribution:
     r"""Weight simulations so that their parameters are distributed like those of pairs.
 
     Each parameter is replaced by its normal score u under the prior. Any prior is then
@@ -67,13 +69,16 @@ def learn_parameters(theta_cal: Tensor, theta: Tensor) -> ParameterDistribution:
             parameters of each, shape ``(n_c, R, d)``. The probabilities are then
             averages over up to ten sets of draws.
         theta: Parameters of at least two simulations from the prior, shape ``(n, d)``.
+        weights: How many draws from the distribution each pair counts as, shape
+            ``(n_c,)``; one if None. The weights of equal parameters are added.
 
     Returns:
         The probabilities of the simulations.
 
     Raises:
         InvalidTypeError: If an argument is not a tensor.
-        InvalidInputError: If the shapes do not fit or a value is not finite.
+        InvalidInputError: If the shapes do not fit, a value is not finite, or a weight
+            is not positive.
     """
     theta = check_tensor("theta", theta)
     if theta.ndim != 2 or len(theta) < 2:
@@ -84,11 +89,21 @@ def learn_parameters(theta_cal: Tensor, theta: Tensor) -> ParameterDistribution:
     theta = check_batch("theta", theta, theta.shape[1:])
     several = check_tensor("theta_cal", theta_cal).shape[1:-1][:1]
     theta_cal = check_batch("theta_cal", theta_cal, (*several, theta.shape[1]))
-    if theta_cal.ndim == 3:
-        return _average(
-            [_learn(draws, theta) for draws in theta_cal.unbind(dim=1)[:NUM_SETS]]
+    if weights is not None:
+        weights = _checked_weights(weights, theta_cal)
+    sets = theta_cal.unbind(dim=1)[:NUM_SETS] if theta_cal.ndim == 3 else [theta_cal]
+    return _average([_learn(draws, theta, weights) for draws in sets])
+
+
+def _checked_weights(weights: Tensor, theta_cal: Tensor) -> Tensor:
+    weights = check_batch("weights", check_tensor("weights", weights), ())
+    check_same_length("theta_cal", theta_cal, "weights", weights)
+    if not bool((weights > 0).all()):
+        raise InvalidInputError(
+            f"Expected positive `weights`; got {float(weights.min())}. Leave out pairs "
+            "that should not count."
         )
-    return _learn(theta_cal, theta)
+    return weights.to(theta_cal.device, torch.double)
 
 
 def _average(parts: Sequence[ParameterDistribution]) -> ParameterDistribution:
@@ -100,17 +115,22 @@ def _average(parts: Sequence[ParameterDistribution]) -> ParameterDistribution:
     )
 
 
-def _learn(theta_cal: Tensor, theta: Tensor) -> ParameterDistribution:
-    theta_cal = theta_cal.unique(dim=0)
+def _learn(
+    theta_cal: Tensor, theta: Tensor, weights: Tensor | None
+) -> ParameterDistribution:
+    theta_cal, place = theta_cal.unique(dim=0, return_inverse=True)
+    counts = torch.ones(len(theta_cal), dtype=torch.double, device=theta_cal.device)
+    if weights is not None:
+        counts = torch.zeros_like(counts).index_add(0, place, weights)
     u_cal, u = normal_scores(theta_cal, theta), normal_scores(theta, theta)
     correlation = torch.atleast_2d(u.T.cov())
     # The small number keeps R positive definite if a parameter is a function of others.
     correlation = correlation + 1e-6 * torch.eye(len(correlation)).to(u)
     normal = MultivariateNormal(torch.zeros_like(u[0]), correlation)
-    fits = [_fit(u_cal, u, correlation, strength) for strength in STRENGTHS]
+    fits = [_fit(u_cal, u, counts, correlation, strength) for strength in STRENGTHS]
     evidence = torch.stack([log_evidence for log_evidence, _ in fits])
     average = evidence.logsumexp(dim=0) - math.log(len(fits))
-    probability = float(torch.sigmoid(normal.log_prob(u_cal).sum() - average))
+    probability = float(torch.sigmoid(counts @ normal.log_prob(u_cal) - average))
     predictive = torch.stack([log_t for _, log_t in fits], dim=1)
     log_t = (predictive + evidence.log_softmax(dim=0)).logsumexp(dim=1)
     ratio = torch.softmax(log_t - normal.log_prob(u), dim=0)
@@ -140,18 +160,18 @@ def normal_scores(theta: Tensor, reference: Tensor) -> Tensor:
 
 
 def _fit(
-    u_cal: Tensor, u: Tensor, correlation: Tensor, strength: float
+    u_cal: Tensor, u: Tensor, counts: Tensor, correlation: Tensor, strength: float
 ) -> tuple[Tensor, Tensor]:
     """Return the log evidence at one strength, and the log predictive density at u."""
-    n, d = u_cal.shape
+    n, d = float(counts.sum()), u_cal.shape[1]
     degrees, scale = strength + d + 1, strength * correlation
-    average = u_cal.mean(dim=0)
+    average = counts @ u_cal / n
     centred = u_cal - average
     # These are the conjugate formulas for a normal distribution with unknown mean and
     # covariance.
     total = strength + n
     new_degrees = degrees + n
-    new_scale = scale + centred.T @ centred
+    new_scale = scale + centred.T @ (counts[:, None] * centred)
     new_scale = new_scale + strength * n / total * torch.outer(average, average)
     log_evidence = (
         -n * d / 2 * math.log(math.pi)

@@ -12,6 +12,7 @@ import torch
 from scipy.stats import t as student
 from torch import Tensor
 
+from sbi_rope._means import Counts, mean_and_error
 from sbi_rope._validation import (
     check_batch,
     check_device,
@@ -27,9 +28,12 @@ __all__ = [
     "CoverageCurve",
     "CoverageErrorScore",
     "acauc_of",
+    "acauc_of_pairs",
     "central_levels",
     "count_ranks",
     "coverage_curve_of",
+    "coverage_curve_of_pairs",
+    "coverage_error_of_pairs",
     "expected_coverage_error_of",
     "mid_ranks",
     "standard_error_of_mean",
@@ -220,19 +224,26 @@ def acauc_of(levels: Tensor, *, allow_missing: bool = False) -> ACAUCScore:
         >>> acauc_of(torch.tensor([[0.5], [1.0]])).value
         0.25
     """
-    levels = _checked_levels(levels, allow_missing=allow_missing).double()
-    per_observation = _mean(levels, dim=1)
-    per_observation = per_observation[~torch.isnan(per_observation)]
-    value = float(per_observation.mean() - 0.5)
-    error, n = standard_error_of_mean(per_observation), len(per_observation)
+    return acauc_of_pairs(_checked_levels(levels, allow_missing=allow_missing))
+
+
+def acauc_of_pairs(levels: Tensor, counts: Counts | None = None) -> ACAUCScore:
+    """Return :func:`acauc_of` of pairs that count differently, or are not independent.
+
+    Args:
+        levels: Checked levels, NaN where they are not known, shape ``(n, d)``.
+        counts: How many pairs each counts as; None for one each.
+    """
+    levels = levels.double()
+    mean, error, n = _mean_over_pairs(_mean(levels, dim=1), counts)
     width = float("nan")
     if n > 1:
         width = float(student.ppf(0.975, n - 1)) * error * (n / (n - 1)) ** 0.5
     return ACAUCScore(
-        value=value,
+        value=mean - 0.5,
         standard_error=error,
-        interval=(value - width, value + width),
-        per_parameter=_mean(levels, dim=0) - 0.5,
+        interval=(mean - 0.5 - width, mean - 0.5 + width),
+        per_parameter=_per_parameter(levels, counts) - 0.5,
     )
 
 
@@ -255,20 +266,29 @@ def coverage_curve_of(levels: Tensor, *, allow_missing: bool = False) -> Coverag
         InvalidTypeError: If the levels are no tensor of real numbers.
         InvalidInputError: If they have another shape, or a level is not in [0, 1].
     """
-    levels = _checked_levels(levels, allow_missing=allow_missing)
+    return coverage_curve_of_pairs(_checked_levels(levels, allow_missing=allow_missing))
+
+
+def coverage_curve_of_pairs(
+    levels: Tensor, counts: Counts | None = None
+) -> CoverageCurve:
+    """Return :func:`coverage_curve_of`, with the arguments of :func:`acauc_of_pairs`.
+
+    The number of observations is the effective one, rounded down.
+    """
     nominal = _nominal_levels(levels)
     # One level at a time, so that no tensor is larger than `levels`.
     coverage, errors = [], []
     for alpha in nominal:
         inside = _inside(levels, alpha)
-        coverage.append(_mean(inside, dim=0))
-        of_rows = _mean(inside, dim=1)
-        errors.append(standard_error_of_mean(of_rows[~torch.isnan(of_rows)]))
+        coverage.append(_per_parameter(inside, counts))
+        errors.append(_mean_over_pairs(_mean(inside, dim=1), counts)[1])
+    number = len(levels) if counts is None else int(counts.effective_number + ROUNDING)
     return CoverageCurve(
         levels=nominal,
         per_parameter=torch.stack(coverage, dim=1),
         standard_error=nominal.new_tensor(errors),
-        num_observations=levels.shape[0],
+        num_observations=number,
     )
 
 
@@ -301,20 +321,25 @@ def expected_coverage_error_of(
         InvalidTypeError: If the levels are no tensor of real numbers.
         InvalidInputError: If they have another shape, or a level is not in [0, 1].
     """
-    levels = _checked_levels(levels, allow_missing=allow_missing)
+    return coverage_error_of_pairs(_checked_levels(levels, allow_missing=allow_missing))
+
+
+def coverage_error_of_pairs(
+    levels: Tensor, counts: Counts | None = None
+) -> CoverageErrorScore:
+    """Return the expected coverage error, as :func:`acauc_of_pairs` does the ACAUC."""
     nominal = _nominal_levels(levels)
     distance = levels.new_zeros(levels.shape[1], dtype=torch.float64)
     influence = levels.new_zeros(levels.shape[0], dtype=torch.float64)
     for alpha in nominal:
         inside = _inside(levels, alpha)
-        gap = _mean(inside, dim=0) - alpha
+        gap = _per_parameter(inside, counts) - alpha
         distance += gap.abs()
         influence += _mean(gap.sign() * inside, dim=1)
     per_parameter = distance / nominal.numel()
-    influence = influence[~torch.isnan(influence)]
     return CoverageErrorScore(
         value=float(_mean(per_parameter, dim=0)),
-        standard_error=standard_error_of_mean(influence / nominal.numel()),
+        standard_error=_mean_over_pairs(influence / nominal.numel(), counts)[1],
         per_parameter=per_parameter,
     )
 
@@ -329,6 +354,28 @@ def standard_error_of_mean(values: Tensor) -> float:
     if torch.isinf(values).any():
         return float("inf")
     return float(values.double().std() / values.numel() ** 0.5)
+
+
+def _mean_over_pairs(
+    values: Tensor, counts: Counts | None
+) -> tuple[float, float, float]:
+    """Return the mean of those that are not NaN, its error, and their number."""
+    known = ~torch.isnan(values)
+    values = values[known]
+    if counts is None:
+        return float(values.mean()), standard_error_of_mean(values), len(values)
+    counts = counts[known.to(counts.weights.device)]
+    if not len(values):
+        return float("nan"), float("nan"), 0.0
+    return *mean_and_error(values, counts), counts.effective_number
+
+
+def _per_parameter(values: Tensor, counts: Counts | None) -> Tensor:
+    """Return the mean over pairs of those that are not NaN, ``(n, d)`` to ``(d,)``."""
+    if counts is None:
+        return _mean(values, dim=0)
+    weights = counts.weights.to(values)[:, None] * ~torch.isnan(values)
+    return (weights * values.nan_to_num()).sum(dim=0) / weights.sum(dim=0)
 
 
 def _mean(values: Tensor, dim: int) -> Tensor:

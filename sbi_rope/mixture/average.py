@@ -40,7 +40,8 @@ def average(
         InvalidTypeError: If it is no list of posteriors.
         InvalidInputError: If there is no posterior, shapes or batches differ, or the
             weights do not fit.
-        UnsupportedPosteriorError: If one of them has no density or no embedding of x.
+        UnsupportedPosteriorError: If one of them has no density or no embedding of x,
+            or is a recalibrated stack.
 
     Example:
         >>> import torch
@@ -70,13 +71,14 @@ def average(
         weights = [1.0 / len(posteriors)] * len(posteriors)
     shares = check_weights("weights", weights, len(posteriors))
     estimators = [_mixture_of(posterior) for posterior in posteriors]
+    parts, of_parts = [], []
+    for share, estimator in zip(shares, estimators, strict=True):
+        own, own_weights = estimator.taken_apart()
+        parts += own
+        of_parts += [share * weight for weight in own_weights]
     mixture = MixtureEstimator(
-        [part for estimator in estimators for part in estimator.parts],
-        [
-            share * weight
-            for share, estimator in zip(shares, estimators, strict=True)
-            for weight in estimator.weights.tolist()
-        ],
+        parts,
+        of_parts,
         tail_mass=min(estimator.tail_mass for estimator in estimators),
     )
     first = posteriors[0]
@@ -86,7 +88,7 @@ def average(
 
 
 def _mixture_of(posterior: Any) -> MixtureEstimator:
-    """Return a copy of a posterior's mixture, which may have a single part."""
+    """Return the mixture of a posterior, which may have a single part."""
     if isinstance(posterior, MixturePosterior):
-        return copy.deepcopy(posterior.posterior_estimator)
+        return posterior.posterior_estimator
     return MixtureEstimator([part_of(estimator_of(posterior))], [1.0])

@@ -1,5 +1,6 @@
 """The density of a mixture of weighted parts, as an estimator in the sense of sbi."""
 
+import copy
 import math
 from collections.abc import Iterator, Sequence
 from itertools import chain
@@ -102,6 +103,14 @@ class MixtureEstimator(MixtureDensity):
     def parts(self) -> list[Part]:
         """All parts, also those with a weight of zero."""
         return cast("list[Part]", list(self._parts))
+
+    def taken_apart(self) -> tuple[list[Part], list[float]]:
+        """Return copies of the parts, and their weights, for another mixture.
+
+        Raises:
+            UnsupportedPosteriorError: If the mixture is more than its parts.
+        """
+        return copy.deepcopy(self).parts, self.weights.tolist()
 
     @property
     def coupled(self) -> list[CoupledEmbeddings]:

@@ -623,7 +623,7 @@ class MixturePosterior(BaseDirectPosterior):
         if self._latest is not None:
             known, leakage = self._latest
             if known.device == x.device and torch.equal(known, x):
-                return leakage
+                return copy.deepcopy(leakage)
         leakage = self.posterior_estimator.mass(
             x,
             accept=self._bound,
@@ -631,7 +631,7 @@ class MixturePosterior(BaseDirectPosterior):
             show_progress_bars=show_progress_bars,
         )
         if len(x) == 1:
-            self._latest = x.clone(), leakage
+            self._latest = x.clone(), copy.deepcopy(leakage)
         return leakage
 
     def leakage_correction(  # type: ignore[override]

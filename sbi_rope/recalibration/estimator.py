@@ -7,8 +7,9 @@ from torch import Tensor
 
 from sbi_rope._bounds import Bounds, to_box, to_line
 from sbi_rope._random import seeded
-from sbi_rope.errors import SamplingError
+from sbi_rope.errors import SamplingError, UnsupportedPosteriorError
 from sbi_rope.mixture import MixtureEstimator
+from sbi_rope.mixture.parts import Part
 from sbi_rope.mixture.sampling import Accept
 from sbi_rope.mixture.truncation import LEAKAGE_DRAWS, Leakage
 from sbi_rope.recalibration.spread import Spread
@@ -32,7 +33,8 @@ class RecalibratedEstimator(MixtureEstimator):
     :math:`\phi` maps the support of the prior to the whole space, see
     :mod:`sbi_rope._bounds`, and :math:`\mu(x)` is the mean of
     :math:`\phi(\theta)` under the mixture inside the support. It is estimated from 256
-    draws, whose random numbers are the same in every call.
+    draws with a seed of their own. The same call always returns the same numbers, but
+    an observation has slightly others in another batch.
 
     If the support is no box, :math:`\phi` knows nothing of its other edges. A mixture
     that became wider is cut off there, as every mixture is.
@@ -55,6 +57,18 @@ class RecalibratedEstimator(MixtureEstimator):
         for name, value in buffers.items():
             self.register_buffer(name, value.to(mixture.weights))
         self.is_box = bounds.are_all
+
+    def taken_apart(self) -> tuple[list[Part], list[float]]:
+        """Raise, because the parts alone are not recalibrated.
+
+        Raises:
+            UnsupportedPosteriorError: Always.
+        """
+        raise UnsupportedPosteriorError(
+            "Expected a posterior that is not recalibrated as a part of another "
+            "mixture, because its factors would be lost; got a recalibrated stack. "
+            "Make it without `recalibrate`."
+        )
 
     def with_factors(self, factors: Tensor) -> "RecalibratedEstimator":
         """Return the same mixture with other factors."""

@@ -6,12 +6,12 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from sbi_rope._means import interval_of_mean, mean_and_error
+from sbi_rope._means import Counts, counts_of, interval_of_mean, mean_and_error
 from sbi_rope._random import seeded
 from sbi_rope.metrics.calibration import (
     ACAUC_IN_WORDS,
     ACAUCScore,
-    acauc_of,
+    acauc_of_pairs,
 )
 from sbi_rope.recalibration.factors import HeldOutGrid, HeldOutMixture
 
@@ -29,11 +29,14 @@ class Recalibration:
             parameter, shape ``(d,)``; all 1 if they are not used.
         gain: By how much the factors raised the mean log score of held-out pairs.
         interval: The 95 % interval of ``gain``.
-        is_used: Whether the factors are used. They are not if they lowered the score by
-            more than its standard error.
+        is_used: Whether the factors are used. They are if they raised the score by more
+            than its standard error, so that a posterior is left as it is in doubt.
         levels_before: The levels of the central intervals that end at the true
             parameters without the factors, shape ``(n, d)``.
         levels_after: The same with the factors of the other folds.
+        pair_weights: How many pairs each pair counts as, shape ``(n,)``.
+        groups: A number for each pair, the same for pairs with the same parameters,
+            shape ``(n,)``; None if all differ.
     """
 
     factors: Tensor
@@ -42,16 +45,22 @@ class Recalibration:
     is_used: bool
     levels_before: Tensor = field(repr=False)
     levels_after: Tensor = field(repr=False)
+    pair_weights: Tensor | None = field(default=None, repr=False)
+    groups: Tensor | None = field(default=None, repr=False)
 
     @property
     def before(self) -> ACAUCScore:
         """The calibration of held-out pairs without the factors."""
-        return acauc_of(self.levels_before)
+        return acauc_of_pairs(self.levels_before, self._counts)
 
     @property
     def after(self) -> ACAUCScore:
         """The calibration of held-out pairs with the factors."""
-        return acauc_of(self.levels_after)
+        return acauc_of_pairs(self.levels_after, self._counts)
+
+    @property
+    def _counts(self) -> Counts | None:
+        return counts_of(self.pair_weights, self.groups)
 
     def __str__(self) -> str:
         low, high = self.interval
@@ -68,17 +77,19 @@ class Recalibration:
 
 @torch.no_grad()
 def recalibrate(
-    folds: Sequence[HeldOutMixture], weights: Tensor, *, seed: int
+    folds: Sequence[HeldOutMixture], counts: Counts, *, seed: int
 ) -> Recalibration:
     """Choose factors for the spread of posteriors by the scores of held-out pairs.
 
     Args:
         folds: The mixture of each fold, with the pairs of the fold. There are at least
             two, so that the pairs of each can be scored with factors of the others.
-        weights: How many pairs each pair counts as, in the order of the folds.
+        counts: How many pairs each pair counts as, in the order of the folds.
         seed: Seed of the draws.
     """
-    grid = HeldOutGrid.of(folds, weights)
+    weights = counts.weights
+    with seeded(seed):
+        grid = HeldOutGrid.of(folds, weights)
     numbers = torch.cat(
         [torch.full((len(fold.theta),), k) for k, fold in enumerate(folds)]
     ).to(weights.device)
@@ -92,8 +103,8 @@ def recalibrate(
             before.append(fold.levels(torch.ones_like(choice.factors)))
             after.append(fold.levels(choice.factors))
     gains = scores - grid.unchanged
-    gain, low, high = interval_of_mean(gains, weights)
-    is_used = gain >= -mean_and_error(gains, weights)[1]
+    gain, low, high = interval_of_mean(gains, counts)
+    is_used = gain > mean_and_error(gains, counts)[1]
     factors = grid.best(torch.ones_like(weights, dtype=torch.bool)).factors
     return Recalibration(
         factors=factors if is_used else torch.ones_like(factors),
@@ -102,4 +113,6 @@ def recalibrate(
         is_used=is_used,
         levels_before=torch.cat(before),
         levels_after=torch.cat(after),
+        pair_weights=weights,
+        groups=counts.groups,
     )

@@ -6,7 +6,8 @@ from sbi_rope.diagnosis import Diagnosis, Finding
 from sbi_rope.diagnosis.report import IN_WORDS
 from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.discrepancy.report import what_outliers_mean
-from sbi_rope.metrics import CoverageCurve, acauc_of
+from sbi_rope.metrics import CoverageCurve
+from sbi_rope.metrics.calibration import acauc_of_pairs
 from sbi_rope.plots import calibration_curves, discrepancy, implied_parameters
 from sbi_rope.reports.numbers import number, percent
 from sbi_rope.reports.page import finding, paragraph, picture, section, table
@@ -30,15 +31,14 @@ def calibration_section(report: StackingReport, names: Sequence[str]) -> str:
     rows = [_row("all parameters", report.acauc.value, report.acauc.interval, curve)]
     curves = {"all parameters": curve}
     for k, name in enumerate(names):
-        partial = bool(report.cross_validation.labels)
-        score = acauc_of(levels[:, [k]], allow_missing=partial)
+        score = acauc_of_pairs(levels[:, [k]], report.cross_validation.counts)
         own = _of_parameter(curve, k)
         if len(names) > 1:
             rows.append(_row(name, score.value, score.interval, own))
             curves[name] = own
     if len(names) > MAX_CURVES:
         curves = {"all parameters": curve}
-    n, drawn = len(levels), calibration_curves(curves)
+    n, drawn = report.cross_validation.effective_number, calibration_curves(curves)
     drawn.set_size_inches(5.8, 3.4)  # so that its text can be read on a narrow screen
     return section(
         "Are the uncertainties right?",
@@ -59,7 +59,7 @@ def calibration_section(report: StackingReport, names: Sequence[str]) -> str:
             "There is a sign of either only if the interval leaves 0 out; among many "
             f"parameters, one in twenty does so by chance. The coverage error is "
             f"{number(report.coverage_error.value, digits=3)}; a calibrated posterior "
-            f"has about {number(0.31 / n**0.5, digits=3)} with {n} pairs.",
+            f"has about {number(0.31 / n**0.5, digits=3)} with {n:.0f} pairs.",
             kind="note",
         ),
         *_sets(report),

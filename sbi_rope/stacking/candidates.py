@@ -1,6 +1,5 @@
 """The kinds of candidates that a stack can be made of."""
 
-import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -265,4 +264,4 @@ def _equal_parts(name: str, posterior: MixturePosterior) -> list[Part]:
             f"equal weights; got {type(posterior).__name__}. For RoPE's coupling, use "
             "a CouplingCandidate."
         )
-    return copy.deepcopy(estimator).parts
+    return estimator.taken_apart()[0]

@@ -11,9 +11,10 @@ from scipy.stats import bootstrap, norm
 from scipy.stats import t as student
 from torch import Tensor
 
-from sbi_rope._means import mean_and_error
+from sbi_rope._means import Counts, counts_of, mean_and_error
 from sbi_rope._validation import check_choice
-from sbi_rope.metrics import CoverageCurve, coverage_curve_of
+from sbi_rope.metrics import CoverageCurve
+from sbi_rope.metrics.calibration import coverage_curve_of_pairs
 from sbi_rope.stacking.held_out import SetScores
 from sbi_rope.stacking.weights import StackingWeights, stacking_weights
 
@@ -72,8 +73,11 @@ class CrossValidation:
             partial labels, the mean over pairs of the sum over measured parameters.
         set_scores: The scores that sets with a guarantee are made from; None in files
             of earlier versions, and if labels are not exact.
-        pair_weights: How many pairs each pair counts as, shape ``(n,)``; None if all
-            count as one.
+        pair_weights: How many pairs each pair counts as, shape ``(n,)``. Pairs with the
+            same parameters share the weight of one. None if all count as one.
+        groups: A number for each pair, the same for pairs with the same parameters,
+            shape ``(n,)``; None if all differ. Errors and intervals are those of means
+            of groups, because pairs of a group are not independent.
         score_errors: The Monte-Carlo errors of ``stack_scores``, if labels are not
             exact.
         labels: What is known of labels that are not exact, or weighted, in words.
@@ -93,6 +97,7 @@ class CrossValidation:
     pseudo_count: float = 1.0
     log_unit: float = float("nan")
     pair_weights: Tensor | None = field(default=None, repr=False)
+    groups: Tensor | None = field(default=None, repr=False)
     score_errors: Tensor | None = field(default=None, repr=False)
     labels: str = ""
     set_scores: SetScores | None = field(default=None, repr=False)
@@ -115,12 +120,15 @@ class CrossValidation:
         )
 
     @property
+    def counts(self) -> Counts | None:
+        """How many pairs each counts as; None if all are independent and count one."""
+        return counts_of(self.pair_weights, self.groups)
+
+    @property
     def effective_number(self) -> float:
-        """The number of pairs of equal weight with the same precision."""
-        if self.pair_weights is None:
-            return float(len(self))
-        weights = self.pair_weights
-        return float(weights.sum().square() / weights.square().sum())
+        """The number of independent pairs of equal weight with the same precision."""
+        counts = self.counts
+        return float(len(self)) if counts is None else counts.effective_number
 
     @property
     def monte_carlo_error(self) -> float:
@@ -134,7 +142,7 @@ class CrossValidation:
 
     def mean_and_error(self, scores: Tensor) -> tuple[float, float]:
         """Return the weighted mean of a score of each pair, and its standard error."""
-        return mean_and_error(scores, self.pair_weights)
+        return mean_and_error(scores, self.counts)
 
     @cached_property
     def comparable_stack_scores(self) -> Tensor:
@@ -154,7 +162,7 @@ class CrossValidation:
     @property
     def coverage(self) -> CoverageCurve:
         """Coverage of the stack's central intervals on held-out pairs."""
-        return coverage_curve_of(self.levels, allow_missing=bool(self.labels))
+        return coverage_curve_of_pairs(self.levels, self.counts)
 
     def scores_of(self, name: str) -> Tensor:
         """Return the log scores of a candidate, or of "stack", shape ``(n,)``.
@@ -183,10 +191,14 @@ class CrossValidation:
         difference = self.scores_of(name) - self.scores_of(other)
         # Where both scores are minus infinity, neither candidate is better.
         difference = difference.nan_to_num(nan=0.0, posinf=torch.inf, neginf=-torch.inf)
+        mean, _ = self.mean_and_error(difference)
         data: tuple[Any, ...] = (difference.cpu().numpy(),)
         statistic: Any = np.mean
-        if self.pair_weights is not None:
-            data, statistic = (*data, self.pair_weights.cpu().numpy()), _weighted_mean
+        if (counts := self.counts) is not None:
+            data = tuple(
+                values.cpu().numpy() for values in counts.of_groups(difference)
+            )
+            statistic = _weighted_mean
         with np.errstate(invalid="ignore"):  # of infinite means
             means = bootstrap(
                 data,
@@ -200,7 +212,6 @@ class CrossValidation:
         # infinite. These quantiles are always one of the means.
         tail = _expanded_tail(self.effective_number)
         low, high = np.quantile(means, [tail, 1 - tail], method="inverted_cdf")
-        mean, _ = self.mean_and_error(difference)
         return Difference(mean=mean, low=float(low), high=float(high))
 
     def as_rows(self) -> list[dict[str, Any]]:

@@ -174,6 +174,25 @@ class Workbench:
         """How many pairs each pair counts as, shape ``(n,)``; None if all are one."""
         return self.labels.weights if self.labels.are_weighted else None
 
+    @cached_property
+    def score_weights(self) -> Tensor | None:
+        """How many pairs each counts as where it is scored; None if all are one.
+
+        Pairs with the same parameters, such as recordings of one person, share the
+        weight of one pair.
+        """
+        if self.score_groups is None:
+            return self.pair_weights
+        sizes = self.score_groups.bincount()[self.score_groups]
+        weights = self.labels.weights.double()
+        return weights / sizes.to(weights)
+
+    @cached_property
+    def score_groups(self) -> Tensor | None:
+        """A number for each label, the same for equal ones; None if all differ."""
+        groups = self.groups.to(self.theta.device)
+        return None if len(groups.unique()) == len(groups) else groups
+
     def tuned_net(self, folds: frozenset[int]) -> nn.Module:
         """Return an embedding net tuned on some folds, with rehearsal."""
         if folds not in self._nets:
@@ -275,7 +294,9 @@ class Fold:
         probabilities = None
         if learn_prior:
             draws = bench.rope.labelled_parameters[self.rows].draws
-            probabilities = learn_parameters(draws, theta_s).probabilities
+            probabilities = learn_parameters(
+                draws, theta_s, weights=_of_rows(bench.score_weights, self.rows)
+            ).probabilities
         estimator = estimator_of(bench.npe)
         if space == "tuned":
             nets, z = self._cross_fitted()

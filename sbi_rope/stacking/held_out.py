@@ -28,6 +28,9 @@ __all__ = [
     "score_fold",
 ]
 
+# So many observations are drawn at a time.
+MAX_OBSERVATIONS = 500
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SetScores:
@@ -113,30 +116,32 @@ def score_fold(
     Raises:
         SamplingError: If the posterior has almost no mass inside the prior's support.
     """
-    levels, joint, marginal = [], [], []
-    with explained():
-        log_prob = posterior.log_prob_batched(theta[None], x)[0].double()
-        with seeded(seed):
-            chunks = draw_chunks(
-                posterior,
-                theta,
-                x,
-                num_samples=num_samples,
-                chunk_size=num_samples,
-                show=False,
-            )
-            for rows, draws in chunks:
-                levels.append(central_levels(count_ranks(draws, theta[rows])))
-                of_draws = posterior.log_prob_batched(draws, x[rows])
-                joint.append(joint_scores(log_prob[rows, None], of_draws.T)[:, 0])
-                columns = draws.permute(1, 2, 0)
-                marginal.append(marginal_scores(theta[rows, :, None], columns)[..., 0])
+    log_prob, levels, joint, marginal = [], [], [], []
+    with explained(), seeded(seed):
+        chunks = draw_chunks(
+            posterior,
+            theta,
+            x,
+            num_samples=num_samples,
+            chunk_size=MAX_OBSERVATIONS,
+            show=False,
+        )
+        for rows, draws in chunks:
+            levels.append(central_levels(count_ranks(draws, theta[rows])))
+            # The mass inside the support has an error, which is the same for the
+            # label and for the draws if both are evaluated for the same rows.
+            of_label = posterior.log_prob_batched(theta[rows][None], x[rows])
+            of_draws = posterior.log_prob_batched(draws, x[rows])
+            log_prob.append(of_label[0].double())
+            joint.append(joint_scores(log_prob[-1][:, None], of_draws.T)[:, 0])
+            columns = draws.permute(1, 2, 0)
+            marginal.append(marginal_scores(theta[rows, :, None], columns)[..., 0])
     return FoldScores(
-        log_prob=log_prob,
+        log_prob=torch.cat(log_prob),
         levels=torch.cat(levels).to(theta),
         joint=torch.cat(joint),
         marginal=torch.cat(marginal),
-        errors=torch.zeros_like(log_prob),
+        errors=torch.zeros(len(theta), dtype=torch.double, device=theta.device),
     )
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from sbi_rope._means import interval_of_mean, mean_and_error
+from sbi_rope._means import Counts, counts_of, interval_of_mean, mean_and_error
 from sbi_rope._validation import check_integer
 from sbi_rope.stacking.cross_validation import CrossValidation, Difference
 
@@ -23,11 +23,13 @@ class LearningCurve:
             number of pairs, with theta in its own units, shape ``(P, n)``.
         pair_weights: How many pairs each held-out pair counts as, shape ``(n,)``; None
             if all count as one.
+        groups: As in :class:`CrossValidation`.
     """
 
     num_pairs: tuple[int, ...]
     pair_scores: Tensor = field(repr=False)
     pair_weights: Tensor | None = field(default=None, repr=False)
+    groups: Tensor | None = field(default=None, repr=False)
 
     @classmethod
     def of(cls, parts: Sequence[CrossValidation]) -> "LearningCurve":
@@ -36,6 +38,7 @@ class LearningCurve:
             num_pairs=tuple(part.num_trained_on for part in parts),
             pair_scores=torch.stack([part.stack_scores.double() for part in parts]),
             pair_weights=parts[0].pair_weights,
+            groups=parts[0].groups,
         )
 
     @property
@@ -83,8 +86,12 @@ class LearningCurve:
         slopes = -(centred @ self.pair_scores) / centred.square().sum()
         last = self.num_pairs[-1]
         scale = 1 / last - 1 / (last + num_more)
-        mean, low, high = interval_of_mean(scale * slopes, self.pair_weights)
+        mean, low, high = interval_of_mean(scale * slopes, self._counts)
         return Difference(mean=mean, low=low, high=high)
 
+    @property
+    def _counts(self) -> Counts | None:
+        return counts_of(self.pair_weights, self.groups)
+
     def _mean_and_error(self, values: Tensor) -> tuple[float, float]:
-        return mean_and_error(values, self.pair_weights)
+        return mean_and_error(values, self._counts)

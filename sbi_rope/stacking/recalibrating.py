@@ -15,6 +15,7 @@ from sbi.utils import within_support
 from torch import Tensor
 
 from sbi_rope._bounds import bounds_of_prior
+from sbi_rope._means import Counts
 from sbi_rope._sbi import MixedDensity, estimator_of, headless
 from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError
 from sbi_rope.mixture import MixtureEstimator
@@ -40,21 +41,22 @@ def check_recalibration(bench: Workbench) -> None:
             f"Expected exact labels to recalibrate; got {bench.labels}. Leave "
             "`recalibrate` out, or stack the exact labels alone."
         )
-    if (count := len(bench.groups.unique())) < MIN_PAIRS:
+    if isinstance(headless(estimator_of(bench.npe)), MixedDensity):
+        raise UnsupportedPosteriorError(
+            "Expected continuous parameters to recalibrate; got some that are "
+            "categories. Leave `recalibrate` out."
+        )
+    usable = _say_something(bench, bench.theta).cpu()
+    if (count := len(bench.groups[usable].unique())) < MIN_PAIRS:
         raise InvalidInputError(
             f"Expected at least {MIN_PAIRS} calibration pairs with different "
-            f"parameters to recalibrate; got {count}. Add pairs, or leave "
-            "`recalibrate` out."
+            "parameters to recalibrate, none of them on a bound of the prior; got "
+            f"{count}. Add pairs, or leave `recalibrate` out."
         )
     if len(bench.folds) < MIN_FOLDS:
         raise InvalidInputError(
             f"Expected at least {MIN_FOLDS} folds to recalibrate; got "
             f"{len(bench.folds)}. Pass a larger `num_folds`."
-        )
-    if isinstance(headless(estimator_of(bench.npe)), MixedDensity):
-        raise UnsupportedPosteriorError(
-            "Expected continuous parameters to recalibrate; got some that are "
-            "categories. Leave `recalibrate` out."
         )
 
 
@@ -95,11 +97,10 @@ def recalibration_of(
     """
     prior = bench.npe.prior
     bounds = bounds_of_prior(prior)
-    folds, counts = [], []
+    folds, kept = [], []
     for number, rows in enumerate(bench.folds):
         theta = bench.theta[rows]
-        # The spread says nothing about labels outside the prior's support.
-        inside = within_support(prior, theta)
+        inside = _say_something(bench, theta)
         if not inside.any():
             continue
         unseen = [k for k, pair in enumerate(pairs) if number in pair]
@@ -114,8 +115,8 @@ def recalibration_of(
                 accept=None if bounds.are_all else partial(within_support, prior),
             )
         )
-        counts.append(_counts(bench)[rows][inside])
-    return recalibrate(folds, torch.cat(counts), seed=seed)
+        kept.append(rows[inside])
+    return recalibrate(folds, _counts(bench)[torch.cat(kept)], seed=seed)
 
 
 def recalibrated(
@@ -127,8 +128,18 @@ def recalibrated(
     return RecalibratedEstimator(mixture, recalibration.factors, bounds_of_prior(prior))
 
 
-def _counts(bench: Workbench) -> Tensor:
-    weights = bench.pair_weights
+def _say_something(bench: Workbench, theta: Tensor) -> Tensor:
+    """Return whether each of some parameters ``(n, d)`` says something about a spread.
+
+    Those outside the prior's support do not. On a bound, the density with another
+    spread is zero or infinite.
+    """
+    prior = bench.npe.prior
+    return within_support(prior, theta) & bounds_of_prior(prior).hold(theta)
+
+
+def _counts(bench: Workbench) -> Counts:
+    weights = bench.score_weights
     if weights is None:
-        return torch.ones(len(bench.theta), dtype=torch.double, device=bench.x.device)
-    return weights.double()
+        weights = torch.ones(len(bench.theta), device=bench.theta.device)
+    return Counts(weights.double(), bench.score_groups)

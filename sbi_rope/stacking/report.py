@@ -15,9 +15,8 @@ from sbi_rope.metrics import (
     ACAUCScore,
     CoverageCurve,
     CoverageErrorScore,
-    acauc_of,
-    expected_coverage_error_of,
 )
+from sbi_rope.metrics.calibration import acauc_of_pairs, coverage_error_of_pairs
 from sbi_rope.recalibration import Recalibration
 from sbi_rope.sets.conformal import rank_needed
 from sbi_rope.stacking.cross_validation import CrossValidation, Difference
@@ -110,8 +109,6 @@ class StackingReport:
         check_instance("learning_curve", learning_curve, LearningCurve, optional=True)
         scores, levels = cross_validation, cross_validation.levels
         score, error = scores.mean_and_error(scores.stack_scores)
-        partial = bool(scores.labels)
-        known = levels[~torch.isnan(levels)]
         return cls(
             cross_validation=scores,
             learning_curve=learning_curve,
@@ -124,9 +121,9 @@ class StackingReport:
                 if name in scores.names
             },
             family_weights=_family_weights(scores),
-            acauc=acauc_of(levels, allow_missing=partial),
-            coverage_error=expected_coverage_error_of(levels, allow_missing=partial),
-            share_inside=float((known <= LEVEL).double().mean()),
+            acauc=acauc_of_pairs(levels, scores.counts),
+            coverage_error=coverage_error_of_pairs(levels, scores.counts),
+            share_inside=_share_inside(scores),
             joint_sets=_joint_sets(scores.set_scores),
             batch=batch,
             discrepancy=discrepancy,
@@ -210,6 +207,15 @@ class StackingReport:
 
     def __str__(self) -> str:
         return "\n".join(lines_of(self))
+
+
+def _share_inside(scores: CrossValidation) -> float:
+    """Return the share of known parameters inside their 90 % intervals."""
+    weights = torch.ones_like(scores.levels, dtype=torch.double)
+    if scores.pair_weights is not None:
+        weights = scores.pair_weights.to(weights)[:, None] * weights
+    weights = weights * ~torch.isnan(scores.levels)
+    return float((weights * (scores.levels <= LEVEL)).sum() / weights.sum())
 
 
 def _joint_sets(scores: SetScores | None) -> tuple[float, float] | None:

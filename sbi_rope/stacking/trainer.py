@@ -193,7 +193,7 @@ class StackTrainer:
             scores.log_scores,
             scores.fold,
             self.pseudo_count,
-            pair_weights=bench.pair_weights,
+            pair_weights=bench.score_weights,
         )
         # The others take as long to train, and hardly change how wide the stack is.
         kept = (weights >= MIN_WEIGHT).any(dim=0).nonzero().flatten()
@@ -254,7 +254,7 @@ class StackTrainer:
             ]
         log_scores, fold = self._log_scores(versions, of_labels)
         weights = fold_weights(
-            log_scores, fold, self.pseudo_count, pair_weights=bench.pair_weights
+            log_scores, fold, self.pseudo_count, pair_weights=bench.score_weights
         )
         of_stack = self._stack_scores(versions, weights, of_labels)
         num_folds = len(self.bench.folds)
@@ -269,7 +269,8 @@ class StackTrainer:
             set_scores=self._set_scores(of_stack, weights),
             pseudo_count=self.pseudo_count,
             log_unit=self._log_unit(),
-            pair_weights=bench.pair_weights,
+            pair_weights=bench.score_weights,
+            groups=bench.score_groups,
             score_errors=None if bench.labels.are_exact else of_stack.errors,
             labels="" if bench.labels.are_simple else str(bench.labels),
         )
@@ -291,7 +292,9 @@ class StackTrainer:
         return SetScores(
             joint=of_stack.joint,
             marginal=of_stack.marginal,
-            is_counted=one_of_each_group(self.bench.groups, seed=self.seeds[2]),
+            is_counted=one_of_each_group(self.bench.groups, seed=self.seeds[2]).to(
+                self.bench.theta.device
+            ),
             weights=weights,
             num_draws=NUM_SAMPLES,
         )
@@ -305,7 +308,9 @@ class StackTrainer:
         if labels.are_exact:
             return float(units.sum())
         known = labels.is_measured.to(units)
-        shares = labels.weights.to(units) / labels.weights.sum().to(units)
+        weights = self.bench.score_weights
+        weights = labels.weights if weights is None else weights
+        shares = weights.to(units) / weights.sum().to(units)
         return float((shares @ known) @ units)
 
     def _log_scores(

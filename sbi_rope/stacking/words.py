@@ -73,10 +73,14 @@ def differs(report: "StackingReport") -> bool:
 
 def lines_of(report: "StackingReport") -> list[str]:
     """Return the lines of a printed report."""
-    n = len(report.cross_validation)
+    scores = report.cross_validation
+    n, several = len(scores), ""
+    if scores.groups is not None:
+        number = len(scores.groups.unique())
+        several = f" with {number} different labels, each of which counts once"
     return [
-        f"Stack of {len(report.cross_validation.names)} candidates, scored on {n} "
-        "held-out calibration pairs",
+        f"Stack of {len(scores.names)} candidates, scored on {n} "
+        f"held-out calibration pairs{several}",
         *_labels(report),
         *_scores(report),
         *_gains(report),
@@ -147,7 +151,8 @@ def _how_many(report: "StackingReport", family: str) -> str:
 
 
 def _calibration(report: "StackingReport") -> list[str]:
-    n, acauc, (low, high) = len(report.levels), report.acauc, report.acauc.interval
+    n = report.cross_validation.effective_number
+    acauc, (low, high) = report.acauc, report.acauc.interval
     if math.isnan(acauc.value):
         return ["  coverage is not known for labels that are given as draws"]
     verdict = acauc.verdict
@@ -162,7 +167,7 @@ def _calibration(report: "StackingReport") -> list[str]:
         f"{high:+.3f}",
         f"    ({ACAUC_IN_WORDS})",
         f"    coverage error {report.coverage_error.value:.3f}; a calibrated posterior "
-        f"has about {0.31 / n**0.5:.3f} with {n} pairs",
+        f"has about {0.31 / n**0.5:.3f} with {n:.0f} pairs",
         f"    {LEVEL:.0%} intervals hold {report.share_inside:.0%} of the parameters",
         *advice,
         *_sets(report),

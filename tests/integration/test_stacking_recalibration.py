@@ -9,12 +9,15 @@ import torch
 from torch import Tensor
 
 import sbi_rope
+from sbi_rope import MixturePosterior
+from sbi_rope._bounds import bounds_of_prior
 from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError
+from sbi_rope.mixture import average
 from sbi_rope.recalibration import Recalibration
 from sbi_rope.recalibration.estimator import RecalibratedEstimator
 from sbi_rope.recalibration.factors import HeldOutMixture
 from sbi_rope.recalibration.recalibration import recalibrate
-from sbi_rope.stacking import StackedPosterior
+from sbi_rope.stacking import DensityCandidate, StackedPosterior
 from sbi_rope.stacking.recalibrating import pairs_of_folds
 from tests import problems
 from tests.stacks import (
@@ -129,6 +132,35 @@ def test_each_fold_is_left_out_with_four_others_at_most() -> None:
             assert sum(number in pair for pair in pairs) == min(4, count - 1)
 
 
+def test_labels_on_a_bound_of_the_prior_say_nothing_about_the_spread() -> None:
+    torch.manual_seed(0)
+    theta, x = near_zero(14)
+    edges = torch.tensor([[1.0, 0.1], [-0.2, 1.0], [-1.0, 0.3], [0.2, -1.0]])
+    theta, x = torch.cat([theta, edges]), torch.cat([x, problems.simulate(edges) + 0.4])
+    posterior = stacked(rope_of((theta, x)), candidates=[PRIOR, NPE], recalibrate=True)
+    found = recalibration_of(posterior)
+    assert len(found.levels_before) == 14
+    assert 0 < found.gain < 2  # with labels on bounds it would be above 20
+    assert float(found.factors.max()) < 1
+
+
+def test_a_recalibrated_mixture_is_no_candidate_of_a_stack() -> None:
+    rope = rope_of()
+    prior = rope.npe.prior
+    narrow = RecalibratedEstimator(
+        average([rope.npe]).posterior_estimator,
+        torch.full((2,), 0.5),
+        bounds_of_prior(prior),
+    )
+    candidate = DensityCandidate(
+        name="narrow",
+        build=lambda rope, seed: MixturePosterior(narrow, prior),
+        fixed=True,
+    )
+    with pytest.raises(UnsupportedPosteriorError, match="its factors would be lost"):
+        stacked(rope, candidates=[PRIOR, candidate])
+
+
 def test_what_cannot_be_recalibrated_is_refused_before_any_training() -> None:
     theta, x = problem(20, seed=1)
     noisy = rope_of((theta[:0], x[:0])).append_calibration(theta, x, theta_std=0.1)
@@ -138,6 +170,9 @@ def test_what_cannot_be_recalibrated_is_refused_before_any_training() -> None:
         stacked(rope_of((theta[:9], x[:9])), recalibrate=True)
     with pytest.raises(InvalidInputError, match="at least 3 folds to recalibrate"):
         stacked(rope_of(), num_folds=2, recalibrate=True)
+    on_a_bound = torch.where(torch.arange(20)[:, None] % 2 == 0, theta, 1.0)
+    with pytest.raises(InvalidInputError, match="on a bound of the prior; got 9"):
+        stacked(rope_of((on_a_bound[:18], x[:18])), recalibrate=True)
     mixed = rope_of(problem(0, seed=1), family="mnpe")
     parameters = problems.mixed_prior(2).sample((10,))
     mixed.append_calibration(parameters, problems.simulate(parameters))

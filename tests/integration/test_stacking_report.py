@@ -26,10 +26,12 @@ from sbi_rope.stacking import (
 from tests import problems
 from tests.stacks import (
     FITTED,
+    NPE,
     OT_ONLY,
     PRIOR,
     ROPE,
     observed,
+    problem,
     rope_of,
     stacked,
     the_coupled_stack,
@@ -257,6 +259,22 @@ def test_rows_are_sorted_and_make_a_table(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ImportError, match="pip install pandas"):
         report.to_dataframe()
+
+
+def test_recordings_with_the_same_parameters_count_once() -> None:
+    theta, _ = problem(12, seed=1)
+    theta = theta.repeat(2, 1)
+    pairs = theta, problems.simulate(theta) + 0.4
+    report = stacked(rope_of(pairs), candidates=[PRIOR, NPE]).report
+    scores = report.cross_validation
+    assert scores.effective_number == pytest.approx(12)
+    assert scores.counts is not None
+    means, _ = scores.counts.of_groups(scores.stack_scores)
+    assert len(means) == 12
+    assert report.score == pytest.approx(
+        (float(means.mean()), float(means.std()) / 12**0.5)
+    )
+    assert "24 held-out calibration pairs with 12 different labels, each" in str(report)
 
 
 def test_the_learning_curve_has_a_point_for_one_two_and_four_folds() -> None:

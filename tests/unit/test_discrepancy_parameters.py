@@ -47,7 +47,9 @@ def test_evidence_and_prediction_agree_with_updates_by_one_pair_after_the_other(
         u = torch.randn(7, d).double() * 0.5 + 0.8
         new, correlation = torch.randn(5, d).double(), CORRELATION[:d, :d]
         for strength in STRENGTHS:
-            evidence, log_t = _fit(u, new, correlation, strength)
+            evidence, log_t = _fit(
+                u, new, torch.ones(len(u)).double(), correlation, strength
+            )
             expected = step_ahead(u.numpy(), new.numpy(), correlation.numpy(), strength)
             assert float(evidence) == pytest.approx(expected[0], abs=1e-9), (
                 d,
@@ -67,7 +69,9 @@ def test_the_evidence_of_one_parameter_agrees_with_numerical_integration() -> No
         prior = prior - x.square() / (2 * v) - (2 * math.pi * v).log() / 2
     log_cell = math.log((30 / 2000) * (18 / 1999))
     integral = (prior + variance.log()).logsumexp((0, 1)) + log_cell
-    evidence, _ = _fit(u, u, torch.ones(1, 1).double(), strength)
+    evidence, _ = _fit(
+        u, u, torch.ones(len(u)).double(), torch.ones(1, 1).double(), strength
+    )
     assert float(evidence) == pytest.approx(float(integral), abs=1e-3)
 
 

@@ -186,6 +186,26 @@ def test_moments_of_a_label_average_over_its_parameters() -> None:
     )
 
 
+def test_a_few_draws_of_a_label_do_not_hide_the_noise_of_simulations() -> None:
+    torch.manual_seed(0)
+    few = torch.randn(3, 2, 2)
+    known = rope().append_calibration(few, torch.zeros(3, 2)).labelled_parameters
+    moments = labelled_moments(rope().source, known, 100, lambda x: x, progress=False)
+    at_one = rope().source.moments(few[:, 0], 1000, lambda x: x, progress=False)
+    for found, expected in zip(moments.covariance, at_one.covariance, strict=True):
+        variances = found.diagonal() / expected.diagonal()
+        assert ((variances > 0.6) & (variances < 1.6)).all()
+
+
+def test_the_order_of_the_draws_of_a_label_does_not_matter() -> None:
+    ordered = torch.randn(2, 200, 2).sort(dim=1).values
+    draws = rope().append_calibration(ordered, torch.zeros(2, 2)).labelled_parameters
+    for first in (draws.draws[:, :10], draws.draws[:, :100]):
+        away = (first.mean(dim=1) - ordered.mean(dim=1)).abs().max()
+        assert float(away) < 3 / first.shape[1] ** 0.5
+    assert torch.equal(draws.draws.sort(dim=1).values, ordered.sort(dim=1).values)
+
+
 def test_the_discrepancy_of_possible_means_is_that_of_the_right_ones() -> None:
     torch.manual_seed(0)
     m = torch.randn(60, 1, dtype=torch.double)
@@ -232,6 +252,23 @@ def test_the_distribution_of_parameters_is_learned_from_draws_of_labels() -> Non
         abs(float(found[theta[:, 0] < 0.25].sum() - wanted[theta[:, 0] < 0.25].sum()))
         < 0.05
     )
+
+
+def test_the_distribution_is_learned_from_pairs_that_count_several_times() -> None:
+    torch.manual_seed(0)
+    theta, pairs = torch.rand(2000, 1), 0.3 * torch.rand(20, 1)
+    weights = torch.tensor([1.0, 3.0] * 10)
+    # Parameters between the same two simulations have the same score.
+    rows = torch.arange(20).repeat_interleave(weights.long())
+    several = pairs[rows] + 1e-7 * torch.arange(len(rows))[:, None]
+    found = learn_parameters(pairs, theta, weights=weights)
+    wanted = learn_parameters(several, theta)
+    assert torch.allclose(found.probabilities, wanted.probabilities, rtol=1e-3)
+    assert not torch.allclose(
+        found.probabilities, learn_parameters(pairs, theta).probabilities, rtol=0.01
+    )
+    with pytest.raises(InvalidInputError, match="positive `weights`"):
+        learn_parameters(pairs, theta, weights=-weights)
 
 
 # Calibration --------------------------------------------------------------------------
@@ -310,6 +347,15 @@ def test_labels_that_make_no_sense_are_refused(
     with pytest.raises(InvalidInputError, match=message):
         conductor.append_calibration(*gaussian.labelled(10), **options)
     assert not len(conductor.labels)
+
+
+def test_a_covariance_may_have_parameters_of_very_different_units() -> None:
+    theta, x = gaussian.labelled(10)
+    covariance = torch.tensor([[1e-6, 1e-2], [1e-2, 1e8]])
+    labels = rope().append_calibration(theta, x, theta_cov=covariance).labels
+    assert torch.equal(labels.covariance[0].float(), covariance)
+    covariance = torch.tensor([[0.0, 0.0], [0.0, 1e14]])
+    assert len(rope().append_calibration(theta, x, theta_cov=covariance).labels) == 10
 
 
 def test_draws_of_labels_are_checked() -> None:

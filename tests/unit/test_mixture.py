@@ -695,6 +695,8 @@ def test_the_mass_of_an_observation_is_kept_until_another_is_asked_for(
     calls = count_draws(posterior, monkeypatch)
     assert torch.equal(posterior.log_prob(theta, x=first), expected)
     assert not calls
+    posterior.leakage(first).mass.mul_(0.5)  # what is returned belongs to the caller
+    assert torch.equal(posterior.log_prob(theta, x=first), expected)
     posterior.log_prob(theta, x=second)
     assert calls
     assert torch.equal(posterior.log_prob(theta, x=first), expected)
