@@ -263,7 +263,7 @@ def test_rows_are_sorted_and_make_a_table(monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_recordings_with_the_same_parameters_count_once() -> None:
     theta, _ = problem(12, seed=1)
-    theta = theta.repeat(2, 1)
+    theta = theta.repeat_interleave(torch.tensor([3] * 6 + [1] * 6), dim=0)
     pairs = theta, problems.simulate(theta) + 0.4
     report = stacked(rope_of(pairs), candidates=[PRIOR, NPE]).report
     scores = report.cross_validation
