@@ -47,6 +47,8 @@ def seeded(seed: int | None) -> Iterator[None]:
     stream = (int(seed) * 0x9E3779B1 + 0x7F4A7C15) % 2**32
     with _LOCK:
         numpy_state, python_state = np.random.get_state(), random.getstate()  # noqa: NPY002
+        has_mps = torch.backends.mps.is_available()
+        mps_state = torch.mps.get_rng_state() if has_mps else None
         with torch.random.fork_rng(devices=list(range(torch.cuda.device_count()))):
             _seed_torch(stream)
             np.random.seed(stream)  # noqa: NPY002
@@ -56,6 +58,8 @@ def seeded(seed: int | None) -> Iterator[None]:
             finally:
                 np.random.set_state(numpy_state)  # noqa: NPY002
                 random.setstate(python_state)
+                if mps_state is not None:
+                    torch.mps.set_rng_state(mps_state)
 
 
 def _seed_torch(seed: int) -> None:

@@ -35,13 +35,14 @@ def deviations(embedding_net: nn.Module, x: Tensor) -> Tensor | None:
 
     Returns:
         The distances in standard deviations of the simulations, shape
-        ``(n, *event_shape)``, or None if NPE does not standardise x.
+        ``(n, *event_shape)``, or None if NPE does not standardise x. Missing entries
+        (NaN) have a distance of zero.
     """
     mean_and_std = standardisation_of(embedding_net)
     if mean_and_std is None:
         return None
     mean, std = mean_and_std
-    return ((x - mean) / std).abs()
+    return ((x - mean) / std).abs().nan_to_num(nan=0.0, posinf=torch.inf)
 
 
 @torch.no_grad()

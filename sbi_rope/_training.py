@@ -3,6 +3,7 @@
 import copy
 import math
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -203,6 +204,18 @@ def epochs_on_pairs(
     return min(max_num_epochs, EPOCHS_WITHOUT_HOLDOUT)
 
 
+def differentiable(module: nn.Module) -> AbstractContextManager[Any]:
+    """Return a context in which the gradients of a module can be computed.
+
+    cuDNN has no gradients of recurrent nets in evaluation mode, which the slower code
+    of torch has.
+    """
+    is_recurrent = any(isinstance(part, nn.RNNBase) for part in module.modules())
+    if is_recurrent and not module.training:
+        return torch.backends.cudnn.flags(enabled=False)
+    return nullcontext()
+
+
 def fit(
     module: nn.Module,
     batches: Callable[[int], Iterable[tuple[Any, ...]]],
@@ -254,12 +267,14 @@ def fit(
         module.train(in_training_mode and update)
         values = []
         for batch in batches(epoch):
-            value = loss(*batch)
+            with differentiable(module):
+                value = loss(*batch)
+                if update:
+                    optimizer.zero_grad()
+                    value.backward()
             values.append(float(value.detach()))
             if not update:
                 continue
-            optimizer.zero_grad()
-            value.backward()
             if clip_max_norm is not None:
                 nn.utils.clip_grad_norm_(module.parameters(), clip_max_norm)
             optimizer.step()

@@ -192,6 +192,11 @@ class CalibrationFinetuner:
         if weights is not None:
             weights = check_batch("weights", weights, ()).to(x)
             check_same_length("x", x, "weights", weights)
+            if not bool((weights > 0).all()):
+                raise InvalidInputError(
+                    f"Expected positive `weights`; got {float(weights.min())}. Leave "
+                    "out pairs that should not count."
+                )
         show = is_shown(show_progress_bars)
         with seeded(seed):
             embedded = _embedded("x", x, embedding_net)

@@ -180,8 +180,12 @@ class Caller:
         shapes = {shape}
         if not leading:
             shapes.add((1, *self.event_shape))
+        if leading == (1,):  # a simulator that squeezes leaves out the row, too
+            shapes.add(tuple(self.event_shape))
         if self.event_shape == (1,):  # one number, without a dimension of its own
             shapes.add(tuple(leading))
+            if leading == (1,):
+                shapes.add(())
         return x.reshape(shape) if tuple(x.shape) in shapes else None
 
     def _unfit(self, theta: Tensor, result: Any) -> SimulationError:

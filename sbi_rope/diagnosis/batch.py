@@ -19,6 +19,7 @@ from sbi_rope.diagnosis.report import Diagnosis, Finding
 from sbi_rope.diagnosis.residuals import (
     CrossFitted,
     cross_fit,
+    means_of_groups,
     num_features,
     residual_finding,
 )
@@ -189,7 +190,7 @@ def _held_out(
             "therefore look like a prior shift, or like a batch that is narrower than "
             "the prior."
         )
-    elif len(theta.unique(dim=0)) < 2:
+    elif len(rope.labels.groups.unique()) < 2:
         note = (
             "Residuals were left out, because all calibration pairs have the same "
             "parameters, or there is only one."
@@ -204,12 +205,15 @@ def _held_out(
 def _residual_findings(
     rope: RoPE, held_out: CrossFitted, simulations: Simulations, notes: list[str]
 ) -> list[Finding]:
-    theta = _moved(rope.calibration[0])
+    groups = rope.labels.groups
+    theta = means_of_groups(_moved(rope.calibration[0]), groups)
+    residuals = means_of_groups(held_out.residuals, groups)
     if num_features(*theta.shape):
-        return [residual_finding(held_out.residuals, theta, simulations)]
+        return [residual_finding(residuals, theta, simulations)]
     notes.append(
         f"Whether residuals depend on parameters was not tested: {len(theta)} "
-        f"calibration pairs are too few for {theta.shape[1]} parameters."
+        f"calibration pairs with different labels are too few for {theta.shape[1]} "
+        "parameters."
     )
     return []
 

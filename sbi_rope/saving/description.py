@@ -69,6 +69,10 @@ class Description:
         return {name.split(".")[0] for name, _ in self.objects}
 
     def _value(self, value: Any, where: str) -> Any:
+        if isinstance(
+            value, np.bool_ | np.number
+        ):  # such as a setting `np.float64(0.1)`
+            value = value.item()
         kind = type(value)
         if value is None or kind in (bool, int, float, str):
             return value

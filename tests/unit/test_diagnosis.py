@@ -20,6 +20,7 @@ from sbi_rope.diagnosis.residuals import (
     CrossFitted,
     cross_fit,
     dependence,
+    means_of_groups,
     num_features,
     residual_finding,
 )
@@ -667,6 +668,23 @@ def test_the_bias_of_residuals_is_recovered_from_noise() -> None:
     assert dependence(noise, theta).bias < 0.1
 
 
+def test_what_recordings_of_a_person_have_in_common_is_no_dependence() -> None:
+    torch.manual_seed(27)
+    people = torch.arange(12).repeat_interleave(5)
+    found = []
+    for _ in range(60):
+        theta = torch.randn(12, 2).double()[people]
+        own = torch.randn(12, 3).double()[people]  # of the person, whatever theta is
+        residuals = own + torch.randn(60, 3).double()
+        means = [means_of_groups(values, people) for values in (residuals, theta)]
+        found.append(dependence(*means).p_value)
+    assert kstest(found, "uniform").pvalue > 0.01
+    torch.testing.assert_close(
+        means_of_groups(torch.tensor([[1.0], [5.0], [3.0]]), torch.tensor([0, 1, 0])),
+        torch.tensor([[2.0], [5.0]]),
+    )
+
+
 def test_bias_is_not_inflated_by_few_pairs() -> None:
     torch.manual_seed(25)
     squares, errors = [], []
@@ -787,6 +805,12 @@ def test_pairs_of_one_parameter_leave_residuals_out() -> None:
     rope.train(seed=0, show_progress_bars=False)
     diagnosis = look(rope, gaussian.real_process(parameters(40)), num_simulations=200)
     assert diagnosis.residuals is None
+    assert "the same parameters, or there is only one" in diagnosis.notes[0]
+    # Equal labels that are not exact have different draws, and are still one.
+    rope = conductor(finetuner=CalibrationFinetuner(max_num_epochs=2))
+    rope.append_calibration(theta, gaussian.real_process(theta), theta_std=0.1)
+    rope.train(seed=0, show_progress_bars=False)
+    diagnosis = look(rope, gaussian.real_process(parameters(40)), num_simulations=200)
     assert "the same parameters, or there is only one" in diagnosis.notes[0]
 
 

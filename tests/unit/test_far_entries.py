@@ -55,6 +55,10 @@ def test_distances_from_simulations_count_below_as_above() -> None:
     far = deviations(net, torch.tensor([[-8.0, -2.0], [12.0, 0.0]]))
     assert far is not None
     assert torch.allclose(far, torch.tensor([[2.0, 10.0], [2.0, 10.0]]))
+    # What is missing is not far, and does not hide what is.
+    far = deviations(net, torch.tensor([[float("nan"), 99.0]]))
+    assert far is not None
+    assert torch.allclose(far, torch.tensor([[0.0, 1000.0]]))
 
 
 def test_an_entry_that_varies_only_in_reality_is_named_and_diagnosed() -> None:

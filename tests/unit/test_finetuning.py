@@ -320,6 +320,14 @@ def test_rehearsal_needs_finite_simulations() -> None:
         rehearsed(linear(), x, x, torch.empty(0, 2), rehearsal=1.0)
 
 
+def test_weights_of_pairs_are_positive() -> None:
+    x = torch.randn(5, 2)
+    with pytest.raises(InvalidInputError, match="positive `weights`"):
+        CalibrationFinetuner().finetune(
+            linear(), x, lambda count: x, weights=torch.tensor([1.0, 1, 0, 1, 1])
+        )
+
+
 def test_pairs_of_a_group_are_held_out_together() -> None:
     """With g = h at the first step, the pairs of group k are at a distance of k."""
     x, net = torch.randn(10, 2), linear()

@@ -231,6 +231,11 @@ def test_networks_of_torch_and_sbi_can_be_saved(
     assert torch.equal(found, expected)
 
 
+def test_settings_may_be_numbers_of_numpy(tmp_path: Path) -> None:
+    posterior = rope_posterior(tail_mass=np.float64(1e-2))
+    assert_same(posterior, saved_and_loaded(posterior, tmp_path), stacks.observed()[:3])
+
+
 def test_a_stack_keeps_its_report_and_its_candidates(tmp_path: Path) -> None:
     stack, x = stack_of(coupled=True), stacks.observed()[:4]
     loaded = saved_and_loaded(stack, tmp_path)

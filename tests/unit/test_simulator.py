@@ -37,6 +37,14 @@ def simulator_of(function: Callable[[Any], Any], *, length: int = 2) -> Simulato
     )
 
 
+@pytest.mark.parametrize("length", [1, 2])
+def test_a_simulator_may_squeeze_the_last_row_of_many(length: int) -> None:
+    simulator = simulator_of(lambda theta: theta[:, :length].squeeze(), length=length)
+    for count in (2, 1):
+        theta = THETA[:count]
+        assert torch.equal(simulator(theta), theta[:, :length])
+
+
 def mixes(theta: Tensor) -> Tensor:
     return theta * theta.norm() + 0.1 * torch.randn_like(theta)
 

@@ -20,6 +20,7 @@ from sbi_rope._training import (
     EPOCHS_WITHOUT_HOLDOUT,
     MIN_PAIRS_FOR_HOLDOUT,
     History,
+    differentiable,
     epochs_on_pairs,
     fit,
     groups_of,
@@ -628,3 +629,17 @@ class TestTrainOnPairs:
             show_progress_bars=False,
         )
         assert history.validation_loss[0] == pytest.approx(expected.item(), rel=1e-5)
+
+
+def test_recurrent_nets_in_evaluation_mode_do_not_use_cudnn() -> None:
+    # cuDNN has no gradients for them. On a CPU only the flag can be seen.
+    before = torch.backends.cudnn.enabled
+    recurrent = nn.Sequential(nn.GRU(1, 2))
+    for net, is_off in (
+        (recurrent.eval(), True),
+        (nn.Sequential(nn.GRU(1, 2)).train(), False),
+        (nn.Linear(1, 2).eval(), False),
+    ):
+        with differentiable(net):
+            assert torch.backends.cudnn.enabled == (before and not is_off)
+        assert torch.backends.cudnn.enabled == before
