@@ -91,8 +91,8 @@ class RoPE:
             ``(d,)`` to one ``(*event)``. It may take tensors or NumPy arrays (of
             float64), and return either, lists, or numbers. A row of x may depend on the
             same row of theta only. The simulator is tried on about thirty parameters
-            to find that out, and a fast one that has a random generator of its own on
-            some seven hundred. Simulations with NaN or Inf, and those for which the
+            to find that out, and a fast one that takes batches and has a random
+            generator of its own on some seven hundred. Simulations with NaN or Inf, and those for which the
             simulator raises, are dropped and counted. :func:`~sbi_rope.parallel` calls
             it in several processes.
         simulations: Instead of a simulator, stored pairs (theta, x) with theta drawn
@@ -570,8 +570,8 @@ class RoPE:
         """How many rows of theta the simulator has simulated so far.
 
         Up to thirty are simulated when RoPE is constructed, to find out how the
-        simulator is called (some seven hundred if it is fast and has a random generator
-        of its own). :meth:`train` simulates 100 for each label (and 2000 with
+        simulator is called (some seven hundred if it is fast, takes batches and has a
+        random generator of its own). :meth:`train` simulates 100 for each label (and 2000 with
         rehearsal), :meth:`build_posterior` ``max(n_o, 1000)`` for each batch, and
         :func:`~sbi_rope.stack` 20,000 from the prior and 100 for each label, and with a
         batch 2000 and ``max(n_o, 1000)`` more. The argument ``num_simulations`` of this

@@ -362,8 +362,9 @@ class MixturePosterior(BaseDirectPosterior):
         batch = self._batch_of_x(x)
         if len(batch) > 1:
             raise InvalidInputError(
-                f"Expected one observation; got {len(batch)}. Use the `_batched` "
-                "methods for several observations."
+                f"Expected one observation; got {len(batch)}. For several, use "
+                "`sample_batched` and `log_prob_batched`; sets and intervals are made "
+                "for one observation at a time."
             )
         return batch
 
