@@ -92,9 +92,9 @@ class RoPE:
             float64), and return either, lists, or numbers. A row of x may depend on the
             same row of theta only. The simulator is tried on about thirty parameters
             to find that out, and a fast one that takes batches and has a random
-            generator of its own on some seven hundred. Simulations with NaN or Inf, and those for which the
-            simulator raises, are dropped and counted. :func:`~sbi_rope.parallel` calls
-            it in several processes.
+            generator of its own on some seven hundred. Simulations with NaN or Inf, and
+            those for which the simulator raises, are dropped and counted.
+            :func:`~sbi_rope.parallel` calls it in several processes.
         simulations: Instead of a simulator, stored pairs (theta, x) with theta drawn
             from the prior. Fine-tuning then uses those with the nearest parameters.
             There is a warning if there are fewer than 1000.
@@ -571,11 +571,11 @@ class RoPE:
 
         Up to thirty are simulated when RoPE is constructed, to find out how the
         simulator is called (some seven hundred if it is fast, takes batches and has a
-        random generator of its own). :meth:`train` simulates 100 for each label (and 2000 with
-        rehearsal), :meth:`build_posterior` ``max(n_o, 1000)`` for each batch, and
-        :func:`~sbi_rope.stack` 20,000 from the prior and 100 for each label, and with a
-        batch 2000 and ``max(n_o, 1000)`` more. The argument ``num_simulations`` of this
-        class sets a number for all of these together.
+        random generator of its own). :meth:`train` simulates 100 for each label (and
+        2000 with rehearsal), :meth:`build_posterior` ``max(n_o, 1000)`` for each batch,
+        and :func:`~sbi_rope.stack` 20,000 from the prior and 100 for each label, and
+        with a batch 2000 and ``max(n_o, 1000)`` more. The argument ``num_simulations``
+        of this class sets a number for all of these together.
         """
         return self._source.num_calls
 

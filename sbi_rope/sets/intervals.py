@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import check_names
+from sbi_rope._validation import check_batch, check_names, check_tensor
 from sbi_rope.sets.guarantee import Guarantee
 
 __all__ = ["CredibleIntervals", "central_intervals"]
@@ -36,6 +36,25 @@ class CredibleIntervals:
     def is_guaranteed(self) -> bool:
         """Whether there is a guarantee."""
         return self.guarantee is not None
+
+    def contains(self, theta: Tensor) -> Tensor:
+        """Tell which parameters are in their intervals, one by one.
+
+        Args:
+            theta: Parameters, shape ``(*batch, d)``.
+
+        Returns:
+            Shape ``(*batch, d)``, bool.
+
+        Raises:
+            InvalidTypeError: If theta is no tensor of numbers.
+            InvalidInputError: If theta has another number of parameters, or is not
+                finite.
+        """
+        shape = check_tensor("theta", theta).shape
+        rows = theta[None] if theta.ndim < 2 else theta.flatten(0, -2)
+        rows = check_batch("theta", rows, self.low.shape).detach().to(self.low)
+        return ((self.low <= rows) & (rows <= self.high)).reshape(shape)
 
     def as_rows(
         self, parameter_names: Sequence[str] | None = None

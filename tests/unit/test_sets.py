@@ -107,6 +107,18 @@ def test_the_default_x_and_the_seed_are_used() -> None:
     assert torch.equal(torch.get_rng_state(), state)
 
 
+def test_intervals_contain_what_is_between_their_ends() -> None:
+    found = exact().credible_intervals(0.9, X, seed=0)
+    inside = torch.stack([found.low, found.high, (found.low + found.high) / 2])
+    assert found.contains(inside).all()
+    outside = torch.stack([found.low - 0.01, found.high])
+    assert found.contains(outside).tolist() == [[False, False], [True, True]]
+    for shape in ((), (3,), (2, 3)):
+        assert found.contains(torch.zeros(*shape, 2)).shape == (*shape, 2)
+    with pytest.raises(InvalidInputError, match=r"shape \(n, 2\)"):
+        found.contains(torch.zeros(4, 3))
+
+
 def test_contains_keeps_the_shape_of_a_batch() -> None:
     found = exact().credible_set(0.9, X, seed=0)
     for shape in ((), (3,), (2, 3)):

@@ -36,6 +36,16 @@ CALLS += [
 ]
 CALLS += [
     Call(
+        name="CredibleIntervals.contains",
+        run=lambda theta=THETA: (
+            stacked().credible_intervals(0.9, X_O[0], seed=0).contains(theta).double()
+        ),
+        tensors={"theta": THETA},
+        accepts=("theta: one row less", "theta: no rows"),
+    ),
+]
+CALLS += [
+    Call(
         name=name,
         run=lambda theta=THETA, guaranteed=guaranteed: (
             stacked()
