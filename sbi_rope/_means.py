@@ -30,7 +30,10 @@ class Counts:
         """Return the weighted mean of each group, and the weight of the group.
 
         Args:
-            values: A number for each pair, shape ``(n,)``.
+            values: A number or vector for each pair, shape ``(n, ...)``.
+
+        Returns:
+            Shapes ``(G, ...)`` and ``(G,)``.
 
         Example:
             >>> import torch
@@ -42,9 +45,13 @@ class Counts:
         if self.groups is None:
             return values, weights
         numbers, place = self.groups.to(values.device).unique(return_inverse=True)
-        nothing = values.new_zeros(len(numbers))
-        total = nothing.index_add(0, place, weights)
-        return nothing.index_add(0, place, weights * values) / total, total
+        if len(numbers) == len(values):
+            return values, weights
+        total = weights.new_zeros(len(numbers)).index_add(0, place, weights)
+        shares = weights / total[place]
+        shares = shares.reshape(-1, *[1] * (values.ndim - 1))
+        sums = values.new_zeros(len(numbers), *values.shape[1:])
+        return sums.index_add(0, place, shares * values), total
 
     @property
     def effective_number(self) -> float:

@@ -27,6 +27,7 @@ from sbi_rope._validation import (
     check_instance,
     check_integer,
     check_not_negative,
+    check_pair_weights,
     check_positive,
     check_readable,
     check_same_length,
@@ -190,13 +191,7 @@ class CalibrationFinetuner:
         x = _checked_inputs("x", x, embedding_net)
         groups = _checked_groups(groups, x)
         if weights is not None:
-            weights = check_batch("weights", weights, ()).to(x)
-            check_same_length("x", x, "weights", weights)
-            if not bool((weights > 0).all()):
-                raise InvalidInputError(
-                    f"Expected positive `weights`; got {float(weights.min())}. Leave "
-                    "out pairs that should not count."
-                )
+            weights = check_pair_weights(weights, "x", x).to(x)
         show = is_shown(show_progress_bars)
         with seeded(seed):
             embedded = _embedded("x", x, embedding_net)

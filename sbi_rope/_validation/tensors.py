@@ -22,6 +22,7 @@ __all__ = [
     "check_finite",
     "check_in_support",
     "check_not_nan",
+    "check_pair_weights",
     "check_prior",
     "check_readable",
     "check_rows",
@@ -235,6 +236,18 @@ def check_device(
             f"Expected `{name}` on {device}, where {where} is; got "
             f"{value.device}. Move it with `{name}.to('{device}')`."
         )
+
+
+def check_pair_weights(weights: Tensor, name: str, rows: Tensor) -> Tensor:
+    """Return the weights of some rows, shape ``(n,)``, which have to be positive."""
+    weights = check_batch("weights", check_tensor("weights", weights), ())
+    check_same_length(name, rows, "weights", weights)
+    if not bool((weights > 0).all()):
+        raise InvalidInputError(
+            f"Expected positive `weights`; got {float(weights.min())}. Leave out pairs "
+            "that should not count."
+        )
+    return weights
 
 
 def check_same_length(name_a: str, a: Tensor, name_b: str, b: Tensor) -> None:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from sbi_rope._means import Counts
 from sbi_rope._npe import TrainedNPE
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
@@ -19,7 +20,6 @@ from sbi_rope.diagnosis.report import Diagnosis, Finding
 from sbi_rope.diagnosis.residuals import (
     CrossFitted,
     cross_fit,
-    means_of_groups,
     num_features,
     residual_finding,
 )
@@ -205,9 +205,11 @@ def _held_out(
 def _residual_findings(
     rope: RoPE, held_out: CrossFitted, simulations: Simulations, notes: list[str]
 ) -> list[Finding]:
-    groups = rope.labels.groups
-    theta = means_of_groups(_moved(rope.calibration[0]), groups)
-    residuals = means_of_groups(held_out.residuals, groups)
+    # Recordings of one person have errors in common, so that they are not independent
+    # evidence for a dependence on the parameters.
+    people = Counts(torch.ones(len(rope.labels)), rope.labels.groups)
+    theta, _ = people.of_groups(_moved(rope.calibration[0]))
+    residuals, _ = people.of_groups(held_out.residuals)
     if num_features(*theta.shape):
         return [residual_finding(residuals, theta, simulations)]
     notes.append(

@@ -17,7 +17,6 @@ __all__ = [
     "Dependence",
     "cross_fit",
     "dependence",
-    "means_of_groups",
     "num_features",
     "residual_finding",
 ]
@@ -137,20 +136,6 @@ def dependence(residuals: Tensor, theta: Tensor) -> Dependence:
         bias=square**0.5,
         error=((variance + square / 2) / n) ** 0.5,
     )
-
-
-def means_of_groups(values: Tensor, groups: Tensor) -> Tensor:
-    """Return the mean of each group, ``(n, ...)`` to ``(G, ...)``.
-
-    Recordings of one person have errors in common, so that each of them is no evidence
-    of its own for a dependence on the parameters.
-    """
-    numbers, place = groups.to(values.device).unique(return_inverse=True)
-    if len(numbers) == len(values):
-        return values
-    total = values.new_zeros(len(numbers), *values.shape[1:])
-    sizes = place.bincount().to(values)
-    return total.index_add(0, place, values) / sizes[:, None]
 
 
 def residual_finding(

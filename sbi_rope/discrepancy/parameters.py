@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
-from sbi_rope._validation import check_batch, check_same_length, check_tensor
+from sbi_rope._validation import check_batch, check_pair_weights, check_tensor
 from sbi_rope.errors import InvalidInputError
 
 __all__ = ["ParameterDistribution", "learn_parameters"]
@@ -90,20 +90,10 @@ def learn_parameters(
     several = check_tensor("theta_cal", theta_cal).shape[1:-1][:1]
     theta_cal = check_batch("theta_cal", theta_cal, (*several, theta.shape[1]))
     if weights is not None:
-        weights = _checked_weights(weights, theta_cal)
+        weights = check_pair_weights(weights, "theta_cal", theta_cal)
+        weights = weights.to(theta_cal.device, torch.double)
     sets = theta_cal.unbind(dim=1)[:NUM_SETS] if theta_cal.ndim == 3 else [theta_cal]
     return _average([_learn(draws, theta, weights) for draws in sets])
-
-
-def _checked_weights(weights: Tensor, theta_cal: Tensor) -> Tensor:
-    weights = check_batch("weights", check_tensor("weights", weights), ())
-    check_same_length("theta_cal", theta_cal, "weights", weights)
-    if not bool((weights > 0).all()):
-        raise InvalidInputError(
-            f"Expected positive `weights`; got {float(weights.min())}. Leave out pairs "
-            "that should not count."
-        )
-    return weights.to(theta_cal.device, torch.double)
 
 
 def _average(parts: Sequence[ParameterDistribution]) -> ParameterDistribution:

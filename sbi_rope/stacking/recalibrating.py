@@ -14,7 +14,7 @@ import torch
 from sbi.utils import within_support
 from torch import Tensor
 
-from sbi_rope._bounds import bounds_of_prior
+from sbi_rope._bounds import Bounds, bounds_of_prior
 from sbi_rope._means import Counts
 from sbi_rope._sbi import MixedDensity, estimator_of, headless
 from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError
@@ -46,7 +46,8 @@ def check_recalibration(bench: Workbench) -> None:
             "Expected continuous parameters to recalibrate; got some that are "
             "categories. Leave `recalibrate` out."
         )
-    usable = _say_something(bench, bench.theta).cpu()
+    prior = bench.npe.prior
+    usable = _say_something(bench.theta, prior, bounds_of_prior(prior)).cpu()
     if (count := len(bench.groups[usable].unique())) < MIN_PAIRS:
         raise InvalidInputError(
             f"Expected at least {MIN_PAIRS} calibration pairs with different "
@@ -100,7 +101,7 @@ def recalibration_of(
     folds, kept = [], []
     for number, rows in enumerate(bench.folds):
         theta = bench.theta[rows]
-        inside = _say_something(bench, theta)
+        inside = _say_something(theta, prior, bounds)
         if not inside.any():
             continue
         unseen = [k for k, pair in enumerate(pairs) if number in pair]
@@ -128,14 +129,13 @@ def recalibrated(
     return RecalibratedEstimator(mixture, recalibration.factors, bounds_of_prior(prior))
 
 
-def _say_something(bench: Workbench, theta: Tensor) -> Tensor:
+def _say_something(theta: Tensor, prior: Any, bounds: Bounds) -> Tensor:
     """Return whether each of some parameters ``(n, d)`` says something about a spread.
 
     Those outside the prior's support do not. On a bound, the density with another
     spread is zero or infinite.
     """
-    prior = bench.npe.prior
-    return within_support(prior, theta) & bounds_of_prior(prior).hold(theta)
+    return within_support(prior, theta) & bounds.hold(theta)
 
 
 def _counts(bench: Workbench) -> Counts:

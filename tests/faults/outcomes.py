@@ -127,7 +127,7 @@ def _judge(
     numbers = [tensor for tensor in found if tensor.is_floating_point()]
     if expected != "anything" and any(tensor.isnan().any() for tensor in numbers):
         return outcome("silent", "NaN")
-    if expected == "the same" and found:
+    if expected == "the same" and found:  # otherwise there is nothing to compare
         plain = torch.as_tensor(value).detach().float()
         if not call.tensors[argument].is_floating_point():
             plain = plain.long()

@@ -12,6 +12,7 @@ from scipy.stats import kstest
 from torch import Tensor
 
 from sbi_rope import CalibrationFinetuner, RoPE, SinkhornCoupler
+from sbi_rope._means import Counts
 from sbi_rope._two_sample import compare_with_pairs, two_sample_test
 from sbi_rope.diagnosis import Diagnosis, diagnose
 from sbi_rope.diagnosis.misspecification import mmd_test
@@ -20,7 +21,6 @@ from sbi_rope.diagnosis.residuals import (
     CrossFitted,
     cross_fit,
     dependence,
-    means_of_groups,
     num_features,
     residual_finding,
 )
@@ -671,16 +671,19 @@ def test_the_bias_of_residuals_is_recovered_from_noise() -> None:
 def test_what_recordings_of_a_person_have_in_common_is_no_dependence() -> None:
     torch.manual_seed(27)
     people = torch.arange(12).repeat_interleave(5)
+    counts = Counts(torch.ones(60), people)
     found = []
     for _ in range(60):
         theta = torch.randn(12, 2).double()[people]
         own = torch.randn(12, 3).double()[people]  # of the person, whatever theta is
         residuals = own + torch.randn(60, 3).double()
-        means = [means_of_groups(values, people) for values in (residuals, theta)]
+        means = [counts.of_groups(values)[0] for values in (residuals, theta)]
         found.append(dependence(*means).p_value)
     assert kstest(found, "uniform").pvalue > 0.01
     torch.testing.assert_close(
-        means_of_groups(torch.tensor([[1.0], [5.0], [3.0]]), torch.tensor([0, 1, 0])),
+        Counts(torch.ones(3), torch.tensor([0, 1, 0])).of_groups(
+            torch.tensor([[1.0], [5.0], [3.0]])
+        )[0],
         torch.tensor([[2.0], [5.0]]),
     )
 

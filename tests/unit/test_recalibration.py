@@ -148,7 +148,7 @@ def test_many_pairs_find_a_factor_for_each_parameter() -> None:
 def test_a_few_pairs_choose_what_the_prior_of_the_factors_says() -> None:
     folds = folds_of(8, too_wide=torch.tensor([2.0, 0.8]), seed=3)
     weights = torch.ones(8).double()
-    found = HeldOutGrid.of(folds, weights).best(weights > 0)
+    found = HeldOutGrid.of(folds, weights).best(torch.ones(8).bool())
     z = torch.cat(
         [(fold.theta - fold.spread.centre) / fold.x[:, 2:].exp() for fold in folds]
     ).double()
