@@ -20,11 +20,12 @@ from pathlib import Path
 
 from benchmarks.cases import Sources
 from benchmarks.cells import Suite, list_suites, load_suite
+from benchmarks.prices import Prices
 from benchmarks.report import write_report
 from benchmarks.runner import run_cells
 from benchmarks.store import Workplace
 from benchmarks.summary import write_summary
-from benchmarks.table import read_table, restore_cells, write_table
+from benchmarks.table import COUNTED, Table, read_table, restore_cells, write_table
 from sbi_rope.errors import InvalidInputError, RoPEError
 
 DEFAULT_OUT = Path("results/benchmark")
@@ -79,7 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     run.add_argument("--retry", action="store_true", help="also what failed")
     _add_out(run, DEFAULT_OUT)
 
-    status = commands.add_parser("status", help="count the cells of all suites")
+    status = commands.add_parser("status", help="count cells, price those not run")
     status.set_defaults(command=_status)
     _add_out(status, DEFAULT_OUT)
 
@@ -176,16 +177,20 @@ def _scheduler(args: argparse.Namespace) -> Iterator[None]:
 
 def _status(args: argparse.Namespace) -> int:
     results = Workplace(folder=args.out, sources=Sources()).results
-    print(f"{'suite':<14}{'cells':>7}{'finished':>10}{'failed':>8}{'not run':>9}")
-    for name in list_suites():
-        suite = load_suite(name)
-        rows = [results.read(cell) for cell in suite.cells]
-        finished = sum(1 for row in rows if row and row["status"] == "finished")
-        failed = sum(1 for row in rows if row and row["status"] == "failed")
-        print(
-            f"{name:<14}{len(rows):>7}{finished:>10}{failed:>8}"
-            f"{len(rows) - finished - failed:>9}"
-        )
+    suites = [load_suite(name) for name in list_suites()]
+    cells = dict.fromkeys(cell for suite in suites for cell in suite.cells)
+    rows = {cell: row for cell in cells if (row := results.read(cell)) is not None}
+    table = Table.of(rows, {})
+    prices = Prices([table.finished])
+    counts = "".join(f"{what:>10}" for what in ("cells", *COUNTED))
+    print(f"{'suite':<14}{counts}  hours of a core")
+    for suite in suites:
+        statuses = {cell: table.status(cell) for cell in suite.cells}
+        numbers = [list(statuses.values()).count(what) for what in COUNTED]
+        counts = "".join(f"{number:>10}" for number in (len(statuses), *numbers))
+        left = [cell for cell, status in statuses.items() if status == "not run"]
+        print(f"{suite.name:<14}{counts}  {prices.of(left)}")
+    print("? stands for what a cell of a method takes that was never run.")
     return 0
 
 

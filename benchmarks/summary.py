@@ -12,6 +12,7 @@ import pandas as pd
 from benchmarks.evidence import evidence_lines
 from benchmarks.methods import METHODS, STACK
 from benchmarks.other_suites import other_suites
+from benchmarks.prices import Prices
 from benchmarks.published import (
     FIXED,
     LETTERS,
@@ -34,7 +35,7 @@ from benchmarks.statements import (
     verdict,
     write_statements,
 )
-from benchmarks.table import Table
+from benchmarks.table import COUNTED, Table
 from sbi_rope._files import write_atomically
 
 __all__ = ["write_summary"]
@@ -137,12 +138,14 @@ def _block(published: Published, link: str) -> list[str]:
 
 def _overview(published: Published) -> list[str]:
     lines = []
+    prices = Prices([known.finished for known in published.tables.values()])
     for name, suite in published.suites.items():
         if name in LEFT_OUT:
             continue
         known = published.tables.get(name, Table.of({}, {}))
         there = set(known.rows.index)
         statuses = [known.status(cell) for cell in suite.cells]
+        left = [cell for cell in suite.cells if known.status(cell) == "not run"]
         complete, stand_ins = [], []
         for where, runs in runs_of(suite).items():
             place = " ".join(where).strip()
@@ -154,13 +157,19 @@ def _overview(published: Published) -> list[str]:
         lines.append(
             [
                 f"[{name}]({name}/report.md)" if there else name,
-                *(statuses.count(s) for s in ("finished", "failed", "not run")),
+                *(statuses.count(status) for status in COUNTED),
+                prices.of(left),
                 ", ".join(complete) if there else "none",
                 ", ".join(stand_ins),
             ]
         )
-    head = ("suite", "finished", "failed", "not run", "complete repetitions")
-    return table((*head, "stand-ins among what was run"), lines)
+    head = ("suite", *COUNTED, "hours", "complete repetitions")
+    return [
+        "Hours are what one core would take for what was not run, by the times of the",
+        "cells most like it; ? is a cell of a method that was never run.",
+        "",
+        *table((*head, "stand-ins among what was run"), lines),
+    ]
 
 
 # The suite main ---------------------------------------------------------------------

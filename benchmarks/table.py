@@ -29,6 +29,7 @@ from sbi_rope._files import read_arrays, write_atomically
 from sbi_rope.errors import InvalidInputError
 
 __all__ = [
+    "COUNTED",
     "Rows",
     "Table",
     "markdown",
