@@ -227,18 +227,22 @@ def acauc_of(levels: Tensor, *, allow_missing: bool = False) -> ACAUCScore:
     return acauc_of_pairs(_checked_levels(levels, allow_missing=allow_missing))
 
 
-def acauc_of_pairs(levels: Tensor, counts: Counts | None = None) -> ACAUCScore:
+def acauc_of_pairs(
+    levels: Tensor, counts: Counts | None = None, *, confidence: float = 0.95
+) -> ACAUCScore:
     """Return :func:`acauc_of` of pairs that count differently, or are not independent.
 
     Args:
         levels: Checked levels, NaN where they are not known, shape ``(n, d)``.
         counts: How many pairs each counts as; None for one each.
+        confidence: The probability of the interval.
     """
     levels = levels.double()
     mean, error, n = _mean_over_pairs(_mean(levels, dim=1), counts)
     width = float("nan")
     if n > 1:
-        width = float(student.ppf(0.975, n - 1)) * error * (n / (n - 1)) ** 0.5
+        reach = float(student.ppf((1 + confidence) / 2, n - 1))
+        width = reach * error * (n / (n - 1)) ** 0.5
     return ACAUCScore(
         value=mean - 0.5,
         standard_error=error,

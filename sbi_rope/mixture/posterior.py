@@ -14,13 +14,10 @@ from torch.distributions import Distribution
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import BaseDirectPosterior, MixedDensity, describe
-from sbi_rope._units import log_unit_of
 from sbi_rope._validation import (
     as_numbers,
     as_shape,
-    check_instance,
     check_integer,
-    check_level,
     check_theta,
     usable_device,
 )
@@ -32,14 +29,12 @@ from sbi_rope.mixture.parts import DTYPE
 from sbi_rope.mixture.sampling import Accept
 from sbi_rope.mixture.truncation import Leakage, is_unbounded
 from sbi_rope.saving import save
-from sbi_rope.sets import CredibleIntervals, CredibleSet
-from sbi_rope.sets.credible_set import highest_density_set
-from sbi_rope.sets.intervals import central_intervals
+from sbi_rope.sets.makes_sets import MakesSets
 
 __all__ = ["MixturePosterior"]
 
 
-class MixturePosterior(BaseDirectPosterior):
+class MixturePosterior(MakesSets, BaseDirectPosterior):
     r"""A mixture of weighted densities as an sbi posterior.
 
     .. math::
@@ -363,8 +358,8 @@ class MixturePosterior(BaseDirectPosterior):
         if len(batch) > 1:
             raise InvalidInputError(
                 f"Expected one observation; got {len(batch)}. For several, use "
-                "`sample_batched` and `log_prob_batched`; sets and intervals are made "
-                "for one observation at a time."
+                "`sample_batched`, `log_prob_batched` and "
+                "`credible_intervals_batched`. Sets are made for one at a time."
             )
         return batch
 
@@ -504,104 +499,6 @@ class MixturePosterior(BaseDirectPosterior):
                 num_init_samples=num_init_samples,
                 **options,
             )
-
-    # --- sets ---
-
-    def credible_set(
-        self,
-        level: float = 0.9,
-        x: Tensor | None = None,
-        *,
-        guaranteed: bool = False,
-        num_samples: int = 1000,
-        seed: int | None = None,
-    ) -> CredibleSet:
-        r"""Return a set that is credible given one observation.
-
-        It is the set of highest density,
-        :math:`\{\theta: \log p(\theta \mid x) \ge t\}`, with t the (1 - level)
-        quantile of the log density of draws. It holds the true parameters as often as
-        the posterior is calibrated. With ``guaranteed``, a stack corrects it by its
-        held-out scores, and :class:`~sbi_rope.sets.Guarantee` says what is promised.
-
-        Args:
-            level: The probability of the set.
-            x: An observation, from the batch if there is one; the default x if None.
-            guaranteed: Whether the set shall hold the true parameters in about
-                ``level`` of the cases, even if the posterior is not calibrated. This
-                needs a stack, and observations drawn as its calibration pairs.
-            num_samples: The number of draws that the set and its volume are estimated
-                from.
-            seed: Seed of the draws; None uses the states of torch, NumPy and Python.
-
-        Returns:
-            The set, which tells its volume and which parameters it contains.
-
-        Raises:
-            InvalidInputError: If an argument is outside its range. With ``guaranteed``,
-                also if this is no stack, or if it has too few pairs for the level.
-            UnseenObservationError: If x is not in the batch and ``unseen="raise"``.
-            SamplingError: If hardly any mass lies inside the prior's support.
-        """
-        self._check_set(level, guaranteed=guaranteed, num_samples=num_samples)
-        with seeded(seed):
-            x = self._one_x(x)
-            if guaranteed:
-                return self._held_out_sets().credible_set(level, x, num_samples)
-            return highest_density_set(
-                self,
-                x,
-                level=level,
-                num_samples=num_samples,
-                log_unit=log_unit_of(self.prior),
-            )
-
-    def credible_intervals(
-        self,
-        level: float = 0.9,
-        x: Tensor | None = None,
-        *,
-        guaranteed: bool = False,
-        num_samples: int = 1000,
-        seed: int | None = None,
-    ) -> CredibleIntervals:
-        """Return an interval for each parameter given one observation.
-
-        It is the central interval of draws. With ``guaranteed``, a stack corrects it by
-        its held-out scores. The level is that of each interval by itself.
-
-        Args:
-            level: The probability of each interval.
-            x: As in :meth:`credible_set`.
-            guaranteed: As in :meth:`credible_set`.
-            num_samples: The number of draws. With ``guaranteed`` there are as many as
-                the stack was scored with.
-            seed: As in :meth:`credible_set`.
-
-        Raises:
-            InvalidInputError: As in :meth:`credible_set`.
-            UnseenObservationError: As in :meth:`credible_set`.
-            SamplingError: As in :meth:`credible_set`.
-        """
-        self._check_set(level, guaranteed=guaranteed, num_samples=num_samples)
-        with seeded(seed):
-            x = self._one_x(x)
-            if guaranteed:
-                return self._held_out_sets().credible_intervals(level, x)
-            return central_intervals(self, x, level=level, num_samples=num_samples)
-
-    def _held_out_sets(self) -> Any:
-        """Return what makes sets with a guarantee. Only a stack has it."""
-        raise InvalidInputError(
-            "Expected a stack for a set with a guarantee, because only a stack has "
-            f"scores on held-out calibration pairs; got {type(self).__name__}. Make "
-            "one with `stack(rope)`, or pass guaranteed=False."
-        )
-
-    def _check_set(self, level: Any, *, guaranteed: Any, num_samples: Any) -> None:
-        check_level("level", level)
-        check_instance("guaranteed", guaranteed, bool)
-        check_integer("num_samples", num_samples, minimum=2)
 
     # --- normalisation ---
 

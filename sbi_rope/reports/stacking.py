@@ -78,7 +78,7 @@ def write_stacking_report(
     check_target(target)
     parts = [
         paragraph(_what_was_done(report)),
-        list_of(verdict_of(report, diagnosis), kind="verdict"),
+        list_of(verdict_of(report, diagnosis, names), kind="verdict"),
         _score_section(report),
         _weight_section(report),
         calibration_section(report, names),

@@ -1,16 +1,18 @@
 """The verdict of a page: the box with what matters most."""
 
+from collections.abc import Sequence
+
 from sbi_rope.diagnosis import Diagnosis
 from sbi_rope.diagnosis.labelled import UNLIKE_PAIRS
 from sbi_rope.reports.numbers import number, percent
 from sbi_rope.stacking import StackingReport
-from sbi_rope.stacking.words import LEVEL, OVER_CONFIDENT, compared
+from sbi_rope.stacking.words import LEVEL, OVER_CONFIDENT, compared, parameters_off
 
 __all__ = ["verdict_of"]
 
 
 def verdict_of(
-    report: StackingReport, diagnosis: Diagnosis | None
+    report: StackingReport, diagnosis: Diagnosis | None, names: Sequence[str]
 ) -> list[tuple[str, bool]]:
     """Return the sentences of the verdict, and whether each is alarming."""
     lines = [
@@ -22,7 +24,9 @@ def verdict_of(
         )
         for name, gain in report.gains.items()
     ]
-    lines += [_calibrated(report), _assumption(report, diagnosis)]
+    lines.append(_calibrated(report))
+    lines += [(f"{line}.", True) for line in parameters_off(report, names)]
+    lines.append(_assumption(report, diagnosis))
     if diagnosis is not None:
         lines.append(
             (

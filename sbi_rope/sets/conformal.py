@@ -253,12 +253,12 @@ def interval_of(low: Tensor, high: Tensor, *, level: float) -> tuple[Tensor, Ten
     that the scores of the pairs give at the new observation.
 
     Args:
-        low: The lower ends, shape ``(n, d)``.
-        high: The upper ends, shape ``(n, d)``.
+        low: The lower ends, shape ``(n, *batch)``.
+        high: The upper ends, shape ``(n, *batch)``.
         level: The level, 1 - alpha, at least one half.
 
     Returns:
-        The lower and the upper ends, each ``(d,)``.
+        The lower and the upper ends, each ``(*batch)``.
 
     Example:
         >>> ends = torch.tensor([[1.0], [2.0], [3.0]])

@@ -1,28 +1,34 @@
-"""An interval for each parameter given one observation."""
+"""An interval for each parameter given one observation, or given each of a batch."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from sbi_rope._validation import check_batch, check_names, check_tensor
+from sbi_rope.errors import InvalidInputError
 from sbi_rope.sets.guarantee import Guarantee
 
 __all__ = ["CredibleIntervals", "central_intervals"]
 
 
+# So many intervals are printed.
+MAX_PRINTED = 20
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CredibleIntervals:
-    """An interval for each parameter given one observation.
+    """An interval for each parameter given one observation, or each of a batch.
 
-    ``posterior.credible_intervals`` makes it. Each interval has the level by itself.
-    All parameters together are inside less often.
+    ``posterior.credible_intervals`` and ``posterior.credible_intervals_batched`` make
+    it. Each interval has the level by itself. All parameters together are inside less
+    often. Of a batch, ``intervals[i]`` are those of one observation.
 
     Attributes:
-        low: The lower ends, shape ``(d,)``.
-        high: The upper ends, shape ``(d,)``.
+        low: The lower ends, shape ``(d,)``, or ``(B, d)`` of a batch.
+        high: The upper ends, as ``low``.
         level: The level of each interval.
         guarantee: The guarantee of each interval; None if there is none.
     """
@@ -32,28 +38,57 @@ class CredibleIntervals:
     level: float
     guarantee: Guarantee | None
 
+    @classmethod
+    def joined(cls, parts: "Sequence[CredibleIntervals]") -> "CredibleIntervals":
+        """Put the intervals of several batches together."""
+        return replace(
+            parts[0],
+            low=torch.cat([part.low for part in parts]),
+            high=torch.cat([part.high for part in parts]),
+        )
+
     @property
     def is_guaranteed(self) -> bool:
         """Whether there is a guarantee."""
         return self.guarantee is not None
 
+    def __len__(self) -> int:
+        return len(self._of_batch)
+
+    def __getitem__(self, index: int) -> "CredibleIntervals":
+        """Return the intervals of one observation of a batch."""
+        low, high = self._of_batch[index], self.high[index]
+        return replace(self, low=low, high=high)
+
+    @property
+    def _of_batch(self) -> Tensor:
+        if self.low.ndim < 2:
+            raise InvalidInputError(
+                "Expected intervals of a batch, as `credible_intervals_batched` makes "
+                "them; got those of one observation. Their ends are `low` and `high`."
+            )
+        return self.low
+
     def contains(self, theta: Tensor) -> Tensor:
         """Tell which parameters are in their intervals, one by one.
 
         Args:
-            theta: Parameters, shape ``(*batch, d)``.
+            theta: Parameters, shape ``(*batch, d)``, or ``(*batch, B, d)`` for
+                intervals of a batch.
 
         Returns:
-            Shape ``(*batch, d)``, bool.
+            The shape of ``theta``, bool.
 
         Raises:
             InvalidTypeError: If theta is no tensor of numbers.
-            InvalidInputError: If theta has another number of parameters, or is not
-                finite.
+            InvalidInputError: If the shape does not fit, or a number is not finite.
         """
+        event = self.low.shape
         shape = check_tensor("theta", theta).shape
-        rows = theta[None] if theta.ndim < 2 else theta.flatten(0, -2)
-        rows = check_batch("theta", rows, self.low.shape).detach().to(self.low)
+        rows = theta[None] if theta.ndim == len(event) else theta
+        if rows.ndim > len(event):
+            rows = rows.flatten(0, rows.ndim - 1 - len(event))
+        rows = check_batch("theta", rows, event).detach().to(self.low)
         return ((self.low <= rows) & (rows <= self.high)).reshape(shape)
 
     def as_rows(
@@ -61,24 +96,39 @@ class CredibleIntervals:
     ) -> list[dict[str, Any]]:
         """Return a row for each parameter: its name, and the ends of its interval.
 
+        The rows of a batch also hold the number of the observation, from 0.
+
         Args:
             parameter_names: A name for each parameter; "theta_1" and so on if None.
 
         Raises:
             InvalidInputError: If the names do not fit.
         """
-        count = len(self.low)
+        count = self.low.shape[-1]
         names = [f"theta_{k + 1}" for k in range(count)]
         if parameter_names is not None:
             names = check_names("parameter_names", parameter_names, count)
+        if self.low.ndim > 1:
+            return [
+                {"observation": number, **row}
+                for number in range(len(self))
+                for row in self[number].as_rows(names)
+            ]
         ends = zip(names, self.low.tolist(), self.high.tolist(), strict=True)
         return [{"parameter": name, "low": a, "high": b} for name, a, b in ends]
 
     def __str__(self) -> str:
+        is_batch = self.low.ndim > 1
+        count = -(-MAX_PRINTED // self.low.shape[-1])
+        shown = replace(self, low=self.low[:count], high=self.high[:count])
+        rows = (shown if is_batch else self).as_rows()
         lines = [
-            f"  {row['parameter']}: {row['low']:.4g} to {row['high']:.4g}"
-            for row in self.as_rows()
+            (f"  observation {row['observation']}," if is_batch else " ")
+            + f" {row['parameter']}: {row['low']:.4g} to {row['high']:.4g}"
+            for row in rows
         ]
+        if is_batch and len(self) > count:
+            lines.append(f"  and those of {len(self) - count} more observations")
         promise = self.guarantee or (
             "They have no guarantee: they hold the true parameters as often as the "
             "posterior is calibrated."
@@ -90,17 +140,17 @@ class CredibleIntervals:
 
 @torch.no_grad()
 def central_intervals(
-    posterior: Any, x: Tensor, *, level: float, num_samples: int
+    posterior: Any, x: Tensor, level: float, *, num_samples: int
 ) -> CredibleIntervals:
-    """Return the central interval of each parameter given one observation.
+    """Return the central interval of each parameter given each observation.
 
     Args:
-        posterior: A posterior with ``sample``.
-        x: The observation.
+        posterior: A posterior with ``sample_batched``.
+        x: The observations, shape ``(B, *event)``.
         level: The probability of each interval under the posterior.
         num_samples: The number of draws.
     """
-    draws = posterior.sample((num_samples,), x=x, show_progress_bars=False)
+    draws = posterior.sample_batched((num_samples,), x, show_progress_bars=False)
     ordered = draws.sort(dim=0).values.double()
     last = num_samples - 1
     ends = []

@@ -58,7 +58,7 @@ class HeldOutRule:
         Those outside the prior's support have infinite scores, and are not.
         """
         log_probs = [
-            posterior.log_prob(theta, x=self.x) for posterior in self.posteriors
+            _log_prob(posterior, theta, self.x) for posterior in self.posteriors
         ]
         at_theta = joint_scores(torch.stack(log_probs), self.draws)
         return is_held(self.scores, self.fold, at_theta, level=self.level)
@@ -73,13 +73,10 @@ class HeldOutSets:
     Args:
         posterior: The stack.
         versions: Its candidates in all versions.
-        masses: The masses inside the prior's support that the stack has estimated.
     """
 
-    def __init__(
-        self, posterior: Any, versions: Versions, masses: dict[int, Tensor]
-    ) -> None:
-        self._posterior, self._versions, self._masses = posterior, versions, masses
+    def __init__(self, posterior: Any, versions: Versions) -> None:
+        self._posterior, self._versions = posterior, versions
         self._validation: CrossValidation = posterior.report.cross_validation
 
     @torch.no_grad()
@@ -94,11 +91,10 @@ class HeldOutSets:
         scores, guarantee = self._scores(level)
         counted = scores.is_counted
         _check_finite(scores.joint[counted], level)
-        # First, because the stack keeps the masses that the stacks without a fold need.
         theta, log_density = self._spread(x, num_samples)
         posteriors = self._posteriors(scores)
         draws = [
-            posterior.log_prob(_sample(posterior, x, scores), x=x)
+            _log_prob(posterior, _sample(posterior, x, scores)[:, 0], x)
             for posterior in posteriors
         ]
         rule = HeldOutRule(
@@ -119,8 +115,8 @@ class HeldOutSets:
         )
 
     @torch.no_grad()
-    def credible_intervals(self, level: float, x: Tensor) -> CredibleIntervals:
-        """Return intervals with a guarantee, each by itself.
+    def credible_intervals(self, x: Tensor, level: float) -> CredibleIntervals:
+        """Return intervals with a guarantee for each observation, each by itself.
 
         The score of a pair is the level of the smallest central interval that contains
         its parameter. At x this score gives an interval under the posterior of its
@@ -131,10 +127,11 @@ class HeldOutSets:
         low, high = [], []
         for number, posterior in enumerate(self._posteriors(scores)):
             rows = scores.is_counted & (self._validation.fold == number)
-            draws = _sample(posterior, x, scores)
-            ends = marginal_ends(scores.marginal[rows].T.to(draws.device), draws.T)
-            low.append(ends[0].T)
-            high.append(ends[1].T)
+            draws = _sample(posterior, x, scores).permute(1, 2, 0)
+            of_pairs = scores.marginal[rows].T.to(draws.device)
+            ends = marginal_ends(of_pairs.expand(len(x), -1, -1), draws)
+            low.append(ends[0].permute(2, 0, 1))
+            high.append(ends[1].permute(2, 0, 1))
         ends = interval_of(torch.cat(low), torch.cat(high), level=level)
         least, most = bounds_of(self._posterior.prior, ends[0])
         return CredibleIntervals(
@@ -169,15 +166,11 @@ class HeldOutSets:
 
     def _posteriors(self, scores: SetScores) -> tuple[MixturePosterior, ...]:
         """Return the stack that has not seen each fold."""
-        versions = self._versions
-        # The first part is that of the couplings, and the same in all folds.
-        is_shared = versions.couplings is not None and 0 in self._masses
         return tuple(
             MixturePosterior(
-                versions.estimator(weights, [number]),
+                self._versions.estimator(weights, [number]),
                 self._posterior.prior,
                 enable_transform=False,
-                shared={0: self._masses[0]} if is_shared else None,
             )
             for number, weights in enumerate(scores.weights)
         )
@@ -218,8 +211,16 @@ class HeldOutSets:
 
 
 def _sample(posterior: MixturePosterior, x: Tensor, scores: SetScores) -> Tensor:
-    """Draw as often as for the scores of the pairs."""
-    return posterior.sample((scores.num_draws,), x=x, show_progress_bars=False)
+    """Draw as often as for the scores of the pairs, ``(M, B, d)``."""
+    return posterior.sample_batched((scores.num_draws,), x, show_progress_bars=False)
+
+
+def _log_prob(posterior: MixturePosterior, theta: Tensor, x: Tensor) -> Tensor:
+    """Return the log density up to a constant, which scores do not depend on.
+
+    The constant is the mass inside the prior's support, which takes long to estimate.
+    """
+    return posterior.log_prob(theta, x=x, norm_posterior=False)
 
 
 def _stretched(theta: Tensor, centre: Tensor, *, by: float) -> Tensor:

@@ -128,12 +128,12 @@ def score_fold(
         )
         for rows, draws in chunks:
             levels.append(central_levels(count_ranks(draws, theta[rows])))
-            # The mass inside the support has an error, which is the same for the
-            # label and for the draws if both are evaluated for the same rows.
-            of_label = posterior.log_prob_batched(theta[rows][None], x[rows])
-            of_draws = posterior.log_prob_batched(draws, x[rows])
-            log_prob.append(of_label[0].double())
-            joint.append(joint_scores(log_prob[-1][:, None], of_draws.T)[:, 0])
+            # In one call, because the mass inside the support is estimated in each.
+            log_probs = posterior.log_prob_batched(
+                torch.cat([theta[rows][None], draws]), x[rows]
+            ).double()
+            log_prob.append(log_probs[0])
+            joint.append(joint_scores(log_probs[:1].T, log_probs[1:].T)[:, 0])
             columns = draws.permute(1, 2, 0)
             marginal.append(marginal_scores(theta[rows, :, None], columns)[..., 0])
     return FoldScores(

@@ -132,7 +132,7 @@ class StackedPosterior(MixturePosterior):
                 "instead of `posterior[i].credible_set(guaranteed=True)`, and the same "
                 "for `credible_intervals`."
             )
-        return HeldOutSets(self, self._versions, self._cache)
+        return HeldOutSets(self, self._versions)
 
     def __getitem__(self, index: int) -> "StackedPosterior":
         """Return the posterior of one observation, which is then the default x.

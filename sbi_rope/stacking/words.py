@@ -2,6 +2,7 @@
 
 import math
 import textwrap
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from sbi_rope.metrics.calibration import ACAUC_IN_WORDS
@@ -20,6 +21,7 @@ __all__ = [
     "differs",
     "gains_of",
     "lines_of",
+    "parameters_off",
     "sets_held",
 ]
 
@@ -169,9 +171,33 @@ def _calibration(report: "StackingReport") -> list[str]:
         f"    coverage error {report.coverage_error.value:.3f}; a calibrated posterior "
         f"has about {0.31 / n**0.5:.3f} with {n:.0f} pairs",
         f"    {LEVEL:.0%} intervals hold {report.share_inside:.0%} of the parameters",
+        *(f"    {line}" for line in parameters_off(report)),
         *advice,
         *_sets(report),
         *_assumption(report),
+    ]
+
+
+def parameters_off(
+    report: "StackingReport", names: Sequence[str] | None = None
+) -> list[str]:
+    """Say which parameters are not calibrated by themselves.
+
+    It says nothing about a single parameter, whose verdict is that of the stack.
+
+    Args:
+        report: The report of a stack.
+        names: A name for each parameter; "theta_1" and so on if None.
+    """
+    scores = report.acauc_of_parameters
+    names = names or [f"theta_{k + 1}" for k in range(len(scores))]
+    return [
+        f"{name} by itself is {score.verdict}: ACAUC {score.value:+.3f}, "
+        f"{100 - 5 / len(scores):.3g} % interval {score.interval[0]:+.3f} to "
+        f"{score.interval[1]:+.3f}"
+        # Reports of older files have none.
+        for name, score in zip(names, scores, strict=False)
+        if len(scores) > 1 and score.verdict != "calibrated"
     ]
 
 

@@ -269,6 +269,17 @@ def test_an_over_confident_stack_says_what_to_do(tmp_path: Path) -> None:
     assert "More labels help most." in text
 
 
+def test_the_page_names_parameters_that_are_not_calibrated(tmp_path: Path) -> None:
+    report = the_stack().report
+    known = report.cross_validation
+    levels = known.levels.clone()
+    levels[:, 1] = 0.9 + 0.1 * levels[:, 1]
+    changed = StackingReport.of(replace(known, levels=levels))
+    text = Page(written(changed, tmp_path, parameter_names=["slope", "size"])).text
+    assert "size by itself is over-confident: ACAUC +0.4" in text
+    assert "slope by itself" not in text
+
+
 def test_the_page_says_how_the_stack_was_made(source: str) -> None:
     report, text = the_stack().report, Page(source).text
     assert report.provenance is not None

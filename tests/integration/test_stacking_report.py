@@ -189,6 +189,35 @@ def test_the_text_says_whether_the_stack_is_over_or_under_confident() -> None:
         assert ("More labels help most." in text) == (verdict[:4] == "over")
 
 
+def test_parameters_that_are_not_calibrated_by_themselves_are_named() -> None:
+    """One is over-confident and one too wide, so that their mean looks calibrated."""
+    report = made_up(n=400)
+    levels = report.levels
+    opposite = torch.stack([levels[:, 0].sqrt(), levels[:, 1].square()], dim=1)
+    scores = replace(report.cross_validation, levels=opposite)
+    text = str(StackingReport.of(scores))
+    assert "\n  calibrated as far as these pairs can tell: ACAUC" in text
+    assert "theta_1 by itself is over-confident: ACAUC +0.1" in text
+    assert "theta_2 by itself is too wide: ACAUC -0.1" in text
+    assert "97.5 % interval" in text
+    assert "by itself" not in str(report)
+    # The verdict on a single parameter is that on the stack.
+    single = replace(report.cross_validation, levels=levels[:, :1].sqrt())
+    assert "by itself" not in str(StackingReport.of(single))
+
+
+def test_calibrated_parameters_are_rarely_named() -> None:
+    """The intervals of several parameters are wide enough for all of them together."""
+    report, wrong = made_up(), 0
+    generator = torch.Generator().manual_seed(1)
+    for _ in range(400):
+        levels = torch.rand(20, 5, generator=generator)
+        scores = replace(report.cross_validation, levels=levels)
+        found = StackingReport.of(scores).acauc_of_parameters
+        wrong += any(score.verdict != "calibrated" for score in found)
+    assert wrong <= 32  # 20 are expected, with a standard deviation of 4.4
+
+
 def test_the_text_names_what_calibration_assumes_about_a_batch() -> None:
     report = made_up()
     assert "holds for observations like those of the pairs" in str(report)

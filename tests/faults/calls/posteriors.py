@@ -108,6 +108,20 @@ CALLS += [
             for method in ("credible_set", "credible_intervals")
         ),
         Call(
+            name=f"{kind}.credible_intervals_batched",
+            run=lambda x=x, make=make, **options: make().credible_intervals_batched(
+                x, **{"num_samples": 20, "seed": 0, **options}
+            ),
+            tensors={"x": x},
+            options={
+                "level": "share",
+                "guaranteed": "instance",
+                "num_samples": "count",
+                "seed": "seed",
+            },
+            accepts=("x: a list", "x: a NumPy array", "x: one row less"),
+        ),
+        Call(
             name=f"{kind}.log_prob",
             run=lambda theta=THETA, x=x[:1], make=make: make().log_prob(theta, x=x),
             tensors={"theta": THETA, "x": x[:1]},

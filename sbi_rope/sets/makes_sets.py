@@ -1,0 +1,174 @@
+"""The part of a posterior that makes sets and intervals."""
+
+from abc import ABC, abstractmethod
+from functools import partial
+from typing import Any
+
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_rope._random import seeded
+from sbi_rope._units import log_unit_of
+from sbi_rope._validation import check_instance, check_integer, check_level
+from sbi_rope.errors import InvalidInputError
+from sbi_rope.sets.credible_set import CredibleSet, highest_density_set
+from sbi_rope.sets.intervals import CredibleIntervals, central_intervals
+
+__all__ = ["MakesSets"]
+
+# So many draws are held at a time.
+MAX_DRAWS = 2**20
+
+
+class MakesSets(ABC):
+    """What a posterior inherits to make sets and intervals.
+
+    Posteriors of stacks also make those with a guarantee. They override
+    ``_held_out_sets`` for it.
+    """
+
+    prior: Distribution
+
+    def credible_set(
+        self,
+        level: float = 0.9,
+        x: Tensor | None = None,
+        *,
+        guaranteed: bool = False,
+        num_samples: int = 1000,
+        seed: int | None = None,
+    ) -> CredibleSet:
+        r"""Return a set that is credible given one observation.
+
+        It is the set of highest density,
+        :math:`\{\theta: \log p(\theta \mid x) \ge t\}`, with t the (1 - level)
+        quantile of the log density of draws. It holds the true parameters as often as
+        the posterior is calibrated. With ``guaranteed``, a stack corrects it by its
+        held-out scores, and :class:`~sbi_rope.sets.Guarantee` says what is promised.
+
+        Args:
+            level: The probability of the set.
+            x: An observation, from the batch if there is one; the default x if None.
+            guaranteed: Whether the set shall hold the true parameters in about
+                ``level`` of the cases, even if the posterior is not calibrated. This
+                needs a stack, and observations drawn as its calibration pairs.
+            num_samples: The number of draws that the set and its volume are estimated
+                from.
+            seed: Seed of the draws; None uses the states of torch, NumPy and Python.
+
+        Returns:
+            The set, which tells its volume and which parameters it contains.
+
+        Raises:
+            InvalidInputError: If an argument is outside its range. With ``guaranteed``,
+                also if this is no stack, or if it has too few pairs for the level.
+            UnseenObservationError: If x is not in the batch and ``unseen="raise"``.
+            SamplingError: If hardly any mass lies inside the prior's support.
+        """
+        _check(level, guaranteed=guaranteed, num_samples=num_samples)
+        with seeded(seed):
+            x = self._one_x(x)
+            if guaranteed:
+                return self._held_out_sets().credible_set(level, x, num_samples)
+            return highest_density_set(
+                self,
+                x,
+                level=level,
+                num_samples=num_samples,
+                log_unit=log_unit_of(self.prior),
+            )
+
+    def credible_intervals(
+        self,
+        level: float = 0.9,
+        x: Tensor | None = None,
+        *,
+        guaranteed: bool = False,
+        num_samples: int = 1000,
+        seed: int | None = None,
+    ) -> CredibleIntervals:
+        """Return an interval for each parameter given one observation.
+
+        It is the central interval of draws. With ``guaranteed``, a stack corrects it by
+        its held-out scores. The level is that of each interval by itself.
+
+        Args:
+            level: The probability of each interval.
+            x: As in :meth:`credible_set`.
+            guaranteed: As in :meth:`credible_set`.
+            num_samples: The number of draws. With ``guaranteed`` there are as many as
+                the stack was scored with.
+            seed: As in :meth:`credible_set`.
+
+        Returns:
+            The intervals, with ends of shape ``(d,)``.
+
+        Raises:
+            InvalidInputError: As in :meth:`credible_set`.
+            UnseenObservationError: As in :meth:`credible_set`.
+            SamplingError: As in :meth:`credible_set`.
+        """
+        intervals = self.credible_intervals_batched(
+            self._one_x(x),
+            level,
+            guaranteed=guaranteed,
+            num_samples=num_samples,
+            seed=seed,
+        )
+        return intervals[0]
+
+    def credible_intervals_batched(
+        self,
+        x: Tensor,
+        level: float = 0.9,
+        *,
+        guaranteed: bool = False,
+        num_samples: int = 1000,
+        seed: int | None = None,
+    ) -> CredibleIntervals:
+        """Return an interval for each parameter given each observation of a batch.
+
+        Args:
+            x: Observations, shape ``(B, *event)``.
+            level: As in :meth:`credible_intervals`.
+            guaranteed: As in :meth:`credible_intervals`.
+            num_samples: As in :meth:`credible_intervals`.
+            seed: As in :meth:`credible_intervals`.
+
+        Returns:
+            The intervals, with ends of shape ``(B, d)``.
+
+        Raises:
+            InvalidInputError: As in :meth:`credible_set`.
+            UnseenObservationError: As in :meth:`credible_set`.
+            SamplingError: As in :meth:`credible_set`.
+        """
+        _check(level, guaranteed=guaranteed, num_samples=num_samples)
+        with seeded(seed):
+            make = partial(central_intervals, self, num_samples=num_samples)
+            if guaranteed:
+                make = self._held_out_sets().credible_intervals
+            blocks = self._batch_of_x(x).split(max(1, MAX_DRAWS // num_samples))
+            return CredibleIntervals.joined([make(block, level) for block in blocks])
+
+    def _held_out_sets(self) -> Any:
+        """Return what makes sets with a guarantee. Only a stack has it."""
+        raise InvalidInputError(
+            "Expected a stack for a set with a guarantee, because only a stack has "
+            f"scores on held-out calibration pairs; got {type(self).__name__}. Make "
+            "one with `stack(rope)`, or pass guaranteed=False."
+        )
+
+    @abstractmethod
+    def _one_x(self, x: Tensor | None) -> Tensor:
+        """Return an observation ``(1, *event)``, the default one if None."""
+
+    @abstractmethod
+    def _batch_of_x(self, x: Tensor) -> Tensor:
+        """Return observations ``(B, *event)`` after a check."""
+
+
+def _check(level: Any, *, guaranteed: Any, num_samples: Any) -> None:
+    check_level("level", level)
+    check_instance("guaranteed", guaranteed, bool)
+    check_integer("num_samples", num_samples, minimum=2)
