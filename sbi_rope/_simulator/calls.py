@@ -182,10 +182,12 @@ class Caller:
             shapes.add((1, *self.event_shape))
         if leading == (1,):  # a simulator that squeezes leaves out the row, too
             shapes.add(tuple(self.event_shape))
-        if self.event_shape == (1,):  # one number, without a dimension of its own
-            shapes.add(tuple(leading))
+        # One number, or one channel, without a dimension of its own.
+        if self.event_shape[:1] == (1,):
+            without = tuple(self.event_shape[1:])
+            shapes.add((*leading, *without))
             if leading == (1,):
-                shapes.add(())
+                shapes.add(without)
         return x.reshape(shape) if tuple(x.shape) in shapes else None
 
     def _unfit(self, theta: Tensor, result: Any) -> SimulationError:

@@ -33,6 +33,13 @@ MIXED_ROWS = (
     "`simulator` returns something else for a row of a batch than for the same theta "
     "alone: its rows depend on each other"
 )
+OWN_NOISE = (
+    "`simulator` has noise that does not follow the seeds of torch, NumPy and Python"
+)
+REPAIR = (
+    "Make its generator inside of it, for instance with `rng = "
+    "np.random.default_rng(np.random.randint(2**31))`."
+)
 
 _State = tuple[bytes, tuple[Any, ...], Any]
 
@@ -105,6 +112,8 @@ class Probe:
         caller = self._caller = trial.caller
         if num_workers is not None:
             self._check_workers(trial.theta, num_workers)
+        else:
+            self._check_own_noise(trial)
         if not caller.form.batched:
             self._check_seeds(trial)
             return caller
@@ -212,6 +221,13 @@ class Probe:
                 "call of it has the same noise. Leave the seed to the caller."
             )
 
+    def _check_own_noise(self, trial: _Trial) -> None:
+        """Warn if the simulator has random numbers that no seed repeats."""
+        again = self._try(trial.caller.form, trial.theta).x
+        # More than the rounding of sums whose order changes, as on GPUs.
+        if again is not None and not _are_equal(trial.x, again, tolerance=1e-3):
+            warn_user(f"{OWN_NOISE}, so that no `seed` repeats a result. {REPAIR}")
+
     def _check_workers(self, theta: Tensor, num_workers: int) -> None:
         """Raise or warn if noise in workers is not what it is in this process."""
         caller = self._caller
@@ -224,25 +240,18 @@ class Probe:
         same = [self._try(caller.form, theta).x for _ in range(2)]
         if any(x is None for x in same) or _are_equal(*same):
             return
-        own = (
-            "`simulator` has noise that does not follow the seeds of torch, NumPy and "
-            "Python"
-        )
-        repair = (
-            "Make its generator inside of it, for instance with `rng = "
-            "np.random.default_rng(np.random.randint(2**31))`."
-        )
         apart = [
             self._try(caller.form, theta, seed=seed, caller=copied).x
             for seed, copied in enumerate(copies)
         ]
         if num_workers > 1 and _are_equal(*apart):
             raise SimulationError(
-                f"{own}; each worker process would repeat the same noise. {repair}"
+                f"{OWN_NOISE}; each worker process would repeat the same noise. "
+                f"{REPAIR}"
             )
         warn_user(
-            f"{own}, so that simulations in worker processes cannot be repeated, and "
-            f"may have the same noise in several of them. {repair}"
+            f"{OWN_NOISE}, so that simulations in worker processes cannot be repeated, "
+            f"and may have the same noise in several of them. {REPAIR}"
         )
 
     def _attempt(self, theta: Tensor) -> Tensor | None:
@@ -269,8 +278,9 @@ class Probe:
         return _Trial(caller=caller, theta=theta, x=x, result=result, state=state)
 
 
-def _are_equal(a: Tensor | None, b: Tensor | None) -> bool:
+def _are_equal(a: Tensor | None, b: Tensor | None, *, tolerance: float = 1e-6) -> bool:
     """Tell whether two simulations are the same, but for rounding."""
     if a is None or b is None:
         return False
-    return torch.allclose(a.double(), b.double(), rtol=1e-6, atol=0.0, equal_nan=True)
+    a, b = a.double(), b.double()
+    return torch.allclose(a, b, rtol=tolerance, atol=0.0, equal_nan=True)

@@ -7,6 +7,8 @@ from typing import Any, Literal
 
 from torch import Tensor
 
+from sbi_rope._notebooks import shown_as_text
+
 __all__ = ["Diagnosis", "Finding"]
 
 Concerned = Literal["NPE", "RoPE", "stack and RoPE"]
@@ -64,6 +66,7 @@ class Finding:
         )
 
 
+@shown_as_text
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Diagnosis:
     r"""Findings about a batch of real observations, and the arrays behind them.

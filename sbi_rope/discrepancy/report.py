@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sbi_rope._notebooks import shown_as_text
 from sbi_rope._progress import progress_bar
 from sbi_rope._simulations import Moments
 from sbi_rope._standardisation import Standardisation
@@ -102,6 +103,7 @@ class SummaryDiscrepancy:
         return self.probability_of_none < 0.5
 
 
+@shown_as_text
 @dataclass(frozen=True, kw_only=True)
 class DiscrepancyReport:
     """The discrepancy of each summary, as estimated from calibration pairs.

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sbi_rope._notebooks import shown_as_text
 from sbi_rope._random import seeded
 from sbi_rope.metrics.calibration import (
     ACAUC_IN_WORDS,
@@ -36,6 +37,7 @@ PRIOR_UNITS = "standard deviations of the prior"
 FEWEST = 5
 
 
+@shown_as_text
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Evaluation:
     """All scores of one posterior on one test set, from one set of samples.

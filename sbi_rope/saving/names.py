@@ -85,14 +85,15 @@ ROOMS: dict[str, tuple[type, ...]] = {
     "sbi_rope.mixture": (*_KINDS, *_POSTERIORS),
     "sbi_rope.recalibration": (nn.Module,),
     "sbi_rope.stacking": _POSTERIORS,
-    "sbi_rope.tasks": (nn.Module, Distribution),
+    "sbi_rope.tasks.hemodynamics.prior_table": (),
+    "sbi_rope.tasks": _KINDS,
 }
 # Dataclasses of these rooms are results, which hold numbers, tensors and networks.
 RESULTS = tuple(
     f"sbi_rope.{room}"
     for room in (
         *("_two_sample", "baselines", "coupling", "discrepancy", "metrics"),
-        *("recalibration", "stacking"),
+        *("recalibration", "stacking", "tasks.hemodynamics.prior_table"),
     )
 )
 # It derives from none of these, and holds tensors.

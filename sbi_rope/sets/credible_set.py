@@ -7,6 +7,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from sbi_rope._notebooks import shown_as_text
 from sbi_rope._validation import check_batch, check_tensor
 from sbi_rope.sets.conformal import DIGITS
 from sbi_rope.sets.guarantee import Guarantee
@@ -22,6 +23,7 @@ class Rule(Protocol):
         ...
 
 
+@shown_as_text
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CredibleSet:
     r"""A set of parameters that are credible given one observation.

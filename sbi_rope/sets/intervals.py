@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sbi_rope._notebooks import shown_as_text
 from sbi_rope._validation import check_batch, check_names, check_tensor
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.sets.guarantee import Guarantee
@@ -18,6 +19,7 @@ __all__ = ["CredibleIntervals", "central_intervals"]
 MAX_PRINTED = 20
 
 
+@shown_as_text
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CredibleIntervals:
     """An interval for each parameter given one observation, or each of a batch.

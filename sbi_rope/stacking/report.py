@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sbi_rope._notebooks import shown_as_text
 from sbi_rope._two_sample import TwoSampleTest
 from sbi_rope._validation import check_instance
 from sbi_rope.discrepancy import DiscrepancyReport
@@ -28,6 +29,7 @@ from sbi_rope.stacking.words import LEVEL, REFERENCES, lines_of
 __all__ = ["StackingReport"]
 
 
+@shown_as_text
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StackingReport:
     """How well a stack predicts held-out pairs, which methods it uses, and coverage.

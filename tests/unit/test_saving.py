@@ -47,6 +47,8 @@ from sbi_rope.stacking.trained_candidates import (
     DiscrepancyCandidate,
     FinetunedCandidate,
 )
+from sbi_rope.tasks.hemodynamics.prior import PopulationPrior
+from sbi_rope.tasks.triangle import UniformTriangle
 from tests import problems, stacks
 from tests.baselines import data_of, trained
 
@@ -206,6 +208,16 @@ def test_priors_can_be_saved(prior: Any, tmp_path: Path) -> None:
         loaded.set_default_x(torch.zeros(1, 3))
         found = loaded.map(num_iter=2, num_init_samples=5, num_to_optimize=2)
         assert found.isfinite().all()
+
+
+@pytest.mark.parametrize(
+    "prior", [UniformTriangle(torch.tensor(0.5)), PopulationPrior()]
+)
+def test_priors_of_the_tasks_can_be_saved(prior: Any, tmp_path: Path) -> None:
+    loaded = saved_and_loaded(PriorPosterior(prior), tmp_path)
+    theta = loaded.prior.sample((20,))
+    assert torch.equal(loaded.prior.log_prob(theta), prior.log_prob(theta))
+    assert loaded.set_default_x(torch.zeros(1, 3)).map(num_iter=2).isfinite().all()
 
 
 @pytest.mark.parametrize(

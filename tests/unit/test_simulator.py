@@ -45,6 +45,42 @@ def test_a_simulator_may_squeeze_the_last_row_of_many(length: int) -> None:
         assert torch.equal(simulator(theta), theta[:, :length])
 
 
+@pytest.mark.parametrize("batched", [True, False])
+def test_a_simulator_may_leave_out_the_dimension_of_a_single_channel(
+    *, batched: bool
+) -> None:
+    """An image of one channel is (1, 4, 5) for NPE, and (4, 5) for most people."""
+
+    def image(theta: Tensor) -> Tensor:
+        if not batched and theta.ndim > 1:
+            raise ValueError("one theta at a time")
+        return theta[..., :1, None] + torch.arange(20.0).reshape(4, 5)
+
+    simulator = Simulator(
+        image,
+        problems.box(2),
+        event_shape=torch.Size((1, 4, 5)),
+        like=torch.zeros(1),
+    )
+    assert simulator.is_batched == batched
+    for count in (2, 1):
+        theta = THETA[:count]
+        expected = theta[:, 0, None, None, None] + torch.arange(20.0).reshape(4, 5)
+        assert torch.equal(simulator(theta), expected)
+
+
+def test_noise_that_no_seed_repeats_is_warned_of() -> None:
+    for function in (
+        has_noise_of_its_own,
+        lambda theta: theta.numpy() + np.random.default_rng().normal(size=theta.shape),
+    ):
+        with pytest.warns(RoPEWarning, match=r"no `seed` repeats.*default_rng\(np"):
+            assert simulator_of(function).is_batched
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        simulator_of(lambda theta: theta + torch.randn_like(theta))
+
+
 def mixes(theta: Tensor) -> Tensor:
     return theta * theta.norm() + 0.1 * torch.randn_like(theta)
 
@@ -101,7 +137,6 @@ def test_simulators_of_batches_are_recognised() -> None:
     for function in (
         gaussian.simulator,
         has_noise_of_a_generator_made_anew,
-        has_noise_of_its_own,
         rejects,
         takes_batches_only,
         lambda theta: theta @ torch.tensor([[1.0, 0.3], [-0.2, 0.7]]),
