@@ -6,13 +6,17 @@ simulation linearly and adds noise again. All matrices are drawn from one seed. 
 posterior given a real observation is Gaussian and known. "LPP - exact" is the mean log
 density of the true parameters minus that of the exact posterior, and "C2ST" the
 accuracy with which a classifier tells samples of the two apart, .5 at best, averaged
-over ten observations. NPE is given a real observation as it is.
+over ten observations. NPE is given a real observation as it is. Rows are kept in a
+file, and an interrupted run goes on where it was.
 
     python -m benchmarks.experiments.fmcpe
 """
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import cache, partial
+from itertools import product
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -22,7 +26,7 @@ from sbi.utils.metrics import c2st
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
-from benchmarks.experiments.common import Row, begin, show
+from benchmarks.experiments.common import Row, begin, kept_rows, show
 from sbi_rope.baselines import FMCPE, FinetunedNPE
 
 OPTIONS = {
@@ -30,7 +34,10 @@ OPTIONS = {
     "--repetitions": {"type": int, "default": 3},
     "--num-simulations": {"type": int, "default": 50_000},
     "--max-num-epochs": {"type": int, "default": 50},
+    "--out": {"type": Path, "default": Path("results/experiments")},
 }
+METHODS: dict[str, Any] = {"NPE": None, "fine-tuned NPE": FinetunedNPE, "FMCPE": FMCPE}
+COLUMNS = ("repetition", "method", "pairs", "LPP - exact", "C2ST")
 DIM, NUM_OBSERVABLES = 3, 10
 # Standard deviation of the entries of the matrix behind the noise of the real process.
 REAL_NOISE = 0.1
@@ -109,39 +116,49 @@ def scores(task: GaussianTask, posterior: Any, theta: Tensor, y: Tensor) -> Row:
     }
 
 
-def rows(args: argparse.Namespace) -> Iterator[Row]:
-    """Yield the scores of each method."""
+def rows_of(
+    args: argparse.Namespace,
+) -> Iterator[tuple[tuple[str, ...], Callable[[], Row]]]:
+    """Yield the head of each row, and a function that computes the rest."""
     task = GaussianTask()
-    npe = trained_npe(task, args)
-    for repetition in range(args.repetitions):
-        torch.manual_seed(1 + repetition)
-        theta, theta_o = (
-            task.prior.sample((n,)) for n in (max(args.n_calibration), NUM_TEST)
-        )
-        y, y_o = task.observe(theta), task.observe(theta_o)
-        yield {
-            "repetition": repetition,
-            "method": "NPE",
-            "pairs": 0,
-            **scores(task, npe, theta_o, y_o),
-        }
-        for n in args.n_calibration:
-            methods = {
-                "fine-tuned NPE": FinetunedNPE.from_posterior(npe),
-                # Its way to simulations starts at noise alone, as in its code.
-                "FMCPE": FMCPE.from_posterior(npe, simulator=task.simulate, noise=None),
-            }
-            for name, method in methods.items():
-                method.append_calibration(theta[:n], y[:n])
-                method.train(seed=repetition, show_progress_bars=False)
-                posterior = method.build_posterior()
-                yield {
-                    "repetition": repetition,
-                    "method": name,
-                    "pairs": n,
-                    **scores(task, posterior, theta_o, y_o),
-                }
+    # It is trained when the first row needs it.
+    npe = cache(lambda: trained_npe(task, args))
+    for repetition, name in product(range(args.repetitions), METHODS):
+        for n in args.n_calibration if name != "NPE" else [0]:
+            head = str(repetition), name, str(n)
+            yield head, partial(score, task, npe, args, repetition, name, n)
+
+
+def score(
+    task: GaussianTask,
+    npe: Callable[[], Any],
+    args: argparse.Namespace,
+    repetition: int,
+    name: str,
+    n: int,
+) -> Row:
+    """Return the scores of a method with so many pairs."""
+    posterior = npe()
+    torch.manual_seed(1 + repetition)
+    theta, theta_o = (
+        task.prior.sample((count,)) for count in (max(args.n_calibration), NUM_TEST)
+    )
+    y, y_o = task.observe(theta), task.observe(theta_o)
+    if name != "NPE":
+        # Its way to simulations starts at noise alone, as in its code.
+        options = {"simulator": task.simulate, "noise": None} if name == "FMCPE" else {}
+        method = METHODS[name].from_posterior(posterior, **options)
+        method.append_calibration(theta[:n], y[:n])
+        method.train(seed=repetition, show_progress_bars=False)
+        posterior = method.build_posterior()
+    return scores(task, posterior, theta_o, y_o)
+
+
+def main() -> None:
+    """Print the table."""
+    args = begin(__doc__, OPTIONS, threads=1)
+    show(kept_rows(args.out / "fmcpe" / "rows.csv", COLUMNS, rows_of(args)))
 
 
 if __name__ == "__main__":
-    show(rows(begin(__doc__, OPTIONS, threads=1)))
+    main()
