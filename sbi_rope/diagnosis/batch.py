@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from sbi_rope._means import Counts
 from sbi_rope._npe import TrainedNPE
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
@@ -205,11 +204,8 @@ def _held_out(
 def _residual_findings(
     rope: RoPE, held_out: CrossFitted, simulations: Simulations, notes: list[str]
 ) -> list[Finding]:
-    # Recordings of one person have errors in common, so that they are not independent
-    # evidence for a dependence on the parameters.
-    people = Counts(torch.ones(len(rope.labels)), rope.labels.groups)
-    theta, _ = people.of_groups(_moved(rope.calibration[0]))
-    residuals, _ = people.of_groups(held_out.residuals)
+    theta = held_out.of_people(_moved(rope.calibration[0]))
+    residuals = held_out.of_people(held_out.residuals)
     if num_features(*theta.shape):
         return [residual_finding(residuals, theta, simulations)]
     notes.append(
@@ -231,7 +227,7 @@ def _spread_findings(
     theta = _moved(rope.labelled_parameters.draws[:, 0])
     counts = [len(shift.batch.means)]
     if shift.held_out is not None:
-        counts.append(len(theta))
+        counts.append(len(shift.held_out.of_people(theta)))
     if min(counts) < FEWEST:
         notes.append(
             "Whether the batch has a narrower range of parameters than the prior was "

@@ -42,7 +42,8 @@ class PriorShift:
         expected: What simulations imply that take the place of observations: as tuning
             would move them, and unchanged. Without tuning the two are the same, and
             there is only one.
-        held_out: What held-out calibration pairs imply, if there are any.
+        pairs: What held-out calibration pairs imply, if there are any.
+        held_out: These pairs.
     """
 
     implied: Tensor
@@ -52,7 +53,8 @@ class PriorShift:
     error: Tensor | None
     batch: Implied
     expected: tuple[Implied, ...]
-    held_out: Implied | None
+    pairs: Implied | None
+    held_out: CrossFitted | None
 
     @property
     def threshold(self) -> Tensor:
@@ -150,7 +152,7 @@ def prior_shift(
     pairs, error = None, None
     if held_out is not None:
         pairs = implied_by(coupling, held_out.embedded, simulations)
-        error = _errors_of_g(coupling, pairs, held_out.targets, simulations)
+        error = _errors_of_g(coupling, pairs, held_out, simulations)
     return PriorShift(
         implied=batch.weights,
         unshifted=expected.weights,
@@ -161,17 +163,19 @@ def prior_shift(
         error=error,
         batch=batch,
         expected=tuple(ends),
-        held_out=pairs,
+        pairs=pairs,
+        held_out=held_out,
     )
 
 
 def _errors_of_g(
-    coupling: Coupling, found: Implied, targets: Tensor, simulations: Simulations
+    coupling: Coupling, found: Implied, held_out: CrossFitted, simulations: Simulations
 ) -> Tensor:
     """Return how far errors of g move the parameters of unseen pairs, shape (d,)."""
-    wanted = implied_by(coupling, simulations.average(targets), simulations)
-    # With few pairs the errors could be small by chance, hence a bootstrap.
-    difference = found.functions - wanted.functions
+    targets = simulations.average(held_out.targets)
+    wanted = implied_by(coupling, targets, simulations)
+    # With few people the errors could be small by chance, hence a bootstrap.
+    difference = held_out.of_people(found.functions - wanted.functions)
     gaps = resampled(difference, len(difference), num_draws=NUM_DRAWS)
     return gaps.abs().amax(dim=-1).quantile(ERROR_QUANTILE, dim=0)
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from sbi_rope._means import Counts
 from sbi_rope._progress import progress_bar
 from sbi_rope._sbi import embed
 from sbi_rope._training import split_groups
@@ -36,15 +37,22 @@ class CrossFitted:
     Attributes:
         embedded: :math:`g(x)`, ``(n_c, l)``.
         targets: :math:`E[h(S(\theta))]`, ``(n_c, l)``.
+        people: Which pairs have the same parameters. Such recordings of one person have
+            errors in common, so that they are not independent evidence.
     """
 
     embedded: Tensor
     targets: Tensor
+    people: Counts | None = None
 
     @property
     def residuals(self) -> Tensor:
         """The differences between the two, ``(n_c, l)``."""
         return self.embedded - self.targets
+
+    def of_people(self, values: Tensor) -> Tensor:
+        """Return the mean of each person of values of the pairs, ``(n_c, ...)``."""
+        return values if self.people is None else self.people.of_groups(values)[0]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +103,11 @@ def cross_fit(rope: RoPE, *, num_folds: int, show_progress_bars: bool) -> CrossF
         part = rope.with_pairs(others, targets=targets[others])
         part.train(show_progress_bars=False)
         embedded[held_out] = embed(part.tuned_embedding_net, x[held_out])
-    return CrossFitted(embedded=embedded.cpu().double(), targets=targets.cpu().double())
+    return CrossFitted(
+        embedded=embedded.cpu().double(),
+        targets=targets.cpu().double(),
+        people=Counts(torch.ones(len(theta)), rope.labels.groups.cpu()),
+    )
 
 
 def dependence(residuals: Tensor, theta: Tensor) -> Dependence:

@@ -125,10 +125,8 @@ def spread_of(
         for end in shift.expected
     ]
     error = None
-    if shift.held_out is not None and theta_cal is not None:
-        predicted = _predicted(
-            shift.held_out.means, theta_cal, theta.var(dim=0), level=level
-        )
+    if shift.pairs is not None and theta_cal is not None:
+        predicted = _predicted(shift, theta_cal, theta.var(dim=0), level=level)
         error = (predicted / usual).clamp_max(1.0)
     return Spread(
         ratio=batch.std(dim=0) / usual,
@@ -147,19 +145,23 @@ def _spreads(means: Tensor, size: int) -> Tensor:
 
 
 def _predicted(
-    means: Tensor, theta: Tensor, variance: Tensor, *, level: float
+    shift: PriorShift, theta: Tensor, variance: Tensor, *, level: float
 ) -> Tensor:
     """Return how far implied means spread at least for a batch of the prior, ``(d,)``.
 
     Args:
-        means: The means that pairs imply, shape ``(n, d)``.
-        theta: Their parameters, shape ``(n, d)``.
+        shift: With what held-out pairs imply.
+        theta: The parameters of these pairs, shape ``(n, d)``.
         variance: The variance of each parameter in the prior, shape ``(d,)``.
-        level: The quantile of the bootstrap over pairs.
+        level: The quantile of the bootstrap over people.
     """
-    n = len(theta)
+    assert shift.pairs is not None
+    assert shift.held_out is not None
+    means = shift.pairs.means
     x, y = theta - theta.mean(dim=0), means - means.mean(dim=0)
     moments = torch.stack([x, y, x * x, x * y, y * y], dim=1)
+    moments = shift.held_out.of_people(moments)
+    n = len(moments)
     draws = resampled(moments, n, num_draws=NUM_DRAWS)
     mean_x, mean_y, xx, xy, yy = draws.unbind(dim=1)
     var_x = (xx - mean_x.square()).clamp_min(SMALLEST**2)

@@ -591,6 +591,37 @@ def test_the_spread_of_pairs_is_carried_over_to_the_range_of_the_prior() -> None
     assert float(spread.error.min()) > 0.6
 
 
+def test_recordings_of_one_person_are_one_piece_of_evidence_about_g() -> None:
+    torch.manual_seed(34)
+    known = simulations(800, is_tuned=True)
+    theta = parameters(20).double()
+    targets = gaussian.GAIN * theta
+    once = CrossFitted(
+        embedded=0.6 * targets + 0.3 * torch.randn(20, 2), targets=targets
+    )
+    rows = torch.arange(20).repeat_interleave(10)
+    often = CrossFitted(embedded=once.embedded[rows], targets=targets[rows])
+    known_people = replace(often, people=Counts(torch.ones(200), rows))
+    found = []
+    for pairs, its_theta in (
+        (once, theta),
+        (known_people, theta[rows]),
+        (often, theta[rows]),
+    ):
+        torch.manual_seed(35)
+        shift = prior_shift(targets, known, held_out=pairs)
+        spread = spread_of(shift, known.theta, theta_cal=its_theta)
+        assert shift.error is not None
+        assert spread.error is not None
+        found.append((shift.error, spread.error))
+    one, same, apart = found
+    for k in range(2):
+        assert torch.allclose(one[k], same[k], rtol=1e-3)
+    # As 200 independent pairs they would seem to know the errors better.
+    assert (apart[0] < 0.95 * one[0]).all()
+    assert (apart[1] > 1.02 * one[1]).all()
+
+
 # --- the calibration pairs ---
 
 
