@@ -54,22 +54,22 @@ class CredibleIntervals:
         """Whether there is a guarantee."""
         return self.guarantee is not None
 
-    def __len__(self) -> int:
-        return len(self._of_batch)
+    def __getitem__(self, index: int | slice) -> "CredibleIntervals":
+        """Return the intervals of one observation of a batch, or of several.
 
-    def __getitem__(self, index: int) -> "CredibleIntervals":
-        """Return the intervals of one observation of a batch."""
-        low, high = self._of_batch[index], self.high[index]
-        return replace(self, low=low, high=high)
-
-    @property
-    def _of_batch(self) -> Tensor:
-        if self.low.ndim < 2:
+        Raises:
+            InvalidInputError: If these are the intervals of one observation.
+        """
+        if not self._is_batch:
             raise InvalidInputError(
                 "Expected intervals of a batch, as `credible_intervals_batched` makes "
                 "them; got those of one observation. Their ends are `low` and `high`."
             )
-        return self.low
+        return replace(self, low=self.low[index], high=self.high[index])
+
+    @property
+    def _is_batch(self) -> bool:
+        return self.low.ndim > 1
 
     def contains(self, theta: Tensor) -> Tensor:
         """Tell which parameters are in their intervals, one by one.
@@ -110,27 +110,25 @@ class CredibleIntervals:
         names = [f"theta_{k + 1}" for k in range(count)]
         if parameter_names is not None:
             names = check_names("parameter_names", parameter_names, count)
-        if self.low.ndim > 1:
+        if self._is_batch:
             return [
                 {"observation": number, **row}
-                for number in range(len(self))
+                for number in range(len(self.low))
                 for row in self[number].as_rows(names)
             ]
         ends = zip(names, self.low.tolist(), self.high.tolist(), strict=True)
         return [{"parameter": name, "low": a, "high": b} for name, a, b in ends]
 
     def __str__(self) -> str:
-        is_batch = self.low.ndim > 1
         count = -(-MAX_PRINTED // self.low.shape[-1])
-        shown = replace(self, low=self.low[:count], high=self.high[:count])
-        rows = (shown if is_batch else self).as_rows()
+        rows = (self[:count] if self._is_batch else self).as_rows()
         lines = [
-            (f"  observation {row['observation']}," if is_batch else " ")
+            (f"  observation {row['observation']}," if self._is_batch else " ")
             + f" {row['parameter']}: {row['low']:.4g} to {row['high']:.4g}"
             for row in rows
         ]
-        if is_batch and len(self) > count:
-            lines.append(f"  and those of {len(self) - count} more observations")
+        if self._is_batch and len(self.low) > count:
+            lines.append(f"  and those of {len(self.low) - count} more observations")
         promise = self.guarantee or (
             "They have no guarantee: they hold the true parameters as often as the "
             "posterior is calibrated."
