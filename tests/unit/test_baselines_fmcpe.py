@@ -1,12 +1,16 @@
 """FMCPE: its maps and densities belong together, and it learns from pairs."""
 
+import copy
 from typing import Any
 
 import pytest
 import torch
+from sbi.utils import BoxUniform
 from torch import Tensor, nn
 
 from sbi_rope.baselines import FMCPE, Training
+from sbi_rope.baselines.fmcpe.standardise import Standardise
+from sbi_rope.baselines.fmcpe.unbounded import Unbounded
 from sbi_rope.baselines.fmcpe.velocity import VelocityField, follow, follow_back
 from tests import gaussian, problems
 
@@ -149,3 +153,87 @@ def test_what_npe_has_outside_the_prior_is_replaced_by_the_prior() -> None:
     assert draws.std(dim=0).allclose(torch.tensor(1 / 3**0.5), atol=0.05)
     log_prob = posterior.log_prob(torch.zeros(1, DIM), x=far, norm_posterior=False)
     assert float(log_prob) == pytest.approx(float(prior.log_prob(torch.zeros(1, DIM))))
+
+
+def box_method(theta: Tensor, *, num_epochs: int = 40) -> Any:
+    """FMCPE in a box, tuned on pairs."""
+    method = FMCPE.from_posterior(
+        problems.npe_posterior("mdn", dim=1),
+        simulator=problems.simulate,
+        num_draws=10,
+        training=Training(
+            learning_rate=3e-3,
+            max_num_epochs=num_epochs,
+            stop_after_epochs=num_epochs,
+        ),
+    )
+    return method.append_calibration(theta, problems.simulate(theta) + 0.3)
+
+
+def test_labels_on_a_bound_are_like_labels_next_to_it() -> None:
+    """Recorded settings are often exactly at the end of their range."""
+    torch.manual_seed(0)
+    theta = problems.box(1).sample((40,))
+    theta[:4] = -1.0
+    torch.manual_seed(1)
+    on = box_method(theta).train(**QUIET).build_posterior()
+    torch.manual_seed(1)
+    theta[:4] = -0.9999
+    near = box_method(theta).train(**QUIET).build_posterior()
+    x = problems.simulate(torch.tensor([[-0.9]])) + 0.3
+    points = torch.tensor([[-1.0], [-0.9999], [-0.99], [0.0], [1.0]])
+    densities = [one.log_prob(points, x=x, norm_posterior=False) for one in (on, near)]
+    torch.testing.assert_close(*densities, atol=0.3, rtol=0)
+    # A density at the bound is like that next to it, and not 60 nats higher.
+    assert float(densities[0][0]) == pytest.approx(float(densities[0][1]), abs=0.01)
+    assert float(densities[0][:3].max()) < 6
+
+
+def test_the_volume_of_the_transform_is_right_far_from_its_middle() -> None:
+    """Parameters near a bound of [0, 5] have rounded distances from it."""
+    prior = BoxUniform(torch.zeros(1), torch.full((1,), 5.0))
+    unbounded = Unbounded(prior)
+    for raw in (-30.0, -18.0, 0.0, 18.0, 30.0):
+        line = torch.tensor([[raw]])
+        u = unbounded.unit(line)
+        slope = 5 * line.double().sigmoid() * (-line.double()).sigmoid()
+        expected = -slope.log().flatten() - unbounded.unit.std.log()
+        torch.testing.assert_close(
+            unbounded.log_scale(u).double(), expected.double(), atol=1e-3, rtol=1e-4
+        )
+
+
+def test_columns_that_share_a_unit_do_not_count_those_that_never_vary() -> None:
+    torch.manual_seed(0)
+    rows = torch.cat([0.05 * torch.randn(500, 10), torch.ones(500, 90)], dim=1)
+    unit = Standardise(rows, shared=True)
+    assert torch.allclose(unit.std, torch.full((100,), 0.05), atol=0.003)
+    assert Standardise(torch.ones(5, 3), shared=True).std.tolist() == [1.0] * 3
+
+
+def test_the_net_behind_the_condition_is_not_trained_on_the_side() -> None:
+    """BatchNorm would follow the observations, and dropout would be random."""
+    torch.manual_seed(0)
+    npe = copy.deepcopy(problems.npe_posterior("mdn", dim=1))
+    for module in list(npe.posterior_estimator.modules()):
+        for name, child in list(module.named_children()):
+            if isinstance(child, nn.Dropout):
+                setattr(module, name, nn.BatchNorm1d(4))
+    theta = problems.box(1).sample((30,))
+    method = FMCPE.from_posterior(
+        npe,
+        simulator=problems.simulate,
+        space="embedding",
+        num_draws=5,
+        training=Training(max_num_epochs=3),
+    )
+    method.append_calibration(theta, problems.simulate(theta) + 5.0)
+    posterior = method.train(**QUIET).build_posterior()
+    after = batch_norms(posterior.posterior_estimator)
+    assert len(after) > 1
+    for one in after:
+        assert not one.running_mean.any()  # as it was
+
+
+def batch_norms(estimator: nn.Module) -> list[Any]:
+    return [one for one in estimator.modules() if isinstance(one, nn.BatchNorm1d)]

@@ -59,6 +59,14 @@ NUM_HELD_OUT = 256
 Space = Literal["input", "embedding"]
 
 
+class Frozen(nn.Sequential):
+    """A net that stays in evaluation mode while what contains it is trained."""
+
+    def train(self, mode: bool = True) -> "Frozen":  # noqa: FBT001, FBT002
+        """Do not switch to training mode."""
+        return super().train(mode=False)
+
+
 class FMCPE(Method):
     r"""Flow matching from observations to simulations, and from NPE to the labels.
 
@@ -93,8 +101,10 @@ class FMCPE(Method):
       each batch chooses among them, instead of new ones for each batch.
     - Of all epochs the best on the held-out pairs is kept, the start included. Fields
       start at zero, at which both maps leave everything where it is.
-    - The maps are integrated by the midpoint rule instead of Euler's, so that samples
-      follow the density.
+    - The maps are integrated by ten steps of the midpoint rule instead of twenty of
+      Euler's, so that samples follow the density.
+    - Parameters on a bound of the prior are taken for parameters next to it, because
+      the transform would put them infinitely far away.
     - Of a series or an image, :math:`v_x` sees an untrained copy of NPE's embedding
       net of the observation, and z itself. The original embeds z, too.
     - Draws of NPE outside the prior's support are replaced by draws of the prior.
@@ -228,7 +238,7 @@ class FMCPE(Method):
         """Return an untrained velocity field of so many entries."""
         condition: nn.Module
         if self.space == "embedding":
-            condition = nn.Sequential(copy.deepcopy(h), nn.Flatten(), unit)
+            condition = nn.Sequential(Frozen(copy.deepcopy(h)), nn.Flatten(), unit)
         elif x[0].numel() > MAX_SUMMARIES and any(True for _ in h.parameters()):
             condition = nn.Sequential(fresh_copy(h), nn.Flatten())
         else:

@@ -15,6 +15,7 @@ from sbi_rope.baselines.fmcpe.velocity import (
     matching_loss,
 )
 from sbi_rope.mixture import MixtureEstimator
+from sbi_rope.mixture.truncation import is_unbounded
 
 __all__ = ["PushedForward"]
 
@@ -64,18 +65,19 @@ class PushedForward(ConditionalDensityEstimator):
         u, log_scale, inside = self.unbounded.checked(theta.flatten(0, 1))
         u_start, divergence = follow_back(self.field, u, c)
         start = self.unbounded.inverse(u_start)
-        _, log_scale_at_start, usable = self.unbounded.checked(start)
+        usable = self.unbounded.contains(start)
         base = self._log_prob_at_start(start.reshape(theta.shape), condition)
-        rest = log_scale - log_scale_at_start - divergence
+        rest = log_scale - self.unbounded.log_scale(u_start) - divergence
         log_prob = base + rest.reshape(count, num_rows)
         inside = (inside & usable).reshape(count, num_rows)
         return log_prob.where(inside, -torch.inf)
 
     def _log_prob_at_start(self, start: Tensor, condition: Tensor) -> Tensor:
         """Return the log density before the map, ``(S, B)``."""
-        inside = self.unbounded.contains
+        prior = self.unbounded.prior
+        inside = None if is_unbounded(prior) else self.unbounded.contains
         outside = 1 - self.base.mass(condition, accept=inside, cache={}).mass
-        replaced = self.unbounded.prior.log_prob(start.flatten(0, 1))
+        replaced = prior.log_prob(start.flatten(0, 1))
         return torch.logaddexp(
             self.base.log_prob(start, condition),
             outside.clamp_min(0).log().to(start) + replaced.reshape(start.shape[:2]),

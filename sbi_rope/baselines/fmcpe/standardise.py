@@ -13,7 +13,8 @@ class Standardise(nn.Module):
 
     Args:
         rows: Shape ``(n, m)``. A column that does not vary has a deviation of one.
-        shared: Whether all columns share a standard deviation, as those of a series.
+        shared: Whether all columns share a standard deviation, as those of a series. It
+            is that of columns that vary.
     """
 
     mean: Tensor
@@ -23,9 +24,11 @@ class Standardise(nn.Module):
         super().__init__()
         std, mean = torch.std_mean(rows, dim=0)
         smallest = ROUNDING * mean.abs().clamp_min(ROUNDING)
-        std = std.where(std > smallest, torch.ones_like(std))
-        if shared:
-            std = std.square().mean().sqrt().expand_as(std).clone()
+        varies = std > smallest
+        if shared and varies.any():
+            std = std[varies].square().mean().sqrt().expand_as(std).clone()
+        else:
+            std = std.where(varies, torch.ones_like(std))
         self.register_buffer("mean", mean)
         self.register_buffer("std", std)
 

@@ -10,8 +10,8 @@ __all__ = ["NUM_STEPS", "VelocityField", "follow", "follow_back", "matching_loss
 
 # Units of each layer, and residual blocks.
 HIDDEN, NUM_BLOCKS = 64, 5
-# Steps of the integration, of second order.
-NUM_STEPS = 20
+# Steps of the integration, of second order. Each evaluates the field twice.
+NUM_STEPS = 10
 # The share of the start that is left at the end of a path.
 SIGMA = 1e-4
 
