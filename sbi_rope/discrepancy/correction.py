@@ -1,21 +1,29 @@
 """Fit the discrepancy, and train a given NPE further on corrected simulations."""
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+import torch
 from torch import Tensor, nn
 
 from sbi_rope._sbi import ConditionalEstimator, embedding_of, headless, with_embedding
 from sbi_rope._simulations import Moments
 from sbi_rope._standardisation import Standardisation
 from sbi_rope._training import History
-from sbi_rope.discrepancy.model import DiscrepancyModel
+from sbi_rope.discrepancy.model import SMALLEST_NOISE, DiscrepancyModel
 from sbi_rope.discrepancy.posterior import Discrepancy
 from sbi_rope.discrepancy.training import train_on_corrected
 from sbi_rope.errors import InvalidInputError
 
-__all__ = ["Correction", "Space", "correct_npe", "fit_discrepancy", "network_of"]
+__all__ = [
+    "Correction",
+    "Space",
+    "correct_npe",
+    "fit_discrepancy",
+    "network_of",
+    "surprise",
+]
 
 # What is corrected: h(x), x itself, or g(x) with nets g tuned on other pairs. In the
 # last case simulations are still represented by h(x), because g is tuned towards h.
@@ -27,6 +35,8 @@ NUM_DRAWS, MAX_ENTRIES = 2000, 2**24
 # Smallest standard deviation of the error, in standard deviations of simulations. It is
 # smaller for x, which can be known more precisely than an embedding.
 SMALLEST_ERROR = {"embedding": 0.01, "tuned": 0.01, "input": 0.003}
+# More standard deviations than this refute that the simulator is right.
+LARGEST_SURPRISE = 5.0
 # Gradient steps of a course. The density behind an embedding net adapts within a
 # hundred steps; a whole network takes longer. Chosen on calibration data, see
 # benchmarks/README.md.
@@ -79,6 +89,11 @@ def fit_discrepancy(
 ) -> Discrepancy:
     """Fit the model to calibration pairs, in standard deviations of simulations.
 
+    That the simulator is right counts as impossible if the pairs refute it by
+    themselves, see :func:`surprise`. The evidence alone would not: with few pairs and
+    many entries, a right simulator that fits badly can have more of it than all
+    discrepancies, each of which has many coefficients to learn.
+
     Args:
         z: The representations of the real observations, shape ``(n, l)``.
         moments: The moments of simulations at the parameters of the pairs.
@@ -98,13 +113,50 @@ def fit_discrepancy(
             "embedding net."
         )
     std = standardisation.std[varies]
-    covariance = moments.covariance.mean(dim=0)[varies][:, varies]
-    return model.fit(
-        standardisation(z.double()),
-        standardisation(moments.means),
-        covariance / std / std[:, None],
-        weights=weights,
+    covariances = moments.covariance[:, varies][:, :, varies] / std / std[:, None]
+    z, means = standardisation(z.double()), standardisation(moments.means)
+    covariance = covariances.mean(dim=0)
+    is_certain = model.probability_of_none in (0.0, 1.0)
+    if not is_certain and surprise(z, means, covariances, weights) > LARGEST_SURPRISE:
+        model = replace(model, probability_of_none=0.0)
+    return model.fit(z, means, covariance, weights=weights)
+
+
+def surprise(
+    z: Tensor, means: Tensor, covariances: Tensor, weights: Tensor | None = None
+) -> float:
+    r"""Return how badly a right simulator would fit, in standard deviations.
+
+    .. math:: \frac{\sum_i w_i (T_i - E_i)}{\sqrt{\sum_i w_i^2 V_i}}, \qquad
+        T_i = (z_i - m_i)^\top C^{-1} (z_i - m_i)
+
+    If :math:`z_i` were a simulation with the covariance :math:`C_i`, then :math:`T_i`
+    would have the mean :math:`E_i = \operatorname{tr}(C^{-1} C_i)` and, if it were
+    Gaussian, the variance :math:`V_i = 2 \operatorname{tr}((C^{-1} C_i)^2)`. Here C is
+    the mean of all :math:`C_i`.
+
+    Args:
+        z: The representations of the real observations, shape ``(n, l)``.
+        means: :math:`m_i`, shape ``(n, l)``, or its possible values, ``(n, R, l)``, of
+            which the nearest counts.
+        covariances: :math:`C_i`, shape ``(n, l, l)``.
+        weights: :math:`w_i`, shape ``(n,)``; one if None.
+    """
+    noise = SMALLEST_NOISE**2 * torch.eye(z.shape[1]).to(covariances)
+    covariances = covariances + noise
+    residual = z.to(covariances).reshape(len(z), -1, z.shape[1]) - means.reshape(
+        len(z), -1, z.shape[1]
     )
+    factor = torch.linalg.cholesky(covariances.mean(dim=0))
+    white = torch.linalg.solve_triangular(factor, residual.mT, upper=False)
+    found = white.square().sum(dim=1).amin(dim=1)
+    inverse = torch.cholesky_inverse(factor)
+    relative = inverse @ covariances
+    expected = relative.diagonal(dim1=1, dim2=2).sum(dim=1)
+    variance = 2 * (relative * relative.mT).sum(dim=(1, 2))
+    w = torch.ones_like(found) if weights is None else weights.to(found)
+    total = (w * (found - expected)).sum() / (w.square() * variance).sum().sqrt()
+    return float(total)
 
 
 def correct_npe(

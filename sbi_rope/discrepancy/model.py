@@ -64,7 +64,9 @@ class DiscrepancyModel:
     which the simulator is right. Before any pair is seen its probability is
     ``probability_of_none``. If the simulator is right, the probability goes to one with
     more pairs, and nothing is corrected. An exception are simulators whose noise varies
-    by a factor of several with the parameters, because C is the same for all pairs.
+    by a factor of several with the parameters, because C is the same for all pairs. If
+    the pairs by themselves refute that the simulator is right, :class:`DiscrepancyNPE`
+    and stacks set the probability to zero.
 
     All quantities are in standard deviations of simulations from the prior.
 

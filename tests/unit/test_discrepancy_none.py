@@ -1,0 +1,77 @@
+"""When pairs refute that the simulator is right, whatever the evidence says."""
+
+import torch
+from torch import Tensor
+
+from sbi_rope._simulations import Moments
+from sbi_rope._standardisation import Standardisation
+from sbi_rope.discrepancy import DiscrepancyModel
+from sbi_rope.discrepancy.correction import fit_discrepancy, surprise
+
+WIDTH = 9
+
+
+def pairs(n: int, *, error: float = 0.0, seed: int = 0) -> tuple[Tensor, Moments]:
+    """Observations of a simulator whose noise depends on the parameters.
+
+    Args:
+        n: The number of pairs.
+        error: The standard deviation of an error, in that of the noise.
+        seed: Seed of everything random.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    draw = torch.randn(n, WIDTH, WIDTH, generator=generator).double()
+    # Some entries are known much more precisely than others.
+    scale = torch.logspace(-1.5, 0, WIDTH)[:, None].double()
+    scale = (0.3 + 0.3 * torch.rand(n, 1, 1, generator=generator).double()) * scale
+    factor = scale * torch.linalg.cholesky(draw @ draw.mT / WIDTH + torch.eye(WIDTH))
+    mean = torch.randn(n, WIDTH, generator=generator).double()
+    noise = torch.randn(n, WIDTH, 1, generator=generator).double()
+    z = mean + (1 + error**2) ** 0.5 * (factor @ noise)[..., 0]
+    return z, Moments(mean=mean, covariance=factor @ factor.mT)
+
+
+def unit() -> Standardisation:
+    return Standardisation(torch.randn(2000, WIDTH).double())
+
+
+def test_the_surprise_of_a_right_simulator_is_about_standard_normal() -> None:
+    """A little lower, because a smallest noise is assumed that is not there."""
+    found = []
+    for seed in range(300):
+        z, moments = pairs(20, seed=seed)
+        found.append(surprise(z, moments.mean, moments.covariance))
+    values = torch.tensor(found)
+    assert -0.5 < float(values.mean()) < 0.1
+    assert 0.8 < float(values.std()) < 1.25
+    assert float(values.max()) < 5
+
+
+def test_weights_of_one_and_copies_of_the_means_change_no_surprise() -> None:
+    z, moments = pairs(20, error=1.0)
+    plain = surprise(z, moments.mean, moments.covariance)
+    ones = surprise(z, moments.mean, moments.covariance, torch.ones(20))
+    several = moments.mean[:, None] + torch.tensor([0.0, 5.0])[:, None].double()
+    nearest = surprise(z, several, moments.covariance)
+    assert abs(plain - ones) < 1e-9
+    assert abs(plain - nearest) < 1e-9
+
+
+def test_ten_pairs_refute_a_simulator_that_all_discrepancies_are_worse_than() -> None:
+    """Each discrepancy of nine entries has so much to learn that evidence is small."""
+    z, moments = pairs(10, error=1.8)
+    evidence = DiscrepancyModel().fit(z, moments.mean, moments.covariance.mean(dim=0))
+    assert evidence.probability_of_none > 0.99
+    torch.manual_seed(0)
+    found = fit_discrepancy(z, moments, unit(), DiscrepancyModel())
+    assert found.probability_of_none == 0.0
+    told = DiscrepancyModel(probability_of_none=1.0)
+    assert fit_discrepancy(z, moments, unit(), told).probability_of_none == 1.0
+
+
+def test_a_right_simulator_stays_right() -> None:
+    for n in (10, 100):
+        z, moments = pairs(n)
+        torch.manual_seed(0)
+        found = fit_discrepancy(z, moments, unit(), DiscrepancyModel())
+        assert found.probability_of_none > 0.99
