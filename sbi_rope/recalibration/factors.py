@@ -123,11 +123,14 @@ class HeldOutGrid:
         common: With one factor for all parameters, shape ``(n, 49)``.
         own: What a factor of one parameter adds, shape ``(n, d, 25)``.
         weights: How many pairs each pair counts as, shape ``(n,)``.
+        says_something: Whether the density of a pair is above zero, shape ``(n,)``.
+            The others say nothing about the spread, and have zeros.
     """
 
     common: Tensor
     own: Tensor
     weights: Tensor
+    says_something: Tensor
 
     @classmethod
     def of(cls, folds: Sequence[HeldOutMixture], weights: Tensor) -> "HeldOutGrid":
@@ -142,19 +145,23 @@ class HeldOutGrid:
         ones = torch.ones(d, dtype=torch.double, device=device)
         factors = COMMON.to(device).exp()[:, None] * ones
         common = torch.cat([fold.log_prob(factors) for fold in folds])
-        # A pair with a density of zero says nothing about the spread.
-        says_nothing = torch.isinf(common[:, [len(COMMON) // 2]])
-        common = common.where(~says_nothing, 0.0)
+        says_something = torch.isfinite(common[:, [len(COMMON) // 2]])
+        common = common.where(says_something, 0.0)
         best = factors[_best_common(common, weights)]
         own = []
         for j in range(d):
             of_one = best.repeat(len(OWN), 1)
             of_one[:, j] *= OWN.to(device).exp()
             own.append(torch.cat([fold.log_prob(of_one) for fold in folds]))
-            own[-1] = own[-1].where(~says_nothing, 0.0)
+            own[-1] = own[-1].where(says_something, 0.0)
         grid = torch.stack(own, dim=1)
         middle = len(OWN) // 2
-        return cls(common=common, own=grid - grid[..., [middle]], weights=weights)
+        return cls(
+            common=common,
+            own=grid - grid[..., [middle]],
+            weights=weights,
+            says_something=says_something[:, 0],
+        )
 
     def best(self, rows: Tensor) -> Choice:
         """Return the best factors for some of the pairs, given by a mask ``(n,)``."""
@@ -165,12 +172,6 @@ class HeldOutGrid:
             _best_common(self.common[rows], weights),
             tuple(added.argmax(dim=1).tolist()),
         )
-
-    def log_prob(self, choice: Choice) -> Tensor:
-        """Return the log density of each pair with some factors, shape ``(n,)``."""
-        parameters = torch.arange(self.own.shape[1])
-        added = self.own[:, parameters, list(choice.own)].sum(dim=1)
-        return self.common[:, choice.common] + added
 
     @property
     def unchanged(self) -> Tensor:

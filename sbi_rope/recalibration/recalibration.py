@@ -100,7 +100,10 @@ def recalibrate(
     for k, fold in enumerate(folds):
         rows = numbers == k
         choice = grid.best(~rows)
-        scores[rows] = grid.log_prob(choice)[rows]
+        # With all factors together, whose effects do not add up if parameters are
+        # correlated.
+        together = fold.log_prob(choice.factors.to(fold.theta.device)[None])[:, 0]
+        scores[rows] = together.where(grid.says_something[rows], 0.0)
         with seeded(seed):
             before.append(fold.levels(torch.ones_like(choice.factors)))
             after.append(fold.levels(choice.factors))

@@ -145,6 +145,50 @@ def test_many_pairs_find_a_factor_for_each_parameter() -> None:
     assert found.after.verdict == "calibrated"
 
 
+class Correlated(problems.Gaussians):
+    """Two parameters with a correlation of 0.9."""
+
+    ROOT = torch.linalg.cholesky(torch.tensor([[1.0, 0.9], [0.9, 1.0]]))
+
+    def log_prob(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
+        mean, log_std = condition.chunk(2, dim=-1)
+        white = ((input - mean) / log_std.exp()) @ torch.linalg.inv(self.ROOT).T
+        first = torch.cat([torch.zeros_like(mean), torch.zeros_like(log_std)], dim=-1)
+        log_det = self.ROOT.diagonal().log().sum() + log_std.sum(-1)
+        return super().log_prob(white, first) - log_det
+
+    def sample(
+        self, sample_shape: torch.Size, condition: Tensor, **kwargs: Any
+    ) -> Tensor:
+        mean, log_std = condition.chunk(2, dim=-1)
+        noise = torch.randn(*sample_shape, *mean.shape).to(mean)
+        return mean + log_std.exp() * (noise @ self.ROOT.T)
+
+
+def test_the_gain_is_that_of_the_density_with_all_factors_together() -> None:
+    """The effects of single factors do not add up if parameters are correlated."""
+    torch.manual_seed(0)
+    x = observations(200)
+    mean, log_std = x.chunk(2, dim=1)
+    noise = torch.randn(mean.shape) @ Correlated.ROOT.T
+    theta = mean + log_std.exp() * noise * torch.tensor([0.7, 1.4])
+    part = Part(Correlated(2), OwnEmbeddings([nn.Identity()], torch.Size((4,))))
+    bounds = Bounds(torch.full((2,), -INF), torch.full((2,), INF), are_all=True)
+    estimator = RecalibratedEstimator(
+        MixtureEstimator([part], [1.0]), torch.ones(2), bounds
+    )
+    # The same pairs in both folds, so that the factors of the others are those of all.
+    fold = HeldOutMixture(estimator=estimator, theta=theta, x=x)
+    found = recalibration([fold, fold])
+    assert found.is_used
+    assert not torch.equal(found.factors, torch.ones(2))
+    changed = RecalibratedEstimator(
+        MixtureEstimator([part], [1.0]), found.factors, bounds
+    )
+    expected = changed.log_prob(theta[None], x) - estimator.log_prob(theta[None], x)
+    assert found.gain == pytest.approx(float(expected.mean()), abs=0.02)
+
+
 def test_a_few_pairs_choose_what_the_prior_of_the_factors_says() -> None:
     folds = folds_of(8, too_wide=torch.tensor([2.0, 0.8]), seed=3)
     weights = torch.ones(8).double()
