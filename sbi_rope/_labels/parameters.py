@@ -82,8 +82,9 @@ def parameters_of(labels: Labels, prior: Any, *, seed: int = 0) -> LabelledParam
         )
     reference = prior_reference(prior, labels.theta)
     parts = []
-    for rows in torch.arange(len(labels)).split(CHUNK_SIZE):
-        with seeded(seed):
+    for number, rows in enumerate(torch.arange(len(labels)).split(CHUNK_SIZE)):
+        # Other proposals for each chunk, so that their errors average out.
+        with seeded(seed + number):
             parts.append(_draw(labels[rows], prior, reference, first=int(rows[0])))
     return LabelledParameters(
         draws=torch.cat([part.draws for part in parts]),
@@ -166,14 +167,13 @@ def _draw(
 def _shuffled(samples: Tensor, *, seed: int) -> Tensor:
     """Return draws in random order, a few of them repeatedly, ``(n, R, d)``.
 
-    Any part of the draws represents all of them then, also if they were sorted. With
-    repetitions there are enough simulations for each label to tell what is noise.
+    Any part of the draws represents all of them then, also if they were sorted. All
+    are repeated equally often. With repetitions there are enough simulations for each label to tell what is noise.
     """
     count = samples.shape[1]
     with seeded(seed):
         rounds = [torch.randperm(count) for _ in range(-(-NUM_DRAWS // count))]
-    order = torch.cat(rounds)[: max(count, NUM_DRAWS)]
-    return samples[:, order.to(samples.device)]
+    return samples[:, torch.cat(rounds).to(samples.device)]
 
 
 def _systematic(shares: Tensor, count: int) -> Tensor:
