@@ -41,7 +41,7 @@ COLUMNS = ("repetition", "method", "pairs", "LPP - exact", "C2ST")
 DIM, NUM_OBSERVABLES = 3, 10
 # Standard deviation of the entries of the matrix behind the noise of the real process.
 REAL_NOISE = 0.1
-NUM_TEST, NUM_COMPARED, NUM_SAMPLES = 500, 10, 1000
+NUM_PAIRS, NUM_TEST, NUM_COMPARED, NUM_SAMPLES = 1000, 500, 10, 1000
 
 
 class GaussianTask:
@@ -126,13 +126,12 @@ def rows_of(
     for repetition, name in product(range(args.repetitions), METHODS):
         for n in args.n_calibration if name != "NPE" else [0]:
             head = str(repetition), name, str(n)
-            yield head, partial(score, task, npe, args, repetition, name, n)
+            yield head, partial(score, task, npe, repetition, name, n)
 
 
 def score(
     task: GaussianTask,
     npe: Callable[[], Any],
-    args: argparse.Namespace,
     repetition: int,
     name: str,
     n: int,
@@ -140,9 +139,7 @@ def score(
     """Return the scores of a method with so many pairs."""
     posterior = npe()
     torch.manual_seed(1 + repetition)
-    theta, theta_o = (
-        task.prior.sample((count,)) for count in (max(args.n_calibration), NUM_TEST)
-    )
+    theta, theta_o = (task.prior.sample((count,)) for count in (NUM_PAIRS, NUM_TEST))
     y, y_o = task.observe(theta), task.observe(theta_o)
     if name != "NPE":
         # Its way to simulations starts at noise alone, as in its code.
@@ -157,7 +154,11 @@ def score(
 def main() -> None:
     """Print the table."""
     args = begin(__doc__, OPTIONS, threads=1)
-    show(kept_rows(args.out / "fmcpe" / "rows.csv", COLUMNS, rows_of(args)))
+    if max(args.n_calibration) > NUM_PAIRS:
+        raise SystemExit(f"There are {NUM_PAIRS} calibration pairs.")
+    # Rows of another NPE are other rows.
+    name = f"rows_{args.num_simulations}_{args.max_num_epochs}.csv"
+    show(kept_rows(args.out / "fmcpe" / name, COLUMNS, rows_of(args)))
 
 
 if __name__ == "__main__":
