@@ -165,8 +165,9 @@ def _overview(published: Published) -> list[str]:
         )
     head = ("suite", *COUNTED, "hours", "complete repetitions")
     return [
-        "Hours are what one core would take for what was not run, by the times of the",
-        "cells most like it; ? is a cell of a method that was never run.",
+        "Hours are what one core would take for what was not run, without the training",
+        "of NPE, by the times of the cells most like it. ? is a cell of a method that",
+        "was never run.",
         "",
         *table((*head, "stand-ins among what was run"), lines),
     ]

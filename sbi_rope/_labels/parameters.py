@@ -168,7 +168,8 @@ def _shuffled(samples: Tensor, *, seed: int) -> Tensor:
     """Return draws in random order, a few of them repeatedly, ``(n, R, d)``.
 
     Any part of the draws represents all of them then, also if they were sorted. All
-    are repeated equally often. With repetitions there are enough simulations for each label to tell what is noise.
+    are repeated equally often. With repetitions there are enough simulations for each
+    label to tell what is noise.
     """
     count = samples.shape[1]
     with seeded(seed):

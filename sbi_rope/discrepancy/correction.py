@@ -38,8 +38,7 @@ SMALLEST_ERROR = {"embedding": 0.01, "tuned": 0.01, "input": 0.003}
 # More standard deviations than this refute that the simulator is right.
 LARGEST_SURPRISE = 5.0
 # Gradient steps of a course. The density behind an embedding net adapts within a
-# hundred steps; a whole network takes longer. Chosen on calibration data, see
-# benchmarks/README.md.
+# hundred steps; a whole network takes longer. Chosen on calibration data.
 NUM_STEPS = {"embedding": 150, "tuned": 150, "input": 400}
 LEARNING_RATES = {"embedding": 5e-3, "tuned": 5e-3, "input": 2e-3}
 

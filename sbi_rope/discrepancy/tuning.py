@@ -13,7 +13,7 @@ __all__ = ["TUNING", "cross_fitted_nets"]
 
 # With rehearsal, g embeds simulations as h does, so that the density can interpret
 # them. The rate and the patience take an eighth of the time of the finetuner's defaults
-# and do not increase the distances, see benchmarks/README.md.
+# and did not increase the distances on calibration data.
 TUNING = CalibrationFinetuner(rehearsal=1.0, learning_rate=3e-3, stop_after_epochs=50)
 
 
