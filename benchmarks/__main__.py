@@ -185,11 +185,10 @@ def _status(args: argparse.Namespace) -> int:
     counts = "".join(f"{what:>10}" for what in ("cells", *COUNTED))
     print(f"{'suite':<14}{counts}  hours of a core")
     for suite in suites:
-        statuses = {cell: table.status(cell) for cell in suite.cells}
-        numbers = [list(statuses.values()).count(what) for what in COUNTED]
-        counts = "".join(f"{number:>10}" for number in (len(statuses), *numbers))
-        left = [cell for cell, status in statuses.items() if status == "not run"]
-        print(f"{suite.name:<14}{counts}  {prices.of(left)}")
+        statuses = [table.status(cell) for cell in suite.cells]
+        numbers = len(statuses), *(statuses.count(what) for what in COUNTED)
+        counts = "".join(f"{number:>10}" for number in numbers)
+        print(f"{suite.name:<14}{counts}  {prices.of(table.not_run(suite))}")
     print("? stands for what a cell of a method takes that was never run.")
     return 0
 

@@ -219,9 +219,7 @@ def _surely_worse(table: Table, cell: Cell, other: Cell) -> bool:
 
 def _missing(suite: Suite, table: Table) -> list[str]:
     lines = []
-    missing = pd.DataFrame(
-        [vars(cell) for cell in suite.cells if table.status(cell) == "not run"]
-    )
+    missing = pd.DataFrame([vars(cell) for cell in table.not_run(suite)])
     failed = table.rows[table.rows["status"] == "failed"]
     if len(missing):
         lines += [f"{len(missing)} of {len(suite.cells)} cells were not run:", ""]

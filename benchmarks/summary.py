@@ -145,7 +145,6 @@ def _overview(published: Published) -> list[str]:
         known = published.tables.get(name, Table.of({}, {}))
         there = set(known.rows.index)
         statuses = [known.status(cell) for cell in suite.cells]
-        left = [cell for cell in suite.cells if known.status(cell) == "not run"]
         complete, stand_ins = [], []
         for where, runs in runs_of(suite).items():
             place = " ".join(where).strip()
@@ -158,7 +157,7 @@ def _overview(published: Published) -> list[str]:
             [
                 f"[{name}]({name}/report.md)" if there else name,
                 *(statuses.count(status) for status in COUNTED),
-                prices.of(left),
+                prices.of(known.not_run(suite)),
                 ", ".join(complete) if there else "none",
                 ", ".join(stand_ins),
             ]

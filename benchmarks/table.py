@@ -77,6 +77,10 @@ class Table(NamedTuple):
         """Return "finished", "failed" or "not run"."""
         return self.rows["status"].get(cell, "not run")
 
+    def not_run(self, suite: Suite) -> list[Cell]:
+        """Return the cells of a suite without a row."""
+        return [cell for cell in suite.cells if self.status(cell) == "not run"]
+
 
 def write_table(suite: Suite, results: Results, folder: Path) -> Table:
     """Collect the results of a suite into `folder`: CSV, arrays, manifest."""
