@@ -10,7 +10,7 @@ from sbi_rope._validation import (
     as_numbers_on,
     check_batch,
     check_in_support,
-    check_same_length,
+    check_pair_weights,
     check_values,
 )
 from sbi_rope.errors import InvalidInputError
@@ -73,7 +73,9 @@ def checked_labels(
         known = labels.is_measured.all(dim=1) & ~labels.is_noisy.any(dim=1)
         check_in_support("theta", theta, prior, rows=known)
     if weights is not None:
-        labels = labels.weighted(_checked_weights(weights, theta))
+        weights = as_numbers_on("weights", weights, theta.device)
+        weights = check_pair_weights(weights, "theta", theta).detach()
+        labels = labels.weighted(weights.to(theta.device, torch.double))
     return labels
 
 
@@ -182,24 +184,6 @@ def _checked_covariance(theta_cov: Any, theta: Tensor) -> Tensor:
             "a small number to its diagonal."
         )
     return (covariance + covariance.mT) / 2
-
-
-def _checked_weights(weights: Any, theta: Tensor) -> Tensor:
-    weights = as_numbers_on("weights", weights, theta.device)
-    if weights.ndim != 1:
-        raise InvalidInputError(
-            "Expected `weights` with one number for each pair, shape (n,); got "
-            f"{tuple(weights.shape)}."
-        )
-    check_values("weights", weights)
-    check_same_length("theta", theta, "weights", weights)
-    weights = weights.detach().to(theta.device, torch.double)
-    if not bool((torch.isfinite(weights) & (weights > 0)).all()):
-        raise InvalidInputError(
-            "Expected `weights` to be finite and positive. Leave out pairs that should "
-            "not count."
-        )
-    return weights
 
 
 def _check_not_infinite(name: str, theta: Tensor) -> None:

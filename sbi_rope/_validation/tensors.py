@@ -32,6 +32,8 @@ __all__ = [
     "check_values",
 ]
 
+# A pair may count as so many. Larger factors are more than sums in float64 can hold.
+LARGEST_WEIGHT = 1e6
 # The dtypes of numbers that torch can compare and add. It can do too little with
 # complex numbers, booleans, and quantised, eight-bit floating-point or wide unsigned
 # numbers.
@@ -207,7 +209,8 @@ def check_batch(
             entry is not finite.
     """
     value = check_tensor(name, value)
-    expected = "(n, " + ", ".join(str(size) for size in event_shape) + ")"
+    sizes = ", ".join(str(size) for size in event_shape)
+    expected = f"(n, {sizes})" if sizes else "(n,)"
     if tuple(value.shape[1:]) != tuple(event_shape) or value.ndim == 0:
         raise InvalidInputError(
             f"Expected `{name}` of shape {expected}; got {tuple(value.shape)}."
@@ -238,14 +241,22 @@ def check_device(
         )
 
 
-def check_pair_weights(weights: Tensor, name: str, rows: Tensor) -> Tensor:
-    """Return the weights of some rows, shape ``(n,)``, which have to be positive."""
-    weights = check_batch("weights", check_tensor("weights", weights), ())
-    check_same_length(name, rows, "weights", weights)
+def check_pair_weights(
+    weights: Tensor, name: str, rows: Tensor, *, weights_name: str = "weights"
+) -> Tensor:
+    """Return how many pairs each row counts as, shape ``(n,)``."""
+    weights = check_batch(weights_name, weights, ())
+    check_same_length(name, rows, weights_name, weights)
     if not bool((weights > 0).all()):
         raise InvalidInputError(
-            f"Expected positive `weights`; got {float(weights.min())}. Leave out pairs "
-            "that should not count."
+            f"Expected positive `{weights_name}`; got {float(weights.min())}. Leave "
+            "out pairs that should not count."
+        )
+    if bool((weights > LARGEST_WEIGHT).any()):
+        raise InvalidInputError(
+            f"Expected `{weights_name}`, each the number of pairs that a pair counts "
+            f"as, of at most {LARGEST_WEIGHT:g}; got {float(weights.max()):g}. Divide "
+            "all by the same number."
         )
     return weights
 

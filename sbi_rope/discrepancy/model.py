@@ -13,6 +13,7 @@ from torch.distributions import MultivariateNormal
 from sbi_rope._random import seeded
 from sbi_rope._validation import (
     check_batch,
+    check_pair_weights,
     check_positive,
     check_same_length,
     check_tensor,
@@ -155,8 +156,7 @@ class DiscrepancyModel:
         z, mean, covariance = _checked(z, mean, covariance)
         noise = covariance + SMALLEST_NOISE**2 * torch.eye(z.shape[1]).to(z)
         if weights is not None:
-            weights = check_batch("weights", weights, ()).to(z)
-            check_same_length("z", z, "weights", weights)
+            weights = check_pair_weights(weights, "z", z).to(z)
         if mean.ndim == 2:
             return self._fit(z, mean, noise, weights)
         with seeded(seed):

@@ -7,11 +7,10 @@ import torch
 from torch import Tensor
 
 from sbi_rope._validation import (
-    check_batch,
     check_integer,
     check_not_negative,
+    check_pair_weights,
     check_positive,
-    check_same_length,
     check_tensor,
     check_values,
 )
@@ -161,6 +160,7 @@ def _checked_scores(
         )
     if pair_weights is None:
         return scores[known], scores.new_ones(int(known.sum()))
-    check_same_length("log_scores", scores, "pair_weights", pair_weights)
-    of_pairs = check_batch("pair_weights", pair_weights, ()).to(scores)
+    of_pairs = check_pair_weights(
+        pair_weights, "log_scores", scores, weights_name="pair_weights"
+    ).to(scores)
     return scores[known], of_pairs[known]

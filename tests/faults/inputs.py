@@ -57,6 +57,12 @@ ODD_TENSORS: dict[str, Callable[[Tensor], Any]] = {
     "of inference mode": lambda good: _of_inference_mode(good),
 }
 
+# Weights of pairs must not have these values either.
+BAD_WEIGHTS: dict[str, Callable[[Tensor], Any]] = {
+    "a negative entry": lambda good: spoilt(good, -1.0),
+    "an entry of zero": lambda good: spoilt(good, 0.0),
+}
+
 # For whole numbers, such as indices of rows, these inputs are good.
 FINE_ROWS = ("one dimension less", "one column more", "one row less")
 # The unusual tensors of whole numbers.

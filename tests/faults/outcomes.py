@@ -27,6 +27,7 @@ class Call:
             is compared.
         tensors: The good tensors by name.
         options: The kind of each option, which is a key of ``BAD_OPTIONS``.
+        pair_weights: Names of the tensors that are weights of pairs.
         accepts: The bad inputs that mean something here, as "argument: input".
         is_random: Whether the call draws from the global random numbers, as users
             expect of a sampler without a seed.
@@ -36,6 +37,7 @@ class Call:
     run: Callable[..., Any]
     tensors: dict[str, Tensor] = field(default_factory=dict)
     options: dict[str, str] = field(default_factory=dict)
+    pair_weights: tuple[str, ...] = ()
     accepts: tuple[str, ...] = ()
     is_random: bool = False
 

@@ -7,6 +7,7 @@ from tests.faults.calls import CALLS
 from tests.faults.inputs import (
     BAD_OPTIONS,
     BAD_TENSORS,
+    BAD_WEIGHTS,
     EXTREME_TENSORS,
     FINE_ROWS,
     ODD_ROWS,
@@ -31,8 +32,9 @@ def tensor_trials(call: Call, name: str) -> Iterator[Trial]:
     """Yield the trials of a tensor."""
     good = call.tensors[name]
     odd = ODD_TENSORS if good.is_floating_point() else ODD_ROWS
+    bad = BAD_TENSORS | BAD_WEIGHTS if name in call.pair_weights else BAD_TENSORS
     for judge, kinds in (
-        (refuse, BAD_TENSORS),
+        (refuse, bad),
         (survive, EXTREME_TENSORS),
         (agree, odd),
     ):

@@ -124,15 +124,12 @@ def test_posteriors_without_a_density_to_score_are_refused() -> None:
 def test_a_rope_of_a_vector_field_is_refused_before_anything_is_simulated() -> None:
     rope = RoPE(problems.vector_field_posterior("fmpe"), simulator=problems.simulate)
     rope.append_calibration(*problem(6, seed=1))
-
-    def refuse(theta: torch.Tensor) -> torch.Tensor:
-        raise AssertionError("simulated")
-
     source: Any = rope.source
-    source.function = refuse
+    of_the_check = source.num_calls
     for x_o in (None, observed()):
         with pytest.raises(UnsupportedPosteriorError, match="train NPE instead"):
             stack(rope, x_o, **QUIET)
+    assert source.num_calls == of_the_check
 
 
 def test_a_rope_of_a_stack_is_refused() -> None:

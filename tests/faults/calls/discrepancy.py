@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from sbi_rope.discrepancy import DiscrepancyModel, DiscrepancyNPE, learn_parameters
@@ -39,7 +40,14 @@ CALLS = [
     Call(
         name="DiscrepancyModel.fit",
         run=fitted,
-        tensors={"z": X, "mean": THETA, "covariance": NOISE},
+        tensors={
+            "z": X,
+            "mean": THETA,
+            "covariance": NOISE,
+            "weights": torch.ones(len(X)),
+        },
+        pair_weights=("weights",),
+        accepts=("weights: None",),
     ),
     Call(
         name="Discrepancy.sample",
@@ -61,11 +69,16 @@ CALLS = [
     ),
     Call(
         name="learn_parameters",
-        run=lambda theta_cal=THETA, theta=THETA_S: (
-            learn_parameters(theta_cal, theta).probabilities
+        run=lambda theta_cal=THETA, theta=THETA_S, weights=None: (
+            learn_parameters(theta_cal, theta, weights=weights).probabilities
         ),
-        tensors={"theta_cal": THETA, "theta": THETA_S},
-        accepts=("theta_cal: one row less", "theta: one row less"),
+        tensors={
+            "theta_cal": THETA,
+            "theta": THETA_S,
+            "weights": torch.ones(len(THETA)),
+        },
+        pair_weights=("weights",),
+        accepts=("theta: one row less", "weights: None"),
     ),
     Call(
         name="DiscrepancyNPE",

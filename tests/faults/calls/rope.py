@@ -73,6 +73,7 @@ CALLS = [
             "theta_std: no dimension",
             "weights: None",
         ),
+        pair_weights=("weights",),
     ),
     Call(
         name="RoPE.append_calibration(covariance)",

@@ -3,6 +3,7 @@
 from typing import Any
 from unittest.mock import patch
 
+import torch
 from torch import Tensor
 
 from sbi_rope import diagnose, stack
@@ -145,6 +146,15 @@ CALLS = [
             "log_scores: one column more",
             "log_scores: no rows",
         ),
+    ),
+    Call(
+        name="stacking_weights(weights of pairs)",
+        run=lambda pair_weights: (
+            stacking_weights(LOG_SCORES, pair_weights=pair_weights).weights
+        ),
+        tensors={"pair_weights": torch.ones(len(LOG_SCORES))},
+        pair_weights=("pair_weights",),
+        accepts=("pair_weights: None",),
     ),
     Call(
         name="diagnose",
