@@ -184,8 +184,10 @@ class RoPE:
         :math:`y \sim \mathcal N(\theta, R)` of some or all of the parameters, and what
         needs the parameters averages over :math:`p(\theta \mid y)` under the prior.
 
-        Tensors, NumPy arrays and lists of numbers are taken here and wherever data are
-        passed. They are copied to the dtype of NPE, and arrays and lists to its device.
+        Tensors, NumPy arrays and lists of numbers are taken here and wherever
+        parameters and observations of a user are passed. They are copied to the dtype
+        of NPE, and arrays and lists to its device. What was computed from them, such as
+        embeddings and samples, has to be a tensor.
 
         Args:
             theta: Parameters, shape ``(n, d)``, inside the prior's support. NaN stands

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from sbi_rope._notebooks import shown_as_text
-from sbi_rope._validation import check_batch, check_tensor
+from sbi_rope._validation import as_numbers_on, check_batch
 from sbi_rope.sets.conformal import DIGITS
 from sbi_rope.sets.guarantee import Guarantee
 
@@ -105,11 +105,12 @@ class CredibleSet:
             Shape ``(*batch)``, bool.
 
         Raises:
-            InvalidTypeError: If theta is no tensor of numbers.
+            InvalidTypeError: If theta holds no numbers.
             InvalidInputError: If theta has another number of parameters, or is not
                 finite.
         """
-        shape = check_tensor("theta", theta).shape[:-1]
+        theta = as_numbers_on("theta", theta, self.draws.device)
+        shape = theta.shape[:-1]
         width = self.draws.shape[1:]
         rows = theta[None] if theta.ndim < 2 else theta.flatten(0, -2)
         rows = check_batch("theta", rows, width).detach().to(self.draws)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from sbi_rope._notebooks import shown_as_text
-from sbi_rope._validation import check_batch, check_names, check_tensor
+from sbi_rope._validation import as_numbers_on, check_batch, check_names
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.sets.guarantee import Guarantee
 
@@ -82,11 +82,12 @@ class CredibleIntervals:
             The shape of ``theta``, bool.
 
         Raises:
-            InvalidTypeError: If theta is no tensor of numbers.
+            InvalidTypeError: If theta holds no numbers.
             InvalidInputError: If the shape does not fit, or a number is not finite.
         """
         event = self.low.shape
-        shape = check_tensor("theta", theta).shape
+        theta = as_numbers_on("theta", theta, self.low.device)
+        shape = theta.shape
         rows = theta[None] if theta.ndim == len(event) else theta
         if rows.ndim > len(event):
             rows = rows.flatten(0, rows.ndim - 1 - len(event))
@@ -140,14 +141,14 @@ class CredibleIntervals:
 
 @torch.no_grad()
 def central_intervals(
-    posterior: Any, x: Tensor, level: float, *, num_samples: int
+    posterior: Any, level: float, x: Tensor, *, num_samples: int
 ) -> CredibleIntervals:
     """Return the central interval of each parameter given each observation.
 
     Args:
         posterior: A posterior with ``sample_batched``.
-        x: The observations, shape ``(B, *event)``.
         level: The probability of each interval under the posterior.
+        x: The observations, shape ``(B, *event)``.
         num_samples: The number of draws.
     """
     draws = posterior.sample_batched((num_samples,), x, show_progress_bars=False)

@@ -109,8 +109,8 @@ class MakesSets(ABC):
             SamplingError: As in :meth:`credible_set`.
         """
         intervals = self.credible_intervals_batched(
-            self._one_x(x),
             level,
+            self._one_x(x),
             guaranteed=guaranteed,
             num_samples=num_samples,
             seed=seed,
@@ -119,8 +119,8 @@ class MakesSets(ABC):
 
     def credible_intervals_batched(
         self,
+        level: float,
         x: Tensor,
-        level: float = 0.9,
         *,
         guaranteed: bool = False,
         num_samples: int = 1000,
@@ -129,8 +129,8 @@ class MakesSets(ABC):
         """Return an interval for each parameter given each observation of a batch.
 
         Args:
-            x: Observations, shape ``(B, *event)``.
             level: As in :meth:`credible_intervals`.
+            x: Observations, shape ``(B, *event)``.
             guaranteed: As in :meth:`credible_intervals`.
             num_samples: As in :meth:`credible_intervals`.
             seed: As in :meth:`credible_intervals`.
@@ -149,7 +149,7 @@ class MakesSets(ABC):
             if guaranteed:
                 make = self._held_out_sets().credible_intervals
             blocks = self._batch_of_x(x).split(max(1, MAX_DRAWS // num_samples))
-            return CredibleIntervals.joined([make(block, level) for block in blocks])
+            return CredibleIntervals.joined([make(level, block) for block in blocks])
 
     def _held_out_sets(self) -> Any:
         """Return what makes sets with a guarantee. Only a stack has it."""

@@ -115,7 +115,7 @@ class HeldOutSets:
         )
 
     @torch.no_grad()
-    def credible_intervals(self, x: Tensor, level: float) -> CredibleIntervals:
+    def credible_intervals(self, level: float, x: Tensor) -> CredibleIntervals:
         """Return intervals with a guarantee for each observation, each by itself.
 
         The score of a pair is the level of the smallest central interval that contains

@@ -134,7 +134,8 @@ class Method(ABC):
     def append_simulations(self, theta: Tensor, x: Tensor) -> "Self":
         """Add simulations; may be called repeatedly.
 
-        Simulations with NaN or Inf are dropped with a warning.
+        Simulations with NaN or Inf are dropped with a warning. NaN stays if it stands
+        for a missing trial that the embedding net leaves out.
 
         Args:
             theta: Parameters drawn from the prior, shape ``(n, d)``.
@@ -144,7 +145,7 @@ class Method(ABC):
             Itself, so that calls can be chained.
 
         Raises:
-            InvalidTypeError: If one of them is not a tensor.
+            InvalidTypeError: If one of them holds no numbers.
             InvalidInputError: If the method does not see simulations, shapes or row
                 counts do not fit, or a theta is not in the support of the prior.
                 Nothing is added then.
@@ -169,7 +170,7 @@ class Method(ABC):
             Itself, so that calls can be chained.
 
         Raises:
-            InvalidTypeError: If one of them is not a tensor.
+            InvalidTypeError: If one of them holds no numbers.
             InvalidInputError: If the method does not see calibration pairs, shapes or
                 row counts do not fit, a value is not finite, or a theta is outside the
                 prior's support. Nothing is added then.
@@ -188,7 +189,7 @@ class Method(ABC):
             Itself, so that calls can be chained.
 
         Raises:
-            InvalidTypeError: If it is not a tensor.
+            InvalidTypeError: If it holds no numbers.
             InvalidInputError: If the method does not see observations, the shape does
                 not fit, or a value is not finite.
         """

@@ -100,7 +100,7 @@ def test_intervals_of_a_gaussian_are_central() -> None:
 
 def test_intervals_of_a_batch_are_those_of_each_observation() -> None:
     posterior, x = exact(), torch.stack([X, -X, 0 * X])
-    found = posterior.credible_intervals_batched(x, num_samples=50_000, seed=0)
+    found = posterior.credible_intervals_batched(0.9, x, num_samples=50_000, seed=0)
     assert found.low.shape == found.high.shape == (3, 2)
     one = posterior.credible_intervals(0.9, -X, num_samples=50_000, seed=0)
     assert torch.allclose(found[1].low, one.low, atol=0.03)
@@ -114,7 +114,7 @@ def test_intervals_of_a_batch_are_those_of_each_observation() -> None:
 
 def test_intervals_of_a_batch_say_which_observation_they_are_of() -> None:
     x = X * torch.linspace(-1, 1, 30)[:, None]
-    found = exact().credible_intervals_batched(x, num_samples=10, seed=0)
+    found = exact().credible_intervals_batched(0.9, x, num_samples=10, seed=0)
     assert len(list(found)) == 30
     rows = found.as_rows(["a", "b"])
     assert [row["observation"] for row in rows[:3]] == [0, 0, 1]
@@ -155,8 +155,11 @@ def test_contains_keeps_the_shape_of_a_batch() -> None:
         assert found.contains(torch.zeros(*shape, 2)).shape == shape
     with pytest.raises(InvalidInputError, match=r"shape \(n, 2\)"):
         found.contains(torch.zeros(3))
-    with pytest.raises(InvalidTypeError):
-        found.contains([0.0, 0.0])  # type: ignore[arg-type]
+    a_list: Any = [0.0, 0.0]
+    assert found.contains(a_list) == found.contains(torch.zeros(2))
+    no_numbers: Any = "x"
+    with pytest.raises(InvalidTypeError, match="theta"):
+        found.contains(no_numbers)
 
 
 def test_a_set_of_a_batch_is_that_of_one_observation() -> None:
@@ -394,7 +397,7 @@ def test_guaranteed_intervals_of_a_batch_are_those_of_each_observation(
     stack: StackedPosterior, x: Tensor
 ) -> None:
     batch = torch.stack([x + 1.0, x, x - 1.0])
-    found = stack.credible_intervals_batched(batch, 0.8, guaranteed=True, seed=0)
+    found = stack.credible_intervals_batched(0.8, batch, guaranteed=True, seed=0)
     assert found.is_guaranteed
     rule: Any = stack.credible_set(0.8, x, guaranteed=True, seed=0).rule
     marginal = stack.report.cross_validation.set_scores.marginal

@@ -110,7 +110,7 @@ CALLS += [
         Call(
             name=f"{kind}.credible_intervals_batched",
             run=lambda x=x, make=make, **options: make().credible_intervals_batched(
-                x, **{"num_samples": 20, "seed": 0, **options}
+                **{"level": 0.9, "num_samples": 20, "seed": 0, **options}, x=x
             ),
             tensors={"x": x},
             options={
