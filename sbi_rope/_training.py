@@ -2,7 +2,7 @@
 
 import copy
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
@@ -22,6 +22,7 @@ __all__ = [
     "fit",
     "groups_of",
     "groups_to_hold_out",
+    "shuffled",
     "split_groups",
     "split_pairs",
     "too_few_pairs",
@@ -202,6 +203,14 @@ def epochs_on_pairs(
         "on a hold-out."
     )
     return min(max_num_epochs, EPOCHS_WITHOUT_HOLDOUT)
+
+
+def shuffled(
+    rows: Tensor, size: int, *, generator: torch.Generator | None = None
+) -> Iterator[Tensor]:
+    """Pass over rows in random order, in batches of a size."""
+    order = torch.randperm(len(rows), generator=generator)
+    yield from rows[order.to(rows.device)].split(size)
 
 
 def differentiable(module: nn.Module) -> AbstractContextManager[Any]:

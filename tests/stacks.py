@@ -3,6 +3,7 @@
 import functools
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from typing import Any
 from unittest.mock import patch
 
@@ -20,7 +21,7 @@ from sbi_rope.stacking import (
     default_candidates,
     stack,
 )
-from sbi_rope.trainers.training import Training
+from sbi_rope.trainers.training import FINETUNING, Training
 from tests import problems
 
 QUIET: dict[str, Any] = {"show_progress_bars": False}
@@ -45,7 +46,9 @@ def quick() -> Iterator[None]:
         "sbi_rope.stacking.folds.NUM_STEPS": steps,
         "sbi_rope.discrepancy.correction.NUM_DRAWS": 50,
         "sbi_rope.discrepancy.training.BATCH_SIZE": 50,
-        "sbi_rope.stacking.finetuning.MAX_NUM_EPOCHS": 2,
+        "sbi_rope.stacking.finetuning.FINETUNING": replace(
+            FINETUNING, max_num_epochs=2
+        ),
     }
     with ExitStack() as patches:
         for name, value in constants.items():

@@ -13,7 +13,7 @@ from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._training import (
     History,
     epochs_on_pairs,
-    fit,
+    shuffled,
     split_pairs,
 )
 from sbi_rope._validation import check_instance, check_integer, check_positive
@@ -29,7 +29,12 @@ from sbi_rope.mixture import (
 )
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
-from sbi_rope.trainers.training import EstimatorBuilder, Training, train_on_pairs
+from sbi_rope.trainers.training import (
+    EstimatorBuilder,
+    Training,
+    train_network,
+    train_on_pairs,
+)
 
 __all__ = ["FRISBI"]
 
@@ -223,19 +228,16 @@ class FRISBI(Method):
             return error(train) + mixing.transport_cost(x_o[some])
 
         def batches(epoch: int) -> Any:
-            order = torch.randperm(len(x_o)).to(x_o.device)
-            size = self.training.training_batch_size
-            return [(some,) for some in order.split(size)]
+            every = torch.arange(len(x_o), device=x_o.device)
+            return zip(shuffled(every, self.training.training_batch_size), strict=True)
 
-        return fit(
+        return train_network(
             mixing.g,
             batches,
             loss,
+            self.training,
             validation_loss=(lambda: error(held_out)) if len(held_out) else None,
-            learning_rate=self.training.learning_rate,
             max_num_epochs=max_num_epochs,
-            stop_after_epochs=self.training.stop_after_epochs,
-            clip_max_norm=self.training.clip_max_norm,
             in_training_mode=False,
             label="FRISBI",
             show_progress_bars=show_progress_bars,

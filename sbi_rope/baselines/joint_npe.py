@@ -8,11 +8,16 @@ from torch import Tensor
 
 from sbi_rope._sbi import direct_posterior, embedding_of
 from sbi_rope._standardisation import warn_of_far_entries
-from sbi_rope._training import History, fit, split_pairs, too_few_pairs
+from sbi_rope._training import History, split_pairs, too_few_pairs
 from sbi_rope._validation import check_instance
 from sbi_rope.errors import warn_user
 from sbi_rope.trainers.base import Method
-from sbi_rope.trainers.training import EstimatorBuilder, Training, estimator_builder
+from sbi_rope.trainers.training import (
+    EstimatorBuilder,
+    Training,
+    estimator_builder,
+    train_network,
+)
 
 __all__ = ["JointNPE"]
 
@@ -114,15 +119,12 @@ class JointNPE(Method):
         def loss(theta: Tensor, x: Tensor) -> Tensor:
             return estimator.loss(theta, condition=x).mean()
 
-        history = fit(
+        history = train_network(
             estimator,
             batches,
             loss,
+            self.training,
             validation_loss=lambda: loss(theta_held, x_held),
-            learning_rate=self.training.learning_rate,
-            max_num_epochs=self.training.max_num_epochs,
-            stop_after_epochs=self.training.stop_after_epochs,
-            clip_max_norm=self.training.clip_max_norm,
             label="J-NPE",
             show_progress_bars=show_progress_bars,
         )

@@ -13,9 +13,9 @@ from sbi_rope._sbi import (
     headless,
 )
 from sbi_rope._standardisation import Standardisation
-from sbi_rope._training import History, fit, split_pairs
+from sbi_rope._training import History, shuffled, split_pairs
 from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError
-from sbi_rope.trainers.training import Training
+from sbi_rope.trainers.training import Training, train_network
 
 __all__ = [
     "NoiseOn",
@@ -146,21 +146,18 @@ def fit_marginal(
     train, held_out = split_pairs(torch.arange(len(s)), training.validation_fraction)
 
     def batches(step: int) -> Any:
-        order = train[torch.randperm(len(train))]
-        return [(s[rows],) for rows in order.split(training.training_batch_size)]
+        for rows in shuffled(train, training.training_batch_size):
+            yield (s[rows],)
 
     def loss(batch: Tensor) -> Tensor:
         return flow.loss(batch + jitter * torch.randn_like(batch)).mean()
 
-    history = fit(
+    history = train_network(
         flow,
         batches,
         loss,
+        training,
         validation_loss=lambda: loss(s[held_out]),
-        learning_rate=training.learning_rate,
-        max_num_epochs=training.max_num_epochs,
-        stop_after_epochs=training.stop_after_epochs,
-        clip_max_norm=training.clip_max_norm,
         label="Density of the statistics",
         show_progress_bars=show_progress_bars,
     )

@@ -2,21 +2,17 @@
 
 import copy
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from sbi_rope._training import fit
+from sbi_rope._training import shuffled
 from sbi_rope.stacking.folds import Fold
+from sbi_rope.trainers.training import FINETUNING, train_network
 
 __all__ = ["finetune_without"]
-
-# Chosen on calibration data, see benchmarks/README.md.
-BATCH_SIZE = 100
-MAX_NUM_EPOCHS = 500
-PATIENCE = 50
-CLIP_MAX_NORM = 5.0
 
 
 def finetune_without(start: Any, fold: Fold, part: int, *, learning_rate: float) -> Any:
@@ -68,19 +64,15 @@ def finetune_without(start: Any, fold: Fold, part: int, *, learning_rate: float)
         return (shares.to(bench.theta) * losses(rows)).sum()
 
     def batches(epoch: int) -> Iterator[tuple[Tensor]]:
-        shuffled = train[torch.randperm(len(train), generator=order).to(train.device)]
-        for rows in shuffled.split(BATCH_SIZE):
-            yield (rows,)
+        size = FINETUNING.training_batch_size
+        return zip(shuffled(train, size, generator=order), strict=True)
 
-    fit(
+    train_network(
         estimator,
         batches,
         loss,
+        replace(FINETUNING, learning_rate=learning_rate),
         validation_loss=lambda: loss(held_out),
-        learning_rate=learning_rate,
-        max_num_epochs=MAX_NUM_EPOCHS,
-        stop_after_epochs=PATIENCE,
-        clip_max_norm=CLIP_MAX_NORM,
         in_training_mode=False,
         label="Fine-tuning NPE",
         show_progress_bars=False,

@@ -38,19 +38,17 @@ from sbi_rope.mixture import (
 )
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
-from sbi_rope.trainers.training import EstimatorBuilder, Training, train_on_pairs
+from sbi_rope.trainers.training import (
+    FINETUNING,
+    EstimatorBuilder,
+    Training,
+    train_on_pairs,
+)
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
 __all__ = ["FinetunedNPE"]
-
-DEFAULT_TRAINING = Training(
-    training_batch_size=100,
-    validation_fraction=0.2,
-    stop_after_epochs=50,
-    max_num_epochs=500,
-)
 
 
 class FinetunedNPE(Method):
@@ -135,7 +133,7 @@ class FinetunedNPE(Method):
         npe = StartingNPE(density_estimator, npe_training)
         super().__init__(prior, npe=npe, device=device)
         self.num_holdouts = num_holdouts
-        self.training = DEFAULT_TRAINING if training is None else training
+        self.training = FINETUNING if training is None else training
         self.learning_rates = learning_rates
         self._starts: list[ConditionalDensityEstimator] = []
         self._other_histories: tuple[History, ...] = ()

@@ -2,13 +2,13 @@
 
 import copy
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
 from sbi.neural_nets import posterior_nn
-from torch import Tensor
+from torch import Tensor, nn
 
 from sbi_rope._random import seeded
 from sbi_rope._sbi import ConditionalDensityEstimator, train_npe
@@ -16,14 +16,17 @@ from sbi_rope._training import (
     History,
     epochs_on_pairs,
     fit,
+    shuffled,
 )
 from sbi_rope._validation import LARGEST_SETTING, check_integer, check_positive
 from sbi_rope.errors import InvalidInputError, InvalidTypeError
 
 __all__ = [
+    "FINETUNING",
     "EstimatorBuilder",
     "Training",
     "estimator_builder",
+    "train_network",
     "train_on_pairs",
     "train_on_simulations",
 ]
@@ -72,6 +75,15 @@ class Training:
         check_integer("max_num_epochs", self.max_num_epochs)
         if self.clip_max_norm is not None:
             check_positive("clip_max_norm", self.clip_max_norm)
+
+
+# How NPE is fine-tuned on pairs, chosen on calibration data: see benchmarks/README.md.
+FINETUNING = Training(
+    training_batch_size=100,
+    validation_fraction=0.2,
+    stop_after_epochs=50,
+    max_num_epochs=500,
+)
 
 
 def estimator_builder(density_estimator: Any) -> EstimatorBuilder:
@@ -177,6 +189,54 @@ def train_on_simulations(
     )
 
 
+def train_network(
+    module: nn.Module,
+    batches: Callable[[int], Iterable[tuple[Any, ...]]],
+    loss: Callable[..., Tensor],
+    training: Training,
+    *,
+    validation_loss: Callable[[], Tensor] | None,
+    max_num_epochs: int | None = None,
+    in_training_mode: bool = True,
+    decay: bool = False,
+    label: str,
+    show_progress_bars: bool,
+) -> History:
+    """Train a module by any loss, in place.
+
+    Args:
+        module: The module.
+        batches: Given the number of the epoch, the batches to pass over.
+        loss: Of a batch, its mean loss.
+        training: Learning rate and so on; ``batches`` has the size of the batches.
+        validation_loss: The loss over the held-out data, if there are any.
+        max_num_epochs: Instead of that of ``training``.
+        in_training_mode: Whether dropout and batch statistics are active in training.
+        decay: Whether the step size falls to zero, along a cosine over all epochs.
+        label: What the progress bar and warnings call it.
+        show_progress_bars: Whether to show the course of the loss.
+
+    Returns:
+        The losses and the epoch that was kept.
+    """
+    if max_num_epochs is None:
+        max_num_epochs = training.max_num_epochs
+    return fit(
+        module,
+        batches,
+        loss,
+        validation_loss=validation_loss,
+        learning_rate=training.learning_rate,
+        max_num_epochs=max_num_epochs,
+        stop_after_epochs=training.stop_after_epochs,
+        clip_max_norm=training.clip_max_norm,
+        in_training_mode=in_training_mode,
+        decay=decay,
+        label=label,
+        show_progress_bars=show_progress_bars,
+    )
+
+
 def train_on_pairs(
     estimator: Any,
     theta: Tensor,
@@ -205,27 +265,23 @@ def train_on_pairs(
         The losses and the epoch that was kept.
     """
     train, held_out = split
-    max_num_epochs = epochs_on_pairs(theta, held_out, training.max_num_epochs)
 
-    def batches(step: int) -> Iterator[tuple[Tensor, Tensor]]:
-        order = train[torch.randperm(len(train))]
-        for rows in order.split(training.training_batch_size):
+    def batches(epoch: int) -> Iterator[tuple[Tensor, Tensor]]:
+        for rows in shuffled(train, training.training_batch_size):
             yield theta[rows], x[rows]
 
     def loss(theta: Tensor, x: Tensor) -> Tensor:
         return estimator.loss(theta, condition=x).mean()
 
-    return fit(
+    return train_network(
         estimator,
         batches,
         loss,
+        training,
         validation_loss=(
             (lambda: loss(theta[held_out], x[held_out])) if len(held_out) else None
         ),
-        learning_rate=training.learning_rate,
-        max_num_epochs=max_num_epochs,
-        stop_after_epochs=training.stop_after_epochs,
-        clip_max_norm=training.clip_max_norm,
+        max_num_epochs=epochs_on_pairs(theta, held_out, training.max_num_epochs),
         in_training_mode=in_training_mode,
         label=label,
         show_progress_bars=show_progress_bars,

@@ -18,7 +18,7 @@ from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._training import (
     History,
     epochs_on_pairs,
-    fit,
+    shuffled,
     split_pairs,
 )
 from sbi_rope._validation import (
@@ -37,7 +37,7 @@ from sbi_rope.baselines.statistics import split_at_statistics
 from sbi_rope.mixture import MixtureEstimator, Part
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
-from sbi_rope.trainers.training import EstimatorBuilder, Training
+from sbi_rope.trainers.training import EstimatorBuilder, Training, train_network
 
 __all__ = ["FMCPE"]
 
@@ -269,9 +269,7 @@ class FMCPE(Method):
             return 0.5 * of_simulations + 0.5 * pushed.loss(x[rows], start, u[rows])
 
         def batches(epoch: int) -> Any:
-            order = train[torch.randperm(len(train)).to(train.device)]
-            size = self.training.training_batch_size
-            return [(rows,) for rows in order.split(size)]
+            return zip(shuffled(train, self.training.training_batch_size), strict=True)
 
         def held_out_loss() -> Tensor:
             # The same noise for all epochs, so that they can be compared.
@@ -279,15 +277,13 @@ class FMCPE(Method):
             with seeded(0):
                 return loss(held_out.repeat(repeats))
 
-        return fit(
+        return train_network(
             nn.ModuleList([to_simulations.field, pushed.field]),
             batches,
             loss,
+            self.training,
             validation_loss=held_out_loss if len(held_out) else None,
-            learning_rate=self.training.learning_rate,
             max_num_epochs=max_num_epochs,
-            stop_after_epochs=self.training.stop_after_epochs,
-            clip_max_norm=self.training.clip_max_norm,
             decay=True,
             label="FMCPE",
             show_progress_bars=show_progress_bars,

@@ -7,11 +7,11 @@ import torch
 from torch import Tensor
 
 from sbi_rope._random import seeded
-from sbi_rope._training import History, fit, split_pairs, too_few_pairs
+from sbi_rope._training import History, split_pairs, too_few_pairs
 from sbi_rope.baselines.hvae.model import HybridVAE
 from sbi_rope.errors import warn_user
 from sbi_rope.mixture import MixtureEstimator
-from sbi_rope.trainers.training import Training
+from sbi_rope.trainers.training import Training, train_network
 
 __all__ = ["train_hybrid"]
 
@@ -66,15 +66,12 @@ def train_hybrid(
                 _with_same_draws, objective, x_o[held_out], *pairs
             )
         x_o = x_o[rows]
-    return fit(
+    return train_network(
         model,
         partial(_batches, torch.cat([x_o, pairs[1]]), *pairs, training),
         objective,
+        training,
         validation_loss=validation_loss,
-        learning_rate=training.learning_rate,
-        max_num_epochs=training.max_num_epochs,
-        stop_after_epochs=training.stop_after_epochs,
-        clip_max_norm=training.clip_max_norm,
         label="HVAE",
         show_progress_bars=show_progress_bars,
     )

@@ -10,8 +10,8 @@ from torch.nn import functional
 
 from sbi_rope._sbi import gaussians_of
 from sbi_rope._standardisation import Standardisation
-from sbi_rope._training import fit, split_pairs
-from sbi_rope.trainers.training import Training
+from sbi_rope._training import shuffled, split_pairs
+from sbi_rope.trainers.training import Training, train_network
 
 __all__ = ["ErrorModel", "fit_surrogate", "log_likelihood"]
 
@@ -108,25 +108,21 @@ def fit_surrogate(
     train, held_out = split_pairs(theta, training.validation_fraction)
 
     def batches(epoch: int) -> Any:
-        order = train[torch.randperm(len(train))]
-        for rows in order.split(training.training_batch_size):
+        for rows in shuffled(train, training.training_batch_size):
             yield theta[rows], s[rows]
 
     def loss(theta: Tensor, s: Tensor) -> Tensor:
         noisy = s + JITTER * torch.randn_like(s)
         return surrogate.loss(noisy, condition=theta).mean()
 
-    fit(
+    train_network(
         surrogate,
         batches,
         loss,
+        training,
         validation_loss=(
             (lambda: loss(theta[held_out], s[held_out])) if len(held_out) else None
         ),
-        learning_rate=training.learning_rate,
-        max_num_epochs=training.max_num_epochs,
-        stop_after_epochs=training.stop_after_epochs,
-        clip_max_norm=training.clip_max_norm,
         label="Likelihood of the statistics",
         show_progress_bars=show_progress_bars,
     )

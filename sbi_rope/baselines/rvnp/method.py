@@ -14,7 +14,7 @@ from sbi_rope._sbi import (
     posterior_from,
     with_embedding,
 )
-from sbi_rope._training import History, fit, split_pairs
+from sbi_rope._training import History, shuffled, split_pairs
 from sbi_rope._validation import (
     check_choice,
     check_instance,
@@ -31,7 +31,7 @@ from sbi_rope.baselines.statistics import (
 )
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
-from sbi_rope.trainers.training import EstimatorBuilder, Training
+from sbi_rope.trainers.training import EstimatorBuilder, Training, train_network
 
 __all__ = ["RVNP"]
 
@@ -236,8 +236,7 @@ class RVNP(Method):
         scored = held_out if len(held_out) else train
 
         def batches(epoch: int) -> Any:
-            order = train[torch.randperm(len(train))]
-            return [(rows,) for rows in order.split(size)]
+            return zip(shuffled(train, size), strict=True)
 
         def loss(rows: Tensor) -> Tensor:
             terms = bound(statistics[rows], y[rows])
@@ -253,15 +252,12 @@ class RVNP(Method):
                 ]
             return -torch.cat(evidence).mean()
 
-        return fit(
+        return train_network(
             bound,
             batches,
             loss,
+            self.training,
             validation_loss=validation_loss,
-            learning_rate=self.training.learning_rate,
-            max_num_epochs=self.training.max_num_epochs,
-            stop_after_epochs=self.training.stop_after_epochs,
-            clip_max_norm=self.training.clip_max_norm,
             in_training_mode=False,
             label="RVNP",
             show_progress_bars=show_progress_bars,
