@@ -257,6 +257,25 @@ def trained(name: str, task: str) -> Method:
     return train(feed(make(name, task), data_of(task)))
 
 
+def result(name: str, task: str | None = None) -> Any:
+    """The posterior of the cached training."""
+    return trained(name, task or first_task(name)).build_posterior()
+
+
+def densities(posterior: Any, name: str, task: str | None = None) -> Tensor:
+    """Log densities that two equal posteriors share and two others do not."""
+    data = data_of(task or first_task(name))
+    return log_prob_batched(
+        posterior, data.theta[:5, None].repeat(1, 4, 1), data.x_o[:4]
+    )
+
+
+@functools.cache
+def expected_densities(name: str, task: str | None = None) -> Tensor:
+    """Those of the cached training."""
+    return densities(result(name, task), name, task)
+
+
 def log_prob(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:
     """Log density at one x, as the estimator states it: not divided by the leakage."""
     options = {"norm_posterior": False} if _rejects_without_bound(posterior) else {}

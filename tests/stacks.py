@@ -42,7 +42,7 @@ def quick() -> Iterator[None]:
         "sbi_rope.stacking.folds.SIMULATIONS_PER_PAIR": 5,
         "sbi_rope.stacking.folds.TUNING": tuning,
         "sbi_rope.stacking.folds.DiscrepancyModel": lambda: model,
-        "sbi_rope.stacking.trainer.NUM_SAMPLES": 40,
+        "sbi_rope.stacking.scoring.NUM_SAMPLES": 40,
         "sbi_rope.stacking.folds.NUM_STEPS": steps,
         "sbi_rope.discrepancy.correction.NUM_DRAWS": 50,
         "sbi_rope.discrepancy.training.BATCH_SIZE": 50,

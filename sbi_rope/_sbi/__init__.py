@@ -31,6 +31,7 @@ from sbi_rope._sbi.embedding import (
 )
 from sbi_rope._sbi.posteriors import (
     BaseDirectPosterior,
+    check_density,
     copy_of_prior,
     describe,
     direct_posterior,
@@ -56,6 +57,7 @@ __all__ = [
     "VectorFieldDensity",
     "VectorFieldPosterior",
     "build_zuko_unconditional_flow",
+    "check_density",
     "check_rows_apart",
     "copy_of_prior",
     "describe",

@@ -20,10 +20,11 @@ from sbi_rope._random import seeded
 from sbi_rope._sbi.densities import MixtureDensity
 from sbi_rope._sbi.embedding import device_of
 from sbi_rope._sbi.refusals import check_prior_of, refuse
-from sbi_rope.errors import InvalidInputError
+from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError
 
 __all__ = [
     "BaseDirectPosterior",
+    "check_density",
     "copy_of_prior",
     "describe",
     "direct_posterior",
@@ -49,6 +50,28 @@ def estimator_of(posterior: Any) -> ConditionalEstimator:
     if not plain or isinstance(posterior.posterior_estimator, MixtureDensity):
         raise refuse(posterior)
     return posterior.posterior_estimator
+
+
+def check_density(
+    estimator: Any, *, what: str = "an estimator", because: str = ""
+) -> ConditionalDensityEstimator:
+    """Return an estimator if it has a density.
+
+    Args:
+        estimator: What :func:`estimator_of` returns.
+        what: What the message calls it.
+        because: A clause of the message that says what needs a density.
+
+    Raises:
+        UnsupportedPosteriorError: If it has none.
+    """
+    if not isinstance(estimator, ConditionalDensityEstimator):
+        clause = f", because {because}" if because else ""
+        raise UnsupportedPosteriorError(
+            f"Expected {what} with a density, such as that of NPE{clause}; got "
+            f"{type(estimator).__name__}. Train NPE instead of FMPE or NPSE."
+        )
+    return estimator
 
 
 def is_bounded(posterior: DirectPosterior) -> bool:

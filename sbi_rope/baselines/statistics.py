@@ -9,12 +9,13 @@ from sbi_rope._sbi import (
     ConditionalDensityEstimator,
     UnconditionalDensityEstimator,
     build_zuko_unconditional_flow,
+    check_density,
     embedding_of,
     headless,
 )
 from sbi_rope._standardisation import Standardisation
 from sbi_rope._training import History, shuffled, split_pairs
-from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError
+from sbi_rope.errors import InvalidInputError
 from sbi_rope.trainers.training import Training, train_network
 
 __all__ = [
@@ -47,11 +48,7 @@ def split_at_statistics(
     Raises:
         UnsupportedPosteriorError: If the estimator has no density.
     """
-    if not isinstance(estimator, ConditionalDensityEstimator):
-        raise UnsupportedPosteriorError(
-            "Expected an estimator with a density; got "
-            f"{type(estimator).__name__}. Use NPE instead of FMPE or NPSE."
-        )
+    check_density(estimator)
     if noise_on == "input":
         return nn.Identity(), estimator
     return embedding_of(estimator), headless(estimator)

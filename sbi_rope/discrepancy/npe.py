@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import (
-    ConditionalDensityEstimator,
+    check_density,
     embed,
     embedding_of,
     estimator_of,
@@ -39,7 +39,6 @@ from sbi_rope.errors import (
     InvalidInputError,
     InvalidTypeError,
     NotReadyError,
-    UnsupportedPosteriorError,
 )
 from sbi_rope.finetuning import CalibrationFinetuner
 from sbi_rope.mixture import MixtureEstimator, MixturePosterior, OwnEmbeddings, Part
@@ -305,7 +304,7 @@ class DiscrepancyNPE(Method):
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
         estimator = estimator_of(npe)
         if self.space == "tuned":
-            _check_density(estimator)
+            check_density(estimator, because="space='tuned' averages over nets")
         theta, x = self._data.calibration
         warn_of_far_entries("x", x, embedding_of(estimator))
         source = self._source()
@@ -359,12 +358,3 @@ class DiscrepancyNPE(Method):
         embeddings = OwnEmbeddings(nets, estimator.condition_shape)
         mixture = MixtureEstimator([Part(headless(estimator), embeddings)], [1.0])
         return MixturePosterior(mixture, copy.deepcopy(self._prior))
-
-
-def _check_density(estimator: Any) -> None:
-    if not isinstance(estimator, ConditionalDensityEstimator):
-        raise UnsupportedPosteriorError(
-            "Expected an estimator with a density, because the posterior with "
-            f"space='tuned' is a mixture; got {type(estimator).__name__}. Use "
-            "space='embedding', or train NPE instead of FMPE or NPSE."
-        )

@@ -11,12 +11,13 @@ from torch import Tensor, nn
 from sbi_rope._sbi import (
     ConditionalDensityEstimator,
     ConditionalEstimator,
+    check_density,
     embed,
     embedding_of,
     headless,
     readable,
 )
-from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError
+from sbi_rope.errors import InvalidInputError
 
 __all__ = [
     "DTYPE",
@@ -205,11 +206,7 @@ def part_of(estimator: ConditionalEstimator) -> Part:
     Raises:
         UnsupportedPosteriorError: If it has no density or no embedding of x.
     """
-    if not isinstance(estimator, ConditionalDensityEstimator):
-        raise UnsupportedPosteriorError(
-            "Expected an estimator with a density, such as those of NPE; got "
-            f"{type(estimator).__name__}. Train NPE instead of FMPE or NPSE."
-        )
+    check_density(estimator)
     own = copy.deepcopy(estimator).requires_grad_(requires_grad=False)
     embeddings = OwnEmbeddings([embedding_of(own)], estimator.condition_shape)
     return Part(headless(own), embeddings).eval()

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import torch
 
-from sbi_rope._sbi import ConditionalDensityEstimator, estimator_of
+from sbi_rope._sbi import check_density, estimator_of
 from sbi_rope._validation import (
     check_choice,
     check_instance,
@@ -238,12 +238,7 @@ def _parts_of(name: str, posterior: Any, rope: RoPE) -> list[Part]:
         parts = _equal_parts(name, posterior)
     else:
         estimator = estimator_of(posterior)
-        if not isinstance(estimator, ConditionalDensityEstimator):
-            raise UnsupportedPosteriorError(
-                f"Expected the candidate {name!r} to have a density to score; got "
-                f"{type(estimator).__name__}. Train NPE instead of FMPE or NPSE."
-            )
-        parts = [part_of(estimator)]
+        parts = [part_of(check_density(estimator, what=f"the candidate {name!r}"))]
     for part in parts:
         shapes = (part.density.input_shape, part.mixing.event_shape)
         if shapes != (theta.shape[1:], x.shape[1:]):

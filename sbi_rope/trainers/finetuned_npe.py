@@ -9,6 +9,7 @@ from torch import Tensor
 
 from sbi_rope._sbi import (
     ConditionalDensityEstimator,
+    check_density,
     embedding_of,
     estimator_of,
     posterior_from,
@@ -29,7 +30,7 @@ from sbi_rope._validation import (
     check_integer,
     check_positive,
 )
-from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError
+from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture import (
     MixtureEstimator,
     MixturePosterior,
@@ -223,11 +224,7 @@ class FinetunedNPE(Method):
         show_progress_bars: bool,
     ) -> tuple[ConditionalDensityEstimator, History]:
         """Tune a copy with each learning rate, and keep the best on the hold-out."""
-        if not isinstance(start, ConditionalDensityEstimator):
-            raise UnsupportedPosteriorError(
-                "Expected an estimator with a density to tune by; got "
-                f"{type(start).__name__}. Use NPE instead of FMPE or NPSE."
-            )
+        check_density(start)
 
         def tuned(
             learning_rate: float,

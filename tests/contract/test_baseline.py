@@ -1,7 +1,6 @@
 """Every baseline keeps one contract: data goes in, a posterior of sbi comes out."""
 
 import copy
-import functools
 import inspect
 import pickle
 import random
@@ -16,13 +15,9 @@ import torch
 from sbi.utils import within_support
 from torch import Tensor, nn
 
-import sbi_rope.baselines
 from sbi_rope import load, save
-from sbi_rope._random import seeded
 from sbi_rope.baselines import (
     CalibrationMLP,
-    Method,
-    PlainNPE,
 )
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import (
@@ -30,22 +25,23 @@ from sbi_rope.errors import (
     InvalidTypeError,
     NotReadyError,
     RoPEWarning,
-    UnsupportedPosteriorError,
 )
 from sbi_rope.mixture import MixturePosterior
 from sbi_rope.trainers.data import Kind
 from tests import baselines
 from tests.baselines import (
     METHODS,
-    SHORT,
     append,
     data_of,
+    densities,
+    expected_densities,
     feed,
     first_task,
     log_prob,
     log_prob_batched,
     make,
     names_that_see,
+    result,
     sample,
     sample_batched,
     task_of,
@@ -87,25 +83,6 @@ ONE_OF_A_KIND = (
 @pytest.fixture(params=METHODS)
 def name(request: pytest.FixtureRequest) -> str:
     return request.param
-
-
-def result(name: str, task: str | None = None) -> Any:
-    """The posterior of the cached training."""
-    return trained(name, task or first_task(name)).build_posterior()
-
-
-def densities(posterior: Any, name: str, task: str | None = None) -> Tensor:
-    """Log densities that two equal posteriors share and two others do not."""
-    data = data_of(task or first_task(name))
-    return log_prob_batched(
-        posterior, data.theta[:5, None].repeat(1, 4, 1), data.x_o[:4]
-    )
-
-
-@functools.cache
-def expected_densities(name: str, task: str | None = None) -> Tensor:
-    """Those of the cached training."""
-    return densities(result(name, task), name, task)
 
 
 def retrained(name: str, data: baselines.Data | None = None, **options: Any) -> Any:
@@ -497,146 +474,3 @@ def test_one_observation_is_enough(name: str) -> None:
     method.append_observations(data.x_o[:1])
     posterior = train(method).build_posterior()
     assert log_prob(posterior, data.theta[:5], data.x_o[0]).isfinite().all()
-
-
-# Which data a method sees.
-
-SEES = {
-    "CalibrationMLP": {"calibration"},
-    "DiscrepancyNPE": {"simulations", "calibration"},
-    "FMCPE": {"simulations", "calibration"},
-    "FRISBI": {"simulations", "calibration", "observations"},
-    "FinetunedNPE": {"simulations", "calibration"},
-    "HVAE": {"simulations", "calibration", "observations"},
-    "JointNPE": {"simulations", "calibration"},
-    "NNPE": {"simulations"},
-    "NPERS": {"simulations", "observations"},
-    "OTOnly": {"simulations", "observations"},
-    "PlainNPE": {"simulations"},
-    "PriorBaseline": set(),
-    "RNPE": {"simulations"},
-    "RVNP": {"simulations", "observations"},
-    "ReferenceNPE": {"simulations"},
-    "TuningOnly": {"simulations", "calibration"},
-}
-
-
-def public_methods() -> list[type[Method]]:
-    public = [getattr(sbi_rope.baselines, name) for name in sbi_rope.baselines.__all__]
-    kinds = {kind for kind in public if inspect.isclass(kind)} | {DiscrepancyNPE}
-    return [kind for kind in kinds if issubclass(kind, Method) and kind is not Method]
-
-
-def test_every_method_is_held_to_this_contract() -> None:
-    assert set(public_methods()) == {entry.kind for entry in METHODS.values()}
-    assert {kind.__name__: set(kind.sees) for kind in public_methods()} == SEES
-
-
-def test_every_method_takes_data_and_trains_as_their_common_base_does() -> None:
-    shared = {f"append_{kind}" for kind in KINDS} | {"train", "build_posterior"}
-    for kind in public_methods():
-        assert kind.__bases__ == (Method,)
-        assert not shared & vars(kind).keys(), kind
-
-
-def test_no_method_takes_labels_of_observations() -> None:
-    calls = {name for name, _ in inspect.getmembers(Method) if "append_" in name}
-    assert calls == {f"append_{kind}" for kind in KINDS}
-    assert list(inspect.signature(Method.append_observations).parameters)[1:] == ["x_o"]
-    options = list(inspect.signature(Method.train).parameters)
-    assert options == ["self", "seed", "show_progress_bars"]
-
-
-@pytest.mark.parametrize("name", ["prior", "calibration_mlp", "joint_npe"])
-def test_data_that_a_method_does_not_see_are_refused(name: str) -> None:
-    sees = {
-        "prior": "no data",
-        "calibration_mlp": "only calibration pairs",
-        "joint_npe": "only simulations and calibration pairs",
-    }
-    method, data = make(name, first_task(name)), data_of(first_task(name))
-    for kind in set(KINDS) - method.sees:
-        with pytest.raises(InvalidInputError, match=f"sees {sees[name]}") as caught:
-            append(method, kind, data)
-        assert f"append_{kind}(" in str(caught.value)
-
-
-# NPE trained beforehand.
-
-BUILDERS = [name for name, entry in METHODS.items() if entry.kind.starts_from_npe]
-
-
-def given(name: str, posterior: Any) -> Any:
-    """A method that starts from a trained posterior."""
-    task = first_task(name)
-    options = dict(METHODS[name].options(task_of(task)))
-    options.pop("npe_training")
-    return METHODS[name].kind.from_posterior(posterior, **options)
-
-
-@pytest.mark.parametrize("name", BUILDERS)
-def test_a_posterior_trained_beforehand_does_as_well_and_is_not_changed(
-    name: str,
-) -> None:
-    task = first_task(name)
-    data = data_of(task)
-    npe = PlainNPE(
-        task_of(task).get_prior(), baselines.builder(task), npe_training=SHORT
-    )
-    npe.append_simulations(data.theta, data.x)
-    with seeded(0):
-        trained_npe = train(npe, seed=None).build_posterior()
-        state = torch.get_rng_state()
-        weights = copy.deepcopy(trained_npe.posterior_estimator.state_dict())
-        method = feed(given(name, trained_npe), data)
-        torch.set_rng_state(state)
-        posterior = train(method, seed=None).build_posterior()
-    assert torch.equal(densities(posterior, name), expected_densities(name))
-    after = trained_npe.posterior_estimator
-    assert all(torch.equal(weights[k], v) for k, v in after.state_dict().items())
-    assert all(p.grad is None for p in after.parameters())
-
-
-@pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
-def test_a_posterior_trained_beforehand_fixes_the_shape_of_x() -> None:
-    for name in BUILDERS:
-        data = data_of(first_task(name))
-        method = given(name, result("npe", first_task(name)))
-        longer = torch.cat([data.x, data.x], dim=-1)
-        with pytest.raises(InvalidInputError, match=r"`x` of shape"):
-            method.append_simulations(data.theta, longer)
-
-
-def test_simulations_that_are_not_needed_earn_a_warning() -> None:
-    of_use = {name for name in BUILDERS if METHODS[name].kind is DiscrepancyNPE}
-    of_use |= {"nnpe", "rnpe", "rvnp", "rvnp_offset"}
-    # These look simulations up, because they have no simulator here.
-    of_use |= {name for name in BUILDERS if name.startswith(("fmcpe", "frisbi"))}
-    of_use |= {"tuning_only"}
-    for name in BUILDERS:
-        data = data_of(first_task(name))
-        method = given(name, result("npe", first_task(name)))
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            method.append_simulations(data.theta, data.x)
-        warned = any("makes no use of simulations" in str(w.message) for w in caught)
-        assert warned is (name not in of_use), name
-
-
-def test_options_without_effect_beside_a_trained_posterior_are_refused() -> None:
-    for kind in {METHODS[name].kind for name in BUILDERS}:
-        for option in ("density_estimator", "npe_training"):
-            with pytest.raises(InvalidInputError, match=f"`{option}`"):
-                kind.from_posterior(result("npe"), **{option: None})
-
-
-def test_what_is_no_posterior_of_npe_is_refused() -> None:
-    for name in BUILDERS:
-        with pytest.raises(UnsupportedPosteriorError, match="`posterior`"):
-            given(name, result("prior", first_task(name)))
-
-
-def test_a_method_that_does_not_start_from_npe_takes_no_posterior() -> None:
-    for name in METHODS.keys() - set(BUILDERS):
-        with pytest.raises(InvalidInputError, match="method that starts from NPE"):
-            METHODS[name].kind.from_posterior(result("npe"))

@@ -102,7 +102,7 @@ def test_a_candidate_of_a_user_needs_a_name_of_its_own_and_a_density() -> None:
 
 def test_posteriors_without_a_density_to_score_are_refused() -> None:
     bad: list[tuple[Any, str]] = [
-        (problems.vector_field_posterior("fmpe"), "density to score"),
+        (problems.vector_field_posterior("fmpe"), "candidate 'bad' with a density"),
         (problems.npe_posterior("mdn", dim=1), r"and theta \(1,\)"),
         (problems.npe_posterior("mdn", "cnn"), r"got x \(1, 8, 8\)"),
         (PriorPosterior(gaussian.prior(3)), r"theta \(3,\)"),
@@ -127,7 +127,7 @@ def test_a_rope_of_a_vector_field_is_refused_before_anything_is_simulated() -> N
     source: Any = rope.source
     of_the_check = source.num_calls
     for x_o in (None, observed()):
-        with pytest.raises(UnsupportedPosteriorError, match="train NPE instead"):
+        with pytest.raises(UnsupportedPosteriorError, match="Train NPE instead"):
             stack(rope, x_o, **QUIET)
     assert source.num_calls == of_the_check
 
