@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._sbi import copy_of_prior, embed, estimator_of
+from sbi_rope._sbi import copy_of_prior, embed
 from sbi_rope._simulations import draw_targets
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._training import (
@@ -17,7 +17,7 @@ from sbi_rope._training import (
     split_pairs,
 )
 from sbi_rope._validation import check_instance, check_integer, check_positive
-from sbi_rope.baselines.statistics import split_at_statistics
+from sbi_rope.baselines.statistics import frozen_statistics
 from sbi_rope.finetuning import trainable_copy
 from sbi_rope.mixture import (
     Mixing,
@@ -172,15 +172,13 @@ class FRISBI(Method):
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
-        estimator = copy.deepcopy(estimator_of(npe)).eval()
-        h, density = split_at_statistics(
-            estimator.requires_grad_(requires_grad=False), "embedding"
-        )
+        h, density = frozen_statistics(npe)
         warn_of_far_entries("x", self._data.calibration[1], h)
         simulated, targets = self._simulated(h, show_progress_bars=show_progress_bars)
         g = trainable_copy(h, targets)
+        event_shape = self._data.observations.shape[1:]
         mixing = AlignedEmbeddings(
-            g, torch.cat([simulated, targets]), estimator.condition_shape, self.gamma
+            g, torch.cat([simulated, targets]), event_shape, self.gamma
         )
         history = self._train(mixing, targets, show_progress_bars=show_progress_bars)
         g.requires_grad_(requires_grad=False)

@@ -4,19 +4,22 @@ import copy
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from sbi_rope._sbi import (
     embed,
-    embedding_of,
     estimator_of,
     posterior_from,
-    with_embedding,
 )
 from sbi_rope._training import History
 from sbi_rope._validation import check_choice, check_instance
 from sbi_rope.baselines.error_model import SpikeAndSlab
-from sbi_rope.baselines.statistics import NoiseOn, SoftClip, split_at_statistics
+from sbi_rope.baselines.statistics import (
+    NoiseOn,
+    SoftClip,
+    split_at_statistics,
+    with_clip,
+)
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
 from sbi_rope.trainers.training import (
@@ -92,6 +95,7 @@ class NNPE(Method):
 
     sees = frozenset({"simulations"})
     starts_from_npe = True
+    trains_on_statistics = True
 
     def __init__(
         self,
@@ -113,24 +117,14 @@ class NNPE(Method):
         self.error_model = SpikeAndSlab() if error_model is None else error_model
         self.training = Training() if training is None else training
 
-    @property
-    def needs_simulations(self) -> bool:
-        """Whether simulations are needed. They are, because it trains on statistics."""
-        return True
-
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
         estimator = copy.deepcopy(estimator_of(npe)).requires_grad_()
-        # The density shares its parameters with the estimator.
-        net, density = split_at_statistics(estimator, self.noise_on)
+        net, _ = split_at_statistics(estimator, self.noise_on)
         theta, x = self._data.simulations
         statistics = embed(net, x)
         clip = SoftClip(statistics)
-        density = with_embedding(density, nn.Sequential(clip, embedding_of(density)))
-        if self.noise_on == "embedding":
-            estimator = with_embedding(estimator, nn.Sequential(net, clip))
-        else:
-            estimator = density
+        density, estimator = with_clip(estimator, clip, self.noise_on)
         scale = clip.std
 
         def with_noise(statistics: Tensor) -> Tensor:

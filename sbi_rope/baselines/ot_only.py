@@ -97,7 +97,7 @@ class OTOnly(Method):
         return RoPE(
             npe,
             simulator=self._simulator,
-            simulations=self._data.simulations if self._simulator is None else None,
+            simulations=self._looked_up,
             coupler=self.coupler,
         )
 

@@ -180,6 +180,7 @@ class RNPE(Method):
 
     sees = frozenset({"simulations"})
     starts_from_npe = True
+    trains_on_statistics = True
 
     def __init__(
         self,
@@ -212,11 +213,6 @@ class RNPE(Method):
             num_draws=num_denoised, num_chains=num_chains, warmup=warmup, thin=thin
         )
         self.training = Training() if training is None else training
-
-    @property
-    def needs_simulations(self) -> bool:
-        """Whether simulations are needed. They are, because it trains on statistics."""
-        return True
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)

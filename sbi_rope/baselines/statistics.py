@@ -1,5 +1,6 @@
 r"""The statistics that NNPE, RNPE and RVNP put errors on."""
 
+import copy
 from typing import Any, Literal
 
 import torch
@@ -11,7 +12,9 @@ from sbi_rope._sbi import (
     build_zuko_unconditional_flow,
     check_density,
     embedding_of,
+    estimator_of,
     headless,
+    with_embedding,
 )
 from sbi_rope._standardisation import Standardisation
 from sbi_rope._training import History, shuffled, split_pairs
@@ -22,8 +25,10 @@ __all__ = [
     "NoiseOn",
     "SoftClip",
     "fit_marginal",
+    "frozen_statistics",
     "split_at_statistics",
     "standardisation_of_statistics",
+    "with_clip",
 ]
 
 NoiseOn = Literal["embedding", "input"]
@@ -52,6 +57,20 @@ def split_at_statistics(
     if noise_on == "input":
         return nn.Identity(), estimator
     return embedding_of(estimator), headless(estimator)
+
+
+def frozen_statistics(
+    posterior: Any,
+) -> tuple[nn.Module, ConditionalDensityEstimator]:
+    r"""Return h and :math:`q(\theta \mid h(x))` of NPE, as frozen copies.
+
+    Raises:
+        UnsupportedPosteriorError: If its estimator has no density.
+    """
+    estimator = copy.deepcopy(estimator_of(posterior)).eval()
+    return split_at_statistics(
+        estimator.requires_grad_(requires_grad=False), "embedding"
+    )
 
 
 def standardisation_of_statistics(statistics: Tensor) -> Standardisation:
@@ -111,6 +130,21 @@ class SoftClip(nn.Module):
         clipped = z.sign() * CLIP * (1 + (outside / CLIP).log())
         # Where nothing is clipped, not even the rounding of NPE's input changes.
         return statistics.where(z.abs() <= CLIP, self.mean + self.std * clipped)
+
+
+def with_clip(estimator: Any, clip: SoftClip, noise_on: NoiseOn) -> tuple[Any, Any]:
+    r"""Return :math:`q(\\theta \\mid s)` and :math:`q(\\theta \\mid x)` that clip s.
+
+    Args:
+        estimator: A trained estimator, whose parameters both share.
+        clip: The clip of statistics.
+        noise_on: As in :func:`split_at_statistics`.
+    """
+    net, density = split_at_statistics(estimator, noise_on)
+    density = with_embedding(density, nn.Sequential(clip, embedding_of(density)))
+    if noise_on == "input":
+        return density, density
+    return density, with_embedding(estimator, nn.Sequential(net, clip))
 
 
 def fit_marginal(

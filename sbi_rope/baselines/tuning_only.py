@@ -71,7 +71,7 @@ class TuningOnly(Method):
         rope = RoPE(
             npe,
             simulator=self._simulator,
-            simulations=self._data.simulations if self._simulator is None else None,
+            simulations=self._looked_up,
             finetuner=self.finetuner,
         )
         rope.append_calibration(*self._data.calibration)

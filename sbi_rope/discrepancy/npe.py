@@ -37,7 +37,6 @@ from sbi_rope.discrepancy.summaries import Summaries
 from sbi_rope.discrepancy.tuning import TUNING, cross_fitted_nets
 from sbi_rope.errors import (
     InvalidInputError,
-    InvalidTypeError,
     NotReadyError,
 )
 from sbi_rope.finetuning import CalibrationFinetuner
@@ -148,11 +147,6 @@ class DiscrepancyNPE(Method):
             check_positive("learning_rate", learning_rate, maximum=LARGEST_SETTING)
         check_integer("num_folds", num_folds, minimum=2)
         check_instance("finetuner", finetuner, CalibrationFinetuner, optional=True)
-        if simulator is not None and not callable(simulator):
-            raise InvalidTypeError(
-                "Expected `simulator` to be callable, from theta (n, d) to x (n, "
-                f"*event), or None; got {type(simulator).__name__}."
-            )
         npe = StartingNPE(density_estimator, npe_training)
         super().__init__(prior, npe=npe, simulator=simulator, device=device)
         self.space: Space = space

@@ -13,7 +13,7 @@ from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import copy_of_prior, device_of, embedding_of, estimator_of
 from sbi_rope._simulations import SimulationSource
-from sbi_rope._simulator import source_of
+from sbi_rope._simulator import check_callable, source_of
 from sbi_rope._training import History
 from sbi_rope._validation import (
     check_default_dtype,
@@ -51,6 +51,8 @@ class Method(ABC):
         sees: The kinds of data that can be appended.
         starts_from_npe: Whether it starts from NPE, so that :meth:`from_posterior` can
             take a trained one.
+        trains_on_statistics: Whether it trains on statistics of simulations, so that it
+            needs simulations also beside a trained NPE.
         simulates: Whether it makes simulations of its own. Without a simulator it looks
             them up among those that were appended.
 
@@ -61,11 +63,13 @@ class Method(ABC):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidTypeError: If the prior is not a torch distribution.
+        InvalidTypeError: If the prior is not a torch distribution, or the simulator
+            cannot be called.
     """
 
     sees: ClassVar[frozenset[Kind]]
     starts_from_npe: ClassVar[bool] = False
+    trains_on_statistics: ClassVar[bool] = False
     simulates: ClassVar[bool] = False
 
     def __init__(
@@ -89,6 +93,8 @@ class Method(ABC):
             )
         self._data = Data(self._prior, self._device)
         self._npe = npe
+        if simulator is not None:
+            check_callable(simulator)
         self._simulator = simulator
         self._posterior: Any = None
         self._history: History | None = None
@@ -248,7 +254,8 @@ class Method(ABC):
     def needs_simulations(self) -> bool:
         """Whether simulations must be appended, to train on or to look up."""
         looks_up = self.simulates and self._simulator is None
-        return "simulations" in self.sees and (looks_up or not self._has_npe)
+        used_anyway = looks_up or self.trains_on_statistics
+        return "simulations" in self.sees and (used_anyway or not self._has_npe)
 
     @property
     def _ignores_simulations(self) -> bool:
@@ -271,6 +278,11 @@ class Method(ABC):
             self._prior, self._data, show_progress_bars=show_progress_bars
         )
 
+    @property
+    def _looked_up(self) -> tuple[Tensor, Tensor] | None:
+        """The appended simulations, if there is no simulator to make others."""
+        return self._data.simulations if self._simulator is None else None
+
     def _source(self) -> SimulationSource:
         """Return the simulator, or the appended simulations where there is none."""
         event_shape = self._data.event_shape
@@ -278,7 +290,7 @@ class Method(ABC):
         return source_of(
             self._prior,
             simulator=self._simulator,
-            simulations=self._data.simulations if self._simulator is None else None,
+            simulations=self._looked_up,
             event_shape=event_shape,
             like=torch.empty(0, *self._prior.event_shape, device=self._device),
             readable=self._data.readable,

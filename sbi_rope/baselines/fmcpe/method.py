@@ -12,7 +12,6 @@ from sbi_rope._sbi import (
     ConditionalDensityEstimator,
     direct_posterior,
     embed,
-    estimator_of,
 )
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._training import (
@@ -33,7 +32,7 @@ from sbi_rope.baselines.fmcpe.to_simulations import ToSimulations
 from sbi_rope.baselines.fmcpe.unbounded import Unbounded
 from sbi_rope.baselines.fmcpe.velocity import VelocityField
 from sbi_rope.baselines.networks import fresh_copy
-from sbi_rope.baselines.statistics import split_at_statistics
+from sbi_rope.baselines.statistics import frozen_statistics
 from sbi_rope.mixture import MixtureEstimator, Part
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
@@ -195,10 +194,7 @@ class FMCPE(Method):
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
-        estimator = copy.deepcopy(estimator_of(npe)).eval()
-        h, density = split_at_statistics(
-            estimator.requires_grad_(requires_grad=False), "embedding"
-        )
+        h, density = frozen_statistics(npe)
         theta, x = self._data.calibration
         warn_of_far_entries("x", x, h)
         statistics = nn.Identity() if self.space == "input" else h

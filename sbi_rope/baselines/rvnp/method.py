@@ -4,15 +4,13 @@ import copy
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from sbi_rope._random import seeded
 from sbi_rope._sbi import (
     embed,
-    embedding_of,
     estimator_of,
     posterior_from,
-    with_embedding,
 )
 from sbi_rope._training import History, shuffled, split_pairs
 from sbi_rope._validation import (
@@ -28,6 +26,7 @@ from sbi_rope.baselines.statistics import (
     SoftClip,
     split_at_statistics,
     standardisation_of_statistics,
+    with_clip,
 )
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
@@ -147,6 +146,7 @@ class RVNP(Method):
 
     sees = frozenset({"simulations", "observations"})
     starts_from_npe = True
+    trains_on_statistics = True
 
     def __init__(
         self,
@@ -184,25 +184,15 @@ class RVNP(Method):
         )
         self.training = DEFAULT_TRAINING if training is None else training
 
-    @property
-    def needs_simulations(self) -> bool:
-        """Whether simulations are needed. They are, because it trains on statistics."""
-        return True
-
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
         estimator = copy.deepcopy(estimator_of(npe)).requires_grad_()
-        # The density shares its parameters with the estimator.
-        net, density = split_at_statistics(estimator, self.noise_on)
+        net, _ = split_at_statistics(estimator, self.noise_on)
         theta, x = self._data.simulations
         simulated = embed(net, x)
         standardise = standardisation_of_statistics(simulated)
         clip = SoftClip(simulated)
-        density = with_embedding(density, nn.Sequential(clip, embedding_of(density)))
-        if self.noise_on == "embedding":
-            estimator = with_embedding(estimator, nn.Sequential(net, clip))
-        else:
-            estimator = density
+        density, estimator = with_clip(estimator, clip, self.noise_on)
         s = standardise(simulated)
         surrogate = fit_surrogate(
             theta,
