@@ -1,4 +1,4 @@
-"""The difference between log scores in the units of theta and of the prior."""
+"""Standard deviations of priors, as units of theta and of log scores."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ from torch import Tensor
 
 from sbi_rope._random import seeded
 
-__all__ = ["log_unit_of", "log_units_of"]
+__all__ = ["log_unit_of", "log_units_of", "std_of_prior"]
 
 # Draws that the standard deviation is estimated from if the prior does not state it.
 NUM_DRAWS = 10_000
@@ -26,10 +26,15 @@ def log_units_of(prior: Any) -> Tensor:
     in standard deviations of the prior is higher by their sum. It is NaN where the
     prior has no finite standard deviation.
     """
+    std = std_of_prior(prior)
+    return std.log().where((std > 0) & torch.isfinite(std), torch.nan)
+
+
+def std_of_prior(prior: Any) -> Tensor:
+    """Return the standard deviations of a prior, ``(d,)``; estimated if not stated."""
     try:
         std = prior.stddev
     except Exception:  # priors of users and of sbi raise all kinds
         with seeded(0):
             std = prior.sample(torch.Size((NUM_DRAWS,))).std(dim=0)
-    std = torch.as_tensor(std).detach().double()
-    return std.log().where((std > 0) & torch.isfinite(std), torch.nan)
+    return torch.as_tensor(std).detach().double()

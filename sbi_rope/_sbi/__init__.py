@@ -16,7 +16,6 @@ from sbi.utils.user_input_checks_utils import move_distribution_to_device
 from sbi_rope._sbi.densities import (
     MixedDensity,
     MixtureDensity,
-    MixtureDensityEstimator,
     VectorFieldDensity,
     gaussians_of,
 )
@@ -50,7 +49,6 @@ __all__ = [
     "DirectPosterior",
     "MixedDensity",
     "MixtureDensity",
-    "MixtureDensityEstimator",
     "NeuralPosterior",
     "SliceSamplerVectorized",
     "UnconditionalDensityEstimator",

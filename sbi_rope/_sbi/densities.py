@@ -22,7 +22,6 @@ from sbi_rope.errors import LogProbUnavailableError
 __all__ = [
     "MixedDensity",
     "MixtureDensity",
-    "MixtureDensityEstimator",
     "VectorFieldDensity",
     "gaussians_of",
 ]

@@ -4,11 +4,11 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from sbi_rope._notebooks import shown_as_text
 from sbi_rope._random import seeded
+from sbi_rope._units import std_of_prior
 from sbi_rope.metrics.calibration import (
     ACAUC_IN_WORDS,
     ACAUCScore,
@@ -155,7 +155,8 @@ def evaluate(
         theta: True parameters, shape ``(n, d)``.
         x: Their observations, shape ``(n, *event_shape)``.
         theta_std: The unit of each parameter for ``lpp_z``, shape ``(d,)``. If None,
-            the standard deviations that the prior of the posterior states, if it does.
+            the standard deviations of the posterior's prior, estimated from draws if
+            it does not state them.
         num_samples: The number of posterior samples for each observation.
         seed: The seed of the samples, which also depend on ``chunk_size``.
         chunk_size: How many observations are scored at a time. Fewer need less memory.
@@ -203,10 +204,10 @@ def evaluate(
 
 
 def _std_of_prior(posterior: Any, theta: Tensor) -> Tensor | None:
-    """Return the standard deviations of a posterior's prior, if it states them."""
+    """Return the standard deviations of a posterior's prior, if they can be known."""
     try:
-        std = torch.as_tensor(posterior.prior.stddev).detach().double().cpu()
+        std = std_of_prior(posterior.prior).cpu()
         check_theta_std(std, theta)
-    except Exception:  # priors of users and of sbi raise all kinds
+    except Exception:  # posteriors of users, which need not have a prior to sample
         return None
     return std

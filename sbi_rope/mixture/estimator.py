@@ -339,7 +339,6 @@ class MixtureEstimator(MixtureDensity):
             if accept is None:
                 mass += share
                 continue
-            num_draws = math.ceil(LEAKAGE_DRAWS * share)
             if k in small:
                 own = Leakage(torch.ones_like(mass), torch.full_like(mass, 0.5))
             elif part.mixing.embeddings is None:
@@ -347,55 +346,22 @@ class MixtureEstimator(MixtureDensity):
                     part,
                     embedded,
                     accept=accept,
-                    num_draws=num_draws,
+                    num_draws=math.ceil(LEAKAGE_DRAWS * share),
                     seed=k,
                     show_progress_bars=show_progress_bars,
                 )
             else:
-                of_each = self.component_mass(
-                    k, accept=accept, cache=cache, show_progress_bars=show_progress_bars
-                )
-                own = shared_mass(part, embedded, of_each)
+                if k not in cache:
+                    cache[k] = component_mass(
+                        part.density,
+                        part.mixing.embeddings,
+                        accept=accept,
+                        show_progress_bars=show_progress_bars,
+                    )
+                own = shared_mass(part, embedded, cache[k])
             mass += share * own.mass
             variance += (share * own.standard_error).square()
         return Leakage(mass, variance.sqrt())
-
-    def component_mass(
-        self,
-        number: int,
-        *,
-        accept: Accept,
-        cache: dict[int, Tensor],
-        show_progress_bars: bool = False,
-    ) -> Tensor:
-        """Return the mass inside the support given each shared embedding of a part.
-
-        Args:
-            number: The number of the part.
-            accept: Tells which parameters ``(n, d)`` are inside.
-            cache: Where the masses are kept after the first call.
-            show_progress_bars: Whether to show progress if the estimate takes long.
-
-        Returns:
-            Shape ``(c,)``, float64.
-
-        Raises:
-            InvalidInputError: If the observations of the part share no embeddings.
-        """
-        part = self.parts[number]
-        embeddings = part.mixing.embeddings
-        if embeddings is None:
-            raise InvalidInputError(
-                f"Expected the number of a part with shared embeddings; got {number}."
-            )
-        if number not in cache:
-            cache[number] = component_mass(
-                part.density,
-                embeddings,
-                accept=accept,
-                show_progress_bars=show_progress_bars,
-            )
-        return cache[number]
 
     def loss(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
         """Return the negative log-probability, shape ``(B,)``."""

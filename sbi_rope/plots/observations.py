@@ -38,7 +38,7 @@ def real_and_simulated(
     x_o: Tensor,
     x_s: Tensor,
     *,
-    names: Sequence[str] = (),
+    x_names: Sequence[str] | None = None,
     labels: tuple[str, str] = ("real", "simulated"),
 ) -> "Figure":
     """Draw real observations beside simulations with the same parameters.
@@ -51,7 +51,7 @@ def real_and_simulated(
             ``(n, length)``, or images, shape ``(n, 3, height, width)``, with values in
             [0, 1].
         x_s: Simulations with the parameters of the real observations, same shape.
-        names: A name for each of the l statistics. Without names, a tensor with two
+        x_names: A name for each of the l statistics. Without names, a tensor with two
             dimensions is taken for series.
         labels: The names of real observations and simulations in the legend.
 
@@ -68,10 +68,10 @@ def real_and_simulated(
     check_batch("x_s", x_s, x_o.shape[1:])
     check_same_length("x_o", x_o, "x_s", x_s)
     check_names("labels", labels, 2)
-    names = check_names("names", names)
+    names = check_names("x_names", () if x_names is None else x_names)
     if names and (x_o.ndim != 2 or len(names) != x_o.shape[1]):
         raise InvalidInputError(
-            f"Expected as many `names` as statistics in `x_o`; got {len(names)} for "
+            f"Expected as many `x_names` as statistics in `x_o`; got {len(names)} for "
             f"`x_o` of shape {tuple(x_o.shape)}."
         )
     drawn = slice(None if names else NUM_SHOWN)

@@ -186,7 +186,7 @@ def _draw(task: Task, theta: Tensor, x_o: Tensor, *, path: Path, seed: int) -> N
         torch.manual_seed(seed)
         x_s = task.get_simulator()(theta)
     figure = real_and_simulated(
-        x_o, x_s, names=task.x_names, labels=(_kind(task), "simulated")
+        x_o, x_s, x_names=task.x_names, labels=(_kind(task), "simulated")
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     try:

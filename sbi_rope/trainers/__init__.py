@@ -2,7 +2,6 @@
 
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.finetuned_npe import FinetunedNPE
-from sbi_rope.trainers.starting_npe import StartingNPE
 from sbi_rope.trainers.training import Training
 
-__all__ = ["FinetunedNPE", "Method", "StartingNPE", "Training"]
+__all__ = ["FinetunedNPE", "Method", "Training"]

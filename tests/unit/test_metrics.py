@@ -413,6 +413,23 @@ def test_a_seed_fixes_the_samples_and_leaves_the_global_random_state_alone() -> 
     assert not torch.equal(first.ranks, other.ranks)
 
 
+class Uniform:
+    """A prior of a user, which does not state its standard deviation."""
+
+    def sample(self, shape: torch.Size) -> Tensor:
+        return 6.0 * torch.rand(*shape, 1)
+
+
+def test_the_unit_is_estimated_where_the_prior_does_not_state_it() -> None:
+    posterior: Any = GaussianPosterior()
+    posterior.prior = Uniform()
+    found = metrics.evaluate(posterior, *gaussian_pairs(50), num_samples=50, seed=0)
+    assert found.unit_z == "standard deviations of the prior"
+    assert found.lpp_z is not None
+    log_std = found.lpp_z.mean - found.lpp.mean
+    assert log_std == pytest.approx(0.5 * math.log(3.0), abs=0.02)
+
+
 def test_a_printed_evaluation_is_a_dozen_lines_that_name_their_units() -> None:
     theta, x = gaussian_pairs(300)
     std = torch.tensor([2.0])

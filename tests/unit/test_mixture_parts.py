@@ -763,12 +763,6 @@ def test_parts_that_do_not_fit_are_refused_by_name() -> None:
             lambda: estimator.part_log_probs(torch.zeros(2, DIM), torch.zeros(3, 3)),
             "same number of rows",
         ),
-        (
-            lambda: estimator.component_mass(
-                0, accept=lambda theta: theta[:, 0] > 0, cache={}
-            ),
-            "shared embeddings",
-        ),
     ]
     for call, match in calls:
         with pytest.raises(InvalidInputError, match=match):

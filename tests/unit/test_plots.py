@@ -417,7 +417,7 @@ def test_overview_says_what_is_wrong_with_its_arguments() -> None:
 
 def test_statistics_are_drawn_as_a_histogram_each() -> None:
     figure = plots.real_and_simulated(
-        torch.randn(100, 5), torch.randn(100, 5) + 1, names=list("abcde")
+        torch.randn(100, 5), torch.randn(100, 5) + 1, x_names=list("abcde")
     )
     assert [axes.get_xlabel() for axes in figure.axes] == list("abcde")
     assert legend_texts(figure.legends[0]) == ["simulated", "real"]
@@ -444,7 +444,7 @@ def test_images_are_drawn_real_above_simulated() -> None:
 
 
 def test_constant_statistics_are_drawn_too() -> None:
-    plots.real_and_simulated(torch.ones(5, 1), torch.ones(5, 1), names=["a"])
+    plots.real_and_simulated(torch.ones(5, 1), torch.ones(5, 1), x_names=["a"])
 
 
 def test_observations_that_cannot_be_drawn_are_refused() -> None:
@@ -461,7 +461,7 @@ def test_observations_that_cannot_be_drawn_are_refused() -> None:
         (images[:, :1], images[:, :1], [], "height"),
     ]
     for x_o, x_s, names, match in cases:
-        assert_refused(match, plots.real_and_simulated, x_o, x_s, names=names)
+        assert_refused(match, plots.real_and_simulated, x_o, x_s, x_names=names)
     for labels in ("ab", ["a"]):
         assert_refused("labels", plots.real_and_simulated, two, two, labels=labels)
 

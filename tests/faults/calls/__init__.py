@@ -82,7 +82,6 @@ NOT_CALLED = {
             "Part",
             "Rows",
             "StackedPosterior",
-            "StartingNPE",
             "check_converged",
             "equal_rows",
             "parameters_named",
