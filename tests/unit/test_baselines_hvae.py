@@ -2,7 +2,6 @@
 
 import copy
 import math
-import pickle
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -539,56 +538,6 @@ def test_npe_is_left_as_it_was_and_is_not_trained_inside_either(npe: Any) -> Non
         strict=True,
     ):
         torch.testing.assert_close(own, given, rtol=0, atol=0)
-
-
-def test_posterior_is_one_of_sbi_with_the_shapes_of_the_data(posterior: Any) -> None:
-    theta, x = real(3, seed=3)
-    assert isinstance(posterior, DirectPosterior)
-    assert posterior.posterior_estimator.condition_shape == (200,)
-    log_prob = posterior.log_prob_batched(theta[None], x=x, norm_posterior=False)
-    assert log_prob.shape == (1, 3)
-    one = posterior.log_prob(theta[:1], x=x[:1], norm_posterior=False)
-    torch.testing.assert_close(one, log_prob[0, :1])
-    quiet = {"show_progress_bars": False, "reject_outside_prior": False}
-    assert posterior.sample((5,), x=x[:1], **quiet).shape == (5, 2)
-    assert posterior.sample_batched((5,), x=x, **quiet).shape == (5, 3, 2)
-
-
-@pytest.mark.filterwarnings("ignore:Only 3 calibration")
-def test_same_seed_gives_the_same_posterior_and_another_seed_another(npe: Any) -> None:
-    theta, x = real(5, seed=3)
-    # Chosen by the bound, which improves within an epoch.
-    methods = [trained(npe, num_pairs=3, seed=seed) for seed in (0, 0, 1)]
-    assert all(method.history.best_epoch > 0 for method in methods)
-    one, same, other = (scores(m.build_posterior(), theta, x) for m in methods)
-    torch.testing.assert_close(one, same, rtol=0, atol=0)
-    assert (one != other).any()
-
-
-def test_posterior_survives_pickling(posterior: Any) -> None:
-    theta, x = real(5, seed=3)
-    restored = pickle.loads(pickle.dumps(posterior))
-    torch.testing.assert_close(scores(restored, theta, x), scores(posterior, theta, x))
-
-
-def test_npe_is_trained_on_simulations_if_none_is_given() -> None:
-    method = HVAE(
-        PRIOR,
-        posterior_nn("maf", embedding_net=embedding_net(), num_transforms=1),
-        physics=physics,
-        npe_training=Training(max_num_epochs=1),
-        training=SMALL,
-        width=2,
-        num_latents=4,
-    )
-    method.append_calibration(*real(10, seed=1))
-    method.append_observations(real(20, seed=2)[1])
-    with pytest.raises(NotReadyError, match="append_simulations"):
-        method.train(seed=0)
-    theta = PRIOR.sample((100,))
-    method.append_simulations(theta, PendulumSimulator()(theta))
-    posterior = method.train(seed=0, show_progress_bars=False).build_posterior()
-    assert torch.isfinite(scores(posterior, *real(5, seed=3))).all()
 
 
 def test_few_pairs_are_all_trained_on_and_observations_are_held_out(npe: Any) -> None:

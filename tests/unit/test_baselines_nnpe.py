@@ -3,7 +3,6 @@
 import copy
 import functools
 import math
-import pickle
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -235,28 +234,6 @@ def test_images_are_taken_with_noise_on_either(noise_on: str) -> None:
         1,
         3,
     )
-
-
-def test_a_seed_repeats_the_training() -> None:
-    method = small(problems.npe_posterior())
-    states = [
-        state_of(
-            estimator_of(method.train(seed=s, show_progress_bars=False)._posterior)
-        )
-        for s in (0, 0, 1)
-    ]
-    assert equal(states[0], states[1])
-    assert not equal(states[0], states[2])
-
-
-def test_the_posterior_survives_pickling() -> None:
-    method = small(problems.npe_posterior()).train(seed=0, show_progress_bars=False)
-    posterior = method.build_posterior()
-    theta, x = torch.zeros(3, 2), torch.randn(3, 3)
-    again = pickle.loads(pickle.dumps(posterior))
-    expected = posterior.log_prob_batched(theta, x=x, norm_posterior=False)
-    values = again.log_prob_batched(theta, x=x, norm_posterior=False)
-    assert torch.equal(values, expected)
 
 
 # --- wrong use ---

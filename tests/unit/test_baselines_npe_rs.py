@@ -1,6 +1,5 @@
 """NPE-RS: the discrepancy is right, and pulls embeddings together in training only."""
 
-import copy
 import math
 from typing import Any
 
@@ -241,15 +240,6 @@ def test_the_validation_loss_has_no_discrepancy_in_it() -> None:
 def test_the_estimator_comes_back_in_evaluation_mode() -> None:
     estimator = trained().build_posterior().posterior_estimator
     assert not any(module.training for module in estimator.modules())
-
-
-def test_the_users_net_is_left_as_it_was() -> None:
-    embedding_net = net()
-    before = copy.deepcopy(embedding_net.state_dict())
-    trained(embedding_net=embedding_net)
-    after = embedding_net.state_dict()
-    assert all(torch.equal(before[key], after[key]) for key in before)
-    assert embedding_net.training
 
 
 def test_batch_statistics_are_those_of_the_simulations() -> None:

@@ -272,14 +272,6 @@ def test_samples_have_the_shapes_of_an_estimator() -> None:
         assert draws.shape == (*sample_shape, 3, 2)
 
 
-def test_the_posterior_that_was_passed_stays_as_it_is() -> None:
-    npe = gaussian.posterior()
-    before = {k: v.clone() for k, v in estimator_of(npe).state_dict().items()}
-    quick(npe).train(seed=0, show_progress_bars=False)
-    after = estimator_of(npe).state_dict()
-    assert all(torch.equal(after[name], value) for name, value in before.items())
-
-
 def test_estimators_of_sbi_can_be_averaged() -> None:
     for family in ["mdn", "nsf", "zuko_maf"]:
         theta = problems.box(2).sample((200,))
