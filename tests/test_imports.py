@@ -221,6 +221,13 @@ def test_every_module_has_a_layer() -> None:
         assert part is None or part in set().union(*LAYERS), f"give {part} a place"
 
 
+def test_every_room_is_described() -> None:
+    rooms = (PACKAGE.parent / "CONTRIBUTING.md").read_text()
+    for part in set().union(*LAYERS):
+        named = f"`{part}/`" in rooms or f"`{part}.py`" in rooms
+        assert named, f"CONTRIBUTING.md says nothing about {part}"
+
+
 def test_no_module_imports_the_package_as_a_whole() -> None:
     # It would hide which layer is meant, and close a circle.
     for path in modules():
