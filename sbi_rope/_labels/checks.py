@@ -110,15 +110,11 @@ def _covariance(theta: Tensor, theta_std: Any, theta_cov: Any) -> Tensor:
             "squares of the standard deviations on its diagonal."
         )
     if theta_cov is not None:
-        covariance = _checked_covariance(theta_cov, theta)
-    elif theta_std is not None:
+        return _checked_covariance(theta_cov, theta)
+    if theta_std is not None:
         std = _checked_std(theta_std, theta)
-        covariance = torch.diag_embed(std.square())
-    else:
-        return theta.new_zeros(n, dim, dim, dtype=torch.double)
-    measured = ~torch.isnan(theta)
-    both = measured[:, :, None] & measured[:, None, :]
-    return torch.where(both, covariance, 0.0)
+        return torch.diag_embed(std.square())
+    return theta.new_zeros(n, dim, dim, dtype=torch.double)
 
 
 def _checked_std(theta_std: Any, theta: Tensor) -> Tensor:
@@ -152,7 +148,10 @@ def _checked_covariance(theta_cov: Any, theta: Tensor) -> Tensor:
             f"{tuple(covariance.shape)}."
         )
     covariance = covariance.detach().to(theta.device, torch.double)
-    covariance = covariance.expand(n, dim, dim)
+    # What was not measured needs no covariance.
+    measured = ~torch.isnan(theta)
+    both = measured[:, :, None] & measured[:, None, :]
+    covariance = torch.where(both, covariance.expand(n, dim, dim), 0.0)
     if not torch.isfinite(covariance).all():
         raise InvalidInputError(
             "Expected `theta_cov` to be finite; got NaN or Inf. Put NaN into `theta` "

@@ -37,6 +37,14 @@ def labelled_moments(
     the possible means of the pair. The covariance of the residuals estimates that of
     simulations at one parameter.
 
+    A surface also fits the noise of the simulations. Its linear and its quadratic terms
+    are shrunk by how much of their size is noise, as James and Stein did, so that
+    labels that are nearly exact have a single possible mean.
+
+    References:
+        | Estimation with Quadratic Loss (James and Stein, 1961)
+        | https://projecteuclid.org/euclid.bsmsp/1200512173
+
     Args:
         source: Where simulations come from.
         parameters: The draws of the parameters.
@@ -50,21 +58,19 @@ def labelled_moments(
     n, num_draws, d = theta.shape
     simulated = source.draws(theta.reshape(-1, d), 1, embed, progress=progress)
     simulated = simulated.double().reshape(n, num_draws, -1)
-    design = _features(theta.double())
     level = simulated.mean(dim=1, keepdim=True)
-    penalty = RIDGE * num_draws * torch.eye(design.shape[2]).to(design)
-    normal = design.mT @ design + penalty
-    coefficients = torch.linalg.solve(normal, design.mT @ (simulated - level))
-    fitted = level + design @ coefficients
-    residual = simulated - fitted
-    # As many parameters as were effectively fitted; for exact labels it is the mean.
-    used = torch.linalg.solve(normal, design.mT @ design).diagonal(dim1=1, dim2=2)
-    freedom = (num_draws - 1 - used.sum(dim=1)).clamp_min(1.0)
-    return Moments(
-        mean=fitted.mean(dim=1),
-        covariance=residual.mT @ residual / freedom[:, None, None],
-        possible=fitted,
-    )
+    residual = simulated - level
+    freedom = simulated.new_full((n,), num_draws - 1)
+    fits = []
+    for terms in _features(theta.double()):
+        fitted, used = _regressed(residual, terms)
+        residual = residual - fitted
+        freedom = freedom - used
+        fits.append((fitted, used))
+    covariance = residual.mT @ residual / freedom.clamp_min(1.0)[:, None, None]
+    noise = covariance.mean(dim=0).diagonal()
+    surface = sum(_shrunk(fitted, used[:, None] * noise) for fitted, used in fits)
+    return Moments(mean=level[:, 0], covariance=covariance, possible=level + surface)
 
 
 def labelled_targets(
@@ -79,8 +85,8 @@ def labelled_targets(
     r"""Return the targets of the tuning, :math:`E[h(S(\theta)) \mid y_i]`.
 
     For exact labels see :func:`~sbi_rope._simulations.draw_targets`. Otherwise the
-    expectation is also over the parameters that the label leaves possible, with one
-    simulation at each of at most ``simulations_per_target`` draws.
+    expectation is also over the parameters that the label leaves possible, with
+    ``simulations_per_target`` simulations at draws of these.
 
     Raises:
         SimulationError: If the simulator fails, or an embedding is not finite.
@@ -94,18 +100,19 @@ def labelled_targets(
             num_neighbors=num_neighbors,
             progress=progress,
         )
-    theta = parameters.draws[:, :simulations_per_target]
-    n, count, d = theta.shape
+    n, num_draws, d = parameters.draws.shape
+    theta = parameters.draws[:, torch.arange(simulations_per_target) % num_draws]
     embedded = source.draws(theta.reshape(-1, d), 1, embed, progress=progress)
-    targets = embedded.reshape(n, count, -1).mean(dim=1)
+    targets = embedded.reshape(n, simulations_per_target, -1).mean(dim=1)
     return check_targets(targets, parameters.mean)
 
 
-def _features(theta: Tensor) -> Tensor:
+def _features(theta: Tensor) -> list[Tensor]:
     """Return linear and, with enough draws, quadratic terms of standardised draws.
 
-    All terms have mean zero, shape ``(n, R, p)``. Parameters that do not vary, because
-    they are known exactly, have terms of zero.
+    All terms have mean zero, shape ``(n, R, p)``, and quadratic ones have no linear
+    part. Parameters that do not vary, because they are known exactly, have terms of
+    zero.
     """
     centred = theta - theta.mean(dim=1, keepdim=True)
     std = centred.square().mean(dim=1, keepdim=True).sqrt()
@@ -114,8 +121,31 @@ def _features(theta: Tensor) -> Tensor:
     d = theta.shape[2]
     num_terms = d + d * (d + 1) // 2
     if num_terms * SIMULATIONS_PER_COEFFICIENT > theta.shape[1]:
-        return linear
+        return [linear]
     first, second = torch.triu_indices(d, d).to(theta.device)
     quadratic = linear[..., first] * linear[..., second]
     quadratic = quadratic - quadratic.mean(dim=1, keepdim=True)
-    return torch.cat([linear, quadratic], dim=2)
+    return [linear, quadratic - _regressed(quadratic, linear)[0]]
+
+
+def _regressed(y: Tensor, terms: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the part of y that is linear in some terms, and how many were fitted.
+
+    Args:
+        y: Shape ``(n, R, l)``.
+        terms: Shape ``(n, R, p)``.
+
+    Returns:
+        The fit, of the shape of y, and the effective number of terms, ``(n,)``.
+    """
+    ridge = RIDGE * terms.shape[1] * torch.eye(terms.shape[2]).to(terms)
+    normal = terms.mT @ terms
+    used = torch.linalg.solve(normal + ridge, normal).diagonal(dim1=1, dim2=2)
+    return terms @ torch.linalg.solve(normal + ridge, terms.mT @ y), used.sum(dim=1)
+
+
+def _shrunk(fitted: Tensor, noise: Tensor) -> Tensor:
+    """Shrink a fit ``(n, R, l)`` by the noise in its sum of squares, ``(n, l)``."""
+    squares = fitted.square().sum(dim=1)
+    shares = 1 - noise / squares.clamp_min(1e-300)
+    return fitted * shares.clamp_min(0.0)[:, None]

@@ -21,6 +21,7 @@ from sbi.utils import within_support
 from torch import Tensor
 from torch.distributions import Chi2
 
+from sbi_rope._bounds import bounds_of
 from sbi_rope._labels.labels import Labels
 
 __all__ = ["Nodes", "Reference", "place_nodes", "reference_of"]
@@ -136,6 +137,7 @@ def place_nodes(
     total = of_each * len(references)
     theta = labels.theta.double()[:, None].expand(n, total, d).clone()
     log_weights = labels.covariance.new_zeros(n, total)
+    low, high = bounds_of(prior, log_weights.new_zeros(d))
     open_ones = ~labels.is_measured | labels.is_noisy
     for pattern in open_ones.unique(dim=0):
         if not pattern.any():
@@ -150,6 +152,7 @@ def place_nodes(
                 measured.nonzero().flatten(),
                 free,
                 of_each,
+                bounds=(low[free], high[free]),
             )
             theta[some[:, None, None], torch.arange(total)[:, None], free] = drawn
             log_weights[some] = -log_density
@@ -168,13 +171,20 @@ def _propose(
     measured: Tensor,
     free: Tensor,
     of_each: int,
+    *,
+    bounds: tuple[Tensor, Tensor],
 ) -> tuple[Tensor, Tensor]:
     """Draw the parameters that labels of one pattern leave open.
+
+    Proposals are centred inside the bounds of these parameters.
 
     Returns:
         Draws of shape ``(n, S, f)`` and the log density of the mixture, ``(n, S)``.
     """
-    updated = [_updated(labels, reference, measured, free) for reference in references]
+    updated = []
+    for reference in references:
+        mean, factor = _updated(labels, reference, measured, free)
+        updated.append((mean.clamp(*bounds), factor))
     draws = torch.cat([_draw(*one, of_each) for one in updated], dim=1)
     log_density = torch.stack([_log_t(draws, *one) for one in updated])
     return draws, log_density.logsumexp(dim=0) - math.log(len(updated))
@@ -193,14 +203,16 @@ def _updated(
     gain = torch.linalg.solve(total, cross, left=False)
     surprise = labels.theta.double()[:, measured] - mean[:, measured]
     mean = mean[:, free] + (gain @ surprise[..., None])[..., 0]
-    left = covariance[:, free][:, :, free] - gain @ cross.mT
-    left = (left + left.mT) / 2
-    # Differences of nearly equal numbers can be negative.
-    variance, directions = torch.linalg.eigh(left)
-    smallest = JITTER * scale[:, free].amin(dim=1, keepdim=True)
-    smallest = torch.minimum(smallest, variance[:, -1:].abs().clamp_min(1e-300))
-    left = directions * variance.clamp_min(smallest)[:, None] @ directions.mT
-    return mean, torch.linalg.cholesky(left)
+    # The form of Joseph, which is a sum. A difference loses the precision of labels
+    # that are nearly exact.
+    every = torch.eye(covariance.shape[1]).to(covariance)
+    kept = every[free] - gain @ every[measured]
+    left = kept @ covariance @ kept.mT + gain @ noise @ gain.mT
+    std = left.diagonal(dim1=1, dim2=2).clamp_min(1e-300).sqrt()
+    correlation = left / (std[:, :, None] * std[:, None, :])
+    variance, directions = torch.linalg.eigh((correlation + correlation.mT) / 2)
+    correlation = directions * variance.clamp_min(JITTER)[:, None] @ directions.mT
+    return mean, std[:, :, None] * torch.linalg.cholesky(correlation)
 
 
 def _draw(mean: Tensor, factor: Tensor, count: int) -> Tensor:

@@ -1,11 +1,13 @@
 """Draws of the parameters that labels leave possible, under the prior."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from sbi_rope._bounds import bounds_of
 from sbi_rope._labels.labels import Labels
 from sbi_rope._labels.nodes import Nodes, Reference, place_nodes, reference_of
 from sbi_rope._random import seeded
@@ -20,6 +22,10 @@ NUM_PRIOR_DRAWS = 5000
 NUM_PROPOSALS, NUM_DRAWS = 2000, 100
 # With fewer effective proposals the draws repeat each other, and there is a warning.
 SMALLEST_SIZE = 20.0
+# A noisy label that misses the prior's support by more standard deviations is refused.
+LARGEST_MISS = 8.0
+# With fewer nodes inside the prior's support, a label gets others.
+FEWEST_INSIDE = 4
 # The number of labels that are treated at a time.
 CHUNK_SIZE = 100
 
@@ -116,7 +122,44 @@ def nodes_of(
         mean=one.mean.expand(n, -1), covariance=one.covariance.expand(n, -1, -1)
     )
     usable = [reference.or_else(wide) for reference in references]
-    return place_nodes(labels, [*usable, wide], prior, num_nodes=num_nodes)
+    nodes = place_nodes(labels, [*usable, wide], prior, num_nodes=num_nodes)
+    inside = torch.isfinite(nodes.log_weights).sum(dim=1)
+    few = (inside < FEWEST_INSIDE).nonzero().flatten()
+    for rows in few.split(CHUNK_SIZE) if len(few) else ():
+        others = _nodes_inside(labels[rows], wide[rows], prior, nodes.theta.shape[1])
+        nodes.theta[rows] = others.theta
+        nodes.log_weights[rows] = others.log_weights
+    return nodes
+
+
+def _nodes_inside(labels: Labels, wide: Reference, prior: Any, count: int) -> Nodes:
+    r"""Return nodes drawn from :math:`p(\theta \mid y)`, which is inside the support.
+
+    Their weights are :math:`p(y) / p(\theta)`. Labels that no parameters fit keep
+    weights of zero.
+    """
+    nodes, log_prior = _proposals(labels, wide, prior)
+    log_posterior = nodes.log_weights + log_prior
+    log_evidence = log_posterior.logsumexp(dim=1) - math.log(log_posterior.shape[1])
+    found = torch.isfinite(log_evidence)
+    shares = torch.softmax(log_posterior[found], dim=1)
+    chosen = _systematic(shares, count)
+    theta = nodes.theta[:, :count].clone()
+    theta[found] = nodes.theta[found].gather(
+        1, chosen[..., None].expand(-1, -1, theta.shape[2])
+    )
+    log_weights = torch.full_like(log_posterior[:, :count], -torch.inf)
+    log_weights[found] = log_evidence[found, None] - log_prior[found].gather(1, chosen)
+    return Nodes(theta=theta, log_weights=log_weights)
+
+
+def _proposals(labels: Labels, wide: Reference, prior: Any) -> tuple[Nodes, Tensor]:
+    """Return proposals for labels, and the log density of the prior at each."""
+    nodes = place_nodes(labels, [wide], prior, num_nodes=NUM_PROPOSALS)
+    # Many densities are zero or infinite on a bound, where an exact parameter may be.
+    low, high = bounds_of(prior, nodes.theta[0, 0])
+    theta = nodes.theta.clamp(low.nextafter(high), high.nextafter(low))
+    return nodes, prior_log_prob(prior, theta).double()
 
 
 def prior_reference(prior: Any, like: Tensor) -> Reference:
@@ -134,10 +177,9 @@ def _draw(
         mean=reference.mean.expand(n, -1),
         covariance=reference.covariance.expand(n, -1, -1),
     )
-    nodes = place_nodes(labels, [wide], prior, num_nodes=NUM_PROPOSALS)
-    log_prior = prior_log_prob(prior, nodes.theta).double()
+    nodes, log_prior = _proposals(labels, wide, prior)
     log_weights = nodes.log_weights + log_prior
-    lost = torch.isneginf(log_weights).all(dim=1)
+    lost = torch.isneginf(log_weights).all(dim=1) | _are_far_outside(labels, prior)
     if lost.any():
         rows = (lost.nonzero().flatten()[:5] + first).tolist()
         raise InvalidInputError(
@@ -162,6 +204,15 @@ def _draw(
         1, chosen[..., None].expand(-1, -1, labels.theta.shape[1])
     )
     return LabelledParameters(draws=draws, effective_sample_size=size)
+
+
+def _are_far_outside(labels: Labels, prior: Any) -> Tensor:
+    """Tell which noisy labels miss the prior's support by many standard deviations."""
+    y = labels.theta.double()
+    low, high = bounds_of(prior, y[0])
+    std = labels.covariance.diagonal(dim1=1, dim2=2).sqrt()
+    missed = torch.maximum(low - y, y - high)
+    return (labels.is_noisy & (missed > LARGEST_MISS * std)).any(dim=1)
 
 
 def _shuffled(samples: Tensor, *, seed: int) -> Tensor:

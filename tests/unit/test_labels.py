@@ -395,3 +395,114 @@ def test_groups_of_labels_that_are_equal() -> None:
         weights=torch.ones(4).double(),
     )
     assert other.groups.tolist() == [0, 1, 2, 3]
+
+
+# Labels that are nearly exact, and labels near bounds --------------------------------
+
+
+def measured(theta: Tensor, *std: float) -> Labels:
+    """Return labels with the same independent noise."""
+    covariance = torch.tensor(std).double().square().diag().expand(len(theta), -1, -1)
+    return Labels(
+        theta=theta, covariance=covariance, weights=torch.ones(len(theta)).double()
+    )
+
+
+def test_labels_that_are_nearly_exact_leave_a_single_possible_mean() -> None:
+    torch.manual_seed(0)
+    normal = gaussian.prior(5)
+    known = parameters_of(measured(normal.sample((40,)), *[1e-3] * 5), normal)
+    conductor = RoPE(gaussian.posterior(5), simulator=gaussian.simulator)
+    moments = labelled_moments(
+        conductor.source, known, 100, lambda x: x, progress=False
+    )
+    assert moments.possible is not None
+    # Without the shrinkage the spread is a fifth of the variance of simulations.
+    spread = moments.possible.var(dim=1).mean()
+    assert float(spread) < 0.03 * gaussian.NOISE_STD**2
+
+
+def test_the_possible_means_of_a_wide_label_are_hardly_shrunk() -> None:
+    torch.manual_seed(0)
+    normal = gaussian.prior(2)
+    known = parameters_of(measured(normal.sample((40,)), 1.0, 1.0), normal)
+    moments = labelled_moments(rope().source, known, 100, lambda x: x, progress=False)
+    assert moments.possible is not None
+    error = moments.possible - known.draws.double()
+    assert float(error.square().mean()) < 0.06 * gaussian.NOISE_STD**2
+
+
+@pytest.mark.parametrize("smallest", [1e-3, 1e-5, 1e-7])
+def test_parameters_may_be_known_with_very_different_precision(smallest: float) -> None:
+    box = BoxUniform(-torch.ones(2), torch.ones(2))
+    y = torch.tensor([[0.3, -0.2]])
+    q = MultivariateNormal(torch.zeros(2).double(), 0.3 * torch.eye(2).double() + 0.1)
+    torch.manual_seed(0)
+    samples = reference_of(q.sample(torch.Size((200, 1))))
+    nodes = nodes_of(measured(y, smallest, 0.1), [samples], box, num_nodes=2000)
+    found = nodes.log_mean(q.log_prob(nodes.theta.double()))
+    noise = torch.tensor([smallest, 0.1]).double().square().diag()
+    exact = MultivariateNormal(q.mean, q.covariance_matrix + noise).log_prob(y.double())
+    assert abs(float(found - exact)) < 0.05
+
+
+@pytest.mark.parametrize("y", [0.9, 1.2, 1.5, 2.0])
+def test_the_density_of_a_label_outside_the_support_is_that_of_quadrature(
+    y: float,
+) -> None:
+    box = BoxUniform(-torch.ones(1), torch.ones(1))
+    label = measured(torch.tensor([[y]]), 0.15)
+    nodes = nodes_of(label, [], box, num_nodes=64)
+    found = nodes.log_mean(torch.full(nodes.log_weights.shape, math.log(0.5)).double())
+    grid = torch.linspace(-1, 1, 20_001, dtype=torch.double)
+    noise = torch.distributions.Normal(grid, 0.15).log_prob(torch.tensor(y).double())
+    assert float(found) == pytest.approx(float(noise.exp().mean().log()), abs=0.6)
+
+
+def test_labels_with_hardly_a_node_inside_get_others() -> None:
+    # The reference is far outside of the box in five of six parameters.
+    box = BoxUniform(-torch.ones(6), torch.ones(6))
+    label = measured(torch.full((1, 6), 1.3), *[0.3] * 6)
+    nodes = nodes_of(label, [], box, num_nodes=32)
+    assert int(torch.isfinite(nodes.log_weights).sum()) >= 4
+    found = nodes.log_mean(torch.full(nodes.log_weights.shape, math.log(0.5**6)))
+    grid = torch.linspace(-1, 1, 20_001, dtype=torch.double)
+    noise = torch.distributions.Normal(grid, 0.3).log_prob(torch.tensor(1.3).double())
+    exact = 6 * float(noise.exp().mean().log())
+    assert float(found) == pytest.approx(exact, abs=1.0)
+
+
+def test_labels_on_a_bound_are_inside() -> None:
+    box = BoxUniform(-torch.ones(2), torch.ones(2))
+    for theta in ([NAN, 1.0], [NAN, -1.0], [0.3, 1.0]):
+        label = measured(torch.tensor([theta]), 0.1, 0.0)
+        if math.isnan(theta[0]):
+            label = Labels.exact(torch.tensor([theta]))
+        draws = parameters_of(label, box).draws[0]
+        assert bool((draws[:, 1] == theta[1]).all())
+        assert float(draws[:, 0].std()) > 0.05
+
+
+def test_a_covariance_may_be_nan_where_a_parameter_was_not_measured() -> None:
+    theta, x = gaussian.labelled(4)
+    theta[:, 0] = NAN
+    covariance = torch.tensor([[NAN, NAN], [NAN, 0.04]])
+    labels = rope().append_calibration(theta, x, theta_cov=covariance).labels
+    expected = torch.tensor([[0.0, 0.0], [0.0, 0.04]]).double()
+    assert torch.allclose(labels.covariance, expected)
+
+
+def test_targets_of_noisy_labels_are_means_of_as_many_simulations_as_asked_for() -> (
+    None
+):
+    called = []
+
+    def simulator(theta: Tensor) -> Tensor:
+        called.append(len(theta))
+        return gaussian.simulator(theta)
+
+    conductor = RoPE(gaussian.posterior(), simulator=simulator)
+    conductor.append_calibration(*gaussian.labelled(3), theta_std=0.3)
+    called.clear()
+    conductor.draw_targets(simulations_per_target=250, show_progress_bars=False)
+    assert sum(called) == 750
