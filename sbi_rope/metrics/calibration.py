@@ -6,6 +6,7 @@ contains the true parameter. For a calibrated posterior :math:`a^*` is uniform o
 function of :math:`a^*`.
 """
 
+import math
 from dataclasses import dataclass, field
 
 import torch
@@ -70,12 +71,14 @@ class ACAUCScore:
 
     @property
     def verdict(self) -> str:
-        """One of "over-confident", "too wide" and "calibrated".
+        """One of "over-confident", "too wide", "calibrated" and "unknown".
 
         It is "calibrated" unless the interval leaves 0 out, and means that the
-        observations show nothing else.
+        observations show nothing else. It is "unknown" where nothing was scored.
         """
         low, high = self.interval
+        if math.isnan(low):
+            return "unknown"
         if low > 0:
             return "over-confident"
         return "too wide" if high < 0 else "calibrated"
@@ -100,8 +103,8 @@ class CoverageCurve:
 
     @property
     def average(self) -> Tensor:
-        """The coverage averaged over parameters, shape ``(99,)``."""
-        return self.per_parameter.mean(dim=0)
+        """The coverage averaged over parameters that are known, shape ``(99,)``."""
+        return _mean(self.per_parameter, dim=0)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -32,6 +32,8 @@ def calibration_section(report: StackingReport, names: Sequence[str]) -> str:
     curves = {"all parameters": curve}
     for k, name in enumerate(names):
         score = acauc_of_pairs(levels[:, [k]], report.cross_validation.counts)
+        if score.verdict == "unknown":  # it was never measured
+            continue
         own = _of_parameter(curve, k)
         if len(names) > 1:
             rows.append(_row(name, score.value, score.interval, own))

@@ -29,7 +29,7 @@ from sbi_rope.reports.page import (
 )
 from sbi_rope.reports.verdict import verdict_of
 from sbi_rope.stacking import StackingReport
-from sbi_rope.stacking.words import IN_WORDS, differs, gains_of
+from sbi_rope.stacking.words import IN_WORDS, are_relative, differs, gains_of
 
 __all__ = ["write_stacking_report"]
 
@@ -81,8 +81,9 @@ def write_stacking_report(
         list_of(verdict_of(report, diagnosis, names), kind="verdict"),
         _score_section(report),
         _weight_section(report),
-        calibration_section(report, names),
     ]
+    if report.acauc.verdict != "unknown":
+        parts.append(calibration_section(report, names))
     parts.append(
         no_discrepancy_section(report)
         if discrepancy is None
@@ -169,6 +170,11 @@ def _score_section(report: StackingReport) -> str:
         "better. In the first column parameters have their own units, in the second "
         "they are in standard deviations of the prior, which adds a constant."
     ]
+    if are_relative(report):
+        notes = [
+            "Mean log density at the draws of a label, relative to that of the prior, "
+            "in nats a measurement; higher is better."
+        ]
     if differs(report):
         notes.append(
             "The stack is corrected for what it puts outside the range of the prior. "

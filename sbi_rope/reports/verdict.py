@@ -6,7 +6,13 @@ from sbi_rope.diagnosis import Diagnosis
 from sbi_rope.diagnosis.labelled import UNLIKE_PAIRS
 from sbi_rope.reports.numbers import number, percent
 from sbi_rope.stacking import StackingReport
-from sbi_rope.stacking.words import LEVEL, OVER_CONFIDENT, compared, parameters_off
+from sbi_rope.stacking.words import (
+    LEVEL,
+    NOT_CHECKED,
+    OVER_CONFIDENT,
+    compared,
+    parameters_off,
+)
 
 __all__ = ["verdict_of"]
 
@@ -40,6 +46,8 @@ def verdict_of(
 
 def _calibrated(report: StackingReport) -> tuple[str, bool]:
     verdict = report.acauc.verdict
+    if verdict == "unknown":
+        return NOT_CHECKED[0].upper() + NOT_CHECKED[1:] + ".", False
     inside = (
         f"{percent(LEVEL)} intervals held {percent(report.share_inside)} of the known "
         "parameters."

@@ -59,10 +59,11 @@ class LearningCurve:
         r"""Return how much more labels would add to the mean score, with an interval.
 
         The curve :math:`s_i(n) = a_i - b_i / n` is fitted to the scores of each
-        held-out pair i. The gain from N pairs, on which the last point was trained, to
-        N + m is
+        held-out pair i. A stack of n labels is the average of posteriors that were
+        each trained on N of them, as the last point was. With m more labels each is
+        trained on N (n + m) / n, and the gain is
 
-        .. math:: \bar b \left( \frac{1}{N} - \frac{1}{N + m} \right) .
+        .. math:: \bar b \left( \frac{1}{N} - \frac{n}{N (n + m)} \right) .
 
         The 95 % interval is that of Student's t for the mean slope :math:`\bar b`. It
         takes the pairs that were trained on as given, and the form of the curve as
@@ -85,7 +86,8 @@ class LearningCurve:
         centred = inverse - inverse.mean()
         slopes = -(centred @ self.pair_scores) / centred.square().sum()
         last = self.num_pairs[-1]
-        scale = 1 / last - 1 / (last + num_more)
+        n = self.pair_scores.shape[1]
+        scale = 1 / last - n / (last * (n + num_more))
         mean, low, high = interval_of_mean(scale * slopes, self._counts)
         return Difference(mean=mean, low=low, high=high)
 

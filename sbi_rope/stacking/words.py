@@ -5,6 +5,8 @@ import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+import torch
+
 from sbi_rope.metrics.calibration import ACAUC_IN_WORDS
 from sbi_rope.stacking.cross_validation import Difference
 from sbi_rope.stacking.learning_curve import LearningCurve
@@ -15,8 +17,10 @@ if TYPE_CHECKING:
 __all__ = [
     "IN_WORDS",
     "LEVEL",
+    "NOT_CHECKED",
     "OVER_CONFIDENT",
     "REFERENCES",
+    "are_relative",
     "compared",
     "differs",
     "gains_of",
@@ -25,6 +29,8 @@ __all__ = [
     "sets_held",
 ]
 
+# Of labels that are given as draws.
+NOT_CHECKED = "coverage is not known for labels that are given as draws"
 # The text says that a stack is mostly one method if this has half of the weight.
 MOSTLY = 0.5
 # The share of parameters inside intervals is stated at this level.
@@ -100,9 +106,12 @@ def _labels(report: "StackingReport") -> list[str]:
         return []
     lines = [f"  {scores.labels}"]
     if scores.score_errors is not None:
+        what = "scores and coverage are those of the measured values, with the noise "
+        what += "of their labels"
+        if are_relative(report):
+            what = "scores are relative to those of the prior at the draws"
         lines += [
-            "    scores and coverage are those of the measured values, with the noise "
-            "of their labels",
+            f"    {what}",
             f"    Monte-Carlo error of the score: {scores.monte_carlo_error:.3f} nats",
         ]
     return lines
@@ -110,6 +119,9 @@ def _labels(report: "StackingReport") -> list[str]:
 
 def _scores(report: "StackingReport") -> list[str]:
     lines = ["  log score of the stack, in nats a pair (higher is better):"]
+    if are_relative(report):
+        score, error = report.score
+        return [*lines, f"    {score:.2f} +- {error:.2f} above the prior"]
     for (score, error), unit in (
         (report.score, "its own units"),
         (report.score_z, "standard deviations of the prior"),
@@ -123,6 +135,11 @@ def _scores(report: "StackingReport") -> list[str]:
             "    corrected, so that the differences below start from this number",
         ]
     return lines
+
+
+def are_relative(report: "StackingReport") -> bool:
+    """Whether labels are given as draws, which have no levels and no density."""
+    return bool(torch.isnan(report.levels).all())
 
 
 def _gains(report: "StackingReport") -> list[str]:
@@ -155,9 +172,9 @@ def _how_many(report: "StackingReport", family: str) -> str:
 def _calibration(report: "StackingReport") -> list[str]:
     n = report.cross_validation.effective_number
     acauc, (low, high) = report.acauc, report.acauc.interval
-    if math.isnan(acauc.value):
-        return ["  coverage is not known for labels that are given as draws"]
     verdict = acauc.verdict
+    if verdict == "unknown":
+        return [f"  {NOT_CHECKED}"]
     advice = [f"    {OVER_CONFIDENT}"] if verdict == "over-confident" else []
     verdict += (
         " as far as these pairs can tell"
@@ -191,14 +208,19 @@ def parameters_off(
     """
     scores = report.acauc_of_parameters
     names = names or [f"theta_{k + 1}" for k in range(len(scores))]
-    return [
-        f"{name} by itself is {score.verdict}: ACAUC {score.value:+.3f}, "
-        f"{100 - 5 / len(scores):.3g} % interval {score.interval[0]:+.3f} to "
-        f"{score.interval[1]:+.3f}"
-        # Reports of older files have none.
-        for name, score in zip(names, scores, strict=False)
-        if len(scores) > 1 and score.verdict != "calibrated"
-    ]
+    if len(scores) < 2:  # reports of older files have none
+        return []
+    lines = []
+    for name, score in zip(names, scores, strict=True):
+        if score.verdict == "unknown":
+            lines.append(f"{name} was not measured, so that nobody checked its width")
+        elif score.verdict != "calibrated":
+            low, high = score.interval
+            lines.append(
+                f"{name} by itself is {score.verdict}: ACAUC {score.value:+.3f}, "
+                f"{100 - 5 / len(scores):.3g} % interval {low:+.3f} to {high:+.3f}"
+            )
+    return lines
 
 
 def _recalibration(report: "StackingReport") -> list[str]:
@@ -270,7 +292,7 @@ def gains_of(curve: LearningCurve) -> list[str]:
     """Say what a few more labels would add, and what twice as many would."""
     gains = {
         more: curve.gain(more)
-        for more in dict.fromkeys((FEW_MORE, curve.num_pairs[-1]))
+        for more in dict.fromkeys((FEW_MORE, curve.pair_scores.shape[1]))
     }
     lines = [
         f"{more} more labels might add {gain.mean:.2f} nats a pair (95 % interval "

@@ -1,6 +1,7 @@
 """Stacks of pairs whose labels are noisy, partial, weighted, or draws."""
 
 import math
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -85,13 +86,29 @@ def test_labels_of_vanishing_noise_are_scored_like_exact_ones() -> None:
     assert torch.allclose(mass[1], mass[0], atol=0.01)
 
 
-def test_labels_given_as_draws_are_scored_relative_to_the_prior() -> None:
+def test_labels_given_as_draws_are_scored_relative_to_the_prior(tmp_path: Path) -> None:
     draws = (THETA[:, None] + 0.05 * torch.randn(NUM_PAIRS, 30, 2)).clamp(-0.99, 0.99)
     posterior = stacked(labelled(draws), candidates=[PRIOR, NPE])
     scores = posterior.report.cross_validation
     assert torch.allclose(scores.scores_of("prior"), torch.zeros(1).double(), atol=1e-5)
     assert torch.isnan(scores.levels).all()
     assert "coverage is not known" in str(posterior.report)
+    assert "above the prior" in str(posterior.report)
+    posterior.report.to_html(tmp_path / "draws.html")
+    page = (tmp_path / "draws.html").read_text()
+    assert ">nan" not in page
+    assert "Coverage is not known" in page
+    assert "calibrated as far as" not in page
+
+
+def test_a_parameter_that_was_never_measured_is_named(tmp_path: Path) -> None:
+    theta = THETA.clone()
+    theta[:, 0] = math.nan
+    report = stacked(labelled(theta), candidates=[PRIOR, NPE]).report
+    assert torch.isfinite(report.coverage.average).all()
+    assert "theta_1 was not measured" in str(report)
+    report.to_html(tmp_path / "never.html", parameter_names=["mass", "length"])
+    assert "mass was not measured" in (tmp_path / "never.html").read_text()
 
 
 def test_the_weights_of_pairs_decide_for_the_candidate_that_they_favour() -> None:

@@ -339,23 +339,26 @@ def curve_of(num_pairs: tuple[int, ...], *scores: list[float]) -> LearningCurve:
 
 
 def test_the_gain_of_more_labels_is_extrapolated_from_the_curve() -> None:
-    # The slopes b of three pairs, s(n) = 1 - b / n, and what their mean adds.
-    slopes = torch.tensor([2.0, 3.0, 7.0]).double()
+    # The slopes b of 25 pairs, s(n) = 1 - b / n, and what their mean adds. A stack of
+    # 25 pairs averages posteriors that were trained on 20, and one of 50 on 40.
+    slopes = torch.linspace(1.0, 7.0, 25).double()
     curve = curve_of((5, 10, 20), *((1 - slopes / n).tolist() for n in (5, 10, 20)))
-    gain = curve.gain(20)
+    gain = curve.gain(25)
     interval = scipy.stats.t.interval(
-        0.95, df=2, loc=4, scale=scipy.stats.sem(slopes.numpy())
+        0.95, df=24, loc=4, scale=scipy.stats.sem(slopes.numpy())
     )
     for found, expected in zip(
         (gain.mean, gain.low, gain.high), (4, *interval), strict=True
     ):
         assert math.isclose(found, expected * (1 / 20 - 1 / 40))
-    assert curve.gain(5).mean == pytest.approx(4 * (1 / 20 - 1 / 25))
-    weighted = replace(curve, pair_weights=torch.tensor([1.0, 1.0, 0.0]))
-    assert weighted.gain(20).mean == pytest.approx(2.5 / 40)
+    assert curve.gain(5).mean == pytest.approx(4 * (1 / 20 - 1 / 24))
+    weights = torch.zeros(25)
+    weights[:2] = 1.0
+    weighted = replace(curve, pair_weights=weights)
+    assert weighted.gain(25).mean == pytest.approx(1.125 / 40)
     with pytest.raises(InvalidInputError, match="`num_more`"):
         curve.gain(0)
-    assert f"20 more labels might add {gain.mean:.2f} nats a pair" in str(
+    assert f"25 more labels might add {gain.mean:.2f} nats a pair" in str(
         replace(made_up(), learning_curve=curve)
     )
     single = curve_of((5,), [0.4, 0.3])
