@@ -20,7 +20,15 @@ from torch.nn.functional import softplus
 
 from sbi_rope._random import seeded
 
-__all__ = ["Bounds", "bounds_of", "bounds_of_prior", "log_slope", "to_box", "to_line"]
+__all__ = [
+    "Bounds",
+    "bounds_of",
+    "bounds_of_prior",
+    "log_slope",
+    "off_bounds",
+    "to_box",
+    "to_line",
+]
 
 # Parameters that are nearer to a bound than float32 rounds are taken for on the bound.
 ROUNDING = torch.finfo(torch.float32).eps
@@ -73,7 +81,8 @@ def bounds_of(prior: Any, like: Tensor) -> tuple[Tensor, Tensor]:
 
     Args:
         prior: A torch distribution over parameters of shape ``(d,)``.
-        like: A tensor of shape ``(d,)``, whose dtype and device the ends get.
+        like: A tensor of shape ``(*batch, d)``, whose shape, dtype and device the ends
+            get.
 
     Example:
         >>> from torch.distributions import Independent, Uniform
@@ -81,20 +90,52 @@ def bounds_of(prior: Any, like: Tensor) -> tuple[Tensor, Tensor]:
         >>> bounds_of(box, torch.zeros(2))
         (tensor([0., 0.]), tensor([1., 1.]))
     """
+    return _bounds(_support_of(prior), like)
+
+
+def _support_of(prior: Any) -> Any:
     try:
-        support = getattr(prior, "support", None)
+        return getattr(prior, "support", None)
     except NotImplementedError:  # torch raises it if a distribution states no support
-        support = None
-    return _bounds(support, like)
+        return None
+
+
+def off_bounds(prior: Any, theta: Tensor) -> Tensor:
+    """Return parameters ``(n, d)``, those on a bound moved to the next number inside.
+
+    Many densities are zero or infinite on a bound. Discrete parameters stay.
+
+    Example:
+        >>> from torch.distributions import Independent, Uniform
+        >>> box = Independent(Uniform(torch.zeros(1), torch.ones(1)), 1)
+        >>> off_bounds(box, torch.tensor([[0.5], [1.0]])) < 1
+        tensor([[True],
+                [True]])
+    """
+    low, high = bounds_of(prior, theta)
+    inside = theta.clamp(low.nextafter(high), high.nextafter(low))
+    return theta.where(_is_discrete(_support_of(prior), theta), inside)
+
+
+def _is_discrete(support: Any, like: Tensor) -> Tensor:
+    if isinstance(support, constraints.independent):
+        return _is_discrete(support.base_constraint, like)
+    if isinstance(support, constraints.cat):
+        columns = like.split(support.lengths, dim=-1)
+        parts = [_is_discrete(*one) for one in zip(support.cseq, columns, strict=True)]
+        return torch.cat(parts, dim=-1)
+    return torch.full_like(
+        like, bool(getattr(support, "is_discrete", False)), dtype=torch.bool
+    )
 
 
 def _bounds(support: Any, like: Tensor) -> tuple[Tensor, Tensor]:
     while isinstance(support, constraints.independent):
         support = support.base_constraint
     if isinstance(support, constraints.cat):  # of sbi's MultipleIndependent
-        columns = like.split(support.lengths)
+        columns = like.split(support.lengths, dim=-1)
         ends = [_bounds(*one) for one in zip(support.cseq, columns, strict=True)]
-        low, high = (torch.cat(some) for some in zip(*ends, strict=True))
+        low, high = (torch.cat(some, dim=-1) for some in zip(*ends, strict=True))
         return low, high
     unknown = (0.0, 1.0) if support is constraints.boolean else (-torch.inf, torch.inf)
     low, high = (

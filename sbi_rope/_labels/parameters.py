@@ -156,10 +156,7 @@ def _nodes_inside(labels: Labels, wide: Reference, prior: Any, count: int) -> No
 def _proposals(labels: Labels, wide: Reference, prior: Any) -> tuple[Nodes, Tensor]:
     """Return proposals for labels, and the log density of the prior at each."""
     nodes = place_nodes(labels, [wide], prior, num_nodes=NUM_PROPOSALS)
-    # Many densities are zero or infinite on a bound, where an exact parameter may be.
-    low, high = bounds_of(prior, nodes.theta[0, 0])
-    theta = nodes.theta.clamp(low.nextafter(high), high.nextafter(low))
-    return nodes, prior_log_prob(prior, theta).double()
+    return nodes, prior_log_prob(prior, nodes.theta).double()
 
 
 def prior_reference(prior: Any, like: Tensor) -> Reference:

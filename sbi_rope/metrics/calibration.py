@@ -37,6 +37,7 @@ __all__ = [
     "coverage_error_of_pairs",
     "expected_coverage_error_of",
     "mid_ranks",
+    "random_ranks",
     "standard_error_of_mean",
 ]
 
@@ -45,6 +46,8 @@ __all__ = [
 ROUNDING = 1e-9
 # How far a level may be above 1. One that was calculated in float32 can be.
 ROUNDING_OF_LEVELS = 1e-6
+# With fewer observations the interval of ACAUC is as wide as all that it can be.
+FEWEST = 5
 # How printed scores explain ACAUC.
 ACAUC_IN_WORDS = "0 is calibrated, positive is over-confident, negative is too wide"
 
@@ -130,7 +133,9 @@ def mid_ranks(samples: Tensor, theta: Tensor) -> Tensor:
         + \#\{m: \theta^m_{ij} < \theta_{ij}\}
         + \tfrac{1}{2} \#\{m: \theta^m_{ij} = \theta_{ij}\} \Big)
 
-    A sample that is equal to the true parameter counts half as below it.
+    A sample that is equal to the true parameter counts half as below it. Scores of this
+    package draw at random how many of them count, so that they are right for discrete
+    parameters, too.
 
     Args:
         samples: Posterior samples, shape ``(M, n, d)``.
@@ -167,6 +172,27 @@ def count_ranks(samples: Tensor, theta: Tensor) -> Tensor:
     below = (samples < theta).sum(dim=0).double()
     equal = (samples == theta).sum(dim=0).double()
     return (below + equal / 2 + 0.5) / (samples.shape[0] + 1)
+
+
+def random_ranks(samples: Tensor, theta: Tensor) -> Tensor:
+    r"""Return ranks in which samples that are equal to the true parameter are random.
+
+    A discrete parameter is often equal to samples. Its mid-rank is near 1/2 then, as if
+    the posterior were too wide. If a uniform share of the equal samples counts as
+    below, ranks of a calibrated posterior are uniform. The shares come from torch's
+    random state, which is left alone if nothing is equal.
+
+    Args:
+        samples: Posterior samples, shape ``(M, n, d)``.
+        theta: True parameters, shape ``(n, d)``.
+    """
+    equal = (samples == theta).sum(dim=0).double()
+    ranks = count_ranks(samples, theta)
+    if not equal.any():
+        return ranks
+    shares = torch.rand(equal.shape, dtype=torch.double).to(ranks) - 0.5
+    moved = ranks + shares * (equal + 1) / (samples.shape[0] + 1)
+    return torch.where(equal > 0, moved, ranks)
 
 
 def central_levels(ranks: Tensor) -> Tensor:

@@ -41,7 +41,7 @@ from sbi_rope.errors import (
     InvalidTypeError,
     LogProbUnavailableError,
 )
-from sbi_rope.metrics.calibration import count_ranks
+from sbi_rope.metrics.calibration import count_ranks, random_ranks
 
 __all__ = [
     "CHUNK_SIZE",
@@ -149,11 +149,11 @@ def draw_ranks(
     chunk_size: int,
     show: bool,
 ) -> Tensor:
-    """Return the mid-ranks of true parameters among samples, shape ``(n, d)``."""
+    """Return the ranks of true parameters among samples, shape ``(n, d)``."""
     chunks = draw_chunks(
         posterior, theta, x, num_samples=num_samples, chunk_size=chunk_size, show=show
     )
-    return torch.cat([count_ranks(samples, theta[rows]) for rows, samples in chunks])
+    return torch.cat([random_ranks(samples, theta[rows]) for rows, samples in chunks])
 
 
 def draw_chunks(

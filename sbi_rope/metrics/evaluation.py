@@ -11,6 +11,7 @@ from sbi_rope._random import seeded
 from sbi_rope._units import std_of_prior
 from sbi_rope.metrics.calibration import (
     ACAUC_IN_WORDS,
+    FEWEST,
     ACAUCScore,
     CoverageCurve,
     CoverageErrorScore,
@@ -33,8 +34,6 @@ __all__ = ["Evaluation", "evaluate"]
 
 GIVEN_UNITS = "units of `theta_std`"
 PRIOR_UNITS = "standard deviations of the prior"
-# With fewer observations the interval of ACAUC is as wide as all that it can be.
-FEWEST = 5
 
 
 @shown_as_text

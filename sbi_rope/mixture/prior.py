@@ -9,6 +9,7 @@ from sbi.utils import within_support
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
+from sbi_rope._bounds import off_bounds
 from sbi_rope._random import seeded
 from sbi_rope._sbi import ConditionalDensityEstimator, move_distribution_to_device
 from sbi_rope._validation import check_prior
@@ -115,6 +116,8 @@ def prior_sample(prior: Distribution, sample_shape: torch.Size) -> Tensor:
 def prior_log_prob(prior: Distribution, theta: Tensor) -> Tensor:
     r"""Return the log density of the prior, :math:`-\infty` outside its support.
 
+    On a bound it is that just inside.
+
     Args:
         prior: A torch distribution over parameters of shape ``(d,)``.
         theta: Parameters, shape ``(*batch, d)``.
@@ -132,5 +135,5 @@ def prior_log_prob(prior: Distribution, theta: Tensor) -> Tensor:
     with seeded(0):
         filler = prior.sample(torch.Size((1,))).to(theta)
     safe = torch.where(inside.unsqueeze(-1), theta, filler)
-    log_prob = prior.log_prob(safe) + 0.0 * safe.sum(dim=-1)
+    log_prob = prior.log_prob(off_bounds(prior, safe)) + 0.0 * safe.sum(dim=-1)
     return log_prob.where(inside, -torch.inf).reshape(shape)

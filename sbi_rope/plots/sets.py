@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from sbi_rope._validation import check_instance
+from sbi_rope.errors import InvalidInputError, warn_user
 from sbi_rope.mixture import MixturePosterior
 from sbi_rope.plots._figures import BLUE, GREY, ORANGE, empty_figure, hide_frame
 from sbi_rope.plots._samples import (
@@ -47,7 +48,9 @@ def credible_set(
     first, so that the smaller one lies on it. With three parameters or more, a panel
     shows the shadow of a set, in which the other parameters have any value of the set.
     The diagonal shows the intervals of each parameter by itself, and draws of the
-    posterior as a histogram.
+    posterior as a histogram. Of a stack that cannot guarantee the level, because it has
+    too few pairs or their labels are not exact, the credible set alone is drawn, with a
+    warning.
 
     Args:
         posterior: A posterior of this package.
@@ -63,25 +66,20 @@ def credible_set(
 
     Raises:
         InvalidTypeError: If the posterior is another one.
-        InvalidInputError: If an argument is outside its range, or if a stack has too
-            few pairs for a guarantee at the level.
+        InvalidInputError: If an argument is outside its range.
         ImportError: If matplotlib is not installed.
     """
     check_instance("posterior", posterior, MixturePosterior)
-    names = [DENSITY]
+    options: dict[str, Any] = {"num_samples": num_samples, "seed": seed}
+    sets = {DENSITY: posterior.credible_set(level, x, **options)}
+    intervals = {DENSITY: posterior.credible_intervals(level, x, **options)}
     if isinstance(posterior, StackedPosterior):
-        names.append(GUARANTEED)
-    options = {"num_samples": num_samples, "seed": seed}
-    sets = {
-        name: posterior.credible_set(level, x, guaranteed=name == GUARANTEED, **options)
-        for name in names
-    }
-    intervals = {
-        name: posterior.credible_intervals(
-            level, x, guaranteed=name == GUARANTEED, **options
-        )
-        for name in names
-    }
+        options["guaranteed"] = True
+        try:
+            sets[GUARANTEED] = posterior.credible_set(level, x, **options)
+            intervals[GUARANTEED] = posterior.credible_intervals(level, x, **options)
+        except InvalidInputError as error:  # the same arguments were good before
+            warn_user(f"No set with a guarantee is drawn. {error}")
     points = torch.cat([found.draws for found in sets.values()])
     # In the order in which they are drawn, the largest first.
     members = {

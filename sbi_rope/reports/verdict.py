@@ -4,12 +4,14 @@ from collections.abc import Sequence
 
 from sbi_rope.diagnosis import Diagnosis
 from sbi_rope.diagnosis.labelled import UNLIKE_PAIRS
+from sbi_rope.metrics.calibration import FEWEST
 from sbi_rope.reports.numbers import number, percent
 from sbi_rope.stacking import StackingReport
 from sbi_rope.stacking.words import (
     LEVEL,
     NOT_CHECKED,
     OVER_CONFIDENT,
+    TOO_FEW,
     compared,
     parameters_off,
 )
@@ -48,6 +50,8 @@ def _calibrated(report: StackingReport) -> tuple[str, bool]:
     verdict = report.acauc.verdict
     if verdict == "unknown":
         return NOT_CHECKED[0].upper() + NOT_CHECKED[1:] + ".", False
+    if report.cross_validation.effective_number < FEWEST:
+        return f"There are {TOO_FEW}: ACAUC {report.acauc.value:+.3f}.", False
     inside = (
         f"{percent(LEVEL)} intervals held {percent(report.share_inside)} of the known "
         "parameters."

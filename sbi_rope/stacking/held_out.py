@@ -9,7 +9,7 @@ from torch import Tensor
 
 from sbi_rope._random import seeded
 from sbi_rope.errors import SamplingError
-from sbi_rope.metrics.calibration import central_levels, count_ranks
+from sbi_rope.metrics.calibration import central_levels, random_ranks
 from sbi_rope.metrics.calls import draw_chunks
 from sbi_rope.mixture import MixturePosterior
 from sbi_rope.sets.conformal import (
@@ -127,7 +127,7 @@ def score_fold(
             show=False,
         )
         for rows, draws in chunks:
-            levels.append(central_levels(count_ranks(draws, theta[rows])))
+            levels.append(central_levels(random_ranks(draws, theta[rows])))
             # In one call, because the mass inside the support is estimated in each.
             log_probs = posterior.log_prob_batched(
                 torch.cat([theta[rows][None], draws]), x[rows]

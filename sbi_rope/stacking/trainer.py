@@ -10,10 +10,12 @@ from sbi_rope._progress import is_shown, progress_bar
 from sbi_rope._sbi import check_density, estimator_of
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._validation import (
+    check_default_dtype,
     check_gradients,
     check_instance,
     check_integer,
     check_not_negative,
+    check_prior,
 )
 from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.discrepancy.correction import network_of
@@ -68,6 +70,7 @@ class StackTrainer:
         tail_mass: float = 1e-3,
     ) -> None:
         check_gradients()
+        check_default_dtype()
         check_instance("rope", rope, RoPE, hint=HOW_TO_MAKE)
         if num_folds is not None:
             check_integer("num_folds", num_folds, minimum=2)
@@ -86,6 +89,7 @@ class StackTrainer:
             show_progress_bars=self.show,
         )
         _check_pairs(len(self.bench.folds))
+        check_prior(self.prior)
         check_density(
             estimator_of(self.bench.npe),
             what="a RoPE of a posterior",

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from sbi_rope.metrics.calibration import ACAUC_IN_WORDS
+from sbi_rope.metrics.calibration import ACAUC_IN_WORDS, FEWEST
 from sbi_rope.stacking.cross_validation import Difference
 from sbi_rope.stacking.learning_curve import LearningCurve
 
@@ -20,6 +20,7 @@ __all__ = [
     "NOT_CHECKED",
     "OVER_CONFIDENT",
     "REFERENCES",
+    "TOO_FEW",
     "are_relative",
     "compared",
     "differs",
@@ -31,6 +32,7 @@ __all__ = [
 
 # Of labels that are given as draws.
 NOT_CHECKED = "coverage is not known for labels that are given as draws"
+TOO_FEW = "too few pairs to say what it means"
 # The text says that a stack is mostly one method if this has half of the weight.
 MOSTLY = 0.5
 # The share of parameters inside intervals is stated at this level.
@@ -175,6 +177,8 @@ def _calibration(report: "StackingReport") -> list[str]:
     verdict = acauc.verdict
     if verdict == "unknown":
         return [f"  {NOT_CHECKED}"]
+    if n < FEWEST:
+        return [f"  ACAUC {acauc.value:+.3f}, of {TOO_FEW}"]
     advice = [f"    {OVER_CONFIDENT}"] if verdict == "over-confident" else []
     verdict += (
         " as far as these pairs can tell"
@@ -208,7 +212,8 @@ def parameters_off(
     """
     scores = report.acauc_of_parameters
     names = names or [f"theta_{k + 1}" for k in range(len(scores))]
-    if len(scores) < 2:  # reports of older files have none
+    few = report.cross_validation.effective_number < FEWEST
+    if few or len(scores) < 2:  # reports of older files have none
         return []
     lines = []
     for name, score in zip(names, scores, strict=True):

@@ -101,6 +101,19 @@ def test_labels_given_as_draws_are_scored_relative_to_the_prior(tmp_path: Path) 
     assert "calibrated as far as" not in page
 
 
+def test_labels_on_a_bound_of_the_prior_have_finite_scores() -> None:
+    theta = THETA.clone()
+    theta[3] = torch.tensor([1.0, -1.0])  # the prior is uniform from -1 to 1
+    report = stacked(labelled(theta), candidates=[PRIOR, NPE]).report
+    assert report.cross_validation.scores_of("prior")[3] == pytest.approx(
+        math.log(0.25)
+    )
+    draws = (THETA[:, None] + 0.05 * torch.randn(NUM_PAIRS, 30, 2)).clamp(-1.0, 1.0)
+    draws[0, :5, 0] = 1.0
+    report = stacked(labelled(draws), candidates=[PRIOR, NPE]).report
+    assert torch.isfinite(report.cross_validation.log_scores).all()
+
+
 def test_a_parameter_that_was_never_measured_is_named(tmp_path: Path) -> None:
     theta = THETA.clone()
     theta[:, 0] = math.nan

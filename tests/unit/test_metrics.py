@@ -109,6 +109,33 @@ def test_mid_ranks_count_an_equal_sample_as_half_below() -> None:
     assert torch.equal(equal, torch.full((3, 2), 0.5, dtype=torch.float64))
 
 
+class Coin:
+    """The exact posterior of a coin that shows its side in 95 % of the cases."""
+
+    def sample_batched(
+        self, sample_shape: torch.Size, x: Tensor, show_progress_bars: bool = True
+    ) -> Tensor:
+        return torch.bernoulli((0.05 + 0.9 * x).expand(*sample_shape, *x.shape))
+
+    def log_prob_batched(self, theta: Tensor, x: Tensor) -> Tensor:
+        probability = torch.where(theta == x, 0.95, 0.05)
+        return probability.log().sum(dim=-1).reshape(-1, len(x))
+
+
+def test_an_exact_posterior_of_a_discrete_parameter_is_calibrated() -> None:
+    torch.manual_seed(0)
+    theta = torch.bernoulli(torch.full((500, 1), 0.5))
+    x = torch.where(torch.rand(500, 1) < 0.95, theta, 1 - theta)
+    # In chunks, which must not repeat the same random numbers.
+    for chunk_size in (1, 500):
+        found = metrics.evaluate(
+            Coin(), theta, x, num_samples=200, chunk_size=chunk_size, seed=0
+        )
+        assert found.acauc.verdict == "calibrated"
+        assert abs(found.acauc.value) < 0.04
+        assert found.expected_coverage_error.value < 0.04
+
+
 GENERATOR = torch.Generator().manual_seed(0)
 SAMPLES = torch.rand(7, 4, 2, generator=GENERATOR)
 TRUTH = torch.rand(4, 2, generator=GENERATOR)
@@ -217,7 +244,7 @@ def test_one_observation_has_no_standard_error() -> None:
     score = metrics.acauc_of(torch.rand(1, 2))
     assert math.isnan(score.standard_error)
     assert all(math.isnan(end) for end in score.interval)
-    assert score.verdict == "calibrated"
+    assert score.verdict == "unknown"
 
 
 @pytest.mark.parametrize(("n", "d", "copies"), [(10, 1, 1), (10, 3, 1), (10, 1, 3)])

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from sbi_rope import SinkhornCoupler, plots
 from sbi_rope.discrepancy import DiscrepancyReport, Interval, SummaryDiscrepancy
+from sbi_rope.errors import RoPEWarning
 from sbi_rope.finetuning import History
 from sbi_rope.metrics import CoverageCurve, coverage_curve_of
 from tests import problems, stacks
@@ -49,6 +50,14 @@ def test_a_stack_has_a_credible_set_and_one_with_a_guarantee() -> None:
     # The larger set lies below the other.
     large, small = (len(one.get_offsets()) for one in figure.axes[1].collections)
     assert large > small > 0
+
+
+def test_a_stack_with_too_few_pairs_for_a_guarantee_is_drawn_without_it() -> None:
+    stack, x = stacks.small_stack(), stacks.observed()[0]
+    with pytest.warns(RoPEWarning, match="No set with a guarantee is drawn"):
+        figure = plots.credible_set(stack, x, level=0.99, num_samples=40)
+    assert legend_texts(figure.legends[0]) == ["99 %, highest density"]
+    assert_refused("`level`", plots.credible_set, stack, x, level=1.5)
 
 
 def test_a_posterior_that_is_no_stack_has_the_set_of_highest_density_only() -> None:
