@@ -181,10 +181,11 @@ def _propose(
     Returns:
         Draws of shape ``(n, S, f)`` and the log density of the mixture, ``(n, S)``.
     """
+    low, high = bounds
     updated = []
     for reference in references:
         mean, factor = _updated(labels, reference, measured, free)
-        updated.append((mean.clamp(*bounds), factor))
+        updated.append((mean.clamp(low, high), factor))
     draws = torch.cat([_draw(*one, of_each) for one in updated], dim=1)
     log_density = torch.stack([_log_t(draws, *one) for one in updated])
     return draws, log_density.logsumexp(dim=0) - math.log(len(updated))

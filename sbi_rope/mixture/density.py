@@ -56,8 +56,9 @@ def without_nan(log_q: Tensor) -> Tensor:
         return log_q
     warn_user(
         f"{int(undefined.sum())} of {undefined.numel()} component densities are NaN "
-        "and count as zero, because the flow fails at these simulations or "
-        "parameters. Train NPE longer, or with another density estimator."
+        "and count as zero, because the density fails at these parameters or "
+        "observations. Look for observations that are far from all simulations. If "
+        "there are none, train NPE longer, or with another density estimator."
     )
     return log_q.where(~undefined, -torch.inf)
 

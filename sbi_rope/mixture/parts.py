@@ -17,7 +17,7 @@ from sbi_rope._sbi import (
     headless,
     readable,
 )
-from sbi_rope.errors import InvalidInputError
+from sbi_rope.errors import InvalidInputError, SamplingError
 
 __all__ = [
     "DTYPE",
@@ -193,8 +193,20 @@ class Part(nn.Module):
         return self.density.log_prob(theta[None], embeddings)[0]
 
     def sample(self, embeddings: Tensor) -> Tensor:
-        """Draw once given each embedding, ``(n, l)`` to ``(n, d)``."""
-        return self.density.sample(torch.Size((1,)), embeddings)[0]
+        """Draw once given each embedding, ``(n, l)`` to ``(n, d)``.
+
+        Raises:
+            SamplingError: If the density is not finite given an embedding.
+        """
+        try:
+            return self.density.sample(torch.Size((1,)), embeddings)[0]
+        except ValueError as error:  # of sbi's mixtures of Gaussians
+            raise SamplingError(
+                "Expected a density that can be sampled given all observations; its "
+                f"network fails at one of them ({error}). Leave out observations that "
+                "are far from all simulations, of which there was a warning or "
+                "`diagnose(rope, x_o)` tells."
+            ) from error
 
 
 def part_of(estimator: ConditionalEstimator) -> Part:

@@ -19,6 +19,7 @@ from sbi_rope.coupling.cost import Distances
 from sbi_rope.errors import (
     InvalidInputError,
     RoPEWarning,
+    SamplingError,
     UnseenObservationError,
     UnsupportedPosteriorError,
 )
@@ -773,3 +774,15 @@ def test_an_estimator_without_a_density_cannot_be_a_part() -> None:
     field = problems.vector_field_posterior("fmpe").vector_field_estimator
     with pytest.raises(UnsupportedPosteriorError, match="Train NPE"):
         part_of(field)
+
+
+def test_an_observation_at_which_a_density_fails_gives_a_named_error() -> None:
+    part = part_of(problems.npe_posterior("mdn").posterior_estimator)
+    with torch.no_grad():
+        for weight in part.density.parameters():
+            weight.mul_(1e8)  # its numbers overflow, as those of others far away
+    mixture = MixtureEstimator([part], [1.0])
+    x = torch.zeros(3, 3)
+    x[1] = 1e20
+    with pytest.raises(SamplingError, match="far from all simulations"):
+        mixture.sample(torch.Size((4,)), x)
