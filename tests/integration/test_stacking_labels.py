@@ -12,6 +12,7 @@ from sbi_rope.errors import InvalidInputError
 from sbi_rope.metrics import lpp
 from tests import gaussian
 from tests.stacks import (
+    CANDIDATES,
     COUPLINGS,
     NPE,
     NUM_PAIRS,
@@ -122,6 +123,23 @@ def test_a_parameter_that_was_never_measured_is_named(tmp_path: Path) -> None:
     assert "theta_1 was not measured" in str(report)
     report.to_html(tmp_path / "never.html", parameter_names=["mass", "length"])
     assert "mass was not measured" in (tmp_path / "never.html").read_text()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"theta_std": 0.0}, {"theta_cov": torch.zeros(2, 2)}, {"weights": [1.0] * 20}],
+)
+def test_labels_without_noise_take_the_path_of_exact_ones(
+    options: dict[str, Any],
+) -> None:
+    candidates = [PRIOR, NPE, *CANDIDATES[-2:]]
+    exact, found = (
+        validated(labelled(THETA, **some), candidates=candidates)
+        for some in ({}, options)
+    )
+    assert torch.equal(exact.log_scores, found.log_scores)
+    assert torch.equal(exact.stack_scores, found.stack_scores)
+    assert torch.equal(exact.levels, found.levels)
 
 
 def test_the_weights_of_pairs_decide_for_the_candidate_that_they_favour() -> None:
