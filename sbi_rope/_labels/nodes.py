@@ -185,7 +185,7 @@ def _propose(
     updated = []
     for reference in references:
         mean, factor = _updated(labels, reference, measured, free)
-        updated.append((mean.clamp(low, high), factor))
+        updated.append((mean.maximum(low).minimum(high), factor))
     draws = torch.cat([_draw(*one, of_each) for one in updated], dim=1)
     log_density = torch.stack([_log_t(draws, *one) for one in updated])
     return draws, log_density.logsumexp(dim=0) - math.log(len(updated))
