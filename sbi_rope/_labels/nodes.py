@@ -182,7 +182,7 @@ def _propose(
         Draws of shape ``(n, S, f)`` and the log density of the mixture, ``(n, S)``.
     """
     low, high = bounds
-    updated = []
+    updated: list[tuple[Tensor, Tensor]] = []
     for reference in references:
         mean, factor = _updated(labels, reference, measured, free)
         updated.append((mean.maximum(low).minimum(high), factor))
