@@ -53,7 +53,11 @@ def estimator_of(posterior: Any) -> ConditionalEstimator:
 
 
 def check_density(
-    estimator: Any, *, what: str = "an estimator", because: str = ""
+    estimator: Any,
+    *,
+    what: str = "an estimator",
+    because: str = "",
+    instead: str = "Train NPE instead of FMPE or NPSE.",
 ) -> ConditionalDensityEstimator:
     """Return an estimator if it has a density.
 
@@ -61,6 +65,7 @@ def check_density(
         estimator: What :func:`estimator_of` returns.
         what: What the message calls it.
         because: A clause of the message that says what needs a density.
+        instead: The sentence of the message that says what to do next.
 
     Raises:
         UnsupportedPosteriorError: If it has none.
@@ -69,7 +74,7 @@ def check_density(
         clause = f", because {because}" if because else ""
         raise UnsupportedPosteriorError(
             f"Expected {what} with a density, such as that of NPE{clause}; got "
-            f"{type(estimator).__name__}. Train NPE instead of FMPE or NPSE."
+            f"{type(estimator).__name__}. {instead}"
         )
     return estimator
 

@@ -298,7 +298,11 @@ class DiscrepancyNPE(Method):
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
         estimator = estimator_of(npe)
         if self.space == "tuned":
-            check_density(estimator, because="space='tuned' averages over nets")
+            check_density(
+                estimator,
+                because="space='tuned' averages over nets",
+                instead="Choose space='embedding', or train NPE.",
+            )
         theta, x = self._data.calibration
         warn_of_far_entries("x", x, embedding_of(estimator))
         source = self._source()

@@ -129,6 +129,7 @@ def prior_log_prob(prior: Distribution, theta: Tensor) -> Tensor:
     shape = theta.shape[:-1]
     # sbi's MultipleIndependent takes theta with at most two dimensions.
     theta = theta.reshape(-1, theta.shape[-1])
+    theta = theta if theta.is_floating_point() else theta.float()
     inside = within_support(prior, theta)
     # torch's distributions raise an error outside their support. There they are
     # evaluated at a draw from the prior, and the result is overwritten.
