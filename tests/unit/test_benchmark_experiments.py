@@ -6,13 +6,15 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from scipy.stats import norm
 from torch import Tensor, nn
 
 from benchmarks.cases import Case, CountingSimulator, Sources
 from benchmarks.cells import Cell
-from benchmarks.experiments import choices, data, finetuning
+from benchmarks.experiments import choices, data, finetuning, ranks
 from benchmarks.experiments.choices import CHOICES, Choice, Run, comparison
 from benchmarks.experiments.common import add_task, begin, show
 from benchmarks.experiments.losses import Loss, as_row, losses, target_distances
@@ -51,6 +53,19 @@ def test_rows_are_printed_as_a_table_when_they_are_there(
 
     show(rows())
     assert capsys.readouterr().out == "| 2 | y |\n"
+
+
+def test_the_factor_of_a_spread_that_is_too_wide_is_found_from_its_coverage() -> None:
+    levels = np.arange(1, 100) / 100
+    needed = norm.ppf((1.0 + levels) / 2.0)
+    shares = ranks.shares_of(2.0 * norm.cdf(needed / 0.8) - 1.0)
+    assert ranks.best_factor(shares) == pytest.approx(0.8, abs=1e-4)
+    # Nothing is better than the right factor. Ten bins see a little less of it than
+    # the closed form for normal densities.
+    gain = ranks.gain_of_factor(shares, 0.8)
+    assert gain == pytest.approx(ranks.gain_of_any_map(shares))
+    assert gain == pytest.approx((0.8**2 - 1.0) / 2.0 - np.log(0.8), rel=0.1)
+    assert ranks.gain_of_any_map(ranks.shares_of(levels)) == pytest.approx(0.0)
 
 
 def test_runs_of_the_finetuning_experiment_are_kept_and_averaged(
