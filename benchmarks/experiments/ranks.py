@@ -76,15 +76,15 @@ def rows_of(args: argparse.Namespace) -> Iterator[Row]:
             of_task.append((acauc, factor, *gains))
         for (task, pairs), measured in found.items():
             means = np.mean(measured, axis=0)
-            scores = zip(MEASURED, means, strict=True)
-            yield {
-                **{
-                    "suite": name,
-                    "task": task,
-                    "pairs": pairs,
-                    "stacks": len(measured),
-                },
-                **{column: f"{mean:.3f}" for column, mean in scores},
+            head = {
+                "suite": name,
+                "task": task,
+                "pairs": pairs,
+                "stacks": len(measured),
+            }
+            yield head | {
+                column: f"{mean:.3f}"
+                for column, mean in zip(MEASURED, means, strict=True)
             }
 
 
