@@ -51,7 +51,7 @@ def warn_if_focused(
             f"{len(theta)} of them, the density of their own parameters is more than "
             f"{FACTOR:g} times below that of the prior, where at most "
             f"{1 / FACTOR:.0%} is possible. It may have been trained over several "
-            "rounds, which fits the neighbourhood of one observation only, or with "
-            "another simulator, other units, or parameters in another order. Train NPE "
-            "on this simulator in one round, at draws of the prior."
+            "rounds, which fits the neighbourhood of one observation only, or too "
+            "briefly, or with another simulator, other units, or parameters in another "
+            "order. Train NPE on this simulator in one round, at draws of the prior."
         )

@@ -40,6 +40,8 @@ __all__ = [
 NUM_AROUND = 50
 # The number of stored simulations that count as simulations at a theta.
 NUM_NEAR = 10
+# So many distances are computed at once.
+MAX_DISTANCES = 50_000_000
 
 Embedding = Callable[[Tensor], Tensor]
 # Tells which simulations an embedding net can read, ``(n, *event)`` to ``(n,)``.
@@ -283,9 +285,13 @@ class StoredSimulations:
 
     def _nearest(self, theta: Tensor, count: int) -> Tensor:
         """Return the rows with the nearest parameters, shape ``(n, count)``."""
-        stored = self._standardised(self.theta)
-        distance = torch.cdist(self._standardised(theta), stored)
-        return distance.topk(count, dim=1, largest=False).indices
+        stored, wanted = self._standardised(self.theta), self._standardised(theta)
+        # Imperfect labels have many possible parameters each, too many for one matrix.
+        nearest = [
+            torch.cdist(some, stored).topk(count, dim=1, largest=False).indices
+            for some in wanted.split(max(1, MAX_DISTANCES // len(stored)))
+        ]
+        return torch.cat(nearest)
 
     def _standardised(self, theta: Tensor) -> Tensor:
         return (theta - self._theta_mean) / self._theta_std

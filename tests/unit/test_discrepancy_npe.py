@@ -13,7 +13,7 @@ from sbi.inference import DirectPosterior, VectorFieldPosterior
 from sbi.neural_nets import posterior_nn
 from torch import Tensor, nn
 
-from sbi_rope import CalibrationFinetuner
+from sbi_rope import CalibrationFinetuner, _simulations
 from sbi_rope._sbi import embedding_of, estimator_of, with_embedding
 from sbi_rope._simulations import Moments, StoredSimulations
 from sbi_rope._simulator import Simulator
@@ -565,6 +565,27 @@ def test_moments_of_stored_simulations_follow_the_slope_around_a_parameter() -> 
             progress=False,
         )
         assert torch.allclose(targets[1].double(), signal[1], atol=0.3), centre
+
+
+def test_few_distances_at_once_give_the_same_nearest_simulations(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    theta = problems.box(2).sample((100,))
+    stored = StoredSimulations(
+        (theta, theta),
+        problems.box(2),
+        theta_shape=torch.Size((2,)),
+        event_shape=torch.Size((2,)),
+        like=theta,
+    )
+    at = problems.box(2).sample((7,))
+    found = []
+    for at_once in (10_000, 200, 1):
+        monkeypatch.setattr(_simulations, "MAX_DISTANCES", at_once)
+        found.append(stored.draws(at, 3, lambda x: x, progress=False))
+    distances = torch.cdist(at / theta.std(dim=0), theta / theta.std(dim=0))
+    nearest = theta[distances.argsort(dim=1)[:, :3]]
+    assert all(torch.equal(one, nearest) for one in found)
 
 
 def test_few_stored_simulations_take_the_slope_of_all() -> None:
