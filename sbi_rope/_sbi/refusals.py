@@ -16,6 +16,7 @@ from sbi.inference.trainers.nle.nle_base import LikelihoodEstimatorTrainer
 from sbi.inference.trainers.nre.nre_base import RatioEstimatorTrainer
 from sbi.neural_nets.estimators.base import ConditionalEstimator
 from sbi.utils import RestrictedPrior
+from sbi.utils.sbiutils import ImproperEmpirical
 
 from sbi_rope._sbi.densities import MixtureDensity
 from sbi_rope.errors import UnsupportedPosteriorError
@@ -41,12 +42,19 @@ def refuse(posterior: Any) -> UnsupportedPosteriorError:
 
 
 def check_prior_of(posterior: Any) -> None:
-    """Raise if the prior was truncated around one observation, as that of TSNPE is.
+    """Raise if the prior is unknown, or truncated around one observation as in TSNPE.
 
-    sbi makes such a prior from a posterior by ``get_density_thresholder``. One that
+    NPE that was made without a prior has one that can neither be sampled nor evaluated.
+    sbi makes a truncated one from a posterior by ``get_density_thresholder``. One that
     leaves out parameters whose simulations fail, by a classifier, is no hindrance.
     """
     prior = getattr(posterior, "prior", None)
+    if isinstance(prior, ImproperEmpirical):
+        raise UnsupportedPosteriorError(
+            "Expected a posterior that knows its prior; got one of an NPE without a "
+            "prior. Name the one that the simulations' parameters were drawn from: "
+            "`npe.build_posterior(prior=prior)`."
+        )
     accepts = getattr(prior, "_accept_reject_fn", None)
     made_by = getattr(accepts, "__qualname__", "").split(".")[0]
     if isinstance(prior, RestrictedPrior) and made_by == "get_density_thresholder":

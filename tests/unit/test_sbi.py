@@ -170,6 +170,17 @@ def test_the_posterior_of_truncated_sequential_npe_is_refused() -> None:
     assert estimator_of(posterior) is posterior.posterior_estimator
 
 
+def test_npe_without_a_prior_is_asked_for_it() -> None:
+    theta = problems.box(2).sample((50,))
+    npe = NPE(density_estimator="mdn", show_progress_bars=False)
+    npe.append_simulations(theta, problems.simulate(theta)).train(max_num_epochs=1)
+    with pytest.raises(
+        UnsupportedPosteriorError, match=r"build_posterior\(prior=prior"
+    ):
+        RoPE(npe.build_posterior(), simulator=problems.simulate)
+    RoPE(npe.build_posterior(prior=problems.box(2)), simulator=problems.simulate)
+
+
 @pytest.mark.parametrize("sample_with", ["mcmc", "rejection", "vi"])
 def test_an_npe_posterior_sampled_another_way_is_refused(sample_with: str) -> None:
     theta = problems.box(2).sample((50,))
