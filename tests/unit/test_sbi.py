@@ -174,9 +174,7 @@ def test_npe_without_a_prior_is_asked_for_it() -> None:
     theta = problems.box(2).sample((50,))
     npe = NPE(density_estimator="mdn", show_progress_bars=False)
     npe.append_simulations(theta, problems.simulate(theta)).train(max_num_epochs=1)
-    with pytest.raises(
-        UnsupportedPosteriorError, match=r"build_posterior\(prior=prior"
-    ):
+    with pytest.raises(UnsupportedPosteriorError, match=r"build_posterior\(prior="):
         RoPE(npe.build_posterior(), simulator=problems.simulate)
     RoPE(npe.build_posterior(prior=problems.box(2)), simulator=problems.simulate)
 
