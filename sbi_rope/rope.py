@@ -11,6 +11,7 @@ from sbi_rope._focus import warn_if_focused
 from sbi_rope._labels import (
     LabelledParameters,
     Labels,
+    labelled_moments,
     labelled_targets,
     parameters_of,
 )
@@ -22,7 +23,7 @@ from sbi_rope._random import seeded
 from sbi_rope._sbi import embed
 from sbi_rope._simulations import SimulationSource
 from sbi_rope._simulator import source_of
-from sbi_rope._standardisation import warn_of_far_entries
+from sbi_rope._standardisation import Standardisation, warn_of_far_entries
 from sbi_rope._validation import (
     check_batch,
     check_choice,
@@ -38,6 +39,7 @@ from sbi_rope._validation import (
 )
 from sbi_rope.batch import EmbeddedBatch, check_converged
 from sbi_rope.coupling import SinkhornCoupler
+from sbi_rope.discrepancy.targets import tuning_targets
 from sbi_rope.errors import (
     InvalidInputError,
     NotReadyError,
@@ -253,7 +255,8 @@ class RoPE:
     ) -> "RoPE":
         """Tune the embedding net on all calibration pairs appended so far.
 
-        Every call starts from the embedding net of NPE.
+        Every call starts from the embedding net of NPE. Targets of labels that are not
+        exact are also given x, under a discrepancy model of the embedding.
 
         Args:
             seed: Seed of the simulations and of the hold-out split, for torch, NumPy
@@ -283,7 +286,9 @@ class RoPE:
         def targets(count: int) -> Tensor:
             if known is not None:
                 return known
-            return self.draw_targets(count, show_progress_bars=show)
+            if self._labels.are_exact:
+                return self.draw_targets(count, show_progress_bars=show)
+            return self._targets_of_labels(progress=show)
 
         result = self.finetuner.finetune(
             self._npe.h,
@@ -323,6 +328,21 @@ class RoPE:
             simulations_per_target=simulations_per_target,
             num_neighbors=self.finetuner.num_neighbors,
             progress=is_shown(show_progress_bars),
+        )
+
+    def _targets_of_labels(self, *, progress: bool) -> Tensor:
+        _, simulated = self._source.kept(MIN_SIMULATIONS, progress=progress)
+        return tuning_targets(
+            embed(self._npe.h, self._x_cal),
+            labelled_moments(
+                self._source,
+                self._parameters,
+                self.finetuner.simulations_per_target,
+                self._embed_simulations,
+                progress=progress,
+            ),
+            Standardisation(self._embed_simulations(simulated).double()),
+            weights=self._labels.weights if self._labels.are_weighted else None,
         )
 
     def embed(

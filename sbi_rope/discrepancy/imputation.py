@@ -8,11 +8,13 @@ from torch.distributions import MultivariateNormal
 
 from sbi_rope.discrepancy.posterior import Discrepancy
 
-__all__ = ["impute"]
+__all__ = ["expected_means", "impute"]
 
 # Imputations that are left out, because they depend on where they started, and those
 # that the posterior is averaged over.
 NUM_WARM_UP, NUM_KEPT = 10, 20
+# Draws of the discrepancy that an expected mean is averaged over.
+NUM_DRAWS = 40
 
 
 def impute(
@@ -65,6 +67,28 @@ def impute(
     )
 
 
+def expected_means(discrepancy: Discrepancy, z: Tensor, possible: Tensor) -> Tensor:
+    r"""Return the means of observations that are expected given them.
+
+    This is :math:`\sum_r p_{ir}\, m_{ir}` with the probabilities of :func:`impute`,
+    averaged over the posterior of the discrepancy. Random numbers come from torch's
+    random state.
+
+    Args:
+        discrepancy: The posterior.
+        z: Representations of the real observations, shape ``(n, l)``.
+        possible: :math:`m_{ir}`, shape ``(n, R, l)``, equally probable before.
+
+    Returns:
+        Shape ``(n, l)``.
+    """
+    probabilities = torch.zeros(possible.shape[:2]).to(possible)
+    for _ in range(NUM_DRAWS):
+        drawn = _drawn(discrepancy, discrepancy.noise)
+        probabilities += _probabilities(z, possible, *drawn) / NUM_DRAWS
+    return (probabilities[..., None] * possible).sum(dim=1)
+
+
 def _drawn(discrepancy: Discrepancy, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Draw a gain, an offset and the covariance of observations at one parameter."""
     width = len(noise)
@@ -79,10 +103,18 @@ def _imputed(
     z: Tensor, possible: Tensor, gain: Tensor, offset: Tensor, covariance: Tensor
 ) -> Tensor:
     """Draw one of the possible means of each observation, shape ``(n, l)``."""
+    probabilities = _probabilities(z, possible, gain, offset, covariance)
+    chosen = torch.multinomial(probabilities, 1)
+    return possible[torch.arange(len(z)), chosen[:, 0]]
+
+
+def _probabilities(
+    z: Tensor, possible: Tensor, gain: Tensor, offset: Tensor, covariance: Tensor
+) -> Tensor:
+    """Return the probability of each possible mean given z, shape ``(n, R)``."""
     residual = z[:, None] - possible @ gain.mT - offset
     normal = MultivariateNormal(torch.zeros_like(offset), covariance)
-    chosen = torch.multinomial(torch.softmax(normal.log_prob(residual), dim=1), 1)
-    return possible[torch.arange(len(z)), chosen[:, 0]]
+    return torch.softmax(normal.log_prob(residual), dim=1)
 
 
 def _mean(values: list[float]) -> float:

@@ -15,11 +15,13 @@ from sbi_rope._random import seeded
 from sbi_rope._sbi import embed, estimator_of, headless
 from sbi_rope._simulations import Moments
 from sbi_rope._simulator import Simulator
+from sbi_rope._standardisation import Standardisation
 from sbi_rope._training import split_groups
 from sbi_rope.discrepancy.correction import NUM_STEPS, Space, correct_npe, network_of
 from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.parameters import learn_parameters
 from sbi_rope.discrepancy.report import DiscrepancyReport, report_discrepancy
+from sbi_rope.discrepancy.targets import tuning_targets
 from sbi_rope.discrepancy.tuning import TUNING
 from sbi_rope.finetuning import CalibrationFinetuner
 from sbi_rope.rope import RoPE
@@ -193,6 +195,19 @@ class Workbench:
         groups = self.groups.to(self.theta.device)
         return None if len(groups.unique()) == len(groups) else groups
 
+    def targets(self, rows: Tensor, seed: int) -> Tensor:
+        """Return the targets of tuning on some pairs, which only these know."""
+        moments = self.moments("embedding")[rows]
+        if self.labels.are_exact:
+            return moments.mean.to(self.embedded)
+        return tuning_targets(
+            embed(self.embedding_net, self.x[rows]),
+            moments,
+            Standardisation(self.embedded.double()),
+            weights=_of_rows(self.pair_weights, rows),
+            seed=seed,
+        )
+
     def tuned_net(self, folds: frozenset[int]) -> nn.Module:
         """Return an embedding net tuned on some folds, with rehearsal."""
         if folds not in self._nets:
@@ -202,7 +217,7 @@ class Workbench:
     def tune(self, rows: Tensor, seed: int) -> nn.Module:
         """Return an embedding net tuned on some pairs, with rehearsal."""
         _, simulated = self.simulations
-        targets = self.moments("tuned").mean.to(self.embedded)[rows]
+        targets = self.targets(rows, seed)
         return TUNING.finetune(
             self.embedding_net,
             self.x[rows],
@@ -253,10 +268,12 @@ class Fold:
         """Return RoPE, tuned on these pairs with the settings of a finetuner."""
         bench, targets = self.bench, None
         # The moments already hold the targets of the usual tuning. With stored
-        # simulations, or another number of simulations, RoPE computes its own targets.
+        # simulations, or another number of simulations, RoPE computes its own targets,
+        # if labels are exact.
         is_usual = finetuner.simulations_per_target == SIMULATIONS_PER_PAIR
-        if isinstance(bench.rope.source, Simulator) and is_usual:
-            targets = bench.moments("embedding").mean.to(bench.embedded)[self.rows]
+        knows = isinstance(bench.rope.source, Simulator) and is_usual
+        if knows or not bench.labels.are_exact:
+            targets = bench.targets(self.rows, self.seed)
         part = bench.rope.with_pairs(self.rows, targets=targets, finetuner=finetuner)
         return part.train(seed=self.seed, show_progress_bars=False)
 

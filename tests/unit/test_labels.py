@@ -9,7 +9,7 @@ from sbi.utils import BoxUniform
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
-from sbi_rope import RoPE
+from sbi_rope import CalibrationFinetuner, RoPE
 from sbi_rope._labels import (
     Labels,
     labelled_moments,
@@ -18,6 +18,7 @@ from sbi_rope._labels import (
     reference_of,
 )
 from sbi_rope.discrepancy import DiscrepancyModel, learn_parameters
+from sbi_rope.discrepancy.imputation import expected_means
 from sbi_rope.errors import InvalidInputError, RoPEWarning
 from sbi_rope.metrics import acauc_of, coverage_curve_of, expected_coverage_error_of
 from sbi_rope.stacking import stacking_weights
@@ -430,6 +431,42 @@ def test_the_possible_means_of_a_wide_label_are_hardly_shrunk() -> None:
     assert moments.possible is not None
     error = moments.possible - known.draws.double()
     assert float(error.square().mean()) < 0.06 * gaussian.NOISE_STD**2
+
+
+def test_tuning_on_partial_labels_keeps_what_x_says_about_missing_parameters() -> None:
+    torch.manual_seed(0)
+    theta = gaussian.prior().sample((600,))
+    x = gaussian.real_process(theta)
+    theta[::2, 0] = NAN
+    theta[1::2, 1] = NAN
+    finetuner = CalibrationFinetuner(learning_rate=1e-2, max_num_epochs=300)
+    conductor = RoPE(
+        gaussian.posterior(), simulator=gaussian.simulator, finetuner=finetuner
+    )
+    conductor.append_calibration(theta, x).train(seed=0, show_progress_bars=False)
+    at = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    level, *moved = conductor.tuned_embedding_net(at).detach()
+    # Of exact labels the slope is that of E[0.8 theta | x]. Targets that only know the
+    # label would give half of it.
+    slope = gaussian.GAIN**2 / gaussian.SCALE
+    expected = slope * torch.eye(2)
+    assert torch.allclose(torch.stack(moved) - level, expected, atol=0.15 * slope)
+
+
+def test_expected_means_are_those_of_the_normal_posterior() -> None:
+    torch.manual_seed(0)
+    m = torch.randn(2000, 1).double()
+    noise = 0.1 * torch.eye(1).double()
+    # Reality has a gain of 0.5, an offset of 2, and errors of variance 0.04.
+    z = 0.5 * m + 2.0 + 0.2 * torch.randn_like(m)
+    discrepancy = DiscrepancyModel().fit(z, m, noise)
+    possible = torch.distributions.Normal(0.0, 1.0).icdf(torch.arange(1, 1000) / 1000)
+    at = torch.tensor([[1.5], [2.0], [3.0]]).double()
+    found = expected_means(
+        discrepancy, at, possible.double()[None, :, None].expand(3, -1, -1)
+    )
+    expected = 0.5 / (0.25 + 0.04) * (at - 2.0)
+    assert torch.allclose(found, expected, atol=0.05)
 
 
 @pytest.mark.parametrize("smallest", [1e-3, 1e-5, 1e-7])
