@@ -10,14 +10,15 @@ from benchmarks.published import MISSING, Published, table
 __all__ = ["readme_lines"]
 
 TASK, SIZES, OF_ACAUC = "light_tunnel_sensors", (10, 50, 200), 50
-# Where a user starts, what is tuned on the labels, the rivals of 2025 and 2026 in their
-# better form, the paper's method, and the default of this package.
+# Where a user starts, what is tuned on the labels, the rivals of 2025 and 2026 in the
+# form that does better over all numbers of labels, the paper's method, and the default
+# of this package.
 METHODS = {
     "prior": "prior",
     "NPE": "NPE as it was",
     "fine-tuned NPE": "fine-tuned NPE",
-    "FMCPE (embedding)": "FMCPE",
-    "FRISBI (distilled)": "FRISBI",
+    "FMCPE (embedding)": "FMCPE (embedding)",
+    "FRISBI (distilled)": "FRISBI (distilled)",
     "RoPE": "RoPE",
     STACK: "**`stack`**",
 }

@@ -131,8 +131,8 @@ class CredibleIntervals:
         if self._is_batch and len(self.low) > count:
             lines.append(f"  and those of {len(self.low) - count} more observations")
         promise = self.guarantee or (
-            "They have no guarantee: they hold the true parameters as often as the "
-            "posterior is calibrated."
+            "They have no guarantee: they hold the true parameters so often only if "
+            "the posterior is calibrated."
         )
         return "\n".join(
             [f"{100 * self.level:.4g} % intervals, one by one:", *lines, str(promise)]
