@@ -22,6 +22,7 @@ from sbi_rope.discrepancy.imputation import expected_means
 from sbi_rope.errors import InvalidInputError, RoPEWarning
 from sbi_rope.metrics import acauc_of, coverage_curve_of, expected_coverage_error_of
 from sbi_rope.stacking import stacking_weights
+from sbi_rope.stacking.folds import Workbench
 from sbi_rope.stacking.label_scores import label_levels
 from tests import gaussian
 
@@ -433,12 +434,33 @@ def test_the_possible_means_of_a_wide_label_are_hardly_shrunk() -> None:
     assert float(error.square().mean()) < 0.06 * gaussian.NOISE_STD**2
 
 
-def test_tuning_on_partial_labels_keeps_what_x_says_about_missing_parameters() -> None:
+def half_measured(count: int) -> tuple[Tensor, Tensor]:
+    """Return pairs of which each has one parameter."""
     torch.manual_seed(0)
-    theta = gaussian.prior().sample((600,))
+    theta = gaussian.prior().sample((count,))
     x = gaussian.real_process(theta)
     theta[::2, 0] = NAN
     theta[1::2, 1] = NAN
+    return theta, x
+
+
+def test_targets_of_missing_parameters_are_what_x_says_about_them() -> None:
+    theta, x = half_measured(200)
+    conductor = RoPE(gaussian.posterior(), simulator=gaussian.simulator)
+    bench = Workbench(
+        conductor.append_calibration(theta, x),
+        num_folds=2,
+        seed=0,
+        show_progress_bars=False,
+    )
+    targets = bench.targets(torch.arange(200), seed=0)
+    # E[0.8 theta | x], whose mean size is 0.57.
+    error = (targets - gaussian.GAIN**2 * gaussian.undo(x))[theta.isnan()]
+    assert float(error.abs().mean()) < 0.15
+
+
+def test_tuning_on_partial_labels_keeps_what_x_says_about_missing_parameters() -> None:
+    theta, x = half_measured(600)
     finetuner = CalibrationFinetuner(learning_rate=1e-2, max_num_epochs=300)
     conductor = RoPE(
         gaussian.posterior(), simulator=gaussian.simulator, finetuner=finetuner
