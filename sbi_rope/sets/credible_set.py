@@ -30,7 +30,7 @@ class CredibleSet:
 
     ``posterior.credible_set`` makes it. Without a guarantee it is the set of highest
     density, :math:`\{\theta: \log p(\theta \mid x) \ge t\}`, with a probability of
-    ``level`` under the posterior. It holds the true parameters so often only
+    ``level`` under the posterior. It holds the true parameters this often only
     if the posterior is calibrated. A set with a guarantee is described in
     :class:`~sbi_rope.sets.Guarantee`.
 
@@ -125,7 +125,7 @@ class CredibleSet:
             "prior"
         )
         promise = self.guarantee or (
-            "It has no guarantee: it holds the true parameters so often only if the "
+            "It has no guarantee: it holds the true parameters this often only if the "
             "posterior is calibrated."
         )
         return (

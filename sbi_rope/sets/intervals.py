@@ -131,7 +131,7 @@ class CredibleIntervals:
         if self._is_batch and len(self.low) > count:
             lines.append(f"  and those of {len(self.low) - count} more observations")
         promise = self.guarantee or (
-            "They have no guarantee: they hold the true parameters so often only if "
+            "They have no guarantee: they hold the true parameters this often only if "
             "the posterior is calibrated."
         )
         return "\n".join(

@@ -196,7 +196,7 @@ class Workbench:
         return None if len(groups.unique()) == len(groups) else groups
 
     def targets(self, rows: Tensor, seed: int) -> Tensor:
-        """Return the targets of tuning on some pairs, which only these know."""
+        """Return the targets of tuning on some pairs, computed from these alone."""
         moments = self.moments("embedding")[rows]
         if self.labels.are_exact:
             return moments.mean.to(self.embedded)
