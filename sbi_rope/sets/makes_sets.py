@@ -43,8 +43,9 @@ class MakesSets(ABC):
         It is the set of highest density,
         :math:`\{\theta: \log p(\theta \mid x) \ge t\}`, with t the (1 - level)
         quantile of the log density of draws. It holds the true parameters this often
-        only if the posterior is calibrated. With ``guaranteed``, a stack corrects it by its
-        held-out scores, and :class:`~sbi_rope.sets.Guarantee` says what is promised.
+        only if the posterior is calibrated. With ``guaranteed``, a stack corrects it by
+        its held-out scores, and :class:`~sbi_rope.sets.Guarantee` says what is
+        promised.
 
         Args:
             level: The probability of the set.
