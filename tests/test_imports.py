@@ -56,11 +56,13 @@ LAYERS = [
     # average them in a mixture. Tasks have simulators. Labels have a density under a
     # posterior and its prior. A mixture is recalibrated by its density.
     {"_labels", "batch", "trainers", "tasks", "recalibration"},
-    # RoPE conducts fine-tuning, coupling and mixture.
+    # The NPE that knows the discrepancy is a trainer.
+    {"discrepancy"},
+    # RoPE conducts fine-tuning, coupling and mixture. The discrepancy tells what labels
+    # that are not exact are tuned to.
     {"rope"},
-    # A sweep asks RoPE for many mixtures. The NPE that knows the discrepancy is a
-    # trainer.
-    {"sweep", "discrepancy"},
+    # A sweep asks RoPE for many mixtures.
+    {"sweep"},
     # Stacks weigh posteriors of RoPE and of the discrepancy. The diagnosis looks at the
     # parts of RoPE. Baselines are trainers, two of which are stages of RoPE.
     {"stacking", "diagnosis", "baselines"},

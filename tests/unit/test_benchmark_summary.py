@@ -224,7 +224,7 @@ def test_readme_shows_scores_on_real_measurements_with_their_intervals(
     assert line(text, "NPE as it was")[0] == "-30.00 ± 0.00 (3)"
     # Of one repetition the interval is over its test observations.
     assert line(text, "RoPE")[:2] == ["-3.00 ± 0.20 (1)"] * 2
-    assert line(text, "FRISBI") == ["-"] * 4
+    assert line(text, "FRISBI (distilled)") == ["-"] * 4
 
 
 def test_a_page_without_a_place_for_the_block_is_refused_and_nothing_written(
