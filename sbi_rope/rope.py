@@ -255,8 +255,10 @@ class RoPE:
     ) -> "RoPE":
         """Tune the embedding net on all calibration pairs appended so far.
 
-        Every call starts from the embedding net of NPE. Targets of labels that are not
-        exact are also given x, under a discrepancy model of the embedding.
+        Every call starts from the embedding net of NPE. Where labels are not exact,
+        targets are averages given the label and x, under a discrepancy model of the
+        embedding. They take one simulation at each of the draws of a label, whatever
+        ``simulations_per_target`` is.
 
         Args:
             seed: Seed of the simulations and of the hold-out split, for torch, NumPy
@@ -296,7 +298,7 @@ class RoPE:
             targets,
             draw_simulations=lambda count: self._source.kept(count, progress=show)[1],
             groups=self._labels.groups,
-            weights=self._labels.weights if self._labels.are_weighted else None,
+            weights=self._labels.pair_weights,
             seed=seed,
             show_progress_bars=show,
         )
@@ -315,7 +317,8 @@ class RoPE:
 
         Returns:
             :math:`E[h(S(\theta)) \mid y_i]`, shape ``(n_c, l)``. Over labels that are
-            not exact it averages the parameters, too.
+            not exact it averages the parameters, too. :meth:`train` tunes to averages
+            that are also given x there.
 
         Raises:
             SimulationError: If the simulator fails, or an embedding is not finite.
@@ -331,6 +334,7 @@ class RoPE:
         )
 
     def _targets_of_labels(self, *, progress: bool) -> Tensor:
+        """Return targets, ``(n_c, l)``, where some labels leave parameters open."""
         _, simulated = self._source.kept(MIN_SIMULATIONS, progress=progress)
         return tuning_targets(
             embed(self._npe.h, self._x_cal),
@@ -342,7 +346,7 @@ class RoPE:
                 progress=progress,
             ),
             Standardisation(self._embed_simulations(simulated).double()),
-            weights=self._labels.weights if self._labels.are_weighted else None,
+            weights=self._labels.pair_weights,
         )
 
     def embed(

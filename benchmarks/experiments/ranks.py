@@ -4,8 +4,8 @@ Recalibration sees where held-out parameters lie in their posteriors. This reads
 committed results where those of the test set lie: at which levels of central intervals,
 averaged over parameters. "factor" is the factor of the spread that a normal posterior
 would need, "its gain" what it adds to the log density of a parameter, and "any map"
-what the best monotone map of the levels adds, which no choice of a map can exceed. All
-are means over variants and repetitions. Up to .005 of "any map" is noise.
+what the best monotone map of the levels adds, if it may choose the share of each of ten
+bins. All are means over variants and repetitions. Up to .005 of "any map" is noise.
 
     python -m benchmarks.experiments.ranks --suite stacking main
 """

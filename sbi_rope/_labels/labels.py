@@ -117,6 +117,11 @@ class Labels:
         return bool((self.weights != 1).any())
 
     @property
+    def pair_weights(self) -> Tensor | None:
+        """The weights, shape ``(n,)``; None if all labels count as one pair."""
+        return self.weights if self.are_weighted else None
+
+    @property
     def are_simple(self) -> bool:
         """Whether all labels are exact and count as one pair."""
         return self.are_exact and not self.are_weighted

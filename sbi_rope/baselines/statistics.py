@@ -133,12 +133,16 @@ class SoftClip(nn.Module):
 
 
 def with_clip(estimator: Any, clip: SoftClip, noise_on: NoiseOn) -> tuple[Any, Any]:
-    r"""Return :math:`q(\\theta \\mid s)` and :math:`q(\\theta \\mid x)` that clip s.
+    r"""Return :math:`q(\theta \mid s)` and :math:`q(\theta \mid x)` that clip s.
 
     Args:
         estimator: A trained estimator, whose parameters both share.
         clip: The clip of statistics.
         noise_on: As in :func:`split_at_statistics`.
+
+    Returns:
+        The density given statistics, and the one given x. They are the same if x is
+        its own statistic.
     """
     net, density = split_at_statistics(estimator, noise_on)
     density = with_embedding(density, nn.Sequential(clip, embedding_of(density)))

@@ -82,7 +82,9 @@ def cross_fit(rope: RoPE, *, num_folds: int, show_progress_bars: bool) -> CrossF
     r"""Embed each calibration pair by a g that was trained on the other folds.
 
     The residuals of pairs that g was trained on would be too small. There is one
-    training for each fold.
+    training for each fold. Where labels are not exact, g is tuned to averages given the
+    label alone, other than by :meth:`RoPE.train`, because residuals from averages that
+    are also given x would be too small.
 
     Args:
         rope: RoPE with its calibration pairs; it is not changed.

@@ -174,7 +174,7 @@ class Workbench:
     @property
     def pair_weights(self) -> Tensor | None:
         """How many pairs each pair counts as, shape ``(n,)``; None if all are one."""
-        return self.labels.weights if self.labels.are_weighted else None
+        return self.labels.pair_weights
 
     @cached_property
     def score_weights(self) -> Tensor | None:
@@ -267,9 +267,9 @@ class Fold:
     def tuned(self, finetuner: CalibrationFinetuner) -> RoPE:
         """Return RoPE, tuned on these pairs with the settings of a finetuner."""
         bench, targets = self.bench, None
-        # The moments already hold the targets of the usual tuning. With stored
-        # simulations, or another number of simulations, RoPE computes its own targets,
-        # if labels are exact.
+        # The moments already hold what the usual tuning needs. If labels are exact,
+        # RoPE computes its own targets with stored simulations, and with another number
+        # of simulations.
         is_usual = finetuner.simulations_per_target == SIMULATIONS_PER_PAIR
         knows = isinstance(bench.rope.source, Simulator) and is_usual
         if knows or not bench.labels.are_exact:

@@ -108,12 +108,11 @@ def _labels(report: "StackingReport") -> list[str]:
         return []
     lines = [f"  {scores.labels}"]
     if scores.score_errors is not None:
-        what = "scores and coverage are those of the measured values, with the noise "
-        what += "of their labels"
-        if are_relative(report):
-            what = "scores are relative to those of the prior at the draws"
         lines += [
-            f"    {what}",
+            "    scores are relative to those of the prior at the draws"
+            if are_relative(report)
+            else "    scores and coverage are those of the measured values, with the "
+            "noise of their labels",
             f"    Monte-Carlo error of the score: {scores.monte_carlo_error:.3f} nats",
         ]
     return lines
@@ -218,7 +217,7 @@ def parameters_off(
     lines = []
     for name, score in zip(names, scores, strict=True):
         if score.verdict == "unknown":
-            lines.append(f"{name} was not measured, so that nobody checked its width")
+            lines.append(f"{name} was not measured, so that its width is not checked")
         elif score.verdict != "calibrated":
             low, high = score.interval
             lines.append(
