@@ -63,9 +63,11 @@ LAYERS = [
     {"rope"},
     # A sweep asks RoPE for many mixtures.
     {"sweep"},
-    # Stacks weigh posteriors of RoPE and of the discrepancy. The diagnosis looks at the
-    # parts of RoPE. Baselines are trainers, two of which are stages of RoPE.
-    {"stacking", "diagnosis", "baselines"},
+    # Baselines are trainers, two of which are stages of RoPE. The diagnosis looks at
+    # the parts of RoPE.
+    {"baselines", "diagnosis"},
+    # Stacks weigh posteriors of RoPE, of the discrepancy, and of a baseline.
+    {"stacking"},
     # Plots know what they draw.
     {"plots"},
     # Reports are pages with plots.

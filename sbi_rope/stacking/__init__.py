@@ -17,6 +17,7 @@ from sbi_rope.stacking.trained_candidates import (
     DiscrepancyCandidate,
     FinetunedCandidate,
 )
+from sbi_rope.stacking.unlabelled_candidates import RVNPCandidate
 from sbi_rope.stacking.weights import StackingWeights, stacking_weights
 
 __all__ = [
@@ -29,6 +30,7 @@ __all__ = [
     "FinetunedCandidate",
     "LearningCurve",
     "Provenance",
+    "RVNPCandidate",
     "SetScores",
     "StackedPosterior",
     "StackingReport",

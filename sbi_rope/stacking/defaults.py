@@ -4,6 +4,8 @@ import itertools
 from collections.abc import Sequence
 from typing import Any
 
+from torch import Tensor
+
 from sbi_rope._validation import check_instance, check_numbers
 from sbi_rope.mixture import PriorPosterior
 from sbi_rope.rope import RoPE
@@ -18,6 +20,7 @@ from sbi_rope.stacking.trained_candidates import (
     DiscrepancyCandidate,
     FinetunedCandidate,
 )
+from sbi_rope.stacking.unlabelled_candidates import RVNPCandidate
 
 __all__ = ["default_candidates"]
 
@@ -29,6 +32,7 @@ REHEARSAL = 1.0
 
 def default_candidates(
     rope: RoPE | None = None,
+    x_o: Tensor | None = None,
     *,
     couplings: bool = False,
     gammas: Sequence[float] = GAMMAS,
@@ -40,6 +44,9 @@ def default_candidates(
     Args:
         rope: A RoPE with its calibration pairs. Candidates that these data do not
             allow or need are left out, as in :func:`stack`. None returns all.
+        x_o: Real observations without labels, shape ``(n_o, *event)``. They add RVNP,
+            which learns errors from them, with errors in the embedding and in x. With
+            a rope, there must be a hundred of them.
         couplings: Whether to add RoPE and OT-only over a grid of gamma and tau, and
             tuning-only. They are for the stack of a batch of observations.
         gammas: Values of gamma, in units of the median distance between simulated
@@ -68,8 +75,12 @@ def default_candidates(
         FinetunedCandidate(space="input"),
         FinetunedCandidate(space="tuned"),
     )
+    if x_o is not None:
+        amortised += (RVNPCandidate(x_o), RVNPCandidate(x_o, space="input"))
     if rope is not None:
         check_instance("rope", rope, RoPE)
+        if x_o is not None:
+            rope.checked_observations(x_o)
         bench = Workbench(rope, num_folds=NUM_FOLDS, seed=0, show_progress_bars=False)
         amortised = tuple(one for one in amortised if one.applies_to(bench))
     if not couplings:

@@ -123,6 +123,18 @@ class Workbench:
         return short and bool(torch.isfinite(self.x).all())
 
     @cached_property
+    def reads_summaries(self) -> bool:
+        """Whether x is a short vector and NPE has an embedding net.
+
+        Without a net to lose information, errors in x are those in h(x). Where
+        simulations have missing entries (NaN), only h(x) can be corrected.
+        """
+        has_net = any(True for _ in self.embedding_net.parameters())
+        if not self.has_summaries or not has_net:
+            return False
+        return bool(torch.isfinite(self.simulations[1]).all())
+
+    @cached_property
     def _moments(self) -> Moments:
         # Embeddings and summaries x are put side by side, so that both have moments
         # from the same simulations.

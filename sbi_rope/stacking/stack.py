@@ -70,7 +70,9 @@ def stack(
         candidates: What to stack. If None,
             :func:`~sbi_rope.stacking.default_candidates`: the prior, NPE, fine-tuned
             NPE and discrepancy models, and with ``x_o`` also tuning-only, RoPE, RoPE
-            tuned with rehearsal and OT-only at four gammas and three taus.
+            tuned with rehearsal and OT-only at four gammas and three taus, and RVNP if
+            there are a hundred observations. For a stack that has learned from
+            ``x_o`` and answers any x, pass ``default_candidates(rope, x_o)``.
         num_folds: The number of folds, 5 if None, and at most the number of different
             parameters. Pairs with the same parameters are in the same fold.
         num_simulations: The number of simulations to couple with, as in

@@ -4,9 +4,7 @@ import copy
 from dataclasses import dataclass
 from typing import Any
 
-import torch
-
-from sbi_rope._sbi import embedding_of, estimator_of, headless, with_embedding
+from sbi_rope._sbi import estimator_of, headless, with_embedding
 from sbi_rope._validation import check_choice, check_instance
 from sbi_rope.discrepancy.correction import Space
 from sbi_rope.mixture import OwnEmbeddings, Part, part_of
@@ -53,7 +51,7 @@ class DiscrepancyCandidate(AmortisedCandidate):
     def applies_to(self, bench: Workbench) -> bool:
         """Tell whether x is a short vector, or there are enough folds to tune."""
         if self.space == "input":
-            return _has_summaries(bench)
+            return bench.reads_summaries
         return self.space == "embedding" or len(bench.folds) > 2
 
     def parts(self, fold: Fold) -> list[Part]:
@@ -64,19 +62,6 @@ class DiscrepancyCandidate(AmortisedCandidate):
             return [part_of(estimator)]
         embeddings = OwnEmbeddings(corrected.nets, fold.bench.x.shape[1:])
         return [Part(headless(estimator), embeddings)]
-
-
-def _has_summaries(bench: Workbench) -> bool:
-    """Tell whether x is a short vector and NPE has an embedding net.
-
-    Without a net to lose information, correcting x adds nothing to correcting h(x).
-    Where simulations have missing entries (NaN), only h(x) can be corrected.
-    """
-    net = embedding_of(estimator_of(bench.npe))
-    has_net = any(True for _ in net.parameters())
-    if not bench.has_summaries or not has_net:
-        return False
-    return bool(torch.isfinite(bench.simulations[1]).all())
 
 
 # Learning rates of fine-tuning, by what was corrected in the net that it starts from.

@@ -1,6 +1,7 @@
 """Train the candidates of a stack, fold by fold, and have them scored."""
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, Literal
 
 import torch
@@ -23,6 +24,7 @@ from sbi_rope.errors import (
     InvalidInputError,
     NotReadyError,
 )
+from sbi_rope.mixture import Part
 from sbi_rope.recalibration import Recalibration
 from sbi_rope.rope import HOW_TO_MAKE, RoPE
 from sbi_rope.stacking.candidates import (
@@ -109,7 +111,7 @@ class StackTrainer:
 
     def _chosen(self, candidates: Sequence[Candidate] | None) -> tuple[Candidate, ...]:
         if candidates is None:
-            chosen = default_candidates(couplings=self.x_o is not None)
+            chosen = default_candidates(x_o=self.x_o, couplings=self.x_o is not None)
             return tuple(
                 candidate
                 for candidate in chosen
@@ -202,6 +204,11 @@ class StackTrainer:
         weights = weights[:, kept] / weights[:, kept].sum(dim=1, keepdim=True)
         return recalibration_of(bench, versions, pairs, weights, seed=self.seeds[2])
 
+    @cached_property
+    def _fixed(self) -> dict[str, list[Part]]:
+        """The densities of the candidates that do not depend on the pairs."""
+        return train_version(self.candidates, Fold(self.bench, [0]), fixed=True)
+
     def discrepancy(self) -> DiscrepancyReport | None:
         """Return what the pairs say about each entry of x, if a candidate uses it."""
         corrected = (DiscrepancyCandidate, FinetunedCandidate)
@@ -211,6 +218,10 @@ class StackTrainer:
         return None
 
     def _train(self, folds: Sequence[Fold], chosen: Sequence[Candidate]) -> Versions:
+        names = [candidate.name for candidate in chosen]
+        # These come first, because they show the progress of their own training, and
+        # because what a user passed to them may be refused.
+        fixed = {name: of for name, of in self._fixed.items() if name in names}
         count = sum(isinstance(c, AmortisedCandidate) and not c.fixed for c in chosen)
         with progress_bar(
             show=self.show,
@@ -235,8 +246,8 @@ class StackTrainer:
                 show_progress_bars=self.show,
             )
         return Versions(
-            names=tuple(candidate.name for candidate in chosen),
-            fixed=train_version(chosen, folds[0], fixed=True),
+            names=tuple(names),
+            fixed=fixed,
             trained=trained,
             couplings=couplings,
             tail_mass=self.tail_mass,

@@ -65,6 +65,8 @@ IN_WORDS = {
     "has corrected",
     "discrepancy, fine-tuned": "NPE of simulations that a linear model has corrected, "
     "trained further by the labels",
+    "RVNP": "NPE trained on observations without labels, with errors that are learnt "
+    "from them",
 }
 
 
