@@ -45,8 +45,9 @@ def default_candidates(
         rope: A RoPE with its calibration pairs. Candidates that these data do not
             allow or need are left out, as in :func:`stack`. None returns all.
         x_o: Real observations without labels, shape ``(n_o, *event)``. They add RVNP,
-            which learns errors from them, with errors in the embedding and in x. With
-            a rope, there must be a hundred of them.
+            which learns errors from them. With a rope, there must be a hundred of
+            them, and the errors are in x if it is a short vector and NPE has an
+            embedding net, in the embedding otherwise.
         couplings: Whether to add RoPE and OT-only over a grid of gamma and tau, and
             tuning-only. They are for the stack of a batch of observations.
         gammas: Values of gamma, in units of the median distance between simulated

@@ -29,7 +29,8 @@ class RVNPCandidate(AmortisedCandidate):
             these or about others. The observations of the calibration pairs should
             not be among them, so that the scores are those of new observations.
         space: What the errors are in: the ``"embedding"`` h(x), or the ``"input"`` x,
-            whose shape must be ``(l,)`` then.
+            whose shape must be ``(l,)`` then. The default stack has the latter if x
+            is a short vector and NPE has an embedding net.
 
     Raises:
         InvalidInputError: If an argument is outside its range. Shape and values of x_o
@@ -55,10 +56,9 @@ class RVNPCandidate(AmortisedCandidate):
         return "RVNP"
 
     def applies_to(self, bench: Workbench) -> bool:
-        """Tell whether there are enough observations, and x is a short vector."""
-        if len(self.x_o) < MIN_OBSERVATIONS:
-            return False
-        return self.space == "embedding" or bench.reads_summaries
+        """Tell whether there are enough observations, and errors suit the space."""
+        suits = "input" if bench.reads_summaries else "embedding"
+        return len(self.x_o) >= MIN_OBSERVATIONS and self.space == suits
 
     def parts(self, fold: Fold) -> list[Part]:
         """Train errors and posterior on the observations; return the density."""
