@@ -12,6 +12,7 @@ from sbi_rope.stacking import (
     DensityCandidate,
     DiscrepancyCandidate,
     FinetunedCandidate,
+    RVNPCandidate,
     cross_validate,
     default_candidates,
     stacking_weights,
@@ -115,6 +116,17 @@ CALLS = [
             "rehearsal": "not negative",
         },
         accepts=("rehearsal: None",),
+    ),
+    Call(
+        name="default_candidates(x_o)",
+        run=lambda x_o=X_O: repr(default_candidates(trained(), x_o)),
+        tensors={"x_o": X_O},
+        accepts=("x_o: None", *FEWER_X_O),
+    ),
+    Call(
+        name="RVNPCandidate",
+        run=lambda **options: repr(RVNPCandidate(X_O, **options)),
+        options={"space": "choice"},
     ),
     Call(
         name="CouplingCandidate",
