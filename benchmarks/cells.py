@@ -18,7 +18,14 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-__all__ = ["FOLDER", "Cell", "Suite", "list_suites", "load_suite"]
+__all__ = [
+    "FOLDER",
+    "Cell",
+    "Suite",
+    "data_in_words",
+    "list_suites",
+    "load_suite",
+]
 
 FOLDER = Path(__file__).parent / "suites"
 NEEDED = ("title", "question", "preset", "repetitions", "cells")
@@ -26,6 +33,15 @@ AXES = ("n_calibration", "gamma", "tau")
 # Neither a folder nor, with a dot in front, a hidden file or the folder above.
 FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 KEYS = {"tasks", "variants", "methods", "n_calibration", "gammas", "taus", "options"}
+
+
+def data_in_words(task: str, variant: str = "", options: str = "{}") -> list[str]:
+    """Return task, variant and options of a :class:`Cell` as parts of a title."""
+    parts = [task, variant] if variant else [task]
+    for name, value in json.loads(options).items():
+        words = name.replace("_", " ")
+        parts.append(words if value is True else f"{words} {value}")
+    return parts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,9 +93,7 @@ class Cell:
         )
 
     def __str__(self) -> str:
-        parts = [self.task, self.variant, self.method]
-        if self.options != "{}":
-            parts.insert(1, self.options)
+        parts = [*data_in_words(self.task, self.variant, self.options), self.method]
         if self.n_calibration:
             parts.append(f"n_c={self.n_calibration}")
         if self.gamma is not None:

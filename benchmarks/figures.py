@@ -11,7 +11,7 @@ import pandas as pd
 import torch
 from matplotlib.figure import Figure
 
-from benchmarks.cells import Cell, Suite
+from benchmarks.cells import Cell, Suite, data_in_words
 from benchmarks.methods import METHODS
 from benchmarks.table import Table
 from sbi_rope import plots
@@ -25,7 +25,7 @@ UNSCALED = {"RoPE": "#003050", "OT-only": "#2A6F97"}
 # Lines that differ in calibration pairs only.
 MARKERS = {10: "o", 50: "s", 200: "^", 1000: "D"}
 # More labels than these run into each other.
-MAX_TICKS = 6
+MAX_TICKS = 5
 # More panels than this go to another row.
 MAX_COLUMNS = 9
 # Calibration pairs behind calibration curves and corner plots, where there is a choice.
@@ -105,8 +105,9 @@ def curves(axis: str, rows: pd.DataFrame, *, max_columns: int = MAX_COLUMNS) -> 
         part.set_axis_off()
     seen: dict[str, Any] = {}
     for column, (where, group) in enumerate(groups):
-        title = _title(where) + ("\n(stand-in)" if group["stand_in"].any() else "")
-        axes[0, column].set_title(title, size="medium")
+        title = data_in_words(*where)
+        title += ["(stand-in)"] if group["stand_in"].any() else []
+        axes[0, column].set_title("\n".join(title), size="medium")
         _panel(axes[0, column], axis, group, "lpp_z", seen)
         _panel(axes[1, column], axis, group, "acauc", seen)
         axes[1, column].axhline(0, color="0.6", lw=0.8)
@@ -213,10 +214,6 @@ def _lines(axis: str, rows: pd.DataFrame) -> list[str]:
     return labels
 
 
-def _title(where: tuple[str, ...]) -> str:
-    return "\n".join(part for part in where if part not in ("", "{}"))
-
-
 def _style(cell: Cell) -> tuple[str, str, str | None]:
     colour, line, marker = METHODS[cell.method].style
     if cell.cost_scale == "none":
@@ -277,7 +274,8 @@ def _coverage(table: Table) -> Any:
             curve = table.arrays[cell]["coverage"]
             (handle,) = part.plot(levels, curve, color=colour, ls=line, lw=1.4)
             seen.setdefault(name, handle)
-        part.set(xlim=(0, 1), ylim=(0, 1), box_aspect=1, title=_title(where))
+        part.set(xlim=(0, 1), ylim=(0, 1), box_aspect=1)
+        part.set_title("\n".join(data_in_words(*where)))
         part.set_xlabel("credible level")
         part.spines[["top", "right"]].set_visible(False)
     axes[0].set_ylabel("share of true parameters inside")
@@ -293,7 +291,7 @@ def _corners(table: Table) -> Iterator[tuple[str, str, Any]]:
         samples = {n: torch.from_numpy(a["samples"]) for n, a in arrays.items()}
         prior = samples.pop("prior", None)
         theta = torch.from_numpy(arrays["RoPE"]["theta"])
-        name = _title(where).replace("\n", "-")
+        name = "-".join(data_in_words(*where))
         name = "".join(c if c.isalnum() or c in "-_." else "_" for c in name)
         scores = table.rows["acauc_per_parameter"][cells["RoPE"]].split("; ")
         figure = plots.pair_plot(

@@ -9,7 +9,7 @@ import pandas as pd
 from scipy.stats import wilcoxon
 
 from benchmarks import figures
-from benchmarks.cells import Cell, Suite
+from benchmarks.cells import Cell, Suite, data_in_words
 from benchmarks.methods import METHODS
 from benchmarks.stacks import stacking_lines
 from benchmarks.table import Table, markdown, number_text
@@ -70,8 +70,8 @@ def write_report(suite: Suite, table: Table, folder: Path) -> Path:
     return path
 
 
-def _title(where: tuple[str, ...], rows: pd.DataFrame) -> str:
-    title = ", ".join(part for part in where if part not in ("", "{}"))
+def _title(where: tuple[str, str, str], rows: pd.DataFrame) -> str:
+    title = ", ".join(data_in_words(*where))
     stands_in = rows["stand_in"].any()
     return title + (" (a model stands in for the recorded data)" if stands_in else "")
 
@@ -225,8 +225,7 @@ def _missing(suite: Suite, table: Table) -> list[str]:
         lines += [f"{len(missing)} of {len(suite.cells)} cells were not run:", ""]
         groups = missing.groupby([*WHERE, "repetition"], sort=False)["method"]
         for (task, variant, options, repetition), methods in groups:
-            names = " ".join(n for n in (task, variant) if n)
-            names += "" if options == "{}" else f" {options}"
+            names = ", ".join(data_in_words(task, variant, options))
             listed = ", ".join(methods.unique())
             lines.append(f"- {names} #{repetition}: {len(methods)} cells ({listed})")
     if len(failed):

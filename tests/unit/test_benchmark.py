@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 import torch
 
-from benchmarks.cells import Suite, list_suites, load_suite
+from benchmarks.cells import Cell, Suite, data_in_words, list_suites, load_suite
 from benchmarks.figures import LPPAxis
 from benchmarks.methods import METHODS
 from benchmarks.presets import PRESETS
@@ -106,6 +106,13 @@ def test_a_suite_whose_name_cannot_be_that_of_a_folder_is_refused(
     path.write_text(SUITE)
     with pytest.raises(InvalidInputError, match="Expected the name of"):
         load_suite(str(path))
+
+
+def test_titles_and_messages_state_options_in_words() -> None:
+    options = '{"label_noise": 0.1, "stand_in": true}'
+    assert data_in_words("sir", "", options) == ["sir", "label noise 0.1", "stand in"]
+    cell = Cell(task="sir", variant="prior_shift", options=options, method="prior")
+    assert str(cell) == "sir prior_shift label noise 0.1 stand in prior #0"
 
 
 def test_ci_expects_as_many_finished_cells_as_the_smoke_suite_has() -> None:
