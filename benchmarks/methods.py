@@ -69,6 +69,7 @@ class Entry:
         couples: Whether it has gamma and tau.
         tasks: The only tasks that it can be run on; None for all.
         extra: Whether it is run only where it is asked for by name.
+        ours: Whether it is of this package alone: no paper describes it.
     """
 
     style: tuple[str, str, str | None]
@@ -77,6 +78,7 @@ class Entry:
     couples: bool = False
     tasks: tuple[str, ...] | None = None
     extra: bool = False
+    ours: bool = False
 
 
 def methods_where(holds: Callable[[Entry], object]) -> tuple[str, ...]:
@@ -231,26 +233,35 @@ METHODS: dict[str, Entry] = {
         build=lambda case: FinetunedNPE.from_posterior(case.npe),
     ),
     "discrepancy": Entry(
-        style=("#882255", "-", "h"), pairs=True, build=_discrepancy("embedding")
+        style=("#882255", "-", "h"),
+        pairs=True,
+        ours=True,
+        build=_discrepancy("embedding"),
     ),
     # It corrects x itself, which has to be short.
     "discrepancy (input)": Entry(
         style=("#882255", "--", "h"),
         pairs=True,
+        ours=True,
         tasks=("cs", "light_tunnel_sensors", "linear_gaussian", "sir"),
         build=_discrepancy("input"),
     ),
     "discrepancy (tuned)": Entry(
-        style=("#882255", "-.", "h"), pairs=True, build=_discrepancy("tuned")
+        style=("#882255", "-.", "h"),
+        pairs=True,
+        ours=True,
+        build=_discrepancy("tuned"),
     ),
     "discrepancy, prior learned": Entry(
         style=("#882255", ":", "h"),
         pairs=True,
+        ours=True,
         build=_discrepancy("embedding", learn_prior=True),
     ),
     "discrepancy, fine-tuned": Entry(
         style=("#AA4499", "-", "p"),
         pairs=True,
+        ours=True,
         build=_discrepancy(kind=_ThenFinetuned),
     ),
     "FMCPE": Entry(

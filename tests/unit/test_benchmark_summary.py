@@ -147,6 +147,16 @@ def test_the_stack_is_compared_with_the_best_other_on_the_same_repetitions(
     )
 
 
+def test_methods_of_this_package_are_no_rivals_of_the_stack(
+    folder: Path, docs_page: Path
+) -> None:
+    lpp = {"stack": -1.0, "discrepancy": -1.0, "J-NPE": -1.5}
+    publish(folder, "main", with_stack({0: lpp, 1: lpp}))
+    text = write(folder, docs_page)
+    assert "best other beyond the interval over repetitions: 0 of 3" in text
+    assert "best of those that are not of this package: 3 of 3" in text
+
+
 def test_a_stack_below_npe_or_another_method_is_counted_and_named(
     folder: Path, docs_page: Path
 ) -> None:
