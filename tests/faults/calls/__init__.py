@@ -100,6 +100,8 @@ NOT_CALLED = {
             "DiscrepancyCandidate.parts",
             "FinetunedCandidate.applies_to",
             "FinetunedCandidate.parts",
+            "RVNPCandidate.applies_to",
+            "RVNPCandidate.parts",
         ),
         _FOR_STACK,
     ),
