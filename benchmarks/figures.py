@@ -13,13 +13,13 @@ from matplotlib.figure import Figure
 
 from benchmarks.cells import Cell, Suite, data_in_words
 from benchmarks.methods import METHODS
+from benchmarks.schema import WHERE
 from benchmarks.table import Table
 from sbi_rope import plots
 from sbi_rope._files import write_atomically
 
 __all__ = ["LPPAxis", "curves", "draw_all", "save"]
 
-WHERE = ["task", "variant", "options"]
 # With the distances as they are, as in the paper.
 UNSCALED = {"RoPE": "#003050", "OT-only": "#2A6F97"}
 # Lines that differ in calibration pairs only.

@@ -19,6 +19,7 @@ from benchmarks.published import (
     lpp_text,
     table,
 )
+from benchmarks.schema import WHERE
 
 __all__ = ["other_suites"]
 
@@ -119,8 +120,13 @@ def _grid(published: Published, suite: str, grid: Grid) -> list[str]:
     rows = rows[rows["method"].isin(grid.methods)]
     rows = rows[grid.all_sizes | (rows["n_calibration"] == SIZE)]
     places = [[name(cell) for cell in rows.index], rows.index.map(grid.column)]
+    counts = rows.groupby([*WHERE])["repetition"].nunique()
     entries = {
-        place: entry(part, partial(grid.text, published))
+        place: entry(
+            part,
+            partial(grid.text, published),
+            out_of=counts[tuple(part[[*WHERE]].iloc[0])],
+        )
         for place, part in rows.groupby(places)
     }
     names = dict.fromkeys(places[0])

@@ -1,6 +1,6 @@
 """Committed tables, in the words that the summary speaks of them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -26,6 +26,7 @@ __all__ = [
     "gap",
     "lpp_text",
     "mean",
+    "num_repetitions",
     "runs_of",
     "table",
 ]
@@ -89,24 +90,12 @@ class Published:
 
     @cached_property
     def rows(self) -> dict[str, pd.DataFrame]:
-        """Rows by suite, of the repetitions in which a task is complete.
-
-        Of the one with the most methods where none is: a mean over more of them for one
-        method than for the next would compare data, not methods.
-        """
-        rows = {}
-        for name, suite in self.suites.items():
-            known = self.tables.get(name, Table.of({}, {})).rows
-            there: set[Cell] = set(known.index)
-            kept: list[Cell] = []
-            for runs in runs_of(suite).values():
-                whole = [run for run in runs if there.issuperset(run)]
-                known_runs = [[cell for cell in run if cell in there] for run in runs]
-                fullest = max(known_runs, key=_num_methods)
-                for run in whole or [fullest]:
-                    kept += run
-            rows[name] = known.loc[kept].infer_objects()
-        return rows
+        """Rows by suite, of all repetitions that were run."""
+        none = Table.of({}, {})
+        return {
+            name: self.tables.get(name, none).rows.infer_objects()
+            for name in self.suites
+        }
 
     @cached_property
     def _by_method(self) -> dict[str, dict[str, list[Cell]]]:
@@ -194,8 +183,9 @@ def runs_of(suite: Suite) -> dict[tuple[str, str], list[list[Cell]]]:
     return {where: [*parts.values()] for where, parts in runs.items()}
 
 
-def _num_methods(cells: list[Cell]) -> int:
-    return len({cell.method for cell in cells})
+def num_repetitions(parts: Iterable[pd.DataFrame]) -> int:
+    """Return the number of repetitions of which there are rows."""
+    return len({repetition for part in parts for repetition in part["repetition"]})
 
 
 def _finished(rows: pd.DataFrame) -> pd.DataFrame:
@@ -228,13 +218,27 @@ def _mean_difference(a: dict[int, float], b: dict[int, float]) -> float | None:
 # Texts ------------------------------------------------------------------------------
 
 
-def entry(rows: pd.DataFrame, text: Callable[[pd.DataFrame], str]) -> str:
-    """Return scores as text, with what failed."""
+def entry(
+    rows: pd.DataFrame,
+    text: Callable[[pd.DataFrame], str],
+    *,
+    out_of: int | None = None,
+) -> str:
+    """Return scores as text, with what failed.
+
+    Args:
+        rows: One a repetition.
+        text: Makes a text of those that were finished.
+        out_of: The number of repetitions of what it stands beside. If there are fewer
+            rows, the entry says of how many it is.
+    """
     scored = _finished(rows)
     if not len(scored):
         return "failed" if len(rows) else MISSING
     failed = len(rows) - len(scored)
-    return text(scored) + (f" ({failed} of {len(rows)} failed)" if failed else "")
+    fewer = f" [{len(rows)}]" if out_of is not None and len(rows) < out_of else ""
+    failures = f" ({failed} of {len(rows)} failed)" if failed else ""
+    return text(scored) + fewer + failures
 
 
 def lpp_text(rows: pd.DataFrame) -> str:

@@ -11,14 +11,13 @@ from scipy.stats import wilcoxon
 from benchmarks import figures
 from benchmarks.cells import Cell, Suite, data_in_words
 from benchmarks.methods import METHODS
+from benchmarks.schema import WHERE
 from benchmarks.stacks import stacking_lines
 from benchmarks.table import Table, markdown, number_text
 from sbi_rope._files import write_atomically
 
 __all__ = ["write_report"]
 
-# Cells with the same of these are of one section.
-WHERE = ["task", "variant", "options"]
 SETTING = ["cost_scale", "gamma", "tau"]
 # Lines to compare with, not methods that compete.
 REFERENCES = ("SBI",)

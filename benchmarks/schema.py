@@ -17,6 +17,7 @@ from sbi_rope.tasks import Task, get_task
 __all__ = [
     "CELL_COLUMNS",
     "COLUMNS",
+    "WHERE",
     "as_text",
     "check_row",
     "check_scores",
@@ -24,6 +25,8 @@ __all__ = [
 ]
 
 STATUSES = ("finished", "failed")
+# Cells with the same of these are of one section.
+WHERE = ["task", "variant", "options"]
 # Log-probabilities are kept in single precision, and sums of them depend on the order.
 RELATIVE, ABSOLUTE = 1e-6, 1e-6
 # `acauc_per_parameter` has four digits.

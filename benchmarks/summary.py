@@ -4,6 +4,7 @@ import math
 import os
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,6 +25,7 @@ from benchmarks.published import (
     entry,
     lpp_text,
     mean,
+    num_repetitions,
     runs_of,
     table,
 )
@@ -53,14 +55,17 @@ prior (higher is better), ± its standard deviation over repetitions where there
 several. ACAUC is 0 for calibrated posteriors, positive for over-confident ones. SBI is
 NPE on simulations instead of real observations. A to F are the tasks of the paper, G is
 ours; on a stand-in a richer model takes the place of recorded data, and what is found
-there holds for that model. Means are over the repetitions in which a task is complete,
-or of the one with the most methods where none is. A dash is what was not run.
+there holds for that model. Means are over all repetitions in which a method was run. If
+these are fewer than those of others on the same task, their number stands beside the
+mean in square brackets. Differences between methods are means over the repetitions that
+both were run in. A dash is what was not run.
 """
 SETTINGS = f"""\
 OT-only and RoPE compete in one setting, fixed beforehand: gamma {FIXED.gamma:g} in
 units of the median distance between simulated embeddings, tau {FIXED.tau:g}. The
 others, among them the paper's gamma {PAPER.gamma:g} of the embedding, are shown below
-and do not compete. **Bold** is the best LPP of those that do.
+and do not compete. **Bold** is the best LPP of those that do and have a score in all
+repetitions of the task.
 """
 
 
@@ -124,8 +129,10 @@ def _block(published: Published, link: str) -> list[str]:
     counts = Counter(verdict(s.check(published)) for s in STATEMENTS)
     verdicts = ", ".join(f"{counts[what]} {what}" for what in VERDICTS if counts[what])
     return [
-        f"LPP with {SIZE} calibration pairs, in standard deviations of the prior. Bold",
-        "is the best; RoPE and OT-only compete in one setting, fixed beforehand (gamma",
+        f"LPP with {SIZE} calibration pairs, in standard deviations of the prior, as mean",
+        "± standard deviation over repetitions. A method that was run in fewer of them",
+        "has their number in square brackets. Bold is the best of the others; RoPE and",
+        "OT-only compete in one setting, fixed beforehand (gamma",
         f"{FIXED.gamma:g} in units of the median distance, tau {FIXED.tau:g}).",
         *("", *_main(published, lpp_text, with_settings=("RoPE",)), ""),
         *(_in_words(_compared(published)), ""),
@@ -191,11 +198,17 @@ def _main(
     columns = [
         {name: published.select(name, task=task) for name in METHODS} for task in tasks
     ]
-    bold = [_best(column) if text is lpp_text else None for column in columns]
-    counts = [pd.concat(column.values())["repetition"].nunique() for column in columns]
+    counts = [num_repetitions(column.values()) for column in columns]
+    bold = [
+        _best(column, count) if text is lpp_text else None
+        for column, count in zip(columns, counts, strict=True)
+    ]
     lines = [["repetitions", *map(str, counts)]]
     for name in METHODS:
-        entries = [entry(column[name], text) for column in columns]
+        entries = [
+            entry(column[name], text, out_of=count)
+            for column, count in zip(columns, counts, strict=True)
+        ]
         if any(len(column[name]) for column in columns):
             marked = [
                 f"**{entry}**" if name == best else entry
@@ -204,8 +217,15 @@ def _main(
             lines.append([name, *marked])
     for name in with_settings:
         for setting in OTHER_SETTINGS:
-            parts = [published.select(name, task=t, setting=setting) for t in tasks]
-            lines.append([f"{name} ({setting})", *(entry(p, text) for p in parts)])
+            entries = [
+                entry(
+                    published.select(name, task=task, setting=setting),
+                    text,
+                    out_of=count,
+                )
+                for task, count in zip(tasks, counts, strict=True)
+            ]
+            lines.append([f"{name} ({setting})", *entries])
     missing = [f"{LETTERS[task]} {task}" for task in LETTERS if task not in tasks]
     return [
         *table(("", *(published.name(task) for task in tasks)), lines),
@@ -213,8 +233,13 @@ def _main(
     ]
 
 
-def _best(rows: dict[str, pd.DataFrame]) -> str | None:
-    scores = {name: mean(part) for name, part in rows.items() if name != "SBI"}
+def _best(rows: dict[str, pd.DataFrame], repetitions: int) -> str | None:
+    """Return the method with the best mean among those of all repetitions."""
+    scores = {
+        name: mean(part)
+        for name, part in rows.items()
+        if name != "SBI" and (part["status"] == "finished").sum() == repetitions
+    }
     known = {name: score for name, score in scores.items() if score is not None}
     best = max(known, key=known.__getitem__, default=None)
     return best if best and known[best] > -math.inf else None
@@ -224,12 +249,15 @@ def _by_size(published: Published) -> list[str]:
     sizes = sorted({size for task in LETTERS for size in published.sizes(task)})
     lines = []
     for task in _tasks(published):
-        entries = {
-            name: entry(published.select(name, task=task), both_texts)
+        others = {
+            name: published.select(name, task=task)
             for name in ("prior", "OT-only", "SBI")
         }
         parts = [published.select("RoPE", task=task, size=size) for size in sizes]
-        rope = [entry(part, both_texts) for part in parts]
+        count = num_repetitions([*others.values(), *parts])
+        text = partial(entry, text=both_texts, out_of=count)
+        entries = {name: text(rows) for name, rows in others.items()}
+        rope = [text(part) for part in parts]
         ends = entries["prior"], entries["OT-only"]
         lines.append([published.name(task), *ends, *rope, entries["SBI"]])
     return table(("", "prior", "OT-only", *(f"{n} pairs" for n in sizes), "SBI"), lines)
@@ -286,11 +314,14 @@ def _stack_in_words(published: Published) -> list[str]:
     results = []
     for task in _tasks(published):
         for size in published.sizes(task):
-            rows = {
-                name: published.select(name, task=task, size=size) for name in METHODS
-            }
-            if len(rows[STACK]):
-                results.append(_best(rows) == STACK)
+            gaps = [
+                published.above(STACK, other, task=task, size=size)
+                for other in METHODS
+                if other not in ("SBI", STACK)
+            ]
+            known = [gap for gap in gaps if gap is not None]
+            if known:
+                results.append(min(known) >= 0)
     if not results:
         return []
     return [

@@ -287,20 +287,38 @@ def test_of_several_complete_repetitions_mean_and_spread_are_shown(
     assert "cs 3/3" in text
 
 
-def test_an_incomplete_repetition_does_not_enter_the_means(
+def test_means_over_fewer_repetitions_than_others_say_so_and_do_not_compete(
     folder: Path, docs_page: Path
 ) -> None:
     def scores(cell: Cell) -> tuple[float, float] | None:
-        late = cell.repetition == 1 and cell.method == "RoPE"
-        if cell.task != "cs" or (cell.repetition and not late):
+        often = cell.method in ("RoPE", "NPE")
+        if cell.task != "cs" or cell.repetition == 2 or (cell.repetition and not often):
             return None
-        return (9.0 if late else 1.0 + (cell.method == "NPE")), 0.0
+        # On the first repetition's data RoPE has 1, and the prior a little more.
+        return {"RoPE": 1.0 + cell.repetition, "prior": 1.2}.get(cell.method, 0.0), 0.0
 
     publish(folder, "main", scores)
     text = write(folder, docs_page)
-    assert line(text, "RoPE") == ["1.00"]
-    assert line(text, "repetitions") == ["1"]
+    assert line(text, "repetitions") == ["2"]
+    assert line(text, "RoPE") == ["**1.50 ± 0.71**"]
+    assert line(text, "prior") == ["1.20 [1]"]
     assert "cs 1/3" in text
+    # In the repetition that both were run in, the prior is above RoPE.
+    assert "below the prior in 4 of 4" in text
+
+
+def test_a_method_that_failed_in_a_repetition_does_not_compete(
+    folder: Path, docs_page: Path
+) -> None:
+    def scores(cell: Cell) -> tuple[float, float] | str | None:
+        if cell.task != "cs" or cell.method not in ("RoPE", "NPE"):
+            return None
+        return "failed" if (cell.method, cell.repetition) == ("NPE", 1) else (0.5, 0.0)
+
+    publish(folder, "main", scores)
+    text = write(folder, docs_page)
+    assert line(text, "NPE") == ["0.50 ± 0.00 (1 of 3 failed)"]
+    assert line(text, "RoPE") == ["**0.50 ± 0.00**"]
 
 
 def test_what_failed_what_is_infinite_and_what_was_not_run_is_shown(
