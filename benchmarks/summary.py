@@ -130,10 +130,10 @@ def _block(published: Published, link: str) -> list[str]:
     verdicts = ", ".join(f"{counts[what]} {what}" for what in VERDICTS if counts[what])
     return [
         f"LPP with {SIZE} calibration pairs, in standard deviations of the prior: the",
-        "mean ± the standard deviation over repetitions. A method that was run in fewer",
-        "of them has their number in square brackets. Bold is the best of the others.",
-        f"RoPE and OT-only compete in one setting, fixed beforehand (gamma {FIXED.gamma:g}",
-        f"in units of the median distance, tau {FIXED.tau:g}).",
+        "mean ± the standard deviation over repetitions. A method that was run in",
+        "fewer of them has their number in square brackets. Bold is the best of the",
+        "others. RoPE and OT-only compete in one setting, fixed beforehand: gamma",
+        f"{FIXED.gamma:g} in units of the median distance, tau {FIXED.tau:g}.",
         *("", *_main(published, lpp_text, with_settings=("RoPE",)), ""),
         *(_in_words(_compared(published)), ""),
         *_stack_in_words(published),
