@@ -155,6 +155,8 @@ def test_methods_of_this_package_are_no_rivals_of_the_stack(
     text = write(folder, docs_page)
     assert "best other beyond the interval over repetitions: 0 of 3" in text
     assert "best of those that are not of this package: 3 of 3" in text
+    assert "mean |ACAUC| of 0.020" in text
+    assert "(aimed at 0.03; SBI has 0.020 on these tasks)" in text
 
 
 def test_a_stack_below_npe_or_another_method_is_counted_and_named(
