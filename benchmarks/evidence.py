@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from scipy.stats import t as student
 
 from benchmarks import figures
-from benchmarks.methods import COUPLED_STACK, METHODS, STACK, methods_where
+from benchmarks.methods import METHODS, STACK, STACKS, methods_where
 from benchmarks.published import FIXED, LETTERS, MISSING, Published, Setting, table
 from benchmarks.table import Table
 
@@ -33,7 +33,7 @@ SHOWN = (
     STACK,
 )
 # They are no methods, or need what others do not.
-NO_RIVALS = ("SBI", STACK, COUPLED_STACK)
+NO_RIVALS = ("SBI", *STACKS)
 # They are of this package alone, and candidates of the stack.
 OURS = methods_where(lambda entry: entry.ours)
 # The goals, fixed beforehand: with up to so many pairs, in nats and ACAUC.
@@ -295,7 +295,7 @@ def _ranks(rows: pd.DataFrame, compared: Sequence[Comparison]) -> pd.DataFrame |
                 (rows["task"] == one.task)
                 & (rows["repetition"] == repetition)
                 & rows["n_calibration"].isin([0, one.size])
-                & ~rows["method"].isin(["SBI", COUPLED_STACK])
+                & ((rows["method"] == STACK) | ~rows["method"].isin(NO_RIVALS))
             ]
             scores = there.set_index("method")["lpp_z"]
             cells[one.task, (one.size, int(repetition))] = scores

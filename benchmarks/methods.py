@@ -33,7 +33,16 @@ from sbi_rope.discrepancy.correction import Space
 if TYPE_CHECKING:
     from benchmarks.cases import Case
 
-__all__ = ["COUPLED_STACK", "METHODS", "STACK", "Entry", "append_data", "methods_where"]
+__all__ = [
+    "COUPLED_STACK",
+    "METHODS",
+    "RVNP_STACK",
+    "STACK",
+    "STACKS",
+    "Entry",
+    "append_data",
+    "methods_where",
+]
 
 # Tasks whose observations are statistics: NNPE's noise is on them, not on h(x).
 STATISTICS = ("cs", "sir", "linear_gaussian")
@@ -54,8 +63,10 @@ LOOK_UP = (
     "OT-only",
     "tuning-only",
 )
-# Of any observation, and of the test set as a batch, with couplings.
-STACK, COUPLED_STACK = "stack", "stack of a batch"
+# Of the pairs alone; with RVNP, which learns from the test set without its labels; and
+# with couplings of the test set besides.
+STACK, RVNP_STACK, COUPLED_STACK = "stack", "stack with RVNP", "stack of a batch"
+STACKS = (STACK, RVNP_STACK, COUPLED_STACK)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -314,5 +325,6 @@ METHODS: dict[str, Entry] = {
     ),
     "RoPE": Entry(style=("#0072B2", "-", "o"), pairs=True, couples=True),
     STACK: Entry(style=("black", "-", "*"), pairs=True),
+    RVNP_STACK: Entry(style=("black", ":", "*"), pairs=True),
     COUPLED_STACK: Entry(style=("black", "--", "*"), pairs=True),
 }

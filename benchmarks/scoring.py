@@ -11,11 +11,18 @@ import torch
 
 from benchmarks.cases import Case, Pairs
 from benchmarks.cells import Cell
-from benchmarks.methods import COUPLED_STACK, METHODS, STACK, append_data
+from benchmarks.methods import (
+    COUPLED_STACK,
+    METHODS,
+    RVNP_STACK,
+    STACK,
+    STACKS,
+    append_data,
+)
 from sbi_rope import RoPE, SinkhornCoupler
 from sbi_rope.baselines import ReferenceNPE
 from sbi_rope.metrics import Evaluation, evaluate
-from sbi_rope.stacking import StackedPosterior, stack
+from sbi_rope.stacking import StackedPosterior, default_candidates, stack
 from sbi_rope.sweep import sweep
 
 __all__ = ["Failure", "Score", "evaluate_on", "rope_of", "scores"]
@@ -79,7 +86,7 @@ def scores(
     if METHODS[method].couples:
         yield from _coupled_scores(case, cells, group)
     else:
-        score = _stack_score if method in (STACK, COUPLED_STACK) else _score
+        score = _stack_score if method in STACKS else _score
         for cell in cells:
             yield score(case, cell)
 
@@ -175,11 +182,19 @@ def rope_of(case: Case) -> RoPE:
 
 
 def _stack_score(case: Case, cell: Cell) -> Score:
-    batch = case.test_set[1] if cell.method == COUPLED_STACK else None
+    x_o = case.test_set[1]
     count = _Count(case)
     start = time.perf_counter()
     rope = rope_of(case).append_calibration(*case.calibration)
-    posterior = stack(rope, batch, seed=case.seed, show_progress_bars=False)
+    posterior = stack(
+        rope,
+        x_o if cell.method == COUPLED_STACK else None,
+        candidates=(
+            default_candidates(rope, x_o) if cell.method == RVNP_STACK else None
+        ),
+        seed=case.seed,
+        show_progress_bars=False,
+    )
     train_seconds = time.perf_counter() - start
     score = _scored(
         case,

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.cells import Cell
-from benchmarks.methods import COUPLED_STACK, STACK
+from benchmarks.methods import STACK, STACKS
 from benchmarks.table import Table, markdown
 
 __all__ = ["Comparison", "comparisons", "stacking_lines"]
@@ -71,7 +71,7 @@ def comparisons(table: Table) -> list[Comparison]:
     found = []
     for cell, row in table.rows.iterrows():
         arrays = table.arrays.get(cell, {})
-        if cell.method not in (STACK, COUPLED_STACK) or "candidates" not in arrays:
+        if cell.method not in STACKS or "candidates" not in arrays:
             continue
         names = [str(name) for name in arrays["candidates"]]
         found.append(
@@ -91,7 +91,8 @@ def stacking_lines(table: Table) -> list[str]:
     found = comparisons(table)
     if not found:
         return []
-    heads = ("task", "variant", "pairs", *BASICS, "best", "", "picked", "**stack**")
+    heads = ("task", "variant", "method", "pairs")
+    heads += (*BASICS, "best", "", "picked", "**stack**")
     heads += ("stack - best", "held out", "ACAUC", "ECE", "s")
     lines = ["## The stack against its candidates", "", EXPLANATION]
     lines += markdown(heads, map(_entries, found))
@@ -104,6 +105,7 @@ def _entries(one: Comparison) -> list[str]:
     return [
         one.cell.task,
         one.cell.variant,
+        one.cell.method,
         str(one.cell.n_calibration),
         *(f"{one.test[name]:.2f}" if name in one.test else "" for name in BASICS),
         f"{one.test[one.best]:.2f}",

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import pandas as pd
 
 from benchmarks.evidence import evidence_lines
-from benchmarks.methods import METHODS, STACK
+from benchmarks.methods import METHODS, STACK, STACKS
 from benchmarks.other_suites import other_suites
 from benchmarks.prices import Prices
 from benchmarks.published import (
@@ -283,8 +283,8 @@ def _compared(published: Published) -> list[Compared]:
             gaps = {
                 other: published.above("RoPE", other, task=task, size=size)
                 for other in METHODS
-                # The stack contains RoPE.
-                if other not in ("RoPE", "SBI", STACK)
+                # A stack may contain RoPE.
+                if other not in ("RoPE", "SBI", *STACKS)
             }
             known = {name: value for name, value in gaps.items() if value is not None}
             if lpp is not None and known:
@@ -317,7 +317,7 @@ def _stack_in_words(published: Published) -> list[str]:
             gaps = [
                 published.above(STACK, other, task=task, size=size)
                 for other in METHODS
-                if other not in ("SBI", STACK)
+                if other not in ("SBI", *STACKS)
             ]
             known = [gap for gap in gaps if gap is not None]
             if known:

@@ -118,6 +118,13 @@ def npe_posterior(
         return npe.build_posterior()
 
 
+class Filled(nn.Module):
+    """Puts zeros where numbers are missing."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x.nan_to_num(0.0)
+
+
 def simulate_trials(theta: Tensor) -> Tensor:
     """Up to four noisy readings of theta, (n, 4, 2); those that are missing are NaN."""
     trials = theta[:, None] + 0.3 * torch.randn(len(theta), 4, 2)

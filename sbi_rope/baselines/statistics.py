@@ -24,6 +24,7 @@ from sbi_rope.trainers.training import Training, train_network
 __all__ = [
     "NoiseOn",
     "SoftClip",
+    "check_statistics",
     "fit_marginal",
     "frozen_statistics",
     "split_at_statistics",
@@ -73,6 +74,25 @@ def frozen_statistics(
     )
 
 
+def check_statistics(name: str, statistics: Tensor) -> None:
+    """Check that statistics can have errors, which missing ones (NaN) cannot.
+
+    Args:
+        name: What x is called, of which these are the statistics.
+        statistics: Shape ``(n, l)``.
+
+    Raises:
+        InvalidInputError: If an entry is not finite.
+    """
+    rows = (~torch.isfinite(statistics)).flatten(1).any(dim=1)
+    if rows.any():
+        raise InvalidInputError(
+            f"Expected statistics of `{name}` without missing entries (NaN); those of "
+            f"{int(rows.sum())} of {len(rows)} have some. Use noise_on='embedding', "
+            "with an embedding net that reads missing entries."
+        )
+
+
 def standardisation_of_statistics(statistics: Tensor) -> Standardisation:
     """Return the map from statistics to standard deviations of simulated ones.
 
@@ -80,7 +100,8 @@ def standardisation_of_statistics(statistics: Tensor) -> Standardisation:
         statistics: Statistics of simulations, shape ``(n, l)``.
 
     Raises:
-        InvalidInputError: If they are no vectors, or all of them are constant.
+        InvalidInputError: If they are no vectors, not finite, or all of them are
+            constant.
     """
     if statistics.ndim != 2:
         raise InvalidInputError(
@@ -88,6 +109,7 @@ def standardisation_of_statistics(statistics: Tensor) -> Standardisation:
             f"noise_on='input'; got x of shape {tuple(statistics.shape)}. Use "
             "noise_on='embedding'."
         )
+    check_statistics("x", statistics)
     standardisation = Standardisation(statistics)
     if not standardisation.varies.any():
         raise InvalidInputError(

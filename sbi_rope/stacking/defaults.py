@@ -7,6 +7,7 @@ from typing import Any
 from torch import Tensor
 
 from sbi_rope._validation import check_instance, check_numbers
+from sbi_rope.errors import warn_user
 from sbi_rope.mixture import PriorPosterior
 from sbi_rope.rope import RoPE
 from sbi_rope.stacking.candidates import (
@@ -20,7 +21,11 @@ from sbi_rope.stacking.trained_candidates import (
     DiscrepancyCandidate,
     FinetunedCandidate,
 )
-from sbi_rope.stacking.unlabelled_candidates import RVNPCandidate
+from sbi_rope.stacking.unlabelled_candidates import (
+    MAX_STATISTICS,
+    MIN_OBSERVATIONS,
+    RVNPCandidate,
+)
 
 __all__ = ["default_candidates"]
 
@@ -39,15 +44,16 @@ def default_candidates(
     taus: Sequence[float] = TAUS,
     rehearsal: float | None = REHEARSAL,
 ) -> tuple[Candidate, ...]:
-    """Return the prior, NPE, fine-tuned NPE and the discrepancy models.
+    """Return the prior, NPE, fine-tuned NPE, discrepancy models, and RVNP with x_o.
 
     Args:
         rope: A RoPE with its calibration pairs. Candidates that these data do not
             allow or need are left out, as in :func:`stack`. None returns all.
-        x_o: Real observations without labels, shape ``(n_o, *event)``. They add RVNP,
-            which learns errors from them. With a rope, there must be a hundred of
-            them, and the errors are in x if it is a short vector and NPE has an
-            embedding net, in the embedding otherwise.
+        x_o: Real observations without labels, shape ``(n_o, *event)``, other than those
+            of the pairs. They add RVNP, which learns errors from them. With a rope, it
+            is left out if there are fewer than a hundred observations, or more than 20
+            statistics: these are x if it is a short vector and NPE has an embedding
+            net, and the embedding otherwise.
         couplings: Whether to add RoPE and OT-only over a grid of gamma and tau, and
             tuning-only. They are for the stack of a batch of observations.
         gammas: Values of gamma, in units of the median distance between simulated
@@ -63,7 +69,8 @@ def default_candidates(
 
     Raises:
         InvalidTypeError: If ``rope`` is not a RoPE.
-        InvalidInputError: If a gamma, a tau or the rehearsal is outside its range.
+        InvalidInputError: If a gamma, a tau or the rehearsal is outside its range, or,
+            with a rope, x_o has the wrong shape or device, is empty or not finite.
     """
     gammas, taus = check_numbers("gammas", gammas), check_numbers("taus", taus)
     amortised: tuple[AmortisedCandidate, ...] = (
@@ -76,14 +83,21 @@ def default_candidates(
         FinetunedCandidate(space="input"),
         FinetunedCandidate(space="tuned"),
     )
+    if rope is not None:
+        check_instance("rope", rope, RoPE)
+        x_o = None if x_o is None else rope.checked_observations(x_o)
     if x_o is not None:
         amortised += (RVNPCandidate(x_o), RVNPCandidate(x_o, space="input"))
     if rope is not None:
-        check_instance("rope", rope, RoPE)
-        if x_o is not None:
-            rope.checked_observations(x_o)
         bench = Workbench(rope, num_folds=NUM_FOLDS, seed=0, show_progress_bars=False)
         amortised = tuple(one for one in amortised if one.applies_to(bench))
+        with_rvnp = any(isinstance(one, RVNPCandidate) for one in amortised)
+        if x_o is not None and not couplings and not with_rvnp:
+            warn_user(
+                f"`x_o` adds no candidate: RVNP needs {MIN_OBSERVATIONS} observations, "
+                f"of which there are {len(x_o)}, and at most {MAX_STATISTICS} "
+                "statistics, some of which differ between simulations."
+            )
     if not couplings:
         return amortised
     rehearsed = [] if rehearsal is None else [{"rehearsal": rehearsal}]

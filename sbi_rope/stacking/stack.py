@@ -52,9 +52,8 @@ def stack(
     average has a higher expected score, for observations like those of the pairs. The
     version trained on all pairs is not scored.
 
-    Without ``x_o`` no candidate depends on a batch, and the stack answers any
-    observation. With ``x_o``, RoPE and OT-only at many values of gamma and tau take
-    part, and the stack belongs to that batch.
+    Without ``x_o`` the stack answers any observation. With ``x_o``, RoPE and OT-only at
+    many values of gamma and tau take part, and the stack is for that batch only.
 
     The weights, the scores and the calibration in the report hold for observations like
     those of the pairs. With ``x_o`` the two are compared by an energy test of their
@@ -71,8 +70,9 @@ def stack(
             :func:`~sbi_rope.stacking.default_candidates`: the prior, NPE, fine-tuned
             NPE and discrepancy models, and with ``x_o`` also tuning-only, RoPE, RoPE
             tuned with rehearsal and OT-only at four gammas and three taus, and RVNP if
-            there are a hundred observations. For a stack that has learned from
-            ``x_o`` and answers any x, pass ``default_candidates(rope, x_o)``.
+            there are a hundred observations of at most 20 statistics. For a stack that
+            has learned from ``x_o`` and answers any x, pass
+            ``default_candidates(rope, x_o)`` here and no ``x_o``.
         num_folds: The number of folds, 5 if None, and at most the number of different
             parameters. Pairs with the same parameters are in the same fold.
         num_simulations: The number of simulations to couple with, as in

@@ -43,6 +43,7 @@ from sbi_rope.stacking.trained_candidates import (
     DiscrepancyCandidate,
     FinetunedCandidate,
 )
+from sbi_rope.stacking.unlabelled_candidates import RVNPCandidate
 from sbi_rope.stacking.versions import Versions, train_version
 
 __all__ = ["StackTrainer"]
@@ -122,7 +123,9 @@ class StackTrainer:
         corrected = [
             candidate
             for candidate in chosen
-            if isinstance(candidate, DiscrepancyCandidate | FinetunedCandidate)
+            if isinstance(
+                candidate, DiscrepancyCandidate | FinetunedCandidate | RVNPCandidate
+            )
         ]
         if any(candidate.space == "input" for candidate in corrected):
             # Raises for images and series, before any candidate is trained.
@@ -136,8 +139,9 @@ class StackTrainer:
         if not coupled and self.x_o is not None:
             raise InvalidInputError(
                 "Expected couplings among the candidates with `x_o`; got none, so that "
-                "nothing depends on the batch. Leave `x_o` out, or add couplings, "
-                "such as those of `default_candidates(couplings=True)`."
+                "the stack is for any observation. Leave `x_o` out of this call, also "
+                "if RVNP learns from it, or add couplings, such as those of "
+                "`default_candidates(couplings=True)`."
             )
         return chosen
 

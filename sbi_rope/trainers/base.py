@@ -86,10 +86,11 @@ class Method(ABC):
         self._device = usable_device(device)
         if hasattr(self._prior, "to"):
             self._prior.to(self._device)  # type: ignore[attr-defined]
-        elif self._device.type != "cpu":
+        elif (of_prior := _device_of_draws(self._prior)) != self._device:
             raise InvalidInputError(
-                f"Cannot move the prior to {device}: a {type(prior).__name__} has no "
-                "method `to`. Use a prior of sbi, such as BoxUniform."
+                f"Cannot move the prior from {of_prior} to {self._device}: a "
+                f"{type(prior).__name__} has no method `to`. Use a prior of sbi, such "
+                "as BoxUniform, or make the prior there."
             )
         self._data = Data(self._prior, self._device)
         self._npe = npe
@@ -323,3 +324,8 @@ class Method(ABC):
     def _untrained(self) -> "Self":
         self._posterior = self._history = None
         return self
+
+
+def _device_of_draws(prior: Distribution) -> torch.device:
+    with seeded(0):
+        return prior.sample((1,)).device

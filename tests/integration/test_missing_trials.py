@@ -189,16 +189,9 @@ def test_the_number_of_trials_is_mended_with_nan() -> None:
         rope().checked_observations([x[0, :2].tolist(), x[1].tolist()])  # type: ignore[arg-type]
 
 
-class Filled(nn.Module):
-    """Puts zeros where numbers are missing."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        return x.nan_to_num(0.0)
-
-
 def test_missing_numbers_of_a_vector_are_embedded_but_not_corrected() -> None:
     npe = problems.npe_posterior()
-    net = nn.Sequential(Filled(), *embedding_of(npe.posterior_estimator))
+    net = nn.Sequential(problems.Filled(), *embedding_of(npe.posterior_estimator))
     estimator = with_embedding(npe.posterior_estimator, net)
     rope = RoPE(posterior_from(npe, estimator), simulator=problems.simulate)
     theta = problems.box(2).sample((12,))

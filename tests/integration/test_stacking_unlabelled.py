@@ -9,20 +9,29 @@ from unittest.mock import patch
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.distributions import Independent, Normal
 
 from sbi_rope import RoPE, StackedPosterior, load, save, stack
 from sbi_rope._random import seeded
-from sbi_rope._sbi import estimator_of
+from sbi_rope._sbi import embedding_of, estimator_of, posterior_from, with_embedding
 from sbi_rope.baselines import RVNP, Training
 from sbi_rope.baselines.rvnp.likelihood import fit_surrogate
-from sbi_rope.errors import InvalidInputError
+from sbi_rope.errors import InvalidInputError, RoPEWarning
 from sbi_rope.mixture import MixtureEstimator
 from sbi_rope.stacking import RVNPCandidate, default_candidates
 from sbi_rope.stacking.folds import Fold, Workbench
-from tests import gaussian
-from tests.stacks import FITTED, NPE, PRIOR, observed, rope_of, stacked
+from tests import gaussian, problems
+from tests.stacks import (
+    FITTED,
+    NPE,
+    NUM_PAIRS,
+    PRIOR,
+    observed,
+    problem,
+    rope_of,
+    stacked,
+)
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::sbi_rope.errors.RoPEWarning", "ignore:Maximum number of epochs"
@@ -137,7 +146,8 @@ def test_a_batch_of_a_hundred_observations_brings_it_into_the_default_stack() ->
     assert [candidate.name for candidate in default_candidates(rope, x_o)] == [
         *(*plain, "RVNP (input)"),
     ]
-    assert [c.name for c in default_candidates(rope, x_o[:99])] == plain
+    with pytest.warns(RoPEWarning, match="adds no candidate"):
+        assert [c.name for c in default_candidates(rope, x_o[:99])] == plain
     # Without an embedding net the embedding is the input.
     flat = rope_of(embedding="none")
     names = [candidate.name for candidate in default_candidates(flat, x_o)]
@@ -146,6 +156,87 @@ def test_a_batch_of_a_hundred_observations_brings_it_into_the_default_stack() ->
     with few:
         of_batch = stacked(rope, x_o, candidates=None)
     assert "RVNP (input)" in of_batch.candidate_weights
+
+
+def test_what_would_take_hours_or_cannot_be_learned_is_left_out_with_a_warning() -> (
+    None
+):
+    rope, x_o = rope_of(), observed(120)
+    number = len(default_candidates(rope))
+    room = "sbi_rope.stacking.unlabelled_candidates."
+    with (
+        patch(room + "MAX_STATISTICS", 2),
+        pytest.warns(RoPEWarning, match="adds no candidate"),
+    ):
+        assert len(default_candidates(rope, x_o)) == number
+    # An embedding that is the same in all simulations.
+    theta = problems.box(2).sample((60,))
+    same = RoPE(
+        problems.npe_posterior("mdn", "none"), simulations=(theta, torch.ones(60, 3))
+    )
+    same.append_calibration(*problem(NUM_PAIRS, seed=1))
+    number = len(default_candidates(same))
+    with pytest.warns(RoPEWarning, match="adds no candidate"):
+        assert len(default_candidates(same, x_o)) == number
+
+
+def test_it_learns_from_a_part_of_many_observations() -> None:
+    learned = []
+    append = RVNP.append_observations
+
+    def kept(self: RVNP, x_o: Tensor) -> RVNP:
+        learned.append(x_o)
+        return append(self, x_o)  # type: ignore[return-value]
+
+    with (
+        patch.object(RVNP, "append_observations", kept),
+        patch("sbi_rope.stacking.unlabelled_candidates.MAX_OBSERVATIONS", 50),
+    ):
+        made = stacked(rope_of(), candidates=with_rvnp())
+    (part,) = learned
+    rows = (part[:, None] == observed(NUM_OBSERVATIONS)).all(dim=2)
+    assert len(part) == 50
+    assert rows.any(dim=1).all()
+    assert len(rows.int().argmax(dim=1).unique()) == 50
+    assert made.log_prob(torch.zeros(1, 2), x=other_x()[0]).isfinite()
+
+
+def test_missing_numbers_of_observations_put_the_errors_in_the_embedding() -> None:
+    npe = problems.npe_posterior()
+    net = nn.Sequential(problems.Filled(), *embedding_of(npe.posterior_estimator))
+    estimator = with_embedding(npe.posterior_estimator, net)
+    reads_missing = posterior_from(npe, estimator)
+    rope = RoPE(reads_missing, simulator=problems.simulate)
+    rope.append_calibration(*problem(NUM_PAIRS, seed=1))
+    x_o = observed(120)
+    assert default_candidates(rope, x_o)[-1].name == "RVNP (input)"
+    x_o[3, 1] = torch.nan
+    assert default_candidates(rope, x_o)[-1].name == "RVNP"
+    method = RVNP.from_posterior(reads_missing, noise_on="input")
+    theta = problems.box(2).sample((50,))
+    method.append_simulations(theta, problems.simulate(theta)).append_observations(x_o)
+    with pytest.raises(InvalidInputError, match=r"`x_o` without missing.*1 of 120"):
+        method.train(show_progress_bars=False)
+
+
+def test_errors_in_images_are_refused_before_anything_is_simulated() -> None:
+    calls = []
+
+    def simulator(theta: Tensor) -> Tensor:
+        calls.append(len(theta))
+        return problems.simulate_image(theta)
+
+    theta, _ = problem(NUM_PAIRS, seed=1)
+    images = problems.simulate_image(theta)
+    rope = RoPE(problems.npe_posterior("maf", "cnn"), simulator=simulator)
+    rope.append_calibration(theta, images)
+    calls.clear()
+    with pytest.raises(InvalidInputError, match="space='input'"):
+        stacked(rope, candidates=[NPE, RVNPCandidate(images, space="input")])
+    assert not calls
+    # The embedding of images is fine, for a stack and for what is asked in float64.
+    made = stacked(rope, candidates=[NPE, RVNPCandidate(images.double())])
+    assert "RVNP" in made.candidate_weights
 
 
 def _few(**options: Any) -> tuple[Any, ...]:

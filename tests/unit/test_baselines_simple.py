@@ -567,3 +567,15 @@ class TestBase:
         prior.base_dist.high.fill_(9.0)
         posterior = method.train().build_posterior()
         assert posterior.sample((100,)).max() <= 1
+
+
+def test_a_prior_that_cannot_be_moved_may_already_be_on_the_device() -> None:
+    def normal(device: str) -> Distribution:
+        zero, one = torch.zeros(2, device=device), torch.ones(2, device=device)
+        return Independent(Normal(zero, one, validate_args=False), 1)
+
+    # "meta" stands in for a GPU.
+    PlainNPE(normal("meta"), device="meta")
+    PlainNPE(normal("cpu"))
+    with pytest.raises(InvalidInputError, match="from cpu to meta"):
+        PlainNPE(normal("cpu"), device="meta")

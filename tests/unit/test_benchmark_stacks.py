@@ -59,13 +59,14 @@ def test_a_row_shows_what_was_scored() -> None:
         if line.startswith("| pendulum |") and "**" in line
     )
     entries = [entry.strip() for entry in row.strip("|").split("|")]
-    # Task, variant, pairs, prior, NPE, two that were no candidates, best and its name.
-    assert entries[:9] == [
-        *("pendulum", "", "10", "-3.00", "-9.00", "", "", "-1.50"),
+    # Task, variant, method, pairs, prior, NPE, two that were no candidates, best and
+    # its name.
+    assert entries[:10] == [
+        *("pendulum", "", "stack", "10", "-3.00", "-9.00", "", "", "-1.50"),
         REHEARSED,
     ]
-    assert entries[9:12] == ["-2.00", "**-1.20**", "+0.30"]
-    assert entries[12].startswith("-1.30")
+    assert entries[10:13] == ["-2.00", "**-1.20**", "+0.30"]
+    assert entries[13].startswith("-1.30")
     assert entries[-1] == "3"
 
 

@@ -24,6 +24,7 @@ from sbi_rope.baselines.rvnp.likelihood import ErrorModel, fit_surrogate
 from sbi_rope.baselines.statistics import (
     NoiseOn,
     SoftClip,
+    check_statistics,
     split_at_statistics,
     standardisation_of_statistics,
     with_clip,
@@ -126,7 +127,7 @@ class RVNP(Method):
     Raises:
         InvalidTypeError: If an argument has the wrong type.
         InvalidInputError: If sbi knows no estimator of that name, an option is outside
-            its range, or, in ``train``, no statistic varies.
+            its range, or, in ``train``, no statistic varies or one is missing (NaN).
         UnsupportedPosteriorError: In ``train``, if the estimator has no density.
 
     Example:
@@ -189,8 +190,9 @@ class RVNP(Method):
         estimator = copy.deepcopy(estimator_of(npe)).requires_grad_()
         net, _ = split_at_statistics(estimator, self.noise_on)
         theta, x = self._data.simulations
-        simulated = embed(net, x)
+        simulated, observed = embed(net, x), embed(net, self._data.observations)
         standardise = standardisation_of_statistics(simulated)
+        check_statistics("x_o", observed)
         clip = SoftClip(simulated)
         density, estimator = with_clip(estimator, clip, self.noise_on)
         s = standardise(simulated)
@@ -207,7 +209,6 @@ class RVNP(Method):
             depends_on_theta=self.depends_on_theta,
         )
         bound = Bound(density, errors, surrogate, self._prior, self.num_draws)
-        observed = embed(net, self._data.observations)
         history = self._train(
             bound,
             observed,
