@@ -211,6 +211,36 @@ def test_columns_that_share_a_unit_do_not_count_those_that_never_vary() -> None:
     assert Standardise(torch.ones(5, 3), shared=True).std.tolist() == [1.0] * 3
 
 
+@pytest.mark.parametrize("space", ["input", "embedding"])
+def test_fields_see_observations_in_their_own_unit_however_far_they_are(
+    space: str,
+) -> None:
+    torch.manual_seed(0)
+    npe = problems.npe_posterior("mdn", "none", dim=1)
+    theta = problems.box(1).sample((40,))
+    x = 30.0 + 7.0 * problems.simulate(theta)
+    for count in (40, 1):
+        method = FMCPE.from_posterior(
+            npe,
+            simulator=problems.simulate,
+            space=space,  # type: ignore[arg-type]
+            num_draws=3,
+            training=Training(max_num_epochs=1),
+        )
+        method.append_calibration(theta[:count], x[:count])
+        estimator = method.train(**QUIET).build_posterior().posterior_estimator
+        fields = [m for m in estimator.modules() if isinstance(m, VelocityField)]
+        assert len(fields) == 2
+        for field in fields:
+            seen = field.condition(x)
+            if count == 1:  # in units of simulations, the only ones there are
+                assert seen.isfinite().all()
+                assert seen.abs().max() > 10
+                continue
+            assert torch.allclose(seen.mean(dim=0), torch.zeros(3), atol=1e-3)
+            assert torch.allclose(seen.std(dim=0), torch.ones(3), atol=1e-3)
+
+
 def test_the_net_behind_the_condition_is_not_trained_on_the_side() -> None:
     """BatchNorm would follow the observations, and dropout would be random."""
     torch.manual_seed(0)

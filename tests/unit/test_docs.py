@@ -56,6 +56,11 @@ def test_links_between_pages_lead_to_files_and_headings_that_exist(page: Path) -
     assert broken_links(page) == []
 
 
+def test_no_page_holds_the_place_of_something_that_is_still_to_come() -> None:
+    places = re.compile(r"@@|\b(TODO|TBD|FIXME|XXX)\b")
+    assert [str(page) for page in PAGES if places.search(prose(page))] == []
+
+
 def test_a_link_to_a_file_or_a_heading_that_is_not_there_is_found(
     tmp_path: Path,
 ) -> None:

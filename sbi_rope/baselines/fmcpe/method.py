@@ -93,9 +93,13 @@ class FMCPE(Method):
 
     Where this differs from the original code:
 
-    - The density is an average over K = 100 simulations. With K = 1, as published, it
-      is too small on average, because the logarithm of an average is larger than the
-      average of logarithms.
+    - The density is an average over K = 100 simulations. With K = 1 it is too small on
+      average, because the logarithm of an average is larger than the average of
+      logarithms. The published code has no density.
+    - Simulations are in standard deviations of all simulations at the calibration
+      parameters, and parameters in those of the prior. The original takes those of one
+      simulation for each pair, and of the labels.
+    - Times are uniform. The original draws later ones more often in one of its tasks.
     - Simulations at the calibration parameters are made once, 100 for each pair, and
       each batch chooses among them, instead of new ones for each batch.
     - Of all epochs the best on the held-out pairs is kept, the start included. Fields
@@ -199,11 +203,16 @@ class FMCPE(Method):
         warn_of_far_entries("x", x, h)
         statistics = nn.Identity() if self.space == "input" else h
         bank = self._bank(statistics, show_progress_bars=show_progress_bars)
-        unit = Standardise(bank.flatten(0, 1), shared=bank.shape[-1] > MAX_SUMMARIES)
+        share = bank.shape[-1] > MAX_SUMMARIES
+        unit = Standardise(bank.flatten(0, 1), shared=share)
+        # Real observations may be far from simulations, so that they have a unit of
+        # their own where the fields see them. One observation has none.
+        observed = embed(statistics, x).flatten(1)
+        seen_in = Standardise(observed, shared=share) if len(x) > 1 else unit
         to_simulations = ToSimulations(
             statistics,
             unit,
-            self._field(x, unit, h, size=bank.shape[-1]),
+            self._field(x, seen_in, h, size=bank.shape[-1]),
             h if self.space == "input" else nn.Identity(),
             event_shape=x.shape[1:],
             noise=self.noise,
@@ -211,7 +220,7 @@ class FMCPE(Method):
         ).to(self._device)
         base = MixtureEstimator([Part(density, to_simulations)], [1.0])
         pushed = PushedForward(
-            base, self._prior, self._field(x, unit, h, size=theta.shape[1])
+            base, self._prior, self._field(x, seen_in, h, size=theta.shape[1])
         ).to(self._device)
         history = self._train(
             pushed, to_simulations, density, bank, show_progress_bars=show_progress_bars
