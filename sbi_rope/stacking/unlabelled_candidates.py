@@ -16,9 +16,8 @@ __all__ = ["RVNPCandidate"]
 
 # With fewer observations, or with more statistics, the default stack does without it.
 # One of thousands of steps takes .05 s with 6 statistics, .4 s with 20 and 3 s with 50.
-# All three numbers are fixed beforehand.
 MIN_OBSERVATIONS, MAX_STATISTICS = 100, 20
-# Training takes longer with every observation, and errors are known well from these.
+# Training takes longer with every observation. None of these was tuned.
 MAX_OBSERVATIONS = 1000
 
 
@@ -32,8 +31,8 @@ class RVNPCandidate(AmortisedCandidate):
     Args:
         x_o: Real observations, shape ``(n_o, *event)``. The stack may be asked about
             these or about others. The observations of the calibration pairs should
-            not be among them, so that the scores are those of new observations. Of
-            more than 1000, so many are drawn.
+            not be among them, so that the scores are those of new observations. If
+            there are more than 1000, a thousand of them are drawn.
         space: What the errors are in: the ``"embedding"`` h(x), or the ``"input"`` x,
             whose shape must be ``(l,)`` then. The default stack has the latter if x
             is a short vector and NPE has an embedding net. Training takes minutes
