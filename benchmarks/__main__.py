@@ -147,8 +147,7 @@ def _run(args: argparse.Namespace) -> int:
     path = write_report(suite, table, folder)
     print(f"Written: {path}")
     unfinished = 0
-    for cell in cells:
-        status = table.status(cell)
+    for cell, status in zip(cells, table.statuses(cells), strict=True):
         if status == "not run":
             print(f"no result: {cell}")
         elif status == "failed":
@@ -185,7 +184,7 @@ def _status(args: argparse.Namespace) -> int:
     counts = "".join(f"{what:>10}" for what in ("cells", *COUNTED))
     print(f"{'suite':<14}{counts}  hours of a core")
     for suite in suites:
-        statuses = [table.status(cell) for cell in suite.cells]
+        statuses = table.statuses(suite.cells)
         numbers = len(statuses), *(statuses.count(what) for what in COUNTED)
         counts = "".join(f"{number:>10}" for number in numbers)
         print(f"{suite.name:<14}{counts}  {prices.of(table.not_run(suite))}")

@@ -151,7 +151,7 @@ def _overview(published: Published) -> list[str]:
             continue
         known = published.tables.get(name, Table.of({}, {}))
         there = set(known.rows.index)
-        statuses = [known.status(cell) for cell in suite.cells]
+        statuses = known.statuses(suite.cells)
         complete, stand_ins = [], []
         for where, runs in runs_of(suite).items():
             place = " ".join(where).strip()

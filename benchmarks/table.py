@@ -73,13 +73,15 @@ class Table(NamedTuple):
         """The rows that have scores, with numbers as numbers."""
         return self.rows[self.rows["status"] == "finished"].infer_objects()
 
-    def status(self, cell: Cell) -> str:
-        """Return "finished", "failed" or "not run"."""
-        return self.rows["status"].get(cell, "not run")
+    def statuses(self, cells: Iterable[Cell]) -> list[str]:
+        """Return "finished", "failed" or "not run" for each cell."""
+        known = self.rows["status"].to_dict()
+        return [known.get(cell, "not run") for cell in cells]
 
     def not_run(self, suite: Suite) -> list[Cell]:
         """Return the cells of a suite without a row."""
-        return [cell for cell in suite.cells if self.status(cell) == "not run"]
+        known = set(self.rows.index)
+        return [cell for cell in suite.cells if cell not in known]
 
 
 def write_table(suite: Suite, results: Results, folder: Path) -> Table:
@@ -100,7 +102,7 @@ def write_table(suite: Suite, results: Results, folder: Path) -> Table:
     }
     with write_atomically(folder / ARRAYS) as path, path.open("wb") as file:
         np.savez_compressed(file, **flat)  # type: ignore[arg-type]
-    statuses = [table.status(cell) for cell in suite.cells]
+    statuses = table.statuses(suite.cells)
     manifest = {
         "suite": suite.name,
         "cells": len(suite.cells),

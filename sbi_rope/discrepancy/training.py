@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from sbi_rope._progress import progress_bar
 from sbi_rope._random import seeded
 from sbi_rope._standardisation import Standardisation
-from sbi_rope._training import History
+from sbi_rope._training import History, adam
 from sbi_rope.discrepancy.posterior import DiscrepancyDraws
 
 __all__ = ["train_on_corrected"]
@@ -96,7 +96,8 @@ def _one_course(
     learning_rate: float,
     show_progress_bars: bool,  # noqa: FBT001
 ) -> list[float]:
-    optimizer = torch.optim.Adam(density.parameters(), lr=learning_rate)
+    parameters = list(density.parameters())
+    optimizer = adam(parameters, learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, num_steps)
     losses: list[float] = []
     bar = progress_bar(range(num_steps), show=show_progress_bars, desc="Correcting NPE")
@@ -105,8 +106,8 @@ def _one_course(
         loss = density.loss(theta, condition=corrected).mean()
         optimizer.zero_grad()
         loss.backward()
-        nn.utils.clip_grad_norm_(density.parameters(), CLIP_MAX_NORM)
-        for parameter in density.parameters():
+        nn.utils.clip_grad_norm_(parameters, CLIP_MAX_NORM)
+        for parameter in parameters:
             if parameter.grad is not None:  # a parameter may have no part in the loss
                 parameter.grad.nan_to_num_(0.0, 0.0, 0.0)
         optimizer.step()
