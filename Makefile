@@ -4,6 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 
 .PHONY: quickstart test test-slow test-latest-sbi lint types docs docs-links format clean
+.PHONY: examples example-quickstart example-tunnel example-tasks example-people
 
 quickstart: $(VENV)/.installed
 	$(BIN)/python examples/quickstart.py
@@ -31,11 +32,39 @@ types: $(VENV)/.installed
 # them with a package that has changed.
 docs: $(VENV)/.docs
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -m docs -n auto --dist worksteal
-	$(BIN)/sphinx-build -W --keep-going -b html docs docs/_build/html
+	OMP_NUM_THREADS=1 $(BIN)/sphinx-build -W --keep-going -j auto -b html \
+	    docs docs/_build/html
 
 # Asks for every address of other sites, and needs the network.
 docs-links: $(VENV)/.docs
 	$(BIN)/sphinx-build -b linkcheck docs docs/_build/linkcheck
+
+# In reduced size. Each uses one core, so that `make -j 2 examples` runs two at a time.
+OUT ?= results/examples
+DATA ?= ../shared/data/causal_chamber
+EXAMPLE := OMP_NUM_THREADS=1 $(BIN)/python examples
+
+examples: example-tunnel example-quickstart example-tasks example-people
+
+example-quickstart: $(VENV)/.installed
+	$(EXAMPLE)/quickstart.py --num-simulations 1000 --max-num-epochs 2 \
+	    --n-calibration 10 --n-test 50 --out $(OUT)/quickstart
+
+example-tunnel: $(VENV)/.installed
+ifneq ($(wildcard $(DATA)),)
+	$(EXAMPLE)/light_tunnel_sensors.py --root $(DATA) --num-simulations 2000 \
+	    --n-calibration 10 --n-test 50 --out $(OUT)/tunnel
+else
+	@echo "examples/light_tunnel_sensors.py: skipped, no $(DATA)"
+endif
+
+example-tasks: $(VENV)/.installed
+	$(EXAMPLE)/all_tasks.py --root $(DATA) --num-simulations 500 \
+	    --max-num-epochs 2 --n-calibration 10 --n-test 30 --out $(OUT)/all_tasks
+
+example-people: $(VENV)/.installed
+	$(EXAMPLE)/hemodynamics.py --rounds 2 --max-num-epochs 2 \
+	    --n-calibration 10 --n-test 30 --out $(OUT)/hemodynamics
 
 format: $(VENV)/.installed
 	$(BIN)/ruff check --fix .

@@ -2,6 +2,9 @@
 
 import argparse
 import csv
+import json
+import subprocess
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,11 +16,27 @@ from benchmarks.machine import describe_machine
 # Nothing of the package is imported here: `mixture.py` chooses later which version of
 # it is measured.
 
-__all__ = ["Options", "Row", "add_task", "begin", "kept_rows", "show"]
+__all__ = [
+    "BEFORE",
+    "Options",
+    "Row",
+    "add_task",
+    "begin",
+    "kept_rows",
+    "measured",
+    "show",
+    "versions",
+]
+
+ROOT = Path(__file__).resolve().parents[2]
 
 # Options of the command line, with what argparse is to know of them.
 Options = dict[str, Mapping[str, Any]]
 Row = Mapping[str, object]
+# Of experiments that compare two versions of the package.
+BEFORE: Options = {
+    "--before": {"type": Path, "help": "another checkout to measure too"}
+}
 
 
 def begin(
@@ -55,6 +74,33 @@ def add_task(options: Options, **task: Any) -> Options:
         "--out": {"type": Path, "default": Path("results/experiments")},
         **options,
     }
+
+
+def versions(before: Path | None) -> dict[str, Path]:
+    """Return the checkouts to measure, by the name of the version."""
+    earlier = {} if before is None else {"before": before.resolve()}
+    return earlier | {"now": ROOT}
+
+
+def measured(experiment: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what an experiment measures in a process of its own.
+
+    Args:
+        experiment: The name of its module. It is given the settings as JSON, and prints
+            what it has measured as JSON in its last line.
+        settings: What it needs to know. ``root`` is the checkout that it imports.
+    """
+    name = f"benchmarks.experiments.{experiment}"
+    done = subprocess.run(
+        [sys.executable, "-m", name, json.dumps(settings, default=str)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode:
+        raise RuntimeError(done.stderr)
+    return json.loads(done.stdout.splitlines()[-1])
 
 
 def kept_rows(

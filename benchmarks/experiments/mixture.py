@@ -12,7 +12,6 @@ compare within a run.
 import argparse
 import itertools
 import json
-import subprocess
 import sys
 import tempfile
 import time
@@ -28,11 +27,9 @@ from sbi.neural_nets import posterior_nn
 from sbi.utils import BoxUniform
 from torch import Tensor
 
-from benchmarks.experiments.common import Row, begin, show
+from benchmarks.experiments.common import BEFORE, Row, begin, measured, show, versions
 from benchmarks.machine import forget_peak, memory, peak_memory
 
-ROOT = Path(__file__).resolve().parents[2]
-NAME = "benchmarks.experiments.mixture"
 X_DIM = 10
 COLUMNS = {
     "version": "version",
@@ -87,15 +84,12 @@ OPTIONS = {
     "--gamma": {"type": float, "default": 0.5},
     "--tau": {"type": float, "default": 0.9},
     "--repeats": {"type": int, "default": 1},
-    "--before": {"type": Path, "help": "another checkout to measure too"},
+    **BEFORE,
 }
 
 
 def rows(args: argparse.Namespace) -> Iterator[Row]:
     """Yield one row for each dimension, version and repetition."""
-    versions = {"now": ROOT}
-    if args.before is not None:
-        versions = {"before": args.before.resolve(), **versions}
     print(
         f"{args.n_o} observations, {args.n_s} components, {args.num_samples} samples "
         f"each, gamma {args.gamma}, tau {args.tau}\n"
@@ -106,26 +100,12 @@ def rows(args: argparse.Namespace) -> Iterator[Row]:
             # Of sbi alone: it can be read whatever the version of this package.
             torch.save(trained_npe(estimator, dim), path)
             for _, (name, root) in itertools.product(
-                range(args.repeats), versions.items()
+                range(args.repeats), versions(args.before).items()
             ):
                 settings = vars(args) | {"theta_dim": dim, "estimator": estimator}
                 settings |= {"npe": path, "root": root, "version": name}
-                row = settings | measured(settings)
+                row = settings | measured("mixture", settings)
                 yield {column: row[key] for column, key in COLUMNS.items()}
-
-
-def measured(settings: dict[str, Any]) -> dict[str, Any]:
-    """Measure a cell in a process of its own."""
-    done = subprocess.run(
-        [sys.executable, "-m", NAME, json.dumps(settings, default=str)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if done.returncode:
-        raise RuntimeError(done.stderr)
-    return json.loads(done.stdout.splitlines()[-1])
 
 
 def measure(settings: dict[str, Any]) -> None:

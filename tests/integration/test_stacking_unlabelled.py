@@ -64,10 +64,10 @@ def with_rvnp(**options: Any) -> list[Any]:
 
 
 @functools.cache
-def the_stack() -> StackedPosterior:
+def the_stack(**options: Any) -> StackedPosterior:
     """Return a stack with RVNP. Tests share it and must not change it."""
     with torch.random.fork_rng():
-        return stacked(rope_of(), candidates=with_rvnp())
+        return stacked(rope_of(), candidates=with_rvnp(**options))
 
 
 def other_x() -> Tensor:
@@ -125,10 +125,11 @@ def test_it_is_trained_once() -> None:
     assert trained == [NUM_OBSERVATIONS]
 
 
+@pytest.mark.parametrize("options", [{}, {"space": "input"}], ids=str)
 def test_the_stack_answers_observations_it_has_not_seen_and_can_be_kept(
-    tmp_path: Path,
+    options: dict[str, str], tmp_path: Path
 ) -> None:
-    made, x = the_stack(), other_x()
+    made, x = the_stack(**options), other_x()
     assert made.report.family_weights["RVNP"] > 0
     theta = made.sample_batched((3,), x, show_progress_bars=False)
     expected = made.log_prob_batched(theta, x)
