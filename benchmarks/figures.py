@@ -28,6 +28,8 @@ MARKERS = {10: "o", 50: "s", 200: "^", 1000: "D"}
 MAX_TICKS = 5
 # More panels than this go to another row.
 MAX_COLUMNS = 9
+# Lines of a legend in an inch of height.
+LEGEND_LINES = 4.5
 # Calibration pairs behind calibration curves and corner plots, where there is a choice.
 SHOWN_PAIRS = 50
 # Methods in corner plots.
@@ -117,8 +119,20 @@ def curves(axis: str, rows: pd.DataFrame, *, max_columns: int = MAX_COLUMNS) -> 
             part.spines[["top", "right"]].set_visible(False)
     axes[0, 0].set_ylabel("LPP, in prior sd")
     axes[1, 0].set_ylabel("ACAUC (0 is calibrated)")
-    figure.legend(seen.values(), seen.keys(), loc="outside right center", frameon=False)
+    _add_legend(figure, seen)
     return figure
+
+
+def _add_legend(figure: Figure, seen: dict[str, Any]) -> None:
+    """Name all lines beside the panels, in as many columns as the height asks for."""
+    lines = LEGEND_LINES * figure.get_figheight()
+    figure.legend(
+        seen.values(),
+        seen.keys(),
+        loc="outside right center",
+        frameon=False,
+        ncols=math.ceil(len(seen) / lines),
+    )
 
 
 def _panel(
@@ -279,7 +293,7 @@ def _coverage(table: Table) -> Any:
         part.set_xlabel("credible level")
         part.spines[["top", "right"]].set_visible(False)
     axes[0].set_ylabel("share of true parameters inside")
-    figure.legend(seen.values(), seen.keys(), loc="outside right center", frameon=False)
+    _add_legend(figure, seen)
     return figure
 
 

@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from benchmarks.cells import Suite, load_suite
+from benchmarks.figures import curves
 from benchmarks.report import write_report
 from benchmarks.store import Results
 from benchmarks.summary import write_summary
@@ -179,6 +181,18 @@ def test_the_committed_tables_fit_their_arrays() -> None:
     assert NAMES
     for name in NAMES:
         assert len(read_table(load_suite(name), COMMITTED / name).rows)
+
+
+def test_the_legend_of_the_suite_with_the_most_methods_is_not_cut_off() -> None:
+    table = read_table(load_suite("main"), COMMITTED / "main")
+    figure = curves("n_calibration", table.finished)
+    FigureCanvasAgg(figure).draw()
+    (legend,) = figure.legends
+    assert len(legend.texts) > 25
+    drawn, whole = legend.get_window_extent(), figure.bbox
+    assert drawn.ymin >= whole.ymin
+    assert drawn.ymax <= whole.ymax
+    assert drawn.xmax <= whole.xmax
 
 
 @pytest.mark.slow
