@@ -13,8 +13,8 @@ import torch
 
 from benchmarks.machine import describe_machine
 
-# Nothing of the package is imported here: `mixture.py` chooses later which version of
-# it is measured.
+# Nothing of the package is imported here: `mixture` and `training` choose later which
+# version of it is measured.
 
 __all__ = [
     "BEFORE",
