@@ -144,17 +144,19 @@ def read_table(suite: Suite, folder: Path) -> Table:
 
 
 def restore_cells(table: Table, results: Results) -> int:
-    """Write the finished cells of a table as results that a run keeps.
+    """Write the cells of a table, finished or failed, as results that a run keeps.
 
-    Results that are there already are not replaced.
+    Results that are there already are not replaced. Finished cells whose arrays are not
+    in the table are left out, because a run could not make tables of them.
 
     Returns:
         The number of cells that were written.
     """
     written = 0
     for cell, row in table.rows.iterrows():
-        arrays = table.arrays[cell]
-        if row["status"] != "finished" or not arrays or results.read(cell):
+        arrays = table.arrays.get(cell, {})
+        incomplete = row["status"] == "finished" and not arrays
+        if incomplete or results.read(cell):
             continue
         results.write(cell, row.drop("suite").to_dict(), arrays)
         written += 1

@@ -13,7 +13,12 @@ from sbi_rope._standardisation import Standardisation
 from sbi_rope._training import History
 from sbi_rope.discrepancy.model import SMALLEST_NOISE, DiscrepancyModel
 from sbi_rope.discrepancy.posterior import Discrepancy
-from sbi_rope.discrepancy.training import train_on_corrected
+from sbi_rope.discrepancy.training import (
+    ONE,
+    UNTIL_SETTLED,
+    Courses,
+    train_on_corrected,
+)
 from sbi_rope.errors import InvalidInputError
 
 __all__ = [
@@ -169,6 +174,7 @@ def correct_npe(
     weights: Tensor | None = None,
     probabilities: Tensor | None = None,
     num_steps: int | None = None,
+    courses: Courses = UNTIL_SETTLED,
     learning_rate: float | None = None,
     show_progress_bars: bool = False,
 ) -> Correction:
@@ -185,8 +191,9 @@ def correct_npe(
         weights: How many pairs each pair counts as, shape ``(n_c,)``; one if None.
         probabilities: The probabilities with which simulations are drawn; None makes
             them equal.
-        num_steps: Gradient steps. If None, courses follow each other, whose length
-            depends on the space, until one changes almost nothing.
+        num_steps: Gradient steps of a single course. If None, courses follow each
+            other, whose length depends on the space.
+        courses: When another course follows, if ``num_steps`` is None.
         learning_rate: Learning rate of Adam; it depends on the space if None.
         show_progress_bars: Whether to show the loss during training.
 
@@ -211,7 +218,7 @@ def correct_npe(
         standardisation,
         probabilities=probabilities,
         num_steps=NUM_STEPS[space] if num_steps is None else num_steps,
-        until_settled=num_steps is None,
+        courses=courses if num_steps is None else ONE,
         learning_rate=(
             LEARNING_RATES[space] if learning_rate is None else learning_rate
         ),

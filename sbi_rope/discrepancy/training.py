@@ -1,6 +1,8 @@
 r"""Train a density on corrected simulations."""
 
+import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -12,15 +14,36 @@ from sbi_rope._standardisation import Standardisation
 from sbi_rope._training import History, adam
 from sbi_rope.discrepancy.posterior import DiscrepancyDraws
 
-__all__ = ["train_on_corrected"]
+__all__ = ["IF_TOO_NARROW", "ONE", "UNTIL_SETTLED", "Courses", "train_on_corrected"]
 
 BATCH_SIZE = 500
 CLIP_MAX_NORM = 5.0
 # Each point of the history averages over so many steps.
 STEPS_PER_POINT = 20
-# A course that lowers the loss by less than SETTLED nats is the last. The loss is
-# compared on NUM_COMPARED corrected simulations, which are the same for all courses.
-SETTLED, NUM_COMPARED, MAX_COURSES = 0.01, 2000, 12
+# The loss is compared on NUM_COMPARED corrected simulations, which are the same for all
+# courses.
+NUM_COMPARED, MAX_COURSES = 2000, 12
+
+
+@dataclass(frozen=True, kw_only=True)
+class Courses:
+    """When another course of training follows.
+
+    Attributes:
+        after_first: The nats by which the first course has to lower the loss for a
+            second.
+        after_others: The nats by which any later course has to lower it for another.
+    """
+
+    after_first: float
+    after_others: float
+
+
+ONE = Courses(after_first=math.inf, after_others=math.inf)
+UNTIL_SETTLED = Courses(after_first=0.01, after_others=0.01)
+# For versions of a stack, of which there are many. A density that was not much too
+# narrow at the start gains at most a tenth of a nat by further courses.
+IF_TOO_NARROW = Courses(after_first=10.0, after_others=0.1)
 
 
 def train_on_corrected(
@@ -32,7 +55,7 @@ def train_on_corrected(
     *,
     probabilities: Tensor | None,
     num_steps: int,
-    until_settled: bool = False,
+    courses: Courses = ONE,
     learning_rate: float,
     show_progress_bars: bool,
 ) -> History:
@@ -57,8 +80,8 @@ def train_on_corrected(
         probabilities: The probability of each simulation to be drawn; None makes them
             equal.
         num_steps: Gradient steps of a course.
-        until_settled: Whether to add courses until one changes almost nothing. A
-            density that is much too narrow at the start needs several.
+        courses: When another course follows. A density that is much too narrow at the
+            start needs several.
         learning_rate: Learning rate of Adam at the start of a course. It falls to zero
             along a cosine.
         show_progress_bars: Whether to show the loss during training.
@@ -75,13 +98,15 @@ def train_on_corrected(
 
     compared = batch(NUM_COMPARED)
     loss, losses = _loss(density, *compared), []
-    for _ in range(MAX_COURSES if until_settled else 1):
+    needed = courses.after_first
+    for _ in range(MAX_COURSES):
         losses += _one_course(
             density, batch, num_steps, learning_rate, show_progress_bars
         )
         before, loss = loss, _loss(density, *compared)
-        if not before - loss > SETTLED:
+        if not before - loss > needed:
             break
+        needed = courses.after_others
     density.requires_grad_(requires_grad=False)
     parts = torch.tensor(losses).split(STEPS_PER_POINT)
     return History(

@@ -17,11 +17,12 @@ from sbi_rope._simulations import Moments
 from sbi_rope._simulator import Simulator
 from sbi_rope._standardisation import Standardisation
 from sbi_rope._training import split_groups
-from sbi_rope.discrepancy.correction import NUM_STEPS, Space, correct_npe, network_of
+from sbi_rope.discrepancy.correction import Space, correct_npe, network_of
 from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.parameters import learn_parameters
 from sbi_rope.discrepancy.report import DiscrepancyReport, report_discrepancy
 from sbi_rope.discrepancy.targets import tuning_targets
+from sbi_rope.discrepancy.training import IF_TOO_NARROW
 from sbi_rope.discrepancy.tuning import TUNING
 from sbi_rope.finetuning import CalibrationFinetuner
 from sbi_rope.rope import RoPE
@@ -342,9 +343,7 @@ class Fold:
             model=DiscrepancyModel(),
             weights=_of_rows(bench.pair_weights, self.rows),
             probabilities=probabilities,
-            # Without further courses, which take long. If they are needed, the weights
-            # show it.
-            num_steps=NUM_STEPS[space],
+            courses=IF_TOO_NARROW,
         )
         return Corrected(
             estimator=correction.estimator,

@@ -21,7 +21,11 @@ from sbi_rope._standardisation import Standardisation
 from sbi_rope.baselines import Training
 from sbi_rope.discrepancy import DiscrepancyModel, DiscrepancyNPE
 from sbi_rope.discrepancy.posterior import DiscrepancyDraws
-from sbi_rope.discrepancy.training import train_on_corrected
+from sbi_rope.discrepancy.training import (
+    IF_TOO_NARROW,
+    UNTIL_SETTLED,
+    train_on_corrected,
+)
 from sbi_rope.discrepancy.tuning import cross_fitted_nets
 from sbi_rope.errors import (
     InvalidInputError,
@@ -388,11 +392,22 @@ def test_courses_are_added_until_the_loss_has_settled() -> None:
     one, several = Slow(), Slow()
     assert len(settle(one).training_loss) == 2
     assert (one.bias < 3).all()
-    history = settle(several, until_settled=True)
+    history = settle(several, courses=UNTIL_SETTLED)
     assert 4 <= len(history.training_loss) < 24
     assert torch.allclose(several.bias, torch.full((2,), 5.0), atol=0.2)
     # From where it has settled one course is enough.
-    assert len(settle(several, until_settled=True).training_loss) == 2
+    assert len(settle(several, courses=UNTIL_SETTLED).training_loss) == 2
+
+
+def test_a_stack_adds_courses_only_if_the_first_changed_much() -> None:
+    # The loss is 50 at the start, and 3 of these are left after the first course.
+    far = Slow()
+    assert len(settle(far, courses=IF_TOO_NARROW).training_loss) >= 6
+    assert torch.allclose(far.bias, torch.full((2,), 5.0), atol=0.3)
+    # From 5 nats away the first course cannot gain 10.
+    near = Slow()
+    near.bias.data.fill_(3.4)
+    assert len(settle(near, courses=IF_TOO_NARROW).training_loss) == 2
 
 
 def test_only_simulations_with_a_probability_are_drawn() -> None:
