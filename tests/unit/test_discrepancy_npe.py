@@ -400,11 +400,11 @@ def test_courses_are_added_until_the_loss_has_settled() -> None:
 
 
 def test_a_stack_adds_courses_only_if_the_first_changed_much() -> None:
-    # The loss is 50 at the start, and 3 of these are left after the first course.
+    # The loss is 51 nats at the start, and 18 after the first course.
     far = Slow()
     assert len(settle(far, courses=IF_TOO_NARROW).training_loss) >= 6
     assert torch.allclose(far.bias, torch.full((2,), 5.0), atol=0.3)
-    # From 5 nats away the first course cannot gain 10.
+    # With a loss of 6 nats at the start the first course cannot gain 10.
     near = Slow()
     near.bias.data.fill_(3.4)
     assert len(settle(near, courses=IF_TOO_NARROW).training_loss) == 2
