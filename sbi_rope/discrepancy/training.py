@@ -14,7 +14,7 @@ from sbi_rope._standardisation import Standardisation
 from sbi_rope._training import History, adam
 from sbi_rope.discrepancy.posterior import DiscrepancyDraws
 
-__all__ = ["IF_TOO_NARROW", "ONE", "UNTIL_SETTLED", "Courses", "train_on_corrected"]
+__all__ = ["IF_FAR_FROM_SETTLED", "ONE", "UNTIL_SETTLED", "Courses", "train_on_corrected"]
 
 BATCH_SIZE = 500
 CLIP_MAX_NORM = 5.0
@@ -30,20 +30,20 @@ class Courses:
     """When another course of training follows.
 
     Attributes:
-        after_first: The nats by which the first course has to lower the loss for a
-            second.
-        after_others: The nats by which any later course has to lower it for another.
+        gain: The nats by which a course has to lower the loss for another.
+        late_fall: The nats by which the loss has to fall in the second half of the
+            first course for a second.
     """
 
-    after_first: float
-    after_others: float
+    gain: float
+    late_fall: float = -math.inf
 
 
-ONE = Courses(after_first=math.inf, after_others=math.inf)
-UNTIL_SETTLED = Courses(after_first=0.01, after_others=0.01)
-# For versions of a stack, of which there are many. A density that was not much too
-# narrow at the start gains at most a tenth of a nat by further courses.
-IF_TOO_NARROW = Courses(after_first=10.0, after_others=0.1)
+ONE = Courses(gain=math.inf)
+UNTIL_SETTLED = Courses(gain=0.01)
+# For versions of a stack, of which there are many. Further courses pay where the first
+# was much too short. Elsewhere they cost time, and the stack is no better for them.
+IF_FAR_FROM_SETTLED = Courses(gain=0.1, late_fall=0.25)
 
 
 def train_on_corrected(
@@ -98,15 +98,16 @@ def train_on_corrected(
 
     compared = batch(NUM_COMPARED)
     loss, losses = _loss(density, *compared), []
-    needed = courses.after_first
-    for _ in range(MAX_COURSES):
-        losses += _one_course(
+    for number in range(MAX_COURSES):
+        course = _one_course(
             density, batch, num_steps, learning_rate, show_progress_bars
         )
+        losses += course
         before, loss = loss, _loss(density, *compared)
-        if not before - loss > needed:
+        if not before - loss > courses.gain:
             break
-        needed = courses.after_others
+        if number == 0 and not _late_fall(course) > courses.late_fall:
+            break
     density.requires_grad_(requires_grad=False)
     parts = torch.tensor(losses).split(STEPS_PER_POINT)
     return History(
@@ -140,6 +141,12 @@ def _one_course(
         losses.append(float(loss.detach()))
         bar.set_postfix(loss=losses[-1], refresh=False)
     return losses
+
+
+def _late_fall(losses: list[float]) -> float:
+    """Return by how much the loss fell between the middle and the last fifth."""
+    fifths = torch.tensor(losses).tensor_split(5)
+    return float(fifths[2].mean() - fifths[4].mean())
 
 
 @torch.no_grad()

@@ -22,7 +22,7 @@ from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.parameters import learn_parameters
 from sbi_rope.discrepancy.report import DiscrepancyReport, report_discrepancy
 from sbi_rope.discrepancy.targets import tuning_targets
-from sbi_rope.discrepancy.training import IF_TOO_NARROW
+from sbi_rope.discrepancy.training import IF_FAR_FROM_SETTLED
 from sbi_rope.discrepancy.tuning import TUNING
 from sbi_rope.finetuning import CalibrationFinetuner
 from sbi_rope.rope import RoPE
@@ -343,7 +343,7 @@ class Fold:
             model=DiscrepancyModel(),
             weights=_of_rows(bench.pair_weights, self.rows),
             probabilities=probabilities,
-            courses=IF_TOO_NARROW,
+            courses=IF_FAR_FROM_SETTLED,
         )
         return Corrected(
             estimator=correction.estimator,
