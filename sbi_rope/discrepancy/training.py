@@ -14,7 +14,13 @@ from sbi_rope._standardisation import Standardisation
 from sbi_rope._training import History, adam
 from sbi_rope.discrepancy.posterior import DiscrepancyDraws
 
-__all__ = ["IF_FAR_FROM_SETTLED", "ONE", "UNTIL_SETTLED", "Courses", "train_on_corrected"]
+__all__ = [
+    "IF_FAR_FROM_SETTLED",
+    "ONE",
+    "UNTIL_SETTLED",
+    "Courses",
+    "train_on_corrected",
+]
 
 BATCH_SIZE = 500
 CLIP_MAX_NORM = 5.0
