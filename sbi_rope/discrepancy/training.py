@@ -112,7 +112,7 @@ def train_on_corrected(
         before, loss = loss, _loss(density, *compared)
         if not before - loss > courses.gain:
             break
-        if number == 0 and not _late_fall(course) > courses.late_fall:
+        if number == 0 and _late_fall(course) < courses.late_fall:
             break
     density.requires_grad_(requires_grad=False)
     parts = torch.tensor(losses).split(STEPS_PER_POINT)

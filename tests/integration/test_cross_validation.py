@@ -3,6 +3,7 @@
 import functools
 import math
 from typing import Any, ClassVar
+from unittest.mock import patch
 
 import pytest
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor, nn
 from sbi_rope import CalibrationFinetuner, RoPE
 from sbi_rope._sbi import embed, embedding_of
 from sbi_rope._training import groups_of
+from sbi_rope.discrepancy.training import ONE, Courses
 from sbi_rope.metrics import acauc_of
 from sbi_rope.mixture import MixturePosterior
 from sbi_rope.stacking import (
@@ -196,6 +198,19 @@ def test_fine_tuning_of_a_tuned_candidate_starts_with_the_net_without_the_part()
             assert torch.equal(found, embed(net, bench.x))
             without = bench.tuned_net(frozenset({0, 1, 3} - {number}))
             assert torch.equal(found, embed(without, bench.x))
+
+
+def test_a_version_goes_through_the_courses_that_the_rule_asks_for() -> None:
+    def trained(courses: Courses) -> Tensor:
+        bench = Workbench(
+            rope_of(problem(12, seed=1)), num_folds=4, seed=0, show_progress_bars=False
+        )
+        with quick(), patch("sbi_rope.stacking.folds.IF_FAR_FROM_SETTLED", courses):
+            version = Fold(bench, [0, 1]).corrected("embedding", learn_prior=False)
+        return nn.utils.parameters_to_vector(version.estimator.parameters())
+
+    assert torch.equal(trained(ONE), trained(ONE))
+    assert not torch.equal(trained(ONE), trained(Courses(gain=-math.inf)))
 
 
 # --- labels ---
