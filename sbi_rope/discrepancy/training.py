@@ -48,7 +48,7 @@ class Courses:
 ONE = Courses(gain=math.inf)
 UNTIL_SETTLED = Courses(gain=0.01)
 # For versions of a stack, of which there are many. Further courses pay where the first
-# was much too short. Elsewhere they cost time, and the stack is no better for them.
+# was much too short. On the pendulum they took time, and the stack was no better.
 IF_FAR_FROM_SETTLED = Courses(gain=0.1, late_fall=0.25)
 
 
