@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "COUPLED_STACK",
+    "GIVEN_PRIOR_STACK",
     "METHODS",
     "RVNP_STACK",
     "STACK",
@@ -63,10 +64,11 @@ LOOK_UP = (
     "OT-only",
     "tuning-only",
 )
-# Of the pairs alone; with RVNP, which learns from the test set without its labels; and
-# with couplings of the test set besides.
-STACK, RVNP_STACK, COUPLED_STACK = "stack", "stack with RVNP", "stack of a batch"
-STACKS = (STACK, RVNP_STACK, COUPLED_STACK)
+# Of the pairs alone; of candidates that keep NPE's prior; with RVNP, which learns from
+# the test set without its labels; and with couplings of the test set besides.
+STACK, GIVEN_PRIOR_STACK = "stack", "stack, given prior"
+RVNP_STACK, COUPLED_STACK = "stack with RVNP", "stack of a batch"
+STACKS = (STACK, GIVEN_PRIOR_STACK, RVNP_STACK, COUPLED_STACK)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -325,6 +327,7 @@ METHODS: dict[str, Entry] = {
     ),
     "RoPE": Entry(style=("#0072B2", "-", "o"), pairs=True, couples=True),
     STACK: Entry(style=("black", "-", "*"), pairs=True),
+    GIVEN_PRIOR_STACK: Entry(style=("black", "-.", "*"), pairs=True, extra=True),
     RVNP_STACK: Entry(style=("black", ":", "*"), pairs=True),
     COUPLED_STACK: Entry(style=("black", "--", "*"), pairs=True),
 }

@@ -13,6 +13,7 @@ from benchmarks.cases import Case, Pairs
 from benchmarks.cells import Cell
 from benchmarks.methods import (
     COUPLED_STACK,
+    GIVEN_PRIOR_STACK,
     METHODS,
     RVNP_STACK,
     STACK,
@@ -186,12 +187,15 @@ def _stack_score(case: Case, cell: Cell) -> Score:
     count = _Count(case)
     start = time.perf_counter()
     rope = rope_of(case).append_calibration(*case.calibration)
+    candidates = None
+    if cell.method == GIVEN_PRIOR_STACK:
+        candidates = default_candidates(rope, learn_prior=False)
+    elif cell.method == RVNP_STACK:
+        candidates = default_candidates(rope, x_o)
     posterior = stack(
         rope,
         x_o if cell.method == COUPLED_STACK else None,
-        candidates=(
-            default_candidates(rope, x_o) if cell.method == RVNP_STACK else None
-        ),
+        candidates=candidates,
         seed=case.seed,
         show_progress_bars=False,
     )

@@ -10,9 +10,11 @@ from sbi_rope.stacking import StackingReport
 from sbi_rope.stacking.words import (
     LEVEL,
     NOT_CHECKED,
+    OTHER_PARAMETERS,
     OVER_CONFIDENT,
     TOO_FEW,
     compared,
+    follow_the_prior,
     parameters_off,
 )
 
@@ -34,6 +36,10 @@ def verdict_of(
     ]
     lines.append(_calibrated(report))
     lines += [(f"{line}.", True) for line in parameters_off(report, names)]
+    if not follow_the_prior(report):
+        text = "The known parameters are not distributed as the prior assumes, and the "
+        text += f"stack has learned where they are. {OTHER_PARAMETERS}"
+        lines.append((text, True))
     lines.append(_assumption(report, diagnosis))
     if diagnosis is not None:
         lines.append(

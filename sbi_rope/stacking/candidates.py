@@ -102,10 +102,12 @@ class AmortisedCandidate(ABC):
     Attributes:
         name: Its name in the report.
         fixed: Whether it does not depend on the calibration pairs.
+        learns_prior: Whether it learns from the pairs how parameters are distributed.
     """
 
     name: str
     fixed: bool = False
+    learns_prior: bool = False
 
     @property
     def family(self) -> str:

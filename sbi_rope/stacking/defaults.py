@@ -39,6 +39,7 @@ def default_candidates(
     rope: RoPE | None = None,
     x_o: Tensor | None = None,
     *,
+    learn_prior: bool = True,
     couplings: bool = False,
     gammas: Sequence[float] = GAMMAS,
     taus: Sequence[float] = TAUS,
@@ -54,6 +55,10 @@ def default_candidates(
             is left out if there are fewer than a hundred observations, or more than 20
             statistics: these are x if it is a short vector and NPE has an embedding
             net, and the embedding otherwise.
+        learn_prior: Whether candidates may learn from the pairs how parameters are
+            distributed. They should if the pairs are drawn like the observations to be
+            inferred. With False, discrepancy models keep the prior of NPE, and
+            fine-tuned candidates are left out, because they cannot.
         couplings: Whether to add RoPE and OT-only over a grid of gamma and tau, and
             tuning-only. They are for the stack of a batch of observations.
         gammas: Values of gamma, in units of the median distance between simulated
@@ -68,21 +73,24 @@ def default_candidates(
         The candidates, couplings first.
 
     Raises:
-        InvalidTypeError: If ``rope`` is not a RoPE.
+        InvalidTypeError: If ``rope`` is not a RoPE, or ``learn_prior`` not a bool.
         InvalidInputError: If a gamma, a tau or the rehearsal is outside its range, or,
             with a rope, x_o has the wrong shape or device, is empty or not finite.
     """
     gammas, taus = check_numbers("gammas", gammas), check_numbers("taus", taus)
+    check_instance("learn_prior", learn_prior, bool)
     amortised: tuple[AmortisedCandidate, ...] = (
         DensityCandidate(name="prior", build=_prior, fixed=True),
         DensityCandidate(name="NPE", build=_npe, fixed=True),
         FinetunedCandidate(),
-        DiscrepancyCandidate(space="embedding"),
-        DiscrepancyCandidate(space="input"),
-        DiscrepancyCandidate(space="tuned"),
+        DiscrepancyCandidate(space="embedding", learn_prior=learn_prior),
+        DiscrepancyCandidate(space="input", learn_prior=learn_prior),
+        DiscrepancyCandidate(space="tuned", learn_prior=learn_prior),
         FinetunedCandidate(space="input"),
         FinetunedCandidate(space="tuned"),
     )
+    if not learn_prior:
+        amortised = tuple(one for one in amortised if not one.learns_prior)
     if rope is not None:
         check_instance("rope", rope, RoPE)
         x_o = None if x_o is None else rope.checked_observations(x_o)

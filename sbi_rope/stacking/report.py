@@ -71,6 +71,9 @@ class StackingReport:
         acauc_of_parameters: ACAUC of each parameter by itself. The intervals are so
             wide that those of d calibrated parameters all hold 0 in at least 95 % of
             the cases (Bonferroni).
+        probability_of_prior: The probability that the parameters of the pairs were
+            drawn from the prior, see :func:`~sbi_rope.discrepancy.learn_parameters`.
+            None if no candidate learns their distribution.
     """
 
     cross_validation: CrossValidation
@@ -89,6 +92,7 @@ class StackingReport:
     provenance: Provenance | None = None
     recalibration: Recalibration | None = None
     acauc_of_parameters: tuple[ACAUCScore, ...] = ()
+    probability_of_prior: float | None = None
 
     @classmethod
     def of(
@@ -100,6 +104,7 @@ class StackingReport:
         discrepancy: DiscrepancyReport | None = None,
         provenance: Provenance | None = None,
         recalibration: Recalibration | None = None,
+        probability_of_prior: float | None = None,
     ) -> "StackingReport":
         """Compute the report of a stack.
 
@@ -110,6 +115,8 @@ class StackingReport:
             discrepancy: What the pairs say about each entry of x.
             provenance: How the stack was made.
             recalibration: By which factors it was made narrower or wider.
+            probability_of_prior: The probability that the parameters of the pairs were
+                drawn from the prior.
         """
         check_instance("cross_validation", cross_validation, CrossValidation)
         check_instance("learning_curve", learning_curve, LearningCurve, optional=True)
@@ -136,6 +143,7 @@ class StackingReport:
             provenance=provenance,
             recalibration=recalibration,
             acauc_of_parameters=_acauc_of_parameters(scores),
+            probability_of_prior=probability_of_prior,
         )
 
     @property

@@ -150,6 +150,7 @@ def stack(
             curve,
             batch=batch,
             discrepancy=trainer.discrepancy(),
+            probability_of_prior=trainer.probability_of_prior(),
             recalibration=trainer.recalibration(scores) if recalibrate else None,
             # This comes last, because it counts what came before.
             provenance=stopwatch.provenance(seed),

@@ -48,6 +48,11 @@ class DiscrepancyCandidate(AmortisedCandidate):
         """The method that it is a setting of."""
         return "discrepancy"
 
+    @property
+    def learns_prior(self) -> bool:  # type: ignore[override]
+        """Whether it learns from the pairs how parameters are distributed."""
+        return self.learn_prior
+
     def applies_to(self, bench: Workbench) -> bool:
         """Tell whether x is a short vector, or there are enough folds to tune."""
         if self.space == "input":
@@ -83,6 +88,7 @@ class FinetunedCandidate(AmortisedCandidate):
     """
 
     space: Space | None = None
+    learns_prior = True
 
     def __post_init__(self) -> None:
         """Check the value of the field."""

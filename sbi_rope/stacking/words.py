@@ -18,12 +18,14 @@ __all__ = [
     "IN_WORDS",
     "LEVEL",
     "NOT_CHECKED",
+    "OTHER_PARAMETERS",
     "OVER_CONFIDENT",
     "REFERENCES",
     "TOO_FEW",
     "are_relative",
     "compared",
     "differs",
+    "follow_the_prior",
     "gains_of",
     "lines_of",
     "parameters_off",
@@ -50,6 +52,15 @@ REFERENCES = {"prior": "the prior", "NPE": "NPE as it was"}
 # What to do about a stack whose intervals are too narrow.
 OVER_CONFIDENT = (
     "More labels help most. Until then, take intervals of a higher level than you need."
+)
+
+# The text says that the parameters of the pairs do not follow the prior if this is less
+# probable. At most one in 19 sets of pairs from the prior gets there by chance, because
+# the two were equally probable before (Markov's inequality).
+IMPROBABLE = 0.05
+OTHER_PARAMETERS = (
+    "It expects the same of new observations, and is too sure about those with other "
+    "parameters."
 )
 
 # What each method is. Whether it is better than others is for the scores to say.
@@ -97,6 +108,7 @@ def lines_of(report: "StackingReport") -> list[str]:
         *_scores(report),
         *_gains(report),
         *_weights(report),
+        *_parameters(report),
         *_calibration(report),
         *_recalibration(report),
         *_more_labels(report),
@@ -170,6 +182,24 @@ def _weights(report: "StackingReport") -> list[str]:
 def _how_many(report: "StackingReport", family: str) -> str:
     count = report.cross_validation.families.count(family)
     return f" ({count} candidates)" if count > 1 else ""
+
+
+def follow_the_prior(report: "StackingReport") -> bool:
+    """Tell whether the parameters of the pairs can be draws from the prior."""
+    probability = report.probability_of_prior
+    return probability is None or probability >= IMPROBABLE
+
+
+def _parameters(report: "StackingReport") -> list[str]:
+    if follow_the_prior(report):
+        return []
+    return [
+        "  the parameters of the pairs are not distributed like the prior (probability "
+        f"{report.probability_of_prior:.1g}),",
+        "    and the stack has learned where they are. " + OTHER_PARAMETERS,
+        "    If those to be inferred can be anywhere in the prior, pass",
+        "    `candidates=default_candidates(rope, learn_prior=False)`",
+    ]
 
 
 def _calibration(report: "StackingReport") -> list[str]:

@@ -269,6 +269,15 @@ def test_an_over_confident_stack_says_what_to_do(tmp_path: Path) -> None:
     assert "More labels help most." in text
 
 
+def test_the_verdict_names_pairs_whose_parameters_do_not_follow_the_prior(
+    source: str, tmp_path: Path
+) -> None:
+    sentence = "The known parameters are not distributed as the prior assumes"
+    assert sentence not in Page(source).text
+    changed = replace(the_stack().report, probability_of_prior=0.001)
+    assert sentence in Page(written(changed, tmp_path)).text
+
+
 def test_the_page_names_parameters_that_are_not_calibrated(tmp_path: Path) -> None:
     report = the_stack().report
     known = report.cross_validation

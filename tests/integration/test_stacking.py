@@ -505,6 +505,18 @@ def test_default_candidates_have_different_names() -> None:
     assert FinetunedCandidate(space="embedding").name == "discrepancy, fine-tuned"
 
 
+def test_default_candidates_can_keep_the_prior_of_npe() -> None:
+    kept = default_candidates(learn_prior=False)
+    assert [candidate.name for candidate in kept] == [
+        *("prior", "NPE", "discrepancy, given prior"),
+        *("discrepancy (input), given prior", "discrepancy (tuned), given prior"),
+    ]
+    assert not any(candidate.learns_prior for candidate in kept)
+    coupled = default_candidates(couplings=True, learn_prior=False)
+    assert len(coupled) == 36 + 6
+    assert coupled[-1].name == "tuning-only"
+
+
 def test_without_a_seed_the_state_of_torch_decides() -> None:
     found = []
     for state in (5, 5, 6):

@@ -258,6 +258,27 @@ def test_a_stack_with_a_discrepancy_says_what_the_pairs_say_about_each_entry() -
     assert without.discrepancy is None
 
 
+def test_a_report_names_pairs_whose_parameters_do_not_follow_the_prior() -> None:
+    theta = problem(20, seed=1)[0]
+    middle = rope_of((0.2 * theta, problems.simulate(0.2 * theta) + 0.4))
+    candidates = [PRIOR, NPE, DISCREPANCY]
+    found = stacked(middle, candidates=candidates).report
+    assert found.probability_of_prior is not None
+    assert found.probability_of_prior < 1e-3
+    assert "pairs are not distributed like the prior (probability " in str(found)
+    assert "default_candidates(rope, learn_prior=False)" in str(found)
+    # These pairs follow the prior.
+    usual = the_stack().report
+    assert usual.probability_of_prior is not None
+    assert usual.probability_of_prior > 0.5
+    assert "not distributed like the prior" not in str(usual)
+    # Nothing is said of candidates that keep the prior of NPE.
+    given = DiscrepancyCandidate(space="embedding", learn_prior=False)
+    kept = stacked(middle, candidates=[PRIOR, NPE, given]).report
+    assert kept.probability_of_prior is None
+    assert "not distributed like the prior" not in str(kept)
+
+
 def test_a_report_knows_how_it_was_made() -> None:
     made = the_stack().report.provenance
     assert made is not None

@@ -111,6 +111,7 @@ CALLS = [
         run=lambda **options: repr(default_candidates(couplings=True, **options)),
         options={
             "rope": "instance",
+            "learn_prior": "instance",
             "gammas": "numbers",
             "taus": "numbers",
             "rehearsal": "not negative",
