@@ -100,6 +100,7 @@ PRIORS: tuple[Prior, ...] = (box, skewed, discrete, single)
 
 
 def test_pairs_from_the_prior_hardly_change_it() -> None:
+    improbable = 0
     for prior in PRIORS:
         for n in (1, 10, 100):
             torch.manual_seed(0)
@@ -114,6 +115,9 @@ def test_pairs_from_the_prior_hardly_change_it() -> None:
             case = (prior.__name__, n)
             assert float(probability.median()) > (0.75 if n == 100 else 0.45), case
             assert float(size.median()) > 0.9 * 5000, case
+            improbable += int((probability < 0.05).sum())
+    # By Markov's inequality, at most one in 19 of these 120 sets of pairs is expected.
+    assert improbable <= 120 / 19
 
 
 def test_shifted_pairs_give_more_density_to_parameters_like_theirs() -> None:
