@@ -13,6 +13,7 @@ from torch.distributions import Gamma
 from sbi_rope.discrepancy import learn_parameters
 from sbi_rope.discrepancy.parameters import STRENGTHS, _fit, normal_scores
 from sbi_rope.errors import InvalidInputError
+from sbi_rope.tasks import Task, get_task
 
 CORRELATION = torch.tensor([[1.0, 0.6], [0.6, 1.0]]).double()
 
@@ -141,6 +142,22 @@ def test_shifted_pairs_give_more_density_to_parameters_like_theirs() -> None:
             # Who knows the region gains 1.2 nats.
             case = (prior.__name__, n)
             assert least < sum(gains) / 4 < math.log(1 / 0.3), case
+
+
+def test_fifty_pairs_from_the_middle_of_the_prior_are_recognised() -> None:
+    biased = get_task("linear_gaussian", variant="biased_calibration")
+    usual = get_task("linear_gaussian")
+    theta = usual.get_prior().sample((5000,))
+
+    def improbable(task: Task, n: int, *, below: float = 0.05) -> int:
+        pairs = (task.get_calibration_set(n, seed=seed)[0] for seed in range(50))
+        found = [learn_parameters(one, theta).probability_of_prior for one in pairs]
+        return sum(probability < below for probability in found)
+
+    assert improbable(biased, 50, below=1e-3) == 50
+    # Ten pairs are often too few to tell.
+    assert 5 <= improbable(biased, 10) <= 25
+    assert improbable(usual, 10) + improbable(usual, 50) <= 1
 
 
 def test_weighted_simulations_have_the_mean_and_spread_of_the_pairs() -> None:
