@@ -150,13 +150,13 @@ def test_fifty_pairs_from_the_middle_of_the_prior_are_recognised() -> None:
     theta = usual.get_prior().sample((5000,))
 
     def improbable(task: Task, n: int, *, below: float = 0.05) -> int:
-        pairs = (task.get_calibration_set(n, seed=seed)[0] for seed in range(50))
+        pairs = (task.get_calibration_set(n, seed=seed)[0] for seed in range(30))
         found = [learn_parameters(one, theta).probability_of_prior for one in pairs]
         return sum(probability < below for probability in found)
 
-    assert improbable(biased, 50, below=1e-3) == 50
+    assert improbable(biased, 50, below=1e-3) == 30
     # Ten pairs are often too few to tell.
-    assert 5 <= improbable(biased, 10) <= 25
+    assert 2 <= improbable(biased, 10) <= 15
     assert improbable(usual, 10) + improbable(usual, 50) <= 1
 
 
