@@ -334,7 +334,12 @@ def check_prior(prior: Any) -> None:
 
 
 def check_in_support(
-    name: str, theta: Tensor, prior: Any, *, rows: Tensor | None = None
+    name: str,
+    theta: Tensor,
+    prior: Any,
+    *,
+    rows: Tensor | None = None,
+    instead: str = "",
 ) -> None:
     """Raise if any row of ``theta`` lies outside the prior's support.
 
@@ -343,6 +348,7 @@ def check_in_support(
         theta: Parameters, shape ``(n, d)``.
         prior: The prior.
         rows: Which rows are checked, shape ``(n,)``; all if None.
+        instead: What else the caller can do, as a sentence.
     """
     if not len(theta):  # sbi cannot check an empty batch
         return
@@ -354,11 +360,13 @@ def check_in_support(
             outside[rows] = ~within_support(prior, theta[rows])
     if outside.any():
         first = outside.nonzero().flatten()[:5].tolist()
-        raise InvalidInputError(
+        message = (
             f"Expected `{name}` inside the support of the prior; {int(outside.sum())} "
             f"of {theta.shape[0]} rows are outside (first: {first}). Check the units "
-            f"and the order of the parameters, or train NPE with a wider prior."
+            f"and the order of the parameters, or train NPE with a wider prior. "
+            f"{instead}"
         )
+        raise InvalidInputError(message.rstrip())
 
 
 def _no_numbers(name: str, value: Any) -> str:

@@ -10,11 +10,10 @@ from sbi_rope.stacking import StackingReport
 from sbi_rope.stacking.words import (
     LEVEL,
     NOT_CHECKED,
-    OTHER_PARAMETERS,
     OVER_CONFIDENT,
     TOO_FEW,
     compared,
-    follow_the_prior,
+    not_the_prior,
     parameters_off,
 )
 
@@ -36,10 +35,9 @@ def verdict_of(
     ]
     lines.append(_calibrated(report))
     lines += [(f"{line}.", True) for line in parameters_off(report, names)]
-    if not follow_the_prior(report):
-        text = "The known parameters are not distributed as the prior assumes, and the "
-        text += f"stack has learned where they are. {OTHER_PARAMETERS}"
-        lines.append((text, True))
+    if what_follows := not_the_prior(report):
+        start = "The known parameters are not distributed as the prior assumes."
+        lines.append((f"{start} {what_follows}", True))
     lines.append(_assumption(report, diagnosis))
     if diagnosis is not None:
         lines.append(
@@ -58,10 +56,11 @@ def _calibrated(report: StackingReport) -> tuple[str, bool]:
         return NOT_CHECKED[0].upper() + NOT_CHECKED[1:] + ".", False
     if report.cross_validation.effective_number < FEWEST:
         return f"There are {TOO_FEW}: ACAUC {report.acauc.value:+.3f}.", False
-    inside = (
-        f"{percent(LEVEL)} intervals held {percent(report.share_inside)} of the known "
-        "parameters."
-    )
+    known = "known parameters"
+    if report.cross_validation.score_errors is not None:
+        known = "measured values, with the noise of their labels"
+    held = percent(report.share_inside)
+    inside = f"{percent(LEVEL)} intervals held {held} of the {known}."
     if verdict == "calibrated":
         start = "Its uncertainties are calibrated as far as these pairs can tell"
         return f"{start}: {inside}", False

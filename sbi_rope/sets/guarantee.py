@@ -56,10 +56,18 @@ class Guarantee:
         """
         return promised_coverage(self.level, self.num_pairs, self.num_folds)
 
-    def __str__(self) -> str:
+    def says(self, what: str) -> str:
+        """Return the promise in words.
+
+        Args:
+            what: What holds what, such as "it holds the true parameters".
+        """
         return (
             f"For observations drawn as the {self.num_pairs} calibration pairs were, "
-            f"it holds the true parameters in about {self.level:.4g} of the cases, and "
-            f"in at least {self.lower_bound:.3f} of them in theory, on average over "
-            "observations and calibration sets."
+            f"{what} in about {self.level:.4g} of the cases, and in at least "
+            f"{self.lower_bound:.3f} of them in theory, on average over observations "
+            "and calibration sets."
         )
+
+    def __str__(self) -> str:
+        return self.says("it holds the true parameters")

@@ -130,12 +130,17 @@ class CredibleIntervals:
         ]
         if self._is_batch and len(self.low) > count:
             lines.append(f"  and those of {len(self.low) - count} more observations")
-        promise = self.guarantee or (
-            "They have no guarantee: they hold the true parameters this often only if "
-            "the posterior is calibrated."
-        )
+        if self.guarantee is None:
+            promise = (
+                "They have no guarantee: each holds its true parameter this often only "
+                "if the posterior is calibrated."
+            )
+        else:
+            promise = self.guarantee.says("each holds its true parameter")
+        if self.low.shape[-1] > 1:
+            promise += " All together hold theirs less often."
         return "\n".join(
-            [f"{100 * self.level:.4g} % intervals, one by one:", *lines, str(promise)]
+            [f"{100 * self.level:.4g} % intervals, one by one:", *lines, promise]
         )
 
 

@@ -37,6 +37,8 @@ SIMULATIONS_PER_PAIR = 100
 MAX_SUMMARIES = 20
 # Folds of the calibration pairs.
 NUM_FOLDS = 5
+# Draws of the prior that the parameters of the pairs are compared with.
+NUM_FROM_PRIOR = 10_000
 # Samples of an estimator that is trained on labels that are not exact, and the nodes at
 # which their density is computed.
 NUM_SAMPLES, NUM_NODES = 200, 64
@@ -215,6 +217,19 @@ class Workbench:
             self.simulations[0],
             weights=_of_rows(self.score_weights, rows),
         )
+
+    def probability_of_prior(self) -> float:
+        """Return the probability that the parameters of all pairs follow the prior.
+
+        It needs no simulations, so that a stack without corrections makes none.
+        """
+        with seeded(self.seed_of(frozenset())):
+            theta = self.npe.prior.sample(torch.Size((NUM_FROM_PRIOR,)))
+        return learn_parameters(
+            self.rope.labelled_parameters.draws,
+            theta.to(self.theta.device),
+            weights=self.score_weights,
+        ).probability_of_prior
 
     def targets(self, rows: Tensor, seed: int) -> Tensor:
         """Return the targets of tuning on some pairs, computed from these alone."""

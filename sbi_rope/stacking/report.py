@@ -72,8 +72,10 @@ class StackingReport:
             wide that those of d calibrated parameters all hold 0 in at least 95 % of
             the cases (Bonferroni).
         probability_of_prior: The probability that the parameters of the pairs were
-            drawn from the prior, see :func:`~sbi_rope.discrepancy.learn_parameters`.
-            None if no candidate learns their distribution.
+            drawn from the prior, see :func:`~sbi_rope.discrepancy.learn_parameters`;
+            None if it is not known.
+        learns_prior: Whether a candidate learns from the pairs how parameters are
+            distributed.
     """
 
     cross_validation: CrossValidation
@@ -93,6 +95,7 @@ class StackingReport:
     recalibration: Recalibration | None = None
     acauc_of_parameters: tuple[ACAUCScore, ...] = ()
     probability_of_prior: float | None = None
+    learns_prior: bool = True
 
     @classmethod
     def of(
@@ -105,6 +108,7 @@ class StackingReport:
         provenance: Provenance | None = None,
         recalibration: Recalibration | None = None,
         probability_of_prior: float | None = None,
+        learns_prior: bool = True,
     ) -> "StackingReport":
         """Compute the report of a stack.
 
@@ -117,6 +121,7 @@ class StackingReport:
             recalibration: By which factors it was made narrower or wider.
             probability_of_prior: The probability that the parameters of the pairs were
                 drawn from the prior.
+            learns_prior: Whether a candidate learns how parameters are distributed.
         """
         check_instance("cross_validation", cross_validation, CrossValidation)
         check_instance("learning_curve", learning_curve, LearningCurve, optional=True)
@@ -144,6 +149,7 @@ class StackingReport:
             recalibration=recalibration,
             acauc_of_parameters=_acauc_of_parameters(scores),
             probability_of_prior=probability_of_prior,
+            learns_prior=learns_prior,
         )
 
     @property

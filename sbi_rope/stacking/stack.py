@@ -6,6 +6,7 @@ from typing import Literal
 from torch import Tensor
 
 from sbi_rope._validation import check_choice, check_instance, check_unit_interval
+from sbi_rope.errors import warn_user
 from sbi_rope.rope import HOW_TO_MAKE, RoPE
 from sbi_rope.stacking.batch import compare_batch
 from sbi_rope.stacking.candidates import Candidate
@@ -16,11 +17,18 @@ from sbi_rope.stacking.provenance import Stopwatch
 from sbi_rope.stacking.recalibrating import check_recalibration
 from sbi_rope.stacking.report import StackingReport
 from sbi_rope.stacking.trainer import StackTrainer
+from sbi_rope.stacking.words import is_improbable
 
 __all__ = ["cross_validate", "stack"]
 
 # The learning curve trains on these shares of the folds, and on all folds but one.
 SMALLER = (0.25, 0.5)
+RECALIBRATES_FOR_PAIRS = (
+    "The parameters of the pairs are not distributed like the prior, which all "
+    "candidates keep. `recalibrate` makes the stack fit the pairs, and it can become "
+    "over-confident about other parameters. Leave it out, unless the observations are "
+    "drawn like the pairs."
+)
 
 
 def stack(
@@ -132,6 +140,9 @@ def stack(
         check_recalibration(trainer.bench)
     # This comes first, so that nobody waits for the training to hear of it.
     batch = None if trainer.x_o is None else compare_batch(trainer.bench, trainer.x_o)
+    probability = trainer.bench.probability_of_prior()
+    if recalibrate and not trainer.learns_prior and is_improbable(probability):
+        warn_user(RECALIBRATES_FOR_PAIRS)
     versions, scores = trainer.cross_validate(with_refit=True)
     curve = None
     if learning_curve:
@@ -150,7 +161,8 @@ def stack(
             curve,
             batch=batch,
             discrepancy=trainer.discrepancy(),
-            probability_of_prior=trainer.probability_of_prior(),
+            probability_of_prior=probability,
+            learns_prior=trainer.learns_prior,
             recalibration=trainer.recalibration(scores) if recalibrate else None,
             # This comes last, because it counts what came before.
             provenance=stopwatch.provenance(seed),

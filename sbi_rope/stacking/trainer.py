@@ -221,16 +221,11 @@ class StackTrainer:
             return self.bench.discrepancy()
         return None
 
-    def probability_of_prior(self) -> float | None:
-        """Return how probable it is that the parameters of the pairs follow the prior.
-
-        It is None if no candidate learns from the pairs how parameters are distributed.
-        """
+    @property
+    def learns_prior(self) -> bool:
+        """Whether a candidate learns from the pairs how parameters are distributed."""
         amortised = (c for c in self.candidates if isinstance(c, AmortisedCandidate))
-        if not any(candidate.learns_prior for candidate in amortised):
-            return None
-        rows = torch.arange(len(self.bench.theta), device=self.bench.theta.device)
-        return self.bench.learned_parameters(rows).probability_of_prior
+        return any(candidate.learns_prior for candidate in amortised)
 
     def _train(self, folds: Sequence[Fold], chosen: Sequence[Candidate]) -> Versions:
         names = [candidate.name for candidate in chosen]

@@ -18,16 +18,16 @@ __all__ = [
     "IN_WORDS",
     "LEVEL",
     "NOT_CHECKED",
-    "OTHER_PARAMETERS",
     "OVER_CONFIDENT",
     "REFERENCES",
     "TOO_FEW",
     "are_relative",
     "compared",
     "differs",
-    "follow_the_prior",
     "gains_of",
+    "is_improbable",
     "lines_of",
+    "not_the_prior",
     "parameters_off",
     "sets_held",
 ]
@@ -58,9 +58,13 @@ OVER_CONFIDENT = (
 # probable. At most one in 19 sets of pairs from the prior gets there by chance, because
 # the two were equally probable before (Markov's inequality).
 IMPROBABLE = 0.05
-OTHER_PARAMETERS = (
-    "It expects the same of new observations, and is too sure about those with other "
-    "parameters."
+IF_LEARNED = (
+    "The stack has learned where they are. It expects the same of new observations, "
+    "and is too sure about those with other parameters."
+)
+IF_KEPT = (
+    "The stack keeps the prior. Its scores, its widths and sets with a guarantee hold "
+    "for such parameters only, where it may look too wide."
 )
 
 # What each method is. Whether it is better than others is for the scores to say.
@@ -184,22 +188,36 @@ def _how_many(report: "StackingReport", family: str) -> str:
     return f" ({count} candidates)" if count > 1 else ""
 
 
-def follow_the_prior(report: "StackingReport") -> bool:
-    """Tell whether the parameters of the pairs can be draws from the prior."""
-    probability = report.probability_of_prior
-    return probability is None or probability >= IMPROBABLE
+def is_improbable(probability_of_prior: float | None) -> bool:
+    """Tell whether the parameters of pairs are hardly draws from the prior."""
+    return probability_of_prior is not None and probability_of_prior < IMPROBABLE
+
+
+def not_the_prior(report: "StackingReport") -> str:
+    """Say what follows if the pairs do not follow the prior; nothing if they may."""
+    if not is_improbable(report.probability_of_prior):
+        return ""
+    return IF_LEARNED if report.learns_prior else IF_KEPT
 
 
 def _parameters(report: "StackingReport") -> list[str]:
-    if follow_the_prior(report):
+    what_follows = not_the_prior(report)
+    if not what_follows:
         return []
-    return [
+    lines = [
         "  the parameters of the pairs are not distributed like the prior (probability "
-        f"{report.probability_of_prior:.1g}),",
-        "    and the stack has learned where they are. " + OTHER_PARAMETERS,
-        "    If those to be inferred can be anywhere in the prior, pass",
-        "    `candidates=default_candidates(rope, learn_prior=False)`",
+        f"that they are: {report.probability_of_prior:.1g})",
+        *textwrap.wrap(
+            what_follows, 88, initial_indent="    ", subsequent_indent="    "
+        ),
     ]
+    if report.learns_prior:
+        lines += [
+            "    If those to be inferred can be anywhere in the prior, keep it:",
+            "      from sbi_rope.stacking import default_candidates",
+            "      stack(rope, candidates=default_candidates(rope, learn_prior=False))",
+        ]
+    return lines
 
 
 def _calibration(report: "StackingReport") -> list[str]:

@@ -54,7 +54,9 @@ def test_a_stack_is_scored_on_what_was_measured(tmp_path: Any) -> None:
     assert loaded.report.cross_validation.labels == scores.labels
     loaded.report.to_html(tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert "20 labels, 20 with noise and 10 partial" in page
+    assert "2 parameters (20 labels, 20 with noise and 10 partial)" in page
+    assert "2 parameters are known" not in page
+    assert "of the measured values, with the noise of their labels" in page
     assert ">nan<" not in page
 
 

@@ -4,6 +4,7 @@ import math
 import sys
 import warnings
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import scipy.stats
@@ -265,18 +266,31 @@ def test_a_report_names_pairs_whose_parameters_do_not_follow_the_prior() -> None
     found = stacked(middle, candidates=candidates).report
     assert found.probability_of_prior is not None
     assert found.probability_of_prior < 1e-3
-    assert "pairs are not distributed like the prior (probability " in str(found)
+    sentence = "pairs are not distributed like the prior (probability that they are: "
+    assert sentence in str(found)
+    assert "The stack has learned where they are." in str(found)
     assert "default_candidates(rope, learn_prior=False)" in str(found)
     # These pairs follow the prior.
     usual = the_stack().report
     assert usual.probability_of_prior is not None
     assert usual.probability_of_prior > 0.5
     assert "not distributed like the prior" not in str(usual)
-    # Nothing is said of candidates that keep the prior of NPE.
-    given = DiscrepancyCandidate(space="embedding", learn_prior=False)
-    kept = stacked(middle, candidates=[PRIOR, NPE, given]).report
-    assert kept.probability_of_prior is None
-    assert "not distributed like the prior" not in str(kept)
+
+
+def test_a_stack_that_keeps_the_prior_says_what_holds_for_the_pairs_only() -> None:
+    theta = 0.2 * problem(20, seed=1)[0]
+    middle = rope_of((theta, problems.simulate(theta) + 0.4))
+    options: dict[str, Any] = {"candidates": [PRIOR, NPE], "num_folds": 3}
+    with pytest.warns(RoPEWarning, match="`recalibrate` makes the stack fit the pairs"):
+        kept = stacked(middle, recalibrate=True, **options).report
+    assert not kept.learns_prior
+    assert "not distributed like the prior" in str(kept)
+    assert "The stack keeps the prior." in str(kept)
+    assert "learn_prior=False" not in str(kept)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="The parameters of the pairs are not")
+        stacked(rope_of(), recalibrate=True, **options)
+        stacked(middle, **options)
 
 
 def test_a_report_knows_how_it_was_made() -> None:
@@ -459,6 +473,8 @@ def test_a_report_says_how_often_the_simulator_was_called_for_the_stack() -> Non
     theta = problems.box(2).sample((1000,))
     stored = rope_of(simulations=(theta, problems.simulate(theta)))
     assert calls_of(stacked(stored, candidates=[PRIOR, DISCREPANCY]).report) == 0
+    # These candidates need no simulations.
+    assert calls_of(stacked(rope_of(), candidates=[PRIOR, NPE]).report) == 0
 
 
 def calls_of(report: StackingReport) -> int:

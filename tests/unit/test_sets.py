@@ -428,6 +428,9 @@ def test_a_set_says_what_it_promises(stack: StackedPosterior, x: Tensor) -> None
         assert found.is_guaranteed
         assert "20 calibration pairs" in str(found)
         assert "90 %" in str(found)
+    # Two intervals of 90 % hold both of their parameters less often.
+    assert "each holds its true parameter in about 0.9 of the cases" in str(found)
+    assert "All together hold theirs less often." in str(found)
 
 
 def test_a_level_that_the_pairs_cannot_give_is_refused(
