@@ -71,17 +71,19 @@ def checked_labels(
         )
         # Noise may move a label out of the prior, but an exact one must be inside.
         known = labels.is_measured.all(dim=1) & ~labels.is_noisy.any(dim=1)
-        check_in_support("theta", theta, prior, rows=known, instead=IF_NOISY)
+        check_in_support(
+            "theta",
+            theta,
+            prior,
+            rows=known,
+            instead="If the labels are noisy, say how much with `theta_std`. They may "
+            "then be outside.",
+        )
     if weights is not None:
         weights = as_numbers_on("weights", weights, theta.device)
         weights = check_pair_weights(weights, "theta", theta).detach()
         labels = labels.weighted(weights.to(theta.device, torch.double))
     return labels
-
-
-IF_NOISY = (
-    "If the labels are noisy, say how much with `theta_std`. They may then be outside."
-)
 
 
 def _from_draws(theta: Tensor, theta_std: Any, theta_cov: Any, prior: Any) -> Labels:

@@ -363,7 +363,7 @@ def check_in_support(
         message = (
             f"Expected `{name}` inside the support of the prior; {int(outside.sum())} "
             f"of {theta.shape[0]} rows are outside (first: {first}). Check the units "
-            f"and the order of the parameters, or train NPE with a wider prior. "
+            "and the order of the parameters, or train NPE with a wider prior. "
             f"{instead}"
         )
         raise InvalidInputError(message.rstrip())

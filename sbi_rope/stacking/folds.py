@@ -19,7 +19,7 @@ from sbi_rope._standardisation import Standardisation
 from sbi_rope._training import split_groups
 from sbi_rope.discrepancy.correction import Space, correct_npe, network_of
 from sbi_rope.discrepancy.model import DiscrepancyModel
-from sbi_rope.discrepancy.parameters import ParameterDistribution, learn_parameters
+from sbi_rope.discrepancy.parameters import learn_parameters
 from sbi_rope.discrepancy.report import DiscrepancyReport, report_discrepancy
 from sbi_rope.discrepancy.targets import tuning_targets
 from sbi_rope.discrepancy.training import IF_FAR_FROM_SETTLED
@@ -210,14 +210,6 @@ class Workbench:
         groups = self.groups.to(self.theta.device)
         return None if len(groups.unique()) == len(groups) else groups
 
-    def learned_parameters(self, rows: Tensor) -> ParameterDistribution:
-        """Return the distribution of parameters, learned from those of some pairs."""
-        return learn_parameters(
-            self.rope.labelled_parameters[rows].draws,
-            self.simulations[0],
-            weights=_of_rows(self.score_weights, rows),
-        )
-
     def probability_of_prior(self) -> float:
         """Return the probability that the parameters of all pairs follow the prior.
 
@@ -346,7 +338,10 @@ class Fold:
         theta_s, x_s = bench.simulations
         probabilities = None
         if learn_prior:
-            probabilities = bench.learned_parameters(self.rows).probabilities
+            draws = bench.rope.labelled_parameters[self.rows].draws
+            probabilities = learn_parameters(
+                draws, theta_s, weights=_of_rows(bench.score_weights, self.rows)
+            ).probabilities
         estimator = estimator_of(bench.npe)
         if space == "tuned":
             nets, z = self._cross_fitted()
