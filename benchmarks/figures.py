@@ -141,12 +141,14 @@ def _panel(
     rows = rows.assign(position=[_position(axis, cell) for cell in rows.index])
     positions = sorted(rows["position"].dropna().unique())
     values = rows[score][np.isfinite(rows[score])]
-    if not len(values) or not positions:
+    if not len(values):
         return
     if score == "lpp_z":
         _set_scale(axes, rows, values)
     bottom = axes.get_ylim()[0]
-    for label, line in rows.groupby(_lines(axis, rows), sort=False):
+    # A list of a single label would be taken for a list of keys, which are tuples.
+    labels = pd.Series(_lines(axis, rows), index=rows.index)
+    for label, line in rows.groupby(labels, sort=False):
         cell = line.index[0]
         colour, style, marker = _style(cell)
         if axis != "n_calibration" and cell.n_calibration:
@@ -167,7 +169,7 @@ def _panel(
             edge = [bottom] * len(positions)
             (handle,) = axes.plot(positions, edge, "v", color=colour)
         seen.setdefault(label, handle)
-    if positions[0] > 0 and positions[-1] / positions[0] >= 8:
+    if positions and positions[0] > 0 and positions[-1] / positions[0] >= 8:
         axes.set_xscale("log")
     turned = 90 if len(positions) > MAX_TICKS else 0
     axes.set_xticks(positions, [f"{p:g}" for p in positions], rotation=turned)

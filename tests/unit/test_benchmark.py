@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from benchmarks.cells import Cell, Suite, data_in_words, list_suites, load_suite
-from benchmarks.figures import LPPAxis
+from benchmarks.figures import LPPAxis, curves
 from benchmarks.methods import METHODS
 from benchmarks.presets import PRESETS
 from benchmarks.report import worse, write_report
@@ -251,6 +251,19 @@ def test_the_axis_of_the_figures_is_linear_above_the_prior_and_logarithmic_below
     assert heights[2:].tolist() == [0.0, 0.5, 1.0]
     assert axis.forward(-4.0 - 6 * 11) == pytest.approx(-2.0)
     assert axis.forward(-4.0 - 6 * 111) == pytest.approx(-3.0)
+
+
+def test_a_task_with_a_single_method_without_pairs_has_its_line_and_name(
+    suite: Suite, tmp_path: Path
+) -> None:
+    results = Results(tmp_path / "cells")
+    cell = next(cell for cell in suite.cells if cell.method == "prior")
+    results.write(cell, *result_of(cell, [-3.1, -3.0, -2.9]))
+    rows = write_table(suite, results, tmp_path / "out").finished
+    figure = curves("n_calibration", rows)
+    (line,) = figure.axes[0].lines
+    assert list(line.get_ydata()) == pytest.approx([-3.0, -3.0])
+    assert [text.get_text() for text in figure.legends[0].texts] == ["prior"]
 
 
 def test_a_report_without_arrays_marks_nothing(
