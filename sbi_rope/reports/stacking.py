@@ -131,15 +131,16 @@ def _named(
 def _what_was_done(report: StackingReport) -> str:
     scores = report.cross_validation
     n, d = report.levels.shape
-    known = f"whose {d} parameters are known"
+    known, scored = f"whose {d} parameters are known", "known parameters"
     if scores.labels:
         known = f"with labels of their {d} parameters ({scores.labels})"
+        scored = "labels"
     return (
         "A neural posterior estimate (NPE) was trained on simulations, and the "
         "simulator may be wrong about the real measurements. It was repaired with "
         f"{n} real measurements {known}: {len(scores.names)} "
         "candidate posteriors learned from a part of them and were scored by the "
-        "probability density that they give to the known parameters of the others. "
+        f"probability density that they give to the {scored} of the others. "
         "The result is the average of the candidates, weighted by these scores, and "
         "is called the stack."
     )

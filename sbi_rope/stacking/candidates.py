@@ -136,6 +136,8 @@ class DensityCandidate(AmortisedCandidate):
             then built once, with a RoPE that has no pairs. Do not use it for a
             posterior that was trained on the calibration pairs: it would be scored by
             labels that it has seen.
+        learns_prior: Whether the pairs may teach it how parameters are distributed, as
+            all training on them does. It has no effect if ``fixed``.
 
     Example:
         Another trained posterior:
@@ -149,11 +151,13 @@ class DensityCandidate(AmortisedCandidate):
     name: str
     build: Callable[[RoPE, int], Any]
     fixed: bool = False
+    learns_prior: bool = True
 
     def __post_init__(self) -> None:
         """Check the types of all fields."""
         check_instance("name", self.name, str)
         check_instance("fixed", self.fixed, bool)
+        check_instance("learns_prior", self.learns_prior, bool)
         _check_name(self.name)
         if not callable(self.build):
             raise InvalidTypeError(

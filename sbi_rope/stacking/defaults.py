@@ -57,8 +57,8 @@ def default_candidates(
             net, and the embedding otherwise.
         learn_prior: Whether candidates may learn from the pairs how parameters are
             distributed. They should if the pairs are drawn like the observations to be
-            inferred. With False, discrepancy models keep the prior of NPE, and
-            fine-tuned candidates are left out, because they cannot.
+            inferred. With False, discrepancy models keep the prior of NPE.
+            Fine-tuned candidates cannot keep it, and are left out.
         couplings: Whether to add RoPE and OT-only over a grid of gamma and tau, and
             tuning-only. They are for the stack of a batch of observations.
         gammas: Values of gamma, in units of the median distance between simulated
@@ -90,7 +90,7 @@ def default_candidates(
         FinetunedCandidate(space="tuned"),
     )
     if not learn_prior:
-        amortised = tuple(one for one in amortised if not one.learns_prior)
+        amortised = tuple(one for one in amortised if one.fixed or not one.learns_prior)
     if rope is not None:
         check_instance("rope", rope, RoPE)
         x_o = None if x_o is None else rope.checked_observations(x_o)
@@ -114,7 +114,7 @@ def default_candidates(
         CouplingCandidate(gamma=gamma, tau=tau, **net)
         for net, gamma, tau in itertools.product(nets, gammas, taus)
     ]
-    tuned = DensityCandidate(name="tuning-only", build=_tuning_only)
+    tuned = DensityCandidate(name="tuning-only", build=_tuning_only, learns_prior=False)
     return (*coupled, *amortised, tuned)
 
 

@@ -225,7 +225,7 @@ class StackTrainer:
     def learns_prior(self) -> bool:
         """Whether a candidate learns from the pairs how parameters are distributed."""
         amortised = (c for c in self.candidates if isinstance(c, AmortisedCandidate))
-        return any(candidate.learns_prior for candidate in amortised)
+        return any(one.learns_prior and not one.fixed for one in amortised)
 
     def _train(self, folds: Sequence[Fold], chosen: Sequence[Candidate]) -> Versions:
         names = [candidate.name for candidate in chosen]

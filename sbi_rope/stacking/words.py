@@ -63,8 +63,8 @@ IF_LEARNED = (
     "and is too sure about those with other parameters."
 )
 IF_KEPT = (
-    "The stack keeps the prior. Its scores, its widths and sets with a guarantee hold "
-    "for such parameters only, where it may look too wide."
+    "The stack keeps the prior. It may look too wide for such parameters, and its "
+    "scores, its calibration and its sets with a guarantee hold for these only."
 )
 
 # What each method is. Whether it is better than others is for the scores to say.

@@ -511,7 +511,7 @@ def test_default_candidates_can_keep_the_prior_of_npe() -> None:
         *("prior", "NPE", "discrepancy, given prior"),
         *("discrepancy (input), given prior", "discrepancy (tuned), given prior"),
     ]
-    assert not any(candidate.learns_prior for candidate in kept)
+    assert all(candidate.fixed or not candidate.learns_prior for candidate in kept)
     coupled = default_candidates(couplings=True, learn_prior=False)
     assert len(coupled) == 36 + 6
     assert coupled[-1].name == "tuning-only"

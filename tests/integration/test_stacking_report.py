@@ -287,6 +287,10 @@ def test_a_stack_that_keeps_the_prior_says_what_holds_for_the_pairs_only() -> No
     assert "not distributed like the prior" in str(kept)
     assert "The stack keeps the prior." in str(kept)
     assert "learn_prior=False" not in str(kept)
+    # A user's candidate that is trained on the pairs does not keep it.
+    mixed = stacked(middle, candidates=[PRIOR, NPE, FITTED]).report
+    assert mixed.learns_prior
+    assert "The stack has learned where they are." in str(mixed)
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message="The parameters of the pairs are not")
         stacked(rope_of(), recalibrate=True, **options)

@@ -203,6 +203,11 @@ CALLS = [
                 **options,
             )
         ),
-        options={"name": "text", "build": "function", "fixed": "instance"},
+        options={
+            "name": "text",
+            "build": "function",
+            "fixed": "instance",
+            "learns_prior": "instance",
+        },
     ),
 ]
