@@ -135,6 +135,13 @@ def _few(sizes: Tensor) -> Finding:
 
 def _indistinct(sizes: Tensor, num_simulations: int) -> Finding:
     share = float(sizes.median()) / num_simulations
+    remedy = "A smaller gamma separates the observations."
+    if len(sizes) == 1:
+        # The sums of the columns are given, and a single row has to have them.
+        remedy = (
+            "At tau=1 a single observation has the prior for any gamma. Couple it with "
+            "others, or use `stack(rope)`, which needs no batch."
+        )
     return Finding(
         name="posteriors like the prior",
         value=share,
@@ -146,6 +153,6 @@ def _indistinct(sizes: Tensor, num_simulations: int) -> Finding:
         ),
         reason=(
             "Alarming above the threshold: a posterior over half of all simulations is "
-            "almost the prior. A smaller gamma separates the observations."
+            f"almost the prior. {remedy}"
         ),
     )

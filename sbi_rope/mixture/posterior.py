@@ -14,6 +14,7 @@ from torch.distributions import Distribution
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import BaseDirectPosterior, MixedDensity, describe
+from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._validation import (
     as_numbers,
     as_shape,
@@ -368,7 +369,10 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         x = as_numbers("x", x).to(torch.float32)
         if x.shape == event_shape:
             x = x[None]
-        return self.posterior_estimator.checked_x(x).to(x.device)
+        x = self.posterior_estimator.checked_x(x).to(x.device)
+        if self.is_amortised:  # RoPE has warned of a batch when it was given
+            warn_of_far_entries("x", x, self.posterior_estimator)
+        return x
 
     def log_prob(
         self,

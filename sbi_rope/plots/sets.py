@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 __all__ = ["credible_set"]
 
-DENSITY, GUARANTEED = "highest density", "guaranteed"
+CREDIBLE, GUARANTEED = "of the posterior", "guaranteed"
 STYLES: dict[str, dict[str, Any]] = {
-    DENSITY: {"color": BLUE, "linestyle": "-"},
+    CREDIBLE: {"color": BLUE, "linestyle": "-"},
     GUARANTEED: {"color": ORANGE, "linestyle": "--"},
 }
 
@@ -71,8 +71,8 @@ def credible_set(
     """
     check_instance("posterior", posterior, MixturePosterior)
     options: dict[str, Any] = {"num_samples": num_samples, "seed": seed}
-    sets = {DENSITY: posterior.credible_set(level, x, **options)}
-    intervals = {DENSITY: posterior.credible_intervals(level, x, **options)}
+    sets = {CREDIBLE: posterior.credible_set(level, x, **options)}
+    intervals = {CREDIBLE: posterior.credible_intervals(level, x, **options)}
     if isinstance(posterior, StackedPosterior):
         options["guaranteed"] = True
         try:
@@ -87,7 +87,7 @@ def credible_set(
         for name, found in sorted(sets.items(), key=lambda item: -item[1].volume)
     }
     draws, truth, labels = check_samples(
-        {"posterior": sets[DENSITY].draws, **members}, theta, parameter_names
+        {"posterior": sets[CREDIBLE].draws, **members}, theta, parameter_names
     )
     return _drawn(draws, intervals, truth, labels, level=level)
 

@@ -188,8 +188,14 @@ def no_discrepancy_section(report: StackingReport) -> str:
     )
 
 
-def diagnosis_section(diagnosis: Diagnosis) -> str:
-    """Return the findings about a batch."""
+def diagnosis_section(diagnosis: Diagnosis, names: Sequence[str]) -> str:
+    """Return the findings about a batch.
+
+    Args:
+        diagnosis: The findings.
+        names: The names of the parameters on the rest of the page. The sentences of the
+            diagnosis have those that it was made with.
+    """
     shown = (*diagnosis.unexpected, *diagnosis.expected)
     quiet = [result for result in diagnosis.findings if not result.alarming]
     return section(
@@ -198,6 +204,7 @@ def diagnosis_section(diagnosis: Diagnosis) -> str:
             f"{len(diagnosis.distance)} measurements were compared with "
             f"{len(diagnosis.theta)} simulations: {diagnosis.verdict}"
         ),
+        *_other_names(diagnosis.parameter_names, names),
         *(
             finding(
                 result.name,
@@ -215,6 +222,16 @@ def diagnosis_section(diagnosis: Diagnosis) -> str:
             wide=len(diagnosis.parameter_names) > 2,
         ),
     )
+
+
+def _other_names(own: Sequence[str], names: Sequence[str]) -> list[str]:
+    """Say which names of the diagnosis mean which parameters, where they differ."""
+    renamed = [
+        f"{before} is {name}"
+        for before, name in zip(own, names, strict=True)
+        if before != name
+    ]
+    return [paragraph(f"In this section {', '.join(renamed)}.")] if renamed else []
 
 
 def _in_words(result: Finding) -> str:

@@ -90,7 +90,7 @@ def write_stacking_report(
         else discrepancy_section(discrepancy)
     )
     if diagnosis is not None:
-        parts.append(diagnosis_section(diagnosis))
+        parts.append(diagnosis_section(diagnosis, names))
     parts += [_provenance_section(report), _glossary()]
     write_page(target, page(TITLE, *parts))
 
@@ -101,15 +101,15 @@ def _parameter_names(
     names: Sequence[str] | None,
 ) -> list[str]:
     count = report.levels.shape[1]
-    if names is not None:
-        return check_names("parameter_names", names, count)
-    if diagnosis is None:
-        return [f"theta_{k + 1}" for k in range(count)]
-    if len(diagnosis.parameter_names) != count:
+    if diagnosis is not None and len(diagnosis.parameter_names) != count:
         raise InvalidInputError(
             f"Expected `diagnosis` of a batch with {count} parameters, as the report "
             f"has; got {len(diagnosis.parameter_names)}."
         )
+    if names is not None:
+        return check_names("parameter_names", names, count)
+    if diagnosis is None:
+        return [f"theta_{k + 1}" for k in range(count)]
     return list(diagnosis.parameter_names)
 
 

@@ -185,6 +185,8 @@ def test_the_page_says_what_a_diagnosis_found(
     assert text.count("Alarming: ") == len(diagnosis.unexpected)
     assert diagnosis.verdict in text
     assert all(note.split(".")[0] in text for note in diagnosis.notes)
+    # Its sentences have names of their own, which the page explains.
+    assert f"In this section theta_1 is {NAMES[0]}, theta_2 is {NAMES[1]}." in text
 
 
 def test_the_verdict_names_a_batch_that_differs_from_the_pairs(source: str) -> None:
@@ -338,6 +340,7 @@ def test_names_and_a_diagnosis_that_do_not_fit_are_refused(
     with pytest.raises(InvalidTypeError, match="`path` to be a path"):
         report.to_html(3)  # type: ignore[arg-type]
     three = replace(diagnosis, parameter_names=("a", "b", "c"))
-    with pytest.raises(InvalidInputError, match="a batch with 2 parameters"):
-        report.to_html(path, diagnosis=three)
+    for names in (None, NAMES):
+        with pytest.raises(InvalidInputError, match="a batch with 2 parameters"):
+            report.to_html(path, diagnosis=three, parameter_names=names)
     assert not path.exists()

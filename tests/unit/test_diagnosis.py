@@ -458,6 +458,11 @@ def test_posteriors_of_very_few_or_very_many_simulations_alarm(tuned: RoPE) -> N
         )
         name = name or "posteriors like the prior"
         assert diagnosis[name].alarming
+    assert "A smaller gamma separates" in diagnosis[name].reason
+    # No gamma separates a single observation from others.
+    single = look(tuned, x_o[:1], num_simulations=200, num_folds=None)[name]
+    assert single.alarming
+    assert "use `stack(rope)`, which needs no batch" in single.reason
 
 
 # --- prior shift ---

@@ -15,6 +15,7 @@ from sbi_rope._standardisation import FAR, deviations
 from sbi_rope.baselines import CalibrationMLP, FinetunedNPE, Training
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import RoPEWarning
+from sbi_rope.mixture import average
 from sbi_rope.tasks import get_task
 from tests import problems
 
@@ -84,6 +85,21 @@ def test_an_entry_that_varies_only_in_reality_is_named_and_diagnosed() -> None:
     assert finding.alarming
     assert "Entry 2 of observation" in finding.sentence
     assert not usual["entries far from simulations"].alarming
+
+
+def test_an_amortised_posterior_warns_of_an_observation_in_another_unit() -> None:
+    posterior = average([npe_of("independent"), npe_of("independent")])
+    x = simulator(THETA[:3])
+    other = x * torch.tensor([1000.0, 1000.0, 1.0])
+    with pytest.warns(RoPEWarning, match=r"\(first: \[0, 1\]\).*Check the units"):
+        posterior.log_prob_batched(THETA[:3], other, norm_posterior=False)
+    with pytest.warns(RoPEWarning, match="in 1 of 1 rows"):
+        posterior.set_default_x(other[0])
+    with pytest.warns(RoPEWarning, match="in 1 of 1 rows"):
+        posterior.sample((1,), reject_outside_prior=False, **QUIET)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        posterior.sample_batched((1,), x, **QUIET)
 
 
 def test_npe_that_standardises_all_entries_alike_gives_no_warning() -> None:

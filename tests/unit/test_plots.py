@@ -40,7 +40,7 @@ def test_a_stack_has_a_credible_set_and_one_with_a_guarantee() -> None:
     stack, x = stacks.small_stack(), stacks.observed()[0]
     figure = plots.credible_set(stack, x, torch.zeros(2), num_samples=40)
     assert len(figure.axes) == 3
-    texts = ["90 %, highest density", "90 %, guaranteed", "truth"]
+    texts = ["90 %, of the posterior", "90 %, guaranteed", "truth"]
     assert legend_texts(figure.legends[0]) == texts
     intervals = stack.credible_intervals(
         0.9, x, guaranteed=True, num_samples=40, seed=0
@@ -56,14 +56,14 @@ def test_a_stack_with_too_few_pairs_for_a_guarantee_is_drawn_without_it() -> Non
     stack, x = stacks.small_stack(), stacks.observed()[0]
     with pytest.warns(RoPEWarning, match="No set with a guarantee is drawn"):
         figure = plots.credible_set(stack, x, level=0.99, num_samples=40)
-    assert legend_texts(figure.legends[0]) == ["99 %, highest density"]
+    assert legend_texts(figure.legends[0]) == ["99 %, of the posterior"]
     assert_refused("`level`", plots.credible_set, stack, x, level=1.5)
 
 
 def test_a_posterior_that_is_no_stack_has_the_set_of_highest_density_only() -> None:
     posterior = problems.gaussian_posterior(dim=1)[0]
     figure = plots.credible_set(posterior, level=0.5, num_samples=40)
-    assert legend_texts(figure.legends[0]) == ["50 %, highest density"]
+    assert legend_texts(figure.legends[0]) == ["50 %, of the posterior"]
     assert len(figure.axes) == 1
     assert_refused("MixturePosterior", plots.credible_set, problems.box(2))
 
