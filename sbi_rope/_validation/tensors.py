@@ -161,7 +161,7 @@ def check_readable(name: str, value: Tensor, can_read: Tensor) -> None:
             unread & ~infinite & ~empty,
             "to be finite; got NaN",
             " NaN may stand for missing trials or readings if the embedding net leaves "
-            "these out, as sbi's PermutationInvariantEmbedding does. This net does not.",
+            "them out, as sbi's PermutationInvariantEmbedding does. This net does not.",
         ),
     )
     raise InvalidInputError(
