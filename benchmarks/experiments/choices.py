@@ -123,6 +123,7 @@ CHOICES = {
     "pseudo-count 3": Choice(pseudo_count=3.0),
     "pseudo-count 10": Choice(pseudo_count=10.0),
     "without fine-tuned NPE": Choice(without=("fine-tuned NPE",)),
+    "without fine-tuned NPE, rehearsed": Choice(without=("fine-tuned NPE, rehearsed",)),
     "without discrepancy, fine-tuned": Choice(
         without=("discrepancy (input), fine-tuned", "discrepancy (tuned), fine-tuned")
     ),

@@ -16,6 +16,7 @@ from sbi_rope.stacking.stack import cross_validate, stack
 from sbi_rope.stacking.trained_candidates import (
     DiscrepancyCandidate,
     FinetunedCandidate,
+    RehearsedCandidate,
 )
 from sbi_rope.stacking.unlabelled_candidates import RVNPCandidate
 from sbi_rope.stacking.weights import StackingWeights, stacking_weights
@@ -31,6 +32,7 @@ __all__ = [
     "LearningCurve",
     "Provenance",
     "RVNPCandidate",
+    "RehearsedCandidate",
     "SetScores",
     "StackedPosterior",
     "StackingReport",

@@ -20,6 +20,7 @@ from sbi_rope.stacking.folds import NUM_FOLDS, Workbench
 from sbi_rope.stacking.trained_candidates import (
     DiscrepancyCandidate,
     FinetunedCandidate,
+    RehearsedCandidate,
 )
 from sbi_rope.stacking.unlabelled_candidates import (
     MAX_STATISTICS,
@@ -83,6 +84,7 @@ def default_candidates(
         DensityCandidate(name="prior", build=_prior, fixed=True),
         DensityCandidate(name="NPE", build=_npe, fixed=True),
         FinetunedCandidate(),
+        RehearsedCandidate(),
         DiscrepancyCandidate(space="embedding", learn_prior=learn_prior),
         DiscrepancyCandidate(space="input", learn_prior=learn_prior),
         DiscrepancyCandidate(space="tuned", learn_prior=learn_prior),

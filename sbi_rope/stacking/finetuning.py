@@ -14,14 +14,35 @@ from sbi_rope.trainers.training import FINETUNING, train_network
 
 __all__ = ["finetune_without"]
 
+# Of training with rehearsal: pairs in a batch, as many simulations as pairs, and steps
+# in an epoch, after each of which the held-out part is scored.
+BATCH_SIZE, STEPS = 50, 100
+# Epochs without improvement after which it stops. Chosen with the rate on calibration
+# data, see benchmarks/README.md.
+REHEARSED = replace(FINETUNING, stop_after_epochs=10)
 
-def finetune_without(start: Any, fold: Fold, part: int, *, learning_rate: float) -> Any:
+
+def finetune_without(
+    start: Any,
+    fold: Fold,
+    part: int,
+    *,
+    learning_rate: float,
+    rehearse: bool = False,
+) -> Any:
     r"""Train an estimator on the pairs of a fold, except for one held-out part.
 
     .. math::
         \min_q \; \sum_{i \notin \text{part}} -\log q(\theta_i \mid x_i)
         \quad\text{until}\quad \sum_{i \in \text{part}} -\log q(\theta_i \mid x_i)
         \quad\text{does not fall any more}
+
+    With rehearsal the mean over the pairs and that over simulations count half each:
+
+    .. math::
+        \min_q \; \tfrac12 \operatorname{mean}_{i \notin \text{part}}
+        \bigl[-\log q(\theta_i \mid x_i)\bigr]
+        + \tfrac12 \mathbb{E}_{p(\theta, x_s)}\bigl[-\log q(\theta \mid x_s)\bigr]
 
     The density of a label that is not exact is an average over the parameters that it
     leaves possible (:mod:`sbi_rope._labels.nodes`), and a weight multiplies its term.
@@ -35,6 +56,8 @@ def finetune_without(start: Any, fold: Fold, part: int, *, learning_rate: float)
         fold: The pairs that may be learned from.
         part: The number of the part to hold out, one of ``fold.used``.
         learning_rate: Of Adam.
+        rehearse: Whether to train on simulations, too. A net that has many parameters
+            and does not forget them learns more from the pairs before it overfits.
 
     Returns:
         The trained estimator, in evaluation mode.
@@ -67,11 +90,22 @@ def finetune_without(start: Any, fold: Fold, part: int, *, learning_rate: float)
         size = FINETUNING.training_batch_size
         return zip(shuffled(train, size, generator=order), strict=True)
 
+    def rehearsed_batches(epoch: int) -> Iterator[tuple[Tensor, Tensor]]:
+        num_simulations = len(bench.simulations[0])
+        for _ in range(STEPS):
+            pairs = torch.randint(len(train), (BATCH_SIZE,), generator=order)
+            others = torch.randint(num_simulations, (BATCH_SIZE,), generator=order)
+            yield train[pairs.to(train.device)], others
+
+    def rehearsed_loss(rows: Tensor, others: Tensor) -> Tensor:
+        theta, x = (one[others.to(one.device)] for one in bench.simulations)
+        return 0.5 * loss(rows) + 0.5 * estimator.loss(theta, condition=x).mean()
+
     train_network(
         estimator,
-        batches,
-        loss,
-        replace(FINETUNING, learning_rate=learning_rate),
+        rehearsed_batches if rehearse else batches,
+        rehearsed_loss if rehearse else loss,
+        replace(REHEARSED if rehearse else FINETUNING, learning_rate=learning_rate),
         validation_loss=lambda: loss(held_out),
         in_training_mode=False,
         label="Fine-tuning NPE",
