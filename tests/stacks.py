@@ -22,6 +22,7 @@ from sbi_rope.stacking import (
     default_candidates,
     stack,
 )
+from sbi_rope.stacking.finetuning import REHEARSED
 from sbi_rope.trainers.training import FINETUNING, Training
 from tests import problems
 
@@ -51,6 +52,8 @@ def quick() -> Iterator[None]:
         "sbi_rope.stacking.finetuning.FINETUNING": replace(
             FINETUNING, max_num_epochs=2
         ),
+        "sbi_rope.stacking.finetuning.REHEARSED": replace(REHEARSED, max_num_epochs=1),
+        "sbi_rope.stacking.finetuning.STEPS": 3,
     }
     with ExitStack() as patches:
         for name, value in constants.items():

@@ -1,16 +1,19 @@
 """How long and how fast are a stack's candidates to be fine-tuned?
 
-The table of rates and patiences of "The choices inside the stack" in
+The tables of rates and patiences of "The choices inside the stack" in
 `benchmarks/README.md`. A candidate is trained without each of some folds of the
 calibration pairs. The average of these versions is scored on 300 others of the
 calibration set, not of the test set.
 
     python -m benchmarks.experiments.patience --task pendulum --starts NPE tuned
+    python -m benchmarks.experiments.patience --task pendulum --starts rehearsed \
+        --rates 1e-3 2e-3 --patiences 10
 """
 
 import argparse
 import itertools
 from collections.abc import Iterator
+from dataclasses import replace
 from unittest.mock import patch
 
 import torch
@@ -18,36 +21,57 @@ import torch
 from benchmarks.experiments.common import Row, add_task, begin, show
 from benchmarks.experiments.data import calibration_data, case_of
 from sbi_rope.mixture import MixtureEstimator
-from sbi_rope.stacking import FinetunedCandidate
+from sbi_rope.stacking import FinetunedCandidate, RehearsedCandidate
+from sbi_rope.stacking.finetuning import REHEARSED
 from sbi_rope.stacking.folds import Fold, Workbench
+from sbi_rope.trainers.training import FINETUNING
 
-RATES, PATIENCES = (1e-3, 3e-4), (20, 50)
-SPACES = {"NPE": None, "embedding": "embedding", "input": "input", "tuned": "tuned"}
+CANDIDATES = {
+    "NPE": FinetunedCandidate(),
+    "embedding": FinetunedCandidate(space="embedding"),
+    "input": FinetunedCandidate(space="input"),
+    "tuned": FinetunedCandidate(space="tuned"),
+    "rehearsed": RehearsedCandidate(),
+}
 NUM_FOLDS = 5
 OPTIONS = {
     "--n-calibration": {"type": int, "default": 200},
-    "--starts": {"nargs": "+", "default": ["NPE", "tuned"], "choices": SPACES},
+    "--starts": {"nargs": "+", "default": ["NPE", "tuned"], "choices": CANDIDATES},
+    "--rates": {"type": float, "nargs": "+", "default": [1e-3, 3e-4]},
+    "--patiences": {"type": int, "nargs": "+", "default": [20, 50]},
     "--versions": {"type": int, "default": 2, "help": "folds to train without"},
+    "--seed": {"type": int, "default": 1, "help": "of the pairs"},
 }
 
 
 def rows(args: argparse.Namespace) -> Iterator[Row]:
     """Yield LPPs in standard deviations of the prior, by start, rate and patience."""
     case = case_of(args, method="stack")
-    rope, (theta, x) = calibration_data(case, args.n_calibration, seed=1)
-    bench = Workbench(rope, num_folds=NUM_FOLDS, seed=1, show_progress_bars=False)
+    rope, (theta, x) = calibration_data(case, args.n_calibration, seed=args.seed)
+    bench = Workbench(
+        rope, num_folds=NUM_FOLDS, seed=args.seed, show_progress_bars=False
+    )
     numbers = range(len(bench.folds))
     folds = [
         Fold(bench, [number for number in numbers if number != left_out])
         for left_out in numbers[: args.versions]
     ]
-    for start, rate, patience in itertools.product(args.starts, RATES, PATIENCES):
-        candidate = FinetunedCandidate(space=SPACES[start])
+    for start, rate, patience in itertools.product(
+        args.starts, args.rates, args.patiences
+    ):
+        candidate = CANDIDATES[start]
+        space = getattr(candidate, "space", None)
+        trainings = {"FINETUNING": FINETUNING, "REHEARSED": REHEARSED}
         with (
-            patch("sbi_rope.stacking.finetuning.PATIENCE", patience),
+            patch.multiple(
+                "sbi_rope.stacking.finetuning",
+                **{
+                    name: replace(training, stop_after_epochs=patience)
+                    for name, training in trainings.items()
+                },
+            ),
             patch.dict(
-                "sbi_rope.stacking.trained_candidates.LEARNING_RATES",
-                {candidate.space: rate},
+                "sbi_rope.stacking.trained_candidates.LEARNING_RATES", {space: rate}
             ),
         ):
             parts = [part for fold in folds for part in candidate.parts(fold)]

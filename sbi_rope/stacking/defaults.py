@@ -84,12 +84,12 @@ def default_candidates(
         DensityCandidate(name="prior", build=_prior, fixed=True),
         DensityCandidate(name="NPE", build=_npe, fixed=True),
         FinetunedCandidate(),
-        RehearsedCandidate(),
         DiscrepancyCandidate(space="embedding", learn_prior=learn_prior),
         DiscrepancyCandidate(space="input", learn_prior=learn_prior),
         DiscrepancyCandidate(space="tuned", learn_prior=learn_prior),
         FinetunedCandidate(space="input"),
         FinetunedCandidate(space="tuned"),
+        RehearsedCandidate(),
     )
     if not learn_prior:
         amortised = tuple(one for one in amortised if one.fixed or not one.learns_prior)

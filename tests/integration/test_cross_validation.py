@@ -10,21 +10,22 @@ import torch
 from torch import Tensor, nn
 
 from sbi_rope import CalibrationFinetuner, RoPE
-from sbi_rope._sbi import embed, embedding_of
+from sbi_rope._sbi import embed, embedding_of, estimator_of
 from sbi_rope._training import groups_of
 from sbi_rope.discrepancy.training import ONE, Courses
 from sbi_rope.metrics import acauc_of
-from sbi_rope.mixture import MixturePosterior
+from sbi_rope.mixture import MixtureEstimator, MixturePosterior
 from sbi_rope.stacking import (
     AmortisedCandidate,
     CrossValidation,
     DensityCandidate,
     FinetunedCandidate,
+    RehearsedCandidate,
     StackedPosterior,
     stacking_weights,
     trained_candidates,
 )
-from sbi_rope.stacking.finetuning import finetune_without
+from sbi_rope.stacking.finetuning import BATCH_SIZE, finetune_without
 from sbi_rope.stacking.folds import Fold, Workbench
 from tests import problems
 from tests.stacks import (
@@ -110,6 +111,7 @@ def test_recordings_of_a_person_are_never_both_trained_on_and_held_out(
     person_of = {tuple(row): int(p) for row, p in zip(x.tolist(), people, strict=True)}
     tuned: list[tuple[set[int], Tensor]] = []
     splits: list[tuple[set[int], set[int]]] = []
+    rehearsed: list[tuple[set[int], set[int]]] = []
     finetune, without = (
         CalibrationFinetuner.finetune,
         trained_candidates.finetune_without,
@@ -127,7 +129,7 @@ def test_recordings_of_a_person_are_never_both_trained_on_and_held_out(
         bench = fold.bench
         sides = [bench.rows_of(fold.used - {part}), bench.folds[part]]
         train, held_out = ({int(p) for p in people[side]} for side in sides)
-        splits.append((train, held_out))
+        (rehearsed if options.get("rehearse") else splits).append((train, held_out))
         return without(start, fold, part, **options)
 
     monkeypatch.setattr(CalibrationFinetuner, "finetune", spied_finetune)
@@ -150,7 +152,11 @@ def test_recordings_of_a_person_are_never_both_trained_on_and_held_out(
     # Each of the four versions of a fine-tuned candidate holds out each of its parts.
     assert splits
     assert len(splits) % 12 == 0
-    assert all(known.isdisjoint(others) and others for known, others in splits)
+    # One of each version with rehearsal.
+    assert len(rehearsed) == 4
+    assert all(
+        known.isdisjoint(others) and others for known, others in splits + rehearsed
+    )
 
 
 class Indifferent(nn.Module):
@@ -181,6 +187,55 @@ def test_a_net_is_not_tuned_on_the_part_that_tells_it_when_to_stop() -> None:
     assert part == set(bench.x[bench.folds[1], 0].tolist())
     others = torch.cat([bench.folds[0], bench.folds[3]])
     assert Indifferent.trained == set(bench.x[others, 0].tolist())
+
+
+def test_with_rehearsal_pairs_and_simulations_count_half_each() -> None:
+    bench = Workbench(
+        rope_of(problem(12, seed=1)), num_folds=4, seed=0, show_progress_bars=False
+    )
+    start = estimator_of(bench.npe)
+    with quick():
+        simulated = bench.simulations
+        with patch("sbi_rope.stacking.finetuning.train_network") as train:
+            finetune_without(
+                start, Fold(bench, [0, 1, 3]), 1, learning_rate=1e-3, rehearse=True
+            )
+        _, batches, loss, training = train.call_args.args
+        found = list(batches(0))
+    assert len(found) == 3  # of a quick stack
+    assert training.learning_rate == 1e-3
+    pairs, others = found[0]
+    assert len(pairs) == len(others) == BATCH_SIZE
+    # Neither the part that is held out nor the fold that is scored is trained on.
+    seen = torch.cat([rows for rows, _ in found]).unique()
+    assert set(seen.tolist()) == set(bench.rows_of(frozenset({0, 3})).tolist())
+    of_pairs, of_others = (
+        -start.log_prob(theta[rows][None], x[rows]).mean()
+        for (theta, x), rows in (((bench.theta, bench.x), pairs), (simulated, others))
+    )
+    assert torch.allclose(loss(pairs, others), (of_pairs + of_others) / 2)
+
+
+def test_every_part_is_held_out_by_another_version_with_rehearsal() -> None:
+    bench = Workbench(
+        rope_of(problem(12, seed=1)), num_folds=4, seed=0, show_progress_bars=False
+    )
+    start = estimator_of(bench.npe)
+    held_out = []
+    with patch.object(
+        trained_candidates, "finetune_without", return_value=start
+    ) as train:
+        for used in ([1, 2, 3], [2, 3, 0], [3, 0, 1], [0, 1, 2], [0, 1, 2, 3]):
+            RehearsedCandidate().parts(Fold(bench, used))
+            held_out.append(train.call_args.args[2])
+        train.reset_mock()
+        # Of a single fold nothing can be held out, and NPE stays as it is.
+        (part,) = RehearsedCandidate().parts(Fold(bench, [2]))
+        assert not train.called
+    assert held_out == [1, 2, 3, 0, 0]
+    theta, x = bench.theta[:3], bench.x[:3]
+    found = MixtureEstimator([part], [1.0]).log_prob(theta[None], x)
+    assert torch.allclose(found, start.log_prob(theta[None], x), atol=1e-5)
 
 
 def test_fine_tuning_of_a_tuned_candidate_starts_with_the_net_without_the_part() -> (

@@ -316,6 +316,18 @@ def test_images_are_stacked_without_candidates_that_need_summaries() -> None:
     assert posterior.log_prob_batched(theta, x).isfinite().all()
     names = [candidate.name for candidate in default_candidates(rope)]
     assert names == list(posterior.candidate_weights)
+    # With a hundred pairs of images NPE is trained on pairs and simulations alike.
+    theta = problems.box(2).sample((100,))
+    rope.append_calibration(theta[:89], problems.simulate_image(theta[:89]))
+    assert [c.name for c in default_candidates(rope)] == names
+    rope.append_calibration(theta[89:90], problems.simulate_image(theta[89:90]))
+    assert [c.name for c in default_candidates(rope)] == [
+        *names,
+        "fine-tuned NPE, rehearsed",
+    ]
+    assert "fine-tuned NPE, rehearsed" not in [
+        c.name for c in default_candidates(rope_of(problem(100, seed=1)))
+    ]
     candidates = [PRIOR, DensityCandidate(name="never", build=never)]
     candidates += [DiscrepancyCandidate(space="input")]
     with pytest.raises(InvalidInputError, match="space='embedding'"):
@@ -489,10 +501,10 @@ def test_default_candidates_have_different_names() -> None:
     assert [candidate.name for candidate in amortised] == [
         *("prior", "NPE", "fine-tuned NPE", "discrepancy", "discrepancy (input)"),
         *("discrepancy (tuned)", "discrepancy (input), fine-tuned"),
-        "discrepancy (tuned), fine-tuned",
+        *("discrepancy (tuned), fine-tuned", "fine-tuned NPE, rehearsed"),
     ]
     names = [candidate.name for candidate in all_of_them]
-    assert len(set(names)) == len(names) == 36 + 9
+    assert len(set(names)) == len(names) == 36 + 10
     assert {c.family for c in all_of_them if isinstance(c, CouplingCandidate)} == {
         *("RoPE", "OT-only"),
     }

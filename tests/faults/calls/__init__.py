@@ -102,6 +102,8 @@ NOT_CALLED = {
             "FinetunedCandidate.parts",
             "RVNPCandidate.applies_to",
             "RVNPCandidate.parts",
+            "RehearsedCandidate.applies_to",
+            "RehearsedCandidate.parts",
         ),
         _FOR_STACK,
     ),
