@@ -16,6 +16,7 @@ from scipy.stats import t as student
 from benchmarks import figures
 from benchmarks.methods import METHODS, STACK, STACKS, methods_where
 from benchmarks.published import FIXED, LETTERS, MISSING, Published, Setting, table
+from benchmarks.stacks import other_trainings
 from benchmarks.table import Table
 
 __all__ = ["evidence_lines", "finished_rows", "half_width"]
@@ -104,7 +105,8 @@ def evidence_lines(published: Published, folder: Path) -> list[str]:
     head = ("task", "pairs", "repetitions", "stack", "ACAUC", "best other")
     head += ("its LPP", "difference", "s", "calls")
     lines += table(head, [_entries(published, one, rows) for one in compared])
-    return [*lines, "", *_goals(compared, rows), "", *_costs(published, rows)]
+    lines += ["", *other_trainings(published.tables["main"])]
+    return [*lines, *_goals(compared, rows), "", *_costs(published, rows)]
 
 
 def finished_rows(published: Published) -> pd.DataFrame:

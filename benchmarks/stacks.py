@@ -9,8 +9,11 @@ from benchmarks.cells import Cell
 from benchmarks.methods import STACK, STACKS
 from benchmarks.table import Table, markdown
 
-__all__ = ["Comparison", "comparisons", "stacking_lines"]
+__all__ = ["Comparison", "comparisons", "other_trainings", "stacking_lines"]
 
+# NPE is deterministic on one machine. Scores that differ by more than rounding are of
+# networks that were trained on different ones.
+SAME = 0.005
 # The goals, fixed beforehand, in nats and ACAUC.
 NEAR, CALIBRATED = 0.1, 0.05
 BASICS = ("prior", "NPE", "tuning-only", "fine-tuned NPE")
@@ -86,6 +89,53 @@ def comparisons(table: Table) -> list[Comparison]:
     return found
 
 
+def other_trainings(table: Table) -> list[str]:
+    """Name the stacks that start from another NPE than others on the same data.
+
+    A repetition has one NPE, which is trained anew where a run goes on on another
+    machine. The reference is the row of NPE, or without one that of most stacks.
+    """
+    found = [one for one in comparisons(table) if "NPE" in one.test]
+    known = {
+        _data(cell): row["lpp_z"]
+        for cell, row in table.rows.iterrows()
+        if cell.method == "NPE"
+    }
+    by_data: dict[tuple[Any, ...], list[Comparison]] = {}
+    for one in found:
+        by_data.setdefault(_data(one.cell), []).append(one)
+    named = []
+    for data, stacks in by_data.items():
+        own = [round(one.test["NPE"], 2) for one in stacks]
+        reference = known.get(data, max(own, key=own.count))
+        others: dict[float, list[str]] = {}
+        for one, score in zip(stacks, own, strict=True):
+            if abs(one.test["NPE"] - reference) > SAME:
+                name = f"{one.cell.method} with {one.cell.n_calibration} pairs"
+                others.setdefault(score, []).append(name)
+        cell = stacks[0].cell
+        where = f"{cell.task} {cell.variant}".strip()
+        named += [
+            f"- {where}, repetition {cell.repetition}: {score:.2f} instead of "
+            f"{reference:.2f} ({', '.join(names)})"
+            for score, names in others.items()
+        ]
+    if not named:
+        return []
+    return [
+        "These stacks start from an NPE that was trained on another machine than that",
+        "of the methods beside them, with the same settings on the same data. LPP of",
+        "the two NPEs:",
+        "",
+        *named,
+        "",
+    ]
+
+
+def _data(cell: Cell) -> tuple[Any, ...]:
+    return cell.task, cell.variant, cell.options, cell.preset, cell.repetition
+
+
 def stacking_lines(table: Table) -> list[str]:
     """Return the comparison of all stacks in Markdown; nothing if there is none."""
     found = comparisons(table)
@@ -96,7 +146,10 @@ def stacking_lines(table: Table) -> list[str]:
     heads += ("stack - best", "held out", "ACAUC", "ECE", "s")
     lines = ["## The stack against its candidates", "", EXPLANATION]
     lines += markdown(heads, map(_entries, found))
-    return [*lines, "", *_goals(found), "", *_rehearsal(found)]
+    return [
+        *(*lines, "", *other_trainings(table)),
+        *(*_goals(found), "", *_rehearsal(found)),
+    ]
 
 
 def _entries(one: Comparison) -> list[str]:

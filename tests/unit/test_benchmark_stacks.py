@@ -1,5 +1,7 @@
 """The stack against its candidates, from a table that is made up."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from benchmarks.stacks import (
     REHEARSED,
     Comparison,
     comparisons,
+    other_trainings,
     stacking_lines,
 )
 from benchmarks.table import Table
@@ -95,6 +98,32 @@ def test_rehearsal_is_compared_where_both_were_candidates() -> None:
     assert "| pendulum |  | 10 | -2.00 | -1.50 | +0.50 |" in stacking_lines(a_table())
     names = {candidate.name for candidate in default_candidates(couplings=True)}
     assert {ONE_SETTING, REHEARSED} <= names
+
+
+def test_a_stack_that_starts_from_another_npe_than_others_is_named() -> None:
+    def table(npe: float | None, *stacks: tuple[int, float]) -> Table:
+        (stack, row), (prior, _) = a_table().rows.iterrows()
+        rows, arrays = {prior: row.to_dict()}, {prior: {}}
+        if npe is not None:
+            cell = replace(prior, method="NPE")
+            rows[cell], arrays[cell] = {**row, "lpp_z": npe}, {}
+        for size, score in stacks:
+            cell = replace(stack, n_calibration=size)
+            test = np.array(list({**TEST, "NPE": score}.values()))
+            rows[cell] = row.to_dict()
+            arrays[cell] = {**a_table().arrays[stack], "test": test}
+        return Table.of(rows, arrays)
+
+    assert other_trainings(table(-9.0, (10, -9.0), (50, -9.001))) == []
+    *_, line, _ = other_trainings(table(-9.0, (10, -9.0), (50, -7.5), (200, -7.5)))
+    assert line == (
+        "- pendulum, repetition 0: -7.50 instead of -9.00 (stack with 50 pairs, stack "
+        "with 200 pairs)"
+    )
+    # Without a row of NPE, most stacks tell.
+    *_, line, _ = other_trainings(table(None, (10, -7.5), (50, -7.5), (200, -9.0)))
+    assert line.endswith("-9.00 instead of -7.50 (stack with 200 pairs)")
+    assert line in stacking_lines(table(None, (10, -7.5), (50, -7.5), (200, -9.0)))
 
 
 def test_without_a_stack_nothing_is_said() -> None:
