@@ -12,6 +12,7 @@ from sbi_rope.stacking import (
     DensityCandidate,
     DiscrepancyCandidate,
     FinetunedCandidate,
+    RehearsedCandidate,
     RVNPCandidate,
     cross_validate,
     default_candidates,
@@ -187,6 +188,7 @@ CALLS = [
         run=lambda **options: repr(FinetunedCandidate(**options)),
         options={"space": "choice"},
     ),
+    Call(name="RehearsedCandidate", run=lambda: repr(RehearsedCandidate())),
     Call(
         name="DiscrepancyCandidate",
         run=lambda space="embedding", **options: repr(
