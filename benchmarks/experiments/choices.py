@@ -22,7 +22,7 @@ from benchmarks.cases import Case
 from benchmarks.experiments.common import Row, add_task, begin, show
 from benchmarks.experiments.data import calibration_data, case_of
 from sbi_rope import stack
-from sbi_rope.stacking import stacking_weights
+from sbi_rope.stacking import default_candidates, stacking_weights
 
 __all__ = ["CHOICES", "Choice", "Run", "comparison", "run"]
 
@@ -147,6 +147,7 @@ def rows(args: argparse.Namespace) -> Iterator[Row]:
                     "pairs": args.n_calibration,
                     "folds": args.folds,
                     "seed": seed,
+                    "candidates": [one.name for one in default_candidates()],
                 },
                 lambda s=seed, c=case: run(c, args.n_calibration, args.folds, s),
                 pack=vars,

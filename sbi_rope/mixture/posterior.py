@@ -82,8 +82,12 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         shared: A dictionary in which the posterior keeps the masses :math:`Z_j` that it
             estimates. Posteriors of the same prior and the same parts, in the same
             order, may share it, whatever their weights and couplings are.
+        warns: Whether an amortised posterior warns of observations whose entries are
+            far from the simulations of NPE, if NPE standardises them. Those with which
+            a stack scores the pairs do not, because RoPE has warned of these.
     """
 
+    warns = True
     # The observation that the mass was last estimated for, and this mass.
     _latest: tuple[Tensor, Leakage] | None = None
 
@@ -94,6 +98,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         *,
         enable_transform: bool = True,
         shared: dict[int, Tensor] | None = None,
+        warns: bool = True,
     ) -> None:
         # A category that sbi has standardised and put back may differ by rounding, and
         # is no category then.
@@ -110,6 +115,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         self.posterior_estimator: MixtureEstimator = estimator
         # Posteriors of single observations share it, so that all is estimated once.
         self._cache: dict[int, Tensor] = {} if shared is None else shared
+        self.warns = warns
         describe(self, _purpose(estimator))
 
     def __getstate__(self) -> dict[str, Any]:
@@ -319,7 +325,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             check_integer("max_sampling_batch_size", max_sampling_batch_size)
         return self.posterior_estimator.sample(
             as_shape("sample_shape", sample_shape),
-            self._batch_of_x(x),
+            self._warned_of(self._batch_of_x(x)),
             accept=self._inside if reject_outside_prior else None,
             batch_size=max_sampling_batch_size,
             show_progress_bars=is_shown(show_progress_bars),
@@ -345,7 +351,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         Raises:
             InvalidInputError: If the shape does not fit, or a value is not finite.
         """
-        self._keep_default_x(self._batch_of_x(x))
+        self._keep_default_x(self._warned_of(self._batch_of_x(x)))
         return self
 
     def _one_x(self, x: Tensor | None) -> Tensor:
@@ -369,8 +375,11 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         x = as_numbers("x", x).to(torch.float32)
         if x.shape == event_shape:
             x = x[None]
-        x = self.posterior_estimator.checked_x(x).to(x.device)
-        if self.is_amortised:  # RoPE has warned of a batch when it was given
+        return self.posterior_estimator.checked_x(x).to(x.device)
+
+    def _warned_of(self, x: Tensor) -> Tensor:
+        """Return observations, after a warning if entries are far from simulations."""
+        if self.warns and self.is_amortised:  # RoPE has warned of its batch
             warn_of_far_entries("x", x, self.posterior_estimator)
         return x
 
@@ -402,7 +411,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         """
         return super().log_prob(
             check_theta(theta, self.posterior_estimator.input_shape, batched=False),
-            self._one_x(x),
+            self._warned_of(self._one_x(x)),
             norm_posterior,
             track_gradients,
             leakage_correction_params,
@@ -459,7 +468,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         """
         return super().log_prob_batched(
             check_theta(theta, self.posterior_estimator.input_shape, batched=True),
-            self._batch_of_x(x),
+            self._warned_of(self._batch_of_x(x)),
             norm_posterior,
             track_gradients,
             leakage_correction_params,

@@ -17,8 +17,8 @@ __all__ = ["finetune_without"]
 # Of training with rehearsal: pairs in a batch, as many simulations as pairs, and steps
 # in an epoch, after each of which the held-out part is scored.
 BATCH_SIZE, STEPS = 50, 100
-# Epochs without improvement after which it stops. Chosen with the rate on calibration
-# data, see benchmarks/README.md.
+# It stops after so many epochs without improvement. No other number was tried. What it
+# gains on calibration data is in benchmarks/README.md.
 REHEARSED = replace(FINETUNING, stop_after_epochs=10)
 
 
@@ -48,16 +48,17 @@ def finetune_without(
     leaves possible (:mod:`sbi_rope._labels.nodes`), and a weight multiplies its term.
 
     All parameters are trained in evaluation mode. The epoch with the lowest loss on the
-    held-out part is kept; this can be the start. A candidate averages the nets that
-    hold out each part of a fold in turn, which reduces the effect of overfitting.
+    held-out part is kept; this can be the start. Without rehearsal a candidate averages
+    the nets that hold out each part of a fold in turn, which reduces the effect of
+    overfitting.
 
     Args:
         start: An estimator of sbi with a density; it is not changed.
         fold: The pairs that may be learned from.
         part: The number of the part to hold out, one of ``fold.used``.
         learning_rate: Of Adam.
-        rehearse: Whether to train on simulations, too. A net that has many parameters
-            and does not forget them learns more from the pairs before it overfits.
+        rehearse: Whether to train on simulations, too. A large net that keeps seeing
+            them learns more from the pairs before it overfits.
 
     Returns:
         The trained estimator, in evaluation mode.

@@ -118,12 +118,16 @@ class Workbench:
         """The embedding net h of NPE."""
         return self.rope.embedding_net
 
+    @property
+    def is_short(self) -> bool:
+        """Whether x is a vector of few entries, and neither a series nor an image."""
+        return self.x.ndim == 2 and self.x.shape[1] <= MAX_SUMMARIES
+
     @cached_property
     def has_summaries(self) -> bool:
         """Whether x is a vector of so few entries that it can be corrected itself."""
-        short = self.x.ndim == 2 and self.x.shape[1] <= MAX_SUMMARIES
         # Missing entries (NaN) can be embedded, but not corrected.
-        return short and bool(torch.isfinite(self.x).all())
+        return self.is_short and bool(torch.isfinite(self.x).all())
 
     @cached_property
     def reads_summaries(self) -> bool:

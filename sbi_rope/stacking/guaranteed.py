@@ -171,6 +171,7 @@ class HeldOutSets:
                 self._versions.estimator(weights, [number]),
                 self._posterior.prior,
                 enable_transform=False,
+                warns=False,
             )
             for number, weights in enumerate(scores.weights)
         )

@@ -143,6 +143,7 @@ def _stack_scores(
             bench.npe.prior,
             enable_transform=False,
             shared=shared,
+            warns=False,
         )
         if of_labels is None:
             scores = score_fold(

@@ -19,9 +19,11 @@ from sbi_rope.stacking import (
     DensityCandidate,
     DiscrepancyCandidate,
     FinetunedCandidate,
+    RehearsedCandidate,
     default_candidates,
     stacking_weights,
 )
+from sbi_rope.stacking.folds import Workbench
 from tests import gaussian, problems
 from tests.stacks import (
     COUPLINGS,
@@ -325,13 +327,22 @@ def test_images_are_stacked_without_candidates_that_need_summaries() -> None:
         *names,
         "fine-tuned NPE, rehearsed",
     ]
-    assert "fine-tuned NPE, rehearsed" not in [
-        c.name for c in default_candidates(rope_of(problem(100, seed=1)))
-    ]
+    scores = validated(rope, candidates=[RehearsedCandidate()])
+    assert scores.log_scores.isfinite().all()
+    assert not RehearsedCandidate().applies_to(workbench(rope, num_folds=2))
+    # A short vector is no series, also if one of its entries is missing.
+    bench = workbench(rope_of(problem(100, seed=1)), num_folds=5)
+    assert not RehearsedCandidate().applies_to(bench)
+    bench.x = bench.x.clone().index_fill(0, torch.tensor([3]), torch.nan)
+    assert not RehearsedCandidate().applies_to(bench)
     candidates = [PRIOR, DensityCandidate(name="never", build=never)]
     candidates += [DiscrepancyCandidate(space="input")]
     with pytest.raises(InvalidInputError, match="space='embedding'"):
         stacked(rope, candidates=candidates)
+
+
+def workbench(rope: RoPE, *, num_folds: int) -> Workbench:
+    return Workbench(rope, num_folds=num_folds, seed=0, show_progress_bars=False)
 
 
 def never(rope: RoPE, seed: int) -> Any:

@@ -1,6 +1,7 @@
 """Entries of x that are far from simulations, or the same in all of them."""
 
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -10,12 +11,13 @@ from sbi.neural_nets import posterior_nn
 from sbi.utils.sbiutils import Standardize
 from torch import Tensor, nn
 
-from sbi_rope import CalibrationFinetuner, RoPE, diagnose
+from sbi_rope import CalibrationFinetuner, RoPE, diagnose, stack
 from sbi_rope._standardisation import FAR, deviations
 from sbi_rope.baselines import CalibrationMLP, FinetunedNPE, Training
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import RoPEWarning
 from sbi_rope.mixture import average
+from sbi_rope.stacking import default_candidates
 from sbi_rope.tasks import get_task
 from tests import problems
 
@@ -100,6 +102,28 @@ def test_an_amortised_posterior_warns_of_an_observation_in_another_unit() -> Non
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         posterior.sample_batched((1,), x, **QUIET)
+    # A call warns once, whatever it does inside.
+    calls: tuple[Callable[[], Tensor], ...] = (
+        lambda: posterior.sample((1,), reject_outside_prior=False, **QUIET),
+        lambda: posterior.log_prob(THETA[:1], norm_posterior=False),
+    )
+    for call in calls:
+        with warnings.catch_warnings(record=True) as found:
+            warnings.simplefilter("always")
+            call()
+        assert len([one for one in found if one.category is RoPEWarning]) == 1
+
+
+def test_a_stack_does_not_warn_of_its_pairs_again() -> None:
+    rope = RoPE(npe_of("independent"), simulator=simulator)
+    with pytest.warns(RoPEWarning, match="entries of `x`"):
+        rope.append_calibration(THETA_CAL, real(THETA_CAL))
+    candidates = [c for c in default_candidates() if c.name in ("prior", "NPE")]
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*deviations away from simulations")
+        posterior = stack(rope, candidates=candidates, seed=0, **QUIET)
+    with pytest.warns(RoPEWarning, match="deviations away from simulations"):
+        posterior.sample_batched((1,), real(THETA[:2]), **QUIET)
 
 
 def test_npe_that_standardises_all_entries_alike_gives_no_warning() -> None:
