@@ -146,6 +146,19 @@ def test_labels_without_noise_take_the_path_of_exact_ones(
     assert torch.equal(exact.levels, found.levels)
 
 
+def test_rehearsal_learns_from_labels_that_are_not_exact() -> None:
+    rehearsed = [c for c in CANDIDATES if c.name == "fine-tuned NPE, rehearsed"]
+    weights = torch.linspace(0.5, 2.0, NUM_PAIRS)
+    exact, noisy, weighted = (
+        validated(labelled(THETA, **some), candidates=rehearsed).log_scores
+        for some in ({}, {"theta_std": 0.3}, {"weights": weights})
+    )
+    assert noisy.isfinite().all()
+    assert weighted.isfinite().all()
+    assert not torch.equal(noisy, exact)
+    assert not torch.equal(weighted, exact)
+
+
 def test_the_weights_of_pairs_decide_for_the_candidate_that_they_favour() -> None:
     # NPE is right about the first half, and the prior about the others.
     theta, x = problem(NUM_PAIRS, seed=1)
