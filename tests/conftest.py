@@ -1,5 +1,6 @@
 """Fixtures and guards shared by all tests."""
 
+import gc
 import socket
 import sys
 from collections.abc import Iterator
@@ -15,6 +16,12 @@ EXTRACT_ROWS = {
 }
 # The whole data sets, which some machines have beside the repository.
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+def pytest_collection_finish() -> None:
+    """Leave what was imported and collected out of later garbage collections."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)

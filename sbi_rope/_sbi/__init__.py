@@ -28,6 +28,7 @@ from sbi_rope._sbi.embedding import (
     standardisation_of,
     with_embedding,
 )
+from sbi_rope._sbi.mmd import squared_mmd
 from sbi_rope._sbi.posteriors import (
     BaseDirectPosterior,
     check_density,
@@ -72,6 +73,7 @@ __all__ = [
     "posterior_from",
     "readable",
     "reads_missing",
+    "squared_mmd",
     "standardisation_of",
     "train_npe",
     "with_embedding",

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from sbi_rope._sbi import squared_mmd
 from sbi_rope.diagnosis.report import Finding
 from sbi_rope.diagnosis.simulations import Simulations
 
@@ -59,24 +60,16 @@ def mmd_test(batch: Tensor, simulated: Tensor, *, null: Tensor) -> MMDTest:
     for i in range(NUM_DRAWS):
         order = torch.randperm(len(simulated))[: num_real + num_simulated]
         real, other = order[:num_real], order[num_real:]
-        usual[i] = _mmd(null[real], simulated[other])
-    value = _mmd(chosen, simulated[torch.randperm(len(simulated))[:num_simulated]])
+        usual[i] = squared_mmd(null[real], simulated[other])
+    value = squared_mmd(
+        chosen, simulated[torch.randperm(len(simulated))[:num_simulated]]
+    )
     return MMDTest(
         mmd=value,
         usual=float(usual.median()),
         # The batch itself counts as one of the draws, so that p is never 0.
         p_value=(1 + int((usual >= value).sum())) / (1 + NUM_DRAWS),
     )
-
-
-def _mmd(a: Tensor, b: Tensor) -> float:
-    # It is imported here because it needs packages that nothing else here needs.
-    from sbi.diagnostics import calc_misspecification_mmd
-
-    _, (_, mmd) = calc_misspecification_mmd(
-        a, b, mode="x_space", n_shuffle=1, max_samples=len(b)
-    )
-    return float(mmd)
 
 
 def misspecification_findings(

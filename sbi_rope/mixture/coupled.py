@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from sbi_rope._sbi import embed, readable
+from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._validation import (
     check_batch,
     check_choice,
@@ -216,6 +217,7 @@ class CoupledEmbeddings(Mixing):
                 "`unseen='extend'` to either of them, which then extends the old "
                 "coupling to new observations."
             )
+        warn_of_far_entries("x", x, self.nets[0].net)
         embedded = torch.stack(
             [embed(net.net, x).to(net.real) for net in self.nets], dim=1
         )

@@ -114,6 +114,20 @@ def test_an_amortised_posterior_warns_of_an_observation_in_another_unit() -> Non
         assert len([one for one in found if one.category is RoPEWarning]) == 1
 
 
+def test_a_coupling_that_is_extended_warns_of_an_observation_in_another_unit() -> None:
+    rope = RoPE(npe_of("independent"), simulator=simulator)
+    posterior = rope.build_posterior(
+        simulator(THETA), unseen="extend", require_convergence=False, **QUIET
+    )
+    x = simulator(THETA[:2])
+    with pytest.warns(RoPEWarning, match="in 2 of 2 rows.*Check the units"):
+        posterior.sample_batched((1,), 1000.0 * x, **QUIET)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message="Extended the coupling")
+        posterior.sample_batched((1,), x, **QUIET)
+
+
 def test_a_stack_does_not_warn_of_its_pairs_again() -> None:
     rope = RoPE(npe_of("independent"), simulator=simulator)
     with pytest.warns(RoPEWarning, match="entries of `x`"):
