@@ -2,8 +2,9 @@
 
 import copy
 import math
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -11,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from sbi_rope._progress import progress_bar
-from sbi_rope.errors import warn_user
+from sbi_rope.errors import RoPEWarning, warn_user
 
 __all__ = [
     "EPOCHS_WITHOUT_HOLDOUT",
@@ -27,6 +28,7 @@ __all__ = [
     "split_groups",
     "split_pairs",
     "too_few_pairs",
+    "without_warning_of_few_pairs",
 ]
 
 Trained = TypeVar("Trained")
@@ -204,6 +206,16 @@ def epochs_on_pairs(
         "on a hold-out."
     )
     return min(max_num_epochs, EPOCHS_WITHOUT_HOLDOUT)
+
+
+@contextmanager
+def without_warning_of_few_pairs() -> Iterator[None]:
+    """Train on some of the user's pairs, whose number the user did not choose."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings(
+            "ignore", message="Only .* none is held out", category=RoPEWarning
+        )
+        yield
 
 
 def shuffled(

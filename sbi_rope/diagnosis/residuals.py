@@ -8,7 +8,7 @@ from torch import Tensor
 from sbi_rope._means import Counts
 from sbi_rope._progress import progress_bar
 from sbi_rope._sbi import embed
-from sbi_rope._training import split_groups
+from sbi_rope._training import split_groups, without_warning_of_few_pairs
 from sbi_rope.diagnosis.report import Finding
 from sbi_rope.diagnosis.simulations import Simulations
 from sbi_rope.rope import RoPE
@@ -103,7 +103,8 @@ def cross_fit(rope: RoPE, *, num_folds: int, show_progress_bars: bool) -> CrossF
     for held_out in progress_bar(folds, show=show_progress_bars, desc="Folds"):
         others = torch.cat([fold for fold in folds if fold is not held_out])
         part = rope.with_pairs(others, targets=targets[others])
-        part.train(show_progress_bars=False)
+        with without_warning_of_few_pairs():
+            part.train(show_progress_bars=False)
         embedded[held_out] = embed(part.tuned_embedding_net, x[held_out])
     return CrossFitted(
         embedded=embedded.cpu().double(),

@@ -16,7 +16,7 @@ from sbi_rope._sbi import embed, estimator_of, headless
 from sbi_rope._simulations import Moments
 from sbi_rope._simulator import Simulator
 from sbi_rope._standardisation import Standardisation
-from sbi_rope._training import split_groups
+from sbi_rope._training import split_groups, without_warning_of_few_pairs
 from sbi_rope.discrepancy.correction import Space, correct_npe, network_of
 from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.parameters import learn_parameters
@@ -250,16 +250,17 @@ class Workbench:
         """Return an embedding net tuned on some pairs, with rehearsal."""
         _, simulated = self.simulations
         targets = self.targets(rows, seed)
-        return TUNING.finetune(
-            self.embedding_net,
-            self.x[rows],
-            lambda count: targets,
-            draw_simulations=lambda count: simulated[:count],
-            groups=self.groups[rows.cpu()],
-            weights=_of_rows(self.pair_weights, rows),
-            seed=seed,
-            show_progress_bars=False,
-        ).embedding_net
+        with without_warning_of_few_pairs():
+            return TUNING.finetune(
+                self.embedding_net,
+                self.x[rows],
+                lambda count: targets,
+                draw_simulations=lambda count: simulated[:count],
+                groups=self.groups[rows.cpu()],
+                weights=_of_rows(self.pair_weights, rows),
+                seed=seed,
+                show_progress_bars=False,
+            ).embedding_net
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -307,7 +308,8 @@ class Fold:
         if knows or not bench.labels.are_exact:
             targets = bench.targets(self.rows, self.seed)
         part = bench.rope.with_pairs(self.rows, targets=targets, finetuner=finetuner)
-        return part.train(seed=self.seed, show_progress_bars=False)
+        with without_warning_of_few_pairs():
+            return part.train(seed=self.seed, show_progress_bars=False)
 
     @torch.no_grad()
     def nodes(self, start: Any) -> Nodes:
