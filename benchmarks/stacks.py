@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.cells import Cell
+from benchmarks.cells import Cell, data_in_words
 from benchmarks.methods import STACK, STACKS
 from benchmarks.table import Table, markdown
 
@@ -89,6 +89,11 @@ def comparisons(table: Table) -> list[Comparison]:
     return found
 
 
+def _variant(cell: Cell) -> str:
+    """Return the variant and the options of a cell in words."""
+    return " ".join(data_in_words(cell.task, cell.variant, cell.options)[1:])
+
+
 def other_trainings(table: Table) -> list[str]:
     """Name the stacks that start from another NPE than others on the same data.
 
@@ -115,7 +120,7 @@ def other_trainings(table: Table) -> list[str]:
                 name = f"{one.cell.method} with {one.cell.n_calibration} pairs"
                 others.setdefault(f"{score:.2f}", []).append(name)
         cell = stacks[0].cell
-        where = f"{cell.task} {cell.variant}".strip()
+        where = " ".join(data_in_words(cell.task, cell.variant, cell.options))
         named += [
             f"- {where}, repetition {cell.repetition}: {score} instead of "
             f"{reference:.2f} ({', '.join(names)})"
@@ -158,7 +163,7 @@ def _entries(one: Comparison) -> list[str]:
     seconds = row["seconds_train"] + row["seconds_couple"]
     return [
         one.cell.task,
-        one.cell.variant,
+        _variant(one.cell),
         one.cell.method,
         str(one.cell.n_calibration),
         *(f"{one.test[name]:.2f}" if name in one.test else "" for name in BASICS),
@@ -215,7 +220,7 @@ def _rehearsal(found: list[Comparison]) -> list[str]:
         without, rehearsed = one.test[ONE_SETTING], one.test[REHEARSED]
         numbers = f"{without:.2f}", f"{rehearsed:.2f}", f"{rehearsed - without:+.2f}"
         cell = one.cell
-        lines.append([cell.task, cell.variant, cell.n_calibration, *numbers])
+        lines.append([cell.task, _variant(cell), cell.n_calibration, *numbers])
     heads = ("task", "variant", "pairs", "without", "with", "gain")
     what = f"{ONE_SETTING} with and without rehearsal, on the test set:"
     return [what, "", *markdown(heads, lines)]
