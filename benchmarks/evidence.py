@@ -14,12 +14,12 @@ from matplotlib.figure import Figure
 from scipy.stats import t as student
 
 from benchmarks import figures
-from benchmarks.methods import METHODS, STACK, STACKS, methods_where
+from benchmarks.methods import COUPLED_STACK, METHODS, STACK, STACKS, methods_where
 from benchmarks.published import FIXED, LETTERS, MISSING, Published, Setting, table
 from benchmarks.stacks import other_trainings
 from benchmarks.table import Table
 
-__all__ = ["evidence_lines", "finished_rows", "half_width"]
+__all__ = ["draw_evidence", "evidence_lines", "finished_rows", "half_width"]
 
 # The methods of the picture: what a user starts from, what is tuned on the pairs, the
 # rivals of 2025 and 2026, the paper's method and the default of this package.
@@ -39,6 +39,7 @@ NO_RIVALS = ("SBI", *STACKS)
 OURS = methods_where(lambda entry: entry.ours)
 # The goals, fixed beforehand: with up to so many pairs, in nats and ACAUC.
 MAX_PAIRS, NEAR, CALIBRATED = 200, 0.1, 0.03
+CURVES, RANKS = "methods.png", "ranks.png"
 # Panels side by side, so that they can be read at the width of a page.
 MAX_COLUMNS = 4
 CONFIDENCE, NUM_RESAMPLES = 0.95, 2000
@@ -52,6 +53,11 @@ by their mass inside the prior. NPE and the methods that are trained networks, s
 fine-tuned NPE, are not, which makes their LPP lower where mass is outside. "s" are the
 seconds of training on one thread, without the NPE that methods share, and with other
 work beside it. "Calls" are simulations beyond those that NPE was trained on.
+"""
+OF_A_BATCH = f"""\
+RoPE, OT-only, FRISBI and RVNP see the test observations, without their labels. The
+stack above does not. This is what `{COUPLED_STACK}` has, which sees them too:
+`default_candidates(rope, x_o)`, with RVNP and couplings among its candidates.
 """
 
 
@@ -95,18 +101,31 @@ class Comparison(NamedTuple):
         return min(float(self.gaps[name].mean()) for name in ("prior", "NPE"))
 
 
-def evidence_lines(published: Published, folder: Path) -> list[str]:
-    """Return the section in Markdown, and write its figures into a folder."""
+def evidence_lines(published: Published) -> list[str]:
+    """Return the section in Markdown, which links the pictures of `draw_evidence`."""
     rows = finished_rows(published)
     compared = _compared(rows)
     if not compared:
         return ["Not run."]
-    lines = [*_pictures(rows, compared, folder), "", EXPLANATION]
-    head = ("task", "pairs", "repetitions", "stack", "ACAUC", "best other")
-    head += ("its LPP", "difference", "s", "calls")
-    lines += table(head, [_entries(published, one, rows) for one in compared])
-    lines += ["", *other_trainings(published.tables["main"])]
-    return [*lines, *_goals(compared, rows), "", *_costs(published, rows)]
+    lines = [f"![{what}]({name})\n" for name, what in _pictures(rows, compared).items()]
+    lines += [EXPLANATION, *_comparison(published, rows, compared), ""]
+    lines += [*other_trainings(published.tables["main"]), *_goals(compared, rows), ""]
+    of_a_batch = _compared(rows, COUPLED_STACK)
+    if of_a_batch:
+        lines += [OF_A_BATCH, *_comparison(published, rows, of_a_batch), ""]
+        lines += [*_goals(of_a_batch, rows), ""]
+    return [*lines, *_costs(published, rows)]
+
+
+def draw_evidence(published: Published, folder: Path) -> None:
+    """Write the pictures that the section links into a folder."""
+    rows = finished_rows(published)
+    compared = _compared(rows)
+    pictures = _pictures(rows, compared)
+    if CURVES in pictures:
+        figures.save(_curves(rows), folder / CURVES)
+    if RANKS in pictures:
+        figures.save(_rank_figure(rows, compared), folder / RANKS)
 
 
 def finished_rows(published: Published) -> pd.DataFrame:
@@ -117,9 +136,9 @@ def finished_rows(published: Published) -> pd.DataFrame:
     return rows[rows["task"].isin(LETTERS)]
 
 
-def _compared(rows: pd.DataFrame) -> list[Comparison]:
+def _compared(rows: pd.DataFrame, method: str = STACK) -> list[Comparison]:
     compared = []
-    stacks = rows[rows["method"] == STACK]
+    stacks = rows[rows["method"] == method]
     for task in LETTERS:
         of_task = rows[rows["task"] == task]
         for size in sorted(stacks["n_calibration"][stacks["task"] == task].unique()):
@@ -128,13 +147,13 @@ def _compared(rows: pd.DataFrame) -> list[Comparison]:
                 index="repetition", columns="method", values="lpp_z", sort=False
             )
             gaps = {
-                name: _gap(by_method[[STACK, name]].dropna())
+                name: _gap(by_method[[method, name]].dropna())
                 for name in by_method.columns
                 if name not in NO_RIVALS
             }
             gaps = {name: gap for name, gap in gaps.items() if len(gap)}
             if gaps:
-                stack = there[there["method"] == STACK]
+                stack = there[there["method"] == method]
                 compared.append(Comparison(task, int(size), stack, gaps))
     return compared
 
@@ -143,6 +162,15 @@ def _gap(scores: pd.DataFrame) -> pd.Series:
     """Return how far one column is above the other; 0 where both are -inf."""
     first, second = scores.iloc[:, 0], scores.iloc[:, 1]
     return (first - second).where(first != second, 0.0)
+
+
+def _comparison(
+    published: Published, rows: pd.DataFrame, compared: Sequence[Comparison]
+) -> list[str]:
+    """Return a table with the best other method of each task and number of pairs."""
+    head = ("task", "pairs", "repetitions", "stack", "ACAUC", "best other")
+    head += ("its LPP", "difference", "s", "calls")
+    return table(head, [_entries(published, one, rows) for one in compared])
 
 
 def _entries(published: Published, one: Comparison, rows: pd.DataFrame) -> list[object]:
@@ -262,25 +290,23 @@ def _costs(published: Published, rows: pd.DataFrame) -> list[str]:
 # Pictures ---------------------------------------------------------------------------
 
 
-def _pictures(
-    rows: pd.DataFrame, compared: Sequence[Comparison], folder: Path
-) -> list[str]:
+def _pictures(rows: pd.DataFrame, compared: Sequence[Comparison]) -> dict[str, str]:
+    """Name the pictures that can be drawn, and what they show."""
+    if not compared:
+        return {}
+    pictures = {
+        CURVES: f"LPP and ACAUC of {len(SHOWN)} methods against the number of pairs"
+    }
+    if _ranks(rows, compared) is not None:
+        pictures[RANKS] = "Mean ranks of the methods over tasks"
+    return pictures
+
+
+def _curves(rows: pd.DataFrame) -> Figure:
     shown = rows[rows["method"].isin(SHOWN)]
     order = [*LETTERS]
     shown = shown.iloc[shown["task"].map(order.index).argsort(kind="stable")]
-    figures.save(
-        figures.curves("n_calibration", shown, max_columns=MAX_COLUMNS),
-        folder / "methods.png",
-    )
-    lines = [
-        f"![LPP and ACAUC of {len(SHOWN)} methods against the number of pairs]"
-        "(methods.png)"
-    ]
-    ranks = _ranks(rows, compared)
-    if ranks is not None:
-        figures.save(_rank_figure(ranks), folder / "ranks.png")
-        lines += ["", "![Mean ranks of the methods over tasks](ranks.png)"]
-    return lines
+    return figures.curves("n_calibration", shown, max_columns=MAX_COLUMNS)
 
 
 def _ranks(rows: pd.DataFrame, compared: Sequence[Comparison]) -> pd.DataFrame | None:
@@ -307,8 +333,10 @@ def _ranks(rows: pd.DataFrame, compared: Sequence[Comparison]) -> pd.DataFrame |
     return scores.rank(ascending=False)
 
 
-def _rank_figure(ranks: pd.DataFrame) -> Figure:
+def _rank_figure(rows: pd.DataFrame, compared: Sequence[Comparison]) -> Figure:
     """Draw mean ranks with bootstrap intervals over tasks."""
+    ranks = _ranks(rows, compared)
+    assert ranks is not None  # or this picture was not asked for
     by_task = ranks.T.groupby(level=0).mean()
     mean = by_task.mean().sort_values(ascending=False)
     draws = np.random.default_rng(0).integers(

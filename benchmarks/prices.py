@@ -1,7 +1,6 @@
 """What cells that were not run would cost, from the seconds of those that were."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
 from typing import Any, NamedTuple
 
 import pandas as pd
@@ -73,7 +72,7 @@ class Prices:
         return Price(seconds / 3600, unknown)
 
     def _seconds(self, cell: Cell) -> tuple[float, ...] | None:
-        values = asdict(cell)
+        values = vars(cell)
         for on, medians in zip(ALIKE, self._medians, strict=False):
             found = medians.get(tuple(values[name] for name in on))
             if found is not None:

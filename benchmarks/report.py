@@ -181,7 +181,8 @@ def worse(values: np.ndarray, best: np.ndarray) -> bool:
     difference = values[finite].astype(float) - best[finite].astype(float)
     if not np.any(difference):
         return False
-    return bool(wilcoxon(difference, alternative="less").pvalue < SIGNIFICANT)
+    test = wilcoxon(difference, alternative="less", method="asymptotic")
+    return bool(test.pvalue < SIGNIFICANT)
 
 
 def _losses(finished: pd.DataFrame, table: Table) -> list[str]:

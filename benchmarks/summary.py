@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from benchmarks.evidence import evidence_lines
+from benchmarks.evidence import draw_evidence, evidence_lines
 from benchmarks.methods import METHODS, STACK, STACKS
 from benchmarks.other_suites import other_suites
 from benchmarks.prices import Prices
@@ -40,7 +40,7 @@ from benchmarks.statements import (
 from benchmarks.table import COUNTED, Table
 from sbi_rope._files import write_atomically
 
-__all__ = ["write_summary"]
+__all__ = ["page_of", "write_summary"]
 
 BEGIN, END = "<!-- results -->", "<!-- /results -->"
 # Its numbers mean nothing.
@@ -81,11 +81,12 @@ def write_summary(folder: Path, *, docs_page: Path, readme: Path) -> Path:
     # Before the work, because a page without a place is refused.
     around = {path: _around_block(path) for path in (docs_page, readme)}
     page = folder / "README.md"
-    texts = {page: "\n".join(_page(published, folder)) + "\n"}
+    texts = {page: page_of(published)}
     for other, lines_of in ((docs_page, _block), (readme, readme_lines)):
         link = Path(os.path.relpath(page, other.parent)).as_posix()
         before, after = around[other]
         texts[other] = "\n".join([before, *lines_of(published, link), after])
+    draw_evidence(published, folder)
     for path, text in texts.items():
         with write_atomically(path) as temporary:
             temporary.write_text(text)
@@ -102,27 +103,24 @@ def _around_block(path: Path) -> tuple[str, str]:
     return before + BEGIN, END + after
 
 
-def _page(published: Published, folder: Path) -> list[str]:
+def page_of(published: Published) -> str:
+    """Return the page of all results in Markdown."""
     both = ("OT-only", "RoPE")
-    return [
+    lines = [
         *("# Results of the benchmark", "", UNITS),
         *("`python -m benchmarks summary` writes this page from the tables.", ""),
         *("## What was run", "", *_overview(published), ""),
         *(f"## All tasks, {SIZE} calibration pairs", "", SETTINGS),
         *("LPP:", "", *_main(published, lpp_text, with_settings=both), ""),
         *("ACAUC:", "", *_main(published, acauc_text, with_settings=both), ""),
-        *(
-            "## The stack against all others",
-            "",
-            *evidence_lines(published, folder),
-            "",
-        ),
+        *("## The stack against all others", "", *evidence_lines(published), ""),
         *("## RoPE with fewer and more calibration pairs", ""),
         *(f"LPP (ACAUC), {FIXED}.", "", *_by_size(published), ""),
         *("## What the paper states", "", *write_statements(published), ""),
         *("## Where RoPE loses", "", *_losses(published), ""),
         *("## What the other suites say", *other_suites(published)),
     ]
+    return "\n".join(lines) + "\n"
 
 
 def _block(published: Published, link: str) -> list[str]:

@@ -314,11 +314,14 @@ def test_the_tuned_posterior_of_the_family_is_the_flow_on_the_tuned_embedding(
     assert torch.isfinite(samples).all()
 
 
+# Of these flows thousands of draws take seconds.
+SLOW = ("zuko_unaf", "zuko_naf", "zuko_bpf", "zuko_sospf")
+
+
 @pytest.mark.parametrize(
     "family",
     [
-        # Its thousands of draws are made one by one.
-        pytest.param(family, marks=[pytest.mark.slow] if family == "zuko_unaf" else [])
+        pytest.param(family, marks=[pytest.mark.slow] if family in SLOW else [])
         for family in problems.FAMILIES
     ],
 )
@@ -335,7 +338,9 @@ def test_densities_of_the_family_integrate_to_one_inside_the_prior(
     assert float(density.sum() * 0.02) == pytest.approx(1.0, abs=0.02)
 
 
-@pytest.mark.parametrize("method", ["fmpe", "npse"])
+@pytest.mark.parametrize(
+    "method", ["fmpe", pytest.param("npse", marks=pytest.mark.slow)]
+)
 def test_vector_fields_can_be_sampled_but_have_no_density(method: str) -> None:
     vector_field = problems.vector_field_posterior(method)
     theta = vector_field.prior.sample((20,))
@@ -356,7 +361,9 @@ def test_vector_fields_can_be_sampled_but_have_no_density(method: str) -> None:
             call()
 
 
-@pytest.mark.parametrize("method", ["fmpe", "npse"])
+@pytest.mark.parametrize(
+    "method", ["fmpe", pytest.param("npse", marks=pytest.mark.slow)]
+)
 def test_the_samples_of_a_vector_field_are_those_of_sbi(method: str) -> None:
     original = problems.vector_field_posterior(method)
     estimator, x = estimator_of(original), torch.randn(4, 3)
@@ -430,6 +437,7 @@ def test_the_mixed_density_is_the_sum_over_all_simulations(dim: int) -> None:
     assert torch.allclose(log_prob, expected, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_mixed_density_has_the_masses_of_its_samples() -> None:
     # Trained for long enough that the parts depend on each other.
     npe = problems.npe_posterior("mnpe", dim=1, num_epochs=60)

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 import sbi_rope
+from sbi_rope import plots
 from tests.faults.calls import CALLS, NOT_CALLED
 from tests.faults.outcomes import Call, TraceError, no_trace
 from tests.faults.problem import QUIET
@@ -23,7 +24,14 @@ for _call in CALLS:
     CALLS_OF.setdefault(_call.owner, []).append(_call)
 
 
-@pytest.mark.parametrize("name", CALLS_OF)
+# Hundreds of pictures take a while.
+NAMES = [
+    pytest.param(name, marks=[pytest.mark.slow] if name in plots.__all__ else [])
+    for name in CALLS_OF
+]
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_bad_arguments_are_refused_and_good_ones_change_nothing_else(name: str) -> None:
     outcomes = [trial() for trial in trials(CALLS_OF[name])]
     wrong = [str(o) for o in outcomes if o.verdict in ("raw", "silent")]

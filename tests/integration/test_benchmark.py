@@ -385,6 +385,7 @@ def test_the_row_of_ot_only_is_that_of_the_method_of_its_name(tmp_path: Path) ->
     assert torch.equal(ours[0], score.evaluation.lpp.log_probs)
 
 
+@pytest.mark.slow
 def test_what_is_fine_tuned_is_a_discrepancy_of_x_itself_where_it_is_short(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

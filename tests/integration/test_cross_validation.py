@@ -320,6 +320,7 @@ def test_labels_of_a_fold_do_not_change_the_versions_that_are_scored_on_it(
     assert not changed[~rows][:, fixed].any()
 
 
+@pytest.mark.slow
 def test_observations_of_a_fold_do_not_change_the_versions_scored_on_it() -> None:
     before, theta, x = base(6)
     rows = scores_of(before).fold == 1

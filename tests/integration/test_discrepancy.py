@@ -118,7 +118,10 @@ def marginal(x: Tensor, draws: DiscrepancyDraws, *, std: float, mean: float) -> 
     return joint - joint.logsumexp(dim=0) - math.log(float(THETA[1] - THETA[0]))
 
 
-@pytest.mark.parametrize(("num_pairs", "space"), [(4, "embedding"), (50, "input")])
+@pytest.mark.parametrize(
+    ("num_pairs", "space"),
+    [(4, "embedding"), pytest.param(50, "input", marks=pytest.mark.slow)],
+)
 def test_the_posterior_is_that_with_the_discrepancy_integrated_out(
     num_pairs: int, space: str
 ) -> None:
@@ -140,6 +143,7 @@ def test_the_posterior_is_that_with_the_discrepancy_integrated_out(
     assert (float(plugged.mean()) > 0.05) or num_pairs == 50
 
 
+@pytest.mark.slow
 def test_with_many_pairs_it_becomes_the_posterior_of_a_known_discrepancy() -> None:
     real = Reality(0.6, 0.8, 0.4)
     losses = []
@@ -212,6 +216,7 @@ def test_a_discrepancy_that_is_plugged_in_is_over_confident(
     assert float(shares.mean()) < 0.9 - 3 * error - 0.005
 
 
+@pytest.mark.slow
 def test_where_the_simulator_is_right_the_loss_against_npe_is_small() -> None:
     right = Reality(1.0, 0.0, NOISE)
     lost = []
@@ -225,6 +230,7 @@ def test_where_the_simulator_is_right_the_loss_against_npe_is_small() -> None:
     assert sum(lost) / 2 < 0.05
 
 
+@pytest.mark.slow
 def test_the_linear_gaussian_task_is_solved_with_fifty_pairs() -> None:
     task: Any = get_task("linear_gaussian")
     builder = posterior_nn("mdn", hidden_features=20, num_components=1)

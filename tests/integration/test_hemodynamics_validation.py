@@ -68,6 +68,7 @@ def test_pressures_in_77_arteries_come_closer_to_openbf_with_finer_cells(
     assert fine < 0.75 * coarse
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("viscoelastic", [False, True])
 def test_small_waves_come_closer_to_the_linear_equations_with_finer_cells(
     viscoelastic: bool,
@@ -101,6 +102,7 @@ def test_as_much_blood_leaves_as_enters_once_beats_repeat() -> None:
     assert simulate_beat(BASELINE, Physics(num_cycles=20)).mass_error < 1e-4
 
 
+@pytest.mark.slow
 def test_coarser_cells_and_shorter_steps_give_the_same_beat(beat: Beat) -> None:
     assert beat.period_error < 0.3
     assert refinement_error() < 1.0
@@ -120,6 +122,7 @@ def test_waves_in_elastic_arteries_travel_at_the_velocity_asked_for() -> None:
     assert max(errors.values()) < 8.0, errors
 
 
+@pytest.mark.slow
 def test_waves_in_viscoelastic_arteries_travel_at_the_velocity_asked_for() -> None:
     errors = {
         velocity: velocity_error(velocity, viscoelastic=True)

@@ -48,6 +48,7 @@ def test_with_the_exact_g_the_mixture_approaches_the_exact_posterior() -> None:
     assert errors[2] < 0.05
 
 
+@pytest.mark.slow
 def test_a_larger_gamma_moves_the_mixture_towards_the_prior() -> None:
     _, x_o = gaussian.labelled(300)
     x_s = gaussian.undo(x_o)
@@ -63,6 +64,7 @@ def test_a_larger_gamma_moves_the_mixture_towards_the_prior() -> None:
     assert errors[2] == pytest.approx(float(prior_error), abs=0.05)
 
 
+@pytest.mark.slow
 def test_without_misspecification_rope_hardly_moves_the_posterior() -> None:
     """Tolerance in nats, on average over the batch, at gamma 0.05 and n = 1000.
 

@@ -63,6 +63,7 @@ def test_rope_repairs_a_posterior_of_trials_some_of_which_are_missing() -> None:
     assert torch.allclose(posterior.log_prob(theta_o[3:4], x=x_o[3]), expected)
 
 
+@pytest.mark.slow
 def test_a_stack_takes_trials_some_of_which_are_missing() -> None:
     theta_o, x_o = labelled(20)
     names = ("NPE", "fine-tuned NPE", "discrepancy (tuned)")

@@ -65,6 +65,7 @@ def repaired() -> tuple[RoPE, MixturePosterior, Tensor]:
     return rope, posterior, theta[30:]
 
 
+@pytest.mark.slow
 def test_sbc_accepts_calibrated_posteriors_and_notices_shifted_ones(
     posterior: MixturePosterior, theta: Tensor
 ) -> None:

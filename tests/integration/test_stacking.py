@@ -288,7 +288,11 @@ def test_a_stack_and_its_candidates_move_to_a_gpu() -> None:
 
 @pytest.mark.parametrize(
     ("family", "embedding"),
-    [("maf", "none"), ("zuko_maf", "linear"), ("mnpe", "linear")],
+    [
+        ("maf", "none"),
+        ("zuko_maf", "linear"),
+        pytest.param("mnpe", "linear", marks=pytest.mark.slow),
+    ],
 )
 def test_every_family_can_be_stacked(family: str, embedding: str) -> None:
     prior = problems.npe_posterior(family, embedding).prior
@@ -381,6 +385,7 @@ def test_moments_of_a_long_series_are_those_of_its_embedding_alone(
     assert 24 in seen
 
 
+@pytest.mark.slow
 def test_a_stack_can_use_stored_simulations() -> None:
     theta = problems.box(2).sample((200,))
     x = problems.simulate(theta)
@@ -405,6 +410,7 @@ class Untransformed(BoxUniform):
         raise NotImplementedError
 
 
+@pytest.mark.slow
 def test_a_prior_that_sbi_cannot_transform_can_be_used() -> None:
     prior = Untransformed(-torch.ones(2), torch.ones(2))
     npe = DirectPosterior(

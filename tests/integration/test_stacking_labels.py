@@ -10,6 +10,7 @@ import torch
 from sbi_rope import RoPE, load, stack
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.metrics import lpp
+from sbi_rope.stacking import default_candidates
 from tests import gaussian
 from tests.stacks import (
     CANDIDATES,
@@ -39,7 +40,8 @@ PARTIAL[::2, 0] = math.nan
 
 
 def test_a_stack_is_scored_on_what_was_measured(tmp_path: Any) -> None:
-    posterior = stacked(labelled(PARTIAL, theta_std=0.1))
+    rope = labelled(PARTIAL, theta_std=0.1)
+    posterior = stacked(rope, candidates=default_candidates()[:4])
     scores = posterior.report.cross_validation
     assert torch.isfinite(scores.log_scores).all()
     assert torch.equal(torch.isnan(scores.levels), torch.isnan(PARTIAL))

@@ -208,6 +208,7 @@ def test_parameters_that_are_not_calibrated_by_themselves_are_named() -> None:
     assert "by itself" not in str(StackingReport.of(single))
 
 
+@pytest.mark.slow
 def test_calibrated_parameters_are_rarely_named() -> None:
     """The intervals of several parameters are wide enough for all of them together."""
     report, wrong = made_up(), 0

@@ -108,6 +108,7 @@ def test_with_a_single_epoch_it_is_npe_around_the_observation() -> None:
     torch.testing.assert_close(found, expected, atol=0.05, rtol=0.01)
 
 
+@pytest.mark.slow
 def test_inside_a_box_the_density_has_mass_one_and_samples_follow_it() -> None:
     torch.manual_seed(0)
     posterior = problems.npe_posterior("mdn", dim=1)
@@ -170,6 +171,7 @@ def box_method(theta: Tensor, *, num_epochs: int = 40) -> Any:
     return method.append_calibration(theta, problems.simulate(theta) + 0.3)
 
 
+@pytest.mark.slow
 def test_labels_on_a_bound_are_like_labels_next_to_it() -> None:
     """Recorded settings are often exactly at the end of their range."""
     torch.manual_seed(0)

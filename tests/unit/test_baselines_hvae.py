@@ -498,6 +498,7 @@ def test_training_improves_on_npe_for_held_out_real_data(npe: Any) -> None:
     assert history.kept_validation_loss < history.validation_loss[0]
 
 
+@pytest.mark.slow
 def test_epochs_are_chosen_by_the_first_few_draws_of_the_posterior(
     npe: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -118,6 +118,7 @@ def test_with_a_right_simulator_it_stays_near_npe(noise_on: str) -> None:
     assert -0.05 < loss < 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise_on", ["embedding", "input"])
 def test_with_one_wrong_statistic_it_is_far_better_than_npe(noise_on: str) -> None:
     theta = prior().sample(torch.Size((500,)))

@@ -199,6 +199,7 @@ class TestWhatItLearns:
         assert abs(score - npe_score) < 0.1
         assert abs(score - exact) < 0.1
 
+    @pytest.mark.slow
     def test_where_a_statistic_is_wrong_real_and_simulated_embeddings_meet(
         self,
     ) -> None:

@@ -86,7 +86,9 @@ def closed_form(x: float) -> tuple[float, float]:
 # --- against known answers ---
 
 
-@pytest.mark.parametrize("noise_on", ["embedding", "input"])
+@pytest.mark.parametrize(
+    "noise_on", ["embedding", pytest.param("input", marks=pytest.mark.slow)]
+)
 def test_one_gaussian_statistic_gives_the_posterior_found_by_quadrature(
     noise_on: str,
 ) -> None:

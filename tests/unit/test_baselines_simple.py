@@ -85,6 +85,7 @@ def log_probs(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:
     return posterior.log_prob_batched(theta[None], x, norm_posterior=False)[0]
 
 
+@pytest.mark.slow
 class TestWithPlentyOfPairs:
     """Trained on 2400 pairs of the real process, scored on 1000 others."""
 

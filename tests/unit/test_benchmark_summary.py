@@ -14,7 +14,7 @@ from benchmarks.cells import Cell, load_suite
 from benchmarks.published import FIXED, Published, gap
 from benchmarks.schema import COLUMNS
 from benchmarks.statements import STATEMENTS, verdict
-from benchmarks.summary import write_summary
+from benchmarks.summary import page_of, write_summary
 
 # A cell to its LPP and ACAUC, or None if it was not run, or "failed".
 Scores = Callable[[Cell], tuple[float, float] | str | None]
@@ -104,6 +104,11 @@ def write(folder: Path, docs_page: Path) -> str:
     return write_summary(folder, docs_page=docs_page, readme=readme).read_text()
 
 
+def page(folder: Path) -> str:
+    """Return the page of all results, without drawing its pictures."""
+    return page_of(Published.read(folder))
+
+
 def line(text: str, start: str, *, after: str = "") -> list[str]:
     """Return the entries of the first line of a table that starts like this."""
     text = text[text.index(after) :]
@@ -127,7 +132,7 @@ def with_stack(by_repetition: dict[int, dict[str, float]]) -> Scores:
 
 
 def test_the_stack_is_compared_with_the_best_other_on_the_same_repetitions(
-    folder: Path, docs_page: Path
+    folder: Path,
 ) -> None:
     of_run = {
         0: {"stack": -1.0, "J-NPE": -1.5},
@@ -135,35 +140,41 @@ def test_the_stack_is_compared_with_the_best_other_on_the_same_repetitions(
         2: {"stack": -1.1, "J-NPE": -1.5},
     }
     publish(folder, "main", with_stack(of_run))
-    text = write(folder, docs_page)
+    text = page(folder)
     row = line(text, "A cs | 50", after="The stack against all others")
     # 4.303 is Student's quantile of two degrees of freedom.
     width = 4.303 * 0.1 / 3**0.5
     assert row[1:4] == ["3", "-1.10", "+0.020"]
     assert row[4:7] == ["J-NPE", "-1.50", f"+0.40 ± {width:.2f}"]
-    assert (
-        "better than the best other beyond the interval over repetitions: 3 of 3"
-        in (text)
-    )
+    assert "best other beyond the interval over repetitions: 3 of 3" in text
 
 
-def test_methods_of_this_package_are_no_rivals_of_the_stack(
-    folder: Path, docs_page: Path
-) -> None:
+def test_a_stack_that_sees_the_observations_is_compared_apart(folder: Path) -> None:
+    lpp = {"stack": -1.0, "stack of a batch": -0.2, "RVNP": -0.5}
+    publish(folder, "main", with_stack({0: lpp}))
+    text = page(folder)
+    alone, of_a_batch = text.split("stack above does not")
+    row = line(alone, "A cs | 10", after="against all others")
+    assert row[2:7] == ["-1.00", "+0.020", "RVNP", "-0.50", "-0.50"]
+    row = line(of_a_batch, "A cs | 10")
+    assert row[2:7] == ["-0.20", "+0.020", "RVNP", "-0.50", "+0.30"]
+    assert "best, or within 0.1 nats of the best: 0 of 3" in alone
+    assert "best, or within 0.1 nats of the best: 3 of 3" in of_a_batch
+
+
+def test_methods_of_this_package_are_no_rivals_of_the_stack(folder: Path) -> None:
     lpp = {"stack": -1.0, "discrepancy": -1.0, "J-NPE": -1.5}
     publish(folder, "main", with_stack({0: lpp, 1: lpp}))
-    text = write(folder, docs_page)
+    text = page(folder)
     assert "best other beyond the interval over repetitions: 0 of 3" in text
     assert "best of those that are not of this package: 3 of 3" in text
     assert "mean |ACAUC| of 0.020" in text
     assert "(aimed at 0.03; SBI has 0.020 on these tasks)" in text
 
 
-def test_a_stack_below_npe_or_another_method_is_counted_and_named(
-    folder: Path, docs_page: Path
-) -> None:
+def test_a_stack_below_npe_or_another_method_is_counted_and_named(folder: Path) -> None:
     publish(folder, "main", with_stack({0: {"stack": -2.0, "NPE": -1.5}}))
-    text = write(folder, docs_page)
+    text = page(folder)
     assert "- best, or within 0.1 nats of the best: 0 of 3" in text
     assert "- not more than 0.1 nats below the prior or NPE: 0 of 3" in text
     # Of a single repetition there is no interval.
@@ -171,24 +182,13 @@ def test_a_stack_below_npe_or_another_method_is_counted_and_named(
     assert row[6] == "-0.50"
 
 
-def test_ranks_are_drawn_of_methods_that_were_run_everywhere(
-    folder: Path, docs_page: Path
-) -> None:
-    publish(folder, "main", with_stack({0: {"stack": -1.0}}))
-    first_bytes = write(folder, docs_page), (folder / "ranks.png").read_bytes()
-    assert (
-        write(folder, docs_page),
-        (folder / "ranks.png").read_bytes(),
-    ) == first_bytes
-
-
-def test_without_a_stack_nothing_is_compared(folder: Path, docs_page: Path) -> None:
+def test_without_a_stack_nothing_is_compared(folder: Path) -> None:
     publish(
         folder,
         "main",
         first(lambda cell: (-1.0, 0.0) if cell.method == "NPE" else None),
     )
-    text = write(folder, docs_page)
+    text = page(folder)
     section = text[text.index("The stack against all others") :]
     assert section.splitlines()[2] == "Not run."
 
@@ -199,14 +199,16 @@ def test_without_a_stack_nothing_is_compared(folder: Path, docs_page: Path) -> N
 def test_the_block_replaces_what_is_between_the_markers_and_nothing_else(
     folder: Path, docs_page: Path
 ) -> None:
-    publish(folder, "main", by_method(RoPE=0.0))
+    publish(folder, "main", by_method(RoPE=0.0, stack=1.0))
     command = ["summary", "--out", str(folder), "--docs-page", str(docs_page)]
     assert main([*command, "--readme", str(readme_beside(docs_page))]) == 0
     text = docs_page.read_text()
-    page = (folder / "README.md").read_bytes()
+    written = [folder / name for name in ("README.md", "methods.png", "ranks.png")]
+    before = [path.read_bytes() for path in written]
     write(folder, docs_page)
     # The same tables give the same bytes.
-    assert (docs_page.read_text(), (folder / "README.md").read_bytes()) == (text, page)
+    assert docs_page.read_text() == text
+    assert [path.read_bytes() for path in written] == before
     assert text.startswith("before\n<!-- results -->\n")
     assert text.endswith("\n<!-- /results -->\nafter\n")
     assert "replaced" not in text
@@ -264,33 +266,31 @@ def test_a_folder_without_results_is_refused(folder: Path, docs_page: Path) -> N
 # The suite main ---------------------------------------------------------------------
 
 
-def test_neither_sbi_nor_another_setting_of_rope_competes(
-    folder: Path, docs_page: Path
-) -> None:
+def test_neither_sbi_nor_another_setting_of_rope_competes(folder: Path) -> None:
     publish(
         folder, "main", by_method(SBI=3.0, RoPE_other=2.0, OT_only_other=2.0, NPE=1.0)
     )
-    text = write(folder, docs_page)
+    text = page(folder)
     assert line(text, "NPE") == ["**1.00**", "**1.00**"]
     assert line(text, "SBI") == ["3.00", "3.00"]
     assert line(text, "RoPE (gamma 0.1, tau 0.9)") == ["2.00", "2.00"]
 
 
 def test_of_several_complete_repetitions_mean_and_spread_are_shown(
-    folder: Path, docs_page: Path
+    folder: Path,
 ) -> None:
     def scores(cell: Cell) -> tuple[float, float] | None:
         return (float(cell.repetition), 0.0) if cell.task == "cs" else None
 
     publish(folder, "main", scores)
-    text = write(folder, docs_page)
+    text = page(folder)
     # Of 0, 1 and 2.
     assert line(text, "NPE") == ["1.00 ± 1.00"]
     assert "cs 3/3" in text
 
 
 def test_means_over_fewer_repetitions_than_others_say_so_and_do_not_compete(
-    folder: Path, docs_page: Path
+    folder: Path,
 ) -> None:
     def scores(cell: Cell) -> tuple[float, float] | None:
         often = cell.method in ("RoPE", "NPE")
@@ -300,7 +300,7 @@ def test_means_over_fewer_repetitions_than_others_say_so_and_do_not_compete(
         return {"RoPE": 1.0 + cell.repetition, "prior": 1.2}.get(cell.method, 0.0), 0.0
 
     publish(folder, "main", scores)
-    text = write(folder, docs_page)
+    text = page(folder)
     assert line(text, "repetitions") == ["2"]
     assert line(text, "RoPE") == ["**1.50 ± 0.71**"]
     assert line(text, "prior") == ["1.20 [1]"]
@@ -309,22 +309,20 @@ def test_means_over_fewer_repetitions_than_others_say_so_and_do_not_compete(
     assert "below the prior in 4 of 4" in text
 
 
-def test_a_method_that_failed_in_a_repetition_does_not_compete(
-    folder: Path, docs_page: Path
-) -> None:
+def test_a_method_that_failed_in_a_repetition_does_not_compete(folder: Path) -> None:
     def scores(cell: Cell) -> tuple[float, float] | str | None:
         if cell.task != "cs" or cell.method not in ("RoPE", "NPE"):
             return None
         return "failed" if (cell.method, cell.repetition) == ("NPE", 1) else (0.5, 0.0)
 
     publish(folder, "main", scores)
-    text = write(folder, docs_page)
+    text = page(folder)
     assert line(text, "NPE") == ["0.50 ± 0.00 (1 of 3 failed)"]
     assert line(text, "RoPE") == ["**0.50 ± 0.00**"]
 
 
 def test_what_failed_what_is_infinite_and_what_was_not_run_is_shown(
-    folder: Path, docs_page: Path
+    folder: Path,
 ) -> None:
     def scores(cell: Cell) -> tuple[float, float] | str | None:
         if cell.task != "cs" or cell.repetition:
@@ -333,7 +331,7 @@ def test_what_failed_what_is_infinite_and_what_was_not_run_is_shown(
         return special.get(cell.method, (-1.0, 0.0))
 
     publish(folder, "main", scores)
-    text = write(folder, docs_page)
+    text = page(folder)
     assert line(text, "MLP") == ["failed"]
     assert line(text, "NPE") == ["-inf"]
     assert "| J-NPE |" not in text
@@ -489,7 +487,7 @@ def test_a_statement_on_all_sizes_waits_for_the_last(folder: Path) -> None:
 
 
 def test_the_other_suites_have_a_column_for_each_value_that_was_run(
-    folder: Path, docs_page: Path
+    folder: Path,
 ) -> None:
     def scores(cell: Cell) -> tuple[float, float] | None:
         noise = cell.options != "{}" and cell.variant == "noisy_labels"
@@ -498,7 +496,7 @@ def test_the_other_suites_have_a_column_for_each_value_that_was_run(
 
     for suite in ("labels", "wellspecified"):
         publish(folder, suite, first(scores))
-    text = write(folder, docs_page)
+    text = page(folder)
     assert line(text, "", after="### Noisy labels") == ["0", "1", "5", "10"]
     name = "G light_tunnel_sensors, MLP"
     assert line(text, name) == ["0.05", "-0.95", "-0.95", "-0.95"]

@@ -184,6 +184,7 @@ def test_the_committed_tables_fit_their_arrays() -> None:
         assert len(read_table(load_suite(name), COMMITTED / name).rows)
 
 
+@pytest.mark.slow
 def test_the_legend_of_the_suite_with_the_most_methods_is_not_cut_off() -> None:
     table = read_table(load_suite("main"), COMMITTED / "main")
     figure = curves("n_calibration", table.finished)

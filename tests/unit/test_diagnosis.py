@@ -161,6 +161,7 @@ def test_a_prior_shift_is_found_in_the_parameter_that_shifts(tuned: RoPE) -> Non
     assert not diagnosis[SHIFTS[1]].alarming
 
 
+@pytest.mark.slow
 def test_a_batch_of_a_quarter_of_the_prior_is_found_to_be_narrow(tuned: RoPE) -> None:
     torch.manual_seed(27)
     x_o = gaussian.real_process(0.25 * parameters(100))
@@ -382,6 +383,7 @@ def test_p_values_of_the_mmd_test_are_uniform_for_simulations(
     assert kstest(values, "uniform").pvalue > 0.01
 
 
+@pytest.mark.slow
 def test_averaging_over_noise_is_not_taken_for_misspecification() -> None:
     torch.manual_seed(12)
     # With so much noise an observation explains a third of a parameter's variance.
@@ -531,6 +533,7 @@ def test_errors_of_g_on_calibration_pairs_raise_the_threshold_of_a_shift() -> No
 # --- spread ---
 
 
+@pytest.mark.slow
 def test_narrow_batches_alarm_and_batches_from_the_prior_do_not() -> None:
     torch.manual_seed(30)
     quiet, loud = 0, 0
@@ -683,6 +686,7 @@ def test_pairs_with_the_same_parameters_count_once() -> None:
 # --- residuals ---
 
 
+@pytest.mark.slow
 def test_p_values_of_the_residual_test_are_uniform_without_dependence() -> None:
     torch.manual_seed(19)
     values = [
@@ -704,6 +708,7 @@ def test_the_bias_of_residuals_is_recovered_from_noise() -> None:
     assert dependence(noise, theta).bias < 0.1
 
 
+@pytest.mark.slow
 def test_what_recordings_of_a_person_have_in_common_is_no_dependence() -> None:
     torch.manual_seed(27)
     people = torch.arange(12).repeat_interleave(5)
@@ -724,6 +729,7 @@ def test_what_recordings_of_a_person_have_in_common_is_no_dependence() -> None:
     )
 
 
+@pytest.mark.slow
 def test_bias_is_not_inflated_by_few_pairs() -> None:
     torch.manual_seed(25)
     squares, errors = [], []
@@ -763,6 +769,7 @@ def folding_process(theta: Tensor) -> Tensor:
     return gaussian.simulator(torch.stack([theta[:, 0], theta[:, 1].abs()], dim=1))
 
 
+@pytest.mark.slow
 def test_a_real_process_that_folds_a_parameter_alarms() -> None:
     torch.manual_seed(22)
     theta = parameters(80)

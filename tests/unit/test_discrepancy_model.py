@@ -211,6 +211,7 @@ def from_the_prior(n: int, width: int) -> tuple[dict[str, Any], Tensor, Tensor]:
     return truth, torch.as_tensor(z), mean
 
 
+@pytest.mark.slow
 def test_draws_are_calibrated_over_repetitions_from_the_prior() -> None:
     num_repetitions, num_draws, width = 300, 99, 2
     ranks: list[list[float]] = []

@@ -239,6 +239,7 @@ def test_discrepancy_and_history_are_those_of_the_last_training() -> None:
                .history.training_loss) == 3  # fmt: skip
 
 
+@pytest.mark.slow
 def test_learned_parameters_move_the_posterior_to_those_of_the_pairs() -> None:
     theta = problems.box(2).sample((2000,))
     theta = theta[theta[:, 0] > 0.5][:100]

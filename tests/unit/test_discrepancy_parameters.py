@@ -121,6 +121,7 @@ def test_pairs_from_the_prior_hardly_change_it() -> None:
     assert improbable <= 120 / 19
 
 
+@pytest.mark.slow
 def test_shifted_pairs_give_more_density_to_parameters_like_theirs() -> None:
     for prior in PRIORS:
         theta = prior(20_000)
@@ -144,6 +145,7 @@ def test_shifted_pairs_give_more_density_to_parameters_like_theirs() -> None:
             assert least < sum(gains) / 4 < math.log(1 / 0.3), case
 
 
+@pytest.mark.slow
 def test_fifty_pairs_from_the_middle_of_the_prior_are_recognised() -> None:
     biased = get_task("linear_gaussian", variant="biased_calibration")
     usual = get_task("linear_gaussian")

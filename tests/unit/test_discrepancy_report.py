@@ -85,6 +85,7 @@ def test_a_planted_discrepancy_is_found_in_units_of_x_and_no_other() -> None:
     assert "do not fit" not in text
 
 
+@pytest.mark.slow
 def test_intervals_of_95_percent_hold_the_truth_in_95_percent_of_repetitions() -> None:
     # Gains, shifts and errors are drawn from the prior of the model.
     n, num_repetitions, covered = 5, 250, torch.zeros(3)
@@ -122,6 +123,7 @@ def test_intervals_of_95_percent_hold_the_truth_in_95_percent_of_repetitions() -
     assert (covered / num_repetitions < 0.95 + 0.04).all(), covered
 
 
+@pytest.mark.slow
 def test_summaries_without_discrepancy_are_rarely_said_to_have_one() -> None:
     off = 0
     for _ in range(12):
@@ -157,6 +159,7 @@ def test_many_pairs_that_do_not_fit_are_taken_for_a_bent_reality() -> None:
     assert "Look whether a label" not in text
 
 
+@pytest.mark.slow
 def test_pairs_that_fit_the_others_are_rarely_named() -> None:
     for n in (10, 300):
         repetitions = 50 if n < 300 else 20

@@ -51,6 +51,7 @@ def _grid(prior: PopulationPrior, points: int = 801) -> tuple[Tensor, float]:
     return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1), area
 
 
+@pytest.mark.slow
 def test_people_follow_the_density_and_its_moments(
     prior: PopulationPrior, kind: str, people: dict[str, Tensor]
 ) -> None:

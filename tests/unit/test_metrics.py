@@ -228,6 +228,7 @@ def test_coverage_error_of_calibrated_levels_has_its_expected_value() -> None:
     assert sum(values) / 40 == pytest.approx(0.313 / 20, rel=0.1)
 
 
+@pytest.mark.slow
 def test_coverage_error_standard_error_matches_its_spread() -> None:
     # One parameter over-confident, one under-confident, by the same latent error.
     scales = torch.tensor([0.5, 2.0], dtype=torch.float64)
@@ -247,6 +248,7 @@ def test_one_observation_has_no_standard_error() -> None:
     assert score.verdict == "unknown"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n", "d", "copies"), [(10, 1, 1), (10, 3, 1), (10, 1, 3)])
 def test_calibrated_levels_of_ten_seldom_have_an_interval_without_zero(
     n: int, d: int, copies: int

@@ -427,6 +427,7 @@ def test_samples_follow_the_density() -> None:
     assert abs(score - 0.5) < 0.05
 
 
+@pytest.mark.slow
 def test_samples_have_the_cdf_of_the_truncated_mixture_in_blocks_of_any_size(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

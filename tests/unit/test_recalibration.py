@@ -211,6 +211,7 @@ def test_a_few_pairs_choose_what_the_prior_of_the_factors_says() -> None:
     assert float(expected.log().abs().max()) < 0.8
 
 
+@pytest.mark.slow
 def test_a_calibrated_posterior_is_left_as_it_is_or_hardly_changed() -> None:
     gains = []
     for seed in range(20):
@@ -325,6 +326,7 @@ def test_in_a_triangle_the_density_has_mass_one_and_is_that_of_the_draws(
     assert (both[..., 0] >= both[..., 1]).all()
 
 
+@pytest.mark.slow
 def test_what_is_moved_out_of_a_triangle_counts_when_factors_are_chosen() -> None:
     torch.manual_seed(0)
     triangle = UniformTriangle(torch.tensor(1.0))

@@ -638,8 +638,8 @@ def test_a_sweep_checks_its_settings_at_once_and_its_couplings_on_the_way() -> N
 def test_a_posterior_of_a_sweep_can_be_moved_without_the_others() -> None:
     conductor = RoPE(problems.npe_posterior(), simulator=problems.simulate)
     x_o, theta = 0.3 * torch.randn(30, 3), torch.rand(30, 2) - 0.5
-    settings = {"gammas": iter((0.5, 0.1)), "taus": (1.0,), "seed": 3}
-    posteriors = sweep(conductor, x_o, **settings)  # type: ignore[arg-type]
+    options: dict[str, Any] = {"num_simulations": 100, "seed": 3}
+    posteriors = sweep(conductor, x_o, gammas=iter((0.5, 0.1)), taus=(1.0,), **options)
     first = next(posteriors)
     first.log_prob_batched(theta, x_o)
     first.to("cpu")
@@ -647,7 +647,7 @@ def test_a_posterior_of_a_sweep_can_be_moved_without_the_others() -> None:
     # What was moved belongs to the first alone.
     first._cache[0] = 0.5 * first._cache[0]
     coupler = SinkhornCoupler(gamma=0.1)
-    expected = conductor.build_posterior(x_o, coupler=coupler, seed=3)
+    expected = conductor.build_posterior(x_o, coupler=coupler, **options)
     ours, theirs = (p.log_prob_batched(theta, x_o) for p in (second, expected))
     assert torch.allclose(ours, theirs, atol=1e-3)
 

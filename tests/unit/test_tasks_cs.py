@@ -184,6 +184,7 @@ def test_means_under_the_prior_are_those_of_an_independent_implementation(
     assert ((x.mean(dim=0) - mean).abs() < 4 * error).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("simulator", [CancerStromaSimulator(), NECROSIS])
 def test_tissues_simulated_together_follow_the_law_of_single_ones(
     simulator: CancerStromaSimulator,

@@ -181,6 +181,7 @@ def test_statistics_are_those_of_a_naive_implementation() -> None:
         np.testing.assert_allclose(summarise(series).numpy(), expected, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_means_under_the_prior_are_those_of_an_independent_implementation() -> None:
     _, x = SIR().get_simulations(3000)
     mean, std = torch.tensor(MEAN), torch.tensor(STD)
@@ -190,6 +191,7 @@ def test_means_under_the_prior_are_those_of_an_independent_implementation() -> N
     torch.testing.assert_close(x.std(dim=0), std, rtol=0.1, atol=0.0)
 
 
+@pytest.mark.slow
 def test_the_delay_of_reports_changes_the_autocorrelation_only() -> None:
     theta = SIR().get_prior().sample((3000,))
     simulated = seeded(SIRSimulator(), theta)

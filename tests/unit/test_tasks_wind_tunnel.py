@@ -163,6 +163,7 @@ def test_pressure_is_linear_in_the_hatch_with_the_published_factor() -> None:
     torch.testing.assert_close((x[4] + x[5]) / 2, middle, rtol=0.0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_interpolated_pressures_are_exact_to_2e_5_pascal() -> None:
     for jitter in (0.05, 0.3, 0.6):
         shift = jitter * (2 * torch.rand(500, dtype=torch.float64) - 1)
@@ -421,6 +422,7 @@ def test_the_stand_in_has_other_fans_and_correlated_noise() -> None:
     )
 
 
+@pytest.mark.slow
 def test_to_the_simulator_the_stand_in_looks_like_a_hatch_that_is_open_wider() -> None:
     theta, x = WindTunnel(variant="synthetic", onset_jitter=0.0).get_test_set(2000)
     error = Oracle().estimate(x) - theta[:, 0]
