@@ -171,17 +171,16 @@ def box_method(theta: Tensor, *, num_epochs: int = 40) -> Any:
     return method.append_calibration(theta, problems.simulate(theta) + 0.3)
 
 
-@pytest.mark.slow
 def test_labels_on_a_bound_are_like_labels_next_to_it() -> None:
     """Recorded settings are often exactly at the end of their range."""
     torch.manual_seed(0)
     theta = problems.box(1).sample((40,))
     theta[:4] = -1.0
     torch.manual_seed(1)
-    on = box_method(theta).train(**QUIET).build_posterior()
+    on = box_method(theta, num_epochs=15).train(**QUIET).build_posterior()
     torch.manual_seed(1)
     theta[:4] = -0.9999
-    near = box_method(theta).train(**QUIET).build_posterior()
+    near = box_method(theta, num_epochs=15).train(**QUIET).build_posterior()
     x = problems.simulate(torch.tensor([[-0.9]])) + 0.3
     points = torch.tensor([[-1.0], [-0.9999], [-0.99], [0.0], [1.0]])
     densities = [one.log_prob(points, x=x, norm_posterior=False) for one in (on, near)]

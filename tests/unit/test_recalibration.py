@@ -326,11 +326,10 @@ def test_in_a_triangle_the_density_has_mass_one_and_is_that_of_the_draws(
     assert (both[..., 0] >= both[..., 1]).all()
 
 
-@pytest.mark.slow
 def test_what_is_moved_out_of_a_triangle_counts_when_factors_are_chosen() -> None:
     torch.manual_seed(0)
     triangle = UniformTriangle(torch.tensor(1.0))
-    x = torch.cat([triangle.sample((400,)), torch.full((400, 2), math.log(0.3))], dim=1)
+    x = torch.cat([triangle.sample((100,)), torch.full((100, 2), math.log(0.3))], dim=1)
     estimator = RecalibratedEstimator(
         gaussians(), torch.ones(2), bounds_of_prior(triangle)
     )
@@ -343,7 +342,7 @@ def test_what_is_moved_out_of_a_triangle_counts_when_factors_are_chosen() -> Non
             x=x[rows],
             accept=partial(within_support, triangle),
         )
-        for rows in torch.arange(400).chunk(4)
+        for rows in torch.arange(100).chunk(4)
     ]
     found = recalibration(folds)
     assert float(found.factors.log().abs().max()) < 0.16
