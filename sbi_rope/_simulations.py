@@ -161,6 +161,21 @@ class SimulationSource(Protocol):
         """
         ...
 
+    def once_at(
+        self, theta: Tensor, embed: Embedding, *, progress: bool
+    ) -> tuple[Tensor, Tensor]:
+        """Simulate once at each of several parameters of each pair.
+
+        Args:
+            theta: Parameters, shape ``(n, R, d)``.
+            embed: The representation of simulations that is returned.
+            progress: Whether to show the progress of slow simulations.
+
+        Returns:
+            The parameters, shape ``(n, R, d)``, and the embeddings, ``(n, R, l)``.
+        """
+        ...
+
     def kept(self, count: int, *, progress: bool) -> tuple[Tensor, Tensor]:
         """Return up to ``count`` pairs (theta, x) from the prior, always the same."""
         ...
@@ -276,6 +291,13 @@ class StoredSimulations:
         nearest = self._nearest(theta, min(count, NUM_NEAR, len(self.x)))
         embedded = embed(self.x[nearest.flatten()])
         return embedded.reshape(*nearest.shape, -1)
+
+    def once_at(
+        self, theta: Tensor, embed: Embedding, *, progress: bool
+    ) -> tuple[Tensor, Tensor]:
+        """Embed the stored simulation with the nearest parameters."""
+        embedded = self.draws(theta.flatten(0, 1), 1, embed, progress=progress)
+        return theta, embedded.reshape(*theta.shape[:2], -1)
 
     def kept(self, count: int, *, progress: bool) -> tuple[Tensor, Tensor]:
         """Return stored pairs, chosen at random because they may be sorted."""

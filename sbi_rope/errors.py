@@ -35,6 +35,8 @@ __all__ = [
 LONGEST_TEXT = 200
 # The most rows of a matrix.
 NUM_ROWS = 5
+# Warnings point at no line of these packages.
+PASSED_OVER = ("sbi_rope", "sbi", "torch", "contextlib", "functools")
 
 
 class RoPEError(Exception):
@@ -130,12 +132,13 @@ def in_digits(rows: Any) -> str:
 def warn_user(message: str) -> None:
     """Issue a :class:`RoPEWarning` that points at the line of the user's code.
 
-    That line is the innermost call from outside of this package, sbi and torch.
+    That line is the innermost call from outside of this package, sbi and torch, and of
+    what calls them in between.
     """
     level, frame = 1, inspect.currentframe()
     while frame is not None:
         package = frame.f_globals.get("__name__", "").split(".")[0]
-        if package not in ("sbi_rope", "sbi", "torch", "contextlib"):
+        if package not in PASSED_OVER:
             break
         level, frame = level + 1, frame.f_back
     warnings.warn(message, RoPEWarning, stacklevel=level)

@@ -15,7 +15,7 @@ from sbi_rope._labels import (
     labelled_targets,
     parameters_of,
 )
-from sbi_rope._labels.checks import checked_labels
+from sbi_rope._labels.checks import checked_labels, warn_of_ambiguous
 from sbi_rope._npe import TrainedNPE
 from sbi_rope._pickling import picklable
 from sbi_rope._progress import is_shown
@@ -241,11 +241,14 @@ class RoPE:
         if not known.all():
             warn_user(
                 f"{int((~known).sum())} of {len(known)} labels say nothing about any "
-                "parameter, and are left out."
+                "parameter, and are left out (first rows: "
+                f"{(~known).nonzero().flatten()[:5].tolist()}). Reports number the "
+                "pairs that are left."
             )
             labels, x = labels[known], x[known]
         labels = self._labels.appended(labels) if len(self._labels) else labels
         self._parameters = parameters_of(labels, self._npe.prior)
+        warn_of_ambiguous(labels)
         self._labels, self._x_cal = labels, torch.cat([self._x_cal, x])
         self._g, self._history, self._targets = None, None, None
         return self

@@ -13,9 +13,9 @@ from sbi_rope._validation import (
     check_pair_weights,
     check_values,
 )
-from sbi_rope.errors import InvalidInputError
+from sbi_rope.errors import InvalidInputError, warn_user
 
-__all__ = ["checked_labels"]
+__all__ = ["checked_labels", "warn_of_ambiguous"]
 
 # A covariance may be this much asymmetric, or below zero, relative to its diagonal.
 ROUNDING = 1e-6
@@ -199,4 +199,24 @@ def _check_not_infinite(name: str, theta: Tensor) -> None:
         raise InvalidInputError(
             f"Expected `{name}` without Inf; {int(infinite.sum())} of {len(theta)} "
             f"rows have it (first: {rows})."
+        )
+
+
+def warn_of_ambiguous(labels: Labels) -> None:
+    """Warn of labels that may not mean what the user thinks they do."""
+    total, effective = float(labels.weights.sum()), labels.effective_number
+    if total < effective / 2:
+        warn_user(
+            f"The weights of the {len(labels)} calibration pairs sum to {total:.3g}, "
+            f"so that all together count as {total:.3g} pair(s). A weight is the "
+            "number of pairs that a pair counts as. If you have normalised the "
+            "weights, multiply them by the number of pairs."
+        )
+    num_different = len(labels.groups.unique())
+    if not labels.are_exact and num_different < len(labels) / 2:
+        warn_user(
+            f"{len(labels)} labels that are not exact have {num_different} different "
+            "values. Pairs with equal labels are taken for recordings at the same "
+            "parameters, and together count once. If they are not, add random numbers "
+            "far smaller than the noise to their labels."
         )

@@ -160,5 +160,8 @@ class Labels:
             num_partial = int((~self.is_measured).any(dim=1).sum())
             text = f"{n} labels, {num_noisy} with noise and {num_partial} partial"
         if self.are_weighted:
-            text += f", weighted like {self.effective_number:.1f} of equal weight"
+            text += (
+                f", weighted like {self.effective_number:.1f} of equal weight, and "
+                f"counted as {float(self.weights.sum()):.3g}"
+            )
         return text

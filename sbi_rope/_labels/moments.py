@@ -55,9 +55,9 @@ def labelled_moments(
     theta = parameters.draws
     if parameters.are_exact:
         return source.moments(theta[:, 0], count, embed, progress=progress)
-    n, num_draws, d = theta.shape
-    simulated = source.draws(theta.reshape(-1, d), 1, embed, progress=progress)
-    simulated = simulated.double().reshape(n, num_draws, -1)
+    n, num_draws, _ = theta.shape
+    theta, simulated = source.once_at(theta, embed, progress=progress)
+    simulated = simulated.double()
     level = simulated.mean(dim=1, keepdim=True)
     residual = simulated - level
     freedom = simulated.new_full((n,), num_draws - 1)
@@ -100,11 +100,10 @@ def labelled_targets(
             num_neighbors=num_neighbors,
             progress=progress,
         )
-    n, num_draws, d = parameters.draws.shape
+    num_draws = parameters.draws.shape[1]
     theta = parameters.draws[:, torch.arange(simulations_per_target) % num_draws]
-    embedded = source.draws(theta.reshape(-1, d), 1, embed, progress=progress)
-    targets = embedded.reshape(n, simulations_per_target, -1).mean(dim=1)
-    return check_targets(targets, parameters.mean)
+    _, embedded = source.once_at(theta, embed, progress=progress)
+    return check_targets(embedded.mean(dim=1), parameters.mean)
 
 
 def _features(theta: Tensor) -> list[Tensor]:

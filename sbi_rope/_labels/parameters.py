@@ -181,9 +181,9 @@ def _draw(
         rows = (lost.nonzero().flatten()[:5] + first).tolist()
         raise InvalidInputError(
             "Expected labels that some parameters inside the support of the prior "
-            f"fit; found none for {int(lost.sum())} labels (first: {rows}). Check "
-            "their units and their standard deviations, or train NPE with a wider "
-            "prior."
+            f"fit; found none for {int(lost.sum())} labels (first: {rows} of all pairs "
+            "appended so far, without those that say nothing). Check their units and "
+            "their standard deviations, or train NPE with a wider prior."
         )
     shares = torch.softmax(log_weights, dim=1)
     size = 1.0 / shares.square().sum(dim=1)

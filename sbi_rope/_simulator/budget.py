@@ -98,6 +98,12 @@ class LimitedSimulator:
         stored = self._made(progress=progress)
         return stored.draws(theta, count, embed, progress=progress)
 
+    def once_at(
+        self, theta: Tensor, embed: Embedding, *, progress: bool
+    ) -> tuple[Tensor, Tensor]:
+        """Embed the simulation with the nearest parameters."""
+        return self._made(progress=progress).once_at(theta, embed, progress=progress)
+
     def kept(self, count: int, *, progress: bool) -> tuple[Tensor, Tensor]:
         """Return up to ``count`` of the simulations."""
         return self._made(progress=progress).kept(count, progress=progress)

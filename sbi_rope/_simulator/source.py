@@ -150,6 +150,24 @@ class Simulator:
         usable = embedded[torch.arange(len(theta)), first][:, None]
         return embedded.where(valid[..., None], usable)
 
+    def once_at(
+        self, theta: Tensor, embed: Embedding, *, progress: bool
+    ) -> tuple[Tensor, Tensor]:
+        """Simulate at each of the parameters that a label leaves possible.
+
+        A simulation that is not finite is replaced by that of other parameters of the
+        label, and its parameters are replaced by these.
+        """
+        embedded, valid = self._at(theta, embed, progress=progress)
+        numbers = torch.arange(theta.shape[1], device=theta.device).expand(valid.shape)
+        # The k-th that is missing is replaced by the k-th that is there.
+        usable = (~valid).int().argsort(dim=1, stable=True)
+        missing = (~valid).cumsum(dim=1) - 1
+        place = missing.clamp_min(0) % valid.sum(dim=1, keepdim=True)
+        chosen = numbers.where(valid, usable.gather(1, place))
+        rows = torch.arange(len(theta), device=theta.device)[:, None]
+        return theta[rows, chosen], embedded[rows, chosen]
+
     def kept(self, count: int, *, progress: bool) -> tuple[Tensor, Tensor]:
         """Simulate at parameters from the prior once, and keep the simulations."""
         count = min(count, max(1, MAX_KEPT // self.event_shape.numel()))
@@ -165,20 +183,33 @@ class Simulator:
         self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
     ) -> tuple[Tensor, Tensor]:
         """Return embeddings ``(n, count, l)`` at each theta, and which are finite."""
-        repeated = theta.repeat_interleave(count, dim=0)
-        failures = Failures(len(repeated))
-        embedded, valid = self._embed_at(repeated, embed, failures, progress=progress)
+        repeated = theta[:, None].expand(-1, count, -1)
+        return self._at(repeated, embed, progress=progress)
+
+    def _at(
+        self, theta: Tensor, embed: Embedding, *, progress: bool
+    ) -> tuple[Tensor, Tensor]:
+        """Simulate at several parameters of each pair, ``(n, count, d)``.
+
+        Returns:
+            Embeddings, shape ``(n, count, l)``, and which of them are finite.
+        """
+        n, count, d = theta.shape
+        failures = Failures(n * count)
+        embedded, valid = self._embed_at(
+            theta.reshape(-1, d), embed, failures, progress=progress
+        )
         dropped = int((~valid).sum())
-        valid = valid.reshape(-1, count)
-        embedded = embedded.reshape(*valid.shape, -1)
+        valid = valid.reshape(n, count)
+        embedded = embedded.reshape(n, count, -1)
         self.num_dropped += dropped
         empty = ~valid.any(dim=1)
         if empty.any():
             # Row numbers would mislead, because these may be some of the pairs only.
             raise SimulationError(
                 "All simulations at the calibration parameters "
-                f"{in_digits(theta[empty])} contain NaN or Inf ({int(empty.sum())} "
-                f"pairs in all). Remove these pairs.{failures}"
+                f"{in_digits(theta[empty].mean(dim=1))} contain NaN or Inf "
+                f"({int(empty.sum())} pairs in all). Remove these pairs.{failures}"
             ) from failures.cause
         failures.warn_of_dropped(dropped, "simulations at calibration parameters")
         return embedded, valid

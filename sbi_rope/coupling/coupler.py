@@ -1,7 +1,9 @@
 """Semi-balanced entropic optimal transport, with its settings."""
 
 import itertools
+import warnings
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -23,15 +25,25 @@ from sbi_rope.coupling.pot import solve_pot
 from sbi_rope.coupling.problem import Problem, checked_embeddings, median_distance
 from sbi_rope.coupling.result import Coupling
 from sbi_rope.coupling.warm_start import warm_start
-from sbi_rope.errors import InvalidInputError, warn_user
+from sbi_rope.errors import InvalidInputError, RoPEWarning, warn_user
 
-__all__ = ["SinkhornCoupler"]
+__all__ = ["SMALL_BATCH", "SinkhornCoupler", "without_warning_of_small_batch"]
 
 # With fewer observations than this, few of them decide how the coupling is balanced.
 SMALL_BATCH = 20
 # The largest number of distances to store: 0.4 GB in float64, and as much again for the
 # kernel.
 MAX_STORED = 50_000_000
+
+
+@contextmanager
+def without_warning_of_small_batch() -> Iterator[None]:
+    """Couple a batch whose size the user did not choose."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings(
+            "ignore", message="Coupling a batch of", category=RoPEWarning
+        )
+        yield
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,6 +24,7 @@ from sbi_rope.errors import InvalidInputError
 __all__ = [
     "Correction",
     "Space",
+    "check_complete",
     "correct_npe",
     "fit_discrepancy",
     "network_of",
@@ -81,6 +82,27 @@ def network_of(estimator: ConditionalEstimator, space: Space) -> nn.Module:
             "space='embedding'."
         )
     return nn.Identity()
+
+
+def check_complete(name: str, x: Tensor, *, instead: str) -> None:
+    """Raise if entries of x are missing: what is not there cannot be corrected.
+
+    Args:
+        name: What x is called.
+        x: Observations, shape ``(n, l)``.
+        instead: What to do instead, as a sentence.
+
+    Raises:
+        InvalidInputError: If an entry is not finite.
+    """
+    missing = ~torch.isfinite(x)
+    if missing.any():
+        columns = missing.any(dim=0).nonzero().flatten()
+        raise InvalidInputError(
+            f"Expected {name} without missing entries, because each entry of x is "
+            f"corrected; got NaN or Inf in {len(columns)} of {x.shape[1]} entries "
+            f"(first: {columns[:5].tolist()}). {instead}"
+        )
 
 
 def fit_discrepancy(

@@ -28,7 +28,12 @@ from sbi_rope._validation import (
     check_names,
     check_positive,
 )
-from sbi_rope.discrepancy.correction import Space, correct_npe, network_of
+from sbi_rope.discrepancy.correction import (
+    Space,
+    check_complete,
+    correct_npe,
+    network_of,
+)
 from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.parameters import learn_parameters
 from sbi_rope.discrepancy.posterior import Discrepancy
@@ -52,6 +57,9 @@ __all__ = ["DiscrepancyNPE"]
 
 # The error of the discrepancy cannot be estimated from fewer pairs.
 MIN_PAIRS = 2
+GIVE_SUMMARIES = (
+    "Pass `summaries=`, a function from x to a few numbers for each observation."
+)
 
 
 class DiscrepancyNPE(Method):
@@ -110,7 +118,7 @@ class DiscrepancyNPE(Method):
     Raises:
         InvalidTypeError: If an argument has the wrong type.
         InvalidInputError: If an argument is outside its range. In ``train``, if x is
-            not a vector with ``space="input"``.
+            not a vector, or has missing entries, with ``space="input"``.
         SimulationError: In ``train``, if the simulator fails.
     """
 
@@ -233,8 +241,9 @@ class DiscrepancyNPE(Method):
         Raises:
             NotReadyError: If there are fewer than two pairs, or no simulations.
             InvalidTypeError: If ``summaries`` is no function, or returns no numbers.
-            InvalidInputError: If x is not a vector and no summaries are given, if these
-                have another shape or are not finite, or the names do not fit.
+            InvalidInputError: If x is not a vector or has missing entries and no
+                summaries are given, if these have another shape or are not finite, or
+                the names do not fit.
             SimulationError: If the simulator fails.
         """
         if x_names is not None:
@@ -254,6 +263,9 @@ class DiscrepancyNPE(Method):
         with seeded(seed):
             source = self._source()
             _, simulated = source.kept(self.num_simulations, progress=show)
+            if summaries is None:
+                for name, values in (("pairs", x), ("simulations", simulated)):
+                    check_complete(name, values, instead=GIVE_SUMMARIES)
             if isinstance(net, Summaries):
                 x = net.checked("the pairs", embed(net, x))
                 simulated = net.checked("simulations", embed(net, simulated))
@@ -309,6 +321,9 @@ class DiscrepancyNPE(Method):
         net = network_of(estimator, self.space)
         moments = self._moments(source, net, show_progress_bars)
         theta_s, x_s = self._bank(source, show_progress_bars)
+        if self.space == "input":
+            for name, values in (("pairs", x), ("simulations", x_s)):
+                check_complete(name, values, instead="Use space='embedding'.")
         nets, z = [net], embed(net, x)
         if self.space == "tuned":
             nets, z = cross_fitted_nets(

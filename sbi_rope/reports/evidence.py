@@ -177,8 +177,8 @@ def no_discrepancy_section(report: StackingReport) -> str:
     why = "no candidate of this stack models how reality differs from the simulator"
     if any("discrepancy" in family for family in candidates):
         why = (
-            "a measurement is no short vector here, but an image, a long series or a "
-            "set of trials, say"
+            "measurements are no short vectors here (but images, long series or sets "
+            "of trials, say), or because some entries are missing"
         )
     return section(
         "Where the simulator differs from reality",

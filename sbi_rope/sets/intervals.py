@@ -1,5 +1,6 @@
 """An interval for each parameter given one observation, or given each of a batch."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -125,7 +126,7 @@ class CredibleIntervals:
         rows = (self[:count] if self._is_batch else self).as_rows()
         lines = [
             (f"  observation {row['observation']}," if self._is_batch else " ")
-            + f" {row['parameter']}: {row['low']:.4g} to {row['high']:.4g}"
+            + f" {row['parameter']}: {_ends_in_words(row['low'], row['high'])}"
             for row in rows
         ]
         if self._is_batch and len(self.low) > count:
@@ -142,6 +143,15 @@ class CredibleIntervals:
         return "\n".join(
             [f"{100 * self.level:.4g} % intervals, one by one:", *lines, promise]
         )
+
+
+def _ends_in_words(low: float, high: float) -> str:
+    """Return both ends, with digits enough to see how wide the interval is."""
+    digits, width = 4, high - low
+    if math.isfinite(width) and width > 0:
+        largest = max(abs(low), abs(high))
+        digits = max(digits, 3 + math.floor(math.log10(largest / width)))
+    return f"{low:.{digits}g} to {high:.{digits}g}"
 
 
 @torch.no_grad()

@@ -12,6 +12,7 @@ from sbi_rope._random import seeded
 from sbi_rope._sbi import embed, estimator_of, headless
 from sbi_rope.batch import parameters_named
 from sbi_rope.coupling import Coupling
+from sbi_rope.coupling.coupler import without_warning_of_small_batch
 from sbi_rope.errors import CouplingError
 from sbi_rope.mixture import CoupledEmbeddings, CoupledNet, Part
 from sbi_rope.mixture.chunks import flow_batch
@@ -232,10 +233,12 @@ def _couple(
         group = [c for c in candidates if c.cost_scale == cost_scale]
         gammas = sorted({c.gamma for c in group}, reverse=True)
         taus = sorted({c.tau for c in group}, reverse=True)
-        sweep = replace(rope.coupler, cost_scale=cost_scale).sweep(
-            real, simulated, gammas=gammas, taus=taus, seed=0
-        )
-        grid = dict(zip(itertools.product(gammas, taus), sweep, strict=True))
+        with without_warning_of_small_batch():
+            sweep = replace(rope.coupler, cost_scale=cost_scale).sweep(
+                real, simulated, gammas=gammas, taus=taus, seed=0
+            )
+            couplings = list(sweep)
+        grid = dict(zip(itertools.product(gammas, taus), couplings, strict=True))
         found |= {c: grid[c.gamma, c.tau] for c in group}
     return [found[c] for c in candidates]
 

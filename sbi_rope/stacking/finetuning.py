@@ -55,7 +55,7 @@ def finetune_without(
     Args:
         start: An estimator of sbi with a density; it is not changed.
         fold: The pairs that may be learned from.
-        part: The number of the part to hold out, one of ``fold.used``.
+        part: The number of the part to hold out, one of ``fold.parts``.
         learning_rate: Of Adam.
         rehearse: Whether to train on simulations, too. A large net that keeps seeing
             them learns more from the pairs before it overfits.
@@ -64,7 +64,7 @@ def finetune_without(
         The trained estimator, in evaluation mode.
     """
     bench = fold.bench
-    train, held_out = bench.rows_of(fold.used - {part}), bench.folds[part]
+    train, held_out = fold.rows_without(part), fold.parts[part]
     estimator = copy.deepcopy(start).requires_grad_()
     # The order of the batches depends on the fold alone, not on what was drawn before.
     order = torch.Generator().manual_seed(fold.seed)

@@ -1,6 +1,6 @@
 """The folds of the calibration pairs, and what all candidates share."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -130,16 +130,18 @@ class Workbench:
         return self.is_short and bool(torch.isfinite(self.x).all())
 
     @cached_property
-    def reads_summaries(self) -> bool:
-        """Whether x is a short vector and NPE has an embedding net.
+    def compares_entries(self) -> bool:
+        """Whether x is a short vector without missing entries, simulated or real."""
+        return self.has_summaries and bool(torch.isfinite(self.simulations[1]).all())
 
-        Without a net to lose information, errors in x are those in h(x). Where
-        simulations have missing entries (NaN), only h(x) can be corrected.
+    @cached_property
+    def reads_summaries(self) -> bool:
+        """Whether entries of x can be corrected, and NPE has an embedding net.
+
+        Without a net to lose information, errors in x are those in h(x).
         """
         has_net = any(True for _ in self.embedding_net.parameters())
-        if not self.has_summaries or not has_net:
-            return False
-        return bool(torch.isfinite(self.simulations[1]).all())
+        return has_net and self.compares_entries
 
     @cached_property
     def _moments(self) -> Moments:
@@ -293,6 +295,24 @@ class Fold:
         self._corrected: dict[tuple[Space, bool], Corrected] = {}
 
     @cached_property
+    def parts(self) -> dict[int, Tensor]:
+        """Rows of the parts that are held out in turn; nets learn from the others.
+
+        These are the folds. A single fold is divided further, unless all of its pairs
+        have the same parameters.
+        """
+        if len(self.used) > 1:
+            return {number: self.bench.folds[number] for number in sorted(self.used)}
+        with seeded(self.seed):
+            split = split_groups(self.bench.groups[self.rows.cpu()], NUM_INNER_FOLDS)
+        found = [self.rows[part.to(self.rows.device)] for part in split if len(part)]
+        return dict(enumerate(found))
+
+    def rows_without(self, part: int) -> Tensor:
+        """Return the rows of all parts but one."""
+        return torch.cat([rows for k, rows in self.parts.items() if k != part])
+
+    @cached_property
     def rope(self) -> RoPE:
         """RoPE, tuned on these pairs."""
         return self.tuned(self.bench.rope.finetuner)
@@ -375,26 +395,20 @@ class Fold:
         """Return tuned nets, and the pairs embedded by nets that have not seen them."""
         bench, nets = self.bench, []
         z = bench.embedded.new_empty(len(bench.x), bench.embedded.shape[1])
-        for net, rows in self._tuned_without():
+        for number, rows in self.parts.items():
+            net = self._tuned_without(number)
             z[rows] = embed(net, bench.x[rows])
             nets.append(net)
         return nets, z[self.rows]
 
-    def _tuned_without(self) -> Iterator[tuple[nn.Module, Tensor]]:
-        """Yield nets tuned on some pairs, each with rows that it has not seen."""
+    def _tuned_without(self, part: int) -> nn.Module:
+        """Return a net tuned on the pairs, except for a part."""
         bench = self.bench
         if len(self.used) > 1:
-            for number in sorted(self.used):
-                yield bench.tuned_net(self.used - {number}), bench.folds[number]
-            return
-        split = split_groups(bench.groups[self.rows.cpu()], NUM_INNER_FOLDS)
-        parts = [self.rows[part.to(self.rows.device)] for part in split if len(part)]
-        if len(parts) == 1:  # one person: there are no other pairs to tune on
-            yield bench.embedding_net, self.rows
-            return
-        for number, rows in enumerate(parts):
-            others = torch.cat([part for k, part in enumerate(parts) if k != number])
-            yield bench.tune(others, self.seed), rows
+            return bench.tuned_net(self.used - {part})
+        if len(self.parts) == 1:  # one person: there are no other pairs to tune on
+            return bench.embedding_net
+        return bench.tune(self.rows_without(part), self.seed)
 
 
 def _of_rows(weights: Tensor | None, rows: Tensor) -> Tensor | None:

@@ -115,7 +115,7 @@ class FinetunedCandidate(AmortisedCandidate):
 
     def parts(self, fold: Fold) -> list[Part]:
         """Train one net without each part of the pairs."""
-        if len(fold.used) < 2:
+        if len(fold.parts) < 2:
             # Nothing can be held out, so that NPE is used as it starts.
             if self.space is None:
                 return [part_of(estimator_of(fold.bench.npe))]
@@ -127,7 +127,7 @@ class FinetunedCandidate(AmortisedCandidate):
                     self._start(fold, number), fold, number, learning_rate=rate
                 )
             )
-            for number in sorted(fold.used)
+            for number in fold.parts
         ]
 
     def _start(self, fold: Fold, number: int) -> Any:
@@ -137,7 +137,7 @@ class FinetunedCandidate(AmortisedCandidate):
         if self.space != "tuned":
             return corrected.estimator
         # This net has not seen the part that is held out.
-        net = corrected.nets[sorted(fold.used).index(number)]
+        net = corrected.nets[list(fold.parts).index(number)]
         return with_embedding(corrected.estimator, copy.deepcopy(net))
 
 
@@ -172,11 +172,11 @@ class RehearsedCandidate(AmortisedCandidate):
     def parts(self, fold: Fold) -> list[Part]:
         """Train one net without one part of the pairs."""
         start = estimator_of(fold.bench.npe)
-        if len(fold.used) < 2:  # nothing can be held out
+        if len(fold.parts) < 2:  # nothing can be held out
             return [part_of(start)]
         # The part after the one that the version does not see, so that the versions
         # that are scored hold out different parts.
-        others = sorted(fold.used)
+        others = list(fold.parts)
         unseen = set(range(len(fold.bench.folds))) - fold.used
         after = [number for number in others if number > min(unseen, default=-1)]
         return [

@@ -18,11 +18,13 @@ from sbi_rope._validation import (
     check_not_negative,
     check_prior,
 )
+from sbi_rope.coupling.coupler import SMALL_BATCH
 from sbi_rope.discrepancy import DiscrepancyReport
-from sbi_rope.discrepancy.correction import network_of
+from sbi_rope.discrepancy.correction import check_complete, network_of
 from sbi_rope.errors import (
     InvalidInputError,
     NotReadyError,
+    warn_user,
 )
 from sbi_rope.mixture import Part
 from sbi_rope.recalibration import Recalibration
@@ -99,6 +101,8 @@ class StackTrainer:
             because="candidates are scored by the density of held-out parameters",
         )
         self.candidates = self._chosen(candidates)
+        if self.x_o is not None:
+            _warn_of_small_batch(len(self.x_o), len(self.bench.x))
         self.num_simulations = num_simulations
         self.pseudo_count = pseudo_count
         self.require_convergence = require_convergence
@@ -130,6 +134,11 @@ class StackTrainer:
         if any(candidate.space == "input" for candidate in corrected):
             # Raises for images and series, before any candidate is trained.
             network_of(estimator_of(self.bench.npe), "input")
+            for name, x in (
+                ("pairs", self.bench.x),
+                ("simulations", self.bench.simulations[1]),
+            ):
+                check_complete(name, x, instead="Leave out candidates with 'input'.")
         coupled = any(isinstance(c, CouplingCandidate) for c in chosen)
         if coupled and self.x_o is None:
             raise InvalidInputError(
@@ -217,7 +226,7 @@ class StackTrainer:
         """Return what the pairs say about each entry of x, if a candidate uses it."""
         corrected = (DiscrepancyCandidate, FinetunedCandidate)
         spaces = (c.space for c in self.candidates if isinstance(c, corrected))
-        if self.bench.has_summaries and any(space is not None for space in spaces):
+        if any(space is not None for space in spaces) and self.bench.compares_entries:
             return self.bench.discrepancy()
         return None
 
@@ -270,6 +279,16 @@ def _check_pairs(count: int) -> None:
             f"Expected at least {MIN_PAIRS} calibration pairs with different "
             f"parameters, to hold some out; got {count}. Call "
             "`append_calibration(theta, x)` first."
+        )
+
+
+def _warn_of_small_batch(num_observed: int, num_pairs: int) -> None:
+    if num_observed + num_pairs < SMALL_BATCH:
+        warn_user(
+            f"{num_observed} real observation(s) are coupled together with those of "
+            f"{num_pairs} calibration pairs. These few decide how much weight each "
+            f"simulation gets. Use at least {SMALL_BATCH} together, or leave out "
+            "couplings: `stack(rope)`."
         )
 
 

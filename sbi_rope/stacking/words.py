@@ -138,19 +138,20 @@ def _labels(report: "StackingReport") -> list[str]:
 
 def _scores(report: "StackingReport") -> list[str]:
     lines = ["  log score of the stack, in nats a pair (higher is better):"]
+    scores = {
+        "with theta in its own units": report.score,
+        "with theta in standard deviations of the prior": report.score_z,
+    }
+    unit = " (own units)"
     if are_relative(report):
-        score, error = report.score
-        return [*lines, f"    {score:.2f} +- {error:.2f} above the prior"]
-    for (score, error), unit in (
-        (report.score, "its own units"),
-        (report.score_z, "standard deviations of the prior"),
-    ):
+        scores, unit = {"above the prior": report.score}, ""
+    for kind, (score, error) in scores.items():
         if not math.isnan(score):
-            lines.append(f"    {score:.2f} +- {error:.2f} with theta in {unit}")
+            lines.append(f"    {score:.2f} +- {error:.2f} {kind}")
     if differs(report):
         lines += [
             f"    {report.comparable_score[0]:.2f} before correction for mass outside "
-            "the prior (own units); candidates are not",
+            f"the prior{unit}; candidates are not",
             "    corrected, so that the differences below start from this number",
         ]
     return lines

@@ -236,7 +236,7 @@ def test_a_page_without_batch_and_curve_says_what_it_assumes(tmp_path: Path) -> 
 def test_a_page_without_discrepancies_says_why(tmp_path: Path) -> None:
     report = replace(the_stack().report, discrepancy=None)
     text = Page(written(report, tmp_path)).text
-    assert "because a measurement is no short vector here" in text
+    assert "because measurements are no short vectors here" in text
     scores = replace(
         report.cross_validation,
         families=("prior",) * len(report.cross_validation.families),

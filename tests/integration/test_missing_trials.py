@@ -205,5 +205,33 @@ def test_missing_numbers_of_a_vector_are_embedded_but_not_corrected() -> None:
     method = DiscrepancyNPE.from_posterior(
         posterior_from(npe, estimator), simulator=problems.simulate, space="input"
     )
-    with pytest.raises(InvalidInputError, match="finite"):
+    with pytest.raises(InvalidInputError, match="pairs without missing entries"):
         method.append_calibration(theta, x).train(**QUIET)
+
+
+def test_where_simulated_numbers_are_missing_nothing_says_that_they_are_constant() -> (
+    None
+):
+    def simulator(theta: Tensor) -> Tensor:
+        x = problems.simulate(theta)
+        x[::7, 1] = torch.nan
+        return x
+
+    npe = problems.npe_posterior()
+    net = nn.Sequential(problems.Filled(), *embedding_of(npe.posterior_estimator))
+    npe = posterior_from(npe, with_embedding(npe.posterior_estimator, net))
+    theta = problems.box(2).sample((12,))
+    x = problems.simulate(theta)
+    rope = RoPE(npe, simulator=simulator).append_calibration(theta, x)
+    corrected = DiscrepancyCandidate(space="input")
+    with pytest.raises(InvalidInputError, match=r"simulations without .* \[1\]"):
+        stacked(rope, candidates=[corrected])
+    posterior = stacked(rope, candidates=default_candidates(rope)[:4], num_folds=2)
+    assert "discrepancy" in posterior.candidate_weights
+    assert posterior.report.discrepancy is None
+    method = DiscrepancyNPE.from_posterior(npe, simulator=simulator, space="input")
+    method.append_calibration(theta, x)
+    with pytest.raises(InvalidInputError, match="simulations without missing entries"):
+        method.train(**QUIET)
+    with pytest.raises(InvalidInputError, match=r"Pass `summaries=`"):
+        method.report(**QUIET)

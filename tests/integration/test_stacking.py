@@ -190,6 +190,17 @@ def test_a_stack_of_a_batch_answers_others_only_if_it_extends() -> None:
             call(theta, x)
 
 
+def test_few_observations_and_pairs_are_warned_of_once_with_both_numbers() -> None:
+    pairs = problem(8, seed=1)
+    with pytest.warns(RoPEWarning, match="coupled together|Coupling a") as caught:
+        stacked(rope_of(pairs), observed(3), candidates=[OT_ONLY, NPE], num_folds=2)
+    texts = [str(one.message) for one in caught]
+    few = [text for text in texts if "coupled together" in text]
+    assert len(few) == 1
+    assert "3 real observation(s) are coupled together with those of 8" in few[0]
+    assert not any("Coupling a batch of" in text for text in texts)
+
+
 def test_a_stack_of_a_batch_gives_sets_with_a_guarantee() -> None:
     posterior, x = the_coupled_stack(), observed()[0]
     found = posterior.credible_set(0.9, x, guaranteed=True, num_samples=40, seed=0)

@@ -1,6 +1,7 @@
 """Stacks of pairs whose labels are noisy, partial, weighted, or draws."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -99,6 +100,9 @@ def test_labels_given_as_draws_are_scored_relative_to_the_prior(tmp_path: Path) 
     assert torch.isnan(scores.levels).all()
     assert "coverage is not known" in str(posterior.report)
     assert "above the prior" in str(posterior.report)
+    # What the gains start from is stated here, too, where it is another number.
+    other = replace(posterior.report, comparable_score=(0.25, 0.1))
+    assert "0.25 before correction for mass outside the prior; cand" in str(other)
     posterior.report.to_html(tmp_path / "draws.html")
     page = (tmp_path / "draws.html").read_text()
     assert ">nan" not in page

@@ -1,6 +1,7 @@
 """Labels that are noisy, partial, weighted, or given as draws."""
 
 import math
+import warnings
 from typing import Any
 
 import pytest
@@ -17,9 +18,10 @@ from sbi_rope._labels import (
     parameters_of,
     reference_of,
 )
+from sbi_rope._simulator import Simulator
 from sbi_rope.discrepancy import DiscrepancyModel, learn_parameters
 from sbi_rope.discrepancy.imputation import expected_means
-from sbi_rope.errors import InvalidInputError, RoPEWarning
+from sbi_rope.errors import InvalidInputError, RoPEWarning, SimulationError
 from sbi_rope.metrics import acauc_of, coverage_curve_of, expected_coverage_error_of
 from sbi_rope.stacking import stacking_weights
 from sbi_rope.stacking.folds import Workbench
@@ -301,7 +303,7 @@ def rope() -> RoPE:
 def test_labels_that_say_nothing_are_left_out() -> None:
     theta, x = gaussian.labelled(6)
     theta[2:4] = NAN
-    with pytest.warns(RoPEWarning, match="2 of 6 labels say nothing"):
+    with pytest.warns(RoPEWarning, match=r"2 of 6 labels say .* rows: \[\d, \d\]"):
         conductor = rope().append_calibration(theta, x)
     keep = torch.tensor([0, 1, 4, 5])
     assert torch.equal(conductor.calibration[0], theta[keep])
@@ -565,3 +567,57 @@ def test_targets_of_noisy_labels_are_means_of_as_many_simulations_as_asked_for()
     called.clear()
     conductor.draw_targets(simulations_per_target=250, show_progress_bars=False)
     assert sum(called) == 750
+
+
+# What may be meant differently -------------------------------------------------------
+
+
+def test_weights_that_were_normalised_and_equal_labels_that_are_noisy_are_named() -> (
+    None
+):
+    theta, x = gaussian.labelled(12)
+    rope = RoPE(gaussian.posterior(), simulator=gaussian.simulator)
+    with pytest.warns(RoPEWarning, match=r"12 calibration pairs sum to 1, so that"):
+        rope.append_calibration(theta, x, weights=torch.full((12,), 1 / 12))
+    assert "and counted as 1" in str(rope.labels)
+    rope = RoPE(gaussian.posterior(), simulator=gaussian.simulator)
+    with pytest.warns(RoPEWarning, match="12 labels .* have 5 different values"):
+        rope.append_calibration(theta[torch.arange(12) % 5], x, theta_std=0.1)
+    assert len(rope.labels.groups.unique()) == 5
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RoPEWarning)
+        rope = RoPE(gaussian.posterior(), simulator=gaussian.simulator)
+        rope.append_calibration(theta, x, weights=torch.linspace(0.5, 1.5, 12))
+        rope = RoPE(gaussian.posterior(), simulator=gaussian.simulator)
+        rope.append_calibration(theta[torch.arange(12) % 5], x)
+
+
+def test_a_failed_simulation_is_replaced_by_another_one_of_the_same_label() -> None:
+    """A label is lost only if all simulations at its possible parameters failed."""
+
+    def simulator(theta: Tensor) -> Tensor:
+        x = theta.clone()
+        x[theta[:, 0] > 0] = NAN  # known parameters fail, so that rows can be compared
+        return x
+
+    source = Simulator(
+        simulator,
+        BoxUniform(-torch.ones(2), torch.ones(2)),
+        event_shape=torch.Size((2,)),
+        like=torch.zeros(1, 2),
+    )
+    theta = 2 * torch.rand(6, 50, 2) - 1
+    with pytest.warns(RoPEWarning, match="Dropped"):
+        used, x = source.once_at(theta, lambda x: x, progress=False)
+    assert torch.equal(used, x)
+    usable = theta[..., 0] <= 0
+    assert torch.equal(used[usable], theta[usable])
+    for row in range(6):
+        known = {tuple(one) for one in theta[row][usable[row]].tolist()}
+        assert {tuple(one) for one in used[row].tolist()} == known
+        # All of them are used about equally often.
+        counts = used[row].unique(dim=0, return_counts=True)[1]
+        assert int(counts.max() - counts.min()) <= 1
+    theta[2, :, 0] = 0.5
+    with pytest.raises(SimulationError, match=r"\(1 pairs in all\)"):
+        source.once_at(theta, lambda x: x, progress=False)

@@ -18,7 +18,7 @@ from sbi_rope._random import seeded
 from sbi_rope.errors import InvalidInputError, InvalidTypeError
 from sbi_rope.metrics import coverage_curve_of
 from sbi_rope.mixture import MixtureEstimator, part_of
-from sbi_rope.sets import Guarantee
+from sbi_rope.sets import CredibleIntervals, Guarantee
 from sbi_rope.sets.conformal import (
     interval_of,
     is_held,
@@ -125,6 +125,25 @@ def test_intervals_of_a_batch_say_which_observation_they_are_of() -> None:
     assert "observation" not in str(found[0])
     with pytest.raises(InvalidInputError, match="intervals of a batch"):
         found[0][0]
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "text"),
+    [
+        (-0.12345, 1.2345, "-0.1235 to 1.234"),
+        (2021.8249, 2022.6149, "2021.82 to 2022.61"),
+        (101325.24, 101331.93, "101325.2 to 101331.9"),
+        (1.5e-9, 1.52e-9, "1.5e-09 to 1.52e-09"),
+        (2.0, 2.0, "2 to 2"),
+        (-math.inf, 3.0, "-inf to 3"),
+    ],
+)
+def test_printed_ends_show_how_wide_an_interval_is(
+    low: float, high: float, text: str
+) -> None:
+    ends = torch.tensor([[low], [high]], dtype=torch.double)
+    found = CredibleIntervals(low=ends[0], high=ends[1], level=0.9, guarantee=None)
+    assert f"theta_1: {text}\n" in str(found)
 
 
 def test_the_default_x_and_the_seed_are_used() -> None:
