@@ -34,6 +34,8 @@ __all__ = [
 Trained = TypeVar("Trained")
 # Fewer pairs of different parameters than this leave nothing to hold out.
 MIN_PAIRS_FOR_HOLDOUT = 5
+# More epochs than this are no limit.
+LARGEST_LIMIT = 10**6
 # Without a hold-out nothing says when to stop, so little is risked.
 EPOCHS_WITHOUT_HOLDOUT = 50
 
@@ -323,6 +325,8 @@ def fit(
     progress = progress_bar(
         range(max_num_epochs + 1),
         show=show_progress_bars,
+        # Training without a limit ends where the loss does not fall any more.
+        total=max_num_epochs + 1 if max_num_epochs < LARGEST_LIMIT else math.inf,
         desc=f"{label} (learning rate {learning_rate:g})",
     )
     module.eval()

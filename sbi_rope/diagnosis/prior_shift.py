@@ -214,6 +214,6 @@ def _sentence(
             "same."
         )
     return (
-        f"{sentence} (understated: observations are drawn to the prior). A smaller "
-        "tau trusts the prior less."
+        f"{sentence} (understated: observations are drawn to the prior). In RoPE, a "
+        "smaller tau trusts the prior less."
     )

@@ -187,6 +187,6 @@ def _sentence(name: str, ratio: float, *, narrow: bool, tuned: bool) -> str:
         )
     return (
         f"{sentence}: {size} (the true range is narrower still, because observations "
-        "are noisy). A smaller tau trusts the prior less. Scores and calibration on "
-        "pairs of the whole prior need not hold for this batch."
+        "are noisy). In RoPE, a smaller tau trusts the prior less. Scores and "
+        "calibration on pairs of the whole prior need not hold for this batch."
     )

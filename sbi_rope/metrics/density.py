@@ -40,6 +40,9 @@ class LPPScore:
                 "Expected `log_probs` below infinity; got +Inf, which no density has."
             )
 
+    def __str__(self) -> str:
+        return f"{self.mean:.2f} +- {self.standard_error:.2f}"
+
     @property
     def mean(self) -> float:
         r"""The LPP. It is :math:`-\infty` if a single true parameter is excluded."""

@@ -210,9 +210,9 @@ class CoupledEmbeddings(Mixing):
         if self.unseen == "raise":
             raise UnseenObservationError(
                 f"{len(x)} observation(s) are not in the batch of "
-                f"{len(self.batch)} that this posterior was built for. A posterior of "
-                "RoPE answers for its own batch only, and `posterior[i]` knows its own "
-                "observation alone. Couple the new batch with "
+                f"{self.num_observed} that this posterior was built for. A posterior "
+                "of RoPE answers for its own batch only, and `posterior[i]` knows its "
+                "own observation alone. Couple the new batch with "
                 "`rope.build_posterior(x_new)` or `stack(rope, x_new)`. Or pass "
                 "`unseen='extend'` to either of them, which then extends the old "
                 "coupling to new observations."

@@ -580,7 +580,7 @@ def _purpose(estimator: MixtureEstimator) -> str:
     mixed = f"{num_parts} posterior densities"
     if num_parts == 1:
         mixed = f"{coupled.num_embeddings} simulated posteriors"
-    return (
-        f"It is the mixture of {mixed} for each of {len(coupled.x_o)} real "
-        "observations."
-    )
+    count = len(coupled.x_o)
+    if count == 1:
+        return f"It is the mixture of {mixed} for one real observation."
+    return f"It is the mixture of {mixed} for each of {count} real observations."

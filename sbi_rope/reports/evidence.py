@@ -183,7 +183,8 @@ def no_discrepancy_section(report: StackingReport) -> str:
     return section(
         "Where the simulator differs from reality",
         paragraph(
-            f"Entries of the measurements were not compared one by one, because {why}."
+            f"Entries of the measurements were not compared one by one, because {why}. "
+            "The report of a DiscrepancyNPE can compare summaries of them."
         ),
     )
 

@@ -10,6 +10,7 @@ from sbi_rope.stacking import StackingReport
 from sbi_rope.stacking.words import (
     LEVEL,
     NOT_CHECKED,
+    ON_AVERAGE,
     OVER_CONFIDENT,
     TOO_FEW,
     compared,
@@ -62,7 +63,9 @@ def _calibrated(report: StackingReport) -> tuple[str, bool]:
     held = percent(report.share_inside)
     inside = f"{percent(LEVEL)} intervals held {held} of the {known}."
     if verdict == "calibrated":
-        start = "Its uncertainties are calibrated as far as these pairs can tell"
+        average = ON_AVERAGE if parameters_off(report) else ""
+        start = f"Its uncertainties are calibrated{average} as far as these pairs can "
+        start += "tell"
         return f"{start}: {inside}", False
     text = f"On held-out pairs its uncertainties are {verdict}: {inside}"
     return f"{text} {OVER_CONFIDENT}" if verdict == "over-confident" else text, True

@@ -49,6 +49,8 @@ SLIGHT = 0.1
 # The candidates that a stack is compared with, and how the text calls them.
 REFERENCES = {"prior": "the prior", "NPE": "NPE as it was"}
 
+# What a verdict on all parameters says if it does not hold for each of them.
+ON_AVERAGE = ", on average over the parameters,"
 # What to do about a stack whose intervals are too narrow.
 OVER_CONFIDENT = (
     "More labels help most. Until then, take intervals of a higher level than you need."
@@ -69,7 +71,8 @@ IF_KEPT = (
 
 # What each method is. Whether it is better than others is for the scores to say.
 IN_WORDS = {
-    "prior": "the prior, which learns nothing from x",
+    "prior": "the prior, which learns nothing from x. Check that theta and x of the "
+    "pairs belong together, row by row",
     "NPE": "NPE as it was trained on simulations",
     "OT-only": "observations are coupled with simulations, without tuning",
     "tuning-only": "the embedding net was tuned on the labels, without coupling",
@@ -230,11 +233,11 @@ def _calibration(report: "StackingReport") -> list[str]:
     if n < FEWEST:
         return [f"  ACAUC {acauc.value:+.3f}, of {TOO_FEW}"]
     advice = [f"    {OVER_CONFIDENT}"] if verdict == "over-confident" else []
-    verdict += (
-        " as far as these pairs can tell"
-        if verdict == "calibrated"
-        else " on held-out pairs"
-    )
+    off = parameters_off(report)
+    if verdict == "calibrated":
+        verdict += f"{ON_AVERAGE if off else ''} as far as these pairs can tell"
+    else:
+        verdict += " on held-out pairs"
     return [
         f"  {verdict}: ACAUC {acauc.value:+.3f}, 95 % interval {low:+.3f} to "
         f"{high:+.3f}",
@@ -242,7 +245,7 @@ def _calibration(report: "StackingReport") -> list[str]:
         f"    coverage error {report.coverage_error.value:.3f}; a calibrated posterior "
         f"has about {0.31 / n**0.5:.3f} with {n:.0f} pairs",
         f"    {LEVEL:.0%} intervals hold {report.share_inside:.0%} of the parameters",
-        *(f"    {line}" for line in parameters_off(report)),
+        *(f"    {line}" for line in off),
         *advice,
         *_sets(report),
         *_assumption(report),

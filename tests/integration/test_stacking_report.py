@@ -198,7 +198,8 @@ def test_parameters_that_are_not_calibrated_by_themselves_are_named() -> None:
     opposite = torch.stack([levels[:, 0].sqrt(), levels[:, 1].square()], dim=1)
     scores = replace(report.cross_validation, levels=opposite)
     text = str(StackingReport.of(scores))
-    assert "\n  calibrated as far as these pairs can tell: ACAUC" in text
+    average = "calibrated, on average over the parameters, as far as these pairs can"
+    assert f"\n  {average} tell: ACAUC" in text
     assert "theta_1 by itself is over-confident: ACAUC +0.1" in text
     assert "theta_2 by itself is too wide: ACAUC -0.1" in text
     assert "97.5 % interval" in text

@@ -386,6 +386,10 @@ def test_log_probs_of_minus_infinity_stay_in_the_mean_and_are_counted() -> None:
     assert score.neg_inf_fraction == pytest.approx(0.4)
     score = metrics.LPPScore(log_probs=torch.tensor([-1.0, -torch.inf, -torch.inf]))
     assert score.median == -math.inf
+    assert str(score) == "-inf +- inf"
+    assert str(metrics.LPPScore(log_probs=torch.tensor([-1.0, 0.0, 1.0, 2.0]))) == (
+        "0.50 +- 0.65"
+    )
 
 
 def test_chunks_limit_the_batch_and_change_no_log_prob() -> None:

@@ -285,6 +285,22 @@ class TestFit:
         )
         assert 0 < capsys.readouterr().err.count("Numbers") < 20
 
+    def test_training_without_a_limit_shows_no_total(
+        self, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        module = Number()
+        run(
+            module,
+            towards(module, 1),
+            lambda: (module() - 1).square(),
+            show_progress_bars=True,
+            max_num_epochs=2**31 - 1,
+            stop_after_epochs=5,
+        )
+        text = capsys.readouterr().err
+        assert "Numbers" in text
+        assert "2147483648" not in text
+
 
 class TestSplitPairs:
     def test_each_pair_is_on_one_side(self) -> None:
