@@ -292,7 +292,7 @@ class TestFit:
         run(
             module,
             towards(module, 1),
-            lambda: (module() - 1).square(),
+            towards(module, 1),
             show_progress_bars=True,
             max_num_epochs=2**31 - 1,
             stop_after_epochs=5,
