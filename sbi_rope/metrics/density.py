@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sbi_rope._notebooks import shown_as_text
 from sbi_rope._validation import (
     check_batch,
     check_not_nan,
@@ -20,6 +21,7 @@ from sbi_rope.metrics.calls import CHUNK_SIZE, check_test_set, evaluate_log_prob
 __all__ = ["LPPScore", "check_scales", "check_theta_std", "lpp"]
 
 
+@shown_as_text
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LPPScore:
     r"""Log-probabilities of the true parameters under the posterior. Higher is better.
