@@ -56,8 +56,8 @@ work beside it. "Calls" are simulations beyond those that NPE was trained on.
 """
 OF_A_BATCH = f"""\
 RoPE, OT-only, FRISBI and RVNP see the test observations, without their labels. The
-stack above does not. This is what `{COUPLED_STACK}` has, which sees them too:
-`default_candidates(rope, x_o)`, with RVNP and couplings among its candidates.
+stack above does not. This is what `{COUPLED_STACK}` has, which sees them too: it is
+`stack(rope, x_o)`, with RVNP and couplings among its candidates.
 """
 
 

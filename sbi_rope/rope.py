@@ -247,8 +247,9 @@ class RoPE:
             )
             labels, x = labels[known], x[known]
         labels = self._labels.appended(labels) if len(self._labels) else labels
-        self._parameters = parameters_of(labels, self._npe.prior)
+        parameters = parameters_of(labels, self._npe.prior)
         warn_of_ambiguous(labels)
+        self._parameters = parameters
         self._labels, self._x_cal = labels, torch.cat([self._x_cal, x])
         self._g, self._history, self._targets = None, None, None
         return self
