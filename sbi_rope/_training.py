@@ -2,9 +2,8 @@
 
 import copy
 import math
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -12,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from sbi_rope._progress import progress_bar
-from sbi_rope.errors import RoPEWarning, warn_user
+from sbi_rope.errors import warn_user, without_warning
 
 __all__ = [
     "EPOCHS_WITHOUT_HOLDOUT",
@@ -210,14 +209,9 @@ def epochs_on_pairs(
     return min(max_num_epochs, EPOCHS_WITHOUT_HOLDOUT)
 
 
-@contextmanager
-def without_warning_of_few_pairs() -> Iterator[None]:
+def without_warning_of_few_pairs() -> AbstractContextManager[None]:
     """Train on some of the user's pairs, whose number the user did not choose."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings(
-            "ignore", message="Only .* none is held out", category=RoPEWarning
-        )
-        yield
+    return without_warning("Only .* none is held out")
 
 
 def shuffled(

@@ -6,7 +6,8 @@ that both ``except RoPEError`` and, for instance, ``except ValueError`` catch it
 
 import inspect
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 __all__ = [
@@ -132,8 +133,8 @@ def in_digits(rows: Any) -> str:
 def warn_user(message: str) -> None:
     """Issue a :class:`RoPEWarning` that points at the line of the user's code.
 
-    That line is the innermost call from outside of this package, sbi and torch, and of
-    what calls them in between.
+    That line is the innermost call that was made neither by this package, sbi or torch,
+    nor by the standard library between two calls of theirs.
     """
     level, frame = 1, inspect.currentframe()
     while frame is not None:
@@ -142,3 +143,15 @@ def warn_user(message: str) -> None:
             break
         level, frame = level + 1, frame.f_back
     warnings.warn(message, RoPEWarning, stacklevel=level)
+
+
+@contextmanager
+def without_warning(message: str) -> Iterator[None]:
+    """Silence a :class:`RoPEWarning` about something that the user did not choose.
+
+    Args:
+        message: A regular expression for the start of the warning.
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=message, category=RoPEWarning)
+        yield

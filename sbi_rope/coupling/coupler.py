@@ -1,9 +1,8 @@
 """Semi-balanced entropic optimal transport, with its settings."""
 
 import itertools
-import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -25,7 +24,7 @@ from sbi_rope.coupling.pot import solve_pot
 from sbi_rope.coupling.problem import Problem, checked_embeddings, median_distance
 from sbi_rope.coupling.result import Coupling
 from sbi_rope.coupling.warm_start import warm_start
-from sbi_rope.errors import InvalidInputError, RoPEWarning, warn_user
+from sbi_rope.errors import InvalidInputError, warn_user, without_warning
 
 __all__ = ["SMALL_BATCH", "SinkhornCoupler", "without_warning_of_small_batch"]
 
@@ -36,14 +35,9 @@ SMALL_BATCH = 20
 MAX_STORED = 50_000_000
 
 
-@contextmanager
-def without_warning_of_small_batch() -> Iterator[None]:
+def without_warning_of_small_batch() -> AbstractContextManager[None]:
     """Couple a batch whose size the user did not choose."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings(
-            "ignore", message="Coupling a batch of", category=RoPEWarning
-        )
-        yield
+    return without_warning("Coupling a batch of")
 
 
 @dataclass(frozen=True, kw_only=True)

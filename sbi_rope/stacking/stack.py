@@ -110,7 +110,8 @@ def stack(
     Raises:
         NotReadyError: If there are fewer than two pairs with different parameters.
         InvalidInputError: If an argument is outside its range or has the wrong shape,
-            or if there are couplings among the candidates but no batch.
+            if there are couplings among the candidates but no batch, or if entries of
+            x are missing (NaN) that a candidate with ``space="input"`` corrects.
         UnsupportedPosteriorError: If NPE or a candidate has no density, or the
             posterior cannot be recalibrated.
         CouplingError: If a coupling has not converged.
