@@ -212,6 +212,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         potential_fn.set_x(None)  # another observation may have been asked for last
         view.potential_fn = potential_fn
         view.set_default_x(view.x_o)
+        describe(view, f"{self._purpose} This is that of observation {index} alone.")
         return view
 
     def __iter__(self) -> Iterator["MixturePosterior"]:
@@ -580,7 +581,7 @@ def _purpose(estimator: MixtureEstimator) -> str:
     mixed = f"{num_parts} posterior densities"
     if num_parts == 1:
         mixed = f"{coupled.num_embeddings} simulated posteriors"
-    count = len(coupled.x_o)
-    if count == 1:
-        return f"It is the mixture of {mixed} for one real observation."
-    return f"It is the mixture of {mixed} for each of {count} real observations."
+    return (
+        f"It is the mixture of {mixed} for each of {len(coupled.x_o)} real "
+        "observations."
+    )

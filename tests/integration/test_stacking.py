@@ -222,12 +222,14 @@ def test_the_posterior_of_one_observation_does_not_contain_the_others() -> None:
         found = one.log_prob(theta, norm_posterior=False)
         assert torch.allclose(found, expected, atol=1e-5)
         assert one.candidate_weights == posterior.candidate_weights
+        assert str(one).endswith("This is that of observation 3 alone.")
         with pytest.raises(InvalidInputError, match=r"posterior\[i\]"):
             one.candidate_log_probs(theta[:1], posterior.x_o[3:4])
         with pytest.raises(InvalidInputError, match=r"posterior\[i\]"):
             _ = one.versions
     # The posterior of the batch still has its candidates.
     assert posterior.candidate_log_probs(theta[:1], posterior.x_o[:1]).isfinite().all()
+    assert "alone" not in str(posterior)
     assert len(pickle.dumps(view)) < len(pickle.dumps(posterior))
 
 
