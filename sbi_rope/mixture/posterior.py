@@ -212,7 +212,8 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         potential_fn.set_x(None)  # another observation may have been asked for last
         view.potential_fn = potential_fn
         view.set_default_x(view.x_o)
-        describe(view, f"{self._purpose} This is that of observation {index} alone.")
+        whole = _purpose(self.posterior_estimator)
+        describe(view, f"{whole} This is that of observation {index} alone.")
         return view
 
     def __iter__(self) -> Iterator["MixturePosterior"]:
