@@ -1,7 +1,7 @@
 """Robust posterior estimation: the class that runs its three steps."""
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import torch
@@ -179,6 +179,7 @@ class RoPE:
         theta_std: Tensor | float | None = None,
         theta_cov: Tensor | None = None,
         weights: Tensor | None = None,
+        groups: Tensor | Sequence[int | str] | None = None,
     ) -> "RoPE":
         r"""Add real observations with known parameters to those appended so far.
 
@@ -202,6 +203,10 @@ class RoPE:
             theta_cov: Instead of ``theta_std``, the covariance of the measurements,
                 shape ``(d, d)`` or ``(n, d, d)``.
             weights: How many pairs each pair counts as, shape ``(n,)``; one if None.
+            groups: A number or a name for each pair, n of them. Pairs with the same
+                are recordings of one person or specimen: they are held out together,
+                and count once where they are scored. None if pairs with equal labels
+                are these.
 
         Returns:
             Itself, so that calls can be chained.
@@ -221,6 +226,7 @@ class RoPE:
             theta_std=theta_std,
             theta_cov=theta_cov,
             weights=weights,
+            groups=groups,
             like=self._npe.like,
             prior=self._npe.prior,
         )

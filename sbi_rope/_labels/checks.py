@@ -1,5 +1,7 @@
 """Checks of the labels that users pass, and their conversion."""
 
+import math
+from collections.abc import Hashable, Iterable
 from typing import Any
 
 import torch
@@ -13,7 +15,7 @@ from sbi_rope._validation import (
     check_pair_weights,
     check_values,
 )
-from sbi_rope.errors import InvalidInputError, warn_user
+from sbi_rope.errors import InvalidInputError, InvalidTypeError, warn_user
 
 __all__ = ["checked_labels", "warn_of_ambiguous"]
 
@@ -29,6 +31,7 @@ def checked_labels(
     theta_std: Any,
     theta_cov: Any,
     weights: Any,
+    groups: Any,
     like: Tensor,
     prior: Any,
 ) -> Labels:
@@ -40,6 +43,7 @@ def checked_labels(
         theta_std: Standard deviations of the measurements, or None.
         theta_cov: Their covariance, or None.
         weights: How many pairs each label counts as, or None.
+        groups: The name of the person or specimen of each label, or None.
         like: A tensor of shape ``(0, d)`` with the dtype and device to convert to.
         prior: The prior of NPE.
 
@@ -83,6 +87,8 @@ def checked_labels(
         weights = as_numbers_on("weights", weights, theta.device)
         weights = check_pair_weights(weights, "theta", theta).detach()
         labels = labels.weighted(weights.to(theta.device, torch.double))
+    if groups is not None:
+        labels = labels.named(_checked_names(groups, len(labels)))
     return labels
 
 
@@ -192,6 +198,33 @@ def _checked_covariance(theta_cov: Any, theta: Tensor) -> Tensor:
     return (covariance + covariance.mT) / 2
 
 
+def _checked_names(groups: Any, n: int) -> tuple[Hashable, ...]:
+    # Tensors and arrays become lists of Python's numbers, which are equal if they are.
+    values = groups.tolist() if hasattr(groups, "tolist") else groups
+    if isinstance(values, str) or not isinstance(values, Iterable):
+        raise InvalidTypeError(
+            f"Expected `groups` with a number or a name for each pair; got {groups!r}."
+        )
+    names = tuple(values)
+    if len(names) != n:
+        raise InvalidInputError(
+            f"Expected `groups` with one number or name for each of {n} pairs; got "
+            f"{len(names)}."
+        )
+    for row, name in enumerate(names):
+        if not isinstance(name, str | int | float):
+            raise InvalidTypeError(
+                "Expected numbers or names in `groups`; got "
+                f"{type(name).__name__} in row {row}."
+            )
+        if isinstance(name, float) and math.isnan(name):
+            raise InvalidInputError(
+                f"Expected `groups` without NaN; got it in row {row}. Give a pair that "
+                "belongs to no other a name of its own."
+            )
+    return names
+
+
 def _check_not_infinite(name: str, theta: Tensor) -> None:
     infinite = torch.isinf(theta).flatten(1).any(dim=1)
     if infinite.any():
@@ -213,10 +246,11 @@ def warn_of_ambiguous(labels: Labels) -> None:
             "weights, multiply them by the number of pairs."
         )
     num_different = len(labels.groups.unique())
-    if not labels.are_exact and num_different < len(labels) / 2:
+    unnamed = labels.names is None
+    if unnamed and not labels.are_exact and num_different < len(labels) / 2:
         warn_user(
             f"{len(labels)} labels that are not exact have {num_different} different "
             "values. Pairs with equal labels are taken for recordings at the same "
-            "parameters, and together count once. If they are not, add random numbers "
-            "far smaller than the noise to their labels."
+            "parameters, and together count once. Say with `groups` which of them "
+            "are."
         )

@@ -1,5 +1,6 @@
 """Labels: the measured parameters of calibration pairs, and how well they are known."""
 
+from collections.abc import Hashable
 from dataclasses import dataclass, replace
 
 import torch
@@ -30,12 +31,15 @@ class Labels:
         weights: How many pairs each label counts as, shape ``(n,)``.
         samples: The draws of labels that were given as draws, shape ``(n, S, d)``; None
             otherwise.
+        names: The name of the person or specimen of each label, n of them; None if
+            equal labels are those of the same one.
     """
 
     theta: Tensor
     covariance: Tensor
     weights: Tensor
     samples: Tensor | None = None
+    names: tuple[Hashable, ...] | None = None
 
     @classmethod
     def exact(cls, theta: Tensor) -> "Labels":
@@ -56,14 +60,15 @@ class Labels:
             covariance=self.covariance[rows],
             weights=self.weights[rows],
             samples=None if self.samples is None else self.samples[rows],
+            names=None if self.names is None else _of_rows(self.names, rows),
         )
 
     def appended(self, others: "Labels") -> "Labels":
         """Return these labels followed by others of the same kind.
 
         Raises:
-            InvalidInputError: If some are given as draws and others are not, or the
-                numbers of draws differ.
+            InvalidInputError: If some are given as draws and others are not, the
+                numbers of draws differ, or some have names and others do not.
         """
         counts = [
             0 if labels.samples is None else labels.samples.shape[1]
@@ -75,19 +80,32 @@ class Labels:
                 f"{counts[0]}; got {counts[1]}. Repeat an exact label as often as "
                 "there are draws of the others."
             )
-        samples = self.samples
+        if (self.names is None) != (others.names is None):
+            missing = "these" if others.names is None else "those appended before"
+            raise InvalidInputError(
+                "Expected `groups` of all calibration pairs, or of none; they are "
+                f"missing for {missing}."
+            )
+        samples, names = self.samples, self.names
         if samples is not None and others.samples is not None:
             samples = torch.cat([samples, others.samples])
+        if names is not None and others.names is not None:
+            names = names + others.names
         return Labels(
             theta=torch.cat([self.theta, others.theta]),
             covariance=torch.cat([self.covariance, others.covariance]),
             weights=torch.cat([self.weights, others.weights]),
             samples=samples,
+            names=names,
         )
 
     def weighted(self, weights: Tensor) -> "Labels":
         """Return the same labels with other weights, shape ``(n,)``."""
         return replace(self, weights=weights)
+
+    def named(self, names: tuple[Hashable, ...]) -> "Labels":
+        """Return the same labels with the names of n people or specimens."""
+        return replace(self, names=names)
 
     @property
     def is_measured(self) -> Tensor:
@@ -138,7 +156,13 @@ class Labels:
 
     @property
     def groups(self) -> Tensor:
-        """A number for each label; equal labels have the same, shape ``(n,)``."""
+        """A number for each label, shape ``(n,)``, the same for the same specimen.
+
+        Where there are no names, these are equal labels.
+        """
+        if self.names is not None:
+            numbers = {name: k for k, name in enumerate(dict.fromkeys(self.names))}
+            return torch.tensor([numbers[name] for name in self.names])
         if self.are_exact:
             return groups_of(self.theta)
         # NaN is not equal to itself, and the covariance tells labels apart, too.
@@ -165,3 +189,8 @@ class Labels:
                 f"counted as {float(self.weights.sum()):.3g}"
             )
         return text
+
+
+def _of_rows(names: tuple[Hashable, ...], rows: Tensor) -> tuple[Hashable, ...]:
+    numbers = torch.arange(len(names))[rows.cpu()]
+    return tuple(names[number] for number in numbers.tolist())

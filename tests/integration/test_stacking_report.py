@@ -345,7 +345,39 @@ def test_recordings_with_the_same_parameters_count_once() -> None:
     assert report.score == pytest.approx(
         (float(means.mean()), float(means.std()) / 12**0.5)
     )
-    assert "24 held-out calibration pairs with 12 different labels, each" in str(report)
+    assert "24 held-out calibration pairs of 12 people or specimens, each" in str(
+        report
+    )
+
+
+def test_recordings_of_a_named_specimen_count_once_whatever_their_labels_are() -> None:
+    theta, _ = problem(12, seed=1)
+    repeats = torch.tensor([3] * 6 + [1] * 6)
+    theta = theta.repeat_interleave(repeats, dim=0)
+    names = [f"specimen {k}" for k in range(12) for _ in range(int(repeats[k]))]
+    x = problems.simulate(theta) + 0.4
+
+    def report(labels: torch.Tensor, **options: Any) -> StackingReport:
+        rope = rope_of(problem(0, seed=1)).append_calibration(labels, x, **options)
+        return stacked(rope, candidates=[PRIOR, NPE]).report
+
+    # Equal exact labels are found without names.
+    found, named = report(theta), report(theta, groups=names)
+    assert torch.equal(
+        found.cross_validation.log_scores, named.cross_validation.log_scores
+    )
+    assert found.score == named.score
+    # Readings of the same specimen differ, and are still held out together.
+    noisy = theta + 0.01 * torch.randn(theta.shape)
+    apart, together = (
+        report(noisy, theta_std=0.01, groups=groups) for groups in (None, names)
+    )
+    assert apart.cross_validation.effective_number == 24
+    assert together.cross_validation.effective_number == pytest.approx(12)
+    folds = together.cross_validation.fold
+    for specimen in range(12):
+        rows = [row for row, name in enumerate(names) if name.endswith(f" {specimen}")]
+        assert len(folds[rows].unique()) == 1
 
 
 def test_the_learning_curve_has_a_point_for_one_two_and_four_folds() -> None:

@@ -4,6 +4,7 @@ import math
 import warnings
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
@@ -21,7 +22,12 @@ from sbi_rope._labels import (
 from sbi_rope._simulator import Simulator
 from sbi_rope.discrepancy import DiscrepancyModel, learn_parameters
 from sbi_rope.discrepancy.imputation import expected_means
-from sbi_rope.errors import InvalidInputError, RoPEWarning, SimulationError
+from sbi_rope.errors import (
+    InvalidInputError,
+    InvalidTypeError,
+    RoPEWarning,
+    SimulationError,
+)
 from sbi_rope.metrics import acauc_of, coverage_curve_of, expected_coverage_error_of
 from sbi_rope.stacking import stacking_weights
 from sbi_rope.stacking.folds import Workbench
@@ -342,6 +348,8 @@ STD = torch.tensor([0.1, 0.1])
         ({"weights": torch.zeros(10)}, "positive"),
         ({"weights": torch.ones(9)}, "same number of rows"),
         ({"weights": torch.ones(10, 2)}, r"shape \(n,\)"),
+        ({"groups": [1, 2]}, "each of 10 pairs; got 2"),
+        ({"groups": [NAN] * 10}, "NaN; got it in row 0"),
     ],
 )
 def test_labels_that_make_no_sense_are_refused(
@@ -399,6 +407,28 @@ def test_groups_of_labels_that_are_equal() -> None:
         weights=torch.ones(4).double(),
     )
     assert other.groups.tolist() == [0, 1, 2, 3]
+    named = some.named(("b", "a", "a", "c"))
+    assert named.groups.tolist() == [0, 1, 1, 2]
+    assert named[torch.tensor([3, 2, 1])].groups.tolist() == [0, 1, 1]
+    assert named.appended(named).groups.tolist() == [0, 1, 1, 2, 0, 1, 1, 2]
+
+
+def test_groups_are_numbers_or_names_of_all_pairs() -> None:
+    theta, x = gaussian.labelled(4)
+    numbers = [7, 7, 2, 3]
+    for groups in (numbers, np.array(numbers), torch.tensor(numbers), iter(numbers)):
+        named = rope().append_calibration(theta, x, groups=groups)
+        assert named.labels.groups.tolist() == [0, 0, 1, 2]
+    named = named.append_calibration(theta, x, groups=["mouse", 2, "rat", "mouse"])
+    assert named.labels.groups.tolist() == [0, 0, 1, 2, 3, 1, 4, 3]
+    with pytest.raises(InvalidInputError, match="missing for these"):
+        named.append_calibration(theta, x)
+    assert len(named.labels) == 8
+    with pytest.raises(InvalidInputError, match="missing for those"):
+        rope().append_calibration(theta, x).append_calibration(theta, x, groups=numbers)
+    for wrong in ("abcd", 3, [None] * 4, torch.ones(4, 2)):
+        with pytest.raises(InvalidTypeError, match="groups"):
+            rope().append_calibration(theta, x, groups=wrong)  # type: ignore[arg-type]
 
 
 # Labels that are nearly exact, and labels near bounds --------------------------------
@@ -584,12 +614,16 @@ def test_weights_that_were_normalised_and_equal_labels_that_are_noisy_are_named(
     with pytest.warns(RoPEWarning, match="12 labels .* have 5 different values"):
         rope.append_calibration(theta[torch.arange(12) % 5], x, theta_std=0.1)
     assert len(rope.labels.groups.unique()) == 5
+    equal = theta[torch.arange(12) % 5]
     with warnings.catch_warnings():
         warnings.simplefilter("error", RoPEWarning)
         rope = RoPE(gaussian.posterior(), simulator=gaussian.simulator)
         rope.append_calibration(theta, x, weights=torch.linspace(0.5, 1.5, 12))
         rope = RoPE(gaussian.posterior(), simulator=gaussian.simulator)
-        rope.append_calibration(theta[torch.arange(12) % 5], x)
+        rope.append_calibration(equal, x)
+        rope = RoPE(gaussian.posterior(), simulator=gaussian.simulator)
+        rope.append_calibration(equal, x, theta_std=0.1, groups=range(12))
+    assert len(rope.labels.groups.unique()) == 12
 
 
 def test_a_failed_simulation_is_replaced_by_another_one_of_the_same_label() -> None:
