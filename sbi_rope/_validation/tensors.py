@@ -382,7 +382,24 @@ def _no_numbers(name: str, value: Any) -> str:
             "net can read that if it leaves NaN out, as sbi's "
             "PermutationInvariantEmbedding does."
         )
+    if columns := _columns_without_numbers(value):
+        return (
+            f"{message} whose column(s) {', '.join(columns)} cannot be read as plain "
+            "numbers. Leave these columns out, or convert them with "
+            '`astype("float64")`, which makes missing values NaN.'
+        )
     return f"{message} that holds something else."
+
+
+def _columns_without_numbers(value: Any) -> list[str]:
+    """Return the columns of a dataframe of pandas that are no arrays of numbers."""
+    if not hasattr(value, "columns") or not hasattr(value, "dtypes"):
+        return []
+    return [
+        f"'{column}' ({dtype})"
+        for column, dtype in zip(value.columns, value.dtypes, strict=True)
+        if getattr(dtype, "kind", "O") not in "iuf" or not isinstance(dtype, np.dtype)
+    ]
 
 
 def _lengths(value: Any) -> set[int]:

@@ -111,8 +111,13 @@ class Diagnosis:
 
     @property
     def unexpected(self) -> tuple[Finding, ...]:
-        """The alarming findings that nobody expected, and that call for action."""
-        return tuple(one for one in self.alarming if not one.is_expected)
+        """The alarming findings that nobody expected, and that call for action.
+
+        Those about all posteriors come first, and those about NPE alone last.
+        """
+        order = list(reversed(IN_WORDS))
+        unexpected = [one for one in self.alarming if not one.is_expected]
+        return tuple(sorted(unexpected, key=lambda one: order.index(one.concerns)))
 
     @property
     def expected(self) -> tuple[Finding, ...]:

@@ -306,6 +306,13 @@ def test_alarms_come_first_and_say_whom_they_concern_and_why(
     assert "This is about RoPE, and not a stack without couplings" in shown
     assert "This is about the posterior of `stack` and that of RoPE." in shown
     assert "farthest observation" not in text[text.index("no alarm") :]
+    # What concerns every posterior is read first.
+    all_loud = [replace(one, alarming=True, is_expected=False) for one in loud]
+    concerned = [
+        one.concerns
+        for one in replace(misspecified, findings=tuple(all_loud)).unexpected
+    ]
+    assert [*dict.fromkeys(concerned)] == ["stack and RoPE", "RoPE", "NPE"]
 
 
 def test_a_finding_prints_as_sentences_and_p_values_as_such(

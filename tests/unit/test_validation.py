@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from sbi.utils import BoxUniform
@@ -137,6 +138,17 @@ def test_arrays_and_lists_of_numbers_are_converted_without_loss() -> None:
     for value in ([[1.0], [1.0, 2.0]], [np.ones(1), np.ones(2)], [X, X[:2]]):
         match = "rows of . to . entries.*pad them with NaN"
         assert_refused(match, as_numbers, "x", value, error=InvalidTypeError)
+
+
+def test_columns_of_a_dataframe_that_are_no_numbers_are_named() -> None:
+    numbers = pd.DataFrame({"speed": [1.0, 2.0], "count": [3, np.nan]})
+    expected = torch.tensor(numbers.to_numpy())
+    assert torch.equal(as_numbers("x", numbers).nan_to_num(), expected.nan_to_num())
+    frame = numbers.assign(mouse=["a", "b"], reading=pd.array([1, None], dtype="Int64"))
+    match = r"column\(s\) 'mouse' \(.*\), 'reading' \(Int64\) cannot be read.*astype"
+    assert_refused(match, as_numbers, "x", frame, error=InvalidTypeError)
+    converted = as_numbers("x", frame[["speed", "reading"]].astype("float64"))
+    assert converted.isnan().tolist() == [[False, False], [False, True]]
 
 
 def test_a_shape_that_does_not_fit_is_mended_by_the_hint() -> None:
