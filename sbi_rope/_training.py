@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from sbi_rope._progress import progress_bar
+from sbi_rope._random import seeded
 from sbi_rope.errors import warn_user, without_warning
 
 __all__ = [
@@ -23,6 +24,7 @@ __all__ = [
     "fit",
     "groups_of",
     "groups_to_hold_out",
+    "one_of_each_group",
     "shuffled",
     "split_groups",
     "split_pairs",
@@ -96,6 +98,30 @@ def groups_of(theta: Tensor) -> Tensor:
     first = of_row.new_full((len(different),), num_rows)
     first = first.scatter_reduce(0, of_row, torch.arange(num_rows), "amin")
     return first.argsort().argsort()[of_row]
+
+
+def one_of_each_group(groups: Tensor, *, seed: int) -> Tensor:
+    """Choose a row of each group at random.
+
+    Args:
+        groups: The numbers of the groups, from 0 to G - 1, shape ``(n,)``.
+        seed: Seed of the choice.
+
+    Returns:
+        Whether each row was chosen, shape ``(n,)``.
+
+    Example:
+        >>> one_of_each_group(torch.tensor([0, 1, 2]), seed=0)
+        tensor([True, True, True])
+    """
+    with seeded(seed):
+        order = torch.randperm(len(groups), device=groups.device)
+    chosen = torch.zeros(len(groups), dtype=torch.bool, device=groups.device)
+    # Of rows that write to the same place, an order decides, and not torch.
+    place = groups.new_full((int(groups.max()) + 1,), len(groups))
+    place = place.scatter_reduce(0, groups[order], order.argsort()[order], "amin")
+    chosen[order[place]] = True
+    return chosen
 
 
 def split_pairs(
@@ -186,8 +212,8 @@ def too_few_pairs(theta_or_groups: Tensor) -> str:
     if _num_groups(groups) == len(groups):
         return f"Only {len(groups)} calibration pair(s)"
     return (
-        f"Only {_num_groups(groups)} different parameters among {len(groups)} "
-        "calibration pairs"
+        f"Only {_num_groups(groups)} different parameters (or groups) among "
+        f"{len(groups)} calibration pairs"
     )
 
 

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from sbi_rope._random import seeded
+from sbi_rope._training import one_of_each_group
 
 __all__ = ["LEVEL", "TwoSampleTest", "compare_with_pairs", "two_sample_test"]
 
@@ -45,17 +46,17 @@ def compare_with_pairs(
 
     Args:
         labelled: The embeddings of the pairs, shape ``(n, l)``.
-        groups: A number for each pair, the same for pairs with the same parameters,
-            shape ``(n,)``. Such pairs resemble each other, so that only the first of
-            them is used.
+        groups: A number for each pair, from 0, the same for pairs of one person or
+            specimen, shape ``(n,)``. Such pairs resemble each other, so that one of
+            them is used, chosen at random.
         batch: The embeddings of the batch, shape ``(m, l)``.
 
     Returns:
         The outcome, with the pairs as the first set, or None if there are fewer than
         five of either.
     """
-    first = [int((groups == number).int().argmax()) for number in groups.unique()]
-    return two_sample_test(labelled[first], batch)
+    chosen = one_of_each_group(groups, seed=0)
+    return two_sample_test(labelled[chosen.to(labelled.device)], batch)
 
 
 @torch.no_grad()

@@ -68,7 +68,7 @@ class CalibrationFinetuner:
         \Bigr\rVert_2,
 
     starting from g = h, with Adam on all training pairs at once. A fifth of the pairs
-    is held out; pairs of the same parameters are held out together. Of all epochs,
+    is held out; pairs of the same group are held out together. Of all epochs,
     including the start, the g with the smallest loss on the held-out pairs is kept. On
     these pairs, tuning therefore never makes g worse than h.
 

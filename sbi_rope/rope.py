@@ -204,9 +204,9 @@ class RoPE:
                 shape ``(d, d)`` or ``(n, d, d)``.
             weights: How many pairs each pair counts as, shape ``(n,)``; one if None.
             groups: A number or a name for each pair, n of them. Pairs with the same
-                are recordings of one person or specimen: they are held out together,
-                and count once where they are scored. None if pairs with equal labels
-                are these.
+                are recordings of one person or specimen, also if they were appended by
+                different calls. They are held out together, and count once where they
+                are scored. None if pairs with equal labels are these.
 
         Returns:
             Itself, so that calls can be chained.

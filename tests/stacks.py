@@ -131,6 +131,8 @@ def rope_of(
     *,
     family: str = "mdn",
     embedding: str = "linear",
+    weights: Tensor | None = None,
+    groups: Any = None,
     **options: Any,
 ) -> RoPE:
     """Return a RoPE that is not trained, because a stack does not need that."""
@@ -139,7 +141,9 @@ def rope_of(
     options.setdefault("finetuner", QUICK)
     rope = RoPE(problems.npe_posterior(family, embedding), **options)
     theta, x = problem(NUM_PAIRS, seed=1) if pairs is None else pairs
-    return rope.append_calibration(theta, x) if len(theta) else rope
+    if not len(theta):
+        return rope
+    return rope.append_calibration(theta, x, weights=weights, groups=groups)
 
 
 def trained() -> RoPE:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Hashable, Iterable
+from numbers import Real
 from typing import Any
 
 import torch
@@ -212,12 +213,12 @@ def _checked_names(groups: Any, n: int) -> tuple[Hashable, ...]:
             f"{len(names)}."
         )
     for row, name in enumerate(names):
-        if not isinstance(name, str | int | float):
+        if not isinstance(name, str | Real):
             raise InvalidTypeError(
                 "Expected numbers or names in `groups`; got "
                 f"{type(name).__name__} in row {row}."
             )
-        if isinstance(name, float) and math.isnan(name):
+        if isinstance(name, Real) and math.isnan(name):
             raise InvalidInputError(
                 f"Expected `groups` without NaN; got it in row {row}. Give a pair that "
                 "belongs to no other a name of its own."

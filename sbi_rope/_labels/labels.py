@@ -172,6 +172,14 @@ class Labels:
             known.append(self.samples.double().flatten(1))
         return groups_of(torch.cat(known, dim=1))
 
+    @property
+    def vary_within_groups(self) -> bool:
+        """Whether some person or specimen has labels that differ."""
+        if self.names is None:
+            return False
+        numbers = torch.stack([self.groups, replace(self, names=None).groups], dim=1)
+        return bool(groups_of(numbers).max() > self.groups.max())
+
     def __str__(self) -> str:
         """Say in one sentence what is known about the parameters."""
         n = len(self)

@@ -19,8 +19,7 @@ from sbi_rope.diagnosis.report import Diagnosis, Finding
 from sbi_rope.diagnosis.residuals import (
     CrossFitted,
     cross_fit,
-    num_features,
-    residual_finding,
+    residual_findings,
 )
 from sbi_rope.diagnosis.simulations import Simulations
 from sbi_rope.diagnosis.spread import FEWEST, spread_of
@@ -143,7 +142,7 @@ def diagnose(
         notes += _shift_notes(shift, names)
         residual = []
         if held_out is not None:
-            residual = _residual_findings(rope, held_out, simulations, notes)
+            residual = residual_findings(rope, held_out, simulations, notes)
         findings += _spread_findings(rope, shift, simulations, names, notes)
         findings += residual
         far = far_findings(batch.npe.h, batch.x_o)
@@ -192,28 +191,13 @@ def _held_out(
     elif len(rope.labels.groups.unique()) < 2:
         note = (
             "Residuals were left out, because all calibration pairs have the same "
-            "parameters, or there is only one."
+            "parameters (or group), or there is only one."
         )
     else:
         return cross_fit(
             rope, num_folds=num_folds, show_progress_bars=show_progress_bars
         ), []
     return None, [note]
-
-
-def _residual_findings(
-    rope: RoPE, held_out: CrossFitted, simulations: Simulations, notes: list[str]
-) -> list[Finding]:
-    theta = held_out.of_people(_moved(rope.calibration[0]))
-    residuals = held_out.of_people(held_out.residuals)
-    if num_features(*theta.shape):
-        return [residual_finding(residuals, theta, simulations)]
-    notes.append(
-        f"Whether residuals depend on parameters was not tested: {len(theta)} "
-        f"calibration pairs with different labels are too few for {theta.shape[1]} "
-        "parameters."
-    )
-    return []
 
 
 def _spread_findings(
@@ -232,7 +216,7 @@ def _spread_findings(
         notes.append(
             "Whether the batch has a narrower range of parameters than the prior was "
             f"not tested, which needs at least {FEWEST} observations and {FEWEST} "
-            "calibration pairs."
+            "calibration pairs with different parameters (or groups)."
         )
         return []
     spread = spread_of(shift, simulations.theta, theta_cal=theta)
@@ -262,7 +246,8 @@ def _labelled_findings(
     if test is None:
         notes.append(
             "Whether the batch is like the calibration pairs was not tested, which "
-            "needs at least five observations and five pairs with different parameters."
+            "needs at least five observations and five pairs with different parameters "
+            "(or groups)."
         )
         return []
     return [labelled_finding(test)]

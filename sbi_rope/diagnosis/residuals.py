@@ -8,7 +8,11 @@ from torch import Tensor
 from sbi_rope._means import Counts
 from sbi_rope._progress import progress_bar
 from sbi_rope._sbi import embed
-from sbi_rope._training import split_groups, without_warning_of_few_pairs
+from sbi_rope._training import (
+    one_of_each_group,
+    split_groups,
+    without_warning_of_few_pairs,
+)
 from sbi_rope.diagnosis.report import Finding
 from sbi_rope.diagnosis.simulations import Simulations
 from sbi_rope.rope import RoPE
@@ -20,6 +24,7 @@ __all__ = [
     "dependence",
     "num_features",
     "residual_finding",
+    "residual_findings",
 ]
 
 NUM_PERMUTATIONS = 1000
@@ -37,8 +42,8 @@ class CrossFitted:
     Attributes:
         embedded: :math:`g(x)`, ``(n_c, l)``.
         targets: :math:`E[h(S(\theta))]`, ``(n_c, l)``.
-        people: Which pairs have the same parameters. Such recordings of one person have
-            errors in common, so that they are not independent evidence.
+        people: Which pairs are of the same person or specimen. Such pairs have errors
+            in common, so that they are not independent evidence.
     """
 
     embedded: Tensor
@@ -88,8 +93,8 @@ def cross_fit(rope: RoPE, *, num_folds: int, show_progress_bars: bool) -> CrossF
 
     Args:
         rope: RoPE with its calibration pairs; it is not changed.
-        num_folds: Number of folds, at most the number of different parameters, of
-            which there are two at least.
+        num_folds: Number of folds, at most the number of groups, of which there are
+            two at least.
         show_progress_bars: Whether to show how many folds are done.
     """
     theta, x = rope.calibration
@@ -97,7 +102,7 @@ def cross_fit(rope: RoPE, *, num_folds: int, show_progress_bars: bool) -> CrossF
         rope.finetuner.simulations_per_target, show_progress_bars=False
     )
     embedded = torch.empty_like(targets)
-    # Recordings at the same parameters share a fold, as they do in a stack.
+    # Recordings of one person share a fold, as they do in a stack.
     split = split_groups(rope.labels.groups, num_folds)
     folds = [rows.to(theta.device) for rows in split if len(rows)]
     for held_out in progress_bar(folds, show=show_progress_bars, desc="Folds"):
@@ -151,6 +156,35 @@ def dependence(residuals: Tensor, theta: Tensor) -> Dependence:
         bias=square**0.5,
         error=((variance + square / 2) / n) ** 0.5,
     )
+
+
+def residual_findings(
+    rope: RoPE, held_out: CrossFitted, simulations: Simulations, notes: list[str]
+) -> list[Finding]:
+    """Return a finding about calibration pairs, if they are enough for a test.
+
+    Args:
+        rope: RoPE with its calibration pairs.
+        held_out: The pairs, embedded by nets that were not trained on them.
+        simulations: What is known about simulations.
+        notes: Why there is no finding is appended to these.
+    """
+    theta = rope.calibration[0].detach().cpu().double()
+    residuals = held_out.residuals
+    if rope.labels.vary_within_groups:
+        # The mean over parameters that differ would depend on them less.
+        chosen = one_of_each_group(rope.labels.groups, seed=0)
+        theta, residuals = theta[chosen], residuals[chosen]
+    else:
+        theta, residuals = held_out.of_people(theta), held_out.of_people(residuals)
+    if num_features(*theta.shape):
+        return [residual_finding(residuals, theta, simulations)]
+    notes.append(
+        f"Whether residuals depend on parameters was not tested: {len(theta)} "
+        "calibration pairs with different labels (or groups) are too few for "
+        f"{theta.shape[1]} parameters."
+    )
+    return []
 
 
 def residual_finding(

@@ -37,7 +37,7 @@ class Recalibration:
             parameters without the factors, shape ``(n, d)``.
         levels_after: The same with the factors of the other folds.
         pair_weights: How many pairs each pair counts as, shape ``(n,)``.
-        groups: A number for each pair, the same for pairs with the same parameters,
+        groups: A number for each pair, the same for pairs of one person or specimen,
             shape ``(n,)``; None if all differ.
     """
 

@@ -74,8 +74,8 @@ def check_enough(level: float, n: int) -> None:
         raise InvalidInputError(
             f"Expected `level` of at most n / (n + 1) = {n / (n + 1):.3g} for a set "
             f"with a guarantee, because there are n = {n} calibration pairs with "
-            f"different parameters; got {level:g}. Ask for a smaller level, or add "
-            f"pairs: this level needs {fewest}."
+            f"different parameters (or groups); got {level:g}. Ask for a smaller "
+            f"level, or add pairs: this level needs {fewest}."
         )
 
 

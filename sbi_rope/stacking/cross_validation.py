@@ -78,9 +78,9 @@ class CrossValidation:
             partial labels, the mean over pairs of the sum over measured parameters.
         set_scores: The scores that sets with a guarantee are made from; None in files
             of earlier versions, and if labels are not exact.
-        pair_weights: How many pairs each pair counts as, shape ``(n,)``. Pairs with the
-            same parameters share the weight of one. None if all count as one.
-        groups: A number for each pair, the same for pairs with the same parameters,
+        pair_weights: How many pairs each pair counts as, shape ``(n,)``. Pairs of one
+            group share the weight of one. None if all count as one.
+        groups: A number for each pair, the same for pairs of one person or specimen,
             shape ``(n,)``; None if all differ. Errors and intervals are those of means
             of groups, because pairs of a group are not independent.
         score_errors: The Monte-Carlo errors of ``stack_scores``, if labels are not

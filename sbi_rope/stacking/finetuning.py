@@ -81,11 +81,12 @@ def finetune_without(
         theta = of_rows.theta.movedim(1, 0)
         return -of_rows.log_mean(estimator.log_prob(theta, bench.x[rows]).T)
 
-    def loss(rows: Tensor) -> Tensor:
+    def loss(rows: Tensor, among: Tensor = train) -> Tensor:
         if weights is None:
             return losses(rows).mean()
-        shares = weights[rows] / weights[rows].sum()
-        return (shares.to(bench.theta) * losses(rows)).sum()
+        # In a batch of few pairs, each counts as it does among all.
+        factors = weights[rows] / weights[among].mean()
+        return (factors.to(bench.theta) * losses(rows)).mean()
 
     def batches(epoch: int) -> Iterator[tuple[Tensor]]:
         size = FINETUNING.training_batch_size
@@ -107,7 +108,7 @@ def finetune_without(
         rehearsed_batches if rehearse else batches,
         rehearsed_loss if rehearse else loss,
         replace(REHEARSED if rehearse else FINETUNING, learning_rate=learning_rate),
-        validation_loss=lambda: loss(held_out),
+        validation_loss=lambda: loss(held_out, held_out),
         in_training_mode=False,
         label="Fine-tuning NPE",
         show_progress_bars=False,

@@ -60,7 +60,7 @@ class Workbench:
 
     Args:
         rope: RoPE with all calibration pairs.
-        num_folds: Number of folds. There are at most as many as different parameters.
+        num_folds: Number of folds. There are at most as many as groups of pairs.
         seed: Seed of everything random.
         show_progress_bars: Whether to show the progress of slow simulations.
     """
@@ -201,8 +201,7 @@ class Workbench:
     def score_weights(self) -> Tensor | None:
         """How many pairs each counts as where it is scored; None if all are one.
 
-        Pairs with the same parameters, such as recordings of one person, share the
-        weight of one pair.
+        Pairs of one person or specimen share the weight of one pair.
         """
         if self.score_groups is None:
             return self.pair_weights
@@ -211,8 +210,18 @@ class Workbench:
         return weights / sizes.to(weights)
 
     @cached_property
+    def person_weights(self) -> Tensor | None:
+        """How many draws of parameters each pair counts as; None if all are one.
+
+        Equal parameters are then one draw, unless people were named who have them.
+        """
+        if self.score_weights is None and self.labels.names is not None:
+            return self.labels.weights
+        return self.score_weights
+
+    @cached_property
     def score_groups(self) -> Tensor | None:
-        """A number for each label, the same for equal ones; None if all differ."""
+        """A number for each pair, the same for one person; None if all differ."""
         groups = self.groups.to(self.theta.device)
         return None if len(groups.unique()) == len(groups) else groups
 
@@ -226,7 +235,7 @@ class Workbench:
         return learn_parameters(
             self.rope.labelled_parameters.draws,
             theta.to(self.theta.device),
-            weights=self.score_weights,
+            weights=self.person_weights,
         ).probability_of_prior
 
     def targets(self, rows: Tensor, seed: int) -> Tensor:
@@ -366,7 +375,7 @@ class Fold:
         if learn_prior:
             draws = bench.rope.labelled_parameters[self.rows].draws
             probabilities = learn_parameters(
-                draws, theta_s, weights=_of_rows(bench.score_weights, self.rows)
+                draws, theta_s, weights=_of_rows(bench.person_weights, self.rows)
             ).probabilities
         estimator = estimator_of(bench.npe)
         if space == "tuned":

@@ -24,7 +24,6 @@ __all__ = [
     "SetScores",
     "explained",
     "joined",
-    "one_of_each_group",
     "score_fold",
 ]
 
@@ -43,8 +42,8 @@ class SetScores:
         marginal: The level of the smallest central interval of each parameter that
             contains the true one, shape ``(n, d)``. It is above 1 beyond all draws, see
             :func:`sbi_rope.sets.conformal.marginal_scores`.
-        is_counted: The pairs that count, shape ``(n,)``. Those with the same parameters
-            are not exchangeable one by one. One of them counts, chosen at random.
+        is_counted: The pairs that count, shape ``(n,)``. Those of one group are not
+            exchangeable one by one. One of them counts, chosen at random.
         weights: The weights of the stack that scored each fold, shape ``(F, K)``.
         num_draws: The number of draws that the scores were computed from.
     """
@@ -173,27 +172,3 @@ def joined(of_folds: Sequence[FoldScores], folds: Sequence[Tensor]) -> FoldScore
             for name in names
         }
     )
-
-
-def one_of_each_group(groups: Tensor, *, seed: int) -> Tensor:
-    """Choose a row of each group at random.
-
-    Args:
-        groups: The numbers of the groups, from 0 to G - 1, shape ``(n,)``.
-        seed: Seed of the choice.
-
-    Returns:
-        Whether each row was chosen, shape ``(n,)``.
-
-    Example:
-        >>> one_of_each_group(torch.tensor([0, 1, 2]), seed=0)
-        tensor([True, True, True])
-    """
-    with seeded(seed):
-        order = torch.randperm(len(groups), device=groups.device)
-    chosen = torch.zeros(len(groups), dtype=torch.bool, device=groups.device)
-    # Of rows that write to the same place, an order decides, and not torch.
-    place = groups.new_full((int(groups.max()) + 1,), len(groups))
-    place = place.scatter_reduce(0, groups[order], order.argsort()[order], "amin")
-    chosen[order[place]] = True
-    return chosen

@@ -51,8 +51,8 @@ def check_recalibration(bench: Workbench) -> None:
     if (count := len(bench.groups[usable].unique())) < MIN_PAIRS:
         raise InvalidInputError(
             f"Expected at least {MIN_PAIRS} calibration pairs with different "
-            "parameters to recalibrate, none of them on a bound of the prior; got "
-            f"{count}. Add pairs, or leave `recalibrate` out."
+            "parameters (or groups) to recalibrate, none of them on a bound of the "
+            f"prior; got {count}. Add pairs, or leave `recalibrate` out."
         )
     if len(bench.folds) < MIN_FOLDS:
         raise InvalidInputError(

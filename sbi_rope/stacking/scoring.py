@@ -5,19 +5,14 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from sbi_rope._training import one_of_each_group
 from sbi_rope._units import log_units_of
 from sbi_rope.errors import warn_user
 from sbi_rope.mixture import MixturePosterior
 from sbi_rope.stacking.candidates import Candidate
 from sbi_rope.stacking.cross_validation import CrossValidation, fold_weights
 from sbi_rope.stacking.folds import Workbench
-from sbi_rope.stacking.held_out import (
-    FoldScores,
-    SetScores,
-    joined,
-    one_of_each_group,
-    score_fold,
-)
+from sbi_rope.stacking.held_out import FoldScores, SetScores, joined, score_fold
 from sbi_rope.stacking.label_scores import (
     LabelScores,
     score_labelled_fold,
@@ -77,9 +72,11 @@ def score_versions(
         labels="" if bench.labels.are_simple else str(bench.labels),
     )
     if not scores.weights.converged:
+        counted = bench.score_weights
+        total = len(fold) if counted is None else float(counted.sum())
         warn_user(
             "The weights of the stack have not converged: the held-out score could "
-            f"be better by up to {scores.weights.gap / len(fold):.3f} nats a "
+            f"be better by up to {scores.weights.gap / total:.3f} nats a "
             "pair. Leave out candidates that are nearly the same."
         )
     return scores
@@ -128,7 +125,7 @@ def _stack_scores(
         seed: Seed of the draws.
 
     Returns:
-        The scores, their Monte-Carlo errors (None for exact labels), and the levels of
+        The scores, their Monte-Carlo errors (zero for exact labels), and the levels of
         the central intervals that end at the labels.
     """
     theta, x = bench.theta, bench.x

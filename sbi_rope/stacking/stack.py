@@ -81,8 +81,9 @@ def stack(
             there are a hundred observations of at most 20 statistics. For a stack that
             has learned from ``x_o`` and answers any x, pass
             ``default_candidates(rope, x_o)`` here and no ``x_o``.
-        num_folds: The number of folds, 5 if None, and at most the number of different
-            parameters. Pairs with the same parameters are in the same fold.
+        num_folds: The number of folds, 5 if None, and at most the number of groups.
+            Pairs with equal labels, or of the same of the ``groups`` that were
+            appended, are in the same fold.
         num_simulations: The number of simulations to couple with, as in
             :meth:`~sbi_rope.RoPE.build_posterior`. Candidates are trained on others:
             the simulator makes 20,000 from the prior and 100 for each label. To have
@@ -108,7 +109,7 @@ def stack(
         compares the stack with the prior and with NPE.
 
     Raises:
-        NotReadyError: If there are fewer than two pairs with different parameters.
+        NotReadyError: If there are fewer than two groups of pairs.
         InvalidInputError: If an argument is outside its range or has the wrong shape,
             if there are couplings among the candidates but no batch, or if entries of
             x are missing (NaN) that a candidate with ``space="input"`` corrects.

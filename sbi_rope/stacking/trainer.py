@@ -277,7 +277,7 @@ def _check_pairs(count: int) -> None:
     if count < MIN_PAIRS:
         raise NotReadyError(
             f"Expected at least {MIN_PAIRS} calibration pairs with different "
-            f"parameters, to hold some out; got {count}. Append "
+            f"parameters (or groups), to hold some out; got {count}. Append "
             f"{'more' if count else 'some'} with `append_calibration(theta, x)` first."
         )
 

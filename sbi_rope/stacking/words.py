@@ -107,7 +107,7 @@ def lines_of(report: "StackingReport") -> list[str]:
     n, several = len(scores), ""
     if scores.groups is not None:
         number = len(scores.groups.unique())
-        several = f" of {number} people or specimens, each of which counts once"
+        several = f" in {number} groups, each of which counts once"
     return [
         f"Stack of {len(scores.names)} candidates, scored on {n} "
         f"held-out calibration pairs{several}",

@@ -461,7 +461,9 @@ def test_recordings_of_four_people_leave_none_to_hold_out(name: str) -> None:
             warnings.simplefilter("ignore", RoPEWarning)
             train(method)
     else:
-        with pytest.warns(RoPEWarning, match="Only 4 different parameters among 20"):
+        with pytest.warns(
+            RoPEWarning, match=r"Only 4 different parameters \(or groups\) among 20"
+        ):
             train(method)
     assert densities(method.build_posterior(), name).isfinite().all()
 

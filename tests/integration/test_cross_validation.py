@@ -248,6 +248,45 @@ def test_with_rehearsal_pairs_and_simulations_count_half_each() -> None:
     assert torch.allclose(loss(pairs, others), (of_pairs + of_others) / 2)
 
 
+def test_a_pair_weighs_as_much_in_a_small_batch_as_among_all() -> None:
+    weights = torch.linspace(0.2, 3.0, 12)
+    bench = Workbench(
+        rope_of(problem(12, seed=1), weights=weights),
+        num_folds=4,
+        seed=0,
+        show_progress_bars=False,
+    )
+    with patch("sbi_rope.stacking.finetuning.train_network") as train:
+        finetune_without(
+            estimator_of(bench.npe), Fold(bench, [0, 1, 3]), 1, learning_rate=1e-3
+        )
+    _, batches, loss, _ = train.call_args.args
+    rows = torch.cat([rows for (rows,) in batches(0)])
+    one_by_one = torch.stack([loss(row[None]) for row in rows])
+    assert torch.allclose(one_by_one.mean(), loss(rows))
+    start = estimator_of(bench.npe)
+    losses = -start.log_prob(bench.theta[rows][None], bench.x[rows])[0]
+    of_rows = weights[rows].to(losses)
+    expected = (of_rows * losses).sum() / of_rows.sum()
+    assert torch.allclose(loss(rows), expected, atol=1e-5)
+
+
+def test_equal_labels_of_named_specimens_are_several_draws_of_parameters() -> None:
+    torch.manual_seed(3)
+    theta = problem(5, seed=1)[0].repeat(8, 1)
+    x = problems.simulate(theta)
+
+    def probability(labels: Tensor, **options: Any) -> float:
+        rope = rope_of((labels, x), **options)
+        bench = Workbench(rope, num_folds=4, seed=0, show_progress_bars=False)
+        return bench.probability_of_prior()
+
+    together, apart = probability(theta), probability(theta, groups=range(40))
+    nearly_equal = probability(theta + 1e-5 * torch.randn_like(theta))
+    assert apart == pytest.approx(nearly_equal, rel=1e-2)
+    assert together > 10 * apart
+
+
 def test_every_part_is_held_out_by_another_version_with_rehearsal() -> None:
     bench = Workbench(
         rope_of(problem(12, seed=1)), num_folds=4, seed=0, show_progress_bars=False

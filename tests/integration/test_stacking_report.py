@@ -345,9 +345,7 @@ def test_recordings_with_the_same_parameters_count_once() -> None:
     assert report.score == pytest.approx(
         (float(means.mean()), float(means.std()) / 12**0.5)
     )
-    assert "24 held-out calibration pairs of 12 people or specimens, each" in str(
-        report
-    )
+    assert "24 held-out calibration pairs in 12 groups, each" in str(report)
 
 
 def test_recordings_of_a_named_specimen_count_once_whatever_their_labels_are() -> None:

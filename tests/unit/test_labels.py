@@ -416,7 +416,8 @@ def test_groups_of_labels_that_are_equal() -> None:
 def test_groups_are_numbers_or_names_of_all_pairs() -> None:
     theta, x = gaussian.labelled(4)
     numbers = [7, 7, 2, 3]
-    for groups in (numbers, np.array(numbers), torch.tensor(numbers), iter(numbers)):
+    array = np.array(numbers)
+    for groups in (numbers, array, list(array), torch.tensor(numbers), iter(numbers)):
         named = rope().append_calibration(theta, x, groups=groups)
         assert named.labels.groups.tolist() == [0, 0, 1, 2]
     named = named.append_calibration(theta, x, groups=["mouse", 2, "rat", "mouse"])

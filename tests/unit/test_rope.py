@@ -99,7 +99,9 @@ def test_training_needs_pairs_and_building_a_posterior_needs_training() -> None:
 def test_recordings_of_the_same_parameters_are_held_out_together() -> None:
     theta = gaussian.prior().sample((4,)).repeat(5, 1)
     conductor = rope().append_calibration(theta, gaussian.real_process(theta))
-    with pytest.warns(RoPEWarning, match="Only 4 different parameters among 20"):
+    with pytest.warns(
+        RoPEWarning, match=r"Only 4 different parameters \(or groups\) among 20"
+    ):
         conductor.train(seed=0, show_progress_bars=False)
     assert conductor.history.validation_loss == []
     conductor.append_calibration(*gaussian.labelled(1)).train(show_progress_bars=False)

@@ -362,7 +362,9 @@ class TestSplitPairs:
         theta = torch.randn(MIN_PAIRS_FOR_HOLDOUT - 1, 2).repeat(10, 1)
         train, other = split_pairs(theta, 0.2)
         assert (len(train), len(other)) == (40, 0)
-        with pytest.warns(RoPEWarning, match="Only 4 different parameters among 40"):
+        with pytest.warns(
+            RoPEWarning, match=r"Only 4 different parameters \(or groups\) among 40"
+        ):
             assert epochs_on_pairs(theta, other, 80) == EPOCHS_WITHOUT_HOLDOUT
         with pytest.warns(RoPEWarning, match=r"Only 4 calibration pair\(s\)"):
             assert epochs_on_pairs(theta[:4], other, 30) == 30
