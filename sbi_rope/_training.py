@@ -154,12 +154,12 @@ def split_pairs(
 def split_groups(groups: Tensor, num_folds: int) -> list[Tensor]:
     """Cut rows into folds at random, with the rows of a group in the same fold.
 
-    The folds have as many rows as each other, as far as the groups allow. If there are
-    fewer groups than folds, some folds are empty.
+    The folds have as many rows as each other, as far as the groups allow.
 
     Args:
         groups: What :func:`groups_of` takes.
-        num_folds: Number of folds.
+        num_folds: Number of folds. If there are fewer groups, there are as many folds
+            as groups.
 
     Returns:
         The rows of each fold.
@@ -170,15 +170,15 @@ def split_groups(groups: Tensor, num_folds: int) -> list[Tensor]:
     groups = groups_of(groups)
     order = torch.randperm(_num_groups(groups))
     if len(order) == len(groups):
-        return list(order.tensor_split(num_folds))
+        return list(order.tensor_split(min(num_folds, len(order))))
     sizes = torch.bincount(groups)
-    fold_of, num_rows = torch.empty_like(order), [0] * num_folds
+    fold_of, num_rows = torch.empty_like(order), [0] * min(num_folds, len(order))
     # The largest first, each to the fold with the fewest rows so far.
     for group in order[sizes[order].argsort(descending=True, stable=True)].tolist():
         fold = num_rows.index(min(num_rows))
         fold_of[group] = fold
         num_rows[fold] += int(sizes[group])
-    return [(fold_of[groups] == fold).nonzero()[:, 0] for fold in range(num_folds)]
+    return [(fold_of[groups] == fold).nonzero()[:, 0] for fold in range(len(num_rows))]
 
 
 def _num_groups(groups: Tensor) -> int:

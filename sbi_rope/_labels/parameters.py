@@ -1,7 +1,7 @@
 """Draws of the parameters that labels leave possible, under the prior."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -36,18 +36,12 @@ class LabelledParameters:
 
     Attributes:
         draws: Shape ``(n, R, d)``. For exact labels R is 1.
-        effective_sample_size: Of the proposals behind the draws of each label, shape
-            ``(n,)``; infinite for exact labels and those given as draws.
     """
 
     draws: Tensor
-    effective_sample_size: Tensor = field(repr=False)
 
     def __getitem__(self, rows: Tensor) -> "LabelledParameters":
-        return LabelledParameters(
-            draws=self.draws[rows],
-            effective_sample_size=self.effective_sample_size[rows],
-        )
+        return LabelledParameters(draws=self.draws[rows])
 
     @property
     def are_exact(self) -> bool:
@@ -62,40 +56,29 @@ class LabelledParameters:
         return self.draws.double().mean(dim=1).to(self.draws)
 
 
-def parameters_of(labels: Labels, prior: Any, *, seed: int = 0) -> LabelledParameters:
+def parameters_of(labels: Labels, prior: Any) -> LabelledParameters:
     """Draw the parameters of labels, by importance sampling.
+
+    The draws of a label do not depend on the values of other labels.
 
     Args:
         labels: The labels.
         prior: The prior of NPE.
-        seed: Seed of the draws. The draws of a label do not depend on the values of
-            other labels.
 
     Raises:
         InvalidInputError: If no parameters inside the prior's support fit a label.
     """
     if labels.samples is not None:
-        n = len(labels)
-        return LabelledParameters(
-            draws=_shuffled(labels.samples, seed=seed),
-            effective_sample_size=labels.covariance.new_full((n,), torch.inf),
-        )
+        return LabelledParameters(draws=_shuffled(labels.samples))
     if labels.are_exact:
-        n = len(labels)
-        return LabelledParameters(
-            draws=labels.theta[:, None],
-            effective_sample_size=labels.covariance.new_full((n,), torch.inf),
-        )
+        return LabelledParameters(draws=labels.theta[:, None])
     reference = prior_reference(prior, labels.theta)
     parts = []
     for number, rows in enumerate(torch.arange(len(labels)).split(CHUNK_SIZE)):
         # Other proposals for each chunk, so that their errors average out.
-        with seeded(seed + number):
+        with seeded(number):
             parts.append(_draw(labels[rows], prior, reference, first=int(rows[0])))
-    return LabelledParameters(
-        draws=torch.cat([part.draws for part in parts]),
-        effective_sample_size=torch.cat([part.effective_sample_size for part in parts]),
-    )
+    return LabelledParameters(draws=torch.cat(parts))
 
 
 def nodes_of(
@@ -166,9 +149,7 @@ def prior_reference(prior: Any, like: Tensor) -> Reference:
     return reference_of(samples[:, None])
 
 
-def _draw(
-    labels: Labels, prior: Any, reference: Reference, *, first: int
-) -> LabelledParameters:
+def _draw(labels: Labels, prior: Any, reference: Reference, *, first: int) -> Tensor:
     n = len(labels)
     wide = Reference(
         mean=reference.mean.expand(n, -1),
@@ -197,10 +178,9 @@ def _draw(
             "plausible under the prior."
         )
     chosen = _systematic(shares, NUM_DRAWS)
-    draws = nodes.theta.gather(
+    return nodes.theta.gather(
         1, chosen[..., None].expand(-1, -1, labels.theta.shape[1])
     )
-    return LabelledParameters(draws=draws, effective_sample_size=size)
 
 
 def _are_far_outside(labels: Labels, prior: Any) -> Tensor:
@@ -212,7 +192,7 @@ def _are_far_outside(labels: Labels, prior: Any) -> Tensor:
     return (labels.is_noisy & (missed > LARGEST_MISS * std)).any(dim=1)
 
 
-def _shuffled(samples: Tensor, *, seed: int) -> Tensor:
+def _shuffled(samples: Tensor) -> Tensor:
     """Return draws in random order, a few of them repeatedly, ``(n, R, d)``.
 
     Any part of the draws represents all of them then, also if they were sorted. All
@@ -220,7 +200,7 @@ def _shuffled(samples: Tensor, *, seed: int) -> Tensor:
     label to tell what is noise.
     """
     count = samples.shape[1]
-    with seeded(seed):
+    with seeded(0):
         rounds = [torch.randperm(count) for _ in range(-(-NUM_DRAWS // count))]
     return samples[:, torch.cat(rounds).to(samples.device)]
 

@@ -104,7 +104,7 @@ def cross_fit(rope: RoPE, *, num_folds: int, show_progress_bars: bool) -> CrossF
     embedded = torch.empty_like(targets)
     # Recordings of one person share a fold, as they do in a stack.
     split = split_groups(rope.labels.groups, num_folds)
-    folds = [rows.to(theta.device) for rows in split if len(rows)]
+    folds = [rows.to(theta.device) for rows in split]
     for held_out in progress_bar(folds, show=show_progress_bars, desc="Folds"):
         others = torch.cat([fold for fold in folds if fold is not held_out])
         part = rope.with_pairs(others, targets=targets[others])

@@ -23,6 +23,7 @@ from sbi_rope._training import History
 from sbi_rope._validation import (
     LARGEST_SETTING,
     check_choice,
+    check_finite,
     check_instance,
     check_integer,
     check_names,
@@ -266,12 +267,12 @@ class DiscrepancyNPE(Method):
             if summaries is None:
                 for name, values in (("pairs", x), ("simulations", simulated)):
                     check_complete(name, values, instead=GIVE_SUMMARIES)
-            if isinstance(net, Summaries):
-                x = net.checked("the pairs", embed(net, x))
-                simulated = net.checked("simulations", embed(net, simulated))
+            else:
+                x, simulated = embed(net, x), embed(net, simulated)
+                check_finite("summaries of the pairs", x)
+                check_finite("summaries of simulations", simulated)
             moments = self._moments(source, net, show)
-        if isinstance(net, Summaries):
-            net.checked("simulations at the pairs", moments.mean)
+        check_finite("summaries of simulations at the pairs", moments.mean)
         return report_discrepancy(
             x,
             moments,

@@ -12,6 +12,7 @@ from sbi_rope._notebooks import shown_as_text
 from sbi_rope._progress import progress_bar
 from sbi_rope._simulations import Moments
 from sbi_rope._standardisation import Standardisation
+from sbi_rope._tables import as_dataframe
 from sbi_rope._validation import check_names
 from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.posterior import Discrepancy
@@ -183,13 +184,7 @@ class DiscrepancyReport:
         Raises:
             ImportError: If pandas is not installed.
         """
-        try:
-            import pandas
-        except ModuleNotFoundError as error:
-            raise ImportError(
-                "pandas is not installed. Run `pip install pandas`, or use `as_rows()`."
-            ) from error
-        return pandas.DataFrame(self.as_rows())
+        return as_dataframe(self.as_rows())
 
     def __str__(self) -> str:
         off = [summary for summary in self.summaries if summary.is_off]

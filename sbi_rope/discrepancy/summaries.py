@@ -5,7 +5,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from sbi_rope._validation import as_numbers, check_batch, check_finite
+from sbi_rope._validation import as_numbers, check_batch
 from sbi_rope.errors import InvalidInputError, InvalidTypeError
 
 __all__ = ["Summaries"]
@@ -47,12 +47,3 @@ class Summaries(nn.Module):
         return check_batch("summaries(x)", found, found.shape[1:], finite=False).to(
             x.device
         )
-
-    def checked(self, what: str, summaries: Tensor) -> Tensor:
-        """Return summaries if they are finite; ``what`` says of what they are.
-
-        Raises:
-            InvalidInputError: If some are not.
-        """
-        check_finite(f"summaries of {what}", summaries)
-        return summaries

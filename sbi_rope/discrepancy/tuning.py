@@ -56,7 +56,7 @@ def cross_fitted_nets(
             f"so that some can be held out; all {len(theta)} have the same. Use "
             "space='embedding'."
         )
-    folds = [rows for rows in split_groups(groups, num_folds) if len(rows)]
+    folds = split_groups(groups, num_folds)
     targets = moments.mean.to(x)
     # The simulations may be sorted, and rehearsal takes the first ones.
     simulations = simulations[torch.randperm(len(simulations)).to(simulations.device)]

@@ -183,9 +183,7 @@ class MixtureEstimator(MixtureDensity):
         return torch.cat(log_probs, dim=1).reshape(shape).to(theta)
 
     @torch.no_grad()
-    def part_log_probs(
-        self, theta: Tensor, x: Tensor, *, numbers: Sequence[int] | None = None
-    ) -> Tensor:
+    def part_log_probs(self, theta: Tensor, x: Tensor) -> Tensor:
         r"""Return the log density of each part by itself at pairs of theta and x.
 
         It does not depend on ``tail_mass`` or the weights of the parts.
@@ -193,7 +191,6 @@ class MixtureEstimator(MixtureDensity):
         Args:
             theta: Parameters, shape ``(n, d)``.
             x: Their observations, shape ``(n, *event)``.
-            numbers: The numbers of the K parts to evaluate; all if None.
 
         Returns:
             :math:`\log \sum_j a^k_j(x_i) q_k(\theta_i \mid s^k_j(x_i))`, shape
@@ -205,12 +202,11 @@ class MixtureEstimator(MixtureDensity):
         """
         pairs, x = self._checked_theta(theta), self.checked_x(x)
         check_same_length("theta", pairs[0], "x", x)
-        numbers = range(len(self.parts)) if numbers is None else numbers
-        log_probs = pairs.new_empty(len(x), len(numbers), dtype=torch.double)
-        for column, number in enumerate(numbers):
-            for rows, block in _blocks([self.parts[number]], [1.0], x):
+        log_probs = pairs.new_empty(len(x), len(self.parts), dtype=torch.double)
+        for number, part in enumerate(self.parts):
+            for rows, block in _blocks([part], [1.0], x):
                 log_prob = block_log_prob(pairs[:, rows], block, tail_mass=0.0)
-                log_probs[rows, column] = log_prob[0]
+                log_probs[rows, number] = log_prob[0]
         return log_probs
 
     @property

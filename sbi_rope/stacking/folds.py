@@ -81,7 +81,7 @@ class Workbench:
         seeds = draw_seeds(seed, 2)
         with seeded(seeds[0]):
             split = split_groups(self.groups, num_folds)
-        self.folds = [rows.to(self.theta.device) for rows in split if len(rows)]
+        self.folds = [rows.to(self.theta.device) for rows in split]
         self._seed = seeds[1]
         self._nets: dict[frozenset[int], nn.Module] = {}
 
@@ -314,7 +314,7 @@ class Fold:
             return {number: self.bench.folds[number] for number in sorted(self.used)}
         with seeded(self.seed):
             split = split_groups(self.bench.groups[self.rows.cpu()], NUM_INNER_FOLDS)
-        found = [self.rows[part.to(self.rows.device)] for part in split if len(part)]
+        found = [self.rows[part.to(self.rows.device)] for part in split]
         return dict(enumerate(found))
 
     def rows_without(self, part: int) -> Tensor:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from sbi_rope._notebooks import shown_as_text
+from sbi_rope._tables import as_dataframe
 from sbi_rope._two_sample import TwoSampleTest
 from sbi_rope._validation import check_instance
 from sbi_rope.discrepancy import DiscrepancyReport
@@ -177,13 +178,7 @@ class StackingReport:
         Raises:
             ImportError: If pandas is not installed.
         """
-        try:
-            import pandas
-        except ModuleNotFoundError as error:
-            raise ImportError(
-                "pandas is not installed. Run `pip install pandas`, or use `as_rows()`."
-            ) from error
-        return pandas.DataFrame(self.as_rows())
+        return as_dataframe(self.as_rows())
 
     def to_html(
         self,

@@ -213,7 +213,7 @@ class FinetunedNPE(Method):
         if self.num_holdouts == 1 or int(groups.max()) + 1 < MIN_PAIRS_FOR_HOLDOUT:
             return [split_pairs(theta, self.training.validation_fraction)]
         every = torch.arange(len(groups))
-        parts = [rows for rows in split_groups(groups, self.num_holdouts) if len(rows)]
+        parts = split_groups(groups, self.num_holdouts)
         return [(every[~torch.isin(every, rows)], rows) for rows in parts]
 
     def _tuned(

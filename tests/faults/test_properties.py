@@ -117,7 +117,8 @@ def test_no_group_of_pairs_is_on_both_sides_of_a_split(
     groups: list[int], fraction: float, num_folds: int
 ) -> None:
     numbers = torch.tensor(groups)
-    folds = [rows for rows in split_groups(numbers, num_folds) if len(rows)]
+    folds = split_groups(numbers, num_folds)
+    assert len(folds) == min(num_folds, len(set(groups)))
     for parts in (split_pairs(numbers, fraction), folds):
         assert sorted(torch.cat(list(parts)).tolist()) == list(range(len(groups)))
         seen = [set(numbers[rows].tolist()) for rows in parts]
