@@ -26,6 +26,7 @@ from sbi_rope._sbi import (
 from sbi_rope._validation import (
     as_numbers_on,
     check_batch,
+    check_parameter_names,
     check_readable,
     check_values,
 )
@@ -44,6 +45,7 @@ class TrainedNPE:
     Args:
         posterior: What ``NPE(...).build_posterior()`` returns, or the posterior of
             MNPE, FMPE or NPSE.
+        parameter_names: One name for each parameter, if they have names.
 
     Attributes:
         estimator: The copy of the estimator, in evaluation mode.
@@ -51,13 +53,17 @@ class TrainedNPE:
         h: The embedding net of the copy, with sbi's standardising layer.
         like: An empty tensor of shape ``(0, d)`` with the dtype and device of the
             estimator.
+        parameter_names: The names; None if there are none.
 
     Raises:
         UnsupportedPosteriorError: If the posterior has no embedding to work with, is
             not in float32, or embeds a row of a batch differently among other rows.
+        InvalidTypeError: If the names are not strings.
+        InvalidInputError: If there are not as many names as parameters, or two are
+            equal.
     """
 
-    def __init__(self, posterior: Any) -> None:
+    def __init__(self, posterior: Any, parameter_names: Any = None) -> None:
         estimator = estimator_of(posterior)
         embedding_of(estimator)
         if dtype_of(estimator) != torch.float32:
@@ -79,6 +85,11 @@ class TrainedNPE:
             dtype=dtype_of(estimator),
             device=device_of(estimator),
         )
+        self.parameter_names: tuple[str, ...] | None = None
+        if parameter_names is not None:
+            self.parameter_names = check_parameter_names(
+                parameter_names, self.like.shape[1]
+            )
 
     @property
     def event_shape(self) -> torch.Size:

@@ -117,12 +117,14 @@ class EmbeddedBatch:
         mixture = MixtureEstimator(
             [Part(self.npe.density(), mixing)], [1.0], tail_mass=tail_mass
         )
-        return MixturePosterior(
+        posterior = MixturePosterior(
             mixture,
             copy.deepcopy(self.npe.prior),
             enable_transform=self.npe.enable_transform,
             shared=shared,
         )
+        posterior.parameter_names = self.npe.parameter_names
+        return posterior
 
 
 @contextmanager

@@ -106,13 +106,17 @@ class RoPE:
             the steps ask for it, see :attr:`num_simulator_calls`.
         finetuner: Settings of step 1; ``CalibrationFinetuner()`` if None.
         coupler: Settings of step 2; ``SinkhornCoupler()`` if None.
+        parameter_names: One name for each parameter, for reports and intervals;
+            "theta_1" and so on if None.
 
     Raises:
         UnsupportedPosteriorError: If the posterior has no embedding to work with, or
             one that embeds a row of a batch differently among other rows.
         InvalidInputError: If both or none of simulator and simulations are given,
-            their shapes do not fit the posterior, or ``num_simulations`` is given
-            without a simulator.
+            their shapes do not fit the posterior, ``num_simulations`` is given
+            without a simulator, or the names are not as many different ones as there
+            are parameters.
+        InvalidTypeError: If an argument has the wrong type.
         NotReadyError: If torch's default dtype is not float32.
         SimulationError: If the simulator raises or returns something unusable.
 
@@ -145,12 +149,13 @@ class RoPE:
         num_simulations: int | None = None,
         finetuner: CalibrationFinetuner | None = None,
         coupler: SinkhornCoupler | None = None,
+        parameter_names: Sequence[str] | None = None,
     ) -> None:
         check_instance("finetuner", finetuner, CalibrationFinetuner, optional=True)
         check_instance("coupler", coupler, SinkhornCoupler, optional=True)
         check_default_dtype()
         simulator = picklable(simulator)
-        self._npe = TrainedNPE(posterior)
+        self._npe = TrainedNPE(posterior, parameter_names)
         self._source = source_of(
             self._npe.prior,
             simulator=simulator,
@@ -561,6 +566,11 @@ class RoPE:
         Of labels that are not exact, theta is the mean given the label.
         """
         return self._parameters.mean.clone(), self._x_cal.clone()
+
+    @property
+    def parameter_names(self) -> tuple[str, ...] | None:
+        """The names of the parameters; None if they have none."""
+        return self._npe.parameter_names
 
     @property
     def labels(self) -> Labels:

@@ -19,10 +19,12 @@ from sbi_rope._validation.settings import (
     check_not_negative,
     check_number,
     check_numbers,
+    check_parameter_names,
     check_path,
     check_positive,
     check_unit_interval,
     check_weights,
+    default_names,
     usable_device,
 )
 from sbi_rope._validation.shapes import check_not_swapped
@@ -69,6 +71,7 @@ __all__ = [
     "check_number",
     "check_numbers",
     "check_pair_weights",
+    "check_parameter_names",
     "check_path",
     "check_positive",
     "check_prior",
@@ -80,5 +83,6 @@ __all__ = [
     "check_unit_interval",
     "check_values",
     "check_weights",
+    "default_names",
     "usable_device",
 ]

@@ -27,10 +27,12 @@ __all__ = [
     "check_not_negative",
     "check_number",
     "check_numbers",
+    "check_parameter_names",
     "check_path",
     "check_positive",
     "check_unit_interval",
     "check_weights",
+    "default_names",
     "usable_device",
 ]
 
@@ -91,6 +93,27 @@ def check_names(name: str, value: Any, count: int | None = None) -> list[str]:
             f"Expected `{name}` of length {count}; got {len(names)}."
         )
     return names
+
+
+def check_parameter_names(value: Any, count: int) -> tuple[str, ...]:
+    """Return different names of parameters."""
+    names = check_names("parameter_names", value)
+    if len(names) != count or len(set(names)) != count:
+        raise InvalidInputError(
+            f"Expected `parameter_names` to be {count} different names, one for each "
+            f"parameter; got {shown(value)}."
+        )
+    return tuple(names)
+
+
+def default_names(count: int) -> tuple[str, ...]:
+    """Return the names of parameters that have none of their own.
+
+    Example:
+        >>> default_names(2)
+        ('theta_1', 'theta_2')
+    """
+    return tuple(f"theta_{k + 1}" for k in range(count))
 
 
 def check_path(name: str, value: Any, *, optional: bool = False) -> Path | None:

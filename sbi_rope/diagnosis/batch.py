@@ -9,7 +9,12 @@ from sbi_rope._npe import TrainedNPE
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._two_sample import compare_with_pairs
-from sbi_rope._validation import check_instance, check_integer
+from sbi_rope._validation import (
+    check_instance,
+    check_integer,
+    check_parameter_names,
+    default_names,
+)
 from sbi_rope.coupling import SinkhornCoupler
 from sbi_rope.diagnosis.far_entries import far_findings
 from sbi_rope.diagnosis.labelled import labelled_finding
@@ -85,7 +90,8 @@ def diagnose(
         num_folds: The number of trainings for the residuals of 4, each of which takes
             as long as ``rope.train``. None leaves out 4, and the allowance for errors
             of g in both tests of 3.
-        parameter_names: One name for each parameter; "theta_1" and so on if None.
+        parameter_names: One name for each parameter. If None, those of ``rope``, or
+            "theta_1" and so on.
         seed: Seed of everything random; None uses the states of torch, NumPy and
             Python. The simulations are those of ``rope.build_posterior`` with the same
             seed and number.
@@ -121,7 +127,10 @@ def diagnose(
         batch = rope.embed(
             x_o, num_simulations=num_simulations, show_progress_bars=show_progress_bars
         )
-        names = _names(parameter_names, batch.theta.shape[1])
+        dim = batch.theta.shape[1]
+        names = rope.parameter_names or default_names(dim)
+        if parameter_names is not None:
+            names = check_parameter_names(parameter_names, dim)
         _check_enough(batch.theta)
         coupling = batch.couple(coupler or rope.coupler)
         before = batch.npe.embed("x_o", batch.x_o, batch.npe.h)
@@ -255,22 +264,6 @@ def _labelled_findings(
 
 def _moved(values: Tensor) -> Tensor:
     return values.detach().cpu().double()
-
-
-def _names(names: Sequence[str] | None, dim: int) -> tuple[str, ...]:
-    if names is None:
-        return tuple(f"theta_{k + 1}" for k in range(dim))
-    if (
-        not isinstance(names, Sequence)
-        or isinstance(names, str)
-        or len(names) != dim
-        or len(set(names)) != dim
-    ):
-        raise InvalidInputError(
-            f"Expected `parameter_names` to be {dim} different names, one for each "
-            f"parameter; got {names!r}."
-        )
-    return tuple(names)
 
 
 def _check_enough(theta: Tensor) -> None:

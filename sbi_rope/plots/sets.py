@@ -57,7 +57,8 @@ def credible_set(
         x: An observation, from the batch if there is one; the default x if None.
         theta: The true parameter, shape ``(d,)``, which is marked in black.
         level: The level of the sets and intervals.
-        parameter_names: A label for each parameter, with its unit.
+        parameter_names: A label for each parameter, with its unit. If None, the names
+            that ``RoPE`` was given.
         num_samples: The number of draws, as in ``posterior.credible_set``.
         seed: Seed of the draws.
 
@@ -87,7 +88,9 @@ def credible_set(
         for name, found in sorted(sets.items(), key=lambda item: -item[1].volume)
     }
     draws, truth, labels = check_samples(
-        {"posterior": sets[CREDIBLE].draws, **members}, theta, parameter_names
+        {"posterior": sets[CREDIBLE].draws, **members},
+        theta,
+        posterior.parameter_names if parameter_names is None else parameter_names,
     )
     return _drawn(draws, intervals, truth, labels, level=level)
 

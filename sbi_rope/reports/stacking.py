@@ -3,7 +3,12 @@
 from collections.abc import Sequence
 from typing import Any
 
-from sbi_rope._validation import check_instance, check_names, check_path
+from sbi_rope._validation import (
+    check_instance,
+    check_names,
+    check_path,
+    default_names,
+)
 from sbi_rope.diagnosis import Diagnosis
 from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.errors import InvalidInputError, shown
@@ -108,9 +113,11 @@ def _parameter_names(
         )
     if names is not None:
         return check_names("parameter_names", names, count)
-    if diagnosis is None:
-        return [f"theta_{k + 1}" for k in range(count)]
-    return list(diagnosis.parameter_names)
+    if report.parameter_names is not None:
+        return list(report.parameter_names)
+    if diagnosis is not None:
+        return list(diagnosis.parameter_names)
+    return list(default_names(count))
 
 
 def _named(

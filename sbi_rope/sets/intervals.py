@@ -9,7 +9,12 @@ import torch
 from torch import Tensor
 
 from sbi_rope._notebooks import shown_as_text
-from sbi_rope._validation import as_numbers_on, check_batch, check_names
+from sbi_rope._validation import (
+    as_numbers_on,
+    check_batch,
+    check_names,
+    default_names,
+)
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.sets.guarantee import Guarantee
 
@@ -34,12 +39,14 @@ class CredibleIntervals:
         high: The upper ends, as ``low``.
         level: The level of each interval.
         guarantee: The guarantee of each interval; None if there is none.
+        parameter_names: One name for each parameter; None if they have none.
     """
 
     low: Tensor = field(repr=False)
     high: Tensor = field(repr=False)
     level: float
     guarantee: Guarantee | None
+    parameter_names: tuple[str, ...] | None = None
 
     @classmethod
     def joined(cls, parts: "Sequence[CredibleIntervals]") -> "CredibleIntervals":
@@ -103,15 +110,16 @@ class CredibleIntervals:
         The rows of a batch also hold the number of the observation, from 0.
 
         Args:
-            parameter_names: A name for each parameter; "theta_1" and so on if None.
+            parameter_names: A name for each parameter. If None, those that ``RoPE`` was
+                given, or "theta_1" and so on.
 
         Raises:
             InvalidInputError: If the names do not fit.
         """
         count = self.low.shape[-1]
-        names = [f"theta_{k + 1}" for k in range(count)]
+        names = self.parameter_names or default_names(count)
         if parameter_names is not None:
-            names = check_names("parameter_names", parameter_names, count)
+            names = tuple(check_names("parameter_names", parameter_names, count))
         if self._is_batch:
             return [
                 {"observation": number, **row}

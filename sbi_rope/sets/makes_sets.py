@@ -1,6 +1,7 @@
 """The part of a posterior that makes sets and intervals."""
 
 from abc import ABC, abstractmethod
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -28,6 +29,8 @@ class MakesSets(ABC):
     """
 
     prior: Distribution
+    # One name for each parameter, where they have names.
+    parameter_names: tuple[str, ...] | None = None
 
     def credible_set(
         self,
@@ -150,7 +153,8 @@ class MakesSets(ABC):
             if guaranteed:
                 make = self._held_out_sets().credible_intervals
             blocks = self._batch_of_x(x).split(max(1, MAX_DRAWS // num_samples))
-            return CredibleIntervals.joined([make(level, block) for block in blocks])
+            found = CredibleIntervals.joined([make(level, block) for block in blocks])
+        return replace(found, parameter_names=self.parameter_names)
 
     def _held_out_sets(self) -> Any:
         """Return what makes sets with a guarantee. Only a stack has it."""

@@ -77,6 +77,7 @@ class StackingReport:
             None if it is not known.
         learns_prior: Whether a candidate learns from the pairs how parameters are
             distributed.
+        parameter_names: One name for each parameter; None if they have none.
     """
 
     cross_validation: CrossValidation
@@ -97,6 +98,7 @@ class StackingReport:
     acauc_of_parameters: tuple[ACAUCScore, ...] = ()
     probability_of_prior: float | None = None
     learns_prior: bool = True
+    parameter_names: tuple[str, ...] | None = None
 
     @classmethod
     def of(
@@ -110,6 +112,7 @@ class StackingReport:
         recalibration: Recalibration | None = None,
         probability_of_prior: float | None = None,
         learns_prior: bool = True,
+        parameter_names: tuple[str, ...] | None = None,
     ) -> "StackingReport":
         """Compute the report of a stack.
 
@@ -123,6 +126,7 @@ class StackingReport:
             probability_of_prior: The probability that the parameters of the pairs were
                 drawn from the prior.
             learns_prior: Whether a candidate learns how parameters are distributed.
+            parameter_names: One name for each parameter, if they have names.
         """
         check_instance("cross_validation", cross_validation, CrossValidation)
         check_instance("learning_curve", learning_curve, LearningCurve, optional=True)
@@ -151,6 +155,7 @@ class StackingReport:
             acauc_of_parameters=_acauc_of_parameters(scores),
             probability_of_prior=probability_of_prior,
             learns_prior=learns_prior,
+            parameter_names=parameter_names,
         )
 
     @property
@@ -199,8 +204,8 @@ class StackingReport:
                 package that is there already is replaced, and no other file.
             diagnosis: What :func:`sbi_rope.diagnose` says about the batch, if the
                 report should hold it.
-            parameter_names: A name for each parameter. If None, those of the diagnosis,
-                or "theta_1" and so on.
+            parameter_names: A name for each parameter. If None, those that ``RoPE`` was
+                given, those of the diagnosis, or "theta_1" and so on.
             x_names: A name for each entry of x; "x[0]" and so on if None.
 
         Raises:

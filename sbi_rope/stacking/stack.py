@@ -155,7 +155,7 @@ def stack(
             if 1 <= count < scores.num_folds - 1
         ]
         curve = LearningCurve.of([*smaller, scores])
-    return StackedPosterior(
+    posterior = StackedPosterior(
         versions,
         trainer.prior,
         report=StackingReport.of(
@@ -165,12 +165,15 @@ def stack(
             discrepancy=trainer.discrepancy(),
             probability_of_prior=probability,
             learns_prior=trainer.learns_prior,
+            parameter_names=rope.parameter_names,
             recalibration=trainer.recalibration(scores) if recalibrate else None,
             # This comes last, because it counts what came before.
             provenance=stopwatch.provenance(seed),
         ),
         enable_transform=trainer.bench.npe.enable_transform,
     )
+    posterior.parameter_names = rope.parameter_names
+    return posterior
 
 
 def cross_validate(

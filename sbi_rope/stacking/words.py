@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from sbi_rope._validation import default_names
 from sbi_rope.metrics.calibration import ACAUC_IN_WORDS, FEWEST
 from sbi_rope.stacking.cross_validation import Difference
 from sbi_rope.stacking.learning_curve import LearningCurve
@@ -261,10 +262,11 @@ def parameters_off(
 
     Args:
         report: The report of a stack.
-        names: A name for each parameter; "theta_1" and so on if None.
+        names: A name for each parameter. If None, those of the report, or "theta_1"
+            and so on.
     """
     scores = report.acauc_of_parameters
-    names = names or [f"theta_{k + 1}" for k in range(len(scores))]
+    names = names or report.parameter_names or default_names(len(scores))
     few = report.cross_validation.effective_number < FEWEST
     if few or len(scores) < 2:  # reports of older files have none
         return []

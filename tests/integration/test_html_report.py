@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from sbi_rope import diagnose
+from sbi_rope import diagnose, load
 from sbi_rope._two_sample import TwoSampleTest
 from sbi_rope.diagnosis import Diagnosis, Finding
 from sbi_rope.diagnosis.labelled import UNLIKE_PAIRS
@@ -19,7 +19,16 @@ from sbi_rope.errors import InvalidInputError, InvalidTypeError, NotWritableErro
 from sbi_rope.recalibration import Recalibration
 from sbi_rope.reports.numbers import number, percent
 from sbi_rope.stacking import LearningCurve, StackingReport
-from tests.stacks import QUIET, observed, the_stack, trained
+from tests.stacks import (
+    NPE,
+    PRIOR,
+    QUIET,
+    observed,
+    rope_of,
+    stacked,
+    the_stack,
+    trained,
+)
 
 pytest.importorskip("matplotlib")
 # Batches and calibration sets are small here on purpose.
@@ -92,6 +101,34 @@ def source(tmp_path_factory: pytest.TempPathFactory, diagnosis: Diagnosis) -> st
         parameter_names=NAMES,
         x_names=("left", "right", "<top>"),
     )
+
+
+def test_names_of_parameters_are_given_once(tmp_path: Path) -> None:
+    named = rope_of(parameter_names=("slope", "size")).train(seed=0, **QUIET)
+    posterior = stacked(named, candidates=[PRIOR, NPE])
+    report, x = posterior.report, observed()
+    for page in (
+        written(report, tmp_path),
+        str(posterior.credible_intervals(0.9, x[0])),
+    ):
+        assert "slope" in page
+        assert "theta_1" not in page
+    posterior.save(tmp_path / "stack.pt")
+    loaded = load(tmp_path / "stack.pt")
+    for one in (loaded, named.build_posterior(x, num_simulations=100, seed=0)[0]):
+        rows = one.credible_intervals_batched(0.9, x[:1], num_samples=10).as_rows()
+        assert [row["parameter"] for row in rows] == ["slope", "size"]
+    found = diagnose(named, x, num_simulations=100, num_folds=None, **QUIET)
+    assert found.parameter_names == ("slope", "size")
+    # What is passed comes before what is known, and is not called another name.
+    text = Page(written(report, tmp_path, diagnosis=found)).text
+    assert "In this section" not in text
+    assert (
+        "Slope" in Page(written(report, tmp_path, parameter_names=["Slope", "s"])).text
+    )
+    for names in (("slope",), ("a", "a"), ("a", "b", "c")):
+        with pytest.raises(InvalidInputError, match="2 different names"):
+            rope_of(parameter_names=names)
 
 
 def test_the_page_is_valid_and_needs_nothing_else(source: str) -> None:

@@ -203,6 +203,8 @@ def test_parameters_that_are_not_calibrated_by_themselves_are_named() -> None:
     assert "theta_1 by itself is over-confident: ACAUC +0.1" in text
     assert "theta_2 by itself is too wide: ACAUC -0.1" in text
     assert "97.5 % interval" in text
+    named = StackingReport.of(scores, parameter_names=("slope", "size"))
+    assert "slope by itself is over-confident: ACAUC +0.1" in str(named)
     assert "by itself" not in str(report)
     # The verdict on a single parameter is that on the stack.
     single = replace(report.cross_validation, levels=levels[:, :1].sqrt())

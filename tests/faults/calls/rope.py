@@ -41,6 +41,7 @@ CALLS = [
             "finetuner": "instance",
             "coupler": "instance",
             "num_simulations": "count",
+            "parameter_names": "names",
         },
     ),
     Call(
