@@ -162,7 +162,8 @@ class Labels:
         """
         if self.names is not None:
             numbers = {name: k for k, name in enumerate(dict.fromkeys(self.names))}
-            return torch.tensor([numbers[name] for name in self.names])
+            of_rows = [numbers[name] for name in self.names]
+            return torch.tensor(of_rows, dtype=torch.long)
         if self.are_exact:
             return groups_of(self.theta)
         # NaN is not equal to itself, and the covariance tells labels apart, too.
