@@ -628,8 +628,10 @@ class RoPE:
     def __repr__(self) -> str:
         name = type(self._npe.estimator).__name__
         state = "trained" if self.is_trained else "not trained"
+        count = len(self._labels.groups.unique())
+        groups = f" in {count} groups" if count < len(self._x_cal) else ""
         return (
-            f"RoPE({name}, {len(self._x_cal)} calibration pairs, {state}, "
+            f"RoPE({name}, {len(self._x_cal)} calibration pairs{groups}, {state}, "
             f"gamma {self.coupler.gamma:g}, tau {self.coupler.tau:g})"
         )
 

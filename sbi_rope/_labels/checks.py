@@ -207,6 +207,11 @@ def _checked_names(groups: Any, n: int) -> tuple[Hashable, ...]:
             f"Expected `groups` with a number or a name for each pair; got {groups!r}."
         )
     names = tuple(values)
+    if getattr(groups, "ndim", 1) != 1:
+        raise InvalidInputError(
+            "Expected `groups` with one number or name for each pair; got shape "
+            f"{tuple(groups.shape)}. Of a table, pass a single column."
+        )
     if len(names) != n:
         raise InvalidInputError(
             f"Expected `groups` with one number or name for each of {n} pairs; got "

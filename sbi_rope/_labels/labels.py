@@ -192,6 +192,9 @@ class Labels:
             num_noisy = int(self.is_noisy.any(dim=1).sum())
             num_partial = int((~self.is_measured).any(dim=1).sum())
             text = f"{n} labels, {num_noisy} with noise and {num_partial} partial"
+        num_groups = len(self.groups.unique())
+        if num_groups < n:
+            text += f" in {num_groups} groups"
         if self.are_weighted:
             text += (
                 f", weighted like {self.effective_number:.1f} of equal weight, and "

@@ -388,7 +388,10 @@ def _no_numbers(name: str, value: Any) -> str:
             "numbers. Leave these columns out, or convert them with "
             '`astype("float64")`, which makes missing values NaN.'
         )
-    return f"{message} that holds something else."
+    return (
+        f"{message} that holds something else. If these are numbers that were stored "
+        'with other things, convert them with `astype("float64")`.'
+    )
 
 
 def _columns_without_numbers(value: Any) -> list[str]:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
+from sbi_rope._means import Counts
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import (
@@ -19,7 +20,7 @@ from sbi_rope._sbi import (
 )
 from sbi_rope._simulations import Moments, SimulationSource
 from sbi_rope._standardisation import warn_of_far_entries
-from sbi_rope._training import History
+from sbi_rope._training import History, groups_of
 from sbi_rope._validation import (
     LARGEST_SETTING,
     check_choice,
@@ -222,7 +223,8 @@ class DiscrepancyNPE(Method):
         """Compare simulations with real observations, summary by summary.
 
         The method need not be trained, and with a simulator it needs no appended
-        simulations. The report is about x itself, whatever ``space`` is. Print it.
+        simulations. The report is about x itself, whatever ``space`` is. Pairs with
+        equal parameters, such as recordings of one person, count once. Print it.
 
         Args:
             summaries: A function from observations ``(n, *event)`` to a few summaries
@@ -278,6 +280,7 @@ class DiscrepancyNPE(Method):
             moments,
             simulated,
             model=self.model,
+            counts=_counts(self._data.calibration[0]),
             x_names=x_names,
             show_progress_bars=show,
         )
@@ -372,3 +375,12 @@ class DiscrepancyNPE(Method):
         embeddings = OwnEmbeddings(nets, estimator.condition_shape)
         mixture = MixtureEstimator([Part(headless(estimator), embeddings)], [1.0])
         return MixturePosterior(mixture, copy.deepcopy(self._prior))
+
+
+def _counts(theta: Tensor) -> Counts | None:
+    """Return the counts of pairs, those with equal parameters as one."""
+    groups = groups_of(theta)
+    sizes = groups.bincount()
+    if len(sizes) == len(groups):
+        return None
+    return Counts((1.0 / sizes[groups]).to(theta.device), groups)

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sbi_rope._means import Counts
 from sbi_rope._notebooks import shown_as_text
 from sbi_rope._progress import progress_bar
 from sbi_rope._simulations import Moments
@@ -115,6 +116,8 @@ class DiscrepancyReport:
         summaries: The discrepancy of each summary, from the largest to the smallest.
             Summaries without a sign of discrepancy are last.
         num_pairs: The number of calibration pairs.
+        num_groups: The number of people or specimens that they are of; None if there
+            are as many as pairs.
         constant: The names of summaries that are the same in all simulations. Nothing
             can be said about them.
     """
@@ -122,6 +125,7 @@ class DiscrepancyReport:
     summaries: tuple[SummaryDiscrepancy, ...]
     num_pairs: int
     constant: tuple[str, ...] = ()
+    num_groups: int | None = None
 
     def __getitem__(self, name: str) -> SummaryDiscrepancy:
         for summary in self.summaries:
@@ -131,6 +135,12 @@ class DiscrepancyReport:
             f"Expected the name of a summary; got {name!r}. There are "
             f"{sorted(summary.name for summary in self.summaries)}."
         )
+
+    @property
+    def _in_groups(self) -> str:
+        if self.num_groups is None:
+            return ""
+        return f" in {self.num_groups} groups, each of which counts once,"
 
     def renamed(self, names: Sequence[str]) -> "DiscrepancyReport":
         """Return the same report with other names of the summaries.
@@ -190,7 +200,8 @@ class DiscrepancyReport:
         off = [summary for summary in self.summaries if summary.is_off]
         fine = [summary.name for summary in self.summaries if not summary.is_off]
         lines = [
-            f"What {self.num_pairs} calibration pairs say about the simulator",
+            f"What {self.num_pairs} calibration pairs{self._in_groups} say about the "
+            "simulator",
             "  observed = mean + shift + gain (simulated - mean) + error",
         ]
         if off:
@@ -248,7 +259,7 @@ def report_discrepancy(
     simulated: Tensor,
     *,
     model: DiscrepancyModel,
-    weights: Tensor | None = None,
+    counts: Counts | None = None,
     x_names: Sequence[str] | None = None,
     seed: int = 0,
     show_progress_bars: bool = False,
@@ -263,7 +274,9 @@ def report_discrepancy(
         moments: The moments of simulations at their parameters.
         simulated: Simulations from the prior, shape ``(n_s, l)``.
         model: The model of the discrepancy.
-        weights: How many pairs each pair counts as, shape ``(n,)``; one if None.
+        counts: How many pairs each pair counts as, and which belong together. The
+            errors of pairs of one person or specimen have much in common, so that they
+            should count as one. None if all pairs are independent.
         x_names: Names of the summaries; numbered if None.
         seed: Seed of the draws behind the intervals.
         show_progress_bars: Whether to show the progress if there are many summaries.
@@ -291,7 +304,12 @@ def report_discrepancy(
         z = ((x[:, j].double() - mean) / std)[:, None]
         m = ((moments.means[..., j] - mean) / std)[..., None]
         noise = moments.covariance[:, j, j].mean() / std.square()
-        discrepancy = model.fit(z, m, noise.reshape(1, 1), weights=weights)
+        discrepancy = model.fit(
+            z,
+            m,
+            noise.reshape(1, 1),
+            weights=None if counts is None else counts.weights,
+        )
         summaries.append(
             _summary(names[j], discrepancy, z, m, scale=float(std), seed=seed)
         )
@@ -305,8 +323,15 @@ def report_discrepancy(
             sorted(summaries, key=lambda s: (not s.is_off, -s.size.median))
         ),
         num_pairs=len(x),
+        num_groups=_num_groups(counts),
         constant=tuple(n for n, v in zip(names, varies, strict=True) if not v),
     )
+
+
+def _num_groups(counts: Counts | None) -> int | None:
+    if counts is None or counts.groups is None:
+        return None
+    return len(counts.groups.unique())
 
 
 def _summary(

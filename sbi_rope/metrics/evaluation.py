@@ -151,11 +151,12 @@ def evaluate(
 
     Args:
         posterior: Any posterior with ``sample_batched`` and ``log_prob_batched``.
-        theta: True parameters, shape ``(n, d)``.
+        theta: True parameters, shape ``(n, d)``. Measurements with noise make a good
+            posterior look over-confident.
         x: Their observations, shape ``(n, *event_shape)``.
-        theta_std: The unit of each parameter for ``lpp_z``, shape ``(d,)``. If None,
-            the standard deviations of the posterior's prior, estimated from draws if
-            it does not state them.
+        theta_std: The unit of each parameter for ``lpp_z``, shape ``(d,)``, and not
+            the noise of ``theta``. If None, the standard deviations of the posterior's
+            prior, estimated from draws if it does not state them.
         num_samples: The number of posterior samples for each observation.
         seed: The seed of the samples, which also depend on ``chunk_size``.
         chunk_size: How many observations are scored at a time. Fewer need less memory.

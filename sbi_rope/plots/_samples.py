@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from sbi_rope._validation import (
+    as_numbers,
     check_batch,
     check_mapping,
     check_names,
@@ -62,8 +63,13 @@ def check_samples(
         names = check_names("parameter_names", parameter_names, width[0])
     if theta is None:
         return draws, None, names
-    row = check_batch("theta", check_tensor("theta", theta).reshape(1, -1), width)
-    return draws, drawable("theta", row)[0], names
+    return draws, drawable("theta", check_truth(theta, width[0])), names
+
+
+def check_truth(theta: Any, dim: int) -> Tensor:
+    """Return the true parameters of one observation, shape ``(d,)``."""
+    row = as_numbers("theta", theta).reshape(1, -1)
+    return check_batch("theta", row, (dim,))[0]
 
 
 def drawable(name: str, value: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from sbi_rope.plots._figures import BLUE, GREY, ORANGE, empty_figure, hide_frame
 from sbi_rope.plots._samples import (
     central_interval,
     check_samples,
+    check_truth,
     draw_marginal,
     with_margin,
 )
@@ -71,6 +72,8 @@ def credible_set(
         ImportError: If matplotlib is not installed.
     """
     check_instance("posterior", posterior, MixturePosterior)
+    if theta is not None:  # before the sets, which take a while
+        theta = check_truth(theta, posterior.posterior_estimator.input_shape[0])
     options: dict[str, Any] = {"num_samples": num_samples, "seed": seed}
     sets = {CREDIBLE: posterior.credible_set(level, x, **options)}
     intervals = {CREDIBLE: posterior.credible_intervals(level, x, **options)}

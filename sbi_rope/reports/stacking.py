@@ -138,6 +138,9 @@ def _named(
 def _what_was_done(report: StackingReport) -> str:
     scores = report.cross_validation
     n, d = report.levels.shape
+    of_groups = ""
+    if scores.groups is not None:
+        of_groups = f" in {len(scores.groups.unique())} groups (each counts once)"
     known, scored = f"whose {d} parameters are known", "known parameters"
     if scores.labels:
         known = f"with labels of their {d} parameters ({scores.labels})"
@@ -145,7 +148,7 @@ def _what_was_done(report: StackingReport) -> str:
     return (
         "A neural posterior estimate (NPE) was trained on simulations, and the "
         "simulator may be wrong about the real measurements. It was repaired with "
-        f"{n} real measurements {known}: {len(scores.names)} "
+        f"{n} real measurements{of_groups} {known}: {len(scores.names)} "
         "candidate posteriors learned from a part of them and were scored by the "
         f"probability density that they give to the {scored} of the others. "
         "The result is the average of the candidates, weighted by these scores, and "

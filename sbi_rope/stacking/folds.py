@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from sbi_rope._focus import warn_if_focused
 from sbi_rope._labels import Nodes, labelled_moments, nodes_of, reference_of
+from sbi_rope._means import counts_of
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed, estimator_of, headless
 from sbi_rope._simulations import Moments
@@ -189,7 +190,7 @@ class Workbench:
             self.moments("input"),
             self.simulations[1],
             model=DiscrepancyModel(),
-            weights=self.pair_weights,
+            counts=counts_of(self.score_weights, self.score_groups),
         )
 
     @property

@@ -70,7 +70,8 @@ class LearningCurve:
         right.
 
         Args:
-            num_more: m, the number of labels to add.
+            num_more: m, the number of labels to add. If pairs belong to groups, such as
+                recordings of one person, n and m are numbers of groups.
 
         Returns:
             The gain in nats a pair; NaN if the curve has a single point or a score is
@@ -86,10 +87,17 @@ class LearningCurve:
         centred = inverse - inverse.mean()
         slopes = -(centred @ self.pair_scores) / centred.square().sum()
         last = self.num_pairs[-1]
-        n = self.pair_scores.shape[1]
+        n = self.num_labels
         scale = 1 / last - n / (last * (n + num_more))
         mean, low, high = interval_of_mean(scale * slopes, self._counts)
         return Difference(mean=mean, low=low, high=high)
+
+    @property
+    def num_labels(self) -> int:
+        """The number of pairs, or of their groups."""
+        if self.groups is None:
+            return self.pair_scores.shape[1]
+        return len(self.groups.unique())
 
     @property
     def _counts(self) -> Counts | None:

@@ -161,6 +161,11 @@ def _scores(report: "StackingReport") -> list[str]:
     return lines
 
 
+def is_measured(report: "StackingReport") -> bool:
+    """Whether coverage is that of measured values, and not of the parameters."""
+    return report.cross_validation.score_errors is not None
+
+
 def are_relative(report: "StackingReport") -> bool:
     """Whether labels are given as draws, which have no levels and no density."""
     return bool(torch.isnan(report.levels).all())
@@ -245,7 +250,8 @@ def _calibration(report: "StackingReport") -> list[str]:
         f"    ({ACAUC_IN_WORDS})",
         f"    coverage error {report.coverage_error.value:.3f}; a calibrated posterior "
         f"has about {0.31 / n**0.5:.3f} with {n:.0f} pairs",
-        f"    {LEVEL:.0%} intervals hold {report.share_inside:.0%} of the parameters",
+        f"    {LEVEL:.0%} intervals hold {report.share_inside:.0%} of the "
+        f"{'measured values' if is_measured(report) else 'parameters'}",
         *(f"    {line}" for line in off),
         *advice,
         *_sets(report),
@@ -351,11 +357,12 @@ def _more_labels(report: "StackingReport") -> list[str]:
 def gains_of(curve: LearningCurve) -> list[str]:
     """Say what a few more labels would add, and what twice as many would."""
     gains = {
-        more: curve.gain(more)
-        for more in dict.fromkeys((FEW_MORE, curve.pair_scores.shape[1]))
+        more: curve.gain(more) for more in dict.fromkeys((FEW_MORE, curve.num_labels))
     }
+    size = curve.pair_scores.shape[1] / curve.num_labels
+    kind = "labels" if curve.groups is None else f"groups of {size:.3g} pairs"
     lines = [
-        f"{more} more labels might add {gain.mean:.2f} nats a pair (95 % interval "
+        f"{more} more {kind} might add {gain.mean:.2f} nats a pair (95 % interval "
         f"{gain.low:.2f} to {gain.high:.2f})"
         for more, gain in gains.items()
         if math.isfinite(gain.mean)

@@ -131,6 +131,18 @@ def test_names_of_parameters_are_given_once(tmp_path: Path) -> None:
             rope_of(parameter_names=names)
 
 
+def test_the_page_says_which_pairs_count_once(tmp_path: Path) -> None:
+    report = the_stack().report
+    scores = report.cross_validation
+    groups = torch.arange(len(scores)) // 2
+    grouped = replace(
+        scores, groups=groups, pair_weights=torch.full((len(scores),), 0.5)
+    )
+    text = Page(written(StackingReport.of(grouped), tmp_path)).text
+    assert f"{len(scores)} real measurements in {len(scores) // 2} groups" in text
+    assert "groups" not in Page(written(report, tmp_path)).text
+
+
 def test_the_page_is_valid_and_needs_nothing_else(source: str) -> None:
     page = Page(source)
     assert source.startswith("<!DOCTYPE html>\n<html lang=")

@@ -63,6 +63,12 @@ def test_a_stack_is_scored_on_what_was_measured(tmp_path: Any) -> None:
     assert ">nan<" not in page
 
 
+def test_coverage_of_labels_that_are_not_exact_is_that_of_measured_values() -> None:
+    for options, what in (({"theta_std": 0.1}, "measured values"), ({}, "parameters")):
+        report = stacked(labelled(THETA, **options), candidates=[PRIOR, NPE]).report
+        assert f"of the {what}\n" in str(report)
+
+
 def test_couplings_are_scored_on_labels_that_are_not_exact() -> None:
     scores = validated(
         labelled(PARTIAL), observed(), candidates=[*COUPLINGS[:2], PRIOR, NPE]

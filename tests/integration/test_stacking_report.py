@@ -24,6 +24,7 @@ from sbi_rope.stacking import (
     LearningCurve,
     StackingReport,
 )
+from sbi_rope.stacking.folds import Workbench
 from tests import problems
 from tests.stacks import (
     FITTED,
@@ -374,6 +375,11 @@ def test_recordings_of_a_named_specimen_count_once_whatever_their_labels_are() -
     )
     assert apart.cross_validation.effective_number == 24
     assert together.cross_validation.effective_number == pytest.approx(12)
+    bench = Workbench(
+        rope_of((noisy, x), groups=names), num_folds=4, seed=0, show_progress_bars=False
+    )
+    assert "24 calibration pairs in 12 groups" in str(bench.discrepancy())
+    assert "24 calibration pairs in 12 groups, not trained" in repr(bench.rope)
     folds = together.cross_validation.fold
     for specimen in range(12):
         rows = [row for row, name in enumerate(names) if name.endswith(f" {specimen}")]
@@ -430,6 +436,14 @@ def test_the_gain_of_more_labels_is_extrapolated_from_the_curve() -> None:
     weights[:2] = 1.0
     weighted = replace(curve, pair_weights=weights)
     assert weighted.gain(25).mean == pytest.approx(1.125 / 40)
+    # Recordings of 5 people: labels are those of people.
+    of_people = replace(
+        curve, pair_weights=torch.full((25,), 0.2), groups=torch.arange(25) // 5
+    )
+    assert of_people.gain(5).mean == pytest.approx(gain.mean)
+    assert "5 more groups of 5 pairs might add" in str(
+        replace(made_up(), learning_curve=of_people)
+    )
     with pytest.raises(InvalidInputError, match="`num_more`"):
         curve.gain(0)
     assert f"25 more labels might add {gain.mean:.2f} nats a pair" in str(

@@ -279,6 +279,27 @@ def test_a_method_reports_without_training() -> None:
         assert again.as_rows() == found.as_rows()
 
 
+def test_recordings_of_a_person_do_not_make_intervals_narrower() -> None:
+    theta, x = shifted(20)
+    several = theta.repeat_interleave(3, dim=0)
+    own = 0.5 * torch.randn(20, 3)  # errors that recordings of a person share
+    alone = method(simulator=problems.simulate).append_calibration(theta, x + own)
+    together = method(simulator=problems.simulate).append_calibration(
+        several,
+        problems.simulate(several)
+        + torch.tensor([0.0, 0.7, 0.0])
+        + own.repeat_interleave(3, dim=0),
+    )
+    widths = []
+    for asked in (alone, together):
+        found = asked.report(seed=0, show_progress_bars=False)
+        shifts = [summary.shift for summary in found.summaries]
+        widths.append(sum(shift.high - shift.low for shift in shifts))
+    # As independent pairs, they would be narrower by a factor of 1.7.
+    assert widths[1] / widths[0] == pytest.approx(1.0, abs=0.2)
+    assert "What 60 calibration pairs in 20 groups, each of which counts" in str(found)
+
+
 def test_a_report_asks_for_the_data_that_it_lacks() -> None:
     with pytest.raises(NotReadyError, match="simulations"):
         method().append_calibration(*shifted()).report()

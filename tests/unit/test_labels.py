@@ -5,6 +5,7 @@ import warnings
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from sbi.utils import BoxUniform
@@ -427,7 +428,12 @@ def test_groups_are_numbers_or_names_of_all_pairs() -> None:
     assert len(named.labels) == 8
     with pytest.raises(InvalidInputError, match="missing for those"):
         rope().append_calibration(theta, x).append_calibration(theta, x, groups=numbers)
-    for wrong in ("abcd", 3, [None] * 4, torch.ones(4, 2)):
+    table = pd.DataFrame({"specimen": ["a", "a", "b", "c"]})
+    with pytest.raises(InvalidInputError, match=r"shape \(4, 1\).* a single column"):
+        rope().append_calibration(theta, x, groups=table)  # type: ignore[arg-type]
+    named = rope().append_calibration(theta, x, groups=table["specimen"])
+    assert named.labels.groups.tolist() == [0, 0, 1, 2]
+    for wrong in ("abcd", 3, [None] * 4, [[1]] * 4):
         with pytest.raises(InvalidTypeError, match="groups"):
             rope().append_calibration(theta, x, groups=wrong)  # type: ignore[arg-type]
 

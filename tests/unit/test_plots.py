@@ -38,7 +38,8 @@ def two_posteriors() -> dict[str, Tensor]:
 
 def test_a_stack_has_a_credible_set_and_one_with_a_guarantee() -> None:
     stack, x = stacks.small_stack(), stacks.observed()[0]
-    figure = plots.credible_set(stack, x, torch.zeros(2), num_samples=40)
+    truth: Any = [0.0, 0.0]  # or an array, as everywhere
+    figure = plots.credible_set(stack, x, truth, num_samples=40)
     assert len(figure.axes) == 3
     texts = ["90 %, of the posterior", "90 %, guaranteed", "truth"]
     assert legend_texts(figure.legends[0]) == texts
