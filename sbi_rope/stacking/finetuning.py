@@ -1,13 +1,14 @@
 """Fine-tune NPE on the pairs of a fold, but for a part that is held out."""
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from sbi_rope._sbi import embedding_of, headless
 from sbi_rope._training import shuffled
 from sbi_rope.stacking.folds import Fold
 from sbi_rope.trainers.training import FINETUNING, train_network
@@ -69,17 +70,15 @@ def finetune_without(
     # The order of the batches depends on the fold alone, not on what was drawn before.
     order = torch.Generator().manual_seed(fold.seed)
 
-    nodes = None if bench.labels.are_exact else fold.nodes(start)
+    of_labels = None
+    if not bench.labels.are_exact:
+        of_labels = _losses_of_labels(fold, start, estimator)
     weights = bench.pair_weights
-    place = torch.empty_like(bench.groups, device=fold.rows.device)
-    place[fold.rows] = torch.arange(len(fold.rows), device=fold.rows.device)
 
     def losses(rows: Tensor) -> Tensor:
-        if nodes is None:
-            return estimator.loss(bench.theta[rows], condition=bench.x[rows])
-        of_rows = nodes[place[rows]]
-        theta = of_rows.theta.movedim(1, 0)
-        return -of_rows.log_mean(estimator.log_prob(theta, bench.x[rows]).T)
+        if of_labels is not None:
+            return of_labels(rows)
+        return estimator.loss(bench.theta[rows], condition=bench.x[rows])
 
     def loss(rows: Tensor, among: Tensor = train) -> Tensor:
         if weights is None:
@@ -114,3 +113,23 @@ def finetune_without(
         show_progress_bars=False,
     )
     return estimator.requires_grad_(requires_grad=False)
+
+
+def _losses_of_labels(
+    fold: Fold, start: Any, estimator: Any
+) -> Callable[[Tensor], Tensor]:
+    """Return a function from rows to the negative log densities of their labels."""
+    bench, nodes = fold.bench, fold.nodes(start)
+    place = torch.empty_like(bench.groups, device=fold.rows.device)
+    place[fold.rows] = torch.arange(len(fold.rows), device=fold.rows.device)
+    # The estimator itself would embed an observation once for each of its nodes.
+    embedding, density = embedding_of(estimator), headless(estimator)
+
+    def losses(rows: Tensor) -> Tensor:
+        of_rows = nodes[place[rows]]
+        embedded = embedding(bench.x[rows])
+        return -of_rows.log_mean(
+            density.log_prob(of_rows.theta.movedim(1, 0), embedded).T
+        )
+
+    return losses

@@ -271,6 +271,24 @@ def test_a_pair_weighs_as_much_in_a_small_batch_as_among_all() -> None:
     assert torch.allclose(loss(rows), expected, atol=1e-5)
 
 
+def test_an_observation_is_embedded_once_whatever_its_label_leaves_possible() -> None:
+    theta, x = problem(12, seed=1)
+    rope = rope_of(problem(0, seed=1)).append_calibration(theta, x, theta_std=0.1)
+    bench = Workbench(rope, num_folds=4, seed=0, show_progress_bars=False)
+    start, seen = estimator_of(bench.npe), []
+    embedding_of(start).register_forward_hook(lambda net, x, s: seen.append(len(x[0])))
+    fold = Fold(bench, [0, 1, 3])
+    with patch("sbi_rope.stacking.finetuning.train_network") as train:
+        finetune_without(start, fold, 1, learning_rate=1e-3)
+    rows = fold.rows
+    seen.clear()
+    losses = train.call_args.args[2](rows)
+    assert seen == [len(rows)]
+    nodes = fold.nodes(start)
+    log_prob = start.log_prob(nodes.theta.movedim(1, 0), bench.x[rows]).T
+    assert torch.allclose(losses, -nodes.log_mean(log_prob).mean(), atol=1e-4)
+
+
 def test_equal_labels_of_named_specimens_are_several_draws_of_parameters() -> None:
     torch.manual_seed(3)
     theta = problem(5, seed=1)[0].repeat(8, 1)
