@@ -96,7 +96,7 @@ def check_names(name: str, value: Any, count: int | None = None) -> list[str]:
 
 
 def check_parameter_names(value: Any, count: int) -> tuple[str, ...]:
-    """Return different names of parameters."""
+    """Return ``count`` names of parameters, no two of which are equal."""
     names = check_names("parameter_names", value)
     if len(names) != count or len(set(names)) != count:
         raise InvalidInputError(
