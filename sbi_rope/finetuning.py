@@ -9,16 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from sbi_rope._groups import split_pairs
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed, readable
-from sbi_rope._training import (
-    History,
-    best_of_learning_rates,
-    epochs_on_pairs,
-    fit,
-    split_pairs,
-)
+from sbi_rope._training import History, best_of_learning_rates, epochs_on_pairs, fit
 from sbi_rope._validation import (
     LARGEST_SETTING,
     check_batch,

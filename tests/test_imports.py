@@ -30,10 +30,12 @@ LAYERS = [
     {"errors", "_means", "_notebooks", "_progress", "_processes", "_slices", "_tables"},
     # They raise errors: of seeds, of files and of functions that cannot be pickled.
     {"_random", "_files", "_pickling"},
+    # Groups are held out at random, with a seed.
+    {"_groups"},
     # They raise errors and warn: of arguments, and of a training that goes wrong. Units
     # and bounds of parameters are found by draws of the prior with a seed.
     {"_validation", "_training", "_units", "_bounds"},
-    # sbi's trainer is told by `_training` which simulations to hold out together.
+    # sbi's trainer is told by `_groups` which simulations to hold out together.
     {"_sbi"},
     # Each works on embeddings or posteriors, which `_sbi` takes out of an estimator.
     # Posteriors are saved, whatever they are made of.

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from sbi_rope._training import groups_of
+from sbi_rope._groups import groups_of
 from sbi_rope.errors import InvalidInputError
 
 __all__ = ["Labels"]

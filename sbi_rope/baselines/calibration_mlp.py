@@ -6,10 +6,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from sbi_rope._groups import split_pairs
 from sbi_rope._random import seeded
 from sbi_rope._sbi import ConditionalDensityEstimator, direct_posterior, embedding_of
 from sbi_rope._standardisation import leave_out_constants
-from sbi_rope._training import History, split_pairs
+from sbi_rope._training import History
 from sbi_rope._validation import check_instance
 from sbi_rope.baselines.networks import embedding_with_head
 from sbi_rope.errors import InvalidInputError

@@ -7,15 +7,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from sbi_rope._groups import split_pairs
 from sbi_rope._sbi import copy_of_prior, embed
 from sbi_rope._simulations import draw_targets
 from sbi_rope._standardisation import warn_of_far_entries
-from sbi_rope._training import (
-    History,
-    epochs_on_pairs,
-    shuffled,
-    split_pairs,
-)
+from sbi_rope._training import History, epochs_on_pairs, shuffled
 from sbi_rope._validation import check_instance, check_integer, check_positive
 from sbi_rope.baselines.statistics import frozen_statistics
 from sbi_rope.finetuning import trainable_copy

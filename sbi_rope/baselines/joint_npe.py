@@ -6,9 +6,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sbi_rope._groups import split_pairs, too_few_pairs
 from sbi_rope._sbi import direct_posterior, embedding_of
 from sbi_rope._standardisation import warn_of_far_entries
-from sbi_rope._training import History, split_pairs, too_few_pairs
+from sbi_rope._training import History
 from sbi_rope._validation import check_instance
 from sbi_rope.errors import warn_user
 from sbi_rope.trainers.base import Method

@@ -6,6 +6,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
+from sbi_rope._groups import split_pairs
 from sbi_rope._sbi import (
     ConditionalDensityEstimator,
     UnconditionalDensityEstimator,
@@ -17,7 +18,7 @@ from sbi_rope._sbi import (
     with_embedding,
 )
 from sbi_rope._standardisation import Standardisation
-from sbi_rope._training import History, shuffled, split_pairs
+from sbi_rope._training import History, shuffled
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.trainers.training import Training, train_network
 

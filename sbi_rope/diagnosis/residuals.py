@@ -5,14 +5,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from sbi_rope._groups import one_of_each_group, split_groups
 from sbi_rope._means import Counts
 from sbi_rope._progress import progress_bar
 from sbi_rope._sbi import embed
-from sbi_rope._training import (
-    one_of_each_group,
-    split_groups,
-    without_warning_of_few_pairs,
-)
+from sbi_rope._training import without_warning_of_few_pairs
 from sbi_rope.diagnosis.report import Finding
 from sbi_rope.diagnosis.simulations import Simulations
 from sbi_rope.rope import RoPE

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
+from sbi_rope._groups import groups_of
 from sbi_rope._means import Counts
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
@@ -20,7 +21,7 @@ from sbi_rope._sbi import (
 )
 from sbi_rope._simulations import Moments, SimulationSource
 from sbi_rope._standardisation import warn_of_far_entries
-from sbi_rope._training import History, groups_of
+from sbi_rope._training import History
 from sbi_rope._validation import (
     LARGEST_SETTING,
     check_choice,

@@ -3,9 +3,9 @@
 import torch
 from torch import Tensor, nn
 
+from sbi_rope._groups import groups_of, split_groups
 from sbi_rope._sbi import embed
 from sbi_rope._simulations import Moments
-from sbi_rope._training import groups_of, split_groups
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.finetuning import CalibrationFinetuner
 

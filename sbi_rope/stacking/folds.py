@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from sbi_rope._focus import warn_if_focused
+from sbi_rope._groups import split_groups
 from sbi_rope._labels import Nodes, labelled_moments, nodes_of, reference_of
 from sbi_rope._means import counts_of
 from sbi_rope._random import seeded
@@ -17,7 +18,7 @@ from sbi_rope._sbi import embed, estimator_of, headless
 from sbi_rope._simulations import Moments
 from sbi_rope._simulator import Simulator
 from sbi_rope._standardisation import Standardisation
-from sbi_rope._training import split_groups, without_warning_of_few_pairs
+from sbi_rope._training import without_warning_of_few_pairs
 from sbi_rope.discrepancy.correction import Space, correct_npe, network_of
 from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.parameters import learn_parameters

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from sbi_rope._training import one_of_each_group
+from sbi_rope._groups import one_of_each_group
 from sbi_rope._units import log_units_of
 from sbi_rope.errors import warn_user
 from sbi_rope.mixture import MixturePosterior

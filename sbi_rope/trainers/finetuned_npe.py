@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from sbi_rope._groups import MIN_PAIRS_FOR_HOLDOUT, groups_of, split_groups, split_pairs
 from sbi_rope._sbi import (
     ConditionalDensityEstimator,
     check_density,
@@ -16,14 +17,7 @@ from sbi_rope._sbi import (
     with_embedding,
 )
 from sbi_rope._standardisation import warn_of_far_entries
-from sbi_rope._training import (
-    MIN_PAIRS_FOR_HOLDOUT,
-    History,
-    best_of_learning_rates,
-    groups_of,
-    split_groups,
-    split_pairs,
-)
+from sbi_rope._training import History, best_of_learning_rates
 from sbi_rope._validation import (
     LARGEST_SETTING,
     check_instance,

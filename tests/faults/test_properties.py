@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from sbi_rope import SinkhornCoupler
+from sbi_rope._groups import split_groups, split_pairs
 from sbi_rope._random import seeded
-from sbi_rope._training import split_groups, split_pairs
 from sbi_rope.discrepancy import DiscrepancyModel, learn_parameters
 from sbi_rope.errors import RoPEError
 from sbi_rope.metrics import acauc_of, central_levels, mid_ranks

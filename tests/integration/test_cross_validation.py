@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from sbi_rope import CalibrationFinetuner, RoPE
+from sbi_rope._groups import groups_of
 from sbi_rope._sbi import embed, embedding_of, estimator_of
-from sbi_rope._training import groups_of
 from sbi_rope.discrepancy.training import ONE, Courses
 from sbi_rope.metrics import acauc_of
 from sbi_rope.mixture import MixtureEstimator, MixturePosterior, part_of

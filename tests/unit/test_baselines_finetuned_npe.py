@@ -11,8 +11,8 @@ from sbi.neural_nets import posterior_nn
 from torch import Tensor, nn
 
 from sbi_rope import RoPE, SinkhornCoupler
+from sbi_rope._groups import split_groups, split_pairs
 from sbi_rope._random import seeded
-from sbi_rope._training import split_groups, split_pairs
 from sbi_rope.baselines import FinetunedNPE, PlainNPE, Training
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import (

@@ -7,6 +7,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
+from sbi_rope._groups import split_pairs
 from sbi_rope._random import seeded
 from sbi_rope._sbi import (
     ConditionalDensityEstimator,
@@ -14,12 +15,7 @@ from sbi_rope._sbi import (
     embed,
 )
 from sbi_rope._standardisation import warn_of_far_entries
-from sbi_rope._training import (
-    History,
-    epochs_on_pairs,
-    shuffled,
-    split_pairs,
-)
+from sbi_rope._training import History, epochs_on_pairs, shuffled
 from sbi_rope._validation import (
     check_choice,
     check_instance,

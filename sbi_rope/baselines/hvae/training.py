@@ -6,8 +6,9 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from sbi_rope._groups import split_pairs, too_few_pairs
 from sbi_rope._random import seeded
-from sbi_rope._training import History, split_pairs, too_few_pairs
+from sbi_rope._training import History
 from sbi_rope.baselines.hvae.model import HybridVAE
 from sbi_rope.errors import warn_user
 from sbi_rope.mixture import MixtureEstimator

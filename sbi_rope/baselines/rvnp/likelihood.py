@@ -8,9 +8,10 @@ from torch import Tensor, nn
 from torch.distributions import Categorical, MixtureSameFamily, MultivariateNormal
 from torch.nn import functional
 
+from sbi_rope._groups import split_pairs
 from sbi_rope._sbi import gaussians_of
 from sbi_rope._standardisation import Standardisation
-from sbi_rope._training import shuffled, split_pairs
+from sbi_rope._training import shuffled
 from sbi_rope.trainers.training import Training, train_network
 
 __all__ = ["ErrorModel", "fit_surrogate", "log_likelihood"]

@@ -6,13 +6,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sbi_rope._groups import split_pairs
 from sbi_rope._random import seeded
 from sbi_rope._sbi import (
     embed,
     estimator_of,
     posterior_from,
 )
-from sbi_rope._training import History, shuffled, split_pairs
+from sbi_rope._training import History, shuffled
 from sbi_rope._validation import (
     check_choice,
     check_instance,
