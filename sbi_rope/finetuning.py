@@ -19,13 +19,13 @@ from sbi_rope._validation import (
     check_batch,
     check_finite,
     check_gradients,
+    check_groups,
     check_instance,
     check_integer,
     check_not_negative,
     check_pair_weights,
     check_positive,
     check_readable,
-    check_same_length,
     check_tensor,
     check_values,
 )
@@ -184,7 +184,9 @@ class CalibrationFinetuner:
         check_gradients()
         check_instance("embedding_net", embedding_net, nn.Module)
         x = _checked_inputs("x", x, embedding_net)
-        groups = _checked_groups(groups, x)
+        if groups is None:
+            groups = torch.arange(len(x))
+        groups = check_groups(groups, "x", x)
         if weights is not None:
             weights = check_pair_weights(weights, "x", x).to(x)
         show = is_shown(show_progress_bars)
@@ -335,20 +337,6 @@ def _embedded(name: str, x: Tensor, net: nn.Module) -> Tensor:
             f"Expected `{name}` of a shape and on a device that the embedding net "
             f"takes; for {tuple(x.shape)} on {x.device} it raised: {error}"
         ) from error
-
-
-def _checked_groups(groups: Tensor | None, x: Tensor) -> Tensor:
-    if groups is None:
-        return torch.arange(len(x))
-    groups = check_tensor("groups", groups)
-    if groups.ndim != 1:
-        raise InvalidInputError(
-            "Expected `groups` with one number for each pair, shape (n_c,); got "
-            f"{tuple(groups.shape)}."
-        )
-    check_finite("groups", groups)
-    check_same_length("x", x, "groups", groups)
-    return groups
 
 
 def _checked_targets(targets: Tensor, embedded: Tensor) -> Tensor:

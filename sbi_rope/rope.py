@@ -362,6 +362,7 @@ class RoPE:
             ),
             Standardisation(self._embed_simulations(simulated).double()),
             weights=self._labels.pair_weights,
+            groups=self._labels.groups,
         )
 
     def embed(

@@ -20,6 +20,7 @@ __all__ = [
     "check_batch",
     "check_device",
     "check_finite",
+    "check_groups",
     "check_in_support",
     "check_not_nan",
     "check_pair_weights",
@@ -259,6 +260,19 @@ def check_pair_weights(
             "all by the same number."
         )
     return weights
+
+
+def check_groups(groups: Tensor, name: str, rows: Tensor) -> Tensor:
+    """Return numbers of groups, one for each row, shape ``(n,)``."""
+    groups = check_tensor("groups", groups)
+    if groups.ndim != 1:
+        raise InvalidInputError(
+            "Expected `groups` with one number for each pair, shape (n,); got "
+            f"{tuple(groups.shape)}."
+        )
+    check_finite("groups", groups)
+    check_same_length(name, rows, "groups", groups)
+    return groups
 
 
 def check_same_length(name_a: str, a: Tensor, name_b: str, b: Tensor) -> None:

@@ -7,6 +7,8 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
+from sbi_rope._groups import groups_of
+from sbi_rope._means import Counts
 from sbi_rope._sbi import ConditionalEstimator, embedding_of, headless, with_embedding
 from sbi_rope._simulations import Moments
 from sbi_rope._standardisation import Standardisation
@@ -112,6 +114,7 @@ def fit_discrepancy(
     model: DiscrepancyModel,
     *,
     weights: Tensor | None = None,
+    groups: Tensor | None = None,
 ) -> Discrepancy:
     """Fit the model to calibration pairs, in standard deviations of simulations.
 
@@ -127,6 +130,7 @@ def fit_discrepancy(
             prior.
         model: The model of the discrepancy.
         weights: How many pairs each pair counts as, shape ``(n,)``; one if None.
+        groups: A number for each pair, the same for recordings of one person.
 
     Raises:
         InvalidInputError: If nothing varies between simulations.
@@ -143,13 +147,20 @@ def fit_discrepancy(
     z, means = standardisation(z.double()), standardisation(moments.means)
     covariance = covariances.mean(dim=0)
     is_certain = model.probability_of_none in (0.0, 1.0)
-    if not is_certain and surprise(z, means, covariances, weights) > LARGEST_SURPRISE:
-        model = replace(model, probability_of_none=0.0)
-    return model.fit(z, means, covariance, weights=weights)
+    if not is_certain:
+        found = surprise(z, means, covariances, weights=weights, groups=groups)
+        if found > LARGEST_SURPRISE:
+            model = replace(model, probability_of_none=0.0)
+    return model.fit(z, means, covariance, weights=weights, groups=groups)
 
 
 def surprise(
-    z: Tensor, means: Tensor, covariances: Tensor, weights: Tensor | None = None
+    z: Tensor,
+    means: Tensor,
+    covariances: Tensor,
+    *,
+    weights: Tensor | None = None,
+    groups: Tensor | None = None,
 ) -> float:
     r"""Return how badly a right simulator would fit, in standard deviations.
 
@@ -159,7 +170,8 @@ def surprise(
     If :math:`z_i` were a simulation with the covariance :math:`C_i`, then :math:`T_i`
     would have the mean :math:`E_i = \operatorname{tr}(C^{-1} C_i)` and, if it were
     Gaussian, the variance :math:`V_i = 2 \operatorname{tr}((C^{-1} C_i)^2)`. Here C is
-    the mean of all :math:`C_i`.
+    the mean of all :math:`C_i`. Pairs of one group have much in common at worst, so
+    that each group counts as one pair, with the means of its T, E and V.
 
     Args:
         z: The representations of the real observations, shape ``(n, l)``.
@@ -167,6 +179,7 @@ def surprise(
             which the nearest counts.
         covariances: :math:`C_i`, shape ``(n, l, l)``.
         weights: :math:`w_i`, shape ``(n,)``; one if None.
+        groups: A number for each pair, shape ``(n,)``; None if all differ.
     """
     noise = SMALLEST_NOISE**2 * torch.eye(z.shape[1]).to(covariances)
     covariances = covariances + noise
@@ -181,8 +194,15 @@ def surprise(
     expected = relative.diagonal(dim1=1, dim2=2).sum(dim=1)
     variance = 2 * (relative * relative.mT).sum(dim=(1, 2))
     w = torch.ones_like(found) if weights is None else weights.to(found)
-    total = (w * (found - expected)).sum() / (w.square() * variance).sum().sqrt()
-    return float(total)
+    excess = found - expected
+    if groups is not None:
+        w = w / groups_of(groups).bincount()[groups_of(groups)].to(w)
+        counts = Counts(w, groups)
+        (excess, w), (variance, _) = (
+            counts.of_groups(excess),
+            counts.of_groups(variance),
+        )
+    return float((w * excess).sum() / (w.square() * variance).sum().sqrt())
 
 
 def correct_npe(
@@ -194,6 +214,7 @@ def correct_npe(
     space: Space,
     model: DiscrepancyModel,
     weights: Tensor | None = None,
+    groups: Tensor | None = None,
     probabilities: Tensor | None = None,
     num_steps: int | None = None,
     courses: Courses = UNTIL_SETTLED,
@@ -211,6 +232,7 @@ def correct_npe(
         space: What z is: embeddings h(x), x itself, or embeddings by tuned nets.
         model: The model of the discrepancy.
         weights: How many pairs each pair counts as, shape ``(n_c,)``; one if None.
+        groups: A number for each pair, the same for recordings of one person.
         probabilities: The probabilities with which simulations are drawn; None makes
             them equal.
         num_steps: Gradient steps of a single course. If None, courses follow each
@@ -225,7 +247,9 @@ def correct_npe(
     """
     theta, z_s = simulations
     standardisation = Standardisation(z_s.double())
-    discrepancy = fit_discrepancy(z, moments, standardisation, model, weights=weights)
+    discrepancy = fit_discrepancy(
+        z, moments, standardisation, model, weights=weights, groups=groups
+    )
     corrected = copy.deepcopy(estimator)
     # The two share their parameters, so that training one trains the other.
     density: Any = corrected if space == "input" else headless(corrected)

@@ -10,15 +10,18 @@ import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
+from sbi_rope._groups import groups_of
 from sbi_rope._random import seeded
 from sbi_rope._validation import (
     check_batch,
+    check_groups,
     check_pair_weights,
     check_positive,
     check_same_length,
     check_tensor,
     check_unit_interval,
 )
+from sbi_rope.discrepancy.correlation import GroupErrors, independent_pairs
 from sbi_rope.discrepancy.imputation import impute
 from sbi_rope.discrepancy.posterior import Discrepancy, Term
 from sbi_rope.errors import InvalidInputError, InvalidTypeError
@@ -34,6 +37,8 @@ OFFSET_PRECISION = 1 / 3
 # some statistics have no noise at all. Its unit is the standard deviation of
 # simulations from the prior.
 SMALLEST_NOISE = 0.01
+# How many times as large the variance between the groups is as the one within them.
+VARIANCE_RATIOS = (0.0, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,6 +66,15 @@ class DiscrepancyModel:
     hyper-parameters k, s and :math:`\nu` are averaged over a grid, weighted by their
     evidence, so that there is nothing to choose.
 
+    Recordings of one person or specimen can have errors in common. If these have the
+    correlation :math:`\rho`, a group of k pairs counts as
+
+    .. math:: \frac{k}{1 + (k - 1)\, \rho}
+
+    independent ones (Kish's design effect). The factor is averaged over :math:`\rho`,
+    weighted by its evidence, see :class:`GroupErrors`. The covariance of the errors is
+    still that of all pairs, because a person can be unusual in some entries of z only.
+
     The average contains the model :math:`z_i \mid \theta_i \sim \mathcal N(m_i, C)`, in
     which the simulator is right. Before any pair is seen its probability is
     ``probability_of_none``. If the simulator is right, the probability goes to one with
@@ -74,6 +88,7 @@ class DiscrepancyModel:
     References:
         | Bayesian Calibration of Computer Models (Kennedy and O'Hagan, 2001)
         | https://doi.org/10.1111/1467-9868.00294
+        | Survey Sampling (Kish, 1965), section 5.4, of the design effect
 
     Args:
         gain_precisions: Values of k.
@@ -123,6 +138,7 @@ class DiscrepancyModel:
         covariance: Tensor,
         *,
         weights: Tensor | None = None,
+        groups: Tensor | None = None,
         seed: int = 0,
     ) -> Discrepancy:
         r"""Return the posterior of the discrepancy given calibration pairs.
@@ -144,6 +160,9 @@ class DiscrepancyModel:
             covariance: C, the covariance of simulations at one parameter, averaged over
                 the pairs, shape ``(l, l)``.
             weights: How many pairs each pair counts as, shape ``(n,)``; one if None.
+            groups: A number for each pair, shape ``(n,)``. The errors of pairs with the
+                same number can have something in common, such as those of recordings of
+                one person. None if all are independent.
             seed: Seed of the imputations.
 
         Returns:
@@ -157,25 +176,36 @@ class DiscrepancyModel:
         noise = covariance + SMALLEST_NOISE**2 * torch.eye(z.shape[1]).to(z)
         if weights is not None:
             weights = check_pair_weights(weights, "z", z).to(z)
+        if groups is not None:
+            groups = groups_of(check_groups(groups, "z", z)).to(z.device)
+            if len(groups.unique()) == len(groups):
+                groups = None
         if mean.ndim == 2:
-            return self._fit(z, mean, noise, weights)
+            return self._fit(z, mean, noise, weights, groups)
         with seeded(seed):
             return impute(
-                z, mean, lambda mean: self._fit(z, mean, noise, weights), noise=noise
+                z,
+                mean,
+                lambda mean: self._fit(z, mean, noise, weights, groups),
+                noise=noise,
             )
 
     def _fit(
-        self, z: Tensor, mean: Tensor, noise: Tensor, weights: Tensor | None
+        self,
+        z: Tensor,
+        mean: Tensor,
+        noise: Tensor,
+        weights: Tensor | None,
+        groups: Tensor | None,
     ) -> Discrepancy:
-        settings = list(itertools.product(self.error_scales, self.degrees_of_freedom))
-        regressions = [
-            _Regression.of(z, mean, k, weights=weights) for k in self.gain_precisions
-        ]
-        evidence = torch.stack([r.log_evidence(settings) for r in regressions])
+        if groups is not None:
+            weights = self._independent_pairs(z, mean, weights, groups)
+        regressions, evidence = self._regressions(z, mean, weights=weights)
         average = evidence.logsumexp(dim=(0, 1)) - math.log(evidence.numel())
         right = _log_evidence_of_none(z - mean, noise, weights)
         probability = _posterior_probability(self.probability_of_none, right - average)
         kept = evidence > evidence.max() + math.log(NEGLIGIBLE)
+        settings = self._settings
         terms = [regressions[i].at(*settings[j]) for i, j in kept.nonzero().tolist()]
         return Discrepancy(
             terms=tuple(terms),
@@ -186,6 +216,32 @@ class DiscrepancyModel:
             log_evidence_of_none=float(right),
             num_pairs=len(z),
         )
+
+    def _independent_pairs(
+        self, z: Tensor, mean: Tensor, weights: Tensor | None, groups: Tensor
+    ) -> Tensor:
+        """Return how many independent pairs each pair of a group counts as."""
+        log_evidence, counts = [], []
+        for ratio in VARIANCE_RATIOS:
+            errors = GroupErrors(groups=groups, correlation=ratio / (1 + ratio))
+            _, evidence = self._regressions(z, mean, errors=errors)
+            log_evidence.append(evidence.logsumexp(dim=(0, 1)))
+            counts.append(independent_pairs(groups, errors.correlation, weights))
+        return torch.stack(log_evidence).softmax(dim=0) @ torch.stack(counts)
+
+    def _regressions(
+        self, z: Tensor, mean: Tensor, **options: Any
+    ) -> "tuple[list[_Regression], Tensor]":
+        """Return a regression for each k, and its log evidence at each setting."""
+        regressions = [
+            _Regression.of(z, mean, k, **options) for k in self.gain_precisions
+        ]
+        evidence = [r.log_evidence(self._settings) for r in regressions]
+        return regressions, torch.stack(evidence)
+
+    @property
+    def _settings(self) -> list[tuple[float, float]]:
+        return list(itertools.product(self.error_scales, self.degrees_of_freedom))
 
 
 def _checked(z: Any, mean: Any, covariance: Any) -> tuple[Tensor, Tensor, Tensor]:
@@ -245,7 +301,8 @@ class _Regression:
             ``(l + 1, l + 1)``.
         variances: Eigenvalues of the scatter matrix of the residuals, shape ``(l,)``.
         directions: Its eigenvectors, shape ``(l, l)``.
-        log_volume: The part of the log evidence that comes from the coefficients.
+        log_volume: The part of the log evidence that comes from the coefficients, and
+            from the correlation of the errors.
         num_pairs: The number of calibration pairs, or the sum of their weights.
     """
 
@@ -264,8 +321,12 @@ class _Regression:
         gain_precision: float,
         *,
         weights: Tensor | None = None,
+        errors: GroupErrors | None = None,
     ) -> "_Regression":
-        """Return the conjugate posterior of the coefficients."""
+        """Return the conjugate posterior of the coefficients.
+
+        Either weights or the correlations of the errors are given, or none of them.
+        """
         n, width = z.shape
         identity = torch.eye(width).to(z)
         design = torch.cat([mean, torch.ones_like(mean[:, :1])], dim=1)
@@ -278,6 +339,10 @@ class _Regression:
             n = float(weights.sum())
             residual = residual * weights.sqrt()[:, None]
             design = design * weights.sqrt()[:, None]
+        log_det_errors = 0.0
+        if errors is not None:
+            residual, design = errors.independent(residual), errors.independent(design)
+            log_det_errors = errors.log_det
         factor = torch.linalg.cholesky(precision.diag() + design.T @ design)
         shift = torch.cholesky_solve(design.T @ residual, factor)
         # This is a sum of squares. The usual difference of two terms could be negative.
@@ -292,7 +357,7 @@ class _Regression:
             row_factor=torch.linalg.cholesky(torch.cholesky_inverse(factor)),
             variances=variances.clamp_min(0.0),
             directions=directions,
-            log_volume=width / 2 * (precision.log().sum() - log_det),
+            log_volume=width / 2 * (precision.log().sum() - log_det - log_det_errors),
             num_pairs=n,
         )
 

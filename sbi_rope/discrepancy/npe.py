@@ -8,7 +8,6 @@ import torch
 from torch import Tensor, nn
 
 from sbi_rope._groups import groups_of
-from sbi_rope._means import Counts
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import (
@@ -225,7 +224,8 @@ class DiscrepancyNPE(Method):
 
         The method need not be trained, and with a simulator it needs no appended
         simulations. The report is about x itself, whatever ``space`` is. Pairs with
-        equal parameters, such as recordings of one person, count once. Print it.
+        equal parameters are taken for recordings of one person, whose errors can be
+        alike. Print it.
 
         Args:
             summaries: A function from observations ``(n, *event)`` to a few summaries
@@ -281,7 +281,7 @@ class DiscrepancyNPE(Method):
             moments,
             simulated,
             model=self.model,
-            counts=_counts(self._data.calibration[0]),
+            groups=groups_of(self._data.calibration[0]),
             x_names=x_names,
             show_progress_bars=show,
         )
@@ -350,6 +350,7 @@ class DiscrepancyNPE(Method):
             moments,
             space=self.space,
             model=self.model,
+            groups=groups_of(theta),
             probabilities=probabilities,
             num_steps=self.num_steps,
             learning_rate=self.learning_rate,
@@ -376,12 +377,3 @@ class DiscrepancyNPE(Method):
         embeddings = OwnEmbeddings(nets, estimator.condition_shape)
         mixture = MixtureEstimator([Part(headless(estimator), embeddings)], [1.0])
         return MixturePosterior(mixture, copy.deepcopy(self._prior))
-
-
-def _counts(theta: Tensor) -> Counts | None:
-    """Return the counts of pairs, those with equal parameters as one."""
-    groups = groups_of(theta)
-    sizes = groups.bincount()
-    if len(sizes) == len(groups):
-        return None
-    return Counts((1.0 / sizes[groups]).to(theta.device), groups)

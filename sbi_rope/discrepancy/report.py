@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sbi_rope._means import Counts
 from sbi_rope._notebooks import shown_as_text
 from sbi_rope._progress import progress_bar
 from sbi_rope._simulations import Moments
@@ -140,7 +139,7 @@ class DiscrepancyReport:
     def _in_groups(self) -> str:
         if self.num_groups is None:
             return ""
-        return f" in {self.num_groups} groups, each of which counts once,"
+        return f" in {self.num_groups} groups, whose errors can be alike,"
 
     def renamed(self, names: Sequence[str]) -> "DiscrepancyReport":
         """Return the same report with other names of the summaries.
@@ -259,7 +258,8 @@ def report_discrepancy(
     simulated: Tensor,
     *,
     model: DiscrepancyModel,
-    counts: Counts | None = None,
+    weights: Tensor | None = None,
+    groups: Tensor | None = None,
     x_names: Sequence[str] | None = None,
     seed: int = 0,
     show_progress_bars: bool = False,
@@ -274,9 +274,9 @@ def report_discrepancy(
         moments: The moments of simulations at their parameters.
         simulated: Simulations from the prior, shape ``(n_s, l)``.
         model: The model of the discrepancy.
-        counts: How many pairs each pair counts as, and which belong together. The
-            errors of pairs of one person or specimen have much in common, so that they
-            should count as one. None if all pairs are independent.
+        weights: How many pairs each pair counts as, shape ``(n,)``; one if None.
+        groups: A number for each pair, the same for recordings of one person or
+            specimen, whose errors can have something in common; None if all differ.
         x_names: Names of the summaries; numbered if None.
         seed: Seed of the draws behind the intervals.
         show_progress_bars: Whether to show the progress if there are many summaries.
@@ -305,10 +305,7 @@ def report_discrepancy(
         m = ((moments.means[..., j] - mean) / std)[..., None]
         noise = moments.covariance[:, j, j].mean() / std.square()
         discrepancy = model.fit(
-            z,
-            m,
-            noise.reshape(1, 1),
-            weights=None if counts is None else counts.weights,
+            z, m, noise.reshape(1, 1), weights=weights, groups=groups
         )
         summaries.append(
             _summary(names[j], discrepancy, z, m, scale=float(std), seed=seed)
@@ -323,15 +320,15 @@ def report_discrepancy(
             sorted(summaries, key=lambda s: (not s.is_off, -s.size.median))
         ),
         num_pairs=len(x),
-        num_groups=_num_groups(counts),
+        num_groups=_num_groups(groups),
         constant=tuple(n for n, v in zip(names, varies, strict=True) if not v),
     )
 
 
-def _num_groups(counts: Counts | None) -> int | None:
-    if counts is None or counts.groups is None:
+def _num_groups(groups: Tensor | None) -> int | None:
+    if groups is None or (number := len(groups.unique())) == len(groups):
         return None
-    return len(counts.groups.unique())
+    return number
 
 
 def _summary(

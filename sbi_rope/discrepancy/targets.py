@@ -18,6 +18,7 @@ def tuning_targets(
     standardisation: Standardisation,
     *,
     weights: Tensor | None = None,
+    groups: Tensor | None = None,
     seed: int | None = None,
 ) -> Tensor:
     r"""Return the targets of the tuning, :math:`E[h(S(\theta_i)) \mid y_i, x_i]`.
@@ -34,13 +35,14 @@ def tuning_targets(
         standardisation: The mean and standard deviation of embeddings over simulations
             from the prior.
         weights: How many pairs each pair counts as, shape ``(n,)``; one if None.
+        groups: A number for each pair, the same for recordings of one person.
         seed: Seed of the averages over the discrepancy; None uses torch's state.
 
     Returns:
         Shape ``(n, l)``, in the dtype of z.
     """
     discrepancy = fit_discrepancy(
-        z, moments, standardisation, DiscrepancyModel(), weights=weights
+        z, moments, standardisation, DiscrepancyModel(), weights=weights, groups=groups
     )
     with seeded(seed):
         means = expected_means(

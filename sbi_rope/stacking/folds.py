@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from sbi_rope._focus import warn_if_focused
 from sbi_rope._groups import split_groups
 from sbi_rope._labels import Nodes, labelled_moments, nodes_of, reference_of
-from sbi_rope._means import counts_of
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed, estimator_of, headless
 from sbi_rope._simulations import Moments
@@ -191,7 +190,8 @@ class Workbench:
             self.moments("input"),
             self.simulations[1],
             model=DiscrepancyModel(),
-            counts=counts_of(self.score_weights, self.score_groups),
+            weights=self.pair_weights,
+            groups=self.groups,
         )
 
     @property
@@ -250,6 +250,7 @@ class Workbench:
             moments,
             Standardisation(self.embedded.double()),
             weights=_of_rows(self.pair_weights, rows),
+            groups=self.groups[rows.cpu()],
             seed=seed,
         )
 
@@ -394,6 +395,7 @@ class Fold:
             space=space,
             model=DiscrepancyModel(),
             weights=_of_rows(bench.pair_weights, self.rows),
+            groups=bench.groups[self.rows.cpu()],
             probabilities=probabilities,
             courses=IF_FAR_FROM_SETTLED,
         )

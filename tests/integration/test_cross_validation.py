@@ -22,6 +22,7 @@ from sbi_rope.stacking import (
     FinetunedCandidate,
     RehearsedCandidate,
     StackedPosterior,
+    folds,
     stacking_weights,
     trained_candidates,
 )
@@ -112,9 +113,11 @@ def test_recordings_of_a_person_are_never_both_trained_on_and_held_out(
     tuned: list[tuple[set[int], Tensor]] = []
     splits: list[tuple[set[int], set[int]]] = []
     rehearsed: list[tuple[set[int], set[int]]] = []
-    finetune, without = (
+    corrected: list[Tensor] = []
+    finetune, without, correct = (
         CalibrationFinetuner.finetune,
         trained_candidates.finetune_without,
+        folds.correct_npe,
     )
 
     def spied_finetune(self: Any, h: Any, x: Tensor, *args: Any, **options: Any) -> Any:
@@ -132,6 +135,14 @@ def test_recordings_of_a_person_are_never_both_trained_on_and_held_out(
         (rehearsed if options.get("rehearse") else splits).append((train, held_out))
         return without(start, fold, part, **options)
 
+    def spied_correct(
+        estimator: Any, simulations: Any, z: Any, *args: Any, **options: Any
+    ) -> Any:
+        corrected.append(options["groups"])
+        assert len(options["groups"]) == len(z)
+        return correct(estimator, simulations, z, *args, **options)
+
+    monkeypatch.setattr(folds, "correct_npe", spied_correct)
     monkeypatch.setattr(CalibrationFinetuner, "finetune", spied_finetune)
     monkeypatch.setattr(trained_candidates, "finetune_without", spied_without)
     scores = validated(rope_of((theta, x)), observed(), num_folds=4)
@@ -149,6 +160,9 @@ def test_recordings_of_a_person_are_never_both_trained_on_and_held_out(
     assert sorted(sorted(k) for k, _ in tuned if k not in held_out) == sorted(
         sorted(known) for known in pairs
     )
+    # The discrepancy is learned from whole people, and knows who they are.
+    assert corrected
+    assert all((groups.bincount(minlength=9) % 3 == 0).all() for groups in corrected)
     # Each of the four versions of a fine-tuned candidate holds out each of its parts.
     assert splits
     assert len(splits) % 12 == 0

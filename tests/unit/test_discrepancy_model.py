@@ -11,7 +11,8 @@ from scipy import stats
 from torch import Tensor
 
 from sbi_rope.discrepancy import Discrepancy, DiscrepancyModel
-from sbi_rope.discrepancy.model import SMALLEST_NOISE
+from sbi_rope.discrepancy.correlation import GroupErrors
+from sbi_rope.discrepancy.model import SMALLEST_NOISE, _Regression
 from sbi_rope.errors import InvalidInputError
 
 # Settings of the hyper-parameters k, s and the strength of the error's prior.
@@ -176,6 +177,75 @@ def test_the_evidence_of_the_grid_is_the_average_of_its_settings() -> None:
     expected = float(evidence.logsumexp(0)) - math.log(4)
     assert whole.log_evidence == pytest.approx(expected, abs=1e-9)
     assert torch.allclose(whole.shares, evidence.softmax(0), atol=1e-9)
+
+
+def test_the_evidence_of_correlated_errors_is_a_matrix_t_density(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """With the coefficients and the covariance integrated out by hand."""
+    monkeypatch.setattr("sbi_rope.discrepancy.model.SMALLEST_NOISE", 0.0)
+    groups = torch.tensor([0, 1, 0, 2, 1, 0, 3])
+    n, width, rho = len(groups), 2, 0.6
+    z, mean = pairs(n, width)
+    design = torch.cat([mean, torch.ones(n, 1)], dim=1)
+    rows = rho * (groups[:, None] == groups).double() + (1 - rho) * torch.eye(n)
+    for k, s, strength in SETTINGS:
+        prior = torch.tensor([1 / k] * width + [3 / k]).double()
+        spread = rows + design * prior @ design.T
+        scatter = (z - mean).T @ torch.linalg.solve(spread, z - mean)
+        degrees, scale = strength + width + 1, strength * s**2 * torch.eye(width)
+        expected = (
+            -n * width / 2 * math.log(math.pi)
+            - width / 2 * spread.logdet()
+            + degrees / 2 * scale.double().logdet()
+            - (degrees + n) / 2 * (scale + scatter).logdet()
+            + torch.special.multigammaln(torch.tensor((degrees + n) / 2), width)
+            - torch.special.multigammaln(torch.tensor(degrees / 2), width)
+        )
+        errors = GroupErrors(groups=groups, correlation=rho)
+        regression = _Regression.of(z, mean, k, errors=errors)
+        found = regression.log_evidence([(s, strength)])
+        assert float(found) == pytest.approx(float(expected), abs=1e-4)
+
+
+def std_of_offset(z: Tensor, mean: Tensor, **options: Tensor) -> float:
+    discrepancy = DiscrepancyModel(probability_of_none=0.0).fit(
+        z, mean, no_noise(z.shape[1]), **options
+    )
+    return float(discrepancy.sample(2000, seed=0).offset.std(dim=0).mean())
+
+
+def test_a_group_counts_as_many_pairs_as_its_errors_are_independent() -> None:
+    groups = torch.arange(20).repeat(4)
+    z, mean = pairs(20, 2)
+    copied = z.repeat(4, 1) + 1e-3 * torch.randn(80, 2), mean.repeat(4, 1)
+    alone = std_of_offset(z, mean)
+    assert std_of_offset(*copied) < 0.6 * alone
+    assert std_of_offset(*copied, groups=groups) == pytest.approx(alone, rel=0.15)
+    # Four recordings of twenty specimens whose errors have nothing in common.
+    apart = mean.repeat(4, 1) + 0.5 + 0.3 * torch.randn(80, 2), mean.repeat(4, 1)
+    independent = std_of_offset(*apart)
+    assert std_of_offset(*apart, groups=groups) == pytest.approx(independent, rel=0.1)
+    # Weights of what counts once anyway change nothing.
+    weights = 0.25 * torch.ones(80)
+    found = std_of_offset(*copied, groups=groups, weights=4 * weights)
+    assert found == std_of_offset(*copied, groups=groups)
+    assert std_of_offset(*copied, weights=weights) == pytest.approx(alone, rel=0.15)
+
+
+def test_groups_of_one_pair_each_change_nothing() -> None:
+    z, mean = pairs(12, 2)
+    plain = DiscrepancyModel().fit(z, mean, no_noise(2))
+    single = DiscrepancyModel().fit(z, mean, no_noise(2), groups=torch.arange(12))
+    assert plain.log_evidence == single.log_evidence
+    assert torch.equal(plain.shares, single.shares)
+    for groups, message in [
+        (torch.arange(11), "`z` and `groups` to have the same number of rows"),
+        (torch.zeros(12, 2), r"one number for each pair, shape \(n,\)"),
+        (torch.full((12,), math.nan), "`groups`"),
+    ]:
+        with pytest.raises(InvalidInputError, match=message):
+            DiscrepancyModel().fit(z, mean, no_noise(2), groups=groups)
 
 
 GRID = DiscrepancyModel(

@@ -50,7 +50,7 @@ def test_the_surprise_of_a_right_simulator_is_about_standard_normal() -> None:
 def test_weights_of_one_and_copies_of_the_means_change_no_surprise() -> None:
     z, moments = pairs(20, error=1.0)
     plain = surprise(z, moments.mean, moments.covariance)
-    ones = surprise(z, moments.mean, moments.covariance, torch.ones(20))
+    ones = surprise(z, moments.mean, moments.covariance, weights=torch.ones(20))
     several = moments.mean[:, None] + torch.tensor([0.0, 5.0])[:, None].double()
     nearest = surprise(z, several, moments.covariance)
     assert abs(plain - ones) < 1e-9
@@ -75,3 +75,34 @@ def test_a_right_simulator_stays_right() -> None:
         torch.manual_seed(0)
         found = fit_discrepancy(z, moments, unit(), DiscrepancyModel())
         assert found.probability_of_none > 0.99
+
+
+def test_people_who_differ_as_simulated_ones_do_refute_no_simulator() -> None:
+    """Their recordings do, if they are taken for independent."""
+    groups = torch.arange(8).repeat_interleave(10)
+    noise = 0.09 * torch.eye(WIDTH).double()
+    apart, together = [], []
+    for seed in range(5):
+        torch.manual_seed(seed)
+        mean = torch.randn(8, WIDTH).double()[groups]
+        person = 0.3 * torch.randn(8, WIDTH)[groups]
+        # The people are unusual in some entries, and the recordings differ in others.
+        part = torch.tensor([0.99] * 5 + [0.0] * (WIDTH - 5))
+        recording = 0.3 * torch.randn(80, WIDTH)
+        z = mean + part.sqrt() * person + (1 - part).sqrt() * recording
+        moments = Moments(mean=mean, covariance=noise.expand(80, -1, -1))
+        arguments = z, moments, unit(), DiscrepancyModel()
+        apart.append(fit_discrepancy(*arguments).probability_of_none)
+        found = fit_discrepancy(*arguments, groups=groups)
+        together.append(found.probability_of_none)
+    assert max(apart) < 0.1
+    assert min(together) > 0.9
+
+
+def test_copies_of_pairs_change_no_surprise_if_they_are_known_to_be_copies() -> None:
+    z, moments = pairs(20, error=1.0)
+    rows, groups = torch.arange(20).repeat(3), torch.arange(20).repeat(3)
+    plain = surprise(z, moments.mean, moments.covariance)
+    copied = z[rows], moments.mean[rows], moments.covariance[rows]
+    assert abs(surprise(*copied, groups=groups) - plain) < 1e-9
+    assert surprise(*copied) > 1.5 * plain

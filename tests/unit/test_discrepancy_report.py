@@ -297,7 +297,7 @@ def test_recordings_of_a_person_do_not_make_intervals_narrower() -> None:
         widths.append(sum(shift.high - shift.low for shift in shifts))
     # As independent pairs, they would be narrower by a factor of 1.7.
     assert widths[1] / widths[0] == pytest.approx(1.0, abs=0.2)
-    assert "What 60 calibration pairs in 20 groups, each of which counts" in str(found)
+    assert "What 60 calibration pairs in 20 groups, whose errors can be" in str(found)
 
 
 def test_a_report_asks_for_the_data_that_it_lacks() -> None:
