@@ -42,8 +42,8 @@ def impute(
         noise: The covariance of simulations at one parameter, shape ``(l, l)``.
 
     Returns:
-        The posterior. Its two evidences and ``probability_of_none`` are averages over
-        the imputations.
+        The posterior. Its two evidences, ``probability_of_none`` and
+        ``num_independent`` are averages over the imputations.
     """
     discrepancy = fit(possible.mean(dim=1))
     kept: list[Discrepancy] = []
@@ -64,6 +64,7 @@ def impute(
         log_evidence=_mean([one.log_evidence for one in kept]),
         log_evidence_of_none=_mean([one.log_evidence_of_none for one in kept]),
         num_pairs=len(z),
+        num_independent=_mean([one.num_independent for one in kept]),
     )
 
 

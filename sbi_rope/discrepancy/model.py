@@ -217,6 +217,7 @@ class DiscrepancyModel:
             log_evidence=float(average),
             log_evidence_of_none=float(right),
             num_pairs=len(z),
+            num_independent=len(z) if weights is None else float(weights.sum()),
         )
 
     def _correlation_within(self, groups: Tensor, z: Tensor, mean: Tensor) -> float:

@@ -62,6 +62,8 @@ class Discrepancy:
         log_evidence: Log density of the pairs under a discrepancy.
         log_evidence_of_none: Log density of the pairs if the simulator is right.
         num_pairs: The number of calibration pairs.
+        num_independent: How many independent pairs these count as: the sum of their
+            weights, less if pairs of the same group have errors in common.
     """
 
     terms: tuple[Term, ...] = field(repr=False)
@@ -71,6 +73,7 @@ class Discrepancy:
     log_evidence: float
     log_evidence_of_none: float
     num_pairs: int
+    num_independent: float
 
     @torch.no_grad()
     def sample(

@@ -23,6 +23,7 @@ __all__ = [
     "Interval",
     "SummaryDiscrepancy",
     "report_discrepancy",
+    "what_groups_count_as",
     "what_outliers_mean",
 ]
 
@@ -87,6 +88,8 @@ class SummaryDiscrepancy:
             summaries without outliers no pair is so far away by chance.
         std: The standard deviation of simulations from the prior, in the units of x;
             one if it is not known.
+        num_independent: How many independent pairs the calibration pairs count as here,
+            see :class:`~sbi_rope.discrepancy.DiscrepancyModel`; None if not known.
     """
 
     name: str
@@ -97,6 +100,7 @@ class SummaryDiscrepancy:
     probability_of_none: float
     outliers: tuple[int, ...] = ()
     std: float = 1.0
+    num_independent: float | None = None
 
     @property
     def is_off(self) -> bool:
@@ -137,9 +141,7 @@ class DiscrepancyReport:
 
     @property
     def _in_groups(self) -> str:
-        if self.num_groups is None:
-            return ""
-        return f" in {self.num_groups} groups, whose errors can be alike,"
+        return "" if self.num_groups is None else f" in {self.num_groups} groups"
 
     def renamed(self, names: Sequence[str]) -> "DiscrepancyReport":
         """Return the same report with other names of the summaries.
@@ -184,6 +186,7 @@ class DiscrepancyReport:
                 }
             row["probability_of_none"] = summary.probability_of_none
             row["outliers"] = list(summary.outliers)
+            row["num_independent"] = summary.num_independent
             rows.append(row)
         return rows
 
@@ -213,6 +216,8 @@ class DiscrepancyReport:
             lines.append(f"  no sign of discrepancy: {', '.join(fine)}")
         if self.constant:
             lines.append(f"  the same in all simulations: {', '.join(self.constant)}")
+        if counted := what_groups_count_as(self):
+            lines.append(f"  {counted}")
         outliers: dict[int, list[str]] = {}
         for summary in self.summaries:
             for row in summary.outliers:
@@ -224,6 +229,19 @@ class DiscrepancyReport:
                 f"{what_outliers_mean(len(outliers), self.num_pairs)}"
             )
         return "\n".join(lines)
+
+
+def what_groups_count_as(report: DiscrepancyReport) -> str:
+    """Say how many independent pairs those of a report count as; "" without groups."""
+    numbers = [s.num_independent for s in report.summaries if s.num_independent]
+    if report.num_groups is None or not numbers:
+        return ""
+    least, most = f"{min(numbers):.0f}", f"{max(numbers):.0f}"
+    count = least if least == most else f"{least} to {most}"
+    return (
+        "Pairs of a group can have errors in common. Here, the "
+        f"{report.num_pairs} pairs count as {count} independent ones."
+    )
 
 
 def what_outliers_mean(count: int, num_pairs: int) -> str:
@@ -366,6 +384,7 @@ def _summary(
         probability_of_none=discrepancy.probability_of_none,
         outliers=outliers,
         std=scale,
+        num_independent=discrepancy.num_independent,
     )
 
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from sbi_rope.diagnosis import Diagnosis, Finding
 from sbi_rope.diagnosis.report import IN_WORDS
 from sbi_rope.discrepancy import DiscrepancyReport
-from sbi_rope.discrepancy.report import what_outliers_mean
+from sbi_rope.discrepancy.report import what_groups_count_as, what_outliers_mean
 from sbi_rope.metrics import CoverageCurve
 from sbi_rope.metrics.calibration import acauc_of_pairs
 from sbi_rope.plots import calibration_curves, discrepancy, implied_parameters
@@ -155,6 +155,8 @@ def discrepancy_section(report: DiscrepancyReport) -> str:
         ),
         picture(discrepancy(report), caption="The same as a picture.", wide=True),
     ]
+    if counted := what_groups_count_as(report):
+        parts.append(paragraph(counted))
     outliers = sorted({row for summary in report.summaries for row in summary.outliers})
     if outliers:
         meaning = what_outliers_mean(len(outliers), report.num_pairs)

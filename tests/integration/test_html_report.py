@@ -131,14 +131,24 @@ def test_names_of_parameters_are_given_once(tmp_path: Path) -> None:
             rope_of(parameter_names=names)
 
 
-def test_the_page_says_which_pairs_count_once(tmp_path: Path) -> None:
+def test_the_page_says_which_pairs_belong_together(tmp_path: Path) -> None:
     report = the_stack().report
     scores = report.cross_validation
     groups = torch.arange(len(scores)) // 2
     grouped = replace(
         scores, groups=groups, pair_weights=torch.full((len(scores),), 0.5)
     )
-    text = Page(written(StackingReport.of(grouped), tmp_path)).text
+    assert report.discrepancy is not None
+    first, *others = report.discrepancy.summaries
+    discrepancy = replace(
+        report.discrepancy,
+        num_groups=len(scores) // 2,
+        summaries=(replace(first, num_independent=12.3), *others),
+    )
+    found = StackingReport.of(grouped, discrepancy=discrepancy)
+    text = Page(written(found, tmp_path)).text
+    most = len(scores)
+    assert f"{most} pairs count as 12 to {most} independent ones" in text
     assert f"{len(scores)} real measurements in {len(scores) // 2} groups" in text
     assert "groups" not in Page(written(report, tmp_path)).text
 
