@@ -60,10 +60,19 @@ class Reality:
         return z, mean, groups
 
 
-def fitted(z: Tensor, mean: Tensor, **options: Tensor) -> Discrepancy:
-    """Fit the discrepancy as the candidates of a stack do."""
+def fitted(
+    z: Tensor, mean: Tensor, known: Tensor | None = None, **options: Tensor
+) -> Discrepancy:
+    """Fit the discrepancy as the candidates of a stack do.
+
+    Args:
+        z: Observations.
+        mean: Their simulated means.
+        known: The specimens, if they are known where the simulator is to be refuted.
+        **options: What the model counts the pairs by.
+    """
     noise = NOISE**2 * torch.eye(WIDTH).double()
-    found = surprise(z, mean, noise.expand(len(z), -1, -1), **options)
+    found = surprise(z, mean, noise.expand(len(z), -1, -1), groups=known)
     if found > LARGEST_SURPRISE:
         return DiscrepancyModel(probability_of_none=0.0).fit(z, mean, noise, **options)
     return DiscrepancyModel().fit(z, mean, noise, **options)
@@ -84,9 +93,13 @@ def scores(reality: Reality, specimens: int, recordings: int) -> list[float]:
     """Return the scores of the three ways to count."""
     z, mean, groups = reality.draw(specimens, recordings)
     weights = torch.full((len(z),), 1 / recordings).double()
-    ways: list[dict[str, Tensor]] = [{}, {"weights": weights}, {"groups": groups}]
+    ways = [
+        fitted(z, mean),
+        fitted(z, mean, groups, weights=weights),
+        fitted(z, mean, groups, groups=groups),
+    ]
     others = reality.draw(NUM_SCORED, 1)[:2]
-    return [score(fitted(z, mean, **options), *others) for options in ways]
+    return [score(discrepancy, *others) for discrepancy in ways]
 
 
 def rows_of(args: argparse.Namespace) -> Iterator[Row]:

@@ -170,8 +170,8 @@ def surprise(
     If :math:`z_i` were a simulation with the covariance :math:`C_i`, then :math:`T_i`
     would have the mean :math:`E_i = \operatorname{tr}(C^{-1} C_i)` and, if it were
     Gaussian, the variance :math:`V_i = 2 \operatorname{tr}((C^{-1} C_i)^2)`. Here C is
-    the mean of all :math:`C_i`. Pairs of one group have much in common at worst, so
-    that each group counts as one pair, with the means of its T, E and V.
+    the mean of all :math:`C_i`. In the worst case, pairs of a group have everything in
+    common, so that each group counts as one pair, with the means of its T, E and V.
 
     Args:
         z: The representations of the real observations, shape ``(n, l)``.

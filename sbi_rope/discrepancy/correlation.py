@@ -34,8 +34,8 @@ class GroupErrors:
         tensor([[1.0000, 0.5000, 0.0000],
                 [0.5000, 1.0000, 0.0000],
                 [0.0000, 0.0000, 1.0000]])
-        >>> round(math.exp(errors.log_det), 6)
-        0.75
+        >>> round(math.exp(errors.log_det), 6), round(errors.trace_of_inverse, 6)
+        (0.75, 3.666667)
     """
 
     groups: Tensor
@@ -57,6 +57,13 @@ class GroupErrors:
         sizes = self.groups.bincount().double()
         within = (sizes - 1) * math.log1p(-self.correlation)
         return float((within + ((sizes - 1) * self.correlation).log1p()).sum())
+
+    @property
+    def trace_of_inverse(self) -> float:
+        r""":math:`\operatorname{tr} R^{-1}`."""
+        sizes = self.groups.bincount().double()
+        within = (sizes - 1) / (1 - self.correlation)
+        return float((within + 1 / (1 + (sizes - 1) * self.correlation)).sum())
 
 
 def independent_pairs(

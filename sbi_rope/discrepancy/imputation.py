@@ -20,7 +20,8 @@ NUM_DRAWS = 40
 def impute(
     z: Tensor,
     possible: Tensor,
-    fit: Callable[[Tensor], Discrepancy],
+    fit: Callable[[Tensor, Tensor | None], Discrepancy],
+    counts: Callable[[Tensor], Tensor | None],
     *,
     noise: Tensor,
 ) -> Discrepancy:
@@ -38,18 +39,25 @@ def impute(
     Args:
         z: Representations of the real observations, shape ``(n, l)``.
         possible: :math:`m_{ir}`, shape ``(n, R, l)``, equally probable before.
-        fit: Returns the posterior given one mean of each observation, ``(n, l)``.
+        fit: Returns the posterior given one mean of each observation, ``(n, l)``, and
+            how many pairs each of them counts as.
+        counts: Returns how many pairs each counts as, ``(n,)``, given these means. It
+            is asked at the start, and again for the imputations that are kept.
         noise: The covariance of simulations at one parameter, shape ``(l, l)``.
 
     Returns:
         The posterior. Its two evidences, ``probability_of_none`` and
         ``num_independent`` are averages over the imputations.
     """
-    discrepancy = fit(possible.mean(dim=1))
+    mean = possible.mean(dim=1)
+    weights = counts(mean)
+    discrepancy = fit(mean, weights)
     kept: list[Discrepancy] = []
     for number in range(NUM_WARM_UP + NUM_KEPT):
         mean = _imputed(z, possible, *_drawn(discrepancy, noise))
-        discrepancy = fit(mean)
+        if number == NUM_WARM_UP:
+            weights = counts(mean)
+        discrepancy = fit(mean, weights)
         if number >= NUM_WARM_UP:
             kept.append(discrepancy)
     shares = torch.cat([(1 - one.probability_of_none) * one.shares for one in kept])

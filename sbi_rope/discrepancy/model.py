@@ -3,7 +3,7 @@ r"""A Bayesian linear model of how real observations differ from simulations."""
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -37,8 +37,11 @@ OFFSET_PRECISION = 1 / 3
 # some statistics have no noise at all. Its unit is the standard deviation of
 # simulations from the prior.
 SMALLEST_NOISE = 0.01
-# How many times as large the variance between the groups is as the one within them.
-VARIANCE_RATIOS = (0.0, 0.3, 1.0, 3.0, 10.0, 30.0)
+# How many times as large the variance between the groups is as the one within them, and
+# their prior probabilities. Those below .2 matter for large groups only. Together they
+# are as probable as one of the others.
+VARIANCE_RATIOS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
+PRIOR_OF_RATIOS = (1 / 30,) * 5 + (1 / 6,) * 5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,7 +166,9 @@ class DiscrepancyModel:
             weights: How many pairs each pair counts as, shape ``(n,)``; one if None.
             groups: A number for each pair, shape ``(n,)``. The errors of pairs with the
                 same number can have something in common, such as those of recordings of
-                one person. None if all are independent.
+                one person. None if all are independent. Weights are multiplied by what
+                the groups leave of a pair, so that they should not be divided by the
+                number of recordings.
             seed: Seed of the imputations.
 
         Returns:
@@ -181,27 +186,27 @@ class DiscrepancyModel:
             groups = groups_of(check_groups(groups, "z", z)).to(z.device)
             if len(groups.unique()) == len(groups):
                 groups = None
+
+        def counts(mean: Tensor) -> Tensor | None:
+            if groups is None:
+                return weights
+            correlation = self._correlation_within(groups, z, mean)
+            return independent_pairs(groups, correlation, weights)
+
         if mean.ndim == 2:
-            return self._fit(z, mean, noise, weights, groups)
+            return self._fit(z, mean, noise, counts(mean))
         with seeded(seed):
             return impute(
                 z,
                 mean,
-                lambda mean: self._fit(z, mean, noise, weights, groups),
+                lambda mean, weights: self._fit(z, mean, noise, weights),
+                counts,
                 noise=noise,
             )
 
     def _fit(
-        self,
-        z: Tensor,
-        mean: Tensor,
-        noise: Tensor,
-        weights: Tensor | None,
-        groups: Tensor | None,
+        self, z: Tensor, mean: Tensor, noise: Tensor, weights: Tensor | None
     ) -> Discrepancy:
-        if groups is not None:
-            correlation = self._correlation_within(groups, z, mean)
-            weights = independent_pairs(groups, correlation, weights)
         regressions, evidence = self._regressions(z, mean, weights=weights)
         average = evidence.logsumexp(dim=(0, 1)) - math.log(evidence.numel())
         right = _log_evidence_of_none(z - mean, noise, weights)
@@ -224,12 +229,15 @@ class DiscrepancyModel:
         """Return the mean correlation of the errors of pairs of the same group."""
         ratios = torch.tensor(VARIANCE_RATIOS).to(z)
         correlations = ratios / (1 + ratios)
+        # Half of the precisions are enough to compare correlations.
+        model = replace(self, gain_precisions=self.gain_precisions[::2])
         evidence = []
         for correlation in correlations.tolist():
             errors = GroupErrors(groups=groups, correlation=correlation)
-            _, log_evidence = self._regressions(z, mean, errors=errors)
+            _, log_evidence = model._regressions(z, mean, errors=errors)
             evidence.append(log_evidence.logsumexp(dim=(0, 1)))
-        return float(torch.stack(evidence).softmax(dim=0) @ correlations)
+        log_prior = torch.tensor(PRIOR_OF_RATIOS).to(z).log()
+        return float((torch.stack(evidence) + log_prior).softmax(dim=0) @ correlations)
 
     def _regressions(
         self, z: Tensor, mean: Tensor, **options: Any
@@ -341,17 +349,18 @@ class _Regression:
             n = float(weights.sum())
             residual = residual * weights.sqrt()[:, None]
             design = design * weights.sqrt()[:, None]
-        log_det_errors = 0.0
+        num_rounded, log_det_errors = n, 0.0
         if errors is not None:
             residual, design = errors.independent(residual), errors.independent(design)
-            log_det_errors = errors.log_det
+            num_rounded, log_det_errors = errors.trace_of_inverse, errors.log_det
         factor = torch.linalg.cholesky(precision.diag() + design.T @ design)
         shift = torch.cholesky_solve(design.T @ residual, factor)
         # This is a sum of squares. The usual difference of two terms could be negative.
         left_over = residual - design @ shift
         scatter = left_over.T @ left_over + shift.T @ (precision[:, None] * shift)
         # No z is known more precisely than SMALLEST_NOISE, even if pairs agree exactly.
-        scatter = scatter + n * SMALLEST_NOISE**2 * identity
+        # Pairs are rounded one by one, whatever the errors of a group have in common.
+        scatter = scatter + num_rounded * SMALLEST_NOISE**2 * identity
         variances, directions = torch.linalg.eigh(scatter)
         log_det = 2 * factor.diagonal().log().sum()
         return cls(

@@ -224,8 +224,8 @@ class DiscrepancyNPE(Method):
 
         The method need not be trained, and with a simulator it needs no appended
         simulations. The report is about x itself, whatever ``space`` is. Pairs with
-        equal parameters are taken for recordings of one person, whose errors can be
-        alike. Print it.
+        equal parameters are taken for recordings of one person, whose errors may be
+        correlated. It says how many independent pairs they count as. Print it.
 
         Args:
             summaries: A function from observations ``(n, *event)`` to a few summaries

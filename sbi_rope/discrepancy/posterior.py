@@ -1,5 +1,6 @@
 """The posterior of gain, offset and error, and draws from it."""
 
+import math
 from dataclasses import dataclass, field
 
 import torch
@@ -63,7 +64,8 @@ class Discrepancy:
         log_evidence_of_none: Log density of the pairs if the simulator is right.
         num_pairs: The number of calibration pairs.
         num_independent: How many independent pairs these count as: the sum of their
-            weights, less if pairs of the same group have errors in common.
+            weights, less if pairs of the same group have errors in common. NaN in
+            pickles of earlier versions.
     """
 
     terms: tuple[Term, ...] = field(repr=False)
@@ -73,7 +75,7 @@ class Discrepancy:
     log_evidence: float
     log_evidence_of_none: float
     num_pairs: int
-    num_independent: float
+    num_independent: float = math.nan
 
     @torch.no_grad()
     def sample(

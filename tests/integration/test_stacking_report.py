@@ -15,6 +15,7 @@ from torch.distributions import Cauchy, Independent, MultivariateNormal
 from sbi_rope import plots
 from sbi_rope._two_sample import TwoSampleTest
 from sbi_rope._units import log_unit_of
+from sbi_rope.discrepancy import DiscrepancyModel
 from sbi_rope.errors import InvalidInputError, RoPEWarning
 from sbi_rope.metrics import LPPScore, acauc_of
 from sbi_rope.stacking import (
@@ -349,6 +350,30 @@ def test_recordings_with_the_same_parameters_count_once() -> None:
         (float(means.mean()), float(means.std()) / 12**0.5)
     )
     assert "24 held-out calibration pairs in 12 groups, each" in str(report)
+
+
+def test_every_model_of_the_discrepancy_knows_the_specimens(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    theta, x = problem(16, seed=1)
+    names = [f"specimen {k % 8}" for k in range(16)]
+    rope = rope_of(problem(0, seed=1))
+    rope.append_calibration(theta, x, theta_std=0.1, groups=names)
+    seen: list[Any] = []
+    fit = DiscrepancyModel.fit
+
+    def spied(self: Any, *args: Any, **options: Any) -> Any:
+        seen.append(options["groups"])
+        return fit(self, *args, **options)
+
+    monkeypatch.setattr(DiscrepancyModel, "fit", spied)
+    bench = Workbench(rope, num_folds=4, seed=0, show_progress_bars=False)
+    assert "the 16 pairs count as " in str(bench.discrepancy())
+    assert len(seen) == x.shape[1]
+    bench.targets(torch.arange(16), seed=0)
+    rope.train(seed=0, show_progress_bars=False)
+    assert len(seen) == x.shape[1] + 2
+    assert all(groups.tolist() == [*range(8)] * 2 for groups in seen)
 
 
 def test_recordings_of_a_named_specimen_count_once_whatever_their_labels_are() -> None:

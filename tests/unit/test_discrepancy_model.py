@@ -11,7 +11,7 @@ from scipy import stats
 from torch import Tensor
 
 from sbi_rope.discrepancy import Discrepancy, DiscrepancyModel
-from sbi_rope.discrepancy.correlation import GroupErrors
+from sbi_rope.discrepancy.correlation import GroupErrors, independent_pairs
 from sbi_rope.discrepancy.model import SMALLEST_NOISE, _Regression
 from sbi_rope.errors import InvalidInputError
 
@@ -226,11 +226,44 @@ def test_a_group_counts_as_many_pairs_as_its_errors_are_independent() -> None:
     apart = mean.repeat(4, 1) + 0.5 + 0.3 * torch.randn(80, 2), mean.repeat(4, 1)
     independent = std_of_offset(*apart)
     assert std_of_offset(*apart, groups=groups) == pytest.approx(independent, rel=0.1)
-    # Weights of what counts once anyway change nothing.
-    weights = 0.25 * torch.ones(80)
-    found = std_of_offset(*copied, groups=groups, weights=4 * weights)
-    assert found == std_of_offset(*copied, groups=groups)
-    assert std_of_offset(*copied, weights=weights) == pytest.approx(alone, rel=0.15)
+    once = std_of_offset(*copied, weights=0.25 * torch.ones(80))
+    assert once == pytest.approx(alone, rel=0.15)
+
+
+def counted(groups: Tensor, error: Tensor, **options: Tensor) -> float:
+    """How many independent pairs those with these errors count as."""
+    mean = torch.randn(int(groups.max()) + 1, error.shape[1]).double()[groups]
+    noise = no_noise(error.shape[1])
+    found = DiscrepancyModel().fit(mean + error, mean, noise, groups=groups, **options)
+    return found.num_independent
+
+
+def test_many_recordings_that_are_hardly_correlated_count_as_many_pairs() -> None:
+    groups = torch.arange(10).repeat_interleave(200)
+    for correlation in (0.0, 0.03):
+        common = correlation**0.5 * torch.randn(10, 2)[groups]
+        error = 0.3 * (common + (1 - correlation) ** 0.5 * torch.randn(2000, 2))
+        truth = 2000 / (1 + 199 * correlation)
+        assert truth / 3 < counted(groups, error) < 3 * truth
+
+
+def test_errors_below_the_smallest_noise_are_not_taken_for_common_ones() -> None:
+    groups = torch.arange(20).repeat_interleave(5)
+    for std in (0.0, 0.003, 0.01):
+        assert counted(groups, std * torch.randn(100, 2)) > 60
+
+
+def test_weights_that_differ_within_a_group_count_by_their_effective_number() -> None:
+    # The variance of their mean is that of correlated errors, summed by hand.
+    groups, weights, rho = torch.tensor([0, 0, 1]), torch.tensor([2.0, 1.0, 3.0]), 0.5
+    of_group = (4 + 1 + rho * 2 * 2 * 1) / 3**2 * (3 / 5)
+    found = independent_pairs(groups, rho, weights)
+    assert float(found[:2].sum()) == pytest.approx(1 / of_group)
+    assert float(found[2]) == 3.0
+    # All pairs are of one specimen, and labels leave two parameters possible.
+    groups, mean = torch.zeros(30).long(), torch.randn(30, 2, 2).double()
+    fitted = DiscrepancyModel().fit(mean[:, 0], mean, no_noise(2), groups=groups)
+    assert 1 <= fitted.num_independent <= 30
 
 
 def test_groups_of_one_pair_each_change_nothing() -> None:

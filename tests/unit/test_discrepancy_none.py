@@ -77,7 +77,7 @@ def test_a_right_simulator_stays_right() -> None:
         assert found.probability_of_none > 0.99
 
 
-def test_people_who_differ_as_simulated_ones_do_refute_no_simulator() -> None:
+def test_people_who_differ_as_simulated_ones_do_not_refute_a_simulator() -> None:
     """Their recordings do, if they are taken for independent."""
     groups = torch.arange(8).repeat_interleave(10)
     noise = 0.09 * torch.eye(WIDTH).double()
