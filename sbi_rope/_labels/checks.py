@@ -257,6 +257,6 @@ def warn_of_ambiguous(labels: Labels) -> None:
         warn_user(
             f"{len(labels)} labels that are not exact have {num_different} different "
             "values. Pairs with equal labels are taken for recordings at the same "
-            "parameters, and together count once. Say with `groups` which of them "
-            "are."
+            "parameters, and together count once in scores. Say with `groups` which "
+            "of them are."
         )

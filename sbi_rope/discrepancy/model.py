@@ -77,7 +77,8 @@ class DiscrepancyModel:
     independent ones (Kish's design effect). For :math:`\rho` its mean over a grid is
     taken, weighted by the evidence of matrix normal errors with this correlation. The
     covariance of the errors is still that of all pairs, because a person can be unusual
-    in some entries of z only.
+    in some entries of z only. Whether the simulator is right is judged with each group
+    as one pair.
 
     The average contains the model :math:`z_i \mid \theta_i \sim \mathcal N(m_i, C)`, in
     which the simulator is right. Before any pair is seen its probability is
@@ -187,6 +188,10 @@ class DiscrepancyModel:
             if len(groups.unique()) == len(groups):
                 groups = None
 
+        # Whether the simulator is right is judged with each group as one pair. With a
+        # correlation that is a little too low, a right simulator would be refuted.
+        once = weights if groups is None else independent_pairs(groups, 1.0, weights)
+
         def counts(mean: Tensor) -> Tensor | None:
             if groups is None:
                 return weights
@@ -194,22 +199,30 @@ class DiscrepancyModel:
             return independent_pairs(groups, correlation, weights)
 
         if mean.ndim == 2:
-            return self._fit(z, mean, noise, counts(mean))
+            return self._fit(z, mean, noise, counts(mean), once)
         with seeded(seed):
             return impute(
                 z,
                 mean,
-                lambda mean, weights: self._fit(z, mean, noise, weights),
+                lambda mean, weights: self._fit(z, mean, noise, weights, once),
                 counts,
                 noise=noise,
             )
 
     def _fit(
-        self, z: Tensor, mean: Tensor, noise: Tensor, weights: Tensor | None
+        self,
+        z: Tensor,
+        mean: Tensor,
+        noise: Tensor,
+        weights: Tensor | None,
+        once: Tensor | None,
     ) -> Discrepancy:
         regressions, evidence = self._regressions(z, mean, weights=weights)
-        average = evidence.logsumexp(dim=(0, 1)) - math.log(evidence.numel())
-        right = _log_evidence_of_none(z - mean, noise, weights)
+        judged = evidence
+        if once is not weights:
+            _, judged = self._regressions(z, mean, weights=once)
+        average = judged.logsumexp(dim=(0, 1)) - math.log(judged.numel())
+        right = _log_evidence_of_none(z - mean, noise, once)
         probability = _posterior_probability(self.probability_of_none, right - average)
         kept = evidence > evidence.max() + math.log(NEGLIGIBLE)
         settings = self._settings

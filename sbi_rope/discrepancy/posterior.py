@@ -60,8 +60,9 @@ class Discrepancy:
         shares: The shares of the terms in the evidence, which sum to one.
         noise: The covariance C of simulations at one parameter, shape ``(l, l)``.
         probability_of_none: The probability that the simulator is right.
-        log_evidence: Log density of the pairs under a discrepancy.
-        log_evidence_of_none: Log density of the pairs if the simulator is right.
+        log_evidence: Log density of the pairs under a discrepancy, to the power that
+            each group counts as one pair.
+        log_evidence_of_none: The same if the simulator is right.
         num_pairs: The number of calibration pairs.
         num_independent: How many independent pairs these count as: the sum of their
             weights, less if pairs of the same group have errors in common. NaN in
