@@ -30,7 +30,10 @@ NUM_SCORED, NUM_DRAWS = 400, 1500
 NOISE, ERROR = 0.3, 0.5
 SIZES = ((5, 20), (10, 5), (20, 3))
 CORRELATIONS = (0.0, 0.3, 0.95, "0.95 in half of the entries")
-OPTIONS = {"--trials": {"type": int, "default": 20}}
+OPTIONS = {
+    "--trials": {"type": int, "default": 20},
+    "--seed": {"type": int, "default": 0, "help": "of the random numbers"},
+}
 
 
 class Reality:
@@ -107,7 +110,7 @@ def rows_of(args: argparse.Namespace) -> Iterator[Row]:
     for right in (True, False):
         for specimens, recordings in SIZES:
             for correlation in CORRELATIONS:
-                torch.manual_seed(0)
+                torch.manual_seed(args.seed)
                 found = [
                     scores(
                         Reality(right=right, correlation=correlation),

@@ -196,12 +196,10 @@ def surprise(
     w = torch.ones_like(found) if weights is None else weights.to(found)
     excess = found - expected
     if groups is not None:
-        w = w / groups_of(groups).bincount()[groups_of(groups)].to(w)
-        counts = Counts(w, groups)
-        (excess, w), (variance, _) = (
-            counts.of_groups(excess),
-            counts.of_groups(variance),
-        )
+        numbers = groups_of(groups)
+        counts = Counts(w / numbers.bincount()[numbers].to(w), groups)
+        excess, w = counts.of_groups(excess)
+        variance, _ = counts.of_groups(variance)
     return float((w * excess).sum() / (w.square() * variance).sum().sqrt())
 
 

@@ -72,12 +72,16 @@ def independent_pairs(
     r"""Return how many independent pairs each pair counts as, shape ``(n,)``.
 
     A pair among k of its group counts as :math:`1 / (1 + (k - 1) \rho)`. If the weights
-    of a group differ, k is its effective number of pairs.
+    of a group differ, k is its effective number of pairs: the squared sum of its
+    weights over the sum of their squares.
 
     Args:
         groups: Numbers of the groups from 0 on, shape ``(n,)``.
         correlation: :math:`\rho`.
         weights: What each pair would count as by itself, shape ``(n,)``; one if None.
+
+    References:
+        | Survey Sampling (Kish, 1965), of the design effect
 
     Example:
         >>> independent_pairs(torch.tensor([0, 0, 0, 1]), 0.5)

@@ -167,17 +167,16 @@ class DiscrepancyModel:
             weights: How many pairs each pair counts as, shape ``(n,)``; one if None.
             groups: A number for each pair, shape ``(n,)``. The errors of pairs with the
                 same number can have something in common, such as those of recordings of
-                one person. None if all are independent. Weights are multiplied by what
-                the groups leave of a pair, so that they should not be divided by the
-                number of recordings.
+                one person. None if all are independent. Do not divide the weights by
+                the number of recordings as well: a group counts as fewer pairs anyway.
             seed: Seed of the imputations.
 
         Returns:
             The posterior, in float64.
 
         Raises:
-            InvalidInputError: If the shapes do not fit, a value is not finite, or
-                ``covariance`` is not a covariance matrix.
+            InvalidInputError: If the shapes do not fit, a value is not finite, a weight
+                is not positive, or ``covariance`` is not a covariance matrix.
         """
         z, mean, covariance = _checked(z, mean, covariance)
         noise = covariance + SMALLEST_NOISE**2 * torch.eye(z.shape[1]).to(z)
