@@ -629,7 +629,7 @@ class RoPE:
     def __repr__(self) -> str:
         name = type(self._npe.estimator).__name__
         state = "trained" if self.is_trained else "not trained"
-        count = len(self._labels.groups.unique())
+        count = self._labels.num_groups
         groups = f" in {count} groups" if count < len(self._x_cal) else ""
         return (
             f"RoPE({name}, {len(self._x_cal)} calibration pairs{groups}, {state}, "

@@ -40,10 +40,10 @@ def quick() -> Iterator[None]:
     tuning = CalibrationFinetuner(rehearsal=1.0, learning_rate=0.02, max_num_epochs=3)
     steps = dict.fromkeys(("embedding", "tuned", "input"), 4)
     constants = {
-        "sbi_rope.stacking.folds.NUM_SIMULATIONS": 300,
-        "sbi_rope.stacking.folds.SIMULATIONS_PER_PAIR": 5,
-        "sbi_rope.stacking.folds.TUNING": tuning,
-        "sbi_rope.stacking.folds.DiscrepancyModel": lambda: model,
+        "sbi_rope.stacking.workbench.NUM_SIMULATIONS": 300,
+        "sbi_rope.stacking.workbench.SIMULATIONS_PER_PAIR": 5,
+        "sbi_rope.stacking.workbench.TUNING": tuning,
+        "sbi_rope.stacking.workbench.DiscrepancyModel": lambda: model,
         "sbi_rope.stacking.scoring.NUM_SAMPLES": 40,
         "sbi_rope.stacking.folds.IF_FAR_FROM_SETTLED": ONE,
         "sbi_rope.discrepancy.correction.NUM_STEPS": steps,

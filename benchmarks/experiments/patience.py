@@ -23,7 +23,8 @@ from benchmarks.experiments.data import calibration_data, case_of
 from sbi_rope.mixture import MixtureEstimator
 from sbi_rope.stacking import FinetunedCandidate, RehearsedCandidate
 from sbi_rope.stacking.finetuning import REHEARSED
-from sbi_rope.stacking.folds import Fold, Workbench
+from sbi_rope.stacking.folds import Fold
+from sbi_rope.stacking.workbench import Workbench
 from sbi_rope.trainers.training import FINETUNING
 
 CANDIDATES = {

@@ -251,7 +251,7 @@ def warn_of_ambiguous(labels: Labels) -> None:
             "number of pairs that a pair counts as. If you have normalised the "
             "weights, multiply them by the number of pairs."
         )
-    num_different = len(labels.groups.unique())
+    num_different = labels.num_groups
     unnamed = labels.names is None
     if unnamed and not labels.are_exact and num_different < len(labels) / 2:
         warn_user(

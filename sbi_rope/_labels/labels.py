@@ -174,6 +174,40 @@ class Labels:
         return groups_of(torch.cat(known, dim=1))
 
     @property
+    def num_groups(self) -> int:
+        """The number of people or specimens."""
+        return len(self.groups.unique())
+
+    @property
+    def shared_groups(self) -> Tensor | None:
+        """The groups, on the device of the labels; None if no two labels share one."""
+        if self.num_groups == len(self):
+            return None
+        return self.groups.to(self.theta.device)
+
+    @property
+    def score_weights(self) -> Tensor | None:
+        """How many pairs each counts as where it is scored; None if all are one.
+
+        Labels of one person or specimen share the weight of one.
+        """
+        if (groups := self.shared_groups) is None:
+            return self.pair_weights
+        sizes = groups.bincount()[groups]
+        return self.weights / sizes.to(self.weights)
+
+    @property
+    def parameter_weights(self) -> Tensor | None:
+        """How many draws of parameters each counts as; None if all are one.
+
+        Equal parameters are then one draw, unless people were named who have them.
+        """
+        weights = self.score_weights
+        if weights is None and self.names is not None:
+            return self.weights
+        return weights
+
+    @property
     def vary_within_groups(self) -> bool:
         """Whether some person or specimen has labels that differ."""
         if self.names is None:
@@ -192,8 +226,7 @@ class Labels:
             num_noisy = int(self.is_noisy.any(dim=1).sum())
             num_partial = int((~self.is_measured).any(dim=1).sum())
             text = f"{n} labels, {num_noisy} with noise and {num_partial} partial"
-        num_groups = len(self.groups.unique())
-        if num_groups < n:
+        if (num_groups := self.num_groups) < n:
             text += f" in {num_groups} groups"
         if self.are_weighted:
             text += (

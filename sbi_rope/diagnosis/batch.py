@@ -197,7 +197,7 @@ def _held_out(
             "therefore look like a prior shift, or like a batch that is narrower than "
             "the prior."
         )
-    elif len(rope.labels.groups.unique()) < 2:
+    elif rope.labels.num_groups < 2:
         note = (
             "Residuals were left out, because all calibration pairs have the same "
             "parameters (or group), or there is only one."

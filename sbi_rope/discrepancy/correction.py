@@ -13,8 +13,9 @@ from sbi_rope._sbi import ConditionalEstimator, embedding_of, headless, with_emb
 from sbi_rope._simulations import Moments
 from sbi_rope._standardisation import Standardisation
 from sbi_rope._training import History
-from sbi_rope.discrepancy.model import SMALLEST_NOISE, DiscrepancyModel
+from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.posterior import Discrepancy
+from sbi_rope.discrepancy.regression import SMALLEST_NOISE
 from sbi_rope.discrepancy.training import (
     ONE,
     UNTIL_SETTLED,

@@ -23,7 +23,8 @@ from sbi_rope._validation import (
 )
 from sbi_rope.discrepancy.correlation import GroupErrors, independent_pairs
 from sbi_rope.discrepancy.imputation import impute
-from sbi_rope.discrepancy.posterior import Discrepancy, Term
+from sbi_rope.discrepancy.posterior import Discrepancy
+from sbi_rope.discrepancy.regression import SMALLEST_NOISE, Regression
 from sbi_rope.errors import InvalidInputError, InvalidTypeError
 
 __all__ = ["DiscrepancyModel"]
@@ -31,12 +32,6 @@ __all__ = ["DiscrepancyModel"]
 # Settings of the hyper-parameters are left out if their evidence is less than this
 # share of the evidence of the best setting.
 NEGLIGIBLE = 1e-4
-# The prior precision of the offset is this share of the precision of the gain.
-OFFSET_PRECISION = 1 / 3
-# This standard deviation is added to the noise of simulations at one parameter, because
-# some statistics have no noise at all. Its unit is the standard deviation of
-# simulations from the prior.
-SMALLEST_NOISE = 0.01
 # How many times as large the variance between the groups is as the one within them, and
 # their prior probabilities. Those below .2 matter for large groups only. Together they
 # are as probable as one of the others.
@@ -253,10 +248,10 @@ class DiscrepancyModel:
 
     def _regressions(
         self, z: Tensor, mean: Tensor, **options: Any
-    ) -> "tuple[list[_Regression], Tensor]":
+    ) -> tuple[list[Regression], Tensor]:
         """Return a regression for each k, and its log evidence at each setting."""
         regressions = [
-            _Regression.of(z, mean, k, **options) for k in self.gain_precisions
+            Regression.of(z, mean, k, **options) for k in self.gain_precisions
         ]
         evidence = [r.log_evidence(self._settings) for r in regressions]
         return regressions, torch.stack(evidence)
@@ -297,7 +292,7 @@ def _checked(z: Any, mean: Any, covariance: Any) -> tuple[Tensor, Tensor, Tensor
 def _log_evidence_of_none(
     residual: Tensor, noise: Tensor, weights: Tensor | None
 ) -> Tensor:
-    """Return the log density of z - m, rounded as ``_Regression`` assumes."""
+    """Return the log density of z - m, rounded as ``Regression`` assumes."""
     log_density = MultivariateNormal(torch.zeros_like(residual[0]), noise).log_prob
     n = len(residual) if weights is None else weights.sum()
     inexact = n * SMALLEST_NOISE**2 * torch.linalg.inv(noise).trace()
@@ -311,101 +306,3 @@ def _posterior_probability(prior: float, log_bayes_factor: Tensor) -> float:
     if prior in (0.0, 1.0):
         return prior
     return float(torch.sigmoid(log_bayes_factor + math.log(prior / (1.0 - prior))))
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Regression:
-    r"""Real observations regressed on simulated means, at one precision of the gain.
-
-    Attributes:
-        coefficients: Mean of :math:`(A, b)^\top`, shape ``(l + 1, l)``.
-        row_factor: Lower Cholesky factor of the covariance of its rows, shape
-            ``(l + 1, l + 1)``.
-        variances: Eigenvalues of the scatter matrix of the residuals, shape ``(l,)``.
-        directions: Its eigenvectors, shape ``(l, l)``.
-        log_volume: The part of the log evidence that comes from the coefficients, and
-            from the correlation of the errors.
-        num_pairs: The number of calibration pairs, or the sum of their weights.
-    """
-
-    coefficients: Tensor
-    row_factor: Tensor
-    variances: Tensor
-    directions: Tensor
-    log_volume: Tensor
-    num_pairs: float
-
-    @classmethod
-    def of(
-        cls,
-        z: Tensor,
-        mean: Tensor,
-        gain_precision: float,
-        *,
-        weights: Tensor | None = None,
-        errors: GroupErrors | None = None,
-    ) -> "_Regression":
-        """Return the conjugate posterior of the coefficients.
-
-        Either weights or the correlations of the errors are given, or none of them.
-        """
-        n, width = z.shape
-        identity = torch.eye(width).to(z)
-        design = torch.cat([mean, torch.ones_like(mean[:, :1])], dim=1)
-        prior_mean = torch.cat([identity, torch.zeros_like(identity[:1])])
-        precision = torch.full((width + 1,), gain_precision).to(z)
-        precision[-1] *= OFFSET_PRECISION
-        # Relative to the prior mean, residuals are small, and so are rounding errors.
-        residual = z - design @ prior_mean
-        if weights is not None:
-            n = float(weights.sum())
-            residual = residual * weights.sqrt()[:, None]
-            design = design * weights.sqrt()[:, None]
-        num_rounded, log_det_errors = n, 0.0
-        if errors is not None:
-            residual, design = errors.independent(residual), errors.independent(design)
-            num_rounded, log_det_errors = errors.trace_of_inverse, errors.log_det
-        factor = torch.linalg.cholesky(precision.diag() + design.T @ design)
-        shift = torch.cholesky_solve(design.T @ residual, factor)
-        # This is a sum of squares. The usual difference of two terms could be negative.
-        left_over = residual - design @ shift
-        scatter = left_over.T @ left_over + shift.T @ (precision[:, None] * shift)
-        # No z is known more precisely than SMALLEST_NOISE, even if pairs agree exactly.
-        # Pairs are rounded one by one, whatever the errors of a group have in common.
-        scatter = scatter + num_rounded * SMALLEST_NOISE**2 * identity
-        variances, directions = torch.linalg.eigh(scatter)
-        log_det = 2 * factor.diagonal().log().sum()
-        return cls(
-            coefficients=prior_mean + shift,
-            row_factor=torch.linalg.cholesky(torch.cholesky_inverse(factor)),
-            variances=variances.clamp_min(0.0),
-            directions=directions,
-            log_volume=width / 2 * (precision.log().sum() - log_det - log_det_errors),
-            num_pairs=n,
-        )
-
-    def log_evidence(self, settings: Sequence[tuple[float, float]]) -> Tensor:
-        """Return the log density of the pairs for each error scale and strength."""
-        n, width = self.num_pairs, len(self.variances)
-        error_scale, strength = self.variances.new_tensor(settings).unbind(dim=1)
-        scale = strength * error_scale.square()
-        degrees = strength + width + 1
-        log_det = (self.variances + scale[:, None]).log().sum(dim=1)
-        return (
-            -n * width / 2 * math.log(math.pi)
-            + self.log_volume
-            + degrees / 2 * width * scale.log()
-            - (degrees + n) / 2 * log_det
-            + torch.special.multigammaln((degrees + n) / 2, width)
-            - torch.special.multigammaln(degrees / 2, width)
-        )
-
-    def at(self, error_scale: float, strength: float) -> Term:
-        """Return the posterior at one error scale and strength."""
-        scale = self.variances + strength * error_scale**2
-        return Term(
-            coefficients=self.coefficients,
-            row_factor=self.row_factor,
-            error_factor=self.directions * scale.sqrt(),
-            degrees=strength + len(scale) + 1 + self.num_pairs,
-        )

@@ -5,7 +5,7 @@ from torch import Tensor
 from sbi_rope._sbi import embed
 from sbi_rope._two_sample import TwoSampleTest, compare_with_pairs
 from sbi_rope.errors import warn_user
-from sbi_rope.stacking.folds import Workbench
+from sbi_rope.stacking.workbench import Workbench
 
 __all__ = ["compare_batch"]
 

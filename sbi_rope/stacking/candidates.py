@@ -29,7 +29,8 @@ from sbi_rope.mixture import (
     part_of_prior,
 )
 from sbi_rope.rope import RoPE
-from sbi_rope.stacking.folds import Fold, Workbench
+from sbi_rope.stacking.folds import Fold
+from sbi_rope.stacking.workbench import Workbench
 
 __all__ = [
     "AmortisedCandidate",

@@ -16,7 +16,6 @@ from sbi_rope.stacking.candidates import (
     CouplingCandidate,
     DensityCandidate,
 )
-from sbi_rope.stacking.folds import NUM_FOLDS, Workbench
 from sbi_rope.stacking.trained_candidates import (
     DiscrepancyCandidate,
     FinetunedCandidate,
@@ -27,6 +26,7 @@ from sbi_rope.stacking.unlabelled_candidates import (
     MIN_OBSERVATIONS,
     RVNPCandidate,
 )
+from sbi_rope.stacking.workbench import NUM_FOLDS, Workbench
 
 __all__ = ["default_candidates"]
 

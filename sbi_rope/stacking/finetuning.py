@@ -73,7 +73,7 @@ def finetune_without(
     of_labels = None
     if not bench.labels.are_exact:
         of_labels = _losses_of_labels(fold, start, estimator)
-    weights = bench.pair_weights
+    weights = bench.labels.pair_weights
 
     def losses(rows: Tensor) -> Tensor:
         if of_labels is not None:

@@ -10,9 +10,9 @@ from sbi_rope._random import seeded
 from sbi_rope.metrics.calibration import central_levels, count_ranks
 from sbi_rope.metrics.calls import draw_samples
 from sbi_rope.mixture import MixtureEstimator, MixturePosterior
-from sbi_rope.stacking.folds import Workbench
 from sbi_rope.stacking.held_out import FoldScores, explained
 from sbi_rope.stacking.versions import Versions
+from sbi_rope.stacking.workbench import Workbench
 
 __all__ = ["LabelScores", "label_levels", "score_labelled_fold", "score_labels"]
 

@@ -23,8 +23,8 @@ from sbi_rope.recalibration import Recalibration
 from sbi_rope.recalibration.estimator import RecalibratedEstimator
 from sbi_rope.recalibration.factors import HeldOutMixture
 from sbi_rope.recalibration.recalibration import recalibrate
-from sbi_rope.stacking.folds import Workbench
 from sbi_rope.stacking.versions import Versions
+from sbi_rope.stacking.workbench import Workbench
 
 __all__ = ["check_recalibration", "pairs_of_folds", "recalibrated", "recalibration_of"]
 
@@ -139,7 +139,7 @@ def _say_something(theta: Tensor, prior: Any, bounds: Bounds) -> Tensor:
 
 
 def _counts(bench: Workbench) -> Counts:
-    weights = bench.score_weights
+    weights = bench.labels.score_weights
     if weights is None:
         weights = torch.ones(len(bench.theta), device=bench.theta.device)
-    return Counts(weights.double(), bench.score_groups)
+    return Counts(weights.double(), bench.labels.shared_groups)

@@ -11,7 +11,6 @@ from sbi_rope.errors import warn_user
 from sbi_rope.mixture import MixturePosterior
 from sbi_rope.stacking.candidates import Candidate
 from sbi_rope.stacking.cross_validation import CrossValidation, fold_weights
-from sbi_rope.stacking.folds import Workbench
 from sbi_rope.stacking.held_out import FoldScores, SetScores, joined, score_fold
 from sbi_rope.stacking.label_scores import (
     LabelScores,
@@ -19,6 +18,7 @@ from sbi_rope.stacking.label_scores import (
     score_labels,
 )
 from sbi_rope.stacking.versions import Versions
+from sbi_rope.stacking.workbench import Workbench
 
 __all__ = ["score_versions"]
 
@@ -52,7 +52,7 @@ def score_versions(
         ]
     log_scores, fold = _log_scores(bench, versions, of_labels)
     weights = fold_weights(
-        log_scores, fold, pseudo_count, pair_weights=bench.score_weights
+        log_scores, fold, pseudo_count, pair_weights=bench.labels.score_weights
     )
     of_stack = _stack_scores(bench, versions, weights, of_labels, seed=seed)
     scores = CrossValidation(
@@ -66,13 +66,13 @@ def score_versions(
         set_scores=_set_scores(bench, of_stack, weights, seed=seed),
         pseudo_count=pseudo_count,
         log_unit=_log_unit(bench),
-        pair_weights=bench.score_weights,
-        groups=bench.score_groups,
+        pair_weights=bench.labels.score_weights,
+        groups=bench.labels.shared_groups,
         score_errors=None if bench.labels.are_exact else of_stack.errors,
         labels="" if bench.labels.are_simple else str(bench.labels),
     )
     if not scores.weights.converged:
-        counted = bench.score_weights
+        counted = bench.labels.score_weights
         total = len(fold) if counted is None else float(counted.sum())
         warn_user(
             "The weights of the stack have not converged: the held-out score could "
@@ -190,7 +190,7 @@ def _log_unit(bench: Workbench) -> float:
     if labels.are_exact:
         return float(units.sum())
     known = labels.is_measured.to(units)
-    weights = bench.score_weights
+    weights = bench.labels.score_weights
     weights = labels.weights if weights is None else weights
     shares = weights.to(units) / weights.sum().to(units)
     return float((shares @ known) @ units)

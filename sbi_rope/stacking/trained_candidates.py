@@ -10,7 +10,8 @@ from sbi_rope.discrepancy.correction import Space
 from sbi_rope.mixture import OwnEmbeddings, Part, part_of
 from sbi_rope.stacking.candidates import AmortisedCandidate
 from sbi_rope.stacking.finetuning import finetune_without
-from sbi_rope.stacking.folds import Fold, Workbench
+from sbi_rope.stacking.folds import Fold
+from sbi_rope.stacking.workbench import Workbench
 
 __all__ = ["DiscrepancyCandidate", "FinetunedCandidate", "RehearsedCandidate"]
 

@@ -38,7 +38,7 @@ from sbi_rope.stacking.candidates import (
 from sbi_rope.stacking.couplings import FittedCouplings, fit_couplings
 from sbi_rope.stacking.cross_validation import CrossValidation, fold_weights
 from sbi_rope.stacking.defaults import default_candidates
-from sbi_rope.stacking.folds import NUM_FOLDS, Fold, Workbench, draw_seeds
+from sbi_rope.stacking.folds import Fold
 from sbi_rope.stacking.recalibrating import pairs_of_folds, recalibration_of
 from sbi_rope.stacking.scoring import score_versions
 from sbi_rope.stacking.trained_candidates import (
@@ -47,6 +47,7 @@ from sbi_rope.stacking.trained_candidates import (
 )
 from sbi_rope.stacking.unlabelled_candidates import RVNPCandidate
 from sbi_rope.stacking.versions import Versions, train_version
+from sbi_rope.stacking.workbench import NUM_FOLDS, Workbench, draw_seeds
 
 __all__ = ["StackTrainer"]
 
@@ -206,7 +207,7 @@ class StackTrainer:
             scores.log_scores,
             scores.fold,
             self.pseudo_count,
-            pair_weights=bench.score_weights,
+            pair_weights=bench.labels.score_weights,
         )
         # The others take as long to train, and hardly change how wide the stack is.
         kept = (weights >= MIN_WEIGHT).any(dim=0).nonzero().flatten()

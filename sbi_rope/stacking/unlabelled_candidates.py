@@ -10,7 +10,8 @@ from sbi_rope._sbi import estimator_of
 from sbi_rope._validation import check_choice
 from sbi_rope.mixture import Part, part_of
 from sbi_rope.stacking.candidates import AmortisedCandidate
-from sbi_rope.stacking.folds import Fold, Workbench
+from sbi_rope.stacking.folds import Fold
+from sbi_rope.stacking.workbench import Workbench
 
 __all__ = ["RVNPCandidate"]
 

@@ -27,7 +27,8 @@ from sbi_rope.stacking import (
     trained_candidates,
 )
 from sbi_rope.stacking.finetuning import BATCH_SIZE, finetune_without
-from sbi_rope.stacking.folds import Fold, Workbench
+from sbi_rope.stacking.folds import Fold
+from sbi_rope.stacking.workbench import Workbench
 from tests import problems
 from tests.stacks import (
     CANDIDATES,

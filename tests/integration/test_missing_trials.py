@@ -18,7 +18,7 @@ from sbi_rope.errors import (
 )
 from sbi_rope.metrics import draw_samples, evaluate
 from sbi_rope.stacking import DiscrepancyCandidate, default_candidates
-from sbi_rope.stacking.folds import Workbench
+from sbi_rope.stacking.workbench import Workbench
 from sbi_rope.trainers import FinetunedNPE
 from sbi_rope.trainers.training import Training
 from tests import problems

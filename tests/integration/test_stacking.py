@@ -24,7 +24,7 @@ from sbi_rope.stacking import (
     default_candidates,
     stacking_weights,
 )
-from sbi_rope.stacking.folds import Workbench
+from sbi_rope.stacking.workbench import Workbench
 from tests import gaussian, problems
 from tests.stacks import (
     COUPLINGS,

@@ -25,7 +25,7 @@ from sbi_rope.stacking import (
     LearningCurve,
     StackingReport,
 )
-from sbi_rope.stacking.folds import Workbench
+from sbi_rope.stacking.workbench import Workbench
 from tests import problems
 from tests.stacks import (
     FITTED,

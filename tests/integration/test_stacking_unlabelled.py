@@ -20,7 +20,8 @@ from sbi_rope.baselines.rvnp.likelihood import fit_surrogate
 from sbi_rope.errors import InvalidInputError, RoPEWarning
 from sbi_rope.mixture import MixtureEstimator
 from sbi_rope.stacking import RVNPCandidate, default_candidates
-from sbi_rope.stacking.folds import Fold, Workbench
+from sbi_rope.stacking.folds import Fold
+from sbi_rope.stacking.workbench import Workbench
 from tests import gaussian, problems
 from tests.stacks import (
     FITTED,
@@ -76,7 +77,7 @@ def other_x() -> Tensor:
 
 def test_it_is_rvnp_of_the_simulations_that_other_candidates_see() -> None:
     candidate = RVNPCandidate(observed(NUM_OBSERVATIONS), space="input")
-    with patch("sbi_rope.stacking.folds.NUM_SIMULATIONS", 300):
+    with patch("sbi_rope.stacking.workbench.NUM_SIMULATIONS", 300):
         bench = Workbench(rope_of(), num_folds=3, seed=4, show_progress_bars=False)
         with seeded(7):
             (part,) = candidate.parts(Fold(bench, [0]))

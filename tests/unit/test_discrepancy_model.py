@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sbi_rope.discrepancy import Discrepancy, DiscrepancyModel
 from sbi_rope.discrepancy.correlation import GroupErrors, independent_pairs
-from sbi_rope.discrepancy.model import SMALLEST_NOISE, _Regression
+from sbi_rope.discrepancy.regression import SMALLEST_NOISE, Regression
 from sbi_rope.errors import InvalidInputError
 
 # Settings of the hyper-parameters k, s and the strength of the error's prior.
@@ -135,7 +135,7 @@ def log_predictive(z: Tensor, mean: Tensor, setting: tuple[float, ...]) -> float
 def test_the_evidence_is_the_product_of_one_step_ahead_predictions(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("sbi_rope.discrepancy.model.SMALLEST_NOISE", 0.0)
+    monkeypatch.setattr("sbi_rope.discrepancy.regression.SMALLEST_NOISE", 0.0)
     for width in (1, 2, 4):
         z, mean = pairs(9, width)
         for setting in SETTINGS:
@@ -183,7 +183,7 @@ def test_the_evidence_of_correlated_errors_is_a_matrix_t_density(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """With the coefficients and the covariance integrated out by hand."""
-    monkeypatch.setattr("sbi_rope.discrepancy.model.SMALLEST_NOISE", 0.0)
+    monkeypatch.setattr("sbi_rope.discrepancy.regression.SMALLEST_NOISE", 0.0)
     groups = torch.tensor([0, 1, 0, 2, 1, 0, 3])
     n, width, rho = len(groups), 2, 0.6
     z, mean = pairs(n, width)
@@ -203,7 +203,7 @@ def test_the_evidence_of_correlated_errors_is_a_matrix_t_density(
             - torch.special.multigammaln(torch.tensor(degrees / 2), width)
         )
         errors = GroupErrors(groups=groups, correlation=rho)
-        regression = _Regression.of(z, mean, k, errors=errors)
+        regression = Regression.of(z, mean, k, errors=errors)
         found = regression.log_evidence([(s, strength)])
         assert float(found) == pytest.approx(float(expected), abs=1e-4)
 

@@ -31,8 +31,8 @@ from sbi_rope.errors import (
 )
 from sbi_rope.metrics import acauc_of, coverage_curve_of, expected_coverage_error_of
 from sbi_rope.stacking import stacking_weights
-from sbi_rope.stacking.folds import Workbench
 from sbi_rope.stacking.label_scores import label_levels
+from sbi_rope.stacking.workbench import Workbench
 from tests import gaussian
 
 NAN = math.nan
