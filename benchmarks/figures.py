@@ -33,7 +33,9 @@ LEGEND_LINES = 4.5
 # Calibration pairs behind calibration curves and corner plots, where there is a choice.
 SHOWN_PAIRS = 50
 # Methods in corner plots.
-CORNERS = ("NPE", "RoPE", "fine-tuned NPE", "prior")
+CORNERS = ("NPE", "RoPE", "stack", "prior")
+# More parameters than these make a corner plot that nobody can read.
+MAX_PARAMETERS = 6
 
 
 class LPPAxis:
@@ -304,16 +306,20 @@ def _corners(table: Table) -> Iterator[tuple[str, str, Any]]:
         arrays = {name: table.arrays[c] for name, c in cells.items() if name in CORNERS}
         if "RoPE" not in arrays:
             continue
-        samples = {n: torch.from_numpy(a["samples"]) for n, a in arrays.items()}
+        scores = table.rows["acauc_per_parameter"][cells["RoPE"]].split("; ")
+        names = [score.split("=")[0] for score in scores]
+        shown = slice(MAX_PARAMETERS)
+        samples = {
+            n: torch.from_numpy(a["samples"])[:, shown] for n, a in arrays.items()
+        }
         prior = samples.pop("prior", None)
-        theta = torch.from_numpy(arrays["RoPE"]["theta"])
+        theta = torch.from_numpy(arrays["RoPE"]["theta"])[shown]
         name = "-".join(data_in_words(*where))
         name = "".join(c if c.isalnum() or c in "-_." else "_" for c in name)
-        scores = table.rows["acauc_per_parameter"][cells["RoPE"]].split("; ")
         figure = plots.pair_plot(
-            samples,
-            theta,
-            prior=prior,
-            parameter_names=[score.split("=")[0] for score in scores],
+            samples, theta, prior=prior, parameter_names=names[shown]
         )
-        yield f"corner-{name}.png", f"Posteriors of one observation, {name}", figure
+        what = f"Posteriors of one observation, {name}"
+        if len(names) > MAX_PARAMETERS:
+            what += f", the first {MAX_PARAMETERS} of {len(names)} parameters"
+        yield f"corner-{name}.png", what, figure
