@@ -53,7 +53,7 @@ example-quickstart: $(VENV)/.installed
 example-tunnel: $(VENV)/.installed
 ifneq ($(wildcard $(DATA)),)
 	$(EXAMPLE)/light_tunnel_sensors.py --root $(DATA) --num-simulations 2000 \
-	    --n-calibration 10 --n-test 50 --out $(OUT)/tunnel
+	    --density-estimator mdn --n-calibration 10 --n-test 50 --out $(OUT)/tunnel
 else
 	@echo "examples/light_tunnel_sensors.py: skipped, no $(DATA)"
 endif

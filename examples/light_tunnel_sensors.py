@@ -16,7 +16,13 @@ from sbi_rope import SinkhornCoupler
 from sbi_rope.tasks import Task, get_task
 
 
-def train_npe(task: Task, seed: int, num_simulations: int = 20_000) -> Any:
+def train_npe(
+    task: Task,
+    seed: int,
+    *,
+    num_simulations: int = 20_000,
+    density_estimator: str = "nsf",
+) -> Any:
     """Train plain sbi on simulations; nothing here knows of RoPE."""
     torch.manual_seed(seed)
     prior, simulator = task.get_prior(), task.get_simulator()
@@ -24,7 +30,7 @@ def train_npe(task: Task, seed: int, num_simulations: int = 20_000) -> Any:
     npe = NPE(
         prior,
         density_estimator=posterior_nn(
-            "nsf",
+            density_estimator,
             embedding_net=task.get_embedding_net(),
             num_transforms=3,
             hidden_features=50,
@@ -47,10 +53,20 @@ def main() -> None:
     parser.add_argument("--root", type=Path, required=True, help="folder of the data")
     parser.add_argument("--download", action="store_true", help="fetch the data set")
     parser.add_argument("--num-simulations", type=int, default=20_000)
+    parser.add_argument(
+        "--density-estimator",
+        default="nsf",
+        help="any that sbi's posterior_nn knows; mdn is quicker",
+    )
     args = parser.parse_args()
     Study(
         task=get_task("light_tunnel_sensors", root=args.root, download=args.download),
-        train_npe=lambda task, seed: train_npe(task, seed, args.num_simulations),
+        train_npe=lambda task, seed: train_npe(
+            task,
+            seed,
+            num_simulations=args.num_simulations,
+            density_estimator=args.density_estimator,
+        ),
         # Chosen on calibration data, see benchmarks/README.md.
         coupler=SinkhornCoupler(gamma=0.1, tau=1.0),
         seeds=args.seeds,
