@@ -123,11 +123,16 @@ class Labels:
         return self.is_measured.any(dim=1)
 
     @property
+    def is_exact(self) -> Tensor:
+        """Which labels know all parameters exactly, shape ``(n,)``."""
+        if self.samples is not None:
+            return torch.zeros_like(self.says_something)
+        return (self.is_measured & ~self.is_noisy).all(dim=1)
+
+    @property
     def are_exact(self) -> bool:
         """Whether all parameters of all labels are known exactly."""
-        if self.samples is not None:
-            return False
-        return bool(self.is_measured.all()) and not bool(self.is_noisy.any())
+        return bool(self.is_exact.all()) and self.samples is None
 
     @property
     def are_weighted(self) -> bool:

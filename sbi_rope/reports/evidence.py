@@ -12,7 +12,7 @@ from sbi_rope.plots import calibration_curves, discrepancy, implied_parameters
 from sbi_rope.reports.numbers import number, percent
 from sbi_rope.reports.page import finding, paragraph, picture, section, table
 from sbi_rope.stacking import StackingReport
-from sbi_rope.stacking.words import LEVEL, sets_held
+from sbi_rope.stacking.words import LEVEL, is_measured, sets_held
 
 __all__ = [
     "calibration_section",
@@ -91,11 +91,14 @@ def _sets(report: StackingReport) -> list[str]:
     if held is None:
         return []
     share, size = held
+    of = "the measurements"
+    if is_measured(report):
+        of += " whose parameters are known exactly"
     return [
         paragraph(
             f"{percent(LEVEL)} sets of all parameters together held those of "
-            f"{percent(share)} of the measurements. Sets that are guaranteed to hold "
-            f"about {percent(LEVEL)} are {size}.",
+            f"{percent(share)} of {of}. Sets that are guaranteed to hold about "
+            f"{percent(LEVEL)} are {size}.",
             kind="note",
         )
     ]

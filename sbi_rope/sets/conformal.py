@@ -73,9 +73,9 @@ def check_enough(level: float, n: int) -> None:
         fewest = math.ceil(round(level / (1 - level), DIGITS))
         raise InvalidInputError(
             f"Expected `level` of at most n / (n + 1) = {n / (n + 1):.3g} for a set "
-            f"with a guarantee, because there are n = {n} calibration pairs with "
-            f"different parameters (or groups); got {level:g}. Ask for a smaller "
-            f"level, or add pairs: this level needs {fewest}."
+            f"with a guarantee, because there are n = {n} calibration pairs with exact "
+            f"labels of different parameters (or groups); got {level:g}. Ask for a "
+            f"smaller level, or add pairs: this level needs {fewest}."
         )
 
 

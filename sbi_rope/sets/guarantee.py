@@ -38,7 +38,8 @@ class Guarantee:
 
     Attributes:
         level: The level that was asked for.
-        num_pairs: The number n of calibration pairs, one of each group.
+        num_pairs: The number n of calibration pairs with exact labels, one of each
+            group.
         num_folds: The number K of folds.
     """
 

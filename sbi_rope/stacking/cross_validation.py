@@ -77,7 +77,7 @@ class CrossValidation:
             unknown. Scores with theta in these units are higher by this number. With
             partial labels, the mean over pairs of the sum over measured parameters.
         set_scores: The scores that sets with a guarantee are made from; None in files
-            of earlier versions, and if labels are not exact.
+            of earlier versions, and if no label is exact.
         pair_weights: How many pairs each pair counts as, shape ``(n,)``. Pairs of one
             group share the weight of one. None if all count as one.
         groups: A number for each pair, the same for pairs of one person or specimen,

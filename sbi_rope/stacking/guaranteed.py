@@ -144,12 +144,12 @@ class HeldOutSets:
     def _scores(self, level: float) -> tuple[SetScores, Guarantee]:
         """Return the scores and what they promise; raise if there are too few."""
         scores = self._validation.set_scores
-        if self._validation.score_errors is not None:
+        if scores is None and self._validation.score_errors is not None:
             raise InvalidInputError(
-                "Expected a stack of exact labels for a set with a guarantee; got "
+                "Expected some exact labels for a set with a guarantee; got "
                 f"{self._validation.labels}. A set that holds a measurement need not "
-                "hold the parameters. Use guaranteed=False, or stack the exact labels "
-                "alone."
+                "hold the parameters. Use guaranteed=False, or add pairs whose "
+                "parameters are all known."
             )
         if scores is None:
             raise InvalidInputError(

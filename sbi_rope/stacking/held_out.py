@@ -43,7 +43,8 @@ class SetScores:
             contains the true one, shape ``(n, d)``. It is above 1 beyond all draws, see
             :func:`sbi_rope.sets.conformal.marginal_scores`.
         is_counted: The pairs that count, shape ``(n,)``. Those of one group are not
-            exchangeable one by one. One of them counts, chosen at random.
+            exchangeable one by one. One of them counts, chosen at random. Pairs whose
+            label is not exact do not count, and their scores are NaN.
         weights: The weights of the stack that scored each fold, shape ``(F, K)``.
         num_draws: The number of draws that the scores were computed from.
     """

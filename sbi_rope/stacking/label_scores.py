@@ -10,7 +10,7 @@ from sbi_rope._random import seeded
 from sbi_rope.metrics.calibration import central_levels, count_ranks
 from sbi_rope.metrics.calls import draw_samples
 from sbi_rope.mixture import MixtureEstimator, MixturePosterior
-from sbi_rope.stacking.held_out import FoldScores, explained
+from sbi_rope.stacking.held_out import FoldScores, explained, score_fold
 from sbi_rope.stacking.versions import Versions
 from sbi_rope.stacking.workbench import Workbench
 
@@ -111,8 +111,8 @@ def score_labelled_fold(
         seed: Seed of the draws.
 
     Returns:
-        The scores. Those of sets are NaN: a set that holds a label need not hold the
-        parameters.
+        The scores. Those of sets are NaN where a label is not exact: a set that holds
+        a label need not hold the parameters.
 
     Raises:
         SamplingError: If the posterior has almost no mass inside the prior's support.
@@ -121,12 +121,18 @@ def score_labelled_fold(
     with explained(), seeded(seed):
         log_mass = posterior.leakage_correction(x).double().log()
         levels = label_levels(posterior, labels, x, num_samples=num_samples)
-    unknown = torch.full_like(labels.theta, torch.nan)
+    marginal = torch.full_like(labels.theta, torch.nan)
+    joint = torch.full_like(log_prob, torch.nan)
+    if (exact := labels.is_exact).any():
+        known = score_fold(
+            posterior, labels.theta[exact], x[exact], num_samples=num_samples, seed=seed
+        )
+        joint[exact], marginal[exact] = known.joint, known.marginal.to(marginal)
     return FoldScores(
         log_prob=log_prob - log_mass,
         levels=levels,
-        joint=unknown[:, 0],
-        marginal=unknown,
+        joint=joint,
+        marginal=marginal,
         errors=errors,
     )
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from sbi_rope._groups import one_of_each_group
+from sbi_rope._groups import groups_of, one_of_each_group
 from sbi_rope._units import log_units_of
 from sbi_rope.errors import warn_user
 from sbi_rope.mixture import MixturePosterior
@@ -167,11 +167,14 @@ def _set_scores(
 ) -> SetScores | None:
     """Return what sets with a guarantee are made from; None without exact labels.
 
-    A set that holds a noisy label need not hold the parameters.
+    Labels that are not exact do not count: a set that holds a noisy label need not hold
+    the parameters.
     """
-    if not bench.labels.are_exact:
+    is_counted = bench.labels.is_exact.cpu()
+    if not is_counted.any():
         return None
-    is_counted = one_of_each_group(bench.groups, seed=seed)
+    groups = groups_of(bench.groups[is_counted])
+    is_counted[is_counted.clone()] = one_of_each_group(groups, seed=seed)
     return SetScores(
         joint=of_stack.joint,
         marginal=of_stack.marginal,

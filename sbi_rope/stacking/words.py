@@ -302,8 +302,9 @@ def _sets(report: "StackingReport") -> list[str]:
     if held is None:
         return []
     share, size = held
+    of = "pairs with exact labels" if is_measured(report) else "pairs"
     return [
-        f"    {LEVEL:.0%} sets of all parameters hold {share:.0%} of the pairs; with a "
+        f"    {LEVEL:.0%} sets of all parameters hold {share:.0%} of the {of}; with a "
         "guarantee,",
         f"    `posterior.credible_set({LEVEL}, x, guaranteed=True)`, they are {size}",
     ]

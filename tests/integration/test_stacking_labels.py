@@ -50,7 +50,7 @@ def test_a_stack_is_scored_on_what_was_measured(tmp_path: Any) -> None:
     text = str(posterior.report)
     assert "20 labels, 20 with noise and 10 partial" in text
     assert math.isfinite(posterior.report.acauc.value)
-    with pytest.raises(InvalidInputError, match="exact labels"):
+    with pytest.raises(InvalidInputError, match="some exact labels"):
         posterior.credible_set(0.8, x=observed()[:1], guaranteed=True)
     posterior.save(tmp_path / "stack")
     loaded = load(tmp_path / "stack")
@@ -61,6 +61,33 @@ def test_a_stack_is_scored_on_what_was_measured(tmp_path: Any) -> None:
     assert "2 parameters are known" not in page
     assert "of the measured values, with the noise of their labels" in page
     assert ">nan<" not in page
+
+
+def test_exact_labels_among_others_give_sets_with_a_guarantee(tmp_path: Path) -> None:
+    """One of each specimen counts, and none whose label is noisy or partial."""
+    std = torch.zeros(NUM_PAIRS, 2)
+    std[1] = 0.1
+    options = {"theta_std": std, "groups": [*range(16), 15, 15, 0, 2]}
+    posterior = stacked(labelled(PARTIAL, **options), candidates=[PRIOR, NPE])
+    is_exact = ~torch.isnan(PARTIAL).any(dim=1) & (std[:, 0] == 0)
+    scores = posterior.report.cross_validation.set_scores
+    assert scores is not None
+    for values in (scores.joint, scores.marginal[:, 0], scores.marginal[:, 1]):
+        assert torch.equal(torch.isfinite(values), is_exact)
+    # Nine labels are exact, and two of these are of specimen 15.
+    assert bool((scores.is_counted <= is_exact).all())
+    assert len(scores) == 8
+    x = observed()[:1]
+    found = posterior.credible_set(0.8, x, guaranteed=True, num_samples=40, seed=0)
+    assert found.guarantee is not None
+    assert found.guarantee.num_pairs == 8
+    assert "of the pairs with exact labels" not in str(posterior.report)  # 90 % need 9
+    posterior.save(tmp_path / "stack")
+    again = load(tmp_path / "stack").credible_intervals(0.8, x, guaranteed=True, seed=0)
+    expected = posterior.credible_intervals(0.8, x, guaranteed=True, seed=0)
+    assert torch.equal(again.low, expected.low)
+    with pytest.raises(InvalidInputError, match="n = 8 calibration pairs with exact"):
+        posterior.credible_set(0.9, x, guaranteed=True)
 
 
 def test_coverage_of_labels_that_are_not_exact_is_that_of_measured_values() -> None:
