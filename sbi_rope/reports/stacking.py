@@ -34,7 +34,14 @@ from sbi_rope.reports.page import (
 )
 from sbi_rope.reports.verdict import verdict_of
 from sbi_rope.stacking import StackingReport
-from sbi_rope.stacking.words import IN_WORDS, are_relative, differs, gains_of
+from sbi_rope.stacking.words import (
+    IF_MOSTLY_PRIOR,
+    IN_WORDS,
+    MOSTLY,
+    are_relative,
+    differs,
+    gains_of,
+)
 
 __all__ = ["write_stacking_report"]
 
@@ -238,6 +245,8 @@ def _weight_section(report: StackingReport) -> str:
         ),
         picture(figure, caption="The weight of each method in the stack."),
     ]
+    if weights.get("prior", 0.0) >= MOSTLY:
+        parts.append(paragraph(f"{IF_MOSTLY_PRIOR}.", kind="note"))
     curve = report.learning_curve
     if curve is not None:
         figure, axes = new_figure(5.4, 3.2)

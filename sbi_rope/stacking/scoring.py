@@ -1,11 +1,13 @@
 """Score the candidates of a stack, and the stack itself, on the folds held out."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from sbi_rope._groups import groups_of, one_of_each_group
+from sbi_rope._progress import progress_bar
 from sbi_rope._units import log_units_of
 from sbi_rope.errors import warn_user
 from sbi_rope.mixture import MixturePosterior
@@ -45,16 +47,19 @@ def score_versions(
         pseudo_count: The strength of the prior of the weights.
         seed: Seed of the draws at the held-out pairs.
     """
-    of_labels = None
-    if not bench.labels.are_exact:
-        of_labels = [
-            score_labels(bench, versions, number) for number in range(len(bench.folds))
-        ]
-    log_scores, fold = _log_scores(bench, versions, of_labels)
-    weights = fold_weights(
-        log_scores, fold, pseudo_count, pair_weights=bench.labels.score_weights
-    )
-    of_stack = _stack_scores(bench, versions, weights, of_labels, seed=seed)
+    # Samples of a flow can take longer than its training did.
+    with progress_bar(
+        show=bench.show,
+        desc=f"Scoring the candidates and the stack on {len(bench.folds)} folds",
+        total=2 * len(bench.folds),
+    ) as bar:
+        of_labels, log_scores, fold = _log_scores(bench, versions, bar.update)
+        weights = fold_weights(
+            log_scores, fold, pseudo_count, pair_weights=bench.labels.score_weights
+        )
+        of_stack = _stack_scores(
+            bench, versions, weights, of_labels, seed=seed, advance=bar.update
+        )
     scores = CrossValidation(
         names=tuple(candidate.name for candidate in candidates),
         families=tuple(candidate.family for candidate in candidates),
@@ -83,28 +88,34 @@ def score_versions(
 
 
 def _log_scores(
-    bench: Workbench, versions: Versions, of_labels: Sequence[LabelScores] | None
-) -> tuple[Tensor, Tensor]:
-    """Return the score of each candidate at each pair, and the folds."""
+    bench: Workbench, versions: Versions, advance: Callable[[], Any]
+) -> tuple[list[LabelScores] | None, Tensor, Tensor]:
+    """Return the score of each candidate at each pair, and the folds.
+
+    The first entry has the densities at labels that are not exact. It is None if all
+    are.
+    """
     theta, x = bench.theta, bench.x
     log_scores = theta.new_empty(len(theta), len(versions.names), dtype=torch.double)
     fold = torch.empty(len(theta), dtype=torch.long, device=theta.device)
-    log_q = None
+    log_q, of_labels = None, None if bench.labels.are_exact else []
     if versions.couplings is not None and of_labels is None:
         # All folds share the same simulations, and so the same components.
         log_q = versions.couplings.component_log_probs(theta)
     for number, rows in enumerate(bench.folds):
         fold[rows] = number
         if of_labels is not None:
+            of_labels.append(score_labels(bench, versions, number))
             log_scores[rows] = of_labels[number].of_candidates
-            continue
-        log_scores[rows] = versions.log_probs(
-            theta[rows],
-            x[rows],
-            [number],
-            log_q=None if log_q is None else log_q[rows],
-        )
-    return log_scores, fold
+        else:
+            log_scores[rows] = versions.log_probs(
+                theta[rows],
+                x[rows],
+                [number],
+                log_q=None if log_q is None else log_q[rows],
+            )
+        advance()
+    return of_labels, log_scores, fold
 
 
 def _stack_scores(
@@ -114,6 +125,7 @@ def _stack_scores(
     of_labels: Sequence[LabelScores] | None,
     *,
     seed: int,
+    advance: Callable[[], Any],
 ) -> FoldScores:
     """Return the scores of the stack at each pair, normalised in the support.
 
@@ -123,6 +135,7 @@ def _stack_scores(
         weights: The weights of the stack that scores each fold, ``(F, K)``.
         of_labels: The densities at labels that are not exact; None if all are.
         seed: Seed of the draws.
+        advance: Called after each fold, for a progress bar.
 
     Returns:
         The scores, their Monte-Carlo errors (zero for exact labels), and the levels of
@@ -159,6 +172,7 @@ def _stack_scores(
         of_folds.append(scores)
         if versions.couplings is not None and 0 in shared:
             masses[0] = shared[0]
+        advance()
     return joined(of_folds, bench.folds)
 
 

@@ -101,8 +101,8 @@ def stack(
         require_convergence: Whether a coupling that has not converged is an error.
         seed: Seed of everything random; None uses the states of torch, NumPy and
             Python.
-        show_progress_bars: Whether to show how many folds are done. None does so in a
-            terminal or a notebook, but not in a file.
+        show_progress_bars: Whether to show how many trainings and scores are done.
+            None does so in a terminal or a notebook, but not in a file.
 
     Returns:
         The stack, an sbi posterior. Its ``report`` holds the held-out scores, and

@@ -16,8 +16,10 @@ if TYPE_CHECKING:
     from sbi_rope.stacking.report import StackingReport
 
 __all__ = [
+    "IF_MOSTLY_PRIOR",
     "IN_WORDS",
     "LEVEL",
+    "MOSTLY",
     "NOT_CHECKED",
     "OVER_CONFIDENT",
     "REFERENCES",
@@ -70,10 +72,10 @@ IF_KEPT = (
     "scores, its calibration and its sets with a guarantee hold for these only."
 )
 
+IF_MOSTLY_PRIOR = "Check that theta and x of the pairs belong together, row by row"
 # What each method is. Whether it is better than others is for the scores to say.
 IN_WORDS = {
-    "prior": "the prior, which learns nothing from x. Check that theta and x of the "
-    "pairs belong together, row by row",
+    "prior": "the prior, which learns nothing from x",
     "NPE": "NPE as it was trained on simulations",
     "OT-only": "observations are coupled with simulations, without tuning",
     "tuning-only": "the embedding net was tuned on the labels, without coupling",
@@ -190,6 +192,8 @@ def _weights(report: "StackingReport") -> list[str]:
     line = f"  mostly {family}"
     if family in IN_WORDS:
         line += f": {IN_WORDS[family]}"
+    if family == "prior":
+        line += f". {IF_MOSTLY_PRIOR}"
     return [line, f"  weights: {shares}"]
 
 

@@ -339,6 +339,18 @@ def test_the_verdict_names_pairs_whose_parameters_do_not_follow_the_prior(
     assert sentence in Page(written(changed, tmp_path)).text
 
 
+def test_rows_are_to_be_checked_if_the_stack_is_mostly_the_prior(
+    tmp_path: Path,
+) -> None:
+    report = the_stack().report
+    for weights in ({"NPE": 0.9, "prior": 0.1}, {"prior": 0.9, "NPE": 0.1}):
+        shown = replace(report, family_weights=weights)
+        text = Page(written(shown, tmp_path)).text
+        expected = weights["prior"] == 0.9
+        assert ("pairs belong together, row by row." in text) == expected
+        assert ("pairs belong together, row by row" in str(shown)) == expected
+
+
 def test_the_page_names_parameters_that_are_not_calibrated(tmp_path: Path) -> None:
     report = the_stack().report
     known = report.cross_validation
