@@ -222,17 +222,15 @@ class Labels:
 
     def __str__(self) -> str:
         """Say in one sentence what is known about the parameters."""
-        n = len(self)
+        text = f"{len(self)} exact labels" if self.are_exact else f"{len(self)} labels"
+        if (num_groups := self.num_groups) < len(self):
+            text += f" in {num_groups} groups"
         if self.samples is not None:
-            text = f"{n} labels, each given as {self.samples.shape[1]} draws"
-        elif self.are_exact:
-            text = f"{n} exact labels"
-        else:
+            text += f", each given as {self.samples.shape[1]} draws"
+        elif not self.are_exact:
             num_noisy = int(self.is_noisy.any(dim=1).sum())
             num_partial = int((~self.is_measured).any(dim=1).sum())
-            text = f"{n} labels, {num_noisy} with noise and {num_partial} partial"
-        if (num_groups := self.num_groups) < n:
-            text += f" in {num_groups} groups"
+            text += f", {num_noisy} with noise and {num_partial} partial"
         if self.are_weighted:
             text += (
                 f", weighted like {self.effective_number:.1f} of equal weight, and "
