@@ -35,6 +35,7 @@ from tests import gaussian
 
 NUM_DRAWS = 120
 FINETUNER = CalibrationFinetuner(learning_rate=1e-2, max_num_epochs=150)
+QUICK = CalibrationFinetuner(learning_rate=1e-2, max_num_epochs=2)
 SHIFTS = ("prior shift: theta_1", "prior shift: theta_2")
 NARROW = ("narrower than the prior: theta_1", "narrower than the prior: theta_2")
 UNLIKE = "batch unlike the calibration pairs"
@@ -127,15 +128,14 @@ def test_a_batch_unlike_the_calibration_pairs_is_found_after_tuning(
 
 
 def test_a_batch_for_which_no_guarantee_holds_gives_an_alarm_and_a_page_says_so(
-    tuned: RoPE,
+    tuned: RoPE, misspecified: Diagnosis
 ) -> None:
     torch.manual_seed(26)
     shifted = gaussian.real_process(parameters(200) + 1.0)
     finding = look(tuned, shifted, num_folds=None)[UNLIKE]
     assert finding.alarming
     assert "what sets with a guarantee promise" in finding.sentence
-    like_pairs = gaussian.real_process(parameters(200))
-    assert not look(tuned, like_pairs, num_folds=None)[UNLIKE].alarming
+    assert not misspecified[UNLIKE].alarming
     page = Path(__file__).parents[2] / "docs/howto/guaranteed_sets.md"
     text = " ".join(page.read_text(encoding="utf-8").split())
     assert "nothing is promised. `diagnose(rope, x_o)` tests" in text
@@ -192,7 +192,7 @@ def test_a_narrow_batch_like_its_pairs_is_narrower_than_the_prior_only() -> None
 @pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
 def test_too_few_observations_or_pairs_leave_comparisons_of_them_out() -> None:
     torch.manual_seed(29)
-    rope = conductor(finetuner=CalibrationFinetuner(max_num_epochs=2))
+    rope = conductor(finetuner=QUICK)
     rope.append_calibration(*gaussian.labelled(3)).train(
         seed=0, show_progress_bars=False
     )
@@ -218,7 +218,7 @@ def test_a_single_outlier_is_flagged(tuned: RoPE) -> None:
 def test_too_few_pairs_leave_the_regression_out() -> None:
     assert [num_features(count, 2) for count in (5, 8, 12)] == [0, 2, 4]
     torch.manual_seed(7)
-    rope = conductor().append_calibration(*gaussian.labelled(5))
+    rope = conductor(finetuner=QUICK).append_calibration(*gaussian.labelled(5))
     rope.train(seed=0, show_progress_bars=False)
     diagnosis = look(rope, gaussian.real_process(parameters(40)), num_simulations=200)
     assert "residual depends on parameters" not in {
@@ -264,13 +264,13 @@ def test_simulated_parameters_belong_to_their_embeddings() -> None:
         assert torch.allclose(batch.simulated, factor * gaussian.GAIN * batch.theta)
 
 
-def test_the_same_seed_gives_the_same_diagnosis_and_keeps_the_random_state(
-    tuned: RoPE,
-) -> None:
+def test_the_same_seed_gives_the_same_diagnosis_and_keeps_the_random_state() -> None:
+    rope = conductor(finetuner=QUICK).append_calibration(*gaussian.labelled(20))
+    rope.train(seed=0, show_progress_bars=False)
     x_o = gaussian.real_process(parameters(30))
-    first = look(tuned, x_o, num_simulations=200)
+    first = look(rope, x_o, num_simulations=200)
     state = torch.get_rng_state()
-    second = look(tuned, x_o, num_simulations=200)
+    second = look(rope, x_o, num_simulations=200)
     assert torch.equal(state, torch.get_rng_state())
     assert first.as_rows() == second.as_rows()
 
@@ -330,7 +330,7 @@ def test_a_finding_prints_as_sentences_and_p_values_as_such(
 
 def test_a_rope_whose_pairs_were_not_trained_on_is_trained_as_a_copy() -> None:
     torch.manual_seed(39)
-    rope = conductor(finetuner=CalibrationFinetuner(max_num_epochs=20))
+    rope = conductor(finetuner=QUICK)
     rope.append_calibration(*gaussian.labelled(20))
     x_o = gaussian.real_process(parameters(30))
     options = {"num_simulations": 200, "num_folds": None}
@@ -345,7 +345,7 @@ def test_a_diagnosis_can_use_stored_simulations() -> None:
     torch.manual_seed(9)
     theta = gaussian.prior().sample((400,))
     stored = (theta, gaussian.simulator(theta))
-    rope = conductor(simulator=None, simulations=stored)
+    rope = conductor(simulator=None, simulations=stored, finetuner=QUICK)
     rope.append_calibration(*gaussian.labelled(30)).train(show_progress_bars=False)
     diagnosis = look(rope, gaussian.real_process(parameters(50)))
     assert diagnosis.residuals is not None
@@ -374,7 +374,9 @@ def test_the_mmd_agrees_with_its_definition(monkeypatch: pytest.MonkeyPatch) -> 
     assert test.mmd == pytest.approx(squared_mmd(batch, simulated[:80]), rel=1e-6)
     usual = squared_mmd(simulated[:40], simulated[40:])
     assert test.usual == pytest.approx(usual, rel=1e-6)
-    assert test.p_value == pytest.approx(1 / 121 if test.mmd > usual else 1.0)
+    assert test.p_value == pytest.approx(
+        1 / (1 + NUM_DRAWS) if test.mmd > usual else 1.0
+    )
 
 
 @pytest.mark.slow
@@ -821,30 +823,26 @@ def test_a_real_process_that_folds_a_parameter_alarms() -> None:
 
 def test_residuals_are_of_pairs_that_g_was_not_trained_on() -> None:
     torch.manual_seed(23)
-    theta, x = gaussian.labelled(10)
-    rope = conductor(finetuner=CalibrationFinetuner(max_num_epochs=50))
-    rope.append_calibration(theta, x).train(seed=0, show_progress_bars=False)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    theta, x = gaussian.labelled(6)
+    # Another label for the first pair: its own g has not seen it.
+    changed = theta.clone()
+    changed[0] = -theta[0]
+    finetuner = CalibrationFinetuner(learning_rate=1e-2, max_num_epochs=20)
+    nets = []
+    for labels in (changed, theta):
+        rope = conductor(simulator=lambda t: t + 0.0, finetuner=finetuner)
+        rope.append_calibration(labels, x)
         torch.manual_seed(0)
-        before = cross_fit(rope, num_folds=10, show_progress_bars=False)
-        # Another label for the first pair: its own g has not seen it.
-        theta = theta.clone()
-        theta[0] = -theta[0]
-        other = conductor(simulator=lambda t: t + 0.0, finetuner=rope.finetuner)
-        same = conductor(simulator=lambda t: t + 0.0, finetuner=rope.finetuner)
-        nets = []
-        for part, labels in ((other, theta), (same, rope.calibration[0])):
-            part.append_calibration(labels, x)
-            torch.manual_seed(0)
-            held_out = cross_fit(part, num_folds=10, show_progress_bars=False)
-            nets.append(held_out.embedded)
-            assert torch.allclose(
-                held_out.targets, gaussian.GAIN * labels.double(), atol=1e-6
-            )
-    assert before.residuals.shape == (10, 2)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            held_out = cross_fit(rope, num_folds=6, show_progress_bars=False)
+        nets.append(held_out.embedded)
+        assert held_out.residuals.shape == (6, 2)
+        assert torch.allclose(
+            held_out.targets, gaussian.GAIN * labels.double(), atol=1e-6
+        )
     assert torch.allclose(nets[0][0], nets[1][0], atol=1e-5)
-    assert not torch.allclose(nets[0][1:], nets[1][1:], atol=1e-5)
+    assert not torch.allclose(nets[0][1:], nets[1][1:], atol=1e-4)
 
 
 def test_recordings_at_the_same_parameters_are_held_out_together(
@@ -852,7 +850,7 @@ def test_recordings_at_the_same_parameters_are_held_out_together(
 ) -> None:
     torch.manual_seed(24)
     theta = gaussian.labelled(6)[0].repeat(3, 1)
-    rope = conductor(finetuner=CalibrationFinetuner(max_num_epochs=2))
+    rope = conductor(finetuner=QUICK)
     rope.append_calibration(theta, gaussian.real_process(theta))
     rope.train(seed=0, show_progress_bars=False)
     trained_on = []
@@ -873,7 +871,7 @@ def test_recordings_at_the_same_parameters_are_held_out_together(
 @pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
 def test_a_shift_that_no_distance_could_show_is_not_tested() -> None:
     torch.manual_seed(40)
-    rope = conductor(finetuner=CalibrationFinetuner(max_num_epochs=2))
+    rope = conductor(finetuner=QUICK)
     rope.append_calibration(*gaussian.labelled(4))
     diagnosis = look(rope, gaussian.real_process(parameters(1)), num_simulations=200)
     assert SHIFTS[0] not in diagnosis
@@ -886,14 +884,14 @@ def test_a_shift_that_no_distance_could_show_is_not_tested() -> None:
 def test_pairs_of_one_parameter_leave_residuals_out() -> None:
     torch.manual_seed(25)
     theta = gaussian.labelled(1)[0].repeat(6, 1)
-    rope = conductor(finetuner=CalibrationFinetuner(max_num_epochs=2))
+    rope = conductor(finetuner=QUICK)
     rope.append_calibration(theta, gaussian.real_process(theta))
     rope.train(seed=0, show_progress_bars=False)
     diagnosis = look(rope, gaussian.real_process(parameters(40)), num_simulations=200)
     assert diagnosis.residuals is None
     assert "the same parameters (or group), or there is only one" in diagnosis.notes[0]
     # Equal labels that are not exact have different draws, and are still one.
-    rope = conductor(finetuner=CalibrationFinetuner(max_num_epochs=2))
+    rope = conductor(finetuner=QUICK)
     rope.append_calibration(theta, gaussian.real_process(theta), theta_std=0.1)
     rope.train(seed=0, show_progress_bars=False)
     diagnosis = look(rope, gaussian.real_process(parameters(40)), num_simulations=200)
