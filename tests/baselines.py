@@ -54,7 +54,7 @@ CHAINS: dict[str, Any] = {
 FINETUNER = CalibrationFinetuner(learning_rate=3e-3, max_num_epochs=5)
 
 # Without a simulator: then they learn the same from a posterior trained beforehand.
-FLOWS: dict[str, Any] = {"npe_training": SHORT, "training": SHORT, "num_draws": 4}
+FLOWS: dict[str, Any] = {"npe_training": SHORT, "training": SHORT, "num_draws": 2}
 ALIGNED: dict[str, Any] = {
     "npe_training": SHORT,
     "training": SHORT,
@@ -172,7 +172,7 @@ def task_of(name: str) -> Task:
 def data_of(task: str) -> Data:
     source = task_of(task)
     return Data(
-        *source.get_simulations(200),
+        *source.get_simulations(100),
         *source.get_calibration_set(20),
         *source.get_test_set(30),
     )
@@ -183,14 +183,19 @@ def builder(
 ) -> Any:
     """A small density estimator of sbi, with a small embedding net unless given one."""
     if net is None:
-        with seeded(0):  # the same net, whoever asks first
-            net = flat_net(math.prod(task_of(task).x_shape))
+        net = net_of(task)
     if family is None:
         family = "mdn" if task == "linear_gaussian" else "maf"
     sizes: dict[str, Any] = {"mdn": {"num_components": 2}}.get(
         family, {"num_transforms": 1}
     )
     return posterior_nn(family, embedding_net=net, hidden_features=10, **sizes)
+
+
+def net_of(task: str) -> nn.Module:
+    """The net for the observations of a task, always with the same weights."""
+    with seeded(0):
+        return flat_net(math.prod(task_of(task).x_shape))
 
 
 def flat_net(size: int) -> nn.Module:
