@@ -99,7 +99,9 @@ CALLS += [
     Call(
         name="CalibrationMLP.train",
         run=lambda theta=THETA, x=X, x_o=X_O, seed=0: (
-            baselines.CalibrationMLP(PRIOR)
+            baselines.CalibrationMLP(
+                PRIOR, training=baselines.Training(max_num_epochs=2)
+            )
             .append_calibration(theta, x)
             .train(seed=seed, **QUIET)
             .build_posterior()

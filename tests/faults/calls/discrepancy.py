@@ -26,6 +26,16 @@ def fitted(**tensors: Tensor) -> Any:
     return DiscrepancyModel().fit(**given).sample(3, seed=0)
 
 
+def discrepancy_npe(**options: Any) -> DiscrepancyNPE:
+    """Return a method whose model of the discrepancy is fitted in a few steps."""
+    model = DiscrepancyModel(
+        gain_precisions=(1.0,), error_scales=(0.1,), degrees_of_freedom=(3.0,)
+    )
+    return DiscrepancyNPE.from_posterior(
+        npe(), simulations=(THETA_S, X_S), model=model, **options
+    )
+
+
 CALLS = [
     Call(
         name="DiscrepancyModel",
@@ -102,11 +112,7 @@ CALLS = [
     Call(
         name="DiscrepancyNPE.train",
         run=lambda theta=THETA, x=X, seed=0: (
-            DiscrepancyNPE.from_posterior(
-                npe(),
-                simulations=(THETA_S, X_S),
-                num_steps=2,
-            )
+            discrepancy_npe(num_steps=2)
             .append_calibration(theta, x)
             .train(seed=seed, **QUIET)
             .history.training_loss
@@ -117,7 +123,7 @@ CALLS = [
     Call(
         name="DiscrepancyNPE.report",
         run=lambda x_names=None, seed=0: (
-            DiscrepancyNPE.from_posterior(npe(), simulations=(THETA_S, X_S))
+            discrepancy_npe()
             .append_calibration(THETA, X)
             .report(x_names=x_names, seed=seed, **QUIET)
             .summaries[0]
@@ -128,7 +134,7 @@ CALLS = [
     Call(
         name="DiscrepancyNPE.report(summaries)",
         run=lambda summaries=lambda x: x[:, :1]: (
-            DiscrepancyNPE.from_posterior(npe(), simulations=(THETA_S, X_S))
+            discrepancy_npe()
             .append_calibration(THETA, X)
             .report(summaries=summaries, **QUIET)
         ),

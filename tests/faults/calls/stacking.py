@@ -6,7 +6,7 @@ from unittest.mock import patch
 import torch
 from torch import Tensor
 
-from sbi_rope import diagnose, stack
+from sbi_rope import StackedPosterior, diagnose, stack
 from sbi_rope.stacking import (
     CouplingCandidate,
     DensityCandidate,
@@ -33,6 +33,13 @@ from tests.faults.problem import (
 )
 
 
+def stacked_anew(x_o: Any = None, **options: Any) -> StackedPosterior:
+    """Return a stack of two folds, with few draws to score it by."""
+    given = {"num_folds": 2, "seed": 0} | QUIET | options
+    with patch("sbi_rope.stacking.scoring.NUM_SAMPLES", 20):
+        return stack(trained(), x_o, **given)
+
+
 def distances_of(x_o: Any = X_O, **options: Any) -> Tensor:
     """Diagnose a batch, with few draws of the MMD of simulations."""
     given = {"num_simulations": 100, "num_folds": None, "seed": 0} | QUIET | options
@@ -49,17 +56,8 @@ CALLS = [
     ),
     Call(
         name="stack",
-        run=lambda **options: (
-            stack(
-                trained(),
-                **{
-                    "candidates": CANDIDATES,
-                    "num_folds": 2,
-                    "seed": 0,
-                    **QUIET,
-                    **options,
-                },
-            ).candidate_weights
+        run=lambda candidates=CANDIDATES, **options: (
+            stacked_anew(candidates=candidates, **options).candidate_weights
         ),
         options={
             "candidates": "instance",
@@ -73,18 +71,11 @@ CALLS = [
     ),
     Call(
         name="stack(x_o)",
-        run=lambda x_o=X_O, **options: (
-            stack(
-                trained(),
+        run=lambda x_o=X_O, num_simulations=30: (
+            stacked_anew(
                 x_o,
-                **{
-                    "candidates": [CouplingCandidate(gamma=0.5, tau=0.5, tuned=False)],
-                    "num_folds": 2,
-                    "num_simulations": 30,
-                    "seed": 0,
-                    **QUIET,
-                    **options,
-                },
+                candidates=[CouplingCandidate(gamma=0.5, tau=0.5, tuned=False)],
+                num_simulations=num_simulations,
             ).report.cross_validation.stack_scores
         ),
         tensors={"x_o": X_O},
