@@ -61,6 +61,12 @@ def terminal(
 
 
 @pytest.fixture
+def rough_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw pictures without arranging their parts, which takes longer than drawing."""
+    monkeypatch.setattr("matplotlib.figure.Figure.get_layout_engine", lambda self: None)
+
+
+@pytest.fixture
 def shorter_files(monkeypatch: pytest.MonkeyPatch) -> None:
     """Allow files of causal chambers with fewer rows than the published ones."""
     monkeypatch.setattr("sbi_rope.tasks.chambers.PUBLISHED_ROWS", {})

@@ -25,6 +25,8 @@ from sbi_rope import SinkhornCoupler
 from sbi_rope.baselines import OTOnly
 from sbi_rope.errors import RoPEWarning
 
+pytestmark = pytest.mark.usefixtures("rough_pictures")
+
 ROOT = Path(__file__).parents[2]
 SUITE = """
 title = "Tiny"
@@ -67,6 +69,7 @@ def uninterrupted(
     return rows_of(folder)
 
 
+@pytest.mark.slow
 def test_a_run_in_parts_gives_the_same_table_also_where_a_cell_was_damaged(
     suite_file: Path, uninterrupted: list[dict[str, str]], tmp_path: Path
 ) -> None:

@@ -32,7 +32,11 @@ from tests.stacks import (
 
 pytest.importorskip("matplotlib")
 # Batches and calibration sets are small here on purpose.
-pytestmark = pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning"),
+    # The page that most tests share is made before, with pictures as users see them.
+    pytest.mark.usefixtures("rough_pictures"),
+]
 
 NAMES = ("mass <kg> & more", 'the "length"')
 # Elements without an end.

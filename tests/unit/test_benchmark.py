@@ -21,6 +21,8 @@ from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks import get_task, list_tasks
 from tests.results import SUITE, result_of, write_results
 
+pytestmark = pytest.mark.usefixtures("rough_pictures")
+
 
 @pytest.fixture
 def suite(tmp_path: Path) -> Suite:

@@ -16,6 +16,8 @@ from benchmarks.schema import COLUMNS
 from benchmarks.statements import STATEMENTS, verdict
 from benchmarks.summary import page_of, write_summary
 
+pytestmark = pytest.mark.usefixtures("rough_pictures")
+
 # A cell to its LPP and ACAUC, or None if it was not run, or "failed".
 Scores = Callable[[Cell], tuple[float, float] | str | None]
 
