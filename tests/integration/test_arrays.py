@@ -14,7 +14,7 @@ from sbi_rope.sweep import sweep
 from sbi_rope.trainers import FinetunedNPE
 from sbi_rope.trainers.training import Training
 from tests import gaussian, problems
-from tests.stacks import QUICK, QUIET, problem, stacked
+from tests.stacks import NPE, OT_ONLY, PRIOR, QUICK, QUIET, problem, stacked
 
 PAIRS, OBSERVED = problem(12, seed=1), problem(25, seed=2)
 QUICKLY: dict[str, Any] = {"num_simulations": 60, "seed": 0, **QUIET}
@@ -59,7 +59,9 @@ def test_pairs_and_observations_are_those_of_tensors(convert: Any) -> None:
 
 def test_a_stack_and_its_diagnosis_take_arrays() -> None:
     x_o = array(OBSERVED[1])
-    posterior = stacked(rope(map(array, PAIRS)), x_o, num_folds=2)
+    posterior = stacked(
+        rope(map(array, PAIRS)), x_o, candidates=[PRIOR, NPE, OT_ONLY], num_folds=2
+    )
     assert posterior.sample_batched((2,), x=x_o, **QUIET).shape == (2, 25, 2)
     trained = rope(PAIRS).train(seed=0, **QUIET)
     options = {"num_simulations": 100, "num_folds": None, "seed": 0, **QUIET}

@@ -4,8 +4,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from sbi_rope import MixturePosterior, RoPE, SinkhornCoupler
+from sbi_rope import CalibrationFinetuner, MixturePosterior, RoPE, SinkhornCoupler
 from sbi_rope.metrics import evaluate
+from sbi_rope.mixture import part_of
 from tests import gaussian, problems
 
 
@@ -18,7 +19,7 @@ def with_exact_g(x_o: Tensor, n_s: int, coupler: SinkhornCoupler) -> MixturePost
         simulated = h(gaussian.simulator(gaussian.prior().sample((n_s,))))
         coupling = coupler.couple(h(gaussian.undo(x_o)), simulated)
     mixture = problems.coupled_mixture(
-        rope.build_posterior(x_o).posterior_estimator.parts[0].density,
+        part_of(npe.posterior_estimator).density,
         simulated,
         coupling,
         x_o,
@@ -83,7 +84,11 @@ def test_without_misspecification_rope_hardly_moves_the_posterior() -> None:
 def test_at_tau_one_the_mean_posterior_is_the_mean_of_the_simulated_ones() -> None:
     theta_cal, x_cal = gaussian.labelled(50)
     _, x_o = gaussian.labelled(100)
-    rope = RoPE(gaussian.posterior(), simulator=gaussian.simulator)
+    rope = RoPE(
+        gaussian.posterior(),
+        simulator=gaussian.simulator,
+        finetuner=CalibrationFinetuner(learning_rate=1e-2, max_num_epochs=20),
+    )
     rope.append_calibration(theta_cal, x_cal).train(show_progress_bars=False)
     posterior = rope.build_posterior(
         x_o,

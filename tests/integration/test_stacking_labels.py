@@ -1,5 +1,6 @@
 """Stacks of pairs whose labels are noisy, partial, weighted, or draws."""
 
+import functools
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ import torch
 from sbi_rope import RoPE, load, stack
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.metrics import lpp
-from sbi_rope.stacking import default_candidates
+from sbi_rope.stacking import CrossValidation, default_candidates
 from tests import gaussian
 from tests.stacks import (
     CANDIDATES,
@@ -166,6 +167,19 @@ def test_a_parameter_that_was_never_measured_is_named(tmp_path: Path) -> None:
     assert "mass was not measured" in (tmp_path / "never.html").read_text()
 
 
+def scores_of_labels(**options: Any) -> CrossValidation:
+    names = ("discrepancy (tuned), fine-tuned", "fine-tuned NPE, rehearsed")
+    candidates = [PRIOR, NPE, *(c for c in CANDIDATES if c.name in names)]
+    assert len(candidates) == 4
+    return validated(labelled(THETA, **options), candidates=candidates)
+
+
+@functools.cache
+def scores_of_exact_labels() -> CrossValidation:
+    with torch.random.fork_rng():
+        return scores_of_labels()
+
+
 @pytest.mark.parametrize(
     "options",
     [{"theta_std": 0.0}, {"theta_cov": torch.zeros(2, 2)}, {"weights": [1.0] * 20}],
@@ -173,13 +187,7 @@ def test_a_parameter_that_was_never_measured_is_named(tmp_path: Path) -> None:
 def test_labels_without_noise_take_the_path_of_exact_ones(
     options: dict[str, Any],
 ) -> None:
-    names = ("discrepancy (tuned), fine-tuned", "fine-tuned NPE, rehearsed")
-    candidates = [PRIOR, NPE, *(c for c in CANDIDATES if c.name in names)]
-    assert len(candidates) == 4
-    exact, found = (
-        validated(labelled(THETA, **some), candidates=candidates)
-        for some in ({}, options)
-    )
+    exact, found = scores_of_exact_labels(), scores_of_labels(**options)
     assert torch.equal(exact.log_scores, found.log_scores)
     assert torch.equal(exact.stack_scores, found.stack_scores)
     assert torch.equal(exact.levels, found.levels)

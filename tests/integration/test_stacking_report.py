@@ -35,6 +35,7 @@ from tests.stacks import (
     ROPE,
     observed,
     problem,
+    quick,
     rope_of,
     stacked,
     the_coupled_stack,
@@ -367,10 +368,11 @@ def test_every_model_of_the_discrepancy_knows_the_specimens(
         return fit(self, *args, **options)
 
     monkeypatch.setattr(DiscrepancyModel, "fit", spied)
-    bench = Workbench(rope, num_folds=4, seed=0, show_progress_bars=False)
-    assert "the 16 pairs count as " in str(bench.discrepancy())
-    assert len(seen) == x.shape[1]
-    bench.targets(torch.arange(16), seed=0)
+    with quick():
+        bench = Workbench(rope, num_folds=4, seed=0, show_progress_bars=False)
+        assert "the 16 pairs count as " in str(bench.discrepancy())
+        assert len(seen) == x.shape[1]
+        bench.targets(torch.arange(16), seed=0)
     rope.train(seed=0, show_progress_bars=False)
     assert len(seen) == x.shape[1] + 2
     assert all(groups.tolist() == [*range(8)] * 2 for groups in seen)

@@ -81,6 +81,13 @@ def npe() -> Any:
     return method.append_simulations(*simulations(2000)).train(**QUIET)
 
 
+@functools.cache
+def quick_npe() -> Any:
+    """An NPE that is hardly trained, for reading only."""
+    method = PlainNPE(TASK.get_prior(), builder(), npe_training=SHORT)
+    return method.append_simulations(*simulations()).train(**QUIET)
+
+
 def log_probs(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:
     return posterior.log_prob_batched(theta[None], x, norm_posterior=False)[0]
 
@@ -283,7 +290,7 @@ class TestFinetunedNPE:
         kept = {}
         for rates in [(1e-6,), (1e-2,), (1e-6, 1e-2), (1e-2, 1e-6)]:
             method = FinetunedNPE.from_posterior(
-                npe().build_posterior(),
+                quick_npe().build_posterior(),
                 training=Training(max_num_epochs=10, validation_fraction=0.2),
                 learning_rates=rates,
             )
@@ -295,14 +302,14 @@ class TestFinetunedNPE:
 
     def test_with_too_few_pairs_to_choose_the_smallest_is_taken(self) -> None:
         method = FinetunedNPE.from_posterior(
-            npe().build_posterior(), training=SHORT, learning_rates=(1e-2, 1e-4)
+            quick_npe().build_posterior(), training=SHORT, learning_rates=(1e-2, 1e-4)
         )
         with pytest.warns(RoPEWarning, match="Only 3 calibration pair"):
             method.append_calibration(*real(3)).train(**QUIET)
         assert method.history.learning_rate == 1e-4
 
     def test_all_parameters_are_tuned(self) -> None:
-        posterior = npe().build_posterior()
+        posterior = quick_npe().build_posterior()
         posterior.posterior_estimator.requires_grad_(requires_grad=False)
         method = FinetunedNPE.from_posterior(
             posterior, training=SHORT, learning_rates=(1e-3,)
@@ -318,12 +325,12 @@ class TestFinetunedNPE:
     @pytest.mark.filterwarnings("ignore:Fine-tuning NPE. the loss is not finite")
     def test_the_start_is_kept_where_tuning_makes_it_worse(self) -> None:
         method = FinetunedNPE.from_posterior(
-            npe().build_posterior(), training=LONG, learning_rates=(100.0,)
+            quick_npe().build_posterior(), training=LONG, learning_rates=(100.0,)
         )
         theta, x = simulations(2050)
         method.append_calibration(theta[2000:], x[2000:]).train(**QUIET)
         assert method.history.best_epoch == 0
-        expected = log_probs(npe().build_posterior(), theta[:9], x[:9])
+        expected = log_probs(quick_npe().build_posterior(), theta[:9], x[:9])
         posterior = method.build_posterior()
         assert torch.equal(log_probs(posterior, theta[:9], x[:9]), expected)
 
@@ -359,7 +366,7 @@ class TestRoPEsParts:
             else {"simulator": TASK.get_simulator()}
         )
         finetuner = CalibrationFinetuner(learning_rate=1e-2, max_num_epochs=10)
-        posterior = npe().build_posterior()
+        posterior = quick_npe().build_posterior()
         rope = RoPE(posterior, finetuner=finetuner, **source)
         rope.append_calibration(*real()).train(**QUIET)
         method = TuningOnly.from_posterior(
@@ -381,7 +388,7 @@ class TestRoPEsParts:
             else {"simulator": TASK.get_simulator()}
         )
         coupler = SinkhornCoupler(gamma=0.8, tau=0.9)
-        posterior, (_, x_o) = npe().build_posterior(), TASK.get_test_set(30)
+        posterior, (_, x_o) = quick_npe().build_posterior(), TASK.get_test_set(30)
         expected = RoPE(posterior, coupler=coupler, **source).build_posterior(
             x_o, num_simulations=50, seed=0
         )
@@ -402,7 +409,7 @@ class TestRoPEsParts:
 
     def test_simulations_or_a_simulator_are_needed_beside_npe(self) -> None:
         for kind in [TuningOnly, OTOnly]:
-            method = kind.from_posterior(npe().build_posterior())
+            method = kind.from_posterior(quick_npe().build_posterior())
             if kind is TuningOnly:
                 method.append_calibration(*real())
             else:
@@ -416,7 +423,7 @@ class TestRoPEsParts:
         untrained = OTOnly(TASK.get_prior(), simulator=TASK.get_simulator())
         with pytest.raises(NotReadyError, match="from_posterior"):
             untrained.build_rope()
-        method = OTOnly.from_posterior(npe().build_posterior())
+        method = OTOnly.from_posterior(quick_npe().build_posterior())
         with pytest.raises(NotReadyError, match=r"append_simulations\(theta, x\)"):
             method.build_rope()
 
@@ -426,12 +433,12 @@ class TestRoPEsParts:
 
     def test_the_tuned_net_is_not_that_of_npe(self) -> None:
         method = TuningOnly.from_posterior(
-            npe().build_posterior(), simulator=TASK.get_simulator()
+            quick_npe().build_posterior(), simulator=TASK.get_simulator()
         )
         method.finetuner = CalibrationFinetuner(learning_rate=1e-2, max_num_epochs=10)
         method.append_calibration(*real()).train(**QUIET)
         tuned = method.build_posterior().posterior_estimator
-        start = npe().build_posterior().posterior_estimator
+        start = quick_npe().build_posterior().posterior_estimator
         x = torch.randn(5, 2)
         assert not torch.equal(embedding_of(tuned)(x), embedding_of(start)(x))
 
@@ -483,7 +490,7 @@ class TestSBI:
             method.simulated_test_set(torch.zeros(2, 2), TASK.get_simulator())
 
     def test_it_knows_the_shape_of_a_posterior_trained_beforehand(self) -> None:
-        method = ReferenceNPE.from_posterior(npe().build_posterior())
+        method = ReferenceNPE.from_posterior(quick_npe().build_posterior())
         _, x = method.simulated_test_set(torch.zeros(3, 2), TASK.get_simulator())
         assert x.shape == (3, 2)
 
@@ -522,7 +529,7 @@ class TestBase:
         method = PriorBaseline(TASK.get_prior()).train()
         with pytest.raises(NotReadyError, match="PriorBaseline"):
             _ = method.history
-        ready = PlainNPE.from_posterior(npe().build_posterior()).train(**QUIET)
+        ready = PlainNPE.from_posterior(quick_npe().build_posterior()).train(**QUIET)
         with pytest.raises(NotReadyError, match="NPE"):
             _ = ready.history
 
@@ -535,12 +542,12 @@ class TestBase:
 
     def test_options_given_to_from_posterior_are_those_of_the_constructor(self) -> None:
         method = FinetunedNPE.from_posterior(
-            npe().build_posterior(), learning_rates=(0.25,)
+            quick_npe().build_posterior(), learning_rates=(0.25,)
         )
         assert method.learning_rates == (0.25,)
         with pytest.raises(TypeError, match="learning_rate_of_mine"):
             FinetunedNPE.from_posterior(
-                npe().build_posterior(), learning_rate_of_mine=1
+                quick_npe().build_posterior(), learning_rate_of_mine=1
             )
 
     def test_a_posterior_in_training_mode_gives_one_in_evaluation_mode(self) -> None:

@@ -38,6 +38,7 @@ from sbi_rope.metrics import evaluate
 from sbi_rope.stacking import default_candidates
 from sbi_rope.sweep import sweep
 from tests import gaussian, problems
+from tests.stacks import quick
 
 QUICK = CalibrationFinetuner(max_num_epochs=20)
 
@@ -778,7 +779,7 @@ def test_threads_get_the_densities_of_their_own_unseen_observations() -> None:
 
 
 def test_training_and_the_mode_work_where_gradients_are_off() -> None:
-    with torch.no_grad():
+    with torch.no_grad(), quick():
         conductor = trained()
         posterior = conductor.build_posterior(X_O, num_simulations=60, seed=0)
         mode = posterior[0].map(num_iter=5, num_to_optimize=2, num_init_samples=10)

@@ -14,7 +14,7 @@ import torch
 from scipy.integrate import odeint
 from torch import Tensor
 
-from sbi_rope import RoPE, parallel
+from sbi_rope import CalibrationFinetuner, RoPE, parallel
 from sbi_rope._simulator import Simulator
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import (
@@ -25,6 +25,7 @@ from sbi_rope.errors import (
 )
 from tests import gaussian, problems
 
+QUICK = CalibrationFinetuner(max_num_epochs=2)
 OWN_NOISE = torch.Generator().manual_seed(0)
 
 
@@ -544,7 +545,7 @@ def test_calls_of_the_simulator_are_counted_from_the_first_on() -> None:
             warnings.simplefilter("ignore")
             rope.embed(x, num_simulations=30, show_progress_bars=False)
         assert rope.num_simulator_calls == sum(rows)
-    before = RoPE(gaussian.posterior(), simulator=gaussian.simulator)
+    before = RoPE(gaussian.posterior(), simulator=gaussian.simulator, finetuner=QUICK)
     probed = before.num_simulator_calls
     before.append_calibration(theta, x).train(show_progress_bars=False)
     assert before.num_simulator_calls == probed + 1000
@@ -556,14 +557,18 @@ def test_calls_of_the_simulator_are_counted_from_the_first_on() -> None:
 def test_a_simulator_with_a_number_of_simulations_is_called_so_often_in_all() -> None:
     theta, x = gaussian.labelled(10)
     count, rows = counted(gaussian.simulator)
-    rope = RoPE(gaussian.posterior(), simulator=count, num_simulations=1200)
+    rope = RoPE(
+        gaussian.posterior(), simulator=count, num_simulations=1200, finetuner=QUICK
+    )
     probed = sum(rows)
     rope.append_calibration(theta, x).train(seed=0, show_progress_bars=False)
     found = rope.build_posterior(x, seed=0, show_progress_bars=False)
     assert sum(rows) == rope.num_simulator_calls == probed + 1200
     # The simulations are used as stored ones are.
     stored = RoPE(
-        gaussian.posterior(), simulations=rope.source.kept(1200, progress=False)
+        gaussian.posterior(),
+        simulations=rope.source.kept(1200, progress=False),
+        finetuner=QUICK,
     )
     stored.append_calibration(theta, x).train(seed=0, show_progress_bars=False)
     again = rope.build_posterior(x, seed=0, num_simulations=1200)
