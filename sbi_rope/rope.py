@@ -211,7 +211,9 @@ class RoPE:
             groups: A number or a name for each pair, n of them. Pairs with the same
                 are recordings of one person or specimen, also if they were appended by
                 different calls. They are held out together, and count once where they
-                are scored. None if pairs with equal labels are these.
+                are scored. None if pairs with equal labels are these. If a label that
+                lacks some parameters agrees with another one in the rest, there is a
+                warning, because the two are taken for different specimens.
 
         Returns:
             Itself, so that calls can be chained.

@@ -22,6 +22,8 @@ __all__ = ["checked_labels", "warn_of_ambiguous"]
 
 # A covariance may be this much asymmetric, or below zero, relative to its diagonal.
 ROUNDING = 1e-6
+# So many labels are compared with all others at a time.
+CHUNK_SIZE = 100
 # A correlation whose smallest eigenvalue is below this is singular.
 SINGULAR = 1e-12
 
@@ -59,6 +61,12 @@ def checked_labels(
         raise InvalidInputError(
             "Expected `theta` of shape (n, d), or (n, S, d) with two draws of each "
             f"label at least; got {tuple(theta.shape)}."
+        )
+    if theta.ndim == 2 and theta.shape[1] < dim:
+        raise InvalidInputError(
+            f"Expected `theta` of shape (n, {dim}), with a column for each of the "
+            f"{dim} parameters of NPE; got {tuple(theta.shape)}. NaN stands for a "
+            "parameter that was not measured."
         )
     event_shape = (theta.shape[1], dim) if is_draws else (dim,)
     theta = check_batch("theta", theta, event_shape, finite=False)
@@ -260,3 +268,25 @@ def warn_of_ambiguous(labels: Labels) -> None:
             "parameters, and together count once in scores. Say with `groups` which "
             "of them are."
         )
+    if unnamed and len(rows := _rows_that_agree(labels)):
+        warn_user(
+            f"{len(rows)} of {len(labels)} labels lack some parameters (NaN), and "
+            "agree with the label of another pair in all that were measured in both "
+            f"(first rows: {rows[:5].tolist()}). Each is taken for another person or "
+            "specimen, and may be trained on while recordings of the same one are "
+            "held out. Pass `groups`, a number or a name for each pair, to say which "
+            "pairs belong together."
+        )
+
+
+def _rows_that_agree(labels: Labels) -> Tensor:
+    """Return the partial labels that another group's label agrees with, ``(m,)``."""
+    theta, groups = labels.theta, labels.groups.to(labels.theta.device)
+    measured = labels.is_measured
+    partial = (~measured.all(dim=1)).nonzero().flatten()
+    found = [partial[:0]]
+    for rows in partial.split(CHUNK_SIZE) if len(partial) else ():
+        both = measured[rows, None] & measured
+        agree = ((theta[rows, None] == theta) | ~both).all(dim=2) & both.any(dim=2)
+        found.append(rows[(agree & (groups[rows, None] != groups)).any(dim=1)])
+    return torch.cat(found)

@@ -633,6 +633,31 @@ def test_weights_that_were_normalised_and_equal_labels_that_are_noisy_are_named(
     assert len(rope.labels.groups.unique()) == 12
 
 
+def test_partial_labels_that_may_be_those_of_another_pair_are_named() -> None:
+    theta, x = gaussian.labelled(9)
+    theta[4:7] = theta[0]
+    theta[5, 0] = theta[6, 1] = theta[8, 1] = NAN
+    match = r"2 of 9 labels lack .* \(first rows: \[5, 6\]\).* Pass `groups`"
+    with pytest.warns(RoPEWarning, match=match):
+        rope().append_calibration(theta, x)
+    with pytest.warns(RoPEWarning, match=match):  # also if they come one by one
+        rope().append_calibration(theta[:5], x[:5]).append_calibration(theta[5:], x[5:])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RoPEWarning)
+        rope().append_calibration(theta, x, groups=[0, 1, 2, 3, 0, 0, 0, 7, 8])
+        # Those that measure different parameters have nothing to agree in.
+        rope().append_calibration(theta[5:], x[5:])
+        # Equal labels are one group already.
+        rope().append_calibration(theta[[5, 5, 8, 2]], x[:4])
+
+
+def test_a_label_without_a_column_for_each_parameter_says_what_stands_for_one() -> None:
+    theta, x = gaussian.labelled(9)
+    match = r"each of the 2 parameters of NPE; got \(9, 1\). NaN stands for a param"
+    with pytest.raises(InvalidInputError, match=match):
+        rope().append_calibration(theta[:, :1], x)
+
+
 def test_a_failed_simulation_is_replaced_by_another_one_of_the_same_label() -> None:
     """A label is lost only if all simulations at its possible parameters failed."""
 
