@@ -631,10 +631,12 @@ class RoPE:
     def __repr__(self) -> str:
         name = type(self._npe.estimator).__name__
         state = "trained" if self.is_trained else "not trained"
-        count = self._labels.num_groups
-        groups = f" in {count} groups" if count < len(self._x_cal) else ""
+        num_pairs, num_groups = len(self._x_cal), self._labels.num_groups
+        pairs = f"{num_pairs} calibration pair{'' if num_pairs == 1 else 's'}"
+        if num_groups < num_pairs:
+            pairs += f" in {num_groups} group{'' if num_groups == 1 else 's'}"
         return (
-            f"RoPE({name}, {len(self._x_cal)} calibration pairs{groups}, {state}, "
+            f"RoPE({name}, {pairs}, {state}, "
             f"gamma {self.coupler.gamma:g}, tau {self.coupler.tau:g})"
         )
 

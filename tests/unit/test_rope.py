@@ -68,6 +68,18 @@ def test_calibration_may_be_appended_in_parts() -> None:
     assert torch.equal(nets[0](x), nets[1](x))
 
 
+def test_the_text_of_a_rope_counts_its_pairs() -> None:
+    theta, x = gaussian.labelled(3)
+    conductor = rope()
+    assert ", 0 calibration pairs, not" in repr(conductor)
+    conductor.append_calibration(theta[:1], x[:1])
+    assert ", 1 calibration pair, not" in repr(conductor)
+    conductor.append_calibration(theta[:1], x[1:2])
+    assert ", 2 calibration pairs in 1 group, not" in repr(conductor)
+    conductor.append_calibration(theta[1:2], x[2:])
+    assert ", 3 calibration pairs in 2 groups, not" in repr(conductor)
+
+
 def test_without_calibration_g_is_h() -> None:
     conductor = rope()
     posterior = conductor.build_posterior(X_O, seed=3)
