@@ -25,8 +25,10 @@ from sbi_rope._simulations import SimulationSource
 from sbi_rope._simulator import source_of
 from sbi_rope._standardisation import Standardisation, warn_of_far_entries
 from sbi_rope._validation import (
+    KnownColumns,
     check_batch,
     check_choice,
+    check_columns,
     check_default_dtype,
     check_gradients,
     check_instance,
@@ -36,6 +38,7 @@ from sbi_rope._validation import (
     check_same_length,
     check_tensor,
     check_unit_interval,
+    column_names,
 )
 from sbi_rope.batch import EmbeddedBatch, check_converged
 from sbi_rope.coupling import SinkhornCoupler
@@ -99,23 +102,27 @@ class RoPE:
             :func:`~sbi_rope.parallel` calls it in several processes.
         simulations: Instead of a simulator, stored pairs (theta, x) with theta drawn
             from the prior. Fine-tuning then uses those with the nearest parameters.
-            There is a warning if there are fewer than 1000.
+            There is a warning if there are fewer than 1000. If theta or x is a table
+            whose columns have names, a later table with the same names in another order
+            is refused.
         num_simulations: For a simulator that takes long: how many simulations it makes
             in all, at draws of the prior, when they are first needed. They are then
             used as stored simulations are. If None, the simulator is called as often as
             the steps ask for it, see :attr:`num_simulator_calls`.
         finetuner: Settings of step 1; ``CalibrationFinetuner()`` if None.
         coupler: Settings of step 2; ``SinkhornCoupler()`` if None.
-        parameter_names: One name for each parameter, for reports and intervals;
-            "theta_1" and so on if None.
+        parameter_names: One name for each parameter, for reports and intervals. If
+            None, the columns of a table of parameters in ``simulations``, or "theta_1"
+            and so on. Tables of parameters with the same names in another order are
+            refused.
 
     Raises:
         UnsupportedPosteriorError: If the posterior has no embedding to work with, or
             one that embeds a row of a batch differently among other rows.
         InvalidInputError: If both or none of simulator and simulations are given,
             their shapes do not fit the posterior, ``num_simulations`` is given
-            without a simulator, or the names are not as many different ones as there
-            are parameters.
+            without a simulator, the names are not as many different ones as there
+            are parameters, or the columns of stored parameters are in another order.
         InvalidTypeError: If an argument has the wrong type.
         NotReadyError: If torch's default dtype is not float32.
         SimulationError: If the simulator raises or returns something unusable.
@@ -165,6 +172,13 @@ class RoPE:
             like=self._npe.like,
             readable=self._npe.readable,
         )
+        names = self._npe.parameter_names
+        known: KnownColumns = {} if names is None else {names: "`parameter_names`"}
+        theta_s, x_s = (None, None) if simulations is None else simulations
+        self._theta_columns = check_columns("simulations[0]", theta_s, known)
+        self._x_columns = check_columns("simulations[1]", x_s, {})
+        if names is None:
+            self._npe.parameter_names = column_names(theta_s) or None
         self.finetuner = CalibrationFinetuner() if finetuner is None else finetuner
         self.coupler = SinkhornCoupler() if coupler is None else coupler
         self._labels = Labels.exact(self._npe.like)
@@ -195,7 +209,9 @@ class RoPE:
         Tensors, NumPy arrays and lists of numbers are taken here and wherever
         parameters and observations of a user are passed. They are copied to the dtype
         of NPE, and arrays and lists to its device. What was computed from them, such as
-        embeddings and samples, has to be a tensor.
+        embeddings and samples, has to be a tensor. A table whose columns have names is
+        refused if those that RoPE knows are the same in another order: the parameter
+        names, and the columns of stored simulations and of pairs appended before.
 
         Args:
             theta: Parameters, shape ``(n, d)``, inside the prior's support. NaN stands
@@ -221,13 +237,18 @@ class RoPE:
         Raises:
             InvalidTypeError: If an argument does not hold numbers.
             InvalidInputError: If shapes, numbers of rows or devices do not fit, a value
-                is not finite, an exact theta is outside the prior's support, or no
-                parameters inside it fit a label. Nothing is added then.
+                is not finite, an exact theta is outside the prior's support, no
+                parameters inside it fit a label, or the columns of a table are in
+                another order. Nothing is added then.
             UnsupportedPosteriorError: If labels are not exact and some parameters are
                 discrete, or if values of x are missing (NaN) and the embedding net
                 takes their number from another row.
         """
         check_not_swapped(theta, x, self._npe.like.shape[1:], self._npe.event_shape)
+        theta_columns = check_columns("theta", theta, self._theta_columns)
+        check_columns("theta_std", theta_std, theta_columns)
+        check_columns("theta_cov", theta_cov, theta_columns, how="df.loc[{0}, {0}]")
+        x_columns = check_columns("x", x, self._x_columns)
         labels = checked_labels(
             theta,
             theta_std=theta_std,
@@ -264,6 +285,7 @@ class RoPE:
         warn_of_ambiguous(labels)
         self._parameters = parameters
         self._labels, self._x_cal = labels, torch.cat([self._x_cal, x])
+        self._theta_columns, self._x_columns = theta_columns, x_columns
         self._g, self._history, self._targets = None, None, None
         return self
 
@@ -407,7 +429,7 @@ class RoPE:
                 "was not called after that. Call `train()` first."
             )
         net = self._npe.h if self._g is None else self._g
-        x_o = self._npe.checked_x("x_o", x_o)
+        x_o = self.checked_observations(x_o)
         real = self._npe.embed("x_o", x_o, net)
         if num_simulations is not None:
             check_integer("num_simulations", num_simulations)
@@ -510,8 +532,10 @@ class RoPE:
 
         Raises:
             InvalidInputError: If x_o has the wrong shape or device, is empty, or not
-                finite.
+                finite, or is a table whose columns are those of simulations or pairs
+                in another order.
         """
+        check_columns("x_o", x_o, self._x_columns)
         return self._npe.checked_x("x_o", x_o)
 
     def with_pairs(

@@ -5,6 +5,7 @@ and, where there is something to do about it, what to do next. Public functions 
 checks once. Private code trusts what it is given.
 """
 
+from sbi_rope._validation.columns import KnownColumns, check_columns, column_names
 from sbi_rope._validation.settings import (
     LARGEST_SETTING,
     as_shape,
@@ -50,12 +51,14 @@ from sbi_rope._validation.tensors import (
 
 __all__ = [
     "LARGEST_SETTING",
+    "KnownColumns",
     "as_float32",
     "as_numbers",
     "as_numbers_on",
     "as_shape",
     "check_batch",
     "check_choice",
+    "check_columns",
     "check_default_dtype",
     "check_device",
     "check_finite",
@@ -85,6 +88,7 @@ __all__ = [
     "check_unit_interval",
     "check_values",
     "check_weights",
+    "column_names",
     "default_names",
     "usable_device",
 ]

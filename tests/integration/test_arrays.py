@@ -1,13 +1,15 @@
-"""NumPy arrays and lists of numbers are taken wherever users pass data."""
+"""Arrays, lists and tables of numbers are taken wherever users pass data."""
 
+import re
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from torch import Tensor
 
-from sbi_rope import RoPE, diagnose
+from sbi_rope import RoPE, diagnose, stack
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.metrics import draw_samples, evaluate
 from sbi_rope.sweep import sweep
@@ -105,3 +107,110 @@ def test_swapped_arguments_are_named_where_shapes_tell() -> None:
     ):
         with pytest.raises(InvalidInputError, match="Did you swap them"):
             call()
+
+
+# Tables ------------------------------------------------------------------------------
+
+NAMES, CHANNELS = ["Vmax", "Km"], ["blue", "red"]
+
+
+def tables(count: int, seed: int) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return parameters with their real x, as tables with names of columns."""
+    torch.manual_seed(seed)
+    theta, x = gaussian.labelled(count)
+    return pd.DataFrame(theta, columns=NAMES), pd.DataFrame(x, columns=CHANNELS)
+
+
+THETA, X = tables(12, seed=1)
+THETA_S, X_S = tables(1000, seed=2)
+SWAPPED = THETA[NAMES[::-1]], X[CHANNELS[::-1]]
+
+
+def refused(expected: list[str], source: str) -> Any:
+    """Expect that columns are refused, because those of a source say another order."""
+    text = f"order of {source}, {expected}; got {expected[::-1]}. Pass `df[{expected}]"
+    return pytest.raises(InvalidInputError, match=re.escape(text))
+
+
+def of_tables(**options: Any) -> RoPE:
+    return RoPE(gaussian.posterior(), finetuner=QUICK, **options)
+
+
+def test_tables_with_known_columns_are_those_of_tensors() -> None:
+    rope = of_tables(simulations=(THETA_S, X_S)).append_calibration(THETA, X)
+    for ours, table in zip(rope.calibration, (THETA, X), strict=True):
+        assert torch.equal(ours, torch.tensor(table.to_numpy()))
+    # Names that are spelled differently, or are no strings, say nothing.
+    for theta, x in (
+        (SWAPPED[0].add_suffix(" [mM]"), SWAPPED[1].add_suffix(" (nm)")),
+        (THETA.set_axis([1, 0], axis=1), X.set_axis([1, 0], axis=1)),
+    ):
+        rope.append_calibration(theta, x)
+    rope.append_calibration(torch.tensor(THETA.to_numpy()), X.to_numpy())
+    assert len(rope.labels) == 48
+
+
+def test_the_parameters_of_a_table_of_simulations_have_its_names() -> None:
+    assert of_tables(simulations=(THETA_S, X_S)).parameter_names == ("Vmax", "Km")
+    names = ("a", "b")
+    given = of_tables(simulations=(THETA_S, X_S), parameter_names=names)
+    assert given.parameter_names == names
+    for theta in (THETA_S.to_numpy(), THETA_S.set_axis(["a", "a"], axis=1)):
+        assert of_tables(simulations=(theta, X_S)).parameter_names is None
+
+
+def test_parameters_in_another_order_than_the_names_are_refused() -> None:
+    named = of_tables(simulator=gaussian.simulator, parameter_names=NAMES)
+    with refused(NAMES, "`parameter_names`"):
+        named.append_calibration(SWAPPED[0], X)
+    with refused(NAMES, "`parameter_names`"):
+        of_tables(simulations=(THETA_S[NAMES[::-1]], X_S), parameter_names=NAMES)
+    stored = of_tables(simulations=(THETA_S, X_S), parameter_names=["speed", "size"])
+    with refused(NAMES, "the earlier table `simulations[0]`"):
+        stored.append_calibration(SWAPPED[0], X)
+    simulated = of_tables(simulator=gaussian.simulator).append_calibration(THETA, X)
+    with refused(NAMES, "the earlier table `theta`"):
+        simulated.append_calibration(SWAPPED[0], X)
+    assert len(named.labels) == len(stored.labels) == 0
+    assert len(simulated.labels) == 12
+
+
+def test_the_noise_of_parameters_in_another_order_is_refused() -> None:
+    named = of_tables(simulator=gaussian.simulator, parameter_names=NAMES)
+    noise = SWAPPED[0].abs()
+    for theta_std in (noise, noise.mean()):
+        with refused(NAMES, "`parameter_names`"):
+            named.append_calibration(THETA, X, theta_std=theta_std)
+    unnamed = of_tables(simulator=gaussian.simulator)
+    with refused(NAMES, "the earlier table `theta`"):
+        unnamed.append_calibration(THETA, X, theta_std=noise)
+    covariance = noise.cov()
+    hint = re.escape(f"Pass `df.loc[{NAMES}, {NAMES}]`")
+    with pytest.raises(InvalidInputError, match=hint):
+        named.append_calibration(THETA, X, theta_cov=covariance)
+    covariance = covariance.loc[NAMES, NAMES]
+    rope = named.append_calibration(THETA, X, theta_cov=covariance)
+    assert rope.labels.covariance[0].numpy() == pytest.approx(covariance.to_numpy())
+
+
+def test_observations_in_another_order_than_earlier_ones_are_refused() -> None:
+    stored = of_tables(simulations=(THETA_S, X_S))
+    with refused(CHANNELS, "the earlier table `simulations[1]`"):
+        stored.append_calibration(THETA, SWAPPED[1])
+    simulated = of_tables(simulator=gaussian.simulator).append_calibration(THETA, X)
+    with refused(CHANNELS, "the earlier table `x`"):
+        simulated.append_calibration(THETA, SWAPPED[1])
+    calls: list[Any] = [
+        *(stored.embed, stored.build_posterior, stored.checked_observations),
+        lambda x: diagnose(stored, x),
+    ]
+    for call in calls:
+        with refused(CHANNELS, "the earlier table `simulations[1]`"):
+            call(SWAPPED[1])
+    with refused(CHANNELS, "the earlier table `x`"):
+        stack(simulated, SWAPPED[1])  # type: ignore[arg-type]
+    # A refused table leaves no names behind.
+    other = of_tables(simulator=gaussian.simulator)
+    with pytest.raises(InvalidInputError):
+        other.append_calibration(THETA, SWAPPED[1][:3])
+    other.append_calibration(THETA, X)

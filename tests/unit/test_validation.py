@@ -16,6 +16,7 @@ from sbi_rope._validation import (
     as_numbers,
     check_batch,
     check_choice,
+    check_columns,
     check_device,
     check_finite,
     check_in_support,
@@ -31,6 +32,7 @@ from sbi_rope._validation import (
     check_tensor,
     check_unit_interval,
     check_weights,
+    column_names,
 )
 from sbi_rope.errors import InvalidInputError, InvalidTypeError, shown
 from tests.refusals import assert_refused
@@ -149,6 +151,42 @@ def test_columns_of_a_dataframe_that_are_no_numbers_are_named() -> None:
     assert_refused(match, as_numbers, "x", frame, error=InvalidTypeError)
     converted = as_numbers("x", frame[["speed", "reading"]].astype("float64"))
     assert converted.isnan().tolist() == [[False, False], [False, True]]
+
+
+def table(*names: Any) -> pd.DataFrame:
+    return pd.DataFrame(np.arange(2.0 * len(names)).reshape(2, -1), columns=names)
+
+
+def test_known_columns_in_another_order_are_refused_and_the_hint_mends_them() -> None:
+    known = {("b", "a", "c"): "`parameter_names`"}
+    df = table("a", "b", "c")
+    match = re.escape(
+        "`theta` with its columns in the order of `parameter_names`, ['b', 'a', 'c']; "
+        "got ['a', 'b', 'c']. Pass `df[['b', 'a', 'c']]`"
+    )
+    assert_refused(match, check_columns, "theta", df, known)
+    assert check_columns("theta", df[["b", "a", "c"]], known) == known
+    assert_refused("order of `param", check_columns, "theta_std", df.std(), known)
+    many = [f"pixel {k}" for k in range(400)]
+    swapped = table(*many[:7], many[8], many[7], *many[9:])
+    known = {tuple(many): "the earlier table `x`"}
+    match = "the earlier table `x`; got 'pixel 8' in column 7, where 'pixel 7' is .*"
+    assert_refused(match + r"`df\[names\]`", check_columns, "x_o", swapped, known)
+    assert check_columns("x_o", swapped[many], known) == known
+
+
+def test_columns_of_which_nothing_is_known_are_accepted_and_remembered() -> None:
+    known = {("a", "b"): "`parameter_names`"}
+    for other in (table("B", "A"), table("b", "B"), table("b", "a", "c")):
+        names = column_names(other)
+        assert check_columns("theta", other, known) == {
+            **known,
+            names: "the earlier table `theta`",
+        }
+    unnamed = (X, X.numpy(), X.tolist(), None, 0.1, "ba", table(1, 0), table("b", "b"))
+    for value in (*unnamed, table("b", 1)):
+        assert column_names(value) == ()
+        assert check_columns("theta", value, known) == known
 
 
 def test_a_shape_that_does_not_fit_is_mended_by_the_hint() -> None:

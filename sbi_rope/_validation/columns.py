@@ -1,0 +1,70 @@
+"""Checks of tables whose columns have names, such as the dataframes of pandas.
+
+Tables are read as arrays, which have no names. The same columns in another order would
+be taken for each other.
+"""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from sbi_rope.errors import InvalidInputError
+
+__all__ = ["KnownColumns", "check_columns", "column_names"]
+
+# The names of columns in orders that are known to be right, and where each comes from.
+KnownColumns = Mapping[tuple[str, ...], str]
+# Of more columns the first that is in the wrong place is named, and not all of them.
+MOST_LISTED = 10
+
+
+def column_names(table: Any) -> tuple[str, ...]:
+    """Return the names of the columns of a table, or of the entries of a series.
+
+    There are none if two are equal, or one is no string, and none of a tensor.
+    """
+    found = getattr(table, "columns", getattr(table, "index", None))
+    names = tuple(found) if isinstance(found, Iterable) else ()
+    if len(set(names)) < len(names) or not all(isinstance(n, str) for n in names):
+        return ()
+    return tuple(str(name) for name in names)
+
+
+def check_columns(
+    name: str, table: Any, known: KnownColumns, *, how: str = "df[{0}]"
+) -> KnownColumns:
+    """Raise if a table has known columns in another order.
+
+    Other names say nothing, because they may be other spellings.
+
+    Args:
+        name: What the argument is called.
+        table: What the user gave, of any type.
+        known: The orders that are known.
+        how: Code that puts the columns into the order of a list.
+
+    Returns:
+        The orders that are known, with that of this table.
+
+    Raises:
+        InvalidInputError: If the order is another one.
+    """
+    names = column_names(table)
+    for expected, source in known.items():
+        if names == expected or sorted(names) != sorted(expected):
+            continue
+        start = f"Expected `{name}` with its columns in the order of {source}"
+        if len(names) <= MOST_LISTED:
+            raise InvalidInputError(
+                f"{start}, {list(expected)}; got {list(names)}. Pass "
+                f"`{how.format(list(expected))}`, where `df` is this table."
+            )
+        pairs = zip(names, expected, strict=True)
+        first = next(k for k, (ours, other) in enumerate(pairs) if ours != other)
+        raise InvalidInputError(
+            f"{start}; got {names[first]!r} in column {first}, where "
+            f"{expected[first]!r} is expected. Pass `{how.format('names')}`, where "
+            "`df` is this table and `names` is the list of columns in that order."
+        )
+    if not names or names in known:
+        return known
+    return {**known, names: f"the earlier table `{name}`"}
