@@ -16,7 +16,9 @@ from sbi_rope._validation import (
     default_names,
 )
 from sbi_rope.coupling import SinkhornCoupler
+from sbi_rope.diagnosis.also_in_pairs import also_in_pairs, implied_by_pairs
 from sbi_rope.diagnosis.far_entries import far_findings
+from sbi_rope.diagnosis.in_use import read_for, use_of
 from sbi_rope.diagnosis.labelled import labelled_finding
 from sbi_rope.diagnosis.misspecification import misspecification_findings
 from sbi_rope.diagnosis.prior_shift import PriorShift, prior_shift
@@ -30,6 +32,7 @@ from sbi_rope.diagnosis.simulations import Simulations
 from sbi_rope.diagnosis.spread import FEWEST, spread_of
 from sbi_rope.diagnosis.support import support_of
 from sbi_rope.errors import InvalidInputError
+from sbi_rope.mixture import MixturePosterior
 from sbi_rope.rope import HOW_TO_MAKE, RoPE
 
 __all__ = ["diagnose"]
@@ -38,6 +41,10 @@ __all__ = ["diagnose"]
 FEWEST_SIMULATIONS = 100
 # So many draws of the prior make a smooth histogram.
 NUM_DRAWN = 20_000
+LEFT_OUT = (
+    "Pass what `stack` or `rope.build_posterior` returns, or leave it out: then all "
+    "alarms are counted."
+)
 NO_STANDARDISATION = (
     "Whether an entry of x is far from all simulations was not tested, because NPE "
     "does not standardise x entry by entry (as for sets of trials)."
@@ -51,6 +58,7 @@ def diagnose(
     num_simulations: int | None = None,
     coupler: SinkhornCoupler | None = None,
     num_folds: int | None = 5,
+    posterior: MixturePosterior | None = None,
     parameter_names: Sequence[str] | None = None,
     seed: int | None = None,
     show_progress_bars: bool | None = None,
@@ -90,6 +98,12 @@ def diagnose(
         num_folds: The number of trainings for the residuals of 4, each of which takes
             as long as ``rope.train``. None leaves out 4, and the allowance for errors
             of g in both tests of 3.
+        posterior: The posterior that you use, such as that of :func:`sbi_rope.stack`,
+            made with the same pairs. Alarms are then counted for it, and what concerns
+            other posteriors only comes last. A shift against the prior is no alarm, but
+            expected, if the posterior is a stack that has learned it from the pairs,
+            the pairs show it as well, and 6 shows no sign of a difference. None counts
+            all alarms.
         parameter_names: One name for each parameter. If None, those of ``rope``, or
             "theta_1" and so on.
         seed: Seed of everything random; None uses the states of torch, NumPy and
@@ -113,6 +127,9 @@ def diagnose(
     """
     check_instance("rope", rope, RoPE, hint=HOW_TO_MAKE)
     check_instance("coupler", coupler, SinkhornCoupler, optional=True)
+    check_instance(
+        "posterior", posterior, MixturePosterior, optional=True, hint=LEFT_OUT
+    )
     if num_simulations is not None:
         check_integer("num_simulations", num_simulations, minimum=FEWEST_SIMULATIONS)
     if num_folds is not None:
@@ -158,14 +175,19 @@ def diagnose(
         if not far:
             notes.append(NO_STANDARDISATION)
         findings += far
-        findings += _labelled_findings(rope, before, batch.npe, notes)
+        # It decides whether anything that was found on the pairs holds for the batch.
+        findings = _labelled_findings(rope, before, batch.npe, notes) + findings
+        also = ()
+        if tuned:
+            pairs = implied_by_pairs(rope, batch.npe, simulations)
+            also = also_in_pairs(shift, pairs, names)
         prior = _moved(batch.npe.prior.sample(torch.Size((NUM_DRAWN,))))
     if not coupling.converged:
         notes.append(
             "The coupling has not converged, so that its effective sample sizes are "
             "approximate."
         )
-    return Diagnosis(
+    diagnosis = Diagnosis(
         findings=tuple(findings),
         notes=tuple(notes),
         flags=support.flags,
@@ -177,7 +199,9 @@ def diagnose(
         residuals=None if held_out is None else held_out.residuals,
         parameter_names=names,
         prior=prior,
+        also_in_pairs=also,
     )
+    return diagnosis if posterior is None else read_for(diagnosis, use_of(posterior))
 
 
 def _held_out(
@@ -193,9 +217,9 @@ def _held_out(
         )
     elif num_folds is None:
         note = (
-            "Residuals of calibration pairs were left out, as asked. Errors of g can "
-            "therefore look like a prior shift, or like a batch that is narrower than "
-            "the prior."
+            "Residuals of calibration pairs were left out, as asked. Errors of the "
+            "tuned embedding net can therefore look like a prior shift, or like a "
+            "batch that is narrower than the prior."
         )
     elif rope.labels.num_groups < 2:
         note = (

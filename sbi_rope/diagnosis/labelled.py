@@ -1,11 +1,9 @@
 """Say whether a batch is like the observations of the calibration pairs."""
 
 from sbi_rope._two_sample import LEVEL, TwoSampleTest
-from sbi_rope.diagnosis.report import Finding
+from sbi_rope.diagnosis.report import UNLIKE_PAIRS, Finding
 
 __all__ = ["UNLIKE_PAIRS", "labelled_finding"]
-
-UNLIKE_PAIRS = "batch unlike the calibration pairs"
 
 
 def labelled_finding(test: TwoSampleTest) -> Finding:

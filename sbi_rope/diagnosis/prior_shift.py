@@ -94,16 +94,18 @@ class PriorShift:
         return float(self.threshold[k]) < 1.0
 
     def _reason(self, k: int) -> str:
-        reason = (
-            "Alarming above the threshold (a Kolmogorov-Smirnov distance): one batch "
-            "of the prior in a hundred gets there in any parameter"
+        what = "Alarming above the threshold, a Kolmogorov-Smirnov distance"
+        chance = (
+            "one in a hundred batches that are drawn from the prior has more than "
+            f"{float(self.chance[k]):.2f} in one of its parameters"
         )
-        if self.error is None:
-            return f"{reason}."
-        return (
-            f"{reason} ({float(self.chance[k]):.2f}), and errors of g may add as much "
-            f"as for calibration pairs it has not seen ({float(self.error[k]):.2f})."
-        )
+        if self.error is not None:
+            what += ". It is the sum of two numbers"
+            chance += (
+                ", and errors of the tuned embedding net, as seen on calibration pairs "
+                f"that it was not trained on, may add {float(self.error[k]):.2f}"
+            )
+        return f"{what}: {chance}. In RoPE, a smaller tau trusts the prior less."
 
 
 def prior_shift(
@@ -210,10 +212,7 @@ def _sentence(
     sentence = f"The batch seems to have other values of {name} than the prior: {where}"
     if not tuned:
         return (
-            f"{sentence}. But g was not tuned, and then misspecification looks the "
-            "same."
+            f"{sentence}. But no calibration pairs have tuned the embedding net, and "
+            "then misspecification looks the same."
         )
-    return (
-        f"{sentence} (understated: observations are drawn to the prior). In RoPE, a "
-        "smaller tau trusts the prior less."
-    )
+    return f"{sentence} (understated: observations are drawn to the prior)."

@@ -9,16 +9,58 @@ from torch import Tensor
 
 from sbi_rope._notebooks import shown_as_text
 
-__all__ = ["Diagnosis", "Finding"]
+__all__ = [
+    "IN_BRIEF",
+    "OF_OTHERS",
+    "UNLIKE_PAIRS",
+    "Diagnosis",
+    "Finding",
+    "PosteriorInUse",
+    "whom_it_concerns",
+    "why_expected",
+]
 
 Concerned = Literal["NPE", "RoPE", "stack and RoPE"]
 
-# Whom an alarm concerns, in words.
+UNLIKE_PAIRS = "batch unlike the calibration pairs"
+# Whom an alarm concerns, in words. Those that concern most come last.
 IN_WORDS: dict[Concerned, str] = {
     "NPE": "NPE as it was trained, before any repair",
-    "RoPE": "RoPE, and not a stack without couplings among its candidates",
+    "RoPE": "the posteriors of RoPE and of `stack(rope, x_o)`, and not about that of "
+    "`stack(rope)`, which has no couplings",
     "stack and RoPE": "the posterior of `stack` and that of RoPE",
 }
+IN_BRIEF: dict[Concerned, str] = {
+    "NPE": "NPE",
+    "RoPE": "RoPE, stack(rope, x_o)",
+    "stack and RoPE": "RoPE and any stack",
+}
+# The heading of findings that do not concern the posterior in use.
+OF_OTHERS = (
+    "about RoPE and stacks with couplings, and not about this stack, which has none"
+)
+HOW_TO_COUNT = (
+    "`diagnose(rope, x_o, posterior=posterior)` counts only the alarms that concern "
+    "the posterior that you use."
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PosteriorInUse:
+    """What a diagnosis has to know of the posterior that is used.
+
+    Attributes:
+        name: What it is called: "this stack" or "this posterior".
+        has_couplings: Whether it may use the couplings of RoPE or its embedding net, so
+            that all findings concern it.
+        has_learned_parameters: Whether it is a stack that has learned from the pairs
+            how parameters are distributed, and the parameters of the pairs are not
+            distributed like the prior.
+    """
+
+    name: str
+    has_couplings: bool = True
+    has_learned_parameters: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,8 +77,10 @@ class Finding:
         concerns: Whose posterior an alarm is about: "NPE" as it was, that of "RoPE"
             only, or those of "stack and RoPE".
         is_p_value: Whether the number is a p-value.
-        is_expected: Whether the number is alarming, but expected where the simulator is
-            wrong, and no reason to distrust a repaired posterior.
+        is_expected: Whether the number is alarming, but no reason to distrust the
+            posterior: NPE is expected to be wrong where the simulator is, and a batch
+            is expected to differ from the prior as the pairs do, if a stack has learned
+            this from them.
     """
 
     name: str
@@ -57,7 +101,7 @@ class Finding:
 
     def __str__(self) -> str:
         mark = "!" if self.alarming and not self.is_expected else "-"
-        whom = f"This is about {IN_WORDS[self.concerns]}."
+        whom = whom_it_concerns(self)
         return "\n".join(
             [
                 f"{mark} {self.name}: {self.number}",
@@ -72,7 +116,8 @@ class Diagnosis:
     r"""Findings about a batch of real observations, and the arrays behind them.
 
     All tensors are float64 on the CPU unless said otherwise. Print it: alarms come
-    first and in full, and the other findings have a line each.
+    first and in full, and the other findings have a line each. Those that do not
+    concern the posterior in use come last, if one was given.
 
     Attributes:
         findings: The results of all tests.
@@ -90,6 +135,9 @@ class Diagnosis:
             trained on other pairs, ``(n_c, l)``; None if they were left out.
         parameter_names: One name for each parameter.
         prior: Draws of the prior, ``(n, d)``, for pictures.
+        also_in_pairs: The names of findings in which the calibration pairs differ from
+            the prior as the batch does, whether they are alarming or not.
+        posterior: What is known of the posterior in use, if one was given.
     """
 
     findings: tuple[Finding, ...]
@@ -103,38 +151,63 @@ class Diagnosis:
     residuals: Tensor | None = field(repr=False)
     parameter_names: tuple[str, ...]
     prior: Tensor = field(repr=False)
+    also_in_pairs: tuple[str, ...] = ()
+    posterior: PosteriorInUse | None = None
 
     @property
     def alarming(self) -> tuple[Finding, ...]:
-        """The findings beyond their thresholds, the expected ones included."""
+        """All findings beyond their thresholds, also those that are expected."""
         return tuple(finding for finding in self.findings if finding.alarming)
 
     @property
     def unexpected(self) -> tuple[Finding, ...]:
         """The alarming findings that nobody expected, and that call for action.
 
-        Those about all posteriors come first, and those about NPE alone last.
+        Those about all posteriors come first, and those about NPE alone last. Those
+        that do not concern the posterior in use are left out, if one was given.
         """
         order = list(reversed(IN_WORDS))
-        unexpected = [one for one in self.alarming if not one.is_expected]
+        unexpected = [one for one in self._own if one.alarming and not one.is_expected]
         return tuple(sorted(unexpected, key=lambda one: order.index(one.concerns)))
 
     @property
     def expected(self) -> tuple[Finding, ...]:
-        """The findings that only say that the simulator is wrong, as expected."""
-        return tuple(one for one in self.alarming if one.is_expected)
+        """The alarming findings that are expected, see :attr:`Finding.is_expected`."""
+        return tuple(one for one in self._own if one.alarming and one.is_expected)
+
+    @property
+    def quiet(self) -> tuple[Finding, ...]:
+        """The findings that are not alarming, without those about other posteriors."""
+        return tuple(one for one in self._own if not one.alarming)
+
+    @property
+    def others(self) -> tuple[Finding, ...]:
+        """The findings that do not concern the posterior in use, if one was given."""
+        return tuple(one for one in self.findings if not self._concerns(one))
+
+    @property
+    def _own(self) -> tuple[Finding, ...]:
+        return tuple(one for one in self.findings if self._concerns(one))
+
+    def _concerns(self, finding: Finding) -> bool:
+        used = self.posterior
+        return used is None or used.has_couplings or finding.concerns != "RoPE"
 
     @property
     def verdict(self) -> str:
         """How many findings are alarming, in a sentence."""
-        count = len(self.unexpected)
+        count, whose = len(self.unexpected), ""
+        if self.posterior is not None:
+            whose = f" that concern {self.posterior.name}"
         verdict = (
-            f"{count or 'none'} of {len(self.findings)} findings "
+            f"{count or 'none'} of {len(self._own)} findings{whose} "
             f"{'is' if count < 2 else 'are'} alarming."
         )
-        if self.expected:
-            one = "Another" if count else "One"
-            verdict += f" {one} is as expected where the simulator is wrong."
+        for why, found in _by_reason(self.expected).items():
+            number = f"{len(found)}{' others' * bool(count)} are"
+            if len(found) == 1:
+                number = f"{'Another' if count else 'One'} is"
+            verdict += f" {number} as expected {why}."
         return verdict
 
     def __contains__(self, name: str) -> bool:
@@ -150,25 +223,70 @@ class Diagnosis:
         return [asdict(finding) for finding in self.findings]
 
     def __str__(self) -> str:
-        quiet = [finding for finding in self.findings if not finding.alarming]
         count = len(self.distance)
         lines = [
             _indented(
                 f"Diagnosis of {count} observation{'s' * (count > 1)} against "
-                f"{len(self.theta)} simulations: {self.verdict}",
+                f"{len(self.theta)} simulations: {self.verdict}{self._like_pairs}",
                 first="",
             ),
             *_in_full(self.unexpected),
         ]
-        if self.expected:
-            lines.append("as expected where the simulator is wrong:")
-        for one in self.expected:
-            lines += [f"  {one.name}: {one.number}", _indented(one.sentence)]
-        if quiet:
-            lines.append("no alarm (in brackets whose posterior one would be about):")
-        lines += [f"  {one.name}: {one.number} [{one.concerns}]" for one in quiet]
-        lines += [_indented(note, first="* ") for note in self.notes]
+        for why, found in _by_reason(self.expected).items():
+            lines.append(_indented(f"as expected {why}:", first=""))
+            for one in found:
+                lines += [f"  {one.name}: {one.number}", _indented(one.sentence)]
+        brief = {one: f" [{IN_BRIEF[one]}]" for one in IN_BRIEF}
+        if self.posterior is not None:
+            brief = dict.fromkeys(IN_BRIEF, "")
+            if self.quiet:
+                lines.append("no alarm:")
+        elif self.quiet:
+            lines.append(
+                "no alarm (an alarm would be about the posteriors in brackets):"
+            )
+        lines += [
+            f"  {one.name}: {one.number}{brief[one.concerns]}" for one in self.quiet
+        ]
+        if self.others:
+            lines.append(f"{OF_OTHERS}:")
+        lines += [
+            f"  {one.name}: {one.number}{', alarming' * one.alarming}"
+            for one in self.others
+        ]
+        notes = list(self.notes)
+        if self.posterior is None and self.unexpected:
+            notes.append(HOW_TO_COUNT)
+        lines += [_indented(note, first="* ") for note in notes]
         return "\n".join(lines)
+
+    @property
+    def _like_pairs(self) -> str:
+        """Say in a sentence what decides whether what was found on pairs holds here."""
+        if UNLIKE_PAIRS not in self or self[UNLIKE_PAIRS].alarming:
+            return ""
+        value = f"p = {self[UNLIKE_PAIRS].value:.3g}"
+        return f" No sign that the batch is unlike the calibration pairs ({value})."
+
+
+def whom_it_concerns(finding: Finding) -> str:
+    """Return a sentence that says which posteriors a finding is about."""
+    return f"This is about {IN_WORDS[finding.concerns]}."
+
+
+def why_expected(finding: Finding) -> str:
+    """Say why a finding is expected, after "as expected"."""
+    if finding.concerns == "NPE":
+        return "where the simulator is wrong"
+    return "of this stack, which has learned from the pairs where parameters are"
+
+
+def _by_reason(findings: Iterable[Finding]) -> dict[str, list[Finding]]:
+    """Return expected findings by why they are expected."""
+    reasons: dict[str, list[Finding]] = {}
+    for one in findings:
+        reasons.setdefault(why_expected(one), []).append(one)
+    return reasons
 
 
 def _in_full(findings: Iterable[Finding]) -> list[str]:

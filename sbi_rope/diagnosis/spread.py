@@ -63,16 +63,21 @@ class Spread:
         ]
 
     def _reason(self, k: int) -> str:
-        reason = (
-            "Alarming below the threshold (a ratio of standard deviations): one batch "
-            "of the prior in a hundred gets there in any parameter"
+        what = "Alarming below the threshold, a ratio of standard deviations"
+        chance = (
+            "one in a hundred batches that are drawn from the prior has less than "
+            f"{float(self.chance[k]):.2f} in one of its parameters"
         )
-        if self.error is None:
-            return f"{reason}."
+        if self.error is not None:
+            what += ". It is the product of two numbers"
+            chance += (
+                ", and errors of the tuned embedding net, as seen on calibration pairs "
+                "that it was not trained on, may lower the ratio by a factor of "
+                f"{float(self.error[k]):.2f}"
+            )
         return (
-            f"{reason} ({float(self.chance[k]):.2f}), and errors of g, as seen on "
-            "calibration pairs that it was not trained on, may lower the ratio by a "
-            f"factor of {float(self.error[k]):.2f}."
+            f"{what}: {chance}. In RoPE, a smaller tau trusts the prior less. Scores "
+            "and calibration on pairs of the whole prior need not hold for this batch."
         )
 
 
@@ -182,11 +187,10 @@ def _sentence(name: str, ratio: float, *, narrow: bool, tuned: bool) -> str:
     sentence = f"The batch seems to have a narrower range of {name} than the prior"
     if not tuned:
         return (
-            f"{sentence}: {size}. But g was not tuned, and then misspecification looks "
-            "the same."
+            f"{sentence}: {size}. But no calibration pairs have tuned the embedding "
+            "net, and then misspecification looks the same."
         )
     return (
         f"{sentence}: {size} (the true range is narrower still, because observations "
-        "are noisy). In RoPE, a smaller tau trusts the prior less. Scores and "
-        "calibration on pairs of the whole prior need not hold for this batch."
+        "are noisy)."
     )

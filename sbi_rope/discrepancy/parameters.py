@@ -11,13 +11,17 @@ from torch.distributions import MultivariateNormal
 from sbi_rope._validation import check_batch, check_pair_weights, check_tensor
 from sbi_rope.errors import InvalidInputError
 
-__all__ = ["ParameterDistribution", "learn_parameters"]
+__all__ = ["ParameterDistribution", "is_improbable", "learn_parameters"]
 
 # Draws of each label that is not exact.
 NUM_SETS = 10
 # The prior's mean and covariance count as much as this number of pairs. The results are
 # averaged, weighted by their evidence.
 STRENGTHS = (2.0, 5.0, 10.0, 30.0, 100.0)
+# Parameters of pairs are said not to follow the prior if this is less probable. At most
+# one in 19 sets of pairs from the prior gets there by chance, because the two were
+# equally probable before (Markov's inequality).
+IMPROBABLE = 0.05
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -94,6 +98,11 @@ def learn_parameters(
         weights = weights.to(theta_cal.device, torch.double)
     sets = theta_cal.unbind(dim=1)[:NUM_SETS] if theta_cal.ndim == 3 else [theta_cal]
     return _average([_learn(draws, theta, weights) for draws in sets])
+
+
+def is_improbable(probability_of_prior: float | None) -> bool:
+    """Tell whether the parameters of pairs are hardly draws from the prior."""
+    return probability_of_prior is not None and probability_of_prior < IMPROBABLE
 
 
 def _average(parts: Sequence[ParameterDistribution]) -> ParameterDistribution:

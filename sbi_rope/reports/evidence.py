@@ -3,7 +3,12 @@
 from collections.abc import Sequence
 
 from sbi_rope.diagnosis import Diagnosis, Finding
-from sbi_rope.diagnosis.report import IN_WORDS
+from sbi_rope.diagnosis.report import (
+    IN_BRIEF,
+    OF_OTHERS,
+    whom_it_concerns,
+    why_expected,
+)
 from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.discrepancy.report import what_groups_count_as, what_outliers_mean
 from sbi_rope.metrics import CoverageCurve
@@ -203,7 +208,6 @@ def diagnosis_section(diagnosis: Diagnosis, names: Sequence[str]) -> str:
             diagnosis have those that it was made with.
     """
     shown = (*diagnosis.unexpected, *diagnosis.expected)
-    quiet = [result for result in diagnosis.findings if not result.alarming]
     return section(
         "Diagnosis of the batch",
         paragraph(
@@ -220,7 +224,8 @@ def diagnosis_section(diagnosis: Diagnosis, names: Sequence[str]) -> str:
             )
             for result in shown
         ),
-        *_no_alarm(quiet),
+        *_no_alarm(diagnosis.quiet),
+        *_of_others(diagnosis.others),
         *(paragraph(note, kind="note") for note in diagnosis.notes),
         picture(
             implied_parameters(diagnosis),
@@ -242,8 +247,8 @@ def _other_names(own: Sequence[str], names: Sequence[str]) -> list[str]:
 
 def _in_words(result: Finding) -> str:
     if result.is_expected:
-        return f"{result.sentence} It is as expected where the simulator is wrong."
-    return f"{result.sentence} This is about {IN_WORDS[result.concerns]}."
+        return f"{result.sentence} It is as expected {why_expected(result)}."
+    return f"{result.sentence} {whom_it_concerns(result)}"
 
 
 def _no_alarm(quiet: Sequence[Finding]) -> list[str]:
@@ -253,6 +258,24 @@ def _no_alarm(quiet: Sequence[Finding]) -> list[str]:
         paragraph("No alarm:"),
         table(
             ("finding", "number", "whose posterior it would be about"),
-            [(result.name, result.number, result.concerns) for result in quiet],
+            [
+                (result.name, result.number, IN_BRIEF[result.concerns])
+                for result in quiet
+            ],
+        ),
+    ]
+
+
+def _of_others(others: Sequence[Finding]) -> list[str]:
+    if not others:
+        return []
+    return [
+        paragraph(f"{OF_OTHERS[0].upper()}{OF_OTHERS[1:]}:"),
+        table(
+            ("finding", "number", "alarming"),
+            [
+                (result.name, result.number, "yes" if result.alarming else "no")
+                for result in others
+            ],
         ),
     ]

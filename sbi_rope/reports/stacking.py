@@ -10,6 +10,7 @@ from sbi_rope._validation import (
     default_names,
 )
 from sbi_rope.diagnosis import Diagnosis
+from sbi_rope.diagnosis.in_use import read_for, stack_in_use
 from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.errors import InvalidInputError, shown
 from sbi_rope.plots._figures import new_figure
@@ -88,6 +89,10 @@ def write_stacking_report(
     names = _parameter_names(report, diagnosis, parameter_names)
     discrepancy = _named(report.discrepancy, x_names)
     check_target(target)
+    if diagnosis is not None:
+        # The page is about this stack, whichever posterior the diagnosis was made for.
+        used = stack_in_use(report, is_amortised=report.is_amortised)
+        diagnosis = read_for(diagnosis, used)
     parts = [
         paragraph(_what_was_done(report)),
         list_of(verdict_of(report, diagnosis, names), kind="verdict"),

@@ -78,6 +78,8 @@ class StackingReport:
         learns_prior: Whether a candidate learns from the pairs how parameters are
             distributed.
         parameter_names: One name for each parameter; None if they have none.
+        is_amortised: Whether the stack has no couplings, and answers any x; None if it
+            is not known.
     """
 
     cross_validation: CrossValidation
@@ -99,6 +101,7 @@ class StackingReport:
     probability_of_prior: float | None = None
     learns_prior: bool = True
     parameter_names: tuple[str, ...] | None = None
+    is_amortised: bool | None = None
 
     @classmethod
     def of(
@@ -113,6 +116,7 @@ class StackingReport:
         probability_of_prior: float | None = None,
         learns_prior: bool = True,
         parameter_names: tuple[str, ...] | None = None,
+        is_amortised: bool | None = None,
     ) -> "StackingReport":
         """Compute the report of a stack.
 
@@ -127,6 +131,7 @@ class StackingReport:
                 drawn from the prior.
             learns_prior: Whether a candidate learns how parameters are distributed.
             parameter_names: One name for each parameter, if they have names.
+            is_amortised: Whether it has no couplings.
         """
         check_instance("cross_validation", cross_validation, CrossValidation)
         check_instance("learning_curve", learning_curve, LearningCurve, optional=True)
@@ -156,6 +161,7 @@ class StackingReport:
             probability_of_prior=probability_of_prior,
             learns_prior=learns_prior,
             parameter_names=parameter_names,
+            is_amortised=is_amortised,
         )
 
     @property
@@ -203,7 +209,8 @@ class StackingReport:
             path: The file. Its folder is made if there is none. A report of this
                 package that is there already is replaced, and no other file.
             diagnosis: What :func:`sbi_rope.diagnose` says about the batch, if the
-                report should hold it.
+                report should hold it. The page counts the alarms that concern this
+                stack, whichever posterior the diagnosis was made for.
             parameter_names: A name for each parameter. If None, those that ``RoPE`` was
                 given, those of the diagnosis, or "theta_1" and so on.
             x_names: A name for each entry of x; "x[0]" and so on if None.

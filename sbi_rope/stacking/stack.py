@@ -6,6 +6,7 @@ from typing import Literal
 from torch import Tensor
 
 from sbi_rope._validation import check_choice, check_instance, check_unit_interval
+from sbi_rope.discrepancy.parameters import is_improbable
 from sbi_rope.errors import warn_user
 from sbi_rope.rope import HOW_TO_MAKE, RoPE
 from sbi_rope.stacking.batch import compare_batch
@@ -17,7 +18,6 @@ from sbi_rope.stacking.provenance import Stopwatch
 from sbi_rope.stacking.recalibrating import check_recalibration
 from sbi_rope.stacking.report import StackingReport
 from sbi_rope.stacking.trainer import StackTrainer
-from sbi_rope.stacking.words import is_improbable
 
 __all__ = ["cross_validate", "stack"]
 
@@ -165,6 +165,7 @@ def stack(
             discrepancy=trainer.discrepancy(),
             probability_of_prior=probability,
             learns_prior=trainer.learns_prior,
+            is_amortised=versions.couplings is None,
             parameter_names=rope.parameter_names,
             recalibration=trainer.recalibration(scores) if recalibrate else None,
             # This comes last, because it counts what came before.

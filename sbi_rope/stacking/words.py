@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from sbi_rope._validation import default_names
+from sbi_rope.discrepancy.parameters import is_improbable
 from sbi_rope.metrics.calibration import ACAUC_IN_WORDS, FEWEST
 from sbi_rope.stacking.cross_validation import Difference
 from sbi_rope.stacking.learning_curve import LearningCurve
@@ -28,7 +29,6 @@ __all__ = [
     "compared",
     "differs",
     "gains_of",
-    "is_improbable",
     "lines_of",
     "not_the_prior",
     "parameters_off",
@@ -59,10 +59,7 @@ OVER_CONFIDENT = (
     "More labels help most. Until then, take intervals of a higher level than you need."
 )
 
-# The text says that the parameters of the pairs do not follow the prior if this is less
-# probable. At most one in 19 sets of pairs from the prior gets there by chance, because
-# the two were equally probable before (Markov's inequality).
-IMPROBABLE = 0.05
+# What follows if the parameters of the pairs do not follow the prior.
 IF_LEARNED = (
     "The stack has learned where they are. It expects the same of new observations, "
     "and is too sure about those with other parameters."
@@ -200,11 +197,6 @@ def _weights(report: "StackingReport") -> list[str]:
 def _how_many(report: "StackingReport", family: str) -> str:
     count = report.cross_validation.families.count(family)
     return f" ({count} candidates)" if count > 1 else ""
-
-
-def is_improbable(probability_of_prior: float | None) -> bool:
-    """Tell whether the parameters of pairs are hardly draws from the prior."""
-    return probability_of_prior is not None and probability_of_prior < IMPROBABLE
 
 
 def not_the_prior(report: "StackingReport") -> str:

@@ -150,7 +150,7 @@ def test_misspecification_is_found_in_a_rope_without_pairs() -> None:
     # Nothing repairs it without pairs.
     assert diagnosis.expected == ()
     assert "observations no simulation matches" in alarms(diagnosis)
-    assert "g was not tuned" in diagnosis[SHIFTS[0]].sentence
+    assert "no calibration pairs have tuned" in diagnosis[SHIFTS[0]].sentence
 
 
 def test_a_prior_shift_is_found_in_the_parameter_that_shifts(tuned: RoPE) -> None:
@@ -286,6 +286,11 @@ def test_the_text_has_a_line_for_each_finding_and_rows_their_numbers(
         assert finding.reason not in " ".join(text.split())
     verdict = "none of 12 findings is alarming. One is as expected"
     assert verdict in " ".join(text.split())
+    # What decides whether anything found on the pairs holds here is read at once.
+    like = "No sign that the batch is unlike the calibration pairs (p = "
+    assert like in " ".join(text.split())[:350]
+    assert misspecified.findings[0].name == UNLIKE
+    assert f"{UNLIKE}: {misspecified[UNLIKE].number} [RoPE and any stack]" in text
     assert "\n! " not in text
     assert len(text.splitlines()) < 30
 
@@ -304,7 +309,8 @@ def test_alarms_come_first_and_say_whom_they_concern_and_why(
     assert text.index("! prior shift: theta_2") < text.index("no alarm")
     for finding in loud:
         assert (finding.sentence in shown) == finding.alarming
-    assert "This is about RoPE, and not a stack without couplings" in shown
+    about_rope = "This is about the posteriors of RoPE and of `stack(rope, x_o)`, and"
+    assert f"{about_rope} not about that of `stack(rope)`" in shown
     assert "This is about the posterior of `stack` and that of RoPE." in shown
     assert "farthest observation" not in text[text.index("no alarm") :]
     # What concerns every posterior is read first.
@@ -326,6 +332,14 @@ def test_a_finding_prints_as_sentences_and_p_values_as_such(
     assert whole.startswith(unlike.sentence)
     assert whole.endswith(unlike.reason)
     assert "p = " not in misspecified["farthest observation"].number
+
+
+def test_thresholds_are_explained_without_symbols(misspecified: Diagnosis) -> None:
+    for name, how in ((SHIFTS[0], "sum"), (NARROW[0], "product")):
+        finding = misspecified[name]
+        assert f"It is the {how} of two numbers: " in finding.reason
+        assert "errors of the tuned embedding net" in finding.reason
+        assert " g " not in str(finding)
 
 
 def test_a_rope_whose_pairs_were_not_trained_on_is_trained_as_a_copy() -> None:

@@ -169,6 +169,7 @@ CALLS = [
             "num_simulations": "count",
             "coupler": "instance",
             "num_folds": "count",
+            "posterior": "instance",
             "parameter_names": "names",
             "seed": "seed",
         },

@@ -1,0 +1,206 @@
+"""A diagnosis for the posterior in use counts the alarms that concern it."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from sbi_rope import RoPE, StackedPosterior, diagnose
+from sbi_rope.diagnosis import Diagnosis
+from sbi_rope.diagnosis.in_use import read_for, stack_in_use
+from sbi_rope.errors import InvalidTypeError
+from sbi_rope.mixture import MixturePosterior
+from tests import problems
+from tests.stacks import FITTED, NPE, NUM_PAIRS, PRIOR, QUIET, problem, rope_of, stacked
+
+# Batches and calibration sets are small here on purpose.
+pytestmark = pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
+
+SHIFTS = {"prior shift: theta_1", "prior shift: theta_2"}
+NARROW = {"narrower than the prior: theta_1", "narrower than the prior: theta_2"}
+UNLIKE = "batch unlike the calibration pairs"
+AFTER = "misspecification after tuning"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _fewer_draws() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sbi_rope.diagnosis.misspecification.NUM_DRAWS", 120)
+        yield
+
+
+def drawn(n: int, *, seed: int, centre: float = 0.5) -> tuple[Tensor, Tensor]:
+    """Return pairs whose parameters are in a part of the prior."""
+    theta = 0.3 * problem(n, seed=seed)[0] + centre
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        return theta, problems.simulate(theta) + 0.4
+
+
+@pytest.fixture(scope="module")
+def rope() -> RoPE:
+    return rope_of(drawn(NUM_PAIRS, seed=1)).train(seed=0, **QUIET)
+
+
+@pytest.fixture(scope="module")
+def stack(rope: RoPE) -> StackedPosterior:
+    return stacked(rope, candidates=[PRIOR, NPE, FITTED])
+
+
+@pytest.fixture(scope="module")
+def x_o() -> Tensor:
+    return drawn(60, seed=2)[1]
+
+
+def look(
+    rope: RoPE, x_o: Tensor, posterior: MixturePosterior | None = None
+) -> Diagnosis:
+    return diagnose(
+        rope,
+        x_o,
+        posterior=posterior,
+        num_simulations=200,
+        num_folds=None,
+        seed=0,
+        **QUIET,
+    )
+
+
+@pytest.fixture(scope="module")
+def of_stack(rope: RoPE, stack: StackedPosterior, x_o: Tensor) -> Diagnosis:
+    return look(rope, x_o, stack)
+
+
+@pytest.fixture(scope="module")
+def of_anyone(rope: RoPE, x_o: Tensor) -> Diagnosis:
+    return look(rope, x_o)
+
+
+def names(findings: object) -> set[str]:
+    return {finding.name for finding in findings}  # type: ignore[attr-defined]
+
+
+def test_nothing_alarms_about_a_stack_whose_batch_is_drawn_like_its_pairs(
+    of_stack: Diagnosis, of_anyone: Diagnosis
+) -> None:
+    assert names(of_anyone.unexpected) > SHIFTS | NARROW
+    assert of_stack.unexpected == ()
+    assert names(of_stack.expected) >= SHIFTS | NARROW
+    assert {one.concerns for one in of_stack.others} == {"RoPE"}
+    # They are the same numbers, read by somebody who uses the stack.
+    numbers = [(one.name, one.number, one.alarming) for one in of_anyone.findings]
+    assert numbers == [
+        (one.name, one.number, one.alarming) for one in of_stack.findings
+    ]
+
+
+def test_the_verdict_for_the_stack_comes_first_and_what_does_not_concern_it_last(
+    of_stack: Diagnosis,
+) -> None:
+    text = " ".join(str(of_stack).split())
+    verdict = "none of 7 findings that concern this stack is alarming."
+    assert verdict in text
+    like = f"the batch is unlike the calibration pairs ({of_stack[UNLIKE].number[:5]}"
+    assert like in text[: text.index("as expected where the simulator is wrong:")]
+    first, _, last = text.partition("and not about this stack, which has none:")
+    assert f"{AFTER}: " not in first
+    # An alarm about others is said to be one.
+    assert of_stack[AFTER].alarming
+    assert f"{AFTER}: {of_stack[AFTER].number}, alarming" in last
+    assert "\n! " not in str(of_stack)
+    assert "posterior=posterior" not in text
+
+
+def test_without_a_posterior_all_is_counted_and_the_text_says_how_to_give_one(
+    of_anyone: Diagnosis,
+) -> None:
+    assert of_anyone.others == ()
+    assert of_anyone[AFTER] in of_anyone.unexpected
+    assert "`diagnose(rope, x_o, posterior=posterior)` counts only" in str(of_anyone)
+
+
+def test_a_shift_that_the_pairs_do_not_show_is_an_alarm_about_the_stack(
+    rope: RoPE, stack: StackedPosterior
+) -> None:
+    diagnosis = look(rope, drawn(60, seed=2, centre=-0.5)[1], stack)
+    assert names(diagnosis.unexpected) >= SHIFTS | {UNLIKE}
+    assert SHIFTS.isdisjoint(diagnosis.also_in_pairs)
+    assert f"! {UNLIKE}" in str(diagnosis)
+    # Without the sign in one test, the other keeps the alarm.
+    quiet = tuple(
+        replace(one, alarming=one.name != UNLIKE and one.alarming)
+        for one in diagnosis.findings
+    )
+    used = diagnosis.posterior
+    assert used is not None
+    found = read_for(replace(diagnosis, findings=quiet), used)
+    assert names(found.unexpected) >= SHIFTS
+
+
+def test_a_shift_that_the_pairs_show_is_an_alarm_where_nothing_has_learned_it(
+    stack: StackedPosterior, of_stack: Diagnosis
+) -> None:
+    report = stack.report
+    for other in (
+        replace(report, learns_prior=False),
+        replace(report, probability_of_prior=0.3),
+        replace(report, probability_of_prior=None),
+    ):
+        found = read_for(of_stack, stack_in_use(other, is_amortised=True))
+        assert names(found.unexpected) == SHIFTS | NARROW
+    # Nor is it expected where the comparison with the pairs is missing.
+    others = tuple(one for one in of_stack.findings if one.name != UNLIKE)
+    used = of_stack.posterior
+    assert used is not None
+    found = read_for(replace(of_stack, findings=others), used)
+    assert names(found.unexpected) == SHIFTS | NARROW
+
+
+def test_all_findings_concern_posteriors_with_couplings(
+    rope: RoPE,
+    stack: StackedPosterior,
+    x_o: Tensor,
+    of_stack: Diagnosis,
+    of_anyone: Diagnosis,
+) -> None:
+    coupled = rope.build_posterior(x_o, num_simulations=100, seed=0)
+    diagnosis = look(rope, x_o, coupled)
+    assert diagnosis.others == ()
+    assert names(diagnosis.unexpected) == names(of_anyone.unexpected)
+    assert "that concern this posterior are alarming" in diagnosis.verdict
+    with_couplings = stack_in_use(stack.report, is_amortised=False)
+    found = read_for(of_stack, with_couplings)
+    assert AFTER in names(found.unexpected)
+    assert names(found.expected) >= SHIFTS
+
+
+def test_what_is_no_posterior_of_this_package_is_refused(
+    rope: RoPE, x_o: Tensor
+) -> None:
+    with pytest.raises(InvalidTypeError, match="`posterior` to be a MixturePosterior"):
+        look(rope, x_o, rope.npe)
+
+
+def test_the_page_of_a_stack_counts_its_alarms_whomever_the_diagnosis_was_for(
+    stack: StackedPosterior,
+    of_stack: Diagnosis,
+    of_anyone: Diagnosis,
+    tmp_path: Path,
+) -> None:
+    pytest.importorskip("matplotlib")
+    assert stack.report.is_amortised
+
+    def page(diagnosis: Diagnosis) -> str:
+        path = tmp_path / "report.html"
+        stack.report.to_html(path, diagnosis=diagnosis)
+        return path.read_text(encoding="utf-8")
+
+    for diagnosis in (of_anyone, of_stack):
+        text = page(diagnosis)
+        assert "none of 7 findings that concern this stack is alarming" in text
+        assert "and not about this stack" in text
+        assert "It is as expected of this stack, which has learned" in text
+        assert 'class="finding alarm"' not in text
