@@ -33,7 +33,7 @@ nitpicky = True
 OTHERS = r"(abc|collections|os|pathlib|sbi|torch)\..*|Figure|DirectPosterior"
 # What signatures name and users never make themselves.
 INSIDE = (
-    r"sbi_rope\.(_.*|.*\.(KeptEmbeddings|Rule|StartingNPE|Term|Versions)|tasks\..*)"
+    r"sbi_rope\.(_.*|.*\.(KeptEmbeddings|PosteriorInUse|Rule|StartingNPE|Term|Versions)|tasks\..*)"
 )
 nitpick_ignore_regex = [("py:.*", f"{OTHERS}|{INSIDE}")]
 

@@ -172,7 +172,7 @@ class Diagnosis:
 
     @property
     def expected(self) -> tuple[Finding, ...]:
-        """The alarming findings that are expected, see :attr:`Finding.is_expected`."""
+        """The alarming findings that are expected, see ``Finding.is_expected``."""
         return tuple(one for one in self._own if one.alarming and one.is_expected)
 
     @property
