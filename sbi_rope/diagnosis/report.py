@@ -236,18 +236,7 @@ class Diagnosis:
             lines.append(_indented(f"as expected {why}:", first=""))
             for one in found:
                 lines += [f"  {one.name}: {one.number}", _indented(one.sentence)]
-        brief = {one: f" [{IN_BRIEF[one]}]" for one in IN_BRIEF}
-        if self.posterior is not None:
-            brief = dict.fromkeys(IN_BRIEF, "")
-            if self.quiet:
-                lines.append("no alarm:")
-        elif self.quiet:
-            lines.append(
-                "no alarm (an alarm would be about the posteriors in brackets):"
-            )
-        lines += [
-            f"  {one.name}: {one.number}{brief[one.concerns]}" for one in self.quiet
-        ]
+        lines += self._without_alarm()
         if self.others:
             lines.append(f"{OF_OTHERS}:")
         lines += [
@@ -259,6 +248,19 @@ class Diagnosis:
             notes.append(HOW_TO_COUNT)
         lines += [_indented(note, first="* ") for note in notes]
         return "\n".join(lines)
+
+    def _without_alarm(self) -> list[str]:
+        """Return a line for each quiet finding; of one posterior, not whose it is."""
+        if not self.quiet:
+            return []
+        lines = [f"  {one.name}: {one.number}" for one in self.quiet]
+        if self.posterior is not None:
+            return ["no alarm:", *lines]
+        whose = [f" [{IN_BRIEF[one.concerns]}]" for one in self.quiet]
+        return [
+            "no alarm (an alarm would be about the posteriors in brackets):",
+            *(line + text for line, text in zip(lines, whose, strict=True)),
+        ]
 
     @property
     def _like_pairs(self) -> str:
