@@ -7,6 +7,7 @@ from torch import Tensor
 
 from sbi_rope._groups import one_of_each_group, split_groups
 from sbi_rope._means import Counts
+from sbi_rope._permutation import permutation_test
 from sbi_rope._progress import progress_bar
 from sbi_rope._sbi import embed
 from sbi_rope._training import without_warning_of_few_pairs
@@ -24,7 +25,6 @@ __all__ = [
     "residual_findings",
 ]
 
-NUM_PERMUTATIONS = 1000
 LEVEL = 0.01
 # Averaging over the simulator's noise explains at most this, see `residual_finding`.
 LARGEST_RATIO = 0.5
@@ -132,24 +132,13 @@ def dependence(residuals: Tensor, theta: Tensor) -> Dependence:
     count = num_features(*theta.shape)
     standard = (theta - theta.mean(dim=0)) / theta.std(dim=0).clamp_min(1e-12)
     features = torch.cat([standard, standard.square()], dim=1)[:, :count]
-    features = features - features.mean(dim=0)
-    vectors, values, _ = torch.linalg.svd(features, full_matrices=False)
-    basis = vectors[:, values > 1e-9 * values.max()]
-    centred = residuals - residuals.mean(dim=0)
-    explained = float((basis.T @ centred).square().sum())
-    permuted = torch.stack(
-        [
-            (basis.T @ centred[torch.randperm(len(centred))]).square().sum()
-            for _ in range(NUM_PERMUTATIONS)
-        ]
-    )
-    # A permutation that is equal up to rounding counts.
-    reached = int((permuted >= explained * (1 - 1e-12)).sum())
-    n, p = len(centred), basis.shape[1]
-    variance = (float(centred.square().sum()) - explained) / (n - 1 - p)
-    square = max(explained - p * variance, 0.0) / n
+    found = permutation_test(residuals, features)
+    n, p = len(residuals), found.num_features
+    total = float((residuals - residuals.mean(dim=0)).square().sum())
+    variance = (total - found.explained) / (n - 1 - p)
+    square = max(found.explained - p * variance, 0.0) / n
     return Dependence(
-        p_value=(1 + reached) / (1 + NUM_PERMUTATIONS),
+        p_value=found.p_value,
         bias=square**0.5,
         error=((variance + square / 2) / n) ** 0.5,
     )

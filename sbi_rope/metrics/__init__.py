@@ -12,6 +12,7 @@ return one score each. All of them use the functions in
 No score enters sbi's unbounded rejection loops: see ``sbi_rope.metrics.calls``.
 """
 
+from sbi_rope.metrics.by_estimate import CoverageByEstimate, coverage_by_estimate
 from sbi_rope.metrics.calibration import (
     ACAUCScore,
     CoverageCurve,
@@ -29,6 +30,7 @@ from sbi_rope.metrics.evaluation import Evaluation, evaluate
 
 __all__ = [
     "ACAUCScore",
+    "CoverageByEstimate",
     "CoverageCurve",
     "CoverageErrorScore",
     "Evaluation",
@@ -36,6 +38,7 @@ __all__ = [
     "acauc",
     "acauc_of",
     "central_levels",
+    "coverage_by_estimate",
     "coverage_curve",
     "coverage_curve_of",
     "draw_samples",

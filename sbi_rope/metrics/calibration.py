@@ -36,6 +36,7 @@ __all__ = [
     "coverage_curve_of_pairs",
     "coverage_error_of_pairs",
     "expected_coverage_error_of",
+    "means_of_pairs",
     "mid_ranks",
     "random_ranks",
     "standard_error_of_mean",
@@ -276,7 +277,7 @@ def acauc_of_pairs(
         value=mean - 0.5,
         standard_error=error,
         interval=(mean - 0.5 - width, mean - 0.5 + width),
-        per_parameter=_per_parameter(levels, counts) - 0.5,
+        per_parameter=means_of_pairs(levels, counts) - 0.5,
     )
 
 
@@ -314,7 +315,7 @@ def coverage_curve_of_pairs(
     coverage, errors = [], []
     for alpha in nominal:
         inside = _inside(levels, alpha)
-        coverage.append(_per_parameter(inside, counts))
+        coverage.append(means_of_pairs(inside, counts))
         errors.append(_mean_over_pairs(_mean(inside, dim=1), counts)[1])
     number = len(levels) if counts is None else int(counts.effective_number + ROUNDING)
     return CoverageCurve(
@@ -366,7 +367,7 @@ def coverage_error_of_pairs(
     influence = levels.new_zeros(levels.shape[0], dtype=torch.float64)
     for alpha in nominal:
         inside = _inside(levels, alpha)
-        gap = _per_parameter(inside, counts) - alpha
+        gap = means_of_pairs(inside, counts) - alpha
         distance += gap.abs()
         influence += _mean(gap.sign() * inside, dim=1)
     per_parameter = distance / nominal.numel()
@@ -403,7 +404,7 @@ def _mean_over_pairs(
     return *mean_and_error(values, counts), counts.effective_number
 
 
-def _per_parameter(values: Tensor, counts: Counts | None) -> Tensor:
+def means_of_pairs(values: Tensor, counts: Counts | None) -> Tensor:
     """Return the mean over pairs of those that are not NaN, ``(n, d)`` to ``(d,)``."""
     if counts is None:
         return _mean(values, dim=0)

@@ -1,14 +1,23 @@
 """All scores of a posterior from one set of samples."""
 
 import math
+import textwrap
 from dataclasses import dataclass, field
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from sbi_rope._notebooks import shown_as_text
 from sbi_rope._random import seeded
 from sbi_rope._units import std_of_prior
+from sbi_rope._validation import default_names
+from sbi_rope.metrics.by_estimate import (
+    CoverageByEstimate,
+    coverage_by_estimate_of_pairs,
+    estimates_and_ranks,
+    in_words,
+)
 from sbi_rope.metrics.calibration import (
     ACAUC_IN_WORDS,
     FEWEST,
@@ -19,12 +28,13 @@ from sbi_rope.metrics.calibration import (
     central_levels,
     coverage_curve_of,
     expected_coverage_error_of,
+    random_ranks,
 )
 from sbi_rope.metrics.calls import (
     CHUNK_SIZE,
     check_num_samples,
     check_test_set,
-    draw_ranks,
+    draw_chunks,
     evaluate_log_probs,
     is_normalised,
 )
@@ -53,6 +63,7 @@ class Evaluation:
         acauc: The average coverage AUC of central intervals.
         coverage: The coverage of central intervals.
         expected_coverage_error: The distance of the coverage from the diagonal.
+        by_estimate: Whether the coverage of 90 % intervals depends on the estimate.
         unit_z: The units of ``lpp_z`` in words.
         is_normalised: Whether the density is corrected for mass outside the prior; None
             if that is not known.
@@ -64,6 +75,7 @@ class Evaluation:
     acauc: ACAUCScore
     coverage: CoverageCurve
     expected_coverage_error: CoverageErrorScore
+    by_estimate: CoverageByEstimate
     unit_z: str = GIVEN_UNITS
     is_normalised: bool | None = None
 
@@ -91,8 +103,9 @@ class Evaluation:
             f"{0.31 / n**0.5:.3f} with {n} observations",
             f"  50% intervals hold {self._inside(0.5):.0%} of the true parameters, 90% "
             f"intervals {self._inside(0.9):.0%}",
+            *self._by_estimate(),
             "  all values: .lpp, .lpp_z, .ranks, .acauc, .coverage, "
-            ".expected_coverage_error",
+            ".expected_coverage_error, .by_estimate",
         ]
         return "\n".join(lines)
 
@@ -104,6 +117,15 @@ class Evaluation:
         if verdict == "calibrated":
             verdict += " as far as these observations can tell"
         return f"{verdict}: {value}, 95 % interval {low:+.3f} to {high:+.3f}"
+
+    def _by_estimate(self) -> list[str]:
+        return [
+            part
+            for line in in_words(self.by_estimate, default_names(self.ranks.shape[1]))
+            for part in textwrap.wrap(
+                line, 88, initial_indent="  ", subsequent_indent="    "
+            )
+        ]
 
     def _densities(self) -> list[str]:
         scores = {"theta in its own units": self.lpp}
@@ -182,7 +204,8 @@ def evaluate(
                 posterior, theta, x, chunk_size=chunk_size, show=show_progress_bars
             )
         )
-        ranks = draw_ranks(
+        of_all, of_halves = [], []
+        chunks = draw_chunks(
             posterior,
             theta,
             x,
@@ -190,7 +213,12 @@ def evaluate(
             chunk_size=chunk_size,
             show=show_progress_bars,
         )
+        for rows, samples in chunks:
+            of_all.append(random_ranks(samples, theta[rows]))
+            of_halves.append(estimates_and_ranks(samples, theta[rows]))
+    ranks = torch.cat(of_all)
     levels = central_levels(ranks)
+    estimates, held_out = (torch.cat(parts) for parts in zip(*of_halves, strict=True))
     return Evaluation(
         lpp=natural,
         lpp_z=None if theta_std is None else natural.standardised(theta_std),
@@ -198,6 +226,7 @@ def evaluate(
         acauc=acauc_of(levels),
         coverage=coverage_curve_of(levels),
         expected_coverage_error=expected_coverage_error_of(levels),
+        by_estimate=coverage_by_estimate_of_pairs(held_out, estimates),
         unit_z=unit_z,
         is_normalised=is_normalised(posterior),
     )

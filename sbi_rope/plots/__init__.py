@@ -7,6 +7,7 @@ when a function is called. Install it with ``pip install sbi-rope[benchmarks]``.
 from sbi_rope.plots.diagnosis import implied_parameters
 from sbi_rope.plots.diagnostics import (
     calibration_curves,
+    coverage_by_estimate,
     effective_sample_sizes,
     finetuning_history,
 )
@@ -19,6 +20,7 @@ from sbi_rope.plots.summaries import discrepancy
 
 __all__ = [
     "calibration_curves",
+    "coverage_by_estimate",
     "credible_set",
     "discrepancy",
     "effective_sample_sizes",

@@ -1,33 +1,46 @@
-"""Pictures of calibration curves, losses of a fine-tuning, and sizes of couplings."""
+"""Pictures of calibration, losses of a fine-tuning, and sizes of couplings."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import torch
 
-from sbi_rope._validation import check_batch, check_instance, check_mapping
+from sbi_rope._validation import (
+    check_batch,
+    check_instance,
+    check_mapping,
+    check_names,
+    default_names,
+)
 from sbi_rope.coupling import Coupling
 from sbi_rope.finetuning import History
-from sbi_rope.metrics import CoverageCurve
+from sbi_rope.metrics import CoverageByEstimate, CoverageCurve
 from sbi_rope.plots._figures import (
     BLUE,
     GREY,
     SKY,
     VERMILLION,
     draw_calibrated_band,
+    empty_figure,
+    hide_frame,
     line_styles,
     new_figure,
 )
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = [
     "calibration_curves",
+    "coverage_by_estimate",
     "effective_sample_sizes",
     "finetuning_history",
 ]
+
+# The most parameters that are drawn, each in a panel.
+MAX_PANELS = 6
 
 
 def calibration_curves(curves: Mapping[str, CoverageCurve]) -> "Figure":
@@ -71,6 +84,69 @@ def calibration_curves(curves: Mapping[str, CoverageCurve]) -> "Figure":
     # The legend is beside the axes, because a curve can be in any corner inside.
     axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.02, 1.0))
     return figure
+
+
+def coverage_by_estimate(
+    found: CoverageByEstimate, *, parameter_names: Sequence[str] | None = None
+) -> "Figure":
+    r"""Draw the ranks of true parameters against the posterior means.
+
+    A rank of 0 is below all samples of the posterior, and one of 1 above all. If the
+    posterior is calibrated, ranks are spread evenly over the whole height, whatever the
+    estimate is. Parameters in the grey bands are outside their intervals. Lines divide
+    the thirds of the estimates, and the share inside the intervals is written above
+    each. There is a panel for each of the first six parameters.
+
+    Args:
+        found: What :func:`sbi_rope.metrics.coverage_by_estimate` returns, or
+            ``posterior.report.by_estimate`` of a stack.
+        parameter_names: A name for each parameter; "theta_1" and so on if None.
+
+    Returns:
+        The figure.
+
+    Raises:
+        InvalidTypeError: If the argument is something else.
+        InvalidInputError: If the names do not fit.
+        ImportError: If matplotlib is not installed.
+    """
+    check_instance("found", found, CoverageByEstimate)
+    count = len(found.p_values)
+    names: Sequence[str] = default_names(count)
+    if parameter_names is not None:
+        names = check_names("parameter_names", parameter_names, count)
+    shown = min(count, MAX_PANELS)
+    columns = min(shown, 3)
+    rows = math.ceil(shown / columns)
+    figure = empty_figure(max(3.2 * columns, 4.2), 2.8 * rows)
+    panels = figure.subplots(rows, columns, sharey=True, squeeze=False).flat
+    for k, (axes, name) in enumerate(zip(panels, names[:shown], strict=False)):
+        _draw_ranks(axes, found, k)
+        axes.set_xlabel(f"estimate of {name}")
+        if k % columns == 0:
+            axes.set_ylabel("rank of the true parameter")
+    for axes in figure.axes[shown:]:
+        axes.set_axis_off()
+    return figure
+
+
+def _draw_ranks(axes: "Axes", found: CoverageByEstimate, k: int) -> None:
+    tail = (1 - found.level) / 2
+    for low, high in ((0.0, tail), (1 - tail, 1.0)):
+        axes.axhspan(low, high, color="0.88", lw=0)
+    axes.plot(found.estimates[:, k], found.ranks[:, k], "o", color=BLUE, ms=3.5)
+    left, right = axes.get_xlim()
+    edges = [edge for edge in found.edges[k].tolist() if not math.isnan(edge)]
+    for edge in edges:
+        axes.axvline(edge, color=GREY, lw=0.8)
+    if edges:
+        ends = [left, *edges, right]
+        for share, start, stop in zip(
+            found.shares[k].tolist(), ends, ends[1:], strict=False
+        ):
+            axes.text((start + stop) / 2, 1.03, f"{share:.0%}", ha="center", size=9)
+    axes.set(xlim=(left, right), ylim=(0, 1))
+    hide_frame(axes)
 
 
 def finetuning_history(history: History) -> "Figure":

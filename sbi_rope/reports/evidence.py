@@ -1,5 +1,6 @@
 """Sections of a page about calibration, discrepancies and a diagnosis."""
 
+import math
 from collections.abc import Sequence
 
 from sbi_rope.diagnosis import Diagnosis, Finding
@@ -13,11 +14,22 @@ from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.discrepancy.report import what_groups_count_as, what_outliers_mean
 from sbi_rope.metrics import CoverageCurve
 from sbi_rope.metrics.calibration import acauc_of_pairs
-from sbi_rope.plots import calibration_curves, discrepancy, implied_parameters
+from sbi_rope.plots import (
+    calibration_curves,
+    coverage_by_estimate,
+    discrepancy,
+    implied_parameters,
+)
 from sbi_rope.reports.numbers import number, percent
 from sbi_rope.reports.page import finding, paragraph, picture, section, table
 from sbi_rope.stacking import StackingReport
-from sbi_rope.stacking.words import LEVEL, is_measured, sets_held
+from sbi_rope.stacking.words import (
+    IF_IT_DEPENDS,
+    LEVEL,
+    depends_on_estimate,
+    is_measured,
+    sets_held,
+)
 
 __all__ = [
     "calibration_section",
@@ -77,7 +89,50 @@ def calibration_section(report: StackingReport, names: Sequence[str]) -> str:
             "Below the diagonal intervals are too narrow, above it too wide. The band "
             "holds 95 % of the curves of calibrated posteriors.",
         ),
+        *_by_estimate(report, names),
     )
+
+
+def _by_estimate(report: StackingReport, names: Sequence[str]) -> list[str]:
+    """Return whether coverage is the same for low and for high estimates."""
+    found = report.by_estimate
+    if found is None or not found.num_tested:
+        return []
+    inside, rows, alarming = percent(found.level), [], []
+    for name, shares, p_value, depends in zip(
+        names, found.shares.tolist(), found.p_values, found.depends, strict=True
+    ):
+        if math.isnan(p_value):
+            continue
+        if depends:
+            alarming.append(len(rows))
+        rows.append((name, *map(percent, shares), number(p_value, digits=3)))
+    depends = depends_on_estimate(report)
+    verdict = "depends on it" if depends else "shows no sign that it depends on it"
+    text = (
+        "Coverage can be right on average and wrong for low or high estimates. Here it "
+        f"{verdict}. The table has the share of known parameters inside their {inside} "
+        "intervals for each third of the estimates, and the p-value of a test of "
+        "whether intervals are equally good everywhere."
+    )
+    return [
+        paragraph(f"{text} {IF_IT_DEPENDS}" if depends else text),
+        table(
+            ("parameter", "lowest third", "middle third", "highest third", "p"),
+            rows,
+            numbers=(1, 2, 3, 4),
+            alarming=alarming,
+        ),
+        picture(
+            coverage_by_estimate(found, parameter_names=names),
+            caption="Where each known parameter is among samples of its posterior, "
+            "from 0 (below all) to 1 (above all), against the estimate. For a "
+            "calibrated posterior the points are spread evenly everywhere. Those in "
+            f"the grey bands are outside their {inside} intervals, and the numbers "
+            "above are the shares inside.",
+            wide=len(names) > 2,
+        ),
+    ]
 
 
 def _recalibration(report: StackingReport) -> list[str]:

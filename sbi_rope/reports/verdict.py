@@ -14,6 +14,8 @@ from sbi_rope.stacking.words import (
     OVER_CONFIDENT,
     TOO_FEW,
     compared,
+    coverage_by_estimate,
+    depends_on_estimate,
     not_the_prior,
     parameters_off,
 )
@@ -36,6 +38,9 @@ def verdict_of(
     ]
     lines.append(_calibrated(report))
     lines += [(f"{line}.", True) for line in parameters_off(report, names)]
+    if depends_on_estimate(report):
+        found = coverage_by_estimate(report, names)
+        lines += [(f"{_sentence(line)}.", True) for line in found]
     if what_follows := not_the_prior(report):
         start = "The known parameters are not distributed as the prior assumes."
         lines.append((f"{start} {what_follows}", True))
@@ -51,10 +56,14 @@ def verdict_of(
     return lines
 
 
+def _sentence(line: str) -> str:
+    return line[0].upper() + line[1:]
+
+
 def _calibrated(report: StackingReport) -> tuple[str, bool]:
     verdict = report.acauc.verdict
     if verdict == "unknown":
-        return NOT_CHECKED[0].upper() + NOT_CHECKED[1:] + ".", False
+        return f"{_sentence(NOT_CHECKED)}.", False
     if report.cross_validation.effective_number < FEWEST:
         return f"There are {TOO_FEW}: ACAUC {report.acauc.value:+.3f}.", False
     known = "known parameters"

@@ -72,6 +72,12 @@ class CrossValidation:
             normalised inside the support of the prior as the stack's ``log_prob`` is.
         levels: The levels of the stack's central intervals that end at the true
             parameters, shape ``(n, d)``. They are uniform if the stack is calibrated.
+        estimates: The means of the stack at each pair, shape ``(n, d)``; None in files
+            of earlier versions.
+        ranks: The ranks of the true parameters in the stack, shape ``(n, d)``. They
+            come from other draws than the means, see
+            :func:`~sbi_rope.metrics.coverage_by_estimate`. None in files of earlier
+            versions.
         pseudo_count: As in :func:`stacking_weights`.
         log_unit: The sum of the logs of the prior's standard deviations; NaN if it is
             unknown. Scores with theta in these units are higher by this number. With
@@ -99,6 +105,8 @@ class CrossValidation:
     num_trained_on: int
     stack_scores: Tensor = field(repr=False)
     levels: Tensor = field(repr=False)
+    estimates: Tensor | None = field(default=None, repr=False)
+    ranks: Tensor | None = field(default=None, repr=False)
     pseudo_count: float = 1.0
     log_unit: float = float("nan")
     pair_weights: Tensor | None = field(default=None, repr=False)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from sbi_rope._random import seeded
 from sbi_rope.errors import SamplingError
+from sbi_rope.metrics.by_estimate import estimates_and_ranks
 from sbi_rope.metrics.calibration import central_levels, random_ranks
 from sbi_rope.metrics.calls import draw_chunks
 from sbi_rope.mixture import MixturePosterior
@@ -83,6 +84,8 @@ class FoldScores:
     Attributes:
         log_prob: The log density, normalised inside the prior's support, ``(n,)``.
         levels: As in :class:`~sbi_rope.stacking.CrossValidation`, ``(n, d)``.
+        estimates: As in :class:`~sbi_rope.stacking.CrossValidation`, ``(n, d)``.
+        ranks: As in :class:`~sbi_rope.stacking.CrossValidation`, ``(n, d)``.
         joint: As in :class:`SetScores`.
         marginal: As in :class:`SetScores`.
         errors: The Monte-Carlo errors of ``log_prob``, zero for exact labels, ``(n,)``.
@@ -90,6 +93,8 @@ class FoldScores:
 
     log_prob: Tensor
     levels: Tensor
+    estimates: Tensor
+    ranks: Tensor
     joint: Tensor
     marginal: Tensor
     errors: Tensor
@@ -116,7 +121,7 @@ def score_fold(
     Raises:
         SamplingError: If the posterior has almost no mass inside the prior's support.
     """
-    log_prob, levels, joint, marginal = [], [], [], []
+    log_prob, levels, joint, marginal, by_estimate = [], [], [], [], []
     with explained(), seeded(seed):
         chunks = draw_chunks(
             posterior,
@@ -136,9 +141,13 @@ def score_fold(
             joint.append(joint_scores(log_probs[:1].T, log_probs[1:].T)[:, 0])
             columns = draws.permute(1, 2, 0)
             marginal.append(marginal_scores(theta[rows, :, None], columns)[..., 0])
+            by_estimate.append(estimates_and_ranks(draws, theta[rows]))
+    estimates, ranks = (torch.cat(parts) for parts in zip(*by_estimate, strict=True))
     return FoldScores(
         log_prob=torch.cat(log_prob),
         levels=torch.cat(levels).to(theta),
+        estimates=estimates.to(theta),
+        ranks=ranks.to(theta),
         joint=torch.cat(joint),
         marginal=torch.cat(marginal),
         errors=torch.zeros(len(theta), dtype=torch.double, device=theta.device),

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from sbi_rope._labels import Labels, Nodes, Reference, nodes_of, reference_of
 from sbi_rope._random import seeded
+from sbi_rope.metrics.by_estimate import estimates_and_ranks
 from sbi_rope.metrics.calibration import central_levels, count_ranks
 from sbi_rope.metrics.calls import draw_samples
 from sbi_rope.mixture import MixtureEstimator, MixturePosterior
@@ -120,7 +121,9 @@ def score_labelled_fold(
     log_prob, errors = scores.of_stack(weights)
     with explained(), seeded(seed):
         log_mass = posterior.leakage_correction(x).double().log()
-        levels = label_levels(posterior, labels, x, num_samples=num_samples)
+        levels, estimates, ranks = label_levels(
+            posterior, labels, x, num_samples=num_samples
+        )
     marginal = torch.full_like(labels.theta, torch.nan)
     joint = torch.full_like(log_prob, torch.nan)
     if (exact := labels.is_exact).any():
@@ -131,6 +134,8 @@ def score_labelled_fold(
     return FoldScores(
         log_prob=log_prob - log_mass,
         levels=levels,
+        estimates=estimates,
+        ranks=ranks,
         joint=joint,
         marginal=marginal,
         errors=errors,
@@ -139,7 +144,7 @@ def score_labelled_fold(
 
 def label_levels(
     posterior: MixturePosterior, labels: Labels, x: Tensor, *, num_samples: int
-) -> Tensor:
+) -> tuple[Tensor, Tensor, Tensor]:
     r"""Return the levels of the central intervals of labels that end at them.
 
     For a noisy label this is the interval of the measurement, not of the parameter:
@@ -153,13 +158,20 @@ def label_levels(
         num_samples: The number of draws for each observation.
 
     Returns:
-        Shape ``(n, d)``, NaN for parameters that were not measured, and for labels
-        given as draws.
+        The levels, the means of the posterior and the ranks of the labels, each of
+        shape ``(n, d)``. Levels and ranks are NaN for parameters that were not
+        measured, and for labels given as draws.
     """
+    unknown = torch.full_like(labels.theta, torch.nan)
     if labels.samples is not None:
-        return torch.full_like(labels.theta, torch.nan)
+        return unknown, unknown, unknown
     samples = draw_samples(posterior, x, num_samples=num_samples)
     std = labels.covariance.diagonal(dim1=1, dim2=2).sqrt().to(samples)
     measured = samples + std * torch.randn_like(samples)
     levels = central_levels(count_ranks(measured, labels.theta)).to(labels.theta)
-    return levels.where(labels.is_measured, torch.nan)
+    estimates, ranks = estimates_and_ranks(measured, labels.theta)
+    return (
+        levels.where(labels.is_measured, torch.nan),
+        estimates.to(labels.theta),
+        ranks.to(labels.theta).where(labels.is_measured, torch.nan),
+    )

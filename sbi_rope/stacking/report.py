@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sbi_rope._groups import groups_of, one_of_each_group
 from sbi_rope._notebooks import shown_as_text
 from sbi_rope._tables import as_dataframe
 from sbi_rope._two_sample import TwoSampleTest
@@ -15,9 +16,11 @@ from sbi_rope._validation import check_instance
 from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.metrics import (
     ACAUCScore,
+    CoverageByEstimate,
     CoverageCurve,
     CoverageErrorScore,
 )
+from sbi_rope.metrics.by_estimate import coverage_by_estimate_of_pairs
 from sbi_rope.metrics.calibration import acauc_of_pairs, coverage_error_of_pairs
 from sbi_rope.recalibration import Recalibration
 from sbi_rope.sets.conformal import rank_needed
@@ -72,6 +75,8 @@ class StackingReport:
         acauc_of_parameters: ACAUC of each parameter by itself. The intervals are so
             wide that those of d calibrated parameters all hold 0 in at least 95 % of
             the cases (Bonferroni).
+        by_estimate: Whether the coverage of the stack's 90 % intervals depends on the
+            estimate. None in files of earlier versions.
         probability_of_prior: The probability that the parameters of the pairs were
             drawn from the prior, see :func:`~sbi_rope.discrepancy.learn_parameters`;
             None if it is not known.
@@ -98,6 +103,7 @@ class StackingReport:
     provenance: Provenance | None = None
     recalibration: Recalibration | None = None
     acauc_of_parameters: tuple[ACAUCScore, ...] = ()
+    by_estimate: CoverageByEstimate | None = None
     probability_of_prior: float | None = None
     learns_prior: bool = True
     parameter_names: tuple[str, ...] | None = None
@@ -158,6 +164,7 @@ class StackingReport:
             provenance=provenance,
             recalibration=recalibration,
             acauc_of_parameters=_acauc_of_parameters(scores),
+            by_estimate=_by_estimate(scores),
             probability_of_prior=probability_of_prior,
             learns_prior=learns_prior,
             parameter_names=parameter_names,
@@ -243,6 +250,17 @@ def _acauc_of_parameters(scores: CrossValidation) -> tuple[ACAUCScore, ...]:
     return tuple(
         acauc_of_pairs(column, scores.counts, confidence=confidence)
         for column in columns
+    )
+
+
+def _by_estimate(scores: CrossValidation) -> CoverageByEstimate | None:
+    if scores.ranks is None or scores.estimates is None:
+        return None
+    chosen = None
+    if scores.groups is not None:
+        chosen = one_of_each_group(groups_of(scores.groups), seed=0)
+    return coverage_by_estimate_of_pairs(
+        scores.ranks, scores.estimates, scores.counts, chosen=chosen, level=LEVEL
     )
 
 

@@ -68,6 +68,8 @@ def score_versions(
         num_trained_on=len(fold) * num_training_folds // len(bench.folds),
         stack_scores=of_stack.log_prob,
         levels=of_stack.levels,
+        estimates=of_stack.estimates,
+        ranks=of_stack.ranks,
         set_scores=_set_scores(bench, of_stack, weights, seed=seed),
         pseudo_count=pseudo_count,
         log_unit=_log_unit(bench),

@@ -9,6 +9,7 @@ import torch
 
 from sbi_rope._validation import default_names
 from sbi_rope.discrepancy.parameters import is_improbable
+from sbi_rope.metrics.by_estimate import in_words
 from sbi_rope.metrics.calibration import ACAUC_IN_WORDS, FEWEST
 from sbi_rope.stacking.cross_validation import Difference
 from sbi_rope.stacking.learning_curve import LearningCurve
@@ -27,6 +28,8 @@ __all__ = [
     "TOO_FEW",
     "are_relative",
     "compared",
+    "coverage_by_estimate",
+    "depends_on_estimate",
     "differs",
     "gains_of",
     "lines_of",
@@ -57,6 +60,12 @@ ON_AVERAGE = ", on average over the parameters,"
 # What to do about a stack whose intervals are too narrow.
 OVER_CONFIDENT = (
     "More labels help most. Until then, take intervals of a higher level than you need."
+)
+
+# What to do if they are too narrow for some estimates and too wide for others.
+IF_IT_DEPENDS = (
+    "Trust an interval as its own third deserves, and label more observations there. A "
+    "guarantee is about all observations together, and does not change this."
 )
 
 # What follows if the parameters of the pairs do not follow the prior.
@@ -250,6 +259,7 @@ def _calibration(report: "StackingReport") -> list[str]:
         f"{'measured values' if is_measured(report) else 'parameters'}",
         *(f"    {line}" for line in off),
         *advice,
+        *_by_estimate(report),
         *_sets(report),
         *_assumption(report),
     ]
@@ -283,6 +293,42 @@ def parameters_off(
                 f"{100 - 5 / len(scores):.3g} % interval {low:+.3f} to {high:+.3f}"
             )
     return lines
+
+
+def depends_on_estimate(report: "StackingReport") -> bool:
+    """Whether the coverage of a parameter depends on its estimate, as far as known."""
+    return report.by_estimate is not None and any(report.by_estimate.depends)
+
+
+def coverage_by_estimate(
+    report: "StackingReport", names: Sequence[str] | None = None
+) -> list[str]:
+    """Say for which parameters the coverage depends on the estimate, or for none.
+
+    Args:
+        report: The report of a stack.
+        names: A name for each parameter. If None, those of the report, or "theta_1"
+            and so on.
+    """
+    found = report.by_estimate
+    if found is None:
+        return []
+    names = names or report.parameter_names or default_names(len(found.p_values))
+    known = "measured values" if is_measured(report) else "parameters"
+    return in_words(found, names, known=known)
+
+
+def _by_estimate(report: "StackingReport") -> list[str]:
+    lines = coverage_by_estimate(report)
+    if depends_on_estimate(report):
+        lines.append(IF_IT_DEPENDS)
+    return [
+        part
+        for line in lines
+        for part in textwrap.wrap(
+            line, 88, initial_indent="    ", subsequent_indent="      "
+        )
+    ]
 
 
 def _recalibration(report: "StackingReport") -> list[str]:

@@ -17,7 +17,7 @@ from sbi_rope._two_sample import TwoSampleTest
 from sbi_rope._units import log_unit_of
 from sbi_rope.discrepancy import DiscrepancyModel
 from sbi_rope.errors import InvalidInputError, RoPEWarning
-from sbi_rope.metrics import LPPScore, acauc_of
+from sbi_rope.metrics import LPPScore, acauc_of, coverage_by_estimate
 from sbi_rope.stacking import (
     CrossValidation,
     Difference,
@@ -212,6 +212,58 @@ def test_parameters_that_are_not_calibrated_by_themselves_are_named() -> None:
     # The verdict on a single parameter is that on the stack.
     single = replace(report.cross_validation, levels=levels[:, :1].sqrt())
     assert "by itself" not in str(StackingReport.of(single))
+
+
+@pytest.mark.parametrize("groups", [False, True])
+def test_a_parameter_whose_coverage_depends_on_its_estimate_is_named(
+    groups: bool,
+) -> None:
+    """The second has intervals that are too narrow where its estimate is large."""
+    report, n = made_up(n=100), 100
+    assert "the estimate" not in str(report)  # where ranks are not known
+    generator = torch.Generator().manual_seed(4)
+    ranks = torch.rand(n, 2, generator=generator, dtype=torch.double)
+    estimates = torch.randn(n, 2, generator=generator, dtype=torch.double)
+    scores = replace(report.cross_validation, ranks=ranks, estimates=estimates)
+    if groups:  # every two pairs are of one specimen
+        halves = torch.full((n,), 0.5)
+        scores = replace(scores, groups=torch.arange(n) // 2, pair_weights=halves)
+    sentence = "no sign that coverage depends on the estimate (smallest p-value of 2:"
+    assert sentence in str(StackingReport.of(scores))
+    if groups:  # a pair and its twin are no more evidence than one of them
+        alone = coverage_by_estimate(ranks[::2], estimates[::2])
+        rows = torch.arange(n) // 2 * 2
+        twins = replace(scores, ranks=ranks[rows], estimates=estimates[rows])
+        of_twins = StackingReport.of(twins).by_estimate
+        assert of_twins is not None
+        assert of_twins.p_values == alone.p_values
+    high = estimates[:, 1] > estimates[:, 1].median()
+    off = ranks.clone()
+    off[high, 1] = ranks[high, 1].round() * 0.98 + 0.01
+    scores = replace(scores, ranks=off)
+    found = StackingReport.of(scores, parameter_names=("slope", "size"))
+    assert found.by_estimate is not None
+    assert found.by_estimate.depends == (False, True)
+    low, middle, high_share = found.by_estimate.shares[1].tolist()
+    assert high_share == 0.0
+    text = " ".join(str(found).split())
+    p_value = f"(p = {found.by_estimate.p_values[1]:.1g})"
+    assert f"the coverage of size depends on its estimate {p_value}: 90% inter" in text
+    assert f"hold {low:.0%}, {middle:.0%} and 0% of the parameters for the low" in text
+    assert "label more observations there" in text
+    assert "the coverage of slope" not in text
+
+
+def test_estimates_and_ranks_are_those_of_held_out_pairs() -> None:
+    scores = the_stack().report.cross_validation
+    assert scores.ranks is not None
+    assert scores.estimates is not None
+    # The levels come from all draws, and the ranks from half of them.
+    assert float((2 * scores.ranks - 1).abs().sub(scores.levels).abs().mean()) < 0.1
+    theta = rope_of().calibration[0]
+    is_above = scores.ranks > 0.5
+    agrees = is_above == (theta > scores.estimates)
+    assert float(agrees.double().mean()) > 0.8
 
 
 @pytest.mark.slow

@@ -142,7 +142,9 @@ def test_levels_of_noisy_labels_are_uniform_if_the_posterior_is_right() -> None:
         weights=torch.ones(300, dtype=torch.double),
     )
     posterior: Any = gaussian.posterior()
-    levels = label_levels(posterior, noisy, gaussian.simulator(theta), num_samples=200)
+    levels, *_ = label_levels(
+        posterior, noisy, gaussian.simulator(theta), num_samples=200
+    )
     assert torch.allclose(levels.mean(dim=0), torch.tensor(0.5), atol=0.05)
 
 
