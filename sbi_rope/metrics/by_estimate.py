@@ -94,7 +94,11 @@ class CoverageByEstimate:
 
 
 def coverage_by_estimate(
-    ranks: Tensor, estimates: Tensor, *, level: float = 0.9
+    ranks: Tensor,
+    estimates: Tensor,
+    *,
+    level: float = 0.9,
+    allow_missing: bool = False,
 ) -> CoverageByEstimate:
     r"""Test whether the ranks of true parameters depend on the posterior means.
 
@@ -112,9 +116,10 @@ def coverage_by_estimate(
 
     Args:
         ranks: The ranks of the true parameters, from 0 to 1, shape ``(n, d)``, such as
-            those of :func:`mid_ranks`. NaN where a parameter is not known.
+            those of :func:`mid_ranks`.
         estimates: The posterior means, shape ``(n, d)``.
         level: The level of the intervals whose coverage is stated.
+        allow_missing: Whether ranks may be NaN, where the parameter is not known.
 
     Returns:
         The coverage in each third of the estimates, and the p-values. They are always
@@ -139,7 +144,8 @@ def coverage_by_estimate(
     check_batch("ranks", ranks, estimates.shape[1:], finite=False)
     check_same_length("ranks", ranks, "estimates", estimates)
     check_device("ranks", ranks, estimates.device, where="`estimates`")
-    central_levels(ranks[~torch.isnan(ranks)])  # checks that they are in [0, 1]
+    known = ranks[~torch.isnan(ranks)] if allow_missing else ranks
+    central_levels(known)  # checks that they are in [0, 1]
     return coverage_by_estimate_of_pairs(ranks, estimates, level=level)
 
 
@@ -171,7 +177,9 @@ def coverage_by_estimate_of_pairs(
     edges = torch.stack(
         [_edges(estimates[rows, k]) for k, rows in enumerate(known.unbind(dim=1))]
     )
-    part = (estimates[:, :, None] > edges).sum(dim=2)
+    # A third of the observations each, even if estimates are equal.
+    place = estimates.where(known, torch.inf).argsort(dim=0, stable=True).argsort(dim=0)
+    part = place * NUM_PARTS // known.sum(dim=0).clamp_min(1)
     inside = ((2 * ranks - 1).abs() <= level + ROUNDING).double()
     shares = [
         means_of_pairs(inside.where(known & (part == number), torch.nan), counts)

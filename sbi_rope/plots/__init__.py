@@ -7,9 +7,9 @@ when a function is called. Install it with ``pip install sbi-rope[benchmarks]``.
 from sbi_rope.plots.diagnosis import implied_parameters
 from sbi_rope.plots.diagnostics import (
     calibration_curves,
-    coverage_by_estimate,
     effective_sample_sizes,
     finetuning_history,
+    ranks_by_estimate,
 )
 from sbi_rope.plots.observations import real_and_simulated
 from sbi_rope.plots.posteriors import pair_plot
@@ -20,7 +20,6 @@ from sbi_rope.plots.summaries import discrepancy
 
 __all__ = [
     "calibration_curves",
-    "coverage_by_estimate",
     "credible_set",
     "discrepancy",
     "effective_sample_sizes",
@@ -28,6 +27,7 @@ __all__ = [
     "implied_parameters",
     "overview",
     "pair_plot",
+    "ranks_by_estimate",
     "real_and_simulated",
     "stacking_report",
 ]

@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 
 __all__ = [
     "calibration_curves",
-    "coverage_by_estimate",
     "effective_sample_sizes",
     "finetuning_history",
+    "ranks_by_estimate",
 ]
 
 # The most parameters that are drawn, each in a panel.
@@ -86,7 +86,7 @@ def calibration_curves(curves: Mapping[str, CoverageCurve]) -> "Figure":
     return figure
 
 
-def coverage_by_estimate(
+def ranks_by_estimate(
     found: CoverageByEstimate, *, parameter_names: Sequence[str] | None = None
 ) -> "Figure":
     r"""Draw the ranks of true parameters against the posterior means.

@@ -16,9 +16,9 @@ from sbi_rope.metrics import CoverageCurve
 from sbi_rope.metrics.calibration import acauc_of_pairs
 from sbi_rope.plots import (
     calibration_curves,
-    coverage_by_estimate,
     discrepancy,
     implied_parameters,
+    ranks_by_estimate,
 )
 from sbi_rope.reports.numbers import number, percent
 from sbi_rope.reports.page import finding, paragraph, picture, section, table
@@ -124,7 +124,7 @@ def _by_estimate(report: StackingReport, names: Sequence[str]) -> list[str]:
             alarming=alarming,
         ),
         picture(
-            coverage_by_estimate(found, parameter_names=names),
+            ranks_by_estimate(found, parameter_names=names),
             caption="Where each known parameter is among samples of its posterior, "
             "from 0 (below all) to 1 (above all), against the estimate. For a "
             "calibrated posterior the points are spread evenly everywhere. Those in "

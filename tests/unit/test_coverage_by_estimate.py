@@ -121,18 +121,27 @@ def test_shares_are_those_of_each_third() -> None:
             assert ((estimates[rows, k] < found.edges[k, 1]) == (number < 2)).all()
 
 
+def test_thirds_are_filled_if_estimates_are_equal() -> None:
+    ranks = torch.rand(30, 1, generator=torch.Generator().manual_seed(5))
+    found = coverage_by_estimate(ranks, torch.ones(30, 1))
+    assert found.p_values == (1.0,)
+    inside = ((ranks - 0.5).abs() <= 0.45).double().reshape(3, 10).mean(dim=1)
+    assert torch.equal(found.shares[0], inside)
+
+
 def test_parameters_that_are_not_known_are_left_out() -> None:
     theta, mean = estimated()
     ranks = ranks_in(theta, 1.3 * mean, gaussian.POSTERIOR_STD)
     alone = coverage_by_estimate(ranks[::2], mean[::2])
     gaps = ranks.clone()
     gaps[1::2] = torch.nan
-    found = coverage_by_estimate(gaps, mean)
+    found = coverage_by_estimate(gaps, mean, allow_missing=True)
     assert found.p_values == alone.p_values
     assert torch.equal(found.shares, alone.shares)
     beside = coverage_by_estimate(
         torch.cat([ranks, torch.full_like(ranks, torch.nan)], dim=1),
         torch.cat([mean, mean], dim=1),
+        allow_missing=True,
     )
     assert beside.num_tested == 1
     assert beside.depends == (True, False)
@@ -206,10 +215,10 @@ def found_somewhere() -> CoverageByEstimate:
 def test_the_picture_has_a_panel_for_each_of_six_parameters() -> None:
     one = found_somewhere()
     many = coverage_by_estimate(one.ranks.repeat(1, 8), one.estimates.repeat(1, 8))
-    figure = plots.coverage_by_estimate(many)
+    figure = plots.ranks_by_estimate(many)
     labels = [axes.get_xlabel() for axes in figure.axes]
     assert labels == [f"estimate of theta_{k}" for k in range(1, 7)]
-    named = plots.coverage_by_estimate(one, parameter_names=("slope",))
+    named = plots.ranks_by_estimate(one, parameter_names=("slope",))
     (axes,) = named.axes
     assert axes.get_xlabel() == "estimate of slope"
     shown = [text.get_text() for text in axes.texts]
@@ -227,7 +236,7 @@ def test_bad_arguments_are_refused() -> None:
     assert_refused(
         "ranks", coverage_by_estimate, "ranks", estimates, error=InvalidTypeError
     )
-    draw = plots.coverage_by_estimate
+    draw = plots.ranks_by_estimate
     assert_refused("found", draw, ranks, error=InvalidTypeError)
     names = ("a", "b")
     assert_refused("parameter_names", draw, found_somewhere(), parameter_names=names)

@@ -41,6 +41,7 @@ NOT_CALLED = {
         (
             "ACAUCScore",
             "Coupling",
+            "CoverageByEstimate",
             "CoverageCurve",
             "CoverageErrorScore",
             "CredibleIntervals",

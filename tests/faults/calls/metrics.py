@@ -119,6 +119,14 @@ CALLS = [
         ),
     ),
     Call(
+        name="coverage_by_estimate",
+        run=lambda ranks=LEVELS, estimates=THETA, **options: (
+            metrics.coverage_by_estimate(ranks, estimates, **options)
+        ),
+        tensors={"ranks": LEVELS, "estimates": THETA},
+        options={"level": "share"},
+    ),
+    Call(
         name="mid_ranks",
         run=lambda samples=SAMPLES, theta=THETA: metrics.mid_ranks(samples, theta),
         tensors={"samples": SAMPLES, "theta": THETA},

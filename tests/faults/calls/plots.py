@@ -139,6 +139,18 @@ CALLS = [
         is_random=True,
     ),
     Call(
+        name="ranks_by_estimate",
+        run=lambda found=None, **options: drawn(plots.ranks_by_estimate)(
+            metrics.coverage_by_estimate(torch.rand(20, 2), THETA)
+            if found is None
+            else found,
+            **options,
+        ),
+        options={"found": "instance", "parameter_names": "names"},
+        accepts=("parameter_names: ['a', 'a']", "parameter_names: None"),
+        is_random=True,
+    ),
+    Call(
         name="effective_sample_sizes",
         run=lambda coupling=None: drawn(plots.effective_sample_sizes)(
             posterior().coupling if coupling is None else coupling
