@@ -27,7 +27,16 @@ DEPENDENCIES = "import ot, numpy, torch, tqdm.auto, sbi.inference, sbi.utils"
 LAYERS = [
     # They know nothing of inference: errors, means, results in notebooks and tables,
     # progress, processes, slices.
-    {"errors", "_means", "_notebooks", "_progress", "_processes", "_slices", "_tables"},
+    {
+        "errors",
+        "_means",
+        "_notebooks",
+        "_permutation",
+        "_progress",
+        "_processes",
+        "_slices",
+        "_tables",
+    },
     # They raise errors: of seeds, of files and of functions that cannot be pickled.
     {"_random", "_files", "_pickling"},
     # Groups are held out at random, with a seed.

@@ -61,6 +61,8 @@ class CoverageByEstimate:
         shares: The share of true parameters inside their intervals, for the lowest, the
             middle and the highest third of the posterior means, shape ``(d, 3)``. NaN
             if nothing is known.
+        above: The share of true parameters above the posterior's median in each third,
+            shape ``(d, 3)``. It is about one half if the posterior is calibrated.
         edges: The posterior means that divide the thirds, shape ``(d, 2)``.
         p_values: The p-value of each parameter, see :func:`coverage_by_estimate`. NaN
             if there are fewer than ten observations.
@@ -70,6 +72,7 @@ class CoverageByEstimate:
 
     level: float
     shares: Tensor = field(repr=False)
+    above: Tensor = field(repr=False)
     edges: Tensor = field(repr=False)
     p_values: tuple[float, ...]
     estimates: Tensor = field(repr=False)
@@ -180,14 +183,23 @@ def coverage_by_estimate_of_pairs(
     # A third of the observations each, even if estimates are equal.
     place = estimates.where(known, torch.inf).argsort(dim=0, stable=True).argsort(dim=0)
     part = place * NUM_PARTS // known.sum(dim=0).clamp_min(1)
-    inside = ((2 * ranks - 1).abs() <= level + ROUNDING).double()
-    shares = [
-        means_of_pairs(inside.where(known & (part == number), torch.nan), counts)
-        for number in range(NUM_PARTS)
-    ]
+    inside = (2 * ranks - 1).abs() <= level + ROUNDING
+    shares, above = (
+        torch.stack(
+            [
+                means_of_pairs(
+                    event.double().where(known & (part == number), torch.nan), counts
+                )
+                for number in range(NUM_PARTS)
+            ],
+            dim=1,
+        )
+        for event in (inside, ranks > 0.5)
+    )
     return CoverageByEstimate(
         level=level,
-        shares=torch.stack(shares, dim=1),
+        shares=shares,
+        above=above,
         edges=edges,
         p_values=p_values,
         estimates=estimates,
@@ -224,15 +236,17 @@ def in_words(
     if not found.num_tested:
         return []
     sentences = [
-        f"the coverage of {name} depends on its estimate (p = {p_value:.1g}): "
-        f"{found.level:.0%} intervals hold {shares[0]:.0%}, {shares[1]:.0%} and "
-        f"{shares[2]:.0%} of the {known} for the lowest, the middle and the highest "
-        f"third of the estimates (below {edges[0]:.3g}, above {edges[1]:.3g})"
-        for name, p_value, shares, edges, depends in zip(
+        f"the coverage of {name} depends on its estimate (p = {p_value:.1g}): for the "
+        f"lowest, the middle and the highest third of the estimates (below "
+        f"{edges[0]:.3g}, above {edges[1]:.3g}), {found.level:.0%} intervals hold "
+        f"{_listed(shares)} of the {known}, and {_listed(above)} are above the median "
+        "of the posterior"
+        for name, p_value, edges, shares, above, depends in zip(
             names,
             found.p_values,
-            found.shares.tolist(),
             found.edges.tolist(),
+            found.shares.tolist(),
+            found.above.tolist(),
             found.depends,
             strict=True,
         )
@@ -243,6 +257,11 @@ def in_words(
         "no sign that coverage depends on the estimate (smallest p-value of "
         f"{found.num_tested}: {least:.2g})"
     ]
+
+
+def _listed(shares: Sequence[float]) -> str:
+    *first, last = (f"{share:.0%}" for share in shares)
+    return f"{', '.join(first)} and {last}"
 
 
 def _p_value(ranks: Tensor, estimates: Tensor) -> float:

@@ -248,8 +248,11 @@ def test_a_parameter_whose_coverage_depends_on_its_estimate_is_named(
     assert high_share == 0.0
     text = " ".join(str(found).split())
     p_value = f"(p = {found.by_estimate.p_values[1]:.1g})"
-    assert f"the coverage of size depends on its estimate {p_value}: 90% inter" in text
-    assert f"hold {low:.0%}, {middle:.0%} and 0% of the parameters for the low" in text
+    assert (
+        f"the coverage of size depends on its estimate {p_value}: for the lowest"
+        in text
+    )
+    assert f"hold {low:.0%}, {middle:.0%} and 0% of the parameters, and " in text
     assert "label more observations there" in text
     assert "the coverage of slope" not in text
 

@@ -117,6 +117,8 @@ def test_shares_are_those_of_each_third() -> None:
         for number, rows in enumerate(order.split(30)):
             inside = ((ranks[rows, k] >= 0.25) & (ranks[rows, k] <= 0.75)).double()
             assert found.shares[k, number] == inside.mean()
+            above = (ranks[rows, k] > 0.5).double().mean()
+            assert found.above[k, number] == above
             assert ((estimates[rows, k] > found.edges[k, 0]) == (number > 0)).all()
             assert ((estimates[rows, k] < found.edges[k, 1]) == (number < 2)).all()
 
@@ -201,8 +203,11 @@ def test_an_evaluation_says_where_coverage_is_off() -> None:
     assert "the coverage of theta_1 depends on its estimate (p = 0.001)" in str(wrong)
     low, middle, high = wrong.by_estimate.shares[0].tolist()
     assert max(low, high) < middle
-    share = f"90% intervals hold {low:.0%}, {middle:.0%}"
-    assert share in " ".join(str(wrong).split())
+    text = " ".join(str(wrong).split())
+    assert f"90% intervals hold {low:.0%}, {middle:.0%} and {high:.0%} of" in text
+    # Posteriors of what is low are too low, so that the truth is above their median.
+    assert wrong.by_estimate.above[0, 0] > 0.7
+    assert wrong.by_estimate.above[0, 2] < 0.3
 
 
 def found_somewhere() -> CoverageByEstimate:
