@@ -140,15 +140,14 @@ def _compared(rows: pd.DataFrame, method: str = STACK) -> list[Comparison]:
     compared = []
     stacks = rows[rows["method"] == method]
     for task in LETTERS:
-        of_task = rows[rows["task"] == task]
-        for size in sorted(stacks["n_calibration"][stacks["task"] == task].unique()):
+        sizes = sorted(stacks["n_calibration"][stacks["task"] == task].unique())
+        of_task = rows[rows["task"] == task] if sizes else rows[:0]
+        for size in sizes:
             there = of_task[of_task["n_calibration"].isin([0, size])]
-            by_method = there.pivot_table(
-                index="repetition", columns="method", values="lpp_z", sort=False
-            )
+            scores = _scores(there)
             gaps = {
-                name: _gap(by_method[[method, name]].dropna())
-                for name in by_method.columns
+                name: _gap(scores[method], scores[name])
+                for name in scores
                 if name not in NO_RIVALS
             }
             gaps = {name: gap for name, gap in gaps.items() if len(gap)}
@@ -158,10 +157,23 @@ def _compared(rows: pd.DataFrame, method: str = STACK) -> list[Comparison]:
     return compared
 
 
-def _gap(scores: pd.DataFrame) -> pd.Series:
-    """Return how far one column is above the other; 0 where both are -inf."""
-    first, second = scores.iloc[:, 0], scores.iloc[:, 1]
-    return (first - second).where(first != second, 0.0)
+def _scores(rows: pd.DataFrame) -> dict[str, dict[int, float]]:
+    """Return the LPP of each method, by repetition, in the order of the rows."""
+    groups = rows.groupby(["method", "repetition"], sort=False)
+    means = groups["lpp_z"].mean().to_dict()
+    repetitions = rows["repetition"].unique()
+    return {
+        name: {r: means[name, r] for r in repetitions if (name, r) in means}
+        for name in rows["method"].unique()
+    }
+
+
+def _gap(first: dict[int, float], second: dict[int, float]) -> pd.Series:
+    """Return how far one method is above another; 0 where both are -inf."""
+    common = [repetition for repetition in first if repetition in second]
+    pairs = [(first[repetition], second[repetition]) for repetition in common]
+    gaps = [0.0 if one == other else one - other for one, other in pairs]
+    return pd.Series(gaps, index=common, dtype=float)
 
 
 def _comparison(

@@ -1,8 +1,8 @@
 """What the suites beside `main` say, a small table each."""
 
+import functools
 import json
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import pandas as pd
@@ -107,29 +107,36 @@ def other_suites(published: Published) -> list[str]:
 
 
 def _grid(published: Published, suite: str, grid: Grid) -> list[str]:
-    def name(cell: Cell) -> str:
-        same = {"task": cell.task, "variant": cell.variant, "options": cell.options}
+    @functools.cache  # of rows of the same data, of which each would select them anew
+    def name_of(task: str, variant: str, options: str, line: str) -> str:
+        same = {"task": task, "variant": variant, "options": options}
         lpps = [
             f"{other} {entry(published.select(other, suite=suite, **same), lpp_text)}"
             for other in grid.beside
         ]
-        text = f"{published.name(cell.task, suite=suite)}, {grid.line(cell)}"
+        text = f"{published.name(task, suite=suite)}, {line}"
         return text + (f" ({', '.join(lpps)})" if lpps else "")
 
     rows = published.rows[suite]
     rows = rows[rows["method"].isin(grid.methods)]
     rows = rows[grid.all_sizes | (rows["n_calibration"] == SIZE)]
-    places = [[name(cell) for cell in rows.index], rows.index.map(grid.column)]
+    names = [
+        name_of(cell.task, cell.variant, cell.options, grid.line(cell))
+        for cell in rows.index
+    ]
+    places = [names, rows.index.map(grid.column)]
     counts = rows.groupby([*WHERE])["repetition"].nunique()
     entries = {
         place: entry(
             part,
-            partial(grid.text, published),
+            functools.partial(grid.text, published),
             out_of=counts[tuple(part[[*WHERE]].iloc[0])],
         )
         for place, part in rows.groupby(places)
     }
-    names = dict.fromkeys(places[0])
     columns = sorted({column for _, column in entries})
-    lines = [[n, *(entries.get((n, c), MISSING) for c in columns)] for n in names]
+    lines = [
+        [line, *(entries.get((line, column), MISSING) for column in columns)]
+        for line in dict.fromkeys(names)
+    ]
     return table(("", *(f"{column:g}" for column in columns)), lines)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import pandas as pd
 
 from benchmarks.cells import Cell, Suite, list_suites, load_suite
-from benchmarks.table import Table, markdown, number_text, read_table
+from benchmarks.table import Table, markdown, number_text, read_table, with_numbers
 
 __all__ = [
     "FIXED",
@@ -93,8 +93,7 @@ class Published:
         """Rows by suite, of all repetitions that were run."""
         none = Table.of({}, {})
         return {
-            name: self.tables.get(name, none).rows.infer_objects()
-            for name in self.suites
+            name: with_numbers(self.tables.get(name, none).rows) for name in self.suites
         }
 
     @cached_property
@@ -163,9 +162,15 @@ class Published:
 
     def letter(self, task: str, *, suite: str = "main") -> str:
         """Return a task's letter, marked if a model stands in for recorded data."""
-        rows = self.rows[suite]
-        stands_in = (rows["stand_in"] == True)[rows["task"] == task].any()  # noqa: E712
-        return LETTERS[task] + (" (stand-in)" if stands_in else "")
+        return LETTERS[task] + (" (stand-in)" if task in self._stand_ins[suite] else "")
+
+    @cached_property
+    def _stand_ins(self) -> dict[str, set[str]]:
+        """Tasks by suite, of which a model stands in for recorded data."""
+        return {
+            name: {*rows["task"][rows["stand_in"] == True]}  # noqa: E712
+            for name, rows in self.rows.items()
+        }
 
     def name(self, task: str, *, suite: str = "main") -> str:
         """Name a task with its letter, marked if a model stands in for it."""

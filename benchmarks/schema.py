@@ -17,6 +17,7 @@ from sbi_rope.tasks import Task, get_task
 __all__ = [
     "CELL_COLUMNS",
     "COLUMNS",
+    "TEXT_COLUMNS",
     "WHERE",
     "as_text",
     "check_row",
@@ -121,6 +122,7 @@ OF_RESULTS = {
 CELL_COLUMNS = tuple(field.name for field in fields(Cell))
 COLUMNS = ("suite", *CELL_COLUMNS, "status", *OF_RESULTS, "error")
 KINDS = {"suite": FILLED, **OF_CELLS, "status": FILLED, **OF_RESULTS, "error": TEXT}
+TEXT_COLUMNS = tuple(name for name, kind in KINDS.items() if kind.type is str)
 
 
 def check_row(row: Mapping[str, Any], cell: Cell | None = None) -> None:
