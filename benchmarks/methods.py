@@ -25,6 +25,7 @@ from sbi_rope.baselines import (
     PlainNPE,
     PriorBaseline,
     ReferenceNPE,
+    Training,
     TuningOnly,
 )
 from sbi_rope.discrepancy import DiscrepancyNPE
@@ -152,9 +153,13 @@ def _from_scratch(case: "Case") -> tuple[Any, Any]:
 class _ThenFinetuned(DiscrepancyNPE):
     """A corrected NPE that is then fine-tuned on the same pairs."""
 
+    own_training: Training | None = None  # of the fine-tuning
+
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         corrected, _ = super()._fit(show_progress_bars=show_progress_bars)
-        method = FinetunedNPE.from_posterior(corrected, num_holdouts=NUM_HOLDOUTS)
+        method = FinetunedNPE.from_posterior(
+            corrected, training=self.own_training, num_holdouts=NUM_HOLDOUTS
+        )
         method.append_calibration(*self._data.calibration)
         method.train(show_progress_bars=show_progress_bars)
         return method.build_posterior(), method.history
@@ -177,6 +182,12 @@ def _discrepancy(
     )
 
 
+def _then_finetuned(case: "Case") -> Method:
+    method: Any = _discrepancy(kind=_ThenFinetuned)(case)
+    method.own_training = case.settings.own_training
+    return method
+
+
 def _variational(*, shift: bool) -> "Callable[[Case], Method]":
     """Return how RVNP is constructed, with errors as published or with an offset."""
     return lambda case: RVNP.from_posterior(
@@ -184,6 +195,7 @@ def _variational(*, shift: bool) -> "Callable[[Case], Method]":
         noise_on=_noise_on(case),
         shift=shift,
         surrogate_training=case.settings.training,
+        training=case.settings.own_training,
     )
 
 
@@ -238,12 +250,18 @@ METHODS: dict[str, Entry] = {
     "MLP": Entry(
         style=("0.35", ":", "x"),
         pairs=True,
-        build=lambda case: CalibrationMLP(*_from_scratch(case), device=case.device),
+        build=lambda case: CalibrationMLP(
+            *_from_scratch(case),
+            training=case.settings.own_training,
+            device=case.device,
+        ),
     ),
     "fine-tuned NPE": Entry(
         style=("#E69F00", "-", "D"),
         pairs=True,
-        build=lambda case: FinetunedNPE.from_posterior(case.npe),
+        build=lambda case: FinetunedNPE.from_posterior(
+            case.npe, training=case.settings.own_training
+        ),
     ),
     "discrepancy": Entry(
         style=("#882255", "-", "h"),
@@ -275,20 +293,26 @@ METHODS: dict[str, Entry] = {
         style=("#AA4499", "-", "p"),
         pairs=True,
         ours=True,
-        build=_discrepancy(kind=_ThenFinetuned),
+        build=_then_finetuned,
     ),
     "FMCPE": Entry(
         style=("#E31A1C", "-", "<"),
         pairs=True,
         build=lambda case: FMCPE.from_posterior(
-            case.npe, simulator=case.simulator, noise=_published_noise(case)
+            case.npe,
+            simulator=case.simulator,
+            noise=_published_noise(case),
+            training=case.settings.own_training,
         ),
     ),
     "FMCPE (embedding)": Entry(
         style=("#E31A1C", "--", "<"),
         pairs=True,
         build=lambda case: FMCPE.from_posterior(
-            case.npe, simulator=case.simulator, space="embedding"
+            case.npe,
+            simulator=case.simulator,
+            space="embedding",
+            training=case.settings.own_training,
         ),
     ),
     "FRISBI": Entry(

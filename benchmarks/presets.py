@@ -22,20 +22,27 @@ class Settings:
         training: How these are trained.
         n_test: Test observations, or all there are if that is less.
         num_samples: Posterior samples of each behind the calibration scores.
+        c2st_observations: Test observations that C2ST is a mean over.
         light_net: Whether the small embedding net of the task is used.
         flow: Name of the flow for sbi's ``posterior_nn``.
         flow_options: Its options.
         finetuner: Settings of the fine-tuning of RoPE.
+        own_training: How methods are trained whose papers, or whose goals, ask for a
+            training of their own; None for that.
+        num_folds: Folds of the pairs of a stack; None for its own number.
     """
 
     num_simulations: int
     training: Training
     n_test: int = 1000
     num_samples: int = 500
+    c2st_observations: int = 5
     light_net: bool = True
     flow: str = "nsf"
     flow_options: dict[str, Any] = field(default_factory=lambda: {"num_transforms": 2})
     finetuner: CalibrationFinetuner = field(default_factory=CalibrationFinetuner)
+    own_training: Training | None = None
+    num_folds: int | None = None
 
     def builder(self, task: Task) -> Any:
         """Return the builder of untrained estimators."""
@@ -55,14 +62,18 @@ def _finetuner(task: Task) -> CalibrationFinetuner:
 
 def smoke(task: Task) -> Settings:
     """Return settings that show that everything runs, and nothing else."""
+    training = Training(training_batch_size=50, max_num_epochs=3)
     return Settings(
         num_simulations=300,
-        training=Training(training_batch_size=50, max_num_epochs=3),
+        training=training,
         n_test=40,
         num_samples=50,
+        c2st_observations=1,
         flow="maf",
         flow_options={"num_transforms": 1, "hidden_features": 10},
         finetuner=CalibrationFinetuner(max_num_epochs=20, simulations_per_target=5),
+        own_training=training,
+        num_folds=2,
     )
 
 

@@ -30,8 +30,8 @@ from sbi_rope.metrics import draw_samples
 __all__ = ["PACKAGES", "git_commit", "run_cells"]
 
 PACKAGES = ("torch", "sbi", "POT", "numpy")
-# Observations and samples behind the comparison with a posterior in closed form.
-C2ST_OBSERVATIONS, C2ST_SAMPLES = 5, 500
+# Samples behind the comparison with a posterior in closed form.
+C2ST_SAMPLES = 500
 # Posterior samples of the first observation that are kept for a picture.
 KEPT_SAMPLES = 300
 
@@ -235,7 +235,7 @@ def _c2st(case: Case, score: Score) -> float | None:
     if not known or score.cell.method == "SBI":
         return None
     values = []
-    for i in range(min(C2ST_OBSERVATIONS, len(score.test_set[1]))):
+    for i in range(min(case.settings.c2st_observations, len(score.test_set[1]))):
         x = score.test_set[1][i : i + 1]
         with torch.random.fork_rng():
             torch.manual_seed(case.seed)

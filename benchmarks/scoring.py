@@ -196,6 +196,7 @@ def _stack_score(case: Case, cell: Cell) -> Score:
         rope,
         x_o if cell.method == COUPLED_STACK else None,
         candidates=candidates,
+        num_folds=case.settings.num_folds,
         seed=case.seed,
         show_progress_bars=False,
     )
