@@ -3,7 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: quickstart test test-slow test-latest-sbi lint types docs docs-links format clean
+.PHONY: quickstart test test-slow test-latest-sbi lint types docs docs-code docs-site
+.PHONY: docs-links format clean tasks package
 .PHONY: examples example-quickstart example-tunnel example-tasks example-people
 
 quickstart: $(VENV)/.installed
@@ -26,12 +27,16 @@ lint: $(VENV)/.installed
 types: $(VENV)/.installed
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-# The code on the pages runs. A warning is an error: a link or a reference that leads
-# nowhere, a cell that fails.
+docs: docs-code docs-site
+
+# The code on the pages runs.
+docs-code: $(VENV)/.docs
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -m docs -n auto --dist worksteal
+
+# A warning is an error: a link or a reference that leads nowhere, a cell that fails.
 # Notebooks are executed again if their cells have changed. Remove docs/_build to execute
 # them with a package that has changed.
-docs: $(VENV)/.docs
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -m docs -n auto --dist worksteal
+docs-site: $(VENV)/.docs
 	OMP_NUM_THREADS=1 $(BIN)/sphinx-build -W --keep-going -j auto -b html \
 	    docs docs/_build/html
 
@@ -65,6 +70,13 @@ example-tasks: $(VENV)/.installed
 example-people: $(VENV)/.installed
 	$(EXAMPLE)/hemodynamics.py --rounds 2 --max-num-epochs 2 \
 	    --n-calibration 10 --n-test 30 --out $(OUT)/hemodynamics
+
+# What the command that lists the tasks measures holds for one thread.
+tasks: $(VENV)/.installed
+	OMP_NUM_THREADS=1 $(BIN)/python -m sbi_rope.tasks
+
+package: $(VENV)/.installed
+	PYTHON=$(PYTHON) OMP_NUM_THREADS=1 .ci/package
 
 format: $(VENV)/.installed
 	$(BIN)/ruff check --fix .
