@@ -48,28 +48,29 @@ docs-links: $(VENV)/.docs
 OUT ?= results/examples
 DATA ?= ../shared/data/causal_chamber
 EXAMPLE := OMP_NUM_THREADS=1 $(BIN)/python examples
+REDUCED := --n-calibration 10 --max-tuning-epochs 20 --num-folds 2
 
 examples: example-tunnel example-quickstart example-tasks example-people
 
 example-quickstart: $(VENV)/.installed
 	$(EXAMPLE)/quickstart.py --num-simulations 1000 --max-num-epochs 2 \
-	    --n-calibration 10 --n-test 50 --out $(OUT)/quickstart
+	    $(REDUCED) --n-test 50 --out $(OUT)/quickstart
 
 example-tunnel: $(VENV)/.installed
 ifneq ($(wildcard $(DATA)),)
 	$(EXAMPLE)/light_tunnel_sensors.py --root $(DATA) --num-simulations 2000 \
-	    --density-estimator mdn --n-calibration 10 --n-test 50 --out $(OUT)/tunnel
+	    --density-estimator mdn $(REDUCED) --n-test 50 --out $(OUT)/tunnel
 else
 	@echo "examples/light_tunnel_sensors.py: skipped, no $(DATA)"
 endif
 
 example-tasks: $(VENV)/.installed
 	$(EXAMPLE)/all_tasks.py --root $(DATA) --num-simulations 500 \
-	    --max-num-epochs 2 --n-calibration 10 --n-test 30 --out $(OUT)/all_tasks
+	    --max-num-epochs 2 $(REDUCED) --n-test 30 --out $(OUT)/all_tasks
 
 example-people: $(VENV)/.installed
 	$(EXAMPLE)/hemodynamics.py --rounds 2 --max-num-epochs 2 \
-	    --n-calibration 10 --n-test 30 --out $(OUT)/hemodynamics
+	    $(REDUCED) --n-test 30 --out $(OUT)/hemodynamics
 
 # What the command that lists the tasks measures holds for one thread.
 tasks: $(VENV)/.installed

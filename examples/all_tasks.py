@@ -11,7 +11,7 @@ from typing import Any
 
 from study import Study, argument_parser, print_table, train_small_npe
 
-from sbi_rope import SinkhornCoupler
+from sbi_rope import CalibrationFinetuner, SinkhornCoupler
 from sbi_rope.tasks import Task, get_task, list_tasks
 
 # Small images are quick to simulate and to embed.
@@ -70,7 +70,9 @@ def main() -> None:
             n_calibration=args.n_calibration,
             n_test=args.n_test,
             out=args.out / name,
+            finetuner=CalibrationFinetuner(max_num_epochs=args.max_tuning_epochs),
             with_stack=args.stack,
+            num_folds=args.num_folds,
             with_diagnosis=args.diagnose,
         ).run()
     print("\n\n==== all tasks ====")

@@ -75,7 +75,9 @@ def main() -> None:
         ),
         stored=lambda task, seed: split_people(task, seed, args.rounds)["stored"],
         held_out=lambda task, seed: split_people(task, seed, args.rounds)["held_out"],
-        finetuner=CalibrationFinetuner(num_neighbors=args.num_neighbors),
+        finetuner=CalibrationFinetuner(
+            num_neighbors=args.num_neighbors, max_num_epochs=args.max_tuning_epochs
+        ),
         # Fixed beforehand.
         coupler=SinkhornCoupler(gamma=0.1, tau=1.0),
         seeds=args.seeds,
@@ -83,6 +85,7 @@ def main() -> None:
         n_test=args.n_test,
         out=args.out,
         with_stack=args.stack,
+        num_folds=args.num_folds,
         with_diagnosis=args.diagnose,
     ).run()
 

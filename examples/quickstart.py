@@ -7,7 +7,7 @@ from sbi.inference import NPE
 from sbi.neural_nets import posterior_nn
 from study import Study, argument_parser
 
-from sbi_rope import SinkhornCoupler
+from sbi_rope import CalibrationFinetuner, SinkhornCoupler
 from sbi_rope.tasks import Task, get_task
 
 
@@ -50,7 +50,9 @@ def main() -> None:
         n_calibration=args.n_calibration,
         n_test=args.n_test,
         out=args.out,
+        finetuner=CalibrationFinetuner(max_num_epochs=args.max_tuning_epochs),
         with_stack=args.stack,
+        num_folds=args.num_folds,
         with_diagnosis=args.diagnose,
     ).run()
 

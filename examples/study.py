@@ -56,9 +56,10 @@ class Study:
 
     With ``stored``, RoPE uses these simulations instead of the task's simulator. With
     ``held_out``, NPE is also scored on simulations it has not seen: the row "SBI".
-    ``with_stack`` weighs NPE, fine-tuned NPE and discrepancy models, prints the report
-    of the stack, and says what is wrong with each summary of x if these have names;
-    ``with_diagnosis`` prints whether the test observations are fit for RoPE.
+    ``with_stack`` weighs NPE, fine-tuned NPE and discrepancy models by ``num_folds``
+    folds of the pairs, prints the report of the stack, and says what is wrong with each
+    summary of x if these have names; ``with_diagnosis`` prints whether the test
+    observations are fit for RoPE.
     """
 
     task: Task
@@ -72,6 +73,7 @@ class Study:
     stored: Callable[[Task, int], tuple[Tensor, Tensor]] | None = None
     held_out: Callable[[Task, int], tuple[Tensor, Tensor]] | None = None
     with_stack: bool = False
+    num_folds: int | None = None
     with_diagnosis: bool = False
 
     def run(self) -> list[dict[str, Any]]:
@@ -152,7 +154,12 @@ class Study:
             if self.with_stack:
                 start = time.perf_counter()
                 print("  stacking ...", flush=True)
-                stacked = stack(rope, seed=seed, show_progress_bars=False)
+                stacked = stack(
+                    rope,
+                    num_folds=self.num_folds,
+                    seed=seed,
+                    show_progress_bars=False,
+                )
                 score("stack", stacked, start, n)
                 print(stacked.report, flush=True)
                 self._save(plots.stacking_report(stacked.report), f"stack_{name}")
@@ -335,6 +342,17 @@ def argument_parser(
         action=argparse.BooleanOptionalAction,
         default=with_stack,
         help="weigh many methods by held-out pairs; a minute or two each",
+    )
+    parser.add_argument(
+        "--max-tuning-epochs",
+        type=int,
+        default=CalibrationFinetuner().max_num_epochs,
+        help="epochs after which the fine-tuning of RoPE ends",
+    )
+    parser.add_argument(
+        "--num-folds",
+        type=int,
+        help="folds of the pairs, for the stack; fewer are quicker",
     )
     parser.add_argument(
         "--diagnose",
