@@ -31,7 +31,8 @@ docs: docs-code docs-site
 
 # The code on the pages runs.
 docs-code: $(VENV)/.docs
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -m docs -n auto --dist worksteal
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -m docs -n auto --dist worksteal \
+	    tests/integration/test_docs_code.py
 
 # A warning is an error: a link or a reference that leads nowhere, a cell that fails.
 # Notebooks are executed again if their cells have changed. Remove docs/_build to execute
