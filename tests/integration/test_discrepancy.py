@@ -103,11 +103,11 @@ def log_probs(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:
     return posterior.log_prob_batched(theta[None], x, norm_posterior=False)[0]
 
 
-THETA = torch.linspace(-5, 5, 401).double()
+THETA = torch.linspace(-5, 5, 201).double()
 
 
 def marginal(x: Tensor, draws: DiscrepancyDraws, *, std: float, mean: float) -> Tensor:
-    """log p(theta | x, pairs) on THETA by integration, ``(401, n)``."""
+    """log p(theta | x, pairs) on THETA by integration, ``(201, n)``."""
     z, m = (x[:, 0].double() - mean) / std, (THETA - mean) / std
     gain, offset = draws.gain[:, 0, 0], draws.offset[:, 0]
     variance = draws.error_factor[:, 0, 0] ** 2 + gain**2 * (NOISE / std) ** 2

@@ -24,9 +24,9 @@ from tests.results import SUITE, result_of, write_results
 pytestmark = pytest.mark.usefixtures("rough_pictures")
 
 
-@pytest.fixture
-def suite(tmp_path: Path) -> Suite:
-    path = tmp_path / "tiny.toml"
+@pytest.fixture(scope="module")
+def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
+    path = tmp_path_factory.mktemp("suite") / "tiny.toml"
     path.write_text(SUITE)
     return load_suite(str(path))
 
@@ -133,9 +133,10 @@ def test_no_two_methods_are_drawn_alike() -> None:
 # Reports ----------------------------------------------------------------------------
 
 
-@pytest.fixture
-def results(suite: Suite, tmp_path: Path) -> Results:
-    return write_results(suite, tmp_path / "cells")
+@pytest.fixture(scope="module")
+def results(suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Results:
+    """Results for reading only."""
+    return write_results(suite, tmp_path_factory.mktemp("results") / "cells")
 
 
 def report_of(suite: Suite, results: Results, folder: Path) -> str:
