@@ -93,6 +93,8 @@ class CoverageByEstimate:
         return tuple(p_value * self.num_tested < LEVEL for p_value in self.p_values)
 
     def __str__(self) -> str:
+        if not self.num_tested:
+            return f"not tested, with fewer than {FEWEST} independent observations"
         return "\n".join(in_words(self, default_names(len(self.p_values))))
 
 

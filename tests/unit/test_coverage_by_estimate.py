@@ -162,6 +162,7 @@ def test_too_few_observations_are_not_tested() -> None:
     assert few.num_tested == 0
     assert not any(few.depends)
     assert in_words(few, ("a", "b")) == []
+    assert str(few) == "not tested, with fewer than 10 independent observations"
 
 
 def test_only_one_pair_of_a_group_is_tested_and_groups_count_once() -> None:
