@@ -1,14 +1,15 @@
 """A batch of real observations and the simulations that it is coupled with."""
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from torch import Tensor, nn
 
 from sbi_rope._npe import TrainedNPE
+from sbi_rope._validation import KnownColumns
 from sbi_rope.coupling import Coupling, SinkhornCoupler
 from sbi_rope.errors import CouplingError
 from sbi_rope.mixture import (
@@ -35,6 +36,7 @@ class EmbeddedBatch:
         simulated: The embeddings :math:`h(x_s)` of the simulations, shape ``(n_s, l)``.
         npe: The NPE that the embeddings belong to.
         embedding_net: g, or h if nothing was tuned.
+        columns: The names of columns of "theta" and "x" in orders that are known.
     """
 
     x_o: Tensor
@@ -43,6 +45,7 @@ class EmbeddedBatch:
     simulated: Tensor
     npe: TrainedNPE
     embedding_net: nn.Module
+    columns: Mapping[str, KnownColumns] = field(default_factory=dict)
 
     def couple(self, coupler: SinkhornCoupler, *, seed: int | None = None) -> Coupling:
         """Couple the observations with the simulations.
@@ -124,6 +127,7 @@ class EmbeddedBatch:
             shared=shared,
         )
         posterior.parameter_names = self.npe.parameter_names
+        posterior.columns = dict(self.columns)
         return posterior
 
 

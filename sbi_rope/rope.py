@@ -450,6 +450,7 @@ class RoPE:
             simulated=simulated,
             npe=self._npe,
             embedding_net=net,
+            columns=self.columns,
         )
 
     def build_posterior(
@@ -598,6 +599,11 @@ class RoPE:
     def parameter_names(self) -> tuple[str, ...] | None:
         """The names of the parameters; None if they have none."""
         return self._npe.parameter_names
+
+    @property
+    def columns(self) -> dict[str, KnownColumns]:
+        """The names of columns of "theta" and "x" in orders that are known."""
+        return {"theta": self._theta_columns, "x": self._x_columns}
 
     @property
     def labels(self) -> Labels:

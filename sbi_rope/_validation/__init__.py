@@ -5,7 +5,12 @@ and, where there is something to do about it, what to do next. Public functions 
 checks once. Private code trusts what it is given.
 """
 
-from sbi_rope._validation.columns import KnownColumns, check_columns, column_names
+from sbi_rope._validation.columns import (
+    KnownColumns,
+    check_columns,
+    check_tables,
+    column_names,
+)
 from sbi_rope._validation.settings import (
     LARGEST_SETTING,
     as_shape,
@@ -83,6 +88,7 @@ __all__ = [
     "check_readable",
     "check_rows",
     "check_same_length",
+    "check_tables",
     "check_tensor",
     "check_theta",
     "check_unit_interval",

@@ -9,7 +9,12 @@ from typing import Any
 
 from sbi_rope.errors import InvalidInputError
 
-__all__ = ["KnownColumns", "check_columns", "column_names"]
+__all__ = [
+    "KnownColumns",
+    "check_columns",
+    "check_tables",
+    "column_names",
+]
 
 # The names of columns in orders that are known to be right, and where each comes from.
 KnownColumns = Mapping[tuple[str, ...], str]
@@ -27,6 +32,22 @@ def column_names(table: Any) -> tuple[str, ...]:
     if len(set(names)) < len(names) or not all(isinstance(n, str) for n in names):
         return ()
     return tuple(str(name) for name in names)
+
+
+def check_tables(posterior: Any, **tables: Any) -> None:
+    """Raise if tables have the columns of those that a posterior was made with, moved.
+
+    Args:
+        posterior: The posterior, of any kind. Those of this package have ``columns``.
+        tables: What the user gave as ``theta`` and ``x``.
+
+    Raises:
+        InvalidInputError: If the order of columns is another one.
+    """
+    columns = getattr(posterior, "columns", None)
+    for name, table in tables.items():
+        if isinstance(columns, Mapping):
+            check_columns(name, table, columns.get(name, {}))
 
 
 def check_columns(

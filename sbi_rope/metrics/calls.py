@@ -33,6 +33,7 @@ from sbi_rope._validation import (
     check_not_swapped,
     check_readable,
     check_same_length,
+    check_tables,
     check_tensor,
     check_values,
 )
@@ -95,6 +96,7 @@ def check_test_set(
         InvalidInputError: If a shape does not fit or an entry is not finite.
     """
     check_integer("chunk_size", chunk_size)
+    check_tables(posterior, theta=theta, x=x)
     theta, x = _as_tensor("theta", theta), _as_tensor("x", x)
     theta_shape = theta.shape[1:]
     if isinstance(posterior, DirectPosterior):
@@ -227,6 +229,7 @@ def draw_samples(posterior: Any, x: Tensor, *, num_samples: int) -> Tensor:
             from 1 to 10^8.
     """
     check_num_samples(num_samples)
+    check_tables(posterior, x=x)
     x = _as_tensor("x", x)
     _check_x(posterior, x)
     if isinstance(posterior, NeuralPosterior):

@@ -19,6 +19,7 @@ from sbi_rope._validation import (
     as_numbers,
     as_shape,
     check_integer,
+    check_tables,
     check_theta,
     usable_device,
 )
@@ -373,6 +374,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         return batch
 
     def _batch_of_x(self, x: Tensor) -> Tensor:
+        check_tables(self, x=x)
         event_shape = self.posterior_estimator.condition_shape
         x = as_numbers("x", x).to(torch.float32)
         if x.shape == event_shape:
@@ -411,6 +413,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             UnseenObservationError: If x is not in the batch and ``unseen="raise"``.
             SamplingError: If the mixture has no mass inside the prior's support.
         """
+        check_tables(self, theta=theta)
         return super().log_prob(
             check_theta(theta, self.posterior_estimator.input_shape, batched=False),
             self._warned_of(self._one_x(x)),
@@ -439,6 +442,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             InvalidInputError: As in :meth:`log_prob`.
             UnseenObservationError: As in :meth:`log_prob`.
         """
+        check_tables(self, theta=theta)
         theta = check_theta(theta, self.posterior_estimator.input_shape, batched=False)
         return super().potential(theta, self._one_x(x), track_gradients)
 
@@ -468,6 +472,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             UnseenObservationError: If an x is not in the batch and ``unseen="raise"``.
             SamplingError: If a mixture has no mass inside the prior's support.
         """
+        check_tables(self, theta=theta)
         return super().log_prob_batched(
             check_theta(theta, self.posterior_estimator.input_shape, batched=True),
             self._warned_of(self._batch_of_x(x)),

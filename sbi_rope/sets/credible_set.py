@@ -1,6 +1,7 @@
 """A set of parameters that are credible given one observation."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -8,7 +9,12 @@ import torch
 from torch import Tensor
 
 from sbi_rope._notebooks import shown_as_text
-from sbi_rope._validation import as_numbers_on, check_batch
+from sbi_rope._validation import (
+    KnownColumns,
+    as_numbers_on,
+    check_batch,
+    check_tables,
+)
 from sbi_rope.sets.conformal import DIGITS
 from sbi_rope.sets.guarantee import Guarantee
 
@@ -44,6 +50,7 @@ class CredibleSet:
         draws: The parameters that the volume was estimated from, shape ``(m, d)``.
         inside: Which of the draws are in the set, shape ``(m,)``.
         rule: What tells which parameters are in the set.
+        columns: The names of columns of tables of "theta" in orders that are known.
     """
 
     level: float
@@ -54,6 +61,7 @@ class CredibleSet:
     draws: Tensor = field(repr=False)
     inside: Tensor = field(repr=False)
     rule: Rule = field(repr=False)
+    columns: Mapping[str, KnownColumns] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(
@@ -109,6 +117,7 @@ class CredibleSet:
             InvalidInputError: If theta has another number of parameters, or is not
                 finite.
         """
+        check_tables(self, theta=theta)
         theta = as_numbers_on("theta", theta, self.draws.device)
         shape = theta.shape[:-1]
         width = self.draws.shape[1:]

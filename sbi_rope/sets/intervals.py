@@ -1,7 +1,7 @@
 """An interval for each parameter given one observation, or given each of a batch."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -10,9 +10,11 @@ from torch import Tensor
 
 from sbi_rope._notebooks import shown_as_text
 from sbi_rope._validation import (
+    KnownColumns,
     as_numbers_on,
     check_batch,
     check_names,
+    check_tables,
     default_names,
 )
 from sbi_rope.errors import InvalidInputError
@@ -40,6 +42,7 @@ class CredibleIntervals:
         level: The level of each interval.
         guarantee: The guarantee of each interval; None if there is none.
         parameter_names: One name for each parameter; None if they have none.
+        columns: The names of columns of tables of "theta" in orders that are known.
     """
 
     low: Tensor = field(repr=False)
@@ -47,6 +50,7 @@ class CredibleIntervals:
     level: float
     guarantee: Guarantee | None
     parameter_names: tuple[str, ...] | None = None
+    columns: Mapping[str, KnownColumns] = field(default_factory=dict, repr=False)
 
     @classmethod
     def joined(cls, parts: "Sequence[CredibleIntervals]") -> "CredibleIntervals":
@@ -94,6 +98,7 @@ class CredibleIntervals:
             InvalidInputError: If the shape does not fit, or a number is not finite.
         """
         event = self.low.shape
+        check_tables(self, theta=theta)
         theta = as_numbers_on("theta", theta, self.low.device)
         shape = theta.shape
         rows = theta[None] if theta.ndim == len(event) else theta

@@ -1,8 +1,10 @@
 """The part of a posterior that makes sets and intervals."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
+from types import MappingProxyType
 from typing import Any
 
 from torch import Tensor
@@ -10,7 +12,12 @@ from torch.distributions import Distribution
 
 from sbi_rope._random import seeded
 from sbi_rope._units import log_unit_of
-from sbi_rope._validation import check_instance, check_integer, check_level
+from sbi_rope._validation import (
+    KnownColumns,
+    check_instance,
+    check_integer,
+    check_level,
+)
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.sets.credible_set import CredibleSet, highest_density_set
 from sbi_rope.sets.intervals import CredibleIntervals, central_intervals
@@ -31,6 +38,8 @@ class MakesSets(ABC):
     prior: Distribution
     # One name for each parameter, where they have names.
     parameter_names: tuple[str, ...] | None = None
+    # The names of columns of "theta" and "x" in the orders of tables that were used.
+    columns: Mapping[str, KnownColumns] = MappingProxyType({})
 
     def credible_set(
         self,
@@ -73,14 +82,16 @@ class MakesSets(ABC):
         with seeded(seed):
             x = self._one_x(x)
             if guaranteed:
-                return self._held_out_sets().credible_set(level, x, num_samples)
-            return highest_density_set(
-                self,
-                x,
-                level=level,
-                num_samples=num_samples,
-                log_unit=log_unit_of(self.prior),
-            )
+                found = self._held_out_sets().credible_set(level, x, num_samples)
+            else:
+                found = highest_density_set(
+                    self,
+                    x,
+                    level=level,
+                    num_samples=num_samples,
+                    log_unit=log_unit_of(self.prior),
+                )
+        return replace(found, columns=self.columns)
 
     def credible_intervals(
         self,
@@ -154,7 +165,9 @@ class MakesSets(ABC):
                 make = self._held_out_sets().credible_intervals
             blocks = self._batch_of_x(x).split(max(1, MAX_DRAWS // num_samples))
             found = CredibleIntervals.joined([make(level, block) for block in blocks])
-        return replace(found, parameter_names=self.parameter_names)
+        return replace(
+            found, parameter_names=self.parameter_names, columns=self.columns
+        )
 
     def _held_out_sets(self) -> Any:
         """Return what makes sets with a guarantee. Only a stack has it."""

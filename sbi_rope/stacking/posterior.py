@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_rope._sbi import describe
+from sbi_rope._validation import check_tables
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture import MixturePosterior
 from sbi_rope.mixture.sharing import share_equal_tensors
@@ -121,6 +122,7 @@ class StackedPosterior(MixturePosterior):
             UnseenObservationError: If the posterior belongs to a batch that does not
                 contain an x, and ``unseen="raise"``.
         """
+        check_tables(self, theta=theta)
         return self.versions.log_probs(theta, self._batch_of_x(x))
 
     def _held_out_sets(self) -> HeldOutSets:

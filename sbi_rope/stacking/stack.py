@@ -174,6 +174,7 @@ def stack(
         enable_transform=trainer.bench.npe.enable_transform,
     )
     posterior.parameter_names = rope.parameter_names
+    posterior.columns = rope.columns
     return posterior
 
 

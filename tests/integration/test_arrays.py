@@ -1,6 +1,8 @@
 """Arrays, lists and tables of numbers are taken wherever users pass data."""
 
 import re
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,14 +11,23 @@ import pytest
 import torch
 from torch import Tensor
 
-from sbi_rope import RoPE, diagnose, stack
+from sbi_rope import RoPE, diagnose, load, stack
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.metrics import draw_samples, evaluate
 from sbi_rope.sweep import sweep
 from sbi_rope.trainers import FinetunedNPE
 from sbi_rope.trainers.training import Training
 from tests import gaussian, problems
-from tests.stacks import NPE, OT_ONLY, PRIOR, QUICK, QUIET, problem, stacked
+from tests.stacks import (
+    NPE,
+    OT_ONLY,
+    PRIOR,
+    QUICK,
+    QUIET,
+    problem,
+    quick,
+    stacked,
+)
 
 PAIRS, OBSERVED = problem(12, seed=1), problem(25, seed=2)
 QUICKLY: dict[str, Any] = {"num_simulations": 60, "seed": 0, **QUIET}
@@ -112,6 +123,7 @@ def test_swapped_arguments_are_named_where_shapes_tell() -> None:
 # Tables ------------------------------------------------------------------------------
 
 NAMES, CHANNELS = ["Vmax", "Km"], ["blue", "red"]
+BANDS = [*CHANNELS, "infrared"]
 
 
 def tables(count: int, seed: int) -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -191,6 +203,55 @@ def test_the_noise_of_parameters_in_another_order_is_refused() -> None:
     covariance = covariance.loc[NAMES, NAMES]
     rope = named.append_calibration(THETA, X, theta_cov=covariance)
     assert rope.labels.covariance[0].numpy() == pytest.approx(covariance.to_numpy())
+
+
+def assert_columns_are_known(
+    posterior: Any, right_theta: pd.DataFrame, right_x: pd.DataFrame
+) -> None:
+    """Fail unless a posterior and its sets refuse tables in another order."""
+    theta, x = right_theta[NAMES[::-1]], right_x[BANDS[::-1]]
+    first = right_x.iloc[0]
+    of_x: list[Callable[[], Any]] = [
+        lambda: posterior.sample((2,), x=x.iloc[0]),
+        lambda: posterior.sample_batched((2,), x=x),
+        lambda: posterior.set_default_x(x.iloc[0]),
+        lambda: posterior.credible_intervals(0.5, x.iloc[0]),
+        lambda: draw_samples(posterior, x, num_samples=2),
+        lambda: evaluate(posterior, right_theta, x),
+    ]
+    of_theta: list[Callable[[], Any]] = [
+        lambda: posterior.log_prob(theta, x=first),
+        lambda: posterior.log_prob_batched(theta, x=right_x),
+        lambda: posterior.potential(theta, x=first),
+        lambda: posterior.credible_set(0.5, first).contains(theta),
+        lambda: posterior.credible_intervals(0.5, first).contains(theta),
+        lambda: evaluate(posterior, theta, right_x),
+    ]
+    for name, columns, calls in (("x", BANDS, of_x), ("theta", NAMES, of_theta)):
+        for call in calls:
+            with refused(columns, f"the earlier table `{name}`"):
+                call()
+
+
+@pytest.mark.filterwarnings("ignore:Coupling a batch:sbi_rope.errors.RoPEWarning")
+def test_posteriors_refuse_tables_in_another_order_than_the_pairs(
+    tmp_path: Path,
+) -> None:
+    theta, x = (
+        pd.DataFrame(array(values), columns=names)
+        for values, names in zip(PAIRS, (NAMES, BANDS), strict=True)
+    )
+    given = rope((theta, x)).train(**QUIET)
+    with quick():
+        whole = stack(given, candidates=[PRIOR, NPE], **QUIET)
+    whole.save(tmp_path / "stack.pt")
+    coupled = given.build_posterior(x, **QUICKLY)
+    for posterior in (coupled, whole, load(tmp_path / "stack.pt")):
+        assert_columns_are_known(posterior, theta, x)
+    # Those in the right order are what tensors of the same numbers are.
+    plain = torch.tensor(theta.to_numpy()), torch.tensor(x.to_numpy()[0])
+    log_prob = whole.log_prob(theta, x=x.iloc[0])
+    assert torch.equal(log_prob, whole.log_prob(plain[0], x=plain[1]))
 
 
 def test_observations_in_another_order_than_earlier_ones_are_refused() -> None:
