@@ -115,6 +115,11 @@ def test_bars_that_are_asked_for_are_shown_without_a_terminal_and_on_stderr(
     work(show_progress_bars=True)
     printed = capsys.readouterr()
     assert printed.out == ""
-    of_stack = "Training 1 candidates in 3 folds: 100%"
-    bars = ("Fine-tuning", "Sampling", of_stack, "Training NPE: 3 epochs")
+    bars = (
+        "Fine-tuning",
+        "Sampling",
+        "Training 1 candidates in 3 folds: 100%",
+        "Scoring the candidates and the stack on 2 folds: 100%",
+        "Training NPE: 3 epochs",
+    )
     assert [bar for bar in bars if bar not in printed.err] == []
