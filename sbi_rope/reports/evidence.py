@@ -108,10 +108,12 @@ def _by_estimate(report: StackingReport, names: Sequence[str]) -> list[str]:
             alarming.append(len(rows))
         rows.append((name, *map(percent, shares), number(p_value, digits=3)))
     depends = depends_on_estimate(report)
-    verdict = "depends on it" if depends else "shows no sign that it depends on it"
+    verdict = "There is no sign of it here."
+    if depends:
+        verdict = "Here it depends on the estimate."
     text = (
-        "Coverage can be right on average and wrong for low or high estimates. Here it "
-        f"{verdict}. The table has the share of known parameters inside their {inside} "
+        "Coverage can be right on average and wrong for low or high estimates. "
+        f"{verdict} The table has the share of known parameters inside their {inside} "
         "intervals for each third of the estimates, and the p-value of a test of "
         "whether intervals are equally good everywhere."
     )

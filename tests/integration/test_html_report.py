@@ -374,7 +374,7 @@ def test_the_page_names_parameters_that_are_not_calibrated(tmp_path: Path) -> No
 def test_the_page_shows_where_coverage_depends_on_the_estimate(tmp_path: Path) -> None:
     report = the_stack().report
     page = Page(written(report, tmp_path)).text
-    assert "Here it shows no sign that it depends on it" in page
+    assert "There is no sign of it here." in page
     assert "depends on its estimate" not in page
     scores = report.cross_validation
     assert scores.ranks is not None
@@ -386,7 +386,7 @@ def test_the_page_shows_where_coverage_depends_on_the_estimate(tmp_path: Path) -
     page = Page(written(off, tmp_path, parameter_names=NAMES)).text
     assert f"The coverage of {NAMES[0]} depends on its estimate (p = 0.001)" in page
     assert f"The coverage of {NAMES[1]} depends" not in page
-    assert "Here it depends on it." in page
+    assert "Here it depends on the estimate." in page
     assert off.by_estimate is not None
     shares = (percent(share) for share in off.by_estimate.shares[0].tolist())
     assert " ".join([NAMES[0], *shares, number(0.000999, digits=3)]) in page
