@@ -2,10 +2,18 @@
 
 from dataclasses import dataclass
 
+import torch
 from scipy.stats import t as student
 from torch import Tensor
 
-__all__ = ["Counts", "counts_of", "interval_of_mean", "mean_and_error"]
+__all__ = [
+    "Counts",
+    "counts_of",
+    "interval_of_mean",
+    "mean_and_error",
+    "mean_of_known",
+    "means_of_pairs",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,3 +104,16 @@ def interval_of_mean(
     n = len(values) if counts is None else len(counts.of_groups(values)[0])
     half = float(student.ppf(0.975, max(1, n - 1))) * error
     return mean, mean - half, mean + half
+
+
+def means_of_pairs(values: Tensor, counts: Counts | None) -> Tensor:
+    """Return the mean over pairs of those that are not NaN, ``(n, d)`` to ``(d,)``."""
+    if counts is None:
+        return mean_of_known(values, dim=0)
+    weights = counts.weights.to(values)[:, None] * ~torch.isnan(values)
+    return (weights * values.nan_to_num()).sum(dim=0) / weights.sum(dim=0)
+
+
+def mean_of_known(values: Tensor, dim: int) -> Tensor:
+    """Return the mean of those that are not NaN; NaN if there are none."""
+    return values.nanmean(dim=dim) if values.isnan().any() else values.mean(dim=dim)

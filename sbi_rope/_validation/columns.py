@@ -35,10 +35,11 @@ def column_names(table: Any) -> tuple[str, ...]:
 
 
 def check_tables(posterior: Any, **tables: Any) -> None:
-    """Raise if tables have the columns of those that a posterior was made with, moved.
+    """Raise if a table has columns that a posterior knows in another order.
 
     Args:
-        posterior: The posterior, of any kind. Those of this package have ``columns``.
+        posterior: A posterior of any kind, or its set or intervals. Those of this
+            package know the orders of columns as ``columns``.
         tables: What the user gave as ``theta`` and ``x``.
 
     Raises:

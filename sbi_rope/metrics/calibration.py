@@ -13,7 +13,12 @@ import torch
 from scipy.stats import t as student
 from torch import Tensor
 
-from sbi_rope._means import Counts, mean_and_error
+from sbi_rope._means import (
+    Counts,
+    mean_and_error,
+    mean_of_known,
+    means_of_pairs,
+)
 from sbi_rope._validation import (
     check_batch,
     check_device,
@@ -36,7 +41,6 @@ __all__ = [
     "coverage_curve_of_pairs",
     "coverage_error_of_pairs",
     "expected_coverage_error_of",
-    "means_of_pairs",
     "mid_ranks",
     "random_ranks",
     "standard_error_of_mean",
@@ -108,7 +112,7 @@ class CoverageCurve:
     @property
     def average(self) -> Tensor:
         """The coverage averaged over parameters that are known, shape ``(99,)``."""
-        return _mean(self.per_parameter, dim=0)
+        return mean_of_known(self.per_parameter, dim=0)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -268,7 +272,7 @@ def acauc_of_pairs(
         confidence: The probability of the interval.
     """
     levels = levels.double()
-    mean, error, n = _mean_over_pairs(_mean(levels, dim=1), counts)
+    mean, error, n = _mean_over_pairs(mean_of_known(levels, dim=1), counts)
     width = float("nan")
     if n > 1:
         reach = float(student.ppf((1 + confidence) / 2, n - 1))
@@ -316,7 +320,7 @@ def coverage_curve_of_pairs(
     for alpha in nominal:
         inside = _inside(levels, alpha)
         coverage.append(means_of_pairs(inside, counts))
-        errors.append(_mean_over_pairs(_mean(inside, dim=1), counts)[1])
+        errors.append(_mean_over_pairs(mean_of_known(inside, dim=1), counts)[1])
     number = len(levels) if counts is None else int(counts.effective_number + ROUNDING)
     return CoverageCurve(
         levels=nominal,
@@ -369,10 +373,10 @@ def coverage_error_of_pairs(
         inside = _inside(levels, alpha)
         gap = means_of_pairs(inside, counts) - alpha
         distance += gap.abs()
-        influence += _mean(gap.sign() * inside, dim=1)
+        influence += mean_of_known(gap.sign() * inside, dim=1)
     per_parameter = distance / nominal.numel()
     return CoverageErrorScore(
-        value=float(_mean(per_parameter, dim=0)),
+        value=float(mean_of_known(per_parameter, dim=0)),
         standard_error=_mean_over_pairs(influence / nominal.numel(), counts)[1],
         per_parameter=per_parameter,
     )
@@ -402,19 +406,6 @@ def _mean_over_pairs(
     if not len(values):
         return float("nan"), float("nan"), 0.0
     return *mean_and_error(values, counts), counts.effective_number
-
-
-def means_of_pairs(values: Tensor, counts: Counts | None) -> Tensor:
-    """Return the mean over pairs of those that are not NaN, ``(n, d)`` to ``(d,)``."""
-    if counts is None:
-        return _mean(values, dim=0)
-    weights = counts.weights.to(values)[:, None] * ~torch.isnan(values)
-    return (weights * values.nan_to_num()).sum(dim=0) / weights.sum(dim=0)
-
-
-def _mean(values: Tensor, dim: int) -> Tensor:
-    """Return the mean of those that are not NaN; NaN if there are none."""
-    return values.nanmean(dim=dim) if values.isnan().any() else values.mean(dim=dim)
 
 
 def _checked_levels(levels: Tensor, *, allow_missing: bool) -> Tensor:

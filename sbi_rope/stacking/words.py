@@ -64,8 +64,9 @@ OVER_CONFIDENT = (
 
 # What to do if they are too narrow for some estimates and too wide for others.
 IF_IT_DEPENDS = (
-    "Trust an interval as its own third deserves, and label more observations there. A "
-    "guarantee is about all observations together, and does not change this."
+    "Expect an interval to hold as often as the share of its third says, and label "
+    "more observations there. A guarantee is about all observations together, and does "
+    "not change this."
 )
 
 # What follows if the parameters of the pairs do not follow the prior.

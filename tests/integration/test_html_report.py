@@ -381,7 +381,8 @@ def test_the_page_shows_where_coverage_depends_on_the_estimate(tmp_path: Path) -
     ranks, n = scores.ranks.clone(), len(scores)
     order = scores.estimates[:, 0].argsort()  # type: ignore[index]
     ranks[order, 0] = torch.linspace(0.99, 0.01, n).to(ranks)
-    ranks[:, 1] = torch.linspace(0, 1, n).to(ranks)[torch.randperm(n)]
+    shuffled = torch.randperm(n, generator=torch.Generator().manual_seed(0))
+    ranks[:, 1] = torch.linspace(0, 1, n).to(ranks)[shuffled]
     off = StackingReport.of(replace(scores, ranks=ranks))
     page = Page(written(off, tmp_path, parameter_names=NAMES)).text
     assert f"The coverage of {NAMES[0]} depends on its estimate (p = 0.001)" in page
