@@ -379,6 +379,7 @@ def test_the_samples_of_a_vector_field_are_those_of_sbi(method: str) -> None:
     assert torch.allclose(samples, expected, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_sampling_a_vector_field_does_not_warn_of_draws_it_will_reject() -> None:
     posterior = RoPE(
         problems.vector_field_posterior("npse"), simulator=problems.simulate

@@ -1,7 +1,7 @@
 """Pair every public callable with all bad inputs for its arguments."""
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 from tests.faults.calls import CALLS
 from tests.faults.inputs import (
@@ -15,7 +15,7 @@ from tests.faults.inputs import (
 )
 from tests.faults.outcomes import Call, Outcome, agree, refuse, survive
 
-Trial = Callable[[], Outcome]
+Trial = functools.partial[Outcome]
 
 
 def trials(calls: list[Call] = CALLS) -> Iterator[Trial]:

@@ -407,10 +407,12 @@ def test_labels_of_a_fold_do_not_change_the_versions_that_are_scored_on_it(
             if not equal
         }
         # All other versions of candidates that learn have learned from these labels.
-        # With more pairs some are held out, and then the start can be the best.
-        assert changed <= {*names} - UNTRAINED
+        # Where some pairs are held out, the start can be the best: with rehearsal, and
+        # with more pairs.
+        learn = {*names} - UNTRAINED
+        assert changed <= learn
         assert len(changed) > 3
-        assert num_pairs > 6 or changed == {*names} - UNTRAINED
+        assert num_pairs > 6 or changed >= learn - {"fine-tuned NPE, rehearsed"}
     # The scores of the fold itself have changed with its labels.
     changed = scores_of(before).log_scores != scores_of(after).log_scores
     assert changed[rows][:, [k for k, n in enumerate(names) if n != "prior"]].any()

@@ -37,6 +37,7 @@ def divergence(x_s: Tensor, posterior: MixturePosterior, draws: int = 30) -> flo
     return float((exact.log_prob(theta) - log_prob).mean())
 
 
+@pytest.mark.slow
 def test_with_the_exact_g_the_mixture_approaches_the_exact_posterior() -> None:
     errors = []
     for n in (30, 150, 600):

@@ -304,7 +304,7 @@ def test_a_stack_and_its_candidates_move_to_a_gpu() -> None:
     ("family", "embedding"),
     [
         ("maf", "none"),
-        ("zuko_maf", "linear"),
+        pytest.param("zuko_maf", "linear", marks=pytest.mark.slow),
         pytest.param("mnpe", "linear", marks=pytest.mark.slow),
     ],
 )
@@ -323,6 +323,7 @@ def test_every_family_can_be_stacked(family: str, embedding: str) -> None:
     assert samples.shape == (3, 22, theta.shape[1])
 
 
+@pytest.mark.slow
 def test_images_are_stacked_without_candidates_that_need_summaries() -> None:
     theta = problems.box(2).sample((20,))
     x = problems.simulate_image(theta) + 0.3

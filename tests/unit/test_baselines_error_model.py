@@ -133,6 +133,7 @@ def quadrature(y: float) -> tuple[float, float, float]:
     return float(mean), float(variance) ** 0.5, float(spike)
 
 
+@pytest.mark.slow
 def test_denoised_draws_have_the_moments_found_by_quadrature() -> None:
     # At 3 spike and slab compete; at 1000 q(s) alone is left.
     values = [0.0, 1.0, 3.0, 5.0, 1000.0]

@@ -78,7 +78,9 @@ def mean_log_prob(posterior: Any, theta: Tensor, x: Tensor) -> float:
     return float(posterior.log_prob_batched(theta[None], x).mean())
 
 
-@pytest.mark.parametrize("distilled", [False, True])
+@pytest.mark.parametrize(
+    "distilled", [False, pytest.param(True, marks=pytest.mark.slow)]
+)
 def test_it_undoes_most_of_a_linear_error_for_observations_it_has_not_seen(
     distilled: bool,
 ) -> None:

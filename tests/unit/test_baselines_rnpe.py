@@ -121,6 +121,7 @@ def test_log_prob_is_the_mean_density_over_the_denoised_statistics() -> None:
             assert float(values[sample, row]) == pytest.approx(expected, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_samples_follow_the_density() -> None:
     posterior = one_statistic().build_posterior()
     x = X_O[2:3]
@@ -274,6 +275,7 @@ def test_samples_have_the_shapes_of_an_estimator() -> None:
         assert draws.shape == (*sample_shape, 3, 2)
 
 
+@pytest.mark.slow
 def test_estimators_of_sbi_can_be_averaged() -> None:
     for family in ["mdn", "nsf", "zuko_maf"]:
         theta = problems.box(2).sample((200,))

@@ -190,9 +190,8 @@ def scores(posterior: Any, offset: float, extra_std: float) -> tuple[float, floa
     return float(found.mean()), float(exact.log_prob(theta).mean())
 
 
-@pytest.mark.parametrize(
-    "extra_std", [pytest.param(0.0, marks=pytest.mark.slow), EXTRA_STD]
-)
+@pytest.mark.parametrize("extra_std", [0.0, EXTRA_STD])
+@pytest.mark.slow
 def test_it_undoes_most_of_an_offset_and_learns_the_noise(extra_std: float) -> None:
     posterior = trained(OFFSET, extra_std)
     npe, exact = scores(gaussian.posterior(), OFFSET, extra_std)

@@ -144,6 +144,7 @@ def report_of(suite: Suite, results: Results, folder: Path) -> str:
     return write_report(suite, table, folder).read_text()
 
 
+@pytest.mark.slow
 def test_the_same_table_gives_the_same_bytes(
     suite: Suite, results: Results, tmp_path: Path
 ) -> None:

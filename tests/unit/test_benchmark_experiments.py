@@ -232,6 +232,7 @@ def lpp_in_the_benchmark(case: Case, method: str) -> float:
     return score.evaluation.lpp.mean
 
 
+@pytest.mark.slow
 def test_lines_that_are_methods_score_as_in_the_benchmark(
     case: Case, lines: dict[tuple[str, float | None], Loss]
 ) -> None:

@@ -682,6 +682,7 @@ def test_the_p_value_is_the_share_of_divisions_as_far_apart() -> None:
     assert test.p_value == pytest.approx(reached / len(divisions), abs=0.04)
 
 
+@pytest.mark.slow
 def test_sets_of_one_distribution_seldom_differ_and_a_narrow_one_does() -> None:
     torch.manual_seed(35)
     tests = [

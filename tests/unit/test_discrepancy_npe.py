@@ -126,6 +126,7 @@ def test_every_source_of_simulations_gives_a_posterior_of_sbi(space: str) -> Non
         assert not torch.equal(found, log_probs(problems.npe_posterior())), name
 
 
+@pytest.mark.slow
 def test_vector_fields_are_corrected_and_can_be_sampled() -> None:
     x = labelled(1)[1]
     for kind, space in (("fmpe", "embedding"), ("npse", "input")):

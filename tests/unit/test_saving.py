@@ -173,7 +173,9 @@ def test_every_family_can_be_saved(family: str, tmp_path: Path) -> None:
         assert_same(posterior, loaded, x, truncated=False)
 
 
-@pytest.mark.parametrize("method", ["fmpe", "npse"])
+@pytest.mark.parametrize(
+    "method", ["fmpe", pytest.param("npse", marks=pytest.mark.slow)]
+)
 def test_posteriors_of_vector_fields_can_be_saved(method: str, tmp_path: Path) -> None:
     posterior = problems.vector_field_posterior(method)
     loaded = saved_and_loaded(posterior, tmp_path)

@@ -295,7 +295,14 @@ NOISE: dict[str, tuple[float, float]] = {
 }
 
 
-@pytest.mark.parametrize("name", NOISE)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("right", marks=pytest.mark.slow),
+        "too narrow",
+        pytest.param("shifted", marks=pytest.mark.slow),
+    ],
+)
 def test_guaranteed_sets_cover_as_promised_whatever_the_posterior_is(name: str) -> None:
     n, num_folds, level, num_draws, repetitions = 29, 5, 0.9, 60, 500
     shift, factor = NOISE[name]

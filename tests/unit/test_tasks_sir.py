@@ -97,6 +97,7 @@ def test_noise_has_the_variance_of_a_square_root_process() -> None:
     assert growth.mean() == pytest.approx(0.0, abs=0.005)
 
 
+@pytest.mark.slow
 def test_finer_steps_on_one_brownian_path_converge() -> None:
     theta = SIR().get_prior().sample((200,)).double().T
     fine = torch.randn(364, 40, 200, dtype=torch.float64)
