@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from benchmarks.cells import Cell
-from sbi_rope.metrics.calibration import standard_error_of_mean
+from sbi_rope._means import standard_error_of_mean
 from sbi_rope.tasks import Task, get_task
 
 __all__ = [

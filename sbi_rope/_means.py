@@ -13,6 +13,7 @@ __all__ = [
     "mean_and_error",
     "mean_of_known",
     "means_of_pairs",
+    "standard_error_of_mean",
 ]
 
 
@@ -73,6 +74,18 @@ def counts_of(weights: Tensor | None, groups: Tensor | None) -> Counts | None:
     return None if weights is None else Counts(weights, groups)
 
 
+def standard_error_of_mean(values: Tensor) -> float:
+    """Return the standard error of the mean of a vector.
+
+    It is NaN for a single value, and infinite if a value is infinite.
+    """
+    if values.numel() < 2:
+        return float("nan")
+    if torch.isinf(values).any():
+        return float("inf")
+    return float(values.double().std() / values.numel() ** 0.5)
+
+
 def mean_and_error(values: Tensor, counts: Counts | None) -> tuple[float, float]:
     """Return a mean over pairs and its standard error.
 
@@ -81,7 +94,7 @@ def mean_and_error(values: Tensor, counts: Counts | None) -> tuple[float, float]
         counts: How many pairs each counts as; None for one each.
     """
     if counts is None:
-        return float(values.mean()), float(values.std() / len(values) ** 0.5)
+        return float(values.mean()), standard_error_of_mean(values)
     values, weights = counts.of_groups(values)
     n = len(values)
     mean = (weights * values).sum() / weights.sum()

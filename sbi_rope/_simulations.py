@@ -2,9 +2,10 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
+from scipy.stats import ks_2samp
 from torch import Tensor
 from torch.distributions import Distribution
 
@@ -40,6 +41,9 @@ __all__ = [
 NUM_AROUND = 50
 # The number of stored simulations that count as simulations at a theta.
 NUM_NEAR = 10
+# Draws of the prior that stored parameters are compared with, and the p-value below
+# which a warning says that they differ.
+NUM_FROM_PRIOR, NOT_FROM_PRIOR = 10_000, 1e-6
 # So many distances are computed at once.
 MAX_DISTANCES = 50_000_000
 
@@ -218,6 +222,7 @@ class StoredSimulations:
             raise SimulationError("All stored simulations contain NaN or Inf.")
         warn_of_dropped(int((~valid).sum()), len(valid), "stored simulations")
         check_in_support("simulations[0]", theta[valid], prior)
+        _warn_if_not_from_prior(theta[valid], prior)
         self.num_dropped = int((~valid).sum())
         self.theta, self.x = theta[valid], x[valid]
         # Distances between parameters are in standard deviations of the stored ones.
@@ -370,6 +375,26 @@ def check_targets(targets: Tensor, theta: Tensor) -> Tensor:
             "or remove these pairs."
         )
     return targets
+
+
+def _warn_if_not_from_prior(theta: Tensor, prior: Distribution) -> None:
+    """Compare each stored parameter with draws of the prior."""
+    with seeded(0):
+        drawn = prior.sample(torch.Size((NUM_FROM_PRIOR,)))
+    p_values = []
+    for stored, of_prior in zip(theta.T.cpu(), drawn.T.cpu(), strict=True):
+        test: Any = ks_2samp(stored.numpy(), of_prior.numpy(), method="asymp")
+        p_values.append(float(test.pvalue))
+    unlike = [k for k, p_value in enumerate(p_values) if p_value < NOT_FROM_PRIOR]
+    if unlike:
+        warn_user(
+            f"The parameters {unlike} of `simulations` (counted from 0) are not "
+            "distributed like the prior (p = "
+            f"{min(p_values):.0e} in a Kolmogorov-Smirnov test). They are taken for "
+            "draws of the prior, so that posteriors will prefer parameters of which "
+            "there are many. Pass simulations at draws of the prior, or train NPE with "
+            "the prior that these were drawn from."
+        )
 
 
 def warn_of_dropped(dropped: int, total: int, what: str) -> None:

@@ -49,6 +49,7 @@ def quick() -> Iterator[None]:
         "sbi_rope.discrepancy.correction.NUM_STEPS": steps,
         "sbi_rope.discrepancy.correction.NUM_DRAWS": 50,
         "sbi_rope.discrepancy.training.BATCH_SIZE": 50,
+        "sbi_rope.discrepancy.training.NUM_COMPARED": 50,
         "sbi_rope.stacking.finetuning.FINETUNING": replace(
             FINETUNING, max_num_epochs=2
         ),

@@ -18,6 +18,7 @@ from sbi_rope._means import (
     mean_and_error,
     mean_of_known,
     means_of_pairs,
+    standard_error_of_mean,
 )
 from sbi_rope._validation import (
     check_batch,
@@ -43,7 +44,6 @@ __all__ = [
     "expected_coverage_error_of",
     "mid_ranks",
     "random_ranks",
-    "standard_error_of_mean",
 ]
 
 # Levels and ranks are ratios of integers. Those that are equal before rounding must
@@ -380,18 +380,6 @@ def coverage_error_of_pairs(
         standard_error=_mean_over_pairs(influence / nominal.numel(), counts)[1],
         per_parameter=per_parameter,
     )
-
-
-def standard_error_of_mean(values: Tensor) -> float:
-    """Return the standard error of the mean of a vector.
-
-    It is NaN for a single value, and infinite if a value is infinite.
-    """
-    if values.numel() < 2:
-        return float("nan")
-    if torch.isinf(values).any():
-        return float("inf")
-    return float(values.double().std() / values.numel() ** 0.5)
 
 
 def _mean_over_pairs(

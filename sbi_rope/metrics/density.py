@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sbi_rope._means import standard_error_of_mean
 from sbi_rope._notebooks import shown_as_text
 from sbi_rope._validation import (
     check_batch,
@@ -15,7 +16,6 @@ from sbi_rope._validation import (
     check_tensor,
 )
 from sbi_rope.errors import InvalidInputError
-from sbi_rope.metrics.calibration import standard_error_of_mean
 from sbi_rope.metrics.calls import CHUNK_SIZE, check_test_set, evaluate_log_probs
 
 __all__ = ["LPPScore", "check_scales", "check_theta_std", "lpp"]

@@ -4,14 +4,22 @@ import copy
 from collections.abc import Sequence
 from typing import Any
 
+import torch
+from sbi.utils import within_support
+from torch import Tensor
+
+from sbi_rope._random import seeded
 from sbi_rope._sbi import estimator_of
-from sbi_rope._validation import check_weights
+from sbi_rope._validation import KnownColumns, check_weights
 from sbi_rope.errors import InvalidInputError, InvalidTypeError
 from sbi_rope.mixture.estimator import MixtureEstimator
 from sbi_rope.mixture.parts import part_of
 from sbi_rope.mixture.posterior import MixturePosterior
 
 __all__ = ["average"]
+
+# Draws of each prior that are looked for in the others.
+NUM_FROM_PRIOR = 100
 
 
 def average(
@@ -38,8 +46,9 @@ def average(
 
     Raises:
         InvalidTypeError: If it is no list of posteriors.
-        InvalidInputError: If there is no posterior, shapes or batches differ, or the
-            weights do not fit.
+        InvalidInputError: If there is no posterior, shapes, batches or priors differ,
+            two know the columns of tables in different orders, or the weights do not
+            fit.
         UnsupportedPosteriorError: If one of them has no density or no embedding of x,
             or is a recalibrated stack.
 
@@ -81,10 +90,53 @@ def average(
         of_parts,
         tail_mass=min(estimator.tail_mass for estimator in estimators),
     )
+    _check_same_prior([posterior.prior for posterior in posteriors])
     first = posteriors[0]
-    return MixturePosterior(
+    averaged = MixturePosterior(
         mixture, copy.deepcopy(first.prior), enable_transform=first.enable_transform
     )
+    names = {tuple(getattr(one, "parameter_names", None) or ()) for one in posteriors}
+    averaged.parameter_names = names.pop() or None if len(names) == 1 else None
+    averaged.columns = {name: _columns_of(name, posteriors) for name in ("theta", "x")}
+    return averaged
+
+
+def _check_same_prior(priors: Sequence[Any]) -> None:
+    """Raise if draws of a prior have another density under another."""
+    with seeded(0):
+        drawn = [prior.sample(torch.Size((NUM_FROM_PRIOR,))) for prior in priors]
+    for number, (prior, theta) in enumerate(zip(priors, drawn, strict=True)):
+        if not (_agree(priors[0], prior, drawn[0]) and _agree(prior, priors[0], theta)):
+            raise InvalidInputError(
+                "Expected `posteriors` with the same prior; got another prior in "
+                f"posteriors[{number}] than in posteriors[0]. Train all of them with "
+                "one prior."
+            )
+
+
+def _agree(one: Any, other: Any, theta: Tensor) -> bool:
+    """Whether draws of one prior are inside another, and have the same density."""
+    if not bool(within_support(other, theta).all()):
+        return False
+    return torch.allclose(one.log_prob(theta), other.log_prob(theta), atol=1e-3)
+
+
+def _columns_of(name: str, posteriors: Sequence[Any]) -> KnownColumns:
+    """Return the orders of columns that posteriors know, which must not differ."""
+    known: dict[tuple[str, ...], str] = {}
+    for number, posterior in enumerate(posteriors):
+        of_posterior = getattr(posterior, "columns", None) or {}
+        for order, source in of_posterior.get(name, {}).items():
+            for earlier in known:
+                if order != earlier and sorted(order) == sorted(earlier):
+                    raise InvalidInputError(
+                        f"Expected `posteriors` that know the columns of `{name}` in "
+                        f"one order; got {list(order)} in posteriors[{number}], and "
+                        f"{list(earlier)} before. Make all of them from tables with "
+                        "the same order of columns."
+                    )
+            known.setdefault(order, source)
+    return known
 
 
 def _mixture_of(posterior: Any) -> MixtureEstimator:

@@ -68,7 +68,10 @@ class Recalibration:
         low, high = self.interval
         gain = f"{self.gain:+.2f} nats a held-out pair ({low:+.2f} to {high:+.2f})"
         if not self.is_used:
-            return f"Recalibration was not used, because it would add {gain}."
+            return (
+                f"Recalibration was not used: its gain, {gain}, is not more than its "
+                "standard error."
+            )
         factors = ", ".join(f"{factor:.2f}" for factor in self.factors.tolist())
         return (
             f"Recalibration multiplies the spread of the parameters by {factors}: "

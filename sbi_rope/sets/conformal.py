@@ -83,9 +83,11 @@ def promised_coverage(level: float, n: int, num_folds: int) -> float:
     """Return the bound of the coverage in theory, at least 0; see this module.
 
     Example:
-        >>> [round(promised_coverage(0.9, 50, folds), 3) for folds in (5, 50)]
-        [0.655, 0.8]
+        >>> [round(promised_coverage(0.9, 50, folds), 3) for folds in (5, 50, 60)]
+        [0.655, 0.8, 0.8]
     """
+    # Folds without a counted pair change nothing.
+    num_folds = min(num_folds, n)
     share = 1 / num_folds
     of_folds = 2 * (1 - share) / (n * share + 1)
     of_pairs = (1 - num_folds / n) / (num_folds + 1)

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from os import PathLike
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from sbi_rope._groups import groups_of, one_of_each_group
@@ -157,7 +156,7 @@ class StackingReport:
             family_weights=_family_weights(scores),
             acauc=acauc_of_pairs(levels, scores.counts),
             coverage_error=coverage_error_of_pairs(levels, scores.counts),
-            share_inside=_share_inside(scores),
+            share_inside=float(scores.coverage.average[round(100 * LEVEL) - 1]),
             joint_sets=_joint_sets(scores.set_scores),
             batch=batch,
             discrepancy=discrepancy,
@@ -262,15 +261,6 @@ def _by_estimate(scores: CrossValidation) -> CoverageByEstimate | None:
     return coverage_by_estimate_of_pairs(
         scores.ranks, scores.estimates, scores.counts, chosen=chosen, level=LEVEL
     )
-
-
-def _share_inside(scores: CrossValidation) -> float:
-    """Return the share of known parameters inside their 90 % intervals."""
-    weights = torch.ones_like(scores.levels, dtype=torch.double)
-    if scores.pair_weights is not None:
-        weights = scores.pair_weights.to(weights)[:, None] * weights
-    weights = weights * ~torch.isnan(scores.levels)
-    return float((weights * (scores.levels <= LEVEL)).sum() / weights.sum())
 
 
 def _joint_sets(scores: SetScores | None) -> tuple[float, float] | None:

@@ -93,8 +93,8 @@ def stack(
             estimate what more labels would add. It takes about twice the time.
         recalibrate: Whether to make the stack narrower or wider around its centre, as
             held-out pairs say; ``report.recalibration`` tells by how much. The average
-            of several versions is often too wide. Ten more versions are trained for
-            this, which takes up to three times as long.
+            of several versions is often too wide. Further versions are trained for
+            this, ten with five folds, which takes up to three times as long.
         unseen: What the posterior of a batch does with an x outside the batch:
             ``"raise"`` an error, or ``"extend"`` each coupling by one row.
         tail_mass: As in :meth:`~sbi_rope.RoPE.build_posterior`.

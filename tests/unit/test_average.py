@@ -2,18 +2,22 @@
 
 import copy
 
+import pandas as pd
 import pytest
 import torch
 from sbi.inference import EnsemblePosterior
+from sbi.utils import BoxUniform
 from torch import Tensor
+from torch.distributions import Distribution
 
 from sbi_rope import MixturePosterior, RoPE
+from sbi_rope._sbi import estimator_of
 from sbi_rope.errors import (
     InvalidInputError,
     InvalidTypeError,
     UnsupportedPosteriorError,
 )
-from sbi_rope.mixture import average
+from sbi_rope.mixture import MixtureEstimator, average, part_of
 from tests import problems
 from tests.stacks import QUIET, unnormalised
 
@@ -94,3 +98,52 @@ def test_what_cannot_be_averaged_is_refused() -> None:
         average([member, problems.gaussian_posterior()])
     with pytest.raises(InvalidInputError, match="as the first"):
         average([member, problems.gaussian_posterior(dim=3)])
+
+
+def single(prior: Distribution) -> MixturePosterior:
+    """Return a mixture of one part, with any prior."""
+    part = part_of(estimator_of(problems.npe_posterior("mdn")))
+    return MixturePosterior(MixtureEstimator([part], [1.0]), prior)
+
+
+def test_posteriors_with_other_priors_are_not_averaged() -> None:
+    narrow, wide = (
+        MixturePosterior(
+            MixtureEstimator(
+                [part_of(estimator_of(problems.npe_posterior("mdn")))], [1]
+            ),
+            BoxUniform(-side * torch.ones(2), side * torch.ones(2)),
+        )
+        for side in (1.0, 5.0)
+    )
+    same = copy.deepcopy(narrow)
+    assert average([narrow, same]).prior is not narrow.prior
+    for members in ([narrow, wide], [wide, narrow]):
+        with pytest.raises(
+            InvalidInputError, match=r"another prior in posteriors\[1\]"
+        ):
+            average(members)
+
+
+def test_an_average_knows_names_and_orders_of_columns_that_its_members_know() -> None:
+    first, second = (
+        MixturePosterior(
+            MixtureEstimator(
+                [part_of(estimator_of(problems.npe_posterior("mdn")))], [1]
+            ),
+            problems.box(2),
+        )
+        for _ in range(2)
+    )
+    first.columns = {"x": {("u", "v", "w"): "the pairs"}}
+    first.parameter_names = second.parameter_names = ("a", "b")
+    posterior = average([first, second])
+    table = pd.DataFrame(torch.zeros(1, 3).numpy(), columns=["v", "u", "w"])
+    with pytest.raises(InvalidInputError, match="in the order of the pairs"):
+        posterior.sample((1,), x=table)
+    assert posterior.parameter_names == ("a", "b")
+    second.parameter_names = ("b", "a")
+    assert average([first, second]).parameter_names is None
+    second.columns = {"x": {("v", "u", "w"): "the pairs"}}
+    with pytest.raises(InvalidInputError, match="columns of `x` in one order"):
+        average([first, second])

@@ -274,6 +274,17 @@ def test_levels_too_large_are_over_confident_and_too_small_too_wide() -> None:
 # Gaussian posteriors with known scores ------------------------------------------------
 
 
+@pytest.mark.parametrize("factor", [0.95, 1.05])
+def test_acauc_of_a_factor_near_one_is_its_logarithm_divided_by_pi(
+    factor: float,
+) -> None:
+    # The parameters are the quantiles of a normal distribution, in units of its width.
+    shares = torch.linspace(0, 1, 10_001, dtype=torch.double)[1:-1, None]
+    levels = torch.special.erf(factor * torch.special.ndtri(shares).abs() / 2**0.5)
+    found = metrics.acauc_of(levels).value
+    assert found == pytest.approx(math.log(factor) / math.pi, rel=0.01)
+
+
 def test_acauc_of_gaussian_posteriors_has_its_exact_and_its_published_value() -> None:
     theta, x = gaussian_pairs(1500)
     for bias, scale, *published in (

@@ -271,7 +271,7 @@ def test_factors_that_lower_the_score_are_not_used() -> None:
     assert found.interval[1] < 0
     assert not found.is_used
     assert torch.equal(found.factors, torch.ones(2).double())
-    assert "was not used, because it would add -" in str(found)
+    assert "was not used: its gain, -" in str(found)
 
 
 def test_a_pair_with_a_density_of_zero_says_nothing_about_the_spread() -> None:

@@ -523,6 +523,16 @@ def test_targets_are_means_over_the_finite_simulations() -> None:
     assert 20 < source.num_dropped < 80
 
 
+def test_stored_parameters_that_are_no_draws_of_the_prior_are_warned_of() -> None:
+    theta = gaussian.prior().sample((1000,))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RoPEWarning)
+        RoPE(gaussian.posterior(), simulations=(theta, gaussian.simulator(theta)))
+    theta[:, 1] *= 0.5
+    with pytest.warns(RoPEWarning, match=r"parameters \[1\] .* not distributed like"):
+        RoPE(gaussian.posterior(), simulations=(theta, gaussian.simulator(theta)))
+
+
 def test_stored_simulations_are_chosen_at_random() -> None:
     theta = gaussian.prior().sample((100,))
     conductor = RoPE(
