@@ -6,7 +6,6 @@ from typing import Any
 
 import torch
 from sbi.utils import within_support
-from torch import Tensor
 
 from sbi_rope._random import seeded
 from sbi_rope._sbi import estimator_of
@@ -18,7 +17,7 @@ from sbi_rope.mixture.posterior import MixturePosterior
 
 __all__ = ["average"]
 
-# Draws of each prior that are looked for in the others.
+# Draws of the first prior, at which the others must have the same density.
 NUM_FROM_PRIOR = 100
 
 
@@ -102,23 +101,19 @@ def average(
 
 
 def _check_same_prior(priors: Sequence[Any]) -> None:
-    """Raise if draws of a prior have another density under another."""
+    """Raise if draws of the first prior have another density under another."""
     with seeded(0):
-        drawn = [prior.sample(torch.Size((NUM_FROM_PRIOR,))) for prior in priors]
-    for number, (prior, theta) in enumerate(zip(priors, drawn, strict=True)):
-        if not (_agree(priors[0], prior, drawn[0]) and _agree(prior, priors[0], theta)):
+        theta = priors[0].sample(torch.Size((NUM_FROM_PRIOR,)))
+    for number, prior in enumerate(priors[1:], start=1):
+        # Outside its support a prior of torch has no density, but an error.
+        if not bool(within_support(prior, theta).all()) or not torch.allclose(
+            prior.log_prob(theta), priors[0].log_prob(theta), atol=1e-3
+        ):
             raise InvalidInputError(
                 "Expected `posteriors` with the same prior; got another prior in "
                 f"posteriors[{number}] than in posteriors[0]. Train all of them with "
                 "one prior."
             )
-
-
-def _agree(one: Any, other: Any, theta: Tensor) -> bool:
-    """Whether draws of one prior are inside another, and have the same density."""
-    if not bool(within_support(other, theta).all()):
-        return False
-    return torch.allclose(one.log_prob(theta), other.log_prob(theta), atol=1e-3)
 
 
 def _columns_of(name: str, posteriors: Sequence[Any]) -> KnownColumns:

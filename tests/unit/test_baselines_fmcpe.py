@@ -171,7 +171,6 @@ def box_method(theta: Tensor, *, num_epochs: int = 40) -> Any:
     return method.append_calibration(theta, problems.simulate(theta) + 0.3)
 
 
-@pytest.mark.slow
 def test_labels_on_a_bound_are_like_labels_next_to_it() -> None:
     """Recorded settings are often exactly at the end of their range."""
     torch.manual_seed(0)

@@ -228,7 +228,6 @@ def test_coverage_error_of_calibrated_levels_has_its_expected_value() -> None:
     assert sum(values) / 40 == pytest.approx(0.313 / 20, rel=0.1)
 
 
-@pytest.mark.slow
 def test_coverage_error_standard_error_matches_its_spread() -> None:
     # One parameter over-confident, one under-confident, by the same latent error.
     scales = torch.tensor([0.5, 2.0], dtype=torch.float64)

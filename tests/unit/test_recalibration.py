@@ -326,7 +326,6 @@ def test_in_a_triangle_the_density_has_mass_one_and_is_that_of_the_draws(
     assert (both[..., 0] >= both[..., 1]).all()
 
 
-@pytest.mark.slow
 def test_what_is_moved_out_of_a_triangle_counts_when_factors_are_chosen(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
