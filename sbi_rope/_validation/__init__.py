@@ -10,6 +10,7 @@ from sbi_rope._validation.columns import (
     check_columns,
     check_tables,
     column_names,
+    joined_columns,
 )
 from sbi_rope._validation.settings import (
     LARGEST_SETTING,
@@ -96,5 +97,6 @@ __all__ = [
     "check_weights",
     "column_names",
     "default_names",
+    "joined_columns",
     "usable_device",
 ]

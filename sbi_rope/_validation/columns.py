@@ -4,7 +4,7 @@ Tables are read as arrays, which have no names. The same columns in another orde
 be taken for each other.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from sbi_rope.errors import InvalidInputError
@@ -14,6 +14,7 @@ __all__ = [
     "check_columns",
     "check_tables",
     "column_names",
+    "joined_columns",
 ]
 
 # The names of columns in orders that are known to be right, and where each comes from.
@@ -90,3 +91,27 @@ def check_columns(
     if not names or names in known:
         return known
     return {**known, names: f"the earlier table `{name}`"}
+
+
+def joined_columns(name: str, sources: Sequence[KnownColumns]) -> KnownColumns:
+    """Return the orders of columns that several posteriors know.
+
+    Args:
+        name: What the argument is called.
+        sources: The orders that each posterior knows.
+
+    Raises:
+        InvalidInputError: If two know the same columns in different orders.
+    """
+    joined: dict[tuple[str, ...], str] = {}
+    first: dict[frozenset[str], tuple[str, ...]] = {}
+    for order, source in (item for known in sources for item in known.items()):
+        earlier = first.setdefault(frozenset(order), order)
+        if earlier != order:
+            raise InvalidInputError(
+                f"Expected `posteriors` that know the columns of `{name}` in one "
+                f"order; got {list(earlier)} and {list(order)}. Make all of them from "
+                "tables with the same order of columns."
+            )
+        joined.setdefault(order, source)
+    return joined

@@ -9,7 +9,7 @@ from sbi.utils import within_support
 
 from sbi_rope._random import seeded
 from sbi_rope._sbi import estimator_of
-from sbi_rope._validation import KnownColumns, check_weights
+from sbi_rope._validation import check_weights, joined_columns
 from sbi_rope.errors import InvalidInputError, InvalidTypeError
 from sbi_rope.mixture.estimator import MixtureEstimator
 from sbi_rope.mixture.parts import part_of
@@ -94,9 +94,12 @@ def average(
     averaged = MixturePosterior(
         mixture, copy.deepcopy(first.prior), enable_transform=first.enable_transform
     )
-    names = {tuple(getattr(one, "parameter_names", None) or ()) for one in posteriors}
-    averaged.parameter_names = names.pop() or None if len(names) == 1 else None
-    averaged.columns = {name: _columns_of(name, posteriors) for name in ("theta", "x")}
+    averaged.parameter_names = _common_names(posteriors)
+    known = [getattr(posterior, "columns", {}) for posterior in posteriors]
+    averaged.columns = {
+        name: joined_columns(name, [columns.get(name, {}) for columns in known])
+        for name in ("theta", "x")
+    }
     return averaged
 
 
@@ -116,22 +119,10 @@ def _check_same_prior(priors: Sequence[Any]) -> None:
             )
 
 
-def _columns_of(name: str, posteriors: Sequence[Any]) -> KnownColumns:
-    """Return the orders of columns that posteriors know, which must not differ."""
-    known: dict[tuple[str, ...], str] = {}
-    for number, posterior in enumerate(posteriors):
-        of_posterior = getattr(posterior, "columns", None) or {}
-        for order, source in of_posterior.get(name, {}).items():
-            for earlier in known:
-                if order != earlier and sorted(order) == sorted(earlier):
-                    raise InvalidInputError(
-                        f"Expected `posteriors` that know the columns of `{name}` in "
-                        f"one order; got {list(order)} in posteriors[{number}], and "
-                        f"{list(earlier)} before. Make all of them from tables with "
-                        "the same order of columns."
-                    )
-            known.setdefault(order, source)
-    return known
+def _common_names(posteriors: Sequence[Any]) -> tuple[str, ...] | None:
+    """Return the names of the parameters if all posteriors have the same."""
+    first, *others = (getattr(one, "parameter_names", None) for one in posteriors)
+    return first if all(names == first for names in others) else None
 
 
 def _mixture_of(posterior: Any) -> MixtureEstimator:

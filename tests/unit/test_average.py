@@ -108,12 +108,7 @@ def single(prior: Distribution) -> MixturePosterior:
 
 def test_posteriors_with_other_priors_are_not_averaged() -> None:
     narrow, wide = (
-        MixturePosterior(
-            MixtureEstimator(
-                [part_of(estimator_of(problems.npe_posterior("mdn")))], [1]
-            ),
-            BoxUniform(-side * torch.ones(2), side * torch.ones(2)),
-        )
+        single(BoxUniform(-side * torch.ones(2), side * torch.ones(2)))
         for side in (1.0, 5.0)
     )
     same = copy.deepcopy(narrow)
@@ -126,15 +121,7 @@ def test_posteriors_with_other_priors_are_not_averaged() -> None:
 
 
 def test_an_average_knows_names_and_orders_of_columns_that_its_members_know() -> None:
-    first, second = (
-        MixturePosterior(
-            MixtureEstimator(
-                [part_of(estimator_of(problems.npe_posterior("mdn")))], [1]
-            ),
-            problems.box(2),
-        )
-        for _ in range(2)
-    )
+    first, second = single(problems.box(2)), single(problems.box(2))
     first.columns = {"x": {("u", "v", "w"): "the pairs"}}
     first.parameter_names = second.parameter_names = ("a", "b")
     posterior = average([first, second])
