@@ -102,6 +102,7 @@ class RoPE:
             :func:`~sbi_rope.parallel` calls it in several processes.
         simulations: Instead of a simulator, stored pairs (theta, x) with theta drawn
             from the prior. Fine-tuning then uses those with the nearest parameters.
+            A warning says if their parameters are not distributed like the prior.
             There is a warning if there are fewer than 1000. If theta or x is a table
             whose columns have names, a later table with the same names in another order
             is refused.
