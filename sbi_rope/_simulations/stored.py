@@ -1,8 +1,6 @@
-"""Sources of simulations: what RoPE needs of them, and a stored set of pairs."""
+"""A set of pairs (theta, x) that were simulated beforehand."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from scipy.stats import ks_2samp
@@ -10,6 +8,8 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_rope._random import seeded
+from sbi_rope._simulations.moments import Moments
+from sbi_rope._simulations.source import Embedding, Readable, all_finite
 from sbi_rope._validation import (
     as_numbers_on,
     check_batch,
@@ -21,21 +21,10 @@ from sbi_rope.errors import (
     InvalidInputError,
     InvalidTypeError,
     SimulationError,
-    in_digits,
     warn_user,
 )
 
-__all__ = [
-    "Embedding",
-    "Moments",
-    "Readable",
-    "SimulationSource",
-    "StoredSimulations",
-    "all_finite",
-    "check_targets",
-    "draw_targets",
-    "warn_of_dropped",
-]
+__all__ = ["StoredSimulations"]
 
 # The number of stored simulations around a theta from which its moments are estimated.
 NUM_AROUND = 50
@@ -46,143 +35,6 @@ NUM_NEAR = 10
 NUM_FROM_PRIOR, NOT_FROM_PRIOR = 10_000, 1e-6
 # So many distances are computed at once.
 MAX_DISTANCES = 50_000_000
-
-Embedding = Callable[[Tensor], Tensor]
-# Tells which simulations an embedding net can read, ``(n, *event)`` to ``(n,)``.
-Readable = Callable[[Tensor], Tensor]
-
-
-def all_finite(x: Tensor) -> Tensor:
-    """Tell which rows are finite, which is what most embedding nets can read."""
-    return torch.isfinite(x).flatten(1).all(dim=1)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Moments:
-    """Mean and covariance of the embeddings of simulations at given parameters.
-
-    Attributes:
-        mean: Shape ``(n, l)``, float64.
-        covariance: Shape ``(n, l, l)``, float64.
-        possible: Where labels are not exact, means at R parameters that each of them
-            leaves possible, shape ``(n, R, l)``; ``mean`` is their average. None for
-            exact labels.
-    """
-
-    mean: Tensor
-    covariance: Tensor
-    possible: Tensor | None = None
-
-    def __getitem__(self, rows: Tensor) -> "Moments":
-        return Moments(
-            mean=self.mean[rows],
-            covariance=self.covariance[rows],
-            possible=None if self.possible is None else self.possible[rows],
-        )
-
-    @classmethod
-    def joined(cls, parts: Sequence["Moments"]) -> "Moments":
-        """Return the moments of several sets of parameters, one after the other."""
-        possible = [part.possible for part in parts if part.possible is not None]
-        return cls(
-            mean=torch.cat([part.mean for part in parts]),
-            covariance=torch.cat([part.covariance for part in parts]),
-            possible=torch.cat(possible) if possible else None,
-        )
-
-    def columns(self, columns: slice) -> "Moments":
-        """Return the moments of some entries of the embeddings."""
-        possible = self.possible
-        return Moments(
-            mean=self.mean[:, columns],
-            covariance=self.covariance[:, columns, columns],
-            possible=None if possible is None else possible[..., columns],
-        )
-
-    @property
-    def means(self) -> Tensor:
-        """The possible means, ``(n, R, l)``, or the only ones, ``(n, l)``."""
-        return self.mean if self.possible is None else self.possible
-
-
-class SimulationSource(Protocol):
-    """What RoPE needs of simulations. Each is reduced to its embedding at once."""
-
-    @property
-    def num_dropped(self) -> int:
-        """How many simulations were dropped so far because of NaN or Inf."""
-        ...
-
-    @property
-    def num_calls(self) -> int:
-        """How many rows a simulator has simulated so far."""
-        ...
-
-    def from_prior(
-        self, count: int | None, at_least: int, embed: Embedding, *, progress: bool
-    ) -> tuple[Tensor, Tensor]:
-        """Return parameters from the prior, and the embedding of one simulation each.
-
-        Args:
-            count: The number of simulations.
-            at_least: The number of simulations if ``count`` is None.
-            embed: The embedding h.
-            progress: Whether to show the progress of slow simulations.
-
-        Returns:
-            theta of shape ``(n_s, d)`` and embeddings of shape ``(n_s, l)``.
-        """
-        ...
-
-    def targets(
-        self,
-        theta: Tensor,
-        embed: Embedding,
-        *,
-        simulations_per_target: int,
-        num_neighbors: int,
-        progress: bool,
-    ) -> Tensor:
-        """Return the mean embedding of simulations at each theta, ``(n, l)``.
-
-        A simulator makes ``simulations_per_target`` simulations at each theta. Of
-        stored simulations, those with the ``num_neighbors`` nearest parameters count.
-        """
-        ...
-
-    def moments(
-        self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
-    ) -> Moments:
-        """Return mean and covariance of the embedding of simulations at each theta."""
-        ...
-
-    def draws(
-        self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
-    ) -> Tensor:
-        """Return embeddings of simulations at each theta, ``(n, count, l)``.
-
-        Of stored simulations, those with the nearest parameters count, at most ten.
-        """
-        ...
-
-    def once_at(
-        self, theta: Tensor, embed: Embedding, *, progress: bool
-    ) -> tuple[Tensor, Tensor]:
-        """Simulate once at each of several parameters of each pair.
-
-        Args:
-            theta: Parameters, shape ``(n, R, d)``.
-            embed: The representation of simulations that is returned.
-            progress: Whether to show the progress of slow simulations.
-
-        Returns:
-            The parameters, shape ``(n, R, d)``, and the embeddings, ``(n, R, l)``.
-        """
-        ...
-
-    def kept(self, count: int, *, progress: bool) -> tuple[Tensor, Tensor]:
-        """Return up to ``count`` pairs (theta, x) from the prior, always the same."""
-        ...
 
 
 class StoredSimulations:
@@ -220,7 +72,7 @@ class StoredSimulations:
         valid &= readable(x)
         if not valid.any():
             raise SimulationError("All stored simulations contain NaN or Inf.")
-        warn_of_dropped(int((~valid).sum()), len(valid), "stored simulations")
+        _warn_of_dropped(int((~valid).sum()), len(valid), "stored simulations")
         check_in_support("simulations[0]", theta[valid], prior)
         _warn_if_not_from_prior(theta[valid], prior)
         self.num_dropped = int((~valid).sum())
@@ -324,59 +176,6 @@ class StoredSimulations:
         return (theta - self._theta_mean) / self._theta_std
 
 
-def draw_targets(
-    source: SimulationSource,
-    theta: Tensor,
-    embed: Embedding,
-    *,
-    simulations_per_target: int,
-    num_neighbors: int,
-    progress: bool,
-) -> Tensor:
-    r"""Return the targets of the tuning, :math:`E_\varepsilon[h(S(\theta_i))]`.
-
-    Args:
-        source: The source of simulations.
-        theta: Parameters of the pairs, shape ``(n, d)``.
-        embed: The embedding h.
-        simulations_per_target: The number of simulations that a simulator makes for
-            each target.
-        num_neighbors: The number of stored simulations for each target.
-        progress: Whether to show the progress of slow simulations.
-
-    Returns:
-        Shape ``(n, l)``.
-
-    Raises:
-        SimulationError: If the simulator fails, or an embedding is not finite.
-    """
-    targets = source.targets(
-        theta,
-        embed,
-        simulations_per_target=simulations_per_target,
-        num_neighbors=num_neighbors,
-        progress=progress,
-    )
-    return check_targets(targets, theta)
-
-
-def check_targets(targets: Tensor, theta: Tensor) -> Tensor:
-    """Return the targets of the tuning if they are finite.
-
-    Raises:
-        SimulationError: If they are not.
-    """
-    usable = torch.isfinite(torch.linalg.vector_norm(targets, dim=1))
-    if not usable.all():
-        raise SimulationError(
-            "Expected simulations with a finite embedding; got NaN, Inf or numbers "
-            f"too large to compare at the calibration parameters "
-            f"{in_digits(theta[~usable])}. Check what the simulator returns there, "
-            "or remove these pairs."
-        )
-    return targets
-
-
 def _warn_if_not_from_prior(theta: Tensor, prior: Distribution) -> None:
     """Compare each stored parameter with draws of the prior."""
     with seeded(0):
@@ -397,7 +196,7 @@ def _warn_if_not_from_prior(theta: Tensor, prior: Distribution) -> None:
         )
 
 
-def warn_of_dropped(dropped: int, total: int, what: str) -> None:
+def _warn_of_dropped(dropped: int, total: int, what: str) -> None:
     """Warn if simulations were dropped."""
     if dropped:
         warn_user(
