@@ -2,14 +2,47 @@
 
 import multiprocessing
 import os
+import pickle
 import threading
 import time
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import BrokenExecutor
+from typing import Any
 
-__all__ = ["end_with"]
+import joblib
+
+__all__ = ["WORKER_ERRORS", "end_with", "in_workers"]
+
+# What is raised if a worker dies, or if something cannot be sent to it.
+WORKER_ERRORS = (BrokenExecutor, pickle.PicklingError)
 
 # Seconds between two looks of a worker at its parent.
 INTERVAL = 0.5
 _watched: list[int] = []
+
+
+def in_workers(
+    function: Callable[..., Any],
+    arguments: Iterable[tuple[Any, ...]],
+    num_workers: int,
+) -> Iterator[Any]:
+    """Call a function in several processes; yield what it returns, in order.
+
+    Args:
+        function: What to call. With one worker it is called in this process.
+        arguments: The arguments of each call.
+        num_workers: The number of processes.
+    """
+    # A seeded block waits for those of other threads, so that threads do not do.
+    options: dict[str, Any] = {"backend": "loky", "return_as": "generator"}
+    run: Any = joblib.Parallel(n_jobs=num_workers, **options)
+    parent = os.getpid()
+    yield from run(joblib.delayed(_call)(parent, function, *each) for each in arguments)
+
+
+def _call(parent: int, function: Callable[..., Any], *arguments: Any) -> Any:
+    end_with(parent)
+    return function(*arguments)
 
 
 def end_with(parent: int) -> None:

@@ -1,11 +1,15 @@
-"""How much time of a processor does it take to train all candidates of a stack?
+"""How long does it take to train all candidates of a stack?
 
-The table "A stack: how fast" of `benchmarks/README.md`. Every row is a process of its
-own. With ``--before`` each row is measured on another checkout of the package too, in
-turns; compare within a run. The last column is the density that the stack gives to its
-own pairs: it shows whether both versions train the same networks.
+The tables of "A stack: how fast" of `benchmarks/README.md`. Every row is a process of
+its own. With ``--before`` each row is measured on another checkout of the package too,
+in turns; compare within a run. The last column is the density that the stack gives to
+its own pairs: it shows whether all rows train the same networks.
 
     python -m benchmarks.experiments.training --before ../old-checkout
+    python -m benchmarks.experiments.training --estimator mdn --workers 1 2
+
+The time of the processor is that of the first process alone, so that it is not given if
+there are several.
 """
 
 import argparse
@@ -25,11 +29,21 @@ from torch import Tensor, nn
 
 from benchmarks.experiments.common import BEFORE, Row, begin, measured, show, versions
 
-COLUMNS = ("estimator", "pairs", "repeat", "version", "CPU s", "mean log density")
+COLUMNS = (
+    "estimator",
+    "pairs",
+    "repeat",
+    "version",
+    "workers",
+    "CPU s",
+    "s",
+    "mean log density",
+)
 OPTIONS = {
     "--estimator": {"nargs": "+", "default": ["mdn", "nsf"]},
     "--n-calibration": {"type": int, "default": 20},
     "--repeats": {"type": int, "default": 2},
+    "--workers": {"type": int, "nargs": "+", "default": [1]},
     **BEFORE,
 }
 PRIOR = BoxUniform(-torch.ones(2), torch.ones(2))
@@ -42,11 +56,14 @@ def simulate(theta: Tensor) -> Tensor:
 
 
 def rows(args: argparse.Namespace) -> Iterator[Row]:
-    """Yield one row for each estimator, repetition and version."""
+    """Yield one row for each estimator, repetition, version and number of workers."""
     for estimator, repeat in itertools.product(args.estimator, range(args.repeats)):
-        for version, root in versions(args.before).items():
+        for (version, root), workers in itertools.product(
+            versions(args.before).items(), args.workers
+        ):
             settings = {"estimator": estimator, "pairs": args.n_calibration}
             settings |= {"repeat": repeat, "version": version, "root": root}
+            settings |= {"workers": workers}
             settings |= {"threads": args.threads}
             row = settings | measured("training", settings)
             yield {column: row[column] for column in COLUMNS}
@@ -69,12 +86,17 @@ def measure(settings: dict[str, Any]) -> None:
     x = 1.1 * simulate(theta) + 0.1
     rope = RoPE(npe.build_posterior(), simulator=simulate)
     rope.append_calibration(theta, x)
-    start = time.process_time()
-    posterior = stack(rope, seed=0, show_progress_bars=False)
-    seconds = time.process_time() - start
+    workers = settings["workers"]
+    # An older checkout may not have this argument.
+    several = {"num_workers": workers} if workers > 1 else {}
+    start, start_cpu = time.perf_counter(), time.process_time()
+    posterior = stack(rope, seed=0, show_progress_bars=False, **several)
+    seconds = time.perf_counter() - start
+    of_cpu = "-" if several else f"{time.process_time() - start_cpu:.0f}"
     log_probs = posterior.log_prob_batched(theta[None], x, norm_posterior=False)
     density = f"{float(log_probs.mean()):.6f}"
-    print(json.dumps({"CPU s": f"{seconds:.0f}", "mean log density": density}))
+    times = {"CPU s": of_cpu, "s": f"{seconds:.0f}"}
+    print(json.dumps({**times, "mean log density": density}))
 
 
 if __name__ == "__main__":

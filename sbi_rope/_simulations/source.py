@@ -33,6 +33,10 @@ class SimulationSource(Protocol):
         """How many rows a simulator has simulated so far."""
         ...
 
+    def count(self, num_calls: int, num_dropped: int) -> None:
+        """Count what a copy of this source has simulated in another process."""
+        ...
+
     def from_prior(
         self, count: int | None, at_least: int, embed: Embedding, *, progress: bool
     ) -> tuple[Tensor, Tensor]:

@@ -59,6 +59,10 @@ class LimitedSimulator:
         """How many rows the simulator has simulated."""
         return self._simulator.num_calls
 
+    def count(self, num_calls: int, num_dropped: int) -> None:
+        """Count what a copy of the simulator has simulated in another process."""
+        self._simulator.count(num_calls, num_dropped)
+
     def from_prior(
         self, count: int | None, at_least: int, embed: Embedding, *, progress: bool
     ) -> tuple[Tensor, Tensor]:

@@ -92,6 +92,11 @@ class Simulator:
         failures.warn()
         return x
 
+    def count(self, num_calls: int, num_dropped: int) -> None:
+        """Count what a copy of the simulator has simulated in another process."""
+        self.num_calls += num_calls
+        self.num_dropped += num_dropped
+
     def from_prior(
         self, count: int | None, at_least: int, embed: Embedding, *, progress: bool
     ) -> tuple[Tensor, Tensor]:

@@ -4,7 +4,6 @@ import os
 import pickle
 import traceback
 from collections.abc import Callable
-from concurrent.futures import BrokenExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +11,7 @@ import joblib
 import torch
 from torch import Tensor
 
-from sbi_rope._processes import end_with
+from sbi_rope._processes import WORKER_ERRORS, in_workers
 from sbi_rope._random import seeded
 from sbi_rope._simulator.calls import (
     Caller,
@@ -134,21 +133,18 @@ def simulate_in_workers(
     """
     pieces = theta.split(ROWS if caller.form.batched else 1)
     seeds = torch.randint(2**31, (len(pieces),)).tolist()
-    # A seeded block waits for those of other threads, so that threads do not do.
-    options: dict[str, Any] = {"backend": "loky", "return_as": "generator"}
-    run: Any = joblib.Parallel(n_jobs=num_workers, **options)
-    simulated = []
+    parent, simulated = os.getpid(), []
+    arguments = (
+        (parent, caller, piece, seed) for piece, seed in zip(pieces, seeds, strict=True)
+    )
     try:
-        for part in run(
-            joblib.delayed(_simulate_piece)(os.getpid(), caller, piece, seed)
-            for piece, seed in zip(pieces, seeds, strict=True)
-        ):
+        for part in in_workers(_simulate_piece, arguments, num_workers):
             simulated.append(part)
             advance(len(part.x))
     except SimulationError as error:
         # Without the traceback of the worker, which says the same.
         raise SimulationError(*error.args) from None
-    except (BrokenExecutor, pickle.PicklingError) as error:
+    except WORKER_ERRORS as error:
         raise SimulationError(
             f"Expected a simulator that works in {num_workers} worker processes; got "
             f"{describe(error)}\n{REPAIR}"
@@ -161,7 +157,6 @@ class _RaisedInWorkerError(Exception):
 
 
 def _simulate_piece(parent: int, caller: Caller, theta: Tensor, seed: int) -> Simulated:
-    end_with(parent)
     with seeded(seed):
         simulated = caller.simulate(theta)
     first = simulated.first

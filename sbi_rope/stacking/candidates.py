@@ -119,6 +119,13 @@ class AmortisedCandidate(ABC):
         """Tell whether the data allow it. The default stack leaves it out if not."""
         return True
 
+    def prepare(self, bench: Workbench) -> None:  # noqa: B027 -- most have nothing
+        """Compute what all versions share, before they are trained; nothing by default.
+
+        What is computed here is computed once, also if versions are trained in several
+        processes.
+        """
+
     @abstractmethod
     def parts(self, fold: Fold) -> list[Part]:
         """Train on the pairs of a fold; return densities with equal shares."""
@@ -166,6 +173,11 @@ class DensityCandidate(AmortisedCandidate):
                 f"posterior; got {type(self.build).__name__}. Wrap a posterior: "
                 "`lambda rope, seed: posterior`."
             )
+
+    def prepare(self, bench: Workbench) -> None:
+        """Compute the targets that RoPE is tuned to."""
+        if bench.has_targets_of(bench.rope.finetuner):
+            bench.moments("embedding")
 
     def parts(self, fold: Fold) -> list[Part]:
         """Build the posterior, and return its densities."""

@@ -45,6 +45,7 @@ def stack(
     tail_mass: float = 1e-3,
     require_convergence: bool = True,
     seed: int | None = None,
+    num_workers: int = 1,
     show_progress_bars: bool | None = None,
 ) -> StackedPosterior:
     r"""Mix candidate posteriors with the weights that score best on held-out pairs.
@@ -101,6 +102,10 @@ def stack(
         require_convergence: Whether a coupling that has not converged is an error.
         seed: Seed of everything random; None uses the states of torch, NumPy and
             Python.
+        num_workers: The number of processes that train versions of the candidates. Six
+            are trained with five folds, so that six processes are the fastest. Each
+            has a copy of the simulations in its memory. The numbers are those of one
+            process, up to rounding.
         show_progress_bars: Whether to show how many trainings and scores are done.
             None does so in a terminal or a notebook, but not in a file.
 
@@ -111,8 +116,9 @@ def stack(
     Raises:
         NotReadyError: If there are fewer than two groups of pairs.
         InvalidInputError: If an argument is outside its range or has the wrong shape,
-            if there are couplings among the candidates but no batch, or if entries of
-            x are missing (NaN) that a candidate with ``space="input"`` corrects.
+            if there are couplings among the candidates but no batch, if entries of
+            x are missing (NaN) that a candidate with ``space="input"`` corrects, or if
+            something cannot be sent to ``num_workers`` processes, or one of them dies.
         UnsupportedPosteriorError: If NPE or a candidate has no density, or the
             posterior cannot be recalibrated.
         CouplingError: If a coupling has not converged.
@@ -136,6 +142,7 @@ def stack(
         tail_mass=tail_mass,
         require_convergence=require_convergence,
         seed=seed,
+        num_workers=num_workers,
         show_progress_bars=show_progress_bars,
     )
     if recalibrate:
@@ -189,6 +196,7 @@ def cross_validate(
     pseudo_count: float = 1.0,
     require_convergence: bool = True,
     seed: int | None = None,
+    num_workers: int = 1,
     show_progress_bars: bool | None = None,
 ) -> CrossValidation:
     """Score candidates on calibration pairs that they were not trained on.
@@ -205,6 +213,7 @@ def cross_validate(
         pseudo_count: As in :func:`stack`.
         require_convergence: As in :func:`stack`.
         seed: As in :func:`stack`.
+        num_workers: As in :func:`stack`.
         show_progress_bars: As in :func:`stack`.
 
     Returns:
@@ -226,6 +235,7 @@ def cross_validate(
         pseudo_count=pseudo_count,
         require_convergence=require_convergence,
         seed=seed,
+        num_workers=num_workers,
         show_progress_bars=show_progress_bars,
     )
     return trainer.cross_validate(num_training_folds=num_training_folds)[1]

@@ -60,6 +60,10 @@ class DiscrepancyCandidate(AmortisedCandidate):
             return bench.reads_summaries
         return self.space == "embedding" or len(bench.folds) > 2
 
+    def prepare(self, bench: Workbench) -> None:
+        """Simulate at the labels, and from the prior."""
+        bench.moments(self.space)
+
     def parts(self, fold: Fold) -> list[Part]:
         """Train NPE on corrected simulations; return its density."""
         corrected = fold.corrected(self.space, learn_prior=self.learn_prior)
@@ -113,6 +117,11 @@ class FinetunedCandidate(AmortisedCandidate):
             bench
         )
         return start and len(bench.folds) > 2
+
+    def prepare(self, bench: Workbench) -> None:
+        """Simulate at the labels, and from the prior, if NPE is corrected first."""
+        if self.space is not None:
+            bench.moments(self.space)
 
     def parts(self, fold: Fold) -> list[Part]:
         """Train one net without each part of the pairs."""
@@ -169,6 +178,10 @@ class RehearsedCandidate(AmortisedCandidate):
         """Tell whether x is no short vector, and there are pairs and folds enough."""
         enough = int(bench.groups.max()) + 1 >= MIN_TO_REHEARSE
         return enough and not bench.is_short and len(bench.folds) > 2
+
+    def prepare(self, bench: Workbench) -> None:
+        """Simulate from the prior."""
+        _ = bench.simulations
 
     def parts(self, fold: Fold) -> list[Part]:
         """Train one net without one part of the pairs."""

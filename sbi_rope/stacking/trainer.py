@@ -48,6 +48,7 @@ from sbi_rope.stacking.trained_candidates import (
 from sbi_rope.stacking.unlabelled_candidates import RVNPCandidate
 from sbi_rope.stacking.versions import Versions, train_version
 from sbi_rope.stacking.workbench import NUM_FOLDS, Workbench, draw_seeds
+from sbi_rope.stacking.workers import check_sendable, train_versions
 
 __all__ = ["StackTrainer"]
 
@@ -71,6 +72,7 @@ class StackTrainer:
         pseudo_count: float,
         require_convergence: bool,
         seed: int | None,
+        num_workers: int,
         show_progress_bars: bool | None,
         unseen: Literal["raise", "extend"] = "raise",
         tail_mass: float = 1e-3,
@@ -84,6 +86,7 @@ class StackTrainer:
             check_integer("num_simulations", num_simulations)
         check_not_negative("pseudo_count", pseudo_count)
         check_instance("require_convergence", require_convergence, bool)
+        check_integer("num_workers", num_workers, maximum=1000)
         _check_pairs(len(rope.calibration[0]))
         self.x_o = None if x_o is None else _checked_observations(x_o, rope)
         self.show = is_shown(show_progress_bars)
@@ -104,9 +107,12 @@ class StackTrainer:
         self.candidates = self._chosen(candidates)
         if self.x_o is not None:
             _warn_of_small_batch(len(self.x_o), len(self.bench.x))
+        if num_workers > 1:
+            check_sendable(self.candidates, self.bench)
         self.num_simulations = num_simulations
         self.pseudo_count = pseudo_count
         self.require_convergence = require_convergence
+        self.num_workers = num_workers
         self.unseen: Literal["raise", "extend"] = unseen
         self.tail_mass = tail_mass
 
@@ -248,8 +254,8 @@ class StackTrainer:
             desc=f"Training {count} candidates in {len(folds)} folds",
             total=count * len(folds),
         ) as bar:
-            trained = tuple(
-                train_version(chosen, fold, advance=bar.update) for fold in folds
+            trained = train_versions(
+                chosen, folds, num_workers=self.num_workers, advance=bar.update
             )
         couplings: FittedCouplings | None = None
         coupled = [c for c in chosen if isinstance(c, CouplingCandidate)]

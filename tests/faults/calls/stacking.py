@@ -67,6 +67,7 @@ CALLS = [
             "tail_mass": "share",
             "require_convergence": "instance",
             "seed": "seed",
+            "num_workers": "count",
         },
     ),
     Call(
