@@ -154,7 +154,8 @@ class Method(ABC):
         Raises:
             InvalidTypeError: If one of them holds no numbers.
             InvalidInputError: If the method does not see simulations, shapes or row
-                counts do not fit, or a theta is not in the support of the prior.
+                counts do not fit, a theta is not in the support of the prior, or the
+                columns of a table are in another order than those of an earlier one.
                 Nothing is added then.
         """
         self._check_seen("simulations")
@@ -179,8 +180,9 @@ class Method(ABC):
         Raises:
             InvalidTypeError: If one of them holds no numbers.
             InvalidInputError: If the method does not see calibration pairs, shapes or
-                row counts do not fit, a value is not finite, or a theta is outside the
-                prior's support. Nothing is added then.
+                row counts do not fit, a value is not finite, a theta is outside the
+                prior's support, or the columns of a table are in another order than
+                those of an earlier one. Nothing is added then.
         """
         self._check_seen("calibration")
         self._data.append_calibration(theta, x)
@@ -198,7 +200,8 @@ class Method(ABC):
         Raises:
             InvalidTypeError: If it holds no numbers.
             InvalidInputError: If the method does not see observations, the shape does
-                not fit, or a value is not finite.
+                not fit, a value is not finite, or the columns of a table are in another
+                order than those of an earlier one.
         """
         self._check_seen("observations")
         self._data.append_observations(x_o)
@@ -242,7 +245,10 @@ class Method(ABC):
                 f"{type(self).__name__} is not trained, or data was appended since. "
                 "Call `train()` first."
             )
-        return copy.deepcopy(self._posterior)
+        posterior = copy.deepcopy(self._posterior)
+        # Those of sbi do not look at it, but `evaluate` and `draw_samples` do.
+        posterior.columns = dict(self._data.columns)
+        return posterior
 
     @property
     def history(self) -> History:

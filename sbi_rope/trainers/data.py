@@ -8,8 +8,10 @@ from torch.distributions import Distribution
 
 from sbi_rope._sbi import readable
 from sbi_rope._validation import (
+    KnownColumns,
     as_numbers,
     check_batch,
+    check_columns,
     check_finite,
     check_in_support,
     check_not_swapped,
@@ -61,6 +63,7 @@ class Data:
         event_shape: Shape of one x, that of the first which was appended; None before.
         embedding_net: The net that is to read x, if it was trained beforehand. Missing
             entries (NaN) are accepted if it can read them.
+        columns: The names of columns of "theta" and "x" in orders that are known.
     """
 
     def __init__(self, prior: Distribution, device: torch.device) -> None:
@@ -70,6 +73,7 @@ class Data:
         self.embedding_net: nn.Module = nn.Identity()
         self._simulations, self._calibration = Pairs(), Pairs()
         self._x_o: Tensor | None = None
+        self.columns: dict[str, KnownColumns] = {"theta": {}, "x": {}}
 
     @property
     def simulations(self) -> tuple[Tensor, Tensor]:
@@ -96,6 +100,7 @@ class Data:
     def append_simulations(self, theta: Any, x: Any) -> None:
         """Add simulations; those with NaN or Inf are dropped with a warning."""
         self._check_order(theta, x)
+        columns = self._checked_columns(theta=theta, x=x)
         theta = self.checked_theta("theta", theta)
         check_in_support("theta", theta, self._prior)
         x = self._checked_x("x", x)
@@ -111,25 +116,27 @@ class Data:
                 "contain NaN or Inf."
             )
         self._simulations.append(theta[valid], x[valid])
-        self.event_shape = x.shape[1:]
+        self.event_shape, self.columns = x.shape[1:], columns
 
     def append_calibration(self, theta: Any, x: Any) -> None:
         """Add calibration pairs."""
         self._check_order(theta, x)
+        columns = self._checked_columns(theta=theta, x=x)
         theta = self.checked_theta("theta", theta)
         check_in_support("theta", theta, self._prior)
         x = self._checked_x("x", x)
         check_readable("x", x, self.readable(x))
         check_same_length("theta", theta, "x", x)
         self._calibration.append(theta, x)
-        self.event_shape = x.shape[1:]
+        self.event_shape, self.columns = x.shape[1:], columns
 
     def append_observations(self, x_o: Any) -> None:
         """Add observations without parameters."""
+        known = check_columns("x_o", x_o, self.columns["x"])
         x_o = self._checked_x("x_o", x_o)
         check_readable("x_o", x_o, self.readable(x_o))
         self._x_o = _joined(self._x_o, x_o)
-        self.event_shape = x_o.shape[1:]
+        self.event_shape, self.columns["x"] = x_o.shape[1:], known
 
     def readable(self, x: Tensor) -> Tensor:
         """Tell which x are finite, or can be read by the net in spite of NaN."""
@@ -146,6 +153,13 @@ class Data:
     def _check_order(self, theta: Any, x: Any) -> None:
         if self.event_shape is not None:
             check_not_swapped(theta, x, self._prior.event_shape, self.event_shape)
+
+    def _checked_columns(self, **tables: Any) -> dict[str, KnownColumns]:
+        """Return the known orders of columns, with those of these tables."""
+        return {
+            name: check_columns(name, table, self.columns[name])
+            for name, table in tables.items()
+        }
 
     def _checked_x(self, name: str, x: Any) -> Tensor:
         x = as_numbers(name, x)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from sbi_rope import RoPE, diagnose, load, stack
+from sbi_rope.baselines import FRISBI
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.metrics import draw_samples, evaluate
 from sbi_rope.sweep import sweep
@@ -275,3 +276,32 @@ def test_observations_in_another_order_than_earlier_ones_are_refused() -> None:
     with pytest.raises(InvalidInputError):
         other.append_calibration(THETA, SWAPPED[1][:3])
     other.append_calibration(THETA, X)
+
+
+def test_trainers_refuse_tables_in_another_order_than_earlier_ones() -> None:
+    method = FRISBI(gaussian.posterior().prior, simulator=gaussian.simulator)
+    with pytest.raises(InvalidInputError):  # which leaves no names behind
+        method.append_simulations(SWAPPED[0], SWAPPED[1][:3])
+    method.append_simulations(THETA_S, X_S)
+    for append in (method.append_simulations, method.append_calibration):
+        with refused(CHANNELS, "the earlier table `x`"):
+            append(THETA, SWAPPED[1])
+        with refused(NAMES, "the earlier table `theta`"):
+            append(SWAPPED[0], X)
+        append(THETA, X)
+    with refused(CHANNELS, "the earlier table `x`"):
+        method.append_observations(SWAPPED[1])
+    method.append_observations(X)
+
+
+def test_posteriors_of_trainers_know_the_columns_of_the_pairs() -> None:
+    method = FinetunedNPE.from_posterior(
+        gaussian.posterior(), training=Training(max_num_epochs=1)
+    )
+    method.append_calibration(THETA, X)
+    posterior = method.train(seed=0, **QUIET).build_posterior()
+    with refused(NAMES, "the earlier table `theta`"):
+        evaluate(posterior, SWAPPED[0], X)
+    with refused(CHANNELS, "the earlier table `x`"):
+        draw_samples(posterior, SWAPPED[1], num_samples=2)
+    assert draw_samples(posterior, X, num_samples=2).shape == (2, 12, 2)
