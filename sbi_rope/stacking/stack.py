@@ -93,9 +93,9 @@ def stack(
         learning_curve: Whether to train on fewer folds too, so that the report can
             estimate what more labels would add. It takes about twice the time.
         recalibrate: Whether to make the stack narrower or wider around its centre, as
-            held-out pairs say; ``report.recalibration`` tells by how much. The average
-            of several versions is often too wide. Further versions are trained for
-            this, ten with five folds, which takes up to three times as long.
+            held-out pairs say; ``report.recalibration`` tells by how much. Further
+            versions are trained for this, ten with five folds, which takes up to three
+            times as long.
         unseen: What the posterior of a batch does with an x outside the batch:
             ``"raise"`` an error, or ``"extend"`` each coupling by one row.
         tail_mass: As in :meth:`~sbi_rope.RoPE.build_posterior`.
