@@ -1,5 +1,6 @@
 """Functions of a user that can be pickled, also those without a name of their own."""
 
+import pickle
 import types
 from collections.abc import Callable
 from typing import Any
@@ -8,7 +9,7 @@ import joblib
 
 from sbi_rope.errors import InvalidInputError
 
-__all__ = ["picklable"]
+__all__ = ["packed", "picklable"]
 
 
 def picklable(function: Any) -> Any:
@@ -19,6 +20,11 @@ def picklable(function: Any) -> Any:
     pickles such a function by its code.
     """
     return _Function(function) if isinstance(function, types.FunctionType) else function
+
+
+def packed(thing: Any) -> bytes:
+    """Return the pickle of anything, functions without a name of their own included."""
+    return pickle.dumps(joblib.wrap_non_picklable_objects(thing, keep_wrapper=False))
 
 
 class _Function:

@@ -5,7 +5,7 @@ import os
 import pickle
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import BrokenExecutor
 from typing import Any
 
@@ -25,14 +25,18 @@ def in_workers(
     function: Callable[..., Any],
     arguments: Iterable[tuple[Any, ...]],
     num_workers: int,
-) -> Iterator[Any]:
+) -> Generator[Any, None, None]:
     """Call a function in several processes; yield what it returns, in order.
+
+    In a worker there are no further workers.
 
     Args:
         function: What to call. With one worker it is called in this process.
         arguments: The arguments of each call.
         num_workers: The number of processes.
     """
+    if _is_worker():
+        num_workers = 1
     # A seeded block waits for those of other threads, so that threads do not do.
     options: dict[str, Any] = {"backend": "loky", "return_as": "generator"}
     run: Any = joblib.Parallel(n_jobs=num_workers, **options)
@@ -65,10 +69,14 @@ def end_with(parent: int) -> None:
     if os.getppid() == parent:
         _watched.append(parent)
         threading.Thread(target=_watch, args=(parent,), daemon=True).start()
-    elif type(multiprocessing.current_process()).__name__ == "LokyProcess":
+    elif _is_worker():
         # These workers are always children of the process they work for, so that it
         # must have ended already.
         os._exit(1)
+
+
+def _is_worker() -> bool:
+    return type(multiprocessing.current_process()).__name__ == "LokyProcess"
 
 
 def _watch(parent: int) -> None:

@@ -34,11 +34,13 @@ from sbi_rope._validation import (
     check_instance,
     check_integer,
     check_not_swapped,
+    check_parameter_order,
     check_rows,
     check_same_length,
     check_tensor,
     check_unit_interval,
     column_names,
+    columns_of,
 )
 from sbi_rope.batch import EmbeddedBatch, check_converged
 from sbi_rope.coupling import SinkhornCoupler
@@ -174,10 +176,14 @@ class RoPE:
             readable=self._npe.readable,
         )
         names = self._npe.parameter_names
-        known: KnownColumns = {} if names is None else {names: "`parameter_names`"}
+        earlier = columns_of(posterior)
+        known = earlier["theta"]
+        if names is not None:
+            check_parameter_order(names, known)
+            known = {names: "`parameter_names`", **known}
         theta_s, x_s = (None, None) if simulations is None else simulations
         self._theta_columns = check_columns("simulations[0]", theta_s, known)
-        self._x_columns = check_columns("simulations[1]", x_s, {})
+        self._x_columns = check_columns("simulations[1]", x_s, earlier["x"])
         if names is None:
             self._npe.parameter_names = column_names(theta_s) or None
         self.finetuner = CalibrationFinetuner() if finetuner is None else finetuner

@@ -33,7 +33,7 @@ class SimulationSource(Protocol):
         """How many rows a simulator has simulated so far."""
         ...
 
-    def count(self, num_calls: int, num_dropped: int) -> None:
+    def add_counts(self, num_calls: int, num_dropped: int) -> None:
         """Count what a copy of this source has simulated in another process."""
         ...
 

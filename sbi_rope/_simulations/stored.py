@@ -83,7 +83,7 @@ class StoredSimulations:
         self._theta_mean = self.theta.mean(dim=0)
         self._theta_std = self.theta.std(dim=0).clamp_min(1e-12)
 
-    def count(self, num_calls: int, num_dropped: int) -> None:
+    def add_counts(self, num_calls: int, num_dropped: int) -> None:
         """Do nothing, because nothing is simulated."""
 
     def from_prior(

@@ -4,8 +4,15 @@
 and ``source`` makes it a source of simulations.
 """
 
+from sbi_rope._simulator.budget import LimitedSimulator
 from sbi_rope._simulator.calls import check_callable
 from sbi_rope._simulator.source import Simulator, source_of
 from sbi_rope._simulator.workers import parallel
 
-__all__ = ["Simulator", "check_callable", "parallel", "source_of"]
+__all__ = [
+    "LimitedSimulator",
+    "Simulator",
+    "check_callable",
+    "parallel",
+    "source_of",
+]

@@ -59,9 +59,9 @@ class LimitedSimulator:
         """How many rows the simulator has simulated."""
         return self._simulator.num_calls
 
-    def count(self, num_calls: int, num_dropped: int) -> None:
+    def add_counts(self, num_calls: int, num_dropped: int) -> None:
         """Count what a copy of the simulator has simulated in another process."""
-        self._simulator.count(num_calls, num_dropped)
+        self._simulator.add_counts(num_calls, num_dropped)
 
     def from_prior(
         self, count: int | None, at_least: int, embed: Embedding, *, progress: bool

@@ -92,7 +92,7 @@ class Simulator:
         failures.warn()
         return x
 
-    def count(self, num_calls: int, num_dropped: int) -> None:
+    def add_counts(self, num_calls: int, num_dropped: int) -> None:
         """Count what a copy of the simulator has simulated in another process."""
         self.num_calls += num_calls
         self.num_dropped += num_dropped

@@ -7,10 +7,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import joblib
 import torch
 from torch import Tensor
 
+from sbi_rope._pickling import packed
 from sbi_rope._processes import WORKER_ERRORS, in_workers
 from sbi_rope._random import seeded
 from sbi_rope._simulator.calls import (
@@ -104,7 +104,7 @@ def copy_in_worker(simulator: Callable[[Any], Any]) -> Callable[[Any], Any]:
         SimulationError: If it cannot be sent there.
     """
     try:
-        return pickle.loads(pickle.dumps(joblib.wrap_non_picklable_objects(simulator)))
+        return pickle.loads(packed(simulator))
     except Exception as error:  # pickling runs code of the user
         raise SimulationError(
             "Expected a simulator that can be sent to worker processes; got "

@@ -8,8 +8,10 @@ checks once. Private code trusts what it is given.
 from sbi_rope._validation.columns import (
     KnownColumns,
     check_columns,
+    check_parameter_order,
     check_tables,
     column_names,
+    columns_of,
     joined_columns,
 )
 from sbi_rope._validation.settings import (
@@ -83,6 +85,7 @@ __all__ = [
     "check_numbers",
     "check_pair_weights",
     "check_parameter_names",
+    "check_parameter_order",
     "check_path",
     "check_positive",
     "check_prior",
@@ -96,6 +99,7 @@ __all__ = [
     "check_values",
     "check_weights",
     "column_names",
+    "columns_of",
     "default_names",
     "joined_columns",
     "usable_device",

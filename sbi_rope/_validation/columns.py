@@ -12,8 +12,10 @@ from sbi_rope.errors import InvalidInputError
 __all__ = [
     "KnownColumns",
     "check_columns",
+    "check_parameter_order",
     "check_tables",
     "column_names",
+    "columns_of",
     "joined_columns",
 ]
 
@@ -35,21 +37,45 @@ def column_names(table: Any) -> tuple[str, ...]:
     return tuple(str(name) for name in names)
 
 
+def columns_of(posterior: Any) -> dict[str, KnownColumns]:
+    """Return the orders of columns of "theta" and "x" that a posterior knows.
+
+    Args:
+        posterior: A posterior of any kind, or its set or intervals. Those of this
+            package, and those that its trainers made, know them as ``columns``.
+    """
+    columns = getattr(posterior, "columns", None)
+    known = columns if isinstance(columns, Mapping) else {}
+    return {name: dict(known.get(name, {})) for name in ("theta", "x")}
+
+
+def check_parameter_order(names: Sequence[str], known: KnownColumns) -> None:
+    """Raise if the names of parameters are known in another order.
+
+    Raises:
+        InvalidInputError: If they are.
+    """
+    for expected, source in known.items():
+        if sorted(names) == sorted(expected) and tuple(names) != expected:
+            raise InvalidInputError(
+                f"Expected `parameter_names` in the order of {source}, which the "
+                f"posterior was trained on, {list(expected)}; got {list(names)}."
+            )
+
+
 def check_tables(posterior: Any, **tables: Any) -> None:
     """Raise if a table has columns that a posterior knows in another order.
 
     Args:
-        posterior: A posterior of any kind, or its set or intervals. Those of this
-            package know the orders of columns as ``columns``.
+        posterior: As in :func:`columns_of`.
         tables: What the user gave as ``theta`` and ``x``.
 
     Raises:
         InvalidInputError: If the order of columns is another one.
     """
-    columns = getattr(posterior, "columns", None)
+    known = columns_of(posterior)
     for name, table in tables.items():
-        if isinstance(columns, Mapping):
-            check_columns(name, table, columns.get(name, {}))
+        check_columns(name, table, known[name])
 
 
 def check_columns(

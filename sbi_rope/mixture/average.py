@@ -9,7 +9,7 @@ from sbi.utils import within_support
 
 from sbi_rope._random import seeded
 from sbi_rope._sbi import estimator_of
-from sbi_rope._validation import check_weights, joined_columns
+from sbi_rope._validation import check_weights, columns_of, joined_columns
 from sbi_rope.errors import InvalidInputError, InvalidTypeError
 from sbi_rope.mixture.estimator import MixtureEstimator
 from sbi_rope.mixture.parts import part_of
@@ -95,9 +95,9 @@ def average(
         mixture, copy.deepcopy(first.prior), enable_transform=first.enable_transform
     )
     averaged.parameter_names = _common_names(posteriors)
-    known = [getattr(posterior, "columns", {}) for posterior in posteriors]
+    known = [columns_of(posterior) for posterior in posteriors]
     averaged.columns = {
-        name: joined_columns(name, [columns.get(name, {}) for columns in known])
+        name: joined_columns(name, [columns[name] for columns in known])
         for name in ("theta", "x")
     }
     return averaged

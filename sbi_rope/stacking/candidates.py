@@ -8,6 +8,7 @@ from typing import Any, Literal
 import torch
 
 from sbi_rope._sbi import check_density, estimator_of
+from sbi_rope._simulator import LimitedSimulator
 from sbi_rope._validation import (
     check_choice,
     check_instance,
@@ -21,6 +22,7 @@ from sbi_rope.errors import (
     RoPEError,
     UnsupportedPosteriorError,
 )
+from sbi_rope.finetuning import NUM_REHEARSED
 from sbi_rope.mixture import (
     MixturePosterior,
     Part,
@@ -122,8 +124,9 @@ class AmortisedCandidate(ABC):
     def prepare(self, bench: Workbench) -> None:  # noqa: B027 -- most have nothing
         """Compute what all versions share, before they are trained; nothing by default.
 
-        What is computed here is computed once, also if versions are trained in several
-        processes.
+        What is kept here, such as ``bench.simulations``, is there for all versions. If
+        these are trained in several processes, what :meth:`parts` keeps is lost.
+        Random numbers are seeded. A stack may call it several times.
         """
 
     @abstractmethod
@@ -175,9 +178,12 @@ class DensityCandidate(AmortisedCandidate):
             )
 
     def prepare(self, bench: Workbench) -> None:
-        """Compute the targets that RoPE is tuned to."""
-        if bench.has_targets_of(bench.rope.finetuner):
+        """Simulate what RoPE is tuned with."""
+        finetuner, source = bench.rope.finetuner, bench.rope.source
+        if bench.has_targets_of(finetuner):
             bench.moments("embedding")
+        if finetuner.rehearsal or isinstance(source, LimitedSimulator):
+            source.kept(NUM_REHEARSED, progress=bench.show)
 
     def parts(self, fold: Fold) -> list[Part]:
         """Build the posterior, and return its densities."""

@@ -102,10 +102,10 @@ def stack(
         require_convergence: Whether a coupling that has not converged is an error.
         seed: Seed of everything random; None uses the states of torch, NumPy and
             Python.
-        num_workers: The number of processes that train versions of the candidates. Six
-            are trained with five folds, so that six processes are the fastest. Each
-            has a copy of the simulations in its memory. The numbers are those of one
-            process, up to rounding.
+        num_workers: The number of processes that train versions of the candidates. With
+            five folds there are six versions. Each process has a copy of the
+            simulations in its memory. The numbers are those of one process, up to
+            rounding, which grows in the course of a training.
         show_progress_bars: Whether to show how many trainings and scores are done.
             None does so in a terminal or a notebook, but not in a file.
 

@@ -108,7 +108,7 @@ class StackTrainer:
         if self.x_o is not None:
             _warn_of_small_batch(len(self.x_o), len(self.bench.x))
         if num_workers > 1:
-            check_sendable(self.candidates, self.bench)
+            check_sendable(_amortised(self.candidates), self.bench)
         self.num_simulations = num_simulations
         self.pseudo_count = pseudo_count
         self.require_convergence = require_convergence
@@ -227,7 +227,9 @@ class StackTrainer:
     @cached_property
     def _fixed(self) -> dict[str, list[Part]]:
         """The densities of the candidates that do not depend on the pairs."""
-        return train_version(self.candidates, Fold(self.bench, [0]), fixed=True)
+        return train_version(
+            _amortised(self.candidates, fixed=True), Fold(self.bench, [0])
+        )
 
     def discrepancy(self) -> DiscrepancyReport | None:
         """Return what the pairs say about each entry of x, if a candidate uses it."""
@@ -240,25 +242,29 @@ class StackTrainer:
     @property
     def learns_prior(self) -> bool:
         """Whether a candidate learns from the pairs how parameters are distributed."""
-        amortised = (c for c in self.candidates if isinstance(c, AmortisedCandidate))
-        return any(one.learns_prior and not one.fixed for one in amortised)
+        return any(candidate.learns_prior for candidate in _amortised(self.candidates))
 
     def _train(self, folds: Sequence[Fold], chosen: Sequence[Candidate]) -> Versions:
         names = [candidate.name for candidate in chosen]
         # These come first, because they show the progress of their own training, and
         # because what a user passed to them may be refused.
         fixed = {name: of for name, of in self._fixed.items() if name in names}
-        count = sum(isinstance(c, AmortisedCandidate) and not c.fixed for c in chosen)
+        coupled = [c for c in chosen if isinstance(c, CouplingCandidate)]
+        if any(candidate.tuned for candidate in coupled):
+            # Couplings need the tuned nets here, and other candidates may too. In a
+            # process of their own these would tune again.
+            for fold in folds:
+                _ = fold.rope
+        trained = _amortised(chosen)
         with progress_bar(
             show=self.show,
-            desc=f"Training {count} candidates in {len(folds)} folds",
-            total=count * len(folds),
+            desc=f"Training {len(trained)} candidates in {len(folds)} folds",
+            total=len(trained) * len(folds),
         ) as bar:
-            trained = train_versions(
-                chosen, folds, num_workers=self.num_workers, advance=bar.update
+            versions = train_versions(
+                trained, folds, num_workers=self.num_workers, advance=bar.update
             )
         couplings: FittedCouplings | None = None
-        coupled = [c for c in chosen if isinstance(c, CouplingCandidate)]
         if coupled:
             assert self.x_o is not None
             couplings = fit_couplings(
@@ -274,10 +280,21 @@ class StackTrainer:
         return Versions(
             names=tuple(names),
             fixed=fixed,
-            trained=trained,
+            trained=versions,
             couplings=couplings,
             tail_mass=self.tail_mass,
         )
+
+
+def _amortised(
+    candidates: Sequence[Candidate], *, fixed: bool = False
+) -> list[AmortisedCandidate]:
+    """Return the candidates that are trained in each version, or once if fixed."""
+    return [
+        candidate
+        for candidate in candidates
+        if isinstance(candidate, AmortisedCandidate) and candidate.fixed == fixed
+    ]
 
 
 def _check_pairs(count: int) -> None:

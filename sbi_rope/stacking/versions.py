@@ -12,7 +12,7 @@ from sbi_rope._validation import check_batch, check_same_length
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture import MixtureEstimator, Part
 from sbi_rope.mixture.parts import DTYPE
-from sbi_rope.stacking.candidates import AmortisedCandidate, Candidate
+from sbi_rope.stacking.candidates import AmortisedCandidate
 from sbi_rope.stacking.couplings import FittedCouplings
 from sbi_rope.stacking.folds import Fold
 
@@ -20,19 +20,16 @@ __all__ = ["Versions", "train_version"]
 
 
 def train_version(
-    candidates: Sequence[Candidate],
+    candidates: Sequence[AmortisedCandidate],
     fold: Fold,
     *,
-    fixed: bool = False,
     advance: Callable[[], object] = lambda: None,
 ) -> dict[str, list[Part]]:
-    """Return the densities of amortised candidates by name.
+    """Train candidates and return their densities by name.
 
     Args:
-        candidates: All candidates; the amortised ones among them are trained.
+        candidates: The candidates.
         fold: The pairs to train on.
-        fixed: Whether to return the candidates that do not depend on the pairs.
-            Otherwise the others are returned.
         advance: Called after each candidate, for a progress bar.
 
     Raises:
@@ -40,8 +37,6 @@ def train_version(
     """
     trained: dict[str, list[Part]] = {}
     for candidate in candidates:
-        if not isinstance(candidate, AmortisedCandidate) or candidate.fixed != fixed:
-            continue
         # A candidate that ignores its seed still does not change the caller's random
         # state.
         with seeded(fold.seed):

@@ -1,16 +1,20 @@
 """Train the versions of a stack in several processes."""
 
 import pickle
+import traceback
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 
-import joblib
+import torch
 
+from sbi_rope._pickling import packed
 from sbi_rope._processes import WORKER_ERRORS, in_workers
-from sbi_rope.errors import InvalidInputError, RoPEWarning, warn_user
+from sbi_rope._random import seeded
+from sbi_rope.errors import InvalidInputError, RoPEError, RoPEWarning, warn_user
 from sbi_rope.mixture import Part
-from sbi_rope.stacking.candidates import AmortisedCandidate, Candidate
+from sbi_rope.stacking.candidates import AmortisedCandidate
 from sbi_rope.stacking.folds import Fold
 from sbi_rope.stacking.versions import train_version
 from sbi_rope.stacking.workbench import Workbench
@@ -26,23 +30,29 @@ class _Trained:
         densities: The densities of its candidates, by name.
         num_calls: How many simulations were made.
         num_dropped: How many of them were dropped.
-        warned: Text and category of each warning.
+        warned: Text, category, file and line of each warning.
     """
 
     densities: dict[str, list[Part]]
     num_calls: int
     num_dropped: int
-    warned: tuple[tuple[str, type[Warning]], ...]
+    warned: tuple[tuple[str, type[Warning], str, int], ...]
 
 
-def check_sendable(candidates: Sequence[Candidate], bench: Workbench) -> None:
+def check_sendable(candidates: Sequence[AmortisedCandidate], bench: Workbench) -> None:
     """Raise unless candidates and all they share can be sent to other processes.
+
+    Args:
+        candidates: Those that are trained there.
+        bench: What they share.
 
     Raises:
         InvalidInputError: If they cannot.
     """
+    if not candidates:
+        return
     try:
-        pickle.dumps(joblib.wrap_non_picklable_objects([_trained(candidates), bench]))
+        pickle.loads(packed((candidates, bench)))
     except Exception as error:  # pickling runs code of the user
         raise InvalidInputError(
             "Expected a simulator, a prior and candidates that can be sent to other "
@@ -53,7 +63,7 @@ def check_sendable(candidates: Sequence[Candidate], bench: Workbench) -> None:
 
 
 def train_versions(
-    candidates: Sequence[Candidate],
+    candidates: Sequence[AmortisedCandidate],
     folds: Sequence[Fold],
     *,
     num_workers: int,
@@ -65,70 +75,85 @@ def train_versions(
     trained. What all versions share is computed before, in this process.
 
     Args:
-        candidates: All candidates; the amortised ones that depend on the pairs are
-            trained.
+        candidates: Those that are trained in each version.
         folds: The pairs that each version may learn from, of the same workbench.
         num_workers: The number of processes.
         advance: Is told how many candidates were trained, whenever some were.
 
     Raises:
-        InvalidInputError: If a candidate returns no density, or if a process dies.
+        InvalidInputError: If a candidate returns no density. With several processes
+            also if one of them dies, or a candidate raises there.
     """
-    bench, trained = folds[0].bench, _trained(candidates)
-    for candidate in trained:
-        candidate.prepare(bench)
-    if num_workers == 1 or len(folds) == 1 or not trained:
+    bench = folds[0].bench
+    with seeded(bench.seed_of(frozenset())):
+        for candidate in candidates:
+            candidate.prepare(bench)
+    num_workers = min(num_workers, len(folds))
+    if num_workers == 1 or not candidates:
         return tuple(
-            train_version(trained, fold, advance=lambda: advance(1)) for fold in folds
+            train_version(candidates, fold, advance=lambda: advance(1))
+            for fold in folds
         )
-    versions: list[dict[str, list[Part]]] = []
+    # Each version gets a copy of its own, and gives its result back as a copy, also if
+    # joblib decides to start no process.
+    sent = packed((candidates, list(folds)))
+    tasks = ((sent, number, torch.get_num_threads()) for number in range(len(folds)))
+    versions = []
     try:
-        for version in in_workers(
-            _train_version,
-            ((trained, fold) for fold in folds),
-            min(num_workers, len(folds)),
-        ):
-            versions.append(_received(version, bench))
-            advance(len(trained))
+        with closing(in_workers(_train_version, tasks, num_workers)) as received:
+            for version in received:
+                versions.append(_unpacked(version, bench))
+                advance(len(candidates))
     except WORKER_ERRORS as error:
         raise InvalidInputError(
             f"Expected candidates that can be trained in {num_workers} processes; got "
             f"{type(error).__name__}: {error}\nEach process has a copy of the "
-            "simulations in its memory. Use fewer `num_workers`."
+            "simulations in its memory. If it was full, use fewer `num_workers`."
         ) from error
     return tuple(versions)
 
 
-def _trained(candidates: Sequence[Candidate]) -> list[AmortisedCandidate]:
-    """Return the candidates that are trained anew in each version."""
-    return [
-        candidate
-        for candidate in candidates
-        if isinstance(candidate, AmortisedCandidate) and not candidate.fixed
-    ]
+def _train_version(sent: bytes, number: int, num_threads: int) -> bytes:
+    """Train a version in a worker.
 
-
-def _train_version(candidates: Sequence[Candidate], fold: Fold) -> _Trained:
-    """Train a version in a worker."""
-    rope = fold.bench.rope
+    Args:
+        sent: The candidates and all folds.
+        number: The fold to train on.
+        num_threads: The threads of torch that it may use at most.
+    """
+    torch.set_num_threads(min(torch.get_num_threads(), num_threads))
+    candidates, folds = pickle.loads(sent)
+    rope = folds[number].bench.rope
     calls, dropped = rope.num_simulator_calls, rope.num_dropped_simulations
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        densities = train_version(candidates, fold)
-    return _Trained(
-        densities=densities,
-        num_calls=rope.num_simulator_calls - calls,
-        num_dropped=rope.num_dropped_simulations - dropped,
-        warned=tuple((str(one.message), one.category) for one in caught),
-    )
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            densities = train_version(candidates, folds[number])
+        warned = ((str(w.message), w.category, w.filename, w.lineno) for w in caught)
+        return packed(
+            _Trained(
+                densities=densities,
+                num_calls=rope.num_simulator_calls - calls,
+                num_dropped=rope.num_dropped_simulations - dropped,
+                warned=tuple(dict.fromkeys(warned)),
+            )
+        )
+    except RoPEError:
+        raise
+    except Exception as error:  # not every error can be sent back
+        raise InvalidInputError(
+            "Expected candidates that can be trained in another process; got "
+            f"{type(error).__name__}: {error}\n{traceback.format_exc()}"
+        ) from None
 
 
-def _received(version: _Trained, bench: Workbench) -> dict[str, list[Part]]:
+def _unpacked(version: bytes, bench: Workbench) -> dict[str, list[Part]]:
     """Do in this process what a worker would have done: count, and warn."""
-    bench.rope.source.count(version.num_calls, version.num_dropped)
-    for text, category in version.warned:
+    trained: _Trained = pickle.loads(version)
+    bench.rope.source.add_counts(trained.num_calls, trained.num_dropped)
+    for text, category, filename, line in trained.warned:
         if issubclass(category, RoPEWarning):
             warn_user(text)
         else:
-            warnings.warn(text, category, stacklevel=2)
-    return version.densities
+            warnings.warn_explicit(text, category, filename, line)
+    return trained.densities

@@ -19,6 +19,7 @@ from sbi_rope._validation import (
     check_default_dtype,
     check_gradients,
     check_prior,
+    columns_of,
     usable_device,
 )
 from sbi_rope.errors import InvalidInputError, NotReadyError, warn_user
@@ -135,6 +136,7 @@ class Method(ABC):
         assert method._npe is not None
         method._npe.replace_by(posterior)
         method._data.event_shape = estimator.condition_shape
+        method._data.columns = columns_of(posterior)
         method._data.embedding_net = copy.deepcopy(embedding_of(estimator))
         return method
 

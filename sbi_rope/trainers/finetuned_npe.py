@@ -23,6 +23,7 @@ from sbi_rope._validation import (
     check_instance,
     check_integer,
     check_positive,
+    columns_of,
 )
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture import (
@@ -163,6 +164,7 @@ class FinetunedNPE(Method):
         first = posterior_from(posterior, starts[0])
         method = super().from_posterior(first, **options)
         method._starts = copy.deepcopy(starts)
+        method._data.columns = columns_of(posterior)
         return method
 
     @property

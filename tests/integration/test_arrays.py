@@ -13,6 +13,7 @@ from torch import Tensor
 
 from sbi_rope import RoPE, diagnose, load, stack
 from sbi_rope.baselines import FRISBI
+from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.metrics import draw_samples, evaluate
 from sbi_rope.sweep import sweep
@@ -305,3 +306,22 @@ def test_posteriors_of_trainers_know_the_columns_of_the_pairs() -> None:
     with refused(CHANNELS, "the earlier table `x`"):
         draw_samples(posterior, SWAPPED[1], num_samples=2)
     assert draw_samples(posterior, X, num_samples=2).shape == (2, 12, 2)
+    # What starts from them knows the columns, too.
+    corrected = DiscrepancyNPE.from_posterior(
+        gaussian.posterior(),
+        simulator=gaussian.simulator,
+        num_simulations=100,
+        simulations_per_pair=3,
+        num_steps=2,
+        space="tuned",
+    ).append_calibration(THETA, X)
+    averaged = corrected.train(seed=0, **QUIET).build_posterior()
+    for start in (posterior, averaged):
+        again = FinetunedNPE.from_posterior(start)
+        with refused(NAMES, "the earlier table `theta`"):
+            again.append_calibration(SWAPPED[0], X)
+    repaired = RoPE(posterior, simulator=gaussian.simulator, parameter_names=NAMES)
+    with refused(CHANNELS, "the earlier table `x`"):
+        repaired.append_calibration(THETA, SWAPPED[1])
+    with pytest.raises(InvalidInputError, match="`parameter_names` in the order of"):
+        RoPE(posterior, simulator=gaussian.simulator, parameter_names=NAMES[::-1])

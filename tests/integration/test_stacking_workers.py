@@ -3,27 +3,39 @@
 import os
 import threading
 import warnings
+from dataclasses import dataclass
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 import torch
+from torch import Tensor
 
-from sbi_rope import RoPE
+from sbi_rope import CalibrationFinetuner, RoPE, parallel
 from sbi_rope.errors import InvalidInputError, RoPEWarning, warn_user
 from sbi_rope.mixture import Part, part_of_prior
-from sbi_rope.stacking import AmortisedCandidate, DensityCandidate, stack
+from sbi_rope.stacking import (
+    AmortisedCandidate,
+    DensityCandidate,
+    default_candidates,
+    stack,
+)
 from sbi_rope.stacking.folds import Fold
 from sbi_rope.stacking.workbench import Workbench
 from tests import problems
 from tests.stacks import (
     FINETUNED,
     NUM_FOLDS,
+    OT_ONLY,
     PRIOR,
     QUIET,
+    ROPE,
     finetuned,
+    observed,
     problem,
     rope_of,
     stacked,
+    validated,
 )
 
 # Whatever else warns here, because there are few pairs and simulations.
@@ -32,8 +44,8 @@ pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 
 def restless(rope: RoPE, seed: int) -> Any:
     """Simulate and warn in every version."""
-    theta, _ = rope.source.from_prior(7, 7, lambda x: x, progress=False)
-    warn_user(f"Simulated {len(theta)} times.")
+    rope.source.from_prior(7, 7, lambda x: x, progress=False)
+    warn_user("Simulated 7 times.")
     warnings.warn("Something of another package.", FutureWarning, stacklevel=2)
     return finetuned(rope, seed)
 
@@ -57,56 +69,126 @@ class Shared(AmortisedCandidate):
         ]
 
 
-def test_several_processes_give_the_numbers_calls_and_warnings_of_one() -> None:
-    theta, x = problem(8, seed=5)
-    scores, drawn, calls, warned = [], [], [], []
-    for num_workers in (1, 2):
-        rope = rope_of()
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            result = stacked(
-                rope,
-                candidates=[PRIOR, FINETUNED, RESTLESS, Shared()],
-                num_workers=num_workers,
-            )
-        warned.append(
-            [
-                (str(one.message), one.category)
-                for one in caught
-                if one.category in (RoPEWarning, FutureWarning)
-            ]
+@dataclass(frozen=True)
+class Outcome:
+    """What is to be the same, wherever versions are trained."""
+
+    scores: Tensor
+    num_calls: int
+    num_dropped: int
+    warned: set[tuple[str, type[Warning]]]
+
+
+def outcome(rope: RoPE, x_o: Tensor | None = None, **options: Any) -> Outcome:
+    calls, dropped = rope.num_simulator_calls, rope.num_dropped_simulations
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        scores = validated(rope, x_o, **options).log_scores
+    return Outcome(
+        scores=scores,
+        num_calls=rope.num_simulator_calls - calls,
+        num_dropped=rope.num_dropped_simulations - dropped,
+        warned={
+            (str(one.message), one.category)
+            for one in caught
+            if issubclass(one.category, RoPEWarning | FutureWarning)
+        },
+    )
+
+
+def assert_same(of_one: Outcome, of_several: Outcome) -> None:
+    # Sums may be rounded differently with another number of threads.
+    torch.testing.assert_close(of_one.scores, of_several.scores, rtol=1e-4, atol=1e-4)
+    assert of_one.num_calls == of_several.num_calls
+    assert of_one.num_dropped == of_several.num_dropped
+    assert of_one.warned == of_several.warned
+
+
+def sometimes(theta: Tensor) -> Tensor:
+    """Simulate, but not every time."""
+    return problems.simulate(theta).where(torch.rand(len(theta), 1) < 0.8, torch.nan)
+
+
+def stored(count: int) -> tuple[Tensor, Tensor]:
+    theta, _ = problem(count, seed=6)
+    return theta, problems.simulate(theta)
+
+
+MINE = (PRIOR, FINETUNED, RESTLESS, Shared())
+REHEARSED = CalibrationFinetuner(
+    max_num_epochs=2, simulations_per_target=5, rehearsal=1.0
+)
+CASES: dict[str, dict[str, Any]] = {
+    "the user's own": {"simulator": sometimes, "candidates": MINE},
+    "a limited number": {"num_simulations": 60, "candidates": [PRIOR, FINETUNED]},
+    "rehearsal": {"finetuner": REHEARSED, "candidates": [PRIOR, FINETUNED]},
+    "default": {"candidates": default_candidates()},
+    "stored": {"simulations": stored(1000), "candidates": [PRIOR, FINETUNED]},
+    "a batch": {"x_o": observed(), "candidates": [PRIOR, FINETUNED, ROPE, OT_ONLY]},
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_copies_of_folds_give_the_scores_calls_and_warnings_of_the_folds(
+    case: str,
+) -> None:
+    def in_this_process(train: Any, tasks: Any, num_workers: int) -> Any:
+        yield from (train(*task) for task in tasks)
+
+    options = dict(CASES[case])
+    given = {
+        name: options.pop(name) for name in ("x_o", "candidates") if name in options
+    }
+    # What `quick` patches is not patched in other processes.
+    with patch("sbi_rope.stacking.workers.in_workers", in_this_process):
+        of_one, of_several = (
+            outcome(rope_of(**options), num_workers=count, **given) for count in (1, 2)
         )
-        calls.append(result.report.provenance.num_simulator_calls)
-        scores.append(result.report.cross_validation.log_scores)
-        torch.manual_seed(0)
-        drawn.append(result.sample_batched((5,), x=x, **QUIET))
-        assert torch.isfinite(result.log_prob_batched(theta[None], x=x)).all()
-    for of_one, of_two in (scores, drawn):
-        # Sums may be rounded differently with another number of threads.
-        torch.testing.assert_close(of_one, of_two, rtol=1e-4, atol=1e-4)
-    assert calls[0] == calls[1]
-    assert warned[0] == warned[1]
-    assert ("Simulated 7 times.", RoPEWarning) in warned[0]
-    assert ("Something of another package.", FutureWarning) in warned[0]
+    assert_same(of_one, of_several)
+    if case == "the user's own":
+        assert of_one.num_dropped > 0
+        assert ("Simulated 7 times.", RoPEWarning) in of_one.warned
+        assert ("Something of another package.", FutureWarning) in of_one.warned
+
+
+def test_two_processes_are_as_good_as_one() -> None:
+    def simulator(theta: Tensor) -> Tensor:  # which has no name of its own
+        return problems.simulate(theta)
+
+    candidates = [PRIOR, FINETUNED, RESTLESS]
+    of_one, of_two = (
+        outcome(
+            rope_of(simulator=parallel(simulator, num_workers=2)),
+            candidates=candidates,
+            num_workers=count,
+        )
+        for count in (1, 2)
+    )
+    assert_same(of_one, of_two)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("embedding", ["linear", "none"])
-def test_default_candidates_simulate_what_they_share_once(embedding: str) -> None:
-    scores, calls = [], []
-    for num_workers in (1, 2):
-        result = stack(
-            rope_of(problem(12, seed=1), embedding=embedding),
+def test_default_candidates_that_are_trained_in_two_processes_are_as_good() -> None:
+    of_one, of_two = (
+        stack(
+            rope_of(problem(12, seed=1)),
             num_folds=NUM_FOLDS,
-            num_workers=num_workers,
+            num_workers=count,
             seed=0,
             **QUIET,
-        )
-        calls.append(result.report.provenance.num_simulator_calls)
-        scores.append(result.report.cross_validation.log_scores)
-    assert calls[0] == calls[1]
+        ).report
+        for count in (1, 2)
+    )
+    assert (
+        of_one.provenance.num_simulator_calls == of_two.provenance.num_simulator_calls
+    )
     # Rounding grows in the course of a training.
-    torch.testing.assert_close(*scores, rtol=0.05, atol=0.05)
+    torch.testing.assert_close(
+        of_one.cross_validation.log_scores,
+        of_two.cross_validation.log_scores,
+        rtol=0.05,
+        atol=0.05,
+    )
 
 
 def test_what_cannot_be_sent_to_a_process_is_refused_before_anything_is_trained() -> (
@@ -143,18 +225,38 @@ def dies(rope: RoPE, seed: int) -> Any:
     os._exit(1)
 
 
+class FailsOddly(AmortisedCandidate):
+    """It raises an error that cannot be sent to another process."""
+
+    name = "odd"
+
+    def parts(self, fold: Fold) -> list[Part]:
+        raise OddError(lock=threading.Lock())
+
+
+class OddError(Exception):
+    def __init__(self, *, lock: Any) -> None:
+        super().__init__("no solution", lock)
+
+
 @pytest.mark.parametrize(
-    ("build", "match"),
+    ("candidate", "match"),
     [
-        (fails, r"'it' raised ArithmeticError: no solution"),
+        (FailsOddly(), r"got OddError: .*no solution.*line \d+, in parts"),
         pytest.param(
-            dies,
-            r"trained in 2 processes; got Terminated.*Use fewer `num_workers`",
-            marks=pytest.mark.slow,  # because other tests need new processes then
+            DensityCandidate(name="fails", build=fails),
+            r"'fails' raised ArithmeticError: no solution",
+            marks=pytest.mark.slow,  # after an error others need new processes
+        ),
+        pytest.param(
+            DensityCandidate(name="dies", build=dies),
+            r"trained in 2 processes; got Terminated.*use fewer `num_workers`",
+            marks=pytest.mark.slow,
         ),
     ],
 )
-def test_an_error_and_the_end_of_a_process_are_reported(build: Any, match: str) -> None:
-    candidate = DensityCandidate(name="it", build=build)
+def test_an_error_and_the_end_of_a_process_are_reported(
+    candidate: AmortisedCandidate, match: str
+) -> None:
     with pytest.raises(InvalidInputError, match=f"(?s){match}"):
         stacked(rope_of(), candidates=[PRIOR, candidate], num_workers=2)

@@ -97,7 +97,7 @@ CALLS = [
                 },
             ).log_scores
         ),
-        options={"num_training_folds": "count", "seed": "seed"},
+        options={"num_training_folds": "count", "seed": "seed", "num_workers": "count"},
     ),
     Call(
         name="default_candidates",
