@@ -13,9 +13,9 @@ from sbi.inference import DirectPosterior, VectorFieldPosterior
 from sbi.neural_nets import posterior_nn
 from torch import Tensor, nn
 
-from sbi_rope import CalibrationFinetuner, _simulations
+from sbi_rope import CalibrationFinetuner
 from sbi_rope._sbi import embedding_of, estimator_of, with_embedding
-from sbi_rope._simulations import Moments, StoredSimulations
+from sbi_rope._simulations import Moments, StoredSimulations, stored
 from sbi_rope._simulator import Simulator
 from sbi_rope._standardisation import Standardisation
 from sbi_rope.baselines import Training
@@ -588,7 +588,7 @@ def test_few_distances_at_once_give_the_same_nearest_simulations(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     theta = problems.box(2).sample((100,))
-    stored = StoredSimulations(
+    source = StoredSimulations(
         (theta, theta),
         problems.box(2),
         theta_shape=torch.Size((2,)),
@@ -598,8 +598,8 @@ def test_few_distances_at_once_give_the_same_nearest_simulations(
     at = problems.box(2).sample((7,))
     found = []
     for at_once in (10_000, 200, 1):
-        monkeypatch.setattr(_simulations, "MAX_DISTANCES", at_once)
-        found.append(stored.draws(at, 3, lambda x: x, progress=False))
+        monkeypatch.setattr(stored, "MAX_DISTANCES", at_once)
+        found.append(source.draws(at, 3, lambda x: x, progress=False))
     distances = torch.cdist(at / theta.std(dim=0), theta / theta.std(dim=0))
     nearest = theta[distances.argsort(dim=1)[:, :3]]
     assert all(torch.equal(one, nearest) for one in found)
