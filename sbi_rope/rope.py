@@ -125,7 +125,8 @@ class RoPE:
         InvalidInputError: If both or none of simulator and simulations are given,
             their shapes do not fit the posterior, ``num_simulations`` is given
             without a simulator, the names are not as many different ones as there
-            are parameters, or the columns of stored parameters are in another order.
+            are parameters, or they, or the columns of stored simulations, are in
+            another order than those that the posterior was trained on.
         InvalidTypeError: If an argument has the wrong type.
         NotReadyError: If torch's default dtype is not float32.
         SimulationError: If the simulator raises or returns something unusable.

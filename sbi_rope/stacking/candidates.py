@@ -121,7 +121,7 @@ class AmortisedCandidate(ABC):
         """Tell whether the data allow it. The default stack leaves it out if not."""
         return True
 
-    def prepare(self, bench: Workbench) -> None:  # noqa: B027 -- most have nothing
+    def prepare(self, bench: Workbench) -> None:  # noqa: B027 -- a choice
         """Compute what all versions share, before they are trained; nothing by default.
 
         What is kept here, such as ``bench.simulations``, is there for all versions. If
