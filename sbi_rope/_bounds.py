@@ -25,6 +25,7 @@ __all__ = [
     "bounds_of",
     "bounds_of_prior",
     "log_slope",
+    "moved_inside",
     "off_bounds",
     "to_box",
     "to_line",
@@ -98,6 +99,32 @@ def _support_of(prior: Any) -> Any:
         return getattr(prior, "support", None)
     except NotImplementedError:  # torch raises it if a distribution states no support
         return None
+
+
+def moved_inside(prior: Any, theta: Tensor) -> tuple[Tensor, Tensor]:
+    """Return parameters ``(n, d)``, those outside the support replaced by one inside.
+
+    Outside, torch's distributions raise an error, and networks may return anything,
+    NaN and gradients of NaN included. What was computed there is to be overwritten.
+
+    Args:
+        prior: A prior that can be sampled.
+        theta: Parameters, shape ``(n, d)``.
+
+    Returns:
+        The parameters, and which of them were inside, ``(n,)``.
+
+    Example:
+        >>> from torch.distributions import Independent, Uniform
+        >>> box = Independent(Uniform(torch.zeros(1), torch.ones(1)), 1)
+        >>> theta, inside = moved_inside(box, torch.tensor([[0.5], [2.0]]))
+        >>> bool(theta[1] < 1), inside
+        (True, tensor([ True, False]))
+    """
+    inside = within_support(prior, theta).reshape(len(theta))
+    with seeded(0):
+        filler = prior.sample(torch.Size((1,))).to(theta)
+    return torch.where(inside[:, None], theta, filler), inside
 
 
 def off_bounds(prior: Any, theta: Tensor) -> Tensor:

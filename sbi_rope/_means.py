@@ -114,8 +114,13 @@ def interval_of_mean(
         2.00, from -0.48 to 4.48
     """
     mean, error = mean_and_error(values, counts)
-    n = len(values) if counts is None else len(counts.of_groups(values)[0])
-    half = float(student.ppf(0.975, max(1, n - 1))) * error
+    n = float(len(values))
+    if counts is not None:
+        # A few that count as much as all others tell as little as so few alone. Their
+        # variance is estimated by these few, too.
+        count, n = len(counts.of_groups(values)[0]), max(2.0, counts.effective_number)
+        error *= (n / (n - 1) * max(1, count - 1) / count) ** 0.5
+    half = float(student.ppf(0.975, max(1.0, n - 1))) * error
     return mean, mean - half, mean + half
 
 

@@ -17,6 +17,9 @@ NUM_PERMUTATIONS = 999
 FEWEST = 5
 # The cost grows with the square of the number of rows.
 MOST = 1000
+# What is further from the median, in standard deviations of a normal distribution that
+# has the same quartiles, counts as being this far away.
+FARTHEST = 10.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,8 +69,10 @@ def two_sample_test(first: Tensor, second: Tensor) -> TwoSampleTest | None:
     The statistic is the energy distance
     :math:`2\,E\|X - Y\| - E\|X - X'\| - E\|Y - Y'\|`, which is zero only if the two
     distributions are the same. It sees other means and other spreads alike. Each column
-    is divided by its standard deviation in both sets together. Among two sets of one
-    distribution, one in a hundred has a p-value below 0.01, whatever the distribution.
+    is divided by its standard deviation in both sets together. Entries that are far
+    from all others are moved closer first. Otherwise a single one could hide that the
+    sets differ. Among two sets of one distribution, one in a hundred has a p-value
+    below 0.01, whatever the distribution.
 
     References:
         | Testing for Equal Distributions in High Dimension (Szekely and Rizzo, 2004)
@@ -87,7 +92,7 @@ def two_sample_test(first: Tensor, second: Tensor) -> TwoSampleTest | None:
             values.detach().cpu().double()[torch.randperm(len(values))[:MOST]]
             for values in (first, second)
         ]
-        rows, n = torch.cat(sets), len(sets[0])
+        rows, n = _closer(torch.cat(sets)), len(sets[0])
         # Of two equal embeddings, only rounding would be left to compare.
         std = rows.std(dim=0)
         varies = std > 1e-9 * rows.abs().amax(dim=0).clamp_min(1e-30)
@@ -106,6 +111,14 @@ def two_sample_test(first: Tensor, second: Tensor) -> TwoSampleTest | None:
         p_value=float(reached.double().mean()),
         spread=_ratio(other[0] * m / (m - 1), within[0] * n / (n - 1)),
     )
+
+
+def _closer(rows: Tensor) -> Tensor:
+    """Move entries that are far from the median of their column closer to it."""
+    low, median, high = rows.quantile(rows.new_tensor([0.25, 0.5, 0.75]), dim=0)
+    reach = FARTHEST * (high - low) / 1.349
+    reach = reach.where(reach > 0, torch.inf)  # most entries of the column are equal
+    return rows.clamp(median - reach, median + reach)
 
 
 def _mean_distances(distances: Tensor, member: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -17,11 +17,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from sbi.utils import within_support
 from torch import Tensor
 from torch.distributions import Chi2
 
-from sbi_rope._bounds import bounds_of
+from sbi_rope._bounds import bounds_of, moved_inside
 from sbi_rope._labels.labels import Labels
 
 __all__ = ["Nodes", "Reference", "place_nodes", "reference_of"]
@@ -75,7 +74,8 @@ class Nodes:
     .. math:: p(y_i \mid x_i) \approx \frac1S \sum_s u_{is}\, q(\theta_{is} \mid x_i)
 
     Attributes:
-        theta: Shape ``(n, S, d)``, in the dtype of the labels.
+        theta: Shape ``(n, S, d)``, in the dtype of the labels. All are inside the
+            support of the prior, so that those with no weight do no harm to gradients.
         log_weights: :math:`\log u`, minus infinity outside the support of the prior,
             shape ``(n, S)``, float64.
     """
@@ -114,7 +114,7 @@ class Nodes:
         weights = self.log_weights
         if log_q.ndim == 3:
             weights = weights[..., None]
-        # A network may return anything outside the support, where the weight is zero.
+        # Where the weight is zero, the density may be anything.
         return torch.where(
             torch.isneginf(weights), weights, log_q.to(weights) + weights
         )
@@ -157,11 +157,10 @@ def place_nodes(
             theta[some[:, None, None], torch.arange(total)[:, None], free] = drawn
             log_weights[some] = -log_density
     log_weights = log_weights + _log_likelihood(labels, theta)
-    theta = theta.to(labels.theta)
-    inside = within_support(prior, theta.reshape(-1, d)).reshape(n, total)
+    theta, inside = moved_inside(prior, theta.to(labels.theta).reshape(-1, d))
     return Nodes(
-        theta=theta,
-        log_weights=log_weights.where(inside, torch.full_like(log_weights, -torch.inf)),
+        theta=theta.reshape(n, total, d),
+        log_weights=log_weights.where(inside.reshape(n, total), -torch.inf),
     )
 
 

@@ -6,13 +6,16 @@ import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
+from sbi_rope.discrepancy.conditional import Conditional
 from sbi_rope.discrepancy.posterior import Discrepancy
 
 __all__ = ["expected_means", "impute"]
 
 # Imputations that are left out, because they depend on where they started, and those
-# that the posterior is averaged over.
-NUM_WARM_UP, NUM_KEPT = 10, 20
+# that the posterior is averaged over. So many later imputations belong to each of them.
+# If labels are as noisy as the prior is wide, imputations that far apart are nearly
+# independent.
+NUM_WARM_UP, NUM_KEPT, APART = 100, 20, 30
 # Draws of the discrepancy that an expected mean is averaged over.
 NUM_DRAWS = 40
 
@@ -20,10 +23,8 @@ NUM_DRAWS = 40
 def impute(
     z: Tensor,
     possible: Tensor,
-    fit: Callable[[Tensor, Tensor | None], Discrepancy],
+    conditional: Callable[[Tensor, Tensor | None], Conditional],
     counts: Callable[[Tensor], Tensor | None],
-    *,
-    noise: Tensor,
 ) -> Discrepancy:
     r"""Average the posterior over imputed parameters, by Gibbs sampling.
 
@@ -39,11 +40,10 @@ def impute(
     Args:
         z: Representations of the real observations, shape ``(n, l)``.
         possible: :math:`m_{ir}`, shape ``(n, R, l)``, equally probable before.
-        fit: Returns the posterior given one mean of each observation, ``(n, l)``, and
-            how many pairs each of them counts as.
+        conditional: Returns the posterior given one mean of each observation,
+            ``(n, l)``, and how many pairs each of them counts as.
         counts: Returns how many pairs each counts as, ``(n,)``, given these means. It
             is asked at the start, and again for the imputations that are kept.
-        noise: The covariance of simulations at one parameter, shape ``(l, l)``.
 
     Returns:
         The posterior. Its two evidences, ``probability_of_none`` and
@@ -51,15 +51,15 @@ def impute(
     """
     mean = possible.mean(dim=1)
     weights = counts(mean)
-    discrepancy = fit(mean, weights)
+    given = conditional(mean, weights)
     kept: list[Discrepancy] = []
-    for number in range(NUM_WARM_UP + NUM_KEPT):
-        mean = _imputed(z, possible, *_drawn(discrepancy, noise))
+    for number in range(1, NUM_WARM_UP + NUM_KEPT * APART + 1):
+        mean = _imputed(z, possible, *given.draw())
         if number == NUM_WARM_UP:
             weights = counts(mean)
-        discrepancy = fit(mean, weights)
-        if number >= NUM_WARM_UP:
-            kept.append(discrepancy)
+        given = conditional(mean, weights)
+        if number > NUM_WARM_UP and (number - NUM_WARM_UP) % APART == 0:
+            kept.append(given.posterior())
     shares = torch.cat([(1 - one.probability_of_none) * one.shares for one in kept])
     total = shares.sum()
     if not total > 0:  # the simulator is right in all of them
@@ -67,7 +67,7 @@ def impute(
     return Discrepancy(
         terms=tuple(term for one in kept for term in one.terms),
         shares=shares / total,
-        noise=noise,
+        noise=given.noise,
         probability_of_none=_mean([one.probability_of_none for one in kept]),
         log_evidence=_mean([one.log_evidence for one in kept]),
         log_evidence_of_none=_mean([one.log_evidence_of_none for one in kept]),

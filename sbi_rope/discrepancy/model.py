@@ -1,14 +1,12 @@
 r"""A Bayesian linear model of how real observations differ from simulations."""
 
 import itertools
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.distributions import MultivariateNormal
 
 from sbi_rope._groups import groups_of
 from sbi_rope._random import seeded
@@ -21,17 +19,15 @@ from sbi_rope._validation import (
     check_tensor,
     check_unit_interval,
 )
+from sbi_rope.discrepancy.conditional import Conditional
 from sbi_rope.discrepancy.correlation import GroupErrors, independent_pairs
 from sbi_rope.discrepancy.imputation import impute
 from sbi_rope.discrepancy.posterior import Discrepancy
-from sbi_rope.discrepancy.regression import SMALLEST_NOISE, Regression
+from sbi_rope.discrepancy.regression import SMALLEST_NOISE, Regressions
 from sbi_rope.errors import InvalidInputError, InvalidTypeError
 
 __all__ = ["DiscrepancyModel"]
 
-# Settings of the hyper-parameters are left out if their evidence is less than this
-# share of the evidence of the best setting.
-NEGLIGIBLE = 1e-4
 # How many times as large the variance between the groups is as the one within them, and
 # their prior probabilities. Those below .2 matter for large groups only. Together they
 # are as probable as one of the others.
@@ -146,7 +142,8 @@ class DiscrepancyModel:
         If parameters are not known exactly, ``mean`` holds the means at R parameters
         that are equally probable before the observation is seen. The parameters are
         then imputed and the discrepancy is drawn in turn (data augmentation, a Gibbs
-        sampler), and the posterior is the average over 20 imputations.
+        sampler). After 100 rounds, the posterior is the average over 20 imputations that
+        are 30 rounds apart.
 
         References:
             | The Calculation of Posterior Distributions by Data Augmentation (Tanner
@@ -192,69 +189,35 @@ class DiscrepancyModel:
             correlation = self._correlation_within(groups, z, mean)
             return independent_pairs(groups, correlation, weights)
 
-        if mean.ndim == 2:
-            return self._fit(z, mean, noise, counts(mean), once)
-        with seeded(seed):
-            return impute(
+        def conditional(mean: Tensor, weights: Tensor | None) -> Conditional:
+            return Conditional.of(
                 z,
                 mean,
-                lambda mean, weights: self._fit(z, mean, noise, weights, once),
-                counts,
-                noise=noise,
+                noise,
+                gain_precisions=self.gain_precisions,
+                settings=self._settings,
+                prior_of_none=self.probability_of_none,
+                weights=weights,
+                once=once,
             )
 
-    def _fit(
-        self,
-        z: Tensor,
-        mean: Tensor,
-        noise: Tensor,
-        weights: Tensor | None,
-        once: Tensor | None,
-    ) -> Discrepancy:
-        regressions, evidence = self._regressions(z, mean, weights=weights)
-        judged = evidence
-        if once is not weights:
-            _, judged = self._regressions(z, mean, weights=once)
-        average = judged.logsumexp(dim=(0, 1)) - math.log(judged.numel())
-        right = _log_evidence_of_none(z - mean, noise, once)
-        probability = _posterior_probability(self.probability_of_none, right - average)
-        kept = evidence > evidence.max() + math.log(NEGLIGIBLE)
-        settings = self._settings
-        terms = [regressions[i].at(*settings[j]) for i, j in kept.nonzero().tolist()]
-        return Discrepancy(
-            terms=tuple(terms),
-            shares=torch.softmax(evidence[kept], dim=0),
-            noise=noise,
-            probability_of_none=probability,
-            log_evidence=float(average),
-            log_evidence_of_none=float(right),
-            num_pairs=len(z),
-            num_independent=len(z) if weights is None else float(weights.sum()),
-        )
+        if mean.ndim == 2:
+            return conditional(mean, counts(mean)).posterior()
+        with seeded(seed):
+            return impute(z, mean, conditional, counts)
 
     def _correlation_within(self, groups: Tensor, z: Tensor, mean: Tensor) -> float:
         """Return the mean correlation of the errors of pairs of the same group."""
         ratios = torch.tensor(VARIANCE_RATIOS).to(z)
         correlations = ratios / (1 + ratios)
-        # Half of the precisions are enough to compare correlations.
-        model = replace(self, gain_precisions=self.gain_precisions[::2])
         evidence = []
         for correlation in correlations.tolist():
             errors = GroupErrors(groups=groups, correlation=correlation)
-            _, log_evidence = model._regressions(z, mean, errors=errors)
-            evidence.append(log_evidence.logsumexp(dim=(0, 1)))
+            # Half of the precisions are enough to compare correlations.
+            some = Regressions.of(z, mean, self.gain_precisions[::2], errors=errors)
+            evidence.append(some.log_evidence(self._settings).logsumexp(dim=(0, 1)))
         log_prior = torch.tensor(PRIOR_OF_RATIOS).to(z).log()
         return float((torch.stack(evidence) + log_prior).softmax(dim=0) @ correlations)
-
-    def _regressions(
-        self, z: Tensor, mean: Tensor, **options: Any
-    ) -> tuple[list[Regression], Tensor]:
-        """Return a regression for each k, and its log evidence at each setting."""
-        regressions = [
-            Regression.of(z, mean, k, **options) for k in self.gain_precisions
-        ]
-        evidence = [r.log_evidence(self._settings) for r in regressions]
-        return regressions, torch.stack(evidence)
 
     @property
     def _settings(self) -> list[tuple[float, float]]:
@@ -287,22 +250,3 @@ def _checked(z: Any, mean: Any, covariance: Any) -> tuple[Tensor, Tensor, Tensor
             f"smallest is {float(smallest):.3g}."
         )
     return z, mean, covariance
-
-
-def _log_evidence_of_none(
-    residual: Tensor, noise: Tensor, weights: Tensor | None
-) -> Tensor:
-    """Return the log density of z - m, rounded as ``Regression`` assumes."""
-    log_density = MultivariateNormal(torch.zeros_like(residual[0]), noise).log_prob
-    n = len(residual) if weights is None else weights.sum()
-    inexact = n * SMALLEST_NOISE**2 * torch.linalg.inv(noise).trace()
-    log_densities = log_density(residual)
-    if weights is not None:
-        log_densities = weights * log_densities
-    return log_densities.sum() - inexact / 2
-
-
-def _posterior_probability(prior: float, log_bayes_factor: Tensor) -> float:
-    if prior in (0.0, 1.0):
-        return prior
-    return float(torch.sigmoid(log_bayes_factor + math.log(prior / (1.0 - prior))))

@@ -40,6 +40,7 @@ __all__ = [
     "count_ranks",
     "coverage_curve_of",
     "coverage_curve_of_pairs",
+    "coverage_error_if_calibrated",
     "coverage_error_of_pairs",
     "expected_coverage_error_of",
     "mid_ranks",
@@ -101,7 +102,9 @@ class CoverageCurve:
         per_parameter: The coverage of each parameter, shape ``(d, 99)``.
         standard_error: The standard error of ``average`` over observations, shape
             ``(99,)``.
-        num_observations: The size of the test set.
+        num_observations: The size of the test set. If some parameters are not known
+            everywhere, the number of complete observations that tell as much about a
+            curve, on average over parameters.
     """
 
     levels: Tensor = field(repr=False)
@@ -321,12 +324,11 @@ def coverage_curve_of_pairs(
         inside = _inside(levels, alpha)
         coverage.append(means_of_pairs(inside, counts))
         errors.append(_mean_over_pairs(mean_of_known(inside, dim=1), counts)[1])
-    number = len(levels) if counts is None else int(counts.effective_number + ROUNDING)
     return CoverageCurve(
         levels=nominal,
         per_parameter=torch.stack(coverage, dim=1),
         standard_error=nominal.new_tensor(errors),
-        num_observations=number,
+        num_observations=int(_number_known(levels, counts) + ROUNDING),
     )
 
 
@@ -380,6 +382,37 @@ def coverage_error_of_pairs(
         standard_error=_mean_over_pairs(influence / nominal.numel(), counts)[1],
         per_parameter=per_parameter,
     )
+
+
+def coverage_error_if_calibrated(levels: Tensor, counts: Counts | None = None) -> float:
+    r"""Return the coverage error that a calibrated posterior has on average.
+
+    It is :math:`0.31 / \sqrt{n}`, see :func:`expected_coverage_error_of`. NaN if no
+    level is known.
+
+    Args:
+        levels: As in :func:`acauc_of_pairs`.
+        counts: As in :func:`acauc_of_pairs`.
+    """
+    number = _number_known(levels, counts)
+    return 0.31 / number**0.5 if number else float("nan")
+
+
+def _number_known(levels: Tensor, counts: Counts | None) -> float:
+    """Return the number of complete observations that tell as much about a curve.
+
+    A curve that is known at n of them has an error in proportion to 1 / sqrt(n). The
+    mean of this error over parameters is kept. Zero if no level is known.
+    """
+    known = ~torch.isnan(levels)
+    numbers = known.sum(dim=0).double()
+    if counts is not None:
+        kept = (counts[rows.to(counts.weights.device)] for rows in known.unbind(dim=1))
+        numbers = numbers.new_tensor(
+            [each.effective_number if len(each.weights) else 0.0 for each in kept]
+        )
+    numbers = numbers[numbers > 0]
+    return float(numbers.rsqrt().mean() ** -2) if len(numbers) else 0.0
 
 
 def _mean_over_pairs(

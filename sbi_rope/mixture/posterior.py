@@ -11,6 +11,7 @@ from sbi.utils import within_support
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_rope._bounds import moved_inside
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import BaseDirectPosterior, MixedDensity, describe
@@ -342,6 +343,11 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
     def _inside(self, theta: Tensor) -> Tensor:
         return within_support(self.prior, theta).reshape(len(theta))
 
+    def _moved_inside(self, theta: Tensor) -> tuple[Tensor, Tensor]:
+        """Return parameters, and which are inside; components may be NaN outside."""
+        flat, inside = moved_inside(self.prior, theta.reshape(-1, theta.shape[-1]))
+        return flat.reshape(theta.shape), inside
+
     def set_default_x(self, x: Tensor) -> "MixturePosterior":
         """Set the observation that methods take when they are given none.
 
@@ -414,13 +420,16 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             SamplingError: If the mixture has no mass inside the prior's support.
         """
         check_tables(self, theta=theta)
-        return super().log_prob(
-            check_theta(theta, self.posterior_estimator.input_shape, batched=False),
+        theta = check_theta(theta, self.posterior_estimator.input_shape, batched=False)
+        safe, inside = self._moved_inside(theta)
+        log_prob = super().log_prob(
+            safe,
             self._warned_of(self._one_x(x)),
             norm_posterior,
             track_gradients,
             leakage_correction_params,
         )
+        return log_prob.where(inside.reshape(log_prob.shape), -torch.inf)
 
     def potential(
         self,
@@ -473,13 +482,16 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             SamplingError: If a mixture has no mass inside the prior's support.
         """
         check_tables(self, theta=theta)
-        return super().log_prob_batched(
-            check_theta(theta, self.posterior_estimator.input_shape, batched=True),
+        theta = check_theta(theta, self.posterior_estimator.input_shape, batched=True)
+        safe, inside = self._moved_inside(theta)
+        log_prob = super().log_prob_batched(
+            safe,
             self._warned_of(self._batch_of_x(x)),
             norm_posterior,
             track_gradients,
             leakage_correction_params,
         )
+        return log_prob.where(inside.reshape(log_prob.shape), -torch.inf)
 
     def map(  # type: ignore[override]
         self,

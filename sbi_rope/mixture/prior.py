@@ -5,11 +5,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from sbi.utils import within_support
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
-from sbi_rope._bounds import off_bounds
+from sbi_rope._bounds import moved_inside, off_bounds
 from sbi_rope._random import seeded
 from sbi_rope._sbi import ConditionalDensityEstimator, move_distribution_to_device
 from sbi_rope._validation import check_prior
@@ -130,11 +129,6 @@ def prior_log_prob(prior: Distribution, theta: Tensor) -> Tensor:
     # sbi's MultipleIndependent takes theta with at most two dimensions.
     theta = theta.reshape(-1, theta.shape[-1])
     theta = theta if theta.is_floating_point() else theta.float()
-    inside = within_support(prior, theta)
-    # torch's distributions raise an error outside their support. There they are
-    # evaluated at a draw from the prior, and the result is overwritten.
-    with seeded(0):
-        filler = prior.sample(torch.Size((1,))).to(theta)
-    safe = torch.where(inside.unsqueeze(-1), theta, filler)
+    safe, inside = moved_inside(prior, theta)
     log_prob = prior.log_prob(off_bounds(prior, safe)) + 0.0 * safe.sum(dim=-1)
     return log_prob.where(inside, -torch.inf).reshape(shape)

@@ -13,7 +13,11 @@ from sbi_rope.diagnosis.report import (
 from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.discrepancy.report import what_groups_count_as, what_outliers_mean
 from sbi_rope.metrics import CoverageCurve
-from sbi_rope.metrics.calibration import acauc_of_pairs
+from sbi_rope.metrics.calibration import (
+    acauc_of_pairs,
+    coverage_curve_of_pairs,
+    coverage_error_if_calibrated,
+)
 from sbi_rope.plots import (
     calibration_curves,
     discrepancy,
@@ -45,19 +49,21 @@ MAX_CURVES = 5
 def calibration_section(report: StackingReport, names: Sequence[str]) -> str:
     """Return what held-out pairs say about the intervals of each parameter."""
     levels, curve = report.levels, report.coverage
+    counts = report.cross_validation.counts
     rows = [_row("all parameters", report.acauc.value, report.acauc.interval, curve)]
     curves = {"all parameters": curve}
     for k, name in enumerate(names):
-        score = acauc_of_pairs(levels[:, [k]], report.cross_validation.counts)
+        score = acauc_of_pairs(levels[:, [k]], counts)
         if score.verdict == "unknown":  # it was never measured
             continue
-        own = _of_parameter(curve, k)
+        own = coverage_curve_of_pairs(levels[:, [k]], counts)
         if len(names) > 1:
             rows.append(_row(name, score.value, score.interval, own))
             curves[name] = own
     if len(names) > MAX_CURVES:
         curves = {"all parameters": curve}
     n, drawn = report.cross_validation.effective_number, calibration_curves(curves)
+    expected = coverage_error_if_calibrated(levels, counts)
     drawn.set_size_inches(5.8, 3.4)  # so that its text can be read on a narrow screen
     return section(
         "Are the uncertainties right?",
@@ -78,7 +84,7 @@ def calibration_section(report: StackingReport, names: Sequence[str]) -> str:
             "There is a sign of either only if the interval leaves 0 out; among many "
             f"parameters, one in twenty does so by chance. The coverage error is "
             f"{number(report.coverage_error.value, digits=3)}; a calibrated posterior "
-            f"has about {number(0.31 / n**0.5, digits=3)} with {n:.0f} pairs.",
+            f"has about {number(expected, digits=3)} with {n:.0f} pairs.",
             kind="note",
         ),
         *_sets(report),
@@ -86,8 +92,8 @@ def calibration_section(report: StackingReport, names: Sequence[str]) -> str:
         picture(
             drawn,
             caption="The share of known parameters inside intervals of each level. "
-            "Below the diagonal intervals are too narrow, above it too wide. The band "
-            "holds 95 % of the curves of calibrated posteriors.",
+            "Below the diagonal intervals are too narrow, above it too wide. At "
+            "each level the band holds 95 % of the curves of calibrated posteriors.",
         ),
         *_by_estimate(report, names),
     )
@@ -172,15 +178,6 @@ def _row(
     low, high = (number(end, sign=True, digits=3) for end in interval)
     half, most = (percent(float(curve.average[level - 1])) for level in (50, 90))
     return name, half, most, number(value, sign=True, digits=3), f"{low} to {high}"
-
-
-def _of_parameter(curve: CoverageCurve, k: int) -> CoverageCurve:
-    return CoverageCurve(
-        levels=curve.levels,
-        per_parameter=curve.per_parameter[[k]],
-        standard_error=curve.standard_error,
-        num_observations=curve.num_observations,
-    )
 
 
 def discrepancy_section(report: DiscrepancyReport) -> str:

@@ -15,7 +15,8 @@ holds the parameters with a probability of at least
     \frac{1 - K/n}{K + 1} \Big\},
 
 and in practice of about :math:`1 - \alpha`. The bound is for folds of equal size. Those
-of a stack differ by one pair at most, unless pairs share their parameters.
+of a stack differ by one pair at most, unless pairs share their parameters, or some
+labels are not exact: only exact ones have scores, and they are not spread evenly.
 
 References:
     | Predictive Inference with the Jackknife+ (Barber et al., 2021), theorem 4

@@ -11,7 +11,7 @@ from torch import Tensor
 from sbi_rope._sbi import embedding_of, headless
 from sbi_rope._training import shuffled
 from sbi_rope.stacking.folds import Fold
-from sbi_rope.trainers.training import FINETUNING, train_network
+from sbi_rope.trainers.training import FINETUNING, rows_with_density, train_network
 
 __all__ = ["finetune_without"]
 
@@ -79,6 +79,10 @@ def finetune_without(
         if of_labels is not None:
             return of_labels(rows)
         return estimator.loss(bench.theta[rows], condition=bench.x[rows])
+
+    with_density = rows_with_density(losses, train, held_out)
+    if all(map(len, with_density)):
+        train, held_out = with_density
 
     def loss(rows: Tensor, among: Tensor = train) -> Tensor:
         if weights is None:

@@ -10,7 +10,11 @@ import torch
 from sbi_rope._validation import default_names
 from sbi_rope.discrepancy.parameters import is_improbable
 from sbi_rope.metrics.by_estimate import in_words
-from sbi_rope.metrics.calibration import ACAUC_IN_WORDS, FEWEST
+from sbi_rope.metrics.calibration import (
+    ACAUC_IN_WORDS,
+    FEWEST,
+    coverage_error_if_calibrated,
+)
 from sbi_rope.stacking.cross_validation import Difference
 from sbi_rope.stacking.learning_curve import LearningCurve
 
@@ -244,6 +248,9 @@ def _calibration(report: "StackingReport") -> list[str]:
         return [f"  {NOT_CHECKED}"]
     if n < FEWEST:
         return [f"  ACAUC {acauc.value:+.3f}, of {TOO_FEW}"]
+    expected = coverage_error_if_calibrated(
+        report.levels, report.cross_validation.counts
+    )
     advice = [f"    {OVER_CONFIDENT}"] if verdict == "over-confident" else []
     off = parameters_off(report)
     if verdict == "calibrated":
@@ -255,7 +262,7 @@ def _calibration(report: "StackingReport") -> list[str]:
         f"{high:+.3f}",
         f"    ({ACAUC_IN_WORDS})",
         f"    coverage error {report.coverage_error.value:.3f}; a calibrated posterior "
-        f"has about {0.31 / n**0.5:.3f} with {n:.0f} pairs",
+        f"has about {expected:.3f} with {n:.0f} pairs",
         f"    {LEVEL:.0%} intervals hold {report.share_inside:.0%} of the "
         f"{'measured values' if is_measured(report) else 'parameters'}",
         *(f"    {line}" for line in off),

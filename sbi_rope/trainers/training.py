@@ -19,13 +19,14 @@ from sbi_rope._training import (
     shuffled,
 )
 from sbi_rope._validation import LARGEST_SETTING, check_integer, check_positive
-from sbi_rope.errors import InvalidInputError, InvalidTypeError
+from sbi_rope.errors import InvalidInputError, InvalidTypeError, warn_user
 
 __all__ = [
     "FINETUNING",
     "EstimatorBuilder",
     "Training",
     "estimator_builder",
+    "rows_with_density",
     "train_network",
     "train_on_pairs",
     "train_on_simulations",
@@ -237,6 +238,34 @@ def train_network(
     )
 
 
+@torch.no_grad()
+def rows_with_density(
+    losses: Callable[[Tensor], Tensor], *splits: Tensor
+) -> tuple[Tensor, ...]:
+    """Return the rows of pairs whose loss is finite, after a warning of the others.
+
+    A single infinite loss would end the training of all pairs. A label exactly on a
+    bound of the prior has one if the estimator's density is zero there.
+
+    Args:
+        losses: Of rows, the loss of each.
+        splits: The rows of each part of the pairs.
+    """
+    kept = tuple(
+        torch.cat([some[torch.isfinite(losses(some))] for some in rows.split(100)])
+        for rows in splits
+    )
+    missing = sum(map(len, splits)) - sum(map(len, kept))
+    if missing:
+        warn_user(
+            f"{missing} calibration pair(s) have no density under NPE before it is "
+            "trained on them, and are left out of this training. Their parameters may "
+            "be exactly on a bound of the prior, where some density estimators are "
+            "zero. If they are rounded, say by how much with `theta_std`."
+        )
+    return kept
+
+
 def train_on_pairs(
     estimator: Any,
     theta: Tensor,
@@ -264,7 +293,12 @@ def train_on_pairs(
     Returns:
         The losses and the epoch that was kept.
     """
-    train, held_out = split
+    estimator.eval()
+    train, held_out = rows_with_density(
+        lambda rows: estimator.loss(theta[rows], condition=x[rows]), *split
+    )
+    if not len(train):
+        train, held_out = split  # the training says that it has no finite loss
 
     def batches(epoch: int) -> Iterator[tuple[Tensor, Tensor]]:
         for rows in shuffled(train, training.training_batch_size):

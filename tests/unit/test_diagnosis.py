@@ -684,6 +684,17 @@ def test_the_p_value_is_the_share_of_divisions_as_far_apart() -> None:
     assert test.p_value == pytest.approx(reached / len(divisions), abs=0.04)
 
 
+def test_one_far_row_does_not_hide_that_two_sets_differ() -> None:
+    torch.manual_seed(38)
+    first, second = torch.randn(30, 3), torch.randn(60, 3) + 1.0
+    assert two_sample_test(first, second).is_different  # type: ignore[union-attr]
+    second[0] = 1e6
+    test = two_sample_test(first, second)
+    assert test is not None
+    assert test.is_different
+    assert test.spread < 2.0  # it was above 20 with the row where it is
+
+
 @pytest.mark.slow
 def test_sets_of_one_distribution_seldom_differ_and_a_narrow_one_does() -> None:
     torch.manual_seed(35)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sbi_rope.discrepancy import Discrepancy, DiscrepancyModel
 from sbi_rope.discrepancy.correlation import GroupErrors, independent_pairs
-from sbi_rope.discrepancy.regression import SMALLEST_NOISE, Regression
+from sbi_rope.discrepancy.regression import SMALLEST_NOISE, Regressions
 from sbi_rope.errors import InvalidInputError
 
 # Settings of the hyper-parameters k, s and the strength of the error's prior.
@@ -147,7 +147,8 @@ def test_the_evidence_is_the_product_of_one_step_ahead_predictions(
 def test_the_evidence_of_a_simulator_that_is_right_is_a_normal_density(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("sbi_rope.discrepancy.model.SMALLEST_NOISE", 0.0)
+    for module in ("model", "conditional"):
+        monkeypatch.setattr(f"sbi_rope.discrepancy.{module}.SMALLEST_NOISE", 0.0)
     z, mean = pairs(6, 2)
     noise = torch.tensor([[0.5, 0.2], [0.2, 0.3]]).double()
     model = replace(at(*SETTINGS[0]), probability_of_none=0.2)
@@ -203,7 +204,7 @@ def test_the_evidence_of_correlated_errors_is_a_matrix_t_density(
             - torch.special.multigammaln(torch.tensor(degrees / 2), width)
         )
         errors = GroupErrors(groups=groups, correlation=rho)
-        regression = Regression.of(z, mean, k, errors=errors)
+        regression = Regressions.of(z, mean, [k], errors=errors)
         found = regression.log_evidence([(s, strength)])
         assert float(found) == pytest.approx(float(expected), abs=1e-4)
 
@@ -536,3 +537,47 @@ def test_a_prior_probability_of_zero_or_one_is_not_changed() -> None:
         discrepancy: Discrepancy = model.fit(z, mean, no_noise(2))
         assert discrepancy.probability_of_none == certain
         assert len(discrepancy.sample(10)) == 10
+
+
+def test_imputed_means_lead_to_the_posterior_of_quadrature() -> None:
+    # The labels are as noisy as the parameters are spread.
+    torch.manual_seed(0)
+    k, s, strength, n = 0.3, 0.2, 3.0, 30
+    theta = torch.randn(n, 1, 1).double()
+    label = theta + torch.randn(n, 1, 1)
+    possible = label / 2 + 0.5**0.5 * torch.randn(n, 40, 1).double()
+    z = 0.7 * theta[:, 0] + 0.4 + 0.2 * torch.randn(n, 1)
+    # Gains, offsets and variances, with the log of their posterior density.
+    axes = torch.linspace(0, 1.6, 36), torch.linspace(-0.6, 1.2, 36)
+    log_variances = torch.linspace(-7.0, 1.0, 36)
+    gain, offset, log_variance = torch.meshgrid(*axes, log_variances, indexing="ij")
+    gain, offset, variance = (
+        values.double().reshape(-1, 1, 1)
+        for values in (gain, offset, log_variance.exp())
+    )
+    residual = z - gain * possible[..., 0] - offset
+    log_density = (-residual.square() / variance / 2).logsumexp(dim=2).sum(dim=1)
+    gain, offset, variance = (one.flatten() for one in (gain, offset, variance))
+    log_density += (
+        -(n + 2) / 2 * variance.log()
+        - (k * (gain - 1).square() + k / 3 * offset.square()) / variance / 2
+        # An inverse gamma density, times the variance because the grid has its log.
+        - (strength + 2) / 2 * variance.log()
+        - strength * s**2 / variance / 2
+    )
+    shares = torch.softmax(log_density, dim=0)
+
+    model = replace(at(k, s, strength), probability_of_none=0.0)
+    noise = torch.tensor([[1e-8]])
+    fits = [model.fit(z, possible, noise, seed=seed) for seed in range(2)]
+    draws = [one.sample(4000, smallest_error=0.0, seed=0) for one in fits]
+    for expected, found in (
+        (gain, [one.gain for one in draws]),
+        (offset, [one.offset for one in draws]),
+        (variance.sqrt(), [one.error_factor.abs() for one in draws]),
+    ):
+        mean = shares @ expected
+        std = (shares @ (expected - mean).square()).sqrt()
+        for values in found:
+            assert abs(values.mean() - mean) < 0.5 * std
+        assert torch.stack(found).std() == pytest.approx(float(std), rel=0.25)

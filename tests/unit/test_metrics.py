@@ -21,6 +21,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from sbi_rope import metrics
 from sbi_rope.errors import InvalidInputError, LogProbUnavailableError
+from sbi_rope.metrics.calibration import coverage_error_if_calibrated
 from sbi_rope.mixture import PriorPosterior
 from tests import gaussian
 from tests.refusals import assert_refused
@@ -221,11 +222,20 @@ def test_coverage_error_does_not_cancel_over_parameters() -> None:
     assert score.value == pytest.approx(0.5)
 
 
-def test_coverage_error_of_calibrated_levels_has_its_expected_value() -> None:
-    values = [
-        metrics.expected_coverage_error_of(torch.rand(400, 4)).value for _ in range(40)
-    ]
-    assert sum(values) / 40 == pytest.approx(0.313 / 20, rel=0.1)
+@pytest.mark.parametrize("measured", [(400, 400, 400, 400), (40, 100, 400, 0)])
+def test_coverage_error_of_calibrated_levels_has_its_expected_value(
+    measured: tuple[int, ...],
+) -> None:
+    levels = torch.rand(40, 400, 4)
+    for number, of_parameter in zip(measured, levels.unbind(dim=2), strict=True):
+        of_parameter[:, number:] = math.nan
+    errors = [metrics.expected_coverage_error_of(e, allow_missing=True) for e in levels]
+    mean = sum(error.value for error in errors) / 40
+    assert mean == pytest.approx(coverage_error_if_calibrated(levels[0]), rel=0.1)
+    curve = metrics.coverage_curve_of(levels[0], allow_missing=True)
+    # The number that is as good for each parameter on average.
+    parts = [number**-0.5 for number in measured if number]
+    assert curve.num_observations == int((sum(parts) / len(parts)) ** -2 + 1e-9)
 
 
 def test_coverage_error_standard_error_matches_its_spread() -> None:

@@ -1,0 +1,120 @@
+"""An NPE whose density is NaN or zero outside the prior's support and on its bounds."""
+
+import functools
+import warnings
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from sbi.inference import NPE
+from sbi.neural_nets import posterior_nn
+from sbi.utils import within_support
+from torch import Tensor, nn
+from torch.distributions import Gamma, Independent
+
+from sbi_rope import RoPE
+from sbi_rope._labels.checks import checked_labels
+from sbi_rope._labels.nodes import place_nodes, reference_of
+from sbi_rope.baselines import FinetunedNPE
+from sbi_rope.errors import RoPEWarning
+from sbi_rope.stacking import StackedPosterior, default_candidates, stack
+from sbi_rope.trainers.training import FINETUNING
+
+PRIOR = Independent(Gamma(1.5 * torch.ones(2), torch.ones(2)), 1)
+
+
+def simulator(theta: Tensor) -> Tensor:
+    return (theta + 0.05).log() + 0.1 * torch.randn_like(theta)
+
+
+@functools.cache
+def npe_posterior() -> Any:
+    torch.manual_seed(0)
+    theta = PRIOR.sample((600,))
+    build = posterior_nn(
+        "zuko_maf",
+        hidden_features=10,
+        num_transforms=2,
+        embedding_net=nn.Linear(2, 3),
+        z_score_theta="transform_to_unconstrained",
+        x_dist=PRIOR,
+    )
+    trainer = NPE(PRIOR, density_estimator=build, show_progress_bars=False)
+    trainer.append_simulations(theta, simulator(theta)).train(max_num_epochs=15)
+    posterior = trainer.build_posterior()
+    density = posterior.posterior_estimator
+    x = torch.zeros(1, 2)
+    assert density.log_prob(torch.tensor([[[-1.0, 1.0]]]), x).isnan().all()
+    assert not density.log_prob(torch.tensor([[[0.0, 1.0]]]), x).isfinite().any()
+    return posterior
+
+
+def measured(theta: Tensor) -> Tensor:
+    return simulator(theta) + 0.4
+
+
+def stacked(theta_cal: Tensor, x_cal: Tensor, *names: str) -> StackedPosterior:
+    rope = RoPE(npe_posterior(), simulator=simulator)
+    rope.append_calibration(theta_cal, x_cal)
+    kept = [c for c in default_candidates() if c.name in names]
+    return stack(rope, candidates=kept, num_folds=2, seed=0)
+
+
+def labels() -> Tensor:
+    torch.manual_seed(1)
+    return PRIOR.sample((24,))
+
+
+def test_the_density_outside_the_support_is_zero_without_a_warning() -> None:
+    posterior = stacked(labels(), measured(labels()), "prior", "NPE")
+    x, theta = torch.zeros(1, 2), torch.tensor([[-1.0, 1.0], [1.0, 1.0]])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = posterior.log_prob(theta, x=x)
+        assert torch.equal(posterior.log_prob_batched(theta[:, None], x)[:, 0], found)
+    assert torch.isneginf(found[0])
+    assert torch.isfinite(found[1])
+
+
+def test_a_label_on_a_bound_does_not_stop_fine_tuning() -> None:
+    theta, start = labels(), npe_posterior().posterior_estimator
+    x = measured(theta)
+    on_bound = theta.clone()
+    on_bound[0, 0] = 0.0
+    training = replace(FINETUNING, max_num_epochs=20)
+    method = FinetunedNPE.from_posterior(npe_posterior(), training=training)
+    method.append_calibration(on_bound, x)
+    with pytest.warns(RoPEWarning, match=r"1 calibration pair.* on a bound"):
+        method.train(show_progress_bars=False)
+    tuned = method.build_posterior().posterior_estimator
+    assert (start.loss(theta, x) - tuned.loss(theta, x)).mean() > 0.1
+
+
+@pytest.mark.slow
+def test_parameters_that_were_not_measured_do_not_stop_fine_tuning() -> None:
+    theta = labels()
+    x = measured(theta)
+    theta[::3, 0] = torch.nan
+    posterior = stacked(theta, x, "NPE", "fine-tuned NPE")
+    scores = posterior.report.cross_validation
+    gain = scores.scores_of("fine-tuned NPE") - scores.scores_of("NPE")
+    assert gain.mean() > 0.1
+
+
+def test_what_labels_leave_possible_is_inside_the_support() -> None:
+    theta = labels()
+    theta[::3, 0] = torch.nan
+    of_labels = checked_labels(
+        theta,
+        theta_std=0.5,
+        theta_cov=None,
+        weights=None,
+        groups=None,
+        like=theta[:0],
+        prior=PRIOR,
+    )
+    draws = 0.1 + torch.randn(50, 24, 2)
+    nodes = place_nodes(of_labels, [reference_of(draws)], PRIOR, num_nodes=40)
+    assert torch.isneginf(nodes.log_weights).any()
+    assert within_support(PRIOR, nodes.theta.reshape(-1, 2)).all()
