@@ -43,11 +43,19 @@ def write_atomically(path: Path) -> Iterator[Path]:
     """Yield a temporary path, and move the file written there to ``path`` at the end.
 
     Nobody ever finds half a file under ``path``: not a reader, not another process that
-    writes the same file, and not after this process is killed or the power fails.
+    writes the same file, and not after this process is killed or the power fails. If
+    ``path`` is a link, what it points to is replaced.
 
     Raises:
-        NotWritableError: If nothing can be written to the folder.
+        NotWritableError: If nothing can be written to the folder, ``path`` is no
+            ordinary file, such as a device, or the disk is full.
     """
+    path = path.resolve()
+    if path.exists() and not path.is_file():
+        raise NotWritableError(
+            f"Expected a file, or a path where there is nothing yet; got {path}, which "
+            "is a folder or a device. Use another path."
+        )
     # Files made by `mkstemp` can be read by their owner only.
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.tmp")
     try:
@@ -64,6 +72,11 @@ def write_atomically(path: Path) -> Iterator[Path]:
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
         temporary.replace(path)
+    except OSError as error:
+        raise NotWritableError(
+            f"Expected to write {path}; got {error.strerror or error}. Make room on "
+            "the disk, or use another folder. What was there before is unchanged."
+        ) from error
     finally:
         temporary.unlink(missing_ok=True)
     _sync_folder(path.parent)

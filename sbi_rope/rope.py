@@ -323,12 +323,10 @@ class RoPE:
         """
         check_gradients()
         check_instance("finetuner", self.finetuner, CalibrationFinetuner)
-        if not len(self._x_cal):
-            raise NotReadyError(
-                "No calibration pairs to train on. Call `append_calibration(theta, "
-                "x)` first. Or call `build_posterior(x_o)` without training, which "
-                "then couples with the embedding net of NPE (OT-only)."
-            )
+        self._check_pairs(
+            "Or call `build_posterior(x_o)` without training, which then couples with "
+            "the embedding net of NPE (OT-only)."
+        )
         known = None if self.finetuner.resample_targets else self._targets
         show = is_shown(show_progress_bars)
 
@@ -368,9 +366,11 @@ class RoPE:
             that are also given x there.
 
         Raises:
+            NotReadyError: If no calibration pairs were appended.
             SimulationError: If the simulator fails, or an embedding is not finite.
         """
         check_integer("simulations_per_target", simulations_per_target)
+        self._check_pairs("Targets are those of pairs.")
         return labelled_targets(
             self._source,
             self._parameters,
@@ -379,6 +379,13 @@ class RoPE:
             num_neighbors=self.finetuner.num_neighbors,
             progress=is_shown(show_progress_bars),
         )
+
+    def _check_pairs(self, hint: str) -> None:
+        if not len(self._x_cal):
+            raise NotReadyError(
+                "No calibration pairs to train on. Call `append_calibration(theta, "
+                f"x)` first. {hint}"
+            )
 
     def _targets_of_labels(self, *, progress: bool) -> Tensor:
         """Return targets, ``(n_c, l)``, where some labels leave parameters open."""

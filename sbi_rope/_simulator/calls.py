@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sbi_rope._validation import as_array
 from sbi_rope.errors import InvalidTypeError, SimulationError, shown
 
 __all__ = ["Caller", "Failure", "Form", "Simulated", "check_callable", "describe"]
@@ -235,7 +236,7 @@ def _as_numbers(result: Any) -> Tensor | None:
     if isinstance(result, Tensor):
         return result.detach().clone() if _holds_numbers(result) else None
     try:
-        array = np.asarray(result)
+        array = as_array(result)
     except (TypeError, ValueError, RuntimeError):  # such as lists of unequal length
         return None
     return torch.from_numpy(array.astype(float)) if _holds_numbers(array) else None

@@ -38,6 +38,7 @@ from sbi_rope._validation.settings import (
 )
 from sbi_rope._validation.shapes import check_not_swapped
 from sbi_rope._validation.tensors import (
+    as_array,
     as_float32,
     as_numbers,
     as_numbers_on,
@@ -60,6 +61,7 @@ from sbi_rope._validation.tensors import (
 __all__ = [
     "LARGEST_SETTING",
     "KnownColumns",
+    "as_array",
     "as_float32",
     "as_numbers",
     "as_numbers_on",

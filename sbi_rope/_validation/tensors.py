@@ -14,6 +14,7 @@ from sbi_rope.errors import InvalidInputError, InvalidTypeError
 
 __all__ = [
     "DTYPES",
+    "as_array",
     "as_float32",
     "as_numbers",
     "as_numbers_on",
@@ -71,7 +72,8 @@ def check_tensor(name: str, value: Any) -> Tensor:
 def as_numbers(name: str, value: Any) -> Tensor:
     """Return ``value`` as a tensor of numbers; lists and arrays are converted.
 
-    They are copied, in float64, which holds the numbers of all of them.
+    They are copied, in float64, which holds the numbers of all of them. What is masked
+    becomes NaN.
 
     Raises:
         InvalidTypeError: If it holds no real numbers, or its rows differ in length.
@@ -79,12 +81,27 @@ def as_numbers(name: str, value: Any) -> Tensor:
     if isinstance(value, Tensor):
         return check_tensor(name, value)
     try:
-        array = np.asarray(value)
+        array = as_array(value)
     except (TypeError, ValueError, RuntimeError) as error:
         raise InvalidTypeError(_no_numbers(name, value)) from error
     if array.dtype.kind not in "iuf":
         raise InvalidTypeError(_no_numbers(name, value))
     return torch.from_numpy(array.astype(np.float64))
+
+
+def as_array(value: Any) -> np.ndarray:
+    """Return ``value`` as an array; masked numbers become NaN.
+
+    NumPy itself drops the mask, and would use what is under it.
+
+    Example:
+        >>> as_array(np.ma.masked_equal([[1, -9]], -9))
+        array([[ 1., nan]])
+    """
+    array = np.ma.asarray(value)
+    if np.ma.is_masked(array) and array.dtype.kind in "biuf":
+        return np.ma.filled(array.astype(np.float64), np.nan)
+    return array.data
 
 
 def as_numbers_on(name: str, value: Any, device: torch.device) -> Tensor:

@@ -142,8 +142,8 @@ class DiscrepancyModel:
         If parameters are not known exactly, ``mean`` holds the means at R parameters
         that are equally probable before the observation is seen. The parameters are
         then imputed and the discrepancy is drawn in turn (data augmentation, a Gibbs
-        sampler). After 100 rounds, the posterior is the average over 20 imputations that
-        are 30 rounds apart.
+        sampler). After 100 rounds, the posterior is the average over 20 imputations
+        that are 30 rounds apart.
 
         References:
             | The Calculation of Posterior Distributions by Data Augmentation (Tanner

@@ -77,6 +77,7 @@ def default_candidates(
         InvalidTypeError: If ``rope`` is not a RoPE, or ``learn_prior`` not a bool.
         InvalidInputError: If a gamma, a tau or the rehearsal is outside its range, or,
             with a rope, x_o has the wrong shape or device, is empty or not finite.
+        NotReadyError: If ``rope`` has fewer than two calibration pairs.
     """
     gammas, taus = check_numbers("gammas", gammas), check_numbers("taus", taus)
     check_instance("learn_prior", learn_prior, bool)

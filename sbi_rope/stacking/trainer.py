@@ -23,7 +23,6 @@ from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.discrepancy.correction import check_complete, network_of
 from sbi_rope.errors import (
     InvalidInputError,
-    NotReadyError,
     warn_user,
 )
 from sbi_rope.mixture import Part
@@ -47,13 +46,11 @@ from sbi_rope.stacking.trained_candidates import (
 )
 from sbi_rope.stacking.unlabelled_candidates import RVNPCandidate
 from sbi_rope.stacking.versions import Versions, train_version
-from sbi_rope.stacking.workbench import NUM_FOLDS, Workbench, draw_seeds
+from sbi_rope.stacking.workbench import NUM_FOLDS, Workbench, check_pairs, draw_seeds
 from sbi_rope.stacking.workers import check_sendable, train_versions
 
 __all__ = ["StackTrainer"]
 
-# Fewest pairs: one to train on and one to score.
-MIN_PAIRS = 2
 # A recalibration leaves out candidates with a smaller weight in all folds.
 MIN_WEIGHT = 0.01
 
@@ -87,7 +84,6 @@ class StackTrainer:
         check_not_negative("pseudo_count", pseudo_count)
         check_instance("require_convergence", require_convergence, bool)
         check_integer("num_workers", num_workers, maximum=1000)
-        _check_pairs(len(rope.calibration[0]))
         self.x_o = None if x_o is None else _checked_observations(x_o, rope)
         self.show = is_shown(show_progress_bars)
         self.seeds = draw_seeds(seed, 3)
@@ -97,7 +93,7 @@ class StackTrainer:
             seed=self.seeds[0],
             show_progress_bars=self.show,
         )
-        _check_pairs(len(self.bench.folds))
+        check_pairs(len(self.bench.folds))
         check_prior(self.prior)
         check_density(
             estimator_of(self.bench.npe),
@@ -295,15 +291,6 @@ def _amortised(
         for candidate in candidates
         if isinstance(candidate, AmortisedCandidate) and candidate.fixed == fixed
     ]
-
-
-def _check_pairs(count: int) -> None:
-    if count < MIN_PAIRS:
-        raise NotReadyError(
-            f"Expected at least {MIN_PAIRS} calibration pairs with different "
-            f"parameters (or groups), to hold some out; got {count}. Append "
-            f"{'more' if count else 'some'} with `append_calibration(theta, x)` first."
-        )
 
 
 def _warn_of_small_batch(num_observed: int, num_pairs: int) -> None:

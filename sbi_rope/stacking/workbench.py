@@ -23,10 +23,11 @@ from sbi_rope.discrepancy.parameters import learn_parameters
 from sbi_rope.discrepancy.report import DiscrepancyReport, report_discrepancy
 from sbi_rope.discrepancy.targets import tuning_targets
 from sbi_rope.discrepancy.tuning import TUNING
+from sbi_rope.errors import NotReadyError
 from sbi_rope.finetuning import CalibrationFinetuner
 from sbi_rope.rope import RoPE
 
-__all__ = ["Workbench", "draw_seeds"]
+__all__ = ["Workbench", "check_pairs", "draw_seeds"]
 
 # Simulations from the prior that the corrected candidates are trained on.
 NUM_SIMULATIONS = 20_000
@@ -34,6 +35,8 @@ NUM_SIMULATIONS = 20_000
 SIMULATIONS_PER_PAIR = 100
 # A vector x with more entries is not treated as a list of summaries.
 MAX_SUMMARIES = 20
+# Fewest pairs: one to train on and one to score.
+MIN_PAIRS = 2
 # Folds of the calibration pairs.
 NUM_FOLDS = 5
 # Draws of the prior that the parameters of the pairs are compared with.
@@ -44,6 +47,16 @@ def draw_seeds(seed: int | None, count: int) -> list[int]:
     """Return seeds that follow from one seed, or from torch's state if it is None."""
     with seeded(seed):
         return torch.randint(2**31, (count,)).tolist()
+
+
+def check_pairs(count: int) -> None:
+    """Raise unless there are enough pairs, or groups of pairs, to hold some out."""
+    if count < MIN_PAIRS:
+        raise NotReadyError(
+            f"Expected at least {MIN_PAIRS} calibration pairs with different "
+            f"parameters (or groups), to hold some out; got {count}. Append "
+            f"{'more' if count else 'some'} with `append_calibration(theta, x)` first."
+        )
 
 
 class Workbench:
@@ -57,6 +70,9 @@ class Workbench:
         num_folds: Number of folds. There are at most as many as groups of pairs.
         seed: Seed of everything random.
         show_progress_bars: Whether to show the progress of slow simulations.
+
+    Raises:
+        NotReadyError: If there are fewer than two pairs.
     """
 
     def __init__(
@@ -67,6 +83,7 @@ class Workbench:
         seed: int,
         show_progress_bars: bool,
     ) -> None:
+        check_pairs(len(rope.calibration[0]))
         self.rope = rope
         self.show = show_progress_bars
         self.theta, self.x = rope.calibration

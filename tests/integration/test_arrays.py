@@ -325,3 +325,17 @@ def test_posteriors_of_trainers_know_the_columns_of_the_pairs() -> None:
         repaired.append_calibration(THETA, SWAPPED[1])
     with pytest.raises(InvalidInputError, match="`parameter_names` in the order of"):
         RoPE(posterior, simulator=gaussian.simulator, parameter_names=NAMES[::-1])
+
+
+def test_what_an_array_masks_is_missing() -> None:
+    theta, x = map(array, PAIRS)
+    x_masked = np.ma.masked_array(x, mask=np.zeros_like(x))
+    x_masked[::3, 0] = np.ma.masked
+    x_masked.data[::3, 0] = -9.0
+    with pytest.raises(InvalidInputError, match="got NaN in 4 of 12 rows"):
+        rope((theta, x_masked))
+    with pytest.raises(InvalidInputError, match="NaN"):
+        rope((theta, list(x_masked)))
+    theta_masked = np.ma.masked_array(theta, mask=x_masked.mask[:, :2])
+    known = rope((theta_masked, x)).labels.is_measured
+    assert torch.equal(~known, torch.from_numpy(theta_masked.mask))
