@@ -40,7 +40,6 @@ __all__ = [
     "count_ranks",
     "coverage_curve_of",
     "coverage_curve_of_pairs",
-    "coverage_error_if_calibrated",
     "coverage_error_of_pairs",
     "expected_coverage_error_of",
     "mid_ranks",
@@ -127,11 +126,14 @@ class CoverageErrorScore:
         standard_error: The standard error of ``value`` over observations, to first
             order.
         per_parameter: The mean over levels, shape ``(d,)``.
+        if_calibrated: What a calibrated posterior scores on average. NaN in files of
+            earlier versions, and if nothing is known.
     """
 
     value: float
     standard_error: float
     per_parameter: Tensor = field(repr=False)
+    if_calibrated: float = math.nan
 
 
 def mid_ranks(samples: Tensor, theta: Tensor) -> Tensor:
@@ -376,26 +378,13 @@ def coverage_error_of_pairs(
         gap = means_of_pairs(inside, counts) - alpha
         distance += gap.abs()
         influence += mean_of_known(gap.sign() * inside, dim=1)
-    per_parameter = distance / nominal.numel()
+    per_parameter, number = distance / nominal.numel(), _number_known(levels, counts)
     return CoverageErrorScore(
         value=float(mean_of_known(per_parameter, dim=0)),
         standard_error=_mean_over_pairs(influence / nominal.numel(), counts)[1],
         per_parameter=per_parameter,
+        if_calibrated=0.31 / number**0.5 if number else math.nan,
     )
-
-
-def coverage_error_if_calibrated(levels: Tensor, counts: Counts | None = None) -> float:
-    r"""Return the coverage error that a calibrated posterior has on average.
-
-    It is :math:`0.31 / \sqrt{n}`, see :func:`expected_coverage_error_of`. NaN if no
-    level is known.
-
-    Args:
-        levels: As in :func:`acauc_of_pairs`.
-        counts: As in :func:`acauc_of_pairs`.
-    """
-    number = _number_known(levels, counts)
-    return 0.31 / number**0.5 if number else float("nan")
 
 
 def _number_known(levels: Tensor, counts: Counts | None) -> float:

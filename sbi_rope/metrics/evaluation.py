@@ -27,7 +27,6 @@ from sbi_rope.metrics.calibration import (
     acauc_of,
     central_levels,
     coverage_curve_of,
-    coverage_error_if_calibrated,
     expected_coverage_error_of,
     random_ranks,
 )
@@ -93,16 +92,15 @@ class Evaluation:
 
     def __str__(self) -> str:
         n, d = self.ranks.shape
-        error = self.expected_coverage_error.value
-        expected = coverage_error_if_calibrated(self.ranks)
+        error = self.expected_coverage_error
         lines = [
             f"Scores on {n} observations, with {d} true parameters each",
             "  log probability of the true parameters (LPP), in nats an observation:",
             *self._densities(),
             f"  {self._verdict()}",
             f"    ({ACAUC_IN_WORDS})",
-            f"  coverage error {error:.3f}; a calibrated posterior has about "
-            f"{expected:.3f} with {n} observations",
+            f"  coverage error {error.value:.3f}; a calibrated posterior has about "
+            f"{error.if_calibrated:.3f} with {n} observations",
             f"  50% intervals hold {self._inside(0.5):.0%} of the true parameters, 90% "
             f"intervals {self._inside(0.9):.0%}",
             *self._by_estimate(),

@@ -346,7 +346,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
     def _moved_inside(self, theta: Tensor) -> tuple[Tensor, Tensor]:
         """Return parameters, and which are inside; components may be NaN outside."""
         flat, inside = moved_inside(self.prior, theta.reshape(-1, theta.shape[-1]))
-        return flat.reshape(theta.shape), inside
+        return flat.reshape(theta.shape), inside.reshape(theta.shape[:-1])
 
     def set_default_x(self, x: Tensor) -> "MixturePosterior":
         """Set the observation that methods take when they are given none.
@@ -429,7 +429,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             track_gradients,
             leakage_correction_params,
         )
-        return log_prob.where(inside.reshape(log_prob.shape), -torch.inf)
+        return log_prob.where(inside, -torch.inf)
 
     def potential(
         self,
@@ -491,7 +491,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             track_gradients,
             leakage_correction_params,
         )
-        return log_prob.where(inside.reshape(log_prob.shape), -torch.inf)
+        return log_prob.where(inside, -torch.inf)
 
     def map(  # type: ignore[override]
         self,

@@ -16,7 +16,6 @@ from sbi_rope.metrics import CoverageCurve
 from sbi_rope.metrics.calibration import (
     acauc_of_pairs,
     coverage_curve_of_pairs,
-    coverage_error_if_calibrated,
 )
 from sbi_rope.plots import (
     calibration_curves,
@@ -49,7 +48,7 @@ MAX_CURVES = 5
 def calibration_section(report: StackingReport, names: Sequence[str]) -> str:
     """Return what held-out pairs say about the intervals of each parameter."""
     levels, curve = report.levels, report.coverage
-    counts = report.cross_validation.counts
+    counts, error = report.cross_validation.counts, report.coverage_error
     rows = [_row("all parameters", report.acauc.value, report.acauc.interval, curve)]
     curves = {"all parameters": curve}
     for k, name in enumerate(names):
@@ -63,7 +62,6 @@ def calibration_section(report: StackingReport, names: Sequence[str]) -> str:
     if len(names) > MAX_CURVES:
         curves = {"all parameters": curve}
     n, drawn = report.cross_validation.effective_number, calibration_curves(curves)
-    expected = coverage_error_if_calibrated(levels, counts)
     drawn.set_size_inches(5.8, 3.4)  # so that its text can be read on a narrow screen
     return section(
         "Are the uncertainties right?",
@@ -83,8 +81,8 @@ def calibration_section(report: StackingReport, names: Sequence[str]) -> str:
             "ACAUC: 0 is calibrated, positive is over-confident, negative is too wide. "
             "There is a sign of either only if the interval leaves 0 out; among many "
             f"parameters, one in twenty does so by chance. The coverage error is "
-            f"{number(report.coverage_error.value, digits=3)}; a calibrated posterior "
-            f"has about {number(expected, digits=3)} with {n:.0f} pairs.",
+            f"{number(error.value, digits=3)}; a calibrated posterior has about "
+            f"{number(error.if_calibrated, digits=3)} with {n:.0f} pairs.",
             kind="note",
         ),
         *_sets(report),

@@ -282,6 +282,7 @@ def _equal_parts(name: str, posterior: MixturePosterior) -> list[Part]:
         raise UnsupportedPosteriorError(
             f"Expected the candidate {name!r} to be amortised, and a mixture to have "
             f"equal weights; got {type(posterior).__name__}. For RoPE's coupling, use "
-            "a CouplingCandidate."
+            "a CouplingCandidate. A stack cannot be a candidate of another, because it "
+            "has seen the pairs; leave it out."
         )
     return estimator.taken_apart()[0]

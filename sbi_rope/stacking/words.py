@@ -10,11 +10,7 @@ import torch
 from sbi_rope._validation import default_names
 from sbi_rope.discrepancy.parameters import is_improbable
 from sbi_rope.metrics.by_estimate import in_words
-from sbi_rope.metrics.calibration import (
-    ACAUC_IN_WORDS,
-    FEWEST,
-    coverage_error_if_calibrated,
-)
+from sbi_rope.metrics.calibration import ACAUC_IN_WORDS, FEWEST
 from sbi_rope.stacking.cross_validation import Difference
 from sbi_rope.stacking.learning_curve import LearningCurve
 
@@ -248,9 +244,11 @@ def _calibration(report: "StackingReport") -> list[str]:
         return [f"  {NOT_CHECKED}"]
     if n < FEWEST:
         return [f"  ACAUC {acauc.value:+.3f}, of {TOO_FEW}"]
-    expected = coverage_error_if_calibrated(
-        report.levels, report.cross_validation.counts
-    )
+    error = report.coverage_error
+    beside = ""
+    if not math.isnan(error.if_calibrated):
+        expected = f"{error.if_calibrated:.3f} with {n:.0f} pairs"
+        beside = f"; a calibrated posterior has about {expected}"
     advice = [f"    {OVER_CONFIDENT}"] if verdict == "over-confident" else []
     off = parameters_off(report)
     if verdict == "calibrated":
@@ -261,8 +259,7 @@ def _calibration(report: "StackingReport") -> list[str]:
         f"  {verdict}: ACAUC {acauc.value:+.3f}, 95 % interval {low:+.3f} to "
         f"{high:+.3f}",
         f"    ({ACAUC_IN_WORDS})",
-        f"    coverage error {report.coverage_error.value:.3f}; a calibrated posterior "
-        f"has about {expected:.3f} with {n:.0f} pairs",
+        f"    coverage error {error.value:.3f}{beside}",
         f"    {LEVEL:.0%} intervals hold {report.share_inside:.0%} of the "
         f"{'measured values' if is_measured(report) else 'parameters'}",
         *(f"    {line}" for line in off),

@@ -253,6 +253,8 @@ def rows_with_density(
     """
     kept = tuple(
         torch.cat([some[torch.isfinite(losses(some))] for some in rows.split(100)])
+        if len(rows)
+        else rows
         for rows in splits
     )
     missing = sum(map(len, splits)) - sum(map(len, kept))

@@ -21,7 +21,6 @@ from torch.utils.tensorboard import SummaryWriter
 
 from sbi_rope import metrics
 from sbi_rope.errors import InvalidInputError, LogProbUnavailableError
-from sbi_rope.metrics.calibration import coverage_error_if_calibrated
 from sbi_rope.mixture import PriorPosterior
 from tests import gaussian
 from tests.refusals import assert_refused
@@ -231,7 +230,7 @@ def test_coverage_error_of_calibrated_levels_has_its_expected_value(
         of_parameter[:, number:] = math.nan
     errors = [metrics.expected_coverage_error_of(e, allow_missing=True) for e in levels]
     mean = sum(error.value for error in errors) / 40
-    assert mean == pytest.approx(coverage_error_if_calibrated(levels[0]), rel=0.1)
+    assert mean == pytest.approx(errors[0].if_calibrated, rel=0.1)
     curve = metrics.coverage_curve_of(levels[0], allow_missing=True)
     # The number that is as good for each parameter on average.
     parts = [number**-0.5 for number in measured if number]
