@@ -11,6 +11,7 @@ from sbi_rope._sbi import (
     MixedDensity,
     VectorFieldDensity,
     check_rows_apart,
+    check_weights_of,
     copy_of_prior,
     device_of,
     dtype_of,
@@ -57,7 +58,8 @@ class TrainedNPE:
 
     Raises:
         UnsupportedPosteriorError: If the posterior has no embedding to work with, is
-            not in float32, or embeds a row of a batch differently among other rows.
+            not in float32, has weights that are not finite, or embeds a row of a batch
+            differently among other rows.
         InvalidTypeError: If the names are not strings.
         InvalidInputError: If there are not as many names as parameters, or two are
             equal.
@@ -66,6 +68,7 @@ class TrainedNPE:
     def __init__(self, posterior: Any, parameter_names: Any = None) -> None:
         estimator = estimator_of(posterior)
         embedding_of(estimator)
+        check_weights_of(estimator)
         if dtype_of(estimator) != torch.float32:
             raise UnsupportedPosteriorError(
                 f"Expected an estimator in float32; got {dtype_of(estimator)}. sbi "

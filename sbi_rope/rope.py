@@ -15,7 +15,11 @@ from sbi_rope._labels import (
     labelled_targets,
     parameters_of,
 )
-from sbi_rope._labels.checks import checked_labels, warn_of_ambiguous
+from sbi_rope._labels.checks import (
+    checked_labels,
+    warn_of_ambiguous,
+    warn_of_labels_on_bounds,
+)
 from sbi_rope._npe import TrainedNPE
 from sbi_rope._pickling import picklable
 from sbi_rope._progress import is_shown
@@ -35,6 +39,7 @@ from sbi_rope._validation import (
     check_integer,
     check_not_swapped,
     check_parameter_order,
+    check_row_order,
     check_rows,
     check_same_length,
     check_tensor,
@@ -121,7 +126,8 @@ class RoPE:
 
     Raises:
         UnsupportedPosteriorError: If the posterior has no embedding to work with, or
-            one that embeds a row of a batch differently among other rows.
+            one that embeds a row of a batch differently among other rows, or a weight
+            of its networks is not finite.
         InvalidInputError: If both or none of simulator and simulations are given,
             their shapes do not fit the posterior, ``num_simulations`` is given
             without a simulator, the names are not as many different ones as there
@@ -183,6 +189,7 @@ class RoPE:
             check_parameter_order(names, known)
             known = {names: "`parameter_names`", **known}
         theta_s, x_s = (None, None) if simulations is None else simulations
+        check_row_order(**{"simulations[0]": theta_s, "simulations[1]": x_s})
         self._theta_columns = check_columns("simulations[0]", theta_s, known)
         self._x_columns = check_columns("simulations[1]", x_s, earlier["x"])
         if names is None:
@@ -246,13 +253,16 @@ class RoPE:
             InvalidTypeError: If an argument does not hold numbers.
             InvalidInputError: If shapes, numbers of rows or devices do not fit, a value
                 is not finite, an exact theta is outside the prior's support, no
-                parameters inside it fit a label, or the columns of a table are in
-                another order. Nothing is added then.
+                parameters inside it fit a label, or the columns or rows of a table are
+                in another order. Nothing is added then.
             UnsupportedPosteriorError: If labels are not exact and some parameters are
                 discrete, or if values of x are missing (NaN) and the embedding net
                 takes their number from another row.
         """
         check_not_swapped(theta, x, self._npe.like.shape[1:], self._npe.event_shape)
+        check_row_order(
+            theta=theta, x=x, theta_std=theta_std, weights=weights, groups=groups
+        )
         theta_columns = check_columns("theta", theta, self._theta_columns)
         check_columns("theta_std", theta_std, theta_columns)
         check_columns("theta_cov", theta_cov, theta_columns, how="df.loc[{0}, {0}]")
@@ -291,6 +301,7 @@ class RoPE:
         labels = self._labels.appended(labels) if len(self._labels) else labels
         parameters = parameters_of(labels, self._npe.prior)
         warn_of_ambiguous(labels)
+        warn_of_labels_on_bounds(labels, self._npe.prior, self.parameter_names)
         self._parameters = parameters
         self._labels, self._x_cal = labels, torch.cat([self._x_cal, x])
         self._theta_columns, self._x_columns = theta_columns, x_columns

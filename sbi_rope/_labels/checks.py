@@ -1,13 +1,14 @@
 """Checks of the labels that users pass, and their conversion."""
 
 import math
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable, Iterable, Sequence
 from numbers import Real
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from sbi_rope._bounds import off_bounds
 from sbi_rope._labels.labels import Labels
 from sbi_rope._validation import (
     as_numbers_on,
@@ -15,10 +16,11 @@ from sbi_rope._validation import (
     check_in_support,
     check_pair_weights,
     check_values,
+    default_names,
 )
 from sbi_rope.errors import InvalidInputError, InvalidTypeError, warn_user
 
-__all__ = ["checked_labels", "warn_of_ambiguous"]
+__all__ = ["checked_labels", "warn_of_ambiguous", "warn_of_labels_on_bounds"]
 
 # A covariance may be this much asymmetric, or below zero, relative to its diagonal.
 ROUNDING = 1e-6
@@ -26,6 +28,8 @@ ROUNDING = 1e-6
 CHUNK_SIZE = 100
 # A correlation whose smallest eigenvalue is below this is singular.
 SINGULAR = 1e-12
+# A larger share of labels on a bound is no accident of rounding.
+MANY_ON_BOUNDS = 0.05
 
 
 def checked_labels(
@@ -277,6 +281,37 @@ def warn_of_ambiguous(labels: Labels) -> None:
             "held out. Pass `groups`, a number or a name for each pair, to say which "
             "pairs belong together."
         )
+
+
+def warn_of_labels_on_bounds(
+    labels: Labels, prior: Any, parameter_names: Sequence[str] | None
+) -> None:
+    """Warn of parameters of which several labels are exactly on a bound of the prior.
+
+    A posterior with a density does not expect any such label.
+    """
+    exact = labels.is_measured & ~labels.is_noisy
+    if labels.samples is not None:
+        exact = torch.zeros_like(exact)
+    on_bound = exact & (labels.theta != off_bounds(prior, labels.theta))
+    counts, numbers = on_bound.sum(dim=0), exact.sum(dim=0)
+    many = (counts > 1) & (counts > MANY_ON_BOUNDS * numbers)
+    if not many.any():
+        return
+    names = parameter_names or default_names(len(many))
+    found = [
+        f"{int(counts[j])} of {int(numbers[j])} of {names[j]}"
+        for j in many.nonzero().flatten().tolist()
+    ]
+    warn_user(
+        f"Labels are exactly on a bound of the prior: {', '.join(found)}. Posteriors "
+        "with a density give a single number no probability. Their credible intervals "
+        "hold hardly any of these labels, whatever the level is, although coverage can "
+        "be right on average. Intervals of a stack with `guaranteed=True` are widened "
+        "until they hold enough of them. If such a label stands for a value that is "
+        "too small or too large to be measured, say with `theta_std` how well it is "
+        "known."
+    )
 
 
 def _rows_that_agree(labels: Labels) -> Tensor:

@@ -40,6 +40,7 @@ from sbi_rope._sbi.posteriors import (
     posterior_from,
 )
 from sbi_rope._sbi.reading import check_rows_apart, readable, reads_missing
+from sbi_rope._sbi.refusals import check_weights_of
 from sbi_rope._sbi.trainer import train_npe
 
 __all__ = [
@@ -58,6 +59,7 @@ __all__ = [
     "build_zuko_unconditional_flow",
     "check_density",
     "check_rows_apart",
+    "check_weights_of",
     "copy_of_prior",
     "describe",
     "device_of",

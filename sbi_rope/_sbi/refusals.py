@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import torch
 from sbi.inference import (
     EnsemblePosterior,
     ImportanceSamplingPosterior,
@@ -17,11 +18,12 @@ from sbi.inference.trainers.nre.nre_base import RatioEstimatorTrainer
 from sbi.neural_nets.estimators.base import ConditionalEstimator
 from sbi.utils import RestrictedPrior
 from sbi.utils.sbiutils import ImproperEmpirical
+from torch import nn
 
 from sbi_rope._sbi.densities import MixtureDensity
 from sbi_rope.errors import UnsupportedPosteriorError
 
-__all__ = ["check_prior_of", "refuse"]
+__all__ = ["check_prior_of", "check_weights_of", "refuse"]
 
 TRAIN_NPE = "Train NPE on the same simulations and pass its posterior."
 SAMPLERS = (
@@ -64,6 +66,18 @@ def check_prior_of(posterior: Any) -> None:
             "in truncated sequential NPE (TSNPE). Train NPE in one round, on "
             "simulations from the prior, and pass its posterior."
         )
+
+
+def check_weights_of(estimator: nn.Module) -> None:
+    """Raise if a weight of the networks is NaN or Inf, as after a failed training."""
+    for name, weights in estimator.named_parameters():
+        if not torch.isfinite(weights).all():
+            raise UnsupportedPosteriorError(
+                "Expected a posterior whose networks have finite weights; its "
+                f"estimator has NaN or Inf in `{name}`, so that its training has "
+                "failed. Train NPE again, with a lower learning rate or without the "
+                "simulations that are far from all others."
+            )
 
 
 def _advice(posterior: Any) -> str:

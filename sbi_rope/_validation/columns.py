@@ -1,10 +1,11 @@
-"""Checks of tables whose columns have names, such as the dataframes of pandas.
+"""Checks of tables whose columns and rows have names, such as dataframes of pandas.
 
-Tables are read as arrays, which have no names. The same columns in another order would
-be taken for each other.
+Tables are read as arrays, which have no names. The same columns or rows in another
+order would be taken for each other.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import Any
 
 from sbi_rope.errors import InvalidInputError
@@ -13,6 +14,7 @@ __all__ = [
     "KnownColumns",
     "check_columns",
     "check_parameter_order",
+    "check_row_order",
     "check_tables",
     "column_names",
     "columns_of",
@@ -20,7 +22,7 @@ __all__ = [
 ]
 
 # The names of columns in orders that are known to be right, and where each comes from.
-KnownColumns = Mapping[tuple[str, ...], str]
+KnownColumns = Mapping[tuple[Hashable, ...], str]
 # Of more columns the first that is in the wrong place is named, and not all of them.
 MOST_LISTED = 10
 
@@ -30,11 +32,50 @@ def column_names(table: Any) -> tuple[str, ...]:
 
     There are none if two are equal, or one is no string, and none of a tensor.
     """
-    found = getattr(table, "columns", getattr(table, "index", None))
-    names = tuple(found) if isinstance(found, Iterable) else ()
+    names = _labels_of(table, "columns") or _labels_of(table, "index")
     if len(set(names)) < len(names) or not all(isinstance(n, str) for n in names):
         return ()
     return tuple(str(name) for name in names)
+
+
+def _labels_of(table: Any, axis: str) -> tuple[Hashable, ...]:
+    """Return the labels of an axis of a table, whatever they are; none of an array."""
+    found = getattr(table, axis, None)
+    if callable(found) or not isinstance(found, Iterable):
+        return ()
+    # Pandas has numbers of NumPy, which would be printed with their type.
+    return tuple(found.tolist() if hasattr(found, "tolist") else found)
+
+
+def check_row_order(**tables: Any) -> None:
+    """Raise if the rows of two tables have the same labels in different orders.
+
+    Rows are paired by their position, so that they would be paired wrongly.
+
+    Args:
+        tables: What the user gave, of any type.
+
+    Raises:
+        InvalidInputError: If the order is another one.
+    """
+    known: tuple[str, tuple[Hashable, ...]] | None = None
+    for name, table in tables.items():
+        rows = _labels_of(table, "index")
+        if known is None:
+            known = (name, rows) if rows else None
+            continue
+        first, expected = known
+        if rows == expected or len(rows) != len(expected):
+            continue
+        if Counter(rows) == Counter(expected):
+            row = next(k for k, label in enumerate(rows) if label != expected[k])
+            raise InvalidInputError(
+                f"Expected `{first}` and `{name}` with their rows in the same order, "
+                f"because they are paired by position; got row {expected[row]!r} of "
+                f"`{first}` and row {rows[row]!r} of `{name}` in place {row}. Pass "
+                f"`{name}.loc[{first}.index]`, or `{name}.to_numpy()` if the labels "
+                "of the rows mean nothing."
+            )
 
 
 def columns_of(posterior: Any) -> dict[str, KnownColumns]:
@@ -56,7 +97,7 @@ def check_parameter_order(names: Sequence[str], known: KnownColumns) -> None:
         InvalidInputError: If they are.
     """
     for expected, source in known.items():
-        if sorted(names) == sorted(expected) and tuple(names) != expected:
+        if Counter(names) == Counter(expected) and tuple(names) != expected:
             raise InvalidInputError(
                 f"Expected `parameter_names` in the order of {source}, which the "
                 f"posterior was trained on, {list(expected)}; got {list(names)}."
@@ -97,9 +138,9 @@ def check_columns(
     Raises:
         InvalidInputError: If the order is another one.
     """
-    names = column_names(table)
+    names = _labels_of(table, "columns") or column_names(table)
     for expected, source in known.items():
-        if names == expected or sorted(names) != sorted(expected):
+        if names == expected or Counter(names) != Counter(expected):
             continue
         start = f"Expected `{name}` with its columns in the order of {source}"
         if len(names) <= MOST_LISTED:
@@ -129,10 +170,10 @@ def joined_columns(name: str, sources: Sequence[KnownColumns]) -> KnownColumns:
     Raises:
         InvalidInputError: If two know the same columns in different orders.
     """
-    joined: dict[tuple[str, ...], str] = {}
-    first: dict[frozenset[str], tuple[str, ...]] = {}
+    joined: dict[tuple[Hashable, ...], str] = {}
+    first: dict[frozenset[Any], tuple[Hashable, ...]] = {}
     for order, source in (item for known in sources for item in known.items()):
-        earlier = first.setdefault(frozenset(order), order)
+        earlier = first.setdefault(frozenset(Counter(order).items()), order)
         if earlier != order:
             raise InvalidInputError(
                 f"Expected `posteriors` that know the columns of `{name}` in one "

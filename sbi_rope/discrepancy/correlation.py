@@ -42,11 +42,12 @@ class GroupErrors:
     correlation: float
 
     def independent(self, values: Tensor) -> Tensor:
-        """Return :math:`R^{-1/2}` times values of the pairs, shape ``(n, k)``."""
+        """Return :math:`R^{-1/2}` times values of the pairs, ``(*batch, n, k)``."""
+        *batch, _, width = values.shape
         sizes = self.groups.bincount().to(values)[:, None]
-        sums = values.new_zeros(len(sizes), values.shape[1])
-        sums = sums.index_add(0, self.groups, values)
-        mean = (sums / sizes)[self.groups]
+        sums = values.new_zeros(*batch, len(sizes), width)
+        sums = sums.index_add(-2, self.groups, values)
+        mean = (sums / sizes)[..., self.groups, :]
         # The eigenvalues of R, of means of groups and of differences within groups.
         of_means = (1 + (sizes - 1) * self.correlation)[self.groups]
         return mean / of_means.sqrt() + (values - mean) / (1 - self.correlation) ** 0.5
@@ -67,9 +68,9 @@ class GroupErrors:
 
 
 def independent_pairs(
-    groups: Tensor, correlation: float, weights: Tensor | None = None
+    groups: Tensor, correlation: float | Tensor, weights: Tensor | None = None
 ) -> Tensor:
-    r"""Return how many independent pairs each pair counts as, shape ``(n,)``.
+    r"""Return how many independent pairs each pair counts as, ``(*batch, n)``.
 
     A pair among k of its group counts as :math:`1 / (1 + (k - 1) \rho)`. If the weights
     of a group differ, k is its effective number of pairs: the squared sum of its
@@ -77,7 +78,7 @@ def independent_pairs(
 
     Args:
         groups: Numbers of the groups from 0 on, shape ``(n,)``.
-        correlation: :math:`\rho`.
+        correlation: :math:`\rho`, a number or of shape ``batch``.
         weights: What each pair would count as by itself, shape ``(n,)``; one if None.
 
     References:
@@ -89,4 +90,5 @@ def independent_pairs(
     """
     w = torch.ones_like(groups).double() if weights is None else weights.double()
     number = groups.bincount(weights=w).square() / groups.bincount(weights=w.square())
+    correlation = torch.as_tensor(correlation).to(w)[..., None]
     return w / (1 + (number[groups] - 1) * correlation)

@@ -4,18 +4,21 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor
-from torch.distributions import MultivariateNormal
 
 from sbi_rope.discrepancy.conditional import Conditional
 from sbi_rope.discrepancy.posterior import Discrepancy
 
 __all__ = ["expected_means", "impute"]
 
-# Imputations that are left out, because they depend on where they started, and those
-# that the posterior is averaged over. So many later imputations belong to each of them.
-# If labels are as noisy as the prior is wide, imputations that far apart are nearly
-# independent.
-NUM_WARM_UP, NUM_KEPT, APART = 100, 20, 30
+# Chains that are run side by side, which costs hardly more than one of them.
+NUM_CHAINS = 10
+# Imputations of a chain that are left out, because they depend on where it started, and
+# those that the posterior is averaged over. So many later imputations belong to each of
+# them. If labels are as noisy as the prior is wide, imputations that far apart are
+# nearly independent.
+NUM_WARM_UP, NUM_KEPT, APART = 100, 2, 30
+# Numbers in the largest tensor, unless one chain needs more.
+MAX_ENTRIES = 2**22
 # Draws of the discrepancy that an expected mean is averaged over.
 NUM_DRAWS = 40
 
@@ -35,21 +38,23 @@ def impute(
 
     One of them is drawn for each observation. Given these means the posterior of the
     discrepancy has a closed form, of which the next gain, offset and error are drawn.
-    Random numbers come from torch's random state.
+    C chains of such draws are independent of each other. Random numbers come from
+    torch's random state.
 
     Args:
         z: Representations of the real observations, shape ``(n, l)``.
         possible: :math:`m_{ir}`, shape ``(n, R, l)``, equally probable before.
-        conditional: Returns the posterior given one mean of each observation,
-            ``(n, l)``, and how many pairs each of them counts as.
-        counts: Returns how many pairs each counts as, ``(n,)``, given these means. It
-            is asked at the start, and again for the imputations that are kept.
+        conditional: Returns the posteriors given C sets of means, ``(C, n, l)``, and
+            how many pairs each of them counts as.
+        counts: Returns how many pairs each counts as, ``(n,)`` or ``(C, n)``, given
+            these means. It is asked at the start, and again for the imputations that
+            are kept.
 
     Returns:
         The posterior. Its two evidences, ``probability_of_none`` and
         ``num_independent`` are averages over the imputations.
     """
-    mean = possible.mean(dim=1)
+    mean = possible.mean(dim=1).expand(NUM_CHAINS, -1, -1)
     weights = counts(mean)
     given = conditional(mean, weights)
     kept: list[Discrepancy] = []
@@ -59,11 +64,11 @@ def impute(
             weights = counts(mean)
         given = conditional(mean, weights)
         if number > NUM_WARM_UP and (number - NUM_WARM_UP) % APART == 0:
-            kept.append(given.posterior())
+            kept.extend(given.posteriors())
     shares = torch.cat([(1 - one.probability_of_none) * one.shares for one in kept])
     total = shares.sum()
     if not total > 0:  # the simulator is right in all of them
-        shares, total = torch.cat([one.shares for one in kept]), float(NUM_KEPT)
+        shares, total = torch.cat([one.shares for one in kept]), float(len(kept))
     return Discrepancy(
         terms=tuple(term for one in kept for term in one.terms),
         shares=shares / total,
@@ -91,10 +96,9 @@ def expected_means(discrepancy: Discrepancy, z: Tensor, possible: Tensor) -> Ten
     Returns:
         Shape ``(n, l)``.
     """
-    probabilities = torch.zeros(possible.shape[:2]).to(possible)
-    for _ in range(NUM_DRAWS):
-        drawn = _drawn(discrepancy, discrepancy.noise)
-        probabilities += _probabilities(z, possible, *drawn) / NUM_DRAWS
+    drawn = [_drawn(discrepancy, discrepancy.noise) for _ in range(NUM_DRAWS)]
+    gain, offset, covariance = map(torch.stack, zip(*drawn, strict=True))
+    probabilities = _probabilities(z, possible, gain, offset, covariance).mean(dim=0)
     return (probabilities[..., None] * possible).sum(dim=1)
 
 
@@ -111,19 +115,44 @@ def _drawn(discrepancy: Discrepancy, noise: Tensor) -> tuple[Tensor, Tensor, Ten
 def _imputed(
     z: Tensor, possible: Tensor, gain: Tensor, offset: Tensor, covariance: Tensor
 ) -> Tensor:
-    """Draw one of the possible means of each observation, shape ``(n, l)``."""
+    """Draw one of the possible means of each observation, shape ``(C, n, l)``."""
     probabilities = _probabilities(z, possible, gain, offset, covariance)
-    chosen = torch.multinomial(probabilities, 1)
-    return possible[torch.arange(len(z)), chosen[:, 0]]
+    # This is several times faster than torch.multinomial.
+    bounds = probabilities.cumsum(dim=-1)
+    drawn = torch.rand(bounds.shape[:-1]).to(bounds) * bounds[..., -1]
+    chosen = torch.searchsorted(bounds, drawn[..., None], right=True)[..., 0]
+    return possible[torch.arange(len(z)), chosen.clamp_max(possible.shape[1] - 1)]
 
 
 def _probabilities(
     z: Tensor, possible: Tensor, gain: Tensor, offset: Tensor, covariance: Tensor
 ) -> Tensor:
-    """Return the probability of each possible mean given z, shape ``(n, R)``."""
-    residual = z[:, None] - possible @ gain.mT - offset
-    normal = MultivariateNormal(torch.zeros_like(offset), covariance)
-    return torch.softmax(normal.log_prob(residual), dim=1)
+    """Return the probability of each possible mean given z, shape ``(C, n, R)``.
+
+    Args:
+        z: Representations of the real observations, shape ``(n, l)``.
+        possible: Their possible means, shape ``(n, R, l)``.
+        gain: C gains, shape ``(C, l, l)``.
+        offset: Offsets, shape ``(C, l)``.
+        covariance: Covariances of observations at one parameter, ``(C, l, l)``.
+    """
+    # Observations and means are mapped to where their differences are standard normal.
+    identity = torch.eye(z.shape[1]).to(z).expand_as(covariance)
+    factor = torch.linalg.cholesky(covariance)
+    whiten = torch.linalg.solve_triangular(factor, identity, upper=False)
+    observed = (z - offset[:, None]) @ whiten.mT
+    flat = possible.flatten(0, 1)
+    chunk = max(1, MAX_ENTRIES // possible.numel())
+    parts = zip(observed.split(chunk), (whiten @ gain).split(chunk), strict=True)
+    distances = [
+        torch.cdist(
+            seen[:, :, None],
+            (flat @ to_seen.mT).unflatten(1, possible.shape[:2]),
+            compute_mode="donot_use_mm_for_euclid_dist",
+        )[:, :, 0]
+        for seen, to_seen in parts
+    ]
+    return torch.softmax(-torch.cat(distances).square() / 2, dim=-1)
 
 
 def _mean(values: list[float]) -> float:

@@ -142,8 +142,8 @@ class DiscrepancyModel:
         If parameters are not known exactly, ``mean`` holds the means at R parameters
         that are equally probable before the observation is seen. The parameters are
         then imputed and the discrepancy is drawn in turn (data augmentation, a Gibbs
-        sampler). After 100 rounds, the posterior is the average over 20 imputations
-        that are 30 rounds apart.
+        sampler), in ten chains. The posterior is the average over two imputations of
+        each chain, after 130 and after 160 rounds.
 
         References:
             | The Calculation of Posterior Distributions by Data Augmentation (Tanner
@@ -186,8 +186,8 @@ class DiscrepancyModel:
         def counts(mean: Tensor) -> Tensor | None:
             if groups is None:
                 return weights
-            correlation = self._correlation_within(groups, z, mean)
-            return independent_pairs(groups, correlation, weights)
+            correlations = self._correlations_within(groups, z, mean)
+            return independent_pairs(groups, correlations, weights)
 
         def conditional(mean: Tensor, weights: Tensor | None) -> Conditional:
             return Conditional.of(
@@ -202,12 +202,22 @@ class DiscrepancyModel:
             )
 
         if mean.ndim == 2:
-            return conditional(mean, counts(mean)).posterior()
+            [discrepancy] = conditional(mean[None], counts(mean[None])).posteriors()
+            return discrepancy
         with seeded(seed):
             return impute(z, mean, conditional, counts)
 
-    def _correlation_within(self, groups: Tensor, z: Tensor, mean: Tensor) -> float:
-        """Return the mean correlation of the errors of pairs of the same group."""
+    def _correlations_within(self, groups: Tensor, z: Tensor, mean: Tensor) -> Tensor:
+        """Return the mean correlation of the errors of pairs of the same group.
+
+        Args:
+            groups: A number for each pair, shape ``(n,)``.
+            z: Representations of the real observations, shape ``(n, l)``.
+            mean: C sets of means, shape ``(C, n, l)``.
+
+        Returns:
+            Shape ``(C,)``.
+        """
         ratios = torch.tensor(VARIANCE_RATIOS).to(z)
         correlations = ratios / (1 + ratios)
         evidence = []
@@ -215,9 +225,9 @@ class DiscrepancyModel:
             errors = GroupErrors(groups=groups, correlation=correlation)
             # Half of the precisions are enough to compare correlations.
             some = Regressions.of(z, mean, self.gain_precisions[::2], errors=errors)
-            evidence.append(some.log_evidence(self._settings).logsumexp(dim=(0, 1)))
+            evidence.append(some.log_evidence(self._settings).logsumexp(dim=(1, 2)))
         log_prior = torch.tensor(PRIOR_OF_RATIOS).to(z).log()
-        return float((torch.stack(evidence) + log_prior).softmax(dim=0) @ correlations)
+        return (torch.stack(evidence, dim=1) + log_prior).softmax(dim=1) @ correlations
 
     @property
     def _settings(self) -> list[tuple[float, float]]:

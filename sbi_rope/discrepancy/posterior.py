@@ -18,36 +18,40 @@ MAX_ENTRIES = 2**22
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Term:
-    r"""The posterior at one setting of the hyper-parameters.
+    r"""The posterior at one setting of the hyper-parameters, or a batch of these.
 
     Attributes:
-        coefficients: Mean of :math:`(A, b)^\top`, shape ``(l + 1, l)``.
+        coefficients: Mean of :math:`(A, b)^\top`, shape ``(*batch, l + 1, l)``.
         row_factor: Lower Cholesky factor of the covariance of its rows, shape
-            ``(l + 1, l + 1)``.
+            ``(*batch, l + 1, l + 1)``.
         error_factor: L, with :math:`L L^\top` the scale of the inverse Wishart
-            distribution of :math:`\Sigma`, shape ``(l, l)``.
-        degrees: Its degrees of freedom.
+            distribution of :math:`\Sigma`, shape ``(*batch, l, l)``.
+        degrees: Its degrees of freedom, shape ``batch``.
     """
 
     coefficients: Tensor
     row_factor: Tensor
     error_factor: Tensor
-    degrees: float
+    degrees: Tensor
 
     def sample(self, count: int) -> tuple[Tensor, Tensor, Tensor]:
-        r"""Draw :math:`A`, :math:`b` and :math:`\Sigma`."""
-        width, like = len(self.error_factor), self.error_factor
+        r"""Draw :math:`A`, :math:`b` and :math:`\Sigma`, ``count`` of each term."""
+        *batch, width, _ = self.error_factor.shape
+        like = self.error_factor
         # The Bartlett decomposition: T T' follows a Wishart distribution, so that
         # L (T T')^-1 L' follows an inverse Wishart distribution with scale L L'.
-        degrees = self.degrees - torch.arange(width).to(like)
-        triangle = torch.randn(count, width, width).to(like).tril(-1)
+        # Pickles of earlier versions hold the degrees as a number.
+        degrees = torch.as_tensor(self.degrees).to(like)[..., None]
+        degrees = degrees - torch.arange(width).to(like)
+        triangle = torch.randn(count, *batch, width, width).to(like).tril(-1)
         triangle = triangle + torch.diag_embed(Chi2(degrees).sample((count,)).sqrt())
         identity = torch.eye(width).to(like).expand_as(triangle)
         inverse = torch.linalg.solve_triangular(triangle, identity, upper=False)
         factor = self.error_factor @ inverse.mT
         noise = torch.randn(count, *self.coefficients.shape).to(like)
         coefficients = self.coefficients + self.row_factor @ noise @ factor.mT
-        return coefficients[:, :-1].mT, coefficients[:, -1], factor @ factor.mT
+        gain, offset = coefficients[..., :-1, :].mT, coefficients[..., -1, :]
+        return gain, offset, factor @ factor.mT
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -32,6 +32,7 @@ from sbi_rope._validation import (
     check_integer,
     check_not_swapped,
     check_readable,
+    check_row_order,
     check_same_length,
     check_tables,
     check_tensor,
@@ -97,6 +98,7 @@ def check_test_set(
     """
     check_integer("chunk_size", chunk_size)
     check_tables(posterior, theta=theta, x=x)
+    check_row_order(theta=theta, x=x)
     theta, x = _as_tensor("theta", theta), _as_tensor("x", x)
     theta_shape = theta.shape[1:]
     if isinstance(posterior, DirectPosterior):

@@ -64,6 +64,8 @@ class Evaluation:
         coverage: The coverage of central intervals.
         expected_coverage_error: The distance of the coverage from the diagonal.
         by_estimate: Whether the coverage of 90 % intervals depends on the estimate.
+        parameter_names: The names that the posterior has for the parameters; None if
+            it has none.
         unit_z: The units of ``lpp_z`` in words.
         is_normalised: Whether the density is corrected for mass outside the prior; None
             if that is not known.
@@ -76,6 +78,7 @@ class Evaluation:
     coverage: CoverageCurve
     expected_coverage_error: CoverageErrorScore
     by_estimate: CoverageByEstimate
+    parameter_names: tuple[str, ...] | None = None
     unit_z: str = GIVEN_UNITS
     is_normalised: bool | None = None
 
@@ -119,9 +122,10 @@ class Evaluation:
         return f"{verdict}: {value}, 95 % interval {low:+.3f} to {high:+.3f}"
 
     def _by_estimate(self) -> list[str]:
+        names = self.parameter_names or default_names(self.ranks.shape[1])
         return [
             part
-            for line in in_words(self.by_estimate, default_names(self.ranks.shape[1]))
+            for line in in_words(self.by_estimate, names)
             for part in textwrap.wrap(
                 line, 88, initial_indent="  ", subsequent_indent="    "
             )
@@ -227,6 +231,7 @@ def evaluate(
         coverage=coverage_curve_of(levels),
         expected_coverage_error=expected_coverage_error_of(levels),
         by_estimate=coverage_by_estimate_of_pairs(held_out, estimates),
+        parameter_names=getattr(posterior, "parameter_names", None),
         unit_z=unit_z,
         is_normalised=is_normalised(posterior),
     )

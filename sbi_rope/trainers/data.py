@@ -16,6 +16,7 @@ from sbi_rope._validation import (
     check_in_support,
     check_not_swapped,
     check_readable,
+    check_row_order,
     check_same_length,
     check_values,
 )
@@ -153,6 +154,7 @@ class Data:
     def _check_order(self, theta: Any, x: Any) -> None:
         if self.event_shape is not None:
             check_not_swapped(theta, x, self._prior.event_shape, self.event_shape)
+        check_row_order(theta=theta, x=x)
 
     def _checked_columns(self, **tables: Any) -> dict[str, KnownColumns]:
         """Return the known orders of columns, with those of these tables."""

@@ -5,7 +5,12 @@ from typing import Any
 
 from torch.distributions import Distribution
 
-from sbi_rope._sbi import direct_posterior, estimator_of, posterior_from
+from sbi_rope._sbi import (
+    check_weights_of,
+    direct_posterior,
+    estimator_of,
+    posterior_from,
+)
 from sbi_rope._training import History
 from sbi_rope._validation import check_instance
 from sbi_rope.trainers.data import Data
@@ -47,7 +52,9 @@ class StartingNPE:
 
     def replace_by(self, posterior: Any) -> None:
         """Take a copy of a trained posterior of sbi instead of training one."""
-        self._given = posterior_from(posterior, copy.deepcopy(estimator_of(posterior)))
+        estimator = estimator_of(posterior)
+        check_weights_of(estimator)
+        self._given = posterior_from(posterior, copy.deepcopy(estimator))
 
     def posterior(
         self, prior: Distribution, data: Data, *, show_progress_bars: bool

@@ -154,7 +154,7 @@ def test_tables_with_known_columns_are_those_of_tensors() -> None:
     rope = of_tables(simulations=(THETA_S, X_S)).append_calibration(THETA, X)
     for ours, table in zip(rope.calibration, (THETA, X), strict=True):
         assert torch.equal(ours, torch.tensor(table.to_numpy()))
-    # Names that are spelled differently, or are no strings, say nothing.
+    # Names that are other ones, or spelled differently, say nothing.
     for theta, x in (
         (SWAPPED[0].add_suffix(" [mM]"), SWAPPED[1].add_suffix(" (nm)")),
         (THETA.set_axis([1, 0], axis=1), X.set_axis([1, 0], axis=1)),
@@ -162,6 +162,50 @@ def test_tables_with_known_columns_are_those_of_tensors() -> None:
         rope.append_calibration(theta, x)
     rope.append_calibration(torch.tensor(THETA.to_numpy()), X.to_numpy())
     assert len(rope.labels) == 48
+
+
+def test_columns_whose_names_are_not_strings_or_not_unique_keep_their_order() -> None:
+    for names in ([0, 1], [("a", 1), ("a", 2)]):
+        theta, x = THETA.set_axis(names, axis=1), X.set_axis(names, axis=1)
+        known = of_tables(simulator=gaussian.simulator).append_calibration(theta, x)
+        for swapped in ((theta[names[::-1]], x), (theta, x[names[::-1]])):
+            with pytest.raises(InvalidInputError, match="columns in the order of the"):
+                known.append_calibration(*swapped)
+        known.append_calibration(theta, x)
+    method = FRISBI(gaussian.posterior(3).prior, simulator=gaussian.simulator)
+    doubled = pd.DataFrame(torch.zeros(4, 3), columns=["a", "a", "b"])
+    method.append_simulations(doubled, doubled)
+    with pytest.raises(InvalidInputError, match="columns in the order of the"):
+        method.append_simulations(doubled.iloc[:, [0, 2, 1]], doubled)
+
+
+def test_tables_whose_rows_are_in_different_orders_are_refused() -> None:
+    rows = [f"plot {k}" for k in range(12)]
+    theta, x = (table.set_axis(rows, axis=0) for table in (THETA, X))
+    other, weights = x.iloc[::-1], theta["Km"].abs()[::-1]
+    rope = of_tables(simulator=gaussian.simulator)
+    method = FRISBI(gaussian.posterior().prior, simulator=gaussian.simulator)
+    hint = re.escape(
+        "row 'plot 0' of `theta` and row 'plot 11' of `x` in place 0. Pass"
+    )
+    for call in (
+        lambda: rope.append_calibration(theta, other),
+        lambda: method.append_calibration(theta, other),
+        lambda: method.append_simulations(theta, other),
+        lambda: evaluate(gaussian.posterior(), theta, other),
+    ):
+        with pytest.raises(InvalidInputError, match=hint):
+            call()
+    with pytest.raises(
+        InvalidInputError, match=r"`theta` and `weights` with their row"
+    ):
+        rope.append_calibration(theta, x, weights=weights)
+    with pytest.raises(InvalidInputError, match=r"`simulations\[1\]` with their rows"):
+        of_tables(simulations=(THETA_S, X_S.iloc[::-1]))
+    # Rows of which at least one table says nothing are paired by position.
+    rope.append_calibration(theta, X).append_calibration(theta.to_numpy(), other)
+    rope.append_calibration(theta, other.loc[rows], weights=weights.loc[rows])
+    assert len(rope.labels) == 36
 
 
 def test_the_parameters_of_a_table_of_simulations_have_its_names() -> None:

@@ -199,9 +199,14 @@ def test_an_evaluation_says_where_coverage_is_off() -> None:
     assert not any(right.by_estimate.depends)
     assert "no sign that coverage depends on the estimate" in str(right)
     # With too large a gain, the posterior overestimates what is large.
-    wrong = evaluate(gaussian.posterior(), theta, 1.4 * x, num_samples=100, seed=0)
+    posterior = gaussian.posterior()
+    wrong = evaluate(posterior, theta, 1.4 * x, num_samples=100, seed=0)
     assert all(wrong.by_estimate.depends)
     assert "the coverage of theta_1 depends on its estimate (p = 0.001)" in str(wrong)
+    posterior.parameter_names = ("mass", "length")  # as stacks have
+    named = str(evaluate(posterior, theta, 1.4 * x, num_samples=100, seed=0))
+    assert "coverage of mass depends" in named
+    assert "coverage of length depends" in named
     low, middle, high = wrong.by_estimate.shares[0].tolist()
     assert max(low, high) < middle
     text = " ".join(str(wrong).split())

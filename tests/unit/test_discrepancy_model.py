@@ -11,6 +11,7 @@ from scipy import stats
 from torch import Tensor
 
 from sbi_rope.discrepancy import Discrepancy, DiscrepancyModel
+from sbi_rope.discrepancy.conditional import Conditional
 from sbi_rope.discrepancy.correlation import GroupErrors, independent_pairs
 from sbi_rope.discrepancy.regression import SMALLEST_NOISE, Regressions
 from sbi_rope.errors import InvalidInputError
@@ -237,6 +238,43 @@ def counted(groups: Tensor, error: Tensor, **options: Tensor) -> float:
     noise = no_noise(error.shape[1])
     found = DiscrepancyModel().fit(mean + error, mean, noise, groups=groups, **options)
     return found.num_independent
+
+
+def test_sets_of_means_have_each_the_posterior_that_they_have_alone() -> None:
+    z, mean = pairs(9, 2)
+    means = mean + 0.3 * torch.randn(4, 9, 2)
+    groups, correlations = torch.arange(9) // 3, torch.tensor([0.0, 0.2, 0.5, 0.9])
+    weights = independent_pairs(groups, correlations, torch.rand(9) + 0.5)
+    assert weights.shape == (4, 9)
+
+    def conditional(some: slice) -> Conditional:
+        return Conditional.of(
+            z,
+            means[some],
+            0.1 * no_noise(2) + 0.1 * torch.eye(2),
+            gain_precisions=(0.1, 1.0),
+            settings=[(0.1, 3.0), (0.4, 10.0), (0.4, 30.0)],
+            prior_of_none=0.5,
+            weights=weights[some],
+            once=torch.rand(9, generator=torch.Generator().manual_seed(0)).double(),
+        )
+
+    for number, one in enumerate(conditional(slice(None)).posteriors()):
+        [alone] = conditional(slice(number, number + 1)).posteriors()
+        assert torch.allclose(one.shares, alone.shares)
+        assert one.num_independent == pytest.approx(float(weights[number].sum()))
+        for name in ("probability_of_none", "log_evidence", "log_evidence_of_none"):
+            assert getattr(one, name) == pytest.approx(getattr(alone, name))
+        for term, other in zip(one.terms, alone.terms, strict=True):
+            for part, same in zip(
+                vars(term).values(), vars(other).values(), strict=True
+            ):
+                assert torch.allclose(part.abs(), same.abs())  # signs of eigenvectors
+    errors = GroupErrors(groups=groups, correlation=0.3)
+    some = Regressions.of(z, means, [1.0], errors=errors).log_evidence([(0.2, 3.0)])
+    for number in range(4):
+        alone = Regressions.of(z, means[number], [1.0], errors=errors)
+        assert torch.allclose(some[number], alone.log_evidence([(0.2, 3.0)]))
 
 
 def test_many_recordings_that_are_hardly_correlated_count_as_many_pairs() -> None:

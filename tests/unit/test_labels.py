@@ -34,6 +34,7 @@ from sbi_rope.stacking import stacking_weights
 from sbi_rope.stacking.label_scores import label_levels
 from sbi_rope.stacking.workbench import Workbench
 from tests import gaussian
+from tests.stacks import problem, rope_of
 
 NAN = math.nan
 PRIOR = MultivariateNormal(
@@ -651,6 +652,24 @@ def test_partial_labels_that_may_be_those_of_another_pair_are_named() -> None:
         rope().append_calibration(theta[5:], x[5:])
         # Equal labels are one group already.
         rope().append_calibration(theta[[5, 5, 8, 2]], x[:4])
+
+
+def test_several_labels_exactly_on_a_bound_of_the_prior_are_named() -> None:
+    def appended(*on_bound: int, **options: Any) -> None:
+        theta, x = problem(40, seed=1)  # the prior is uniform from -1 to 1
+        theta[list(on_bound), 1] = -1.0
+        made = rope_of((theta[:0], x[:0]), parameter_names=("height", "harvest"))
+        made.append_calibration(theta, x, **options)
+
+    match = r"on a bound of the prior: 3 of 40 of harvest\. .* `guaranteed=True`"
+    with pytest.warns(RoPEWarning, match=match):
+        appended(3, 8, 20)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RoPEWarning)
+        appended(3, 8)  # a share that rounding explains
+        appended(3, 8, 20, theta_std=0.1)
+        theta, x = gaussian.labelled(20)  # a prior without bounds
+        rope().append_calibration(theta, x)
 
 
 def test_a_label_without_a_column_for_each_parameter_says_what_stands_for_one() -> None:
