@@ -10,6 +10,7 @@ from torch.distributions import Distribution
 from sbi_rope._random import seeded
 from sbi_rope._simulations.moments import Moments
 from sbi_rope._simulations.source import Embedding, Readable, all_finite
+from sbi_rope._standardisation import divisors
 from sbi_rope._validation import (
     as_numbers_on,
     check_batch,
@@ -81,7 +82,7 @@ class StoredSimulations:
         # The mean is subtracted, because float32 cannot tell numbers far from zero
         # apart.
         self._theta_mean = self.theta.mean(dim=0)
-        self._theta_std = self.theta.std(dim=0).clamp_min(1e-12)
+        self._theta_std = divisors(self.theta.double().std(dim=0)).to(self.theta)
 
     def add_counts(self, num_calls: int, num_dropped: int) -> None:
         """Do nothing, because nothing is simulated."""

@@ -10,7 +10,6 @@ from sbi_rope._npe import TrainedNPE
 from sbi_rope.diagnosis.implied import Implied, couple_by_itself, implied_by
 from sbi_rope.diagnosis.prior_shift import PriorShift
 from sbi_rope.diagnosis.simulations import Simulations
-from sbi_rope.diagnosis.spread import SMALLEST
 from sbi_rope.rope import RoPE
 
 __all__ = ["also_in_pairs", "implied_by_pairs"]
@@ -76,5 +75,8 @@ def _distance(a: Implied, b: Implied) -> Tensor:
 
 
 def _log_ratio(a: Implied, b: Implied) -> Tensor:
-    spreads = [one.means.std(dim=0).clamp_min(SMALLEST) for one in (a, b)]
-    return (spreads[0] / spreads[1]).log().abs()
+    logs = [
+        one.means.std(dim=0).clamp_min(torch.finfo(one.means.dtype).tiny).log()
+        for one in (a, b)
+    ]
+    return (logs[0] - logs[1]).abs()

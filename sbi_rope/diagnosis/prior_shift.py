@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from sbi_rope._standardisation import divisors
 from sbi_rope.coupling import Coupling
 from sbi_rope.diagnosis.implied import (
     Implied,
@@ -64,11 +65,11 @@ class PriorShift:
     def findings(self, simulations: Simulations, names: Sequence[str]) -> list[Finding]:
         """Return a finding for each parameter whose threshold can be exceeded."""
         theta = simulations.theta
-        std = theta.std(dim=0).clamp_min(1e-12)
+        std = divisors(theta.std(dim=0))
         mean, spread = _moments(theta, self.implied)
         usual_mean, usual_spread = _moments(theta, self.unshifted)
         move = ((mean - usual_mean) / std).tolist()
-        ratio = (spread / usual_spread.clamp_min(1e-12)).tolist()
+        ratio = (spread / divisors(usual_spread)).tolist()
         return [
             Finding(
                 name=f"prior shift: {name}",

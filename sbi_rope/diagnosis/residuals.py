@@ -10,6 +10,7 @@ from sbi_rope._means import Counts
 from sbi_rope._permutation import permutation_test
 from sbi_rope._progress import progress_bar
 from sbi_rope._sbi import embed
+from sbi_rope._standardisation import divisors
 from sbi_rope._training import without_warning_of_few_pairs
 from sbi_rope.diagnosis.report import Finding
 from sbi_rope.diagnosis.simulations import Simulations
@@ -130,7 +131,7 @@ def dependence(residuals: Tensor, theta: Tensor) -> Dependence:
         theta: Parameters, shape ``(n, d)``.
     """
     count = num_features(*theta.shape)
-    standard = (theta - theta.mean(dim=0)) / theta.std(dim=0).clamp_min(1e-12)
+    standard = (theta - theta.mean(dim=0)) / divisors(theta.std(dim=0))
     features = torch.cat([standard, standard.square()], dim=1)[:, :count]
     found = permutation_test(residuals, features)
     n, p = len(residuals), found.num_features

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from sbi_rope._slices import slices
+from sbi_rope._standardisation import divisors
 
 __all__ = ["Simulations", "nearest_distances"]
 
@@ -42,7 +43,7 @@ class Simulations:
         the estimate is too large.
         """
         theta, embedded = self.theta[:MAX_FOR_NOISE], self.embedded[:MAX_FOR_NOISE]
-        standard = (theta - theta.mean(dim=0)) / theta.std(dim=0).clamp_min(1e-12)
+        standard = (theta - theta.mean(dim=0)) / divisors(theta.std(dim=0))
         ones = torch.ones_like(standard[:, :1])
         features = torch.cat([ones, standard, standard.square()], dim=1)
         residual = embedded - features @ (torch.linalg.pinv(features) @ embedded)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from sbi_rope._standardisation import divisors
 from sbi_rope.diagnosis.implied import resampled
 from sbi_rope.diagnosis.prior_shift import PriorShift
 from sbi_rope.diagnosis.report import Finding
@@ -16,7 +17,6 @@ __all__ = ["FEWEST", "Spread", "spread_of"]
 FEWEST = 5
 NUM_DRAWS = 1000
 LEVEL = 0.01
-SMALLEST = 1e-12
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -122,9 +122,9 @@ def spread_of(
             are any.
     """
     batch, (reference, *_) = shift.batch.means, shift.expected
-    usual = reference.means.std(dim=0).clamp_min(SMALLEST)
+    usual = divisors(reference.means.std(dim=0))
     level = LEVEL / theta.shape[1]
-    again = _spreads(reference.means, len(reference.means))
+    again = divisors(_spreads(reference.means, len(reference.means)))
     chances = [
         (_spreads(end.means, len(batch)) / again).quantile(level, dim=0)
         for end in shift.expected
@@ -146,7 +146,7 @@ def _spreads(means: Tensor, size: int) -> Tensor:
     moments = torch.stack([centred, centred.square()], dim=1)
     mean, square = resampled(moments, size, num_draws=NUM_DRAWS).unbind(dim=1)
     variance = (square - mean.square()) * size / (size - 1)
-    return variance.clamp_min(SMALLEST**2).sqrt()
+    return variance.clamp_min(0.0).sqrt()
 
 
 def _predicted(
@@ -169,7 +169,7 @@ def _predicted(
     n = len(moments)
     draws = resampled(moments, n, num_draws=NUM_DRAWS)
     mean_x, mean_y, xx, xy, yy = draws.unbind(dim=1)
-    var_x = (xx - mean_x.square()).clamp_min(SMALLEST**2)
+    var_x = divisors((xx - mean_x.square()).clamp_min(0.0))
     cov = xy - mean_x * mean_y
     slope = cov / var_x
     left = (yy - mean_y.square() - slope * cov).clamp_min(0.0) * n / (n - 2)

@@ -78,7 +78,7 @@ class Evaluation:
     coverage: CoverageCurve
     expected_coverage_error: CoverageErrorScore
     by_estimate: CoverageByEstimate
-    parameter_names: tuple[str, ...] | None = None
+    parameter_names: tuple[str, ...] | None = field(default=None, repr=False)
     unit_z: str = GIVEN_UNITS
     is_normalised: bool | None = None
 

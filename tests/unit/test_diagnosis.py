@@ -584,8 +584,23 @@ def test_the_spread_is_that_of_mean_parameters_of_single_observations() -> None:
     cost = torch.cdist(known.embedded, known.embedded).fill_diagonal_(torch.inf)
     usual = ((-cost / coupling.gamma).softmax(dim=1) @ known.theta).std(dim=0)
     expected = (coupling.weights @ known.theta).std(dim=0) / usual
-    found = spread_of(prior_shift(real, known), known.theta).ratio
-    assert torch.allclose(found, expected, rtol=1e-6)
+    found = spread_of(prior_shift(real, known), known.theta)
+    assert torch.allclose(found.ratio, expected, rtol=1e-6)
+    # Parameters in grams and in solar masses lead to the same sentences.
+    heavy = replace(known, theta=1e-33 * known.theta)
+    shift, spread = (
+        prior_shift(real, heavy),
+        spread_of(prior_shift(real, heavy), heavy.theta),
+    )
+    assert torch.allclose(spread.ratio, found.ratio)
+    assert torch.allclose(spread.threshold, found.threshold, rtol=0.1)  # of draws
+    for one, other in zip(
+        shift.findings(heavy, NARROW),
+        prior_shift(real, known).findings(known, NARROW),
+        strict=True,
+    ):
+        assert one.sentence == other.sentence
+    assert torch.allclose(heavy.noise, known.noise)
 
 
 def test_a_g_that_squeezes_unseen_pairs_lowers_the_limit_of_the_spread() -> None:
@@ -757,6 +772,8 @@ def test_the_bias_of_residuals_is_recovered_from_noise() -> None:
     assert found.bias == pytest.approx((2 * (0.09 + 0.08)) ** 0.5, rel=0.1)
     assert found.p_value < 0.01
     assert dependence(noise, theta).bias < 0.1
+    tiny = dependence(noise, 1e-33 * theta).bias
+    assert tiny == pytest.approx(dependence(noise, theta).bias)
 
 
 @pytest.mark.slow

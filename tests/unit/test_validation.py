@@ -177,16 +177,19 @@ def test_known_columns_in_another_order_are_refused_and_the_hint_mends_them() ->
 
 def test_columns_of_which_nothing_is_known_are_accepted_and_remembered() -> None:
     known = {("a", "b"): "`parameter_names`"}
-    for other in (table("B", "A"), table("b", "B"), table("b", "a", "c")):
-        names = column_names(other)
-        assert check_columns("theta", other, known) == {
+    others = [("B", "A"), ("b", "B"), ("b", "a", "c"), (1, 0), ("b", "b"), ("b", 1)]
+    for names in others:
+        assert check_columns("theta", table(*names), known) == {
             **known,
             names: "the earlier table `theta`",
         }
-    unnamed = (X, X.numpy(), X.tolist(), None, 0.1, "ba", table(1, 0), table("b", "b"))
-    for value in (*unnamed, table("b", 1)):
+    for value in (X, X.numpy(), X.tolist(), None, 0.1, "ba"):
         assert column_names(value) == ()
         assert check_columns("theta", value, known) == known
+    # The parameters are not named after numbers, or after a name that two have.
+    assert column_names(table("B", "A")) == ("B", "A")
+    for names in others[3:]:
+        assert column_names(table(*names)) == ()
 
 
 def test_a_shape_that_does_not_fit_is_mended_by_the_hint() -> None:
