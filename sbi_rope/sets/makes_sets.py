@@ -1,5 +1,6 @@
 """The part of a posterior that makes sets and intervals."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
@@ -19,6 +20,7 @@ from sbi_rope._validation import (
     check_level,
 )
 from sbi_rope.errors import InvalidInputError
+from sbi_rope.sets.conformal import DIGITS
 from sbi_rope.sets.credible_set import CredibleSet, highest_density_set
 from sbi_rope.sets.intervals import CredibleIntervals, central_intervals
 
@@ -66,7 +68,7 @@ class MakesSets(ABC):
                 ``level`` of the cases, even if the posterior is not calibrated. This
                 needs a stack, and observations drawn as its calibration pairs.
             num_samples: The number of draws that the set and its volume are estimated
-                from.
+                from, one of which has to be outside at least.
             seed: Seed of the draws; None uses the states of torch, NumPy and Python.
 
         Returns:
@@ -78,7 +80,7 @@ class MakesSets(ABC):
             UnseenObservationError: If x is not in the batch and ``unseen="raise"``.
             SamplingError: If hardly any mass lies inside the prior's support.
         """
-        _check(level, guaranteed=guaranteed, num_samples=num_samples)
+        _check(level, guaranteed=guaranteed, num_samples=num_samples, num_ends=1)
         with seeded(seed):
             x = self._one_x(x)
             if guaranteed:
@@ -111,8 +113,9 @@ class MakesSets(ABC):
             level: The probability of each interval.
             x: As in :meth:`credible_set`.
             guaranteed: As in :meth:`credible_set`.
-            num_samples: The number of draws. With ``guaranteed`` there are as many as
-                the stack was scored with.
+            num_samples: The number of draws, one of which has to be beyond each end at
+                least. With ``guaranteed`` there are as many as the stack was scored
+                with.
             seed: As in :meth:`credible_set`.
 
         Returns:
@@ -158,7 +161,7 @@ class MakesSets(ABC):
             UnseenObservationError: As in :meth:`credible_set`.
             SamplingError: As in :meth:`credible_set`.
         """
-        _check(level, guaranteed=guaranteed, num_samples=num_samples)
+        _check(level, guaranteed=guaranteed, num_samples=num_samples, num_ends=2)
         with seeded(seed):
             make = partial(central_intervals, self, num_samples=num_samples)
             if guaranteed:
@@ -186,7 +189,14 @@ class MakesSets(ABC):
         """Return observations ``(B, *event)`` after a check."""
 
 
-def _check(level: Any, *, guaranteed: Any, num_samples: Any) -> None:
+def _check(level: Any, *, guaranteed: Any, num_samples: Any, num_ends: int) -> None:
+    """Check the arguments of a set, or of an interval, which has two ends."""
     check_level("level", level)
     check_instance("guaranteed", guaranteed, bool)
     check_integer("num_samples", num_samples, minimum=2)
+    needed = math.ceil(round(num_ends / (1 - level), DIGITS))
+    if num_samples < needed and not guaranteed:
+        raise InvalidInputError(
+            f"Expected `num_samples` of at least {needed} for a level of {level:g}, so "
+            f"that a draw is beyond each end; got {num_samples}."
+        )

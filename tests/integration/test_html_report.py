@@ -121,7 +121,7 @@ def test_names_of_parameters_are_given_once(tmp_path: Path) -> None:
     posterior.save(tmp_path / "stack.pt")
     loaded = load(tmp_path / "stack.pt")
     for one in (loaded, named.build_posterior(x, num_simulations=100, seed=0)[0]):
-        rows = one.credible_intervals_batched(0.9, x[:1], num_samples=10).as_rows()
+        rows = one.credible_intervals_batched(0.9, x[:1], num_samples=20).as_rows()
         assert [row["parameter"] for row in rows] == ["slope", "size"]
     found = diagnose(named, x, num_simulations=100, num_folds=None, **QUIET)
     assert found.parameter_names == ("slope", "size")

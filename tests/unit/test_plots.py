@@ -56,7 +56,7 @@ def test_a_stack_has_a_credible_set_and_one_with_a_guarantee() -> None:
 def test_a_stack_with_too_few_pairs_for_a_guarantee_is_drawn_without_it() -> None:
     stack, x = stacks.small_stack(), stacks.observed()[0]
     with pytest.warns(RoPEWarning, match="No set with a guarantee is drawn"):
-        figure = plots.credible_set(stack, x, level=0.99, num_samples=40)
+        figure = plots.credible_set(stack, x, level=0.99, num_samples=200)
     assert legend_texts(figure.legends[0]) == ["99 %, of the posterior"]
     assert_refused("`level`", plots.credible_set, stack, x, level=1.5)
 

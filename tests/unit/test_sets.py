@@ -98,6 +98,17 @@ def test_intervals_of_a_gaussian_are_central() -> None:
     assert names == ["a", "b"]
 
 
+def test_a_level_that_needs_more_draws_than_there_are_is_refused() -> None:
+    posterior = exact()
+    for make, needed in (
+        (posterior.credible_set, 1000),
+        (posterior.credible_intervals, 2000),
+    ):
+        with pytest.raises(InvalidInputError, match=f"at least {needed} for a level"):
+            make(0.999, X, num_samples=needed - 1)
+        make(0.999, X, num_samples=needed)
+
+
 def test_intervals_of_a_batch_are_those_of_each_observation() -> None:
     posterior, x = exact(), torch.stack([X, -X, 0 * X])
     found = posterior.credible_intervals_batched(0.9, x, num_samples=50_000, seed=0)
@@ -114,7 +125,7 @@ def test_intervals_of_a_batch_are_those_of_each_observation() -> None:
 
 def test_intervals_of_a_batch_say_which_observation_they_are_of() -> None:
     x = X * torch.linspace(-1, 1, 30)[:, None]
-    found = exact().credible_intervals_batched(0.9, x, num_samples=10, seed=0)
+    found = exact().credible_intervals_batched(0.9, x, num_samples=20, seed=0)
     assert len(list(found)) == 30
     rows = found.as_rows(["a", "b"])
     assert [row["observation"] for row in rows[:3]] == [0, 0, 1]
