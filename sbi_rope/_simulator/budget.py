@@ -1,5 +1,7 @@
 """A simulator that is called a given number of times, and not again."""
 
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
@@ -9,10 +11,13 @@ from sbi_rope._simulations import (
     Embedding,
     Moments,
     Readable,
-    SimulationSource,
     StoredSimulations,
     all_finite,
 )
+from sbi_rope._simulator.calls import Simulated
+
+if TYPE_CHECKING:
+    from sbi_rope._simulator.source import Simulator
 
 __all__ = ["LimitedSimulator"]
 
@@ -20,7 +25,8 @@ __all__ = ["LimitedSimulator"]
 class LimitedSimulator:
     """Simulates at draws of the prior once; all that is asked for is looked up there.
 
-    The simulations are made when they are first needed.
+    The simulations are made when they are first needed. If that is interrupted, the
+    next call goes on where it was.
 
     Args:
         simulator: The simulator.
@@ -33,7 +39,7 @@ class LimitedSimulator:
 
     def __init__(
         self,
-        simulator: SimulationSource,
+        simulator: "Simulator",
         num_simulations: int,
         prior: Distribution,
         *,
@@ -47,6 +53,7 @@ class LimitedSimulator:
         self._prior = prior
         self._event_shape = event_shape
         self._like = like
+        self._finished: list[Simulated] = []
         self._stored: StoredSimulations | None = None
 
     @property
@@ -121,6 +128,7 @@ class LimitedSimulator:
                     self.num_simulations,
                     lambda x: x,
                     progress=progress,
+                    finished=self._finished,
                 )
             self._stored = StoredSimulations(
                 simulations,
@@ -130,4 +138,5 @@ class LimitedSimulator:
                 like=self._like,
                 readable=self._readable,
             )
+            self._finished = []
         return self._stored

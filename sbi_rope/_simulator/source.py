@@ -18,7 +18,7 @@ from sbi_rope._simulations import (
     all_finite,
 )
 from sbi_rope._simulator.budget import LimitedSimulator
-from sbi_rope._simulator.calls import check_callable
+from sbi_rope._simulator.calls import Simulated, check_callable
 from sbi_rope._simulator.failures import Failures, warn_of_few
 from sbi_rope._simulator.probe import Probe
 from sbi_rope._simulator.workers import ParallelSimulator, simulate_in_workers
@@ -30,6 +30,9 @@ __all__ = ["Simulator", "source_of"]
 # Simulations that are held in memory before they are embedded. If they come one by one
 # there are few, so that a slow simulator shows its progress.
 BATCHED_CHUNK, SINGLE_CHUNK = 1000, 10
+# The same if worker processes simulate one at a time, and an interrupted call goes on
+# where it was. It does not depend on their number, nor do the simulations.
+RESUMED_CHUNK = 100
 # A progress bar appears after this many seconds.
 DELAY = 2.0
 # The largest number of entries of simulations kept for training. If each simulation is
@@ -88,9 +91,10 @@ class Simulator:
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate, theta ``(n, d)`` to x ``(n, *event)``; x may contain NaN."""
         failures = Failures(len(theta))
-        x = self._simulate(theta, failures, 0, advance=lambda count: None)
+        simulated = self._simulate(theta, advance=lambda count: None)
+        failures.add(simulated, 0)
         failures.warn()
-        return x
+        return simulated.x
 
     def add_counts(self, num_calls: int, num_dropped: int) -> None:
         """Count what a copy of the simulator has simulated in another process."""
@@ -98,13 +102,30 @@ class Simulator:
         self.num_dropped += num_dropped
 
     def from_prior(
-        self, count: int | None, at_least: int, embed: Embedding, *, progress: bool
+        self,
+        count: int | None,
+        at_least: int,
+        embed: Embedding,
+        *,
+        progress: bool,
+        finished: list[Simulated] | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Simulate at parameters from the prior; drop rows that are not finite."""
+        """Simulate at parameters from the prior; drop rows that are not finite.
+
+        Args:
+            count: The number of simulations; ``at_least`` if None.
+            at_least: See ``count``.
+            embed: The embedding of simulations.
+            progress: Whether to show progress.
+            finished: Parts that an interrupted call with the same arguments has
+                simulated. They are not simulated again, and others are added.
+        """
         count = at_least if count is None else count
         theta = self.prior.sample(torch.Size((count,))).to(self.like)
         failures = Failures(count)
-        embedded, valid = self._embed_at(theta, embed, failures, progress=progress)
+        embedded, valid = self._embed_at(
+            theta, embed, failures, progress=progress, finished=finished
+        )
         if not valid.any():
             raise SimulationError(
                 f"All {count} simulations from the prior contain NaN or Inf.{failures}"
@@ -220,9 +241,16 @@ class Simulator:
         return embedded, valid
 
     def _embed_at(
-        self, theta: Tensor, embed: Embedding, failures: Failures, *, progress: bool
+        self,
+        theta: Tensor,
+        embed: Embedding,
+        failures: Failures,
+        *,
+        progress: bool,
+        finished: list[Simulated] | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Return embeddings of simulations, and which of them are finite."""
+        parts = theta.split(self._chunk(is_resumed=finished is not None))
         embeddings, valid, start = [], [], 0
         with progress_bar(
             show=progress,
@@ -230,9 +258,11 @@ class Simulator:
             total=len(theta),
             delay=DELAY,
         ) as bar:
-            for part in theta.split(self._chunk):
-                x = self._simulate(part, failures, start, advance=bar.update)
+            for number, part in enumerate(parts):
+                simulated = self._part(number, part, finished, advance=bar.update)
+                failures.add(simulated, start)
                 start += len(part)
+                x = simulated.x
                 ok = self._readable(x)
                 # Embedding nets may raise on NaN. They get zeros instead, and these
                 # rows are dropped later.
@@ -244,21 +274,37 @@ class Simulator:
                 valid.append(ok & (all_finite(embedded) | ~all_finite(x)))
         return torch.cat(embeddings), torch.cat(valid)
 
-    @property
-    def _chunk(self) -> int:
-        """How many rows are simulated before they are embedded."""
-        one_by_one = not self.is_batched and self._num_workers is None
-        return SINGLE_CHUNK if one_by_one else BATCHED_CHUNK
+    def _chunk(self, *, is_resumed: bool) -> int:
+        """Return how many rows are simulated before they are embedded."""
+        if self.is_batched:
+            return BATCHED_CHUNK
+        if self._num_workers is None:
+            return SINGLE_CHUNK
+        return RESUMED_CHUNK if is_resumed else BATCHED_CHUNK
 
-    def _simulate(
+    def _part(
         self,
+        number: int,
         theta: Tensor,
-        failures: Failures,
-        start: int,
+        finished: list[Simulated] | None,
         *,
         advance: Callable[[int], object],
-    ) -> Tensor:
-        """Simulate rows of which the first has the number ``start``."""
+    ) -> Simulated:
+        """Return the simulations of one part, which may be finished already."""
+        if finished is None:
+            return self._simulate(theta, advance=advance)
+        if number < len(finished):
+            advance(len(theta))
+        else:
+            # With a seed of its own, no part depends on where a call was interrupted.
+            with seeded(number):
+                finished.append(self._simulate(theta, advance=advance))
+        return finished[number]
+
+    def _simulate(
+        self, theta: Tensor, *, advance: Callable[[int], object]
+    ) -> Simulated:
+        """Simulate rows, and count them."""
         if self._num_workers is None:
             simulated = self._caller.simulate(theta)
             advance(len(theta))
@@ -267,8 +313,7 @@ class Simulator:
                 self._caller, theta, self._num_workers, advance=advance
             )
         self.num_calls += simulated.num_calls
-        failures.add(simulated, start)
-        return simulated.x
+        return simulated
 
 
 def source_of(

@@ -599,6 +599,42 @@ def test_few_simulations_are_warned_about() -> None:
         RoPE(gaussian.posterior(), simulations=(theta, x))
 
 
+@pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
+@pytest.mark.parametrize("num_workers", [None, 1])
+def test_simulations_that_were_interrupted_go_on_where_they_were(
+    num_workers: int | None,
+) -> None:
+    calls, broken = [], []
+
+    def one(theta: Tensor) -> Tensor:
+        assert theta.shape == (2,)
+        if len(calls) in broken:
+            raise KeyboardInterrupt
+        calls.append(theta)
+        return theta + torch.randn(2)
+
+    simulator = one if num_workers is None else parallel(one, num_workers=num_workers)
+
+    def rope() -> RoPE:
+        made = RoPE(gaussian.posterior(), simulator=simulator, num_simulations=350)
+        return made.append_calibration(*pairs)
+
+    pairs = gaussian.labelled(5)
+    undisturbed = rope().draw_targets(1)
+    interrupted = rope()
+    # Within the third part, which has ten simulations, or a hundred of processes.
+    done, size = (20, 10) if num_workers is None else (200, 100)
+    broken.append(len(calls) + done + size // 2)
+    with pytest.raises(KeyboardInterrupt):
+        interrupted.draw_targets(1)
+    broken.clear()
+    before = len(calls)
+    assert torch.equal(interrupted.draw_targets(1), undisturbed)
+    assert len(calls) - before == 350 - done
+    interrupted.draw_targets(1)
+    assert len(calls) - before == 350 - done
+
+
 def test_the_bar_of_a_slow_simulator_says_how_often_it_is_called(
     terminal: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
