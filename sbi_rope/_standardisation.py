@@ -14,6 +14,7 @@ __all__ = [
     "divisors",
     "leave_out_constants",
     "warn_of_far_entries",
+    "warn_of_unseen_gaps",
 ]
 
 # An entry is far if it is more than so many standard deviations away from simulations.
@@ -102,6 +103,35 @@ def warn_of_far_entries(name: str, x: Tensor, embedding_net: nn.Module) -> None:
         "for these rows cannot be trusted. Check the units. Leave out entries that do "
         "not vary in simulations, or train NPE with z_score_x='structured', which uses "
         "one standard deviation for all entries."
+    )
+
+
+def warn_of_unseen_gaps(x: Tensor, simulated: Tensor) -> None:
+    """Warn of entries that are missing (NaN) in reality, but in no simulation.
+
+    Entries of vectors are compared one by one. Which trials of a set are missing, or
+    which pixels of an image, does not matter.
+
+    Args:
+        x: Real observations, shape ``(n, *event_shape)``.
+        simulated: Simulations, shape ``(n_s, *event_shape)``.
+    """
+    real, seen = x.isnan(), simulated.isnan().any(dim=0)
+    if x.ndim > 2:
+        seen = seen.any()
+    unseen = real & ~seen
+    if not unseen.any():
+        return
+    entries = unseen.any(dim=0)
+    rows = unseen.flatten(1).any(dim=1).nonzero().flatten()
+    which = f", in {len(rows)} of {len(x)} rows (first: {rows[:5].tolist()})"
+    if x.ndim == 2:
+        which = f" (first: {entries.nonzero().flatten()[:5].tolist()}){which}"
+    warn_user(
+        f"{int(entries.sum())} of the {entries.numel()} entries of the calibration `x` "
+        f"are missing (NaN){which}, but in none of {len(simulated):,} simulations. The "
+        "embedding net has not learned what to do without them. Train NPE on "
+        "simulations whose entries are missing as in reality, or leave these pairs out."
     )
 
 

@@ -15,7 +15,7 @@ from sbi_rope._random import seeded
 from sbi_rope._sbi import embed, estimator_of, headless
 from sbi_rope._simulations import Moments
 from sbi_rope._simulator import Simulator
-from sbi_rope._standardisation import Standardisation
+from sbi_rope._standardisation import Standardisation, warn_of_unseen_gaps
 from sbi_rope._training import without_warning_of_few_pairs
 from sbi_rope.discrepancy.correction import Space
 from sbi_rope.discrepancy.model import DiscrepancyModel
@@ -120,6 +120,7 @@ class Workbench:
     def embedded(self) -> Tensor:
         """The embeddings h(x) of :attr:`simulations`, shape ``(n_s, l)``."""
         theta, x = self.simulations
+        warn_of_unseen_gaps(self.x, x)
         embedded = embed(self.embedding_net, x)
         density = headless(estimator_of(self.npe))
         warn_if_focused(density, self.npe.prior, theta, embedded)

@@ -9,10 +9,12 @@ from torch import Tensor, nn
 
 from sbi_rope import RoPE, diagnose
 from sbi_rope._sbi import embedding_of, posterior_from, readable, with_embedding
+from sbi_rope._standardisation import warn_of_unseen_gaps
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import (
     InvalidInputError,
     InvalidTypeError,
+    RoPEWarning,
     SimulationError,
     UnsupportedPosteriorError,
 )
@@ -200,6 +202,9 @@ def test_missing_numbers_of_a_vector_are_embedded_but_not_corrected() -> None:
     x[0, 1] = torch.nan
     rope.append_calibration(theta, x)
     bench = Workbench(rope, num_folds=2, seed=0, **QUIET)
+    match = r"1 of the 3 entries .* \(first: \[1\]\), in 1 of 12 rows \(first: \[0\]\)"
+    with pytest.warns(RoPEWarning, match=match):
+        assert torch.isfinite(bench.embedded).all()
     for space, applies in (("embedding", True), ("input", False)):
         assert DiscrepancyCandidate(space=space).applies_to(bench) is applies
     method = DiscrepancyNPE.from_posterior(
@@ -207,6 +212,21 @@ def test_missing_numbers_of_a_vector_are_embedded_but_not_corrected() -> None:
     )
     with pytest.raises(InvalidInputError, match="pairs without missing entries"):
         method.append_calibration(theta, x).train(**QUIET)
+
+
+def test_gaps_are_warned_of_if_no_simulation_has_them() -> None:
+    simulated = torch.zeros(20, 4, 2)
+    simulated[3, 2:] = torch.nan
+    real = torch.zeros(5, 4, 2)
+    real[1, 1:] = torch.nan
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # It does not matter which of the trials of a set are missing.
+        warn_of_unseen_gaps(real, simulated)
+        warn_of_unseen_gaps(real[:, 2], simulated[:, 3])
+    for x, x_s in ((real, simulated[:3]), (real[:, 1], simulated[:, 1])):
+        with pytest.warns(RoPEWarning, match=r"in none of .* leave these pairs out"):
+            warn_of_unseen_gaps(x, x_s)
 
 
 def test_where_simulated_numbers_are_missing_nothing_says_that_they_are_constant() -> (
