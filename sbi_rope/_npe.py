@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from sbi_rope._random import seeded
 from sbi_rope._sbi import (
     ConditionalDensityEstimator,
     MixedDensity,
@@ -62,7 +63,7 @@ class TrainedNPE:
             differently among other rows.
         InvalidTypeError: If the names are not strings.
         InvalidInputError: If there are not as many names as parameters, or two are
-            equal.
+            equal, or the prior has another number of parameters than the estimator.
     """
 
     def __init__(self, posterior: Any, parameter_names: Any = None) -> None:
@@ -79,6 +80,7 @@ class TrainedNPE:
         )
         self._posterior: Any = posterior_from(posterior, self.estimator)
         self.prior = copy_of_prior(posterior.prior)
+        _check_size_of_prior(self.prior, estimator.input_shape)
         self.h = embedding_of(self.estimator)
         self._q = headless(self.estimator)
         check_rows_apart(self.h, self.event_shape, device_of(estimator))
@@ -168,3 +170,14 @@ class TrainedNPE:
         check_values(name, value)
         # Numbers that float32 cannot hold become Inf.
         return value.detach().to(self.like.dtype, copy=True)
+
+
+def _check_size_of_prior(prior: Any, input_shape: torch.Size) -> None:
+    with seeded(0):
+        shape = prior.sample(torch.Size((1,))).shape[1:]
+    if tuple(shape) != tuple(input_shape):
+        raise InvalidInputError(
+            f"Expected a prior of {input_shape.numel()} parameters, as NPE was trained "
+            f"with; got one whose draws have shape {tuple(shape)}. Pass the prior of "
+            "the simulations to `NPE(prior)`, or to `build_posterior(prior=...)`."
+        )

@@ -359,10 +359,15 @@ def _is_unbounded_direct(posterior: Any) -> bool:
 
 def _require_log_prob(posterior: Any) -> None:
     if not callable(getattr(posterior, "log_prob_batched", None)):
+        instead = (
+            "Score what its `build_posterior` returns."
+            if hasattr(posterior, "build_posterior")
+            else "You can still score its calibration with `acauc` (kinds 'central' "
+            "and 'rank') and `coverage_curve`."
+        )
         raise LogProbUnavailableError(
-            f"Expected `posterior` with a method `log_prob_batched`; got "
-            f"{type(posterior).__name__}. You can still score its calibration with "
-            f"`acauc` (kinds 'central' and 'rank') and `coverage_curve`."
+            "Expected `posterior` with a method `log_prob_batched`; got "
+            f"{type(posterior).__name__}. {instead}"
         )
 
 

@@ -38,7 +38,7 @@ from sbi_rope._sbi import (
     with_embedding,
 )
 from sbi_rope.baselines import PlainNPE
-from sbi_rope.errors import RoPEError, UnsupportedPosteriorError
+from sbi_rope.errors import InvalidInputError, RoPEError, UnsupportedPosteriorError
 from sbi_rope.trainers import FinetunedNPE
 from tests import problems
 
@@ -178,6 +178,14 @@ def test_npe_without_a_prior_is_asked_for_it() -> None:
     with pytest.raises(UnsupportedPosteriorError, match=r"build_posterior\(prior="):
         RoPE(npe.build_posterior(), simulator=problems.simulate)
     RoPE(npe.build_posterior(prior=problems.box(2)), simulator=problems.simulate)
+
+
+def test_a_prior_of_other_parameters_than_the_estimator_is_refused() -> None:
+    posterior = copy.deepcopy(problems.npe_posterior())
+    posterior.prior = problems.box(3)
+    match = r"prior of 2 parameters, .* draws have shape \(3,\)"
+    with pytest.raises(InvalidInputError, match=match):
+        RoPE(posterior, simulator=problems.simulate)
 
 
 def test_networks_whose_training_has_failed_are_refused() -> None:
