@@ -11,7 +11,6 @@ __all__ = [
     "ROUNDING",
     "Standardisation",
     "deviations",
-    "divisors",
     "leave_out_constants",
     "warn_of_far_entries",
     "warn_of_unseen_gaps",
@@ -45,19 +44,6 @@ def deviations(embedding_net: nn.Module, x: Tensor) -> Tensor | None:
         return None
     mean, std = mean_and_std
     return ((x - mean) / std).abs().nan_to_num(nan=0.0, posinf=torch.inf)
-
-
-def divisors(std: Tensor) -> Tensor:
-    """Return standard deviations, or variances, with one in the place of zero.
-
-    What does not vary may be divided by them. A smallest number would be wrong for
-    parameters in units that make all of them small.
-
-    Example:
-        >>> divisors(torch.tensor([2.0, 1e-20, 0.0]))
-        tensor([2.0000e+00, 1.0000e-20, 1.0000e+00])
-    """
-    return std.where(std > 0, 1.0)
 
 
 @torch.no_grad()

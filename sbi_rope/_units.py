@@ -1,4 +1,4 @@
-"""Standard deviations of priors, as units of theta and of log scores."""
+"""Standard deviations, as units of theta and of log scores."""
 
 from typing import Any
 
@@ -7,10 +7,23 @@ from torch import Tensor
 
 from sbi_rope._random import seeded
 
-__all__ = ["log_unit_of", "log_units_of", "std_of_prior"]
+__all__ = ["divisors", "log_unit_of", "log_units_of", "std_of_prior"]
 
 # Draws that the standard deviation is estimated from if the prior does not state it.
 NUM_DRAWS = 10_000
+
+
+def divisors(std: Tensor) -> Tensor:
+    """Return standard deviations, or variances, with one in the place of zero.
+
+    What does not vary may be divided by them. A smallest number would be wrong for
+    parameters in units that make all of them small.
+
+    Example:
+        >>> divisors(torch.tensor([2.0, 1e-20, 0.0]))
+        tensor([2.0000e+00, 1.0000e-20, 1.0000e+00])
+    """
+    return std.where(std > 0, 1.0)
 
 
 def log_unit_of(prior: Any) -> float:

@@ -10,7 +10,7 @@ from torch.distributions import Distribution
 from sbi_rope._random import seeded
 from sbi_rope._simulations.moments import Moments
 from sbi_rope._simulations.source import Embedding, Readable, all_finite
-from sbi_rope._standardisation import divisors
+from sbi_rope._units import divisors
 from sbi_rope._validation import (
     as_numbers_on,
     check_batch,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sbi_rope._standardisation import divisors
+from sbi_rope._units import divisors
 from sbi_rope.coupling import Coupling
 from sbi_rope.diagnosis.implied import (
     Implied,

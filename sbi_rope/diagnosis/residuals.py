@@ -10,8 +10,8 @@ from sbi_rope._means import Counts
 from sbi_rope._permutation import permutation_test
 from sbi_rope._progress import progress_bar
 from sbi_rope._sbi import embed
-from sbi_rope._standardisation import divisors
 from sbi_rope._training import without_warning_of_few_pairs
+from sbi_rope._units import divisors
 from sbi_rope.diagnosis.report import Finding
 from sbi_rope.diagnosis.simulations import Simulations
 from sbi_rope.rope import RoPE

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from sbi_rope._slices import slices
-from sbi_rope._standardisation import divisors
+from sbi_rope._units import divisors
 
 __all__ = ["Simulations", "nearest_distances"]
 
