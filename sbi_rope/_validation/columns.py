@@ -44,7 +44,8 @@ def _labels_of(table: Any, axis: str) -> tuple[Hashable, ...]:
     if callable(found) or not isinstance(found, Iterable):
         return ()
     # Pandas has numbers of NumPy, which would be printed with their type.
-    return tuple(found.tolist() if hasattr(found, "tolist") else found)
+    to_list = getattr(found, "tolist", None)
+    return tuple(found if to_list is None else to_list())
 
 
 def check_row_order(**tables: Any) -> None:
