@@ -588,10 +588,8 @@ def test_the_spread_is_that_of_mean_parameters_of_single_observations() -> None:
     assert torch.allclose(found.ratio, expected, rtol=1e-6)
     # Parameters in grams and in solar masses lead to the same sentences.
     heavy = replace(known, theta=1e-33 * known.theta)
-    shift, spread = (
-        prior_shift(real, heavy),
-        spread_of(prior_shift(real, heavy), heavy.theta),
-    )
+    shift = prior_shift(real, heavy)
+    spread = spread_of(shift, heavy.theta)
     assert torch.allclose(spread.ratio, found.ratio)
     assert torch.allclose(spread.threshold, found.threshold, rtol=0.1)  # of draws
     for one, other in zip(
