@@ -27,6 +27,7 @@ __all__ = [
     "log_slope",
     "moved_inside",
     "off_bounds",
+    "support_of",
     "to_box",
     "to_line",
 ]
@@ -91,10 +92,11 @@ def bounds_of(prior: Any, like: Tensor) -> tuple[Tensor, Tensor]:
         >>> bounds_of(box, torch.zeros(2))
         (tensor([0., 0.]), tensor([1., 1.]))
     """
-    return _bounds(_support_of(prior), like)
+    return _bounds(support_of(prior), like)
 
 
-def _support_of(prior: Any) -> Any:
+def support_of(prior: Any) -> Any:
+    """Return the support that a prior states, a constraint of torch; None if none."""
     try:
         return getattr(prior, "support", None)
     except NotImplementedError:  # torch raises it if a distribution states no support
@@ -141,7 +143,7 @@ def off_bounds(prior: Any, theta: Tensor) -> Tensor:
     """
     low, high = bounds_of(prior, theta)
     inside = theta.clamp(low.nextafter(high), high.nextafter(low))
-    return theta.where(_is_discrete(_support_of(prior), theta), inside)
+    return theta.where(_is_discrete(support_of(prior), theta), inside)
 
 
 def _is_discrete(support: Any, like: Tensor) -> Tensor:

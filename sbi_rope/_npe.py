@@ -173,6 +173,7 @@ class TrainedNPE:
 
 
 def _check_size_of_prior(prior: Any, input_shape: torch.Size) -> None:
+    """Raise unless draws of the prior have the shape of the estimator's parameters."""
     with seeded(0):
         shape = prior.sample(torch.Size((1,))).shape[1:]
     if tuple(shape) != tuple(input_shape):

@@ -30,8 +30,9 @@ __all__ = ["Simulator", "source_of"]
 # Simulations that are held in memory before they are embedded. If they come one by one
 # there are few, so that a slow simulator shows its progress.
 BATCHED_CHUNK, SINGLE_CHUNK = 1000, 10
-# The same if worker processes simulate one at a time, and an interrupted call goes on
-# where it was. It does not depend on their number, nor do the simulations.
+# The same if worker processes simulate one at a time, and an interrupted call can go on
+# where it was. Each chunk has a seed of its own. The size is the same for any number of
+# workers, so that the simulations are, too.
 RESUMED_CHUNK = 100
 # A progress bar appears after this many seconds.
 DELAY = 2.0

@@ -174,7 +174,9 @@ def joined_columns(name: str, sources: Sequence[KnownColumns]) -> KnownColumns:
     joined: dict[tuple[Hashable, ...], str] = {}
     first: dict[frozenset[Any], tuple[Hashable, ...]] = {}
     for order, source in (item for known in sources for item in known.items()):
-        earlier = first.setdefault(frozenset(Counter(order).items()), order)
+        # The same names in any order, each as often.
+        same = frozenset(Counter(order).items())
+        earlier = first.setdefault(same, order)
         if earlier != order:
             raise InvalidInputError(
                 f"Expected `posteriors` that know the columns of `{name}` in one "

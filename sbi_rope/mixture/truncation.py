@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
+from sbi_rope._bounds import support_of
 from sbi_rope._progress import progress_bar
 from sbi_rope._random import seeded
 from sbi_rope._sbi import ConditionalDensityEstimator
@@ -147,10 +148,7 @@ def _bar(parts: Iterable[Any], *, show: bool) -> Any:
 
 def is_unbounded(prior: Distribution) -> bool:
     """Tell whether a prior says that its support is the whole space."""
-    try:
-        support: Any = getattr(prior, "support", None)
-    except NotImplementedError:  # torch raises it if a distribution states no support
-        return False
+    support = support_of(prior)
     while isinstance(support, constraints.independent):
         support = support.base_constraint
     return support in (constraints.real, constraints.real_vector)
