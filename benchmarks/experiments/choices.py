@@ -124,7 +124,8 @@ CHOICES = {
     "pseudo-count 10": Choice(pseudo_count=10.0),
     "without fine-tuned NPE": Choice(without=("fine-tuned NPE",)),
     "without fine-tuned NPE, rehearsed": Choice(without=("fine-tuned NPE, rehearsed",)),
-    "without discrepancy, fine-tuned": Choice(
+    "without discrepancy, fine-tuned": Choice(without=("discrepancy, fine-tuned",)),
+    "without discrepancy (input) and (tuned), fine-tuned": Choice(
         without=("discrepancy (input), fine-tuned", "discrepancy (tuned), fine-tuned")
     ),
     "without discrepancy": Choice(without=("discrepancy",)),

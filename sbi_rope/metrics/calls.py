@@ -64,6 +64,10 @@ CHUNK_SIZE = 100
 # score more precise.
 MAX_SAMPLES = 10**8
 
+# The fewest draws for one observation by which calibration is judged. A parameter is
+# above one draw, or below it, about as often for any posterior that is not to one side.
+MIN_SAMPLES = 20
+
 # How many draws of each observation have their density evaluated in one call. It is
 # small because some flows embed x once for every draw.
 DRAWS_PER_CALL = 10
@@ -78,8 +82,14 @@ EXPECTED_WARNINGS = (
 
 
 def check_num_samples(num_samples: Any) -> None:
-    """Raise unless the number of draws is an integer from 1 to 10^8."""
+    """Raise unless calibration can be judged by a number of draws."""
     check_integer("num_samples", num_samples, maximum=MAX_SAMPLES)
+    if num_samples < MIN_SAMPLES:
+        raise InvalidInputError(
+            f"Expected `num_samples` of at least {MIN_SAMPLES}, so that a draw is "
+            f"beyond each end of a 90 % interval; got {num_samples}. With fewer draws "
+            "any posterior would look calibrated."
+        )
 
 
 def check_test_set(
@@ -230,7 +240,7 @@ def draw_samples(posterior: Any, x: Tensor, *, num_samples: int) -> Tensor:
         InvalidInputError: If ``x`` is empty or not finite, or ``num_samples`` is not
             from 1 to 10^8.
     """
-    check_num_samples(num_samples)
+    check_integer("num_samples", num_samples, maximum=MAX_SAMPLES)
     check_tables(posterior, x=x)
     x = _as_tensor("x", x)
     _check_x(posterior, x)

@@ -73,10 +73,10 @@ def acauc(
         theta: True parameters, shape ``(n, d)``.
         x: Their observations, shape ``(n, *event_shape)``.
         kind: The credible regions, as above.
-        num_samples: The number of posterior samples for each observation. The default
-            is 1000, or 200 for ``"hpd"``, which evaluates the density of every sample.
-            Where that is slow, as for a mixture of many components, 50 samples lose
-            little accuracy.
+        num_samples: The number of posterior samples for each observation, 20 or more.
+            The default is 1000, or 200 for ``"hpd"``, which evaluates the density of
+            every sample. Where that is slow, as for a mixture of many components, 50
+            samples lose little accuracy.
         num_observations: How many observations are used. They are evenly spaced over
             the test set. The default is all, or at most 200 for ``"hpd"``.
         seed: The seed of the samples, which also depend on ``chunk_size``.
@@ -130,7 +130,7 @@ def coverage_curve(
         posterior: Any posterior with ``sample_batched``.
         theta: True parameters, shape ``(n, d)``.
         x: Their observations, shape ``(n, *event_shape)``.
-        num_samples: The number of posterior samples for each observation.
+        num_samples: The number of posterior samples for each observation, 20 or more.
         seed: The seed of the samples, which also depend on ``chunk_size``.
         chunk_size: How many observations are scored at a time.
         show_progress_bars: Whether to show progress.
@@ -175,7 +175,7 @@ def expected_coverage_error(
         posterior: Any posterior with ``sample_batched``.
         theta: True parameters, shape ``(n, d)``.
         x: Their observations, shape ``(n, *event_shape)``.
-        num_samples: The number of posterior samples for each observation.
+        num_samples: The number of posterior samples for each observation, 20 or more.
         seed: The seed of the samples, which also depend on ``chunk_size``.
         chunk_size: How many observations are scored at a time.
         show_progress_bars: Whether to show progress.

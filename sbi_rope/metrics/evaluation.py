@@ -183,7 +183,7 @@ def evaluate(
         theta_std: The unit of each parameter for ``lpp_z``, shape ``(d,)``, and not
             the noise of ``theta``. If None, the standard deviations of the posterior's
             prior, estimated from draws if it does not state them.
-        num_samples: The number of posterior samples for each observation.
+        num_samples: The number of posterior samples for each observation, 20 or more.
         seed: The seed of the samples, which also depend on ``chunk_size``.
         chunk_size: How many observations are scored at a time. Fewer need less memory.
         show_progress_bars: Whether to show progress.

@@ -12,9 +12,11 @@ from sbi_rope.mixture.parts import DTYPE
 
 __all__ = ["Accept", "BlockSampler"]
 
-# Rejection sampling gives up on an observation if, after MIN_PROPOSALS proposals, less
-# than a share of MIN_ACCEPTANCE of them lies inside the prior's support.
-MIN_PROPOSALS, MIN_ACCEPTANCE = 100_000, 1e-3
+# An observation is slow if, after MIN_PROPOSALS proposals, less than a share of
+# MIN_ACCEPTANCE of them lies inside the prior's support. Rejection sampling gives up on
+# slow observations if they would take more than MAX_PROPOSALS further proposals, which
+# are minutes. In a stack the prior often keeps a share just below MIN_ACCEPTANCE.
+MIN_PROPOSALS, MIN_ACCEPTANCE, MAX_PROPOSALS = 100_000, 1e-3, 10_000_000
 # Observations for which this many proposals were all rejected are counted together: if
 # a whole batch lies outside the support, MIN_PROPOSALS for all of it are enough.
 MIN_WITHOUT_ANY = 5_000
@@ -112,16 +114,27 @@ class BlockSampler:
             first[:1] = True
             theta[filled[first]] = draws[chosen[first]]
             still_open[filled] = False
-            self._count(rows, accepted)
+            self._count(rows, accepted, slots[still_open])
             rate = float(accepted.double().mean())
         return theta
 
-    def _count(self, rows: Tensor, accepted: Tensor) -> None:
+    def _count(self, rows: Tensor, accepted: Tensor, missing: Tensor) -> None:
+        """Count proposals, and give up on rows that would take too many more.
+
+        Args:
+            rows: The row of each proposal.
+            accepted: Which proposals were accepted.
+            missing: The row of each draw that is still missing.
+        """
         self._proposed += rows.bincount(minlength=self.num_rows)
         self._inside += rows[accepted].bincount(minlength=self.num_rows)
-        hopeless = (self._proposed >= MIN_PROPOSALS) & (
-            self._inside < MIN_ACCEPTANCE * self._proposed
-        )
+        num_missing = missing.bincount(minlength=self.num_rows)
+        share = self._inside / self._proposed.clamp_min(1)
+        slow = (num_missing > 0) & (self._proposed >= MIN_PROPOSALS)
+        slow &= share < MIN_ACCEPTANCE
+        # Infinite if nothing was accepted so far.
+        further = (num_missing[slow] / share[slow]).sum()
+        hopeless = slow & (further > MAX_PROPOSALS)
         without_any = (self._proposed >= MIN_WITHOUT_ANY) & (self._inside == 0)
         if int(self._proposed[without_any].sum()) >= MIN_PROPOSALS:
             hopeless |= without_any
@@ -131,8 +144,10 @@ class BlockSampler:
                 f"Less than one in {int(1 / MIN_ACCEPTANCE)} draws lies inside the "
                 f"support of the prior for the observations in rows {numbers} of `x`: "
                 "the densities in the mixture have nearly all of their mass outside. "
-                "Train NPE longer, or with z_score_theta='transform_to_unconstrained', "
-                "or pass reject_outside_prior=False."
+                "Leave these observations out (`leakage(x).mass` has the mass inside "
+                "for each of a batch), or train NPE longer or with "
+                "z_score_theta='transform_to_unconstrained', or pass "
+                "reject_outside_prior=False."
             )
 
 

@@ -88,6 +88,7 @@ def default_candidates(
         DiscrepancyCandidate(space="embedding", learn_prior=learn_prior),
         DiscrepancyCandidate(space="input", learn_prior=learn_prior),
         DiscrepancyCandidate(space="tuned", learn_prior=learn_prior),
+        FinetunedCandidate(space="embedding"),
         FinetunedCandidate(space="input"),
         FinetunedCandidate(space="tuned"),
         RehearsedCandidate(),

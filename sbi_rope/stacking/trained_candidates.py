@@ -112,11 +112,17 @@ class FinetunedCandidate(AmortisedCandidate):
         return "fine-tuned NPE" if self.space is None else "discrepancy, fine-tuned"
 
     def applies_to(self, bench: Workbench) -> bool:
-        """Tell whether there are parts to hold out, and the starting NPE applies."""
-        start = self.space is None or DiscrepancyCandidate(space=self.space).applies_to(
-            bench
-        )
-        return start and len(bench.folds) > 2
+        """Tell whether there are parts to hold out, and the starting NPE applies.
+
+        The embedding is corrected first where x itself is not.
+        """
+        if self.space is None:
+            starts = True
+        elif self.space == "embedding":
+            starts = not bench.reads_summaries
+        else:
+            starts = DiscrepancyCandidate(space=self.space).applies_to(bench)
+        return starts and len(bench.folds) > 2
 
     def prepare(self, bench: Workbench) -> None:
         """Simulate at the labels, and from the prior, if NPE is corrected first."""

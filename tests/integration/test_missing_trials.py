@@ -19,12 +19,16 @@ from sbi_rope.errors import (
     UnsupportedPosteriorError,
 )
 from sbi_rope.metrics import draw_samples, evaluate
-from sbi_rope.stacking import DiscrepancyCandidate, default_candidates
+from sbi_rope.stacking import (
+    DiscrepancyCandidate,
+    FinetunedCandidate,
+    default_candidates,
+)
 from sbi_rope.stacking.workbench import Workbench
 from sbi_rope.trainers import FinetunedNPE
 from sbi_rope.trainers.training import Training
 from tests import problems
-from tests.stacks import COUPLINGS, QUICK, QUIET, stacked
+from tests.stacks import COUPLINGS, QUICK, QUIET, rope_of, stacked
 
 
 def labelled(n: int) -> tuple[Tensor, Tensor]:
@@ -207,6 +211,13 @@ def test_missing_numbers_of_a_vector_are_embedded_but_not_corrected() -> None:
         assert torch.isfinite(bench.embedded).all()
     for space, applies in (("embedding", True), ("input", False)):
         assert DiscrepancyCandidate(space=space).applies_to(bench) is applies
+        assert not FinetunedCandidate(space=space).applies_to(bench)  # of two folds
+    # What is fine-tuned is corrected in x if that can be, and else in the embedding.
+    complete = rope_of()
+    for one, in_x in ((rope, False), (complete, True)):
+        three = Workbench(one, num_folds=3, seed=0, **QUIET)
+        assert FinetunedCandidate(space="input").applies_to(three) is in_x
+        assert FinetunedCandidate(space="embedding").applies_to(three) is not in_x
     method = DiscrepancyNPE.from_posterior(
         posterior_from(npe, estimator), simulator=problems.simulate, space="input"
     )

@@ -455,7 +455,7 @@ def test_evaluation_agrees_with_the_single_scores() -> None:
 
 def test_evaluation_without_scales_has_no_standardised_lpp() -> None:
     theta, x = gaussian_pairs(5)
-    result = metrics.evaluate(GaussianPosterior(), theta, x, num_samples=10)
+    result = metrics.evaluate(GaussianPosterior(), theta, x, num_samples=20)
     assert result.lpp_z is None
     assert math.isnan(result.as_row()["lpp_z"])
 
@@ -647,10 +647,10 @@ def test_a_posterior_with_bounded_rejection_is_called_as_it_is(
 
     npe, theta, x = bounded_npe
     posterior = Bounded(npe.posterior_estimator, npe.prior)
-    result = metrics.evaluate(posterior, theta, x, num_samples=5)
+    result = metrics.evaluate(posterior, theta, x, num_samples=20)
     assert result.lpp.mean == 0.0
     assert "    corrected for mass outside the prior" in str(result)
-    score = metrics.acauc(posterior, theta, x, kind="hpd", num_samples=5)
+    score = metrics.acauc(posterior, theta, x, kind="hpd", num_samples=20)
     assert score.value == 0.0
 
 
@@ -669,9 +669,10 @@ def test_an_evaluation_says_what_is_wrong_with_parameters_and_their_units() -> N
         ({"theta_std": torch.ones(3)}, "theta_std"),
         ({"theta_std": torch.tensor([1.0, 0.0])}, "`theta_std` to be positive"),
         ({"num_samples": 10**30}, "`num_samples`.*from 1 to"),
+        ({"num_samples": 19}, "of at least 20.* would look calibrated"),
         ({"seed": -(10**5000)}, "`seed`"),
     ]
-    good: dict[str, Any] = {"theta": theta, "x": x, "num_samples": 5}
+    good: dict[str, Any] = {"theta": theta, "x": x, "num_samples": 20}
     for change, match in cases:
         assert_refused(match, metrics.evaluate, AnyWidth(), **good | change)
 

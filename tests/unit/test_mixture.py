@@ -608,6 +608,19 @@ def test_the_error_names_the_observation_in_blocks_of_any_size(
         posterior.sample_batched((3,), posterior.x_o[order], **QUIET)
 
 
+def test_an_observation_with_hardly_any_mass_is_sampled_if_it_takes_minutes() -> None:
+    """As one in a stack in which the prior keeps a small share."""
+    spikes = torch.tensor([[100.0, -3.0], [0.0, -3.0]])
+    weights = torch.tensor([[1 - 4e-4, 4e-4], [0.0, 1.0]])
+    posterior = gaussian_posterior(dim=1, n_o=2, weights=weights, embeddings=spikes)
+    draws = posterior.sample_batched((300,), posterior.x_o, **QUIET)
+    assert draws.abs().max() < 1
+    for one in draws.unbind(dim=1):
+        assert float(one.std()) == pytest.approx(math.exp(-3), rel=0.2)
+    with pytest.raises(SamplingError, match=r"rows \[0\] of `x`.*Leave these"):
+        posterior.sample_batched((10_000,), posterior.x_o, **QUIET)
+
+
 def test_rejection_gives_up_after_a_bounded_number_of_draws(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

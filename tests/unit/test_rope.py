@@ -742,7 +742,7 @@ def test_an_embedding_net_that_works_in_place_changes_no_data() -> None:
     conductor = RoPE(npe, simulator=gaussian.simulator, finetuner=QUICK)
     conductor.append_calibration(theta, x).train(seed=0, show_progress_bars=False)
     assert torch.equal(conductor.calibration[1], x_o)
-    evaluate(npe, theta_o, x_o, num_samples=10)
+    evaluate(npe, theta_o, x_o, num_samples=20)
     assert torch.equal(x_o, x)
     posterior = conductor.build_posterior(x_o, seed=0)
     first, second = (posterior.log_prob_batched(theta, x_o) for _ in range(2))
