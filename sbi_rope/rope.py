@@ -26,7 +26,7 @@ from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed
 from sbi_rope._simulations import SimulationSource
-from sbi_rope._simulator import source_of
+from sbi_rope._simulator import columns_with_simulated, source_of
 from sbi_rope._standardisation import Standardisation, warn_of_far_entries
 from sbi_rope._validation import (
     KnownColumns,
@@ -191,7 +191,8 @@ class RoPE:
         theta_s, x_s = (None, None) if simulations is None else simulations
         check_row_order(**{"simulations[0]": theta_s, "simulations[1]": x_s})
         self._theta_columns = check_columns("simulations[0]", theta_s, known)
-        self._x_columns = check_columns("simulations[1]", x_s, earlier["x"])
+        known = check_columns("simulations[1]", x_s, earlier["x"])
+        self._x_columns = columns_with_simulated(self._source, known)
         if names is None:
             self._npe.parameter_names = column_names(theta_s) or None
         self.finetuner = CalibrationFinetuner() if finetuner is None else finetuner
@@ -226,7 +227,8 @@ class RoPE:
         of NPE, and arrays and lists to its device. What was computed from them, such as
         embeddings and samples, has to be a tensor. A table whose columns have names is
         refused if those that RoPE knows are the same in another order: the parameter
-        names, and the columns of stored simulations and of pairs appended before.
+        names, and the columns of stored simulations, of the tables that the simulator
+        returns, and of pairs appended before.
 
         Args:
             theta: Parameters, shape ``(n, d)``, inside the prior's support. NaN stands

@@ -33,6 +33,11 @@ class SimulationSource(Protocol):
         """How many rows a simulator has simulated so far."""
         ...
 
+    @property
+    def x_columns(self) -> tuple[str, ...]:
+        """The names of the columns of the tables that a simulator returns, if any."""
+        ...
+
     def add_counts(self, num_calls: int, num_dropped: int) -> None:
         """Count what a copy of this source has simulated in another process."""
         ...

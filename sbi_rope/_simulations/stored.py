@@ -45,6 +45,7 @@ class StoredSimulations:
     """
 
     num_calls = 0
+    x_columns = ()  # those of tables are read where the tables are passed
 
     def __init__(
         self,

@@ -66,6 +66,11 @@ class LimitedSimulator:
         """How many rows the simulator has simulated."""
         return self._simulator.num_calls
 
+    @property
+    def x_columns(self) -> tuple[str, ...]:
+        """The names of the columns of the tables that the simulator returns, if any."""
+        return self._simulator.x_columns
+
     def add_counts(self, num_calls: int, num_dropped: int) -> None:
         """Count what a copy of the simulator has simulated in another process."""
         self._simulator.add_counts(num_calls, num_dropped)

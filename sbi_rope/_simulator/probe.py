@@ -15,6 +15,7 @@ from sbi_rope._random import seeded
 from sbi_rope._simulator.calls import Caller, Form, describe
 from sbi_rope._simulator.rows import rows_depend_on_each_other
 from sbi_rope._simulator.workers import copy_in_worker
+from sbi_rope._validation import column_names
 from sbi_rope.errors import SimulationError, shown, warn_user
 
 __all__ = ["Probe"]
@@ -78,6 +79,7 @@ class Probe:
 
     Attributes:
         num_calls: How many rows were simulated so far.
+        x_columns: The names of the columns of the tables that it returns, if any.
     """
 
     def __init__(
@@ -89,6 +91,7 @@ class Probe:
         like: Tensor,
     ) -> None:
         self.num_calls = 0
+        self.x_columns: tuple[str, ...] = ()
         self._caller = Caller(
             function=function, form=FORMS[0], event_shape=event_shape, like=like
         )
@@ -110,6 +113,7 @@ class Probe:
         """
         trial = self._working_trial()
         caller = self._caller = trial.caller
+        self.x_columns = column_names(trial.result)
         if num_workers is not None:
             self._check_workers(trial.theta, num_workers)
         else:

@@ -8,6 +8,7 @@ checks once. Private code trusts what it is given.
 from sbi_rope._validation.columns import (
     KnownColumns,
     check_columns,
+    check_order,
     check_parameter_order,
     check_row_order,
     check_tables,
@@ -86,6 +87,7 @@ __all__ = [
     "check_not_swapped",
     "check_number",
     "check_numbers",
+    "check_order",
     "check_pair_weights",
     "check_parameter_names",
     "check_parameter_order",

@@ -13,6 +13,7 @@ from sbi_rope.errors import InvalidInputError
 __all__ = [
     "KnownColumns",
     "check_columns",
+    "check_order",
     "check_parameter_order",
     "check_row_order",
     "check_tables",
@@ -140,25 +141,55 @@ def check_columns(
         InvalidInputError: If the order is another one.
     """
     names = _labels_of(table, "columns") or column_names(table)
-    for expected, source in known.items():
+    return check_order(
+        name, names, known, source=f"the earlier table `{name}`", how=how
+    )
+
+
+def check_order(
+    name: str,
+    names: tuple[Hashable, ...],
+    known: KnownColumns,
+    *,
+    source: str,
+    do: str = "Pass",
+    how: str = "df[{0}]",
+) -> KnownColumns:
+    """Raise if names of columns are known in another order.
+
+    Args:
+        name: What the table is called.
+        names: The names of its columns; none of an array.
+        known: As in :func:`check_columns`.
+        source: Where these names come from.
+        do: What to do with a table in the right order.
+        how: As in :func:`check_columns`.
+
+    Returns:
+        The orders that are known, with this one.
+
+    Raises:
+        InvalidInputError: If the order is another one.
+    """
+    for expected, earlier in known.items():
         if names == expected or Counter(names) != Counter(expected):
             continue
-        start = f"Expected `{name}` with its columns in the order of {source}"
+        start = f"Expected `{name}` with its columns in the order of {earlier}"
         if len(names) <= MOST_LISTED:
             raise InvalidInputError(
-                f"{start}, {list(expected)}; got {list(names)}. Pass "
+                f"{start}, {list(expected)}; got {list(names)}. {do} "
                 f"`{how.format(list(expected))}`, where `df` is this table."
             )
         pairs = zip(names, expected, strict=True)
         first = next(k for k, (ours, other) in enumerate(pairs) if ours != other)
         raise InvalidInputError(
             f"{start}; got {names[first]!r} in column {first}, where "
-            f"{expected[first]!r} is expected. Pass `{how.format('names')}`, where "
+            f"{expected[first]!r} is expected. {do} `{how.format('names')}`, where "
             "`df` is this table and `names` is the list of columns in that order."
         )
     if not names or names in known:
         return known
-    return {**known, names: f"the earlier table `{name}`"}
+    return {**known, names: source}
 
 
 def joined_columns(name: str, sources: Sequence[KnownColumns]) -> KnownColumns:

@@ -13,7 +13,7 @@ from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import copy_of_prior, device_of, embedding_of, estimator_of
 from sbi_rope._simulations import SimulationSource
-from sbi_rope._simulator import check_callable, source_of
+from sbi_rope._simulator import check_callable, columns_with_simulated, source_of
 from sbi_rope._training import History
 from sbi_rope._validation import (
     check_default_dtype,
@@ -296,7 +296,7 @@ class Method(ABC):
         """Return the simulator, or the appended simulations where there is none."""
         event_shape = self._data.event_shape
         assert event_shape is not None
-        return source_of(
+        source = source_of(
             self._prior,
             simulator=self._simulator,
             simulations=self._looked_up,
@@ -304,6 +304,9 @@ class Method(ABC):
             like=torch.empty(0, *self._prior.event_shape, device=self._device),
             readable=self._data.readable,
         )
+        columns = self._data.columns
+        columns["x"] = columns_with_simulated(source, columns["x"])
+        return source
 
     def _check_data(self) -> None:
         """Raise unless all data that is needed was appended."""
