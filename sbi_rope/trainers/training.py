@@ -98,14 +98,28 @@ def estimator_builder(density_estimator: Any) -> EstimatorBuilder:
         InvalidInputError: If sbi knows no estimator of that name.
     """
     if isinstance(density_estimator, str):
-        density_estimator = _builder_of_name(density_estimator)
-    if not callable(density_estimator):
+        _builder_of_name(density_estimator)
+    elif not callable(density_estimator):
         raise InvalidTypeError(
             "Expected `density_estimator` to be a name such as 'nsf', or what sbi's "
             f"`posterior_nn(...)` returns; got {type(density_estimator).__name__}."
         )
+    return _CopyingBuilder(density_estimator)
 
-    def build(theta: Tensor, x: Tensor) -> Any:
+
+@dataclass(frozen=True)
+class _CopyingBuilder:
+    """Builds estimators from copies of the networks that sbi's builder was given.
+
+    It holds the name, because sbi's builders cannot be pickled.
+    """
+
+    density_estimator: str | EstimatorBuilder
+
+    def __call__(self, theta: Tensor, x: Tensor) -> Any:
+        builder = self.density_estimator
+        if isinstance(builder, str):
+            builder = _builder_of_name(builder)
         modes: dict[Any, bool] = {}
 
         def in_evaluation_mode(module: Any, inputs: Any) -> None:
@@ -117,14 +131,12 @@ def estimator_builder(density_estimator: Any) -> EstimatorBuilder:
             in_evaluation_mode
         )
         try:
-            built = density_estimator(theta, x)
+            built = builder(theta, x)
         finally:
             hook.remove()
             for module, training in modes.items():
                 module.training = training
         return copy.deepcopy(built)
-
-    return build
 
 
 @functools.cache

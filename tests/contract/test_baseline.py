@@ -285,6 +285,16 @@ def test_the_seed_alone_decides_and_training_leaves_no_trace(
         assert torch.equal(value, getattr(data_of(task), field))
 
 
+def test_an_untrained_method_can_be_sent_to_another_process(name: str) -> None:
+    task = first_task(name)
+    method = feed(make(name, task, density_estimator="mdn"), data_of(task))
+    copied = pickle.loads(pickle.dumps(method))
+    assert type(copied) is type(method)
+    if name == "joint_npe":
+        ours, theirs = (train(one).build_posterior() for one in (method, copied))
+        assert torch.equal(densities(ours, name), densities(theirs, name))
+
+
 def test_an_untrained_method_has_no_posterior() -> None:
     method = feed(make("npe", "linear_gaussian"), data_of("linear_gaussian"))
     with pytest.raises(NotReadyError, match=r"train\(\)"):
