@@ -87,8 +87,8 @@ def check_num_samples(num_samples: Any) -> None:
     if num_samples < MIN_SAMPLES:
         raise InvalidInputError(
             f"Expected `num_samples` of at least {MIN_SAMPLES}, so that a draw is "
-            f"beyond each end of a 90 % interval; got {num_samples}. With fewer draws "
-            "any posterior would look calibrated."
+            f"beyond each end of a 90 % interval; got {num_samples}. By a few draws an "
+            "over-confident posterior looks calibrated."
         )
 
 

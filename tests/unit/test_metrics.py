@@ -669,7 +669,7 @@ def test_an_evaluation_says_what_is_wrong_with_parameters_and_their_units() -> N
         ({"theta_std": torch.ones(3)}, "theta_std"),
         ({"theta_std": torch.tensor([1.0, 0.0])}, "`theta_std` to be positive"),
         ({"num_samples": 10**30}, "`num_samples`.*from 1 to"),
-        ({"num_samples": 19}, "of at least 20.* would look calibrated"),
+        ({"num_samples": 19}, "of at least 20.* looks calibrated"),
         ({"seed": -(10**5000)}, "`seed`"),
     ]
     good: dict[str, Any] = {"theta": theta, "x": x, "num_samples": 20}
