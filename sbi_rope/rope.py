@@ -26,7 +26,7 @@ from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed
 from sbi_rope._simulations import SimulationSource
-from sbi_rope._simulator import columns_with_simulated, source_of
+from sbi_rope._simulator import source_of
 from sbi_rope._standardisation import Standardisation, warn_of_far_entries
 from sbi_rope._validation import (
     KnownColumns,
@@ -42,6 +42,7 @@ from sbi_rope._validation import (
     check_row_order,
     check_rows,
     check_same_length,
+    check_simulated_columns,
     check_tensor,
     check_unit_interval,
     column_names,
@@ -192,7 +193,7 @@ class RoPE:
         check_row_order(**{"simulations[0]": theta_s, "simulations[1]": x_s})
         self._theta_columns = check_columns("simulations[0]", theta_s, known)
         known = check_columns("simulations[1]", x_s, earlier["x"])
-        self._x_columns = columns_with_simulated(self._source, known)
+        self._x_columns = check_simulated_columns(self._source.x_columns, known)
         if names is None:
             self._npe.parameter_names = column_names(theta_s) or None
         self.finetuner = CalibrationFinetuner() if finetuner is None else finetuner

@@ -6,18 +6,13 @@ and ``source`` makes it a source of simulations.
 
 from sbi_rope._simulator.budget import LimitedSimulator
 from sbi_rope._simulator.calls import check_callable
-from sbi_rope._simulator.source import (
-    Simulator,
-    columns_with_simulated,
-    source_of,
-)
+from sbi_rope._simulator.source import Simulator, source_of
 from sbi_rope._simulator.workers import parallel
 
 __all__ = [
     "LimitedSimulator",
     "Simulator",
     "check_callable",
-    "columns_with_simulated",
     "parallel",
     "source_of",
 ]

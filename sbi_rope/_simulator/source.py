@@ -22,10 +22,10 @@ from sbi_rope._simulator.calls import Simulated, check_callable
 from sbi_rope._simulator.failures import Failures, warn_of_few
 from sbi_rope._simulator.probe import Probe
 from sbi_rope._simulator.workers import ParallelSimulator, simulate_in_workers
-from sbi_rope._validation import KnownColumns, check_integer, check_order
+from sbi_rope._validation import check_integer
 from sbi_rope.errors import InvalidInputError, SimulationError, in_digits
 
-__all__ = ["Simulator", "columns_with_simulated", "source_of"]
+__all__ = ["Simulator", "source_of"]
 
 # Simulations that are held in memory before they are embedded. If they come one by one
 # there are few, so that a slow simulator shows its progress.
@@ -384,21 +384,4 @@ def source_of(
         event_shape=event_shape,
         like=like,
         readable=readable,
-    )
-
-
-def columns_with_simulated(
-    source: SimulationSource, known: KnownColumns
-) -> KnownColumns:
-    """Return the known orders of columns of x, with that of a simulator's tables.
-
-    Raises:
-        InvalidInputError: If the simulator returns known columns in another order.
-    """
-    return check_order(
-        "simulator(theta)",
-        source.x_columns,
-        known,
-        source="the tables that `simulator` returns",
-        do="Return",
     )

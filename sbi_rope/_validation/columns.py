@@ -13,9 +13,9 @@ from sbi_rope.errors import InvalidInputError
 __all__ = [
     "KnownColumns",
     "check_columns",
-    "check_order",
     "check_parameter_order",
     "check_row_order",
+    "check_simulated_columns",
     "check_tables",
     "column_names",
     "columns_of",
@@ -141,12 +141,31 @@ def check_columns(
         InvalidInputError: If the order is another one.
     """
     names = _labels_of(table, "columns") or column_names(table)
-    return check_order(
+    return _check_order(
         name, names, known, source=f"the earlier table `{name}`", how=how
     )
 
 
-def check_order(
+def check_simulated_columns(
+    names: tuple[str, ...], known: KnownColumns
+) -> KnownColumns:
+    """Raise if a simulator returns tables with known columns in another order.
+
+    Args:
+        names: The names of the columns of its tables; none if it returns arrays.
+        known: The orders of columns of x that are known.
+
+    Returns:
+        The orders that are known, with that of these tables.
+
+    Raises:
+        InvalidInputError: If the order is another one.
+    """
+    source = "the tables that `simulator` returns"
+    return _check_order("simulator(theta)", names, known, source=source, do="Return")
+
+
+def _check_order(
     name: str,
     names: tuple[Hashable, ...],
     known: KnownColumns,
@@ -155,7 +174,7 @@ def check_order(
     do: str = "Pass",
     how: str = "df[{0}]",
 ) -> KnownColumns:
-    """Raise if names of columns are known in another order.
+    """Raise if names of columns are known in another order; return all orders.
 
     Args:
         name: What the table is called.
@@ -164,12 +183,6 @@ def check_order(
         source: Where these names come from.
         do: What to do with a table in the right order.
         how: As in :func:`check_columns`.
-
-    Returns:
-        The orders that are known, with this one.
-
-    Raises:
-        InvalidInputError: If the order is another one.
     """
     for expected, earlier in known.items():
         if names == expected or Counter(names) != Counter(expected):

@@ -64,8 +64,8 @@ CHUNK_SIZE = 100
 # score more precise.
 MAX_SAMPLES = 10**8
 
-# The fewest draws for one observation by which calibration is judged. A parameter is
-# above one draw, or below it, about as often for any posterior that is not to one side.
+# The fewest draws for one observation by which calibration is judged. By a single draw
+# all posteriors look calibrated whose draws are too large as often as too small.
 MIN_SAMPLES = 20
 
 # How many draws of each observation have their density evaluated in one call. It is

@@ -13,12 +13,13 @@ from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import copy_of_prior, device_of, embedding_of, estimator_of
 from sbi_rope._simulations import SimulationSource
-from sbi_rope._simulator import check_callable, columns_with_simulated, source_of
+from sbi_rope._simulator import check_callable, source_of
 from sbi_rope._training import History
 from sbi_rope._validation import (
     check_default_dtype,
     check_gradients,
     check_prior,
+    check_simulated_columns,
     columns_of,
     usable_device,
 )
@@ -305,7 +306,7 @@ class Method(ABC):
             readable=self._data.readable,
         )
         columns = self._data.columns
-        columns["x"] = columns_with_simulated(source, columns["x"])
+        columns["x"] = check_simulated_columns(source.x_columns, columns["x"])
         return source
 
     def _check_data(self) -> None:

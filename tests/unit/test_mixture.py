@@ -608,7 +608,7 @@ def test_the_error_names_the_observation_in_blocks_of_any_size(
         posterior.sample_batched((3,), posterior.x_o[order], **QUIET)
 
 
-def test_an_observation_with_hardly_any_mass_is_sampled_if_it_takes_minutes() -> None:
+def test_little_mass_inside_the_prior_is_sampled_unless_it_takes_too_long() -> None:
     """As one in a stack in which the prior keeps a small share."""
     spikes = torch.tensor([[100.0, -3.0], [0.0, -3.0]])
     weights = torch.tensor([[1 - 4e-4, 4e-4], [0.0, 1.0]])
