@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: quickstart test test-slow test-latest-sbi lint types docs docs-code docs-site
+.PHONY: quickstart test test-fast test-slow test-latest-sbi lint types docs docs-code docs-site
 .PHONY: docs-links format clean tasks package
 .PHONY: examples example-quickstart example-tunnel example-tasks example-people
 
@@ -13,6 +13,11 @@ quickstart: $(VENV)/.installed
 # A process for each core, and a thread for each process.
 test: $(VENV)/.installed
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --dist worksteal
+
+# While one works on something.
+test-fast: $(VENV)/.installed
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --dist worksteal \
+	    -m "not medium and not slow and not docs and not gpu and not network"
 
 test-slow: $(VENV)/.installed
 	$(BIN)/python -m pytest -q -m "slow and not gpu and not network"

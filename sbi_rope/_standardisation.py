@@ -92,20 +92,20 @@ def warn_of_far_entries(name: str, x: Tensor, embedding_net: nn.Module) -> None:
     )
 
 
-def warn_of_unseen_gaps(x: Tensor, simulated: Tensor) -> None:
+def warn_of_unseen_gaps(name: str, x: Tensor, seen: Tensor) -> None:
     """Warn of entries that are missing (NaN) in reality, but in no simulation.
 
     Entries of vectors are compared one by one. Which trials of a set are missing, or
     which pixels of an image, does not matter.
 
     Args:
+        name: What the user calls ``x``.
         x: Real observations, shape ``(n, *event_shape)``.
-        simulated: Simulations, shape ``(n_s, *event_shape)``.
+        seen: Which entries are missing in some simulation, shape ``(*event_shape)``.
     """
-    real, seen = x.isnan(), simulated.isnan().any(dim=0)
     if x.ndim > 2:
         seen = seen.any()
-    unseen = real & ~seen
+    unseen = x.isnan() & ~seen
     if not unseen.any():
         return
     entries = unseen.any(dim=0)
@@ -114,10 +114,10 @@ def warn_of_unseen_gaps(x: Tensor, simulated: Tensor) -> None:
     if x.ndim == 2:
         which = f" (first: {entries.nonzero().flatten()[:5].tolist()}){which}"
     warn_user(
-        f"{int(entries.sum())} of the {entries.numel()} entries of the calibration `x` "
-        f"are missing (NaN){which}, but in none of {len(simulated):,} simulations. The "
-        "embedding net has not learned what to do without them. Train NPE on "
-        "simulations whose entries are missing as in reality, or leave these pairs out."
+        f"{int(entries.sum())} of the {entries.numel()} entries of `{name}` are "
+        f"missing (NaN){which}, but in no simulation. The embedding net of NPE has not "
+        "learned what to do without them. Train NPE on simulations whose entries are "
+        "missing as in reality, or leave these rows out."
     )
 
 

@@ -27,7 +27,11 @@ from sbi_rope._random import seeded
 from sbi_rope._sbi import embed
 from sbi_rope._simulations import SimulationSource
 from sbi_rope._simulator import source_of
-from sbi_rope._standardisation import Standardisation, warn_of_far_entries
+from sbi_rope._standardisation import (
+    Standardisation,
+    warn_of_far_entries,
+    warn_of_unseen_gaps,
+)
 from sbi_rope._validation import (
     KnownColumns,
     check_batch,
@@ -462,13 +466,20 @@ class RoPE:
         real = self._npe.embed("x_o", x_o, net)
         if num_simulations is not None:
             check_integer("num_simulations", num_simulations)
+        gaps = torch.zeros_like(x_o[0], dtype=torch.bool)
+
+        def represent(x: Tensor) -> Tensor:
+            gaps.logical_or_(x.isnan().any(dim=0))
+            return self._embed_simulations(x)
+
         with seeded(seed):
             theta, simulated = self._source.from_prior(
                 num_simulations,
                 max(len(x_o), MIN_SIMULATIONS),
-                self._embed_simulations,
+                represent,
                 progress=is_shown(show_progress_bars),
             )
+        warn_of_unseen_gaps("x_o", x_o, gaps)
         if not self._was_looked_at:
             self._was_looked_at = True
             warn_if_focused(self._npe.density(), self._npe.prior, theta, simulated)

@@ -139,6 +139,7 @@ print(json.dumps(dict(alone=alone, new=new, all=everything, theirs=theirs, ours=
 """
 
 
+@pytest.mark.medium
 def test_importing_prints_nothing_loads_nothing_heavy_and_changes_no_state() -> None:
     # One test, because a fresh interpreter takes seconds to import torch and sbi.
     result = subprocess.run(
@@ -352,6 +353,7 @@ def foreign_insides(tree: ast.AST) -> set[str]:
     return used & private_names_of_sbi() - private_names(tree)
 
 
+@pytest.mark.medium
 def test_only_one_module_uses_what_is_private_to_sbi() -> None:
     for path in modules():
         name = module_name(path)

@@ -120,7 +120,7 @@ class Workbench:
     def embedded(self) -> Tensor:
         """The embeddings h(x) of :attr:`simulations`, shape ``(n_s, l)``."""
         theta, x = self.simulations
-        warn_of_unseen_gaps(self.x, x)
+        warn_of_unseen_gaps("calibration x", self.x, x.isnan().any(dim=0))
         embedded = embed(self.embedding_net, x)
         density = headless(estimator_of(self.npe))
         warn_if_focused(density, self.npe.prior, theta, embedded)

@@ -93,6 +93,7 @@ def retrained(name: str, data: baselines.Data | None = None, **options: Any) -> 
 # What comes out.
 
 
+@pytest.mark.medium
 def test_samples_and_densities_have_the_shapes_of_sbi(name: str) -> None:
     posterior, data = result(name), data_of(first_task(name))
     dim = data.theta.shape[1]
@@ -147,6 +148,7 @@ def grid() -> Tensor:
     return torch.cartesian_prod(axis, axis)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", ONE_OF_A_KIND)
 def test_the_density_integrates_to_one_and_is_that_of_the_samples(
     name: str, grid: Tensor
@@ -164,6 +166,7 @@ def test_the_density_integrates_to_one_and_is_that_of_the_samples(
         assert float((below - marginal.cumsum(0)).abs().max()) < 1.95 / 2000**0.5
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", ONE_OF_A_KIND)
 def test_inside_a_bounded_prior_is_the_mass_that_the_samples_have_there(
     name: str,
@@ -193,6 +196,7 @@ def test_inside_a_bounded_prior_is_the_mass_that_the_samples_have_there(
     assert torch.isneginf(log_prob(posterior, outside[:5], x)).all()
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", [*ONE_OF_A_KIND, "hvae"])
 def test_a_copy_of_the_posterior_has_the_same_density(name: str) -> None:
     posterior, expected = result(name), expected_densities(name)
@@ -200,6 +204,7 @@ def test_a_copy_of_the_posterior_has_the_same_density(name: str) -> None:
         assert torch.equal(densities(copied, name), expected)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", [*ONE_OF_A_KIND, "fmcpe", "frisbi", "hvae"])
 def test_the_posterior_can_be_saved(name: str, tmp_path: Path) -> None:
     posterior, expected = result(name), expected_densities(name)
@@ -219,6 +224,7 @@ def test_training_leaves_no_file_in_the_working_folder(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", [*ONE_OF_A_KIND, "hvae"])
 def test_the_posterior_can_be_moved(name: str) -> None:
     # Not on the first task: sbi moves no posterior whose prior is torch's own.
@@ -252,6 +258,7 @@ def states() -> tuple[bytes, str, Any]:
     )
 
 
+@pytest.mark.medium
 def test_the_seed_alone_decides_and_training_leaves_no_trace(
     name: str, terminal: pytest.CaptureFixture[str]
 ) -> None:
@@ -403,6 +410,7 @@ def test_options_of_another_type_are_refused() -> None:
                 make(name, first_task(name), density_estimator="fancy")
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     "name",
     ["tuning_only", "calibration_mlp", "discrepancy_tuned", "npe_rs", "nnpe", "rnpe"],
@@ -440,6 +448,7 @@ def test_simulations_that_all_have_nan_are_refused() -> None:
         method.append_simulations(data.theta, data.x * torch.nan)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", WITH_PAIRS)
 def test_one_calibration_pair_is_enough_with_a_warning(name: str) -> None:
     data, method = data_of(first_task(name)), make(name, first_task(name))
@@ -458,6 +467,7 @@ def test_one_calibration_pair_is_enough_with_a_warning(name: str) -> None:
     assert densities(method.build_posterior(), name).isfinite().all()
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", WITH_PAIRS)
 def test_recordings_of_four_people_leave_none_to_hold_out(name: str) -> None:
     data, method = data_of(first_task(name)), make(name, first_task(name))
@@ -475,6 +485,7 @@ def test_recordings_of_four_people_leave_none_to_hold_out(name: str) -> None:
     assert densities(method.build_posterior(), name).isfinite().all()
 
 
+@pytest.mark.medium
 @pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
 @pytest.mark.parametrize("name", names_that_see("observations"))
 def test_one_observation_is_enough(name: str) -> None:

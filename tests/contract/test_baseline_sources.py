@@ -109,6 +109,7 @@ def given(name: str, posterior: Any) -> Any:
     return METHODS[name].kind.from_posterior(posterior, **options)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", BUILDERS)
 def test_a_posterior_trained_beforehand_does_as_well_and_is_not_changed(
     name: str,

@@ -110,6 +110,7 @@ def test_every_name_of_sbi_is_among_the_cases_or_refused() -> None:
     assert set(factory.model_builders) == tested | refused
 
 
+@pytest.mark.medium
 @with_cases()
 def test_on_embeddings_densities_and_samples_are_those_of_the_estimator(
     npe: Any, estimator: Any
@@ -129,6 +130,7 @@ def test_on_embeddings_densities_and_samples_are_those_of_the_estimator(
     assert (samples - expected).abs().max() == 0
 
 
+@pytest.mark.medium
 @with_cases(embedding="linear", families=(*ASSEMBLED, *problems.MIXED_FAMILIES))
 def test_splitting_leaves_the_estimator_as_it_was(npe: Any, estimator: Any) -> None:
     state = copy.deepcopy(estimator.state_dict())
@@ -164,6 +166,7 @@ def test_a_tuned_embedding_in_its_place_changes_the_density_accordingly(
         assert (swapped - estimator.log_prob(theta, x)).abs().max() > 1e-3
 
 
+@pytest.mark.medium
 @with_cases(embedding="none", families=("maf", "mnpe"))
 def test_without_an_embedding_net_the_standardised_x_is_the_embedding(
     npe: Any, estimator: Any
@@ -177,6 +180,7 @@ def test_without_an_embedding_net_the_standardised_x_is_the_embedding(
 
 
 # Tuning sees the embedding net alone, not the flow behind it.
+@pytest.mark.medium
 @with_cases(families=("maf",))
 def test_tuning_starts_at_the_embedding_and_follows_shifted_targets(
     npe: Any, estimator: Any
@@ -242,6 +246,7 @@ REPAIRED = pytest.mark.parametrize(
 )
 
 
+@pytest.mark.medium
 @REPAIRED
 def test_rope_makes_of_posteriors_of_the_family_others_that_can_be_pickled(
     family: str, embedding: str, dim: int
@@ -318,6 +323,7 @@ def test_the_tuned_posterior_of_the_family_is_the_flow_on_the_tuned_embedding(
 SLOW = ("zuko_unaf", "zuko_naf", "zuko_bpf", "zuko_sospf")
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     "family",
     [
@@ -424,6 +430,7 @@ def with_categories(theta: Tensor, first: float, second: float) -> Tensor:
     return torch.cat([theta, torch.tensor([[first, second]]).expand(len(theta), 2)], 1)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("dim", [1, 2])
 def test_the_mixed_density_is_the_sum_over_all_simulations(dim: int) -> None:
     npe = problems.npe_posterior("mnpe", dim=dim)
@@ -485,6 +492,7 @@ def test_log_transformed_densities_are_zero_at_zero_and_below() -> None:
     assert torch.isfinite(log_prob[2])
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("missing", [0.0, 1.0, 2.0])
 def test_a_category_that_was_never_trained_on_has_no_mass(missing: float) -> None:
     prior = problems.mixed_prior(1)
@@ -523,6 +531,7 @@ def test_a_prior_that_sbi_cannot_transform_works_without_the_transform() -> None
     assert torch.isfinite(posterior.log_prob_batched(samples, posterior.x_o)).all()
 
 
+@pytest.mark.medium
 def test_the_maximum_of_a_mixed_density_has_categories() -> None:
     posterior, _ = mixed_mixture(problems.npe_posterior("mnpe", dim=1))
     for view in (posterior[0], posterior[1]):

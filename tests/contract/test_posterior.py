@@ -173,6 +173,7 @@ def test_gradients_are_not_tracked_unless_asked_for() -> None:
     assert not posterior.potential(theta, x=posterior.x_o[0]).requires_grad
 
 
+@pytest.mark.medium
 def test_map_finds_the_mode() -> None:
     posterior = gaussian_posterior()
     axis = torch.linspace(-0.99, 0.99, 150)
@@ -185,6 +186,7 @@ def test_map_finds_the_mode() -> None:
         assert view.log_prob(mode) > best - 0.02
 
 
+@pytest.mark.medium
 def test_map_is_the_best_start_where_no_step_improves_on_it() -> None:
     view = gaussian_posterior()[0]
     view.map(num_iter=200, num_init_samples=200, show_progress_bars=False)

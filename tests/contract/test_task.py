@@ -121,6 +121,7 @@ def test_density_spread_and_quantiles_of_the_prior_are_those_of_its_draws(
             assert (prior.log_prob(outside) == -torch.inf).all()
 
 
+@pytest.mark.medium
 @TASK
 def test_the_parts_of_a_task_are_new_each_time_and_making_them_draws_nothing(
     task: Task,
@@ -139,6 +140,7 @@ def test_the_parts_of_a_task_are_new_each_time_and_making_them_draws_nothing(
 # The simulator and the network -------------------------------------------------------
 
 
+@pytest.mark.medium
 @TASK
 def test_the_simulator_returns_finite_batches_of_any_size(task: Task) -> None:
     simulator, theta = task.get_simulator(), task.get_prior().sample((1000,))
@@ -169,6 +171,7 @@ def test_the_noise_of_the_simulator_follows_the_global_seed(task: Task) -> None:
     assert not torch.equal(first, second)
 
 
+@pytest.mark.medium
 @TASK
 def test_embedding_nets_are_new_and_use_all_of_their_parameters(task: Task) -> None:
     x = task.get_simulator()(task.get_prior().sample((50,)))
@@ -192,6 +195,7 @@ def test_embedding_nets_are_new_and_use_all_of_their_parameters(task: Task) -> N
             task.get_embedding_net(light=light)  # type: ignore[arg-type]
 
 
+@pytest.mark.medium
 @TASK
 def test_simulations_to_train_on_are_a_prefix_of_more_and_share_nothing_with_the_sets(
     task: Task,
@@ -210,6 +214,7 @@ def test_simulations_to_train_on_are_a_prefix_of_more_and_share_nothing_with_the
     assert same_rows(x, task.get_simulations(150, seed=2)[1]) == 0
 
 
+@pytest.mark.medium
 @TASK
 def test_sbi_simulates_and_builds_a_posterior_on_the_task(task: Task) -> None:
     prior = process_prior(task.get_prior())[0]

@@ -38,6 +38,7 @@ def recorded(request: pytest.FixtureRequest, written_root: Path) -> Task:
     return get_task(name, variant=variant, root=written_root, **OPTIONS[name])
 
 
+@pytest.mark.medium
 def test_recorded_sets_have_the_shapes_asked_for_and_share_no_observation(
     recorded: Task,
 ) -> None:
@@ -57,6 +58,7 @@ def test_recorded_sets_have_the_shapes_asked_for_and_share_no_observation(
     assert same_rows(torch.cat(sets[:2]), torch.cat(sets[2:])) == 0
 
 
+@pytest.mark.medium
 def test_recorded_sets_are_reproducible_prefixes_that_differ_between_seeds(
     recorded: Task,
 ) -> None:

@@ -138,6 +138,7 @@ def test_all_tasks_make_their_sets_with_the_code_of_the_base_class() -> None:
             assert kinds <= {DrawnPairs, RecordedPairs}
 
 
+@pytest.mark.medium
 @KINDS
 def test_sets_have_the_shapes_asked_for_and_no_observation_in_common(
     labelled: Task,
@@ -165,6 +166,7 @@ def test_sets_have_the_shapes_asked_for_and_no_observation_in_common(
             assert same_rows(theta, shared(labelled, part, seed=seed)[0]) == 0
 
 
+@pytest.mark.medium
 @KINDS
 def test_a_set_depends_on_nothing_but_its_seed_and_leaves_no_trace(
     labelled: Task, capfd: pytest.CaptureFixture[str]
@@ -189,6 +191,7 @@ def test_a_set_depends_on_nothing_but_its_seed_and_leaves_no_trace(
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.medium
 @KINDS
 def test_calibration_and_test_sets_follow_one_law_unless_the_variant_says_otherwise(
     labelled: Task, variant: str | None
@@ -203,6 +206,7 @@ def test_calibration_and_test_sets_follow_one_law_unless_the_variant_says_otherw
         assert not all(same)
 
 
+@pytest.mark.medium
 @kinds("well_specified")
 def test_real_observations_follow_the_simulator_only_where_the_variant_says_so(
     labelled: Task, variant: str | None

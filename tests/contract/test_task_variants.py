@@ -22,6 +22,7 @@ def test_shifted_parameters_stay_in_the_region(name: str) -> None:
             assert (values <= high).all()
 
 
+@pytest.mark.medium
 @EVERY_TASK
 def test_biased_calibration_parameters_crowd_in_the_middle(name: str) -> None:
     task = make(name, variant="biased_calibration")
@@ -37,6 +38,7 @@ def test_biased_calibration_parameters_crowd_in_the_middle(name: str) -> None:
     assert (spread[1] > 0.289 - margin[1]).all()
 
 
+@pytest.mark.medium
 @EVERY_TASK
 def test_noisy_labels_belong_to_the_observations_of_the_standard_task(
     name: str,

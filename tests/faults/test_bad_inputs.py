@@ -33,6 +33,7 @@ NAMES = [
 ]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(("name", "every"), NAMES)
 def test_bad_arguments_are_refused_and_good_ones_change_nothing_else(
     name: str, every: int

@@ -125,6 +125,7 @@ def test_no_group_of_pairs_is_on_both_sides_of_a_split(
         assert sum(map(len, seen)) == len(set(groups))
 
 
+@pytest.mark.medium
 @brief
 @given(
     z=matrices(rows=st.just(8), columns=st.just(2), largest=1e3),

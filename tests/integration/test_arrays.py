@@ -72,6 +72,7 @@ def test_pairs_and_observations_are_those_of_tensors(convert: Any) -> None:
         assert draw_samples(scored, x_o, num_samples=3).shape == (3, 25, 2)
 
 
+@pytest.mark.medium
 def test_a_stack_and_its_diagnosis_take_arrays() -> None:
     x_o = array(OBSERVED[1])
     posterior = stacked(
@@ -368,6 +369,7 @@ def test_trainers_refuse_tables_in_another_order_than_earlier_ones() -> None:
     method.append_observations(X)
 
 
+@pytest.mark.medium
 def test_posteriors_of_trainers_know_the_columns_of_the_pairs() -> None:
     method = FinetunedNPE.from_posterior(
         gaussian.posterior(), training=Training(max_num_epochs=1)

@@ -86,6 +86,7 @@ def test_a_run_in_parts_gives_the_same_table_also_where_a_cell_was_damaged(
     assert rows_of(tmp_path) == uninterrupted
 
 
+@pytest.mark.medium
 def test_a_folder_belongs_to_the_data_it_was_first_used_with(
     suite_file: Path, tmp_path: Path
 ) -> None:
@@ -114,6 +115,7 @@ def test_a_folder_belongs_to_the_data_it_was_first_used_with(
             main(command)
 
 
+@pytest.mark.medium
 def test_two_runs_do_not_share_a_folder(
     suite_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -165,6 +167,7 @@ def test_a_cell_without_a_result_is_no_success(
     assert "no result: pendulum prior #0" in capsys.readouterr().out
 
 
+@pytest.mark.medium
 def test_stored_people_are_shared_out_without_overlap(tmp_path: Path) -> None:
     cell = Cell(task="hemodynamics", preset="smoke", method="SBI")
     place = Workplace(folder=tmp_path, sources=Sources())
@@ -202,6 +205,7 @@ def test_people_of_the_simulator_are_the_real_ones_where_it_is_right(
             assert simulated.isdisjoint(map(tuple, theta.tolist()))
 
 
+@pytest.mark.medium
 def test_what_is_finished_is_not_computed_again(
     suite_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -304,6 +308,7 @@ def test_two_workers_give_the_same_table(
     assert rows_of(tmp_path) == uninterrupted
 
 
+@pytest.mark.medium
 def test_a_failing_method_does_not_stop_the_others_and_is_no_success(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

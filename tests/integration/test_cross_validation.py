@@ -61,6 +61,7 @@ def scores_of(posterior: StackedPosterior) -> CrossValidation:
 # --- folds ---
 
 
+@pytest.mark.medium
 def test_every_pair_is_held_out_once_and_trains_all_other_folds() -> None:
     seen: list[Tensor] = []
 
@@ -106,6 +107,7 @@ def recordings() -> tuple[Tensor, Tensor]:
     return theta.repeat(3, 1)[order], x[order]
 
 
+@pytest.mark.medium
 def test_recordings_of_a_person_are_never_both_trained_on_and_held_out(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -354,6 +356,7 @@ def test_fine_tuning_of_a_tuned_candidate_starts_with_the_net_without_the_part()
             assert torch.equal(found, embed(without, bench.x))
 
 
+@pytest.mark.medium
 def test_a_version_goes_through_the_courses_that_the_rule_asks_for() -> None:
     def trained(courses: Courses) -> Tensor:
         bench = Workbench(
@@ -377,6 +380,7 @@ def base(num_pairs: int) -> tuple[StackedPosterior, Tensor, Tensor]:
         return stacked(rope_of((theta, x)), observed(), num_folds=3), theta, x
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("num_pairs", "number"), [pytest.param(6, 1, marks=pytest.mark.slow), (15, 1)]
 )
@@ -437,6 +441,7 @@ def test_observations_of_a_fold_do_not_change_the_versions_scored_on_it() -> Non
         assert torch.equal(first, second) == (version == 1)
 
 
+@pytest.mark.medium
 def test_with_two_training_folds_labels_of_a_fold_affect_two_others() -> None:
     # With so few pairs in a fold, tuning holds none of them out.
     theta, x = problem(10, seed=1)
@@ -475,6 +480,7 @@ def changed_in_a_fold(theta: Tensor, x: Tensor, finetuner: Any) -> Tensor:
 # --- scores ---
 
 
+@pytest.mark.medium
 def test_scores_are_the_densities_of_the_versions_without_the_fold() -> None:
     posterior = the_coupled_stack()
     scores, (theta, x) = scores_of(posterior), problem(NUM_PAIRS, seed=1)
@@ -490,6 +496,7 @@ def test_scores_are_the_densities_of_the_versions_without_the_fold() -> None:
             assert torch.allclose(found, expected, atol=1e-4), name
 
 
+@pytest.mark.medium
 def test_the_stack_that_scores_a_fold_is_weighted_by_the_others() -> None:
     posterior = the_coupled_stack()
     scores, (theta, x) = scores_of(posterior), problem(NUM_PAIRS, seed=1)
@@ -534,6 +541,7 @@ def test_the_stack_of_each_fold_is_normalised_by_its_own_mass() -> None:
     assert float((scores.stack_scores - box).mean()) == pytest.approx(0.0, abs=0.15)
 
 
+@pytest.mark.medium
 def test_a_cross_validation_is_that_of_the_stack_with_the_same_seed() -> None:
     options: dict[str, Any] = {"candidates": [PRIOR, FINETUNED], "num_folds": 2}
     scores = validated(rope_of(), **options)
@@ -574,6 +582,7 @@ def test_the_seed_of_folds_does_not_depend_on_their_number() -> None:
 # --- the table ---
 
 
+@pytest.mark.medium
 def test_differences_are_means_over_pairs_with_a_bootstrap_interval() -> None:
     scores = scores_of(the_stack())
     for name, other in (("NPE", "prior"), ("stack", "prior"), ("NPE", "NPE")):

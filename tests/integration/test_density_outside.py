@@ -66,6 +66,7 @@ def labels() -> Tensor:
     return PRIOR.sample((24,))
 
 
+@pytest.mark.medium
 def test_the_density_outside_the_support_is_zero_without_a_warning() -> None:
     posterior = stacked(labels(), measured(labels()), "prior", "NPE")
     x, theta = torch.zeros(1, 2), torch.tensor([[-1.0, 1.0], [1.0, 1.0]])

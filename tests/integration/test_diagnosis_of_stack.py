@@ -83,6 +83,7 @@ def names(findings: object) -> set[str]:
     return {finding.name for finding in findings}  # type: ignore[attr-defined]
 
 
+@pytest.mark.medium
 def test_nothing_alarms_about_a_stack_whose_batch_is_drawn_like_its_pairs(
     of_stack: Diagnosis, of_anyone: Diagnosis
 ) -> None:
@@ -184,6 +185,7 @@ def test_what_is_no_posterior_of_this_package_is_refused(
         look(rope, x_o, rope.npe)
 
 
+@pytest.mark.medium
 def test_the_page_of_a_stack_counts_its_alarms_whomever_the_diagnosis_was_for(
     stack: StackedPosterior,
     of_stack: Diagnosis,

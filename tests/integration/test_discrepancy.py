@@ -118,6 +118,7 @@ def marginal(x: Tensor, draws: DiscrepancyDraws, *, std: float, mean: float) -> 
     return joint - joint.logsumexp(dim=0) - math.log(float(THETA[1] - THETA[0]))
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("num_pairs", "space"),
     [(4, "embedding"), pytest.param(50, "input", marks=pytest.mark.slow)],

@@ -90,6 +90,7 @@ def test_a_bifurcation_reflects_waves_as_its_admittances_predict() -> None:
 # The solution itself -----------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_no_blood_is_lost() -> None:
     for viscoelastic in (False, True):
         physics = Physics(viscoelastic=viscoelastic)
@@ -98,6 +99,7 @@ def test_no_blood_is_lost() -> None:
         assert mass_error(flow) < 1e-10
 
 
+@pytest.mark.medium
 def test_as_much_blood_leaves_as_enters_once_beats_repeat() -> None:
     assert simulate_beat(BASELINE, Physics(num_cycles=20)).mass_error < 1e-4
 
@@ -114,6 +116,7 @@ def test_coarser_cells_and_shorter_steps_give_the_same_beat(beat: Beat) -> None:
 # Physiology --------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_waves_in_elastic_arteries_travel_at_the_velocity_asked_for() -> None:
     errors = {
         velocity: velocity_error(velocity, viscoelastic=False)
@@ -139,6 +142,7 @@ def test_waves_in_the_softest_viscoelastic_arteries_are_as_fast_as_asked_for() -
     assert velocity_error(5.5, viscoelastic=True) < 8.0
 
 
+@pytest.mark.medium
 def test_the_mean_pressure_is_near_its_target(beat: Beat) -> None:
     for target in (75.0, 110.0):
         wave = simulate_beat(replace(BASELINE, mean_pressure=target)).pressure["aortic"]
@@ -176,6 +180,7 @@ def test_closure_of_the_valve_leaves_a_notch_in_the_aortic_pressure(
     assert after > wave[notch] + 0.5
 
 
+@pytest.mark.medium
 def test_stiffer_arteries_have_a_larger_pulse(beat: Beat) -> None:
     stiff = simulate_beat(replace(BASELINE, pulse_wave_velocity=10.0))
     assert np.ptp(stiff.pressure["aortic"]) > 1.3 * np.ptp(beat.pressure["aortic"])

@@ -108,6 +108,7 @@ def source(tmp_path_factory: pytest.TempPathFactory, diagnosis: Diagnosis) -> st
     )
 
 
+@pytest.mark.medium
 def test_names_of_parameters_are_given_once(tmp_path: Path) -> None:
     named = rope_of(parameter_names=("slope", "size")).train(seed=0, **QUIET)
     posterior = stacked(named, candidates=[PRIOR, NPE])
@@ -136,6 +137,7 @@ def test_names_of_parameters_are_given_once(tmp_path: Path) -> None:
             rope_of(parameter_names=names)
 
 
+@pytest.mark.medium
 def test_the_page_says_which_pairs_belong_together(tmp_path: Path) -> None:
     report = the_stack().report
     scores = report.cross_validation
@@ -158,6 +160,7 @@ def test_the_page_says_which_pairs_belong_together(tmp_path: Path) -> None:
     assert "groups" not in Page(written(report, tmp_path)).text
 
 
+@pytest.mark.medium
 def test_the_page_is_valid_and_needs_nothing_else(source: str) -> None:
     page = Page(source)
     assert source.startswith("<!DOCTYPE html>\n<html lang=")
@@ -175,6 +178,7 @@ def test_the_page_is_valid_and_needs_nothing_else(source: str) -> None:
     assert "@import" not in source
 
 
+@pytest.mark.medium
 def test_names_are_text_and_not_elements(source: str) -> None:
     assert "<kg>" not in source
     assert "<top>" not in source
@@ -217,6 +221,7 @@ def test_the_page_says_how_large_sets_with_a_guarantee_are(source: str) -> None:
     assert "Sets that are guaranteed to hold about 90 %" in text
 
 
+@pytest.mark.medium
 def test_the_page_says_what_more_labels_and_a_recalibration_add(
     source: str, tmp_path: Path
 ) -> None:
@@ -260,6 +265,7 @@ def test_the_verdict_names_a_batch_that_differs_from_the_pairs(source: str) -> N
     assert "differs from them (p = 0.002), so that it need not hold there" in source
 
 
+@pytest.mark.medium
 def test_the_verdict_holds_the_comparison_of_a_diagnosis(
     tmp_path: Path, diagnosis: Diagnosis
 ) -> None:
@@ -278,6 +284,7 @@ def test_the_verdict_holds_the_comparison_of_a_diagnosis(
     assert "This report does not compare" not in text
 
 
+@pytest.mark.medium
 def test_an_expected_finding_does_not_look_like_an_alarm(
     tmp_path: Path, diagnosis: Diagnosis
 ) -> None:
@@ -301,6 +308,7 @@ def test_a_page_without_batch_and_curve_says_what_it_assumes(tmp_path: Path) -> 
     assert "theta_1" in text
 
 
+@pytest.mark.medium
 def test_a_page_without_discrepancies_says_why(tmp_path: Path) -> None:
     report = replace(the_stack().report, discrepancy=None)
     text = Page(written(report, tmp_path)).text
@@ -314,6 +322,7 @@ def test_a_page_without_discrepancies_says_why(tmp_path: Path) -> None:
     assert "because no candidate of this stack models" in text
 
 
+@pytest.mark.medium
 def test_the_score_of_the_stack_is_one_number_and_the_other_is_explained(
     tmp_path: Path,
 ) -> None:
@@ -348,6 +357,7 @@ def test_the_verdict_names_pairs_whose_parameters_do_not_follow_the_prior(
     assert sentence in Page(written(changed, tmp_path)).text
 
 
+@pytest.mark.medium
 def test_rows_are_to_be_checked_if_the_stack_is_mostly_the_prior(
     tmp_path: Path,
 ) -> None:
@@ -360,6 +370,7 @@ def test_rows_are_to_be_checked_if_the_stack_is_mostly_the_prior(
         assert ("pairs belong together, row by row" in str(shown)) == expected
 
 
+@pytest.mark.medium
 def test_the_page_names_parameters_that_are_not_calibrated(tmp_path: Path) -> None:
     report = the_stack().report
     known = report.cross_validation
@@ -371,6 +382,7 @@ def test_the_page_names_parameters_that_are_not_calibrated(tmp_path: Path) -> No
     assert "slope by itself" not in text
 
 
+@pytest.mark.medium
 def test_the_page_shows_where_coverage_depends_on_the_estimate(tmp_path: Path) -> None:
     report = the_stack().report
     page = Page(written(report, tmp_path)).text
@@ -404,6 +416,7 @@ def test_the_page_says_how_the_stack_was_made(source: str) -> None:
     assert f"simulator calls {calls:,}" in text
 
 
+@pytest.mark.medium
 def test_an_own_report_is_replaced_and_nothing_else(tmp_path: Path) -> None:
     report = the_stack().report
     first = written(report, tmp_path)
@@ -417,6 +430,7 @@ def test_an_own_report_is_replaced_and_nothing_else(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["report.html", "thesis.html"]
 
 
+@pytest.mark.medium
 def test_a_folder_is_made_and_one_without_permission_is_named(tmp_path: Path) -> None:
     report = the_stack().report
     report.to_html(str(tmp_path / "new" / "report.html"))

@@ -111,6 +111,7 @@ def test_at_tau_one_the_mean_posterior_is_the_mean_of_the_simulated_ones() -> No
     )
 
 
+@pytest.mark.medium
 def test_fifty_pairs_repair_the_posterior_of_a_scaled_and_shifted_process() -> None:
     theta_cal, x_cal = gaussian.labelled(50)
     theta_o, x_o = gaussian.labelled(1000)

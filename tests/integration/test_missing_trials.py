@@ -206,9 +206,14 @@ def test_missing_numbers_of_a_vector_are_embedded_but_not_corrected() -> None:
     x[0, 1] = torch.nan
     rope.append_calibration(theta, x)
     bench = Workbench(rope, num_folds=2, seed=0, **QUIET)
-    match = r"1 of the 3 entries .* \(first: \[1\]\), in 1 of 12 rows \(first: \[0\]\)"
-    with pytest.warns(RoPEWarning, match=match):
+    match = r" .* \(first: \[1\]\), in 1 of 12 rows \(first: \[0\]\)"
+    with pytest.warns(
+        RoPEWarning, match=r"1 of the 3 entries of `calibration x`" + match
+    ):
         assert torch.isfinite(bench.embedded).all()
+    untrained = RoPE(posterior_from(npe, estimator), simulator=problems.simulate)
+    with pytest.warns(RoPEWarning, match=r"1 of the 3 entries of `x_o`" + match):
+        assert torch.isfinite(untrained.embed(x).real).all()
     for space, applies in (("embedding", True), ("input", False)):
         assert DiscrepancyCandidate(space=space).applies_to(bench) is applies
         assert not FinetunedCandidate(space=space).applies_to(bench)  # of two folds
@@ -226,20 +231,21 @@ def test_missing_numbers_of_a_vector_are_embedded_but_not_corrected() -> None:
 
 
 def test_gaps_are_warned_of_if_no_simulation_has_them() -> None:
-    simulated = torch.zeros(20, 4, 2)
-    simulated[3, 2:] = torch.nan
+    seen = torch.zeros(4, 2, dtype=torch.bool)
+    seen[2:] = True
     real = torch.zeros(5, 4, 2)
     real[1, 1:] = torch.nan
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         # It does not matter which of the trials of a set are missing.
-        warn_of_unseen_gaps(real, simulated)
-        warn_of_unseen_gaps(real[:, 2], simulated[:, 3])
-    for x, x_s in ((real, simulated[:3]), (real[:, 1], simulated[:, 1])):
-        with pytest.warns(RoPEWarning, match=r"in none of .* leave these pairs out"):
-            warn_of_unseen_gaps(x, x_s)
+        warn_of_unseen_gaps("x", real, seen)
+        warn_of_unseen_gaps("x", real[:, 2], seen[3])
+    for x, in_simulations in ((real, seen & False), (real[:, 1], seen[1])):
+        with pytest.warns(RoPEWarning, match=r"`x` .* in no simulation.* these rows"):
+            warn_of_unseen_gaps("x", x, in_simulations)
 
 
+@pytest.mark.medium
 def test_where_simulated_numbers_are_missing_nothing_says_that_they_are_constant() -> (
     None
 ):

@@ -188,6 +188,7 @@ def test_lc2st_accepts_its_samples(posterior: MixturePosterior, theta: Tensor) -
     assert 0 <= p_value <= 1
 
 
+@pytest.mark.medium
 def test_misspecification_is_noticed_before_tuning_and_much_smaller_after(
     repaired: tuple[RoPE, MixturePosterior, Tensor],
 ) -> None:
@@ -202,6 +203,7 @@ def test_misspecification_is_noticed_before_tuning_and_much_smaller_after(
     assert after[1][1] < 0.3 * before[1][1]
 
 
+@pytest.mark.medium
 def test_the_diagnostics_run_on_what_rope_builds(
     repaired: tuple[RoPE, MixturePosterior, Tensor],
 ) -> None:

@@ -136,6 +136,7 @@ def test_the_density_is_the_weighted_sum_of_the_candidates() -> None:
         assert torch.allclose(found, mixed, rtol=1e-3, atol=1e-5)
 
 
+@pytest.mark.medium
 def test_the_normalised_density_has_mass_one_and_samples_follow_it() -> None:
     x, draws = observed()[:3], 1000
     line = (torch.arange(40) + 0.5) / 20 - 1
@@ -160,6 +161,7 @@ def test_the_normalised_density_has_mass_one_and_samples_follow_it() -> None:
 # --- observations inside and outside of a batch ---
 
 
+@pytest.mark.medium
 def test_an_observation_alone_has_the_density_that_it_has_among_others() -> None:
     posterior = the_stack()
     x = torch.cat([observed(), 3 * torch.randn(5, 3)])
@@ -201,6 +203,7 @@ def test_few_observations_and_pairs_are_warned_of_once_with_both_numbers() -> No
     assert not any("Coupling a batch of" in text for text in texts)
 
 
+@pytest.mark.medium
 def test_a_stack_of_a_batch_gives_sets_with_a_guarantee() -> None:
     posterior, x = the_coupled_stack(), observed()[0]
     found = posterior.credible_set(0.9, x, guaranteed=True, num_samples=40, seed=0)
@@ -211,6 +214,7 @@ def test_a_stack_of_a_batch_gives_sets_with_a_guarantee() -> None:
     assert posterior[0].credible_set(seed=0).inside.any()
 
 
+@pytest.mark.medium
 def test_the_posterior_of_one_observation_does_not_contain_the_others() -> None:
     posterior = the_coupled_stack()
     view = posterior[3]
@@ -235,6 +239,7 @@ def test_the_posterior_of_one_observation_does_not_contain_the_others() -> None:
 # --- copies ---
 
 
+@pytest.mark.medium
 def test_copies_and_small_pickles_have_the_same_densities() -> None:
     x, theta = observed(), problems.box(2).sample((NUM_OBSERVED,))
     for posterior in (the_stack(), the_coupled_stack()):
@@ -299,6 +304,7 @@ def test_a_stack_and_its_candidates_move_to_a_gpu() -> None:
 # --- data of all kinds ---
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("family", "embedding"),
     [
@@ -372,6 +378,7 @@ def long_series(theta: Tensor) -> Tensor:
     return theta @ torch.ones(2, 24) + 0.1 * torch.randn(len(theta), 24)
 
 
+@pytest.mark.medium
 def test_moments_of_a_long_series_are_those_of_its_embedding_alone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -439,6 +446,7 @@ def test_a_prior_that_sbi_cannot_transform_can_be_used() -> None:
     assert (samples.abs() <= 1).all()
 
 
+@pytest.mark.medium
 def test_few_pairs_are_held_out_one_by_one() -> None:
     for num_pairs, x_o in ((2, observed(1)), (3, None)):
         with warnings.catch_warnings():
@@ -457,6 +465,7 @@ def test_few_pairs_are_held_out_one_by_one() -> None:
 # --- what the user passes ---
 
 
+@pytest.mark.medium
 def test_a_stack_changes_nothing_that_it_is_given_and_follows_from_its_seed() -> None:
     rope, x_o = rope_of(), observed()
     rope.train(seed=0, **QUIET)
@@ -501,6 +510,7 @@ def test_a_stack_does_not_change_with_the_posteriors_it_was_made_of() -> None:
     assert torch.equal(unnormalised(posterior, theta, x), before)
 
 
+@pytest.mark.medium
 def test_a_mixture_counts_as_one_version_regardless_of_its_number_of_parts() -> None:
     sizes: list[int] = []
     theirs: list[Any] = []

@@ -41,6 +41,7 @@ PARTIAL = THETA.clone()
 PARTIAL[::2, 0] = math.nan
 
 
+@pytest.mark.medium
 def test_a_stack_is_scored_on_what_was_measured(tmp_path: Any) -> None:
     rope = labelled(PARTIAL, theta_std=0.1)
     posterior = stacked(rope, candidates=default_candidates()[:4])
@@ -64,6 +65,7 @@ def test_a_stack_is_scored_on_what_was_measured(tmp_path: Any) -> None:
     assert ">nan<" not in page
 
 
+@pytest.mark.medium
 def test_exact_labels_among_others_give_sets_with_a_guarantee(tmp_path: Path) -> None:
     """One of each specimen counts, and none whose label is noisy or partial."""
     std = torch.zeros(NUM_PAIRS, 2)
@@ -91,12 +93,14 @@ def test_exact_labels_among_others_give_sets_with_a_guarantee(tmp_path: Path) ->
         posterior.credible_set(0.9, x, guaranteed=True)
 
 
+@pytest.mark.medium
 def test_coverage_of_labels_that_are_not_exact_is_that_of_measured_values() -> None:
     for options, what in (({"theta_std": 0.1}, "measured values"), ({}, "parameters")):
         report = stacked(labelled(THETA, **options), candidates=[PRIOR, NPE]).report
         assert f"of the {what}\n" in str(report)
 
 
+@pytest.mark.medium
 def test_couplings_are_scored_on_labels_that_are_not_exact() -> None:
     scores = validated(
         labelled(PARTIAL), observed(), candidates=[*COUPLINGS[:2], PRIOR, NPE]
@@ -126,6 +130,7 @@ def test_labels_of_vanishing_noise_are_scored_like_exact_ones() -> None:
     assert torch.allclose(mass[1], mass[0], atol=0.01)
 
 
+@pytest.mark.medium
 def test_labels_given_as_draws_are_scored_relative_to_the_prior(tmp_path: Path) -> None:
     draws = (THETA[:, None] + 0.05 * torch.randn(NUM_PAIRS, 30, 2)).clamp(-0.99, 0.99)
     posterior = stacked(labelled(draws), candidates=[PRIOR, NPE])
@@ -157,6 +162,7 @@ def test_labels_on_a_bound_of_the_prior_have_finite_scores() -> None:
     assert torch.isfinite(report.cross_validation.log_scores).all()
 
 
+@pytest.mark.medium
 def test_a_parameter_that_was_never_measured_is_named(tmp_path: Path) -> None:
     theta = THETA.clone()
     theta[:, 0] = math.nan
@@ -180,6 +186,7 @@ def scores_of_exact_labels() -> CrossValidation:
         return scores_of_labels()
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     "options",
     [{"theta_std": 0.0}, {"theta_cov": torch.zeros(2, 2)}, {"weights": [1.0] * 20}],
@@ -193,6 +200,7 @@ def test_labels_without_noise_take_the_path_of_exact_ones(
     assert torch.equal(exact.levels, found.levels)
 
 
+@pytest.mark.medium
 def test_rehearsal_learns_from_labels_that_are_not_exact() -> None:
     rehearsed = [c for c in CANDIDATES if c.name == "fine-tuned NPE, rehearsed"]
     weights = torch.linspace(0.5, 2.0, NUM_PAIRS)

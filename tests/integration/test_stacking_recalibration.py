@@ -64,6 +64,7 @@ def recalibration_of(posterior: StackedPosterior) -> Recalibration:
     return found
 
 
+@pytest.mark.medium
 def test_the_scores_and_weights_are_those_of_the_stack_without(
     stacks: tuple[StackedPosterior, StackedPosterior],
 ) -> None:
@@ -114,6 +115,7 @@ def test_it_is_saved_and_answers_sets_as_any_other_stack(
         assert found.volume > 0
 
 
+@pytest.mark.medium
 def test_the_posterior_of_one_observation_of_a_batch_is_recalibrated_too() -> None:
     torch.manual_seed(0)
     rope, (_, x_o) = rope_of(near_zero()), near_zero(25)
@@ -161,6 +163,7 @@ def test_a_recalibrated_mixture_is_no_candidate_of_a_stack() -> None:
         stacked(rope, candidates=[PRIOR, candidate])
 
 
+@pytest.mark.medium
 def test_what_cannot_be_recalibrated_is_refused_before_any_training() -> None:
     theta, x = problem(20, seed=1)
     noisy = rope_of((theta[:0], x[:0])).append_calibration(theta, x, theta_std=0.1)
@@ -180,6 +183,7 @@ def test_what_cannot_be_recalibrated_is_refused_before_any_training() -> None:
         stacked(mixed, recalibrate=True)
 
 
+@pytest.mark.medium
 def test_the_mixture_that_is_scored_on_a_fold_has_not_seen_its_labels(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -84,6 +84,7 @@ def test_gains_are_mean_differences_of_comparable_scores() -> None:
     assert "not shown to differ from the prior" in with_gain(report, low=-1, high=1)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("n", [2, 4, 10])
 def test_intervals_of_differences_of_few_pairs_hold_the_true_difference(n: int) -> None:
     generator = torch.Generator().manual_seed(0)
@@ -214,6 +215,7 @@ def test_parameters_that_are_not_calibrated_by_themselves_are_named() -> None:
     assert "by itself" not in str(StackingReport.of(single))
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("groups", [False, True])
 def test_a_parameter_whose_coverage_depends_on_its_estimate_is_named(
     groups: bool,
@@ -296,6 +298,7 @@ def test_the_text_names_what_calibration_assumes_about_a_batch() -> None:
     assert "look at `diagnose(rope, x_o)`" in unlike
 
 
+@pytest.mark.medium
 def test_a_batch_unlike_the_pairs_gives_a_warning() -> None:
     options = {"candidates": [OT_ONLY, PRIOR]}
     corner = observed() + 1.0
@@ -340,6 +343,7 @@ def test_a_report_names_pairs_whose_parameters_do_not_follow_the_prior() -> None
     assert "not distributed like the prior" not in str(usual)
 
 
+@pytest.mark.medium
 def test_a_stack_that_keeps_the_prior_says_what_holds_for_the_pairs_only() -> None:
     theta = 0.2 * problem(20, seed=1)[0]
     middle = rope_of((theta, problems.simulate(theta) + 0.4))
@@ -408,6 +412,7 @@ def test_recordings_with_the_same_parameters_count_once() -> None:
     assert "24 held-out calibration pairs in 12 groups, each" in str(report)
 
 
+@pytest.mark.medium
 def test_every_model_of_the_discrepancy_knows_the_specimens(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -433,6 +438,7 @@ def test_every_model_of_the_discrepancy_knows_the_specimens(
     assert all(groups.tolist() == [*range(8)] * 2 for groups in seen)
 
 
+@pytest.mark.medium
 def test_recordings_of_a_named_specimen_count_once_whatever_their_labels_are() -> None:
     theta, _ = problem(12, seed=1)
     repeats = torch.tensor([3] * 6 + [1] * 6)
@@ -468,6 +474,7 @@ def test_recordings_of_a_named_specimen_count_once_whatever_their_labels_are() -
         assert len(folds[rows].unique()) == 1
 
 
+@pytest.mark.medium
 def test_the_learning_curve_has_a_point_for_one_two_and_four_folds() -> None:
     candidates = [ROPE, OT_ONLY, PRIOR, FITTED]
     report, without = (
@@ -596,6 +603,7 @@ def test_a_cross_validation_holds_only_numbers_and_names() -> None:
         )
 
 
+@pytest.mark.medium
 def test_a_report_says_how_often_the_simulator_was_called_for_the_stack() -> None:
     rope = rope_of()
     before = rope.num_simulator_calls

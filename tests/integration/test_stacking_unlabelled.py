@@ -75,6 +75,7 @@ def other_x() -> Tensor:
     return observed(5) + 0.1
 
 
+@pytest.mark.medium
 def test_it_is_rvnp_of_the_simulations_that_other_candidates_see() -> None:
     candidate = RVNPCandidate(observed(NUM_OBSERVATIONS), space="input")
     with patch("sbi_rope.stacking.workbench.NUM_SIMULATIONS", 300):
@@ -94,6 +95,7 @@ def test_it_is_rvnp_of_the_simulations_that_other_candidates_see() -> None:
     assert not torch.allclose(found.float(), npe)
 
 
+@pytest.mark.medium
 def test_the_labels_of_the_pairs_change_its_weight_only() -> None:
     theta, x = rope_of().calibration
     other = rope_of((theta.flip(0), x))
@@ -107,6 +109,7 @@ def test_the_labels_of_the_pairs_change_its_weight_only() -> None:
     assert posteriors[0].candidate_weights != posteriors[1].candidate_weights
 
 
+@pytest.mark.medium
 def test_it_is_trained_once() -> None:
     trained = []
     train = RVNP.train
@@ -126,6 +129,7 @@ def test_it_is_trained_once() -> None:
     assert trained == [NUM_OBSERVATIONS]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("options", [{}, {"space": "input"}], ids=str)
 def test_the_stack_answers_observations_it_has_not_seen_and_can_be_kept(
     options: dict[str, str], tmp_path: Path
@@ -142,6 +146,7 @@ def test_the_stack_answers_observations_it_has_not_seen_and_can_be_kept(
         assert torch.equal(other.log_prob_batched(theta, x), expected)
 
 
+@pytest.mark.medium
 def test_a_batch_of_a_hundred_observations_brings_it_into_the_default_stack() -> None:
     rope, x_o = rope_of(), observed(100)
     plain = [candidate.name for candidate in default_candidates(rope)]

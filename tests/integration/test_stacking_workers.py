@@ -129,6 +129,7 @@ CASES: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("case", CASES)
 def test_copies_of_folds_give_the_scores_calls_and_warnings_of_the_folds(
     case: str,
@@ -152,6 +153,7 @@ def test_copies_of_folds_give_the_scores_calls_and_warnings_of_the_folds(
         assert ("Something of another package.", FutureWarning) in of_one.warned
 
 
+@pytest.mark.medium
 def test_two_processes_give_the_outcome_of_one() -> None:
     def simulator(theta: Tensor) -> Tensor:  # which has no name of its own
         return problems.simulate(theta)
@@ -247,6 +249,7 @@ class OddError(Exception):
         super().__init__("no solution", lock)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("candidate", "match"),
     [

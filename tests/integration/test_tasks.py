@@ -25,6 +25,7 @@ def task(request: pytest.FixtureRequest) -> Task:
     return get_task(name, **options)
 
 
+@pytest.mark.medium
 def test_rope_runs_on_the_task(task: Task) -> None:
     theta, x = task.get_simulations(300)
     npe = NPE(

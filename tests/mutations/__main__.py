@@ -3,7 +3,7 @@
     python -m tests.mutations --out mutations.json
     python -m tests.mutations --quick --only 3 17
 
-Where the named test files notice nothing, all tests of the fast suite are run, which
+Where the named test files notice nothing, all tests of `make test` are run, which
 takes as long as they do.
 """
 

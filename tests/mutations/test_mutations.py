@@ -2,10 +2,13 @@
 
 from pathlib import Path
 
+import pytest
+
 from tests.mutations.catalogue import Mutation, faults_of, read_mutations
 from tests.mutations.trials import broken
 
 
+@pytest.mark.medium
 def test_every_mutation_of_the_list_can_be_made() -> None:
     mutations = read_mutations()
     assert len({mutation.name for mutation in mutations}) == len(mutations)

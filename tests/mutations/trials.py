@@ -48,7 +48,7 @@ def first_failure(root: Path, tests: Sequence[str], *, timeout: float) -> str | 
 
     Args:
         root: The copy.
-        tests: Files or names of tests; all of the fast suite if there is none.
+        tests: Files or names of tests; those of `make test` if there are none.
         timeout: Seconds after which the tests count as failed.
 
     Raises:

@@ -149,6 +149,7 @@ def test_denoised_draws_have_the_moments_found_by_quadrature() -> None:
         )
 
 
+@pytest.mark.medium
 def test_with_gaussian_errors_denoising_is_the_kalman_update() -> None:
     covariance = torch.tensor([[1.0, 0.8], [0.8, 1.0]])
     q = MultivariateNormal(torch.zeros(2), covariance)

@@ -100,6 +100,7 @@ def test_with_one_holdout_it_is_one_network_tuned_on_the_rest() -> None:
     assert torch.equal(log_probs(finetuned(npe()).build_posterior()), expected)
 
 
+@pytest.mark.medium
 def test_every_pair_is_held_out_by_one_network() -> None:
     for count in [2, 5, 20]:
         method = finetuned(npe(), num_holdouts=count)
@@ -172,6 +173,7 @@ def test_what_is_no_number_of_holdouts_is_refused() -> None:
 STILL = Training(learning_rate=1e-9, max_num_epochs=1, validation_fraction=0.2)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("space", ["embedding", "input"])
 @pytest.mark.parametrize("count", [1, 3])
 def test_it_can_start_from_a_corrected_npe(space: str, count: int) -> None:
@@ -184,6 +186,7 @@ def test_it_can_start_from_a_corrected_npe(space: str, count: int) -> None:
     assert torch.equal(log_probs(start), before)
 
 
+@pytest.mark.medium
 def test_each_network_starts_from_one_of_the_tuned_nets() -> None:
     start = discrepancy("tuned")
     (part,) = start.posterior_estimator.parts

@@ -36,6 +36,7 @@ def test_the_way_back_ends_where_the_way_there_began() -> None:
     torch.testing.assert_close(back, z, atol=2e-3, rtol=0)
 
 
+@pytest.mark.medium
 def test_the_divergence_is_the_change_of_volume_of_the_map() -> None:
     field, c = bent_field(), torch.randn(5, 1).double()
     z = torch.randn(5, DIM).double()
@@ -171,6 +172,7 @@ def box_method(theta: Tensor, *, num_epochs: int = 40) -> Any:
     return method.append_calibration(theta, problems.simulate(theta) + 0.3)
 
 
+@pytest.mark.medium
 def test_labels_on_a_bound_are_like_labels_next_to_it() -> None:
     """Recorded settings are often exactly at the end of their range."""
     torch.manual_seed(0)

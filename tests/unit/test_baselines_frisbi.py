@@ -78,6 +78,7 @@ def mean_log_prob(posterior: Any, theta: Tensor, x: Tensor) -> float:
     return float(posterior.log_prob_batched(theta[None], x).mean())
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     "distilled", [False, pytest.param(True, marks=pytest.mark.slow)]
 )
@@ -92,6 +93,7 @@ def test_it_undoes_most_of_a_linear_error_for_observations_it_has_not_seen(
     assert mean_log_prob(posterior, theta, x) > exact - 0.4
 
 
+@pytest.mark.medium
 def test_its_mixture_is_the_stated_sum() -> None:
     posterior: Any = trained().build_posterior()
     mixing = posterior.posterior_estimator.parts[0].mixing
@@ -104,6 +106,7 @@ def test_its_mixture_is_the_stated_sum() -> None:
     torch.testing.assert_close(found.double(), expected, atol=2e-3, rtol=0)
 
 
+@pytest.mark.medium
 def test_g_is_not_worse_than_h_on_pairs_that_are_held_out() -> None:
     history = trained().history
     assert history.kept_validation_loss <= history.validation_loss[0]

@@ -217,6 +217,7 @@ def flow(name: str) -> Any:
     return headless(posterior_nn(name, **options)(theta, x).eval())
 
 
+@pytest.mark.medium
 @pytest.mark.usefixtures("double")
 @pytest.mark.parametrize("name", ["maf", "nsf", "zuko_nsf", "zuko_unaf"])
 def test_gradient_of_a_draw_is_that_of_finite_differences_at_fixed_noise(
@@ -521,6 +522,7 @@ def posterior(npe: Any) -> Any:
     return trained(npe).build_posterior()
 
 
+@pytest.mark.medium
 @pytest.mark.filterwarnings("ignore:Only 3 calibration")
 def test_npe_is_left_as_it_was_and_is_not_trained_inside_either(npe: Any) -> None:
     before = copy.deepcopy(npe.posterior_estimator.state_dict())
@@ -541,12 +543,14 @@ def test_npe_is_left_as_it_was_and_is_not_trained_inside_either(npe: Any) -> Non
         torch.testing.assert_close(own, given, rtol=0, atol=0)
 
 
+@pytest.mark.medium
 def test_few_pairs_are_all_trained_on_and_observations_are_held_out(npe: Any) -> None:
     with pytest.warns(RoPEWarning, match="3 calibration pair"):
         method = trained(npe, num_pairs=3)
     assert len(method.history.validation_loss) == SMALL.max_num_epochs + 1
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", ["zuko_unaf", "zuko_nsf"])
 def test_training_runs_on_flows_of_zuko(name: str) -> None:
     method = HVAE(
@@ -566,6 +570,7 @@ def test_training_runs_on_flows_of_zuko(name: str) -> None:
     assert torch.isfinite(scores(posterior, *real(5, seed=3))).all()
 
 
+@pytest.mark.medium
 def test_images_are_supported() -> None:
     prior = BoxUniform(torch.zeros(3), torch.ones(3))
 

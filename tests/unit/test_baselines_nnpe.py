@@ -208,6 +208,7 @@ def test_statistics_that_are_constant_in_simulations_stay_constant() -> None:
     assert torch.equal(seen, torch.full((3, 1), 0.5))
 
 
+@pytest.mark.medium
 def test_the_density_is_of_the_family_of_npe() -> None:
     for family in ["mdn", "made", "maf", "nsf", "zuko_nsf", "zuko_gf"]:
         npe = problems.npe_posterior(family)

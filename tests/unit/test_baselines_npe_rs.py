@@ -270,6 +270,7 @@ class Recorder(nn.Module):
         return self.linear(x)
 
 
+@pytest.mark.medium
 def test_each_step_draws_anew_from_all_simulations_and_observations() -> None:
     Recorder.seen.clear()
     training = Training(training_batch_size=10, max_num_epochs=10)

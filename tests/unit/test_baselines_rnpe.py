@@ -86,6 +86,7 @@ def closed_form(x: float) -> tuple[float, float]:
 # --- against known answers ---
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     "noise_on", ["embedding", pytest.param("input", marks=pytest.mark.slow)]
 )
@@ -135,6 +136,7 @@ def test_samples_follow_the_density() -> None:
         assert share == pytest.approx(float(cumulative[point - 1]), abs=0.03)
 
 
+@pytest.mark.medium
 def test_with_one_wrong_statistic_it_is_far_better_than_npe() -> None:
     """Two parameters with a reading each; the second reading is off by 20 sd."""
     posterior = quick_posterior(
@@ -147,6 +149,7 @@ def test_with_one_wrong_statistic_it_is_far_better_than_npe() -> None:
     assert lpp(posterior, theta, x).mean > gaussian.prior().log_prob(theta).mean()
 
 
+@pytest.mark.medium
 def test_the_marginal_density_is_that_of_the_statistics() -> None:
     s = torch.randn(2000, 2)
     s[:, 1] = 0.8 * s[:, 0] + 0.6 * s[:, 1]
@@ -210,6 +213,7 @@ def test_constant_statistics_are_left_out_and_come_back_as_simulated() -> None:
 # --- the posterior as an object ---
 
 
+@pytest.mark.medium
 def test_what_was_denoised_is_kept() -> None:
     posterior = quick_posterior()
     mixing, x = mixing_of(posterior), torch.randn(3, 2)
@@ -224,6 +228,7 @@ def test_what_was_denoised_is_kept() -> None:
     assert len(mixing._denoised) == num_kept
 
 
+@pytest.mark.medium
 def test_two_posteriors_of_one_training_are_the_same_function() -> None:
     method = quick().train(seed=0, show_progress_bars=False)
     theta, x = torch.randn(3, 2), torch.randn(3, 2)
@@ -268,6 +273,7 @@ def test_one_observation_serves_many_parameters_and_gradients_flow() -> None:
     assert (theta.grad != 0).any(dim=1).all()
 
 
+@pytest.mark.medium
 def test_samples_have_the_shapes_of_an_estimator() -> None:
     for sample_shape in [(), (5,), (4, 5)]:
         estimator = quick_posterior().posterior_estimator
@@ -307,6 +313,7 @@ def test_chains_that_disagree_are_warned_of_and_measured() -> None:
     assert (mixing_of(posterior).r_hat(x) > 1.1).any()
 
 
+@pytest.mark.medium
 def test_chains_that_agree_are_not_warned_of(recwarn: Any) -> None:
     mixing = mixing_of(one_statistic().build_posterior())
     assert (mixing.r_hat(X_O[:2]) < 1.1).all()
@@ -367,6 +374,7 @@ def test_an_error_model_of_another_type_is_refused() -> None:
         RNPE(gaussian.prior(), error_model=nn.Identity())  # type: ignore[arg-type]
 
 
+@pytest.mark.medium
 def test_far_observations_are_treated_as_at_the_bound() -> None:
     mixing = mixing_of(quick_posterior())
     far, farther = (mixing.embed(torch.tensor([[value, 0.0]])) for value in (1e8, 1e9))

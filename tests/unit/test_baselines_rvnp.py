@@ -56,6 +56,7 @@ def bent_errors() -> ErrorModel:
 # Densities.
 
 
+@pytest.mark.medium
 def test_the_surrogate_is_near_the_simulator() -> None:
     theta = torch.tensor([[0.5, -1.0]])
     logits, means, covariances = gaussians_of(surrogate(), theta)
@@ -91,6 +92,7 @@ def exact_bound(num_draws: int) -> Bound:
     return Bound(q, errors, surrogate(), gaussian.prior(), num_draws)
 
 
+@pytest.mark.medium
 def test_the_bound_is_the_evidence_and_its_weights_the_posterior_with_many_draws() -> (
     None
 ):
@@ -213,6 +215,7 @@ def test_without_an_offset_in_the_errors_it_does_not_undo_one() -> None:
     assert found < exact - 0.4
 
 
+@pytest.mark.medium
 def test_a_strong_penalty_leaves_no_offset_that_varies() -> None:
     theta, _ = simulations()
     y = theta[:500] + 2 * theta[:500].sign()

@@ -161,6 +161,7 @@ def test_the_same_table_gives_the_same_bytes(
     assert contents[0] == contents[1]
 
 
+@pytest.mark.medium
 def test_a_report_shows_infinite_scores_failures_and_what_was_not_run(
     suite: Suite, results: Results, tmp_path: Path
 ) -> None:
@@ -201,6 +202,7 @@ def test_the_paired_test_is_not_blinded_by_one_observation() -> None:
     assert not worse(best, lost)
 
 
+@pytest.mark.medium
 def test_a_method_with_a_missing_repetition_still_competes(
     suite: Suite, tmp_path: Path
 ) -> None:
@@ -234,6 +236,7 @@ def test_a_method_without_labels_can_be_best_at_one_size_only(
     assert "| MLP | -3.00 | **-1.00** |" in text
 
 
+@pytest.mark.medium
 def test_losses_are_listed_against_every_method(suite: Suite, tmp_path: Path) -> None:
     results = Results(tmp_path / "cells")
     for cell in suite.cells:
@@ -270,6 +273,7 @@ def test_a_task_with_a_single_method_without_pairs_has_its_line_and_name(
     assert [text.get_text() for text in figure.legends[0].texts] == ["prior"]
 
 
+@pytest.mark.medium
 def test_a_report_without_arrays_marks_nothing(
     suite: Suite, results: Results, tmp_path: Path
 ) -> None:

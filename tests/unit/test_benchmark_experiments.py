@@ -246,6 +246,7 @@ def test_lines_that_are_methods_score_as_in_the_benchmark(
         assert found == pytest.approx(expected, abs=1e-4)
 
 
+@pytest.mark.medium
 def test_embeddings_are_nearer_to_their_targets_where_less_is_wrong(
     lines: dict[tuple[str, float | None], Loss],
 ) -> None:
@@ -285,6 +286,7 @@ def test_a_task_without_a_simulator_is_refused(tmp_path: Path) -> None:
         next(losses(case, gammas=[0.1]))
 
 
+@pytest.mark.medium
 def test_a_line_shows_what_there_is(
     lines: dict[tuple[str, float | None], Loss],
 ) -> None:

@@ -198,6 +198,7 @@ def test_without_a_stack_nothing_is_compared(folder: Path) -> None:
 # The docs ---------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_the_block_replaces_what_is_between_the_markers_and_nothing_else(
     folder: Path, docs_page: Path
 ) -> None:
@@ -218,6 +219,7 @@ def test_the_block_replaces_what_is_between_the_markers_and_nothing_else(
     assert len(text.splitlines()) < 60
 
 
+@pytest.mark.medium
 def test_readme_shows_scores_on_real_measurements_with_their_intervals(
     folder: Path, docs_page: Path
 ) -> None:
@@ -268,6 +270,7 @@ def test_a_folder_without_results_is_refused(folder: Path, docs_page: Path) -> N
 # The suite main ---------------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_neither_sbi_nor_another_setting_of_rope_competes(folder: Path) -> None:
     publish(
         folder, "main", by_method(SBI=3.0, RoPE_other=2.0, OT_only_other=2.0, NPE=1.0)
@@ -342,6 +345,7 @@ def test_what_failed_what_is_infinite_and_what_was_not_run_is_shown(
     assert line(text, "noniid")[:3] == expected
 
 
+@pytest.mark.medium
 def test_stand_ins_are_named_wherever_their_numbers_are(
     folder: Path, docs_page: Path
 ) -> None:
@@ -359,6 +363,7 @@ def test_stand_ins_are_named_wherever_their_numbers_are(
 # Where RoPE loses -------------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_losses_of_rope_are_counted_and_listed_with_their_gap(
     folder: Path, docs_page: Path
 ) -> None:
@@ -430,6 +435,7 @@ def test_all_statements_are_reproduced_where_all_are_true(folder: Path) -> None:
     assert judge(folder, as_in_the_paper) == ["reproduced"] * len(STATEMENTS)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("statement", "chosen", "score"),
     [

@@ -178,6 +178,7 @@ COMMITTED = Path(__file__).parents[2] / "benchmarks" / "results"
 NAMES = sorted(path.parent.name for path in COMMITTED.glob("*/results.csv"))
 
 
+@pytest.mark.medium
 def test_the_committed_tables_fit_their_arrays() -> None:
     assert NAMES
     for name in NAMES:

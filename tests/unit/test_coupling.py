@@ -62,6 +62,7 @@ def solved_by_the_oracle(
     return real, simulated, gamma, *plan
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("mode", MODES)
 def test_rows_equal_those_of_the_oracle(mode: dict[str, Any]) -> None:
     for ratio, tau in ((1.0, 1.0), (0.1, 0.9), (1e-2, 0.5), (1e-3, 0.9)):
@@ -381,6 +382,7 @@ def balanced_overflow() -> tuple[Tensor, Tensor, float]:
     return real, simulated, 1e-3 * float(cost_of(real, simulated).max())
 
 
+@pytest.mark.medium
 def test_where_scalings_of_pot_overflow_the_rows_stay_exact_and_finite() -> None:
     real, simulated, gamma = balanced_overflow()
     coupler = raw_coupler(
@@ -398,6 +400,7 @@ def test_where_scalings_of_pot_overflow_the_rows_stay_exact_and_finite() -> None
     )
 
 
+@pytest.mark.medium
 def test_accelerated_iterations_converge_where_plain_ones_do_not() -> None:
     real, simulated, gamma = balanced_overflow()
     coupler = raw_coupler(gamma=gamma, max_iterations=3000)
@@ -416,6 +419,7 @@ def test_iterations_of_both_solvers_count_together() -> None:
     assert coupling.num_iterations == 37
 
 
+@pytest.mark.medium
 def test_each_call_of_pot_starts_where_the_last_one_ended() -> None:
     # If each call started from zero, none would get past its last iteration.
     real, simulated = clouds(250, 250, dim=10)
@@ -427,6 +431,7 @@ def test_each_call_of_pot_starts_where_the_last_one_ended() -> None:
     assert coupling.converged
 
 
+@pytest.mark.medium
 def test_a_tolerance_below_the_digits_ends_early_and_says_so() -> None:
     real, simulated = clouds()
     for solver in ("own", "pot"):

@@ -194,6 +194,7 @@ def test_no_entry_of_the_kernel_is_a_denormal_number(
         assert min(smallest) > 1e-31, mode
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("mode", MODES)
 def test_the_size_of_blocks_and_portions_changes_no_row(
     mode: dict[str, Any], monkeypatch: pytest.MonkeyPatch
@@ -350,6 +351,7 @@ def unbalanced_clusters() -> tuple[Tensor, Tensor, float]:
     return real.double(), simulated.double(), gamma
 
 
+@pytest.mark.medium
 def test_plain_iterations_take_over_where_acceleration_gets_lost(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -400,6 +402,7 @@ def test_exhausted_digits_end_the_iteration() -> None:
 GAMMAS, TAUS = [0.1, 1.0, 0.3], [0.5, 1.0, 0.0, 0.9]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("mode", MODES)
 def test_a_sweep_yields_single_solutions_in_the_order_asked_for(
     mode: dict[str, Any],

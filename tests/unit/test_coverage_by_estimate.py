@@ -72,6 +72,7 @@ def held_out_p_value(n: int, seed: int) -> float:
     return coverage_by_estimate(ranks[:, None], means[:, None]).p_values[0]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("n", [15, pytest.param(60, marks=pytest.mark.slow)])
 def test_held_out_posteriors_of_one_set_of_pairs_give_no_more_alarms(n: int) -> None:
     """Folds share most of their pairs, so that their errors are alike."""

@@ -111,6 +111,7 @@ def test_nothing_alarms_where_the_simulator_is_right() -> None:
     assert "far from all simulations was not tested" in diagnosis.notes[-1]
 
 
+@pytest.mark.medium
 def test_misspecification_that_tuning_repairs_is_found_before_tuning_only(
     misspecified: Diagnosis,
 ) -> None:
@@ -120,6 +121,7 @@ def test_misspecification_that_tuning_repairs_is_found_before_tuning_only(
     assert misspecified.unexpected == ()
 
 
+@pytest.mark.medium
 def test_a_batch_unlike_the_calibration_pairs_is_found_after_tuning(
     tuned: RoPE,
 ) -> None:
@@ -129,6 +131,7 @@ def test_a_batch_unlike_the_calibration_pairs_is_found_after_tuning(
     assert diagnosis["misspecification after tuning"].alarming
 
 
+@pytest.mark.medium
 def test_a_batch_for_which_no_guarantee_holds_gives_an_alarm_and_a_page_says_so(
     tuned: RoPE, misspecified: Diagnosis
 ) -> None:
@@ -155,6 +158,7 @@ def test_misspecification_is_found_in_a_rope_without_pairs() -> None:
     assert "no calibration pairs have tuned" in diagnosis[SHIFTS[0]].sentence
 
 
+@pytest.mark.medium
 def test_a_prior_shift_is_found_in_the_parameter_that_shifts(tuned: RoPE) -> None:
     torch.manual_seed(4)
     x_o = gaussian.real_process(parameters(200, shifted=True))
@@ -179,6 +183,7 @@ def test_a_batch_of_a_quarter_of_the_prior_is_found_to_be_narrow(tuned: RoPE) ->
     assert "No sign that theta_1 is shifted" in diagnosis[SHIFTS[0]].sentence
 
 
+@pytest.mark.medium
 def test_a_narrow_batch_like_its_pairs_is_narrower_than_the_prior_only() -> None:
     torch.manual_seed(38)
     theta = 0.25 * parameters(60)
@@ -474,6 +479,7 @@ def test_simulations_are_flagged_as_often_as_stated() -> None:
     assert 5 <= counts <= 45
 
 
+@pytest.mark.medium
 def test_posteriors_of_very_few_or_very_many_simulations_alarm(tuned: RoPE) -> None:
     x_o = gaussian.real_process(parameters(60))
     for gamma, name in ((0.003, "observations with few simulations"), (9.0, None)):
@@ -522,6 +528,7 @@ def test_the_distance_of_a_prior_shift_is_that_of_kolmogorov_and_smirnov() -> No
         assert float(shift.distance[k]) == pytest.approx(float(gap), abs=1e-9)
 
 
+@pytest.mark.medium
 def test_a_shifted_batch_alarms_and_a_batch_from_the_prior_does_not() -> None:
     torch.manual_seed(18)
     quiet, loud = 0, 0
@@ -760,6 +767,7 @@ def test_p_values_of_the_residual_test_are_uniform_without_dependence() -> None:
     assert kstest(values, "uniform").pvalue > 0.01
 
 
+@pytest.mark.medium
 def test_the_bias_of_residuals_is_recovered_from_noise() -> None:
     torch.manual_seed(20)
     theta = torch.randn(4000, 2).double()
@@ -922,6 +930,7 @@ def test_a_shift_that_no_distance_could_show_is_not_tested() -> None:
     ).replace("\n  ", " ")
 
 
+@pytest.mark.medium
 @pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
 def test_pairs_of_one_parameter_leave_residuals_out() -> None:
     torch.manual_seed(25)

@@ -82,6 +82,7 @@ def normal(x: Tensor, variance: Tensor) -> Tensor:
     return -x.square() / (2 * variance) - (2 * math.pi * variance).log() / 2
 
 
+@pytest.mark.medium
 def test_gain_offset_and_error_of_one_summary_agree_with_numerical_integration() -> (
     None
 ):
@@ -294,6 +295,7 @@ def test_errors_below_the_smallest_noise_are_not_taken_for_common_ones() -> None
         assert counted(groups, std * torch.randn(100, 2)) > 60
 
 
+@pytest.mark.medium
 def test_weights_that_differ_within_a_group_count_by_their_effective_number() -> None:
     # The variance of their mean is that of correlated errors, summed by hand.
     groups, weights, rho = torch.tensor([0, 0, 1]), torch.tensor([2.0, 1.0, 3.0]), 0.5
@@ -530,6 +532,7 @@ def test_draws_are_finite_for_extreme_and_degenerate_pairs() -> None:
             assert math.isfinite(discrepancy.log_evidence), case
 
 
+@pytest.mark.medium
 def test_a_long_grid_of_equal_settings_keeps_all_of_them() -> None:
     model = DiscrepancyModel(
         gain_precisions=[1.0 + 1e-6 * i for i in range(150)],
@@ -577,6 +580,7 @@ def test_a_prior_probability_of_zero_or_one_is_not_changed() -> None:
         assert len(discrepancy.sample(10)) == 10
 
 
+@pytest.mark.medium
 def test_imputed_means_lead_to_the_posterior_of_quadrature() -> None:
     # The labels are as noisy as the parameters are spread.
     torch.manual_seed(0)

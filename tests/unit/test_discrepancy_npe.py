@@ -105,6 +105,7 @@ def sources() -> dict[str, Callable[..., DiscrepancyNPE]]:
     }
 
 
+@pytest.mark.medium
 @pytest.mark.filterwarnings(
     "error::sbi_rope.errors.RoPEWarning", "ignore:Only 300 simulations"
 )
@@ -143,6 +144,7 @@ def test_vector_fields_are_corrected_and_can_be_sampled() -> None:
             trained(posterior, space="tuned")
 
 
+@pytest.mark.medium
 def test_mixed_parameters_keep_their_categories() -> None:
     posterior = problems.npe_posterior("mnpe")
     theta = posterior.prior.sample((12,))
@@ -174,6 +176,7 @@ def states() -> tuple[Any, ...]:
     return torch.get_rng_state().tolist(), np.random.get_state()[1].tolist(), random.getstate()  # noqa: E501, NPY002  # fmt: skip
 
 
+@pytest.mark.medium
 def test_the_same_seed_gives_the_same_posterior_and_keeps_the_random_state() -> None:
     pairs = labelled()
     for space in SPACES:
@@ -206,6 +209,7 @@ def test_nothing_that_is_passed_in_is_changed() -> None:
         assert [p.requires_grad for p in net.parameters()] == flags, space
 
 
+@pytest.mark.medium
 def test_training_again_starts_anew() -> None:
     for space in SPACES:
         made = trained(space=space)
@@ -262,6 +266,7 @@ def test_learned_parameters_move_the_posterior_to_those_of_the_pairs() -> None:
     assert 0.6 < means[1] < 0.9
 
 
+@pytest.mark.medium
 @pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
 def test_two_pairs_are_enough() -> None:
     for space in SPACES:
@@ -401,6 +406,7 @@ def test_courses_are_added_until_the_loss_has_settled() -> None:
     assert len(settle(several, courses=UNTIL_SETTLED).training_loss) == 2
 
 
+@pytest.mark.medium
 def test_a_stack_adds_courses_only_if_the_loss_was_still_falling() -> None:
     # The loss is 51 nats at the start, and 18 after a first course of 40 steps.
     short, long = Slow(), Slow()

@@ -100,6 +100,7 @@ Prior = Callable[[int], Tensor]
 PRIORS: tuple[Prior, ...] = (box, skewed, discrete, single)
 
 
+@pytest.mark.medium
 def test_pairs_from_the_prior_hardly_change_it() -> None:
     improbable = 0
     for prior in PRIORS:

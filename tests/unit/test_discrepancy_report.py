@@ -327,6 +327,7 @@ def blocks(x: Tensor) -> Tensor:
     return nn.functional.avg_pool2d(x, 4).flatten(1)
 
 
+@pytest.mark.medium
 def test_the_discrepancy_of_an_image_is_that_of_its_summaries() -> None:
     theta = problems.box(2).sample((30,))
     x = problems.simulate_image(theta)
@@ -398,6 +399,7 @@ def tunnel(root: Any, n: int) -> DiscrepancyReport:
     return asked.report(x_names=task.x_names, show_progress_bars=False)
 
 
+@pytest.mark.medium
 def test_the_published_law_of_the_light_tunnel_over_predicts_all_light(
     chamber_root: Any,
 ) -> None:

@@ -91,6 +91,7 @@ def test_the_reference_describes_all_that_the_package_exports() -> None:
     assert sorted(described) == sorted(sbi_rope.__all__)
 
 
+@pytest.mark.medium
 def test_no_docstring_of_a_property_starts_with_a_type() -> None:
     """Napoleon takes what stands before a colon in it for the type of the property."""
     wrong = []

@@ -64,6 +64,7 @@ def test_distances_from_simulations_count_below_as_above() -> None:
     assert torch.allclose(far, torch.tensor([[0.0, 1000.0]]))
 
 
+@pytest.mark.medium
 def test_an_entry_that_varies_only_in_reality_is_named_and_diagnosed() -> None:
     what = r"1 of the 3 entries of `{}` \(first: \[2\]\) are up to .e\+05 standard"
     for net in (False, True):
@@ -185,6 +186,7 @@ def test_the_posterior_of_such_a_network_has_mass_inside_the_prior_for_any_x() -
     assert (samples.abs() <= 1).all()
 
 
+@pytest.mark.medium
 def test_no_measurement_of_a_task_is_at_half_the_distance_of_a_warning() -> None:
     for name in ("cs", "hemodynamics", "linear_gaussian", "pendulum", "sir"):
         task = get_task(name)

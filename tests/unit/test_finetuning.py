@@ -46,6 +46,7 @@ def test_the_first_losses_are_the_mean_unsquared_distances() -> None:
     assert float(distances.mean()) == pytest.approx(expected, rel=1e-6)
 
 
+@pytest.mark.medium
 def test_many_pairs_lead_to_the_minimiser_known_in_closed_form() -> None:
     """The conditional median of 0.8 theta given x_o: 0.64 (x_o - 0.7) / 1.4.
 
@@ -76,6 +77,7 @@ def test_the_net_that_is_kept_is_the_best_on_the_held_out_pairs() -> None:
     assert validation[-1] > validation[best]
 
 
+@pytest.mark.medium
 def test_of_several_learning_rates_the_best_on_the_hold_out_is_kept() -> None:
     x = torch.randn(30, 2)
     losses = {}
@@ -123,6 +125,7 @@ def test_the_users_net_is_left_as_it_was() -> None:
     assert not torch.equal(g[0].weight, net[0].weight)  # type: ignore[index]
 
 
+@pytest.mark.medium
 def test_a_net_without_parameters_gets_an_affine_map_that_starts_as_identity() -> None:
     x = torch.randn(50, 3)
     g = trainable_copy(nn.Identity(), x)

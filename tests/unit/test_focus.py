@@ -62,6 +62,7 @@ def test_an_npe_of_other_units_is_warned_of() -> None:
         conductor.embed(gaussian.labelled(25)[1], **QUIET)
 
 
+@pytest.mark.medium
 def test_an_npe_that_fits_its_simulations_is_not_warned_of() -> None:
     x_o = gaussian.labelled(25)[1]
     for posterior, simulator, x in (

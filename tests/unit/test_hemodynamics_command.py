@@ -167,6 +167,7 @@ def test_validate_prints_the_table_and_tells_whether_a_row_failed(
         assert lines[2].split()[:3] == ["cca", "not", "run"]
 
 
+@pytest.mark.medium
 def test_validate_draws_beats_of_both_processes(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
@@ -193,6 +194,7 @@ def _anyone(draw: Any) -> Any:
     return young
 
 
+@pytest.mark.medium
 def test_generate_without_numba_says_how_to_install_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

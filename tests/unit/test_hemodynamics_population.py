@@ -58,6 +58,7 @@ def test_cut_normal_numbers_follow_scipys_law() -> None:
     assert truncnorm(-2, 2).std() == pytest.approx(TRUNCATED_SD)
 
 
+@pytest.mark.medium
 def test_age_and_heart_follow_their_laws(people: dict[str, np.ndarray]) -> None:
     age = people["age"]
     assert kstest((age - 25) / 50, "uniform").pvalue > 1e-3
@@ -87,6 +88,7 @@ def test_weisslers_formula_explains_half_of_the_variance_of_the_ejection_time(
     assert np.corrcoef(time, people["heart_rate"])[0, 1] < -0.3
 
 
+@pytest.mark.medium
 def test_the_ejection_leaves_room_in_the_beat() -> None:
     for prior in ("population", "independent"):
         subjects = _draw("simulator", 1500, prior=prior)
@@ -98,6 +100,7 @@ def test_the_ejection_leaves_room_in_the_beat() -> None:
         assert min(s.regurgitant_volume for s in subjects) >= 0.0
 
 
+@pytest.mark.medium
 def test_independent_parameters_follow_the_laws_asked_for() -> None:
     subjects = _draw("simulator", prior="independent")
     volume = np.array([s.stroke_volume for s in subjects])
@@ -108,6 +111,7 @@ def test_independent_parameters_follow_the_laws_asked_for() -> None:
     assert abs(np.corrcoef(volume, time)[0, 1]) < 4 / N**0.5
 
 
+@pytest.mark.medium
 def test_pulse_wave_velocity_has_the_published_quantiles() -> None:
     rng = np.random.default_rng(0)
     arteries = [population._draw_arteries(rng, 55.0) for _ in range(8000)]

@@ -272,6 +272,7 @@ def failing_first(
     return simulate_sites
 
 
+@pytest.mark.medium
 def test_a_failed_run_is_tried_again_with_smaller_steps(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -288,6 +289,7 @@ def test_beats_that_do_not_repeat_are_an_error() -> None:
         waveforms.simulate_beat(BASELINE, physics)
 
 
+@pytest.mark.medium
 def test_a_beat_has_its_pressures_at_256_phases_in_mmhg_the_same_each_time() -> None:
     physics = Physics(cell_length=0.02)
     beat, again = (waveforms.simulate_beat(BASELINE, physics) for _ in range(2))

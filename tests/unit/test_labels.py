@@ -220,6 +220,7 @@ def test_the_order_of_the_draws_of_a_label_does_not_matter() -> None:
     assert torch.equal(draws.draws.sort(dim=1).values, ordered.sort(dim=1).values)
 
 
+@pytest.mark.medium
 def test_the_discrepancy_of_possible_means_is_that_of_the_right_ones() -> None:
     torch.manual_seed(0)
     m = torch.randn(60, 1, dtype=torch.double)
@@ -321,6 +322,7 @@ def test_labels_that_say_nothing_are_left_out() -> None:
     assert conductor.labels.are_exact
 
 
+@pytest.mark.medium
 def test_exact_and_noisy_labels_may_be_appended_one_after_the_other() -> None:
     theta, x = gaussian.labelled(6)
     conductor = rope().append_calibration(theta[:4], x[:4])
@@ -486,6 +488,7 @@ def half_measured(count: int) -> tuple[Tensor, Tensor]:
     return theta, x
 
 
+@pytest.mark.medium
 def test_targets_of_missing_parameters_are_what_x_says_about_them() -> None:
     theta, x = half_measured(200)
     conductor = RoPE(gaussian.posterior(), simulator=gaussian.simulator)
@@ -501,6 +504,7 @@ def test_targets_of_missing_parameters_are_what_x_says_about_them() -> None:
     assert float(error.abs().mean()) < 0.15
 
 
+@pytest.mark.medium
 def test_tuning_on_partial_labels_keeps_what_x_says_about_missing_parameters() -> None:
     theta, x = half_measured(600)
     finetuner = CalibrationFinetuner(learning_rate=1e-2, max_num_epochs=300)

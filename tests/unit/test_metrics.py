@@ -122,6 +122,7 @@ class Coin:
         return probability.log().sum(dim=-1).reshape(-1, len(x))
 
 
+@pytest.mark.medium
 def test_an_exact_posterior_of_a_discrete_parameter_is_calibrated() -> None:
     torch.manual_seed(0)
     theta = torch.bernoulli(torch.full((500, 1), 0.5))
@@ -221,6 +222,7 @@ def test_coverage_error_does_not_cancel_over_parameters() -> None:
     assert score.value == pytest.approx(0.5)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("measured", [(400, 400, 400, 400), (40, 100, 400, 0)])
 def test_coverage_error_of_calibrated_levels_has_its_expected_value(
     measured: tuple[int, ...],
@@ -237,6 +239,7 @@ def test_coverage_error_of_calibrated_levels_has_its_expected_value(
     assert curve.num_observations == int((sum(parts) / len(parts)) ** -2 + 1e-9)
 
 
+@pytest.mark.medium
 def test_coverage_error_standard_error_matches_its_spread() -> None:
     # One parameter over-confident, one under-confident, by the same latent error.
     scales = torch.tensor([0.5, 2.0], dtype=torch.float64)
@@ -293,6 +296,7 @@ def test_acauc_of_a_factor_near_one_is_its_logarithm_divided_by_pi(
     assert found == pytest.approx(math.log(factor) / math.pi, rel=0.01)
 
 
+@pytest.mark.medium
 def test_acauc_of_gaussian_posteriors_has_its_exact_and_its_published_value() -> None:
     theta, x = gaussian_pairs(1500)
     for bias, scale, *published in (

@@ -103,6 +103,7 @@ def test_log_prob_is_the_log_sum_over_all_components() -> None:
 
 
 # One flow of each library; all families go through tests/contract.
+@pytest.mark.medium
 @pytest.mark.parametrize("family", ["mdn", "nsf", "zuko_unaf"])
 def test_log_prob_of_trained_flows_is_the_log_sum_over_all_components(
     family: str,
@@ -116,6 +117,7 @@ def test_log_prob_of_trained_flows_is_the_log_sum_over_all_components(
     )
 
 
+@pytest.mark.medium
 def test_every_kind_of_coupling_gives_the_log_sum_of_its_own_weights() -> None:
     for dtype, blocked in itertools.product(
         (torch.float64, torch.float32), (False, True)
@@ -413,6 +415,7 @@ def test_one_row_of_theta_or_one_x_serves_all_of_the_other() -> None:
 # --- samples ---
 
 
+@pytest.mark.medium
 def test_samples_follow_the_density() -> None:
     posterior = gaussian_posterior(n_o=1, n_s=6)
     size = 400

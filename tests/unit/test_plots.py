@@ -36,6 +36,7 @@ def two_posteriors() -> dict[str, Tensor]:
     return {"NPE": torch.randn(200, 2), "RoPE": torch.randn(300, 2) + 1.0}
 
 
+@pytest.mark.medium
 def test_a_stack_has_a_credible_set_and_one_with_a_guarantee() -> None:
     stack, x = stacks.small_stack(), stacks.observed()[0]
     truth: Any = [0.0, 0.0]  # or an array, as everywhere
@@ -53,6 +54,7 @@ def test_a_stack_has_a_credible_set_and_one_with_a_guarantee() -> None:
     assert large > small > 0
 
 
+@pytest.mark.medium
 def test_a_stack_with_too_few_pairs_for_a_guarantee_is_drawn_without_it() -> None:
     stack, x = stacks.small_stack(), stacks.observed()[0]
     with pytest.warns(RoPEWarning, match="No set with a guarantee is drawn"):
@@ -158,6 +160,7 @@ def test_pair_plot_draws_the_edge_of_the_prior_where_samples_leave_it() -> None:
         assert drawn == pytest.approx([float(edge) for edge in edges])
 
 
+@pytest.mark.medium
 def test_pair_plot_draws_samples_without_an_area_as_a_point_or_a_line() -> None:
     for count in (1, 2, 200):
         same = torch.tensor([[1.0, 2.0]]).repeat(count, 1)

@@ -117,6 +117,7 @@ def test_log_prob_is_minus_infinity_outside_the_support() -> None:
         assert torch.isfinite(values[1])
 
 
+@pytest.mark.medium
 def test_map_is_the_mode_of_the_prior() -> None:
     posterior = PriorPosterior(normal()).set_default_x(torch.zeros(1, 3))
     mode = posterior.map(num_iter=500, show_progress_bars=False)

@@ -25,6 +25,7 @@ def start_a_worker(alive: Connection, *, of_somebody_else: bool) -> None:
     time.sleep(10)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("of_somebody_else", [False, True])
 def test_a_worker_ends_with_the_parent_it_works_for(of_somebody_else: bool) -> None:
     reader, alive = fork.Pipe(duplex=False)

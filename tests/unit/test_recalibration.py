@@ -133,6 +133,7 @@ def test_the_density_integrates_to_one_in_a_box_and_is_that_of_the_draws(
     assert outside.item() == -INF
 
 
+@pytest.mark.medium
 def test_many_pairs_find_a_factor_for_each_parameter() -> None:
     found = recalibration(folds_of(1000, too_wide=torch.tensor([2.0, 0.8])))
     torch.testing.assert_close(
@@ -326,6 +327,7 @@ def test_in_a_triangle_the_density_has_mass_one_and_is_that_of_the_draws(
     assert (both[..., 0] >= both[..., 1]).all()
 
 
+@pytest.mark.medium
 def test_what_is_moved_out_of_a_triangle_counts_when_factors_are_chosen(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

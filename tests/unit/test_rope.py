@@ -773,6 +773,7 @@ def test_a_default_x_is_a_copy() -> None:
     assert torch.equal(posterior.log_prob(theta), before)
 
 
+@pytest.mark.medium
 def test_threads_get_the_densities_of_their_own_unseen_observations() -> None:
     posterior = rope().build_posterior(X_O, num_simulations=60, seed=0, unseen="extend")
     xs = [X_O[i : i + 1] + 0.5 for i in range(4)]

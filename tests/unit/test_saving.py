@@ -129,6 +129,7 @@ assert not [name for name in sys.modules if name.split(".")[0] == "tests"]
 """
 
 
+@pytest.mark.medium
 def test_another_process_loads_the_same_posteriors(tmp_path: Path) -> None:
     batch, stack, coupled = (
         rope_posterior(),
@@ -163,6 +164,7 @@ def test_another_process_loads_the_same_posteriors(tmp_path: Path) -> None:
     assert result.stdout.count(str(coupled.report)) == 2
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("family", [*problems.FAMILIES, "mnpe"])
 def test_every_family_can_be_saved(family: str, tmp_path: Path) -> None:
     npe = problems.npe_posterior(family)
@@ -182,6 +184,7 @@ def test_posteriors_of_vector_fields_can_be_saved(method: str, tmp_path: Path) -
     assert_same(posterior, loaded, problems.simulate(torch.zeros(1, 2)))
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     "prior",
     [
@@ -245,11 +248,13 @@ def test_networks_of_torch_and_sbi_can_be_saved(
     assert torch.equal(found, expected)
 
 
+@pytest.mark.medium
 def test_settings_may_be_numbers_of_numpy(tmp_path: Path) -> None:
     posterior = rope_posterior(tail_mass=np.float64(1e-2))
     assert_same(posterior, saved_and_loaded(posterior, tmp_path), stacks.observed()[:3])
 
 
+@pytest.mark.medium
 def test_a_stack_keeps_its_report_and_its_candidates(tmp_path: Path) -> None:
     stack, x = stack_of(coupled=True), stacks.observed()[:4]
     loaded = saved_and_loaded(stack, tmp_path)
@@ -265,6 +270,7 @@ def test_a_stack_keeps_its_report_and_its_candidates(tmp_path: Path) -> None:
     assert couplings.embeddings is loaded.posterior_estimator.coupled[0]
 
 
+@pytest.mark.medium
 def test_a_loaded_batch_can_be_extended_and_indexed(tmp_path: Path) -> None:
     posterior = rope_posterior(unseen="extend")
     loaded = saved_and_loaded(posterior, tmp_path)

@@ -306,6 +306,7 @@ NOISE: dict[str, tuple[float, float]] = {
 }
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     "name",
     [
@@ -411,6 +412,7 @@ def test_a_guaranteed_set_is_that_of_counting_the_held_out_scores(
     assert abs(found.volume - box) < 4 * found.volume_error + 0.5
 
 
+@pytest.mark.medium
 def test_sets_and_intervals_grow_with_the_level(
     stack: StackedPosterior, x: Tensor
 ) -> None:
@@ -544,6 +546,7 @@ def test_of_pairs_with_the_same_parameters_one_counts(x: Tensor) -> None:
         posterior.credible_set(0.95, x, guaranteed=True)
 
 
+@pytest.mark.medium
 def test_a_saved_stack_gives_the_same_sets(
     stack: StackedPosterior, x: Tensor, tmp_path: Any
 ) -> None:
@@ -558,6 +561,7 @@ def test_a_saved_stack_gives_the_same_sets(
         assert torch.equal(one.inside, other.inside)
 
 
+@pytest.mark.medium
 def test_sets_of_mixed_parameters_hold_categories_only() -> None:
     prior = problems.mixed_prior(2)
     theta = prior.sample((12,))

@@ -442,6 +442,7 @@ def sleepless(theta: Any) -> Any:
     return [float(theta[0]) + noise, float(theta[1])]
 
 
+@pytest.mark.medium
 @pytest.mark.filterwarnings("ignore:Dropped")
 def test_a_seed_gives_the_same_simulations_with_any_number_of_workers() -> None:
     drawn = []

@@ -270,6 +270,7 @@ def test_the_extract_is_the_beginning_of_the_published_files(
         assert published.startswith(extract.read_bytes())
 
 
+@pytest.mark.medium
 @pytest.mark.usefixtures("shorter_files")
 @pytest.mark.parametrize("name", ["light_tunnel", "wind_tunnel"])
 def test_no_file_is_read_that_ends_within_a_row(name: str, tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sbi_rope.tasks.__main__.BUDGET", 0.0)
 
 
+@pytest.mark.medium
 def test_the_list_has_a_line_for_every_task_and_says_whether_its_data_are_there(
     capsys: pytest.CaptureFixture[str], chamber_extract: Path, tmp_path: Path
 ) -> None:
@@ -59,6 +60,7 @@ def test_without_data_the_missing_file_is_named(
 
 
 # One task each of statistics, series and images.
+@pytest.mark.medium
 @pytest.mark.parametrize("name", ["cs", "pendulum", "light_tunnel"])
 def test_a_task_is_described_and_drawn(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -127,6 +129,7 @@ def test_the_module_runs_as_a_command_of_its_own() -> None:
     assert done.stderr == ""
 
 
+@pytest.mark.medium
 def test_real_data_and_their_stand_ins_are_described_as_what_they_are(
     capsys: pytest.CaptureFixture[str], chamber_extract: Path
 ) -> None:

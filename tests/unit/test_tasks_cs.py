@@ -168,6 +168,7 @@ def test_a_tissue_without_a_cancer_cell_has_no_statistics() -> None:
 # The simulator -----------------------------------------------------------------------
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("table", "task"),
     [
@@ -197,6 +198,7 @@ def test_tissues_simulated_together_follow_the_law_of_single_ones(
         assert ks_2samp(a, b).pvalue > 1e-3
 
 
+@pytest.mark.medium
 def test_rows_of_a_batch_belong_to_their_parameters() -> None:
     theta = torch.tensor([[1400.0, 5.0, 15.0], [250.0, 5.0, 15.0]]).repeat(100, 1)
     num_cells = CancerStromaSimulator(batched=True)(theta)[:, :2].sum(dim=1)

@@ -82,6 +82,7 @@ def test_without_noise_the_numbers_solve_the_ordinary_equations() -> None:
     np.testing.assert_allclose(extrapolated, expected, atol=0.01)
 
 
+@pytest.mark.medium
 def test_noise_has_the_variance_of_a_square_root_process() -> None:
     # While nearly all are susceptible, log i moves by the integral of b - gamma, where
     # b has the mean beta and the covariance of an Ornstein-Uhlenbeck process that

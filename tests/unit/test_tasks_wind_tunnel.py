@@ -278,6 +278,7 @@ def test_closed_form_posterior_has_the_known_width_and_score() -> None:
     assert score == pytest.approx(-0.444, abs=1e-3)
 
 
+@pytest.mark.medium
 def test_simulations_follow_the_closed_form_posterior() -> None:
     theta, x = WindTunnel(onset_jitter=0.0).get_simulations(20_000)
     oracle = Oracle()
@@ -432,6 +433,7 @@ def test_to_the_simulator_the_stand_in_looks_like_a_hatch_that_is_open_wider() -
     assert float(error[half_open].mean()) == pytest.approx(7.5, abs=1.5)
 
 
+@pytest.mark.medium
 def test_the_stand_in_has_correlated_noise() -> None:
     theta, x = WindTunnel(variant="synthetic", onset_jitter=0.0).get_test_set(2000)
     # At known timing a pressure is a straight line in the hatch, plus noise.
