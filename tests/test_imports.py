@@ -232,6 +232,7 @@ def test_every_room_is_described() -> None:
         assert named, f"CONTRIBUTING.md says nothing about {part}"
 
 
+@pytest.mark.medium
 def test_no_module_imports_the_package_as_a_whole() -> None:
     # It would hide which layer is meant, and close a circle.
     for path in modules():
@@ -366,6 +367,7 @@ def test_only_one_module_uses_what_is_private_to_sbi() -> None:
         assert not insides, f"{path}: {sorted(insides)} belong into sbi_rope._sbi"
 
 
+@pytest.mark.medium
 def test_the_check_for_what_is_private_to_sbi_finds_it() -> None:
     class Planted(DirectPosterior):
         def map(self) -> Any:  # type: ignore[override]

@@ -515,6 +515,7 @@ def test_calibration_parameters_between_categories_are_refused() -> None:
         rope.append_calibration(theta, x)
 
 
+@pytest.mark.medium
 def test_a_prior_that_sbi_cannot_transform_works_without_the_transform() -> None:
     # Categorical has no mean, which sbi's transform of discrete priors needs.
     prior = MultipleIndependent(

@@ -280,6 +280,7 @@ def test_weights_and_batch_are_attributes_and_the_text_tells_their_sizes() -> No
 # --- copies ---
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("index", [None, 2])
 def test_a_copy_has_the_same_density_and_samples(index: int | None) -> None:
     posterior: Any = gaussian_posterior(std=0.8)

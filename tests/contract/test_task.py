@@ -92,6 +92,7 @@ def test_sbi_takes_the_prior_and_its_float32_draws_as_they_are(task: Task) -> No
         torch.testing.assert_close(copied.log_prob(theta), log_prob)
 
 
+@pytest.mark.medium
 @PRIOR
 def test_density_spread_and_quantiles_of_the_prior_are_those_of_its_draws(
     task: Task,

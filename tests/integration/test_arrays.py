@@ -47,6 +47,7 @@ def rope(pairs: Any) -> RoPE:
     return rope.append_calibration(*pairs)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("convert", [array, Tensor.tolist], ids=["arrays", "lists"])
 def test_pairs_and_observations_are_those_of_tensors(convert: Any) -> None:
     theta_o, x_o = map(convert, OBSERVED)

@@ -180,6 +180,7 @@ def test_stored_people_are_shared_out_without_overlap(tmp_path: Path) -> None:
     assert run_cells(cells, place)["finished"] == 2
 
 
+@pytest.mark.medium
 def test_the_test_set_is_as_large_as_what_is_recorded(tmp_path: Path) -> None:
     cell = Cell(task="hemodynamics", preset="standard", method="prior")
     case = Case.of(cell, Sources(), Cache(tmp_path), "cpu")

@@ -59,6 +59,7 @@ def test_pressures_in_small_networks_agree_with_those_of_openbf(
     assert openbf_error(folder, network) < largest
 
 
+@pytest.mark.medium
 def test_pressures_in_77_arteries_come_closer_to_openbf_with_finer_cells(
     openbf_folder: Path,
 ) -> None:
@@ -134,6 +135,7 @@ def test_waves_in_viscoelastic_arteries_travel_at_the_velocity_asked_for() -> No
     assert max(errors.values()) < 8.0, errors
 
 
+@pytest.mark.medium
 @pytest.mark.xfail(
     reason="Viscous walls spread the wave on its way to the leg, so that its foot is "
     "9 % early in arteries this soft."
@@ -149,6 +151,7 @@ def test_the_mean_pressure_is_near_its_target(beat: Beat) -> None:
         assert wave.mean() == pytest.approx(target, abs=3.0)
 
 
+@pytest.mark.medium
 def test_the_pressures_of_a_man_of_25_are_those_published(beat: Beat) -> None:
     for site, systolic, diastolic in (
         ("aortic", 102, 76),

@@ -299,6 +299,7 @@ def test_an_expected_finding_does_not_look_like_an_alarm(
     assert 'class="finding alarm"' not in source
 
 
+@pytest.mark.medium
 def test_a_page_without_batch_and_curve_says_what_it_assumes(tmp_path: Path) -> None:
     report = replace(the_stack().report, discrepancy=None, provenance=None)
     text = Page(written(report, tmp_path)).text
@@ -340,6 +341,7 @@ def test_the_score_of_the_stack_is_one_number_and_the_other_is_explained(
     assert "uncorrected" not in same
 
 
+@pytest.mark.medium
 def test_an_over_confident_stack_says_what_to_do(tmp_path: Path) -> None:
     report = the_stack().report
     acauc = replace(report.acauc, interval=(0.01, 0.2))
@@ -348,6 +350,7 @@ def test_an_over_confident_stack_says_what_to_do(tmp_path: Path) -> None:
     assert "More labels help most." in text
 
 
+@pytest.mark.medium
 def test_the_verdict_names_pairs_whose_parameters_do_not_follow_the_prior(
     source: str, tmp_path: Path
 ) -> None:

@@ -117,6 +117,7 @@ def test_couplings_are_those_of_the_coupler_with_the_net_of_each_version() -> No
     assert versions.count(None) == 2
 
 
+@pytest.mark.medium
 def test_the_density_is_the_weighted_sum_of_the_candidates() -> None:
     x, theta = observed(), problems.box(2).sample((NUM_OBSERVED,))
     for posterior in (the_stack(), the_coupled_stack()):
@@ -574,6 +575,7 @@ def test_default_candidates_can_keep_the_prior_of_npe() -> None:
     assert coupled[-1].name == "tuning-only"
 
 
+@pytest.mark.medium
 def test_without_a_seed_the_state_of_torch_decides() -> None:
     found = []
     for state in (5, 5, 6):

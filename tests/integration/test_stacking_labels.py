@@ -149,6 +149,7 @@ def test_labels_given_as_draws_are_scored_relative_to_the_prior(tmp_path: Path) 
     assert "calibrated as far as" not in page
 
 
+@pytest.mark.medium
 def test_labels_on_a_bound_of_the_prior_have_finite_scores() -> None:
     theta = THETA.clone()
     theta[3] = torch.tensor([1.0, -1.0])  # the prior is uniform from -1 to 1

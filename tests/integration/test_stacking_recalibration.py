@@ -134,6 +134,7 @@ def test_each_fold_is_left_out_with_four_others_at_most() -> None:
             assert sum(number in pair for pair in pairs) == min(4, count - 1)
 
 
+@pytest.mark.medium
 def test_labels_on_a_bound_of_the_prior_say_nothing_about_the_spread() -> None:
     torch.manual_seed(0)
     theta, x = near_zero(14)

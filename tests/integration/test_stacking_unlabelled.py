@@ -226,6 +226,7 @@ def test_missing_numbers_of_observations_put_the_errors_in_the_embedding() -> No
         method.train(show_progress_bars=False)
 
 
+@pytest.mark.medium
 def test_errors_in_images_are_refused_before_anything_is_simulated() -> None:
     calls = []
 

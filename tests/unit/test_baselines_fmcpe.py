@@ -136,6 +136,7 @@ def test_inside_a_box_the_density_has_mass_one_and_samples_follow_it() -> None:
     assert outside.isneginf().all()
 
 
+@pytest.mark.medium
 def test_what_npe_has_outside_the_prior_is_replaced_by_the_prior() -> None:
     # NPE has no mass inside for this observation, and there is nothing to learn.
     torch.manual_seed(0)
@@ -214,6 +215,7 @@ def test_columns_that_share_a_unit_do_not_count_those_that_never_vary() -> None:
     assert Standardise(torch.ones(5, 3), shared=True).std.tolist() == [1.0] * 3
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("space", ["input", "embedding"])
 def test_fields_see_observations_in_their_own_unit_however_far_they_are(
     space: str,

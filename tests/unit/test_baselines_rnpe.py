@@ -102,6 +102,7 @@ def test_one_gaussian_statistic_gives_the_posterior_found_by_quadrature(
         assert float(draws.std()) == pytest.approx(std, rel=0.15)
 
 
+@pytest.mark.medium
 def test_log_prob_is_the_mean_density_over_the_denoised_statistics() -> None:
     posterior = quick_posterior()
     x, theta = torch.randn(3, 2), torch.randn(4, 3, 2)

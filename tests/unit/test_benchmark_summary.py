@@ -133,6 +133,7 @@ def with_stack(by_repetition: dict[int, dict[str, float]]) -> Scores:
     return scores
 
 
+@pytest.mark.medium
 def test_the_stack_is_compared_with_the_best_other_on_the_same_repetitions(
     folder: Path,
 ) -> None:

@@ -35,6 +35,7 @@ def ranks_in(theta: Tensor, mean: Tensor, std: Tensor | float) -> Tensor:
     return Normal(mean, torch.as_tensor(std)).cdf(theta)
 
 
+@pytest.mark.medium
 def test_p_values_of_calibrated_posteriors_are_uniform() -> None:
     """This holds for estimates of any distribution, and with few observations."""
     generator = torch.Generator().manual_seed(0)
@@ -96,6 +97,7 @@ def test_errors_that_depend_on_the_estimate_are_found(error: str) -> None:
     assert all(coverage_by_estimate(ranks_in(theta, mean, std), mean).depends)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(("shift", "factor"), [(0.0, 1.0), (0.3, 1.0), (0.0, 0.5)])
 def test_errors_that_are_the_same_everywhere_are_not_reported(
     shift: float, factor: float

@@ -211,6 +211,7 @@ def test_too_few_observations_or_pairs_leave_comparisons_of_them_out() -> None:
         assert any(what in n and "was not tested" in n for n in diagnosis.notes)
 
 
+@pytest.mark.medium
 def test_a_single_outlier_is_flagged(tuned: RoPE) -> None:
     torch.manual_seed(5)
     x_o = gaussian.real_process(parameters(100))
@@ -608,6 +609,7 @@ def test_the_spread_is_that_of_mean_parameters_of_single_observations() -> None:
     assert torch.allclose(heavy.noise, known.noise)
 
 
+@pytest.mark.medium
 def test_a_g_that_squeezes_unseen_pairs_lowers_the_limit_of_the_spread() -> None:
     torch.manual_seed(32)
     known = simulations(800, is_tuned=True)
@@ -645,6 +647,7 @@ def test_the_spread_of_pairs_is_carried_over_to_the_range_of_the_prior() -> None
     assert float(spread.error.min()) > 0.6
 
 
+@pytest.mark.medium
 def test_recordings_of_one_person_are_one_piece_of_evidence_about_g() -> None:
     torch.manual_seed(34)
     known = simulations(800, is_tuned=True)
@@ -742,6 +745,7 @@ def test_pairs_with_the_same_parameters_count_once() -> None:
     assert compare_with_pairs(people[:4], groups[:4], batch) is None
 
 
+@pytest.mark.medium
 def test_the_order_of_the_recordings_of_a_specimen_does_not_matter() -> None:
     torch.manual_seed(37)
     groups, different = torch.arange(20).repeat_interleave(5), 0

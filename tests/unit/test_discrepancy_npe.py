@@ -227,6 +227,7 @@ def test_correcting_an_embedding_leaves_its_net_and_correcting_x_does_not() -> N
         assert torch.equal(*embedded) is same, space
 
 
+@pytest.mark.medium
 def test_discrepancy_and_history_are_those_of_the_last_training() -> None:
     made = method()
     with pytest.raises(NotReadyError, match=r"Call `train\(\)` first"):
@@ -395,6 +396,7 @@ class Slow(Exploding):
         return (theta - self.bias).square().sum(dim=1)
 
 
+@pytest.mark.medium
 def test_courses_are_added_until_the_loss_has_settled() -> None:
     one, several = Slow(), Slow()
     assert len(settle(one).training_loss) == 2

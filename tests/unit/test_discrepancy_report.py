@@ -265,6 +265,7 @@ def shifted(n: int = 30) -> tuple[Tensor, Tensor]:
     return theta, problems.simulate(theta) + torch.tensor([0.0, 0.7, 0.0])
 
 
+@pytest.mark.medium
 def test_a_method_reports_without_training() -> None:
     theta = problems.box(2).sample((3000,))
     stored = method().append_simulations(theta, problems.simulate(theta))

@@ -129,6 +129,7 @@ def test_a_coupling_that_is_extended_warns_of_an_observation_in_another_unit() -
         posterior.sample_batched((1,), x, **QUIET)
 
 
+@pytest.mark.medium
 def test_a_stack_does_not_warn_of_its_pairs_again() -> None:
     rope = RoPE(npe_of("independent"), simulator=simulator)
     with pytest.warns(RoPEWarning, match="entries of `x`"):

@@ -166,6 +166,7 @@ def test_a_file_has_the_same_bytes_for_any_number_of_jobs_and_any_backend(
     assert [path.name for path in tmp_path.iterdir()] == ["again.npz"]
 
 
+@pytest.mark.medium
 def test_a_file_has_the_same_bytes_from_a_backend_without_generators(
     made: Path, tmp_path: Path
 ) -> None:
@@ -379,6 +380,7 @@ def test_a_file_with_other_settings_than_asked_for_is_refused(made: Path) -> Non
         load(made, physics=Physics(courant=0.5))
 
 
+@pytest.mark.medium
 def test_stored_beats_load_without_numba(made: Path) -> None:
     with imported_anew(without=("numba",)):
         dataset = importlib.import_module("sbi_rope.tasks.hemodynamics.dataset")

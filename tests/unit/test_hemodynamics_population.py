@@ -161,6 +161,7 @@ def test_the_simulator_gives_everyone_the_same_lengths() -> None:
     assert {s.length_factors for s in _draw("simulator", 20)} == {(1.0,) * NUM_SEGMENTS}
 
 
+@pytest.mark.medium
 def test_real_lengths_vary_with_height_and_by_segment() -> None:
     subjects = _draw("real", 1500)
     logs = np.log([s.length_factors for s in subjects])

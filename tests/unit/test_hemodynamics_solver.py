@@ -86,6 +86,7 @@ def loop(*, viscosity: float = 0.0) -> Network:
 # Rest and steady flow ----------------------------------------------------------------
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("viscosity", [0.0, 0.6])
 def test_tapered_arteries_at_rest_stay_at_rest(viscosity: float) -> None:
     flow = run(loop(viscosity=viscosity), np.zeros(10), num_cycles=5)
@@ -301,6 +302,7 @@ def test_a_beat_has_its_pressures_at_256_phases_in_mmhg_the_same_each_time() -> 
     assert beat.period == BASELINE.period
 
 
+@pytest.mark.medium
 def test_a_beat_begins_at_the_valve_and_reaches_the_elbow_before_the_wrist() -> None:
     pressure = waveforms.simulate_beat(BASELINE).pressure
     assert pressure["aortic"].argmin() in (*range(250, 256), *range(6))

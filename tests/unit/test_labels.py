@@ -658,6 +658,7 @@ def test_partial_labels_that_may_be_those_of_another_pair_are_named() -> None:
         rope().append_calibration(theta[[5, 5, 8, 2]], x[:4])
 
 
+@pytest.mark.medium
 def test_several_labels_exactly_on_a_bound_of_the_prior_are_named() -> None:
     def appended(*on_bound: int, **options: Any) -> None:
         theta, x = problem(40, seed=1)  # the prior is uniform from -1 to 1

@@ -139,6 +139,7 @@ def test_every_kind_of_coupling_gives_the_log_sum_of_its_own_weights() -> None:
         assert torch.allclose(normalised, expected, atol=1e-4)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("tail_mass", [0.0, 0.05])
 def test_the_size_of_blocks_and_batches_changes_no_density(
     tail_mass: float, monkeypatch: pytest.MonkeyPatch
@@ -349,6 +350,7 @@ def embeddings(n_s: int, dim: int = 2) -> Tensor:
     return problems.embeddings_of(dim, n_s)
 
 
+@pytest.mark.medium
 def test_equal_weights_are_not_left_out_because_each_is_small() -> None:
     uniform = torch.full((2, 4000), 1 / 4000)
     posterior = gaussian_posterior(

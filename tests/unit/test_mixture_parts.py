@@ -181,6 +181,7 @@ def counted(target: Any, name: str, monkeypatch: pytest.MonkeyPatch) -> list[Any
 # --- density ---
 
 
+@pytest.mark.medium
 def test_log_prob_is_the_log_sum_over_parts_and_embeddings(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

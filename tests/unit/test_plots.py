@@ -399,6 +399,7 @@ def test_overview_spreads_out_one_dimensional_embeddings() -> None:
     assert points[:, 1].std() > 0.2
 
 
+@pytest.mark.medium
 def test_overview_says_what_is_wrong_with_its_arguments() -> None:
     cases: list[tuple[dict[str, Any], str]] = [
         ({"simulated": torch.zeros(200)}, "simulated"),

@@ -166,6 +166,7 @@ class Correlated(problems.Gaussians):
         return mean + log_std.exp() * (noise @ self.ROOT.T)
 
 
+@pytest.mark.medium
 def test_the_gain_is_that_of_the_density_with_all_factors_together() -> None:
     """The effects of single factors do not add up if parameters are correlated."""
     torch.manual_seed(0)

@@ -855,6 +855,7 @@ def through_joblib(conductor: RoPE) -> RoPE:
     return pickle.loads(cloudpickle.dumps(conductor))
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     "copied", [through_pickle, through_torch, through_joblib, copy.deepcopy]
 )

@@ -325,6 +325,7 @@ def test_equal_tensors_are_stored_once_and_loaded_apart(tmp_path: Path) -> None:
     assert half.any()
 
 
+@pytest.mark.medium
 def test_a_posterior_of_a_gpu_is_loaded_on_the_cpu(tmp_path: Path) -> None:
     posterior = rope_posterior()
     expected = numbers(posterior, posterior.x_o[:2])
@@ -351,6 +352,7 @@ def test_a_posterior_on_a_gpu_is_saved_and_loaded_on_the_cpu(tmp_path: Path) -> 
 # --- one observation ---
 
 
+@pytest.mark.medium
 def test_the_file_of_one_observation_holds_no_other(tmp_path: Path) -> None:
     # Whatever was asked for before.
     posterior, x_o = rope_posterior(), stacks.observed()

@@ -95,6 +95,7 @@ def centres(theta: Tensor) -> Tensor:
     return theta - theta.mean()
 
 
+@pytest.mark.medium
 def test_a_simulator_whose_rows_depend_on_each_other_is_called_one_by_one() -> None:
     for function in (mixes, mixes_with_noise_of_its_own, centres):
         with pytest.warns(RoPEWarning, match="rows depend on each other"):

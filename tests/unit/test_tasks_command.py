@@ -103,6 +103,7 @@ def test_a_picture_without_a_task_is_refused(tmp_path: Path) -> None:
         main(["--plot", str(tmp_path / "x.png")])
 
 
+@pytest.mark.medium
 def test_the_module_runs_as_a_command(
     capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -224,6 +224,7 @@ def test_necrosis_takes_half_of_the_cancer_cells_and_no_stromal_cell() -> None:
     assert (real[:, 2:] >= simulated[:, 2:]).all()
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("batched", [False, True])
 def test_without_necrosis_the_simulator_is_exact(batched: bool) -> None:
     theta = CancerStroma().get_prior().sample((50,))

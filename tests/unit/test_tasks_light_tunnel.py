@@ -384,6 +384,7 @@ def test_layers_of_the_network_are_those_of_the_paper() -> None:
     assert linear == [(27, 100), (100, 20)]
 
 
+@pytest.mark.medium
 def test_no_channel_of_an_untrained_network_is_dead() -> None:
     task = LightTunnel(image_size=SIZE)
     x = task.get_simulator()(task.get_prior().sample((20,)))
@@ -591,6 +592,7 @@ def test_with_a_stand_in_no_variant_needs_files() -> None:
     assert torch.equal(synthetic[1], standard[1])
 
 
+@pytest.mark.medium
 def test_the_stand_in_draws_parameters_as_the_experiments_did() -> None:
     beta = Beta(torch.tensor(5.0), torch.tensor(5.0)).stddev * 255
     for variant, crowded in (

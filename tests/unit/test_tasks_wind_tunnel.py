@@ -250,6 +250,7 @@ def test_batches_of_any_size_keep_their_dtype_and_draws() -> None:
     assert torch.equal(single, WindTunnelSimulator()(theta.double()).float())
 
 
+@pytest.mark.medium
 def test_gradients_exist_even_if_the_first_call_was_in_inference_mode() -> None:
     simulator = WindTunnelSimulator(onset_jitter=0.0, exhaust_offset=0.0125)
     with torch.inference_mode():
@@ -444,6 +445,7 @@ def test_the_stand_in_has_correlated_noise() -> None:
     assert float(products.mean()) / 0.04 == pytest.approx(0.6, abs=0.02)
 
 
+@pytest.mark.medium
 def test_strength_zero_makes_the_simulator_exact() -> None:
     task = WindTunnel(
         variant="synthetic", misspecification_strength=0.0, onset_jitter=0.0
