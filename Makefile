@@ -3,8 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: quickstart test test-fast test-slow test-latest-sbi lint types docs docs-code docs-site
-.PHONY: docs-links format clean tasks package
+.PHONY: quickstart test test-fast test-slow test-latest-sbi lint types
+.PHONY: docs docs-code docs-site docs-links format clean tasks package
 .PHONY: examples example-quickstart example-tunnel example-tasks example-people
 
 quickstart: $(VENV)/.installed
@@ -14,7 +14,7 @@ quickstart: $(VENV)/.installed
 test: $(VENV)/.installed
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --dist worksteal
 
-# While one works on something.
+# Those of them that are quick, to run while working.
 test-fast: $(VENV)/.installed
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --dist worksteal \
 	    -m "not medium and not slow and not docs and not gpu and not network"

@@ -447,7 +447,8 @@ class RoPE:
         Returns:
             :math:`g(x_o)` (:math:`h(x_o)` without calibration pairs), parameters drawn
             from the prior, and :math:`h(x_s)` of one simulation at each of them.
-            Simulations that are not finite are left out.
+            Simulations that are not finite are left out. There is a warning of entries
+            of x_o that are missing (NaN), but in no simulation.
 
         Raises:
             NotReadyError: If calibration pairs were appended after the last training.
