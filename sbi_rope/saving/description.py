@@ -43,25 +43,28 @@ class Description:
 
     Args:
         root: The object.
+        name: What it is called in errors.
 
     Attributes:
         objects: For each object the name of its class and its attributes. The first is
             the root, and each is described before those that it refers to.
         tensors: Different contents of tensors, on the CPU.
+        named: The classes and functions that are named, by their names.
 
     Raises:
         InvalidInputError: If a value cannot be described. The error says where it is.
     """
 
-    def __init__(self, root: Any) -> None:
+    def __init__(self, root: Any, *, name: str = "posterior") -> None:
         self.objects: list[list[Any]] = []
         self.tensors: list[Tensor] = []
+        self.named: dict[str, Any] = {}
         self._numbers: dict[int, int] = {}
         self._tensor_numbers: dict[int, int] = {}
         self._contents: dict[Any, int] = {}
         # Two objects cannot have the same id while both exist.
         self._alive: list[Any] = []
-        self._object(root, "posterior")
+        self._object(root, name)
 
     @property
     def packages(self) -> set[str]:
@@ -77,8 +80,9 @@ class Description:
         if value is None or kind in (bool, int, float, str):
             return value
         if kind in SEQUENCES:
-            items = self._items(value, where)
-            return [SEQUENCES[kind], *items]
+            # Sets have another order in each process.
+            values = sorted(value, key=repr) if kind is set else value
+            return [SEQUENCES[kind], *self._items(values, where)]
         if kind in MAPPINGS:
             pairs = (
                 [self._value(key, where), self._entry(key, entry, where)]
@@ -96,7 +100,7 @@ class Description:
             owner = self._object(value.__self__, where)
             return ["method", owner, value.__name__]
         if isinstance(value, type) or inspect.isroutine(value):
-            return ["name", _checked_name(value, where)]
+            return ["name", self._name(value, where)]
         return _simple(value) or ["object", self._object(value, where)]
 
     def _entry(self, key: Any, value: Any, where: str) -> Any:
@@ -117,9 +121,22 @@ class Description:
             return self._numbers[id(value)]
         number = self._numbers[id(value)] = len(self.objects)
         self._alive.append(value)
-        self.objects.append([name_of(type(value)), None])
+        self.objects.append([self._kept_name(type(value)), None])
         self.objects[number][1] = self._value(_attributes(value, where), where)
         return number
+
+    def _name(self, value: Any, where: str) -> str:
+        name = getattr(value, "__qualname__", "")
+        if inspect.ismethod(value):
+            raise _not_described(f"the method {name}", where)
+        if "<lambda>" in name or "<locals>" in name:
+            raise _not_described(f"the function {name}", where)
+        return self._kept_name(value)
+
+    def _kept_name(self, value: Any) -> str:
+        name = name_of(value)
+        self.named[name] = value
+        return name
 
     def _tensor(self, value: Tensor, where: str) -> list[Any]:
         if type(value) not in (Tensor, nn.Parameter) or value.layout != torch.strided:
@@ -170,15 +187,6 @@ def _attributes(value: Any, where: str) -> Any:
     return state
 
 
-def _checked_name(value: Any, where: str) -> str:
-    name = getattr(value, "__qualname__", "")
-    if inspect.ismethod(value):
-        raise _not_described(f"the method {name}", where)
-    if "<lambda>" in name or "<locals>" in name:
-        raise _not_described(f"the function {name}", where)
-    return name_of(value)
-
-
 def _named(value: Any) -> str:
     return f"an object of the class {type(value).__module__}.{type(value).__qualname__}"
 
@@ -191,7 +199,7 @@ def _inside(where: str, key: Any) -> str:
 
 def _not_described(what: str, where: str) -> InvalidInputError:
     return InvalidInputError(
-        f"Expected a posterior that can be described in a file; got {what} at "
+        f"Expected objects that can be described in a file; got {what} at "
         f"`{where}`. Use a class, or a function written with `def`, that a module "
         "defines, and name it in `sbi_rope.load(path, trusted=[...])`. Objects that "
         "define how they are pickled cannot be described: leave them out, or pickle "

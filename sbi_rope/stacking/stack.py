@@ -1,6 +1,7 @@
 """Make a stack from a RoPE with calibration pairs, in one call."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Literal
 
 from torch import Tensor
@@ -46,6 +47,7 @@ def stack(
     require_convergence: bool = True,
     seed: int | None = None,
     num_workers: int = 1,
+    checkpoints: str | Path | None = None,
     show_progress_bars: bool | None = None,
 ) -> StackedPosterior:
     r"""Mix candidate posteriors with the weights that score best on held-out pairs.
@@ -106,6 +108,14 @@ def stack(
             five folds there are six versions. Each process has a copy of the
             simulations in its memory. The numbers are those of one process, up to
             rounding, which grows in the course of a training.
+        checkpoints: A folder in which trained candidates are kept. The same call, with
+            the same ``seed``, data and folder, goes on where another was interrupted,
+            and returns what that one would have. Simulations are made again, so that
+            nothing is taken over if the simulator has changed. Nothing can be taken
+            over either if it does not return the same simulations for the same states
+            of torch, NumPy and Python. Couplings, and candidates of your own unless
+            they are ``resumable``, are trained again. The files can be removed
+            afterwards.
         show_progress_bars: Whether to show how many trainings and scores are done.
             None does so in a terminal or a notebook, but not in a file.
 
@@ -116,7 +126,8 @@ def stack(
     Raises:
         NotReadyError: If there are fewer than two groups of pairs.
         InvalidInputError: If an argument is outside its range or has the wrong shape,
-            if there are couplings among the candidates but no batch, if entries of
+            if there are couplings among the candidates but no batch, if there are
+            ``checkpoints`` but no seed, if entries of
             x are missing (NaN) that a candidate with ``space="input"`` corrects, or if
             something cannot be sent to ``num_workers`` processes, or one of them dies.
         UnsupportedPosteriorError: If NPE or a candidate has no density, or the
@@ -125,6 +136,7 @@ def stack(
         SamplingError: If the candidates have almost no mass inside the support of the
             prior at a held-out observation.
         SimulationError: If the simulator fails.
+        NotWritableError: If the folder of ``checkpoints`` cannot be made.
     """
     check_choice("unseen", unseen, ("raise", "extend"))
     check_unit_interval("tail_mass", tail_mass)
@@ -143,6 +155,7 @@ def stack(
         require_convergence=require_convergence,
         seed=seed,
         num_workers=num_workers,
+        checkpoints=checkpoints,
         show_progress_bars=show_progress_bars,
     )
     if recalibrate:
@@ -197,6 +210,7 @@ def cross_validate(
     require_convergence: bool = True,
     seed: int | None = None,
     num_workers: int = 1,
+    checkpoints: str | Path | None = None,
     show_progress_bars: bool | None = None,
 ) -> CrossValidation:
     """Score candidates on calibration pairs that they were not trained on.
@@ -214,6 +228,7 @@ def cross_validate(
         require_convergence: As in :func:`stack`.
         seed: As in :func:`stack`.
         num_workers: As in :func:`stack`.
+        checkpoints: As in :func:`stack`.
         show_progress_bars: As in :func:`stack`.
 
     Returns:
@@ -225,6 +240,7 @@ def cross_validate(
         UnsupportedPosteriorError: As in :func:`stack`.
         CouplingError: As in :func:`stack`.
         SimulationError: As in :func:`stack`.
+        NotWritableError: As in :func:`stack`.
     """
     trainer = StackTrainer(
         rope,
@@ -236,6 +252,7 @@ def cross_validate(
         require_convergence=require_convergence,
         seed=seed,
         num_workers=num_workers,
+        checkpoints=checkpoints,
         show_progress_bars=show_progress_bars,
     )
     return trainer.cross_validate(num_training_folds=num_training_folds)[1]

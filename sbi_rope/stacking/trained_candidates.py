@@ -32,6 +32,7 @@ class DiscrepancyCandidate(AmortisedCandidate):
 
     space: Space = "embedding"
     learn_prior: bool = True
+    resumable = True
 
     def __post_init__(self) -> None:
         """Check the values of all fields."""
@@ -94,6 +95,7 @@ class FinetunedCandidate(AmortisedCandidate):
 
     space: Space | None = None
     learns_prior = True
+    resumable = True
 
     def __post_init__(self) -> None:
         """Check the value of the field."""
@@ -174,6 +176,7 @@ class RehearsedCandidate(AmortisedCandidate):
 
     name = "fine-tuned NPE, rehearsed"
     learns_prior = True
+    resumable = True
 
     @property
     def family(self) -> str:

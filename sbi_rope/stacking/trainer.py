@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -34,6 +35,7 @@ from sbi_rope.stacking.candidates import (
     CouplingCandidate,
     check_candidates,
 )
+from sbi_rope.stacking.checkpoints import Checkpoints
 from sbi_rope.stacking.couplings import FittedCouplings, fit_couplings
 from sbi_rope.stacking.cross_validation import CrossValidation, fold_weights
 from sbi_rope.stacking.defaults import default_candidates
@@ -70,6 +72,7 @@ class StackTrainer:
         require_convergence: bool,
         seed: int | None,
         num_workers: int,
+        checkpoints: str | Path | None,
         show_progress_bars: bool | None,
         unseen: Literal["raise", "extend"] = "raise",
         tail_mass: float = 1e-3,
@@ -84,6 +87,12 @@ class StackTrainer:
         check_not_negative("pseudo_count", pseudo_count)
         check_instance("require_convergence", require_convergence, bool)
         check_integer("num_workers", num_workers, maximum=1000)
+        if checkpoints is not None and seed is None:
+            raise InvalidInputError(
+                "Expected a `seed` together with `checkpoints`, so that the same call "
+                "finds again what it has trained; got None. Pass a number, such as "
+                "seed=0."
+            )
         self.x_o = None if x_o is None else _checked_observations(x_o, rope)
         self.show = is_shown(show_progress_bars)
         self.seeds = draw_seeds(seed, 3)
@@ -105,6 +114,11 @@ class StackTrainer:
             _warn_of_small_batch(len(self.x_o), len(self.bench.x))
         if num_workers > 1:
             check_sendable(_amortised(self.candidates), self.bench)
+        self.checkpoints: Checkpoints | None = None
+        if checkpoints is not None:
+            self.checkpoints = Checkpoints(
+                checkpoints, self.candidates, self.bench, self.seeds
+            )
         self.num_simulations = num_simulations
         self.pseudo_count = pseudo_count
         self.require_convergence = require_convergence
@@ -224,7 +238,9 @@ class StackTrainer:
     def _fixed(self) -> dict[str, list[Part]]:
         """The densities of the candidates that do not depend on the pairs."""
         return train_version(
-            _amortised(self.candidates, fixed=True), Fold(self.bench, [0])
+            _amortised(self.candidates, fixed=True),
+            Fold(self.bench, [0]),
+            checkpoints=self.checkpoints,
         )
 
     def discrepancy(self) -> DiscrepancyReport | None:
@@ -258,7 +274,11 @@ class StackTrainer:
             total=len(trained) * len(folds),
         ) as bar:
             versions = train_versions(
-                trained, folds, num_workers=self.num_workers, advance=bar.update
+                trained,
+                folds,
+                num_workers=self.num_workers,
+                checkpoints=self.checkpoints,
+                advance=bar.update,
             )
         couplings: FittedCouplings | None = None
         if coupled:

@@ -13,6 +13,7 @@ from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture import MixtureEstimator, Part
 from sbi_rope.mixture.parts import DTYPE
 from sbi_rope.stacking.candidates import AmortisedCandidate
+from sbi_rope.stacking.checkpoints import Checkpoints
 from sbi_rope.stacking.couplings import FittedCouplings
 from sbi_rope.stacking.folds import Fold
 
@@ -23,6 +24,7 @@ def train_version(
     candidates: Sequence[AmortisedCandidate],
     fold: Fold,
     *,
+    checkpoints: Checkpoints | None = None,
     advance: Callable[[], object] = lambda: None,
 ) -> dict[str, list[Part]]:
     """Train candidates and return their densities by name.
@@ -30,6 +32,7 @@ def train_version(
     Args:
         candidates: The candidates.
         fold: The pairs to train on.
+        checkpoints: Where densities are kept, and looked for before they are trained.
         advance: Called after each candidate, for a progress bar.
 
     Raises:
@@ -37,16 +40,23 @@ def train_version(
     """
     trained: dict[str, list[Part]] = {}
     for candidate in candidates:
-        # A candidate that ignores its seed still does not change the caller's random
-        # state.
-        with seeded(fold.seed):
-            trained[candidate.name] = list(candidate.parts(fold))
-        if not trained[candidate.name]:
-            raise InvalidInputError(
-                f"Expected at least one density of {candidate.name!r}; got none."
-            )
+        kept = checkpoints and checkpoints.trained(candidate, fold)
+        trained[candidate.name] = kept or _trained(candidate, fold)
+        if checkpoints and not kept:
+            checkpoints.keep(candidate, fold, trained[candidate.name])
         advance()
     return trained
+
+
+def _trained(candidate: AmortisedCandidate, fold: Fold) -> list[Part]:
+    # A candidate that ignores its seed still does not change the caller's random state.
+    with seeded(fold.seed):
+        parts = list(candidate.parts(fold))
+    if not parts:
+        raise InvalidInputError(
+            f"Expected at least one density of {candidate.name!r}; got none."
+        )
+    return parts
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

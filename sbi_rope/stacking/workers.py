@@ -15,6 +15,7 @@ from sbi_rope._random import seeded
 from sbi_rope.errors import InvalidInputError, RoPEError, RoPEWarning, warn_user
 from sbi_rope.mixture import Part
 from sbi_rope.stacking.candidates import AmortisedCandidate
+from sbi_rope.stacking.checkpoints import Checkpoints
 from sbi_rope.stacking.folds import Fold
 from sbi_rope.stacking.versions import train_version
 from sbi_rope.stacking.workbench import Workbench
@@ -67,6 +68,7 @@ def train_versions(
     folds: Sequence[Fold],
     *,
     num_workers: int,
+    checkpoints: Checkpoints | None,
     advance: Callable[[int], object],
 ) -> tuple[dict[str, list[Part]], ...]:
     """Return the densities of one version for each of some folds.
@@ -78,6 +80,7 @@ def train_versions(
         candidates: Those that are trained in each version.
         folds: The pairs that each version may learn from, of the same workbench.
         num_workers: The number of processes.
+        checkpoints: As in :func:`train_version`.
         advance: Is told how many candidates were trained, whenever some were.
 
     Raises:
@@ -91,12 +94,14 @@ def train_versions(
     num_workers = min(num_workers, len(folds))
     if num_workers == 1 or not candidates:
         return tuple(
-            train_version(candidates, fold, advance=lambda: advance(1))
+            train_version(
+                candidates, fold, checkpoints=checkpoints, advance=lambda: advance(1)
+            )
             for fold in folds
         )
     # Each version gets a copy of its own, and gives its result back as a copy, also if
     # joblib decides to start no process.
-    sent = packed((candidates, list(folds)))
+    sent = packed((candidates, list(folds), checkpoints))
     tasks = ((sent, number, torch.get_num_threads()) for number in range(len(folds)))
     versions = []
     try:
@@ -117,18 +122,20 @@ def _train_version(sent: bytes, number: int, num_threads: int) -> bytes:
     """Train a version in a worker.
 
     Args:
-        sent: The candidates and all folds.
+        sent: The candidates, all folds, and where densities are kept.
         number: The fold to train on.
         num_threads: The threads of torch that it may use at most.
     """
     torch.set_num_threads(min(torch.get_num_threads(), num_threads))
-    candidates, folds = pickle.loads(sent)
+    candidates, folds, checkpoints = pickle.loads(sent)
     rope = folds[number].bench.rope
     calls, dropped = rope.num_simulator_calls, rope.num_dropped_simulations
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            densities = train_version(candidates, folds[number])
+            densities = train_version(
+                candidates, folds[number], checkpoints=checkpoints
+            )
         warned = ((str(w.message), w.category, w.filename, w.lineno) for w in caught)
         return packed(
             _Trained(

@@ -68,6 +68,7 @@ CALLS = [
             "require_convergence": "instance",
             "seed": "seed",
             "num_workers": "count",
+            "checkpoints": "path",
         },
     ),
     Call(
@@ -97,7 +98,12 @@ CALLS = [
                 },
             ).log_scores
         ),
-        options={"num_training_folds": "count", "seed": "seed", "num_workers": "count"},
+        options={
+            "num_training_folds": "count",
+            "seed": "seed",
+            "num_workers": "count",
+            "checkpoints": "path",
+        },
     ),
     Call(
         name="default_candidates",

@@ -1,0 +1,296 @@
+"""A stack that was interrupted goes on where it was, and only with its own results."""
+
+import copy
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import pytest
+import torch
+from torch import Tensor
+
+from sbi_rope import RoPE, StackedPosterior
+from sbi_rope._sbi import headless
+from sbi_rope.errors import (
+    InvalidInputError,
+    InvalidTypeError,
+    NotWritableError,
+    RoPEWarning,
+)
+from sbi_rope.mixture import Part, part_of_prior
+from sbi_rope.stacking import (
+    AmortisedCandidate,
+    DiscrepancyCandidate,
+    FinetunedCandidate,
+    RVNPCandidate,
+)
+from sbi_rope.stacking.folds import Fold
+from tests import problems
+from tests.stacks import (
+    FINETUNED,
+    NPE,
+    NUM_FOLDS,
+    OT_ONLY,
+    PRIOR,
+    QUICK,
+    observed,
+    problem,
+    rope_of,
+    stacked,
+    uneven,
+    validated,
+)
+
+ROOT = Path(__file__).parents[2]
+
+# Whatever else warns here, because there are few pairs and simulations.
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
+
+CANDIDATES = (PRIOR, NPE, FinetunedCandidate(), DiscrepancyCandidate(space="tuned"))
+# Trainings of CANDIDATES that are kept, and their number before an interruption.
+NUM_KEPT, NUM_BEFORE = 2 * (NUM_FOLDS + 1), 3
+
+
+@contextmanager
+def trainings(*, stop: Any = None) -> Iterator[list[str]]:
+    """List the trainings in a ``with`` block, and stop after some."""
+    names: list[str] = []
+
+    def listed(original: Any) -> Any:
+        def parts(self: AmortisedCandidate, fold: Fold) -> list[Part]:
+            if stop is not None and len(names) == NUM_BEFORE:
+                stop()
+            names.append(self.name)
+            return original(self, fold)
+
+        return parts
+
+    kinds = (FinetunedCandidate, DiscrepancyCandidate)
+    patches = [patch.object(kind, "parts", listed(kind.parts)) for kind in kinds]
+    with patches[0], patches[1]:
+        yield names
+
+
+def interrupt() -> None:
+    raise KeyboardInterrupt
+
+
+def num_trained(folder: Path, rope: RoPE | None = None, **options: Any) -> int:
+    """Return how many trainings a stack with checkpoints takes."""
+    options = {"candidates": CANDIDATES, **options}
+    with trainings() as names:
+        stacked(rope_of() if rope is None else rope, checkpoints=folder, **options)
+    return len(names)
+
+
+def numbers(posterior: StackedPosterior) -> list[Tensor]:
+    theta, x = problem(4, seed=3)
+    torch.manual_seed(0)
+    samples = posterior.sample_batched((3,), x, show_progress_bars=False)
+    log_prob = posterior.log_prob_batched(theta[None], x)
+    return [posterior.report.cross_validation.log_scores, samples, log_prob.detach()]
+
+
+def assert_same(a: StackedPosterior, b: StackedPosterior) -> None:
+    assert all(torch.equal(*pair) for pair in zip(numbers(a), numbers(b), strict=True))
+
+
+ELSEWHERE = """
+import os, sys
+from tests.integration.test_stacking_checkpoints import CANDIDATES, rope_of
+from tests.integration.test_stacking_checkpoints import stacked, trainings
+with trainings(stop=lambda: os._exit(7)):
+    stacked(rope_of(), candidates=CANDIDATES, checkpoints=sys.argv[1])
+"""
+
+
+@pytest.mark.medium
+def test_a_stack_goes_on_where_another_process_was_killed(tmp_path: Path) -> None:
+    killed = subprocess.run(
+        [sys.executable, "-c", ELSEWHERE, str(tmp_path)],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONHASHSEED": "3"},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert killed.returncode == 7, killed.stderr
+    rope = rope_of()
+    with trainings() as names:
+        resumed = stacked(rope, candidates=CANDIDATES, checkpoints=tmp_path)
+    assert len(names) == NUM_KEPT - NUM_BEFORE
+    assert_same(resumed, stacked(rope_of(), candidates=CANDIDATES))
+
+
+def test_what_was_trained_before_an_interruption_is_not_trained_again(
+    tmp_path: Path,
+) -> None:
+    with trainings(stop=interrupt), pytest.raises(KeyboardInterrupt):
+        num_trained(tmp_path)
+    assert num_trained(tmp_path) == NUM_KEPT - NUM_BEFORE
+    assert num_trained(tmp_path) == 0
+    # A candidate more, or less, is no reason to train the others again.
+    assert num_trained(tmp_path, candidates=CANDIDATES[1:3]) == 0
+    more = (*CANDIDATES, FinetunedCandidate(space="embedding"))
+    assert num_trained(tmp_path, candidates=more) == NUM_FOLDS + 1
+    with trainings() as names:
+        validated(rope_of(), candidates=CANDIDATES, checkpoints=tmp_path)
+        stacked(
+            rope_of(),
+            observed(),
+            candidates=[*CANDIDATES, OT_ONLY],
+            checkpoints=tmp_path,
+        )
+    assert not names
+
+
+def other_simulator(theta: Tensor) -> Tensor:
+    return problems.simulate(theta) * 1.001
+
+
+def other_pairs() -> tuple[Tensor, Tensor]:
+    theta, x = problem(20, seed=1)
+    return theta, x.index_fill(0, torch.tensor([3]), 0.1)
+
+
+def of_other_density() -> RoPE:
+    """Return a RoPE whose NPE has the same embedding net, and another density."""
+    npe = copy.deepcopy(problems.npe_posterior("mdn"))
+    with torch.no_grad():
+        next(headless(npe.posterior_estimator).parameters()).add_(0.01)
+    rope = RoPE(npe, simulator=uneven, finetuner=QUICK)
+    return rope.append_calibration(*problem(20, seed=1))
+
+
+OTHERS: dict[str, Callable[[], RoPE]] = {
+    "pairs": lambda: rope_of(other_pairs()),
+    "weights": lambda: rope_of(weights=torch.linspace(0.5, 1.5, 20)),
+    "groups": lambda: rope_of(groups=[n // 2 for n in range(20)]),
+    "embedding net": lambda: rope_of(family="maf"),
+    "density": of_other_density,
+    "simulator": lambda: rope_of(simulator=other_simulator),
+}
+OPTIONS: dict[str, dict[str, Any]] = {"seed": {"seed": 1}, "folds": {"num_folds": 4}}
+
+
+@pytest.fixture(scope="module")
+def full(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with all that a stack has trained."""
+    folder = tmp_path_factory.mktemp("full")
+    assert num_trained(folder, candidates=CANDIDATES[:3]) == NUM_FOLDS + 1
+    return folder
+
+
+@pytest.mark.parametrize("other", [*OTHERS, *OPTIONS])
+def test_a_stack_takes_nothing_of_a_stack_of_others(full: Path, other: str) -> None:
+    rope, options = OTHERS.get(other, rope_of)(), OPTIONS.get(other, {})
+    with pytest.warns(RoPEWarning, match=r"holds trained candidates of other stacks"):
+        found = num_trained(full, rope, candidates=CANDIDATES[:3], **options)
+    assert found == 1 + options.get("num_folds", NUM_FOLDS)
+
+
+def test_the_observations_that_a_candidate_learns_from_are_part_of_it(
+    tmp_path: Path,
+) -> None:
+    def trained(seed: int) -> bool:
+        x_o = problem(30, seed=seed)[1]
+        box = part_of_prior(problems.box(2), x_o.shape[1:])
+        # It takes minutes to train this one.
+        with patch.object(RVNPCandidate, "parts", return_value=[box]) as parts:
+            stacked(rope_of(), candidates=[RVNPCandidate(x_o)], checkpoints=tmp_path)
+        return parts.called
+
+    assert trained(2)
+    assert not trained(2)
+    assert trained(3)
+
+
+class Mine(AmortisedCandidate):
+    """A candidate of the user, which says that it can be kept, or not."""
+
+    name = "user's"
+
+    def __init__(self, *, resumable: bool, removes: str = "", held: Any = None) -> None:
+        self.resumable = resumable
+        self._removes = removes
+        self._held = held
+
+    def parts(self, fold: Fold) -> list[Part]:
+        for folder in Path(self._removes).glob("stack-*") if self._removes else ():
+            if folder.is_dir():
+                folder.rmdir()
+                folder.touch()  # a file, so that nothing can be written there
+        TRAINED.append(self.name)
+        return [part_of_prior(problems.box(2), fold.bench.x.shape[1:])]
+
+
+TRAINED: list[str] = []
+
+
+@pytest.mark.parametrize("resumable", [True, False])
+def test_a_candidate_of_the_user_is_kept_if_it_says_so(
+    tmp_path: Path, resumable: bool
+) -> None:
+    mine = Mine(resumable=resumable)
+    TRAINED.clear()
+    for _ in range(2):
+        stacked(rope_of(), candidates=[mine, FINETUNED], checkpoints=tmp_path)
+    assert len(TRAINED) == (NUM_FOLDS + 1) * (1 if resumable else 2)
+
+
+def test_a_damaged_checkpoint_is_put_aside_and_trained_again(tmp_path: Path) -> None:
+    expected = stacked(rope_of(), candidates=CANDIDATES, checkpoints=tmp_path)
+    damaged = sorted(tmp_path.glob("stack-*/*.pt"))[0]
+    content = damaged.read_bytes()[:-100]
+    damaged.write_bytes(content)
+    with (
+        trainings() as names,
+        pytest.warns(RoPEWarning, match=r"'discrepancy.*is damaged"),
+    ):
+        found = stacked(rope_of(), candidates=CANDIDATES, checkpoints=tmp_path)
+    assert names == ["discrepancy (tuned)"]
+    assert_same(found, expected)
+    assert damaged.with_name(f"{damaged.name}.damaged-1").read_bytes() == content
+
+
+def test_a_stack_goes_on_if_its_checkpoints_cannot_be_written(tmp_path: Path) -> None:
+    mine = Mine(resumable=True, removes=str(tmp_path))
+    with pytest.warns(RoPEWarning, match=r"checkpoint of .user's. was not written"):
+        stacked(rope_of(), candidates=[mine], checkpoints=tmp_path)
+
+
+def test_copies_of_folds_in_other_processes_keep_what_they_train(
+    tmp_path: Path,
+) -> None:
+    def in_this_process(train: Any, tasks: Any, num_workers: int) -> Any:
+        yield from (train(*task) for task in tasks)
+
+    # Other processes take seconds to start.
+    with patch("sbi_rope.stacking.workers.in_workers", in_this_process):
+        assert num_trained(tmp_path, num_workers=2) == NUM_KEPT
+    assert num_trained(tmp_path) == 0
+
+
+def test_checkpoints_that_cannot_be_kept_are_refused_before_training(
+    tmp_path: Path,
+) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    holding = {"candidates": [Mine(resumable=True, held=lambda: 0)]}
+    refused: list[tuple[type[Exception], str, dict[str, Any]]] = [
+        (InvalidInputError, r"a `seed` together with", {"seed": None}),
+        (InvalidTypeError, r"`checkpoints` to be a path", {"checkpoints": 3}),
+        (NotWritableError, r"where one can be made", {"checkpoints": file}),
+        (InvalidInputError, r"`resumable` of .user's. to be False.*_held`", holding),
+    ]
+    for error, match, options in refused:
+        given = {"checkpoints": tmp_path, "candidates": CANDIDATES, **options}
+        with trainings() as names, pytest.raises(error, match=match):
+            stacked(rope_of(), **given)
+        assert not names
