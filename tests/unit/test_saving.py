@@ -41,6 +41,7 @@ from sbi_rope.errors import (
     UntrustedError,
 )
 from sbi_rope.mixture import MixtureEstimator, PriorPosterior, part_of
+from sbi_rope.saving.description import Description
 from sbi_rope.saving.memory import unpacked
 from sbi_rope.saving.names import ROOMS, find_class, find_value
 from sbi_rope.stacking.trained_candidates import (
@@ -252,6 +253,17 @@ def test_networks_of_torch_and_sbi_can_be_saved(
 def test_settings_may_be_numbers_of_numpy(tmp_path: Path) -> None:
     posterior = rope_posterior(tail_mass=np.float64(1e-2))
     assert_same(posterior, saved_and_loaded(posterior, tmp_path), stacks.observed()[:3])
+
+
+def test_a_description_does_not_depend_on_the_order_of_a_set() -> None:
+    # They have the same hash in a small set, as texts may have in another process.
+    one, other = set((0, 8)), set((8, 0))
+    assert list(one) != list(other)
+    posterior: Any = PriorPosterior(problems.box(2))
+    posterior.numbers = one
+    objects = Description(posterior).objects
+    posterior.numbers = other
+    assert Description(posterior).objects == objects
 
 
 @pytest.mark.medium
