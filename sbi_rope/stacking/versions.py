@@ -40,10 +40,14 @@ def train_version(
     """
     trained: dict[str, list[Part]] = {}
     for candidate in candidates:
-        kept = checkpoints and checkpoints.trained(candidate, fold)
-        trained[candidate.name] = kept or _trained(candidate, fold)
-        if checkpoints and not kept:
-            checkpoints.keep(candidate, fold, trained[candidate.name])
+        parts = None
+        if checkpoints is not None:
+            parts = checkpoints.trained(candidate, fold)
+        if parts is None:
+            parts = _trained(candidate, fold)
+            if checkpoints is not None:
+                checkpoints.keep(candidate, fold, parts)
+        trained[candidate.name] = parts
         advance()
     return trained
 
