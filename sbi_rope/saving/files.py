@@ -25,7 +25,7 @@ from sbi_rope.saving.memory import packed, unpacked
 from sbi_rope.saving.names import trusted_names
 from sbi_rope.saving.restoring import restored
 
-__all__ = ["load", "save"]
+__all__ = ["load", "read_object", "save", "write_object"]
 
 FORMAT = "sbi_rope posterior"
 # It changes when older versions of the package could not read newer files.
@@ -84,20 +84,7 @@ def save(posterior: Any, path: str | Path, *, overwrite: bool = False) -> None:
             f"Expected a `path` where there is no file yet; got {target}. Use another "
             "name, or pass overwrite=True."
         )
-    described = Description(posterior)
-    memory, tensors = packed(described.tensors)
-    description = {
-        "format": FORMAT,
-        "format_version": FORMAT_VERSION,
-        "versions": _versions(described.packages),
-        "objects": described.objects,
-        "tensors": tensors,
-    }
-    text = json.dumps(description, separators=(",", ":")).encode()
-    with write_atomically(target) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(
-            file, description=np.frombuffer(text, np.uint8), memory=memory
-        )
+    write_object(posterior, target)
 
 
 def load(path: str | Path, *, trusted: Sequence[type | Callable[..., Any]] = ()) -> Any:
@@ -125,24 +112,66 @@ def load(path: str | Path, *, trusted: Sequence[type | Callable[..., Any]] = ())
             by other versions of the packages.
         UntrustedError: If the file needs a class or function that is not known.
     """
-    source, names = _path(path), trusted_names(trusted)
-    if not source.is_file():
-        raise DataNotFoundError(f"Expected a file at {source}; got none. Check `path`.")
-    description, memory = _read(source)
+    return read_object(_path(path), trusted_names(trusted), NeuralPosterior)
+
+
+def write_object(root: Any, path: Path) -> None:
+    """Write an object to a file, and replace the file if there is one.
+
+    Args:
+        root: The object, whose classes are those of posteriors and their parts.
+        path: The file.
+
+    Raises:
+        InvalidInputError: If it holds something that cannot be described.
+        NotWritableError: If the file cannot be written.
+    """
+    described = Description(root)
+    memory, tensors = packed(described.tensors)
+    description = {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "versions": _versions(described.packages),
+        "objects": described.objects,
+        "tensors": tensors,
+    }
+    text = json.dumps(description, separators=(",", ":")).encode()
+    with write_atomically(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(
+            file, description=np.frombuffer(text, np.uint8), memory=memory
+        )
+
+
+def read_object(path: Path, trusted: Mapping[str, Any], kind: type) -> Any:
+    """Read an object that :func:`write_object` has written.
+
+    Args:
+        path: The file.
+        trusted: Classes and functions that the file may name, by their names.
+        kind: The class of the object.
+
+    Raises:
+        DataNotFoundError: If there is no such file.
+        FileFormatError: As in :func:`load`.
+        UntrustedError: As in :func:`load`.
+    """
+    if not path.is_file():
+        raise DataNotFoundError(f"Expected a file at {path}; got none. Check `path`.")
+    description, memory = _read(path)
     try:
-        _check_versions(source, description["versions"])
+        _check_versions(path, description["versions"])
         tensors = list(unpacked(memory, description["tensors"]))
-        posterior = restored(description["objects"], tensors, names)
-        if not isinstance(posterior, NeuralPosterior):
-            raise TypeError(f"a {type(posterior).__name__} is not a posterior")
+        found = restored(description["objects"], tensors, trusted)
+        if not isinstance(found, kind):
+            raise TypeError(f"a {type(found).__name__} is no {kind.__name__}")
     except RoPEError:
         raise
     except Exception as error:  # a damaged description may lead to any
         raise FileFormatError(
-            f"Expected a whole file of `save`; {source} is damaged "
+            f"Expected a whole file of `save`; {path} is damaged "
             f"({type(error).__name__}: {shown(error)}). Get it again."
         ) from error
-    return posterior
+    return found
 
 
 def _path(path: Any) -> Path:

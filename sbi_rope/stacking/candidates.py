@@ -106,15 +106,11 @@ class AmortisedCandidate(ABC):
         name: Its name in the report.
         fixed: Whether it does not depend on the calibration pairs.
         learns_prior: Whether it learns from the pairs how parameters are distributed.
-        resumable: Whether the ``checkpoints`` of a stack may keep its densities. They
-            must not depend on anything but the fold, its workbench, and the attributes
-            of the candidate, which have to be numbers, text, tensors, or networks.
     """
 
     name: str
     fixed: bool = False
     learns_prior: bool = False
-    resumable: bool = False
 
     @property
     def family(self) -> str:

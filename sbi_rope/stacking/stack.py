@@ -110,12 +110,11 @@ def stack(
             rounding, which grows in the course of a training.
         checkpoints: A folder in which trained candidates are kept. The same call, with
             the same ``seed``, data and folder, goes on where another was interrupted,
-            and returns what that one would have. Simulations are made again, so that
-            nothing is taken over if the simulator has changed. Nothing can be taken
-            over either if it does not return the same simulations for the same states
-            of torch, NumPy and Python. Couplings, and candidates of your own unless
-            they are ``resumable``, are trained again. The files can be removed
-            afterwards.
+            and returns what that one would have. Simulations are made again, and
+            nothing is taken over if they differ. They are the same if the simulator
+            draws from torch, NumPy or Python alone, and from no generator of its own.
+            Couplings and candidates of your own are trained again. Nobody else should
+            be able to write to the folder. It can be removed afterwards.
         show_progress_bars: Whether to show how many trainings and scores are done.
             None does so in a terminal or a notebook, but not in a file.
 

@@ -32,7 +32,6 @@ class DiscrepancyCandidate(AmortisedCandidate):
 
     space: Space = "embedding"
     learn_prior: bool = True
-    resumable = True
 
     def __post_init__(self) -> None:
         """Check the values of all fields."""
@@ -95,7 +94,6 @@ class FinetunedCandidate(AmortisedCandidate):
 
     space: Space | None = None
     learns_prior = True
-    resumable = True
 
     def __post_init__(self) -> None:
         """Check the value of the field."""
@@ -176,7 +174,6 @@ class RehearsedCandidate(AmortisedCandidate):
 
     name = "fine-tuned NPE, rehearsed"
     learns_prior = True
-    resumable = True
 
     @property
     def family(self) -> str:

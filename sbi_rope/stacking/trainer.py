@@ -17,6 +17,7 @@ from sbi_rope._validation import (
     check_instance,
     check_integer,
     check_not_negative,
+    check_path,
     check_prior,
 )
 from sbi_rope.coupling.coupler import SMALL_BATCH
@@ -114,11 +115,7 @@ class StackTrainer:
             _warn_of_small_batch(len(self.x_o), len(self.bench.x))
         if num_workers > 1:
             check_sendable(_amortised(self.candidates), self.bench)
-        self.checkpoints: Checkpoints | None = None
-        if checkpoints is not None:
-            self.checkpoints = Checkpoints(
-                checkpoints, self.candidates, self.bench, self.seeds
-            )
+        self._folder = check_path("checkpoints", checkpoints, optional=True)
         self.num_simulations = num_simulations
         self.pseudo_count = pseudo_count
         self.require_convergence = require_convergence
@@ -240,8 +237,15 @@ class StackTrainer:
         return train_version(
             _amortised(self.candidates, fixed=True),
             Fold(self.bench, [0]),
-            checkpoints=self.checkpoints,
+            checkpoints=self._checkpoints,
         )
+
+    @cached_property
+    def _checkpoints(self) -> Checkpoints | None:
+        """Where trained candidates are kept, if anywhere."""
+        if self._folder is None:
+            return None
+        return Checkpoints(self._folder, self.candidates, self.bench, self.seeds)
 
     def discrepancy(self) -> DiscrepancyReport | None:
         """Return what the pairs say about each entry of x, if a candidate uses it."""
@@ -277,7 +281,7 @@ class StackTrainer:
                 trained,
                 folds,
                 num_workers=self.num_workers,
-                checkpoints=self.checkpoints,
+                checkpoints=self._checkpoints,
                 advance=bar.update,
             )
         couplings: FittedCouplings | None = None

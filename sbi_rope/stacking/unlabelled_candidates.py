@@ -47,7 +47,6 @@ class RVNPCandidate(AmortisedCandidate):
     x_o: Tensor = field(repr=False)
     space: Literal["embedding", "input"] = field(default="embedding", kw_only=True)
     fixed = True
-    resumable = True
 
     def __post_init__(self) -> None:
         """Check the value of the field."""

@@ -2,6 +2,7 @@
 
 import copy
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -176,6 +178,8 @@ OTHERS: dict[str, Callable[[], RoPE]] = {
     "density": of_other_density,
     "simulator": lambda: rope_of(simulator=other_simulator),
 }
+# Fine-tuned NPE depends on no simulation.
+CORRECTED = CANDIDATES[3:]
 OPTIONS: dict[str, dict[str, Any]] = {"seed": {"seed": 1}, "folds": {"num_folds": 4}}
 
 
@@ -183,15 +187,15 @@ OPTIONS: dict[str, dict[str, Any]] = {"seed": {"seed": 1}, "folds": {"num_folds"
 def full(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with all that a stack has trained."""
     folder = tmp_path_factory.mktemp("full")
-    assert num_trained(folder, candidates=CANDIDATES[:3]) == NUM_FOLDS + 1
+    assert num_trained(folder, candidates=CORRECTED) == NUM_FOLDS + 1
     return folder
 
 
 @pytest.mark.parametrize("other", [*OTHERS, *OPTIONS])
 def test_a_stack_takes_nothing_of_a_stack_of_others(full: Path, other: str) -> None:
     rope, options = OTHERS.get(other, rope_of)(), OPTIONS.get(other, {})
-    with pytest.warns(RoPEWarning, match=r"holds trained candidates of other stacks"):
-        found = num_trained(full, rope, candidates=CANDIDATES[:3], **options)
+    with pytest.warns(RoPEWarning, match=r"trained candidates of other stacks"):
+        found = num_trained(full, rope, candidates=CORRECTED, **options)
     assert found == 1 + options.get("num_folds", NUM_FOLDS)
 
 
@@ -211,42 +215,57 @@ def test_the_observations_that_a_candidate_learns_from_are_part_of_it(
     assert trained(3)
 
 
-class Mine(AmortisedCandidate):
-    """A candidate of the user, which says that it can be kept, or not."""
-
-    name = "user's"
-
-    def __init__(self, *, resumable: bool, removes: str = "", held: Any = None) -> None:
-        self.resumable = resumable
-        self._removes = removes
-        self._held = held
+class Mine(FinetunedCandidate):
+    """A candidate of the user, whose code may change."""
 
     def parts(self, fold: Fold) -> list[Part]:
-        for folder in Path(self._removes).glob("stack-*") if self._removes else ():
-            if folder.is_dir():
-                folder.rmdir()
-                folder.touch()  # a file, so that nothing can be written there
-        TRAINED.append(self.name)
+        MINE.append(self.name)
         return [part_of_prior(problems.box(2), fold.bench.x.shape[1:])]
 
 
-TRAINED: list[str] = []
+MINE: list[str] = []
 
 
-@pytest.mark.parametrize("resumable", [True, False])
-def test_a_candidate_of_the_user_is_kept_if_it_says_so(
-    tmp_path: Path, resumable: bool
-) -> None:
-    mine = Mine(resumable=resumable)
-    TRAINED.clear()
+def test_candidates_of_the_user_are_trained_again(tmp_path: Path) -> None:
+    MINE.clear()
     for _ in range(2):
-        stacked(rope_of(), candidates=[mine, FINETUNED], checkpoints=tmp_path)
-    assert len(TRAINED) == (NUM_FOLDS + 1) * (1 if resumable else 2)
+        stacked(rope_of(), candidates=[Mine(), FINETUNED], checkpoints=tmp_path)
+    assert len(MINE) == 2 * (NUM_FOLDS + 1)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_simulator_with_a_generator_of_its_own_is_seen_to_differ(
+    tmp_path: Path,
+) -> None:
+    generator = np.random.default_rng(0)
+
+    def simulator(theta: Tensor) -> Tensor:
+        noise = torch.as_tensor(generator.normal(size=(len(theta), 1)))
+        return problems.simulate(theta) + noise.to(theta)
+
+    rope = rope_of(simulator=simulator)
+    assert num_trained(tmp_path, rope) == NUM_KEPT
+    # It keeps the simulations from the prior, and simulates at the labels again.
+    with pytest.warns(RoPEWarning, match="of other stacks"):
+        again = num_trained(tmp_path, rope, candidates=CORRECTED)
+    assert again == NUM_FOLDS + 1
+
+
+def test_a_prior_that_was_asked_something_is_the_same_prior(tmp_path: Path) -> None:
+    npe = copy.deepcopy(problems.npe_posterior("mdn"))
+    npe.prior = problems.standard_normal(2)
+    rope = RoPE(npe, simulator=uneven, finetuner=QUICK)
+    rope.append_calibration(*problem(20, seed=1))
+    assert num_trained(tmp_path, rope) == NUM_KEPT
+    before = len(vars(npe.prior))
+    assert npe.prior.precision_matrix.shape == (2, 2)
+    assert len(vars(npe.prior)) > before
+    assert num_trained(tmp_path, rope) == 0
 
 
 def test_a_damaged_checkpoint_is_put_aside_and_trained_again(tmp_path: Path) -> None:
     expected = stacked(rope_of(), candidates=CANDIDATES, checkpoints=tmp_path)
-    damaged = sorted(tmp_path.glob("stack-*/*.pt"))[0]
+    damaged = sorted(tmp_path.glob("*.pt"))[0]
     content = damaged.read_bytes()[:-100]
     damaged.write_bytes(content)
     with (
@@ -260,9 +279,17 @@ def test_a_damaged_checkpoint_is_put_aside_and_trained_again(tmp_path: Path) -> 
 
 
 def test_a_stack_goes_on_if_its_checkpoints_cannot_be_written(tmp_path: Path) -> None:
-    mine = Mine(resumable=True, removes=str(tmp_path))
-    with pytest.warns(RoPEWarning, match=r"checkpoint of .user's. was not written"):
-        stacked(rope_of(), candidates=[mine], checkpoints=tmp_path)
+    folder = tmp_path / "checkpoints"
+
+    def replace() -> None:
+        shutil.rmtree(folder)
+        folder.touch()  # a file, so that nothing can be written there
+
+    with trainings(stop=replace) as names, pytest.warns(RoPEWarning) as warned:
+        stacked(rope_of(), candidates=CANDIDATES, checkpoints=folder)
+    assert len(names) == NUM_KEPT
+    written = [one for one in warned if "was not written" in str(one.message)]
+    assert len(written) == 1
 
 
 def test_copies_of_folds_in_other_processes_keep_what_they_train(
@@ -282,15 +309,17 @@ def test_checkpoints_that_cannot_be_kept_are_refused_before_training(
 ) -> None:
     file = tmp_path / "file"
     file.touch()
-    holding = {"candidates": [Mine(resumable=True, held=lambda: 0)]}
+    npe = copy.deepcopy(problems.npe_posterior("mdn"))
+    npe.posterior_estimator.function = lambda: 0
+    rope = RoPE(npe, simulator=uneven).append_calibration(*problem(20, seed=1))
     refused: list[tuple[type[Exception], str, dict[str, Any]]] = [
         (InvalidInputError, r"a `seed` together with", {"seed": None}),
         (InvalidTypeError, r"`checkpoints` to be a path", {"checkpoints": 3}),
         (NotWritableError, r"where one can be made", {"checkpoints": file}),
-        (InvalidInputError, r"`resumable` of .user's. to be False.*_held`", holding),
+        (InvalidInputError, r"NPE that can be described.*function", {"rope": rope}),
     ]
     for error, match, options in refused:
-        given = {"checkpoints": tmp_path, "candidates": CANDIDATES, **options}
+        given = {"rope": rope_of(), "checkpoints": tmp_path, **options}
         with trainings() as names, pytest.raises(error, match=match):
-            stacked(rope_of(), **given)
+            stacked(candidates=CANDIDATES, **given)
         assert not names
