@@ -25,7 +25,7 @@ from sbi_rope.saving.memory import packed, unpacked
 from sbi_rope.saving.names import trusted_names
 from sbi_rope.saving.restoring import restored
 
-__all__ = ["load", "read_object", "save", "write_object"]
+__all__ = ["load", "read_object", "save", "versions_of", "write_object"]
 
 FORMAT = "sbi_rope posterior"
 # It changes when older versions of the package could not read newer files.
@@ -131,7 +131,7 @@ def write_object(root: Any, path: Path) -> None:
     description = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
-        "versions": _versions(described.packages),
+        "versions": versions_of(described.packages),
         "objects": described.objects,
         "tensors": tensors,
     }
@@ -203,7 +203,8 @@ def _read(path: Path) -> tuple[dict[str, Any], np.ndarray]:
     return description, memory
 
 
-def _versions(packages: set[str]) -> dict[str, str]:
+def versions_of(packages: set[str]) -> dict[str, str]:
+    """Return the versions of those packages that a file depends on, by name."""
     used = (name for name in PACKAGES if name in packages | {"sbi_rope", "sbi"})
     return {name: _installed(name) for name in used}
 

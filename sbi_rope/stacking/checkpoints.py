@@ -4,7 +4,6 @@ import hashlib
 import json
 import re
 from collections.abc import Iterable, Sequence
-from importlib.metadata import version
 from pathlib import Path
 
 import torch
@@ -24,7 +23,7 @@ from sbi_rope.errors import (
 )
 from sbi_rope.mixture import MixtureEstimator, Part
 from sbi_rope.saving.description import Description
-from sbi_rope.saving.files import read_object, write_object
+from sbi_rope.saving.files import read_object, versions_of, write_object
 from sbi_rope.stacking.candidates import AmortisedCandidate, Candidate
 from sbi_rope.stacking.folds import Fold
 from sbi_rope.stacking.trained_candidates import (
@@ -39,9 +38,8 @@ __all__ = ["Checkpoints"]
 
 # Of these it is known what they are trained on. Their subclasses are not among them.
 KEPT = (DiscrepancyCandidate, FinetunedCandidate, RehearsedCandidate, RVNPCandidate)
-# Packages of which another version may train something else, as another version of
-# this one.
-PACKAGES = ("sbi", "torch", "nflows", "zuko", "numpy")
+# Another version of this package may train something else, also if it has the same
+# number.
 OURS = Path(__file__).parents[1]
 # Draws of the prior, by which it is recognised.
 NUM_FROM_PRIOR = 1000
@@ -90,7 +88,11 @@ class Checkpoints:
         # Its classes are in use already, so that a file may name them.
         self._trusted = dict(npe.named)
         self._warns = True
-        context = [*_described(npe), *_of_all(bench, seeds)]
+        context = [
+            *_described(npe),
+            versions_of(npe.packages),
+            *_of_all(bench, seeds),
+        ]
         pairs = _of_pairs(bench)
         self._digests = {
             candidate.name: _digest(
@@ -169,7 +171,6 @@ def _of_all(bench: Workbench, seeds: Sequence[int]) -> list[object]:
     with seeded(0):
         theta = bench.npe.prior.sample(torch.Size((NUM_FROM_PRIOR,)))
     return [
-        *(f"{name} {version(name)}" for name in PACKAGES),
         *(path.read_bytes() for path in sorted(OURS.rglob("*.py"))),
         bench.x.device.type,
         list(seeds),
@@ -207,6 +208,7 @@ def _of_candidate(candidate: AmortisedCandidate, bench: Workbench) -> list[objec
 
 
 def _described(described: Description) -> list[object]:
+    # Sets of names, which have another order in each process, are sorted there.
     return [json.dumps(described.objects), *described.tensors]
 
 
