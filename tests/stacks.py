@@ -201,6 +201,11 @@ def the_coupled_stack() -> StackedPosterior:
         return stacked(rope_of(), observed(), tail_mass=0.0, unseen="extend")
 
 
+def in_this_process(train: Any, tasks: Any, num_workers: int) -> Iterator[Any]:
+    """Stand for `in_workers`, whose processes take seconds to start."""
+    yield from (train(*task) for task in tasks)
+
+
 def unnormalised(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:
     return posterior.log_prob_batched(theta, x, norm_posterior=False).detach()
 

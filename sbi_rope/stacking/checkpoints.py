@@ -12,7 +12,6 @@ from torch import Tensor
 from sbi_rope._files import set_aside
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed, estimator_of
-from sbi_rope._simulations import Moments
 from sbi_rope.errors import (
     DataNotFoundError,
     FileFormatError,
@@ -121,10 +120,10 @@ class Checkpoints:
             estimator = read_object(path, self._trusted, MixtureEstimator)
         except DataNotFoundError:  # another process has put it aside
             return None
-        except (FileFormatError, UntrustedError) as error:
+        except (FileFormatError, UntrustedError):
             warn_user(
-                f"{candidate.name!r} is trained again, because its checkpoint cannot "
-                f"be used. {error} {_put_aside(path)}"
+                f"{candidate.name!r} is trained again, because its checkpoint {path} "
+                f"is damaged.{_put_aside(path)}"
             )
             return None
         device = fold.bench.x.device
@@ -184,7 +183,6 @@ def _of_pairs(bench: Workbench) -> list[object]:
     labels = bench.labels
     return [
         len(bench.folds),
-        labels.names,
         *(labels.theta, labels.covariance, labels.weights, labels.samples),
         bench.rope.labelled_parameters.draws,
         bench.groups,
@@ -202,7 +200,7 @@ def _of_candidate(candidate: AmortisedCandidate, bench: Workbench) -> list[objec
     elif isinstance(candidate, DiscrepancyCandidate | FinetunedCandidate):
         if candidate.space is None:
             return contents
-        moments: Moments = bench.moments(candidate.space)
+        moments = bench.moments(candidate.space)
         contents += [moments.mean, moments.covariance, moments.possible]
     return [*contents, *bench.simulations]
 
@@ -231,4 +229,4 @@ def _put_aside(path: Path) -> str:
         other = set_aside(path)
     except OSError:  # nothing can be renamed there
         return ""
-    return "" if other is None else f"It is called {other} now, and can be removed."
+    return "" if other is None else f" It is called {other} now, and can be removed."

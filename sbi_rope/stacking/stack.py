@@ -126,9 +126,10 @@ def stack(
         NotReadyError: If there are fewer than two groups of pairs.
         InvalidInputError: If an argument is outside its range or has the wrong shape,
             if there are couplings among the candidates but no batch, if there are
-            ``checkpoints`` but no seed, if entries of
-            x are missing (NaN) that a candidate with ``space="input"`` corrects, or if
-            something cannot be sent to ``num_workers`` processes, or one of them dies.
+            ``checkpoints`` but no seed, or an NPE that cannot be described in a file,
+            if entries of x are missing (NaN) that a candidate with ``space="input"``
+            corrects, or if something cannot be sent to ``num_workers`` processes, or
+            one of them dies.
         UnsupportedPosteriorError: If NPE or a candidate has no density, or the
             posterior cannot be recalibrated.
         CouplingError: If a coupling has not converged.

@@ -40,6 +40,7 @@ from tests.stacks import (
     OT_ONLY,
     PRIOR,
     QUICK,
+    in_this_process,
     observed,
     problem,
     rope_of,
@@ -295,10 +296,6 @@ def test_a_stack_goes_on_if_its_checkpoints_cannot_be_written(tmp_path: Path) ->
 def test_copies_of_folds_in_other_processes_keep_what_they_train(
     tmp_path: Path,
 ) -> None:
-    def in_this_process(train: Any, tasks: Any, num_workers: int) -> Any:
-        yield from (train(*task) for task in tasks)
-
-    # Other processes take seconds to start.
     with patch("sbi_rope.stacking.workers.in_workers", in_this_process):
         assert num_trained(tmp_path, num_workers=2) == NUM_KEPT
     assert num_trained(tmp_path) == 0

@@ -32,6 +32,7 @@ from tests.stacks import (
     QUIET,
     ROPE,
     finetuned,
+    in_this_process,
     observed,
     problem,
     rope_of,
@@ -134,9 +135,6 @@ CASES: dict[str, dict[str, Any]] = {
 def test_copies_of_folds_give_the_scores_calls_and_warnings_of_the_folds(
     case: str,
 ) -> None:
-    def in_this_process(train: Any, tasks: Any, num_workers: int) -> Any:
-        yield from (train(*task) for task in tasks)
-
     options = dict(CASES[case])
     given = {
         name: options.pop(name) for name in ("x_o", "candidates") if name in options
