@@ -4,7 +4,7 @@ Comparisons are between methods on the same data: a repetition counts where both
 methods were run in it.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -72,33 +72,44 @@ class Comparison(NamedTuple):
     @property
     def best(self) -> str:
         """The method that the stack is least above."""
-        return self._best_of(self.gaps)
+        return min(self.gaps, key=self._mean_gap)
 
     @property
     def best_rival(self) -> str | None:
         """The same, without the methods of this package; None if there is no other."""
-        rivals = [name for name in self.gaps if name not in OURS]
-        return self._best_of(rivals) if rivals else None
+        rivals = (name for name in self.gaps if name not in OURS)
+        return min(rivals, key=self._mean_gap, default=None)
+
+    @property
+    def best_equal(self) -> str | None:
+        """The same, without methods that see observations if this stack does not."""
+        sees = METHODS[self.stack["method"].iloc[0]].observations
+        equals = (name for name in self.gaps if METHODS[name].observations <= sees)
+        return min(equals, key=self._mean_gap, default=None)
 
     @property
     def gap(self) -> np.ndarray:
         """How far the stack is above the best, in the repetitions of both."""
         return self.gaps[self.best].to_numpy()
 
+    def is_near(self, name: str) -> bool:
+        """Tell whether it is above a method, or hardly below it."""
+        return self._mean_gap(name) >= -NEAR
+
     def is_above(self, name: str) -> bool:
         """Tell whether it is above a method beyond the interval over repetitions."""
         gap = self.gaps[name].to_numpy()
         return bool(gap.mean() > half_width(gap))
 
-    def _best_of(self, names: Iterable[str]) -> str:
-        return min(names, key=lambda name: self.gaps[name].mean())
+    def _mean_gap(self, name: str) -> float:
+        return float(self.gaps[name].mean())
 
     @property
     def above_basics(self) -> float | None:
         """How far the stack is above prior and NPE; None if one was not run."""
         if not {"prior", "NPE"} <= set(self.gaps):
             return None
-        return min(float(self.gaps[name].mean()) for name in ("prior", "NPE"))
+        return min(map(self._mean_gap, ("prior", "NPE")))
 
 
 def evidence_lines(published: Published) -> list[str]:
@@ -238,7 +249,12 @@ def _goals(compared: Sequence[Comparison], rows: pd.DataFrame) -> list[str]:
     few = [one for one in compared if one.size <= MAX_PAIRS]
     goals = {
         f"best, or within {NEAR} nats of the best": [
-            (one, one.gap.mean() >= -NEAR) for one in few
+            (one, one.is_near(one.best)) for one in few
+        ],
+        f"best, or within {NEAR} nats of the best of those that see no more data": [
+            (one, one.is_near(one.best_equal))
+            for one in few
+            if one.best_equal is not None
         ],
         "better than the best other beyond the interval over repetitions": [
             (one, one.is_above(one.best)) for one in few

@@ -80,6 +80,7 @@ class Entry:
         build: Constructs it on a case; None for what `scoring.py` makes itself.
         style: Colour, line and marker in figures.
         pairs: Whether it sees calibration pairs.
+        observations: Whether it sees the test observations, without their labels.
         couples: Whether it has gamma and tau.
         tasks: The only tasks that it can be run on; None for all.
         extra: Whether it is run only where it is asked for by name.
@@ -89,6 +90,7 @@ class Entry:
     style: tuple[str, str, str | None]
     build: "Callable[[Case], Method] | None" = None
     pairs: bool = False
+    observations: bool = False
     couples: bool = False
     tasks: tuple[str, ...] | None = None
     extra: bool = False
@@ -230,13 +232,20 @@ METHODS: dict[str, Entry] = {
     ),
     "NPE-RS": Entry(
         style=("#7F3C8D", ":", None),
+        observations=True,
         build=lambda case: NPERS(
             *_from_scratch(case), training=case.settings.training, device=case.device
         ),
     ),
-    "RVNP": Entry(style=("#999933", "-.", None), build=_variational(shift=False)),
+    "RVNP": Entry(
+        style=("#999933", "-.", None),
+        observations=True,
+        build=_variational(shift=False),
+    ),
     "RVNP (offset)": Entry(
-        style=("#999933", ":", None), build=_variational(shift=True)
+        style=("#999933", ":", None),
+        observations=True,
+        build=_variational(shift=True),
     ),
     "J-NPE": Entry(
         style=("#CC79A7", "-.", "v"),
@@ -318,11 +327,13 @@ METHODS: dict[str, Entry] = {
     "FRISBI": Entry(
         style=("#6A3D9A", "-", ">"),
         pairs=True,
+        observations=True,
         build=lambda case: FRISBI.from_posterior(case.npe, simulator=case.simulator),
     ),
     "FRISBI (distilled)": Entry(
         style=("#6A3D9A", "--", ">"),
         pairs=True,
+        observations=True,
         build=lambda case: FRISBI.from_posterior(
             case.npe, simulator=case.simulator, distilled=True
         ),
@@ -331,6 +342,7 @@ METHODS: dict[str, Entry] = {
     "HVAE": Entry(
         style=("#117733", "-.", "P"),
         pairs=True,
+        observations=True,
         tasks=("pendulum", "light_tunnel"),
         extra=True,
         build=lambda case: HVAE.from_posterior(
@@ -346,12 +358,15 @@ METHODS: dict[str, Entry] = {
     ),
     "OT-only": Entry(
         style=("#56B4E9", "--", "s"),
+        observations=True,
         couples=True,
         build=lambda case: OTOnly.from_posterior(case.npe, simulator=case.simulator),
     ),
-    "RoPE": Entry(style=("#0072B2", "-", "o"), pairs=True, couples=True),
+    "RoPE": Entry(
+        style=("#0072B2", "-", "o"), pairs=True, observations=True, couples=True
+    ),
     STACK: Entry(style=("black", "-", "*"), pairs=True),
     GIVEN_PRIOR_STACK: Entry(style=("black", "-.", "*"), pairs=True, extra=True),
-    RVNP_STACK: Entry(style=("black", ":", "*"), pairs=True),
-    COUPLED_STACK: Entry(style=("black", "--", "*"), pairs=True),
+    RVNP_STACK: Entry(style=("black", ":", "*"), pairs=True, observations=True),
+    COUPLED_STACK: Entry(style=("black", "--", "*"), pairs=True, observations=True),
 }

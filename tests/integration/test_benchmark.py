@@ -365,13 +365,15 @@ def smoke_case(task: str, folder: Path) -> Case:
     return Case.of(cell, Sources(), Cache(folder), "cpu")
 
 
-def test_what_sees_calibration_pairs_is_run_for_every_number_of_them(
+def test_entries_say_which_methods_see_calibration_pairs_and_observations(
     tmp_path: Path,
 ) -> None:
     case = smoke_case("linear_gaussian", tmp_path)
     for name, entry in METHODS.items():
         if entry.build and case.task.name in (entry.tasks or (case.task.name,)):
-            assert ("calibration" in entry.build(case).sees) == entry.pairs, name
+            sees = entry.build(case).sees
+            assert ("calibration" in sees) == entry.pairs, name
+            assert ("observations" in sees) == entry.observations, name
 
 
 def test_the_row_of_ot_only_is_that_of_the_method_of_its_name(tmp_path: Path) -> None:

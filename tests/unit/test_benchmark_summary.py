@@ -162,6 +162,7 @@ def test_a_stack_that_sees_the_observations_is_compared_apart(folder: Path) -> N
     row = line(of_a_batch, "A cs | 10")
     assert row[2:7] == ["-0.20", "+0.020", "RVNP", "-0.50", "+0.30"]
     assert "best, or within 0.1 nats of the best: 0 of 3" in alone
+    assert "within 0.1 nats of the best of those that see no more data: 3 of 3" in alone
     assert "best, or within 0.1 nats of the best: 3 of 3" in of_a_batch
 
 
