@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from sbi_rope import CalibrationFinetuner, RoPE, StackedPosterior
 from sbi_rope.baselines import FinetunedNPE, PriorPosterior
 from sbi_rope.discrepancy import DiscrepancyModel
-from sbi_rope.discrepancy.training import ONE
+from sbi_rope.discrepancy.training import ONE_COURSE
 from sbi_rope.stacking import (
     CouplingCandidate,
     CrossValidation,
@@ -45,7 +45,7 @@ def quick() -> Iterator[None]:
         "sbi_rope.stacking.workbench.TUNING": tuning,
         "sbi_rope.stacking.workbench.DiscrepancyModel": lambda: model,
         "sbi_rope.stacking.scoring.NUM_SAMPLES": 40,
-        "sbi_rope.stacking.folds.IF_FAR_FROM_SETTLED": ONE,
+        "sbi_rope.stacking.folds.IN_A_STACK": ONE_COURSE,
         "sbi_rope.discrepancy.correction.NUM_STEPS": steps,
         "sbi_rope.discrepancy.correction.NUM_DRAWS": 50,
         "sbi_rope.discrepancy.training.BATCH_SIZE": 50,

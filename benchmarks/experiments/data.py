@@ -1,6 +1,7 @@
 """The data of experiments on a task: calibration rows only, never the test set."""
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +16,19 @@ from benchmarks.scoring import rope_of
 from benchmarks.store import Cache
 from sbi_rope import RoPE
 from sbi_rope.errors import warn_user
+from sbi_rope.mixture import MixtureEstimator, Part
+from sbi_rope.stacking.folds import Fold
+from sbi_rope.stacking.workbench import NUM_FOLDS, Workbench
 from sbi_rope.tasks import Task
 
 __all__ = [
     "NPE_SETTINGS",
+    "average_lpp",
     "cache_of",
     "calibration_data",
     "case_of",
     "labelled",
+    "some_folds",
     "trained_npe",
 ]
 
@@ -88,6 +94,24 @@ def calibration_data(
     rope = rope_of(case)
     rope.append_calibration(theta[:n_calibration], x[:n_calibration])
     return rope, (theta[n_calibration:], x[n_calibration:])
+
+
+def some_folds(rope: RoPE, count: int, *, seed: int) -> list[Fold]:
+    """Return the pairs without each of the first folds of a stack."""
+    bench = Workbench(rope, num_folds=NUM_FOLDS, seed=seed, show_progress_bars=False)
+    numbers = range(len(bench.folds))
+    return [
+        Fold(bench, [number for number in numbers if number != left_out])
+        for left_out in numbers[:count]
+    ]
+
+
+def average_lpp(parts: Sequence[Part], pairs: Pairs, task: Task) -> float:
+    """Return the LPP of an average, in standard deviations of the prior."""
+    estimator = MixtureEstimator(parts, [1.0 / len(parts)] * len(parts))
+    of_each = estimator.part_log_probs(*pairs) + estimator.weights.log()
+    log_prob = of_each.logsumexp(dim=1).mean()
+    return float(log_prob + task.prior_std.log().sum())
 
 
 def trained_npe(task: Task, *, seed: int, cache: Cache) -> Any:

@@ -16,15 +16,15 @@ from collections.abc import Iterator
 from dataclasses import replace
 from unittest.mock import patch
 
-import torch
-
 from benchmarks.experiments.common import Row, add_task, begin, show
-from benchmarks.experiments.data import calibration_data, case_of
-from sbi_rope.mixture import MixtureEstimator
+from benchmarks.experiments.data import (
+    average_lpp,
+    calibration_data,
+    case_of,
+    some_folds,
+)
 from sbi_rope.stacking import FinetunedCandidate, RehearsedCandidate
 from sbi_rope.stacking.finetuning import REHEARSED
-from sbi_rope.stacking.folds import Fold
-from sbi_rope.stacking.workbench import Workbench
 from sbi_rope.trainers.training import FINETUNING
 
 CANDIDATES = {
@@ -34,11 +34,14 @@ CANDIDATES = {
     "tuned": FinetunedCandidate(space="tuned"),
     "rehearsed": RehearsedCandidate(),
 }
-NUM_FOLDS = 5
 OPTIONS = {
     "--n-calibration": {"type": int, "default": 200},
     "--starts": {"nargs": "+", "default": ["NPE", "tuned"], "choices": CANDIDATES},
     "--rates": {"type": float, "nargs": "+", "default": [1e-3, 3e-4]},
+    "--together": {
+        "action": "store_true",
+        "help": "also choose among the rates by the hold-out of each net",
+    },
     "--patiences": {"type": int, "nargs": "+", "default": [20, 50]},
     "--versions": {"type": int, "default": 2, "help": "folds to train without"},
     "--seed": {"type": int, "default": 1, "help": "of the pairs"},
@@ -48,17 +51,13 @@ OPTIONS = {
 def rows(args: argparse.Namespace) -> Iterator[Row]:
     """Yield LPPs in standard deviations of the prior, by start, rate and patience."""
     case = case_of(args, method="stack")
-    rope, (theta, x) = calibration_data(case, args.n_calibration, seed=args.seed)
-    bench = Workbench(
-        rope, num_folds=NUM_FOLDS, seed=args.seed, show_progress_bars=False
-    )
-    numbers = range(len(bench.folds))
-    folds = [
-        Fold(bench, [number for number in numbers if number != left_out])
-        for left_out in numbers[: args.versions]
-    ]
-    for start, rate, patience in itertools.product(
-        args.starts, args.rates, args.patiences
+    rope, others = calibration_data(case, args.n_calibration, seed=args.seed)
+    folds = some_folds(rope, args.versions, seed=args.seed)
+    chosen = [(rate,) for rate in args.rates]
+    if args.together and len(args.rates) > 1:
+        chosen.append(tuple(args.rates))
+    for start, rates, patience in itertools.product(
+        args.starts, chosen, args.patiences
     ):
         candidate = CANDIDATES[start]
         space = getattr(candidate, "space", None)
@@ -72,15 +71,13 @@ def rows(args: argparse.Namespace) -> Iterator[Row]:
                 },
             ),
             patch.dict(
-                "sbi_rope.stacking.trained_candidates.LEARNING_RATES", {space: rate}
+                "sbi_rope.stacking.trained_candidates.LEARNING_RATES", {space: rates}
             ),
         ):
             parts = [part for fold in folds for part in candidate.parts(fold)]
-        estimator = MixtureEstimator(parts, [1.0 / len(parts)] * len(parts))
-        log_prob = estimator.part_log_probs(theta, x).logsumexp(dim=1)
-        lpp = log_prob.mean() - torch.tensor(float(len(parts))).log()
-        lpp = float(lpp + case.task.prior_std.log().sum())
-        setting = {"start": start, "rate": f"{rate:g}", "patience": patience}
+        lpp = average_lpp(parts, others, case.task)
+        name = " or ".join(f"{rate:g}" for rate in rates)
+        setting = {"start": start, "rate": name, "patience": patience}
         yield {**setting, "LPP": f"{lpp:.2f}"}
 
 

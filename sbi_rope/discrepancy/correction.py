@@ -17,9 +17,8 @@ from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.posterior import Discrepancy
 from sbi_rope.discrepancy.regression import SMALLEST_NOISE
 from sbi_rope.discrepancy.training import (
-    ONE,
+    ONE_COURSE,
     UNTIL_SETTLED,
-    Courses,
     train_on_corrected,
 )
 from sbi_rope.errors import InvalidInputError
@@ -216,7 +215,7 @@ def correct_npe(
     groups: Tensor | None = None,
     probabilities: Tensor | None = None,
     num_steps: int | None = None,
-    courses: Courses = UNTIL_SETTLED,
+    min_gain: float = UNTIL_SETTLED,
     learning_rate: float | None = None,
     show_progress_bars: bool = False,
 ) -> Correction:
@@ -236,7 +235,8 @@ def correct_npe(
             them equal.
         num_steps: Gradient steps of a single course. If None, courses follow each
             other, whose length depends on the space.
-        courses: When another course follows, if ``num_steps`` is None.
+        min_gain: The nats by which a course has to lower the loss for another to
+            follow, if ``num_steps`` is None.
         learning_rate: Learning rate of Adam; it depends on the space if None.
         show_progress_bars: Whether to show the loss during training.
 
@@ -263,7 +263,7 @@ def correct_npe(
         standardisation,
         probabilities=probabilities,
         num_steps=NUM_STEPS[space] if num_steps is None else num_steps,
-        courses=courses if num_steps is None else ONE,
+        min_gain=min_gain if num_steps is None else ONE_COURSE,
         learning_rate=(
             LEARNING_RATES[space] if learning_rate is None else learning_rate
         ),

@@ -1,15 +1,16 @@
 """Fine-tune NPE on the pairs of a fold, but for a part that is held out."""
 
 import copy
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from sbi_rope._labels import Nodes
 from sbi_rope._sbi import embedding_of, headless
-from sbi_rope._training import shuffled
+from sbi_rope._training import History, best_of_learning_rates, shuffled
 from sbi_rope.stacking.folds import Fold
 from sbi_rope.trainers.training import FINETUNING, rows_with_density, train_network
 
@@ -28,7 +29,7 @@ def finetune_without(
     fold: Fold,
     part: int,
     *,
-    learning_rate: float,
+    learning_rates: Sequence[float],
     rehearse: bool = False,
 ) -> Any:
     r"""Train an estimator on the pairs of a fold, except for one held-out part.
@@ -48,16 +49,16 @@ def finetune_without(
     The density of a label that is not exact is an average over the parameters that it
     leaves possible (:mod:`sbi_rope._labels.nodes`), and a weight multiplies its term.
 
-    All parameters are trained in evaluation mode. The epoch with the lowest loss on the
-    held-out part is kept; this can be the start. Without rehearsal a candidate averages
-    the nets that hold out each part of a fold in turn, which reduces the effect of
-    overfitting.
+    All parameters are trained in evaluation mode. Of all epochs and learning rates the
+    one with the lowest loss on the held-out part is kept; this can be the start.
+    Without rehearsal a candidate averages the nets that hold out each part of a fold in
+    turn, which reduces the effect of overfitting.
 
     Args:
         start: An estimator of sbi with a density; it is not changed.
         fold: The pairs that may be learned from.
         part: The number of the part to hold out, one of ``fold.parts``.
-        learning_rate: Of Adam.
+        learning_rates: Of Adam; each is tried from the start.
         rehearse: Whether to train on simulations, too. A large net that keeps seeing
             them learns more from the pairs before it overfits.
 
@@ -65,24 +66,56 @@ def finetune_without(
         The trained estimator, in evaluation mode.
     """
     bench = fold.bench
-    train, held_out = fold.rows_without(part), fold.parts[part]
-    estimator = copy.deepcopy(start).requires_grad_()
+    nodes = None if bench.labels.are_exact else fold.nodes(start)
+
+    def losses_of(estimator: Any) -> Callable[[Tensor], Tensor]:
+        if nodes is not None:
+            return _losses_of_labels(fold, nodes, estimator)
+        return lambda rows: estimator.loss(bench.theta[rows], condition=bench.x[rows])
+
+    split = (fold.rows_without(part), fold.parts[part])
+    with_density = rows_with_density(losses_of(start), *split)
+    if all(map(len, with_density)):
+        split = with_density
+
+    def tuned(learning_rate: float) -> tuple[Any, History]:
+        estimator = copy.deepcopy(start).requires_grad_()
+        history = _train(
+            estimator,
+            losses_of(estimator),
+            fold,
+            split,
+            learning_rate=learning_rate,
+            rehearse=rehearse,
+        )
+        return estimator.requires_grad_(requires_grad=False), history
+
+    estimator, _ = best_of_learning_rates(
+        tuned,
+        learning_rates,
+        num_held_out=len(split[1]),
+        otherwise=min(learning_rates),
+    )
+    return estimator
+
+
+def _train(
+    estimator: Any,
+    losses: Callable[[Tensor], Tensor],
+    fold: Fold,
+    split: tuple[Tensor, ...],
+    *,
+    learning_rate: float,
+    rehearse: bool,
+) -> History:
+    """Train an estimator in place on the first rows of a split; stop by the others.
+
+    ``losses`` maps rows to the negative log density of each.
+    """
+    bench, (train, held_out) = fold.bench, split
+    weights = bench.labels.pair_weights
     # The order of the batches depends on the fold alone, not on what was drawn before.
     order = torch.Generator().manual_seed(fold.seed)
-
-    of_labels = None
-    if not bench.labels.are_exact:
-        of_labels = _losses_of_labels(fold, start, estimator)
-    weights = bench.labels.pair_weights
-
-    def losses(rows: Tensor) -> Tensor:
-        if of_labels is not None:
-            return of_labels(rows)
-        return estimator.loss(bench.theta[rows], condition=bench.x[rows])
-
-    with_density = rows_with_density(losses, train, held_out)
-    if all(map(len, with_density)):
-        train, held_out = with_density
 
     def loss(rows: Tensor, among: Tensor = train) -> Tensor:
         if weights is None:
@@ -106,7 +139,7 @@ def finetune_without(
         theta, x = (one[others.to(one.device)] for one in bench.simulations)
         return 0.5 * loss(rows) + 0.5 * estimator.loss(theta, condition=x).mean()
 
-    train_network(
+    return train_network(
         estimator,
         rehearsed_batches if rehearse else batches,
         rehearsed_loss if rehearse else loss,
@@ -116,14 +149,13 @@ def finetune_without(
         label="Fine-tuning NPE",
         show_progress_bars=False,
     )
-    return estimator.requires_grad_(requires_grad=False)
 
 
 def _losses_of_labels(
-    fold: Fold, start: Any, estimator: Any
+    fold: Fold, nodes: Nodes, estimator: Any
 ) -> Callable[[Tensor], Tensor]:
     """Return a function from rows to the negative log densities of their labels."""
-    bench, nodes = fold.bench, fold.nodes(start)
+    bench = fold.bench
     place = torch.empty_like(bench.groups, device=fold.rows.device)
     place[fold.rows] = torch.arange(len(fold.rows), device=fold.rows.device)
     # The estimator itself would embed an observation once for each of its nodes.

@@ -15,7 +15,7 @@ from sbi_rope._sbi import embed, estimator_of
 from sbi_rope._training import without_warning_of_few_pairs
 from sbi_rope.discrepancy.correction import Space, correct_npe, network_of
 from sbi_rope.discrepancy.parameters import learn_parameters
-from sbi_rope.discrepancy.training import IF_FAR_FROM_SETTLED
+from sbi_rope.discrepancy.training import IN_A_STACK
 from sbi_rope.finetuning import CalibrationFinetuner
 from sbi_rope.rope import RoPE
 from sbi_rope.stacking.workbench import Workbench
@@ -144,7 +144,7 @@ class Fold:
             weights=bench.pair_weights(self.rows),
             groups=bench.groups[self.rows.cpu()],
             probabilities=probabilities,
-            courses=IF_FAR_FROM_SETTLED,
+            min_gain=IN_A_STACK,
         )
         return Corrected(
             estimator=correction.estimator,

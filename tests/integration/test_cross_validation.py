@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from sbi_rope import CalibrationFinetuner, RoPE
 from sbi_rope._groups import groups_of
 from sbi_rope._sbi import embed, embedding_of, estimator_of
-from sbi_rope.discrepancy.training import ONE, Courses
+from sbi_rope.discrepancy.training import ONE_COURSE
 from sbi_rope.metrics import acauc_of
 from sbi_rope.mixture import MixtureEstimator, MixturePosterior, part_of
 from sbi_rope.stacking import (
@@ -200,12 +200,32 @@ def test_a_net_is_not_tuned_on_the_part_that_tells_it_when_to_stop() -> None:
     bench = Workbench(
         rope_of(problem(12, seed=1)), num_folds=4, seed=0, show_progress_bars=False
     )
-    finetune_without(Indifferent(), Fold(bench, [0, 1, 3]), 1, learning_rate=1e-3)
+    finetune_without(Indifferent(), Fold(bench, [0, 1, 3]), 1, learning_rates=[1e-3])
     # At first it is asked which pairs have a density.
     _, _, part, *_ = Indifferent.judged
     assert part == set(bench.x[bench.folds[1], 0].tolist())
     others = torch.cat([bench.folds[0], bench.folds[3]])
     assert Indifferent.trained == set(bench.x[others, 0].tolist())
+
+
+def test_of_several_learning_rates_the_best_on_the_part_that_is_held_out_is_kept() -> (
+    None
+):
+    bench = Workbench(
+        rope_of(problem(12, seed=1)), num_folds=4, seed=0, show_progress_bars=False
+    )
+    fold, start = Fold(bench, [0, 1, 3]), estimator_of(bench.npe)
+    rows = fold.parts[1]
+
+    def held_out_loss(*rates: float) -> float:
+        found = finetune_without(start, fold, 1, learning_rates=rates)
+        return float(found.loss(bench.theta[rows], condition=bench.x[rows]).mean())
+
+    with quick():
+        slow, fast = held_out_loss(1e-5), held_out_loss(1e-2)
+        assert slow != fast
+        for rates in ((1e-5, 1e-2), (1e-2, 1e-5)):
+            assert held_out_loss(*rates) == min(slow, fast)
 
 
 def test_a_single_fold_is_divided_so_that_nets_can_be_tuned_on_it() -> None:
@@ -249,7 +269,7 @@ def test_with_rehearsal_pairs_and_simulations_count_half_each() -> None:
         simulated = bench.simulations
         with patch("sbi_rope.stacking.finetuning.train_network") as train:
             finetune_without(
-                start, Fold(bench, [0, 1, 3]), 1, learning_rate=1e-3, rehearse=True
+                start, Fold(bench, [0, 1, 3]), 1, learning_rates=[1e-3], rehearse=True
             )
         _, batches, loss, training = train.call_args.args
         found = list(batches(0))
@@ -277,7 +297,7 @@ def test_a_pair_weighs_as_much_in_a_small_batch_as_among_all() -> None:
     )
     with patch("sbi_rope.stacking.finetuning.train_network") as train:
         finetune_without(
-            estimator_of(bench.npe), Fold(bench, [0, 1, 3]), 1, learning_rate=1e-3
+            estimator_of(bench.npe), Fold(bench, [0, 1, 3]), 1, learning_rates=[1e-3]
         )
     _, batches, loss, _ = train.call_args.args
     rows = torch.cat([rows for (rows,) in batches(0)])
@@ -298,7 +318,7 @@ def test_an_observation_is_embedded_once_whatever_its_label_leaves_possible() ->
     embedding_of(start).register_forward_hook(lambda net, x, s: seen.append(len(x[0])))
     fold = Fold(bench, [0, 1, 3])
     with patch("sbi_rope.stacking.finetuning.train_network") as train:
-        finetune_without(start, fold, 1, learning_rate=1e-3)
+        finetune_without(start, fold, 1, learning_rates=[1e-3])
     rows = fold.rows
     seen.clear()
     losses = train.call_args.args[2](rows)
@@ -357,17 +377,17 @@ def test_fine_tuning_of_a_tuned_candidate_starts_with_the_net_without_the_part()
 
 
 @pytest.mark.medium
-def test_a_version_goes_through_the_courses_that_the_rule_asks_for() -> None:
-    def trained(courses: Courses) -> Tensor:
+def test_a_version_goes_through_another_course_if_it_gains_enough() -> None:
+    def trained(min_gain: float) -> Tensor:
         bench = Workbench(
             rope_of(problem(12, seed=1)), num_folds=4, seed=0, show_progress_bars=False
         )
-        with quick(), patch("sbi_rope.stacking.folds.IF_FAR_FROM_SETTLED", courses):
+        with quick(), patch("sbi_rope.stacking.folds.IN_A_STACK", min_gain):
             version = Fold(bench, [0, 1]).corrected("embedding", learn_prior=False)
         return nn.utils.parameters_to_vector(version.estimator.parameters())
 
-    assert torch.equal(trained(ONE), trained(ONE))
-    assert not torch.equal(trained(ONE), trained(Courses(gain=-math.inf)))
+    assert torch.equal(trained(ONE_COURSE), trained(ONE_COURSE))
+    assert not torch.equal(trained(ONE_COURSE), trained(-math.inf))
 
 
 # --- labels ---

@@ -21,11 +21,7 @@ from sbi_rope._standardisation import Standardisation
 from sbi_rope.baselines import Training
 from sbi_rope.discrepancy import DiscrepancyModel, DiscrepancyNPE
 from sbi_rope.discrepancy.posterior import DiscrepancyDraws
-from sbi_rope.discrepancy.training import (
-    IF_FAR_FROM_SETTLED,
-    UNTIL_SETTLED,
-    train_on_corrected,
-)
+from sbi_rope.discrepancy.training import UNTIL_SETTLED, train_on_corrected
 from sbi_rope.discrepancy.tuning import cross_fitted_nets
 from sbi_rope.errors import (
     InvalidInputError,
@@ -401,23 +397,14 @@ def test_courses_are_added_until_the_loss_has_settled() -> None:
     one, several = Slow(), Slow()
     assert len(settle(one).training_loss) == 2
     assert (one.bias < 3).all()
-    history = settle(several, courses=UNTIL_SETTLED)
+    history = settle(several, min_gain=UNTIL_SETTLED)
     assert 4 <= len(history.training_loss) < 24
     assert torch.allclose(several.bias, torch.full((2,), 5.0), atol=0.2)
     # From where it has settled one course is enough.
-    assert len(settle(several, courses=UNTIL_SETTLED).training_loss) == 2
-
-
-@pytest.mark.medium
-def test_a_stack_adds_courses_only_if_the_loss_was_still_falling() -> None:
-    # The loss is 51 nats at the start, and 18 after a first course of 40 steps.
-    short, long = Slow(), Slow()
-    assert len(settle(short, courses=IF_FAR_FROM_SETTLED).training_loss) >= 6
-    assert torch.allclose(short.bias, torch.full((2,), 5.0), atol=0.3)
-    # A course of 200 steps lowers it as far as it can within its first half.
-    history = settle(long, courses=IF_FAR_FROM_SETTLED, num_steps=200)
-    assert len(history.training_loss) == 10
-    assert torch.allclose(long.bias, torch.full((2,), 5.0), atol=0.3)
+    assert len(settle(several, min_gain=UNTIL_SETTLED).training_loss) == 2
+    # The loss is 51 nats at the start, and 18 after a first course.
+    assert len(settle(Slow(), min_gain=35.0).training_loss) == 2
+    assert len(settle(Slow(), min_gain=30.0).training_loss) == 4
 
 
 def test_only_simulations_with_a_probability_are_drawn() -> None:
