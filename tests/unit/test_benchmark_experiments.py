@@ -14,14 +14,23 @@ from torch import Tensor, nn
 
 from benchmarks.cases import Case, CountingSimulator, Sources
 from benchmarks.cells import Cell
-from benchmarks.experiments import choices, data, finetuning, ranks
+from benchmarks.experiments import (
+    choices,
+    courses,
+    data,
+    finetuning,
+    patience,
+    ranks,
+)
 from benchmarks.experiments.choices import CHOICES, Choice, Run, comparison
 from benchmarks.experiments.common import add_task, begin, show
 from benchmarks.experiments.losses import Loss, as_row, losses, target_distances
 from benchmarks.methods import METHODS
 from benchmarks.scoring import Score, scores
 from benchmarks.store import Cache
+from sbi_rope._sbi import estimator_of
 from sbi_rope.errors import RoPEWarning
+from sbi_rope.mixture import part_of
 from sbi_rope.stacking import default_candidates, stacking_weights
 from sbi_rope.tasks import get_task
 from tests.stacks import quick
@@ -200,6 +209,43 @@ def test_a_run_scores_pairs_that_the_stack_has_not_seen(
         assert torch.allclose(version[:, k], prior[6:] + unit, atol=1e-4)
     # Held-out scores only weigh candidates; they keep theta's own unit.
     assert torch.allclose(found.held_out[:, k], prior[:6], atol=1e-4)
+
+
+@pytest.mark.medium
+def test_courses_and_rates_are_those_that_the_rows_say(tmp_path: Path) -> None:
+    shared = options(
+        tmp_path, task="linear_gaussian", n_calibration=9, versions=2, seed=1
+    )
+    of_courses = argparse.Namespace(
+        **vars(shared), spaces=["embedding"], gains=[-np.inf, np.inf], finetuned=True
+    )
+    of_rates = argparse.Namespace(
+        **vars(shared),
+        starts=["embedding"],
+        rates=[1e-12, 1e-2],
+        together=True,
+        patiences=[5],
+    )
+    with quick():
+        one, most, again = courses.rows(of_courses)
+        nothing, fast, both = patience.rows(of_rates)
+    corrected, tuned = "discrepancy", "discrepancy, fine-tuned"
+    assert (one[corrected], one[tuned]) == (again[corrected], again[tuned])
+    assert most[corrected] != one[corrected]
+    # A rate of nearly nothing leaves what the training starts from.
+    assert nothing["LPP"] == one[corrected]
+    assert fast["LPP"] != nothing["LPP"]
+    assert both["rate"] == "1e-12 or 0.01"
+
+
+def test_an_average_is_scored_by_its_mean_density(case: Case) -> None:
+    rope, others = data.calibration_data(case, PAIRS, seed=1)
+    parts = [part_of(estimator_of(rope.npe))]
+    log_prob = estimator_of(rope.npe).log_prob(others[0][None], others[1])[0]
+    expected = float(log_prob.mean() + case.task.prior_std.log().sum())
+    for several in (parts, 3 * parts):
+        found = data.average_lpp(several, others, case.task)
+        assert found == pytest.approx(expected, abs=1e-4)
 
 
 # Where RoPE loses ---------------------------------------------------------------------
