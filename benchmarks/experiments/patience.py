@@ -54,7 +54,7 @@ def rows(args: argparse.Namespace) -> Iterator[Row]:
     rope, others = calibration_data(case, args.n_calibration, seed=args.seed)
     folds = some_folds(rope, args.versions, seed=args.seed)
     chosen = [(rate,) for rate in args.rates]
-    if args.together and len(args.rates) > 1:
+    if args.together:
         chosen.append(tuple(args.rates))
     for start, rates, patience in itertools.product(
         args.starts, chosen, args.patiences
