@@ -1,7 +1,7 @@
 r"""Distributions that priors need and torch does not have."""
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from sbi.utils import BoxUniform
@@ -10,6 +10,9 @@ from torch.distributions import Distribution, constraints
 
 from sbi_rope._validation import check_finite, check_tensor
 from sbi_rope.errors import InvalidInputError
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 __all__ = ["Arcsine", "UniformDistance", "box", "check_size"]
 
@@ -52,7 +55,39 @@ def check_size(name: str, value: Any) -> Tensor:
     return value
 
 
-class Arcsine(Distribution):
+class _FromZero(Distribution):
+    """A law on the interval from 0 to ``width`` that is drawn by inversion."""
+
+    has_rsample = True
+
+    def __init__(self, width: Tensor, validate_args: bool | None = None) -> None:  # noqa: FBT001
+        self.width = check_size("width", width)
+        super().__init__(batch_shape=width.shape, validate_args=validate_args)
+
+    @property
+    def arg_constraints(self) -> dict[str, constraints.Constraint]:
+        """The width is positive."""
+        return {"width": constraints.positive}
+
+    @property
+    def support(self) -> constraints.Constraint:
+        """The closed interval from 0 to ``width``."""
+        return constraints.interval(torch.zeros_like(self.width), self.width)
+
+    def rsample(self, sample_shape: Any = Size()) -> Tensor:  # noqa: B008
+        """Draw by inversion, differentiable with respect to ``width``."""
+        shape = self._extended_shape(sample_shape)
+        uniform = torch.rand(shape, dtype=self.width.dtype, device=self.width.device)
+        return self.icdf(uniform)
+
+    def expand(self, batch_shape: Any, _instance: Distribution | None = None) -> "Self":
+        """Return this distribution with a larger batch shape."""
+        return type(self)(
+            self.width.expand(batch_shape), validate_args=self._validate_args
+        )
+
+
+class Arcsine(_FromZero):
     r"""Squared cosine of a uniform angle: what two polarisers let through.
 
     With :math:`\varphi \sim \mathcal{U}(0, 2 \pi)`, the density of
@@ -82,22 +117,6 @@ class Arcsine(Distribution):
         tensor([ 6.8265, -0.4516,  6.8265])
     """
 
-    has_rsample = True
-
-    def __init__(self, width: Tensor, validate_args: bool | None = None) -> None:  # noqa: FBT001
-        self.width = check_size("width", width)
-        super().__init__(batch_shape=width.shape, validate_args=validate_args)
-
-    @property
-    def arg_constraints(self) -> dict[str, constraints.Constraint]:
-        """The width is positive."""
-        return {"width": constraints.positive}
-
-    @property
-    def support(self) -> constraints.Constraint:
-        """The closed interval from 0 to ``width``."""
-        return constraints.interval(torch.zeros_like(self.width), self.width)
-
     @property
     def mean(self) -> Tensor:
         r"""The mean, :math:`w / 2`."""
@@ -107,12 +126,6 @@ class Arcsine(Distribution):
     def variance(self) -> Tensor:
         r"""The variance, :math:`w^2 / 8`."""
         return self.width**2 / 8
-
-    def rsample(self, sample_shape: Any = Size()) -> Tensor:  # noqa: B008
-        """Draw by inversion, differentiable with respect to ``width``."""
-        shape = self._extended_shape(sample_shape)
-        uniform = torch.rand(shape, dtype=self.width.dtype, device=self.width.device)
-        return self.icdf(uniform)
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Return the log density, finite at the ends and minus infinity outside."""
@@ -133,16 +146,8 @@ class Arcsine(Distribution):
         r"""Quantile function, :math:`w \sin^2 (\pi u / 2)`."""
         return self.width * (math.pi / 2 * value).sin() ** 2
 
-    def expand(
-        self, batch_shape: Any, _instance: Distribution | None = None
-    ) -> "Arcsine":
-        """Return this distribution with a larger batch shape."""
-        return Arcsine(
-            self.width.expand(batch_shape), validate_args=self._validate_args
-        )
 
-
-class UniformDistance(Distribution):
+class UniformDistance(_FromZero):
     r"""Distance between two independent uniform draws.
 
     With :math:`U, V \sim \mathcal{U}[a, a + w]`, the density of
@@ -165,22 +170,6 @@ class UniformDistance(Distribution):
         tensor([0.0500])
     """
 
-    has_rsample = True
-
-    def __init__(self, width: Tensor, validate_args: bool | None = None) -> None:  # noqa: FBT001
-        self.width = check_size("width", width)
-        super().__init__(batch_shape=width.shape, validate_args=validate_args)
-
-    @property
-    def arg_constraints(self) -> dict[str, constraints.Constraint]:
-        """The width is positive."""
-        return {"width": constraints.positive}
-
-    @property
-    def support(self) -> constraints.Constraint:
-        """The closed interval from 0 to ``width``."""
-        return constraints.interval(torch.zeros_like(self.width), self.width)
-
     @property
     def mean(self) -> Tensor:
         r"""The mean, :math:`w / 3`."""
@@ -190,12 +179,6 @@ class UniformDistance(Distribution):
     def variance(self) -> Tensor:
         r"""The variance, :math:`w^2 / 18`."""
         return self.width**2 / 18
-
-    def rsample(self, sample_shape: Any = Size()) -> Tensor:  # noqa: B008
-        """Draw by inversion, differentiable with respect to ``width``."""
-        shape = self._extended_shape(sample_shape)
-        uniform = torch.rand(shape, dtype=self.width.dtype, device=self.width.device)
-        return self.icdf(uniform)
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Return the log density, minus infinity outside of the support."""
@@ -214,11 +197,3 @@ class UniformDistance(Distribution):
         r"""Quantile function, :math:`w (1 - \sqrt{1 - u})`."""
         # The same without the difference of two numbers close to one.
         return self.width * value / (1 + (1 - value).sqrt())
-
-    def expand(
-        self, batch_shape: Any, _instance: Distribution | None = None
-    ) -> "UniformDistance":
-        """Return this distribution with a larger batch shape."""
-        return UniformDistance(
-            self.width.expand(batch_shape), validate_args=self._validate_args
-        )
