@@ -272,6 +272,13 @@ METHODS: dict[str, Entry] = {
             case.npe, training=case.settings.own_training
         ),
     ),
+    "fine-tuned NPE (averaged)": Entry(
+        style=("#E69F00", "--", "D"),
+        pairs=True,
+        build=lambda case: FinetunedNPE.from_posterior(
+            case.npe, training=case.settings.own_training, num_holdouts=NUM_HOLDOUTS
+        ),
+    ),
     "discrepancy": Entry(
         style=("#882255", "-", "h"),
         pairs=True,
