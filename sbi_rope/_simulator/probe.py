@@ -212,12 +212,12 @@ class Probe:
         assert x is not None
         if not bool((x == x[:1]).all()):
             return False
-        again = self._try(trial.caller.form, trial.theta, seed=1).x
+        again = self._try(trial.caller.form, trial.theta, seed=2).x
         return again is not None and not torch.equal(again, x)
 
     def _check_seeds(self, trial: _Trial) -> None:
         """Warn if the simulator sets a seed, and so repeats its noise at every call."""
-        again = self._try(trial.caller.form, trial.theta, seed=1)
+        again = self._try(trial.caller.form, trial.theta, seed=2)
         # A simulator that sets no seed leaves different states after different seeds.
         if any(a == b for a, b in zip(trial.state, again.state, strict=True)):
             warn_user(
@@ -246,7 +246,7 @@ class Probe:
             return
         apart = [
             self._try(caller.form, theta, seed=seed, caller=copied).x
-            for seed, copied in enumerate(copies)
+            for seed, copied in enumerate(copies, start=1)
         ]
         if num_workers > 1 and _are_equal(*apart):
             raise SimulationError(
@@ -264,9 +264,12 @@ class Probe:
         return self._caller.attempt(theta)[0]
 
     def _try(
-        self, form: Form, theta: Tensor, *, seed: int = 0, caller: Caller | None = None
+        self, form: Form, theta: Tensor, *, seed: int = 1, caller: Caller | None = None
     ) -> _Trial:
-        """Simulate in some form under a seed."""
+        """Simulate in some form under a seed.
+
+        Seed 0 is that of theta, whose numbers the noise must not repeat.
+        """
         caller = replace(caller or self._caller, form=form)
         self.num_calls += 1 if theta.ndim == 1 else len(theta)
         with seeded(seed), warnings.catch_warnings():

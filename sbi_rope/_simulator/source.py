@@ -300,7 +300,8 @@ class Simulator:
             advance(len(theta))
         else:
             # With a seed of its own, no part depends on where a call was interrupted.
-            with seeded(number):
+            # Seed 0 is that of theta, whose numbers the noise must not repeat.
+            with seeded(number + 1):
                 finished.append(self._simulate(theta, advance=advance))
         return finished[number]
 

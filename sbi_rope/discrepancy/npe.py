@@ -107,7 +107,8 @@ class DiscrepancyNPE(Method):
         num_simulations: Simulations from the prior to train on, if none were appended.
         simulations_per_pair: Simulations at the parameters of each pair.
         num_steps: Gradient steps. If None, NPE is trained in courses of 150 steps (400
-            with ``"input"``), until a course lowers the loss by less than 0.01.
+            with ``"input"``), until a course lowers the loss by less than 0.01, at most
+            twelve.
         learning_rate: Learning rate of Adam at the start of a course; 5e-3 if None
             (2e-3 with ``"input"``).
         num_folds: The number of copies g with ``space="tuned"``; at most one for each

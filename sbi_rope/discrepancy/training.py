@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from sbi_rope._progress import progress_bar
 from sbi_rope._random import seeded
 from sbi_rope._standardisation import Standardisation
-from sbi_rope._training import History, adam
+from sbi_rope._training import History, adam, differentiable
 from sbi_rope.discrepancy.posterior import DiscrepancyDraws
 
 __all__ = ["IN_A_STACK", "ONE_COURSE", "UNTIL_SETTLED", "train_on_corrected"]
@@ -110,9 +110,10 @@ def _one_course(
     bar = progress_bar(range(num_steps), show=show_progress_bars, desc="Correcting NPE")
     for _ in bar:
         theta, corrected = batch(BATCH_SIZE)
-        loss = density.loss(theta, condition=corrected).mean()
         optimizer.zero_grad()
-        loss.backward()
+        with differentiable(density):
+            loss = density.loss(theta, condition=corrected).mean()
+            loss.backward()
         nn.utils.clip_grad_norm_(parameters, CLIP_MAX_NORM)
         for parameter in parameters:
             if parameter.grad is not None:  # a parameter may have no part in the loss

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_rope._random import seeded
-from sbi_rope._sbi import BasePotential, NeuralPosterior, describe
+from sbi_rope._sbi import BasePotential, NeuralPosterior, copy_of_prior, describe
 from sbi_rope._validation import (
     as_numbers,
     as_shape,
@@ -44,7 +44,7 @@ class PriorPosterior(NeuralPosterior):
         | https://arxiv.org/abs/2405.08719
 
     Args:
-        prior: A torch distribution over parameters of shape ``(d,)``.
+        prior: A torch distribution over parameters of shape ``(d,)``. It is copied.
 
     Raises:
         InvalidTypeError: If the prior is not a torch distribution.
@@ -58,6 +58,7 @@ class PriorPosterior(NeuralPosterior):
 
     def __init__(self, prior: Any) -> None:
         check_prior(prior)
+        prior = copy_of_prior(prior)
         transform, self._reason_without_map = None, ""
         with seeded(0):  # both draw from the prior to look at it
             device = prior.sample(torch.Size((1,))).device

@@ -24,7 +24,8 @@ __all__ = ["Recalibration", "recalibrate"]
 class Recalibration:
     """By which factors a posterior was made narrower or wider, and what it gained.
 
-    The pairs of a fold are scored with factors that the other folds chose.
+    The pairs of a fold are scored with factors that the other folds chose, among
+    factors of one parameter around the common factor of all pairs.
 
     Attributes:
         factors: By how much the distance from the centre is multiplied, for each

@@ -1,5 +1,6 @@
 """The kinds of candidates that a stack can be made of."""
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -188,7 +189,12 @@ class DensityCandidate(AmortisedCandidate):
     def parts(self, fold: Fold) -> list[Part]:
         """Build the posterior, and return its densities."""
         bench = fold.bench
-        rope = bench.rope.with_pairs(torch.arange(0)) if self.fixed else fold.rope
+        # A copy, because `build` may train it anew, and couplings use that of the fold.
+        rope = (
+            bench.rope.with_pairs(torch.arange(0))
+            if self.fixed
+            else copy.copy(fold.rope)
+        )
         try:
             posterior = self.build(rope, fold.seed)
         except RoPEError:
@@ -278,7 +284,9 @@ def _parts_of(name: str, posterior: Any, rope: RoPE) -> list[Part]:
 def _equal_parts(name: str, posterior: MixturePosterior) -> list[Part]:
     estimator = posterior.posterior_estimator
     weights = estimator.weights
-    if not posterior.is_amortised or not bool((weights == weights[0]).all()):
+    is_stack = hasattr(posterior, "report")
+    is_equal = bool((weights == weights[0]).all())
+    if is_stack or not is_equal or not posterior.is_amortised:
         raise UnsupportedPosteriorError(
             f"Expected the candidate {name!r} to be amortised, and a mixture to have "
             f"equal weights; got {type(posterior).__name__}. For RoPE's coupling, use "

@@ -12,7 +12,7 @@ from scipy.stats import bootstrap, norm
 from scipy.stats import t as student
 from torch import Tensor
 
-from sbi_rope._means import Counts, counts_of, mean_and_error
+from sbi_rope._means import Counts, counts_of, interval_of_mean, mean_and_error
 from sbi_rope._validation import check_choice
 from sbi_rope.metrics import CoverageCurve
 from sbi_rope.metrics.calibration import coverage_curve_of_pairs
@@ -204,11 +204,10 @@ class CrossValidation:
         difference = self.scores_of(name) - self.scores_of(other)
         # Where both scores are minus infinity, neither candidate is better.
         difference = difference.nan_to_num(nan=0.0, posinf=torch.inf, neginf=-torch.inf)
-        mean, error = self.mean_and_error(difference)
+        mean, low, high = interval_of_mean(difference, self.counts)
         n = self.effective_number
-        if n < FEWEST_TO_RESAMPLE and math.isfinite(error):
-            width = float(student.ppf(0.975, max(n, 2.0) - 1)) * error
-            return Difference(mean=mean, low=mean - width, high=mean + width)
+        if n < FEWEST_TO_RESAMPLE and math.isfinite(high - low):
+            return Difference(mean=mean, low=low, high=high)
         data: tuple[Any, ...] = (difference.cpu().numpy(),)
         statistic: Any = np.mean
         if (counts := self.counts) is not None:

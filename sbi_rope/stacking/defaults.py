@@ -48,6 +48,9 @@ def default_candidates(
 ) -> tuple[Candidate, ...]:
     """Return the prior, NPE, fine-tuned NPE, discrepancy models, and RVNP with x_o.
 
+    NPE is fine-tuned on the pairs alone, and from discrepancy models, and on pairs and
+    simulations together.
+
     Args:
         rope: A RoPE with its calibration pairs. Candidates that these data do not
             allow or need are left out, as in :func:`stack`. None returns all.

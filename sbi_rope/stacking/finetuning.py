@@ -73,10 +73,9 @@ def finetune_without(
             return _losses_of_labels(fold, nodes, estimator)
         return lambda rows: estimator.loss(bench.theta[rows], condition=bench.x[rows])
 
-    split = (fold.rows_without(part), fold.parts[part])
-    with_density = rows_with_density(losses_of(start), *split)
-    if all(map(len, with_density)):
-        split = with_density
+    split = rows_with_density(
+        losses_of(start), fold.rows_without(part), fold.parts[part]
+    )
 
     def tuned(learning_rate: float) -> tuple[Any, History]:
         estimator = copy.deepcopy(start).requires_grad_()

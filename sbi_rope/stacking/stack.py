@@ -142,6 +142,7 @@ def stack(
     check_unit_interval("tail_mass", tail_mass)
     check_instance("rope", rope, RoPE, hint=HOW_TO_MAKE)
     check_instance("recalibrate", recalibrate, bool)
+    check_instance("learning_curve", learning_curve, bool)
     stopwatch = Stopwatch(rope)
     trainer = StackTrainer(
         rope,
@@ -239,6 +240,7 @@ def cross_validate(
         InvalidInputError: As in :func:`stack`.
         UnsupportedPosteriorError: As in :func:`stack`.
         CouplingError: As in :func:`stack`.
+        SamplingError: As in :func:`stack`.
         SimulationError: As in :func:`stack`.
         NotWritableError: As in :func:`stack`.
     """

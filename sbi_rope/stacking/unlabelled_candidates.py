@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from sbi_rope._sbi import estimator_of
-from sbi_rope._validation import check_choice
+from sbi_rope._validation import as_numbers, check_choice, column_names
+from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture import Part, part_of
 from sbi_rope.stacking.candidates import AmortisedCandidate
 from sbi_rope.stacking.folds import Fold
@@ -40,8 +41,10 @@ class RVNPCandidate(AmortisedCandidate):
             with a few statistics, and hours with fifty.
 
     Raises:
-        InvalidInputError: If an argument is outside its range. Shape and values of x_o
-            are checked when the stack is made.
+        InvalidTypeError: If x_o holds no numbers.
+        InvalidInputError: If ``space`` is something else, or x_o is a table whose
+            columns have names. Shape and values of x_o are checked when the stack is
+            made.
     """
 
     x_o: Tensor = field(repr=False)
@@ -49,8 +52,15 @@ class RVNPCandidate(AmortisedCandidate):
     fixed = True
 
     def __post_init__(self) -> None:
-        """Check the value of the field."""
+        """Check the fields, and take a copy of the observations."""
         check_choice("space", self.space, ("embedding", "input"))
+        if column_names(self.x_o):
+            raise InvalidInputError(
+                "Expected `x_o` without names of columns, whose order is not checked "
+                f"here; got {type(self.x_o).__name__}. Use `default_candidates(rope, "
+                "x_o)`, which checks it, or pass `x_o.to_numpy()`."
+            )
+        object.__setattr__(self, "x_o", as_numbers("x_o", self.x_o).clone())
 
     @property
     def name(self) -> str:  # type: ignore[override]

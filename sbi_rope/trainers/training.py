@@ -257,27 +257,32 @@ def rows_with_density(
     """Return the rows of pairs whose loss is finite, after a warning of the others.
 
     A single infinite loss would end the training of all pairs. A label exactly on a
-    bound of the prior has one if the estimator's density is zero there.
+    bound of the prior has one if the estimator's density is zero there. Where a part
+    has no other rows it stays as it is, and its training says so.
 
     Args:
         losses: Of rows, the loss of each.
         splits: The rows of each part of the pairs.
     """
-    kept = tuple(
-        torch.cat([some[torch.isfinite(losses(some))] for some in rows.split(100)])
+    finite = [
+        torch.cat([torch.isfinite(losses(some)) for some in rows.split(100)])
         if len(rows)
-        else rows
+        else rows.bool()
         for rows in splits
-    )
-    missing = sum(map(len, splits)) - sum(map(len, kept))
+    ]
+    missing = sum(int((~of_part).sum()) for of_part in finite)
     if missing:
         warn_user(
             f"{missing} calibration pair(s) have no density under NPE before it is "
             "trained on them, and are left out of this training. Their parameters may "
             "be exactly on a bound of the prior, where some density estimators are "
-            "zero. If they are rounded, say by how much with `theta_std`."
+            "zero. If they are rounded, `RoPE.append_calibration` can be told by how "
+            "much, with `theta_std`."
         )
-    return kept
+    return tuple(
+        rows[of_part] if of_part.any() else rows
+        for rows, of_part in zip(splits, finite, strict=True)
+    )
 
 
 def train_on_pairs(
@@ -311,8 +316,6 @@ def train_on_pairs(
     train, held_out = rows_with_density(
         lambda rows: estimator.loss(theta[rows], condition=x[rows]), *split
     )
-    if not len(train):
-        train, held_out = split  # the training says that it has no finite loss
 
     def batches(epoch: int) -> Iterator[tuple[Tensor, Tensor]]:
         for rows in shuffled(train, training.training_batch_size):

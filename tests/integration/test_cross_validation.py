@@ -37,6 +37,7 @@ from tests.stacks import (
     NUM_PAIRS,
     PRIOR,
     QUIET,
+    ROPE,
     finetuned,
     observed,
     problem,
@@ -627,3 +628,13 @@ def test_rows_of_the_table_are_mean_error_and_weight_of_each_candidate() -> None
         error = float((column - column.mean()).square().sum() / (19 * 20)) ** 0.5
         assert row["standard_error"] == pytest.approx(error, abs=1e-12)
     assert math.isfinite(acauc_of(scores.levels).value)
+
+
+def test_couplings_do_not_use_what_another_candidate_made_of_its_rope() -> None:
+    def retrained(rope: RoPE, seed: int) -> Any:
+        return rope.train(seed=seed + 1, **QUIET).tuned_posterior()
+
+    mine = DensityCandidate(name="mine", build=retrained)
+    alone = validated(rope_of(), observed(), candidates=[ROPE], num_folds=2)
+    beside = validated(rope_of(), observed(), candidates=[mine, ROPE], num_folds=2)
+    assert torch.equal(beside.scores_of(ROPE.name), alone.scores_of(ROPE.name))

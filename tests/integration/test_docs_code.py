@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from sbi_rope import RoPE, plots, stack
+from sbi_rope import RoPE
 from tests import problems, stacks
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -46,9 +46,7 @@ def known() -> dict[str, Any]:
     rope.append_calibration(theta_cal, x_cal)
     names = {"npe": npe, "simulator": simulator, "theta": theta, "x": x}
     names |= {"theta_cal": theta_cal, "x_cal": x_cal, "theta_o": theta_o, "x_o": x_o}
-    names |= {"rope": rope, "posterior": stacks.stacked(rope)}
-    # The first page imports these, and the others build on it.
-    return {**names, "RoPE": RoPE, "stack": stack, "plots": plots}
+    return {**names, "rope": rope, "posterior": stacks.stacked(rope)}
 
 
 @pytest.mark.docs

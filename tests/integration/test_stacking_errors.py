@@ -27,6 +27,7 @@ from sbi_rope.stacking import (
 from tests import gaussian, problems
 from tests.stacks import (
     COUPLINGS,
+    FITTED,
     NPE,
     OT_ONLY,
     PRIOR,
@@ -108,6 +109,7 @@ def test_posteriors_without_a_density_to_score_are_refused() -> None:
         (PriorPosterior(gaussian.prior(3)), r"theta \(3,\)"),
         (the_coupled_stack(), "to be amortised"),
         (the_stack(), "equal weights"),
+        (stacked(rope_of(), candidates=[FITTED]), "has seen the pairs"),
         (None, "NoneType"),
     ]
     rope = rope_of()

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import pandas as pd
 import pytest
 import torch
 from torch import Tensor, nn
@@ -278,6 +279,8 @@ def test_wrong_observations_are_refused_before_anything_is_trained(
         default_candidates(rope_of(), x_o)
     with pytest.raises(InvalidInputError, match="space"):
         RVNPCandidate(x_o, space="tuned")  # type: ignore[arg-type]
+    with pytest.raises(InvalidInputError, match=r"default_candidates\(rope, x_o\)"):
+        RVNPCandidate(pd.DataFrame({"first": [0.0], "second": [1.0]}))  # type: ignore[arg-type]
 
 
 @pytest.mark.slow

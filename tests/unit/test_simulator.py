@@ -582,6 +582,20 @@ def test_a_simulator_with_a_number_of_simulations_is_called_so_often_in_all() ->
         rope.build_posterior(x, num_simulations=1201)
 
 
+@pytest.mark.filterwarnings("ignore:Only 200 simulations")
+def test_the_noise_of_a_number_of_simulations_does_not_repeat_their_parameters() -> (
+    None
+):
+    def simulator(theta: Tensor) -> Tensor:
+        return theta + torch.randn(theta.shape)  # from which the prior draws, too
+
+    rope = RoPE(gaussian.posterior(), simulator=simulator, num_simulations=200)
+    theta, x = rope.source.kept(200, progress=False)
+    both = torch.cat([theta, x - theta], dim=1)
+    correlation = both.T.corrcoef()[:2, 2:]
+    assert correlation.abs().max() < 0.3  # four standard errors
+
+
 def test_a_number_of_simulations_needs_a_simulator() -> None:
     pairs = gaussian.labelled(1000)
     with pytest.raises(InvalidInputError, match="`num_simulations` with a simulator"):
