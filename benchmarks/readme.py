@@ -45,9 +45,8 @@ def readme_lines(published: Published, link: str) -> list[str]:
     return [
         "LPP is the mean log density of the true parameters, in standard deviations of",
         "the prior: higher is better. ± is its 95 % interval over repetitions, whose",
-        "number is in brackets. Where there is one repetition, it is the interval over",
-        "test observations. ACAUC is 0 for calibrated posteriors, positive for",
-        "over-confident and negative for too wide ones.",
+        "number is in brackets (of one, over observations). ACAUC is 0 for calibrated",
+        "posteriors, positive for over-confident and negative for too wide ones.",
         *("", *table(head, lines), ""),
         f"[All tasks, all methods]({link}), also where another method is better.",
     ]

@@ -323,8 +323,8 @@ def _stack_in_words(published: Published) -> list[str]:
     if not results:
         return []
     return [
-        f"The [stack](stacking.md) has the best LPP of all methods other than stacks in "
-        f"{sum(results)} of the {len(results)} cells that it was run in.",
+        "The [stack](stacking.md) has the best LPP of all methods, other stacks apart, "
+        f"in {sum(results)} of the {len(results)} cells that it was run in.",
         "",
     ]
 

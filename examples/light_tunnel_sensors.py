@@ -67,7 +67,7 @@ def main() -> None:
             num_simulations=args.num_simulations,
             density_estimator=args.density_estimator,
         ),
-        # Chosen on calibration data, see benchmarks/README.md.
+        # Chosen on calibration data, see benchmarks/choices.md.
         coupler=SinkhornCoupler(gamma=0.1, tau=1.0),
         seeds=args.seeds,
         n_calibration=args.n_calibration,

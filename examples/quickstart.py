@@ -44,7 +44,7 @@ def main() -> None:
         train_npe=lambda task, seed: train_npe(
             task, seed, args.num_simulations, args.max_num_epochs
         ),
-        # Chosen on calibration data, see benchmarks/README.md.
+        # Chosen on calibration data, see benchmarks/choices.md.
         coupler=SinkhornCoupler(gamma=0.2, tau=1.0),
         seeds=args.seeds,
         n_calibration=args.n_calibration,

@@ -1,6 +1,6 @@
 """Which candidates, what prior of the weights, how much refitting does a stack need?
 
-The first tables of "The choices inside the stack" in `benchmarks/README.md`. All
+The first tables of "The choices inside the stack" in `benchmarks/choices.md`. All
 candidates are trained on some calibration pairs, without each fold of them and on all,
 and every version is scored on 300 others of the calibration set, not of the test set.
 Choices are compared by what their stacks would have scored, so that none needs a second

@@ -1,6 +1,6 @@
 """How fast is the coupling solved, side by side with POT and OTT-JAX?
 
-The tables of "The coupling: how fast" in `benchmarks/README.md`. Seconds are the
+The tables of "The coupling: how fast" in `benchmarks/speed.md`. Seconds are the
 smallest of several repetitions, in which the competitors of a cell take turns; compare
 within a cell, not across tables. Without an error there is no comparison: every row
 shows the marginal error of its potential, computed by one and the same function in

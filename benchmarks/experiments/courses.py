@@ -1,6 +1,6 @@
 """How long is a stack to train its discrepancy models?
 
-The tables of courses of "The choices inside the stack" in `benchmarks/README.md`. A
+The tables of courses of "The choices inside the stack" in `benchmarks/choices.md`. A
 discrepancy model is trained on the calibration pairs without each of some folds. The
 average of these versions is scored on 300 others of the calibration set, not of the
 test set.

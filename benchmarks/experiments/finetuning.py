@@ -1,6 +1,6 @@
 """How should the embedding net be tuned: learning rate, steps, and targets?
 
-The tables of "Tuning the embedding net" in `benchmarks/README.md`. Every setting is
+The tables of "Tuning the embedding net" in `benchmarks/choices.md`. Every setting is
 scored on labelled real observations of the calibration part that were not tuned on; the
 test part is never touched. Runs are kept, so that the experiment can be interrupted.
 

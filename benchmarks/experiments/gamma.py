@@ -1,4 +1,4 @@
-"""Which gamma and tau? The table "gamma and tau" of `benchmarks/README.md`.
+"""Which gamma and tau? The table "gamma and tau" of `benchmarks/choices.md`.
 
 Scores are those of calibration rows that were not tuned on. The test part is never
 touched.

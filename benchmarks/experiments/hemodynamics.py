@@ -1,6 +1,6 @@
 """How long does a beat of the arteries take?
 
-The table "Blood flow: how fast" of `benchmarks/README.md`: seconds a person by length
+The table "Blood flow: how fast" of `benchmarks/speed.md`: seconds a person by length
 of cells, for elastic and viscoelastic walls, on one core and on all; and how long the
 solver takes to compile the first time. Wall times and the scaling are those of the
 cores that are free: where the CPU seconds of all jobs are those of one, jobs do not

@@ -1,6 +1,6 @@
 """How long does it take to fit the discrepancy of labels that are not exact?
 
-The table of "Labels that are not exact: how fast" of `benchmarks/README.md`. Every row
+The table of "Labels that are not exact: how fast" of `benchmarks/speed.md`. Every row
 is a process of its own. With ``--before`` each row is measured on another checkout of
 the package too, in turns; compare within a run. The last columns show whether both
 find the same: the mean gain of the first statistic, and its standard deviation.

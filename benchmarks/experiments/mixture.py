@@ -1,6 +1,6 @@
 """How long does the mixture take: densities, samples, and one observation at a time?
 
-The table "The mixture: how fast" of `benchmarks/README.md`. Every row is a process of
+The table "The mixture: how fast" of `benchmarks/speed.md`. Every row is a process of
 its own; its memory is that of the whole process, most of it Python, torch and sbi.
 With ``--before`` each row is measured on another checkout of the package too, in turns;
 compare within a run.

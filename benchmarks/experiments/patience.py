@@ -1,7 +1,7 @@
 """How long and how fast are a stack's candidates to be fine-tuned?
 
 The tables of rates and patiences of "The choices inside the stack" in
-`benchmarks/README.md`. A candidate is trained without each of some folds of the
+`benchmarks/choices.md`. A candidate is trained without each of some folds of the
 calibration pairs. The average of these versions is scored on 300 others of the
 calibration set, not of the test set.
 

@@ -1,6 +1,6 @@
 """How long does it take to train all candidates of a stack?
 
-The tables of "A stack: how fast" of `benchmarks/README.md`. Every row is a process of
+The tables of "A stack: how fast" of `benchmarks/speed.md`. Every row is a process of
 its own. With ``--before`` each row is measured on another checkout of the package too,
 in turns; compare within a run. The last column is the density that the stack gives to
 its own pairs: it shows whether all rows train the same networks.

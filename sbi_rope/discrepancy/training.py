@@ -26,7 +26,7 @@ NUM_COMPARED, MAX_COURSES = 2000, 12
 
 # The nats by which a course has to lower the loss for another to follow. In a stack,
 # where many versions are trained, a smaller gain is not worth the time. Chosen on
-# calibration data, see benchmarks/README.md.
+# calibration data, see benchmarks/choices.md.
 ONE_COURSE, UNTIL_SETTLED, IN_A_STACK = math.inf, 0.01, 0.1
 
 

@@ -30,7 +30,7 @@ from sbi_rope.stacking.workbench import NUM_FOLDS, Workbench
 
 __all__ = ["default_candidates"]
 
-# Chosen on calibration data, see benchmarks/README.md.
+# Chosen on calibration data, see benchmarks/choices.md.
 GAMMAS = (0.02, 0.05, 0.1, 0.4)
 TAUS = (1.0, 0.5, 0.0)
 REHEARSAL = 1.0

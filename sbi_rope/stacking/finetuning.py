@@ -20,7 +20,7 @@ __all__ = ["finetune_without"]
 # in an epoch, after each of which the held-out part is scored.
 BATCH_SIZE, STEPS = 50, 100
 # It stops after so many epochs without improvement. No other number was tried. What it
-# gains on calibration data is in benchmarks/README.md.
+# gains on calibration data is in benchmarks/choices.md.
 REHEARSED = replace(FINETUNING, stop_after_epochs=10)
 
 

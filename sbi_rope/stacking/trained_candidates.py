@@ -77,7 +77,7 @@ class DiscrepancyCandidate(AmortisedCandidate):
 # Learning rates of fine-tuning, by what was corrected in the net that it starts from.
 # Of several, each net takes the one that is best on the pairs that it holds out. With
 # "input" all parameters were trained already, and a smaller rate is enough. Chosen on
-# calibration data, see benchmarks/README.md.
+# calibration data, see benchmarks/choices.md.
 LEARNING_RATES = {
     None: (1e-3,),
     "embedding": (1e-4, 1e-3),

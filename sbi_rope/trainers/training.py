@@ -78,7 +78,7 @@ class Training:
             check_positive("clip_max_norm", self.clip_max_norm)
 
 
-# How NPE is fine-tuned on pairs, chosen on calibration data: see benchmarks/README.md.
+# How NPE is fine-tuned on pairs, chosen on calibration data: see benchmarks/choices.md.
 FINETUNING = Training(
     training_batch_size=100,
     validation_fraction=0.2,
