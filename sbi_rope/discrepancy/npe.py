@@ -114,7 +114,8 @@ class DiscrepancyNPE(Method):
         num_folds: The number of copies g with ``space="tuned"``; at most one for each
             pair.
         finetuner: How the copies are tuned. If None, with rehearsal and a learning rate
-            of 3e-3.
+            of 3e-3. Their targets are the means of the simulations of each pair, so
+            that its settings of targets have no effect.
         npe_training: How NPE is trained; ``Training()`` if None.
         device: Where to train; data on other devices is moved there.
 
