@@ -28,6 +28,7 @@ SHOWN = (
     "SBI",
     "NPE",
     "fine-tuned NPE",
+    "fine-tuned NPE (averaged)",
     "FMCPE (embedding)",
     "FRISBI (distilled)",
     "RoPE",

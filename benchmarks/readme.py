@@ -16,7 +16,7 @@ TASK, SIZES, OF_ACAUC = "light_tunnel_sensors", (10, 50, 200), 50
 METHODS = {
     "prior": "prior",
     "NPE": "NPE as it was",
-    "fine-tuned NPE": "fine-tuned NPE",
+    "fine-tuned NPE (averaged)": "fine-tuned NPE, averaged",
     "FMCPE (embedding)": "FMCPE (embedding)",
     "FRISBI (distilled)": "FRISBI (distilled)",
     "RoPE": "RoPE",

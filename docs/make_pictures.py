@@ -3,7 +3,7 @@
     python docs/make_pictures.py
 
 The measurements are the extract of the light tunnel's sensors that the tests use. It
-takes about five minutes on two cores, and writes PNG files into ``docs/pictures``.
+takes about ten minutes, and writes PNG files into ``docs/pictures``.
 """
 
 from dataclasses import replace
