@@ -49,11 +49,12 @@ EXPLANATION = f"""\
 there, which no user can know. The difference is the stack's LPP minus its, on the same
 data, with an interval of {CONFIDENCE:.0%} over repetitions (Student's t) where there
 are several. A method that was run in fewer repetitions than the stack is compared in
-these, and so are the LPPs of the row. The stack, RoPE, OT-only and FRISBI are divided
-by their mass inside the prior. NPE and the methods that are trained networks, such as
-fine-tuned NPE, are not, which makes their LPP lower where mass is outside. "s" are the
-seconds of training on one thread, without the NPE that methods share, and with other
-work beside it. "Calls" are simulations beyond those that NPE was trained on.
+these, and so are the LPPs of the row. The stack, RoPE, OT-only, FRISBI and averages of
+networks are divided by their mass inside the prior, and fail where they have none. NPE
+and the methods that are a single network, such as fine-tuned NPE, are not, which makes
+their LPP lower where mass is outside. "s" are the seconds of training on one thread,
+without the NPE that methods share, and with other work beside it. "Calls" are
+simulations beyond those that NPE was trained on.
 """
 OF_A_BATCH = f"""\
 RoPE, OT-only, FRISBI and RVNP see the test observations, without their labels. The
