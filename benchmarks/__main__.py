@@ -6,6 +6,7 @@
     python -m benchmarks restore
     python -m benchmarks report
     python -m benchmarks summary
+    python -m benchmarks claims
 
 Cells that are finished are kept, whichever suite asked for them, and are not computed
 again. Cells that failed are kept with their error; `--retry` computes them again. `run`
@@ -18,9 +19,12 @@ import contextlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from benchmarks.blocks import pages_with_blocks
 from benchmarks.cases import Sources
 from benchmarks.cells import Suite, list_suites, load_suite
+from benchmarks.claims import claims, missing_claims
 from benchmarks.prices import Prices
+from benchmarks.published import Published
 from benchmarks.report import write_report
 from benchmarks.runner import run_cells
 from benchmarks.store import Workplace
@@ -30,8 +34,7 @@ from sbi_rope.errors import InvalidInputError, RoPEError
 
 DEFAULT_OUT = Path("results/benchmark")
 PUBLISHED = Path(__file__).parent / "results"
-DOCS_PAGE = Path(__file__).parents[1] / "docs/background/results.md"
-README = Path(__file__).parents[1] / "README.md"
+ROOT = Path(__file__).parents[1]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -98,14 +101,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     summary = commands.add_parser("summary", help="write what all suites say together")
     summary.set_defaults(command=_summary)
-    for option, path in (("--docs-page", DOCS_PAGE), ("--readme", README)):
-        summary.add_argument(
-            option,
-            type=Path,
-            default=path,
-            help="file with a place for a block of results (%(default)s)",
-        )
+    summary.add_argument(
+        "--pages",
+        type=Path,
+        nargs="+",
+        help="files with places for blocks of results (README and pages of docs)",
+    )
     _add_out(summary, PUBLISHED)
+
+    claims = commands.add_parser("claims", help="check sentences of docs that count")
+    claims.set_defaults(command=_claims)
+    _add_out(claims, PUBLISHED)
     args = parser.parse_args(arguments)
     try:
         return args.command(args)
@@ -219,9 +225,21 @@ def _report(args: argparse.Namespace) -> int:
 
 
 def _summary(args: argparse.Namespace) -> int:
-    page = write_summary(args.out, docs_page=args.docs_page, readme=args.readme)
-    print(f"Written: {page}, {args.docs_page}, {args.readme}")
+    pages = args.pages or pages_with_blocks(ROOT)
+    page = write_summary(args.out, pages=pages)
+    print(f"Written: {', '.join(map(str, (page, *pages)))}")
     return 0
+
+
+def _claims(args: argparse.Namespace) -> int:
+    found = claims(Published.read(args.out))
+    missing = missing_claims(found, ROOT)
+    for claim in missing:
+        print(f"{claim.page} does not say: {claim.text}")
+    print(
+        f"{len(found) - len(missing)} of {len(found)} sentences are as they should be."
+    )
+    return 1 if missing else 0
 
 
 if __name__ == "__main__":

@@ -19,7 +19,15 @@ from benchmarks.published import FIXED, LETTERS, MISSING, Published, Setting, ta
 from benchmarks.stacks import other_trainings
 from benchmarks.table import Table
 
-__all__ = ["draw_evidence", "evidence_lines", "finished_rows", "half_width"]
+__all__ = [
+    "Comparison",
+    "compare",
+    "draw_evidence",
+    "evidence_lines",
+    "finished_rows",
+    "half_width",
+    "lines_of_losses",
+]
 
 # The methods of the picture: what a user starts from, what is tuned on the pairs, the
 # rivals of 2025 and 2026, the paper's method and the default of this package.
@@ -117,13 +125,13 @@ class Comparison(NamedTuple):
 def evidence_lines(published: Published) -> list[str]:
     """Return the section in Markdown, which links the pictures of `draw_evidence`."""
     rows = finished_rows(published)
-    compared = _compared(rows)
+    compared = compare(rows)
     if not compared:
         return ["Not run."]
     lines = [f"![{what}]({name})\n" for name, what in _pictures(rows, compared).items()]
     lines += [EXPLANATION, *_comparison(published, rows, compared), ""]
     lines += [*other_trainings(published.tables["main"]), *_goals(compared, rows), ""]
-    of_a_batch = _compared(rows, COUPLED_STACK)
+    of_a_batch = compare(rows, COUPLED_STACK)
     if of_a_batch:
         lines += [OF_A_BATCH, *_comparison(published, rows, of_a_batch), ""]
         lines += [*_goals(of_a_batch, rows), ""]
@@ -133,7 +141,7 @@ def evidence_lines(published: Published) -> list[str]:
 def draw_evidence(published: Published, folder: Path) -> None:
     """Write the pictures that the section links into a folder."""
     rows = finished_rows(published)
-    compared = _compared(rows)
+    compared = compare(rows)
     pictures = _pictures(rows, compared)
     if CURVES in pictures:
         figures.save(_curves(rows), folder / CURVES)
@@ -149,7 +157,20 @@ def finished_rows(published: Published) -> pd.DataFrame:
     return rows[rows["task"].isin(LETTERS)]
 
 
-def _compared(rows: pd.DataFrame, method: str = STACK) -> list[Comparison]:
+def lines_of_losses(published: Published) -> list[str]:
+    """Return a table of where another method is better than the stack, in Markdown."""
+    rows = finished_rows(published)
+    few = [one for one in compare(rows) if one.size <= MAX_PAIRS]
+    return _comparison(published, rows, [o for o in few if not o.is_near(o.best)])
+
+
+def compare(rows: pd.DataFrame, method: str = STACK) -> list[Comparison]:
+    """Compare a stack with all other methods, by task and number of pairs.
+
+    Args:
+        rows: Those of `finished_rows`.
+        method: Which stack.
+    """
     compared = []
     stacks = rows[rows["method"] == method]
     for task in LETTERS:

@@ -1,4 +1,4 @@
-"""What all suites say together: a page beside the tables, blocks of docs and README."""
+"""What all suites say together: a page beside the tables, and blocks of other pages."""
 
 import math
 import os
@@ -10,7 +10,9 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from benchmarks.evidence import draw_evidence, evidence_lines
+from benchmarks.blocks import check_blocks, fill_blocks
+from benchmarks.evidence import draw_evidence, evidence_lines, lines_of_losses
+from benchmarks.excerpts import EXCERPTS, Excerpt
 from benchmarks.methods import METHODS, STACK, STACKS
 from benchmarks.other_suites import other_suites
 from benchmarks.prices import Prices
@@ -42,7 +44,8 @@ from sbi_rope._files import write_atomically
 
 __all__ = ["page_of", "write_summary"]
 
-BEGIN, END = "<!-- results -->", "<!-- /results -->"
+# The names of the blocks that are not only a table.
+ALL_TASKS, FOR_README, LOSSES = "all-tasks", "readme", "not-the-best"
 # Its numbers mean nothing.
 LEFT_OUT = ("smoke",)
 # Shown beside FIXED; they do not compete, or one of four settings would be chosen by
@@ -69,38 +72,49 @@ repetitions of the task.
 """
 
 
-def write_summary(folder: Path, *, docs_page: Path, readme: Path) -> Path:
-    """Write `README.md` into a folder of suites, and a block of it into two others.
+def write_summary(folder: Path, *, pages: Sequence[Path]) -> Path:
+    """Write `README.md` into a folder of suites, and the blocks of other pages anew.
 
     The same tables give the same bytes.
 
     Raises:
-        SystemExit: If there are no results, or one of the two has no place for a block.
+        SystemExit: If there are no results, or one of the pages has no place for a
+            block.
     """
     published = Published.read(folder)
+    summary = folder / "README.md"
+
+    blocks = _blocks(published, summary)
     # Before the work, because a page without a place is refused.
-    around = {path: _around_block(path) for path in (docs_page, readme)}
-    page = folder / "README.md"
-    texts = {page: page_of(published)}
-    for other, lines_of in ((docs_page, _block), (readme, readme_lines)):
-        link = Path(os.path.relpath(page, other.parent)).as_posix()
-        before, after = around[other]
-        texts[other] = "\n".join([before, *lines_of(published, link), after])
+    for page in pages:
+        check_blocks(page, [*blocks])
+    texts = {summary: page_of(published)}
+    texts |= {page: fill_blocks(page, blocks) for page in pages}
     draw_evidence(published, folder)
     for path, text in texts.items():
         with write_atomically(path) as temporary:
-            temporary.write_text(text)
-    return page
+            temporary.write_text(text, encoding="utf-8")
+    return summary
 
 
-def _around_block(path: Path) -> tuple[str, str]:
-    """Return the text up to the first marker and from the second."""
-    text = path.read_text()
-    before, begin, rest = text.partition(BEGIN)
-    old, end, after = rest.partition(END)
-    if not begin or not end or any(m in before + old + after for m in (BEGIN, END)):
-        raise SystemExit(f"{path} needs one line {BEGIN} and, below it, one {END}.")
-    return before + BEGIN, END + after
+def _blocks(
+    published: Published, summary: Path
+) -> dict[str, Callable[[Path], list[str]]]:
+    """Return what writes each block of a page, by the name of the block."""
+
+    def with_link(
+        lines_of: Callable[[Published, str], list[str]],
+    ) -> Callable[[Path], list[str]]:
+        return lambda page: lines_of(
+            published, Path(os.path.relpath(summary, page.parent)).as_posix()
+        )
+
+    def table_of(excerpt: Excerpt) -> Callable[[Path], list[str]]:
+        return lambda page: excerpt.markdown(published)
+
+    tables = {name: table_of(excerpt) for name, excerpt in EXCERPTS.items()}
+    texts = {ALL_TASKS: with_link(_block), FOR_README: with_link(readme_lines)}
+    return {**texts, LOSSES: lambda page: lines_of_losses(published), **tables}
 
 
 def page_of(published: Published) -> str:

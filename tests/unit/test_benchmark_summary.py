@@ -90,9 +90,10 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def docs_page(tmp_path: Path) -> Path:
-    for path in (readme_beside(tmp_path / "results.md"), tmp_path / "results.md"):
+    for name, block in (("README.md", "readme"), ("results.md", "all-tasks")):
+        path = tmp_path / name
         path.write_text(
-            "before\n<!-- results -->\nreplaced\n<!-- /results -->\nafter\n"
+            f"before\n<!-- results: {block} -->\nreplaced\n<!-- /results -->\nafter\n"
         )
     return path
 
@@ -102,8 +103,8 @@ def readme_beside(docs_page: Path) -> Path:
 
 
 def write(folder: Path, docs_page: Path) -> str:
-    readme = readme_beside(docs_page)
-    return write_summary(folder, docs_page=docs_page, readme=readme).read_text()
+    pages = [docs_page, readme_beside(docs_page)]
+    return write_summary(folder, pages=pages).read_text()
 
 
 def page(folder: Path) -> str:
@@ -205,8 +206,8 @@ def test_the_block_replaces_what_is_between_the_markers_and_nothing_else(
     folder: Path, docs_page: Path
 ) -> None:
     publish(folder, "main", by_method(RoPE=0.0, stack=1.0))
-    command = ["summary", "--out", str(folder), "--docs-page", str(docs_page)]
-    assert main([*command, "--readme", str(readme_beside(docs_page))]) == 0
+    pages = [str(docs_page), str(readme_beside(docs_page))]
+    assert main(["summary", "--out", str(folder), "--pages", *pages]) == 0
     text = docs_page.read_text()
     written = [folder / name for name in ("README.md", "methods.png", "ranks.png")]
     before = [path.read_bytes() for path in written]
@@ -214,7 +215,7 @@ def test_the_block_replaces_what_is_between_the_markers_and_nothing_else(
     # The same tables give the same bytes.
     assert docs_page.read_text() == text
     assert [path.read_bytes() for path in written] == before
-    assert text.startswith("before\n<!-- results -->\n")
+    assert text.startswith("before\n<!-- results: all-tasks -->\n")
     assert text.endswith("\n<!-- /results -->\nafter\n")
     assert "replaced" not in text
     assert "(results/README.md)" in text
@@ -237,7 +238,7 @@ def test_readme_shows_scores_on_real_measurements_with_their_intervals(
     publish(folder, "main", scores)
     write(folder, docs_page)
     text = readme_beside(docs_page).read_text()
-    assert text.startswith("before\n<!-- results -->\n")
+    assert text.startswith("before\n<!-- results: readme -->\n")
     assert "(results/README.md)" in text
     stack = "-1.10 ± 0.25 (3)"  # 4.303 * 0.1 / sqrt(3)
     assert line(text, "**`stack`**") == [stack, stack, stack, "+0.020"]
@@ -251,17 +252,45 @@ def test_a_page_without_a_place_for_the_block_is_refused_and_nothing_written(
     folder: Path, docs_page: Path
 ) -> None:
     publish(folder, "main", by_method())
-    for text in (
-        "nothing",
-        "<!-- results -->",
-        "<!-- /results --> <!-- results -->",
-        "<!-- results --><!-- results --><!-- /results -->",
-    ):
+    begin, end = "<!-- results: batch -->\n", "<!-- /results -->\n"
+    for text in ("nothing", begin, end + begin, begin + begin + end, begin + end + end):
         docs_page.write_text(text)
-        with pytest.raises(SystemExit, match=r"results\.md needs one line <!--"):
+        with pytest.raises(SystemExit, match=r"results\.md needs a line <!--"):
             write(folder, docs_page)
         assert docs_page.read_text() == text
         assert not (folder / "README.md").exists()
+    docs_page.write_text(f"<!-- results: unheard-of -->\n{end}")
+    with pytest.raises(SystemExit, match=r"a block named unheard-of; expected one of"):
+        write(folder, docs_page)
+
+
+@pytest.mark.medium
+def test_excerpts_show_means_how_many_repetitions_they_have_and_what_was_not_run(
+    folder: Path, docs_page: Path
+) -> None:
+    def scores(cell: Cell) -> tuple[float, float] | str | None:
+        if cell.task != "cs" or cell.method not in ("NPE", "stack", "stack of a batch"):
+            return None
+        if cell.method == "stack of a batch":
+            return (-1.0, 0.0) if cell.repetition == 1 else None
+        if cell.method == "stack" and cell.n_calibration == 50 and cell.repetition == 2:
+            return "failed"
+        return -1.5 - cell.repetition, -0.001
+
+    names = "stack-and-others", "batch", "calibration"
+    blocks = [f"<!-- results: {name} -->\n<!-- /results -->\n" for name in names]
+    docs_page.write_text("between\n".join(blocks))
+    publish(folder, "main", scores)
+    write(folder, docs_page)
+    first, of_a_batch, calibration = docs_page.read_text().split("between\n")
+    assert line(first, "NPE")[:2] == ["-2.50", "-"]
+    assert line(first, "stack")[0] == "-2.00 (1 of 3 failed)"
+    assert line(first, "RoPE") == ["-"] * 6
+    # Both are of the second repetition, in which both were run.
+    assert line(of_a_batch, "cs")[0] == " / ".join(["-2.50 [1]"] * 3)
+    assert line(of_a_batch, "cs")[1] == " / ".join(["-1.00 [1]"] * 3)
+    assert line(of_a_batch, "sir") == ["-", "-"]
+    assert line(calibration, "cs")[1:3] == ["0.00", "-"]
 
 
 def test_a_folder_without_results_is_refused(folder: Path, docs_page: Path) -> None:

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -12,8 +13,11 @@ import pandas as pd
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
+from benchmarks.blocks import BLOCK, pages_with_blocks
 from benchmarks.cells import Suite, load_suite
+from benchmarks.claims import claims, missing_claims
 from benchmarks.figures import curves
+from benchmarks.published import Published
 from benchmarks.report import write_report
 from benchmarks.store import Results
 from benchmarks.summary import write_summary
@@ -172,22 +176,29 @@ def test_a_damaged_table_is_refused_with_a_way_on(suite: Suite, out: Path) -> No
         read_table(suite, out)
 
 
-COMMITTED = Path(__file__).parents[2] / "benchmarks" / "results"
+ROOT = Path(__file__).parents[2]
+COMMITTED = ROOT / "benchmarks" / "results"
 
 
 NAMES = sorted(path.parent.name for path in COMMITTED.glob("*/results.csv"))
 
 
+@pytest.fixture(scope="module")
+def published() -> Published:
+    return Published.read(COMMITTED)
+
+
 @pytest.mark.medium
-def test_the_committed_tables_fit_their_arrays() -> None:
-    assert NAMES
-    for name in NAMES:
-        assert len(read_table(load_suite(name), COMMITTED / name).rows)
+def test_the_committed_tables_fit_their_arrays(published: Published) -> None:
+    assert [*published.tables] == NAMES
+    assert all(len(table.rows) for table in published.tables.values())
 
 
 @pytest.mark.slow
-def test_the_legend_of_the_suite_with_the_most_methods_is_not_cut_off() -> None:
-    table = read_table(load_suite("main"), COMMITTED / "main")
+def test_the_legend_of_the_suite_with_the_most_methods_is_not_cut_off(
+    published: Published,
+) -> None:
+    table = published.tables["main"]
     figure = curves("n_calibration", table.finished)
     FigureCanvasAgg(figure).draw()
     (legend,) = figure.legends
@@ -201,17 +212,40 @@ def test_the_legend_of_the_suite_with_the_most_methods_is_not_cut_off() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_the_committed_reports_are_those_of_the_tables(
-    name: str, tmp_path: Path
+    name: str, published: Published, tmp_path: Path
 ) -> None:
-    suite = load_suite(name)
-    path = write_report(suite, read_table(suite, COMMITTED / name), tmp_path)
+    path = write_report(published.suites[name], published.tables[name], tmp_path)
     assert path.read_bytes() == (COMMITTED / name / "report.md").read_bytes()
 
 
 @pytest.mark.slow
-def test_the_committed_page_of_all_suites_is_that_of_the_tables(tmp_path: Path) -> None:
-    docs_page = tmp_path / "page.md"
-    docs_page.write_text("<!-- results -->\n<!-- /results -->\n")
-    folder = Path(shutil.copytree(COMMITTED, tmp_path / "results"))
-    page = write_summary(folder, docs_page=docs_page, readme=docs_page)
-    assert page.read_bytes() == (COMMITTED / "README.md").read_bytes()
+def test_committed_pages_and_blocks_are_those_of_the_tables(tmp_path: Path) -> None:
+    folder = tmp_path / "benchmarks" / "results"
+    shutil.copytree(COMMITTED, folder)
+    pages = pages_with_blocks(ROOT)
+    assert len(pages) > 3
+    copies = [tmp_path / page.relative_to(ROOT) for page in pages]
+    for page, copy in zip(pages, copies, strict=True):
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        # The block is made by the summary, and not taken from the page.
+        copy.write_text(re.sub(r"\n\|.*", "", page.read_text()))
+    summary = write_summary(folder, pages=copies)
+    assert summary.read_bytes() == (COMMITTED / "README.md").read_bytes()
+    for page, copy in zip(pages, copies, strict=True):
+        blocks = [BLOCK.findall(path.read_text()) for path in (page, copy)]
+        assert blocks[0] == blocks[1], page
+
+
+@pytest.mark.medium
+def test_sentences_that_count_say_what_the_tables_say(
+    published: Published, tmp_path: Path
+) -> None:
+    found = claims(published)
+    assert missing_claims(found, ROOT) == []
+    for page in {claim.page for claim in found}:
+        copy = tmp_path / page
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        copy.write_text((ROOT / page).read_text().replace("within 0.1", "within 0.2"))
+    outdated = missing_claims(found, tmp_path)
+    assert outdated == [claim for claim in found if "within 0.1" in claim.text]
+    assert 0 < len(outdated) < len(found)
