@@ -16,8 +16,9 @@ from scipy.stats import t as student
 from benchmarks import figures
 from benchmarks.methods import COUPLED_STACK, METHODS, STACK, STACKS, methods_where
 from benchmarks.published import FIXED, LETTERS, MISSING, Published, Setting, table
+from benchmarks.ranking import rank_figure, relative_ranks
 from benchmarks.stacks import other_trainings
-from benchmarks.table import Table
+from benchmarks.table import Table, with_numbers
 
 __all__ = [
     "Comparison",
@@ -27,6 +28,7 @@ __all__ = [
     "finished_rows",
     "half_width",
     "lines_of_losses",
+    "rows_of_main",
 ]
 
 # The methods of the picture: what a user starts from, what is tuned on the pairs, the
@@ -51,8 +53,13 @@ MAX_PAIRS, NEAR, CALIBRATED = 200, 0.1, 0.03
 CURVES, RANKS = "methods.png", "ranks.png"
 # Panels side by side, so that they can be read at the width of a page.
 MAX_COLUMNS = 4
-CONFIDENCE, NUM_RESAMPLES = 0.95, 2000
+CONFIDENCE = 0.95
 EXPLANATION = f"""\
+A rank is among the methods that were run on the same data, with up to {MAX_PAIRS}
+pairs: 0 is the best and 1 the last, which is also what failed. The picture has means
+over tasks, with bootstrap intervals over these, and says where a method was not run on
+all tasks.
+
 "Best other" is the method with the highest LPP on the test set among all that were run
 there, which no user can know. The difference is the stack's LPP minus its, on the same
 data, with an interval of {CONFIDENCE:.0%} over repetitions (Student's t) where there
@@ -146,15 +153,30 @@ def draw_evidence(published: Published, folder: Path) -> None:
     if CURVES in pictures:
         figures.save(_curves(rows), folder / CURVES)
     if RANKS in pictures:
-        figures.save(_rank_figure(rows, compared), folder / RANKS)
+        figures.save(rank_figure(_ranked(published)), folder / RANKS)
 
 
 def finished_rows(published: Published) -> pd.DataFrame:
     """Return what was finished, with one setting of the couplings."""
-    rows = published.tables.get("main", Table.of({}, {})).finished
+    rows = rows_of_main(published)
+    return with_numbers(rows[rows["status"] == "finished"])
+
+
+def rows_of_main(published: Published) -> pd.DataFrame:
+    """Return what was finished or failed, with one setting of the couplings."""
+    rows = published.tables.get("main", Table.of({}, {})).rows
     fixed = [cell.gamma is None or Setting.of(cell) == FIXED for cell in rows.index]
     rows = rows.loc[np.array(fixed, dtype=bool)]
     return rows[rows["task"].isin(LETTERS)]
+
+
+def _ranked(published: Published) -> pd.DataFrame:
+    """Return the relative ranks of the methods, where the stack was run."""
+    rows = rows_of_main(published)
+    competing = (rows["method"] == STACK) | ~rows["method"].isin(NO_RIVALS)
+    return relative_ranks(
+        with_numbers(rows[competing]), beside=STACK, max_pairs=MAX_PAIRS
+    )
 
 
 def lines_of_losses(published: Published) -> list[str]:
@@ -348,8 +370,7 @@ def _pictures(rows: pd.DataFrame, compared: Sequence[Comparison]) -> dict[str, s
     pictures = {
         CURVES: f"LPP and ACAUC of {len(SHOWN)} methods against the number of pairs"
     }
-    if _ranks(rows, compared) is not None:
-        pictures[RANKS] = "Mean ranks of the methods over tasks"
+    pictures[RANKS] = "Mean ranks of the methods over tasks"
     return pictures
 
 
@@ -358,54 +379,3 @@ def _curves(rows: pd.DataFrame) -> Figure:
     order = [*LETTERS]
     shown = shown.iloc[shown["task"].map(order.index).argsort(kind="stable")]
     return figures.curves("n_calibration", shown, max_columns=MAX_COLUMNS)
-
-
-def _ranks(rows: pd.DataFrame, compared: Sequence[Comparison]) -> pd.DataFrame | None:
-    """Return the rank of each method, by task and (pairs, repetition).
-
-    Only of methods that were run wherever the stack was.
-    """
-    cells: dict[tuple[str, tuple[int, int]], pd.Series] = {}
-    for one in compared:
-        if one.size > MAX_PAIRS:
-            continue
-        for repetition in one.stack["repetition"]:
-            there = rows[
-                (rows["task"] == one.task)
-                & (rows["repetition"] == repetition)
-                & rows["n_calibration"].isin([0, one.size])
-                & ((rows["method"] == STACK) | ~rows["method"].isin(NO_RIVALS))
-            ]
-            scores = there.set_index("method")["lpp_z"]
-            cells[one.task, (one.size, int(repetition))] = scores
-    if not cells:
-        return None
-    scores = pd.DataFrame(cells).dropna()
-    return scores.rank(ascending=False)
-
-
-def _rank_figure(rows: pd.DataFrame, compared: Sequence[Comparison]) -> Figure:
-    """Draw mean ranks with bootstrap intervals over tasks."""
-    ranks = _ranks(rows, compared)
-    assert ranks is not None  # or this picture was not asked for
-    by_task = ranks.T.groupby(level=0).mean()
-    mean = by_task.mean().sort_values(ascending=False)
-    draws = np.random.default_rng(0).integers(
-        len(by_task), size=(NUM_RESAMPLES, len(by_task))
-    )
-    resampled = by_task.to_numpy()[draws].mean(axis=1)
-    tail = (1 - CONFIDENCE) / 2
-    low, high = np.quantile(resampled, [tail, 1 - tail], axis=0)
-    bounds = pd.DataFrame({"low": low, "high": high}, index=by_task.columns)
-    figure = Figure(figsize=(7, 0.3 * len(mean) + 1), layout="constrained")
-    axes = figure.subplots()
-    for height, (name, value) in enumerate(mean.items()):
-        colour = METHODS[str(name)].style[0]
-        axes.plot([bounds["low"][name], bounds["high"][name]], [height] * 2, c=colour)
-        axes.plot(value, height, "o", color=colour)
-    axes.set_yticks(range(len(mean)), mean.index)
-    axes.set_xlabel(
-        f"mean rank over {len(by_task)} tasks (1 is best), with a bootstrap interval"
-    )
-    axes.spines[["top", "right"]].set_visible(False)
-    return figure

@@ -26,7 +26,7 @@ class Excerpt:
         score: The LPP or the ACAUC.
         sizes: The numbers of pairs in an entry; the usual one if there are none.
         same_repetitions: Whether the columns of a line are compared in the repetitions
-            that all of them have.
+            that all of them finished.
     """
 
     lines: Mapping[str, Fields]
@@ -62,6 +62,7 @@ class Excerpt:
             for column in self.columns.values()
         ]
         if self.same_repetitions:
+            parts = [part[part["status"] == "finished"] for part in parts]
             common = set.intersection(*(set(part["repetition"]) for part in parts))
             parts = [part[part["repetition"].isin(common)] for part in parts]
         return parts

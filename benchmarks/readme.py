@@ -3,9 +3,10 @@
 import numpy as np
 import pandas as pd
 
-from benchmarks.evidence import finished_rows, half_width
+from benchmarks.evidence import half_width, rows_of_main
 from benchmarks.methods import STACK
 from benchmarks.published import MISSING, Published, table
+from benchmarks.table import with_numbers
 
 __all__ = ["readme_lines"]
 
@@ -31,7 +32,7 @@ def readme_lines(published: Published, link: str) -> list[str]:
         published: All tables.
         link: From README to the page of all results.
     """
-    rows = finished_rows(published)
+    rows = with_numbers(rows_of_main(published))
     rows = rows[(rows["task"] == TASK) & rows["method"].isin(METHODS)]
     lines = [
         [
@@ -46,9 +47,9 @@ def readme_lines(published: Published, link: str) -> list[str]:
         "LPP is the mean log density of the true parameters, in standard deviations of",
         "the prior: higher is better. ± is its 95 % interval over repetitions, whose",
         "number is in brackets (of one, over observations). ACAUC is 0 for calibrated",
-        "posteriors, positive for over-confident and negative for too wide ones.",
+        "posteriors, positive for over-confident and negative for too wide.",
         *("", *table(head, lines), ""),
-        f"[All tasks, all methods]({link}), also where another method is better.",
+        f"[All tasks, all methods]({link}), also where another is better.",
     ]
 
 
@@ -57,14 +58,18 @@ def _of(rows: pd.DataFrame, method: str, size: int) -> pd.DataFrame:
 
 
 def _lpp(rows: pd.DataFrame) -> str:
-    if not len(rows):
-        return MISSING
-    scores = rows["lpp_z"].to_numpy(dtype=float)
+    finished = rows[rows["status"] == "finished"]
+    failed = len(rows) - len(finished)
+    if not len(finished):
+        return "failed" if failed else MISSING
+    scores = finished["lpp_z"].to_numpy(dtype=float)
     width = half_width(scores)
     if np.isinf(width):
-        width = 1.96 * float(rows["lpp_standard_error"].mean())
-    return f"{scores.mean():.2f} ± {width:.2f} ({len(rows)})"
+        width = 1.96 * float(finished["lpp_standard_error"].mean())
+    count = f"{len(finished)}; {failed} failed" if failed else f"{len(finished)}"
+    return f"{scores.mean():.2f} ± {width:.2f} ({count})"
 
 
 def _acauc(rows: pd.DataFrame) -> str:
-    return f"{rows['acauc'].mean():+.3f}" if len(rows) else MISSING
+    known = rows["acauc"][rows["status"] == "finished"]
+    return f"{known.mean():+.3f}" if len(known) else MISSING

@@ -6,12 +6,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 
 from benchmarks.__main__ import main
 from benchmarks.cells import Cell, load_suite
+from benchmarks.claims import claims
 from benchmarks.published import FIXED, Published, gap
+from benchmarks.ranking import rank_figure, relative_ranks
 from benchmarks.schema import COLUMNS
 from benchmarks.statements import STATEMENTS, verdict
 from benchmarks.summary import page_of, write_summary
@@ -21,6 +24,7 @@ pytestmark = pytest.mark.usefixtures("rough_pictures")
 # A cell to its LPP and ACAUC, or None if it was not run, or "failed".
 Scores = Callable[[Cell], tuple[float, float] | str | None]
 
+COMMITTED = Path(__file__).parents[2] / "benchmarks" / "results"
 LINES, FEW, TRANSPORT, TUNING, NPE_BEST, CATCH_UP, GAMMA, TAU = range(8)
 PRIORS = {"cs": -3.8, "sir": -2.3, "pendulum": -2.5, "hemodynamics": -2.3}
 SBI = {"cs": -0.67, "sir": 2.4, "pendulum": 3.1, "hemodynamics": 0.22}
@@ -227,13 +231,15 @@ def test_readme_shows_scores_on_real_measurements_with_their_intervals(
     folder: Path, docs_page: Path
 ) -> None:
     lpp = {"stack": (-1.0, -1.2, -1.1), "NPE": (-30.0, -30.0, -30.0), "RoPE": (-3.0,)}
+    lpp["FMCPE (embedding)"] = -6.0, -6.0, None
 
-    def scores(cell: Cell) -> tuple[float, float] | None:
+    def scores(cell: Cell) -> tuple[float, float] | str | None:
         of_run = lpp.get(cell.method, ())
         right = cell.task == "light_tunnel_sensors" and cell.gamma in (None, 0.1)
         if not right or cell.tau not in (None, 1.0) or len(of_run) <= cell.repetition:
             return None
-        return of_run[cell.repetition], 0.02
+        score = of_run[cell.repetition]
+        return "failed" if score is None else (score, 0.02)
 
     publish(folder, "main", scores)
     write(folder, docs_page)
@@ -246,6 +252,7 @@ def test_readme_shows_scores_on_real_measurements_with_their_intervals(
     # Of one repetition the interval is over its test observations.
     assert line(text, "RoPE")[:2] == ["-3.00 ± 0.20 (1)"] * 2
     assert line(text, "FRISBI (distilled)") == ["-"] * 4
+    assert line(text, "FMCPE (embedding)")[0] == "-6.00 ± 0.00 (2; 1 failed)"
 
 
 def test_a_page_without_a_place_for_the_block_is_refused_and_nothing_written(
@@ -265,6 +272,27 @@ def test_a_page_without_a_place_for_the_block_is_refused_and_nothing_written(
 
 
 @pytest.mark.medium
+def test_ranks_are_relative_to_what_was_run_and_a_failure_is_the_last() -> None:
+    scores = {"stack": -1.0, "NPE": -2.0, "RoPE": None, "J-NPE": -1.5}
+    lines = [
+        {"task": task, "method": name, "repetition": 0, "lpp_z": score}
+        for task in ("cs", "sir")
+        for name, score in scores.items()
+        if (task, name) != ("sir", "J-NPE")
+    ]
+    rows = pd.DataFrame(lines).assign(n_calibration=50)
+    rows["status"] = np.where(rows["lpp_z"].isna(), "failed", "finished")
+    ranks = relative_ranks(rows, beside="stack", max_pairs=200)
+    expected = {"stack": 0.0, "J-NPE": 1 / 3, "NPE": 2 / 3, "RoPE": 1.0}
+    assert ranks["cs"].to_dict() == pytest.approx(expected)
+    assert ranks["sir"].drop("J-NPE").to_dict() == {"stack": 0, "NPE": 0.5, "RoPE": 1}
+    assert math.isnan(ranks["sir"]["J-NPE"])
+    few = relative_ranks(rows, beside="stack", max_pairs=10)
+    assert few.empty
+    assert rank_figure(ranks).axes[0].get_yticklabels()[1].get_text() == "NPE"
+
+
+@pytest.mark.medium
 def test_excerpts_show_means_how_many_repetitions_they_have_and_what_was_not_run(
     folder: Path, docs_page: Path
 ) -> None:
@@ -272,7 +300,8 @@ def test_excerpts_show_means_how_many_repetitions_they_have_and_what_was_not_run
         if cell.task != "cs" or cell.method not in ("NPE", "stack", "stack of a batch"):
             return None
         if cell.method == "stack of a batch":
-            return (-1.0, 0.0) if cell.repetition == 1 else None
+            # Those that failed are no more of the same repetitions than those not run.
+            return {0: "failed", 1: (-1.0, 0.0)}.get(cell.repetition)
         if cell.method == "stack" and cell.n_calibration == 50 and cell.repetition == 2:
             return "failed"
         return -1.5 - cell.repetition, -0.001
@@ -291,6 +320,19 @@ def test_excerpts_show_means_how_many_repetitions_they_have_and_what_was_not_run
     assert line(of_a_batch, "cs")[1] == " / ".join(["-1.00 [1]"] * 3)
     assert line(of_a_batch, "sir") == ["-", "-"]
     assert line(calibration, "cs")[1:3] == ["0.00", "-"]
+
+
+def test_sentences_need_stacks_and_one_that_failed_needs_a_sentence(
+    folder: Path,
+) -> None:
+    publish(folder, "main", by_method(stack=1.0))
+    with pytest.raises(SystemExit, match="Expected results of stacks in the suite sta"):
+        claims(Published.read(folder))
+    published = Published.read(COMMITTED)
+    rows = published.rows["stacking"]
+    rows.loc[rows.index[0], "status"] = "failed"
+    texts = [claim.text for claim in claims(published)]
+    assert "1 stacks of `stacking` failed" in texts
 
 
 def test_a_folder_without_results_is_refused(folder: Path, docs_page: Path) -> None:
