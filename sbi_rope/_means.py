@@ -92,12 +92,16 @@ def mean_and_error(values: Tensor, counts: Counts | None) -> tuple[float, float]
     Args:
         values: A number for each pair, shape ``(n,)``.
         counts: How many pairs each counts as; None for one each.
+
+    The error is infinite if a value is.
     """
     if counts is None:
         return float(values.mean()), standard_error_of_mean(values)
     values, weights = counts.of_groups(values)
     n = len(values)
     mean = (weights * values).sum() / weights.sum()
+    if torch.isinf(values).any():
+        return float(mean), float("inf")
     square = (weights * (values - mean)).square().sum() / weights.sum().square()
     return float(mean), float((square * n / max(1, n - 1)).sqrt())
 

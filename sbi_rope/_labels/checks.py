@@ -307,10 +307,10 @@ def warn_of_labels_on_bounds(
         f"Labels are exactly on a bound of the prior: {', '.join(found)}. Posteriors "
         "with a density give a single number no probability. Their credible intervals "
         "hold hardly any of these labels, whatever the level is, although coverage can "
-        "be right on average. Intervals of a stack with `guaranteed=True` reach the "
-        "bound if more labels are on it than the level may miss. If such a label "
-        "stands for a value that is too small or too large to be measured, say with "
-        "`theta_std` how well it is known."
+        "be right on average. Most intervals of a stack with `guaranteed=True` reach "
+        "the bound for such observations if more labels are on it than the level may "
+        "miss. If such a label stands for a value that is too small or too large to "
+        "be measured, say with `theta_std` how well it is known."
     )
 
 

@@ -41,7 +41,9 @@ MAX_DISTANCES = 50_000_000
 class StoredSimulations:
     """Pairs (theta, x) simulated beforehand; pairs that are not finite are dropped.
 
-    Pairs with an x that has missing entries (NaN) are kept if it is ``readable``.
+    Pairs with an x that has missing entries (NaN) are kept if it is ``readable``. Those
+    that are known to be ``from_prior`` are not compared with it: without those that
+    failed they may not look like it.
     """
 
     num_calls = 0
@@ -56,6 +58,7 @@ class StoredSimulations:
         event_shape: torch.Size,
         like: Tensor,
         readable: Readable = all_finite,
+        from_prior: bool = False,
     ) -> None:
         if not isinstance(simulations, tuple | list) or len(simulations) != 2:
             raise InvalidTypeError(
@@ -76,7 +79,8 @@ class StoredSimulations:
             raise SimulationError("All stored simulations contain NaN or Inf.")
         _warn_of_dropped(int((~valid).sum()), len(valid), "stored simulations")
         check_in_support("simulations[0]", theta[valid], prior)
-        _warn_if_not_from_prior(theta[valid], prior)
+        if not from_prior:
+            _warn_if_not_from_prior(theta[valid], prior)
         self.num_dropped = int((~valid).sum())
         self.theta, self.x = theta[valid], x[valid]
         # Distances between parameters are in standard deviations of the stored ones.

@@ -142,6 +142,7 @@ class LimitedSimulator:
                 event_shape=self._event_shape,
                 like=self._like,
                 readable=self._readable,
+                from_prior=True,
             )
             self._finished = []
         return self._stored

@@ -318,10 +318,11 @@ def check_rows(name: str, value: Any, count: int) -> Tensor:
 
 
 def check_theta(theta: Any, event_shape: torch.Size, *, batched: bool) -> Tensor:
-    """Return the parameters whose density is asked for, as a tensor.
+    """Return the parameters whose density is asked for, as a tensor of float32.
 
     Args:
-        theta: What the user gave.
+        theta: What the user gave. A bound of the prior is one in float32 only: 0.1 of
+            float64 is below the 0.1 of a prior.
         event_shape: Shape of one theta, ``(d,)``.
         batched: Whether theta belongs to a batch of B observations. Its shape is then
             ``(B, d)``, or ``(S, B, d)`` for S parameters of each observation. Otherwise
@@ -344,7 +345,7 @@ def check_theta(theta: Any, event_shape: torch.Size, *, batched: bool) -> Tensor
             f"Expected at least one `theta`; got shape {tuple(theta.shape)}."
         )
     check_not_nan("theta", theta)
-    return theta
+    return theta.to(torch.float32)
 
 
 def check_prior(prior: Any) -> None:

@@ -161,7 +161,12 @@ class SinkhornCoupler:
         """
         # Our own solver needs the distances about once for a single solution.
         problem, scale = self._set_up(
-            real, simulated, seed, gamma=self.gamma, reused=self.solver == "pot"
+            real,
+            simulated,
+            seed,
+            gamma=self.gamma,
+            tau=self.tau,
+            reused=self.solver == "pot",
         )
         return self._solve(problem, self.gamma * scale, problem.zero_potential())
 
@@ -206,7 +211,7 @@ class SinkhornCoupler:
             replace(self, gamma=gamma, tau=tau)
         smallest = min(gamma for gamma, _ in settings)
         problem, scale = self._set_up(
-            real, simulated, seed, gamma=smallest, reused=True
+            real, simulated, seed, gamma=smallest, tau=max(taus), reused=True
         )
         return self._sweep(problem, scale, settings)
 
@@ -237,6 +242,7 @@ class SinkhornCoupler:
         seed: int | None,
         *,
         gamma: float,
+        tau: float,
         reused: bool,
     ) -> tuple[Problem, float]:
         real, simulated = checked_embeddings(real, simulated)
@@ -246,8 +252,9 @@ class SinkhornCoupler:
                 "SinkhornCoupler(dtype=torch.float32) or move the posterior to the CPU."
             )
         num_fitted = min(len(real), self.num_fitted or len(real))
-        if num_fitted < SMALL_BATCH:
-            self._warn_small_batch(num_fitted, len(real))
+        # With a tau of 0, no observation depends on the others.
+        if num_fitted < SMALL_BATCH and tau > 0.0:
+            self._warn_small_batch(num_fitted, len(real), tau)
         real, simulated = real.to(self.dtype), simulated.to(self.dtype)
         fitted = None
         if num_fitted < len(real):
@@ -267,7 +274,7 @@ class SinkhornCoupler:
         )
         return problem, scale
 
-    def _warn_small_batch(self, num_fitted: int, n_o: int) -> None:
+    def _warn_small_batch(self, num_fitted: int, n_o: int, tau: float) -> None:
         if num_fitted < n_o:
             warn_user(
                 f"The coupling is fitted to num_fitted={num_fitted} of {n_o} real "
@@ -277,11 +284,11 @@ class SinkhornCoupler:
             return
         consequence = (
             "its row is uniform and the posterior is the prior. "
-            if n_o == 1 and self.tau == 1.0
+            if n_o == 1 and tau == 1.0
             else "these few decide how much weight each simulation gets. "
         )
         warn_user(
-            f"Coupling a batch of {n_o} real observation(s), tau={self.tau}: "
+            f"Coupling a batch of {n_o} real observation(s), tau={tau}: "
             + consequence
             + f"Use a batch of at least {SMALL_BATCH}, a smaller tau, or the rows of a "
             "posterior built for a larger batch (`unseen='extend'`)."

@@ -22,6 +22,12 @@ STRENGTHS = (2.0, 5.0, 10.0, 30.0, 100.0)
 # one in 19 sets of pairs from the prior gets there by chance, because the two were
 # equally probable before (Markov's inequality).
 IMPROBABLE = 0.05
+# Scores of labels are cut off where one of so many sets of pairs from the prior has a
+# score at one end. The score of a label on a bound would have no end with ever more
+# simulations, although rounding alone puts labels there.
+SETS_CUT_OFF = 20
+# Normal scores of a parameter with a more frequent value are not normal.
+MAX_SHARE = 0.05
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -31,7 +37,8 @@ class ParameterDistribution:
     Attributes:
         probabilities: The probability of each simulation, shape ``(n,)``; they sum to
             one.
-        probability_of_prior: The probability that real parameters follow the prior.
+        probability_of_prior: The probability that real parameters follow the prior;
+            0.5 if all are discrete.
     """
 
     probabilities: Tensor
@@ -48,9 +55,9 @@ def learn_parameters(
 ) -> ParameterDistribution:
     r"""Weight simulations so that their parameters are distributed like those of pairs.
 
-    Each parameter is replaced by its normal score u under the prior. Any prior is then
-    close to the normal distribution :math:`\mathcal N(0, R)`, with R the correlation of
-    the scores. Real parameters are modelled as
+    Each parameter is replaced by its normal score u under the prior. A continuous prior
+    is then close to the normal distribution :math:`\mathcal N(0, R)`, with R the
+    correlation of the scores. Real parameters are modelled as
 
     .. math::
         u \sim \mathcal N(\mu, \Lambda), \quad
@@ -65,6 +72,11 @@ def learn_parameters(
 
     .. math::
         \pi + (1 - \pi)\, t(u) / \mathcal N(u; 0, R) .
+
+    Discrete parameters, of which more than one in twenty simulations share a value, are
+    left out: they stay distributed as in the prior, given the others.
+    Scores of pairs are cut off where only one of twenty sets of pairs from the prior
+    reaches, so that labels on a bound do not count for more with more simulations.
 
     Args:
         theta_cal: Parameters of the pairs, shape ``(n_c, d)``. Parameters that appear
@@ -96,8 +108,20 @@ def learn_parameters(
     if weights is not None:
         weights = check_pair_weights(weights, "theta_cal", theta_cal)
         weights = weights.to(theta_cal.device, torch.double)
+    is_continuous = [not _is_discrete(column) for column in theta.T]
+    if not any(is_continuous):
+        uniform = theta.new_full((len(theta),), 1.0 / len(theta), dtype=torch.double)
+        return ParameterDistribution(probabilities=uniform, probability_of_prior=0.5)
+    theta, theta_cal = theta[:, is_continuous], theta_cal[..., is_continuous]
     sets = theta_cal.unbind(dim=1)[:NUM_SETS] if theta_cal.ndim == 3 else [theta_cal]
     return _average([_learn(draws, theta, weights) for draws in sets])
+
+
+def _is_discrete(column: Tensor) -> bool:
+    """Tell whether many draws of a parameter share a value."""
+    _, counts = column.unique(return_counts=True)
+    most = int(counts.max())
+    return most > 1 and most > MAX_SHARE * len(column)
 
 
 def is_improbable(probability_of_prior: float | None) -> bool:
@@ -122,6 +146,8 @@ def _learn(
     if weights is not None:
         counts = torch.zeros_like(counts).index_add(0, place, weights)
     u_cal, u = normal_scores(theta_cal, theta), normal_scores(theta, theta)
+    end = torch.special.ndtri(1.0 / (SETS_CUT_OFF * counts.sum()).clamp(min=1.0)).abs()
+    u_cal = u_cal.clamp(-end, end)
     correlation = torch.atleast_2d(u.T.cov())
     # The small number keeps R positive definite if a parameter is a function of others.
     correlation = correlation + 1e-6 * torch.eye(len(correlation)).to(u)

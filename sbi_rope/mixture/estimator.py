@@ -2,6 +2,7 @@
 
 import copy
 import math
+import time
 from collections.abc import Iterator, Sequence
 from itertools import chain
 from typing import Any, cast
@@ -258,6 +259,7 @@ class MixtureEstimator(MixtureDensity):
         accept: Accept | None = None,
         batch_size: int | None = None,
         show_progress_bars: bool = False,
+        max_sampling_time: float | None = None,
         **kwargs: Any,
     ) -> Tensor:
         """Draw from the mixtures of a batch.
@@ -269,15 +271,19 @@ class MixtureEstimator(MixtureDensity):
             batch_size: The largest number of draws the flow makes at a time. If None,
                 the number that is fast on the device.
             show_progress_bars: Whether to show how many draws were accepted so far.
+            max_sampling_time: Seconds after which rejection gives up; never if None.
             **kwargs: Not used; they are in sbi's signature.
 
         Returns:
             Shape ``(*sample_shape, B, d)``.
 
         Raises:
-            SamplingError: If hardly any draw is accepted for some observation.
+            SamplingError: If hardly any draw is accepted for some observation, or the
+                time is over.
             UnseenObservationError: As in :meth:`log_prob`.
         """
+        seconds = math.inf if max_sampling_time is None else max_sampling_time
+        deadline = time.monotonic() + seconds
         x = self.checked_x(condition)
         keep_freed_memory(x.device)
         num_samples = torch.Size(sample_shape).numel()
@@ -291,6 +297,7 @@ class MixtureEstimator(MixtureDensity):
                     accept=accept,
                     batch_size=batch_size or flow_batch(x.device),
                     first_row=rows.start,
+                    deadline=deadline,
                 )
                 for part in blocks(num_samples, len(block.weights)):
                     theta[part, rows] = sampler.sample(part.stop - part.start)

@@ -20,6 +20,7 @@ from sbi_rope._validation import (
     as_numbers,
     as_shape,
     check_integer,
+    check_positive,
     check_tables,
     check_theta,
     usable_device,
@@ -240,6 +241,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         # A new dictionary: the posteriors of a sweep share the old one, and stay on
         # their device.
         self._cache = {k: mass.to(device) for k, mass in self._cache.items()}
+        self._latest = None
         with seeded(0):  # sbi draws from the prior to find out about it
             super().to(device)
 
@@ -270,6 +272,8 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         max_sampling_batch_size: int | None = None,
         show_progress_bars: bool | None = None,  # noqa: FBT001
         reject_outside_prior: bool = True,  # noqa: FBT001, FBT002
+        max_sampling_time: float | None = None,
+        return_partial_on_timeout: bool = False,  # noqa: FBT001, FBT002
     ) -> Tensor:
         r"""Draw from :math:`p(\theta \mid x)` of one observation.
 
@@ -279,13 +283,15 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             max_sampling_batch_size: As in :meth:`sample_batched`.
             show_progress_bars: As in :meth:`sample_batched`.
             reject_outside_prior: As in :meth:`sample_batched`.
+            max_sampling_time: As in :meth:`sample_batched`.
+            return_partial_on_timeout: As in :meth:`sample_batched`.
 
         Returns:
             Shape ``(*sample_shape, d)``.
 
         Raises:
             UnseenObservationError: If x is not in the batch and ``unseen="raise"``.
-            SamplingError: If hardly any mass lies inside the prior's support.
+            SamplingError: As in :meth:`sample_batched`.
         """
         x = self._one_x(x)
         samples = self.sample_batched(
@@ -294,6 +300,8 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             max_sampling_batch_size,
             show_progress_bars,
             reject_outside_prior,
+            max_sampling_time,
+            return_partial_on_timeout,
         )
         return samples.squeeze(-1 - len(self.posterior_estimator.input_shape))
 
@@ -305,6 +313,8 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         max_sampling_batch_size: int | None = None,
         show_progress_bars: bool | None = None,  # noqa: FBT001
         reject_outside_prior: bool = True,  # noqa: FBT001, FBT002
+        max_sampling_time: float | None = None,
+        return_partial_on_timeout: bool = False,  # noqa: FBT001, FBT002
     ) -> Tensor:
         r"""Draw from :math:`p(\theta \mid x_b)` of every observation of a batch.
 
@@ -317,14 +327,28 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
                 None does so in a terminal or a notebook, but not in a file.
             reject_outside_prior: Whether to draw from the mixtures truncated to the
                 prior's support, or from the whole mixtures.
+            max_sampling_time: Seconds after which to give up, if draws outside the
+                prior's support are rejected; None for no limit.
+            return_partial_on_timeout: Must be False. Observations are drawn for one
+                after the other, so that some would have no draw.
 
         Returns:
             Shape ``(*sample_shape, B, d)``.
 
         Raises:
+            InvalidInputError: If an argument is outside its range.
             UnseenObservationError: If an x is not in the batch and ``unseen="raise"``.
-            SamplingError: If hardly any mass lies inside the prior's support.
+            SamplingError: If hardly any mass lies inside the prior's support, or the
+                time is over.
         """
+        if max_sampling_time is not None:
+            check_positive("max_sampling_time", max_sampling_time)
+        if return_partial_on_timeout:
+            raise InvalidInputError(
+                "Expected `return_partial_on_timeout=False`: observations are drawn "
+                "for one after the other, so that some would have no draw. Ask for "
+                "fewer draws at a time and keep those."
+            )
         if max_sampling_batch_size is not None:
             check_integer("max_sampling_batch_size", max_sampling_batch_size)
         return self.posterior_estimator.sample(
@@ -333,6 +357,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             accept=self._inside if reject_outside_prior else None,
             batch_size=max_sampling_batch_size,
             show_progress_bars=is_shown(show_progress_bars),
+            max_sampling_time=max_sampling_time,
         )
 
     @property
@@ -498,6 +523,8 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         x: Tensor | None = None,
         num_iter: int = 100,
         num_to_optimize: int = 5,
+        learning_rate: float = 0.01,
+        init_method: str | Tensor = "posterior",
         num_init_samples: int = 100,
         **options: Any,
     ) -> Tensor:
@@ -507,10 +534,12 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         (1000 steps from the best 100 of 1000 samples) would take many minutes.
 
         Args:
-            x: Not used, as in sbi. Set the default x, or take ``posterior[i]``.
+            x: Must be None, as in sbi. Set the default x, or take ``posterior[i]``.
             num_iter: Number of steps of gradient ascent.
             num_to_optimize: Number of starting points: the samples with the highest
                 density.
+            learning_rate: Learning rate of the ascent, as in sbi.
+            init_method: Where starting points come from, as in sbi.
             num_init_samples: Number of samples to choose the starting points from.
             **options: The other options of sbi's ``DirectPosterior.map``.
 
@@ -528,6 +557,8 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
                 x=x,
                 num_iter=num_iter,
                 num_to_optimize=num_to_optimize,
+                learning_rate=learning_rate,
+                init_method=init_method,
                 num_init_samples=num_init_samples,
                 **options,
             )
@@ -538,9 +569,9 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         r"""Return the mass of each mixture inside the prior's support, with its error.
 
         The mass :math:`Z_j` of every simulation's posterior is estimated once, from
-        1024 draws, and kept. The mass of densities of x itself is estimated for each x,
-        and kept until another x is asked for. The draws have a seed of their own, so
-        that ``log_prob`` always returns the same numbers.
+        1024 draws, and kept. The mass of densities of x itself is estimated for each x.
+        That of a single x is kept until another x is asked for. The draws have a seed
+        of their own, so that ``log_prob`` always returns the same numbers.
 
         Args:
             x: Observations, shape ``(B, *event)``.

@@ -1,5 +1,7 @@
 """Samples of a block of mixtures, without those outside the support of the prior."""
 
+import math
+import time
 from collections.abc import Callable
 
 import torch
@@ -34,6 +36,7 @@ class BlockSampler:
         accept: Tells which proposals ``(n, d)`` to keep; None keeps all.
         batch_size: The largest number of draws the flow makes at a time.
         first_row: The number of the block's first observation, for messages.
+        deadline: When to give up, in seconds of ``time.monotonic()``.
     """
 
     def __init__(
@@ -43,11 +46,13 @@ class BlockSampler:
         accept: Accept | None,
         batch_size: int,
         first_row: int = 0,
+        deadline: float = math.inf,
     ) -> None:
         self.block = block
         self.accept = accept
         self.batch_size = batch_size
         self.first_row = first_row
+        self.deadline = deadline
         self.theta_shape = block.parts[0].density.input_shape
         weights = block.weights
         self.num_rows, self.num_components = weights.shape
@@ -69,7 +74,8 @@ class BlockSampler:
         """Draw from every mixture, ``(num_samples, b, d)``.
 
         Raises:
-            SamplingError: If hardly any draw is accepted for some observation.
+            SamplingError: If hardly any draw is accepted for some observation, or the
+                time is over.
         """
         slots = torch.arange(self.num_rows, device=self._last.device)
         slots = slots.repeat_interleave(num_samples)
@@ -103,6 +109,13 @@ class BlockSampler:
         still_open = torch.ones(len(slots), dtype=torch.bool, device=slots.device)
         rate = 1.0
         while (open_slots := still_open.nonzero().flatten()).numel():
+            if time.monotonic() > self.deadline:
+                raise SamplingError(
+                    f"Sampling took longer than `max_sampling_time`: {len(open_slots)} "
+                    f"of {len(slots)} draws are missing for the observations from row "
+                    f"{self.first_row} of `x` on. Give it more time, ask for fewer "
+                    "draws, or pass reject_outside_prior=False."
+                )
             proposals = open_slots.repeat_interleave(_repeats(len(open_slots), rate))
             rows = slots[proposals]
             draws = self._propose(rows)

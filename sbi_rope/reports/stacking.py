@@ -1,5 +1,6 @@
 """The report of a stack as an HTML page, for readers who do not know this package."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -171,21 +172,19 @@ def _what_was_done(report: StackingReport) -> str:
 def _score_section(report: StackingReport) -> str:
     rows = report.as_rows()
     shown = rows[:MAX_ROWS]
-    unit = report.cross_validation.log_unit
-    scores = {"the stack": report.score}
+    cells = [_score_cells("the stack", "", report.score, report.score_z)]
     if differs(report):
-        scores["the stack, uncorrected"] = report.comparable_score
-    cells = [
-        (name, "", number(mean), number(mean + unit), number(error))
-        for name, (mean, error) in scores.items()
-    ]
+        scores = report.cross_validation
+        in_units = scores.in_units_of_prior(scores.scores_of("stack"))
+        of_prior = scores.mean_and_error(in_units)
+        name = "the stack, uncorrected"
+        cells.append(_score_cells(name, "", report.comparable_score, of_prior))
     cells += [
-        (
+        _score_cells(
             row["candidate"],
             percent(row["weight"]),
-            number(row["score"]),
-            number(row["score_z"]),
-            number(row["standard_error"]),
+            (row["score"], row["standard_error"]),
+            (row["score_z"], row["standard_error_z"]),
         )
         for row in shown
     ]
@@ -205,8 +204,8 @@ def _score_section(report: StackingReport) -> str:
         notes.append(
             "The stack is corrected for what it puts outside the range of the prior. "
             "The candidates are not, because the correction of a single one can have "
-            "no end. Compare them with the uncorrected stack, as the differences above "
-            "do."
+            "no end. Compare them with the uncorrected stack, as the difference from "
+            "NPE above does."
         )
     if len(rows) > len(shown):
         notes.append(
@@ -233,6 +232,15 @@ def _score_section(report: StackingReport) -> str:
             "standard error to each side.",
         ),
     )
+
+
+def _score_cells(
+    name: str, weight: str, own: tuple[float, float], z: tuple[float, float]
+) -> tuple[str, ...]:
+    """Return a line of the table, from scores in two units and their errors."""
+    # With partial labels the error depends on the unit. Some priors have no second one.
+    error = own[1] if math.isnan(z[0]) else z[1]
+    return name, weight, number(own[0]), number(z[0]), number(error)
 
 
 def _weight_section(report: StackingReport) -> str:

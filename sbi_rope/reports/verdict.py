@@ -68,7 +68,7 @@ def _calibrated(report: StackingReport) -> tuple[str, bool]:
         return f"There are {TOO_FEW}: ACAUC {report.acauc.value:+.3f}.", False
     known = "known parameters"
     if report.cross_validation.score_errors is not None:
-        known = "measured values, with the noise of their labels"
+        known = "measured values, with any noise of their labels"
     held = percent(report.share_inside)
     inside = f"{percent(LEVEL)} intervals held {held} of the {known}."
     if verdict == "calibrated":

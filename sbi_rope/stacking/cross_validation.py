@@ -81,7 +81,8 @@ class CrossValidation:
         pseudo_count: As in :func:`stacking_weights`.
         log_unit: The sum of the logs of the prior's standard deviations; NaN if it is
             unknown. Scores with theta in these units are higher by this number. With
-            partial labels, the mean over pairs of the sum over measured parameters.
+            partial labels it is that of each pair, the sum over measured parameters,
+            shape ``(n,)``.
         set_scores: The scores that sets with a guarantee are made from; None in files
             of earlier versions, and if no label is exact.
         pair_weights: How many pairs each pair counts as, shape ``(n,)``. Pairs of one
@@ -108,7 +109,7 @@ class CrossValidation:
     estimates: Tensor | None = field(default=None, repr=False)
     ranks: Tensor | None = field(default=None, repr=False)
     pseudo_count: float = 1.0
-    log_unit: float = float("nan")
+    log_unit: float | Tensor = float("nan")
     pair_weights: Tensor | None = field(default=None, repr=False)
     groups: Tensor | None = field(default=None, repr=False)
     score_errors: Tensor | None = field(default=None, repr=False)
@@ -152,6 +153,11 @@ class CrossValidation:
         if self.pair_weights is not None:
             weights = self.pair_weights.to(weights)
         return float((weights * self.score_errors).norm() / weights.sum())
+
+    def in_units_of_prior(self, scores: Tensor) -> Tensor:
+        """Return scores of the pairs with theta in the prior's standard deviations."""
+        unit = self.log_unit
+        return scores + (unit.to(scores) if isinstance(unit, Tensor) else unit)
 
     def mean_and_error(self, scores: Tensor) -> tuple[float, float]:
         """Return the weighted mean of a score of each pair, and its standard error."""
@@ -201,7 +207,23 @@ class CrossValidation:
         Raises:
             InvalidInputError: If there is no candidate of that name.
         """
-        difference = self.scores_of(name) - self.scores_of(other)
+        return self._difference(self.scores_of(name) - self.scores_of(other), seed)
+
+    def gain_over_prior(self, *, seed: int = 0) -> Difference:
+        """Return by how much the normalised stack scores higher than the prior.
+
+        No density of the prior is outside the prior, so that the stack can be compared
+        with it as it is. Other candidates are not normalised; see :meth:`difference`.
+
+        Args:
+            seed: Seed of the bootstrap over pairs.
+
+        Raises:
+            InvalidInputError: If "prior" is not among the candidates.
+        """
+        return self._difference(self.stack_scores - self.scores_of("prior"), seed)
+
+    def _difference(self, difference: Tensor, seed: int) -> Difference:
         # Where both scores are minus infinity, neither candidate is better.
         difference = difference.nan_to_num(nan=0.0, posinf=torch.inf, neginf=-torch.inf)
         mean, low, high = interval_of_mean(difference, self.counts)
@@ -231,33 +253,25 @@ class CrossValidation:
         return Difference(mean=mean, low=float(low), high=float(high))
 
     def as_rows(self) -> list[dict[str, Any]]:
-        """Return a row for each candidate: name, family, weight, scores, error.
+        """Return a row for each candidate: name, family, weight, scores, errors.
 
         The key "score" is the mean score with theta in its own units, and "score_z"
         that with theta in standard deviations of the prior. Both are in nats a pair.
+        Their standard errors are the same, unless labels are partial.
         """
-        means, errors = zip(
-            *(self.mean_and_error(column) for column in self.log_scores.unbind(dim=1)),
-            strict=True,
-        )
-        return [
-            {
-                "candidate": name,
-                "family": family,
-                "weight": weight,
-                "score": score,
-                "score_z": score + self.log_unit,
-                "standard_error": error,
-            }
-            for name, family, weight, score, error in zip(
-                self.names,
-                self.families,
-                self.weights.weights.tolist(),
-                means,
-                errors,
-                strict=True,
-            )
-        ]
+        rows = []
+        weights = self.weights.weights.tolist()
+        columns = self.log_scores.unbind(dim=1)
+        for name, family, weight, scores in zip(
+            self.names, self.families, weights, columns, strict=True
+        ):
+            score, error = self.mean_and_error(scores)
+            score_z, error_z = self.mean_and_error(self.in_units_of_prior(scores))
+            row = {"candidate": name, "family": family, "weight": weight}
+            row |= {"score": score, "score_z": score_z}
+            row |= {"standard_error": error, "standard_error_z": error_z}
+            rows.append(row)
+        return rows
 
 
 def _weighted_mean(values: Any, weights: Any, axis: int = -1) -> Any:

@@ -48,14 +48,15 @@ class StackingReport:
         learning_curve: The learning curve of the stack, if it was asked for.
         score: Mean held-out log score of the stack's normalised density, in nats a
             pair with theta in its own units, and its standard error.
-        score_z: The same with theta in standard deviations of the prior. The two differ
-            by a constant, the sum of the logs of these standard deviations. NaN if the
-            prior has none.
+        score_z: The same with theta in standard deviations of the prior. Scores of
+            pairs differ by a constant, the sum of the logs of these standard deviations
+            of the parameters that were measured. NaN if the prior has none.
         comparable_score: The same without correction for leakage, so that it can be
             compared with the scores of the candidates.
         gains: How much higher the stack scores than the candidates "prior" and "NPE",
-            by name, if these are among the candidates. None of the scores is corrected
-            for leakage.
+            by name, if these are among the candidates. Compared with the prior the
+            stack is normalised, as it is deployed. Compared with NPE, whose leakage is
+            not corrected, it is not.
         family_weights: The weight of each method, summed over its settings, from the
             largest to the smallest.
         acauc: ACAUC of the stack's central intervals.
@@ -146,10 +147,14 @@ class StackingReport:
             cross_validation=scores,
             learning_curve=learning_curve,
             score=(score, error),
-            score_z=(score + scores.log_unit, error),
+            score_z=scores.mean_and_error(
+                scores.in_units_of_prior(scores.stack_scores)
+            ),
             comparable_score=scores.mean_and_error(scores.scores_of("stack")),
             gains={
-                name: scores.difference("stack", name)
+                name: scores.gain_over_prior()
+                if name == "prior"
+                else scores.difference("stack", name)
                 for name in REFERENCES
                 if name in scores.names
             },

@@ -200,7 +200,7 @@ def _set_scores(
     )
 
 
-def _log_unit(bench: Workbench) -> float:
+def _log_unit(bench: Workbench) -> float | Tensor:
     """Return by how much scores are higher in the prior's standard deviations."""
     labels = bench.labels
     if labels.samples is not None:
@@ -208,8 +208,4 @@ def _log_unit(bench: Workbench) -> float:
     units = log_units_of(bench.npe.prior)
     if labels.are_exact:
         return float(units.sum())
-    known = labels.is_measured.to(units)
-    weights = bench.labels.score_weights
-    weights = labels.weights if weights is None else weights
-    shares = weights.to(units) / weights.sum().to(units)
-    return float((shares @ known) @ units)
+    return labels.is_measured.to(units) @ units

@@ -142,7 +142,7 @@ def _labels(report: "StackingReport") -> list[str]:
         lines += [
             "    scores are relative to those of the prior at the draws"
             if are_relative(report)
-            else "    scores and coverage are those of the measured values, with the "
+            else "    scores and coverage are those of the measured values, with any "
             "noise of their labels",
             f"    Monte-Carlo error of the score: {scores.monte_carlo_error:.3f} nats",
         ]
@@ -164,8 +164,8 @@ def _scores(report: "StackingReport") -> list[str]:
     if differs(report):
         lines += [
             f"    {report.comparable_score[0]:.2f} before correction for mass outside "
-            f"the prior{unit}; candidates are not",
-            "    corrected, so that the differences below start from this number",
+            f"the prior{unit}; NPE is not",
+            "    corrected, so that a difference from NPE starts from this number",
         ]
     return lines
 
@@ -285,7 +285,8 @@ def parameters_off(
     scores = report.acauc_of_parameters
     names = names or report.parameter_names or default_names(len(scores))
     few = report.cross_validation.effective_number < FEWEST
-    if few or len(scores) < 2:  # reports of older files have none
+    unknown = report.acauc.verdict == "unknown"  # that of labels given as draws
+    if few or unknown or len(scores) < 2:  # reports of older files have none
         return []
     lines = []
     for name, score in zip(names, scores, strict=True):

@@ -7,18 +7,22 @@ import pickle
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from sbi.inference import DirectPosterior
+from sbi.utils import BoxUniform
 from torch import Tensor, nn
 
 from sbi_rope.errors import (
     InvalidInputError,
     InvalidTypeError,
     RoPEError,
+    SamplingError,
     UnseenObservationError,
 )
 from sbi_rope.mixture import MixturePosterior
+from sbi_rope.mixture.prior_posterior import PriorPosterior
 from tests import problems
 from tests.problems import gaussian_posterior
 
@@ -99,6 +103,40 @@ def test_log_prob_has_the_shapes_of_sbi() -> None:
         for i in range(5):
             single = posterior.log_prob(theta[:, i], x=x_o[i])
             assert torch.allclose(single, batched[:, i], atol=1e-5)
+
+
+def test_theta_on_a_bound_of_the_prior_is_inside_in_every_form() -> None:
+    # 0.1 and 0.7 of float64 are outside of a prior that has them as float32.
+    prior = BoxUniform(torch.tensor([0.1, 0.1]), torch.tensor([0.7, 0.7]))
+    posterior = gaussian_posterior(prior=prior)
+    x = posterior.x_o
+    flat = PriorPosterior(prior)
+    for corner in ([0.1, 0.7], [0.7, 0.1]):
+        expected = posterior.log_prob(torch.tensor([corner]), x=x[0])
+        potential = posterior.potential(torch.tensor([corner]), x=x[0])
+        assert torch.isfinite(expected).all()
+        for theta in (np.array([corner]), torch.tensor([corner]).double(), [corner]):
+            assert torch.equal(posterior.log_prob(theta, x=x[0]), expected)
+            assert torch.equal(posterior.potential(theta, x=x[0]), potential)
+            batched = posterior.log_prob_batched(theta, x[:1])
+            assert torch.allclose(batched, expected, atol=1e-5)
+            assert torch.isfinite(flat.log_prob(theta)).all()
+
+
+def test_sampling_gives_up_after_the_time_that_it_is_given() -> None:
+    # A prior that few of the first draws are in.
+    prior = BoxUniform(torch.full((2,), 0.5), torch.full((2,), 1.0))
+    posterior = gaussian_posterior(prior=prior)
+    x = posterior.x_o[:1]
+    for sample in (posterior.sample, posterior.sample_batched):
+        with pytest.raises(SamplingError, match="`max_sampling_time`: "):
+            sample((2000,), x, max_sampling_time=1e-9, **QUIET)
+        enough = sample((3,), x, max_sampling_time=60.0, **QUIET)
+        assert enough.shape[0] == 3
+        with pytest.raises(InvalidInputError, match="return_partial_on_timeout=False"):
+            sample((3,), x, return_partial_on_timeout=True, **QUIET)
+        with pytest.raises(InvalidInputError, match="max_sampling_time"):
+            sample((3,), x, max_sampling_time=-1.0, **QUIET)
 
 
 def test_several_observations_need_the_batched_methods() -> None:

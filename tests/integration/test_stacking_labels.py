@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from sbi_rope import RoPE, load, stack
+from sbi_rope._units import log_units_of
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.metrics import lpp
 from sbi_rope.stacking import CrossValidation, default_candidates
@@ -49,6 +50,16 @@ def test_a_stack_is_scored_on_what_was_measured(tmp_path: Any) -> None:
     assert torch.isfinite(scores.log_scores).all()
     assert torch.equal(torch.isnan(scores.levels), torch.isnan(PARTIAL))
     assert 0 < scores.monte_carlo_error < 0.2
+    # In standard deviations of the prior, each parameter that was measured counts.
+    unit = (
+        log_units_of(rope.npe.prior)[1]
+        + (~torch.isnan(PARTIAL[:, 0])).double() * (log_units_of(rope.npe.prior)[0])
+    )
+    in_units = scores.stack_scores + unit
+    score, error = posterior.report.score_z
+    assert score == pytest.approx(float(in_units.mean()), rel=1e-6)
+    assert error == pytest.approx(float(in_units.std()) / 20**0.5, rel=1e-6)
+    assert error != pytest.approx(posterior.report.score[1], rel=1e-3)
     text = str(posterior.report)
     assert "20 labels, 20 with noise and 10 partial" in text
     assert math.isfinite(posterior.report.acauc.value)
@@ -61,7 +72,7 @@ def test_a_stack_is_scored_on_what_was_measured(tmp_path: Any) -> None:
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "2 parameters (20 labels, 20 with noise and 10 partial)" in page
     assert "2 parameters are known" not in page
-    assert "of the measured values, with the noise of their labels" in page
+    assert "of the measured values, with any noise of their labels" in page
     assert ">nan<" not in page
 
 
@@ -141,11 +152,12 @@ def test_labels_given_as_draws_are_scored_relative_to_the_prior(tmp_path: Path) 
     assert "above the prior" in str(posterior.report)
     # What the gains start from is stated here, too, where it is another number.
     other = replace(posterior.report, comparable_score=(0.25, 0.1))
-    assert "0.25 before correction for mass outside the prior; cand" in str(other)
+    assert "0.25 before correction for mass outside the prior; NPE" in str(other)
     posterior.report.to_html(tmp_path / "draws.html")
     page = (tmp_path / "draws.html").read_text()
     assert ">nan" not in page
     assert "Coverage is not known" in page
+    assert "was not measured" not in page
     assert "calibrated as far as" not in page
 
 

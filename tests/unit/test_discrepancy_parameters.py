@@ -188,6 +188,34 @@ def test_normal_scores_do_not_depend_on_the_scale_of_a_parameter() -> None:
             assert (scores[order, j].diff() >= 0).all(), prior.__name__
 
 
+def test_discrete_parameters_are_left_out() -> None:
+    n = 20_000
+    theta = torch.stack([torch.rand(n), (torch.arange(n) < n // 20).float()], dim=1)
+    pairs = torch.stack([torch.rand(100), torch.zeros(100)], dim=1)
+    for ones in (0, 10, 100):
+        pairs[:ones, 1] = 1.0
+        learned = learn_parameters(pairs, theta)
+        assert learned.probability_of_prior > 0.5, ones
+        share = float(learned.probabilities[theta[:, 1] == 1].sum())
+        assert share == pytest.approx(0.05, abs=0.005), ones
+        both = learn_parameters(pairs[:, :1], theta[:, :1])
+        assert torch.equal(learned.probabilities, both.probabilities)
+    of_counts = learn_parameters(pairs[:, 1:], theta[:, 1:])
+    assert of_counts.probability_of_prior == 0.5
+    assert of_counts.effective_sample_size == pytest.approx(n)
+
+
+def test_labels_that_are_rounded_to_the_bounds_are_draws_from_the_prior() -> None:
+    probabilities = [
+        learn_parameters(torch.linspace(0, 1, k)[:, None], theta).probability_of_prior
+        for theta in (torch.rand(2000, 1), torch.rand(200_000, 1))
+        for k in (5, 10)
+    ]
+    assert min(probabilities) > 0.5
+    # However many simulations there are.
+    assert probabilities[:2] == pytest.approx(probabilities[2:], abs=0.02)
+
+
 def test_several_recordings_of_a_person_count_once() -> None:
     theta, people = box(2000), box(4)
     once = learn_parameters(people, theta)

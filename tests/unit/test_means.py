@@ -113,3 +113,9 @@ def test_recordings_with_the_same_parameters_do_not_make_a_report_more_certain()
     assert other["standard_error"] == pytest.approx(row["standard_error"])
     gains = [LearningCurve.of([one, one]) for one in (once, often)]
     assert gains[1].standard_errors == pytest.approx(gains[0].standard_errors)
+
+
+def test_an_infinite_score_has_an_infinite_error_whatever_pairs_count_as() -> None:
+    values = torch.cat([VALUES, torch.tensor([-math.inf]).double()])
+    for counts in (None, Counts(torch.ones(13)), Counts(torch.ones(13), GROUPS[:13])):
+        assert mean_and_error(values, counts) == (-math.inf, math.inf)

@@ -582,6 +582,20 @@ def test_a_simulator_with_a_number_of_simulations_is_called_so_often_in_all() ->
         rope.build_posterior(x, num_simulations=1201)
 
 
+def test_simulations_that_failed_are_not_taken_for_those_of_another_prior() -> None:
+    def fails_where_large(theta: Tensor) -> Tensor:
+        failed = (theta[:, :1] > 0.0).expand(-1, 2)
+        return gaussian.simulator(theta).masked_fill(failed, torch.nan)
+
+    rope = RoPE(gaussian.posterior(), simulator=fails_where_large, num_simulations=1200)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        rope.embed(gaussian.labelled(10)[1], show_progress_bars=False)
+    texts = [str(one.message) for one in caught]
+    assert any("of 1200 simulations from the prior" in text for text in texts)
+    assert not any("distributed like the prior" in text for text in texts)
+
+
 @pytest.mark.filterwarnings("ignore:Only 200 simulations")
 def test_the_noise_of_a_number_of_simulations_does_not_repeat_their_parameters() -> (
     None
