@@ -18,7 +18,12 @@ from benchmarks.evidence import (
     compare,
     finished_rows,
 )
-from benchmarks.methods import COUPLED_STACK, STACK, STACKS
+from benchmarks.methods import (
+    COUPLED_STACK,
+    GIVEN_PRIOR_STACK,
+    STACK,
+    STACKS,
+)
 from benchmarks.published import Published
 from benchmarks.stacks import Comparison, comparisons
 
@@ -50,7 +55,10 @@ def claims(published: Published) -> list[Claim]:
         rows = published.rows[name]
         if not len(rows[(rows["method"] == STACK) & (rows["status"] == "finished")]):
             raise SystemExit(f"Expected results of stacks in the suite {name}.")
-    makers = (_of_failures, _against_candidates, _against_others, _of_single_methods)
+    makers = (
+        *(_of_failures, _against_candidates, _against_others, _of_single_methods),
+        _of_pairs_from_the_middle,
+    )
     return [claim for maker in makers for claim in maker(published)]
 
 
@@ -115,6 +123,12 @@ def _against_candidates(published: Published) -> Iterator[Claim]:
         FOUND, f"it loses more than {NEAR} nats in {len(lost)} of [{len(found)} cells]"
     )
     yield Claim(FOUND, f"Of these, {lost_with_ten} have ten pairs, which cannot tell")
+    most_lost = sorted(one.gap for one in found)
+    yield Claim(
+        FOUND,
+        f"the stack loses {-most_lost[0]:.2f}. In the others it loses "
+        f"{-most_lost[1]:.2f} at most",
+    )
     held = [abs(o.held_out[STACK] - o.stacked) <= 2 * o.held_out_error for o in found]
     yield Claim(
         FOUND, f"In {sum(held)} cells the held-out score is within two standard"
@@ -218,6 +232,25 @@ def _against_others(published: Published) -> Iterator[Claim]:
         f"**In {count} cells it is the best or within {NEAR} nats of the best method**",
     )
     yield Claim(STACKING, f"or within {NEAR} nats of the best, in {count} cells")
+
+
+def _of_pairs_from_the_middle(published: Published) -> Iterator[Claim]:
+    suites = {"light_tunnel_sensors": "noniid", "pendulum": "noniid"}
+    suites["linear_gaussian"] = "failures"
+    gains = [
+        published.above(
+            GIVEN_PRIOR_STACK,
+            STACK,
+            suite=suite,
+            size=size,
+            task=task,
+            variant="biased_calibration",
+        )
+        for task, suite in suites.items()
+        for size in (10, 50, 200)
+    ]
+    better = _count(gain > 0.0 for gain in gains if gain is not None)
+    yield Claim(FOUND, f"**One that keeps the prior is better** in {better} cells")
 
 
 def _mean_acauc(rows: pd.DataFrame, method: str) -> float:

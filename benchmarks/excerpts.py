@@ -6,7 +6,12 @@ from typing import Any
 
 import pandas as pd
 
-from benchmarks.methods import COUPLED_STACK, STACK
+from benchmarks.methods import (
+    COUPLED_STACK,
+    GIVEN_PRIOR_STACK,
+    RVNP_STACK,
+    STACK,
+)
 from benchmarks.published import Published, entry, mean, num_repetitions, table
 
 __all__ = ["EXCERPTS", "Excerpt"]
@@ -96,6 +101,12 @@ TASKS = {
     "sensors (real)": SENSORS,
 }
 IMAGES = {"task": "light_tunnel"}
+WHERE_RVNP_HELPS = {"sir": {"task": "sir"}, "cs": {"task": "cs"}}
+WITH_RVNP = {
+    "RVNP alone": {"method": "RVNP"},
+    "`stack(rope)`": {"method": STACK},
+    "with RVNP": {"method": RVNP_STACK, "suite": "couplings"},
+}
 # By the name that a page calls them with.
 EXCERPTS = {
     "stack-and-others": Excerpt(
@@ -127,6 +138,19 @@ EXCERPTS = {
             "`stack(rope, x_o)`": {"method": COUPLED_STACK},
         },
         sizes=FEW,
+        same_repetitions=True,
+    ),
+    "with-rvnp": Excerpt(
+        lines=WHERE_RVNP_HELPS,
+        columns=WITH_RVNP,
+        sizes=(10, 50),
+        same_repetitions=True,
+    ),
+    "with-rvnp-calibration": Excerpt(
+        lines=WHERE_RVNP_HELPS,
+        columns=WITH_RVNP,
+        score="acauc",
+        sizes=(10, 50),
         same_repetitions=True,
     ),
     "images": Excerpt(
@@ -171,9 +195,7 @@ EXCERPTS = {
             "pendulum": {"task": "pendulum", "suite": "noniid"},
             "linear_gaussian": LINEAR | {"suite": "failures"},
         },
-        columns=_methods(
-            "prior", "RoPE", "fine-tuned NPE", STACK, "stack, given prior"
-        ),
+        columns=_methods("prior", "RoPE", "fine-tuned NPE", STACK, GIVEN_PRIOR_STACK),
         chosen=IN_THE_MIDDLE,
         sizes=FEW,
     ),
