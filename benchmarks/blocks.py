@@ -14,7 +14,8 @@ MARKER = re.compile(r"<!-- /?results")
 
 def pages_with_blocks(root: Path) -> list[Path]:
     """Return README and the pages of docs of a project, where they have blocks."""
-    pages = root / "README.md", *sorted((root / "docs").rglob("*.md"))
+    # `make docs` copies pages into a folder whose name starts with an underscore.
+    pages = root / "README.md", *sorted((root / "docs").glob("[!_]*/**/*.md"))
     return [page for page in pages if MARKER.search(page.read_text(encoding="utf-8"))]
 
 
