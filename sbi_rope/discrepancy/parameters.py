@@ -112,9 +112,8 @@ def learn_parameters(
     if not any(is_continuous):
         uniform = theta.new_full((len(theta),), 1.0 / len(theta), dtype=torch.double)
         return ParameterDistribution(probabilities=uniform, probability_of_prior=0.5)
-    theta, theta_cal = theta[:, is_continuous], theta_cal[..., is_continuous]
     sets = theta_cal.unbind(dim=1)[:NUM_SETS] if theta_cal.ndim == 3 else [theta_cal]
-    return _average([_learn(draws, theta, weights) for draws in sets])
+    return _average([_learn(draws, theta, weights, is_continuous) for draws in sets])
 
 
 def _is_discrete(column: Tensor) -> bool:
@@ -139,12 +138,17 @@ def _average(parts: Sequence[ParameterDistribution]) -> ParameterDistribution:
 
 
 def _learn(
-    theta_cal: Tensor, theta: Tensor, weights: Tensor | None
+    theta_cal: Tensor,
+    theta: Tensor,
+    weights: Tensor | None,
+    is_continuous: list[bool],
 ) -> ParameterDistribution:
+    # People who differ in a discrete parameter only are different people.
     theta_cal, place = theta_cal.unique(dim=0, return_inverse=True)
     counts = torch.ones(len(theta_cal), dtype=torch.double, device=theta_cal.device)
     if weights is not None:
         counts = torch.zeros_like(counts).index_add(0, place, weights)
+    theta_cal, theta = theta_cal[:, is_continuous], theta[:, is_continuous]
     u_cal, u = normal_scores(theta_cal, theta), normal_scores(theta, theta)
     end = torch.special.ndtri(1.0 / (SETS_CUT_OFF * counts.sum()).clamp(min=1.0)).abs()
     u_cal = u_cal.clamp(-end, end)

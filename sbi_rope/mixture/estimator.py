@@ -2,7 +2,6 @@
 
 import copy
 import math
-import time
 from collections.abc import Iterator, Sequence
 from itertools import chain
 from typing import Any, cast
@@ -26,7 +25,7 @@ from sbi_rope.mixture.chunks import blocks, flow_batch, keep_freed_memory
 from sbi_rope.mixture.coupled import CoupledEmbeddings
 from sbi_rope.mixture.density import block_log_prob
 from sbi_rope.mixture.parts import DTYPE, OwnEmbeddings, Part
-from sbi_rope.mixture.sampling import Accept, BlockSampler
+from sbi_rope.mixture.sampling import Accept, BlockSampler, deadline_after
 from sbi_rope.mixture.truncation import (
     LEAKAGE_DRAWS,
     Leakage,
@@ -282,8 +281,7 @@ class MixtureEstimator(MixtureDensity):
                 time is over.
             UnseenObservationError: As in :meth:`log_prob`.
         """
-        seconds = math.inf if max_sampling_time is None else max_sampling_time
-        deadline = time.monotonic() + seconds
+        deadline = deadline_after(max_sampling_time)
         x = self.checked_x(condition)
         keep_freed_memory(x.device)
         num_samples = torch.Size(sample_shape).numel()

@@ -12,7 +12,14 @@ from sbi_rope.mixture.block import Block
 from sbi_rope.mixture.chunks import num_fitting
 from sbi_rope.mixture.parts import DTYPE
 
-__all__ = ["Accept", "BlockSampler"]
+__all__ = [
+    "MIN_ACCEPTANCE",
+    "MIN_PROPOSALS",
+    "Accept",
+    "BlockSampler",
+    "check_time",
+    "deadline_after",
+]
 
 # An observation is slow if, after MIN_PROPOSALS proposals, less than a share of
 # MIN_ACCEPTANCE of them lies inside the prior's support. Rejection sampling gives up on
@@ -109,13 +116,7 @@ class BlockSampler:
         still_open = torch.ones(len(slots), dtype=torch.bool, device=slots.device)
         rate = 1.0
         while (open_slots := still_open.nonzero().flatten()).numel():
-            if time.monotonic() > self.deadline:
-                raise SamplingError(
-                    f"Sampling took longer than `max_sampling_time`: {len(open_slots)} "
-                    f"of {len(slots)} draws are missing for the observations from row "
-                    f"{self.first_row} of `x` on. Give it more time, ask for fewer "
-                    "draws, or pass reject_outside_prior=False."
-                )
+            check_time(self.deadline, len(open_slots), len(slots))
             proposals = open_slots.repeat_interleave(_repeats(len(open_slots), rate))
             rows = slots[proposals]
             draws = self._propose(rows)
@@ -162,6 +163,27 @@ class BlockSampler:
                 "z_score_theta='transform_to_unconstrained', or pass "
                 "reject_outside_prior=False."
             )
+
+
+def check_time(deadline: float, missing: int, total: int) -> None:
+    """Raise if draws are missing, and it is too late to go on.
+
+    Args:
+        deadline: In seconds of ``time.monotonic()``.
+        missing: The number of draws that are missing.
+        total: The number of draws that were asked for.
+    """
+    if missing and time.monotonic() > deadline:
+        raise SamplingError(
+            f"Sampling took longer than `max_sampling_time`: {missing} of {total} "
+            "draws that were made together are missing. Give it more time, ask for "
+            "fewer draws, or pass reject_outside_prior=False."
+        )
+
+
+def deadline_after(seconds: float | None) -> float:
+    """Return when so many seconds are over, by ``time.monotonic()``; None for never."""
+    return math.inf if seconds is None else time.monotonic() + seconds
 
 
 def _repeats(num_open: int, rate: float) -> int:

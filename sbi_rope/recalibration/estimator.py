@@ -10,7 +10,13 @@ from sbi_rope._random import seeded
 from sbi_rope.errors import SamplingError, UnsupportedPosteriorError
 from sbi_rope.mixture import MixtureEstimator
 from sbi_rope.mixture.parts import Part
-from sbi_rope.mixture.sampling import Accept
+from sbi_rope.mixture.sampling import (
+    MIN_ACCEPTANCE,
+    MIN_PROPOSALS,
+    Accept,
+    check_time,
+    deadline_after,
+)
 from sbi_rope.mixture.truncation import LEAKAGE_DRAWS, Leakage
 from sbi_rope.recalibration.spread import Spread
 
@@ -19,8 +25,8 @@ __all__ = ["RecalibratedEstimator"]
 # The centre of each observation is the mean of so many draws. With factors near 1 an
 # error of the centre hardly matters.
 NUM_DRAWS = 256
-# So often draws outside a support that is no box are drawn again.
-MAX_ROUNDS = 100
+# At most so many draws are made at a time for those outside a support that is no box.
+MAX_AT_ONCE = 100_000
 
 
 class RecalibratedEstimator(MixtureEstimator):
@@ -118,6 +124,7 @@ class RecalibratedEstimator(MixtureEstimator):
         condition: Tensor,
         *,
         accept: Accept | None = None,
+        max_sampling_time: float | None = None,
         **options: Any,
     ) -> Tensor:
         """Draw from the mixtures of a batch, inside the bounds.
@@ -127,41 +134,70 @@ class RecalibratedEstimator(MixtureEstimator):
             condition: Observations, shape ``(B, *event)``.
             accept: Tells which draws ``(n, d)`` are inside the support; None keeps all
                 inside the bounds.
+            max_sampling_time: Seconds after which rejection gives up; never if None.
             **options: As in :meth:`MixtureEstimator.sample`.
 
         Returns:
             Shape ``(*sample_shape, B, d)``.
 
         Raises:
-            SamplingError: If hardly any draw is accepted for some observation.
+            SamplingError: If hardly any draw is accepted for some observation, or the
+                time is over.
             UnseenObservationError: As in :meth:`MixtureEstimator.log_prob`.
         """
+        deadline = deadline_after(max_sampling_time)
+        options["max_sampling_time"] = max_sampling_time
         x, count = self.checked_x(condition), torch.Size(sample_shape).numel()
         spread = self.spread(x)
         theta = self._moved(count, x, spread, **options)
         if accept is not None and not self.is_box:
-            self._refill(theta, x, spread, accept)
+            options["show_progress_bars"] = False
+            self._refill(theta, x, spread, accept, deadline=deadline, **options)
         return theta.reshape(*sample_shape, *theta.shape[1:])
 
     def _moved(self, count: int, x: Tensor, spread: Spread, **options: Any) -> Tensor:
         draws = super().sample(torch.Size((count,)), x, accept=self._inside, **options)
         return spread.forward(draws)
 
-    def _refill(self, theta: Tensor, x: Tensor, spread: Spread, accept: Accept) -> None:
+    def _refill(
+        self,
+        theta: Tensor,
+        x: Tensor,
+        spread: Spread,
+        accept: Accept,
+        *,
+        deadline: float,
+        **options: Any,
+    ) -> None:
         """Draw those ``(S, B, d)`` again that a support which is no box leaves out."""
-        for _ in range(MAX_ROUNDS):
-            outside = ~accept(theta.flatten(0, 1)).reshape(theta.shape[:2])
-            counts = outside.sum(dim=0)
-            rows = counts.nonzero().flatten()
-            if not len(rows):
-                return
-            fresh = self._moved(int(counts.max()), x[rows], spread.of_rows(rows))
-            for column, row in enumerate(rows):
-                theta[outside[:, row], row] = fresh[: counts[row], column]
-        raise SamplingError(
-            "Hardly any draw of the recalibrated mixture lies inside the support of "
-            "the prior. Leave `recalibrate` out, or pass reject_outside_prior=False."
-        )
+        outside = ~accept(theta.flatten(0, 1)).reshape(theta.shape[:2])
+        missing = outside.sum(dim=0)
+        proposed = torch.full_like(missing, len(theta))
+        accepted = proposed - missing
+        while missing.any():
+            check_time(deadline, int(missing.sum()), outside.numel())
+            rows = missing.nonzero().flatten()
+            share = (accepted / proposed)[rows]
+            hopeless = (proposed[rows] >= MIN_PROPOSALS) & (share < MIN_ACCEPTANCE)
+            if hopeless.any():
+                raise SamplingError(
+                    f"Less than one in {int(1 / MIN_ACCEPTANCE)} draws of the "
+                    "recalibrated mixture lies inside the support of the prior for "
+                    f"the observations in rows {rows[hopeless][:5].tolist()} of `x`. "
+                    "Leave `recalibrate` out, or pass reject_outside_prior=False."
+                )
+            wanted = int(missing.max() / share.min().clamp(min=MIN_ACCEPTANCE)) + 1
+            wanted = min(wanted, max(1, MAX_AT_ONCE // len(rows)))
+            fresh = self._moved(wanted, x[rows], spread.of_rows(rows), **options)
+            kept = accept(fresh.flatten(0, 1)).reshape(fresh.shape[:2])
+            proposed[rows] += wanted
+            accepted[rows] += kept.sum(dim=0)
+            for column, row in enumerate(rows.tolist()):
+                draws = fresh[kept[:, column], column]
+                slots = outside[:, row].nonzero().flatten()[: len(draws)]
+                theta[slots, row] = draws[: len(slots)]
+                outside[slots, row] = False
+            missing = outside.sum(dim=0)
 
     def mass(
         self,

@@ -17,7 +17,7 @@ from torch.distributions import Exponential, Independent
 from sbi_rope import MixturePosterior
 from sbi_rope._bounds import Bounds, bounds_of_prior, to_line
 from sbi_rope._means import Counts
-from sbi_rope.errors import UnsupportedPosteriorError
+from sbi_rope.errors import SamplingError, UnsupportedPosteriorError
 from sbi_rope.mixture import MixtureEstimator, OwnEmbeddings, Part, average
 from sbi_rope.recalibration import Recalibration
 from sbi_rope.recalibration.estimator import RecalibratedEstimator
@@ -326,6 +326,28 @@ def test_in_a_triangle_the_density_has_mass_one_and_is_that_of_the_draws(
     both = posterior.sample_batched((20,), torch.cat([x, x]), show_progress_bars=False)
     assert both.shape == (20, 2, 2)
     assert (both[..., 0] >= both[..., 1]).all()
+
+
+def test_rare_draws_in_a_triangle_are_found_in_the_time_that_they_are_given() -> None:
+    triangle = UniformTriangle(torch.tensor(1.0))
+    estimator = RecalibratedEstimator(
+        gaussians(), torch.full((2,), 1.1), bounds_of_prior(triangle)
+    )
+    posterior = MixturePosterior(estimator, triangle)
+    x = torch.tensor([[0.4, 0.6], [0.6, 0.4], [0.2, 0.8]])
+    x = torch.cat([x, torch.full((3, 2), math.log(0.07))], dim=1)
+    mass = posterior.leakage(x).mass
+    assert float(mass[0]) < 0.05
+    assert float(mass[1]) > 0.9
+    draws = posterior.sample_batched((3000,), x[:2], show_progress_bars=False)
+    assert (draws[..., 0] >= draws[..., 1]).all()
+    # Where hardly any are inside, those that are lie near the edge.
+    assert float((draws[:, 0, 0] - draws[:, 0, 1]).mean()) < 0.1
+    sample = partial(posterior.sample, (3000,), show_progress_bars=False)
+    with pytest.raises(SamplingError, match="`max_sampling_time`"):
+        sample(x=x[:1], max_sampling_time=1e-9)
+    with pytest.raises(SamplingError, match="Less than one in 1000 draws of the recal"):
+        sample(x=x[2:])
 
 
 @pytest.mark.medium
