@@ -150,7 +150,7 @@ def _learn(
         counts = torch.zeros_like(counts).index_add(0, place, weights)
     theta_cal, theta = theta_cal[:, is_continuous], theta[:, is_continuous]
     u_cal, u = normal_scores(theta_cal, theta), normal_scores(theta, theta)
-    end = torch.special.ndtri(1.0 / (SETS_CUT_OFF * counts.sum()).clamp(min=1.0)).abs()
+    end = -torch.special.ndtri(1.0 / (SETS_CUT_OFF * counts.sum().clamp(min=1.0)))
     u_cal = u_cal.clamp(-end, end)
     correlation = torch.atleast_2d(u.T.cov())
     # The small number keeps R positive definite if a parameter is a function of others.
