@@ -14,8 +14,11 @@ MARKER = re.compile(r"<!-- /?results")
 
 def pages_with_blocks(root: Path) -> list[Path]:
     """Return README and the pages of docs of a project, where they have blocks."""
-    # `make docs` copies pages into a folder whose name starts with an underscore.
-    pages = root / "README.md", *sorted((root / "docs").glob("[!_]*/**/*.md"))
+    docs = root / "docs"
+    # `make docs` copies pages into this folder.
+    built = docs / "_build"
+    written = [page for page in docs.rglob("*.md") if built not in page.parents]
+    pages = [root / "README.md", *sorted(written)]
     return [page for page in pages if MARKER.search(page.read_text(encoding="utf-8"))]
 
 

@@ -21,6 +21,8 @@ from benchmarks.stacks import other_trainings
 from benchmarks.table import Table, with_numbers
 
 __all__ = [
+    "CALIBRATED",
+    "MAX_PAIRS",
     "Comparison",
     "compare",
     "draw_evidence",

@@ -6,12 +6,7 @@ from typing import Any
 
 import pandas as pd
 
-from benchmarks.methods import (
-    COUPLED_STACK,
-    GIVEN_PRIOR_STACK,
-    RVNP_STACK,
-    STACK,
-)
+from benchmarks.methods import COUPLED_STACK, GIVEN_PRIOR_STACK, RVNP_STACK, STACK
 from benchmarks.published import Published, entry, mean, num_repetitions, table
 
 __all__ = ["EXCERPTS", "Excerpt"]

@@ -9,7 +9,14 @@ from benchmarks.cells import Cell, data_in_words
 from benchmarks.methods import STACK, STACKS
 from benchmarks.table import Table, markdown
 
-__all__ = ["Comparison", "comparisons", "other_trainings", "stacking_lines"]
+__all__ = [
+    "CALIBRATED",
+    "NEAR",
+    "Comparison",
+    "comparisons",
+    "other_trainings",
+    "stacking_lines",
+]
 
 # On one machine the training of NPE repeats to the digit, so that scores that differ by
 # more are of two trainings.

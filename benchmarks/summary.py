@@ -83,7 +83,6 @@ def write_summary(folder: Path, *, pages: Sequence[Path]) -> Path:
     """
     published = Published.read(folder)
     summary = folder / "README.md"
-
     blocks = _blocks(published, summary)
     # Before the work, because a page without a place is refused.
     for page in pages:

@@ -233,19 +233,18 @@ def test_blocks_are_used_where_there_are_too_many_distances_to_store(
     assert not raw_coupler().couple(real, simulated).blocked
     monkeypatch.setattr("sbi_rope.coupling.coupler.MAX_STORED", 60 * 50 - 1)
     assert raw_coupler().couple(real, simulated).blocked
+
+    def is_blocked(coupler: SinkhornCoupler, *, reused: bool) -> bool:
+        set_up = coupler._set_up(real, simulated, 0, gamma=1.0, tau=1.0, reused=reused)
+        return set_up[0].blocked
+
     stored = raw_coupler(blocked=False)
-    assert not stored._set_up(real, simulated, 0, gamma=1.0, tau=1.0, reused=False)[
-        0
-    ].blocked
+    assert not is_blocked(stored, reused=False)
     pot = raw_coupler(solver="pot")
-    assert not pot._set_up(real, simulated, 0, gamma=1.0, tau=1.0, reused=True)[
-        0
-    ].blocked
+    assert not is_blocked(pot, reused=True)
     # A part may be stored where the whole may not, and its weights not kept.
     part = raw_coupler(num_fitted=59)
-    assert not part._set_up(real, simulated, 0, gamma=1.0, tau=1.0, reused=False)[
-        0
-    ].blocked
+    assert not is_blocked(part, reused=False)
     assert part.couple(real, simulated).blocked
 
 

@@ -206,9 +206,9 @@ def test_discrete_parameters_are_left_out() -> None:
     theta[:, 1] = (torch.arange(n) % 2).float()
     several = learn_parameters(people, theta)
     weights = torch.ones(len(people))
-    merged = learn_parameters(people, theta, weights=weights)
+    weighted = learn_parameters(people, theta, weights=weights)
     assert several.probability_of_prior < 0.05
-    assert merged.probability_of_prior < 1e-6
+    assert weighted.probability_of_prior < 1e-6
     of_counts = learn_parameters(pairs[:, 1:], theta[:, 1:])
     assert of_counts.probability_of_prior == 0.5
     assert of_counts.effective_sample_size == pytest.approx(n)
