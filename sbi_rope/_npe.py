@@ -22,17 +22,12 @@ from sbi_rope._sbi import (
     headless,
     posterior_from,
     readable,
-    reads_missing,
     with_embedding,
 )
-from sbi_rope._validation import (
-    as_numbers_on,
-    check_batch,
-    check_parameter_names,
-    check_readable,
-    check_values,
-)
+from sbi_rope._validation import check_readable
 from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError
+from sbi_rope.settings import names_of
+from sbi_rope.tensors import as_batch, as_numbers
 
 __all__ = ["TrainedNPE"]
 
@@ -61,7 +56,7 @@ class TrainedNPE:
         UnsupportedPosteriorError: If the posterior has no embedding to work with, is
             not in float32, has weights that are not finite, or embeds a row of a batch
             differently among other rows.
-        InvalidTypeError: If the names are not strings.
+        InvalidInputError: If the names are not strings.
         InvalidInputError: If there are not as many names as parameters, or two are
             equal, or the prior has another number of parameters than the estimator.
     """
@@ -92,9 +87,7 @@ class TrainedNPE:
         )
         self.parameter_names: tuple[str, ...] | None = None
         if parameter_names is not None:
-            self.parameter_names = check_parameter_names(
-                parameter_names, self.like.shape[1]
-            )
+            self.parameter_names = names_of(parameter_names, self.like.shape[1])
 
     @property
     def event_shape(self) -> torch.Size:
@@ -160,14 +153,12 @@ class TrainedNPE:
         return readable(self.h, x)
 
     def _checked(self, name: str, value: Any, event_shape: torch.Size) -> Tensor:
-        value = check_batch(
+        value = as_batch(
             name,
-            as_numbers_on(name, value, self.like.device),
+            as_numbers(name, value, device=self.like.device),
             event_shape,
             finite=False,
-            reads_missing=reads_missing(self.h, self.event_shape, self.like.device),
         )
-        check_values(name, value)
         # Numbers that float32 cannot hold become Inf.
         return value.detach().to(self.like.dtype, copy=True)
 

@@ -15,7 +15,6 @@ __all__ = [
     "DataNotFoundError",
     "FileFormatError",
     "InvalidInputError",
-    "InvalidTypeError",
     "LogProbUnavailableError",
     "NotReadyError",
     "NotWritableError",
@@ -44,12 +43,8 @@ class RoPEError(Exception):
     """Base of all errors raised by this package."""
 
 
-class InvalidInputError(RoPEError, ValueError):
-    """An argument has a value, shape, dtype or device that cannot be used."""
-
-
-class InvalidTypeError(RoPEError, TypeError):
-    """An argument has a type that cannot be used."""
+class InvalidInputError(RoPEError, ValueError, TypeError):
+    """An argument has a value, type, shape or device that cannot be used."""
 
 
 class NotReadyError(RoPEError, RuntimeError):

@@ -15,21 +15,14 @@ from sbi_rope._random import seeded
 from sbi_rope._sbi import embed, readable
 from sbi_rope._training import History, best_of_learning_rates, epochs_on_pairs, fit
 from sbi_rope._validation import (
-    LARGEST_SETTING,
-    check_batch,
     check_finite,
-    check_gradients,
     check_groups,
-    check_instance,
-    check_integer,
-    check_not_negative,
     check_pair_weights,
-    check_positive,
     check_readable,
-    check_tensor,
-    check_values,
 )
 from sbi_rope.errors import InvalidInputError
+from sbi_rope.settings import Count, NotNegative, Positive, check
+from sbi_rope.tensors import as_batch, as_numbers
 
 __all__ = ["CalibrationFinetuner", "FinetuneResult", "History"]
 
@@ -125,14 +118,14 @@ class CalibrationFinetuner:
         if not self._learning_rates:
             raise InvalidInputError("Expected at least one `learning_rate`; got ().")
         for rate in self._learning_rates:
-            check_positive("learning_rate", rate, maximum=LARGEST_SETTING)
-        check_integer("max_num_epochs", self.max_num_epochs)
-        check_integer("stop_after_epochs", self.stop_after_epochs)
-        check_integer("simulations_per_target", self.simulations_per_target)
-        check_integer("num_neighbors", self.num_neighbors)
-        check_instance("resample_targets", self.resample_targets, bool)
-        check_not_negative("rehearsal", self.rehearsal)
-        check_positive("validation_fraction", self.validation_fraction)
+            check("learning_rate", rate, Positive)
+        check("max_num_epochs", self.max_num_epochs, Count)
+        check("stop_after_epochs", self.stop_after_epochs, Count)
+        check("simulations_per_target", self.simulations_per_target, Count)
+        check("num_neighbors", self.num_neighbors, Count)
+        check("resample_targets", self.resample_targets, bool)
+        check("rehearsal", self.rehearsal, NotNegative)
+        check("validation_fraction", self.validation_fraction, Positive)
         if self.validation_fraction > 0.5:
             raise InvalidInputError(
                 "Expected `validation_fraction` in (0, 0.5]; got "
@@ -181,8 +174,7 @@ class CalibrationFinetuner:
             InvalidInputError: If shapes do not fit or a value is not finite.
             NotReadyError: In torch's inference mode.
         """
-        check_gradients()
-        check_instance("embedding_net", embedding_net, nn.Module)
+        check("embedding_net", embedding_net, nn.Module)
         x = _checked_inputs("x", x, embedding_net)
         if groups is None:
             groups = torch.arange(len(x))
@@ -314,13 +306,12 @@ def trainable_copy(embedding_net: nn.Module, embeddings: Tensor) -> nn.Module:
 
 def _checked_inputs(name: str, x: Any, net: nn.Module) -> Tensor:
     """Return what a net is to embed, in the dtype of its parameters."""
-    x = check_tensor(name, x)
+    x = as_numbers(name, x)
     if x.ndim < 2:
         raise InvalidInputError(
             f"Expected `{name}` of shape (n, *event); got {tuple(x.shape)}."
         )
-    check_batch(name, x, x.shape[1:], finite=False)
-    check_values(name, x)
+    as_batch(name, x, x.shape[1:], finite=False)
     known = itertools.chain(net.parameters(), net.buffers())
     dtypes = [values.dtype for values in known if values.is_floating_point()]
     x = x.detach().to(dtypes[0] if dtypes else torch.float32)
@@ -341,7 +332,7 @@ def _embedded(name: str, x: Tensor, net: nn.Module) -> Tensor:
 
 def _checked_targets(targets: Tensor, embedded: Tensor) -> Tensor:
     """Return targets that have exactly the shape of the embeddings."""
-    targets = check_tensor("targets", targets)
+    targets = as_numbers("targets", targets)
     if targets.shape != embedded.shape:
         raise InvalidInputError(
             "Expected `targets` with one for each pair, as wide as the embedding, "

@@ -34,21 +34,13 @@ from sbi_rope._standardisation import (
 )
 from sbi_rope._validation import (
     KnownColumns,
-    check_batch,
-    check_choice,
     check_columns,
     check_default_dtype,
-    check_gradients,
-    check_instance,
-    check_integer,
     check_not_swapped,
     check_parameter_order,
     check_row_order,
     check_rows,
-    check_same_length,
     check_simulated_columns,
-    check_tensor,
-    check_unit_interval,
     column_names,
     columns_of,
 )
@@ -63,6 +55,8 @@ from sbi_rope.errors import (
 )
 from sbi_rope.finetuning import CalibrationFinetuner, History
 from sbi_rope.mixture import MixturePosterior
+from sbi_rope.settings import Count, UnitInterval, check
+from sbi_rope.tensors import as_batch, as_numbers, check_same_length
 
 __all__ = ["RoPE"]
 
@@ -138,7 +132,7 @@ class RoPE:
             without a simulator, the names are not as many different ones as there
             are parameters, or they, or the columns of stored simulations, are in
             another order than those that the posterior was trained on.
-        InvalidTypeError: If an argument has the wrong type.
+        InvalidInputError: If an argument has the wrong type.
         NotReadyError: If torch's default dtype is not float32.
         SimulationError: If the simulator raises or returns something unusable.
 
@@ -173,8 +167,8 @@ class RoPE:
         coupler: SinkhornCoupler | None = None,
         parameter_names: Sequence[str] | None = None,
     ) -> None:
-        check_instance("finetuner", finetuner, CalibrationFinetuner, optional=True)
-        check_instance("coupler", coupler, SinkhornCoupler, optional=True)
+        check("finetuner", finetuner, CalibrationFinetuner | None)
+        check("coupler", coupler, SinkhornCoupler | None)
         check_default_dtype()
         simulator = picklable(simulator)
         self._npe = TrainedNPE(posterior, parameter_names)
@@ -257,7 +251,7 @@ class RoPE:
             Itself, so that calls can be chained.
 
         Raises:
-            InvalidTypeError: If an argument does not hold numbers.
+            InvalidInputError: If an argument does not hold numbers.
             InvalidInputError: If shapes, numbers of rows or devices do not fit, a value
                 is not finite, an exact theta is outside the prior's support, no
                 parameters inside it fit a label, or the columns or rows of a table are
@@ -339,8 +333,7 @@ class RoPE:
                 inference mode.
             SimulationError: If the simulator fails at the calibration parameters.
         """
-        check_gradients()
-        check_instance("finetuner", self.finetuner, CalibrationFinetuner)
+        check("finetuner", self.finetuner, CalibrationFinetuner)
         self._check_pairs(
             "Or call `build_posterior(x_o)` without training, which then couples with "
             "the embedding net of NPE (OT-only)."
@@ -387,7 +380,7 @@ class RoPE:
             NotReadyError: If no calibration pairs were appended.
             SimulationError: If the simulator fails, or an embedding is not finite.
         """
-        check_integer("simulations_per_target", simulations_per_target)
+        check("simulations_per_target", simulations_per_target, Count)
         self._check_pairs("Targets are those of pairs.")
         return labelled_targets(
             self._source,
@@ -466,7 +459,7 @@ class RoPE:
         x_o = self.checked_observations(x_o)
         real = self._npe.embed("x_o", x_o, net)
         if num_simulations is not None:
-            check_integer("num_simulations", num_simulations)
+            check("num_simulations", num_simulations, Count)
         gaps = torch.zeros_like(x_o[0], dtype=torch.bool)
 
         def represent(x: Tensor) -> Tensor:
@@ -538,9 +531,9 @@ class RoPE:
             SimulationError: If the simulator fails.
         """
         coupler = self.coupler if coupler is None else coupler
-        check_instance("coupler", coupler, SinkhornCoupler)
-        check_choice("unseen", unseen, ("raise", "extend"))
-        check_unit_interval("tail_mass", tail_mass)
+        check("coupler", coupler, SinkhornCoupler)
+        check("unseen", unseen, Literal["raise", "extend"])
+        check("tail_mass", tail_mass, UnitInterval)
         batch = self.embed(
             x_o,
             num_simulations=num_simulations,
@@ -599,15 +592,15 @@ class RoPE:
             finetuner: Settings of the tuning; those of this object if None.
 
         Raises:
-            InvalidTypeError: If an argument has the wrong type.
+            InvalidInputError: If an argument has the wrong type.
             InvalidInputError: If a row is not the number of a pair, or there are not as
                 many targets as rows.
         """
         check_rows("rows", rows, len(self._x_cal))
-        check_instance("finetuner", finetuner, CalibrationFinetuner, optional=True)
+        check("finetuner", finetuner, CalibrationFinetuner | None)
         if targets is not None:
-            targets = check_tensor("targets", targets)
-            check_batch("targets", targets, targets.shape[1:])
+            targets = as_numbers("targets", targets)
+            as_batch("targets", targets, targets.shape[1:])
             check_same_length("rows", rows, "targets", targets)
             targets = targets.clone()
         part = copy.copy(self)

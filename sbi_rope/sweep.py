@@ -8,16 +8,12 @@ from typing import Literal
 from torch import Tensor
 
 from sbi_rope._standardisation import warn_of_far_entries
-from sbi_rope._validation import (
-    check_choice,
-    check_instance,
-    check_numbers,
-    check_unit_interval,
-)
+from sbi_rope._validation import check_numbers
 from sbi_rope.batch import check_converged
 from sbi_rope.coupling import SinkhornCoupler
 from sbi_rope.mixture import MixturePosterior
-from sbi_rope.rope import HOW_TO_MAKE, RoPE
+from sbi_rope.rope import RoPE
+from sbi_rope.settings import UnitInterval, check
 
 __all__ = ["sweep"]
 
@@ -68,12 +64,12 @@ def sweep(
         CouplingError: When the iteration reaches a coupling that has not converged.
         SimulationError: If the simulator fails.
     """
-    check_instance("rope", rope, RoPE, hint=HOW_TO_MAKE)
+    check("rope", rope, RoPE)
     settings = rope.coupler if coupler is None else coupler
-    check_instance("coupler", settings, SinkhornCoupler)
+    check("coupler", settings, SinkhornCoupler)
     gammas, taus = check_numbers("gammas", gammas), check_numbers("taus", taus)
-    check_choice("unseen", unseen, ("raise", "extend"))
-    check_unit_interval("tail_mass", tail_mass)
+    check("unseen", unseen, Literal["raise", "extend"])
+    check("tail_mass", tail_mass, UnitInterval)
     batch = rope.embed(
         x_o,
         num_simulations=num_simulations,

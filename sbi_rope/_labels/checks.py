@@ -10,15 +10,10 @@ from torch import Tensor
 
 from sbi_rope._bounds import off_bounds
 from sbi_rope._labels.labels import Labels
-from sbi_rope._validation import (
-    as_numbers_on,
-    check_batch,
-    check_in_support,
-    check_pair_weights,
-    check_values,
-    default_names,
-)
-from sbi_rope.errors import InvalidInputError, InvalidTypeError, warn_user
+from sbi_rope._validation import check_pair_weights
+from sbi_rope.errors import InvalidInputError, warn_user
+from sbi_rope.settings import default_names
+from sbi_rope.tensors import as_batch, as_numbers, check_in_support
 
 __all__ = ["checked_labels", "warn_of_ambiguous", "warn_of_labels_on_bounds"]
 
@@ -55,11 +50,11 @@ def checked_labels(
         prior: The prior of NPE.
 
     Raises:
-        InvalidTypeError: If an argument holds no numbers.
+        InvalidInputError: If an argument holds no numbers.
         InvalidInputError: If a shape or a value does not fit.
     """
     dim = like.shape[1]
-    theta = as_numbers_on("theta", theta, like.device)
+    theta = as_numbers("theta", theta, device=like.device)
     is_draws = theta.ndim == 3
     if is_draws and theta.shape[1] < 2:
         raise InvalidInputError(
@@ -73,8 +68,7 @@ def checked_labels(
             "parameter that was not measured."
         )
     event_shape = (theta.shape[1], dim) if is_draws else (dim,)
-    theta = check_batch("theta", theta, event_shape, finite=False)
-    check_values("theta", theta)
+    theta = as_batch("theta", theta, event_shape, finite=False)
     # Numbers that float32 cannot hold become Inf.
     theta = theta.detach().to(like.dtype, copy=True)
     _check_not_infinite("theta", theta)
@@ -88,16 +82,9 @@ def checked_labels(
         )
         # Noise may move a label out of the prior, but an exact one must be inside.
         known = labels.is_measured.all(dim=1) & ~labels.is_noisy.any(dim=1)
-        check_in_support(
-            "theta",
-            theta,
-            prior,
-            rows=known,
-            instead="If the labels are noisy, say how much with `theta_std`. They may "
-            "then be outside.",
-        )
+        check_in_support("theta", theta, prior, rows=known)
     if weights is not None:
-        weights = as_numbers_on("weights", weights, theta.device)
+        weights = as_numbers("weights", weights, device=theta.device)
         weights = check_pair_weights(weights, "theta", theta).detach()
         labels = labels.weighted(weights.to(theta.device, torch.double))
     if groups is not None:
@@ -145,8 +132,7 @@ def _covariance(theta: Tensor, theta_std: Any, theta_cov: Any) -> Tensor:
 
 def _checked_std(theta_std: Any, theta: Tensor) -> Tensor:
     n, dim = theta.shape
-    std = as_numbers_on("theta_std", theta_std, theta.device)
-    check_values("theta_std", std)
+    std = as_numbers("theta_std", theta_std, device=theta.device)
     if tuple(std.shape) not in ((), (dim,), (n, dim)):
         raise InvalidInputError(
             f"Expected `theta_std` as a number, or of shape ({dim},) or ({n}, {dim}); "
@@ -166,8 +152,7 @@ def _checked_std(theta_std: Any, theta: Tensor) -> Tensor:
 
 def _checked_covariance(theta_cov: Any, theta: Tensor) -> Tensor:
     n, dim = theta.shape
-    covariance = as_numbers_on("theta_cov", theta_cov, theta.device)
-    check_values("theta_cov", covariance)
+    covariance = as_numbers("theta_cov", theta_cov, device=theta.device)
     if tuple(covariance.shape) not in ((dim, dim), (n, dim, dim)):
         raise InvalidInputError(
             f"Expected `theta_cov` of shape ({dim}, {dim}) or ({n}, {dim}, {dim}); got "
@@ -215,7 +200,7 @@ def _checked_names(groups: Any, n: int) -> tuple[Hashable, ...]:
     # Tensors and arrays become lists of Python's numbers, which are equal if they are.
     values = groups.tolist() if hasattr(groups, "tolist") else groups
     if isinstance(values, str) or not isinstance(values, Iterable):
-        raise InvalidTypeError(
+        raise InvalidInputError(
             f"Expected `groups` with a number or a name for each pair; got {groups!r}."
         )
     names = tuple(values)
@@ -231,7 +216,7 @@ def _checked_names(groups: Any, n: int) -> tuple[Hashable, ...]:
         )
     for row, name in enumerate(names):
         if not isinstance(name, str | Real):
-            raise InvalidTypeError(
+            raise InvalidInputError(
                 "Expected numbers or names in `groups`; got "
                 f"{type(name).__name__} in row {row}."
             )

@@ -11,19 +11,13 @@ from sbi_rope._random import seeded
 from sbi_rope._simulations.moments import Moments
 from sbi_rope._simulations.source import Embedding, Readable, all_finite
 from sbi_rope._units import divisors
-from sbi_rope._validation import (
-    as_numbers_on,
-    check_batch,
-    check_in_support,
-    check_not_swapped,
-    check_same_length,
-)
+from sbi_rope._validation import check_not_swapped
 from sbi_rope.errors import (
     InvalidInputError,
-    InvalidTypeError,
     SimulationError,
     warn_user,
 )
+from sbi_rope.tensors import as_batch, as_numbers, check_in_support, check_same_length
 
 __all__ = ["StoredSimulations"]
 
@@ -61,16 +55,16 @@ class StoredSimulations:
         from_prior: bool = False,
     ) -> None:
         if not isinstance(simulations, tuple | list) or len(simulations) != 2:
-            raise InvalidTypeError(
+            raise InvalidInputError(
                 "Expected `simulations` to be a pair (theta, x) of tensors; got "
                 f"{type(simulations).__name__}."
             )
         theta, x = simulations
         check_not_swapped(theta, x, theta_shape, event_shape)
-        theta = as_numbers_on("simulations[0]", theta, like.device)
-        x = as_numbers_on("simulations[1]", x, like.device)
-        theta = check_batch("simulations[0]", theta, theta_shape, finite=False)
-        x = check_batch("simulations[1]", x, event_shape, finite=False)
+        theta = as_numbers("simulations[0]", theta, device=like.device)
+        x = as_numbers("simulations[1]", x, device=like.device)
+        theta = as_batch("simulations[0]", theta, theta_shape, finite=False)
+        x = as_batch("simulations[1]", x, event_shape, finite=False)
         check_same_length("simulations[0]", theta, "simulations[1]", x)
         theta, x = theta.detach().to(like), x.detach().to(like)
         valid = torch.isfinite(theta).all(dim=1)

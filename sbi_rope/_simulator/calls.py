@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import as_array
-from sbi_rope.errors import InvalidTypeError, SimulationError, shown
+from sbi_rope.errors import InvalidInputError, SimulationError, shown
+from sbi_rope.tensors import as_array
 
 __all__ = ["Caller", "Failure", "Form", "Simulated", "check_callable", "describe"]
 
@@ -206,7 +206,7 @@ class Caller:
 def check_callable(simulator: Any) -> None:
     """Raise unless a simulator can be called."""
     if not callable(simulator):
-        raise InvalidTypeError(
+        raise InvalidInputError(
             "Expected `simulator` to be callable, from theta (n, d) to x (n, *event) "
             f"or from one theta (d,) to one x (*event); got {type(simulator).__name__}."
         )

@@ -22,8 +22,8 @@ from sbi_rope._simulator.calls import Simulated, check_callable
 from sbi_rope._simulator.failures import Failures, warn_of_few
 from sbi_rope._simulator.probe import Probe
 from sbi_rope._simulator.workers import ParallelSimulator, simulate_in_workers
-from sbi_rope._validation import check_integer
 from sbi_rope.errors import InvalidInputError, SimulationError, in_digits
+from sbi_rope.settings import Count, check
 
 __all__ = ["Simulator", "source_of"]
 
@@ -354,7 +354,7 @@ def source_of(
             "simulations from the prior."
         )
     if num_simulations is not None:
-        check_integer("num_simulations", num_simulations)
+        check("num_simulations", num_simulations, Count)
     if simulations is not None:
         if num_simulations is not None:
             raise InvalidInputError(

@@ -5,7 +5,7 @@ import pickle
 import traceback
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
@@ -19,8 +19,8 @@ from sbi_rope._simulator.calls import (
     check_callable,
     describe,
 )
-from sbi_rope._validation import check_integer
 from sbi_rope.errors import SimulationError
+from sbi_rope.settings import Range, check
 
 __all__ = [
     "ParallelSimulator",
@@ -82,7 +82,7 @@ def parallel(
             one.
 
     Raises:
-        InvalidTypeError: If the simulator is not callable.
+        InvalidInputError: If the simulator is not callable.
         InvalidInputError: If the number of workers is not a positive integer.
 
     Example:
@@ -93,7 +93,7 @@ def parallel(
         4
     """
     check_callable(simulator)
-    check_integer("num_workers", num_workers, maximum=1000)
+    check("num_workers", num_workers, Annotated[int, Range(1, 1000)])
     return ParallelSimulator(simulator, int(num_workers))
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from sbi_rope._validation.tensors import DTYPES, check_tensor, check_values
-from sbi_rope.errors import InvalidInputError, InvalidTypeError, NotReadyError, shown
+from sbi_rope.errors import InvalidInputError, NotReadyError, shown
 
 __all__ = [
     "LARGEST_SETTING",
@@ -57,7 +57,7 @@ def check_instance(
         hint: A sentence that says how to make such an instance.
     """
     if not isinstance(value, expected) and not (optional and value is None):
-        raise InvalidTypeError(
+        raise InvalidInputError(
             f"Expected `{name}` to be a {expected.__name__}; got "
             f"{type(value).__name__}.{hint and ' '}{hint}"
         )
@@ -66,7 +66,7 @@ def check_instance(
 def check_mapping(name: str, value: Any, *, like: str) -> None:
     """Raise unless ``value`` is a dictionary with at least one entry."""
     if not isinstance(value, Mapping):
-        raise InvalidTypeError(
+        raise InvalidInputError(
             f"Expected `{name}` to be a dictionary of {like} by name; got "
             f"{type(value).__name__}."
         )
@@ -85,7 +85,7 @@ def check_names(name: str, value: Any, count: int | None = None) -> list[str]:
     except TypeError:
         names = None
     if names is None or not all(isinstance(entry, str) for entry in names):
-        raise InvalidTypeError(
+        raise InvalidInputError(
             f"Expected `{name}` to be a list of strings; got {shown(value)}."
         )
     if count is not None and len(names) != count:
@@ -122,7 +122,7 @@ def check_path(name: str, value: Any, *, optional: bool = False) -> Path | None:
         return None
     if not isinstance(value, str | Path):
         alternative = " or None" if optional else ""
-        raise InvalidTypeError(
+        raise InvalidInputError(
             f"Expected `{name}` to be a path{alternative}; got {type(value).__name__}."
         )
     if "\0" in str(value):
@@ -248,7 +248,7 @@ def as_shape(name: str, value: Any) -> torch.Size:
     try:
         shape = torch.Size(value)
     except TypeError as error:
-        raise InvalidTypeError(
+        raise InvalidInputError(
             f"Expected `{name}` to be a tuple of integers, such as (1000,); got "
             f"{value!r}."
         ) from error
@@ -326,6 +326,6 @@ def _as_double(name: str, value: Any, count: int) -> Tensor:
             return torch.as_tensor(value, dtype=torch.double).detach()
     except (TypeError, ValueError, RuntimeError, OverflowError):
         pass  # torch raises these for whatever is no array of numbers
-    raise InvalidTypeError(
+    raise InvalidInputError(
         f"Expected `{name}` to be {count} real numbers; got {shown(value)}."
     )

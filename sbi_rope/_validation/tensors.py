@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_rope._validation.shapes import shape_hint
-from sbi_rope.errors import InvalidInputError, InvalidTypeError
+from sbi_rope.errors import InvalidInputError
 
 __all__ = [
     "DTYPES",
@@ -49,20 +49,20 @@ def check_tensor(name: str, value: Any) -> Tensor:
     """Return ``value`` if it is a dense tensor of real numbers.
 
     Raises:
-        InvalidTypeError: If it is not. The message says how to convert it.
+        InvalidInputError: If it is not. The message says how to convert it.
     """
     if not isinstance(value, Tensor):
-        raise InvalidTypeError(
+        raise InvalidInputError(
             f"Expected `{name}` to be a torch.Tensor; got {type(value).__name__}. "
             f"Convert it with `torch.as_tensor({name}, dtype=torch.float32)`."
         )
     if value.dtype not in DTYPES:
-        raise InvalidTypeError(
+        raise InvalidInputError(
             f"Expected `{name}` to hold real numbers; got dtype {value.dtype}."
         )
     if value.layout != torch.strided or value.is_nested:
         layout = "a nested tensor" if value.is_nested else f"layout {value.layout}"
-        raise InvalidTypeError(
+        raise InvalidInputError(
             f"Expected `{name}` to be a dense tensor; got {layout}. Convert a sparse "
             f"one with `{name}.to_dense()`."
         )
@@ -76,16 +76,16 @@ def as_numbers(name: str, value: Any) -> Tensor:
     becomes NaN.
 
     Raises:
-        InvalidTypeError: If it holds no real numbers, or its rows differ in length.
+        InvalidInputError: If it holds no real numbers, or its rows differ in length.
     """
     if isinstance(value, Tensor):
         return check_tensor(name, value)
     try:
         array = as_array(value)
     except (TypeError, ValueError, RuntimeError) as error:
-        raise InvalidTypeError(_no_numbers(name, value)) from error
+        raise InvalidInputError(_no_numbers(name, value)) from error
     if array.dtype.kind not in "iuf":
-        raise InvalidTypeError(_no_numbers(name, value))
+        raise InvalidInputError(_no_numbers(name, value))
     return torch.from_numpy(array.astype(np.float64))
 
 
@@ -110,7 +110,7 @@ def as_numbers_on(name: str, value: Any, device: torch.device) -> Tensor:
     Lists and arrays, which have no device of their own, are moved there.
 
     Raises:
-        InvalidTypeError: As :func:`as_numbers`.
+        InvalidInputError: As :func:`as_numbers`.
         InvalidInputError: If it is a tensor on another device.
     """
     numbers = as_numbers(name, value)
@@ -222,7 +222,7 @@ def check_batch(
         reads_missing: Whether missing trials (NaN) can be read, for a hint.
 
     Raises:
-        InvalidTypeError: If it is no tensor of real numbers.
+        InvalidInputError: If it is no tensor of real numbers.
         InvalidInputError: If the shape does not fit, an event holds no number, or an
             entry is not finite.
     """
@@ -351,7 +351,7 @@ def check_theta(theta: Any, event_shape: torch.Size, *, batched: bool) -> Tensor
 def check_prior(prior: Any) -> None:
     """Raise unless the prior is a torch distribution over vectors."""
     if not isinstance(prior, Distribution):
-        raise InvalidTypeError(
+        raise InvalidInputError(
             f"Expected `prior` to be a torch distribution; got "
             f"{type(prior).__name__}. Wrap it with "
             f"`sbi.utils.process_prior(prior)[0]`."

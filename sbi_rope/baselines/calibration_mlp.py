@@ -11,9 +11,9 @@ from sbi_rope._random import seeded
 from sbi_rope._sbi import ConditionalDensityEstimator, direct_posterior, embedding_of
 from sbi_rope._standardisation import leave_out_constants
 from sbi_rope._training import History
-from sbi_rope._validation import check_instance
 from sbi_rope.baselines.networks import embedding_with_head
 from sbi_rope.errors import InvalidInputError
+from sbi_rope.settings import check
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.training import (
     EstimatorBuilder,
@@ -173,7 +173,7 @@ class CalibrationMLP(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidTypeError: If an argument has the wrong type.
+        InvalidInputError: If an argument has the wrong type.
         InvalidInputError: If sbi knows no estimator of that name; in ``train``, if
             there is one pair only.
     """
@@ -188,7 +188,7 @@ class CalibrationMLP(Method):
         training: Training | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
-        check_instance("training", training, Training, optional=True)
+        check("training", training, Training | None)
         super().__init__(prior, device=device)
         self._build = estimator_builder(density_estimator)
         self.training = DEFAULT_TRAINING if training is None else training

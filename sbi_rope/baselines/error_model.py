@@ -10,14 +10,9 @@ import torch
 from torch import Tensor
 
 from sbi_rope._sbi import SliceSamplerVectorized
-from sbi_rope._validation import (
-    check_not_nan,
-    check_positive,
-    check_tensor,
-    check_unit_interval,
-    check_values,
-)
-from sbi_rope.errors import InvalidTypeError
+from sbi_rope._validation import check_not_nan
+from sbi_rope.errors import InvalidInputError
+from sbi_rope.settings import Positive, UnitInterval, check
 
 __all__ = ["ChainSettings", "SpikeAndSlab", "denoise", "split_r_hat"]
 
@@ -66,16 +61,16 @@ class SpikeAndSlab:
 
     def __post_init__(self) -> None:
         """Check the ranges of all fields."""
-        check_positive("spike_std", self.spike_std)
-        check_positive("slab_scale", self.slab_scale)
-        check_unit_interval("slab_probability", self.slab_probability)
-        check_positive("bound", self.bound)
+        check("spike_std", self.spike_std, Positive)
+        check("slab_scale", self.slab_scale, Positive)
+        check("slab_probability", self.slab_probability, UnitInterval)
+        check("bound", self.bound, Positive)
 
     def sample_like(self, x: Tensor) -> Tensor:
         """Draw noise of the shape, dtype and device of a tensor.
 
         Raises:
-            InvalidTypeError: If it is no tensor of floating-point numbers.
+            InvalidInputError: If it is no tensor of floating-point numbers.
         """
         _check_floating("x", x)
         spike = self.spike_std * torch.randn_like(x)
@@ -87,7 +82,7 @@ class SpikeAndSlab:
         """Return the log density of every entry of y - s, without the bound.
 
         Raises:
-            InvalidTypeError: If it is no tensor of floating-point numbers.
+            InvalidInputError: If it is no tensor of floating-point numbers.
             InvalidInputError: If an entry is NaN.
         """
         _check_floating("noise", noise)
@@ -101,9 +96,8 @@ class SpikeAndSlab:
 
 
 def _check_floating(name: str, value: Any) -> None:
-    check_values(name, check_tensor(name, value))
     if not value.is_floating_point():
-        raise InvalidTypeError(
+        raise InvalidInputError(
             f"Expected `{name}` to hold floating-point numbers; got {value.dtype}. "
             "Convert it with `.float()`."
         )

@@ -12,7 +12,6 @@ from sbi_rope._sbi import copy_of_prior, embed
 from sbi_rope._simulations import draw_targets
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._training import History, epochs_on_pairs, shuffled
-from sbi_rope._validation import check_instance, check_integer, check_positive
 from sbi_rope.baselines.statistics import frozen_statistics
 from sbi_rope.finetuning import trainable_copy
 from sbi_rope.mixture import (
@@ -23,6 +22,7 @@ from sbi_rope.mixture import (
     Part,
     Rows,
 )
+from sbi_rope.settings import Count, Positive, check
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
 from sbi_rope.trainers.training import (
@@ -109,7 +109,7 @@ class FRISBI(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidTypeError: If an argument has the wrong type.
+        InvalidInputError: If an argument has the wrong type.
         InvalidInputError: If sbi knows no estimator of that name, or an argument is
             outside its range.
         UnsupportedPosteriorError: In ``train``, if the estimator has no density.
@@ -151,12 +151,12 @@ class FRISBI(Method):
         training: Training | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
-        check_positive("gamma", gamma)
-        check_integer("num_simulations", num_simulations)
-        check_integer("simulations_per_target", simulations_per_target)
-        check_instance("distilled", distilled, bool)
-        check_integer("num_draws", num_draws)
-        check_instance("training", training, Training, optional=True)
+        check("gamma", gamma, Positive)
+        check("num_simulations", num_simulations, Count)
+        check("simulations_per_target", simulations_per_target, Count)
+        check("distilled", distilled, bool)
+        check("num_draws", num_draws, Count)
+        check("training", training, Training | None)
         npe = StartingNPE(density_estimator, npe_training)
         super().__init__(prior, npe=npe, simulator=simulator, device=device)
         self.gamma = gamma

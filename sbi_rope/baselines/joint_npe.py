@@ -10,8 +10,8 @@ from sbi_rope._groups import split_pairs, too_few_pairs
 from sbi_rope._sbi import direct_posterior, embedding_of
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._training import History
-from sbi_rope._validation import check_instance
 from sbi_rope.errors import warn_user
+from sbi_rope.settings import check
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.training import (
     EstimatorBuilder,
@@ -59,7 +59,7 @@ class JointNPE(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidTypeError: If an argument has the wrong type.
+        InvalidInputError: If an argument has the wrong type.
         InvalidInputError: If sbi knows no estimator of that name.
 
     Example:
@@ -84,7 +84,7 @@ class JointNPE(Method):
         training: Training | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
-        check_instance("training", training, Training, optional=True)
+        check("training", training, Training | None)
         super().__init__(prior, device=device)
         self._build = estimator_builder(density_estimator)
         self.training = DEFAULT_TRAINING if training is None else training

@@ -1,7 +1,7 @@
 """Noisy neural posterior estimation: NPE trained on statistics with errors."""
 
 import copy
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -12,7 +12,6 @@ from sbi_rope._sbi import (
     posterior_from,
 )
 from sbi_rope._training import History
-from sbi_rope._validation import check_choice, check_instance
 from sbi_rope.baselines.error_model import SpikeAndSlab
 from sbi_rope.baselines.statistics import (
     NoiseOn,
@@ -20,6 +19,7 @@ from sbi_rope.baselines.statistics import (
     split_at_statistics,
     with_clip,
 )
+from sbi_rope.settings import check
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
 from sbi_rope.trainers.training import (
@@ -76,7 +76,7 @@ class NNPE(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidTypeError: If an argument has the wrong type.
+        InvalidInputError: If an argument has the wrong type.
         InvalidInputError: If sbi knows no estimator of that name, or ``noise_on`` is
             neither of the two.
         UnsupportedPosteriorError: In ``train``, if the estimator has no density.
@@ -108,9 +108,9 @@ class NNPE(Method):
         training: Training | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
-        check_choice("noise_on", noise_on, ("embedding", "input"))
-        check_instance("error_model", error_model, SpikeAndSlab, optional=True)
-        check_instance("training", training, Training, optional=True)
+        check("noise_on", noise_on, Literal["embedding", "input"])
+        check("error_model", error_model, SpikeAndSlab | None)
+        check("training", training, Training | None)
         npe = StartingNPE(density_estimator, npe_training)
         super().__init__(prior, npe=npe, device=device)
         self.noise_on: NoiseOn = noise_on

@@ -42,7 +42,7 @@ class PlainNPE(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidTypeError: If an argument has the wrong type.
+        InvalidInputError: If an argument has the wrong type.
         InvalidInputError: If sbi knows no estimator of that name.
 
     Example:
@@ -98,7 +98,7 @@ class ReferenceNPE(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidTypeError: If an argument has the wrong type.
+        InvalidInputError: If an argument has the wrong type.
         InvalidInputError: If sbi knows no estimator of that name.
     """
 

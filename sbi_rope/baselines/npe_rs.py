@@ -7,8 +7,8 @@ from torch import Tensor
 
 from sbi_rope._sbi import direct_posterior, embedding_of
 from sbi_rope._training import History
-from sbi_rope._validation import check_instance, check_integer, check_not_negative
 from sbi_rope.errors import warn_user
+from sbi_rope.settings import Count, NotNegative, check
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.training import (
     EstimatorBuilder,
@@ -117,7 +117,7 @@ class NPERS(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidTypeError: If an argument has the wrong type.
+        InvalidInputError: If an argument has the wrong type.
         InvalidInputError: If sbi knows no estimator of that name, or a number is
             outside its range.
         UnsupportedPosteriorError: In ``train``, if the embedding cannot be separated
@@ -150,10 +150,10 @@ class NPERS(Method):
         training: Training | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
-        check_not_negative("regularisation", regularisation)
-        check_integer("num_mmd_simulations", num_mmd_simulations)
-        check_integer("num_mmd_observations", num_mmd_observations)
-        check_instance("training", training, Training, optional=True)
+        check("regularisation", regularisation, NotNegative)
+        check("num_mmd_simulations", num_mmd_simulations, Count)
+        check("num_mmd_observations", num_mmd_observations, Count)
+        check("training", training, Training | None)
         super().__init__(prior, device=device)
         self._build = estimator_builder(density_estimator)
         self.regularisation = regularisation

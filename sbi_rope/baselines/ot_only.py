@@ -5,11 +5,11 @@ from typing import Any
 
 import torch
 
-from sbi_rope._validation import check_instance, check_integer
 from sbi_rope.coupling import SinkhornCoupler
 from sbi_rope.errors import NotReadyError
 from sbi_rope.mixture import MixturePosterior
 from sbi_rope.rope import RoPE
+from sbi_rope.settings import Count, check
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
 from sbi_rope.trainers.training import EstimatorBuilder, Training
@@ -45,7 +45,7 @@ class OTOnly(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidTypeError: If an argument has the wrong type.
+        InvalidInputError: If an argument has the wrong type.
         InvalidInputError: If sbi knows no estimator of that name.
         CouplingError: In ``train``, if the transport has not converged.
     """
@@ -65,9 +65,9 @@ class OTOnly(Method):
         npe_training: Training | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
-        check_instance("coupler", coupler, SinkhornCoupler, optional=True)
+        check("coupler", coupler, SinkhornCoupler | None)
         if num_simulations is not None:
-            check_integer("num_simulations", num_simulations)
+            check("num_simulations", num_simulations, Count)
         npe = StartingNPE(density_estimator, npe_training)
         super().__init__(prior, npe=npe, simulator=simulator, device=device)
         self.coupler = coupler

@@ -22,7 +22,7 @@ class PriorBaseline(Method):
         device: Where the prior lives.
 
     Raises:
-        InvalidTypeError: If the prior is not a torch distribution.
+        InvalidInputError: If the prior is not a torch distribution.
 
     Example:
         >>> import torch

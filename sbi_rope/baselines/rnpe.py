@@ -1,6 +1,6 @@
 """Robust neural posterior estimation: denoise the statistics, then condition."""
 
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -9,12 +9,6 @@ from sbi_rope._random import seeded
 from sbi_rope._sbi import direct_posterior, embed, estimator_of
 from sbi_rope._standardisation import Standardisation
 from sbi_rope._training import History
-from sbi_rope._validation import (
-    check_batch,
-    check_choice,
-    check_instance,
-    check_integer,
-)
 from sbi_rope.baselines.error_model import ChainSettings, SpikeAndSlab, denoise
 from sbi_rope.baselines.statistics import (
     NoiseOn,
@@ -24,6 +18,8 @@ from sbi_rope.baselines.statistics import (
 )
 from sbi_rope.errors import warn_user
 from sbi_rope.mixture import Mixing, MixtureEstimator, Part, Rows, equal_rows
+from sbi_rope.settings import Count, Range, check
+from sbi_rope.tensors import as_batch
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
 from sbi_rope.trainers.training import EstimatorBuilder, Training
@@ -92,7 +88,7 @@ class DenoisedEmbeddings(Mixing):
         return torch.stack([r_hat for _, r_hat in self._lookup(x)]).to(self.starts)
 
     def _lookup(self, x: Tensor) -> list[tuple[Tensor, Tensor]]:
-        x = check_batch("x", x, self.event_shape).to(self.starts)
+        x = as_batch("x", x, self.event_shape).to(self.starts)
         keys = [row.tobytes() for row in (x.detach().cpu() + 0.0).numpy()]
         # Equal observations are denoised once.
         new = {key: i for i, key in enumerate(keys) if key not in self._denoised}
@@ -172,7 +168,7 @@ class RNPE(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidTypeError: If an argument has the wrong type.
+        InvalidInputError: If an argument has the wrong type.
         InvalidInputError: If sbi knows no estimator of that name, an option is outside
             its range, or, in ``train``, no statistic varies.
         UnsupportedPosteriorError: In ``train``, if the estimator has no density.
@@ -197,14 +193,14 @@ class RNPE(Method):
         training: Training | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
-        check_choice("noise_on", noise_on, ("embedding", "input"))
-        check_instance("error_model", error_model, SpikeAndSlab, optional=True)
-        check_instance("training", training, Training, optional=True)
-        check_integer("num_chains", num_chains, minimum=2)
+        check("noise_on", noise_on, Literal["embedding", "input"])
+        check("error_model", error_model, SpikeAndSlab | None)
+        check("training", training, Training | None)
+        check("num_chains", num_chains, Annotated[int, Range(2)])
         # Halves of chains need two draws for a variance.
-        check_integer("num_denoised", num_denoised, minimum=4 * num_chains)
-        check_integer("warmup", warmup)
-        check_integer("thin", thin)
+        check("num_denoised", num_denoised, Annotated[int, Range(4 * num_chains)])
+        check("warmup", warmup, Count)
+        check("thin", thin, Count)
         npe = StartingNPE(density_estimator, npe_training)
         super().__init__(prior, npe=npe, device=device)
         self.noise_on: NoiseOn = noise_on

@@ -6,9 +6,9 @@ from typing import Any
 import torch
 
 from sbi_rope._training import History
-from sbi_rope._validation import check_instance
 from sbi_rope.finetuning import CalibrationFinetuner
 from sbi_rope.rope import RoPE
+from sbi_rope.settings import check
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
 from sbi_rope.trainers.training import EstimatorBuilder, Training
@@ -43,7 +43,7 @@ class TuningOnly(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidTypeError: If an argument has the wrong type.
+        InvalidInputError: If an argument has the wrong type.
         InvalidInputError: If sbi knows no estimator of that name.
     """
 
@@ -61,7 +61,7 @@ class TuningOnly(Method):
         npe_training: Training | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
-        check_instance("finetuner", finetuner, CalibrationFinetuner, optional=True)
+        check("finetuner", finetuner, CalibrationFinetuner | None)
         npe = StartingNPE(density_estimator, npe_training)
         super().__init__(prior, npe=npe, simulator=simulator, device=device)
         self.finetuner = finetuner

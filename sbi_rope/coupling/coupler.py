@@ -10,13 +10,7 @@ import torch
 from torch import Tensor
 
 from sbi_rope._random import seeded
-from sbi_rope._validation import (
-    check_choice,
-    check_integer,
-    check_numbers,
-    check_positive,
-    check_unit_interval,
-)
+from sbi_rope._validation import check_numbers
 from sbi_rope.coupling.cost import widest
 from sbi_rope.coupling.fixed_point import Solution, solve_fixed_point
 from sbi_rope.coupling.kernel import marginal_error
@@ -25,6 +19,7 @@ from sbi_rope.coupling.problem import Problem, checked_embeddings, median_distan
 from sbi_rope.coupling.result import Coupling
 from sbi_rope.coupling.warm_start import warm_start
 from sbi_rope.errors import InvalidInputError, warn_user, without_warning
+from sbi_rope.settings import Count, Positive, UnitInterval, Whole, check, one_of
 
 __all__ = ["SMALL_BATCH", "SinkhornCoupler", "without_warning_of_small_batch"]
 
@@ -119,17 +114,17 @@ class SinkhornCoupler:
 
     def __post_init__(self) -> None:
         """Check the ranges of all fields."""
-        check_positive("gamma", self.gamma)
-        check_unit_interval("tau", self.tau)
-        check_choice("cost_scale", self.cost_scale, ("none", "simulated"))
-        check_choice("solver", self.solver, ("own", "pot"))
-        check_positive("tolerance", self.tolerance)
-        check_integer("max_iterations", self.max_iterations)
-        check_choice("dtype", self.dtype, (torch.float64, torch.float32))
-        check_choice("blocked", self.blocked, (None, True, False))
+        check("gamma", self.gamma, Positive)
+        check("tau", self.tau, UnitInterval)
+        check("cost_scale", self.cost_scale, Literal["none", "simulated"])
+        check("solver", self.solver, Literal["own", "pot"])
+        check("tolerance", self.tolerance, Positive)
+        check("max_iterations", self.max_iterations, Count)
+        check("dtype", self.dtype, one_of((torch.float64, torch.float32)))
+        check("blocked", self.blocked, one_of((None, True, False)))
         if self.num_fitted is not None:
-            check_integer("num_fitted", self.num_fitted)
-        check_integer("anderson_memory", self.anderson_memory, minimum=0)
+            check("num_fitted", self.num_fitted, Count)
+        check("anderson_memory", self.anderson_memory, Whole)
         if self.solver == "pot" and self.blocked:
             raise InvalidInputError(
                 "Expected `blocked` to be None or False with solver='pot', which needs "

@@ -3,10 +3,10 @@
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import check_batch, check_tensor
 from sbi_rope.coupling.cost import Cost, Distances, widest
 from sbi_rope.coupling.kernel import Kernel
 from sbi_rope.errors import CouplingError, InvalidInputError
+from sbi_rope.tensors import as_batch, as_numbers
 
 __all__ = ["Problem", "checked_embeddings", "median_distance"]
 
@@ -153,12 +153,12 @@ def checked_embeddings(real: Tensor, simulated: Tensor) -> tuple[Tensor, Tensor]
     """Check two sets of embeddings.
 
     Raises:
-        InvalidTypeError: If one is not a tensor of numbers.
+        InvalidInputError: If one is not a tensor of numbers.
         InvalidInputError: If shapes or devices do not fit, a set is empty, or a value
             is not finite.
     """
-    real = check_tensor("real", real)
-    simulated = check_tensor("simulated", simulated)
+    real = as_numbers("real", real)
+    simulated = as_numbers("simulated", simulated)
     if real.device != simulated.device:
         raise InvalidInputError(
             "Expected `real` and `simulated` on the same device; got "
@@ -168,8 +168,8 @@ def checked_embeddings(real: Tensor, simulated: Tensor) -> tuple[Tensor, Tensor]
         raise InvalidInputError(
             f"Expected `simulated` of shape (n_s, l); got {tuple(simulated.shape)}."
         )
-    simulated = check_batch("simulated", simulated, simulated.shape[1:])
-    real = check_batch("real", real, simulated.shape[1:])
+    simulated = as_batch("simulated", simulated, simulated.shape[1:])
+    real = as_batch("real", real, simulated.shape[1:])
     return real.detach(), simulated.detach()
 
 

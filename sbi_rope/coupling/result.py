@@ -7,9 +7,10 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import check_batch, check_rows, usable_device
+from sbi_rope._validation import check_rows, usable_device
 from sbi_rope.coupling.cost import Distances, row_blocks
 from sbi_rope.errors import InvalidInputError
+from sbi_rope.tensors import as_batch
 
 __all__ = ["Coupling"]
 
@@ -104,7 +105,7 @@ class Coupling:
         Raises:
             InvalidInputError: If the shape does not fit, or a value is not finite.
         """
-        real = check_batch("real", real, self.simulated.shape[1:])
+        real = as_batch("real", real, self.simulated.shape[1:])
         return self._distances(real.to(self.simulated))
 
     def rows(self, real: Tensor, *, distances: Tensor | None = None) -> Tensor:
@@ -126,7 +127,7 @@ class Coupling:
             InvalidInputError: If the shape does not fit, a value is not finite, or an
                 observation is so far away that its distances cannot be told apart.
         """
-        real = check_batch("real", real, self.simulated.shape[1:]).to(self.simulated)
+        real = as_batch("real", real, self.simulated.shape[1:]).to(self.simulated)
         if distances is None:
             farthest = self._distances.bound(real)
         else:

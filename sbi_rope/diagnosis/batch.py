@@ -1,6 +1,7 @@
 """Diagnose a batch: run all tests and collect their findings."""
 
 from collections.abc import Sequence
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -9,12 +10,6 @@ from sbi_rope._npe import TrainedNPE
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._two_sample import compare_with_pairs
-from sbi_rope._validation import (
-    check_instance,
-    check_integer,
-    check_parameter_names,
-    default_names,
-)
 from sbi_rope.coupling import SinkhornCoupler
 from sbi_rope.diagnosis.also_in_pairs import also_in_pairs, implied_by_pairs
 from sbi_rope.diagnosis.far_entries import far_findings
@@ -33,7 +28,8 @@ from sbi_rope.diagnosis.spread import FEWEST, spread_of
 from sbi_rope.diagnosis.support import support_of
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture import MixturePosterior
-from sbi_rope.rope import HOW_TO_MAKE, RoPE
+from sbi_rope.rope import RoPE
+from sbi_rope.settings import Range, check, default_names, names_of
 
 __all__ = ["diagnose"]
 
@@ -118,22 +114,24 @@ def diagnose(
         :func:`sbi_rope.plots.implied_parameters`.
 
     Raises:
-        InvalidTypeError: If an argument has the wrong type.
+        InvalidInputError: If an argument has the wrong type.
         InvalidInputError: If x_o has the wrong shape or device, is empty, or not
             finite; if an argument is out of range; or if there are fewer than 100
             simulations.
         CouplingError: If the embeddings cannot be coupled.
         SimulationError: If the simulator fails.
     """
-    check_instance("rope", rope, RoPE, hint=HOW_TO_MAKE)
-    check_instance("coupler", coupler, SinkhornCoupler, optional=True)
-    check_instance(
-        "posterior", posterior, MixturePosterior, optional=True, hint=LEFT_OUT
-    )
+    check("rope", rope, RoPE)
+    check("coupler", coupler, SinkhornCoupler | None)
+    check("posterior", posterior, MixturePosterior | None)
     if num_simulations is not None:
-        check_integer("num_simulations", num_simulations, minimum=FEWEST_SIMULATIONS)
+        check(
+            "num_simulations",
+            num_simulations,
+            Annotated[int, Range(FEWEST_SIMULATIONS)],
+        )
     if num_folds is not None:
-        check_integer("num_folds", num_folds, minimum=2)
+        check("num_folds", num_folds, Annotated[int, Range(2)])
     tuned = len(rope.calibration[0]) > 0
     if tuned and not rope.is_trained:
         rope = rope.with_pairs(torch.arange(len(rope.calibration[0])))
@@ -147,7 +145,7 @@ def diagnose(
         dim = batch.theta.shape[1]
         names = rope.parameter_names or default_names(dim)
         if parameter_names is not None:
-            names = check_parameter_names(parameter_names, dim)
+            names = names_of(parameter_names, dim)
         _check_enough(batch.theta)
         coupling = batch.couple(coupler or rope.coupler)
         before = batch.npe.embed("x_o", batch.x_o, batch.npe.h)

@@ -10,21 +10,15 @@ from torch import Tensor
 
 from sbi_rope._groups import groups_of
 from sbi_rope._random import seeded
-from sbi_rope._validation import (
-    check_batch,
-    check_groups,
-    check_pair_weights,
-    check_positive,
-    check_same_length,
-    check_tensor,
-    check_unit_interval,
-)
+from sbi_rope._validation import check_groups, check_pair_weights
 from sbi_rope.discrepancy.conditional import Conditional
 from sbi_rope.discrepancy.correlation import GroupErrors, independent_pairs
 from sbi_rope.discrepancy.imputation import impute
 from sbi_rope.discrepancy.posterior import Discrepancy
 from sbi_rope.discrepancy.regression import SMALLEST_NOISE, Regressions
-from sbi_rope.errors import InvalidInputError, InvalidTypeError
+from sbi_rope.errors import InvalidInputError
+from sbi_rope.settings import Positive, UnitInterval, check
+from sbi_rope.tensors import as_batch, as_numbers, check_same_length
 
 __all__ = ["DiscrepancyModel"]
 
@@ -94,7 +88,7 @@ class DiscrepancyModel:
         probability_of_none: The prior probability that the simulator is right.
 
     Raises:
-        InvalidTypeError: If one of the first three is not a list.
+        InvalidInputError: If one of the first three is not a list.
         InvalidInputError: If a list is empty or a number is outside its range.
 
     Example:
@@ -118,14 +112,14 @@ class DiscrepancyModel:
         for name in ("gain_precisions", "error_scales", "degrees_of_freedom"):
             values = getattr(self, name)
             if not isinstance(values, Sequence):
-                raise InvalidTypeError(
+                raise InvalidInputError(
                     f"Expected `{name}` to be a list of numbers; got {values!r}."
                 )
             if not len(values):
                 raise InvalidInputError(f"Expected at least one of `{name}`; got none.")
             for value in values:
-                check_positive(name, value)
-        check_unit_interval("probability_of_none", self.probability_of_none)
+                check(name, value, Positive)
+        check("probability_of_none", self.probability_of_none, UnitInterval)
 
     def fit(
         self,
@@ -236,17 +230,17 @@ class DiscrepancyModel:
 
 def _checked(z: Any, mean: Any, covariance: Any) -> tuple[Tensor, Tensor, Tensor]:
     """Check the arguments of ``fit`` and return them in float64."""
-    z = check_tensor("z", z).double()
+    z = as_numbers("z", z).double()
     if z.ndim != 2:
         raise InvalidInputError(
             f"Expected `z` of shape (n, l); got {tuple(z.shape)}. Flatten it first."
         )
     width = z.shape[1]
-    z = check_batch("z", z, (width,))
-    possible = check_tensor("mean", mean).shape[1:-1]
-    mean = check_batch("mean", mean, (*possible[:1], width)).to(z)
+    z = as_batch("z", z, (width,))
+    possible = as_numbers("mean", mean).shape[1:-1]
+    mean = as_batch("mean", mean, (*possible[:1], width)).to(z)
     check_same_length("z", z, "mean", mean)
-    covariance = check_batch("covariance", covariance, (width,)).to(z)
+    covariance = as_batch("covariance", covariance, (width,)).to(z)
     if len(covariance) != width:
         raise InvalidInputError(
             f"Expected `covariance` of shape {(width, width)}; got "

@@ -2,7 +2,7 @@ r"""NPE trained on corrected simulations, as learned from calibration pairs."""
 
 import copy
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -21,15 +21,7 @@ from sbi_rope._sbi import (
 from sbi_rope._simulations import Moments, SimulationSource
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._training import History
-from sbi_rope._validation import (
-    LARGEST_SETTING,
-    check_choice,
-    check_finite,
-    check_instance,
-    check_integer,
-    check_names,
-    check_positive,
-)
+from sbi_rope._validation import check_finite, check_names
 from sbi_rope.discrepancy.correction import (
     Space,
     check_complete,
@@ -48,6 +40,7 @@ from sbi_rope.errors import (
 )
 from sbi_rope.finetuning import CalibrationFinetuner
 from sbi_rope.mixture import MixtureEstimator, MixturePosterior, OwnEmbeddings, Part
+from sbi_rope.settings import Count, Positive, Range, check
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
 from sbi_rope.trainers.training import EstimatorBuilder, Training
@@ -120,7 +113,7 @@ class DiscrepancyNPE(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidTypeError: If an argument has the wrong type.
+        InvalidInputError: If an argument has the wrong type.
         InvalidInputError: If an argument is outside its range. In ``train``, if x is
             not a vector, or has missing entries, with ``space="input"``.
         SimulationError: In ``train``, if the simulator fails.
@@ -148,17 +141,17 @@ class DiscrepancyNPE(Method):
         npe_training: Training | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
-        check_choice("space", space, ("embedding", "input", "tuned"))
-        check_instance("learn_prior", learn_prior, bool)
-        check_instance("model", model, DiscrepancyModel, optional=True)
-        check_integer("num_simulations", num_simulations, minimum=2)
-        check_integer("simulations_per_pair", simulations_per_pair, minimum=2)
+        check("space", space, Literal["embedding", "input", "tuned"])
+        check("learn_prior", learn_prior, bool)
+        check("model", model, DiscrepancyModel | None)
+        check("num_simulations", num_simulations, Annotated[int, Range(2)])
+        check("simulations_per_pair", simulations_per_pair, Annotated[int, Range(2)])
         if num_steps is not None:
-            check_integer("num_steps", num_steps)
+            check("num_steps", num_steps, Count)
         if learning_rate is not None:
-            check_positive("learning_rate", learning_rate, maximum=LARGEST_SETTING)
-        check_integer("num_folds", num_folds, minimum=2)
-        check_instance("finetuner", finetuner, CalibrationFinetuner, optional=True)
+            check("learning_rate", learning_rate, Positive)
+        check("num_folds", num_folds, Annotated[int, Range(2)])
+        check("finetuner", finetuner, CalibrationFinetuner | None)
         npe = StartingNPE(density_estimator, npe_training)
         super().__init__(prior, npe=npe, simulator=simulator, device=device)
         self.space: Space = space
@@ -246,7 +239,7 @@ class DiscrepancyNPE(Method):
 
         Raises:
             NotReadyError: If there are fewer than two pairs, or no simulations.
-            InvalidTypeError: If ``summaries`` is no function, or returns no numbers.
+            InvalidInputError: If ``summaries`` is no function, or returns no numbers.
             InvalidInputError: If x is not a vector or has missing entries and no
                 summaries are given, if these have another shape or are not finite, or
                 the names do not fit.

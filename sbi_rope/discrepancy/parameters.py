@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
-from sbi_rope._validation import check_batch, check_pair_weights, check_tensor
+from sbi_rope._validation import check_pair_weights
 from sbi_rope.errors import InvalidInputError
+from sbi_rope.tensors import as_batch, as_numbers
 
 __all__ = ["ParameterDistribution", "is_improbable", "learn_parameters"]
 
@@ -92,19 +93,19 @@ def learn_parameters(
         The probabilities of the simulations.
 
     Raises:
-        InvalidTypeError: If an argument is not a tensor.
+        InvalidInputError: If an argument is not a tensor.
         InvalidInputError: If the shapes do not fit, a value is not finite, or a weight
             is not positive.
     """
-    theta = check_tensor("theta", theta)
+    theta = as_numbers("theta", theta)
     if theta.ndim != 2 or len(theta) < 2:
         raise InvalidInputError(
             "Expected `theta` of shape (n, d), with n of two or more; got "
             f"{tuple(theta.shape)}."
         )
-    theta = check_batch("theta", theta, theta.shape[1:])
-    several = check_tensor("theta_cal", theta_cal).shape[1:-1][:1]
-    theta_cal = check_batch("theta_cal", theta_cal, (*several, theta.shape[1]))
+    theta = as_batch("theta", theta, theta.shape[1:])
+    several = as_numbers("theta_cal", theta_cal).shape[1:-1][:1]
+    theta_cal = as_batch("theta_cal", theta_cal, (*several, theta.shape[1]))
     if weights is not None:
         weights = check_pair_weights(weights, "theta_cal", theta_cal)
         weights = weights.to(theta_cal.device, torch.double)

@@ -8,7 +8,8 @@ from torch import Tensor
 from torch.distributions import Chi2
 
 from sbi_rope._random import seeded
-from sbi_rope._validation import check_batch, check_integer, check_not_negative
+from sbi_rope.settings import Count, NotNegative, check
+from sbi_rope.tensors import as_batch
 
 __all__ = ["Discrepancy", "DiscrepancyDraws", "Term"]
 
@@ -109,8 +110,8 @@ class Discrepancy:
         Raises:
             InvalidInputError: If an argument is outside its range.
         """
-        check_integer("num_draws", num_draws)
-        check_not_negative("smallest_error", smallest_error)
+        check("num_draws", num_draws, Count)
+        check("smallest_error", smallest_error, NotNegative)
         none = self.probability_of_none
         shares = torch.cat([(1 - none) * self.shares, self.shares.new_tensor([none])])
         with seeded(seed):
@@ -176,7 +177,7 @@ class DiscrepancyDraws:
         Raises:
             InvalidInputError: If the shape does not fit or a value is not finite.
         """
-        z_s = check_batch("z_s", z_s, self.offset.shape[1:])
+        z_s = as_batch("z_s", z_s, self.offset.shape[1:])
         draw = torch.randint(len(self), (len(z_s),)).to(z_s.device)
         noise = torch.randn(z_s.shape, dtype=torch.double).to(z_s.device)
         # A matrix for each simulation needs a lot of memory if z has many entries.

@@ -150,7 +150,7 @@ class DiscrepancyReport:
             names: A name for each entry of x, in the order of x.
 
         Raises:
-            InvalidTypeError: If the names are no list of strings.
+            InvalidInputError: If the names are no list of strings.
             InvalidInputError: If they are not one for each entry of x, or the report
                 has names already.
         """

@@ -5,8 +5,8 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from sbi_rope._validation import as_numbers, check_batch
-from sbi_rope.errors import InvalidInputError, InvalidTypeError
+from sbi_rope.errors import InvalidInputError
+from sbi_rope.tensors import as_batch, as_numbers
 
 __all__ = ["Summaries"]
 
@@ -19,13 +19,13 @@ class Summaries(nn.Module):
             NumPy arrays. A row of the summaries may depend on the same row of x only.
 
     Raises:
-        InvalidTypeError: If it is no function.
+        InvalidInputError: If it is no function.
     """
 
     def __init__(self, function: Callable[[Tensor], Any]) -> None:
         super().__init__()
         if not callable(function):
-            raise InvalidTypeError(
+            raise InvalidInputError(
                 "Expected `summaries` to be callable, from x (n, *event) to (n, k); "
                 f"got {type(function).__name__}."
             )
@@ -35,7 +35,7 @@ class Summaries(nn.Module):
         """Return the summaries, which may not be finite.
 
         Raises:
-            InvalidTypeError: If the function does not return numbers.
+            InvalidInputError: If the function does not return numbers.
             InvalidInputError: If what it returns has another shape.
         """
         found = as_numbers("summaries(x)", self._function(x))
@@ -44,6 +44,6 @@ class Summaries(nn.Module):
                 f"Expected `summaries(x)` of shape ({len(x)}, k) for x of shape "
                 f"{tuple(x.shape)}; got {tuple(found.shape)}."
             )
-        return check_batch("summaries(x)", found, found.shape[1:], finite=False).to(
+        return as_batch("summaries(x)", found, found.shape[1:], finite=False).to(
             x.device
         )

@@ -19,19 +19,14 @@ from sbi_rope._means import Counts, means_of_pairs
 from sbi_rope._notebooks import shown_as_text
 from sbi_rope._permutation import permutation_test
 from sbi_rope._random import seeded
-from sbi_rope._validation import (
-    check_batch,
-    check_device,
-    check_level,
-    check_same_length,
-    check_tensor,
-    default_names,
-)
+from sbi_rope._validation import check_device
 from sbi_rope.metrics.calibration import (
     ROUNDING,
     central_levels,
     random_ranks,
 )
+from sbi_rope.settings import Level, check, default_names
+from sbi_rope.tensors import as_batch, as_numbers, check_same_length
 
 __all__ = [
     "CoverageByEstimate",
@@ -135,7 +130,7 @@ def coverage_by_estimate(
         the same for the same input.
 
     Raises:
-        InvalidTypeError: If an argument has the wrong type.
+        InvalidInputError: If an argument has the wrong type.
         InvalidInputError: If a shape does not fit, a rank is not in [0, 1], or an
             estimate is not finite.
 
@@ -148,9 +143,9 @@ def coverage_by_estimate(
         >>> coverage_by_estimate(ranks ** (1 + estimates / 2), estimates).depends
         (True,)
     """
-    check_level("level", level)
-    check_batch("estimates", estimates, check_tensor("estimates", estimates).shape[-1:])
-    check_batch("ranks", ranks, estimates.shape[1:], finite=False)
+    check("level", level, Level)
+    as_batch("estimates", estimates, as_numbers("estimates", estimates).shape[-1:])
+    as_batch("ranks", ranks, estimates.shape[1:], finite=False)
     check_same_length("ranks", ranks, "estimates", estimates)
     check_device("ranks", ranks, estimates.device, where="`estimates`")
     known = ranks[~torch.isnan(ranks)] if allow_missing else ranks

@@ -20,14 +20,9 @@ from sbi_rope._means import (
     means_of_pairs,
     standard_error_of_mean,
 )
-from sbi_rope._validation import (
-    check_batch,
-    check_device,
-    check_not_nan,
-    check_tensor,
-    check_values,
-)
+from sbi_rope._validation import check_device, check_not_nan
 from sbi_rope.errors import InvalidInputError
+from sbi_rope.tensors import as_batch, as_numbers
 
 __all__ = [
     "ACAUC_IN_WORDS",
@@ -155,7 +150,7 @@ def mid_ranks(samples: Tensor, theta: Tensor) -> Tensor:
         The ranks, strictly between 0 and 1, float64, shape ``(n, d)``.
 
     Raises:
-        InvalidTypeError: If an argument is no tensor of real numbers.
+        InvalidInputError: If an argument is no tensor of real numbers.
         InvalidInputError: If a shape does not fit, there is no sample, or an entry is
             NaN, which cannot be ranked. Infinite entries can be.
 
@@ -163,8 +158,8 @@ def mid_ranks(samples: Tensor, theta: Tensor) -> Tensor:
         >>> mid_ranks(torch.tensor([[[0.0]], [[1.0]], [[1.0]]]), torch.tensor([[1.0]]))
         tensor([[0.6250]], dtype=torch.float64)
     """
-    check_tensor("samples", samples)
-    check_batch("theta", theta, check_tensor("theta", theta).shape[-1:], finite=False)
+    as_numbers("samples", samples)
+    as_batch("theta", theta, as_numbers("theta", theta).shape[-1:], finite=False)
     if samples.ndim != 3 or samples.shape[1:] != theta.shape or not len(samples):
         raise InvalidInputError(
             f"Expected `samples` of shape (M, {theta.shape[0]}, {theta.shape[1]}) with "
@@ -217,10 +212,10 @@ def central_levels(ranks: Tensor) -> Tensor:
         The levels, in the same shape.
 
     Raises:
-        InvalidTypeError: If the ranks are no tensor of real numbers.
+        InvalidInputError: If the ranks are no tensor of real numbers.
         InvalidInputError: If a rank is not in [0, 1].
     """
-    _check_unit_range("ranks", check_tensor("ranks", ranks))
+    _check_unit_range("ranks", as_numbers("ranks", ranks))
     return (2.0 * ranks - 1.0).abs()
 
 
@@ -256,7 +251,7 @@ def acauc_of(levels: Tensor, *, allow_missing: bool = False) -> ACAUCScore:
         The score with its standard error.
 
     Raises:
-        InvalidTypeError: If the levels are no tensor of real numbers.
+        InvalidInputError: If the levels are no tensor of real numbers.
         InvalidInputError: If they have another shape, or a level is not in [0, 1].
 
     Example:
@@ -306,7 +301,7 @@ def coverage_curve_of(levels: Tensor, *, allow_missing: bool = False) -> Coverag
         The curve at .01, .02, ..., .99.
 
     Raises:
-        InvalidTypeError: If the levels are no tensor of real numbers.
+        InvalidInputError: If the levels are no tensor of real numbers.
         InvalidInputError: If they have another shape, or a level is not in [0, 1].
     """
     return coverage_curve_of_pairs(_checked_levels(levels, allow_missing=allow_missing))
@@ -360,7 +355,7 @@ def expected_coverage_error_of(
         The score with its standard error.
 
     Raises:
-        InvalidTypeError: If the levels are no tensor of real numbers.
+        InvalidInputError: If the levels are no tensor of real numbers.
         InvalidInputError: If they have another shape, or a level is not in [0, 1].
     """
     return coverage_error_of_pairs(_checked_levels(levels, allow_missing=allow_missing))
@@ -420,13 +415,12 @@ def _mean_over_pairs(
 
 def _checked_levels(levels: Tensor, *, allow_missing: bool) -> Tensor:
     """Return levels, shape ``(n, d)``, without gradients and in 32 bits or more."""
-    shape = check_tensor("levels", levels).shape
+    shape = as_numbers("levels", levels).shape
     if levels.ndim != 2:
         raise InvalidInputError(
             f"Expected `levels` of shape (n, d); got {tuple(shape)}."
         )
-    check_batch("levels", levels, shape[1:], finite=False)
-    check_values("levels", levels)
+    as_batch("levels", levels, shape[1:], finite=False)
     known = levels[~torch.isnan(levels)] if allow_missing else levels
     _check_unit_range("levels", known)
     levels = levels.detach()
@@ -436,7 +430,6 @@ def _checked_levels(levels: Tensor, *, allow_missing: bool) -> Tensor:
 
 
 def _check_unit_range(name: str, values: Tensor) -> None:
-    check_values(name, values)
     outside = ~((values >= 0) & (values <= 1 + ROUNDING_OF_LEVELS))  # NaN included
     if outside.any():
         raise InvalidInputError(

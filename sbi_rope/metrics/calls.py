@@ -15,7 +15,7 @@ package, is called as it is.
 
 import warnings
 from collections.abc import Iterable, Iterator
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from sbi.inference import DirectPosterior, EnsemblePosterior, VectorFieldPosterior
@@ -26,24 +26,19 @@ from sbi_rope._sbi import MixtureDensity, NeuralPosterior, is_bounded, readable
 from sbi_rope._slices import slices
 from sbi_rope._validation import (
     as_float32,
-    as_numbers,
-    check_batch,
     check_device,
-    check_integer,
     check_not_swapped,
     check_readable,
     check_row_order,
-    check_same_length,
     check_tables,
-    check_tensor,
-    check_values,
 )
 from sbi_rope.errors import (
     InvalidInputError,
-    InvalidTypeError,
     LogProbUnavailableError,
 )
 from sbi_rope.metrics.calibration import count_ranks, random_ranks
+from sbi_rope.settings import Count, Range, check
+from sbi_rope.tensors import as_batch, as_numbers, check_same_length
 
 __all__ = [
     "CHUNK_SIZE",
@@ -83,7 +78,7 @@ EXPECTED_WARNINGS = (
 
 def check_num_samples(num_samples: Any) -> None:
     """Raise unless calibration can be judged by a number of draws."""
-    check_integer("num_samples", num_samples, maximum=MAX_SAMPLES)
+    check("num_samples", num_samples, Annotated[int, Range(1, MAX_SAMPLES)])
     if num_samples < MIN_SAMPLES:
         raise InvalidInputError(
             f"Expected `num_samples` of at least {MIN_SAMPLES}, so that a draw is "
@@ -106,7 +101,7 @@ def check_test_set(
     Raises:
         InvalidInputError: If a shape does not fit or an entry is not finite.
     """
-    check_integer("chunk_size", chunk_size)
+    check("chunk_size", chunk_size, Count)
     check_tables(posterior, theta=theta, x=x)
     check_row_order(theta=theta, x=x)
     theta, x = _as_tensor("theta", theta), _as_tensor("x", x)
@@ -120,7 +115,7 @@ def check_test_set(
             f"Expected `theta` of shape (n, d); got {tuple(theta.shape)}. For one "
             "parameter pass `theta[:, None]`."
         )
-    check_batch("theta", theta, theta_shape)
+    as_batch("theta", theta, theta_shape)
     _check_x(posterior, x)
     check_same_length("theta", theta, "x", x)
     if isinstance(posterior, NeuralPosterior):  # sbi's estimators use float32
@@ -236,11 +231,11 @@ def draw_samples(posterior: Any, x: Tensor, *, num_samples: int) -> Tensor:
         lie outside the prior.
 
     Raises:
-        InvalidTypeError: If the posterior cannot be sampled, or returns no tensor.
+        InvalidInputError: If the posterior cannot be sampled, or returns no tensor.
         InvalidInputError: If ``x`` is empty or not finite, or ``num_samples`` is not
             from 1 to 10^8.
     """
-    check_integer("num_samples", num_samples, maximum=MAX_SAMPLES)
+    check("num_samples", num_samples, Annotated[int, Range(1, MAX_SAMPLES)])
     check_tables(posterior, x=x)
     x = _as_tensor("x", x)
     _check_x(posterior, x)
@@ -265,8 +260,7 @@ def _check_x(posterior: Any, x: Tensor) -> None:
     """Raise if observations do not fit, or are not finite and cannot be read so."""
     estimator = getattr(posterior, "posterior_estimator", None)
     event_shape = getattr(estimator, "condition_shape", x.shape[1:])
-    check_batch("x", x, event_shape, finite=False)
-    check_values("x", x)
+    as_batch("x", x, event_shape, finite=False)
     if isinstance(estimator, MixtureDensity):
         return  # it checks that itself
     net = getattr(estimator, "embedding_net", None)
@@ -277,7 +271,7 @@ def _check_x(posterior: Any, x: Tensor) -> None:
 
 def _sample(posterior: Any, x: Tensor, num_samples: int) -> Tensor:
     if not callable(getattr(posterior, "sample_batched", None)):
-        raise InvalidTypeError(
+        raise InvalidInputError(
             "Expected `posterior` with a method `sample_batched`, such as one of sbi; "
             f"got {type(posterior).__name__}."
         )
@@ -334,13 +328,11 @@ def _density(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:
 def _returned(method: str, value: Any) -> Tensor:
     """Return what a method of the posterior returned, if it is a tensor of numbers."""
     if not isinstance(value, Tensor):
-        raise InvalidTypeError(
+        raise InvalidInputError(
             f"Expected `{method}` of the posterior to return a torch.Tensor; got "
             f"{type(value).__name__}. Wrap the posterior in a class whose `{method}` "
             "returns a tensor, with the dtype and device of `x`."
         )
-    name = f"posterior.{method}(...)"
-    check_values(name, check_tensor(name, value))
     return value
 
 

@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from sbi_rope._random import seeded
-from sbi_rope._validation import check_choice, check_integer
 from sbi_rope.metrics.calibration import (
     ACAUCScore,
     CoverageCurve,
@@ -23,6 +22,7 @@ from sbi_rope.metrics.calls import (
     draw_joint_levels,
     draw_ranks,
 )
+from sbi_rope.settings import Count, check, one_of
 
 __all__ = ["acauc", "coverage_curve", "expected_coverage_error"]
 
@@ -92,14 +92,14 @@ def acauc(
         LogProbUnavailableError: If the kind is ``"hpd"`` and the posterior has no
             ``log_prob_batched``.
     """
-    check_choice("kind", kind, list(DEFAULT_NUM_SAMPLES))
+    check("kind", kind, one_of(list(DEFAULT_NUM_SAMPLES)))
     theta, x = check_test_set(posterior, theta, x, chunk_size)
     if num_samples is None:
         num_samples = DEFAULT_NUM_SAMPLES[kind]
     if num_observations is None:
         num_observations = MAX_JOINT_OBSERVATIONS if kind == "hpd" else theta.shape[0]
     check_num_samples(num_samples)
-    check_integer("num_observations", num_observations)
+    check("num_observations", num_observations, Count)
     theta, x = _thin(theta, x, num_observations)
     draw = draw_joint_levels if kind == "hpd" else draw_ranks
     with seeded(seed):

@@ -8,15 +8,11 @@ from torch import Tensor
 
 from sbi_rope._means import standard_error_of_mean
 from sbi_rope._notebooks import shown_as_text
-from sbi_rope._validation import (
-    check_batch,
-    check_not_nan,
-    check_positive,
-    check_same_length,
-    check_tensor,
-)
+from sbi_rope._validation import check_not_nan
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.metrics.calls import CHUNK_SIZE, check_test_set, evaluate_log_probs
+from sbi_rope.settings import Positive, check
+from sbi_rope.tensors import as_batch, as_numbers, check_same_length
 
 __all__ = ["LPPScore", "check_scales", "check_theta_std", "lpp"]
 
@@ -34,8 +30,8 @@ class LPPScore:
     log_probs: Tensor = field(repr=False)
 
     def __post_init__(self) -> None:
-        check_tensor("log_probs", self.log_probs)
-        check_batch("log_probs", self.log_probs, (), finite=False)
+        as_numbers("log_probs", self.log_probs)
+        as_batch("log_probs", self.log_probs, (), finite=False)
         check_not_nan("log_probs", self.log_probs)
         if torch.isposinf(self.log_probs).any():
             raise InvalidInputError(
@@ -148,5 +144,5 @@ def check_theta_std(theta_std: Tensor | None, theta: Tensor) -> None:
 
 def check_scales(theta_std: Tensor) -> None:
     """Raise unless the units are positive."""
-    check_batch("theta_std", theta_std, ())
-    check_positive("theta_std", float(theta_std.min()))
+    as_batch("theta_std", theta_std, ())
+    check("theta_std", float(theta_std.min()), Positive)

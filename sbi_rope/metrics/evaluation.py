@@ -11,7 +11,6 @@ from torch import Tensor
 from sbi_rope._notebooks import shown_as_text
 from sbi_rope._random import seeded
 from sbi_rope._units import std_of_prior
-from sbi_rope._validation import default_names
 from sbi_rope.metrics.by_estimate import (
     CoverageByEstimate,
     coverage_by_estimate_of_pairs,
@@ -39,6 +38,7 @@ from sbi_rope.metrics.calls import (
     is_normalised,
 )
 from sbi_rope.metrics.density import LPPScore, check_theta_std
+from sbi_rope.settings import default_names
 
 __all__ = ["Evaluation", "evaluate"]
 

@@ -10,7 +10,7 @@ from sbi.utils import within_support
 from sbi_rope._random import seeded
 from sbi_rope._sbi import estimator_of
 from sbi_rope._validation import check_weights, columns_of, joined_columns
-from sbi_rope.errors import InvalidInputError, InvalidTypeError
+from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture.estimator import MixtureEstimator
 from sbi_rope.mixture.parts import part_of
 from sbi_rope.mixture.posterior import MixturePosterior
@@ -44,7 +44,7 @@ def average(
         The average. It belongs to a batch if one of the posteriors does.
 
     Raises:
-        InvalidTypeError: If it is no list of posteriors.
+        InvalidInputError: If it is no list of posteriors.
         InvalidInputError: If there is no posterior, shapes, batches or priors differ,
             two know the columns of tables in different orders, or the weights do not
             fit.
@@ -69,7 +69,7 @@ def average(
         torch.Size([5, 1])
     """
     if not isinstance(posteriors, list | tuple):
-        raise InvalidTypeError(
+        raise InvalidInputError(
             "Expected `posteriors` to be a list of posteriors; got "
             f"{type(posteriors).__name__}."
         )

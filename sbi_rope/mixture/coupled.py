@@ -9,18 +9,14 @@ from torch import Tensor, nn
 
 from sbi_rope._sbi import embed, readable
 from sbi_rope._standardisation import warn_of_far_entries
-from sbi_rope._validation import (
-    check_batch,
-    check_choice,
-    check_integer,
-    check_same_length,
-    check_weights,
-)
+from sbi_rope._validation import check_weights
 from sbi_rope.coupling import Coupling
 from sbi_rope.errors import InvalidInputError, UnseenObservationError, warn_user
 from sbi_rope.mixture.chunks import blocks
 from sbi_rope.mixture.coupled_net import CoupledNet
 from sbi_rope.mixture.parts import Mixing, Rows
+from sbi_rope.settings import Count, check
+from sbi_rope.tensors import as_batch, check_same_length
 
 __all__ = ["CoupledEmbeddings"]
 
@@ -63,9 +59,9 @@ class CoupledEmbeddings(Mixing):
         unseen: Literal["raise", "extend"] = "raise",
     ) -> None:
         super().__init__(batch.shape[1:], len(embeddings))
-        check_choice("unseen", unseen, ("raise", "extend"))
+        check("unseen", unseen, Literal["raise", "extend"])
         if num_observed is not None:
-            check_integer("num_observed", num_observed)
+            check("num_observed", num_observed, Count)
             if num_observed > len(batch):
                 raise InvalidInputError(
                     f"Expected `num_observed` of at most {len(batch)}, the length of "
@@ -74,7 +70,7 @@ class CoupledEmbeddings(Mixing):
         self._nets = nn.ModuleList(nets)
         check_weights("shares", self.shares, len(self.couplings))
         for coupling in self.couplings:
-            check_batch("coupling.simulated", coupling.simulated, embeddings.shape[1:])
+            as_batch("coupling.simulated", coupling.simulated, embeddings.shape[1:])
             check_same_length("embeddings", embeddings, "simulated", coupling.simulated)
             check_same_length("batch", batch, "coupling.real", coupling.real)
         self.num_observed = len(batch) if num_observed is None else num_observed

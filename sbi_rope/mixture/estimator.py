@@ -11,14 +11,7 @@ from torch import Tensor, nn
 
 from sbi_rope._progress import progress_bar
 from sbi_rope._sbi import MixtureDensity
-from sbi_rope._validation import (
-    check_batch,
-    check_readable,
-    check_same_length,
-    check_unit_interval,
-    check_values,
-    check_weights,
-)
+from sbi_rope._validation import check_readable, check_weights
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture.block import Block
 from sbi_rope.mixture.chunks import blocks, flow_batch, keep_freed_memory
@@ -33,6 +26,8 @@ from sbi_rope.mixture.truncation import (
     own_mass,
     shared_mass,
 )
+from sbi_rope.settings import UnitInterval, check
+from sbi_rope.tensors import as_batch, check_same_length
 
 __all__ = ["MixtureEstimator"]
 
@@ -84,7 +79,7 @@ class MixtureEstimator(MixtureDensity):
                     f"{tuple(self.condition_shape)}, as the first; got theta "
                     f"{tuple(shapes[0])} given x {tuple(shapes[1])}."
                 )
-        check_unit_interval("tail_mass", tail_mass)
+        check("tail_mass", tail_mass, UnitInterval)
         self.tail_mass = tail_mass
         self._parts = nn.ModuleList(parts)
         tensors = chain(self._parts.buffers(), self._parts.parameters())
@@ -239,8 +234,7 @@ class MixtureEstimator(MixtureDensity):
             InvalidInputError: If a shape does not fit, or a value is not finite. Some
                 embedding nets can do with missing values (NaN).
         """
-        x = check_batch("x", x, self.condition_shape, finite=False)
-        check_values("x", x)
+        x = as_batch("x", x, self.condition_shape, finite=False)
         x = x.to(self.weights.device, DTYPE)
         if not torch.isfinite(x).all():
             can_read = torch.stack([part.mixing.readable(x) for part in self._used[0]])

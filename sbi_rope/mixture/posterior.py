@@ -16,17 +16,9 @@ from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import BaseDirectPosterior, MixedDensity, describe
 from sbi_rope._standardisation import warn_of_far_entries
-from sbi_rope._validation import (
-    as_numbers,
-    as_shape,
-    check_integer,
-    check_positive,
-    check_tables,
-    check_theta,
-    usable_device,
-)
+from sbi_rope._validation import as_shape, check_tables, check_theta, usable_device
 from sbi_rope.coupling import Coupling
-from sbi_rope.errors import InvalidInputError, InvalidTypeError, SamplingError
+from sbi_rope.errors import InvalidInputError, SamplingError
 from sbi_rope.mixture.coupled import CoupledEmbeddings
 from sbi_rope.mixture.estimator import MixtureEstimator
 from sbi_rope.mixture.parts import DTYPE
@@ -34,6 +26,8 @@ from sbi_rope.mixture.sampling import Accept
 from sbi_rope.mixture.truncation import Leakage, is_unbounded
 from sbi_rope.saving import save
 from sbi_rope.sets.makes_sets import MakesSets
+from sbi_rope.settings import Count, Positive, check
+from sbi_rope.tensors import as_numbers
 
 __all__ = ["MixturePosterior"]
 
@@ -203,7 +197,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         """
         self._coupled("[i]")
         if isinstance(index, bool) or not hasattr(index, "__index__"):
-            raise InvalidTypeError(
+            raise InvalidInputError(
                 f"Expected the number of an observation; got {index!r}. For several, "
                 "use the `_batched` methods with their x."
             )
@@ -256,7 +250,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             overwrite: Whether to replace a file that exists.
 
         Raises:
-            InvalidTypeError: If an argument has the wrong type.
+            InvalidInputError: If an argument has the wrong type.
             InvalidInputError: If the posterior holds something that cannot be
                 described, such as a lambda.
             NotWritableError: If the file exists, or cannot be written.
@@ -342,7 +336,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
                 time is over.
         """
         if max_sampling_time is not None:
-            check_positive("max_sampling_time", max_sampling_time)
+            check("max_sampling_time", max_sampling_time, Positive)
         if return_partial_on_timeout:
             raise InvalidInputError(
                 "Expected `return_partial_on_timeout=False`: observations are drawn "
@@ -350,7 +344,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
                 "fewer draws at a time and keep those."
             )
         if max_sampling_batch_size is not None:
-            check_integer("max_sampling_batch_size", max_sampling_batch_size)
+            check("max_sampling_batch_size", max_sampling_batch_size, Count)
         return self.posterior_estimator.sample(
             as_shape("sample_shape", sample_shape),
             self._warned_of(self._batch_of_x(x)),
@@ -549,9 +543,9 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         Raises:
             InvalidInputError: If a number is outside its range.
         """
-        check_integer("num_iter", num_iter)
-        check_integer("num_to_optimize", num_to_optimize)
-        check_integer("num_init_samples", num_init_samples)
+        check("num_iter", num_iter, Count)
+        check("num_to_optimize", num_to_optimize, Count)
+        check("num_init_samples", num_init_samples, Count)
         with torch.enable_grad():  # the caller may have switched gradients off
             return super().map(
                 x=x,

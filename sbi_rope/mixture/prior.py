@@ -25,7 +25,7 @@ def part_of_prior(prior: Distribution, event_shape: Sequence[int]) -> Part:
         event_shape: Shape of one observation.
 
     Raises:
-        InvalidTypeError: If the prior is not a torch distribution.
+        InvalidInputError: If the prior is not a torch distribution.
         InvalidInputError: If the parameters are not vectors.
     """
     check_prior(prior)

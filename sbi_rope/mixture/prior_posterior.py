@@ -10,17 +10,11 @@ from torch.distributions import Distribution
 
 from sbi_rope._random import seeded
 from sbi_rope._sbi import BasePotential, NeuralPosterior, copy_of_prior, describe
-from sbi_rope._validation import (
-    as_numbers,
-    as_shape,
-    check_batch,
-    check_prior,
-    check_theta,
-    usable_device,
-)
+from sbi_rope._validation import as_shape, check_prior, check_theta, usable_device
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture.prior import prior_log_prob, prior_sample
 from sbi_rope.saving import save
+from sbi_rope.tensors import as_batch, as_numbers
 
 __all__ = ["PriorPosterior"]
 
@@ -47,7 +41,7 @@ class PriorPosterior(NeuralPosterior):
         prior: A torch distribution over parameters of shape ``(d,)``. It is copied.
 
     Raises:
-        InvalidTypeError: If the prior is not a torch distribution.
+        InvalidInputError: If the prior is not a torch distribution.
 
     Example:
         >>> from sbi.utils import BoxUniform
@@ -168,7 +162,7 @@ class PriorPosterior(NeuralPosterior):
             overwrite: Whether to replace a file that exists.
 
         Raises:
-            InvalidTypeError: If an argument has the wrong type.
+            InvalidInputError: If an argument has the wrong type.
             InvalidInputError: If the posterior holds something that cannot be
                 described, such as a lambda.
             NotWritableError: If the file exists, or cannot be written.
@@ -187,7 +181,7 @@ class PriorPosterior(NeuralPosterior):
 
 def _number_of_rows(x: Any) -> int:
     x = as_numbers("x", x)
-    return len(check_batch("x", x, x.shape[1:], finite=False))
+    return len(as_batch("x", x, x.shape[1:], finite=False))
 
 
 class _PriorPotential(BasePotential):

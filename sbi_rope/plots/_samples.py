@@ -7,15 +7,10 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import (
-    as_numbers,
-    check_batch,
-    check_mapping,
-    check_names,
-    check_tensor,
-)
+from sbi_rope._validation import check_mapping, check_names
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.plots._figures import GREY, PRIOR
+from sbi_rope.tensors import as_batch, as_numbers
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,7 +40,7 @@ def check_samples(
         parameter.
     """
     check_mapping("samples", samples, like="posterior samples")
-    first = check_tensor("samples", next(iter(samples.values())))
+    first = as_numbers("samples", next(iter(samples.values())))
     if first.ndim != 2:
         raise InvalidInputError(
             "Expected `samples` of shape (num_samples, d) each; got "
@@ -54,7 +49,7 @@ def check_samples(
     width = first.shape[1:]
     draws = {
         name: drawable(
-            f"samples[{name!r}]", check_batch(f"samples[{name!r}]", value, width)
+            f"samples[{name!r}]", as_batch(f"samples[{name!r}]", value, width)
         )
         for name, value in samples.items()
     }
@@ -69,7 +64,7 @@ def check_samples(
 def check_truth(theta: Any, dim: int) -> Tensor:
     """Return the true parameters of one observation, shape ``(d,)``."""
     row = as_numbers("theta", theta).reshape(1, -1)
-    return check_batch("theta", row, (dim,))[0]
+    return as_batch("theta", row, (dim,))[0]
 
 
 def drawable(name: str, value: Tensor) -> Tensor:
@@ -145,9 +140,7 @@ def _width(low: Tensor, high: Tensor) -> Tensor:
 
 def prior_interval(prior: Any, like: Tensor) -> Tensor:
     """Check samples of the prior and return their central 99 %, shape ``(2, d)``."""
-    return central_interval(
-        drawable("prior", check_batch("prior", prior, like.shape[1:]))
-    )
+    return central_interval(drawable("prior", as_batch("prior", prior, like.shape[1:])))
 
 
 def shade_prior(axes: "Axes", interval: Tensor) -> None:

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import check_instance
 from sbi_rope.diagnosis import Diagnosis
 from sbi_rope.plots._figures import (
     BLUE,
@@ -15,6 +14,7 @@ from sbi_rope.plots._figures import (
     hide_frame,
 )
 from sbi_rope.plots._samples import central_interval, with_margin
+from sbi_rope.settings import check
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -40,10 +40,10 @@ def implied_parameters(diagnosis: Diagnosis) -> "Figure":
         The figure, with one panel for each parameter.
 
     Raises:
-        InvalidTypeError: If the argument is no diagnosis.
+        InvalidInputError: If the argument is no diagnosis.
         ImportError: If matplotlib is not installed.
     """
-    check_instance("diagnosis", diagnosis, Diagnosis)
+    check("diagnosis", diagnosis, Diagnosis)
     theta, names = diagnosis.theta, diagnosis.parameter_names
     size = theta.shape[1]
     weights = {"implied": diagnosis.implied, "unshifted": diagnosis.unshifted}

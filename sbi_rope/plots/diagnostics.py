@@ -6,13 +6,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from sbi_rope._validation import (
-    check_batch,
-    check_instance,
-    check_mapping,
-    check_names,
-    default_names,
-)
+from sbi_rope._validation import check_mapping, check_names
 from sbi_rope.coupling import Coupling
 from sbi_rope.finetuning import History
 from sbi_rope.metrics import CoverageByEstimate, CoverageCurve
@@ -27,6 +21,8 @@ from sbi_rope.plots._figures import (
     line_styles,
     new_figure,
 )
+from sbi_rope.settings import check, default_names
+from sbi_rope.tensors import as_batch
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -63,12 +59,12 @@ def calibration_curves(curves: Mapping[str, CoverageCurve]) -> "Figure":
 
     Raises:
         InvalidInputError: If there is no curve.
-        InvalidTypeError: If the curves are no dictionary of coverage curves.
+        InvalidInputError: If the curves are no dictionary of coverage curves.
         ImportError: If matplotlib is not installed.
     """
     check_mapping("curves", curves, like="coverage curves")
     for name, curve in curves.items():
-        check_instance(f"curves[{name!r}]", curve, CoverageCurve)
+        check(f"curves[{name!r}]", curve, CoverageCurve)
     figure, axes = new_figure(7.4, 4.2)
     count = min(curve.num_observations for curve in curves.values())
     label = f"calibrated, 95 % (n = {count})"
@@ -106,11 +102,11 @@ def ranks_by_estimate(
         The figure.
 
     Raises:
-        InvalidTypeError: If the argument is something else.
+        InvalidInputError: If the argument is something else.
         InvalidInputError: If the names do not fit.
         ImportError: If matplotlib is not installed.
     """
-    check_instance("found", found, CoverageByEstimate)
+    check("found", found, CoverageByEstimate)
     count = len(found.p_values)
     names: Sequence[str] = default_names(count)
     if parameter_names is not None:
@@ -160,13 +156,13 @@ def finetuning_history(history: History) -> "Figure":
         The figure.
 
     Raises:
-        InvalidTypeError: If the argument is no history.
+        InvalidInputError: If the argument is no history.
         InvalidInputError: If the losses are not finite.
         ImportError: If matplotlib is not installed.
     """
-    check_instance("history", history, History)
+    check("history", history, History)
     training, validation = (
-        check_batch(f"history.{name}", torch.tensor(losses), (), allow_empty=True)
+        as_batch(f"history.{name}", torch.tensor(losses), (), empty=True)
         for name, losses in (
             ("training_loss", history.training_loss),
             ("validation_loss", history.validation_loss),
@@ -216,10 +212,10 @@ def effective_sample_sizes(coupling: Coupling) -> "Figure":
         The figure, a histogram on a logarithmic axis.
 
     Raises:
-        InvalidTypeError: If the argument is no coupling.
+        InvalidInputError: If the argument is no coupling.
         ImportError: If matplotlib is not installed.
     """
-    check_instance("coupling", coupling, Coupling)
+    check("coupling", coupling, Coupling)
     sizes = coupling.effective_sample_size.detach().cpu().double()
     figure, axes = new_figure(6.0, 3.6)
     num_simulations = len(coupling.simulated)

@@ -6,12 +6,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import (
-    check_batch,
-    check_names,
-    check_same_length,
-    check_tensor,
-)
+from sbi_rope._validation import check_names
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.plots._figures import (
     BLUE,
@@ -21,6 +16,7 @@ from sbi_rope.plots._figures import (
     hide_frame,
 )
 from sbi_rope.plots._samples import drawable
+from sbi_rope.tensors import as_batch, as_numbers, check_same_length
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -63,9 +59,9 @@ def real_and_simulated(
             names is not that of the statistics.
         ImportError: If matplotlib is not installed.
     """
-    x_o = check_tensor("x_o", x_o)
-    check_batch("x_o", x_o, x_o.shape[1:])
-    check_batch("x_s", x_s, x_o.shape[1:])
+    x_o = as_numbers("x_o", x_o)
+    as_batch("x_o", x_o, x_o.shape[1:])
+    as_batch("x_s", x_s, x_o.shape[1:])
     check_same_length("x_o", x_o, "x_s", x_s)
     check_names("labels", labels, 2)
     names = check_names("x_names", () if x_names is None else x_names)

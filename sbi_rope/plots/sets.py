@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import check_instance
 from sbi_rope.errors import InvalidInputError, warn_user
 from sbi_rope.mixture import MixturePosterior
 from sbi_rope.plots._figures import BLUE, GREY, ORANGE, empty_figure, hide_frame
@@ -18,6 +17,7 @@ from sbi_rope.plots._samples import (
     with_margin,
 )
 from sbi_rope.sets import CredibleIntervals
+from sbi_rope.settings import check
 from sbi_rope.stacking import StackedPosterior
 
 if TYPE_CHECKING:
@@ -67,11 +67,11 @@ def credible_set(
         The figure, with d rows and columns and the intervals on the diagonal.
 
     Raises:
-        InvalidTypeError: If the posterior is another one.
+        InvalidInputError: If the posterior is another one.
         InvalidInputError: If an argument is outside its range.
         ImportError: If matplotlib is not installed.
     """
-    check_instance("posterior", posterior, MixturePosterior)
+    check("posterior", posterior, MixturePosterior)
     if theta is not None:  # before the sets, which take a while
         theta = check_truth(theta, posterior.posterior_estimator.input_shape[0])
     options: dict[str, Any] = {"num_samples": num_samples, "seed": seed}

@@ -4,7 +4,6 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from sbi_rope._validation import check_instance
 from sbi_rope.metrics import CoverageCurve
 from sbi_rope.plots._figures import (
     BLUE,
@@ -14,6 +13,7 @@ from sbi_rope.plots._figures import (
     empty_figure,
     hide_frame,
 )
+from sbi_rope.settings import check
 from sbi_rope.stacking import LearningCurve, StackingReport
 from sbi_rope.stacking.words import differs
 
@@ -57,10 +57,10 @@ def stacking_report(report: StackingReport) -> "Figure":
         The figure.
 
     Raises:
-        InvalidTypeError: If the argument is no report.
+        InvalidInputError: If the argument is no report.
         ImportError: If matplotlib is not installed.
     """
-    check_instance("report", report, StackingReport)
+    check("report", report, StackingReport)
     curve = report.learning_curve
     shown = report.as_rows()[:MAX_CANDIDATES]
     top = 1.2 + 0.28 * len(shown)

@@ -2,19 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import (
-    check_batch,
-    check_finite,
-    check_integer,
-    check_names,
-    check_same_length,
-    check_tensor,
-)
+from sbi_rope._validation import check_finite, check_names
 from sbi_rope.errors import InvalidInputError, shown
 from sbi_rope.plots._figures import (
     BLUE,
@@ -36,6 +29,8 @@ from sbi_rope.plots._samples import (
     shade_prior,
     with_margin,
 )
+from sbi_rope.settings import Range, check
+from sbi_rope.tensors import as_batch, as_numbers, check_same_length
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -130,8 +125,8 @@ def overview(
     before, after, simulated, weights = _check_embeddings(
         before, after, simulated, weights
     )
-    check_integer("index", index, minimum=0, maximum=len(before) - 1)
-    check_tensor("theta", theta)
+    check("index", index, Annotated[int, Range(0, len(before) - 1)])
+    as_numbers("theta", theta)
     check_names("parameter_names", parameter_names)
     draws, truth, names = check_samples(samples, theta, parameter_names)
     assert truth is not None
@@ -328,16 +323,16 @@ def _check_embeddings(
     before: Tensor, after: Tensor, simulated: Tensor, weights: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Check embeddings and weights, and return them on the CPU in float64."""
-    if check_tensor("simulated", simulated).ndim != 2:
+    if as_numbers("simulated", simulated).ndim != 2:
         raise InvalidInputError(
             f"Expected `simulated` of shape (n_s, l); got {tuple(simulated.shape)}."
         )
     event = simulated.shape[1:]
-    check_batch("simulated", simulated, event)
-    check_batch("before", before, event)
-    check_batch("after", after, event)
+    as_batch("simulated", simulated, event)
+    as_batch("before", before, event)
+    as_batch("after", after, event)
     check_same_length("before", before, "after", after)
-    if check_tensor("weights", weights).shape != simulated.shape[:1]:
+    if as_numbers("weights", weights).shape != simulated.shape[:1]:
         raise InvalidInputError(
             f"Expected `weights` of shape ({len(simulated)},), one for each row of "
             f"`simulated`; got {tuple(weights.shape)}. Pass one row of the coupling, "
@@ -367,7 +362,7 @@ def _check_parameters(parameters: Sequence[int] | None, dim: int) -> list[int]:
             f"{dim - 1}; got {shown(parameters)}."
         )
     for j in parameters:
-        check_integer("parameters", j, minimum=0, maximum=dim - 1)
+        check("parameters", j, Annotated[int, Range(0, dim - 1)])
     if len({*parameters}) != len(parameters):
         raise InvalidInputError(
             f"Expected different `parameters`; got {shown(parameters)}."

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from sbi_rope._validation import check_instance
 from sbi_rope.discrepancy import DiscrepancyReport, Interval, SummaryDiscrepancy
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.plots._figures import BLUE, GREY, empty_figure, hide_frame
+from sbi_rope.settings import check
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -40,11 +40,11 @@ def discrepancy(report: DiscrepancyReport) -> "Figure":
         The figure.
 
     Raises:
-        InvalidTypeError: If the argument is no report.
+        InvalidInputError: If the argument is no report.
         InvalidInputError: If the report has no summary.
         ImportError: If matplotlib is not installed.
     """
-    check_instance("report", report, DiscrepancyReport)
+    check("report", report, DiscrepancyReport)
     if not report.summaries:
         raise InvalidInputError("Expected `report` of at least one summary; got none.")
     shown = list(report.summaries[:MAX_SUMMARIES])

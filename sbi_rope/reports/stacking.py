@@ -4,12 +4,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from sbi_rope._validation import (
-    check_instance,
-    check_names,
-    check_path,
-    default_names,
-)
+from sbi_rope._validation import check_names, check_path
 from sbi_rope.diagnosis import Diagnosis
 from sbi_rope.diagnosis.in_use import read_for, stack_in_use
 from sbi_rope.discrepancy import DiscrepancyReport
@@ -35,6 +30,7 @@ from sbi_rope.reports.page import (
     write_page,
 )
 from sbi_rope.reports.verdict import verdict_of
+from sbi_rope.settings import check, default_names
 from sbi_rope.stacking import StackingReport
 from sbi_rope.stacking.words import (
     IF_MOSTLY_PRIOR,
@@ -83,8 +79,8 @@ def write_stacking_report(
     The arguments are those of :meth:`StackingReport.to_html
     <sbi_rope.stacking.StackingReport.to_html>`.
     """
-    check_instance("report", report, StackingReport)
-    check_instance("diagnosis", diagnosis, Diagnosis, optional=True)
+    check("report", report, StackingReport)
+    check("diagnosis", diagnosis, Diagnosis | None)
     target = check_path("path", path)
     assert target is not None
     names = _parameter_names(report, diagnosis, parameter_names)

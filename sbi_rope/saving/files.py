@@ -11,11 +11,11 @@ import numpy as np
 
 from sbi_rope._files import read_arrays, write_atomically
 from sbi_rope._sbi import NeuralPosterior
-from sbi_rope._validation import check_instance, check_path
+from sbi_rope._validation import check_path
 from sbi_rope.errors import (
     DataNotFoundError,
     FileFormatError,
-    InvalidTypeError,
+    InvalidInputError,
     NotWritableError,
     RoPEError,
     shown,
@@ -24,6 +24,7 @@ from sbi_rope.saving.description import Description
 from sbi_rope.saving.memory import packed, unpacked
 from sbi_rope.saving.names import trusted_names
 from sbi_rope.saving.restoring import restored
+from sbi_rope.settings import check
 
 __all__ = ["load", "read_object", "save", "versions_of", "write_object"]
 
@@ -48,7 +49,7 @@ def save(posterior: Any, path: str | Path, *, overwrite: bool = False) -> None:
         overwrite: Whether to replace a file that exists.
 
     Raises:
-        InvalidTypeError: If an argument has the wrong type.
+        InvalidInputError: If an argument has the wrong type.
         InvalidInputError: If the posterior holds something that cannot be described,
             such as a lambda.
         NotWritableError: If the file exists, or cannot be written.
@@ -68,12 +69,12 @@ def save(posterior: Any, path: str | Path, *, overwrite: bool = False) -> None:
         hint = ""
         if hasattr(posterior, "build_posterior"):
             hint = " Save what its `build_posterior` returns."
-        raise InvalidTypeError(
+        raise InvalidInputError(
             "Expected `posterior` to be a posterior of sbi or sbi_rope; got "
             f"{type(posterior).__name__}.{hint}"
         )
     target = _path(path)
-    check_instance("overwrite", overwrite, bool)
+    check("overwrite", overwrite, bool)
     if target.is_dir():
         raise NotWritableError(
             f"Expected `path` to be a file; got the folder {target}. Add a name, such "
@@ -106,7 +107,7 @@ def load(path: str | Path, *, trusted: Sequence[type | Callable[..., Any]] = ())
         was saved.
 
     Raises:
-        InvalidTypeError: If an argument has the wrong type.
+        InvalidInputError: If an argument has the wrong type.
         DataNotFoundError: If there is no such file.
         FileFormatError: If it is not a file of :func:`save`, is damaged, or was written
             by other versions of the packages.

@@ -46,7 +46,7 @@ from sbi_rope._sbi import (
     NeuralPosterior,
     VectorFieldPosterior,
 )
-from sbi_rope.errors import InvalidTypeError
+from sbi_rope.errors import InvalidInputError
 
 __all__ = [
     "FUNCTIONS",
@@ -141,16 +141,16 @@ def trusted_names(trusted: Any) -> dict[str, Any]:
     """Return the classes and functions that a user trusts, by name.
 
     Raises:
-        InvalidTypeError: If there is something else among them.
+        InvalidInputError: If there is something else among them.
     """
     if not isinstance(trusted, Sequence) or isinstance(trusted, str):
-        raise InvalidTypeError(
+        raise InvalidInputError(
             "Expected `trusted` to be a list of classes and functions, such as "
             f"[MyNet]; got {type(trusted).__name__}."
         )
     for value in trusted:
         if not isinstance(value, type) and not inspect.isroutine(value):
-            raise InvalidTypeError(
+            raise InvalidInputError(
                 "Expected `trusted` to hold classes and functions themselves, such as "
                 f"[MyNet]; got {value!r} among them."
             )

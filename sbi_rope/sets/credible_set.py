@@ -9,14 +9,10 @@ import torch
 from torch import Tensor
 
 from sbi_rope._notebooks import shown_as_text
-from sbi_rope._validation import (
-    KnownColumns,
-    as_numbers_on,
-    check_batch,
-    check_tables,
-)
+from sbi_rope._validation import KnownColumns, check_tables
 from sbi_rope.sets.conformal import DIGITS
 from sbi_rope.sets.guarantee import Guarantee
+from sbi_rope.tensors import as_batch, as_numbers
 
 __all__ = ["CredibleSet", "HighestDensity", "Rule", "highest_density_set", "volume_of"]
 
@@ -113,16 +109,16 @@ class CredibleSet:
             Shape ``(*batch)``, bool.
 
         Raises:
-            InvalidTypeError: If theta holds no numbers.
+            InvalidInputError: If theta holds no numbers.
             InvalidInputError: If theta has another number of parameters, or is not
                 finite.
         """
         check_tables(self, theta=theta)
-        theta = as_numbers_on("theta", theta, self.draws.device)
+        theta = as_numbers("theta", theta, device=self.draws.device)
         shape = theta.shape[:-1]
         width = self.draws.shape[1:]
         rows = theta[None] if theta.ndim < 2 else theta.flatten(0, -2)
-        rows = check_batch("theta", rows, width).detach().to(self.draws)
+        rows = as_batch("theta", rows, width).detach().to(self.draws)
         return self.rule.contains(rows).reshape(shape)
 
     def __str__(self) -> str:

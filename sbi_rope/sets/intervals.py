@@ -9,16 +9,11 @@ import torch
 from torch import Tensor
 
 from sbi_rope._notebooks import shown_as_text
-from sbi_rope._validation import (
-    KnownColumns,
-    as_numbers_on,
-    check_batch,
-    check_names,
-    check_tables,
-    default_names,
-)
+from sbi_rope._validation import KnownColumns, check_names, check_tables
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.sets.guarantee import Guarantee
+from sbi_rope.settings import default_names
+from sbi_rope.tensors import as_batch, as_numbers
 
 __all__ = ["CredibleIntervals", "central_intervals"]
 
@@ -94,17 +89,17 @@ class CredibleIntervals:
             The shape of ``theta``, bool.
 
         Raises:
-            InvalidTypeError: If theta holds no numbers.
+            InvalidInputError: If theta holds no numbers.
             InvalidInputError: If the shape does not fit, or a number is not finite.
         """
         event = self.low.shape
         check_tables(self, theta=theta)
-        theta = as_numbers_on("theta", theta, self.low.device)
+        theta = as_numbers("theta", theta, device=self.low.device)
         shape = theta.shape
         rows = theta[None] if theta.ndim == len(event) else theta
         if rows.ndim > len(event):
             rows = rows.flatten(0, rows.ndim - 1 - len(event))
-        rows = check_batch("theta", rows, event).detach().to(self.low)
+        rows = as_batch("theta", rows, event).detach().to(self.low)
         return ((self.low <= rows) & (rows <= self.high)).reshape(shape)
 
     def as_rows(

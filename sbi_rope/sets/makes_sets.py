@@ -6,23 +6,19 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any
 
 from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_rope._random import seeded
 from sbi_rope._units import log_unit_of
-from sbi_rope._validation import (
-    KnownColumns,
-    check_instance,
-    check_integer,
-    check_level,
-)
+from sbi_rope._validation import KnownColumns
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.sets.conformal import DIGITS
 from sbi_rope.sets.credible_set import CredibleSet, highest_density_set
 from sbi_rope.sets.intervals import CredibleIntervals, central_intervals
+from sbi_rope.settings import Level, Range, check
 
 __all__ = ["MakesSets"]
 
@@ -191,9 +187,9 @@ class MakesSets(ABC):
 
 def _check(level: Any, *, guaranteed: Any, num_samples: Any, num_ends: int) -> None:
     """Check the arguments of a set, or of an interval, which has two ends."""
-    check_level("level", level)
-    check_instance("guaranteed", guaranteed, bool)
-    check_integer("num_samples", num_samples, minimum=2)
+    check("level", level, Level)
+    check("guaranteed", guaranteed, bool)
+    check("num_samples", num_samples, Annotated[int, Range(2)])
     needed = math.ceil(round(num_ends / (1 - level), DIGITS))
     if num_samples < needed and not guaranteed:
         raise InvalidInputError(

@@ -10,16 +10,8 @@ import torch
 
 from sbi_rope._sbi import check_density, estimator_of
 from sbi_rope._simulator import LimitedSimulator
-from sbi_rope._validation import (
-    check_choice,
-    check_instance,
-    check_not_negative,
-    check_positive,
-    check_unit_interval,
-)
 from sbi_rope.errors import (
     InvalidInputError,
-    InvalidTypeError,
     RoPEError,
     UnsupportedPosteriorError,
 )
@@ -32,6 +24,7 @@ from sbi_rope.mixture import (
     part_of_prior,
 )
 from sbi_rope.rope import RoPE
+from sbi_rope.settings import NotNegative, Positive, UnitInterval, check
 from sbi_rope.stacking.folds import Fold
 from sbi_rope.stacking.workbench import Workbench
 
@@ -72,17 +65,17 @@ class CouplingCandidate:
 
     def __post_init__(self) -> None:
         """Check the ranges of all fields."""
-        check_positive("gamma", self.gamma)
-        check_unit_interval("tau", self.tau)
-        check_instance("tuned", self.tuned, bool)
+        check("gamma", self.gamma, Positive)
+        check("tau", self.tau, UnitInterval)
+        check("tuned", self.tuned, bool)
         if self.rehearsal is not None:
-            check_not_negative("rehearsal", self.rehearsal)
+            check("rehearsal", self.rehearsal, NotNegative)
             if not self.tuned:
                 raise InvalidInputError(
                     "Expected `rehearsal` of None without tuning; got "
                     f"{self.rehearsal}."
                 )
-        check_choice("cost_scale", self.cost_scale, ("none", "simulated"))
+        check("cost_scale", self.cost_scale, Literal["none", "simulated"])
 
     @property
     def family(self) -> str:
@@ -167,12 +160,12 @@ class DensityCandidate(AmortisedCandidate):
 
     def __post_init__(self) -> None:
         """Check the types of all fields."""
-        check_instance("name", self.name, str)
-        check_instance("fixed", self.fixed, bool)
-        check_instance("learns_prior", self.learns_prior, bool)
+        check("name", self.name, str)
+        check("fixed", self.fixed, bool)
+        check("learns_prior", self.learns_prior, bool)
         _check_name(self.name)
         if not callable(self.build):
-            raise InvalidTypeError(
+            raise InvalidInputError(
                 "Expected `build` to be a function of (rope, seed) that returns a "
                 f"posterior; got {type(self.build).__name__}. Wrap a posterior: "
                 "`lambda rope, seed: posterior`."
@@ -209,7 +202,7 @@ class DensityCandidate(AmortisedCandidate):
 
 def _check_name(name: str) -> None:
     if not isinstance(name, str) or not name:
-        raise InvalidTypeError(f"Expected a `name` of some letters; got {name!r}.")
+        raise InvalidInputError(f"Expected a `name` of some letters; got {name!r}.")
     if name == "stack":
         raise InvalidInputError(
             "Expected another name than 'stack', which is the name of the mixture of "
@@ -224,17 +217,17 @@ def check_candidates(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
     """Check and return the candidates of a user.
 
     Raises:
-        InvalidTypeError: If one of them is not a candidate.
+        InvalidInputError: If one of them is not a candidate.
         InvalidInputError: If there is none, or two have the same name.
     """
     if not isinstance(candidates, Sequence):
-        raise InvalidTypeError(
+        raise InvalidInputError(
             "Expected `candidates` to be a list of candidates; got "
             f"{type(candidates).__name__}."
         )
     for candidate in candidates:
         if not isinstance(candidate, CouplingCandidate | AmortisedCandidate):
-            raise InvalidTypeError(
+            raise InvalidInputError(
                 "Expected `candidates` to be candidates, such as those of "
                 f"`default_candidates()`; got {type(candidate).__name__}. Wrap a "
                 "posterior that was not trained on the calibration pairs: "

@@ -13,9 +13,9 @@ from scipy.stats import t as student
 from torch import Tensor
 
 from sbi_rope._means import Counts, counts_of, interval_of_mean, mean_and_error
-from sbi_rope._validation import check_choice
 from sbi_rope.metrics import CoverageCurve
 from sbi_rope.metrics.calibration import coverage_curve_of_pairs
+from sbi_rope.settings import check, one_of
 from sbi_rope.stacking.held_out import SetScores
 from sbi_rope.stacking.weights import StackingWeights, stacking_weights
 
@@ -193,7 +193,7 @@ class CrossValidation:
         """
         if name == "stack":
             return self.comparable_stack_scores
-        check_choice("name", name, (*self.names, "stack"))
+        check("name", name, one_of((*self.names, "stack")))
         return self.log_scores[:, self.names.index(name)]
 
     def difference(self, name: str, other: str, *, seed: int = 0) -> Difference:

@@ -6,10 +6,11 @@ from typing import Any
 
 from torch import Tensor
 
-from sbi_rope._validation import check_instance, check_numbers
+from sbi_rope._validation import check_numbers
 from sbi_rope.errors import warn_user
 from sbi_rope.mixture import PriorPosterior
 from sbi_rope.rope import RoPE
+from sbi_rope.settings import check
 from sbi_rope.stacking.candidates import (
     AmortisedCandidate,
     Candidate,
@@ -77,13 +78,13 @@ def default_candidates(
         The candidates, couplings first.
 
     Raises:
-        InvalidTypeError: If ``rope`` is not a RoPE, or ``learn_prior`` not a bool.
+        InvalidInputError: If ``rope`` is not a RoPE, or ``learn_prior`` not a bool.
         InvalidInputError: If a gamma, a tau or the rehearsal is outside its range, or,
             with a rope, x_o has the wrong shape or device, is empty or not finite.
         NotReadyError: If ``rope`` has fewer than two calibration pairs.
     """
     gammas, taus = check_numbers("gammas", gammas), check_numbers("taus", taus)
-    check_instance("learn_prior", learn_prior, bool)
+    check("learn_prior", learn_prior, bool)
     amortised: tuple[AmortisedCandidate, ...] = (
         DensityCandidate(name="prior", build=_prior, fixed=True),
         DensityCandidate(name="NPE", build=_npe, fixed=True),
@@ -99,7 +100,7 @@ def default_candidates(
     if not learn_prior:
         amortised = tuple(one for one in amortised if one.fixed or not one.learns_prior)
     if rope is not None:
-        check_instance("rope", rope, RoPE)
+        check("rope", rope, RoPE)
         x_o = None if x_o is None else rope.checked_observations(x_o)
     if x_o is not None:
         amortised += (RVNPCandidate(x_o), RVNPCandidate(x_o, space="input"))

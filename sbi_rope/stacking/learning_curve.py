@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from sbi_rope._means import Counts, counts_of, interval_of_mean, mean_and_error
-from sbi_rope._validation import check_integer
+from sbi_rope.settings import Count, check
 from sbi_rope.stacking.cross_validation import CrossValidation, Difference
 
 __all__ = ["LearningCurve"]
@@ -80,7 +80,7 @@ class LearningCurve:
         Raises:
             InvalidInputError: If the number is below 1.
         """
-        check_integer("num_more", num_more)
+        check("num_more", num_more, Count)
         if len(self.num_pairs) < 2 or not torch.isfinite(self.pair_scores).all():
             return Difference(mean=float("nan"), low=float("nan"), high=float("nan"))
         inverse = torch.tensor(self.num_pairs).to(self.pair_scores).reciprocal()

@@ -11,7 +11,6 @@ from sbi_rope._groups import groups_of, one_of_each_group
 from sbi_rope._notebooks import shown_as_text
 from sbi_rope._tables import as_dataframe
 from sbi_rope._two_sample import TwoSampleTest
-from sbi_rope._validation import check_instance
 from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.metrics import (
     ACAUCScore,
@@ -23,6 +22,7 @@ from sbi_rope.metrics.by_estimate import coverage_by_estimate_of_pairs
 from sbi_rope.metrics.calibration import acauc_of_pairs, coverage_error_of_pairs
 from sbi_rope.recalibration import Recalibration
 from sbi_rope.sets.conformal import rank_needed
+from sbi_rope.settings import check
 from sbi_rope.stacking.cross_validation import CrossValidation, Difference
 from sbi_rope.stacking.held_out import SetScores
 from sbi_rope.stacking.learning_curve import LearningCurve
@@ -139,8 +139,8 @@ class StackingReport:
             parameter_names: One name for each parameter, if they have names.
             is_amortised: Whether it has no couplings.
         """
-        check_instance("cross_validation", cross_validation, CrossValidation)
-        check_instance("learning_curve", learning_curve, LearningCurve, optional=True)
+        check("cross_validation", cross_validation, CrossValidation)
+        check("learning_curve", learning_curve, LearningCurve | None)
         scores, levels = cross_validation, cross_validation.levels
         score, error = scores.mean_and_error(scores.stack_scores)
         return cls(
@@ -227,7 +227,7 @@ class StackingReport:
             x_names: A name for each entry of x; "x[0]" and so on if None.
 
         Raises:
-            InvalidTypeError: If an argument has the wrong type.
+            InvalidInputError: If an argument has the wrong type.
             InvalidInputError: If the path is a folder or a file of something else, or
                 the names do not fit.
             NotWritableError: If the folder cannot be written to.

@@ -6,10 +6,10 @@ from typing import Literal
 
 from torch import Tensor
 
-from sbi_rope._validation import check_choice, check_instance, check_unit_interval
 from sbi_rope.discrepancy.parameters import is_improbable
 from sbi_rope.errors import warn_user
-from sbi_rope.rope import HOW_TO_MAKE, RoPE
+from sbi_rope.rope import RoPE
+from sbi_rope.settings import UnitInterval, check
 from sbi_rope.stacking.batch import compare_batch
 from sbi_rope.stacking.candidates import Candidate
 from sbi_rope.stacking.cross_validation import CrossValidation
@@ -138,11 +138,11 @@ def stack(
         SimulationError: If the simulator fails.
         NotWritableError: If the folder of ``checkpoints`` cannot be made.
     """
-    check_choice("unseen", unseen, ("raise", "extend"))
-    check_unit_interval("tail_mass", tail_mass)
-    check_instance("rope", rope, RoPE, hint=HOW_TO_MAKE)
-    check_instance("recalibrate", recalibrate, bool)
-    check_instance("learning_curve", learning_curve, bool)
+    check("unseen", unseen, Literal["raise", "extend"])
+    check("tail_mass", tail_mass, UnitInterval)
+    check("rope", rope, RoPE)
+    check("recalibrate", recalibrate, bool)
+    check("learning_curve", learning_curve, bool)
     stopwatch = Stopwatch(rope)
     trainer = StackTrainer(
         rope,

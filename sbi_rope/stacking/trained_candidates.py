@@ -2,12 +2,12 @@
 
 import copy
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from sbi_rope._sbi import estimator_of, headless, with_embedding
-from sbi_rope._validation import check_choice, check_instance
 from sbi_rope.discrepancy.correction import Space
 from sbi_rope.mixture import OwnEmbeddings, Part, part_of
+from sbi_rope.settings import check, one_of
 from sbi_rope.stacking.candidates import AmortisedCandidate
 from sbi_rope.stacking.finetuning import finetune_without
 from sbi_rope.stacking.folds import Fold
@@ -35,8 +35,8 @@ class DiscrepancyCandidate(AmortisedCandidate):
 
     def __post_init__(self) -> None:
         """Check the values of all fields."""
-        check_choice("space", self.space, ("embedding", "input", "tuned"))
-        check_instance("learn_prior", self.learn_prior, bool)
+        check("space", self.space, Literal["embedding", "input", "tuned"])
+        check("learn_prior", self.learn_prior, bool)
 
     @property
     def name(self) -> str:  # type: ignore[override]
@@ -103,7 +103,7 @@ class FinetunedCandidate(AmortisedCandidate):
 
     def __post_init__(self) -> None:
         """Check the value of the field."""
-        check_choice("space", self.space, (None, "embedding", "input", "tuned"))
+        check("space", self.space, one_of((None, "embedding", "input", "tuned")))
 
     @property
     def name(self) -> str:  # type: ignore[override]

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from torch import Tensor
@@ -11,15 +11,7 @@ from torch import Tensor
 from sbi_rope._progress import is_shown, progress_bar
 from sbi_rope._sbi import check_density, estimator_of
 from sbi_rope._standardisation import warn_of_far_entries
-from sbi_rope._validation import (
-    check_default_dtype,
-    check_gradients,
-    check_instance,
-    check_integer,
-    check_not_negative,
-    check_path,
-    check_prior,
-)
+from sbi_rope._validation import check_default_dtype, check_path, check_prior
 from sbi_rope.coupling.coupler import SMALL_BATCH
 from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.discrepancy.correction import check_complete, network_of
@@ -29,7 +21,8 @@ from sbi_rope.errors import (
 )
 from sbi_rope.mixture import Part
 from sbi_rope.recalibration import Recalibration
-from sbi_rope.rope import HOW_TO_MAKE, RoPE
+from sbi_rope.rope import RoPE
+from sbi_rope.settings import Count, NotNegative, Range, check
 from sbi_rope.stacking.candidates import (
     AmortisedCandidate,
     Candidate,
@@ -78,16 +71,15 @@ class StackTrainer:
         unseen: Literal["raise", "extend"] = "raise",
         tail_mass: float = 1e-3,
     ) -> None:
-        check_gradients()
         check_default_dtype()
-        check_instance("rope", rope, RoPE, hint=HOW_TO_MAKE)
+        check("rope", rope, RoPE)
         if num_folds is not None:
-            check_integer("num_folds", num_folds, minimum=2)
+            check("num_folds", num_folds, Annotated[int, Range(2)])
         if num_simulations is not None:
-            check_integer("num_simulations", num_simulations)
-        check_not_negative("pseudo_count", pseudo_count)
-        check_instance("require_convergence", require_convergence, bool)
-        check_integer("num_workers", num_workers, maximum=1000)
+            check("num_simulations", num_simulations, Count)
+        check("pseudo_count", pseudo_count, NotNegative)
+        check("require_convergence", require_convergence, bool)
+        check("num_workers", num_workers, Annotated[int, Range(1, 1000)])
         if checkpoints is not None and seed is None:
             raise InvalidInputError(
                 "Expected a `seed` together with `checkpoints`, so that the same call "
@@ -183,7 +175,7 @@ class StackTrainer:
         num_folds = len(bench.folds)
         if num_training_folds is None:
             num_training_folds = num_folds - 1
-        check_integer("num_training_folds", num_training_folds)
+        check("num_training_folds", num_training_folds, Count)
         if num_training_folds >= num_folds:
             raise InvalidInputError(
                 f"Expected `num_training_folds` below the number of folds, {num_folds};"

@@ -7,12 +7,14 @@ import torch
 from torch import Tensor
 
 from sbi_rope._sbi import estimator_of
-from sbi_rope._validation import as_numbers, check_choice, column_names
+from sbi_rope._validation import column_names
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture import Part, part_of
+from sbi_rope.settings import check
 from sbi_rope.stacking.candidates import AmortisedCandidate
 from sbi_rope.stacking.folds import Fold
 from sbi_rope.stacking.workbench import Workbench
+from sbi_rope.tensors import as_numbers
 
 __all__ = ["RVNPCandidate"]
 
@@ -41,7 +43,7 @@ class RVNPCandidate(AmortisedCandidate):
             with a few statistics, and hours with fifty.
 
     Raises:
-        InvalidTypeError: If x_o holds no numbers.
+        InvalidInputError: If x_o holds no numbers.
         InvalidInputError: If ``space`` is something else, or x_o is a table whose
             columns have names. Shape and values of x_o are checked when the stack is
             made.
@@ -53,7 +55,7 @@ class RVNPCandidate(AmortisedCandidate):
 
     def __post_init__(self) -> None:
         """Check the fields, and take a copy of the observations."""
-        check_choice("space", self.space, ("embedding", "input"))
+        check("space", self.space, Literal["embedding", "input"])
         if column_names(self.x_o):
             raise InvalidInputError(
                 "Expected `x_o` without names of columns, whose order is not checked "

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from sbi_rope._random import seeded
-from sbi_rope._validation import check_batch, check_same_length
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture import MixtureEstimator, Part
 from sbi_rope.mixture.parts import DTYPE
@@ -16,6 +15,7 @@ from sbi_rope.stacking.candidates import AmortisedCandidate
 from sbi_rope.stacking.checkpoints import Checkpoints
 from sbi_rope.stacking.couplings import FittedCouplings
 from sbi_rope.stacking.folds import Fold
+from sbi_rope.tensors import as_batch, check_same_length
 
 __all__ = ["Versions", "train_version"]
 
@@ -163,7 +163,7 @@ class Versions:
                 and ``unseen="raise"``.
         """
         numbers = range(len(self.trained)) if numbers is None else numbers
-        theta = check_batch("theta", theta, self._any.density.input_shape).to(DTYPE)
+        theta = as_batch("theta", theta, self._any.density.input_shape).to(DTYPE)
         check_same_length("theta", theta, "x", x)
         scores = self._coupled_log_probs(theta, x, numbers, log_q)
         for name in self.names:

@@ -6,15 +6,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import (
-    check_integer,
-    check_not_negative,
-    check_pair_weights,
-    check_positive,
-    check_tensor,
-    check_values,
-)
+from sbi_rope._validation import check_pair_weights
 from sbi_rope.errors import InvalidInputError, warn_user
+from sbi_rope.settings import Count, NotNegative, Positive, check
 
 __all__ = ["StackingWeights", "stacking_weights"]
 
@@ -82,7 +76,7 @@ def stacking_weights(
         The weights.
 
     Raises:
-        InvalidTypeError: If the scores are not a tensor.
+        InvalidInputError: If the scores are not a tensor.
         InvalidInputError: If the shape does not fit, a score is NaN or plus infinity,
             or an argument is outside its range.
 
@@ -92,9 +86,9 @@ def stacking_weights(
         tensor([0.6670, 0.3330], dtype=torch.float64)
     """
     scores, of_pairs = _checked_scores(log_scores, pair_weights)
-    check_not_negative("pseudo_count", pseudo_count)
-    check_positive("tolerance", tolerance)
-    check_integer("max_iterations", max_iterations)
+    check("pseudo_count", pseudo_count, NotNegative)
+    check("tolerance", tolerance, Positive)
+    check("max_iterations", max_iterations, Count)
     # Relative to the best candidate at each pair, so that exp does not over- or
     # underflow.
     density = (scores - scores.max(dim=1, keepdim=True).values).exp()
@@ -139,7 +133,6 @@ def _checked_scores(
     log_scores: Tensor, pair_weights: Tensor | None
 ) -> tuple[Tensor, Tensor]:
     """Return the scores and weights of the pairs that a candidate does not exclude."""
-    check_values("log_scores", check_tensor("log_scores", log_scores))
     scores = log_scores.detach().double()
     if scores.ndim != 2 or not scores.shape[1]:
         raise InvalidInputError(

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from sbi_rope._validation import default_names
 from sbi_rope.discrepancy.parameters import is_improbable
 from sbi_rope.metrics.by_estimate import in_words
 from sbi_rope.metrics.calibration import ACAUC_IN_WORDS, FEWEST
+from sbi_rope.settings import default_names
 from sbi_rope.stacking.cross_validation import Difference
 from sbi_rope.stacking.learning_curve import LearningCurve
 

@@ -8,8 +8,8 @@ import inspect
 from pathlib import Path
 from typing import Any
 
-from sbi_rope._validation import check_choice
 from sbi_rope.errors import InvalidInputError
+from sbi_rope.settings import check, one_of
 from sbi_rope.tasks.base import Task
 from sbi_rope.tasks.cs import CancerStroma
 from sbi_rope.tasks.hemodynamics.task import Hemodynamics
@@ -67,7 +67,7 @@ def get_task(
         >>> get_task("pendulum", variant="misspecified_prior").parameter_names
         ('omega_0', 'A')
     """
-    check_choice("name", name, list_tasks())
+    check("name", name, one_of(list_tasks()))
     task = TASKS[name]
     accepted = inspect.signature(task).parameters.keys() - {"variant", "root"}
     unknown = sorted(options.keys() - accepted)

@@ -3,22 +3,15 @@ r"""The base class of all tasks: a prior, a simulator and labelled observations.
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import torch
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
-from sbi_rope._validation import (
-    check_batch,
-    check_choice,
-    check_in_support,
-    check_integer,
-    check_path,
-    check_positive,
-    check_unit_interval,
-)
-from sbi_rope.errors import InvalidInputError, InvalidTypeError, shown
+from sbi_rope._validation import check_path
+from sbi_rope.errors import InvalidInputError, shown
+from sbi_rope.settings import Positive, Range, UnitInterval, check, one_of
 from sbi_rope.tasks.settings import PaperSettings
 from sbi_rope.tasks.splits import MAX_SEED, DrawnPairs, Keep, Part, RecordedPairs
 from sbi_rope.tasks.variants import (
@@ -27,6 +20,7 @@ from sbi_rope.tasks.variants import (
     inside_region,
     with_label_noise,
 )
+from sbi_rope.tensors import as_batch, check_in_support
 
 __all__ = ["Task", "check_parameters", "check_theta"]
 
@@ -119,7 +113,7 @@ class Task(ABC):
         label_noise: float | None = None,
     ) -> None:
         if variant is not None:
-            check_choice("variant", variant, list(self.variants))
+            check("variant", variant, one_of(list(self.variants)))
         self.variant = variant
         self.root = check_path("root", root, optional=True)
         self.label_noise = self._option(
@@ -128,9 +122,9 @@ class Task(ABC):
             LABEL_NOISE if variant == "noisy_labels" else 0.0,
             variant="noisy_labels",
         )
-        check_unit_interval("label_noise", self.label_noise)
+        check("label_noise", self.label_noise, UnitInterval)
         if label_noise is not None:
-            check_positive("label_noise", label_noise)
+            check("label_noise", label_noise, Positive)
 
     @property
     def theta_dim(self) -> int:
@@ -255,7 +249,7 @@ class Task(ABC):
             part: ``"calibration"`` or ``"test"``.
             seed: Seed of the set. Variants keep other pairs under other seeds.
         """
-        check_choice("part", part, ("calibration", "test"))
+        check("part", part, Literal["calibration", "test"])
         seed = _checked_seed(seed)
         with torch.device("cpu"):
             process = self._process_of(part)
@@ -326,13 +320,13 @@ def check_theta(theta: Any, theta_dim: int, *, finite: bool = True) -> Tensor:
             transforms (``torch.func``) must not.
 
     Raises:
-        InvalidTypeError: If ``theta`` is not a tensor of floating-point numbers.
+        InvalidInputError: If ``theta`` is not a tensor of floating-point numbers.
         InvalidInputError: If its shape is not ``(n, theta_dim)``, if it is not finite,
             or if it is far larger than parameters are.
     """
-    theta = check_batch("theta", theta, (theta_dim,), finite=finite, allow_empty=True)
+    theta = as_batch("theta", theta, (theta_dim,), finite=finite, empty=True)
     if not theta.is_floating_point():
-        raise InvalidTypeError(
+        raise InvalidInputError(
             f"Expected `theta` to hold floating-point numbers; got {theta.dtype}. "
             "Convert it with `theta.float()`."
         )
@@ -357,11 +351,11 @@ def check_parameters(theta: Any, prior: Distribution) -> Tensor:
 
 
 def _checked_size(n: Any) -> int:
-    check_integer("n", n, maximum=MAX_PAIRS)
+    check("n", n, Annotated[int, Range(1, MAX_PAIRS)])
     return int(n)
 
 
 def _checked_seed(seed: Any) -> int:
     # An int of Python: those of NumPy overflow in the arithmetic of streams.
-    check_integer("seed", seed, minimum=0, maximum=MAX_SEED - 1)
+    check("seed", seed, Annotated[int, Range(0, MAX_SEED - 1)])
     return int(seed)

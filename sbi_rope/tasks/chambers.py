@@ -18,8 +18,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import check_instance
 from sbi_rope.errors import DataNotFoundError, InvalidInputError, shown, warn_user
+from sbi_rope.settings import check
 
 __all__ = [
     "CUT_FILE",
@@ -69,7 +69,7 @@ def check_download(
     root: Path | None, required: Sequence[Path], *, download: bool
 ) -> None:
     """Raise if files are to be downloaded and no ``root`` is given for them."""
-    check_instance("download", download, bool)
+    check("download", download, bool)
     if download and required and root is None:
         raise InvalidInputError(
             "Expected `root` with `download=True`: the folder to download into; got "

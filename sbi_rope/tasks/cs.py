@@ -10,8 +10,8 @@ import torch
 from sbi.utils import BoxUniform
 from torch import Tensor, nn
 
-from sbi_rope._validation import check_instance, check_unit_interval
 from sbi_rope.errors import InvalidInputError
+from sbi_rope.settings import UnitInterval, check
 from sbi_rope.tasks.base import Task, check_parameters, check_theta
 from sbi_rope.tasks.distributions import box
 from sbi_rope.tasks.networks import fully_connected
@@ -69,9 +69,9 @@ class CancerStromaSimulator:
     batched: bool | None = None
 
     def __post_init__(self) -> None:
-        check_unit_interval("necrosis_probability", self.necrosis_probability)
-        check_unit_interval("necrosis_radius", self.necrosis_radius)
-        check_instance("batched", self.batched, bool, optional=True)
+        check("necrosis_probability", self.necrosis_probability, UnitInterval)
+        check("necrosis_radius", self.necrosis_radius, UnitInterval)
+        check("batched", self.batched, bool | None)
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, 3)``, to shape ``(n, 4)``."""
@@ -285,7 +285,7 @@ class CancerStroma(Task):
 
     def get_embedding_net(self, *, light: bool = False) -> nn.Module:
         """Return the paper's network, which is light already and has nine outputs."""
-        check_instance("light", light, bool)
+        check("light", light, bool)
         return fully_connected(len(STATISTICS), (12, 48, 48, 36, 9))
 
     def _real_process(self, part: Part) -> DrawnPairs:

@@ -8,8 +8,9 @@ from sbi.utils import BoxUniform
 from torch import Size, Tensor
 from torch.distributions import Distribution, constraints
 
-from sbi_rope._validation import check_finite, check_tensor
+from sbi_rope._validation import check_finite
 from sbi_rope.errors import InvalidInputError
+from sbi_rope.tensors import as_numbers
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -46,7 +47,7 @@ def box(
 
 def check_size(name: str, value: Any) -> Tensor:
     """Return the size of a support if it is a tensor of finite, positive numbers."""
-    check_finite(name, check_tensor(name, value))
+    check_finite(name, as_numbers(name, value))
     if not value.is_floating_point() or not (value > 0).all():
         raise InvalidInputError(
             f"Expected `{name}` to hold positive floating-point numbers; got "

@@ -7,8 +7,8 @@ import torch
 from sbi.utils import BoxUniform, MultipleIndependent
 from torch import Tensor
 
-from sbi_rope._validation import check_choice, check_in_support, check_instance
 from sbi_rope.errors import InvalidInputError
+from sbi_rope.settings import check, one_of
 from sbi_rope.tasks.base import Task, check_parameters
 from sbi_rope.tasks.chambers import (
     check_complete,
@@ -33,6 +33,7 @@ from sbi_rope.tasks.light_tunnel_network import ImageEmbedding
 from sbi_rope.tasks.settings import PaperSettings
 from sbi_rope.tasks.splits import DrawnPairs, Keep, Part, RecordedPairs, generator_of
 from sbi_rope.tasks.variants import COMMON_VARIANTS
+from sbi_rope.tensors import check_in_support
 
 __all__ = ["LightTunnel"]
 
@@ -164,9 +165,9 @@ class LightTunnel(Task):
         sensor_noise: float | None = None,
     ) -> None:
         super().__init__(variant=variant, root=root, label_noise=label_noise)
-        check_choice("image_size", image_size, IMAGE_SIZES)
-        check_instance("stand_in", stand_in, bool)
-        check_instance("experiment", experiment, str, optional=True)
+        check("image_size", image_size, one_of(IMAGE_SIZES))
+        check("stand_in", stand_in, bool)
+        check("experiment", experiment, str | None)
         self.stand_in = stand_in or variant == "synthetic"
         if experiment is not None and (self.stand_in or variant in OWN_EXPERIMENTS):
             raise InvalidInputError(

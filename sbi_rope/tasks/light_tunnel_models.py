@@ -1,16 +1,13 @@
 r"""Two published models of the light tunnel's images, one with a camera's noise."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from torch import Tensor
 from torch.distributions import Beta, Binomial
 
-from sbi_rope._validation import (
-    check_instance,
-    check_integer,
-    check_unit_interval,
-)
+from sbi_rope.settings import Range, UnitInterval, check
 from sbi_rope.tasks.base import check_theta
 
 __all__ = [
@@ -75,8 +72,8 @@ class HexagonSimulator:
     dequantise: bool = False
 
     def __post_init__(self) -> None:
-        check_integer("image_size", self.image_size, maximum=MAX_SIZE)
-        check_instance("dequantise", self.dequantise, bool)
+        check("image_size", self.image_size, Annotated[int, Range(1, MAX_SIZE)])
+        check("dequantise", self.dequantise, bool)
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, 4)``, to ``(n, 3, size, size)``."""
@@ -138,9 +135,9 @@ class CameraSimulator:
     sensor_noise: float = CAMERA_NOISE
 
     def __post_init__(self) -> None:
-        check_integer("image_size", self.image_size, maximum=MAX_SIZE)
-        check_instance("dequantise", self.dequantise, bool)
-        check_unit_interval("sensor_noise", self.sensor_noise)
+        check("image_size", self.image_size, Annotated[int, Range(1, MAX_SIZE)])
+        check("dequantise", self.dequantise, bool)
+        check("sensor_noise", self.sensor_noise, UnitInterval)
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, 4)``, to ``(n, 3, size, size)``."""

@@ -1,11 +1,14 @@
 r"""The embedding networks of the light tunnel's images."""
 
+from typing import Annotated
+
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._validation import check_batch, check_instance, check_integer
+from sbi_rope.settings import Range, check
 from sbi_rope.tasks.light_tunnel_models import MAX_SIZE
 from sbi_rope.tasks.networks import MAX_WIDTH, fully_connected
+from sbi_rope.tensors import as_batch
 
 __all__ = ["ImageEmbedding"]
 
@@ -50,14 +53,13 @@ class ImageEmbedding(nn.Module):
         self, *, image_size: int = 100, output_dim: int = 20, light: bool = False
     ) -> None:
         super().__init__()
-        check_instance("light", light, bool)
-        check_integer(
+        check("light", light, bool)
+        check(
             "image_size",
             image_size,
-            minimum=MIN_SIZE_LIGHT if light else MIN_SIZE,
-            maximum=MAX_SIZE,
+            Annotated[int, Range(MIN_SIZE_LIGHT if light else MIN_SIZE, MAX_SIZE)],
         )
-        check_integer("output_dim", output_dim, maximum=MAX_WIDTH)
+        check("output_dim", output_dim, Annotated[int, Range(1, MAX_WIDTH)])
         self.image_size = image_size
         self.features = (
             _means(image_size // MIN_SIZE_LIGHT) if light else _convolutions()
@@ -71,7 +73,7 @@ class ImageEmbedding(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Embed images of shape ``(n, 3, size, size)`` as ``(n, output_dim)``."""
         shape = (3, self.image_size, self.image_size)
-        return self.head(self.features(check_batch("x", x, shape, finite=False)))
+        return self.head(self.features(as_batch("x", x, shape, finite=False)))
 
 
 class _LastConvolution(nn.Conv2d):

@@ -7,14 +7,8 @@ import torch
 from sbi.utils import BoxUniform, MultipleIndependent
 from torch import Tensor, nn
 
-from sbi_rope._validation import (
-    LARGEST_SETTING,
-    check_in_support,
-    check_instance,
-    check_not_negative,
-    check_positive,
-)
 from sbi_rope.errors import InvalidInputError
+from sbi_rope.settings import NotNegative, Positive, check
 from sbi_rope.tasks.base import Task, check_parameters, check_theta
 from sbi_rope.tasks.chambers import (
     CUT_FILE,
@@ -27,6 +21,7 @@ from sbi_rope.tasks.distributions import UniformDistance, box
 from sbi_rope.tasks.networks import fully_connected
 from sbi_rope.tasks.splits import Part, RecordedPairs
 from sbi_rope.tasks.variants import COMMON_VARIANTS
+from sbi_rope.tensors import check_in_support
 
 __all__ = ["LightTunnelSensors", "LightTunnelSimulator"]
 
@@ -107,12 +102,8 @@ class LightTunnelSimulator:
     current_noise_std: float = 4.0
 
     def __post_init__(self) -> None:
-        check_not_negative(
-            "relative_noise", self.relative_noise, maximum=LARGEST_SETTING
-        )
-        check_not_negative(
-            "current_noise_std", self.current_noise_std, maximum=LARGEST_SETTING
-        )
+        check("relative_noise", self.relative_noise, NotNegative)
+        check("current_noise_std", self.current_noise_std, NotNegative)
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, 4)``, to shape ``(n, 7)``."""
@@ -235,9 +226,9 @@ class LightTunnelSensors(Task):
         current_noise_std: float = 4.0,
     ) -> None:
         super().__init__(variant=variant, root=root, label_noise=label_noise)
-        check_positive("relative_noise", relative_noise, maximum=LARGEST_SETTING)
-        check_positive("current_noise_std", current_noise_std, maximum=LARGEST_SETTING)
-        check_instance("experiment", experiment, str, optional=True)
+        check("relative_noise", relative_noise, Positive)
+        check("current_noise_std", current_noise_std, Positive)
+        check("experiment", experiment, str | None)
         if experiment is not None and variant in OWN_EXPERIMENTS:
             raise InvalidInputError(
                 f"`experiment` has no effect with `variant={variant!r}`, which chooses "
@@ -285,7 +276,7 @@ class LightTunnelSensors(Task):
 
     def get_embedding_net(self, *, light: bool = False) -> nn.Module:
         """Return a network with three hidden layers of 64 and eight outputs."""
-        check_instance("light", light, bool)
+        check("light", light, bool)
         return fully_connected(len(OUTPUTS), (64, 64, 64, 8))
 
     def _recorded_files(self) -> tuple[Path, ...]:

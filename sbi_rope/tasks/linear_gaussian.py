@@ -8,21 +8,14 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import MultivariateNormal, Normal, StudentT
 
-from sbi_rope._validation import (
-    LARGEST_SETTING,
-    check_batch,
-    check_device,
-    check_instance,
-    check_integer,
-    check_number,
-    check_positive,
-    check_same_length,
-)
+from sbi_rope._validation import check_device
 from sbi_rope.errors import InvalidInputError
+from sbi_rope.settings import Count, Number, Positive, check
 from sbi_rope.tasks.base import Task, check_theta
 from sbi_rope.tasks.networks import fully_connected
 from sbi_rope.tasks.splits import DrawnPairs, Part
 from sbi_rope.tasks.variants import COMMON_VARIANTS
+from sbi_rope.tensors import as_batch, check_same_length
 
 __all__ = ["LinearGaussian", "LinearGaussianSimulator"]
 
@@ -62,8 +55,8 @@ class LinearGaussianSimulator:
     shift: float = 0.0
 
     def __post_init__(self) -> None:
-        check_integer("dim", self.dim)
-        check_positive("noise_std", self.noise_std, maximum=LARGEST_SETTING)
+        check("dim", self.dim, Count)
+        check("noise_std", self.noise_std, Positive)
         _check_gain_and_offset(self.scale, self.shift)
 
     def __call__(self, theta: Tensor) -> Tensor:
@@ -74,7 +67,7 @@ class LinearGaussianSimulator:
     def observe(self, theta: Tensor, noise: Tensor) -> Tensor:
         r"""Return observations for given noise :math:`\varepsilon`, differentiable."""
         theta = check_theta(theta, self.dim, finite=False)
-        check_batch("noise", noise, (self.dim,), finite=False, allow_empty=True)
+        as_batch("noise", noise, (self.dim,), finite=False, empty=True)
         check_same_length("theta", theta, "noise", noise)
         check_device("noise", noise, theta.device, where="`theta`")
         return self._observe(theta, noise)
@@ -100,7 +93,7 @@ class LinearGaussianSimulator:
         Returns:
             One Gaussian for each row, batch shape ``(n,)``, float64.
         """
-        x = check_batch("x", x, (self.dim,)).double()
+        x = as_batch("x", x, (self.dim,)).double()
         matrix = self.matrix(x)
         precision = torch.eye(self.dim, dtype=x.dtype, device=x.device)
         precision = precision + matrix.T @ matrix / self.noise_std**2
@@ -162,12 +155,12 @@ class LinearGaussian(Task):
         noise_std: float = NOISE_STD,
     ) -> None:
         super().__init__(variant=variant, root=root, label_noise=label_noise)
-        check_integer("dim", dim)
+        check("dim", dim, Count)
         if dim > MAX_DIM:
             raise InvalidInputError(
                 f"Expected `dim` to be at most {MAX_DIM}; got {dim}."
             )
-        check_positive("noise_std", noise_std, maximum=LARGEST_SETTING)
+        check("noise_std", noise_std, Positive)
         self.dim = dim
         self.parameter_names = tuple(f"theta_{k + 1}" for k in range(dim))
         self.parameter_units = ("1",) * dim
@@ -195,7 +188,7 @@ class LinearGaussian(Task):
 
     def get_embedding_net(self, *, light: bool = False) -> nn.Module:
         """Return a network with two hidden layers of 64 and 2 d outputs."""
-        check_instance("light", light, bool)
+        check("light", light, bool)
         return fully_connected(self.dim, (64, 64, 2 * self.dim))
 
     @property
@@ -250,8 +243,8 @@ class LinearGaussian(Task):
 
 
 def _check_gain_and_offset(scale: float, shift: float) -> None:
-    check_number("scale", scale, maximum=LARGEST_SETTING)
-    check_number("shift", shift, maximum=LARGEST_SETTING)
+    check("scale", scale, Number)
+    check("shift", shift, Number)
     if scale == 0:
         raise InvalidInputError(
             f"Expected `scale` to be a finite number other than 0; got {scale!r}."

@@ -1,12 +1,14 @@
 r"""Embedding networks that several tasks share."""
 
 from collections.abc import Sequence
+from typing import Annotated
 
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._validation import check_batch, check_integer
-from sbi_rope.errors import InvalidInputError, InvalidTypeError, shown
+from sbi_rope.errors import InvalidInputError, shown
+from sbi_rope.settings import Count, Range, check
+from sbi_rope.tensors import as_batch
 
 __all__ = ["SeriesEmbedding", "fully_connected", "light_series_embedding"]
 
@@ -58,10 +60,10 @@ class SeriesEmbedding(nn.Module):
         decimation: int = 1,
     ) -> None:
         super().__init__()
-        check_integer("num_steps", num_steps, maximum=MAX_WIDTH)
-        check_integer("output_dim", output_dim, maximum=MAX_WIDTH)
-        check_integer("padding", padding, maximum=MAX_WIDTH)
-        check_integer("decimation", decimation)
+        check("num_steps", num_steps, Annotated[int, Range(1, MAX_WIDTH)])
+        check("output_dim", output_dim, Annotated[int, Range(1, MAX_WIDTH)])
+        check("padding", padding, Annotated[int, Range(1, MAX_WIDTH)])
+        check("decimation", decimation, Count)
         _check_pools(pools)
         self.num_steps = num_steps
         self.decimation = decimation
@@ -71,7 +73,7 @@ class SeriesEmbedding(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Embed series of shape ``(n, num_steps)`` as ``(n, output_dim)``."""
-        x = check_batch("x", x, (self.num_steps,), finite=False)
+        x = as_batch("x", x, (self.num_steps,), finite=False)
         return self.head(self.features(x[:, :: self.decimation].unsqueeze(1)))
 
     def _count_features(self, padding: int) -> int:
@@ -102,14 +104,14 @@ def fully_connected(input_dim: int, widths: Sequence[int]) -> nn.Sequential:
           (2): Linear(in_features=64, out_features=8, bias=True)
         )
     """
-    check_integer("input_dim", input_dim, maximum=MAX_WIDTH)
+    check("input_dim", input_dim, Annotated[int, Range(1, MAX_WIDTH)])
     if not isinstance(widths, Sequence) or isinstance(widths, str) or not widths:
-        raise InvalidTypeError(
+        raise InvalidInputError(
             f"Expected `widths` to be a list of at least one integer; got "
             f"{shown(widths)}."
         )
     for width in widths:
-        check_integer("widths", width, maximum=MAX_WIDTH)
+        check("widths", width, Annotated[int, Range(1, MAX_WIDTH)])
     layers: list[nn.Module] = []
     for before, after in zip((input_dim, *widths), widths, strict=False):
         layers += [nn.Linear(before, after), nn.ReLU()]
@@ -131,8 +133,8 @@ def light_series_embedding(*, num_steps: int, output_dim: int) -> nn.Sequential:
         >>> net(torch.zeros(5, 50)).shape
         torch.Size([5, 10])
     """
-    check_integer("num_steps", num_steps, maximum=MAX_WIDTH)
-    check_integer("output_dim", output_dim, maximum=MAX_WIDTH)
+    check("num_steps", num_steps, Annotated[int, Range(1, MAX_WIDTH)])
+    check("output_dim", output_dim, Annotated[int, Range(1, MAX_WIDTH)])
     layers: list[nn.Module] = [nn.Unflatten(1, (1, num_steps))]
     length = num_steps
     for before, after in ((1, 16), (16, 32), (32, 32)):
@@ -147,7 +149,7 @@ def _check_pools(pools: Sequence[tuple[int, int]]) -> None:
     try:
         pairs = [(size, step) for size, step in pools]
     except (TypeError, ValueError) as error:
-        raise InvalidTypeError(
+        raise InvalidInputError(
             f"Expected `pools` to be pairs of a number of neighbours and a stride; got "
             f"{shown(pools)}."
         ) from error
@@ -157,8 +159,8 @@ def _check_pools(pools: Sequence[tuple[int, int]]) -> None:
             f"{len(pairs)}."
         )
     for size, step in pairs:
-        check_integer("the numbers of neighbours in pools", size)
-        check_integer("the strides in pools", step)
+        check("the numbers of neighbours in pools", size, Count)
+        check("the strides in pools", step, Count)
 
 
 def _convolutions(padding: int, pools: Sequence[tuple[int, int]]) -> nn.Sequential:

@@ -8,22 +8,15 @@ import torch
 from sbi.utils import BoxUniform
 from torch import Tensor, nn
 
-from sbi_rope._validation import (
-    LARGEST_SETTING,
-    check_batch,
-    check_device,
-    check_instance,
-    check_not_negative,
-    check_positive,
-    check_same_length,
-    check_unit_interval,
-)
+from sbi_rope._validation import check_device
+from sbi_rope.settings import NotNegative, Positive, UnitInterval, check
 from sbi_rope.tasks.base import Task, check_parameters, check_theta
 from sbi_rope.tasks.distributions import box
 from sbi_rope.tasks.networks import SeriesEmbedding, light_series_embedding
 from sbi_rope.tasks.settings import PaperSettings
 from sbi_rope.tasks.splits import DrawnPairs, Part
 from sbi_rope.tasks.variants import COMMON_VARIANTS
+from sbi_rope.tensors import as_batch, check_same_length
 
 __all__ = ["Pendulum", "PendulumSimulator"]
 
@@ -55,8 +48,8 @@ class PendulumSimulator:
     max_damping: float = 0.0
 
     def __post_init__(self) -> None:
-        check_not_negative("noise_std", self.noise_std, maximum=LARGEST_SETTING)
-        check_not_negative("max_damping", self.max_damping, maximum=LARGEST_SETTING)
+        check("noise_std", self.noise_std, NotNegative)
+        check("max_damping", self.max_damping, NotNegative)
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, 2)``, to shape ``(n, 200)``."""
@@ -79,7 +72,7 @@ class PendulumSimulator:
         """
         theta = check_theta(theta, 2, finite=False)
         for name, value in (("phase", phase), ("damping", damping)):
-            check_batch(name, value, (1,), finite=False, allow_empty=True)
+            as_batch(name, value, (1,), finite=False, empty=True)
             check_same_length("theta", theta, name, value)
             check_device(name, value, theta.device, where="`theta`")
         return self._position(theta, phase, damping)
@@ -162,7 +155,7 @@ class Pendulum(Task):
         max_damping: float | None = None,
     ) -> None:
         super().__init__(variant=variant, root=root, label_noise=label_noise)
-        check_positive("noise_std", noise_std, maximum=LARGEST_SETTING)
+        check("noise_std", noise_std, Positive)
         self.noise_std = noise_std
         damping = 0.0 if variant == "well_specified" else 1.0
         self.max_damping = self._option("max_damping", max_damping, damping)
@@ -172,7 +165,7 @@ class Pendulum(Task):
             0.5 if variant == "misspecified_prior" else 0.0,
             variant="misspecified_prior",
         )
-        check_unit_interval("misspecification_weight", self.misspecification_weight)
+        check("misspecification_weight", self.misspecification_weight, UnitInterval)
         self._real = PendulumSimulator(
             noise_std=self.noise_std, max_damping=self.max_damping
         )
@@ -192,7 +185,7 @@ class Pendulum(Task):
 
     def get_embedding_net(self, *, light: bool = False) -> nn.Module:
         """Return the paper's convolutional network or a light one, with ten outputs."""
-        check_instance("light", light, bool)
+        check("light", light, bool)
         if light:
             return light_series_embedding(num_steps=NUM_STEPS, output_dim=10)
         return SeriesEmbedding(num_steps=NUM_STEPS, output_dim=10)

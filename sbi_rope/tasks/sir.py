@@ -9,20 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._validation import (
-    check_batch,
-    check_instance,
-    check_not_negative,
-    check_positive,
-    check_tensor,
-    check_unit_interval,
-)
 from sbi_rope.errors import InvalidInputError
+from sbi_rope.settings import NotNegative, Positive, UnitInterval, check
 from sbi_rope.tasks.base import Task, check_theta
 from sbi_rope.tasks.networks import fully_connected
 from sbi_rope.tasks.settings import STATISTICS_SETTINGS
 from sbi_rope.tasks.splits import DrawnPairs, Part
 from sbi_rope.tasks.triangle import UniformTriangle
+from sbi_rope.tensors import as_batch, as_numbers
 
 __all__ = ["SIR", "SIRSimulator", "delay_weekend_reports", "summarise"]
 
@@ -87,15 +81,15 @@ class SIRSimulator:
     reported_fraction: float = 1.0
 
     def __post_init__(self) -> None:
-        check_positive("time_step", self.time_step)
+        check("time_step", self.time_step, Positive)
         steps = 1 / self.time_step if self.time_step > 1 / (2 * MAX_STEPS) else 0.0
         if steps > MAX_STEPS or abs(round(steps) * self.time_step - 1) > 1e-9:
             raise InvalidInputError(
                 f"Expected `time_step` to divide a day, into {MAX_STEPS} steps at "
                 f"most; got {self.time_step!r}."
             )
-        check_not_negative("volatility", self.volatility)
-        check_unit_interval("reported_fraction", self.reported_fraction)
+        check("volatility", self.volatility, NotNegative)
+        check("reported_fraction", self.reported_fraction, UnitInterval)
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, 2)``, to shape ``(n, 6)``."""
@@ -181,8 +175,8 @@ def delay_weekend_reports(infections: Tensor, reported_fraction: float) -> Tenso
     Returns:
         Reported numbers of the same shape, with the same total.
     """
-    check_batch("infections", infections, (NUM_DAYS,), finite=False, allow_empty=True)
-    check_unit_interval("reported_fraction", reported_fraction)
+    as_batch("infections", infections, (NUM_DAYS,), finite=False, empty=True)
+    check("reported_fraction", reported_fraction, UnitInterval)
     reported = infections.clone()
     reported[:, SATURDAYS] *= reported_fraction
     reported[:, SUNDAYS] *= reported_fraction
@@ -205,7 +199,7 @@ def summarise(series: Tensor) -> Tensor:
         Statistics, shape ``(n, 6)``. A series that reaches half its total on the
         first day has :math:`-\infty` among them.
     """
-    if check_tensor("series", series).ndim != 2 or series.shape[1] < 2:
+    if as_numbers("series", series).ndim != 2 or series.shape[1] < 2:
         raise InvalidInputError(
             "Expected `series` of shape (n, days) with two days at least; got "
             f"{tuple(series.shape)}."
@@ -306,7 +300,7 @@ class SIR(Task):
 
     def get_embedding_net(self, *, light: bool = False) -> nn.Module:
         """Return the paper's network, which is light already and has six outputs."""
-        check_instance("light", light, bool)
+        check("light", light, bool)
         return fully_connected(len(STATISTICS), (8, 32, 32, 24, 6))
 
     def _real_process(self, part: Part) -> DrawnPairs:

@@ -6,14 +6,8 @@ import torch
 from sbi.utils import BoxUniform
 from torch import Tensor, nn
 
-from sbi_rope._validation import (
-    LARGEST_SETTING,
-    check_in_support,
-    check_instance,
-    check_positive,
-    check_unit_interval,
-)
 from sbi_rope.errors import DataNotFoundError, InvalidInputError
+from sbi_rope.settings import Positive, UnitInterval, check
 from sbi_rope.tasks.base import Task, check_parameters
 from sbi_rope.tasks.chambers import (
     CUT_FILE,
@@ -35,6 +29,7 @@ from sbi_rope.tasks.wind_tunnel_model import (
     WindTunnelSimulator,
     check_jitter,
 )
+from sbi_rope.tensors import check_in_support
 
 __all__ = ["WindTunnel"]
 
@@ -142,10 +137,10 @@ class WindTunnel(Task):
         onset_jitter: float = 0.3,
     ) -> None:
         super().__init__(variant=variant, root=root, label_noise=label_noise)
-        check_positive("noise_std", noise_std, maximum=LARGEST_SETTING)
+        check("noise_std", noise_std, Positive)
         check_jitter(onset_jitter)
-        check_instance("stand_in", stand_in, bool)
-        check_instance("experiment", experiment, str, optional=True)
+        check("stand_in", stand_in, bool)
+        check("experiment", experiment, str | None)
         self.stand_in = stand_in or variant == "synthetic"
         self._check_use(experiment, misspecification_strength)
         self.download = download
@@ -153,7 +148,7 @@ class WindTunnel(Task):
         self.misspecification_strength = self._option(
             "misspecification_strength", misspecification_strength, 1.0
         )
-        check_unit_interval("misspecification_strength", self.misspecification_strength)
+        check("misspecification_strength", self.misspecification_strength, UnitInterval)
         self.noise_std = noise_std
         self.onset_jitter = onset_jitter
         check_download(self.root, self.required_files, download=download)
@@ -189,7 +184,7 @@ class WindTunnel(Task):
 
     def get_embedding_net(self, *, light: bool = False) -> nn.Module:
         """Return the convolutional network of task C or a light one, of ten outputs."""
-        check_instance("light", light, bool)
+        check("light", light, bool)
         if light:
             return light_series_embedding(num_steps=NUM_STEPS, output_dim=10)
         return SeriesEmbedding(num_steps=NUM_STEPS, output_dim=10, padding=2)

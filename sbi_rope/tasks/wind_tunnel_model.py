@@ -8,18 +8,11 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import (
-    LARGEST_SETTING,
-    check_batch,
-    check_device,
-    check_not_negative,
-    check_number,
-    check_positive,
-    check_same_length,
-    check_unit_interval,
-)
+from sbi_rope._validation import check_device
 from sbi_rope.errors import InvalidInputError
+from sbi_rope.settings import NotNegative, Number, Positive, UnitInterval, check
 from sbi_rope.tasks.base import check_theta
+from sbi_rope.tensors import as_batch, check_same_length
 
 __all__ = [
     "NUM_STEPS",
@@ -122,12 +115,12 @@ class WindTunnelSimulator:
     exhaust_offset: float = 0.0
 
     def __post_init__(self) -> None:
-        check_not_negative("noise_std", self.noise_std, maximum=LARGEST_SETTING)
+        check("noise_std", self.noise_std, NotNegative)
         check_jitter(self.onset_jitter)
-        check_number("exhaust_offset", self.exhaust_offset, maximum=LARGEST_SETTING)
-        check_unit_interval("noise_correlation", self.noise_correlation)
-        check_positive("max_pressure", self.max_pressure, maximum=LARGEST_SETTING)
-        check_positive("inertia", self.inertia, maximum=LARGEST_SETTING)
+        check("exhaust_offset", self.exhaust_offset, Number)
+        check("noise_correlation", self.noise_correlation, UnitInterval)
+        check("max_pressure", self.max_pressure, Positive)
+        check("inertia", self.inertia, Positive)
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, 1)``, to shape ``(n, 50)``."""
@@ -154,7 +147,7 @@ class WindTunnelSimulator:
             InvalidInputError: If a shift is larger than ``onset_jitter``.
         """
         theta = check_theta(theta, 1, finite=False)
-        check_batch("onset_shift", onset_shift, (), allow_empty=True)
+        as_batch("onset_shift", onset_shift, (), empty=True)
         check_same_length("theta", theta, "onset_shift", onset_shift)
         check_device("onset_shift", onset_shift, theta.device, where="`theta`")
         if (onset_shift.abs() > self.onset_jitter).any():
@@ -182,7 +175,7 @@ class WindTunnelSimulator:
 
 def check_jitter(onset_jitter: float) -> None:
     """Raise unless an impulse with this largest shift begins after the first sample."""
-    check_not_negative("onset_jitter", onset_jitter)
+    check("onset_jitter", onset_jitter, NotNegative)
     if onset_jitter > MAX_JITTER:
         raise InvalidInputError(
             f"Expected `onset_jitter` from 0 to {MAX_JITTER} s, so that impulses begin "
@@ -210,9 +203,9 @@ def pressure_ratio(
         >>> round(float(s.norm()), 3)
         2.125
     """
-    check_batch("onset_shift", onset_shift, ())
-    check_positive("inertia", inertia, maximum=LARGEST_SETTING)
-    check_number("exhaust_offset", exhaust_offset, maximum=LARGEST_SETTING)
+    as_batch("onset_shift", onset_shift, ())
+    check("inertia", inertia, Positive)
+    check("exhaust_offset", exhaust_offset, Number)
     intake = _fan_speeds(onset_shift, loads=INTAKE_LOADS, inertia=inertia)
     exhaust = _fan_speeds(onset_shift[:1], loads=EXHAUST_LOADS, inertia=inertia)
     return (intake**2 - (exhaust + exhaust_offset) ** 2) / MAX_SPEED**2

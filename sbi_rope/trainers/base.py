@@ -17,7 +17,6 @@ from sbi_rope._simulator import check_callable, source_of
 from sbi_rope._training import History
 from sbi_rope._validation import (
     check_default_dtype,
-    check_gradients,
     check_prior,
     check_simulated_columns,
     columns_of,
@@ -65,7 +64,7 @@ class Method(ABC):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidTypeError: If the prior is not a torch distribution, or the simulator
+        InvalidInputError: If the prior is not a torch distribution, or the simulator
             cannot be called.
     """
 
@@ -155,7 +154,7 @@ class Method(ABC):
             Itself, so that calls can be chained.
 
         Raises:
-            InvalidTypeError: If one of them holds no numbers.
+            InvalidInputError: If one of them holds no numbers.
             InvalidInputError: If the method does not see simulations, shapes or row
                 counts do not fit, a theta is not in the support of the prior, or the
                 columns of a table are in another order than those of an earlier one.
@@ -181,7 +180,7 @@ class Method(ABC):
             Itself, so that calls can be chained.
 
         Raises:
-            InvalidTypeError: If one of them holds no numbers.
+            InvalidInputError: If one of them holds no numbers.
             InvalidInputError: If the method does not see calibration pairs, shapes or
                 row counts do not fit, a value is not finite, a theta is outside the
                 prior's support, or the columns of a table are in another order than
@@ -201,7 +200,7 @@ class Method(ABC):
             Itself, so that calls can be chained.
 
         Raises:
-            InvalidTypeError: If it holds no numbers.
+            InvalidInputError: If it holds no numbers.
             InvalidInputError: If the method does not see observations, the shape does
                 not fit, a value is not finite, or the columns of a table are in another
                 order than those of an earlier one.
@@ -228,7 +227,6 @@ class Method(ABC):
             NotReadyError: If data that the method needs was not appended, or in
                 torch's inference mode.
         """
-        check_gradients()
         self._check_data()
         # Whatever the caller's own setting of gradients.
         with torch.enable_grad(), seeded(seed):

@@ -9,18 +9,14 @@ from torch.distributions import Distribution
 from sbi_rope._sbi import readable
 from sbi_rope._validation import (
     KnownColumns,
-    as_numbers,
-    check_batch,
     check_columns,
     check_finite,
-    check_in_support,
     check_not_swapped,
     check_readable,
     check_row_order,
-    check_same_length,
-    check_values,
 )
 from sbi_rope.errors import InvalidInputError, warn_user
+from sbi_rope.tensors import as_batch, as_numbers, check_in_support, check_same_length
 
 __all__ = ["Data", "Kind", "Pairs"]
 
@@ -146,7 +142,7 @@ class Data:
     def checked_theta(self, name: str, theta: Any) -> Tensor:
         """Return a copy of parameters ``(n, d)``, which have to be finite."""
         theta = as_numbers(name, theta)
-        theta = check_batch(name, theta, self._prior.event_shape)
+        theta = as_batch(name, theta, self._prior.event_shape)
         theta = self._copied(theta)
         check_finite(name, theta)  # float32 may hold less
         return theta
@@ -172,8 +168,7 @@ class Data:
                 f"`{name}[:, None]` for observations of one number each."
             )
         shape = x.shape[1:] if self.event_shape is None else self.event_shape
-        x = check_batch(name, x, shape, finite=False)
-        check_values(name, x)
+        x = as_batch(name, x, shape, finite=False)
         return self._copied(x)
 
     def _copied(self, tensor: Tensor) -> Tensor:

@@ -18,13 +18,7 @@ from sbi_rope._sbi import (
 )
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._training import History, best_of_learning_rates
-from sbi_rope._validation import (
-    LARGEST_SETTING,
-    check_instance,
-    check_integer,
-    check_positive,
-    columns_of,
-)
+from sbi_rope._validation import columns_of
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture import (
     MixtureEstimator,
@@ -32,6 +26,7 @@ from sbi_rope.mixture import (
     OwnEmbeddings,
     part_of,
 )
+from sbi_rope.settings import Count, Positive, check
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
 from sbi_rope.trainers.training import (
@@ -97,7 +92,7 @@ class FinetunedNPE(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidTypeError: If an argument has the wrong type.
+        InvalidInputError: If an argument has the wrong type.
         InvalidInputError: If sbi knows no estimator of that name, a learning rate is
             not positive, or ``num_holdouts`` is not.
         UnsupportedPosteriorError: In ``train``, if the estimator has no density.
@@ -117,15 +112,15 @@ class FinetunedNPE(Method):
         learning_rates: tuple[float, ...] = (1e-4, 1e-3),
         device: str | torch.device = "cpu",
     ) -> None:
-        check_integer("num_holdouts", num_holdouts)
-        check_instance("training", training, Training, optional=True)
-        check_instance("learning_rates", learning_rates, tuple)
+        check("num_holdouts", num_holdouts, Count)
+        check("training", training, Training | None)
+        check("learning_rates", learning_rates, tuple)
         if not learning_rates:
             raise InvalidInputError(
                 "Expected at least one of `learning_rates`; got ()."
             )
         for rate in learning_rates:
-            check_positive("learning_rates", rate, maximum=LARGEST_SETTING)
+            check("learning_rates", rate, Positive)
         npe = StartingNPE(density_estimator, npe_training)
         super().__init__(prior, npe=npe, device=device)
         self.num_holdouts = num_holdouts

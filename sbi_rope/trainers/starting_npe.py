@@ -12,7 +12,7 @@ from sbi_rope._sbi import (
     posterior_from,
 )
 from sbi_rope._training import History
-from sbi_rope._validation import check_instance
+from sbi_rope.settings import check
 from sbi_rope.trainers.data import Data
 from sbi_rope.trainers.training import (
     EstimatorBuilder,
@@ -33,14 +33,14 @@ class StartingNPE:
         training: How NPE is trained; ``Training()`` if None.
 
     Raises:
-        InvalidTypeError: If an argument has the wrong type.
+        InvalidInputError: If an argument has the wrong type.
         InvalidInputError: If sbi knows no estimator of that name.
     """
 
     def __init__(
         self, density_estimator: str | EstimatorBuilder, training: Training | None
     ) -> None:
-        check_instance("npe_training", training, Training, optional=True)
+        check("npe_training", training, Training | None)
         self._build = estimator_builder(density_estimator)
         self._training = Training() if training is None else training
         self._given: Any = None

@@ -18,8 +18,8 @@ from sbi_rope._training import (
     fit,
     shuffled,
 )
-from sbi_rope._validation import LARGEST_SETTING, check_integer, check_positive
-from sbi_rope.errors import InvalidInputError, InvalidTypeError, warn_user
+from sbi_rope.errors import InvalidInputError, warn_user
+from sbi_rope.settings import Count, Positive, check
 
 __all__ = [
     "FINETUNING",
@@ -64,18 +64,18 @@ class Training:
 
     def __post_init__(self) -> None:
         """Check the ranges of all fields."""
-        check_integer("training_batch_size", self.training_batch_size)
-        check_positive("learning_rate", self.learning_rate, maximum=LARGEST_SETTING)
-        check_positive("validation_fraction", self.validation_fraction)
+        check("training_batch_size", self.training_batch_size, Count)
+        check("learning_rate", self.learning_rate, Positive)
+        check("validation_fraction", self.validation_fraction, Positive)
         if self.validation_fraction > 0.5:
             raise InvalidInputError(
                 "Expected `validation_fraction` in (0, 0.5]; got "
                 f"{self.validation_fraction!r}."
             )
-        check_integer("stop_after_epochs", self.stop_after_epochs)
-        check_integer("max_num_epochs", self.max_num_epochs)
+        check("stop_after_epochs", self.stop_after_epochs, Count)
+        check("max_num_epochs", self.max_num_epochs, Count)
         if self.clip_max_norm is not None:
-            check_positive("clip_max_norm", self.clip_max_norm)
+            check("clip_max_norm", self.clip_max_norm, Positive)
 
 
 # How NPE is fine-tuned on pairs, chosen on calibration data: see benchmarks/choices.md.
@@ -94,13 +94,13 @@ def estimator_builder(density_estimator: Any) -> EstimatorBuilder:
     then changes it. Ours builds from a copy, so that several methods can share one.
 
     Raises:
-        InvalidTypeError: If it is neither a name nor callable.
+        InvalidInputError: If it is neither a name nor callable.
         InvalidInputError: If sbi knows no estimator of that name.
     """
     if isinstance(density_estimator, str):
         _builder_of_name(density_estimator)
     elif not callable(density_estimator):
-        raise InvalidTypeError(
+        raise InvalidInputError(
             "Expected `density_estimator` to be a name such as 'nsf', or what sbi's "
             f"`posterior_nn(...)` returns; got {type(density_estimator).__name__}."
         )

@@ -22,7 +22,6 @@ from sbi_rope.baselines import (
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import (
     InvalidInputError,
-    InvalidTypeError,
     NotReadyError,
     RoPEWarning,
 )
@@ -401,10 +400,10 @@ def test_options_of_another_type_are_refused() -> None:
         known = inspect.signature(entry.kind).parameters
         for option in ("training", "npe_training", "finetuner", "coupler"):
             if option in known:
-                with pytest.raises(InvalidTypeError, match=f"`{option}`"):
+                with pytest.raises(InvalidInputError, match=f"`{option}`"):
                     make(name, first_task(name), **{option: {"max_num_epochs": 3}})
         if "density_estimator" in known:
-            with pytest.raises(InvalidTypeError, match=r"`density_estimator`.*int"):
+            with pytest.raises(InvalidInputError, match=r"`density_estimator`.*int"):
                 make(name, first_task(name), density_estimator=3)
             with pytest.raises(InvalidInputError, match=r"`density_estimator`.*fancy"):
                 make(name, first_task(name), density_estimator="fancy")

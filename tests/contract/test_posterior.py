@@ -16,7 +16,6 @@ from torch import Tensor, nn
 
 from sbi_rope.errors import (
     InvalidInputError,
-    InvalidTypeError,
     RoPEError,
     SamplingError,
     UnseenObservationError,
@@ -261,7 +260,7 @@ def test_an_index_outside_the_batch_or_of_another_type_is_refused() -> None:
         with pytest.raises(IndexError):
             posterior[index]
     for index in (1.5, "1", None, slice(0, 2), True):
-        with pytest.raises(InvalidTypeError, match="number of an observation"):
+        with pytest.raises(InvalidInputError, match="number of an observation"):
             posterior[index]
 
 

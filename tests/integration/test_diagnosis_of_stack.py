@@ -11,7 +11,7 @@ from torch import Tensor
 from sbi_rope import RoPE, StackedPosterior, diagnose
 from sbi_rope.diagnosis import Diagnosis
 from sbi_rope.diagnosis.in_use import read_for, stack_in_use
-from sbi_rope.errors import InvalidTypeError
+from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture import MixturePosterior
 from tests import problems
 from tests.stacks import FITTED, NPE, NUM_PAIRS, PRIOR, QUIET, problem, rope_of, stacked
@@ -181,7 +181,7 @@ def test_all_findings_concern_posteriors_with_couplings(
 def test_what_is_no_posterior_of_this_package_is_refused(
     rope: RoPE, x_o: Tensor
 ) -> None:
-    with pytest.raises(InvalidTypeError, match="`posterior` to be a MixturePosterior"):
+    with pytest.raises(InvalidInputError, match="`posterior` to be a MixturePosterior"):
         look(rope, x_o, rope.npe)
 
 

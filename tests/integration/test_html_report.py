@@ -16,7 +16,7 @@ from sbi_rope._two_sample import TwoSampleTest
 from sbi_rope.diagnosis import Diagnosis, Finding
 from sbi_rope.diagnosis.in_use import read_for, stack_in_use
 from sbi_rope.diagnosis.labelled import UNLIKE_PAIRS
-from sbi_rope.errors import InvalidInputError, InvalidTypeError, NotWritableError
+from sbi_rope.errors import InvalidInputError, NotWritableError
 from sbi_rope.recalibration import Recalibration
 from sbi_rope.reports.numbers import number, percent
 from sbi_rope.stacking import LearningCurve, StackingReport
@@ -454,9 +454,9 @@ def test_names_and_a_diagnosis_that_do_not_fit_are_refused(
         report.to_html(path, x_names=("a", "b"))
     with pytest.raises(InvalidInputError, match="Expected no `x_names`"):
         replace(report, discrepancy=None).to_html(path, x_names=("a", "b", "c"))
-    with pytest.raises(InvalidTypeError, match="`diagnosis` to be a Diagnosis"):
+    with pytest.raises(InvalidInputError, match="`diagnosis` to be a Diagnosis"):
         report.to_html(path, diagnosis=SimpleNamespace())
-    with pytest.raises(InvalidTypeError, match="`path` to be a path"):
+    with pytest.raises(InvalidInputError, match="`path` to be a path"):
         report.to_html(3)  # type: ignore[arg-type]
     three = replace(diagnosis, parameter_names=("a", "b", "c"))
     for names in (None, NAMES):

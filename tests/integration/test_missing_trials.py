@@ -13,7 +13,6 @@ from sbi_rope._standardisation import warn_of_unseen_gaps
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import (
     InvalidInputError,
-    InvalidTypeError,
     RoPEWarning,
     SimulationError,
     UnsupportedPosteriorError,
@@ -194,7 +193,7 @@ def test_the_number_of_trials_is_mended_with_nan() -> None:
     for trials, match in ((few, "Pad with NaN to 4 trials"), (many, "on 4 trials")):
         with pytest.raises(InvalidInputError, match=match):
             rope().checked_observations(trials)
-    with pytest.raises(InvalidTypeError, match=r"rows of 2 to 4 entries.*pad them"):
+    with pytest.raises(InvalidInputError, match=r"rows of 2 to 4 entries.*pad them"):
         rope().checked_observations([x[0, :2].tolist(), x[1].tolist()])  # type: ignore[arg-type]
 
 

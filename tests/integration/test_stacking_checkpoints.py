@@ -20,7 +20,6 @@ from sbi_rope import RoPE, StackedPosterior
 from sbi_rope._sbi import headless
 from sbi_rope.errors import (
     InvalidInputError,
-    InvalidTypeError,
     NotWritableError,
     RoPEWarning,
 )
@@ -314,7 +313,7 @@ def test_checkpoints_that_cannot_be_kept_are_refused_before_training(
     rope = RoPE(npe, simulator=uneven).append_calibration(*problem(20, seed=1))
     refused: list[tuple[type[Exception], str, dict[str, Any]]] = [
         (InvalidInputError, r"a `seed` together with", {"seed": None}),
-        (InvalidTypeError, r"`checkpoints` to be a path", {"checkpoints": 3}),
+        (InvalidInputError, r"`checkpoints` to be a path", {"checkpoints": 3}),
         (NotWritableError, r"where one can be made", {"checkpoints": file}),
         (InvalidInputError, r"NPE that can be described.*function", {"rope": rope}),
     ]

@@ -10,7 +10,6 @@ from sbi_rope.baselines import PriorPosterior
 from sbi_rope.errors import (
     CouplingError,
     InvalidInputError,
-    InvalidTypeError,
     NotReadyError,
     SamplingError,
     SimulationError,
@@ -74,9 +73,9 @@ def test_bad_lists_of_candidates_are_refused() -> None:
         ([], InvalidInputError, "at least one candidate"),
         ([OT_ONLY, OT_ONLY], InvalidInputError, "names that differ"),
         ([OT_ONLY, NPE, twice], InvalidInputError, "names that differ"),
-        ([OT_ONLY, "NPE"], InvalidTypeError, "got str"),
-        ([OT_ONLY, PriorPosterior(problems.box(2))], InvalidTypeError, "Wrap"),
-        (OT_ONLY, InvalidTypeError, "candidates"),
+        ([OT_ONLY, "NPE"], InvalidInputError, "got str"),
+        ([OT_ONLY, PriorPosterior(problems.box(2))], InvalidInputError, "Wrap"),
+        (OT_ONLY, InvalidInputError, "candidates"),
     ]
     rope = rope_of()
     for candidates, error, match in bad:
@@ -185,7 +184,7 @@ def test_rehearsal_without_tuning_is_refused() -> None:
 def test_anything_but_a_rope_is_refused() -> None:
     for call in (cross_validate, stack):
         match = r"`rope` to be a RoPE; got DirectPosterior\. Make one .*RoPE\(posterior"
-        with pytest.raises(InvalidTypeError, match=match):
+        with pytest.raises(InvalidInputError, match=match):
             call(problems.npe_posterior("mdn"))  # type: ignore[arg-type]
 
 

@@ -14,7 +14,6 @@ from sbi_rope import MixturePosterior, RoPE
 from sbi_rope._sbi import estimator_of
 from sbi_rope.errors import (
     InvalidInputError,
-    InvalidTypeError,
     UnsupportedPosteriorError,
 )
 from sbi_rope.mixture import MixtureEstimator, average, part_of
@@ -86,7 +85,7 @@ def test_what_cannot_be_averaged_is_refused() -> None:
     member = problems.gaussian_posterior()
     with pytest.raises(InvalidInputError, match="at least one"):
         average([])
-    with pytest.raises(InvalidTypeError, match="a list of posteriors"):
+    with pytest.raises(InvalidInputError, match="a list of posteriors"):
         average(ensemble())  # type: ignore[arg-type]
     with pytest.raises(UnsupportedPosteriorError, match="got NoneType"):
         average([member, None])

@@ -19,7 +19,6 @@ from sbi_rope.baselines.npe import PlainNPE
 from sbi_rope.baselines.statistics import SoftClip
 from sbi_rope.errors import (
     InvalidInputError,
-    InvalidTypeError,
     NotReadyError,
     UnsupportedPosteriorError,
 )
@@ -255,7 +254,7 @@ def test_vector_fields_are_refused() -> None:
 def test_options_that_make_no_sense_are_refused() -> None:
     with pytest.raises(InvalidInputError, match="noise_on"):
         NNPE(prior(), noise_on="output")  # type: ignore[arg-type]
-    with pytest.raises(InvalidTypeError, match="error_model"):
+    with pytest.raises(InvalidInputError, match="error_model"):
         NNPE(prior(), error_model=0.1)  # type: ignore[arg-type]
-    with pytest.raises(InvalidTypeError, match="training"):
+    with pytest.raises(InvalidInputError, match="training"):
         NNPE(prior(), training={})  # type: ignore[arg-type]

@@ -17,7 +17,6 @@ from sbi_rope.baselines.rnpe import RNPE, DenoisedEmbeddings
 from sbi_rope.baselines.statistics import fit_marginal
 from sbi_rope.errors import (
     InvalidInputError,
-    InvalidTypeError,
     NotReadyError,
     RoPEWarning,
     UnsupportedPosteriorError,
@@ -371,7 +370,7 @@ def test_options_out_of_range_are_refused() -> None:
 
 
 def test_an_error_model_of_another_type_is_refused() -> None:
-    with pytest.raises(InvalidTypeError, match="error_model"):
+    with pytest.raises(InvalidInputError, match="error_model"):
         RNPE(gaussian.prior(), error_model=nn.Identity())  # type: ignore[arg-type]
 
 

@@ -37,7 +37,6 @@ from sbi_rope.baselines import (
 from sbi_rope.baselines.calibration_mlp import DiagonalGaussian
 from sbi_rope.errors import (
     InvalidInputError,
-    InvalidTypeError,
     NotReadyError,
     RoPEWarning,
     SimulationError,
@@ -340,8 +339,8 @@ class TestFinetunedNPE:
             ((0.0,), InvalidInputError),
             ((0.001, -1.0), InvalidInputError),
             ((math.nan,), InvalidInputError),
-            ([0.001], InvalidTypeError),
-            (0.001, InvalidTypeError),
+            ([0.001], InvalidInputError),
+            (0.001, InvalidInputError),
         ]:
             with pytest.raises(error, match="`learning_rates`"):
                 FinetunedNPE(TASK.get_prior(), learning_rates=rates)

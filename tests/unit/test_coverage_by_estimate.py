@@ -11,7 +11,7 @@ from torch.distributions import Normal
 
 from sbi_rope import plots
 from sbi_rope._means import Counts
-from sbi_rope.errors import InvalidTypeError
+from sbi_rope.errors import InvalidInputError
 from sbi_rope.metrics import CoverageByEstimate, coverage_by_estimate, evaluate
 from sbi_rope.metrics.by_estimate import (
     coverage_by_estimate_of_pairs,
@@ -248,9 +248,9 @@ def test_bad_arguments_are_refused() -> None:
     assert_refused("ranks", coverage_by_estimate, ranks[:10], estimates)
     assert_refused("ranks", coverage_by_estimate, ranks + 1, estimates)
     assert_refused(
-        "ranks", coverage_by_estimate, "ranks", estimates, error=InvalidTypeError
+        "ranks", coverage_by_estimate, "ranks", estimates, error=InvalidInputError
     )
     draw = plots.ranks_by_estimate
-    assert_refused("found", draw, ranks, error=InvalidTypeError)
+    assert_refused("found", draw, ranks, error=InvalidInputError)
     names = ("a", "b")
     assert_refused("parameter_names", draw, found_somewhere(), parameter_names=names)

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.autograd.functional import jacobian
 from torch.distributions import biject_to
 
-from sbi_rope.errors import InvalidTypeError
+from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.hemodynamics import population_tables as tables
 from sbi_rope.tasks.hemodynamics.population import Population, ejection_time_slopes
 from sbi_rope.tasks.hemodynamics.prior import PopulationPrior, _linear_quantile
@@ -229,5 +229,5 @@ def test_prior_validates_values_if_asked() -> None:
     prior = PopulationPrior(validate_args=True)
     with pytest.raises(ValueError, match="support"):
         prior.log_prob(torch.tensor([60.0, 400.0]))
-    with pytest.raises(InvalidTypeError, match="population"):
+    with pytest.raises(InvalidInputError, match="population"):
         PopulationPrior("population")  # type: ignore[arg-type]

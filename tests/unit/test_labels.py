@@ -25,7 +25,6 @@ from sbi_rope.discrepancy import DiscrepancyModel, learn_parameters
 from sbi_rope.discrepancy.imputation import expected_means
 from sbi_rope.errors import (
     InvalidInputError,
-    InvalidTypeError,
     RoPEWarning,
     SimulationError,
 )
@@ -439,7 +438,7 @@ def test_groups_are_numbers_or_names_of_all_pairs() -> None:
     named = rope().append_calibration(theta, x, groups=table["specimen"])
     assert named.labels.groups.tolist() == [0, 0, 1, 2]
     for wrong in ("abcd", 3, [None] * 4, [[1]] * 4):
-        with pytest.raises(InvalidTypeError, match="groups"):
+        with pytest.raises(InvalidInputError, match="groups"):
             rope().append_calibration(theta, x, groups=wrong)  # type: ignore[arg-type]
 
 

@@ -18,7 +18,7 @@ from torch.distributions import (
 )
 
 from sbi_rope.baselines import PriorBaseline, PriorPosterior
-from sbi_rope.errors import InvalidInputError, InvalidTypeError
+from sbi_rope.errors import InvalidInputError
 from sbi_rope.metrics import acauc, evaluate
 
 
@@ -168,7 +168,7 @@ def test_lpp_of_the_prior_is_minus_its_entropy() -> None:
 
 
 def test_a_prior_that_is_no_distribution_is_refused() -> None:
-    with pytest.raises(InvalidTypeError, match="process_prior"):
+    with pytest.raises(InvalidInputError, match="process_prior"):
         PriorPosterior([box()])
 
 

@@ -27,7 +27,6 @@ from sbi_rope import (
 from sbi_rope.errors import (
     CouplingError,
     InvalidInputError,
-    InvalidTypeError,
     NotReadyError,
     RoPEError,
     RoPEWarning,
@@ -372,7 +371,7 @@ def _raises(theta: Tensor) -> Tensor:
 def test_unusable_simulators_are_refused_at_once() -> None:
     cases: list[tuple[Any, type[Exception], str]] = [
         (None, InvalidInputError, "exactly one"),
-        (3, InvalidTypeError, "`simulator` to be callable"),
+        (3, InvalidInputError, "`simulator` to be callable"),
         (_raises, SimulationError, "KeyError: 'no such file'"),
         (lambda theta: theta[:, :1], SimulationError, r"\(2,\)"),
         (lambda theta: theta.numpy() + 1j, SimulationError, "NumPy arrays or lists"),

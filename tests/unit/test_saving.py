@@ -36,7 +36,6 @@ from sbi_rope.errors import (
     DataNotFoundError,
     FileFormatError,
     InvalidInputError,
-    InvalidTypeError,
     NotWritableError,
     UntrustedError,
 )
@@ -585,16 +584,16 @@ def test_what_cannot_be_described_is_refused_by_its_place(
 
 
 def test_only_posteriors_are_saved(tmp_path: Path) -> None:
-    with pytest.raises(InvalidTypeError, match="Save what its `build_posterior`"):
+    with pytest.raises(InvalidInputError, match="Save what its `build_posterior`"):
         save(stacks.rope_of(), tmp_path / "x.pt")
-    with pytest.raises(InvalidTypeError, match="got int"):
+    with pytest.raises(InvalidInputError, match="got int"):
         save(3, tmp_path / "x.pt")
 
 
 def test_the_trusted_are_classes(tmp_path: Path) -> None:
     save(PriorPosterior(problems.box(2)), tmp_path / "x.pt")
     for trusted in (OwnNet, "OwnNet", ["tests.OwnNet"], [OwnNet()]):
-        with pytest.raises(InvalidTypeError, match=r"\[MyNet\]"):
+        with pytest.raises(InvalidInputError, match=r"\[MyNet\]"):
             load(tmp_path / "x.pt", trusted=trusted)  # type: ignore[arg-type]
 
 

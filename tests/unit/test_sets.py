@@ -15,7 +15,7 @@ from torch import Tensor
 from sbi_rope import MixturePosterior, StackedPosterior, load
 from sbi_rope._bounds import bounds_of
 from sbi_rope._random import seeded
-from sbi_rope.errors import InvalidInputError, InvalidTypeError
+from sbi_rope.errors import InvalidInputError
 from sbi_rope.metrics import coverage_curve_of
 from sbi_rope.mixture import MixtureEstimator, part_of
 from sbi_rope.sets import CredibleIntervals, Guarantee
@@ -188,7 +188,7 @@ def test_contains_keeps_the_shape_of_a_batch() -> None:
     a_list: Any = [0.0, 0.0]
     assert found.contains(a_list) == found.contains(torch.zeros(2))
     no_numbers: Any = "x"
-    with pytest.raises(InvalidTypeError, match="theta"):
+    with pytest.raises(InvalidInputError, match="theta"):
         found.contains(no_numbers)
 
 

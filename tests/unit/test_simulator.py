@@ -19,7 +19,6 @@ from sbi_rope._simulator import Simulator
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import (
     InvalidInputError,
-    InvalidTypeError,
     RoPEWarning,
     SimulationError,
 )
@@ -500,7 +499,7 @@ def test_a_simulator_that_cannot_be_sent_to_workers_is_refused_at_once() -> None
 
 
 def test_what_cannot_be_called_in_parallel_is_refused() -> None:
-    with pytest.raises(InvalidTypeError, match="`simulator` to be callable"):
+    with pytest.raises(InvalidInputError, match="`simulator` to be callable"):
         parallel(3)  # type: ignore[arg-type]
     for num_workers in (0, -1, 1.5, 10**6):
         with pytest.raises(InvalidInputError, match="`num_workers`"):

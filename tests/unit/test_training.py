@@ -24,7 +24,7 @@ from sbi_rope._training import (
     fit,
 )
 from sbi_rope.baselines import Training
-from sbi_rope.errors import InvalidInputError, InvalidTypeError, RoPEWarning
+from sbi_rope.errors import InvalidInputError, RoPEWarning
 from sbi_rope.trainers.training import (
     MIN_SIMULATIONS,
     estimator_builder,
@@ -380,7 +380,7 @@ class TestEstimatorBuilder:
 
     def test_what_cannot_build_is_refused(self) -> None:
         for value in [None, 3, ("maf",)]:
-            with pytest.raises(InvalidTypeError, match="`density_estimator`"):
+            with pytest.raises(InvalidInputError, match="`density_estimator`"):
                 estimator_builder(value)
 
 

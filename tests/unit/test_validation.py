@@ -34,7 +34,7 @@ from sbi_rope._validation import (
     check_weights,
     column_names,
 )
-from sbi_rope.errors import InvalidInputError, InvalidTypeError, shown
+from sbi_rope.errors import InvalidInputError, shown
 from tests.refusals import assert_refused
 
 X = torch.tensor([[0.1, 0.9], [0.2, 0.8], [0.3, 0.7]])
@@ -69,7 +69,7 @@ def test_tensors_of_numbers_are_returned_unchanged() -> None:
 def test_what_is_no_dense_tensor_of_real_numbers_is_refused() -> None:
     for value in (None, 3, "x", X.tolist(), X.numpy()):
         assert_refused(
-            "`x`.*torch.Tensor", check_tensor, "x", value, error=InvalidTypeError
+            "`x`.*torch.Tensor", check_tensor, "x", value, error=InvalidInputError
         )
     for value, match in (
         (X.to(torch.complex64), "complex64"),
@@ -81,7 +81,7 @@ def test_what_is_no_dense_tensor_of_real_numbers_is_refused() -> None:
         (X.to_sparse_csr(), "sparse_csr.*to_dense"),
     ):
         assert_refused(
-            f"`x`.*{match}", check_tensor, "x", value, error=InvalidTypeError
+            f"`x`.*{match}", check_tensor, "x", value, error=InvalidInputError
         )
 
 
@@ -136,10 +136,10 @@ def test_arrays_and_lists_of_numbers_are_converted_without_loss() -> None:
     bad = (None, "1", ["a"], [None], [True], np.array([1j]), np.array([THING]), {})
     for value in bad:
         match = "`x` to be a tensor, an array or a list of numbers; got"
-        assert_refused(match, as_numbers, "x", value, error=InvalidTypeError)
+        assert_refused(match, as_numbers, "x", value, error=InvalidInputError)
     for value in ([[1.0], [1.0, 2.0]], [np.ones(1), np.ones(2)], [X, X[:2]]):
         match = "rows of . to . entries.*pad them with NaN"
-        assert_refused(match, as_numbers, "x", value, error=InvalidTypeError)
+        assert_refused(match, as_numbers, "x", value, error=InvalidInputError)
 
 
 def test_columns_of_a_dataframe_that_are_no_numbers_are_named() -> None:
@@ -148,7 +148,7 @@ def test_columns_of_a_dataframe_that_are_no_numbers_are_named() -> None:
     assert torch.equal(as_numbers("x", numbers).nan_to_num(), expected.nan_to_num())
     frame = numbers.assign(mouse=["a", "b"], reading=pd.array([1, None], dtype="Int64"))
     match = r"column\(s\) 'mouse' \(.*\), 'reading' \(Int64\) cannot be read.*astype"
-    assert_refused(match, as_numbers, "x", frame, error=InvalidTypeError)
+    assert_refused(match, as_numbers, "x", frame, error=InvalidInputError)
     converted = as_numbers("x", frame[["speed", "reading"]].astype("float64"))
     assert converted.isnan().tolist() == [[False, False], [False, True]]
 
@@ -328,7 +328,7 @@ def test_names_are_a_list_of_strings() -> None:
     assert check_names("names", np.array(["a", "b"])) == ["a", "b"]
     assert_refused("length 2; got 1", check_names, "names", ["a"], 2)
     for value in ("ab", b"ab", None, 3, [1, 2], ["a", None], {"a": 1}, THING):
-        match, error = "`names` to be a list of strings", InvalidTypeError
+        match, error = "`names` to be a list of strings", InvalidInputError
         assert_refused(match, check_names, "names", value, error=error)
 
 
@@ -344,7 +344,7 @@ def test_a_path_is_a_string_or_a_path() -> None:
     assert check_path("root", None, optional=True) is None
     match = "`root` to be a path"
     for value in (None, 3, b"a", ["a"], THING):
-        assert_refused(match, check_path, "root", value, error=InvalidTypeError)
+        assert_refused(match, check_path, "root", value, error=InvalidInputError)
     for value in ("a\0b", "~nobody_of_this_name/a"):
         assert_refused(match, check_path, "root", value, error=InvalidInputError)
 

@@ -16,12 +16,6 @@ from sbi_rope._sbi import (
 )
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._training import History, epochs_on_pairs, shuffled
-from sbi_rope._validation import (
-    check_choice,
-    check_instance,
-    check_integer,
-    check_positive,
-)
 from sbi_rope.baselines.fmcpe.pushed_forward import PushedForward
 from sbi_rope.baselines.fmcpe.standardise import Standardise
 from sbi_rope.baselines.fmcpe.to_simulations import ToSimulations
@@ -30,6 +24,7 @@ from sbi_rope.baselines.fmcpe.velocity import VelocityField
 from sbi_rope.baselines.networks import fresh_copy
 from sbi_rope.baselines.statistics import frozen_statistics
 from sbi_rope.mixture import MixtureEstimator, Part
+from sbi_rope.settings import Count, Positive, check
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
 from sbi_rope.trainers.training import EstimatorBuilder, Training, train_network
@@ -136,7 +131,7 @@ class FMCPE(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidTypeError: If an argument has the wrong type.
+        InvalidInputError: If an argument has the wrong type.
         InvalidInputError: If sbi knows no estimator of that name, an argument is
             outside its range, or the prior has neither a support nor moments that sbi's
             ``mcmc_transform`` knows.
@@ -177,12 +172,12 @@ class FMCPE(Method):
         training: Training | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
-        check_choice("space", space, ("input", "embedding"))
+        check("space", space, Literal["input", "embedding"])
         if noise is not None:
-            check_positive("noise", noise)
-        check_integer("num_draws", num_draws)
-        check_integer("simulations_per_pair", simulations_per_pair)
-        check_instance("training", training, Training, optional=True)
+            check("noise", noise, Positive)
+        check("num_draws", num_draws, Count)
+        check("simulations_per_pair", simulations_per_pair, Count)
+        check("training", training, Training | None)
         npe = StartingNPE(density_estimator, npe_training)
         super().__init__(prior, npe=npe, simulator=simulator, device=device)
         Unbounded(self._prior)  # early, for its error

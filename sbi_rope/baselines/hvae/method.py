@@ -18,13 +18,6 @@ from sbi_rope._sbi import (
 )
 from sbi_rope._standardisation import ROUNDING
 from sbi_rope._training import History
-from sbi_rope._validation import (
-    check_batch,
-    check_instance,
-    check_integer,
-    check_not_negative,
-    check_tensor,
-)
 from sbi_rope.baselines.hvae.embeddings import LatentEmbeddings
 from sbi_rope.baselines.hvae.model import FrozenNPE, HybridVAE
 from sbi_rope.baselines.hvae.networks import (
@@ -35,8 +28,10 @@ from sbi_rope.baselines.hvae.networks import (
 from sbi_rope.baselines.hvae.prior import ContinuedPrior
 from sbi_rope.baselines.hvae.reparametrisation import check_differentiable
 from sbi_rope.baselines.hvae.training import train_hybrid
-from sbi_rope.errors import InvalidInputError, InvalidTypeError
+from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture import MixtureEstimator, Part
+from sbi_rope.settings import Count, NotNegative, check
+from sbi_rope.tensors import as_batch, as_numbers
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
 from sbi_rope.trainers.training import EstimatorBuilder, Training
@@ -136,7 +131,7 @@ class HVAE(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidTypeError: If an argument has the wrong type.
+        InvalidInputError: If an argument has the wrong type.
         InvalidInputError: If an argument is outside its range, sbi knows no estimator
             of that name, or the prior's support is not a box. In ``train``, if
             observations are neither series nor images with sides of 16 or more, or if
@@ -163,17 +158,17 @@ class HVAE(Method):
         noisy: bool = False,
         device: str | torch.device = "cpu",
     ) -> None:
-        check_instance("training", training, Training, optional=True)
+        check("training", training, Training | None)
         if not callable(physics):
-            raise InvalidTypeError(
+            raise InvalidInputError(
                 "Expected `physics` to be callable, a differentiable function from "
                 f"theta (n, d) to (n, *event); got {type(physics).__name__}."
             )
-        check_integer("width", width)
-        check_integer("latent_dim", latent_dim)
-        check_integer("num_latents", num_latents)
+        check("width", width, Count)
+        check("latent_dim", latent_dim, Count)
+        check("num_latents", num_latents, Count)
         if calibration_weight is not None:
-            check_not_negative("calibration_weight", calibration_weight)
+            check("calibration_weight", calibration_weight, NotNegative)
         npe = StartingNPE(density_estimator, npe_training)
         super().__init__(prior, npe=npe, device=device)
         ContinuedPrior(self._prior)  # early, for its error
@@ -194,8 +189,8 @@ class HVAE(Method):
         with seeded(0):
             theta = self._prior.sample(torch.Size((NUM_DRAWS_CHECKED,)))
         theta = theta.to(self._device, torch.float32).requires_grad_()
-        x = check_tensor("physics(theta)", self.physics(theta))
-        check_batch("physics(theta)", x, self._data.event_shape)
+        x = as_numbers("physics(theta)", self.physics(theta))
+        as_batch("physics(theta)", x, self._data.event_shape)
         if len(x) != len(theta) or not x.requires_grad:
             raise InvalidInputError(
                 "Expected `physics` to be differentiable, with one result for each "

@@ -6,9 +6,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from sbi_rope._validation import check_integer
 from sbi_rope.baselines.networks import embedding_with_head
 from sbi_rope.errors import InvalidInputError
+from sbi_rope.settings import Count, check
 
 __all__ = ["ConditionalUNet", "LatentEncoder", "bounded", "check_event_shape"]
 
@@ -77,8 +77,8 @@ class ConditionalUNet(nn.Module):
     ) -> None:
         super().__init__()
         check_event_shape(event_shape)
-        check_integer("latent_dim", latent_dim)
-        check_integer("width", width)
+        check("latent_dim", latent_dim, Count)
+        check("width", width, Count)
         # A series is an image of one channel with one side.
         self.shape = event_shape if len(event_shape) == 3 else (1, *event_shape)
         self.residual = residual

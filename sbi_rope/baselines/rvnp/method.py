@@ -1,7 +1,7 @@
 r"""Robust variational neural posterior estimation (RVNP)."""
 
 import copy
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import torch
 from torch import Tensor
@@ -14,12 +14,6 @@ from sbi_rope._sbi import (
     posterior_from,
 )
 from sbi_rope._training import History, shuffled
-from sbi_rope._validation import (
-    check_choice,
-    check_instance,
-    check_integer,
-    check_not_negative,
-)
 from sbi_rope.baselines.rvnp.bound import Bound
 from sbi_rope.baselines.rvnp.likelihood import ErrorModel, fit_surrogate
 from sbi_rope.baselines.statistics import (
@@ -30,6 +24,7 @@ from sbi_rope.baselines.statistics import (
     standardisation_of_statistics,
     with_clip,
 )
+from sbi_rope.settings import NotNegative, Range, check
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
 from sbi_rope.trainers.training import EstimatorBuilder, Training, train_network
@@ -126,7 +121,7 @@ class RVNP(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidTypeError: If an argument has the wrong type.
+        InvalidInputError: If an argument has the wrong type.
         InvalidInputError: If sbi knows no estimator of that name, an option is outside
             its range, or, in ``train``, no statistic varies or one is missing (NaN).
         UnsupportedPosteriorError: In ``train``, if the estimator has no density.
@@ -165,15 +160,13 @@ class RVNP(Method):
         training: Training | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
-        check_choice("noise_on", noise_on, ("embedding", "input"))
-        check_instance("shift", shift, bool)
-        check_instance("depends_on_theta", depends_on_theta, bool)
-        check_not_negative("shrinkage", shrinkage)
-        check_integer("num_draws", num_draws, minimum=2)
-        check_instance(
-            "surrogate_training", surrogate_training, Training, optional=True
-        )
-        check_instance("training", training, Training, optional=True)
+        check("noise_on", noise_on, Literal["embedding", "input"])
+        check("shift", shift, bool)
+        check("depends_on_theta", depends_on_theta, bool)
+        check("shrinkage", shrinkage, NotNegative)
+        check("num_draws", num_draws, Annotated[int, Range(2)])
+        check("surrogate_training", surrogate_training, Training | None)
+        check("training", training, Training | None)
         npe = StartingNPE(density_estimator, npe_training)
         super().__init__(prior, npe=npe, device=device)
         self.noise_on: NoiseOn = noise_on

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from sbi_rope._files import read_arrays
-from sbi_rope._validation import check_choice, check_instance, check_path
+from sbi_rope._validation import check_path
 from sbi_rope.errors import DataNotFoundError, InvalidInputError
+from sbi_rope.settings import check, one_of
 from sbi_rope.tasks.hemodynamics.population import (
     NUISANCES,
     PROCESSES,
@@ -107,8 +108,8 @@ def load(
             or made with other settings.
     """
     path = Path(str(check_path("path", path)))
-    check_instance("population", population, Population, optional=True)
-    check_instance("physics", physics, Physics, optional=True)
+    check("population", population, Population | None)
+    check("physics", physics, Physics | None)
     if not path.is_file():
         raise DataNotFoundError(f"No file {path}. Make it with `{COMMAND}`.")
     try:
@@ -172,7 +173,7 @@ def _check_settings(
         )
     asked: dict[str, Any] = {}
     if process is not None:
-        check_choice("process", process, PROCESSES)
+        check("process", process, one_of(PROCESSES))
         asked["process"] = process
     if population is not None:
         asked["population"] = describe_population(population, settings["process"])

@@ -7,19 +7,15 @@ from collections.abc import Iterable, Iterator
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from sbi_rope._processes import end_with
 from sbi_rope._progress import progress_bar
-from sbi_rope._validation import (
-    check_choice,
-    check_instance,
-    check_integer,
-    check_path,
-)
-from sbi_rope.errors import InvalidInputError, InvalidTypeError, SimulationError
+from sbi_rope._validation import check_path
+from sbi_rope.errors import InvalidInputError, SimulationError
+from sbi_rope.settings import Count, Range, Whole, check, one_of
 from sbi_rope.tasks.hemodynamics.chunks import Simulate, Work, read_part, run_chunk
 from sbi_rope.tasks.hemodynamics.dataset import (
     COLUMNS,
@@ -90,18 +86,18 @@ def generate(
     """
     path = Path(str(check_path("path", path)))
     _check_free(path)
-    check_integer("n", n, maximum=MAX_PEOPLE)
-    check_integer("seed", seed, minimum=0, maximum=None)
-    check_choice("process", process, PROCESSES)
-    check_instance("population", population, Population, optional=True)
-    check_instance("physics", physics, Physics, optional=True)
+    check("n", n, Annotated[int, Range(1, MAX_PEOPLE)])
+    check("seed", seed, Whole)
+    check("process", process, one_of(PROCESSES))
+    check("population", population, Population | None)
+    check("physics", physics, Physics | None)
     if simulate is not None and not callable(simulate):
-        raise InvalidTypeError(
+        raise InvalidInputError(
             "Expected `simulate` to be a function of a subject and its physics; got "
             f"{type(simulate).__name__}."
         )
     if jobs is not None and jobs != -1:
-        check_integer("jobs", jobs)
+        check("jobs", jobs, Count)
     work = Work(
         process=process,
         seed=int(seed),

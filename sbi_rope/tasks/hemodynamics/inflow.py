@@ -12,11 +12,11 @@ References:
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from sbi_rope._validation import check_instance, check_integer
+from sbi_rope.settings import Range, check
 from sbi_rope.tasks.hemodynamics.subject import Subject
 
 __all__ = ["aortic_inflow"]
@@ -67,8 +67,8 @@ def aortic_inflow(subject: Subject, num_samples: int) -> np.ndarray:
     Raises:
         InvalidInputError: If ``num_samples`` is not a positive integer.
     """
-    check_instance("subject", subject, Subject)
-    check_integer("num_samples", num_samples, maximum=MAX_SAMPLES)
+    check("subject", subject, Subject)
+    check("num_samples", num_samples, Annotated[int, Range(1, MAX_SAMPLES)])
     template = _template()
     time = 1000.0 * subject.period * np.arange(num_samples) / num_samples
     reverse_end = subject.ejection_time * TEMPLATE_END / TEMPLATE_CLOSURE

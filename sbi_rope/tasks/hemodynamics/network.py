@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import brentq
 
-from sbi_rope._validation import check_instance
 from sbi_rope.errors import SimulationError
+from sbi_rope.settings import check
 from sbi_rope.tasks.hemodynamics import arteries
 from sbi_rope.tasks.hemodynamics.arteries import MMHG
 from sbi_rope.tasks.hemodynamics.subject import Physics, Subject
@@ -122,8 +122,8 @@ def build_network(subject: Subject, physics: Physics) -> Network:
     Raises:
         SimulationError: If no stiffness gives the subject's wave velocity.
     """
-    check_instance("subject", subject, Subject)
-    check_instance("physics", physics, Physics)
+    check("subject", subject, Subject)
+    check("physics", physics, Physics)
     columns = list(zip(*arteries.SEGMENTS, strict=True))
     inlet_node, outlet_node = np.array(columns[1]) - 1, np.array(columns[2]) - 1
     table_length = 1e-3 * np.array(columns[3])

@@ -7,13 +7,8 @@ from typing import Literal
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from sbi_rope._validation import (
-    check_choice,
-    check_instance,
-    check_integer,
-    check_not_negative,
-)
 from sbi_rope.errors import InvalidInputError
+from sbi_rope.settings import NotNegative, Whole, check, one_of
 from sbi_rope.tasks.hemodynamics import population_tables as tables
 from sbi_rope.tasks.hemodynamics.subject import NUM_SEGMENTS, Subject
 
@@ -117,13 +112,13 @@ class Population:
         # At larger scatters, some arteries are all but gone and others metres long.
         for name, largest in (("height_sd", 0.4), ("segment_sd", 0.5)):
             value = getattr(self, name)
-            check_not_negative(name, value)
+            check(name, value, NotNegative)
             if value > largest:
                 raise InvalidInputError(
                     f"Expected `{name}` from 0 to {largest}; got {value!r}."
                 )
-        check_instance("proximal_aorta", self.proximal_aorta, bool)
-        check_choice("prior", self.prior, ("population", "independent"))
+        check("proximal_aorta", self.proximal_aorta, bool)
+        check("prior", self.prior, Literal["population", "independent"])
 
     def as_dict(self) -> dict[str, float | bool | str]:
         """Return all settings by name, as stored with a data set."""
@@ -144,9 +139,9 @@ class Population:
         Raises:
             InvalidInputError: If an argument is none of these.
         """
-        check_choice("process", process, PROCESSES)
-        check_integer("seed", seed, minimum=0, maximum=None)
-        check_integer("index", index, minimum=0, maximum=None)
+        check("process", process, one_of(PROCESSES))
+        check("seed", seed, Whole)
+        check("index", index, Whole)
         entropy = [seed, PROCESSES.index(process), index]
         rng = np.random.default_rng(np.random.SeedSequence(entropy))
         age, stroke_volume, heart_rate, ejection_time = self._draw_heart(rng)

@@ -9,7 +9,7 @@ from torch.distributions import Distribution, biject_to, constraints
 from torch.distributions.transforms import IndependentTransform, Transform
 from torch.nn.functional import logsigmoid
 
-from sbi_rope._validation import check_instance
+from sbi_rope.settings import check
 from sbi_rope.tasks.hemodynamics.population import Population
 from sbi_rope.tasks.hemodynamics.prior_table import Band, prior_table
 
@@ -57,7 +57,7 @@ class PopulationPrior(Distribution):
         *,
         validate_args: bool | None = None,
     ) -> None:
-        check_instance("population", population, Population, optional=True)
+        check("population", population, Population | None)
         table = prior_table((population or Population()).prior)
         self._band = table.band
         # A caller's inference mode would make tensors that later gradients refuse.

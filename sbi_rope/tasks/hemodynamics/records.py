@@ -6,17 +6,10 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import (
-    LARGEST_SETTING,
-    check_batch,
-    check_choice,
-    check_device,
-    check_instance,
-    check_not_negative,
-    check_same_length,
-    check_tensor,
-)
+from sbi_rope._validation import check_device
 from sbi_rope.errors import InvalidInputError
+from sbi_rope.settings import NotNegative, check
+from sbi_rope.tensors import as_batch, as_numbers, check_same_length
 
 __all__ = ["NUM_STEPS", "SAMPLE_RATE", "Recorder"]
 
@@ -57,8 +50,8 @@ class Recorder:
     normalisation: Normalisation = "per_record"
 
     def __post_init__(self) -> None:
-        check_not_negative("noise_std", self.noise_std, maximum=LARGEST_SETTING)
-        check_choice("normalisation", self.normalisation, ("per_record", "global"))
+        check("noise_std", self.noise_std, NotNegative)
+        check("normalisation", self.normalisation, Literal["per_record", "global"])
 
     def __call__(
         self, beat: Tensor, period: Tensor, *, generator: torch.Generator | None = None
@@ -74,7 +67,7 @@ class Recorder:
             Recordings, shape ``(n, 1000)``, with the dtype of ``beat``.
         """
         _check_beats(beat, period)
-        check_instance("generator", generator, torch.Generator, optional=True)
+        check("generator", generator, torch.Generator | None)
         like = {"dtype": beat.dtype, "device": beat.device}
         start = torch.rand((len(beat),), generator=generator, **like)
         noise = torch.randn((len(beat), NUM_STEPS), generator=generator, **like)
@@ -95,13 +88,13 @@ class Recorder:
 
 
 def _check_beats(beat: Tensor, period: Tensor) -> None:
-    if check_tensor("beat", beat).ndim != 2 or not beat.is_floating_point():
+    if as_numbers("beat", beat).ndim != 2 or not beat.is_floating_point():
         raise InvalidInputError(
             "Expected `beat` of shape (n, m), floating-point numbers; got "
             f"{tuple(beat.shape)}, {beat.dtype}."
         )
-    check_batch("beat", beat, beat.shape[1:], allow_empty=True)
-    check_batch("period", period, (), allow_empty=True)
+    as_batch("beat", beat, beat.shape[1:], empty=True)
+    as_batch("period", period, (), empty=True)
     check_same_length("beat", beat, "period", period)
     check_device("period", period, beat.device, where="`beat`")
     if not (period > 0).all():

@@ -1,18 +1,12 @@
 """A person in the model of the circulation, and settings to solve it with."""
 
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from sbi_rope._validation import (
-    check_instance,
-    check_integer,
-    check_number,
-    check_positive,
-    check_unit_interval,
-)
 from sbi_rope.errors import InvalidInputError, shown
+from sbi_rope.settings import Number, Positive, Range, UnitInterval, check
 
 __all__ = ["NUM_SEGMENTS", "Beat", "Physics", "Subject"]
 
@@ -75,7 +69,7 @@ class Subject:
     def __post_init__(self) -> None:
         for name, (low, high) in PHYSIOLOGICAL.items():
             value = getattr(self, name)
-            check_number(name, value)
+            check(name, value, Number)
             if not low <= value <= high:
                 raise InvalidInputError(
                     f"Expected `{name}` from {low:g} to {high:g}; got {value!r}. Units "
@@ -134,12 +128,12 @@ class Physics:
     def __post_init__(self) -> None:
         lengths = ("cell_length", "min_segment_length", "max_period_error")
         for name in (*lengths, "convection"):
-            check_positive(name, getattr(self, name))
+            check(name, getattr(self, name), Positive)
         for name in ("courant", "fallback_courant"):
-            check_positive(name, getattr(self, name))
-            check_unit_interval(name, getattr(self, name))
-        check_integer("num_cycles", self.num_cycles, minimum=2)
-        check_instance("viscoelastic", self.viscoelastic, bool)
+            check(name, getattr(self, name), Positive)
+            check(name, getattr(self, name), UnitInterval)
+        check("num_cycles", self.num_cycles, Annotated[int, Range(2)])
+        check("viscoelastic", self.viscoelastic, bool)
 
     def as_dict(self) -> dict[str, float | int | bool]:
         """Return all settings by name, as stored with a data set."""

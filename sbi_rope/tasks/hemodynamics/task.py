@@ -9,15 +9,9 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._validation import (
-    LARGEST_SETTING,
-    check_choice,
-    check_in_support,
-    check_instance,
-    check_path,
-    check_positive,
-)
+from sbi_rope._validation import check_path
 from sbi_rope.errors import InvalidInputError
+from sbi_rope.settings import Positive, check
 from sbi_rope.tasks.base import Task, check_parameters, check_theta
 from sbi_rope.tasks.hemodynamics.dataset import BeatSet, differences, load
 from sbi_rope.tasks.hemodynamics.population import Population, Process
@@ -26,6 +20,7 @@ from sbi_rope.tasks.hemodynamics.records import NUM_STEPS, Normalisation, Record
 from sbi_rope.tasks.networks import SeriesEmbedding, light_series_embedding
 from sbi_rope.tasks.settings import PaperSettings
 from sbi_rope.tasks.splits import DrawnPairs, Part, RecordedPairs, generator_of
+from sbi_rope.tensors import check_in_support
 
 __all__ = ["Hemodynamics", "NearestBeatSimulator"]
 
@@ -173,8 +168,8 @@ class Hemodynamics(Task):
         normalisation: Normalisation = "per_record",
     ) -> None:
         super().__init__(variant=variant, root=root, label_noise=label_noise)
-        check_positive("noise_std", noise_std, maximum=LARGEST_SETTING)
-        check_choice("prior", prior, ("population", "independent"))
+        check("noise_std", noise_std, Positive)
+        check("prior", prior, Literal["population", "independent"])
         self.prior: Literal["population", "independent"] = prior
         self.simulations = check_path("simulations", simulations, optional=True)
         observations = check_path("observations", observations, optional=True)
@@ -204,7 +199,7 @@ class Hemodynamics(Task):
 
     def get_embedding_net(self, *, light: bool = False) -> nn.Module:
         """Return the paper's convolutional network or a light one, of five outputs."""
-        check_instance("light", light, bool)
+        check("light", light, bool)
         if light:
             return light_series_embedding(num_steps=NUM_STEPS, output_dim=5)
         pools = ((4, 2), (4, 2), (4, 1))

@@ -1,0 +1,182 @@
+"""The one place where data of a user become tensors, and are checked."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from sbi.utils import within_support
+from torch import Tensor
+
+from sbi_rope.errors import InvalidInputError
+
+__all__ = [
+    "as_array",
+    "as_batch",
+    "as_numbers",
+    "column_names",
+    "check_in_support",
+    "check_same_length",
+    "rows_with",
+]
+
+
+def as_batch(
+    name: str,
+    value: Any,
+    event_shape: Sequence[int] | None = None,
+    *,
+    rows: int | None = None,
+    device: torch.device | None = None,
+    names: Sequence[str] | None = None,
+    finite: bool = True,
+    empty: bool = False,
+) -> Tensor:
+    """Return a user's data as a tensor of shape ``(n, *event_shape)``.
+
+    Args:
+        name: What the argument is called.
+        value: A tensor, an array, a table, or a list of numbers.
+        event_shape: The shape of one row; any if None.
+        rows: The number of rows; any if None.
+        device: Where the tensor has to be, and where arrays and lists are moved.
+        names: Names of columns. A table that has them in another order is put in order.
+        finite: Whether NaN and Inf are errors. Numbers that are too large for float32
+            are infinite there.
+        empty: Whether n may be 0.
+
+    Returns:
+        A tensor without gradients. A floating-point tensor keeps its dtype, and all
+        else becomes float32.
+
+    Raises:
+        InvalidInputError: If it holds no numbers, or their shape, device or values do
+            not fit.
+    """
+    numbers = as_numbers(name, value, device=device, names=names)
+    shape = tuple(numbers.shape)
+    wrong = numbers.ndim == 0 or (
+        event_shape is not None and shape[1:] != tuple(event_shape)
+    )
+    if wrong or (rows is not None and shape[0] != rows):
+        sizes = shape[1:] if event_shape is None else event_shape
+        raise InvalidInputError(
+            f"Expected `{name}` of shape {_in_words(rows, sizes)}; got {shape}."
+            + ("" if event_shape is None else _hint(name, shape, tuple(event_shape)))
+        )
+    if not (empty or shape[0]) or 0 in shape[1:]:
+        raise InvalidInputError(
+            f"Expected `{name}` with at least one number; got shape {shape}."
+        )
+    if finite and not (usable := torch.isfinite(numbers)).all():
+        raise InvalidInputError(
+            f"Expected `{name}` to be finite; got NaN or Inf in {rows_with(~usable)}."
+        )
+    return numbers
+
+
+def as_numbers(
+    name: str,
+    value: Any,
+    *,
+    device: torch.device | None = None,
+    names: Sequence[str] | None = None,
+) -> Tensor:
+    """Return a user's data as a tensor of any shape, see :func:`as_batch`."""
+    if names is not None and sorted(names) == sorted(column_names(value) or ()):
+        value = value[list(names)]
+    if not isinstance(value, Tensor):
+        try:
+            array = as_array(value)
+            if array.dtype.kind not in "iuf":
+                raise TypeError(f"numbers, not {array.dtype}")
+        except (TypeError, ValueError) as error:
+            raise InvalidInputError(
+                f"Expected `{name}` to be a tensor, an array, a table or a list of "
+                f"numbers; got {type(value).__name__} ({error})."
+            ) from error
+        return torch.from_numpy(array.astype(np.float32)).to(device)
+    if device is not None and value.device != device:
+        raise InvalidInputError(f"Expected `{name}` on {device}; got {value.device}.")
+    return value.detach() if value.is_floating_point() else value.detach().float()
+
+
+def as_array(value: Any) -> np.ndarray:
+    """Return ``value`` as an array; masked numbers become NaN.
+
+    NumPy itself drops the mask, and would use what is under it.
+
+    Example:
+        >>> as_array(np.ma.masked_equal([[1, -9]], -9))
+        array([[ 1., nan]])
+    """
+    array = np.ma.asarray(value)
+    if np.ma.is_masked(array) and array.dtype.kind in "biuf":
+        return np.ma.filled(array.astype(np.float64), np.nan)
+    return array.data
+
+
+def column_names(value: Any) -> tuple[str, ...] | None:
+    """Return the names of the columns of a table; None if they have none."""
+    names = tuple(getattr(value, "columns", ()))
+    is_named = len(names) > 0 and all(isinstance(name, str) for name in names)
+    return names if is_named and len(set(names)) == len(names) else None
+
+
+def check_in_support(
+    name: str, theta: Tensor, prior: Any, *, rows: Tensor | None = None
+) -> None:
+    """Raise if a row of ``theta`` is outside the prior's support.
+
+    Args:
+        name: What the argument is called.
+        theta: Parameters, shape ``(n, d)``.
+        prior: The prior.
+        rows: Which rows are checked, shape ``(n,)``; all if None.
+    """
+    if rows is None:
+        rows = torch.ones(len(theta), dtype=torch.bool, device=theta.device)
+    outside = torch.zeros_like(rows)
+    if rows.any():  # sbi cannot check an empty batch
+        outside[rows] = ~within_support(prior, theta[rows])
+    if outside.any():
+        raise InvalidInputError(
+            f"Expected `{name}` inside the support of the prior; got "
+            f"{rows_with(outside)} outside. Check the units and the order of the "
+            "parameters, and give noisy labels with `theta_std`."
+        )
+
+
+def check_same_length(name_a: str, a: Tensor, name_b: str, b: Tensor) -> None:
+    """Raise if two batches have different numbers of rows."""
+    if len(a) != len(b):
+        raise InvalidInputError(
+            f"Expected `{name_a}` and `{name_b}` to have the same number of rows; got "
+            f"{len(a)} and {len(b)}."
+        )
+
+
+def rows_with(bad: Tensor) -> str:
+    """Say in how many rows an entry is bad, and which are the first."""
+    rows = bad.flatten(1).any(dim=1) if bad.ndim > 1 else bad.reshape(-1)
+    first = rows.nonzero().flatten()[:5].tolist()
+    return f"{int(rows.sum())} of {rows.numel()} rows (first: {first})"
+
+
+def _in_words(rows: int | None, sizes: Sequence[int]) -> str:
+    return f"({', '.join(map(str, ['n' if rows is None else rows, *sizes]))})".replace(
+        "(n)", "(n,)"
+    )
+
+
+def _hint(name: str, shape: tuple[int, ...], event: tuple[int, ...]) -> str:
+    """Say how to change a batch so that it fits; nothing if that is not known."""
+    if shape == event:
+        return f" For a single one pass `{name}[None]`."
+    if len(shape) == 1 and event == (1,):
+        return f" For one number in each row pass `{name}[:, None]`."
+    if shape[1:] and math.prod(shape[1:]) == math.prod(event):
+        sizes = ", ".join(map(str, event))
+        return f" If the order of the entries fits, pass `{name}.reshape(-1, {sizes})`."
+    return ""
