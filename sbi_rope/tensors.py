@@ -15,9 +15,9 @@ __all__ = [
     "as_array",
     "as_batch",
     "as_numbers",
-    "column_names",
     "check_in_support",
     "check_same_length",
+    "column_names",
     "rows_with",
 ]
 
