@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: quickstart test test-fast test-slow test-latest-sbi lint types
+.PHONY: quickstart test test-fast test-slow test-latest-sbi lint types size
 .PHONY: docs docs-code docs-site docs-links format clean tasks package
 .PHONY: examples example-quickstart example-tunnel example-tasks example-people
 
@@ -31,6 +31,10 @@ lint: $(VENV)/.installed
 
 types: $(VENV)/.installed
 	$(BIN)/pyright --pythonpath $(BIN)/python
+
+# Lines, room by room, and the budgets that a test holds.
+size: $(VENV)/.installed
+	$(BIN)/python -m tests.test_size
 
 docs: docs-code docs-site
 

@@ -1,0 +1,68 @@
+"""The package stays small enough to be held in one head.
+
+    make size    # prints lines, room by room
+
+Whoever needs more lines takes them from another room, in the same change.
+"""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+# The most lines of all files of a kind in a folder, docstrings included.
+BUDGETS = {
+    "sbi_rope/*.py": 39_500,
+    "tests/*.py": 33_000,
+    "benchmarks/*.py": 6_600,
+    "docs/*.md": 4_437,
+}
+# Checks live at the boundary: in settings, tensors, and where a posterior is split.
+MOST_CHECKS, CHECKS = 60, ("check", "warn", "refuse")
+
+
+def lines_of(place: str) -> int:
+    """Count the lines of files, such as "docs/*.md", in a folder and all below it."""
+    folder, pattern = place.rsplit("/", 1)
+    files = (ROOT / folder).rglob(pattern)
+    return sum(
+        len(file.read_text(encoding="utf-8").splitlines())
+        for file in files
+        if "_build" not in file.parts
+    )
+
+
+def checks() -> list[str]:
+    """Return the functions of the package whose name says that they check or warn."""
+    return [
+        f"{file.relative_to(ROOT)}: {node.name}"
+        for file in sorted((ROOT / "sbi_rope").rglob("*.py"))
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(node, ast.FunctionDef)
+        and node.name.lstrip("_").startswith(CHECKS)
+    ]
+
+
+@pytest.mark.parametrize("place", BUDGETS)
+def test_a_room_is_within_its_budget(place: str) -> None:
+    assert lines_of(place) <= BUDGETS[place]
+
+
+def test_few_functions_check_and_warn() -> None:
+    assert len(found := checks()) <= MOST_CHECKS, "\n".join(found)
+
+
+def main() -> None:
+    rooms = sorted(
+        p for p in (ROOT / "sbi_rope").iterdir() if (p / "__init__.py").exists()
+    )
+    for room in rooms:
+        print(f"{lines_of(f'sbi_rope/{room.name}/*.py'):7,}  sbi_rope/{room.name}")  # noqa: T201
+    for place, budget in BUDGETS.items():
+        print(f"{lines_of(place):7,}  {place} (at most {budget:,})")  # noqa: T201
+    print(f"{len(checks()):7,}  functions that check or warn (at most {MOST_CHECKS})")  # noqa: T201
+
+
+if __name__ == "__main__":
+    main()
