@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sbi_rope.errors import DataNotFoundError, InvalidInputError, SimulationError
+from sbi_rope.errors import SimulationError
 from sbi_rope.tasks.hemodynamics import arteries
 from sbi_rope.tasks.hemodynamics.arteries import MMHG
 from sbi_rope.tasks.hemodynamics.grid import build_grid
@@ -152,7 +152,7 @@ def test_a_carotid_longer_than_the_way_to_the_leg_is_refused() -> None:
     factors = [1.0] * NUM_SEGMENTS
     factors[15 - 1] = 20.0
     subject = replace(BASELINE, length_factors=tuple(factors))
-    with pytest.raises(SimulationError, match="`length_factors`"):
+    with pytest.raises(SimulationError, match="to the carotid"):
         build_network(subject, Physics())
 
 
@@ -335,14 +335,3 @@ def test_the_beats_that_openbf_simulated_are_counted(openbf_folder: Path) -> Non
     case = read_case(openbf_folder, "tube")
     assert case.num_cycles == 4
     assert case.time[0] == pytest.approx(0.0)
-
-
-def test_a_missing_case_of_openbf_is_named(tmp_path: Path) -> None:
-    with pytest.raises(DataNotFoundError, match=r"cca\.yaml"):
-        read_case(tmp_path, "cca")
-
-
-def test_a_network_of_openbf_without_vessels_is_refused(openbf_folder: Path) -> None:
-    (openbf_folder / "tube.yaml").write_text(OPENBF_TEXT.split("network:")[0])
-    with pytest.raises(InvalidInputError, match="vessels"):
-        read_case(openbf_folder, "tube")

@@ -1,9 +1,7 @@
 """Cancer and stromal cells."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +9,6 @@ import torch
 from scipy.stats import ks_2samp
 from torch import Tensor
 
-from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.cs import (
     CancerStroma,
     CancerStromaSimulator,
@@ -19,7 +16,6 @@ from sbi_rope.tasks.cs import (
     tissue_statistics,
 )
 from sbi_rope.tasks.splits import DrawnPairs
-from tests.tasks import accepted
 
 NECROSIS = CancerStromaSimulator(necrosis_probability=0.75)
 # Means and standard deviations of 1500 draws of an independent implementation, under
@@ -257,22 +253,6 @@ def test_pairs_that_are_not_defined_are_replaced_together() -> None:
     assert z.abs().max() < 5.0
 
 
-@pytest.mark.parametrize("batched", [False, True])
-def test_the_simulator_takes_batches_of_any_size(batched: bool) -> None:
-    for n in (0, 1, 300):
-        theta = torch.tensor([[200.0, 3.0, 10.0]], dtype=torch.float64).expand(n, -1)
-        x = CancerStromaSimulator(batched=batched)(theta)
-        assert x.shape == (n, 4)
-        assert x.dtype == torch.float64
-        assert x.isfinite().all()
-
-
-def test_rates_out_of_range_are_refused() -> None:
-    for rate in (-1.0, 2e6):
-        with pytest.raises(InvalidInputError, match=r"from 0 to 1e\+06"):
-            CancerStromaSimulator()(torch.tensor([[500.0, rate, 15.0]]))
-
-
 # The task ----------------------------------------------------------------------------
 
 
@@ -298,10 +278,6 @@ def test_options_reach_the_real_process_only() -> None:
     _, default = CancerStroma().get_test_set(200)
     assert x[:, 1].mean() < 0.5 * default[:, 1].mean()
     assert strong.get_simulator() == CancerStroma().get_simulator()
-    assert (CancerStroma().necrosis_probability, CancerStroma().necrosis_radius) == (
-        0.75,
-        0.8,
-    )
 
 
 def test_network_has_the_widths_of_the_paper() -> None:
@@ -309,23 +285,6 @@ def test_network_has_the_widths_of_the_paper() -> None:
         net = CancerStroma().get_embedding_net(light=light)
         widths = [layer.out_features for layer in net if hasattr(layer, "out_features")]
         assert widths == [12, 48, 48, 36, 9]
-
-
-def test_options_out_of_range_or_without_effect_are_refused() -> None:
-    def make(**options: Any) -> Callable[[], object]:
-        return lambda: CancerStroma(**options)
-
-    assert not accepted(
-        {
-            "p": (make(necrosis_probability=1.1), "necrosis_probability"),
-            "radius": (make(necrosis_radius=-0.1), "necrosis_radius"),
-            "nan": (make(necrosis_radius=math.nan), "necrosis_radius"),
-            "without effect": (
-                make(variant="well_specified", necrosis_radius=0.5),
-                "no effect",
-            ),
-        }
-    )
 
 
 def seeded(simulator: CancerStromaSimulator, theta: Tensor) -> Tensor:

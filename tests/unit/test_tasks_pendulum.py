@@ -1,13 +1,11 @@
 """The pendulum."""
 
 import math
-from functools import partial
 
 import pytest
 import torch
 
 from sbi_rope.tasks.pendulum import Pendulum, PendulumSimulator
-from tests.tasks import accepted
 
 
 def test_prior_log_density_is_analytic() -> None:
@@ -90,25 +88,3 @@ def test_the_weight_is_the_share_of_the_tighter_distribution() -> None:
     assert draws.max(dim=0).values.tolist() == pytest.approx([3.0, 10.0], abs=0.01)
     assert Pendulum(variant="misspecified_prior").misspecification_weight == 0.5
     assert Pendulum().misspecification_weight == 0.0
-
-
-def test_network_has_2048_features_and_ten_outputs() -> None:
-    net = Pendulum().get_embedding_net()
-    assert net.num_features == 2048
-    assert net(torch.randn(4, 200)).shape == (4, 10)
-
-
-def test_options_out_of_range_or_without_effect_are_refused() -> None:
-    misspecified = partial(Pendulum, variant="misspecified_prior")
-    assert not accepted(
-        {
-            "no variant": (
-                partial(Pendulum, misspecification_weight=0.5),
-                "no effect",
-            ),
-            "weight": (partial(misspecified, misspecification_weight=1.5), "[0, 1]"),
-            "noise": (partial(Pendulum, noise_std=0.0), "noise_std"),
-            "damping": (partial(Pendulum, max_damping=-0.1), "max_damping"),
-            "nan": (partial(Pendulum, max_damping=math.nan), "max_damping"),
-        }
-    )
