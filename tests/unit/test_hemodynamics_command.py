@@ -1,6 +1,5 @@
 """The command that generates, validates and describes pressure waves."""
 
-import importlib
 from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +14,6 @@ from sbi_rope.tasks.hemodynamics.__main__ import main
 from sbi_rope.tasks.hemodynamics.dataset import load
 from sbi_rope.tasks.hemodynamics.population import Population
 from sbi_rope.tasks.hemodynamics.subject import Beat, Physics, Subject
-from tests.fresh import imported_anew
 
 PNG = b"\x89PNG"
 PHASE = 2 * np.pi * np.arange(256) / 256
@@ -165,23 +163,3 @@ def _anyone(draw: Any) -> Any:
         return next(subject for subject in subjects if subject.age <= 70.0)
 
     return young
-
-
-@pytest.mark.medium
-def test_generate_without_numba_says_how_to_install_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with imported_anew(without=("numba",)):
-        anew = importlib.import_module("sbi_rope.tasks.hemodynamics.__main__")
-        assert anew.main is not main
-        file = str(tmp_path / "x.npz")
-        arguments = ["generate", "--n", "2", "--process", "real", "--out", file]
-        assert anew.main(arguments) == 2
-    assert (
-        capsys.readouterr()
-        .err.splitlines()[-1]
-        .endswith(
-            'needs numba. Install it with `pip install "sbi-rope[hemodynamics]"`.'
-        )
-    )
-    assert not (tmp_path / "x.npz").exists()

@@ -160,15 +160,6 @@ def test_a_file_has_the_same_bytes_for_any_number_of_jobs_and_any_backend(
     assert [path.name for path in tmp_path.iterdir()] == ["again.npz"]
 
 
-@pytest.mark.medium
-def test_a_file_has_the_same_bytes_from_a_backend_without_generators(
-    made: Path, tmp_path: Path
-) -> None:
-    with joblib.parallel_config(backend="multiprocessing"):
-        _make(tmp_path / "again.npz", jobs=2)
-    assert (tmp_path / "again.npz").read_bytes() == made.read_bytes()
-
-
 def test_an_interrupted_run_goes_on_with_the_same_bytes(
     made: Path, tmp_path: Path
 ) -> None:

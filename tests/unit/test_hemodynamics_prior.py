@@ -5,8 +5,7 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from sbi.utils import mcmc_transform, within_support
-from sbi.utils.user_input_checks import process_prior
+from sbi.utils import within_support
 from scipy.integrate import quad
 from scipy.stats import kstest, norm
 from torch import Tensor
@@ -186,17 +185,6 @@ def test_bijection_has_the_log_determinant_of_its_jacobian(
     assert transform.inv(far).isfinite().all()
 
 
-def test_sbi_takes_the_prior_as_it_is(prior: PopulationPrior) -> None:
-    processed, theta_dim, _ = process_prior(prior)
-    assert processed is prior
-    assert theta_dim == 2
-    theta = prior.sample((7,))
-    to_unconstrained = mcmc_transform(prior)
-    z = to_unconstrained(theta)
-    assert to_unconstrained.log_abs_det_jacobian(theta, z).shape == (7,)
-    torch.testing.assert_close(to_unconstrained.inv(z), theta, rtol=1e-4, atol=1e-3)
-
-
 def test_prior_can_be_copied_expanded_and_moved(prior: PopulationPrior) -> None:
     copied = pickle.loads(pickle.dumps(prior))
     draws = copied.sample((5,))
@@ -210,9 +198,3 @@ def test_prior_can_be_copied_expanded_and_moved(prior: PopulationPrior) -> None:
     copied.to("meta")
     assert copied.mean.device.type == "meta"
     assert PopulationPrior(Population()).mean.device.type == "cpu"
-
-
-def test_prior_validates_values_if_asked() -> None:
-    prior = PopulationPrior(validate_args=True)
-    with pytest.raises(ValueError, match="support"):
-        prior.log_prob(torch.tensor([60.0, 400.0]))

@@ -93,17 +93,3 @@ def test_the_module_runs_as_a_command_of_its_own() -> None:
     assert done.returncode == 0, done.stderr
     assert "linear_gaussian" in done.stdout or "LinearGaussian" in done.stdout
     assert done.stderr == ""
-
-
-@pytest.mark.medium
-def test_real_data_and_their_stand_ins_are_described_as_what_they_are(
-    capsys: pytest.CaptureFixture[str], chamber_extract: Path
-) -> None:
-    arguments = ["wind_tunnel", "-n", "20", "--stand-in", "--variant", "prior_shift"]
-    assert main(arguments) == 0
-    out = capsys.readouterr().out
-    assert "stand-in x (20 test observations)" in out
-    assert "stand_in=True" in out
-    root = str(chamber_extract)
-    assert main(["light_tunnel_sensors", "-n", "20", "--root", root]) == 0
-    assert "real x (20 test observations)" in capsys.readouterr().out

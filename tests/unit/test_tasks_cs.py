@@ -15,7 +15,6 @@ from sbi_rope.tasks.cs import (
     batched_statistics,
     tissue_statistics,
 )
-from sbi_rope.tasks.splits import DrawnPairs
 
 NECROSIS = CancerStromaSimulator(necrosis_probability=0.75)
 # Means and standard deviations of 1500 draws of an independent implementation, under
@@ -194,14 +193,6 @@ def test_tissues_simulated_together_follow_the_law_of_single_ones(
         assert ks_2samp(a, b).pvalue > 1e-3
 
 
-@pytest.mark.medium
-def test_rows_of_a_batch_belong_to_their_parameters() -> None:
-    theta = torch.tensor([[1400.0, 5.0, 15.0], [250.0, 5.0, 15.0]]).repeat(100, 1)
-    num_cells = CancerStromaSimulator(batched=True)(theta)[:, :2].sum(dim=1)
-    assert (num_cells[::2] > 1000).all()
-    assert (num_cells[1::2] < 500).all()
-
-
 def test_the_number_of_cells_is_poisson_with_the_rate_of_theta() -> None:
     theta = torch.tensor([[500.0, 5.0, 15.0]]).expand(1000, -1)
     num_cells = CancerStromaSimulator()(theta)[:, :2].sum(dim=1)
@@ -240,19 +231,6 @@ def test_statistics_that_are_not_defined_are_nan(batched: bool) -> None:
     assert CancerStromaSimulator(batched=batched)(theta[:1]).isnan().all()
 
 
-def test_pairs_that_are_not_defined_are_replaced_together() -> None:
-    def draw_theta(n: int) -> Tensor:
-        rate = torch.where(torch.rand(n) < 0.3, 2.0, 200.0 + 1300.0 * torch.rand(n))
-        return torch.stack([rate, 10 + 0 * rate, 15 + 0 * rate], dim=1)
-
-    pairs = DrawnPairs(draw_theta=draw_theta, observe=CancerStromaSimulator())
-    with pytest.warns(UserWarning, match="Replaced"):
-        theta, x = pairs.take(150, seed=0, part="test")
-    assert theta[:, 0].min() >= 200.0
-    z = (x[:, :2].sum(dim=1) - theta[:, 0]) / theta[:, 0].sqrt()
-    assert z.abs().max() < 5.0
-
-
 # The task ----------------------------------------------------------------------------
 
 
@@ -263,13 +241,6 @@ def test_density_and_quantiles_of_the_prior_are_analytic() -> None:
     theta = torch.tensor([[200.0, 20.0, 12.5], [850.0, 11.5, 20.0]])
     expected = torch.tensor([[0.0, 1.0, 0.25], [0.5, 0.5, 1.0]])
     torch.testing.assert_close(CancerStroma().prior_quantiles(theta), expected)
-
-
-def test_without_necrosis_the_task_is_well_specified() -> None:
-    exact = CancerStroma(necrosis_probability=0.0).get_test_set(50)
-    expected = CancerStroma(variant="well_specified").get_test_set(50)
-    assert torch.equal(exact[0], expected[0])
-    assert torch.equal(exact[1], expected[1])
 
 
 def test_options_reach_the_real_process_only() -> None:

@@ -126,15 +126,6 @@ def test_well_specified_observations_are_of_people_who_are_not_trained_on() -> N
     assert len(trained) == pytest.approx(half, abs=1)
 
 
-def test_the_parameters_of_the_people_of_the_package_follow_the_prior() -> None:
-    task = Hemodynamics()
-    theta = task.get_simulator().theta
-    assert torch.isfinite(task.get_prior().log_prob(theta)).all()
-    levels = task.prior_quantiles(theta).sort(dim=0).values
-    steps = torch.arange(1, len(theta) + 1).unsqueeze(1) / len(theta)
-    assert (levels - steps).abs().max() < 2 / len(theta) ** 0.5
-
-
 def test_the_people_of_the_package_are_few_and_of_a_known_seed() -> None:
     task = Hemodynamics()
     for process in ("simulator", "real"):
@@ -185,24 +176,6 @@ def test_people_of_another_prior_or_physics_are_refused(tmp_path: Path) -> None:
     elastic = changed("real", physics={"viscoelastic": False})
     with pytest.raises(InvalidInputError, match="'viscoelastic': False"):
         Hemodynamics(observations=elastic).get_test_set(1)
-
-
-def test_simulations_keep_the_dtype_whatever_the_default_device() -> None:
-    simulator = Hemodynamics().get_simulator()
-    for dtype in (torch.float64, torch.float16):
-        x = simulator(simulator.theta[:3].to(dtype))
-        assert x.dtype == dtype
-        assert torch.isfinite(x).all()
-    with torch.device("meta"):
-        assert torch.equal(Hemodynamics().get_simulator().theta, simulator.theta)
-
-
-def test_the_networks_return_five_statistics_of_a_recording() -> None:
-    task = Hemodynamics()
-    net = task.get_embedding_net()
-    assert net.num_features == 1024
-    assert net(torch.zeros(2, NUM_STEPS)).shape == (2, 5)
-    assert task.get_embedding_net(light=True)(torch.zeros(2, NUM_STEPS)).shape == (2, 5)
 
 
 def test_paper_settings_are_those_of_the_appendix() -> None:

@@ -6,12 +6,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from sbi.inference import NPE
-from sbi.neural_nets import posterior_nn
 from torch import Tensor, nn
 from torch.distributions import Beta
 
-from sbi_rope import CalibrationFinetuner, RoPE, SinkhornCoupler
 from sbi_rope.errors import DataNotFoundError
 from sbi_rope.tasks.light_tunnel import (
     BETA_BINOMIAL,
@@ -114,19 +111,6 @@ def test_the_mask_has_the_known_number_of_pixels() -> None:
     assert found == {64: 525, 100: 1277, 500: 31489}
 
 
-def test_mask_has_the_area_of_a_hexagon_below_the_middle() -> None:
-    mask = hexagon_mask(1000)
-    area = 1.5 * 3**0.5 * 220**2
-    assert mask.sum() == pytest.approx(area, rel=1e-3)
-    rows = mask.any(dim=1).nonzero().flatten()
-    columns = mask.any(dim=0).nonzero().flatten()
-    # A corner on each side, an edge above and below; rows are counted from below.
-    assert (columns[-1] - columns[0]).item() == pytest.approx(440, abs=2)
-    assert (rows[-1] - rows[0]).item() == pytest.approx(220 * 3**0.5, abs=2)
-    assert (rows[0] + rows[-1]).item() == 2 * 499
-    assert (columns[0] + columns[-1]).item() == 2 * 500
-
-
 @pytest.mark.filterwarnings("ignore:Arrays of 2-dimensional:DeprecationWarning")
 @pytest.mark.parametrize("size", [64, 100])
 def test_simulator_is_model_f1_of_causalchamber(size: int) -> None:
@@ -200,14 +184,6 @@ def test_image_has_the_gradients_of_the_product() -> None:
     torch.testing.assert_close(gradient, expected.double())
 
 
-def test_simulations_are_8_bit_images_without_noise() -> None:
-    theta = LightTunnel().get_prior().sample((50,))
-    x = HexagonSimulator(image_size=SIZE)(theta)
-    levels = 255 * x
-    torch.testing.assert_close(levels, levels.round(), rtol=0.0, atol=1e-4)
-    assert torch.equal(x, HexagonSimulator(image_size=SIZE)(theta))
-
-
 def test_dequantised_simulations_are_uniform_within_their_levels() -> None:
     theta = torch.tensor([[200.0, 101.0, 255.0, 1.0]]).expand(20, -1)
     plain = 255 * HexagonSimulator(image_size=SIZE)(theta)
@@ -220,20 +196,6 @@ def test_dequantised_simulations_are_uniform_within_their_levels() -> None:
         share[:200_000].quantile(levels), levels, atol=0.01, rtol=0.0
     )
     assert spread[0].ne(spread[1]).all()
-
-
-def test_batches_of_any_size_keep_their_dtype() -> None:
-    prior = LightTunnel().get_prior()
-    for simulator in (
-        HexagonSimulator(image_size=SIZE),
-        HexagonSimulator(image_size=SIZE, dequantise=True),
-        CameraSimulator(image_size=SIZE),
-    ):
-        for dtype, n in ((torch.float32, 0), (torch.float32, 1), (torch.float64, 20)):
-            x = simulator(prior.sample((n,)).to(dtype))
-            assert x.shape == (n, 3, SIZE, SIZE)
-            assert x.dtype == dtype
-            assert ((x >= 0) & (x <= 1)).all()
 
 
 def test_camera_adds_noise_before_it_rounds_to_8_bit() -> None:
@@ -258,13 +220,6 @@ def test_prior_log_density_is_analytic() -> None:
     alpha = theta[:, 3]
     expected = -3 * math.log(255) - (math.pi * (alpha * (1 - alpha)).sqrt()).log()
     torch.testing.assert_close(LightTunnel().get_prior().log_prob(theta), expected)
-
-
-def test_parallel_and_crossed_polarisers_have_a_finite_density() -> None:
-    alpha = malus(torch.tensor([[30.0, 30.0], [45.0, -45.0], [10.0, -170.0]]).double())
-    theta = torch.cat([torch.full((3, 3), 100.0), alpha.float()], dim=1)
-    assert alpha[0] == 1.0
-    assert torch.isfinite(LightTunnel().get_prior().log_prob(theta)).all()
 
 
 def test_quantiles_of_recorded_parameters_are_uniform() -> None:
@@ -491,36 +446,3 @@ def test_the_stand_in_draws_parameters_as_the_experiments_did() -> None:
 
 
 # All of it ---------------------------------------------------------------------------
-
-
-@pytest.mark.filterwarnings("ignore:Data has constant values:UserWarning")
-@pytest.mark.filterwarnings("ignore:Maximum number of epochs:UserWarning")
-def test_image_files_lead_to_a_posterior(write_data: WriteData) -> None:
-    task = LightTunnel(root=write_data(60), image_size=SIZE)
-    prior, simulator = task.get_prior(), task.get_simulator()
-    theta = prior.sample((40,))
-    build = posterior_nn(
-        "mdn", embedding_net=task.get_embedding_net(light=True), z_score_x="none"
-    )
-    npe = NPE(prior, density_estimator=build, show_progress_bars=False)
-    npe.append_simulations(theta, simulator(theta)).train(
-        training_batch_size=20, max_num_epochs=2
-    )
-    rope = RoPE(
-        npe.build_posterior(),
-        simulator=simulator,
-        coupler=SinkhornCoupler(gamma=0.5, tau=0.9, cost_scale="simulated"),
-        finetuner=CalibrationFinetuner(max_num_epochs=20),
-    )
-    rope.append_calibration(*task.get_calibration_set(6))
-    rope.train(seed=0, show_progress_bars=False)
-    theta_o, x_o = task.get_test_set(25)
-    posterior = rope.build_posterior(
-        x_o, num_simulations=40, seed=0, show_progress_bars=False
-    )
-    samples = posterior.sample_batched((10,), x=x_o, show_progress_bars=False)
-    assert samples.shape == (10, 25, 4)
-    assert torch.isfinite(samples).all()
-    assert prior.support.check(samples).all()
-    log_prob = posterior.log_prob_batched(theta_o.unsqueeze(0), x=x_o)
-    assert torch.isfinite(log_prob).all()

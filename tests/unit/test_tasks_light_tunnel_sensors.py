@@ -112,13 +112,6 @@ def test_negative_readings_are_cut_off_at_zero() -> None:
     assert (LightTunnelSimulator()(theta)[:, :6] == 0).all()
 
 
-def test_only_the_third_sensor_sees_the_angle() -> None:
-    theta = torch.tensor([[50.0, 20.0, 70.0, 0.0], [50.0, 20.0, 70.0, 40.0]])
-    aligned, turned = LightTunnelSimulator().readings(theta)
-    changed = (aligned != turned).tolist()
-    assert changed == [name in ("ir_3", "vis_3") for name in OUTPUTS]
-
-
 # The prior ---------------------------------------------------------------------------
 
 
@@ -141,16 +134,6 @@ def test_the_law_overpredicts_the_light_by_the_known_ratios(
     ratios = LightTunnelSimulator().readings(theta)[:, :6].mean(dim=0) / measured
     expected = torch.tensor([1.23, 1.24, 1.24, 1.26, 1.26, 1.34])
     torch.testing.assert_close(ratios, expected, atol=0.02, rtol=0.0)
-
-
-def test_a_third_of_the_recorded_rows_is_for_calibration(chamber_extract: Path) -> None:
-    task = LightTunnelSensors(root=chamber_extract)
-    with pytest.raises(InvalidInputError, match="at most 150"):
-        task.get_calibration_set(151)
-    with pytest.raises(InvalidInputError, match="at most 300"):
-        task.get_test_set(301)
-    assert task.num_recorded("calibration") == 150
-    assert task.num_recorded("test") == 300
 
 
 def test_all_6000_recorded_parameters_follow_the_prior(chamber_root: Path) -> None:
@@ -195,18 +178,6 @@ def test_a_recorded_row_becomes_the_parameters_and_the_observation(
     readings = torch.tensor([14377.0, 3598.0, 1767.0, 465.0, 567.0, 159.0])
     torch.testing.assert_close(x[row, :6], readings.log1p())
     assert x[row, 6] == 72.0
-
-
-def test_rows_of_a_file_become_parameters_and_logarithms_of_readings(
-    write_table: WriteTable,
-) -> None:
-    theta, x = all_recorded(LightTunnelSensors(root=write_table()), num_rows=9)
-    order = theta[:, 0].argsort()
-    i = torch.arange(9.0)
-    expected = [i, 2 * i, torch.full((9,), 85.0), 10 + 2.5 * i]
-    assert torch.equal(theta[order], torch.stack(expected, dim=1))
-    torch.testing.assert_close(x[order, :6], (101 + i).log().unsqueeze(1).expand(9, 6))
-    assert torch.equal(x[order, 6], 100 + i)
 
 
 def test_the_readings_come_in_the_order_of_the_simulator(

@@ -196,15 +196,6 @@ def test_the_delay_of_reports_changes_the_autocorrelation_only() -> None:
 # The simulator -----------------------------------------------------------------------
 
 
-def test_the_simulator_takes_batches_of_any_size() -> None:
-    for n in (0, 1, 1500):
-        theta = SIR().get_prior().sample((n,)).double().requires_grad_()
-        x = SIRSimulator(steps_per_day=1)(theta)
-        assert x.shape == (n, 6)
-        assert x.dtype == torch.float64
-        assert x.isfinite().all()
-
-
 def test_corners_of_the_prior_have_finite_statistics() -> None:
     corners = [[0.5, 0.0], [0.5, 0.5], [1e-6, 1e-6], [0.0, 0.0], [0.5, 1e-30]]
     x = SIRSimulator()(torch.tensor(corners))
@@ -222,13 +213,6 @@ def test_density_and_quantiles_of_the_prior_are_analytic() -> None:
     edges = torch.tensor([[0.0, 0.0], [0.5, 0.5], [0.25, 0.25]])
     expected = torch.tensor([[0.0, 0.0], [1.0, 1.0], [0.25, 0.75]])
     torch.testing.assert_close(SIR().prior_quantiles(edges), expected)
-
-
-def test_without_delay_the_task_is_well_specified() -> None:
-    exact = SIR(reported_fraction=1.0).get_test_set(50)
-    expected = SIR(variant="well_specified").get_test_set(50)
-    assert torch.equal(exact[0], expected[0])
-    assert torch.equal(exact[1], expected[1])
 
 
 def test_reported_fraction_is_the_strength_of_the_misspecification() -> None:

@@ -8,12 +8,10 @@ import pytest
 import torch
 from sbi.inference import NPE
 from sbi.neural_nets import posterior_nn
-from torch import Tensor, nn
+from torch import Tensor
 from torch.distributions import Normal
 
-from sbi_rope import CalibrationFinetuner, RoPE
 from sbi_rope.errors import InvalidInputError
-from sbi_rope.tasks.splits import RecordedPairs
 from sbi_rope.tasks.wind_tunnel import DATASET, EXPERIMENT, WindTunnel
 from sbi_rope.tasks.wind_tunnel_model import (
     SAMPLE_TIMES,
@@ -130,16 +128,6 @@ def test_pressure_at_known_timing_is_that_of_causalchamber() -> None:
             )
 
 
-def test_simulated_samples_are_taken_at_the_recorded_times() -> None:
-    times = torch.tensor(SAMPLE_TIMES, dtype=torch.float64)
-    assert times.shape == (50,)
-    assert times[[5, 24, 25, 49]].tolist() == [0.78639, 3.66501, 3.94014, 7.58541]
-    # About seven a second, and a break when the load changes.
-    steps = times.diff()
-    assert steps[24] == pytest.approx(0.27513)
-    assert ((steps > 0.15) & (steps < 0.18)).sum() == 48
-
-
 def test_pressure_is_linear_in_the_hatch_with_the_published_factor() -> None:
     theta = torch.linspace(0, 45, 10, dtype=torch.float64).unsqueeze(1)
     shift = torch.full((10,), 0.123, dtype=torch.float64)
@@ -161,19 +149,6 @@ def test_interpolated_pressures_are_exact_to_2e_5_pascal() -> None:
         x = simulator.pressure(theta, onset_shift=shift)
         direct = 74.82473949999999 * 0.25 * pressure_ratio(shift)
         torch.testing.assert_close(x, direct, rtol=0.0, atol=2e-5)
-
-
-def test_an_impulse_begins_and_ends_with_its_shift() -> None:
-    shift = torch.tensor([-0.2, 0.0, 0.2], dtype=torch.float64)
-    steps = pressure_ratio(shift).diff(dim=1)
-    times = torch.tensor(SAMPLE_TIMES, dtype=torch.float64)[1:]
-    for row, delta in zip(steps, shift, strict=True):
-        begun = times > 0.61425 + delta
-        ended = times > 3.66501 + delta + 0.16
-        # Faster by the load's torque at once, and slower at its end.
-        assert row[begun][0] > row[~begun][-1]
-        assert (row[begun & ~ended][1:-2] > 0.01).all()
-        assert (row[ended] < 0).all()
 
 
 def test_before_the_impulse_the_fans_follow_the_equation_of_motion() -> None:
@@ -224,21 +199,6 @@ def test_shifts_are_uniform_up_to_the_jitter() -> None:
     )
 
 
-def test_batches_of_any_size_keep_their_dtype_and_draws() -> None:
-    for jitter in (0.0, 0.3):
-        for num, dtype in ((0, torch.float32), (1, torch.float32), (9, torch.float64)):
-            theta = 45 * torch.rand(num, 1, dtype=dtype)
-            x = WindTunnelSimulator(onset_jitter=jitter)(theta)
-            assert x.shape == (num, 50)
-            assert x.dtype == dtype
-            assert torch.isfinite(x).all()
-    theta = 45 * torch.rand(5, 1)
-    torch.manual_seed(1)
-    single = WindTunnelSimulator()(theta)
-    torch.manual_seed(1)
-    assert torch.equal(single, WindTunnelSimulator()(theta.double()).float())
-
-
 # The posterior at known timing -------------------------------------------------------
 
 
@@ -281,22 +241,6 @@ def distance_from_the_oracle(npe: NPE, task: WindTunnel) -> float:
         theta.unsqueeze(0), x=x, norm_posterior=False
     )
     return float(Oracle().log_prob(theta, x).mean() - log_prob.double().mean())
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:Maximum number of epochs")
-def test_npe_on_the_estimate_of_least_squares_reaches_the_closed_form() -> None:
-    task = WindTunnel(variant="well_specified", onset_jitter=0.0)
-    oracle = Oracle()
-    net = nn.Linear(50, 1).requires_grad_(requires_grad=False)
-    weight = oracle.ratio / oracle.ratio.square().sum() / oracle.per_degree / 13
-    net.weight.copy_(weight.unsqueeze(0))
-    net.bias.fill_((-oracle.at_zero / oracle.per_degree - 22.5) / 13)
-    build = posterior_nn(
-        "nsf", embedding_net=net, num_transforms=1, hidden_features=30, z_score_x="none"
-    )
-    npe = train_npe(task, 4000, build, ((5e-3, 100, 10), (5e-4, 200, 5)))
-    assert distance_from_the_oracle(npe, task) == pytest.approx(0.0, abs=0.1)
 
 
 @pytest.mark.filterwarnings("ignore:Maximum number of epochs")
@@ -375,11 +319,6 @@ def test_the_stand_in_has_correlated_noise() -> None:
     assert float(products.mean()) / 0.04 == pytest.approx(0.6, abs=0.02)
 
 
-def test_prior_shift_opens_the_hatch_by_half_and_more() -> None:
-    theta, _ = WindTunnel(variant="prior_shift", stand_in=True).get_test_set(500)
-    assert theta.min() > 22.5
-
-
 # Recorded data -----------------------------------------------------------------------
 
 
@@ -391,17 +330,6 @@ def test_each_impulse_becomes_a_hatch_and_a_curve(
     order = [theta.flatten().tolist().index(torch.tensor(h)) for h in hatches]
     expected = torch.arange(300).reshape(6, 50) / 97
     torch.testing.assert_close(x[order], expected, rtol=0.0, atol=1e-6)
-
-
-def test_the_split_of_the_recorded_rows_is_fixed(write_impulses: WriteImpulses) -> None:
-    task = WindTunnel(root=write_impulses(tuple(range(9))))
-    assert isinstance(task._real_process("test"), RecordedPairs)
-    with pytest.raises(InvalidInputError, match="at most 3"):
-        task.get_calibration_set(4)
-    with pytest.raises(InvalidInputError, match="at most 6"):
-        task.get_test_set(7)
-    parts = (task.get_calibration_set(3)[0], task.get_test_set(6)[0])
-    assert sorted(torch.cat(parts).flatten().tolist()) == list(range(9))
 
 
 def test_impulses_that_a_recording_cuts_are_left_out(
@@ -420,35 +348,6 @@ def test_impulses_that_a_recording_cuts_are_left_out(
 
 
 # From a file to a repaired posterior -------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:Maximum number of epochs")
-def test_rope_repairs_a_posterior_with_recorded_pairs(
-    write_impulses: WriteImpulses,
-) -> None:
-    # Eighteen impulses: six to calibrate with, twelve to test on.
-    theta, x = WindTunnel(variant="synthetic").get_test_set(18)
-    hatches = tuple(theta.flatten().tolist())
-    task = WindTunnel(root=write_impulses(hatches, pressures=x))
-    build = posterior_nn("nsf", embedding_net=task.get_embedding_net(light=True))
-    npe = train_npe(task, 500, build, ((1e-3, 50, 3),))
-
-    rope = RoPE(
-        npe.build_posterior(),
-        simulator=task.get_simulator(),
-        finetuner=CalibrationFinetuner(max_num_epochs=50),
-    )
-    rope.append_calibration(*task.get_calibration_set(6))
-    rope.train(seed=0, show_progress_bars=False)
-    theta_o, x_o = task.get_test_set(12)
-    with pytest.warns(match="batch of 12"):
-        posterior = rope.build_posterior(x_o, num_simulations=200, seed=0)
-    samples = posterior.sample_batched((100,), x=x_o, show_progress_bars=False)
-    assert samples.shape == (100, 12, 1)
-    assert ((samples >= 0) & (samples <= 45)).all()
-    log_prob = posterior.log_prob_batched(theta_o.unsqueeze(0), x=x_o)
-    assert torch.isfinite(log_prob).all()
 
 
 def all_recorded(task: WindTunnel, num: int) -> tuple[Tensor, Tensor]:

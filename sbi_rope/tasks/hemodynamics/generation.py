@@ -186,10 +186,7 @@ def _parallel(
     calls: Iterator[Any] = (
         joblib.delayed(_run_chunk_for)(os.getpid(), work, chunk) for chunk in chunks
     )
-    try:
-        parallel = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")
-    except ValueError:  # some backends only return everything at once
-        parallel = joblib.Parallel(n_jobs=jobs)
+    parallel = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")
     return parallel(calls)  # type: ignore[return-value]
 
 

@@ -48,25 +48,6 @@ CALLS = [
     ),
     *(
         Call(
-            name=f"num_recorded({name})",
-            run=lambda part="test", seed=0, name=name: made(name).num_recorded(
-                part, seed=seed
-            ),
-            options={"part": "choice", "seed": "seed"},
-        )
-        for name in WITH_SETS
-    ),
-    *(
-        Call(
-            name=f"prior_quantiles({name})",
-            run=lambda theta, name=name: made(name).prior_quantiles(theta),
-            tensors={"theta": some_theta(name)},
-            accepts=("theta: one row less", "theta: no rows", *OTHER_DTYPES),
-        )
-        for name in NAMES
-    ),
-    *(
-        Call(
             name=f"get_simulator({name})",
             run=lambda theta, name=name: made(name).get_simulator()(theta),
             tensors={"theta": some_theta(name)},
