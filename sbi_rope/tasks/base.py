@@ -81,8 +81,7 @@ class Task(ABC):
         variant: One of ``variants``, or ``None`` for the standard real process.
         root: Folder that holds recorded data. Synthetic tasks do not read it, so
             that one ``root`` can be passed to all tasks.
-        label_noise: From 0 to 1, and only for ``"noisy_labels"``; 0.2
-            unless given.
+        label_noise: From 0 to 1, and only for ``"noisy_labels"``; 0.2 unless given.
     """
 
     name: ClassVar[str]

@@ -9,10 +9,9 @@ import pytest
 import torch
 from sbi.inference import NPE, DirectPosterior
 from sbi.neural_nets import posterior_nn
-from sbi.utils import BoxUniform, MultipleIndependent
+from sbi.utils import BoxUniform
 from torch import Tensor, nn
 from torch.distributions import (
-    Beta,
     Dirichlet,
     MultivariateNormal,
 )
@@ -28,7 +27,6 @@ from sbi_rope.baselines.hvae.prior import ContinuedPrior
 from sbi_rope.baselines.hvae.reparametrisation import reparametrised_sample
 from sbi_rope.errors import (
     InvalidInputError,
-    RoPEWarning,
 )
 from sbi_rope.mixture import MixtureEstimator, Part
 from sbi_rope.tasks.pendulum import PendulumSimulator
@@ -235,19 +233,6 @@ def test_continued_prior_is_the_prior_inside_and_falls_off_outside() -> None:
     assert (outside.grad[:, 1] == 0).all()
 
 
-def test_continued_prior_is_finite_where_the_density_is_not() -> None:
-    half = torch.tensor([0.5])
-    prior = MultipleIndependent(
-        [BoxUniform(torch.zeros(2), torch.ones(2)), Beta(half, half)]
-    )
-    theta = torch.tensor([[0.5, 0.5, 0.0], [0.5, 0.5, 1.0], [0.5, 2.0, -1.0]])
-    continued = ContinuedPrior(prior)
-    assert torch.isfinite(continued.log_prob(theta)).all()
-    nearest = continued.nearest(theta)
-    assert torch.isfinite(prior.log_prob(nearest)).all()
-    torch.testing.assert_close(nearest, theta.clamp(0, 1), atol=1e-3, rtol=0)
-
-
 def test_prior_whose_support_is_no_box_is_refused() -> None:
     with pytest.raises(InvalidInputError, match="support is a box"):
         ContinuedPrior(Dirichlet(torch.ones(3)))
@@ -439,13 +424,6 @@ def test_npe_is_left_as_it_was_and_is_not_trained_inside_either(npe: Any) -> Non
         strict=True,
     ):
         torch.testing.assert_close(own, given, rtol=0, atol=0)
-
-
-@pytest.mark.medium
-def test_few_pairs_are_all_trained_on_and_observations_are_held_out(npe: Any) -> None:
-    with pytest.warns(RoPEWarning, match="3 calibration pair"):
-        method = trained(npe, num_pairs=3)
-    assert len(method.history.validation_loss) == SMALL.max_num_epochs + 1
 
 
 @pytest.mark.medium

@@ -193,6 +193,3 @@ def test_the_network_sees_far_statistics_on_a_logarithmic_scale() -> None:
         3 * (1 + math.log(10)),
     ]
     assert torch.allclose(seen[:, 0], torch.tensor(expected), atol=1e-3)
-
-
-# --- wrong use ---

@@ -182,9 +182,6 @@ def test_without_simulations_the_marginal_density_keeps_its_gaussian_tails() -> 
         assert torch.allclose(-flow.loss(far), expected, atol=1.5)
 
 
-# --- standardisation ---
-
-
 # --- the posterior as an object ---
 
 

@@ -74,19 +74,6 @@ def test_options_of_generate_reach_population_and_physics(tmp_path: Path) -> Non
     )
 
 
-def test_after_an_interrupt_the_command_says_how_to_go_on(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def stop(subject: Subject, physics: Physics) -> Beat:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(generation, "_default_simulate", lambda: stop)
-    assert _generate(tmp_path / "x.npz") == 130
-    assert "The same command goes on" in capsys.readouterr().err
-    monkeypatch.setattr(generation, "_default_simulate", lambda: hum)
-    assert _generate(tmp_path / "x.npz") == 0
-
-
 def test_errors_of_generate_are_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -47,11 +47,6 @@ def random_image(size: int = 16) -> Tensor:
 # Files and tables --------------------------------------------------------------------
 
 
-def test_a_file_is_found_below_the_root(tmp_path: Path) -> None:
-    unpack(tmp_path)
-    assert find_file(FILE, root=tmp_path) == tmp_path / FILE
-
-
 def test_columns_come_in_the_order_asked_for(tmp_path: Path) -> None:
     (tmp_path / "t.csv").write_text("a,b,c\n1,2,x\n3,4,y\n")
     values = read_columns(tmp_path / "t.csv", ["b", "a"])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from sbi_rope.errors import DataNotFoundError, InvalidInputError
+from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.hemodynamics.records import NUM_STEPS, Recorder, play
 from sbi_rope.tasks.hemodynamics.task import Hemodynamics
 
@@ -126,17 +126,6 @@ def test_well_specified_observations_are_of_people_who_are_not_trained_on() -> N
     assert len(trained) == pytest.approx(half, abs=1)
 
 
-def test_the_people_of_the_package_are_few_and_of_a_known_seed() -> None:
-    task = Hemodynamics()
-    for process in ("simulator", "real"):
-        people = task._load(None, process)
-        assert people.settings["seed"] == 0
-        assert len(people) >= 300
-        assert people.period_error.max() < 0.3
-    folder = Path(__file__).parents[2] / "sbi_rope/tasks/hemodynamics/data"
-    assert sum(path.stat().st_size for path in folder.glob("*.npz")) < 3_000_000
-
-
 def test_the_people_of_the_package_have_the_pressures_of_the_literature() -> None:
     for process in ("simulator", "real"):
         beat = Hemodynamics()._load(None, process).beat
@@ -190,16 +179,3 @@ def test_paper_settings_are_those_of_the_appendix() -> None:
         2000,
     )
     assert (settings.joint_epochs, settings.joint_epoch_size) == (50, 6000)
-
-
-def test_missing_files_and_files_of_the_other_process_are_refused(
-    tmp_path: Path,
-) -> None:
-    missing = tmp_path / "people.npz"
-    with pytest.raises(DataNotFoundError, match="generate"):
-        Hemodynamics(simulations=missing).get_simulator()
-    with pytest.raises(DataNotFoundError, match="generate"):
-        Hemodynamics(observations=missing).get_test_set(1)
-    folder = Path(__file__).parents[2] / "sbi_rope/tasks/hemodynamics/data"
-    with pytest.raises(InvalidInputError, match="process"):
-        Hemodynamics(simulations=folder / "real.npz").get_simulator()

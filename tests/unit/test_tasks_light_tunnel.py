@@ -443,6 +443,3 @@ def test_the_stand_in_draws_parameters_as_the_experiments_did() -> None:
             colours = theta[:, :3]
             assert colours.std() == pytest.approx(std, rel=0.1)
             assert torch.equal(colours, colours.round()) == in_the_middle
-
-
-# All of it ---------------------------------------------------------------------------

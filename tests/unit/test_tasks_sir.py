@@ -123,13 +123,6 @@ def test_numpy_and_torch_give_the_same_epidemics() -> None:
     np.testing.assert_allclose(days.numpy(), arrays, rtol=1e-10)
 
 
-def test_a_large_batch_has_the_rows_of_small_ones() -> None:
-    theta = SIR().get_prior().sample((1003,))
-    simulator = SIRSimulator(volatility=0.0, steps_per_day=1)
-    expected = torch.cat([simulator.infections(part) for part in theta.split(101)])
-    torch.testing.assert_close(simulator.infections(theta), expected)
-
-
 # The delay of reports ----------------------------------------------------------------
 
 
@@ -213,15 +206,6 @@ def test_density_and_quantiles_of_the_prior_are_analytic() -> None:
     edges = torch.tensor([[0.0, 0.0], [0.5, 0.5], [0.25, 0.25]])
     expected = torch.tensor([[0.0, 0.0], [1.0, 1.0], [0.25, 0.75]])
     torch.testing.assert_close(SIR().prior_quantiles(edges), expected)
-
-
-def test_reported_fraction_is_the_strength_of_the_misspecification() -> None:
-    correlations = [
-        SIR(reported_fraction=fraction).get_test_set(100)[1][:, 5]
-        for fraction in (0.0, 0.5, 0.95, 1.0)
-    ]
-    assert (torch.stack(correlations).diff(dim=0) > 0).all()
-    assert torch.equal(correlations[2], SIR().get_test_set(100)[1][:, 5])
 
 
 def test_network_has_the_widths_of_the_paper() -> None:

@@ -1,7 +1,6 @@
 """Pairs that share no observation."""
 
 from concurrent.futures import ThreadPoolExecutor
-from typing import get_args
 
 import pytest
 import torch
@@ -43,15 +42,6 @@ def test_streams_of_all_seeds_and_uses_differ() -> None:
     streams = {stream_of(seed, use) for seed in SEEDS for use in uses}
     assert len(streams) == 4 * len(SEEDS)
     assert all(0 <= stream < 2**32 for stream in streams)
-
-
-def test_sets_of_all_seeds_and_parts_differ() -> None:
-    first = [
-        tuple(drawn().take(1, seed=seed, part=part)[0].flatten().tolist())
-        for seed in SEEDS
-        for part in get_args(Part)
-    ]
-    assert len(set(first)) == 3 * len(SEEDS)
 
 
 def test_the_random_state_survives_an_error() -> None:
@@ -126,13 +116,6 @@ def test_parts_are_a_partition_that_does_not_depend_on_the_seed() -> None:
     calibration = rows(6, 0, "calibration")
     assert calibration | rows(14, 1, "test") == set(range(20))
     assert calibration == rows(6, 2, "calibration")
-
-
-def test_the_seed_decides_which_rows_of_a_part_are_taken() -> None:
-    first, second = (
-        recorded(300).take(10, seed=seed, part="calibration")[0] for seed in (0, 1)
-    )
-    assert set(first.flatten().tolist()) != set(second.flatten().tolist())
 
 
 def test_the_split_does_not_follow_the_order_of_the_file() -> None:

@@ -308,17 +308,6 @@ def test_to_the_simulator_the_stand_in_looks_like_a_hatch_that_is_open_wider() -
     assert float(error[half_open].mean()) == pytest.approx(7.5, abs=1.5)
 
 
-@pytest.mark.medium
-def test_the_stand_in_has_correlated_noise() -> None:
-    theta, x = WindTunnel(variant="synthetic", onset_jitter=0.0).get_test_set(2000)
-    # At known timing a pressure is a straight line in the hatch, plus noise.
-    line = torch.cat([torch.ones_like(theta), theta], dim=1).double()
-    noise = x.double() - line @ torch.linalg.lstsq(line, x.double()).solution
-    assert float(noise.std()) == pytest.approx(0.2, rel=0.02)
-    products = noise[:, 1:] * noise[:, :-1]
-    assert float(products.mean()) / 0.04 == pytest.approx(0.6, abs=0.02)
-
-
 # Recorded data -----------------------------------------------------------------------
 
 
