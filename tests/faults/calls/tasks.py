@@ -33,7 +33,7 @@ CALLS = [
     Call(
         name="get_task",
         run=lambda name="pendulum", **options: get_task(name, **options).theta_dim,
-        options={"name": "choice", "variant": "choice", "root": "path"},
+        options={"name": "choice", "variant": "choice"},
     ),
     *(
         Call(
