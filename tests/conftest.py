@@ -11,9 +11,6 @@ import torch
 
 # Small parts of published data, which come with the repository.
 TEST_DATA = Path(__file__).resolve().parent / "data"
-EXTRACT_ROWS = {
-    "lt_interventions_standard_v1": {"uniform_reference": (450,), "uniform_*": (30,)}
-}
 # The whole data sets, which some machines have beside the repository.
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -67,18 +64,8 @@ def rough_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def shorter_files(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Allow files of causal chambers with fewer rows than the published ones."""
-    monkeypatch.setattr("sbi_rope.tasks.chambers.PUBLISHED_ROWS", {})
-
-
-@pytest.fixture
-def chamber_extract(monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Folder with the first rows of recorded experiments, see ``tests/data``.
-
-    The reader expects these numbers of rows in place of the published ones.
-    """
-    monkeypatch.setattr("sbi_rope.tasks.chambers.PUBLISHED_ROWS", EXTRACT_ROWS)
+def chamber_extract() -> Path:
+    """Folder with the first rows of recorded experiments, see ``tests/data``."""
     return TEST_DATA / "causal_chamber"
 
 

@@ -1,20 +1,17 @@
 """Tasks as the tests make them, and ways to compare their sets and their refusals."""
 
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks import Task, get_task
 from tests.conftest import TEST_DATA
 
 __all__ = [
     "ROOTS",
     "SUBTLE",
-    "accepted",
     "as_many",
     "draw",
     "largest_z",
@@ -23,8 +20,7 @@ __all__ = [
     "same_rows",
 ]
 
-# Folders with the recorded data of tasks; the other tasks are drawn here. What reads
-# them needs the fixture `chamber_extract`.
+# Folders with the recorded data of tasks; the other tasks are drawn here.
 ROOTS: dict[str, Path] = {"light_tunnel_sensors": TEST_DATA / "causal_chamber"}
 # Small images are quick to write, read and compare.
 # Without 8-bit levels, no two of them are equal. Recorded sets have their own tests.
@@ -83,21 +79,3 @@ def largest_z(a: Tensor, b: Tensor, *, paired: bool = False) -> float:
         error = ((a - b).var(dim=0) / len(a)).sqrt()
     difference = (a.mean(dim=0) - b.mean(dim=0)).abs()
     return float((difference / error)[difference > 0].max())
-
-
-def accepted(cases: Mapping[str, tuple[Callable[[], object], str]]) -> list[str]:
-    """Return the bad calls that are not refused, or not in the words expected.
-
-    Args:
-        cases: A call that must be refused and a word of the message, by a name.
-    """
-    wrong = []
-    for name, (call, word) in cases.items():
-        try:
-            call()
-        except InvalidInputError as error:
-            if word not in str(error):
-                wrong.append(f"{name}: expected {word!r} in {str(error)!r}")
-        else:
-            wrong.append(f"{name}: was accepted")
-    return wrong

@@ -173,7 +173,6 @@ class CalibrationMLP(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidInputError: If an argument has the wrong type.
         InvalidInputError: If sbi knows no estimator of that name; in ``train``, if
             there is one pair only.
     """
@@ -198,7 +197,7 @@ class CalibrationMLP(Method):
         if len(x) < 2:
             raise InvalidInputError(
                 "Expected at least 2 calibration pairs, by which x is standardised; "
-                "got 1. Append more, or use a method that also sees simulations."
+                "got 1."
             )
         train, held_out = split_pairs(theta, self.training.validation_fraction)
         estimator = self._gaussian(theta[train], x[train]).to(self._device)

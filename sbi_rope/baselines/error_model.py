@@ -3,16 +3,13 @@ r"""The error model of RNPE and NNPE, and statistics with its errors taken away.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from sbi_rope._sbi import SliceSamplerVectorized
-from sbi_rope._validation import check_not_nan
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.settings import Positive, UnitInterval, check
+from sbi_rope.settings import Positive, Settings, UnitInterval
 
 __all__ = ["ChainSettings", "SpikeAndSlab", "denoise", "split_r_hat"]
 
@@ -23,7 +20,7 @@ MAX_WIDTH = 50.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class SpikeAndSlab:
+class SpikeAndSlab(Settings):
     r"""What real statistics differ by from simulated ones: nothing much, or anything.
 
     .. math::
@@ -46,61 +43,31 @@ class SpikeAndSlab:
         bound: Draws farther out are put here, since networks see them. The density
             ignores it; 8e-5 of the default's draws are concerned.
 
-    Raises:
-        InvalidInputError: If an argument is outside its range.
-
     Example:
         >>> SpikeAndSlab().log_prob(torch.zeros(2)).exp().round(decimals=1)
         tensor([20.6000, 20.6000])
     """
 
-    spike_std: float = 0.01
-    slab_scale: float = 0.25
-    slab_probability: float = 0.5
-    bound: float = 1e3
-
-    def __post_init__(self) -> None:
-        """Check the ranges of all fields."""
-        check("spike_std", self.spike_std, Positive)
-        check("slab_scale", self.slab_scale, Positive)
-        check("slab_probability", self.slab_probability, UnitInterval)
-        check("bound", self.bound, Positive)
+    spike_std: Positive = 0.01
+    slab_scale: Positive = 0.25
+    slab_probability: UnitInterval = 0.5
+    bound: Positive = 1e3
 
     def sample_like(self, x: Tensor) -> Tensor:
-        """Draw noise of the shape, dtype and device of a tensor.
-
-        Raises:
-            InvalidInputError: If it is no tensor of floating-point numbers.
-        """
-        _check_floating("x", x)
+        """Draw noise of the shape, dtype and device of a tensor."""
         spike = self.spike_std * torch.randn_like(x)
         slab = torch.empty_like(x).cauchy_(sigma=self.slab_scale)
         is_slab = torch.rand_like(x) < self.slab_probability
         return slab.where(is_slab, spike).clamp(-self.bound, self.bound)
 
     def log_prob(self, noise: Tensor) -> Tensor:
-        """Return the log density of every entry of y - s, without the bound.
-
-        Raises:
-            InvalidInputError: If it is no tensor of floating-point numbers.
-            InvalidInputError: If an entry is NaN.
-        """
-        _check_floating("noise", noise)
-        check_not_nan("noise", noise)
+        """Return the log density of every entry of y - s, without the bound."""
         z = noise / self.spike_std
         spike = -0.5 * z**2 - math.log(self.spike_std * math.sqrt(2 * math.pi))
         z = noise / self.slab_scale
         slab = -torch.log1p(z**2) - math.log(self.slab_scale * math.pi)
         share = torch.tensor(self.slab_probability).to(noise)
         return torch.logaddexp(spike + torch.log1p(-share), slab + share.log())
-
-
-def _check_floating(name: str, value: Any) -> None:
-    if not value.is_floating_point():
-        raise InvalidInputError(
-            f"Expected `{name}` to hold floating-point numbers; got {value.dtype}. "
-            "Convert it with `.float()`."
-        )
 
 
 @dataclass(frozen=True, kw_only=True)

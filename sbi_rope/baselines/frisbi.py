@@ -109,7 +109,6 @@ class FRISBI(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidInputError: If an argument has the wrong type.
         InvalidInputError: If sbi knows no estimator of that name, or an argument is
             outside its range.
         UnsupportedPosteriorError: In ``train``, if the estimator has no density.

@@ -59,8 +59,7 @@ class JointNPE(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidInputError: If an argument has the wrong type.
-        InvalidInputError: If sbi knows no estimator of that name.
+        InvalidInputError: If sbi knows no such estimator, or a setting is out of range.
 
     Example:
         >>> from sbi.utils import BoxUniform

@@ -76,7 +76,6 @@ class NNPE(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidInputError: If an argument has the wrong type.
         InvalidInputError: If sbi knows no estimator of that name, or ``noise_on`` is
             neither of the two.
         UnsupportedPosteriorError: In ``train``, if the estimator has no density.

@@ -42,8 +42,7 @@ class PlainNPE(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidInputError: If an argument has the wrong type.
-        InvalidInputError: If sbi knows no estimator of that name.
+        InvalidInputError: If sbi knows no such estimator, or a setting is out of range.
 
     Example:
         >>> from sbi.utils import BoxUniform
@@ -98,8 +97,7 @@ class ReferenceNPE(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidInputError: If an argument has the wrong type.
-        InvalidInputError: If sbi knows no estimator of that name.
+        InvalidInputError: If sbi knows no such estimator, or a setting is out of range.
     """
 
     sees = frozenset({"simulations"})

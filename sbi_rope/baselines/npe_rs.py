@@ -117,7 +117,6 @@ class NPERS(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidInputError: If an argument has the wrong type.
         InvalidInputError: If sbi knows no estimator of that name, or a number is
             outside its range.
         UnsupportedPosteriorError: In ``train``, if the embedding cannot be separated

@@ -45,8 +45,7 @@ class OTOnly(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidInputError: If an argument has the wrong type.
-        InvalidInputError: If sbi knows no estimator of that name.
+        InvalidInputError: If sbi knows no such estimator, or a setting is out of range.
         CouplingError: In ``train``, if the transport has not converged.
     """
 
@@ -66,8 +65,7 @@ class OTOnly(Method):
         device: str | torch.device = "cpu",
     ) -> None:
         check("coupler", coupler, SinkhornCoupler | None)
-        if num_simulations is not None:
-            check("num_simulations", num_simulations, Count)
+        check("num_simulations", num_simulations, Count | None)
         npe = StartingNPE(density_estimator, npe_training)
         super().__init__(prior, npe=npe, simulator=simulator, device=device)
         self.coupler = coupler

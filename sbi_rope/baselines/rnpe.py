@@ -168,9 +168,8 @@ class RNPE(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidInputError: If an argument has the wrong type.
         InvalidInputError: If sbi knows no estimator of that name, an option is outside
-            its range, or, in ``train``, no statistic varies.
+            its range.
         UnsupportedPosteriorError: In ``train``, if the estimator has no density.
     """
 

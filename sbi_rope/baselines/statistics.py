@@ -19,13 +19,12 @@ from sbi_rope._sbi import (
 )
 from sbi_rope._standardisation import Standardisation
 from sbi_rope._training import History, shuffled
-from sbi_rope.errors import InvalidInputError
+from sbi_rope.tensors import as_batch
 from sbi_rope.trainers.training import Training, train_network
 
 __all__ = [
     "NoiseOn",
     "SoftClip",
-    "check_statistics",
     "fit_marginal",
     "frozen_statistics",
     "split_at_statistics",
@@ -75,25 +74,6 @@ def frozen_statistics(
     )
 
 
-def check_statistics(name: str, statistics: Tensor) -> None:
-    """Check that statistics can have errors, which missing ones (NaN) cannot.
-
-    Args:
-        name: What x is called, of which these are the statistics.
-        statistics: Shape ``(n, l)``.
-
-    Raises:
-        InvalidInputError: If an entry is not finite.
-    """
-    rows = (~torch.isfinite(statistics)).flatten(1).any(dim=1)
-    if rows.any():
-        raise InvalidInputError(
-            f"Expected statistics of `{name}` without missing entries (NaN); those of "
-            f"{int(rows.sum())} of {len(rows)} have some. Use noise_on='embedding', "
-            "with an embedding net that reads missing entries."
-        )
-
-
 def standardisation_of_statistics(statistics: Tensor) -> Standardisation:
     """Return the map from statistics to standard deviations of simulated ones.
 
@@ -101,24 +81,11 @@ def standardisation_of_statistics(statistics: Tensor) -> Standardisation:
         statistics: Statistics of simulations, shape ``(n, l)``.
 
     Raises:
-        InvalidInputError: If they are no vectors, not finite, or all of them are
-            constant.
+        InvalidInputError: If they are no vectors, or not finite.
     """
-    if statistics.ndim != 2:
-        raise InvalidInputError(
-            "Expected one vector of statistics for each simulation with "
-            f"noise_on='input'; got x of shape {tuple(statistics.shape)}. Use "
-            "noise_on='embedding'."
-        )
-    check_statistics("x", statistics)
-    standardisation = Standardisation(statistics)
-    if not standardisation.varies.any():
-        raise InvalidInputError(
-            "Expected statistics that differ between simulations; all of "
-            f"{statistics.shape[1]} are constant. Train NPE longer, or with "
-            "another embedding net."
-        )
-    return standardisation
+    return Standardisation(
+        as_batch("statistics of x", statistics, statistics.shape[-1:])
+    )
 
 
 class SoftClip(nn.Module):

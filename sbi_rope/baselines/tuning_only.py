@@ -43,8 +43,7 @@ class TuningOnly(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidInputError: If an argument has the wrong type.
-        InvalidInputError: If sbi knows no estimator of that name.
+        InvalidInputError: If sbi knows no such estimator, or a setting is out of range.
     """
 
     sees = frozenset({"simulations", "calibration"})

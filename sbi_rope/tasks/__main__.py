@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from sbi_rope.errors import InvalidInputError, RoPEError
+from sbi_rope.errors import RoPEError
 from sbi_rope.tasks import Task, get_task, list_tasks
 
 __all__ = ["main"]
@@ -178,10 +178,6 @@ def _print_table(title: str, columns: dict[str, Tensor]) -> None:
 def _draw(task: Task, theta: Tensor, x_o: Tensor, *, path: Path, seed: int) -> None:
     from sbi_rope.plots import real_and_simulated
 
-    if not path.suffix:
-        raise InvalidInputError(
-            f"Expected a file name with a format, such as {path}.png; got {path}."
-        )
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         x_s = task.get_simulator()(theta)
@@ -189,10 +185,7 @@ def _draw(task: Task, theta: Tensor, x_o: Tensor, *, path: Path, seed: int) -> N
         x_o, x_s, x_names=task.x_names, labels=(_kind(task), "simulated")
     )
     path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        figure.savefig(path, dpi=120)
-    except ValueError as error:  # of matplotlib, for a file name without a format
-        raise InvalidInputError(f"Cannot write {path}: {error}") from error
+    figure.savefig(path, dpi=120)
     print(
         f"\nWritten to {path}: {_kind(task)} test observations, and simulations at "
         "the same parameters."

@@ -3,15 +3,14 @@ r"""The base class of all tasks: a prior, a simulator and labelled observations.
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Annotated, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
-from sbi_rope._validation import check_path
-from sbi_rope.errors import InvalidInputError, shown
-from sbi_rope.settings import Positive, Range, UnitInterval, check, one_of
+from sbi_rope.errors import InvalidInputError
+from sbi_rope.settings import Count, Range, UnitInterval, check, one_of
 from sbi_rope.tasks.settings import PaperSettings
 from sbi_rope.tasks.splits import MAX_SEED, DrawnPairs, Keep, Part, RecordedPairs
 from sbi_rope.tasks.variants import (
@@ -20,18 +19,12 @@ from sbi_rope.tasks.variants import (
     inside_region,
     with_label_noise,
 )
-from sbi_rope.tensors import as_batch, check_in_support
 
-__all__ = ["Task", "check_parameters", "check_theta"]
+__all__ = ["Task"]
 
 Simulator = Callable[[Tensor], Tensor]
-T = TypeVar("T")
 
 LABEL_NOISE = 0.2
-# Products of parameters that are no larger stay finite in float32.
-LARGEST_THETA = 1e15
-# No memory holds more pairs: a slip of the keyboard must not draw for days.
-MAX_PAIRS = 10**9
 
 
 class Task(ABC):
@@ -51,12 +44,11 @@ class Task(ABC):
        :meth:`prior_quantiles` too;
     3. implement :meth:`get_simulator`: an instance of a class defined at the top of
        a module (so that it can be pickled) whose ``__call__`` passes its input
-       through ``check_theta``, draws from torch's global generator, and keeps
-       the dtype and device of ``theta``;
+       through ``as_batch``, draws from torch's global generator, and keeps the dtype
+       and device of ``theta``;
     4. implement :meth:`get_embedding_net`: a new, untrained network;
     5. implement ``_real_process``: the pairs of the real process, drawn or
-       recorded. Read its options with ``_option``, which refuses those that have
-       no effect. The variants common to all tasks need nothing else;
+       recorded. The variants common to all tasks need nothing else;
     6. add the class to ``TASKS`` in ``sbi_rope/tasks/__init__.py``. The tests in
        ``tests/contract/test_task*.py`` then apply to it.
 
@@ -89,8 +81,7 @@ class Task(ABC):
         variant: One of ``variants``, or ``None`` for the standard real process.
         root: Folder that holds recorded data. Synthetic tasks do not read it, so
             that one ``root`` can be passed to all tasks.
-        label_noise: Above 0 and at most 1, and only for ``"noisy_labels"``; 0.2
-            unless given.
+        label_noise: From 0 to 1, and only for ``"noisy_labels"``; 0.2 unless given.
     """
 
     name: ClassVar[str]
@@ -115,16 +106,10 @@ class Task(ABC):
         if variant is not None:
             check("variant", variant, one_of(list(self.variants)))
         self.variant = variant
-        self.root = check_path("root", root, optional=True)
-        self.label_noise = self._option(
-            "label_noise",
-            label_noise,
-            LABEL_NOISE if variant == "noisy_labels" else 0.0,
-            variant="noisy_labels",
+        self.root = None if root is None else Path(root).expanduser()
+        self.label_noise = self._strength(
+            "label_noise", label_noise, LABEL_NOISE, variant="noisy_labels"
         )
-        check("label_noise", self.label_noise, UnitInterval)
-        if label_noise is not None:
-            check("label_noise", label_noise, Positive)
 
     @property
     def theta_dim(self) -> int:
@@ -205,7 +190,7 @@ class Task(ABC):
                 have fewer than ``n`` observations to calibrate with.
             DataNotFoundError: If the task needs files that are not there.
         """
-        theta, x = self._labelled_set(n, seed=seed, part="calibration")
+        theta, x = self._take(n, seed=seed, part="calibration")
         if self.variant == "noisy_labels":
             with torch.device("cpu"):
                 std = self.label_noise * self.prior_std
@@ -217,7 +202,7 @@ class Task(ABC):
 
         Arguments, result and errors are those of :meth:`get_calibration_set`.
         """
-        return self._labelled_set(n, seed=seed, part="test")
+        return self._take(n, seed=seed, part="test")
 
     def get_simulations(self, n: int, *, seed: int = 0) -> tuple[Tensor, Tensor]:
         """Return ``n`` draws of the prior and a simulation of each, to train on.
@@ -226,10 +211,7 @@ class Task(ABC):
         in a warning. Arguments and result are those of :meth:`get_calibration_set`;
         no parameter is shared with the two sets.
         """
-        n, seed = _checked_size(n), _checked_seed(seed)
-        # Whatever torch's default device: every machine has the same sets.
-        with torch.device("cpu"):
-            return self._simulated_process().take(n, seed=seed, part="simulation")
+        return self._take(n, seed=seed, part="simulation")
 
     def _simulated_process(self) -> DrawnPairs:
         """Return the pairs to train on."""
@@ -249,113 +231,55 @@ class Task(ABC):
             part: ``"calibration"`` or ``"test"``.
             seed: Seed of the set. Variants keep other pairs under other seeds.
         """
-        check("part", part, Literal["calibration", "test"])
-        seed = _checked_seed(seed)
         with torch.device("cpu"):
             process = self._process_of(part)
             if isinstance(process, DrawnPairs):
                 return None
             return len(process.rows_kept(seed=seed, part=part, keep=self._keep(part)))
 
-    def _labelled_set(self, n: int, *, seed: int, part: Part) -> tuple[Tensor, Tensor]:
-        n, seed = _checked_size(n), _checked_seed(seed)
+    def _take(self, n: int, *, seed: int, part: Part) -> tuple[Tensor, Tensor]:
+        check("n", n, Count)
+        check("seed", seed, Annotated[int, Range(0, MAX_SEED - 1)])
+        # Whatever torch's default device: every machine has the same sets. Integers of
+        # NumPy would overflow in the arithmetic of streams.
         with torch.device("cpu"):
             process = self._process_of(part)
-            return process.take(n, seed=seed, part=part, keep=self._keep(part))
+            return process.take(
+                int(n), seed=int(seed), part=part, keep=self._keep(part)
+            )
 
     def _process_of(self, part: Part) -> DrawnPairs | RecordedPairs:
+        if part == "simulation":
+            return self._simulated_process()
         if self.variant == "well_specified":
             return self._well_specified_process(part)
         return self._real_process(part)
 
     def _keep(self, part: Part) -> Keep | None:
         """Return which parameters of the real process a part may have."""
-        if self.variant == "prior_shift":
+        if self.variant == "prior_shift" and part != "simulation":
             names, region = self.parameter_names, self.shifted_region
             return lambda theta: inside_region(theta, names, region)
         if self.variant == "biased_calibration" and part == "calibration":
             return lambda theta: beta_shaped(self.prior_quantiles(theta))
         return None
 
-    def _option(
-        self, name: str, value: T | None, default: T, *, variant: str | None = None
-    ) -> T:
-        """Return an option of the real process, or raise where it has no effect.
-
-        Args:
-            name: Name of the option.
-            value: What the user gave, ``None`` for the default.
-            default: The value otherwise.
-            variant: The only variant with an effect; by default that is all of them
-                but ``"well_specified"``.
-        """
-        if value is None:
-            return default
-        if variant is not None and self.variant != variant:
-            raise InvalidInputError(
-                f"`{name}` has no effect without `variant={variant!r}`; got both "
-                f"`{name}={shown(value)}` and `variant={self.variant!r}`."
-            )
-        if variant is None and self.variant == "well_specified":
-            raise InvalidInputError(
-                f"`{name}` has no effect with `variant='well_specified'`, where the "
-                f"real process is the simulator; got `{name}={shown(value)}`."
-            )
-        return value
+    def _strength(
+        self, name: str, value: float | None, default: float, *, variant: str
+    ) -> float:
+        """Return the strength of a variant, from 0 to 1; 0 in all others."""
+        check(name, value, UnitInterval | None)
+        if self.variant != variant:
+            if value is not None:
+                raise InvalidInputError(
+                    f"Expected `{name}` with `variant={variant!r}` only; got "
+                    f"`variant={self.variant!r}`."
+                )
+            return 0.0
+        return default if value is None else value
 
     def __repr__(self) -> str:
         options = [] if self.variant is None else [f"variant={self.variant!r}"]
         if self.stand_in and self.variant != "synthetic":
             options.append("stand_in=True")
         return f"{type(self).__name__}({', '.join(options)})"
-
-
-def check_theta(theta: Any, theta_dim: int, *, finite: bool = True) -> Tensor:
-    """Return ``theta`` if it is a batch of floating-point parameter vectors.
-
-    Args:
-        theta: What a simulator was called with. It may be an empty batch.
-        theta_dim: Number of parameters.
-        finite: Whether to look at the numbers as well. Functions that torch
-            transforms (``torch.func``) must not.
-
-    Raises:
-        InvalidInputError: If ``theta`` is not a tensor of floating-point numbers.
-        InvalidInputError: If its shape is not ``(n, theta_dim)``, if it is not finite,
-            or if it is far larger than parameters are.
-    """
-    theta = as_batch("theta", theta, (theta_dim,), finite=finite, empty=True)
-    if not theta.is_floating_point():
-        raise InvalidInputError(
-            f"Expected `theta` to hold floating-point numbers; got {theta.dtype}. "
-            "Convert it with `theta.float()`."
-        )
-    if finite and theta.numel() and theta.abs().max() > LARGEST_THETA:
-        raise InvalidInputError(
-            f"Expected `theta` with numbers up to {LARGEST_THETA:g}; got "
-            f"{float(theta.abs().max()):g}. Check its units."
-        )
-    return theta
-
-
-def check_parameters(theta: Any, prior: Distribution) -> Tensor:
-    """Return ``theta`` if it is a batch of parameters that the prior supports.
-
-    Args:
-        theta: What was passed.
-        prior: A prior over vectors.
-    """
-    theta = check_theta(theta, prior.event_shape[0])
-    check_in_support("theta", theta, prior)
-    return theta
-
-
-def _checked_size(n: Any) -> int:
-    check("n", n, Annotated[int, Range(1, MAX_PAIRS)])
-    return int(n)
-
-
-def _checked_seed(seed: Any) -> int:
-    # An int of Python: those of NumPy overflow in the arithmetic of streams.
-    check("seed", seed, Annotated[int, Range(0, MAX_SEED - 1)])
-    return int(seed)

@@ -10,27 +10,26 @@ import torch
 from sbi.utils import BoxUniform
 from torch import Tensor, nn
 
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.settings import UnitInterval, check
-from sbi_rope.tasks.base import Task, check_parameters, check_theta
+from sbi_rope.settings import Settings, UnitInterval
+from sbi_rope.tasks.base import Task
 from sbi_rope.tasks.distributions import box
 from sbi_rope.tasks.networks import fully_connected
 from sbi_rope.tasks.settings import STATISTICS_SETTINGS
 from sbi_rope.tasks.splits import DrawnPairs, Part
+from sbi_rope.tensors import as_batch
 
 __all__ = ["CancerStroma", "CancerStromaSimulator"]
 
 Array = TypeVar("Array", np.ndarray, Tensor)
 
 STATISTICS = ("n_stromal", "n_cancer", "mean_distance", "max_distance")
-MAX_RATE = 1e6  # a tissue of that many cells takes seconds and a gigabyte
 NUM_DISTANCES = 50  # the first stromal cells enter the two distances, others do not
 # Tissues that the batched path handles at once; 0.1 GB an array under the prior.
 CHUNK_SIZE = 256
 
 
 @dataclass(frozen=True, kw_only=True)
-class CancerStromaSimulator:
+class CancerStromaSimulator(Settings):
     r"""Four statistics of the cells in a square of tissue.
 
     With rates :math:`(\lambda_c, \lambda_p, \lambda_d)`, the unit square holds
@@ -64,23 +63,13 @@ class CancerStromaSimulator:
         torch.Size([2, 4])
     """
 
-    necrosis_probability: float = 0.0
-    necrosis_radius: float = 0.8
+    necrosis_probability: UnitInterval = 0.0
+    necrosis_radius: UnitInterval = 0.8
     batched: bool | None = None
-
-    def __post_init__(self) -> None:
-        check("necrosis_probability", self.necrosis_probability, UnitInterval)
-        check("necrosis_radius", self.necrosis_radius, UnitInterval)
-        check("batched", self.batched, bool | None)
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, 3)``, to shape ``(n, 4)``."""
-        theta = check_theta(theta, 3).detach()
-        if ((theta < 0) | (theta > MAX_RATE)).any():
-            raise InvalidInputError(
-                f"Expected rates `theta` from 0 to {MAX_RATE:g}; got "
-                f"{float(theta.min())!r} to {float(theta.max())!r}."
-            )
+        theta = as_batch("theta", theta, (3,), empty=True)
         if not len(theta):
             return theta.new_empty(0, len(STATISTICS))
         off_cpu = theta.device.type != "cpu"
@@ -230,10 +219,9 @@ class CancerStroma(Task):
         root: Not used, the task is synthetic.
         label_noise: Noise on the calibration labels, in standard deviations of the
             prior. It is 0.2 unless given, and only for ``"noisy_labels"``.
-        necrosis_probability: Probability of a real parent to be necrotic. It is 0.75
-            unless given. At 0 the simulator is exact.
-        necrosis_radius: Radius of the necrosis, as a fraction of the tumour's. It is
-            0.8 unless given.
+        necrosis_probability: Probability of a real parent to be necrotic. At 0 the
+            simulator is exact.
+        necrosis_radius: Radius of the necrosis, as a fraction of the tumour's.
 
     Example:
         >>> theta, x_o = CancerStroma().get_calibration_set(50)
@@ -256,18 +244,12 @@ class CancerStroma(Task):
         variant: str | None = None,
         root: str | Path | None = None,
         label_noise: float | None = None,
-        necrosis_probability: float | None = None,
-        necrosis_radius: float | None = None,
+        necrosis_probability: float = 0.75,
+        necrosis_radius: float = 0.8,
     ) -> None:
         super().__init__(variant=variant, root=root, label_noise=label_noise)
-        exact = variant == "well_specified"
-        self.necrosis_probability = self._option(
-            "necrosis_probability", necrosis_probability, 0.0 if exact else 0.75
-        )
-        self.necrosis_radius = self._option("necrosis_radius", necrosis_radius, 0.8)
         self._real = CancerStromaSimulator(
-            necrosis_probability=self.necrosis_probability,
-            necrosis_radius=self.necrosis_radius,
+            necrosis_probability=necrosis_probability, necrosis_radius=necrosis_radius
         )
 
     def get_prior(self) -> BoxUniform:
@@ -276,8 +258,7 @@ class CancerStroma(Task):
 
     def prior_quantiles(self, theta: Tensor) -> Tensor:
         """Return relative positions in the box, shape ``(n, 3)``."""
-        prior = self.get_prior()
-        return prior.base_dist.cdf(check_parameters(theta, prior))
+        return self.get_prior().base_dist.cdf(theta)
 
     def get_simulator(self) -> CancerStromaSimulator:
         """Return the simulator without necrosis."""
@@ -285,7 +266,6 @@ class CancerStroma(Task):
 
     def get_embedding_net(self, *, light: bool = False) -> nn.Module:
         """Return the paper's network, which is light already and has nine outputs."""
-        check("light", light, bool)
         return fully_connected(len(STATISTICS), (12, 48, 48, 36, 9))
 
     def _real_process(self, part: Part) -> DrawnPairs:

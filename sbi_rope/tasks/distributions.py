@@ -8,14 +8,10 @@ from sbi.utils import BoxUniform
 from torch import Size, Tensor
 from torch.distributions import Distribution, constraints
 
-from sbi_rope._validation import check_finite
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.tensors import as_numbers
-
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = ["Arcsine", "UniformDistance", "box", "check_size"]
+__all__ = ["Arcsine", "UniformDistance", "box"]
 
 # Nearest relative distance to its ends at which an arcsine density is evaluated.
 ARCSINE_EDGE = 2.0**-23
@@ -45,24 +41,13 @@ def box(
     return BoxUniform(lower, upper)
 
 
-def check_size(name: str, value: Any) -> Tensor:
-    """Return the size of a support if it is a tensor of finite, positive numbers."""
-    check_finite(name, as_numbers(name, value))
-    if not value.is_floating_point() or not (value > 0).all():
-        raise InvalidInputError(
-            f"Expected `{name}` to hold positive floating-point numbers; got "
-            f"{value.dtype}, {value.min().item() if value.numel() else None} at least."
-        )
-    return value
-
-
 class _FromZero(Distribution):
     """A law on the interval from 0 to ``width`` that is drawn by inversion."""
 
     has_rsample = True
 
     def __init__(self, width: Tensor, validate_args: bool | None = None) -> None:  # noqa: FBT001
-        self.width = check_size("width", width)
+        self.width = width
         super().__init__(batch_shape=width.shape, validate_args=validate_args)
 
     @property

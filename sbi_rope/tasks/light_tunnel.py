@@ -7,21 +7,17 @@ import torch
 from sbi.utils import BoxUniform, MultipleIndependent
 from torch import Tensor
 
-from sbi_rope.errors import InvalidInputError
 from sbi_rope.settings import check, one_of
-from sbi_rope.tasks.base import Task, check_parameters
+from sbi_rope.tasks.base import Task
 from sbi_rope.tasks.chambers import (
-    check_complete,
-    check_download,
     find_file,
     find_images,
     read_columns,
     read_images,
-    read_names,
+    read_table,
 )
 from sbi_rope.tasks.distributions import Arcsine, box
 from sbi_rope.tasks.light_tunnel_models import (
-    CAMERA_NOISE,
     MAX_LEVEL,
     CameraSimulator,
     HexagonSimulator,
@@ -108,14 +104,8 @@ class LightTunnel(Task):
             from before version 1.4 have no images of size 64.
         dequantise: Whether to add uniform noise within each 8-bit level, to simulated
             and real images alike.
-        experiment: The recorded experiment that both sets come from,
-            ``"uniform_ap_1.8_iso_500.0_ss_0.005"`` unless given; not for the variants
-            that choose it themselves.
         stand_in: Whether model F3 replaces the recorded images. Without effect in
             the variants that need no files, so that it can be passed to all.
-        sensor_noise: Standard deviation of the stand-in's noise on each pixel, as a
-            share of full brightness. It is 2/255 unless given, and only for a
-            stand-in.
 
     Example:
         >>> task = LightTunnel(variant="synthetic", image_size=64)
@@ -160,33 +150,15 @@ class LightTunnel(Task):
         download: bool = False,
         image_size: int = 100,
         dequantise: bool = False,
-        experiment: str | None = None,
         stand_in: bool = False,
-        sensor_noise: float | None = None,
     ) -> None:
         super().__init__(variant=variant, root=root, label_noise=label_noise)
         check("image_size", image_size, one_of(IMAGE_SIZES))
-        check("stand_in", stand_in, bool)
-        check("experiment", experiment, str | None)
         self.stand_in = stand_in or variant == "synthetic"
-        if experiment is not None and (self.stand_in or variant in OWN_EXPERIMENTS):
-            raise InvalidInputError(
-                f"`experiment` has no effect with a stand-in, or a variant that "
-                f"chooses its own; got {experiment=}, {variant=} and {stand_in=}."
-            )
-        if sensor_noise is not None and not self.stand_in:
-            raise InvalidInputError(
-                f"`sensor_noise` has no effect on recorded images; got {sensor_noise=} "
-                "without `stand_in=True` or `variant='synthetic'`."
-            )
-        self.image_size = int(image_size)
+        self.image_size = image_size
         self.x_shape = (3, self.image_size, self.image_size)
         self.dequantise = dequantise
         self.download = download
-        self.experiment = self._option("experiment", experiment, UNIFORM)
-        check_download(self.root, self.required_files, download=download)
-        self.sensor_noise = self._option("sensor_noise", sensor_noise, CAMERA_NOISE)
-        self._camera()  # refuses a bad `sensor_noise` or `dequantise` now
 
     def get_prior(self) -> MultipleIndependent:
         """Return the prior: uniform colours, and the law of a squared cosine.
@@ -200,7 +172,6 @@ class LightTunnel(Task):
 
     def prior_quantiles(self, theta: Tensor) -> Tensor:
         """Return the distribution functions of colours and alpha, ``(n, 4)``."""
-        theta = check_parameters(theta, self.get_prior())
         colours = _colour_prior().base_dist.cdf(theta[:, :3])
         return torch.cat([colours, _alpha_prior().cdf(theta[:, 3:])], dim=1)
 
@@ -228,8 +199,8 @@ class LightTunnel(Task):
         return tuple(_table(experiment) for experiment in dict.fromkeys(experiments))
 
     def _experiment(self, part: Part) -> str:
-        standard = (self.experiment, self.experiment)
-        return OWN_EXPERIMENTS.get(self.variant or "", standard)[part == "test"]
+        pair = OWN_EXPERIMENTS.get(self.variant or "", (UNIFORM, UNIFORM))
+        return pair[part == "test"]
 
     def _keep(self, part: Part) -> Keep | None:
         # A biased set comes from an experiment that is biased already.
@@ -238,15 +209,9 @@ class LightTunnel(Task):
     def _real_process(self, part: Part) -> DrawnPairs | RecordedPairs:
         return self._drawn(part) if self.stand_in else self._recorded(part)
 
-    def _camera(self) -> CameraSimulator:
-        return CameraSimulator(
-            image_size=self.image_size,
-            dequantise=self.dequantise,
-            sensor_noise=self.sensor_noise,
-        )
-
     def _drawn(self, part: Part) -> DrawnPairs:
-        prior, camera = self.get_prior(), self._camera()
+        prior = self.get_prior()
+        camera = CameraSimulator(image_size=self.image_size, dequantise=self.dequantise)
         crowded = self._experiment(part) == BETA_BINOMIAL
         return DrawnPairs(
             draw_theta=draw_crowded if crowded else lambda n: prior.sample((n,)),  # type: ignore[arg-type]
@@ -260,8 +225,7 @@ class LightTunnel(Task):
         colour, angles = read_columns(path, INPUTS).split([3, 2], dim=1)
         theta = torch.cat([colour, malus(angles)], dim=1).float()
         check_in_support(f"theta of {table}", theta, self.get_prior())
-        names = read_names(path, "image_file")
-        check_complete(path, len(names), dataset=DATASET)
+        names = read_table(path, ["image_file"])["image_file"].astype(str).tolist()
         return RecordedPairs(
             theta=theta, read_x=partial(self._read_x, folder, names, part)
         )

@@ -1,14 +1,13 @@
 r"""Two published models of the light tunnel's images, one with a camera's noise."""
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import torch
 from torch import Tensor
 from torch.distributions import Beta, Binomial
 
-from sbi_rope.settings import Range, UnitInterval, check
-from sbi_rope.tasks.base import check_theta
+from sbi_rope.settings import Count, Settings, UnitInterval
+from sbi_rope.tensors import as_batch
 
 __all__ = [
     "CameraSimulator",
@@ -20,7 +19,6 @@ __all__ = [
 ]
 
 MAX_LEVEL = 255  # of an 8-bit channel, and of a colour of the source
-MAX_SIZE = 10_000  # pixels along a side; a larger image takes more than a gigabyte
 RADIUS = 0.22  # of the light source, as a share of the image
 
 # Constants of model F3 as published with the package causalchamber, fitted by its
@@ -38,7 +36,7 @@ CAMERA_NOISE = 2 / MAX_LEVEL
 
 
 @dataclass(frozen=True, kw_only=True)
-class HexagonSimulator:
+class HexagonSimulator(Settings):
     r"""A hexagon in the colour of the source, dimmed by two polarisers (model F1).
 
     With :math:`M` the pixels of the hexagon, a pixel's red, green and blue are
@@ -68,16 +66,12 @@ class HexagonSimulator:
         tensor([100.,  50.,   0.])
     """
 
-    image_size: int = 100
+    image_size: Count = 100
     dequantise: bool = False
-
-    def __post_init__(self) -> None:
-        check("image_size", self.image_size, Annotated[int, Range(1, MAX_SIZE)])
-        check("dequantise", self.dequantise, bool)
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, 4)``, to ``(n, 3, size, size)``."""
-        theta = check_theta(theta, 4)
+        theta = as_batch("theta", theta, (4,), empty=True)
         levels = (theta[:, 3:] * theta[:, :3]).floor()
         # As they are floored before, a masked pixel is a product with 0 or 1.
         if self.dequantise:
@@ -93,12 +87,11 @@ class HexagonSimulator:
         Returns:
             Images, shape ``(n, 3, size, size)``, differentiable in ``theta``.
         """
-        theta = check_theta(theta, 4, finite=False)
         return _masked(theta[:, 3:] * theta[:, :3] / MAX_LEVEL, self.image_size)
 
 
 @dataclass(frozen=True, kw_only=True)
-class CameraSimulator:
+class CameraSimulator(Settings):
     r"""The hexagon as a camera sees it (model F3), with noise and in 8 bit.
 
     With :math:`W S` the response of the camera to the colours, :math:`e` its
@@ -130,18 +123,13 @@ class CameraSimulator:
         tensor([0.7644, 1.0000, 1.0000])
     """
 
-    image_size: int = 100
+    image_size: Count = 100
     dequantise: bool = False
-    sensor_noise: float = CAMERA_NOISE
-
-    def __post_init__(self) -> None:
-        check("image_size", self.image_size, Annotated[int, Range(1, MAX_SIZE)])
-        check("dequantise", self.dequantise, bool)
-        check("sensor_noise", self.sensor_noise, UnitInterval)
+    sensor_noise: UnitInterval = CAMERA_NOISE
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, 4)``, to ``(n, 3, size, size)``."""
-        image = self.image(check_theta(theta, 4))
+        image = self.image(as_batch("theta", theta, (4,), empty=True))
         noisy = image + self.sensor_noise * torch.randn_like(image)
         levels = (MAX_LEVEL * noisy).round().clamp(0, MAX_LEVEL)
         return as_brightness(levels, dequantise=self.dequantise)
@@ -156,7 +144,6 @@ class CameraSimulator:
             Images, shape ``(n, 3, size, size)``, differentiable in ``theta`` where
             they are not over-exposed.
         """
-        theta = check_theta(theta, 4, finite=False)
         colour, alpha = theta[:, :3] / MAX_LEVEL, theta[:, 3:]
         aligned, crossed = theta.new_tensor(ALIGNED), theta.new_tensor(CROSSED)
         response = theta.new_tensor(RESPONSE).T * theta.new_tensor(WHITE_BALANCE)

@@ -1,20 +1,14 @@
 r"""The embedding networks of the light tunnel's images."""
 
-from typing import Annotated
-
 import torch
 from torch import Tensor, nn
 
-from sbi_rope.settings import Range, check
-from sbi_rope.tasks.light_tunnel_models import MAX_SIZE
-from sbi_rope.tasks.networks import MAX_WIDTH, fully_connected
-from sbi_rope.tensors import as_batch
+from sbi_rope.tasks.networks import fully_connected
 
 __all__ = ["ImageEmbedding"]
 
 # Squares along each side of an image of which the light network takes means.
 NUM_MEANS = 10
-MIN_SIZE, MIN_SIZE_LIGHT = 39, NUM_MEANS
 LAST_BIAS = 0.1
 
 
@@ -41,9 +35,6 @@ class ImageEmbedding(nn.Module):
         light: Whether to replace the convolutions by means over squares, about 10 by
             10 of them, and three linear layers.
 
-    Raises:
-        InvalidInputError: If the images are too small for the layers.
-
     Example:
         >>> ImageEmbedding(image_size=64)(torch.zeros(5, 3, 64, 64)).shape
         torch.Size([5, 20])
@@ -53,17 +44,7 @@ class ImageEmbedding(nn.Module):
         self, *, image_size: int = 100, output_dim: int = 20, light: bool = False
     ) -> None:
         super().__init__()
-        check("light", light, bool)
-        check(
-            "image_size",
-            image_size,
-            Annotated[int, Range(MIN_SIZE_LIGHT if light else MIN_SIZE, MAX_SIZE)],
-        )
-        check("output_dim", output_dim, Annotated[int, Range(1, MAX_WIDTH)])
-        self.image_size = image_size
-        self.features = (
-            _means(image_size // MIN_SIZE_LIGHT) if light else _convolutions()
-        )
+        self.features = _means(image_size // NUM_MEANS) if light else _convolutions()
         with torch.no_grad():
             image = torch.zeros(1, 3, image_size, image_size)
             self.num_features = self.features(image).shape[1]
@@ -72,8 +53,7 @@ class ImageEmbedding(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Embed images of shape ``(n, 3, size, size)`` as ``(n, output_dim)``."""
-        shape = (3, self.image_size, self.image_size)
-        return self.head(self.features(as_batch("x", x, shape, finite=False)))
+        return self.head(self.features(x))
 
 
 class _LastConvolution(nn.Conv2d):

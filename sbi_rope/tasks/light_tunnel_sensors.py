@@ -8,20 +8,14 @@ from sbi.utils import BoxUniform, MultipleIndependent
 from torch import Tensor, nn
 
 from sbi_rope.errors import InvalidInputError
-from sbi_rope.settings import NotNegative, Positive, check
-from sbi_rope.tasks.base import Task, check_parameters, check_theta
-from sbi_rope.tasks.chambers import (
-    CUT_FILE,
-    check_complete,
-    check_download,
-    find_file,
-    read_columns,
-)
+from sbi_rope.settings import NotNegative, Settings, check
+from sbi_rope.tasks.base import Task
+from sbi_rope.tasks.chambers import find_file, read_columns
 from sbi_rope.tasks.distributions import UniformDistance, box
 from sbi_rope.tasks.networks import fully_connected
 from sbi_rope.tasks.splits import Part, RecordedPairs
 from sbi_rope.tasks.variants import COMMON_VARIANTS
-from sbi_rope.tensors import check_in_support
+from sbi_rope.tensors import as_batch, check_in_support
 
 __all__ = ["LightTunnelSensors", "LightTunnelSimulator"]
 
@@ -64,7 +58,7 @@ OWN_EXPERIMENTS = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class LightTunnelSimulator:
+class LightTunnelSimulator(Settings):
     r"""Six light readings and a current, after the published law with noise.
 
     With :math:`c` the colours of the source, :math:`S` the response of the two
@@ -98,16 +92,12 @@ class LightTunnelSimulator:
         tensor([11115.,  1144.])
     """
 
-    relative_noise: float = 0.03
-    current_noise_std: float = 4.0
-
-    def __post_init__(self) -> None:
-        check("relative_noise", self.relative_noise, NotNegative)
-        check("current_noise_std", self.current_noise_std, NotNegative)
+    relative_noise: NotNegative = 0.03
+    current_noise_std: NotNegative = 4.0
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, 4)``, to shape ``(n, 7)``."""
-        readings = self.readings(check_theta(theta, 4))
+        readings = self.readings(as_batch("theta", theta, (4,), empty=True))
         light, current = readings[:, :6], readings[:, 6:]
         light = light * (1 + self.relative_noise * torch.randn_like(light))
         current = current + self.current_noise_std * torch.randn_like(current)
@@ -123,7 +113,6 @@ class LightTunnelSimulator:
         Returns:
             Readings, shape ``(n, 7)``, differentiable in ``theta``.
         """
-        theta = check_theta(theta, 4, finite=False)
         colour, angle = theta[:, :3], theta[:, 3:]
         response = theta.new_tensor(RESPONSE).T * theta.new_tensor(GAIN)
         aligned, crossed = theta.new_tensor(ALIGNED), theta.new_tensor(CROSSED)
@@ -190,9 +179,8 @@ class LightTunnelSensors(Task):
             ``"uniform_reference"`` unless given; not for the variants that choose it
             themselves. Others of the data set change a lamp (``uniform_l_11_mid``) or a
             sensor's setting (``uniform_t_ir_1_strong``) and so misspecify the simulator
-            in another way; those with parameters outside of the prior are refused.
-        relative_noise: Simulated standard deviation of a light reading, as a fraction.
-        current_noise_std: Simulated standard deviation of the current.
+            in another way; those with parameters outside of the prior are refused. A
+            recording of one's own may have any number of rows.
     """
 
     name = "light_tunnel_sensors"
@@ -222,23 +210,16 @@ class LightTunnelSensors(Task):
         label_noise: float | None = None,
         download: bool = False,
         experiment: str | None = None,
-        relative_noise: float = 0.03,
-        current_noise_std: float = 4.0,
     ) -> None:
         super().__init__(variant=variant, root=root, label_noise=label_noise)
-        check("relative_noise", relative_noise, Positive)
-        check("current_noise_std", current_noise_std, Positive)
         check("experiment", experiment, str | None)
         if experiment is not None and variant in OWN_EXPERIMENTS:
             raise InvalidInputError(
-                f"`experiment` has no effect with `variant={variant!r}`, which chooses "
-                f"its own; got `experiment={experiment!r}`."
+                f"Expected no `experiment` with `variant={variant!r}`, which has its "
+                f"own; got {experiment!r}."
             )
         self.download = download
-        self.experiment = self._option("experiment", experiment, REFERENCE)
-        check_download(self.root, self.required_files, download=download)
-        self.relative_noise = relative_noise
-        self.current_noise_std = current_noise_std
+        self.experiment = REFERENCE if experiment is None else experiment
 
     def get_prior(self) -> MultipleIndependent:
         """Return the prior: uniform colours, and the distance of two angles.
@@ -252,7 +233,6 @@ class LightTunnelSensors(Task):
 
     def prior_quantiles(self, theta: Tensor) -> Tensor:
         """Return the distribution functions of colours and angle, ``(n, 4)``."""
-        theta = check_parameters(theta, self.get_prior())
         colours = self._colour_prior().base_dist.cdf(theta[:, :3])
         prior = self._angle_prior()
         angle = prior if isinstance(prior, UniformDistance) else prior.base_dist
@@ -269,14 +249,10 @@ class LightTunnelSensors(Task):
 
     def get_simulator(self) -> LightTunnelSimulator:
         """Return the published law with noise."""
-        return LightTunnelSimulator(
-            relative_noise=self.relative_noise,
-            current_noise_std=self.current_noise_std,
-        )
+        return LightTunnelSimulator()
 
     def get_embedding_net(self, *, light: bool = False) -> nn.Module:
         """Return a network with three hidden layers of 64 and eight outputs."""
-        check("light", light, bool)
         return fully_connected(len(OUTPUTS), (64, 64, 64, 8))
 
     def _recorded_files(self) -> tuple[Path, ...]:
@@ -299,14 +275,9 @@ class LightTunnelSensors(Task):
         file = Path(DATASET, f"{experiment}.csv")
         path = find_file(file, root=self.root, download=self.download)
         values = read_columns(path, INPUTS + OUTPUTS)
-        check_complete(path, len(values), dataset=DATASET)
         colour, positions, readings = values.split([3, 2, len(OUTPUTS)], dim=1)
-        if (readings < 0).any():
-            raise InvalidInputError(
-                f"Expected readings of at least 0 in {path}; got {readings.min()}. "
-                f"{CUT_FILE}"
-            )
         angle = (positions[:, :1] - positions[:, 1:]).abs()
         theta = torch.cat([colour, angle], dim=1)
         check_in_support(f"theta of {file}", theta.float(), self.get_prior())
-        return theta, torch.cat([readings[:, :6].log1p(), readings[:, 6:]], dim=1)
+        x = torch.cat([readings[:, :6].log1p(), readings[:, 6:]], dim=1)
+        return theta, as_batch(f"logarithms of {path}", x)

@@ -3,19 +3,19 @@ r"""The linear-Gaussian task, whose posteriors are all known."""
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from torch import Tensor, nn
 from torch.distributions import MultivariateNormal, Normal, StudentT
 
-from sbi_rope._validation import check_device
 from sbi_rope.errors import InvalidInputError
-from sbi_rope.settings import Count, Number, Positive, check
-from sbi_rope.tasks.base import Task, check_theta
+from sbi_rope.settings import Number, Positive, Range, Settings, default_names
+from sbi_rope.tasks.base import Task
 from sbi_rope.tasks.networks import fully_connected
 from sbi_rope.tasks.splits import DrawnPairs, Part
 from sbi_rope.tasks.variants import COMMON_VARIANTS
-from sbi_rope.tensors import as_batch, check_same_length
+from sbi_rope.tensors import as_batch
 
 __all__ = ["LinearGaussian", "LinearGaussianSimulator"]
 
@@ -30,7 +30,7 @@ TAILS_STD, TAILS_FREEDOM = 0.3, 1.5
 
 
 @dataclass(frozen=True, kw_only=True)
-class LinearGaussianSimulator:
+class LinearGaussianSimulator(Settings):
     r"""A linear map of the parameters with Gaussian noise, then a gain and an offset.
 
     .. math:: x = s\, (A \theta + \sigma \varepsilon) + m, \qquad
@@ -49,30 +49,18 @@ class LinearGaussianSimulator:
         tensor([[1.0000, 2.5000]])
     """
 
-    dim: int = 2
-    noise_std: float = NOISE_STD
-    scale: float = 1.0
-    shift: float = 0.0
-
-    def __post_init__(self) -> None:
-        check("dim", self.dim, Count)
-        check("noise_std", self.noise_std, Positive)
-        _check_gain_and_offset(self.scale, self.shift)
+    dim: Annotated[int, Range(1, MAX_DIM)] = 2
+    noise_std: Positive = NOISE_STD
+    scale: Number = 1.0
+    shift: Number = 0.0
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, d)``, to the same shape."""
-        theta = check_theta(theta, self.dim)
-        return self._observe(theta, torch.randn_like(theta))
+        theta = as_batch("theta", theta, (self.dim,), empty=True)
+        return self.observe(theta, torch.randn_like(theta))
 
     def observe(self, theta: Tensor, noise: Tensor) -> Tensor:
         r"""Return observations for given noise :math:`\varepsilon`, differentiable."""
-        theta = check_theta(theta, self.dim, finite=False)
-        as_batch("noise", noise, (self.dim,), finite=False, empty=True)
-        check_same_length("theta", theta, "noise", noise)
-        check_device("noise", noise, theta.device, where="`theta`")
-        return self._observe(theta, noise)
-
-    def _observe(self, theta: Tensor, noise: Tensor) -> Tensor:
         clean = theta @ self.matrix(theta).T
         return self.scale * (clean + self.noise_std * noise) + self.shift
 
@@ -123,9 +111,9 @@ class LinearGaussian(Task):
         label_noise: Noise on the calibration labels, in standard deviations of the
             prior. It is 0.2 unless given, and only for ``"noisy_labels"``.
         dim: Number of parameters and of entries of x, from 1 to 25.
-        scale: Gain of the real process, not 0. It is 1.4 unless given.
-        shift: Offset of the real process. It is 0.7 unless given. With a gain of 1
-            and an offset of 0 the simulator is exact.
+        scale: Gain of the real process, not 0.
+        shift: Offset of the real process. With a gain of 1 and an offset of 0 the
+            simulator is exact.
         noise_std: Standard deviation of the noise.
 
     Example:
@@ -150,27 +138,24 @@ class LinearGaussian(Task):
         root: str | Path | None = None,
         label_noise: float | None = None,
         dim: int = 2,
-        scale: float | None = None,
-        shift: float | None = None,
+        scale: float = 1.4,
+        shift: float = 0.7,
         noise_std: float = NOISE_STD,
     ) -> None:
         super().__init__(variant=variant, root=root, label_noise=label_noise)
-        check("dim", dim, Count)
-        if dim > MAX_DIM:
-            raise InvalidInputError(
-                f"Expected `dim` to be at most {MAX_DIM}; got {dim}."
-            )
-        check("noise_std", noise_std, Positive)
+        exact = variant == "well_specified"
+        self._real = LinearGaussianSimulator(
+            dim=dim,
+            noise_std=noise_std,
+            scale=1.0 if exact else scale,
+            shift=0.0 if exact else shift,
+        )
         self.dim = dim
-        self.parameter_names = tuple(f"theta_{k + 1}" for k in range(dim))
+        self.parameter_names = default_names(dim)
         self.parameter_units = ("1",) * dim
         self.x_names = tuple(f"x_{k + 1}" for k in range(dim))
         self.x_shape = (dim,)
         self.noise_std = noise_std
-        exact = variant == "well_specified"
-        self.scale = self._option("scale", scale, 1.0 if exact else 1.4)
-        self.shift = self._option("shift", shift, 0.0 if exact else 0.7)
-        _check_gain_and_offset(self.scale, self.shift)
 
     def get_prior(self) -> MultivariateNormal:
         """Return the standard normal prior."""
@@ -179,7 +164,6 @@ class LinearGaussian(Task):
 
     def prior_quantiles(self, theta: Tensor) -> Tensor:
         """Return the normal distribution function of each entry, ``(n, d)``."""
-        theta = check_theta(theta, self.dim)
         return Normal(theta.new_zeros(()), theta.new_ones(())).cdf(theta)
 
     def get_simulator(self) -> LinearGaussianSimulator:
@@ -188,7 +172,6 @@ class LinearGaussian(Task):
 
     def get_embedding_net(self, *, light: bool = False) -> nn.Module:
         """Return a network with two hidden layers of 64 and 2 d outputs."""
-        check("light", light, bool)
         return fully_connected(self.dim, (64, 64, 2 * self.dim))
 
     @property
@@ -217,7 +200,7 @@ class LinearGaussian(Task):
                 "Expected a variant with a posterior in closed form; got "
                 f"{self.variant!r}."
             )
-        return self._real_simulator().posterior(x_o)
+        return self._real.posterior(x_o)
 
     def _real_process(self, part: Part) -> DrawnPairs:
         prior = self.get_prior()
@@ -227,25 +210,10 @@ class LinearGaussian(Task):
         )
 
     def _observe(self, theta: Tensor) -> Tensor:
-        real = self._real_simulator()
-        x = real(theta)
+        x = self._real(theta)
         if self.variant == "curved":
-            return x + BEND * (theta @ real.matrix(theta).T).square()
+            return x + BEND * (theta @ self._real.matrix(theta).T).square()
         if self.variant == "heavy_tails":
             freedom = theta.new_full((), TAILS_FREEDOM)  # torch's default may change
             return x + TAILS_STD * StudentT(freedom).sample(x.shape)
         return x
-
-    def _real_simulator(self) -> LinearGaussianSimulator:
-        return LinearGaussianSimulator(
-            dim=self.dim, noise_std=self.noise_std, scale=self.scale, shift=self.shift
-        )
-
-
-def _check_gain_and_offset(scale: float, shift: float) -> None:
-    check("scale", scale, Number)
-    check("shift", shift, Number)
-    if scale == 0:
-        raise InvalidInputError(
-            f"Expected `scale` to be a finite number other than 0; got {scale!r}."
-        )

@@ -1,14 +1,9 @@
 r"""Embedding networks that several tasks share."""
 
 from collections.abc import Sequence
-from typing import Annotated
 
 import torch
 from torch import Tensor, nn
-
-from sbi_rope.errors import InvalidInputError, shown
-from sbi_rope.settings import Count, Range, check
-from sbi_rope.tensors import as_batch
 
 __all__ = ["SeriesEmbedding", "fully_connected", "light_series_embedding"]
 
@@ -16,7 +11,6 @@ CHANNELS = (1, 16, 64, 128, 128, 128, 128, 128)
 STRIDES = (1, 2, 1, 2, 1, 2, 1)
 POOLS = ((3, 1), (3, 1), (3, 1))
 HEAD = (512, 128, 32)
-MAX_WIDTH = 10**6  # of a layer; a wider one takes gigabytes
 
 
 class SeriesEmbedding(nn.Module):
@@ -42,9 +36,6 @@ class SeriesEmbedding(nn.Module):
         pools: Number of neighbours and stride of each of the three means.
         decimation: Every how many steps one is taken, the others are not looked at.
 
-    Raises:
-        InvalidInputError: If the series is too short for the layers.
-
     Example:
         >>> SeriesEmbedding(num_steps=200, output_dim=10)(torch.zeros(5, 200)).shape
         torch.Size([5, 10])
@@ -60,33 +51,17 @@ class SeriesEmbedding(nn.Module):
         decimation: int = 1,
     ) -> None:
         super().__init__()
-        check("num_steps", num_steps, Annotated[int, Range(1, MAX_WIDTH)])
-        check("output_dim", output_dim, Annotated[int, Range(1, MAX_WIDTH)])
-        check("padding", padding, Annotated[int, Range(1, MAX_WIDTH)])
-        check("decimation", decimation, Count)
-        _check_pools(pools)
         self.num_steps = num_steps
         self.decimation = decimation
         self.features = _convolutions(padding, pools)
-        self.num_features = self._count_features(padding)
+        with torch.no_grad():
+            series = torch.zeros(1, 1, num_steps)[..., ::decimation]
+            self.num_features = self.features(series).shape[1]
         self.head = fully_connected(self.num_features, (*HEAD, output_dim))
 
     def forward(self, x: Tensor) -> Tensor:
         """Embed series of shape ``(n, num_steps)`` as ``(n, output_dim)``."""
-        x = as_batch("x", x, (self.num_steps,), finite=False)
         return self.head(self.features(x[:, :: self.decimation].unsqueeze(1)))
-
-    def _count_features(self, padding: int) -> int:
-        try:
-            with torch.no_grad():
-                series = torch.zeros(1, 1, self.num_steps)[..., :: self.decimation]
-                return self.features(series).shape[1]
-        except RuntimeError as error:
-            raise InvalidInputError(
-                f"Expected `num_steps` large enough for seven convolutions with "
-                f"padding {padding}; got {self.num_steps}. Increase `padding`: 2 "
-                f"keeps the length."
-            ) from error
 
 
 def fully_connected(input_dim: int, widths: Sequence[int]) -> nn.Sequential:
@@ -104,14 +79,6 @@ def fully_connected(input_dim: int, widths: Sequence[int]) -> nn.Sequential:
           (2): Linear(in_features=64, out_features=8, bias=True)
         )
     """
-    check("input_dim", input_dim, Annotated[int, Range(1, MAX_WIDTH)])
-    if not isinstance(widths, Sequence) or isinstance(widths, str) or not widths:
-        raise InvalidInputError(
-            f"Expected `widths` to be a list of at least one integer; got "
-            f"{shown(widths)}."
-        )
-    for width in widths:
-        check("widths", width, Annotated[int, Range(1, MAX_WIDTH)])
     layers: list[nn.Module] = []
     for before, after in zip((input_dim, *widths), widths, strict=False):
         layers += [nn.Linear(before, after), nn.ReLU()]
@@ -133,8 +100,6 @@ def light_series_embedding(*, num_steps: int, output_dim: int) -> nn.Sequential:
         >>> net(torch.zeros(5, 50)).shape
         torch.Size([5, 10])
     """
-    check("num_steps", num_steps, Annotated[int, Range(1, MAX_WIDTH)])
-    check("output_dim", output_dim, Annotated[int, Range(1, MAX_WIDTH)])
     layers: list[nn.Module] = [nn.Unflatten(1, (1, num_steps))]
     length = num_steps
     for before, after in ((1, 16), (16, 32), (32, 32)):
@@ -143,24 +108,6 @@ def light_series_embedding(*, num_steps: int, output_dim: int) -> nn.Sequential:
     return nn.Sequential(
         *layers, nn.Flatten(), fully_connected(32 * length, (64, output_dim))
     )
-
-
-def _check_pools(pools: Sequence[tuple[int, int]]) -> None:
-    try:
-        pairs = [(size, step) for size, step in pools]
-    except (TypeError, ValueError) as error:
-        raise InvalidInputError(
-            f"Expected `pools` to be pairs of a number of neighbours and a stride; got "
-            f"{shown(pools)}."
-        ) from error
-    if len(pairs) != len(POOLS):
-        raise InvalidInputError(
-            f"Expected `pools` to be {len(POOLS)} pairs, one for each mean; got "
-            f"{len(pairs)}."
-        )
-    for size, step in pairs:
-        check("the numbers of neighbours in pools", size, Count)
-        check("the strides in pools", step, Count)
 
 
 def _convolutions(padding: int, pools: Sequence[tuple[int, int]]) -> nn.Sequential:

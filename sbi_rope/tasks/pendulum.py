@@ -8,15 +8,14 @@ import torch
 from sbi.utils import BoxUniform
 from torch import Tensor, nn
 
-from sbi_rope._validation import check_device
-from sbi_rope.settings import NotNegative, Positive, UnitInterval, check
-from sbi_rope.tasks.base import Task, check_parameters, check_theta
+from sbi_rope.settings import NotNegative, Settings
+from sbi_rope.tasks.base import Task
 from sbi_rope.tasks.distributions import box
 from sbi_rope.tasks.networks import SeriesEmbedding, light_series_embedding
 from sbi_rope.tasks.settings import PaperSettings
 from sbi_rope.tasks.splits import DrawnPairs, Part
 from sbi_rope.tasks.variants import COMMON_VARIANTS
-from sbi_rope.tensors import as_batch, check_same_length
+from sbi_rope.tensors import as_batch
 
 __all__ = ["Pendulum", "PendulumSimulator"]
 
@@ -25,7 +24,7 @@ DURATION = 10.0  # s
 
 
 @dataclass(frozen=True, kw_only=True)
-class PendulumSimulator:
+class PendulumSimulator(Settings):
     r"""Noisy positions of a pendulum at 200 times from 0 to 10 s.
 
     .. math:: x(t) = e^{-\alpha t} A \cos(\omega_0 t + \varphi) + \varepsilon_t,
@@ -44,19 +43,15 @@ class PendulumSimulator:
         torch.Size([2, 200])
     """
 
-    noise_std: float = 0.1
-    max_damping: float = 0.0
-
-    def __post_init__(self) -> None:
-        check("noise_std", self.noise_std, NotNegative)
-        check("max_damping", self.max_damping, NotNegative)
+    noise_std: NotNegative = 0.1
+    max_damping: NotNegative = 0.0
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, 2)``, to shape ``(n, 200)``."""
-        theta = check_theta(theta, 2)
+        theta = as_batch("theta", theta, (2,), empty=True)
         phase = math.pi * (2 * torch.rand_like(theta[:, :1]) - 1)
         damping = self.max_damping * torch.rand_like(theta[:, :1])
-        position = self._position(theta, phase, damping)
+        position = self.position(theta, phase=phase, damping=damping)
         return position + self.noise_std * torch.randn_like(position)
 
     def position(self, theta: Tensor, *, phase: Tensor, damping: Tensor) -> Tensor:
@@ -70,14 +65,6 @@ class PendulumSimulator:
         Returns:
             Positions, shape ``(n, 200)``.
         """
-        theta = check_theta(theta, 2, finite=False)
-        for name, value in (("phase", phase), ("damping", damping)):
-            as_batch(name, value, (1,), finite=False, empty=True)
-            check_same_length("theta", theta, name, value)
-            check_device(name, value, theta.device, where="`theta`")
-        return self._position(theta, phase, damping)
-
-    def _position(self, theta: Tensor, phase: Tensor, damping: Tensor) -> Tensor:
         frequency, amplitude = theta[:, :1], theta[:, 1:]
         time = torch.linspace(
             0.0, DURATION, NUM_STEPS, dtype=theta.dtype, device=theta.device
@@ -117,8 +104,8 @@ class Pendulum(Task):
             [0, 1]. It is 0.5 unless given, and only for ``"misspecified_prior"``.
         noise_std: Standard deviation of the noise on simulated and real positions, in
             units of A.
-        max_damping: Largest damping rate of the real process, in 1/s. It is 1 unless
-            given. At 0 the simulator is exact.
+        max_damping: Largest damping rate of the real process, in 1/s. At 0 the
+            simulator is exact.
 
     Example:
         >>> theta, x_o = Pendulum().get_calibration_set(50)
@@ -152,23 +139,17 @@ class Pendulum(Task):
         label_noise: float | None = None,
         misspecification_weight: float | None = None,
         noise_std: float = 0.1,
-        max_damping: float | None = None,
+        max_damping: float = 1.0,
     ) -> None:
         super().__init__(variant=variant, root=root, label_noise=label_noise)
-        check("noise_std", noise_std, Positive)
         self.noise_std = noise_std
-        damping = 0.0 if variant == "well_specified" else 1.0
-        self.max_damping = self._option("max_damping", max_damping, damping)
-        self.misspecification_weight = self._option(
+        self.misspecification_weight = self._strength(
             "misspecification_weight",
             misspecification_weight,
-            0.5 if variant == "misspecified_prior" else 0.0,
+            0.5,
             variant="misspecified_prior",
         )
-        check("misspecification_weight", self.misspecification_weight, UnitInterval)
-        self._real = PendulumSimulator(
-            noise_std=self.noise_std, max_damping=self.max_damping
-        )
+        self._real = PendulumSimulator(noise_std=noise_std, max_damping=max_damping)
 
     def get_prior(self) -> BoxUniform:
         """Return the uniform prior on [0, 3] x [0.5, 10], whose density is 1 / 28.5."""
@@ -176,8 +157,7 @@ class Pendulum(Task):
 
     def prior_quantiles(self, theta: Tensor) -> Tensor:
         """Return relative positions in the box, shape ``(n, 2)``."""
-        prior = self.get_prior()
-        return prior.base_dist.cdf(check_parameters(theta, prior))
+        return self.get_prior().base_dist.cdf(theta)
 
     def get_simulator(self) -> PendulumSimulator:
         """Return the simulator without friction."""
@@ -185,7 +165,6 @@ class Pendulum(Task):
 
     def get_embedding_net(self, *, light: bool = False) -> nn.Module:
         """Return the paper's convolutional network or a light one, with ten outputs."""
-        check("light", light, bool)
         if light:
             return light_series_embedding(num_steps=NUM_STEPS, output_dim=10)
         return SeriesEmbedding(num_steps=NUM_STEPS, output_dim=10)

@@ -9,14 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.settings import NotNegative, Positive, UnitInterval, check
-from sbi_rope.tasks.base import Task, check_theta
+from sbi_rope.settings import Count, NotNegative, Settings, UnitInterval
+from sbi_rope.tasks.base import Task
 from sbi_rope.tasks.networks import fully_connected
 from sbi_rope.tasks.settings import STATISTICS_SETTINGS
 from sbi_rope.tasks.splits import DrawnPairs, Part
 from sbi_rope.tasks.triangle import UniformTriangle
-from sbi_rope.tensors import as_batch, as_numbers
+from sbi_rope.tensors import as_batch
 
 __all__ = ["SIR", "SIRSimulator", "delay_weekend_reports", "summarise"]
 
@@ -34,12 +33,11 @@ INFECTED_AT_START = 0.001  # as a fraction of the population
 REVERSION = 0.05  # of the reproduction number to its mean, in 1/day
 # Day 0 is a Friday; 52 of each.
 SATURDAYS, SUNDAYS, MONDAYS = (slice(day, None, 7) for day in (1, 2, 3))
-MAX_STEPS = 100_000  # in a day; hours of work for a few series
 CHUNK_SIZE = 1000  # series that are simulated together on a CPU, in its cache
 
 
 @dataclass(frozen=True, kw_only=True)
-class SIRSimulator:
+class SIRSimulator(Settings):
     r"""Six statistics of the numbers of infected people on 365 days.
 
     Susceptible and infected fractions :math:`s, i` of the population follow
@@ -63,36 +61,23 @@ class SIRSimulator:
         + \sigma \sqrt{\gamma |b|} \, \mathrm{d}W.
 
     Args:
-        time_step: Step of the scheme, in days. It must divide a day.
+        steps_per_day: Steps of the scheme in a day.
         volatility: The factor :math:`\sigma`, in :math:`\mathrm{day}^{-1/2}`.
         reported_fraction: Fraction of the weekend's infections that is reported on
             the day itself, and not on Monday.
-
-    Raises:
-        InvalidInputError: If an argument is out of range.
 
     Example:
         >>> SIRSimulator()(torch.tensor([[0.4, 0.1], [0.2, 0.1]])).shape
         torch.Size([2, 6])
     """
 
-    time_step: float = 0.1
-    volatility: float = 0.05
-    reported_fraction: float = 1.0
-
-    def __post_init__(self) -> None:
-        check("time_step", self.time_step, Positive)
-        steps = 1 / self.time_step if self.time_step > 1 / (2 * MAX_STEPS) else 0.0
-        if steps > MAX_STEPS or abs(round(steps) * self.time_step - 1) > 1e-9:
-            raise InvalidInputError(
-                f"Expected `time_step` to divide a day, into {MAX_STEPS} steps at "
-                f"most; got {self.time_step!r}."
-            )
-        check("volatility", self.volatility, NotNegative)
-        check("reported_fraction", self.reported_fraction, UnitInterval)
+    steps_per_day: Count = 10
+    volatility: NotNegative = 0.05
+    reported_fraction: UnitInterval = 1.0
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, 2)``, to shape ``(n, 6)``."""
+        theta = as_batch("theta", theta, (2,), empty=True)
         infected = self.infections(theta)
         reported = delay_weekend_reports(infected, self.reported_fraction)
         return summarise(reported).to(theta)
@@ -106,19 +91,12 @@ class SIRSimulator:
         Returns:
             One number a day, shape ``(n, 365)``, float64.
         """
-        theta = check_theta(theta, 2).detach().double()
-        # With more, a step would take away more people than there are.
-        highest = 1 / self.time_step
-        if ((theta < 0) | (theta > highest)).any():
-            raise InvalidInputError(
-                f"Expected rates `theta` from 0 to {highest:g} per day, one over "
-                f"`time_step`; got {float(theta.min())!r} to {float(theta.max())!r}."
-            )
+        theta = theta.double()
         size = CHUNK_SIZE if theta.device.type == "cpu" else max(1, len(theta))
         return torch.cat([self._infections(chunk) for chunk in theta.split(size)])
 
     def _infections(self, theta: Tensor) -> Tensor:
-        shape = round(1 / self.time_step), len(theta)
+        shape = self.steps_per_day, len(theta)
         noise = (
             torch.randn(shape, dtype=theta.dtype, device=theta.device)
             for _ in range(NUM_DAYS - 1)
@@ -175,8 +153,6 @@ def delay_weekend_reports(infections: Tensor, reported_fraction: float) -> Tenso
     Returns:
         Reported numbers of the same shape, with the same total.
     """
-    as_batch("infections", infections, (NUM_DAYS,), finite=False, empty=True)
-    check("reported_fraction", reported_fraction, UnitInterval)
     reported = infections.clone()
     reported[:, SATURDAYS] *= reported_fraction
     reported[:, SUNDAYS] *= reported_fraction
@@ -199,11 +175,6 @@ def summarise(series: Tensor) -> Tensor:
         Statistics, shape ``(n, 6)``. A series that reaches half its total on the
         first day has :math:`-\infty` among them.
     """
-    if as_numbers("series", series).ndim != 2 or series.shape[1] < 2:
-        raise InvalidInputError(
-            "Expected `series` of shape (n, days) with two days at least; got "
-            f"{tuple(series.shape)}."
-        )
     reached = series.cumsum(dim=1) > 0.5 * series.sum(dim=1, keepdim=True)
     before, after = series[:, :-1], series[:, 1:]
     before = before - before.mean(dim=1, keepdim=True)
@@ -251,8 +222,7 @@ class SIR(Task):
         label_noise: Noise on the calibration labels, in standard deviations of the
             prior. It is 0.2 unless given, and only for ``"noisy_labels"``.
         reported_fraction: Fraction of a real weekend's infections that is reported on
-            the day itself, in [0, 1]. It is 0.95 unless given. At 1 the simulator is
-            exact.
+            the day itself, in [0, 1]. At 1 the simulator is exact.
 
     Example:
         >>> theta, x_o = SIR().get_calibration_set(50)
@@ -275,14 +245,10 @@ class SIR(Task):
         variant: str | None = None,
         root: str | Path | None = None,
         label_noise: float | None = None,
-        reported_fraction: float | None = None,
+        reported_fraction: float = 0.95,
     ) -> None:
         super().__init__(variant=variant, root=root, label_noise=label_noise)
-        exact = variant == "well_specified"
-        self.reported_fraction = self._option(
-            "reported_fraction", reported_fraction, 1.0 if exact else 0.95
-        )
-        self._real = SIRSimulator(reported_fraction=self.reported_fraction)
+        self._real = SIRSimulator(reported_fraction=reported_fraction)
 
     def get_prior(self) -> UniformTriangle:
         """Return the uniform prior on the triangle, whose density is 8."""
@@ -290,7 +256,6 @@ class SIR(Task):
 
     def prior_quantiles(self, theta: Tensor) -> Tensor:
         r"""Return :math:`4 \beta^2` and :math:`1 - (1 - 2 \gamma)^2`, ``(n, 2)``."""
-        theta = check_theta(theta, 2)
         infection, recovery = (2 * theta.clamp(0.0, 0.5)).unbind(dim=1)
         return torch.stack([infection**2, 1 - (1 - recovery) ** 2], dim=1)
 
@@ -300,7 +265,6 @@ class SIR(Task):
 
     def get_embedding_net(self, *, light: bool = False) -> nn.Module:
         """Return the paper's network, which is light already and has six outputs."""
-        check("light", light, bool)
         return fully_connected(len(STATISTICS), (8, 32, 32, 24, 6))
 
     def _real_process(self, part: Part) -> DrawnPairs:

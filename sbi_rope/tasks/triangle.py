@@ -8,8 +8,6 @@ from torch.distributions import Distribution, biject_to, constraints
 from torch.distributions.transforms import IndependentTransform, Transform
 from torch.nn.functional import logsigmoid
 
-from sbi_rope.tasks.distributions import check_size
-
 __all__ = ["UniformTriangle"]
 
 
@@ -34,7 +32,7 @@ class UniformTriangle(Distribution):
     has_rsample = True
 
     def __init__(self, high: Tensor, validate_args: bool | None = None) -> None:  # noqa: FBT001
-        self.high = check_size("high", high)
+        self.high = high
         super().__init__(
             batch_shape=high.shape, event_shape=Size((2,)), validate_args=validate_args
         )

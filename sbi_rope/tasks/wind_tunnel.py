@@ -6,16 +6,8 @@ import torch
 from sbi.utils import BoxUniform
 from torch import Tensor, nn
 
-from sbi_rope.errors import DataNotFoundError, InvalidInputError
-from sbi_rope.settings import Positive, UnitInterval, check
-from sbi_rope.tasks.base import Task, check_parameters
-from sbi_rope.tasks.chambers import (
-    CUT_FILE,
-    check_complete,
-    check_download,
-    find_file,
-    read_columns,
-)
+from sbi_rope.tasks.base import Task
+from sbi_rope.tasks.chambers import find_file, read_columns
 from sbi_rope.tasks.distributions import box
 from sbi_rope.tasks.networks import SeriesEmbedding, light_series_embedding
 from sbi_rope.tasks.settings import PaperSettings
@@ -27,9 +19,8 @@ from sbi_rope.tasks.wind_tunnel_model import (
     MAX_PRESSURE,
     NUM_STEPS,
     WindTunnelSimulator,
-    check_jitter,
 )
-from sbi_rope.tensors import check_in_support
+from sbi_rope.tensors import as_batch, check_in_support
 
 __all__ = ["WindTunnel"]
 
@@ -88,17 +79,9 @@ class WindTunnel(Task):
         label_noise: Noise on the calibration labels, in standard deviations of the
             prior. It is 0.2 unless given, and only for ``"noisy_labels"``.
         download: Whether to download the data set into ``root`` if it is not there.
-        experiment: The recorded experiment, ``"load_out_0.5_osr_downwind_4"`` unless
-            given. Others have another load of the exhaust fan
-            (``load_out_1_osr_downwind_4``), unknown to the simulator, or another
-            precision of the barometer (``load_out_0.5_osr_downwind_2``).
         stand_in: Whether to draw real observations from the stand-in instead of reading
             them; always so in the variant ``"synthetic"``. It goes with every variant,
             as ``root`` does, so that all can be run without data.
-        misspecification_strength: How far the stand-in is from the simulator, from 0
-            (not at all) to 1, the default. Only with the stand-in.
-        noise_std: Standard deviation of the noise, in Pa, simulated and in the
-            stand-in.
         onset_jitter: Largest shift of the impulse, in s, from 0 to 0.6, simulated
             and in the stand-in.
 
@@ -130,42 +113,20 @@ class WindTunnel(Task):
         root: str | Path | None = None,
         label_noise: float | None = None,
         download: bool = False,
-        experiment: str | None = None,
         stand_in: bool = False,
-        misspecification_strength: float | None = None,
-        noise_std: float = 0.2,
         onset_jitter: float = 0.3,
     ) -> None:
         super().__init__(variant=variant, root=root, label_noise=label_noise)
-        check("noise_std", noise_std, Positive)
-        check_jitter(onset_jitter)
-        check("stand_in", stand_in, bool)
-        check("experiment", experiment, str | None)
         self.stand_in = stand_in or variant == "synthetic"
-        self._check_use(experiment, misspecification_strength)
         self.download = download
-        self.experiment = self._option("experiment", experiment, EXPERIMENT)
-        self.misspecification_strength = self._option(
-            "misspecification_strength", misspecification_strength, 1.0
-        )
-        check("misspecification_strength", self.misspecification_strength, UnitInterval)
-        self.noise_std = noise_std
         self.onset_jitter = onset_jitter
-        check_download(self.root, self.required_files, download=download)
-
-    def _check_use(self, experiment: str | None, strength: float | None) -> None:
-        """Raise where an option of one real process is given with the other."""
-        stand_in = "`stand_in=True` or `variant='synthetic'`"
-        if experiment is not None and self.stand_in:
-            raise InvalidInputError(
-                f"`experiment` has no effect with {stand_in}, which read no data; got "
-                f"{experiment!r}."
-            )
-        if strength is not None and not self.stand_in:
-            raise InvalidInputError(
-                f"`misspecification_strength` has no effect without {stand_in}; got "
-                f"{strength!r}."
-            )
+        self._stand_in = WindTunnelSimulator(
+            onset_jitter=onset_jitter,
+            noise_correlation=NOISE_CORRELATION,
+            max_pressure=(1 - WEAKER_FANS) * MAX_PRESSURE,
+            inertia=(1 + HEAVIER_FANS) * INERTIA,
+            exhaust_offset=FASTER_EXHAUST,
+        )
 
     def get_prior(self) -> BoxUniform:
         """Return the uniform prior on [0, 45] degrees, whose density is 1 / 45."""
@@ -173,24 +134,20 @@ class WindTunnel(Task):
 
     def prior_quantiles(self, theta: Tensor) -> Tensor:
         """Return relative positions of the hatch, shape ``(n, 1)``."""
-        prior = self.get_prior()
-        return prior.base_dist.cdf(check_parameters(theta, prior))
+        return self.get_prior().base_dist.cdf(theta)
 
     def get_simulator(self) -> WindTunnelSimulator:
         """Return the published model with noise and an impulse at a random time."""
-        return WindTunnelSimulator(
-            noise_std=self.noise_std, onset_jitter=self.onset_jitter
-        )
+        return WindTunnelSimulator(onset_jitter=self.onset_jitter)
 
     def get_embedding_net(self, *, light: bool = False) -> nn.Module:
         """Return the convolutional network of task C or a light one, of ten outputs."""
-        check("light", light, bool)
         if light:
             return light_series_embedding(num_steps=NUM_STEPS, output_dim=10)
         return SeriesEmbedding(num_steps=NUM_STEPS, output_dim=10, padding=2)
 
     def _recorded_files(self) -> tuple[Path, ...]:
-        return () if self.stand_in else (Path(DATASET, f"{self.experiment}.csv"),)
+        return () if self.stand_in else (Path(DATASET, f"{EXPERIMENT}.csv"),)
 
     def _real_process(self, part: Part) -> DrawnPairs | RecordedPairs:
         if not self.stand_in:
@@ -199,64 +156,18 @@ class WindTunnel(Task):
         prior = self.get_prior()
         return DrawnPairs(
             draw_theta=lambda n: prior.sample(torch.Size((n,))),
-            observe=self._stand_in_simulator(),
-        )
-
-    def _stand_in_simulator(self) -> WindTunnelSimulator:
-        strength = self.misspecification_strength
-        return WindTunnelSimulator(
-            noise_std=self.noise_std,
-            onset_jitter=self.onset_jitter,
-            noise_correlation=strength * NOISE_CORRELATION,
-            max_pressure=(1 - strength * WEAKER_FANS) * MAX_PRESSURE,
-            inertia=(1 + strength * HEAVIER_FANS) * INERTIA,
-            exhaust_offset=strength * FASTER_EXHAUST,
+            observe=self._stand_in,
         )
 
     def _recorded(self) -> tuple[Tensor, Tensor]:
         (file,) = self._recorded_files()
-        try:
-            path = find_file(file, root=self.root, download=self.download)
-        except DataNotFoundError as error:
-            raise DataNotFoundError(
-                f"{error} To go on without data, pass `stand_in=True`."
-            ) from error
-        values = read_columns(path, COLUMNS)
-        flag, hatch, inside, ambient = values.T
-        _check_impulses(path, flag)
-        theta = _hatch_of_impulses(path, flag, hatch)
-        check_complete(path, len(values), dataset=DATASET)
-        check_in_support(f"theta of {file}", theta, self.get_prior())
+        path = find_file(file, root=self.root, download=self.download)
+        flag, hatch, inside, ambient = read_columns(path, COLUMNS).T
+        # An impulse that a recording begins or ends in has fewer samples.
+        _, counts = flag.unique_consecutive(return_counts=True)
+        first = (counts.cumsum(0) - counts)[counts == NUM_STEPS]
         # Both are near 95 000 Pa, where float32 has steps of 0.008: subtract first.
-        return theta, (inside - ambient).reshape(-1, NUM_STEPS).float()
-
-
-def _check_impulses(path: Path, flag: Tensor) -> None:
-    """Raise unless every impulse is one block of 50 rows."""
-    flags, counts = flag.unique_consecutive(return_counts=True)
-    first_row = counts.cumsum(0) - counts
-    seen: set[float] = set()
-    for i, impulse in enumerate(flags.tolist()):
-        if counts[i] != NUM_STEPS or impulse in seen:
-            again = " and one before" if impulse in seen else ""
-            raise InvalidInputError(
-                f"Expected every impulse (`flag`) of {path} in one block of "
-                f"{NUM_STEPS} rows; impulse {impulse:g} has a block of "
-                f"{int(counts[i])} rows from row {int(first_row[i])}{again}. "
-                f"{CUT_FILE}"
-            )
-        seen.add(impulse)
-
-
-def _hatch_of_impulses(path: Path, flag: Tensor, hatch: Tensor) -> Tensor:
-    """Return the position of the hatch during each impulse, shape ``(n, 1)``."""
-    hatch = hatch.reshape(-1, NUM_STEPS)
-    moved = (hatch != hatch[:, :1]).any(dim=1)
-    if moved.any():
-        first = flag[NUM_STEPS * int(moved.nonzero()[0])]
-        raise InvalidInputError(
-            f"Expected a constant `hatch` during every impulse of {path}; it moves "
-            f"during {int(moved.sum())} of {len(moved)} (first: impulse "
-            f"{float(first):g}). {CUT_FILE}"
-        )
-    return hatch[:, :1].float()
+        x = (inside - ambient)[first[:, None] + torch.arange(NUM_STEPS)].float()
+        theta = hatch[first, None].float()
+        check_in_support(f"theta of {file}", theta, self.get_prior())
+        return theta, as_batch(f"impulses of {NUM_STEPS} rows in {path}", x)

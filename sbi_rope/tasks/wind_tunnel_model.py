@@ -4,21 +4,25 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import check_device
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.settings import NotNegative, Number, Positive, UnitInterval, check
-from sbi_rope.tasks.base import check_theta
-from sbi_rope.tensors import as_batch, check_same_length
+from sbi_rope.settings import (
+    NotNegative,
+    Number,
+    Positive,
+    Range,
+    Settings,
+    UnitInterval,
+)
+from sbi_rope.tensors import as_batch
 
 __all__ = [
     "NUM_STEPS",
     "SAMPLE_TIMES",
     "WindTunnelSimulator",
-    "check_jitter",
     "pressure_ratio",
 ]
 
@@ -60,7 +64,7 @@ SHIFT_STEP = 1e-3  # s
 
 
 @dataclass(frozen=True, kw_only=True)
-class WindTunnelSimulator:
+class WindTunnelSimulator(Settings):
     r"""Pressure in a wind tunnel above ambient, at 50 times around an impulse.
 
     The fan in front is switched from idle to full load for three seconds while the
@@ -107,26 +111,19 @@ class WindTunnelSimulator:
         torch.Size([2, 50])
     """
 
-    noise_std: float = 0.2
-    onset_jitter: float = 0.3
-    noise_correlation: float = 0.0
-    max_pressure: float = MAX_PRESSURE
-    inertia: float = INERTIA
-    exhaust_offset: float = 0.0
-
-    def __post_init__(self) -> None:
-        check("noise_std", self.noise_std, NotNegative)
-        check_jitter(self.onset_jitter)
-        check("exhaust_offset", self.exhaust_offset, Number)
-        check("noise_correlation", self.noise_correlation, UnitInterval)
-        check("max_pressure", self.max_pressure, Positive)
-        check("inertia", self.inertia, Positive)
+    noise_std: NotNegative = 0.2
+    onset_jitter: Annotated[float, Range(0, MAX_JITTER)] = 0.3
+    noise_correlation: UnitInterval = 0.0
+    max_pressure: Positive = MAX_PRESSURE
+    inertia: Positive = INERTIA
+    exhaust_offset: Number = 0.0
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, 1)``, to shape ``(n, 50)``."""
-        theta = check_theta(theta, 1)
+        theta = as_batch("theta", theta, (1,), empty=True)
         position = torch.rand_like(theta[:, 0], dtype=torch.float64)
-        pressure = self._pressure(theta, self.onset_jitter * (2 * position - 1))
+        shift = self.onset_jitter * (2 * position - 1)
+        pressure = self.pressure(theta, onset_shift=shift)
         noise = torch.randn_like(pressure)
         if self.noise_correlation:
             noise = noise @ _autoregression(self.noise_correlation).to(noise)
@@ -142,22 +139,7 @@ class WindTunnelSimulator:
 
         Returns:
             Pressures above ambient, in Pa, shape ``(n, 50)``, float64.
-
-        Raises:
-            InvalidInputError: If a shift is larger than ``onset_jitter``.
         """
-        theta = check_theta(theta, 1, finite=False)
-        as_batch("onset_shift", onset_shift, (), empty=True)
-        check_same_length("theta", theta, "onset_shift", onset_shift)
-        check_device("onset_shift", onset_shift, theta.device, where="`theta`")
-        if (onset_shift.abs() > self.onset_jitter).any():
-            raise InvalidInputError(
-                f"Expected `onset_shift` within `onset_jitter={self.onset_jitter}`; "
-                f"got {float(onset_shift.abs().max())}."
-            )
-        return self._pressure(theta, onset_shift.double())
-
-    def _pressure(self, theta: Tensor, onset_shift: Tensor) -> Tensor:
         ratio = CLOSED_RATIO + HATCH_EFFECT * theta.double() / MAX_HATCH
         scale = self.max_pressure * (1 - ratio.clamp(max=1.0))
         return scale * self._interpolate(onset_shift)
@@ -171,16 +153,6 @@ class WindTunnelSimulator:
         low, high = shifts[above - 1], shifts[above]
         weight = ((onset_shift - low) / (high - low)).unsqueeze(1)
         return torch.lerp(ratios[above - 1], ratios[above], weight)
-
-
-def check_jitter(onset_jitter: float) -> None:
-    """Raise unless an impulse with this largest shift begins after the first sample."""
-    check("onset_jitter", onset_jitter, NotNegative)
-    if onset_jitter > MAX_JITTER:
-        raise InvalidInputError(
-            f"Expected `onset_jitter` from 0 to {MAX_JITTER} s, so that impulses begin "
-            f"after the first sample; got {onset_jitter!r}."
-        )
 
 
 def pressure_ratio(
@@ -203,9 +175,6 @@ def pressure_ratio(
         >>> round(float(s.norm()), 3)
         2.125
     """
-    as_batch("onset_shift", onset_shift, ())
-    check("inertia", inertia, Positive)
-    check("exhaust_offset", exhaust_offset, Number)
     intake = _fan_speeds(onset_shift, loads=INTAKE_LOADS, inertia=inertia)
     exhaust = _fan_speeds(onset_shift[:1], loads=EXHAUST_LOADS, inertia=inertia)
     return (intake**2 - (exhaust + exhaust_offset) ** 2) / MAX_SPEED**2
@@ -235,24 +204,18 @@ def _fan_speeds(
 def _tabulated_ratio(
     onset_jitter: float, inertia: float, exhaust_offset: float
 ) -> tuple[Tensor, Tensor]:
-    # A table made in a caller's inference mode would fail in later gradients.
-    with torch.inference_mode(mode=False), torch.no_grad():
-        num_steps = math.ceil(onset_jitter / SHIFT_STEP)
-        shifts = torch.linspace(
-            -onset_jitter,
-            onset_jitter,
-            2 * num_steps + 1,
-            dtype=torch.float64,
-            device="cpu",
-        )
-        # Where an edge of the impulse passes a sample, the ratio has a kink.
-        times = shifts.new_tensor(SAMPLE_TIMES)
-        kinks = torch.cat([times - edge for edge in IMPULSE])
-        kinks = kinks[kinks.abs() < onset_jitter]
-        shifts = torch.cat([shifts, kinks]).unique()
-        return shifts, pressure_ratio(
-            shifts, inertia=inertia, exhaust_offset=exhaust_offset
-        )
+    num_steps = 2 * math.ceil(onset_jitter / SHIFT_STEP) + 1
+    shifts = torch.linspace(
+        *(-onset_jitter, onset_jitter, num_steps), dtype=torch.float64, device="cpu"
+    )
+    # Where an edge of the impulse passes a sample, the ratio has a kink.
+    times = shifts.new_tensor(SAMPLE_TIMES)
+    kinks = torch.cat([times - edge for edge in IMPULSE])
+    kinks = kinks[kinks.abs() < onset_jitter]
+    shifts = torch.cat([shifts, kinks]).unique()
+    return shifts, pressure_ratio(
+        shifts, inertia=inertia, exhaust_offset=exhaust_offset
+    )
 
 
 def _autoregression(correlation: float) -> Tensor:

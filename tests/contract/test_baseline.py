@@ -1,7 +1,6 @@
 """Every baseline keeps one contract: data goes in, a posterior of sbi comes out."""
 
 import copy
-import inspect
 import pickle
 import random
 import warnings
@@ -126,17 +125,6 @@ def test_samples_and_densities_have_the_shapes_of_sbi(name: str) -> None:
         assert not estimator.training
 
 
-@pytest.mark.parametrize("name", ["npe", "calibration_mlp", "ot_only"])
-def test_where_nothing_leaks_sbis_defaults_do_as_well(name: str) -> None:
-    posterior, data = result(name, "linear_gaussian"), data_of("linear_gaussian")
-    x = data.x_o[0]
-    samples = posterior.sample((6,), x=x, show_progress_bars=False)
-    assert samples.shape == (6, 2)
-    assert not samples.requires_grad
-    expected = log_prob(posterior, data.theta[:5], x)
-    assert torch.allclose(posterior.log_prob(data.theta[:5], x=x), expected, atol=1e-4)
-
-
 NUM_POINTS, STEP = 121, 0.15
 
 
@@ -213,16 +201,6 @@ def test_the_posterior_can_be_saved(name: str, tmp_path: Path) -> None:
     assert torch.equal(densities(loaded, name), expected)
 
 
-@pytest.mark.parametrize("name", ["npe", "joint_npe", "npe_rs", "nnpe", "frisbi"])
-def test_training_leaves_no_file_in_the_working_folder(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    task = first_task(name)
-    monkeypatch.chdir(tmp_path)
-    train(feed(make(name, task), data_of(task))).build_posterior()
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.medium
 @pytest.mark.parametrize("name", [*ONE_OF_A_KIND, "hvae"])
 def test_the_posterior_can_be_moved(name: str) -> None:
@@ -291,16 +269,6 @@ def test_the_seed_alone_decides_and_training_leaves_no_trace(
         assert torch.equal(value, getattr(data_of(task), field))
 
 
-def test_an_untrained_method_can_be_sent_to_another_process(name: str) -> None:
-    task = first_task(name)
-    method = feed(make(name, task, density_estimator="mdn"), data_of(task))
-    copied = pickle.loads(pickle.dumps(method))
-    assert type(copied) is type(method)
-    if name == "joint_npe":
-        ours, theirs = (train(one).build_posterior() for one in (method, copied))
-        assert torch.equal(densities(ours, name), densities(theirs, name))
-
-
 def test_an_untrained_method_has_no_posterior() -> None:
     method = feed(make("npe", "linear_gaussian"), data_of("linear_gaussian"))
     with pytest.raises(NotReadyError, match=r"train\(\)"):
@@ -340,24 +308,12 @@ class TestWhatIsAppended:
         posterior = train(method).build_posterior()
         assert torch.equal(densities(posterior, name), expected_densities(name))
 
-    def test_in_double_precision_becomes_single(self, name: str) -> None:
-        data = data_of(first_task(name)).map(lambda value: value.double())
-        posterior = retrained(name, data)
-        assert torch.equal(densities(posterior, name), expected_densities(name))
-        assert sample(posterior, (2,), data.x_o[0].float()).dtype is torch.float32
-
     def test_may_change_afterwards(self, name: str) -> None:
         data = data_of(first_task(name)).map(torch.clone)
         method = feed(make(name, first_task(name)), data)
         for value in vars(data).values():
             value.fill_(0.25)
         posterior = train(method).build_posterior()
-        assert torch.equal(densities(posterior, name), expected_densities(name))
-
-    def test_gets_no_gradients(self, name: str) -> None:
-        data = data_of(first_task(name)).map(lambda v: v.clone().requires_grad_())
-        posterior = retrained(name, data)
-        assert all(value.grad is None for value in vars(data).values())
         assert torch.equal(densities(posterior, name), expected_densities(name))
 
 
@@ -395,20 +351,6 @@ def test_what_is_refused_is_not_appended(name: str, kind: Kind) -> None:
 # Options.
 
 
-def test_options_of_another_type_are_refused() -> None:
-    for name, entry in METHODS.items():
-        known = inspect.signature(entry.kind).parameters
-        for option in ("training", "npe_training", "finetuner", "coupler"):
-            if option in known:
-                with pytest.raises(InvalidInputError, match=f"`{option}`"):
-                    make(name, first_task(name), **{option: {"max_num_epochs": 3}})
-        if "density_estimator" in known:
-            with pytest.raises(InvalidInputError, match=r"`density_estimator`.*int"):
-                make(name, first_task(name), density_estimator=3)
-            with pytest.raises(InvalidInputError, match=r"`density_estimator`.*fancy"):
-                make(name, first_task(name), density_estimator="fancy")
-
-
 @pytest.mark.medium
 @pytest.mark.parametrize(
     "name",
@@ -439,12 +381,6 @@ def test_simulations_with_nan_are_dropped_with_a_warning(name: str) -> None:
         method.append_simulations(theta, x)
     posterior = train(method).build_posterior()
     assert torch.equal(densities(posterior, name), expected_densities(name))
-
-
-def test_simulations_that_all_have_nan_are_refused() -> None:
-    data, method = data_of("linear_gaussian"), make("npe", "linear_gaussian")
-    with pytest.raises(InvalidInputError, match="`x` that are finite"):
-        method.append_simulations(data.theta, data.x * torch.nan)
 
 
 @pytest.mark.medium
@@ -482,14 +418,3 @@ def test_recordings_of_four_people_leave_none_to_hold_out(name: str) -> None:
         ):
             train(method)
     assert densities(method.build_posterior(), name).isfinite().all()
-
-
-@pytest.mark.medium
-@pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
-@pytest.mark.parametrize("name", names_that_see("observations"))
-def test_one_observation_is_enough(name: str) -> None:
-    data, method = data_of(first_task(name)), make(name, first_task(name))
-    feed(method, data, without="observations")
-    method.append_observations(data.x_o[:1])
-    posterior = train(method).build_posterior()
-    assert log_prob(posterior, data.theta[:5], data.x_o[0]).isfinite().all()

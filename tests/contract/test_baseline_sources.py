@@ -14,7 +14,6 @@ from sbi_rope.baselines import Method, PlainNPE
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import (
     InvalidInputError,
-    UnsupportedPosteriorError,
 )
 from tests import baselines
 from tests.baselines import (
@@ -157,22 +156,3 @@ def test_simulations_that_are_not_needed_earn_a_warning() -> None:
             method.append_simulations(data.theta, data.x)
         warned = any("makes no use of simulations" in str(w.message) for w in caught)
         assert warned is (name not in of_use), name
-
-
-def test_options_without_effect_beside_a_trained_posterior_are_refused() -> None:
-    for kind in {METHODS[name].kind for name in BUILDERS}:
-        for option in ("density_estimator", "npe_training"):
-            with pytest.raises(InvalidInputError, match=f"`{option}`"):
-                kind.from_posterior(result("npe"), **{option: None})
-
-
-def test_what_is_no_posterior_of_npe_is_refused() -> None:
-    for name in BUILDERS:
-        with pytest.raises(UnsupportedPosteriorError, match="`posterior`"):
-            given(name, result("prior", first_task(name)))
-
-
-def test_a_method_that_does_not_start_from_npe_takes_no_posterior() -> None:
-    for name in METHODS.keys() - set(BUILDERS):
-        with pytest.raises(InvalidInputError, match="method that starts from NPE"):
-            METHODS[name].kind.from_posterior(result("npe"))

@@ -19,7 +19,6 @@ KINDS = [
     ("light_tunnel", "flipped"),
     ("wind_tunnel", None),
 ]
-pytestmark = pytest.mark.usefixtures("shorter_files")
 
 
 @pytest.fixture(scope="module")

@@ -33,7 +33,7 @@ OVERRIDDEN = {
     "_keep": {"light_tunnel"},
     "_simulated_process": {"hemodynamics"},
     "_well_specified_process": {"hemodynamics"},
-    "_labelled_set": set(),
+    "_take": set(),
     "_process_of": set(),
     "get_calibration_set": set(),
     "get_test_set": set(),
@@ -44,8 +44,6 @@ OVERRIDDEN = {
 FOR_THE_REST = {"pendulum", "light_tunnel_sensors"}
 # Tasks whose real process takes a tenth of a second for some hundred observations.
 SLOW_PROCESS = {"cs", "light_tunnel", "sir"}
-
-pytestmark = pytest.mark.usefixtures("chamber_extract")
 
 
 def runs_code_of_its_own(name: str, variant: str | None) -> bool:

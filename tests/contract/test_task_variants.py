@@ -3,12 +3,10 @@
 import pytest
 import torch
 
-from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks import TASKS
-from tests.tasks import accepted, as_many, draw, make
+from tests.tasks import as_many, draw, make
 
 EVERY_TASK = pytest.mark.parametrize("name", sorted(TASKS))
-pytestmark = pytest.mark.usefixtures("chamber_extract")
 
 
 @EVERY_TASK
@@ -64,31 +62,8 @@ def test_noisy_labels_belong_to_the_observations_of_the_standard_task(
     torch.testing.assert_close(large, 2 * small, rtol=0.1, atol=0)
 
 
-def test_label_noise_is_above_0_at_most_1_and_only_for_its_variant() -> None:
-    cases = {
-        f"label noise {noise}": (
-            lambda noise=noise: make(
-                "pendulum", variant="noisy_labels", label_noise=noise
-            ),
-            "label_noise",
-        )
-        for noise in (0.0, -0.1, 1.1, float("nan"), "0.1")
-    }
-    cases |= {
-        name: (lambda name=name: make(name, label_noise=0.1), "noisy_labels")
-        for name in TASKS
-    }
-    assert not accepted(cases)
-
-
 def test_well_specified_data_need_no_files() -> None:
     for name in TASKS:
         task = TASKS[name](variant="well_specified")
         assert task.required_files == ()
         assert torch.isfinite(task.get_test_set(5)[1]).all()
-
-
-def test_an_unknown_variant_is_answered_with_those_there_are() -> None:
-    for name in TASKS:
-        with pytest.raises(InvalidInputError, match=r"prior_shift.*'nothing'"):
-            make(name, variant="nothing")

@@ -1,6 +1,5 @@
 """FMCPE: its maps and densities belong together, and it learns from pairs."""
 
-import copy
 from typing import Any
 
 import pytest
@@ -9,7 +8,6 @@ from sbi.utils import BoxUniform
 from torch import Tensor, nn
 
 from sbi_rope.baselines import FMCPE, Training
-from sbi_rope.baselines.fmcpe.standardise import Standardise
 from sbi_rope.baselines.fmcpe.unbounded import Unbounded
 from sbi_rope.baselines.fmcpe.velocity import VelocityField, follow, follow_back
 from tests import gaussian, problems
@@ -90,23 +88,6 @@ def test_with_many_pairs_it_comes_near_the_exact_posterior(
     found = mean_log_prob(posterior, theta, x)
     assert npe < float(exact) - 1.0
     assert found > float(exact) - 0.25
-
-
-def test_with_a_single_epoch_it_is_npe_around_the_observation() -> None:
-    # Fields start at zero, and the start is kept where nothing is learned.
-    posterior = trained(
-        20,
-        noise=1e-3,
-        training=Training(
-            learning_rate=1e-12, max_num_epochs=1, validation_fraction=0.2
-        ),
-    )
-    theta, x = gaussian.labelled(10)
-    found = posterior.log_prob_batched(theta[None], x, norm_posterior=False)
-    expected = gaussian.posterior().log_prob_batched(
-        theta[None], x, norm_posterior=False
-    )
-    torch.testing.assert_close(found, expected, atol=0.05, rtol=0.01)
 
 
 @pytest.mark.slow
@@ -207,14 +188,6 @@ def test_the_volume_of_the_transform_is_right_far_from_its_middle() -> None:
         )
 
 
-def test_columns_that_share_a_unit_do_not_count_those_that_never_vary() -> None:
-    torch.manual_seed(0)
-    rows = torch.cat([0.05 * torch.randn(500, 10), torch.ones(500, 90)], dim=1)
-    unit = Standardise(rows, shared=True)
-    assert torch.allclose(unit.std, torch.full((100,), 0.05), atol=0.003)
-    assert Standardise(torch.ones(5, 3), shared=True).std.tolist() == [1.0] * 3
-
-
 @pytest.mark.medium
 @pytest.mark.parametrize("space", ["input", "embedding"])
 def test_fields_see_observations_in_their_own_unit_however_far_they_are(
@@ -244,30 +217,6 @@ def test_fields_see_observations_in_their_own_unit_however_far_they_are(
                 continue
             assert torch.allclose(seen.mean(dim=0), torch.zeros(3), atol=1e-3)
             assert torch.allclose(seen.std(dim=0), torch.ones(3), atol=1e-3)
-
-
-def test_the_net_behind_the_condition_is_not_trained_on_the_side() -> None:
-    """BatchNorm would follow the observations, and dropout would be random."""
-    torch.manual_seed(0)
-    npe = copy.deepcopy(problems.npe_posterior("mdn", dim=1))
-    for module in list(npe.posterior_estimator.modules()):
-        for name, child in list(module.named_children()):
-            if isinstance(child, nn.Dropout):
-                setattr(module, name, nn.BatchNorm1d(4))
-    theta = problems.box(1).sample((30,))
-    method = FMCPE.from_posterior(
-        npe,
-        simulator=problems.simulate,
-        space="embedding",
-        num_draws=5,
-        training=Training(max_num_epochs=3),
-    )
-    method.append_calibration(theta, problems.simulate(theta) + 5.0)
-    posterior = method.train(**QUIET).build_posterior()
-    after = batch_norms(posterior.posterior_estimator)
-    assert len(after) > 1
-    for one in after:
-        assert not one.running_mean.any()  # as it was
 
 
 def batch_norms(estimator: nn.Module) -> list[Any]:

@@ -8,7 +8,6 @@ from torch import Tensor, nn
 
 from sbi_rope.baselines import FRISBI, Training
 from sbi_rope.baselines.frisbi import AlignedEmbeddings
-from sbi_rope.errors import InvalidInputError
 from tests import gaussian
 
 QUIET: dict[str, Any] = {"seed": 0, "show_progress_bars": False}
@@ -110,9 +109,3 @@ def test_its_mixture_is_the_stated_sum() -> None:
 def test_g_is_not_worse_than_h_on_pairs_that_are_held_out() -> None:
     history = trained().history
     assert history.kept_validation_loss <= history.validation_loss[0]
-
-
-@pytest.mark.parametrize("name", ["gamma", "num_simulations", "num_draws"])
-def test_settings_outside_their_range_are_refused(name: str) -> None:
-    with pytest.raises(InvalidInputError, match=name):
-        FRISBI.from_posterior(gaussian.posterior(), **{name: 0})

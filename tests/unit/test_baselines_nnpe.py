@@ -1,6 +1,5 @@
 """NNPE: NPE that has seen errors in its statistics."""
 
-import copy
 import functools
 import math
 from dataclasses import dataclass, field
@@ -17,11 +16,6 @@ from sbi_rope.baselines.error_model import SpikeAndSlab
 from sbi_rope.baselines.nnpe import NNPE
 from sbi_rope.baselines.npe import PlainNPE
 from sbi_rope.baselines.statistics import SoftClip
-from sbi_rope.errors import (
-    InvalidInputError,
-    NotReadyError,
-    UnsupportedPosteriorError,
-)
 from sbi_rope.metrics import lpp
 from sbi_rope.trainers.training import Training
 from tests import problems
@@ -199,62 +193,3 @@ def test_the_network_sees_far_statistics_on_a_logarithmic_scale() -> None:
         3 * (1 + math.log(10)),
     ]
     assert torch.allclose(seen[:, 0], torch.tensor(expected), atol=1e-3)
-
-
-def test_statistics_that_are_constant_in_simulations_stay_constant() -> None:
-    clip = SoftClip(torch.full((10, 1), 0.5))
-    seen = clip(torch.tensor([[0.5], [-100.0], [1e6]]))
-    assert torch.equal(seen, torch.full((3, 1), 0.5))
-
-
-@pytest.mark.medium
-def test_the_density_is_of_the_family_of_npe() -> None:
-    for family in ["mdn", "made", "maf", "nsf", "zuko_nsf", "zuko_gf"]:
-        npe = problems.npe_posterior(family)
-        posterior = small(npe).train(seed=0, show_progress_bars=False).build_posterior()
-        assert type(estimator_of(posterior)) is type(estimator_of(npe))
-        assert posterior.posterior_estimator.condition_shape == (3,)
-        x = torch.randn(4, 3)
-        theta = posterior.sample_batched(
-            (6,), x=x, show_progress_bars=False, reject_outside_prior=False
-        )
-        assert theta.shape == (6, 4, 2)
-        values = posterior.log_prob_batched(theta, x=x, norm_posterior=False)
-        assert values.shape == (6, 4)
-
-
-@pytest.mark.parametrize("noise_on", ["embedding", "input"])
-def test_images_are_taken_with_noise_on_either(noise_on: str) -> None:
-    npe = problems.npe_posterior("maf", "cnn")
-    theta = problems.box(2).sample((200,))
-    method = NNPE.from_posterior(npe, noise_on=noise_on, training=ONCE)
-    method.append_simulations(theta, problems.simulate_image(theta))
-    posterior = method.train(seed=0, show_progress_bars=False).build_posterior()
-    x = problems.simulate_image(theta[:3])
-    assert posterior.log_prob_batched(theta[:3], x=x, norm_posterior=False).shape == (
-        1,
-        3,
-    )
-
-
-# --- wrong use ---
-
-
-def test_a_trained_npe_alone_is_not_enough() -> None:
-    with pytest.raises(NotReadyError, match="append_simulations"):
-        NNPE.from_posterior(problems.npe_posterior()).train()
-
-
-def test_vector_fields_are_refused() -> None:
-    npe = copy.deepcopy(problems.vector_field_posterior("fmpe"))
-    with pytest.raises(UnsupportedPosteriorError, match="density"):
-        small(npe).train(show_progress_bars=False)
-
-
-def test_options_that_make_no_sense_are_refused() -> None:
-    with pytest.raises(InvalidInputError, match="noise_on"):
-        NNPE(prior(), noise_on="output")  # type: ignore[arg-type]
-    with pytest.raises(InvalidInputError, match="error_model"):
-        NNPE(prior(), error_model=0.1)  # type: ignore[arg-type]
-    with pytest.raises(InvalidInputError, match="training"):
-        NNPE(prior(), training={})  # type: ignore[arg-type]

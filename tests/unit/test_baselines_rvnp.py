@@ -6,7 +6,6 @@ from typing import Any
 import pytest
 import torch
 from sbi.neural_nets import posterior_nn
-from sbi.utils import BoxUniform
 from torch import Tensor, nn
 from torch.distributions import Independent, MultivariateNormal, Normal
 
@@ -116,24 +115,6 @@ def test_the_bound_is_the_evidence_and_its_weights_the_posterior_with_many_draws
             assert found.item() == pytest.approx(expected.item(), abs=0.03)
 
 
-def test_draws_outside_the_prior_have_no_weight_and_leave_the_bound_finite() -> None:
-    # Nearly all of q is far outside the box, and a few draws are inside.
-    bound = exact_bound(40)
-    bound.prior = BoxUniform(torch.full((2,), 0.2), torch.full((2,), 0.4))
-    y = torch.full((3, 2), 30.0)
-    terms = bound(y, y)
-    assert terms.log_evidence.isfinite().all()
-    terms.cross_entropy.sum().backward()
-    assert all(p.grad.isfinite().all() for p in bound.q.parameters())
-
-
-def test_parameters_far_from_simulations_have_a_likelihood() -> None:
-    theta = torch.tensor([[1e3, -1e3], [1e6, 1e6]])
-    found, _ = log_likelihood(surrogate(), bent_errors(), torch.zeros(2, 2), theta)
-    assert found.isfinite().all()
-    assert (found < -100).all()
-
-
 @pytest.mark.parametrize("shift", [True, False])
 @pytest.mark.parametrize("depends_on_theta", [True, False])
 def test_errors_have_the_parts_that_are_asked_for(
@@ -240,7 +221,7 @@ def test_a_strong_penalty_leaves_no_offset_that_varies() -> None:
 # What is refused.
 
 
-def test_an_input_that_is_no_vector_is_refused_by_name() -> None:
+def test_an_input_that_is_no_vector_is_refused() -> None:
     theta = simulations()[0][:100]
     method = RVNP(
         gaussian.prior(),
@@ -250,13 +231,5 @@ def test_an_input_that_is_no_vector_is_refused_by_name() -> None:
     )
     method.append_simulations(theta, torch.randn(100, 2, 3))
     method.append_observations(torch.randn(5, 2, 3))
-    with pytest.raises(InvalidInputError, match="noise_on='embedding'"):
+    with pytest.raises(InvalidInputError, match="statistics of x"):
         method.train(**QUIET)
-
-
-@pytest.mark.parametrize(
-    "options", [{"num_draws": 1}, {"shrinkage": -1.0}, {"noise_on": "both"}]
-)
-def test_settings_outside_their_range_are_refused(options: dict[str, Any]) -> None:
-    with pytest.raises(InvalidInputError, match=next(iter(options))):
-        RVNP.from_posterior(gaussian.posterior(), **options)

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.hemodynamics import inflow
 from sbi_rope.tasks.hemodynamics.inflow import aortic_inflow
 from sbi_rope.tasks.hemodynamics.subject import NUM_SEGMENTS, Subject
@@ -77,11 +76,6 @@ def test_reverse_flow_is_shortened_to_fit_the_beat() -> None:
     assert flow.mean() * subject.period == pytest.approx(66.0, rel=1e-5)
     assert (flow[: int(0.96 * 8000)] >= 0).all()
     assert (flow[int(0.961 * 8000) :] < 0).all()
-
-
-def test_inflow_needs_a_positive_number_of_samples() -> None:
-    with pytest.raises(InvalidInputError, match="num_samples"):
-        aortic_inflow(_subject(), 0)
 
 
 def test_the_table_reproduces_the_published_waveform() -> None:

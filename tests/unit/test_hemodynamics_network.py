@@ -6,10 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sbi_rope.errors import DataNotFoundError, InvalidInputError, SimulationError
+from sbi_rope.errors import SimulationError
 from sbi_rope.tasks.hemodynamics import arteries
 from sbi_rope.tasks.hemodynamics.arteries import MMHG
-from sbi_rope.tasks.hemodynamics.grid import build_grid
 from sbi_rope.tasks.hemodynamics.linear import linear_pressure
 from sbi_rope.tasks.hemodynamics.network import (
     Network,
@@ -20,7 +19,6 @@ from sbi_rope.tasks.hemodynamics.network import (
 from sbi_rope.tasks.hemodynamics.openbf import read_case
 from sbi_rope.tasks.hemodynamics.subject import NUM_SEGMENTS, Physics
 from sbi_rope.tasks.hemodynamics.validation import BASELINE
-from sbi_rope.tasks.hemodynamics.waveforms import SITES
 from tests.conftest import SHARED_DATA
 
 OPENBF_TEXT = """project_name: tube
@@ -152,7 +150,7 @@ def test_a_carotid_longer_than_the_way_to_the_leg_is_refused() -> None:
     factors = [1.0] * NUM_SEGMENTS
     factors[15 - 1] = 20.0
     subject = replace(BASELINE, length_factors=tuple(factors))
-    with pytest.raises(SimulationError, match="`length_factors`"):
+    with pytest.raises(SimulationError, match="to the carotid"):
         build_network(subject, Physics())
 
 
@@ -174,25 +172,6 @@ def test_only_walls_of_segments_longer_than_11_mm_are_viscous() -> None:
     )
 
 
-def test_walls_can_be_elastic() -> None:
-    network = build_network(BASELINE, Physics(viscoelastic=False))
-    assert not network.wall_viscosity.any()
-
-
-def test_pressures_are_recorded_in_the_arteries_that_the_sites_are_named_after() -> (
-    None
-):
-    found = {
-        site: (arteries.SEGMENTS[segment][0], position)
-        for site, (segment, position) in SITES.items()
-    }
-    assert found == {
-        "radial": ("left radial", 0.5),
-        "brachial": ("left brachial", 0.5),
-        "aortic": ("ascending aorta", 0.0),
-    }
-
-
 # Geometry ----------------------------------------------------------------------------
 
 
@@ -210,23 +189,6 @@ def test_the_diameter_factor_widens_large_arteries_only() -> None:
     ratio = wide.outlet_radius / usual.outlet_radius
     np.testing.assert_allclose(ratio[mean_radius(usual) > 4.25e-3], 1.1)
     np.testing.assert_allclose(ratio[mean_radius(usual) < 4.23e-3], 1.0)
-
-
-def test_branches_of_large_arteries_begin_as_wide_as_these() -> None:
-    wide = build_network(replace(BASELINE, diameter_factor=1.1), Physics())
-    usual = build_network(BASELINE, Physics())
-    ratio = wide.inlet_radius / usual.inlet_radius
-    left_external_iliac, left_femoral = 44 - 1, 46 - 1
-    assert ratio[left_external_iliac] == pytest.approx(1.1)
-    assert ratio[left_femoral] == 1.0
-
-
-def test_cells_are_about_as_long_as_asked_for() -> None:
-    network = build_network(BASELINE, Physics())
-    grid = build_grid(network, 0.01)
-    np.testing.assert_allclose(grid.num_cells * grid.cell_length, network.length)
-    assert grid.cell_length.max() < 0.015
-    assert grid.cell_length.min() > 0.0066
 
 
 # Vascular beds -----------------------------------------------------------------------
@@ -259,12 +221,6 @@ def test_most_outlets_have_the_impedance_of_their_artery() -> None:
     assert set(segment[~matched] + 1) <= {26}
 
 
-def test_every_outlet_has_a_resistance_even_behind_a_strong_heart() -> None:
-    subject = replace(BASELINE, stroke_volume=110.0, pulse_wave_velocity=9.0)
-    outlets = build_network(subject, Physics()).outlets
-    assert (outlets.distal_resistance > 0).all()
-
-
 # Small waves -------------------------------------------------------------------------
 
 
@@ -284,31 +240,6 @@ def test_a_matched_tube_only_delays_a_wave() -> None:
     )
     delayed = np.sin(2 * np.pi * (time - np.array([[0.0], [0.5 / speed]])))
     np.testing.assert_allclose(wave, 1e-6 * impedance * delayed, atol=1e-4)
-
-
-def test_two_halves_of_a_tube_carry_waves_as_the_whole_does() -> None:
-    whole = tube()
-    halves = replace(
-        whole,
-        inlet_node=np.array([0, 2]),
-        outlet_node=np.array([2, 1]),
-        length=np.full(2, 0.5),
-        inlet_radius=np.full(2, 0.01),
-        outlet_radius=np.full(2, 0.01),
-        stiffness=np.repeat(whole.stiffness, 2, axis=1),
-        wall_viscosity=np.zeros((2, 2)),
-        reference_pressure=np.full(2, 1e4),
-        friction=np.zeros(2),
-        outlets=replace(whole.outlets, segment=np.array([1])),
-    )
-    inflow = 1e-6 * np.maximum(np.sin(np.linspace(0, 2 * np.pi, 200)), 0)
-    first, second = (
-        linear_pressure(
-            network, inflow, 1.0, pressure=1.1e4, sites=sites, num_harmonics=30
-        )
-        for network, sites in ((whole, [(0, 0.5)]), (halves, [(1, 0.0)]))
-    )
-    np.testing.assert_allclose(first, second, atol=1e-9 * np.abs(first).max())
 
 
 # openBF ------------------------------------------------------------------------------
@@ -335,14 +266,3 @@ def test_the_beats_that_openbf_simulated_are_counted(openbf_folder: Path) -> Non
     case = read_case(openbf_folder, "tube")
     assert case.num_cycles == 4
     assert case.time[0] == pytest.approx(0.0)
-
-
-def test_a_missing_case_of_openbf_is_named(tmp_path: Path) -> None:
-    with pytest.raises(DataNotFoundError, match=r"cca\.yaml"):
-        read_case(tmp_path, "cca")
-
-
-def test_a_network_of_openbf_without_vessels_is_refused(openbf_folder: Path) -> None:
-    (openbf_folder / "tube.yaml").write_text(OPENBF_TEXT.split("network:")[0])
-    with pytest.raises(InvalidInputError, match="vessels"):
-        read_case(openbf_folder, "tube")

@@ -5,15 +5,13 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from sbi.utils import mcmc_transform, within_support
-from sbi.utils.user_input_checks import process_prior
+from sbi.utils import within_support
 from scipy.integrate import quad
 from scipy.stats import kstest, norm
 from torch import Tensor
 from torch.autograd.functional import jacobian
 from torch.distributions import biject_to
 
-from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.hemodynamics import population_tables as tables
 from sbi_rope.tasks.hemodynamics.population import Population, ejection_time_slopes
 from sbi_rope.tasks.hemodynamics.prior import PopulationPrior, _linear_quantile
@@ -187,17 +185,6 @@ def test_bijection_has_the_log_determinant_of_its_jacobian(
     assert transform.inv(far).isfinite().all()
 
 
-def test_sbi_takes_the_prior_as_it_is(prior: PopulationPrior) -> None:
-    processed, theta_dim, _ = process_prior(prior)
-    assert processed is prior
-    assert theta_dim == 2
-    theta = prior.sample((7,))
-    to_unconstrained = mcmc_transform(prior)
-    z = to_unconstrained(theta)
-    assert to_unconstrained.log_abs_det_jacobian(theta, z).shape == (7,)
-    torch.testing.assert_close(to_unconstrained.inv(z), theta, rtol=1e-4, atol=1e-3)
-
-
 def test_prior_can_be_copied_expanded_and_moved(prior: PopulationPrior) -> None:
     copied = pickle.loads(pickle.dumps(prior))
     draws = copied.sample((5,))
@@ -211,23 +198,3 @@ def test_prior_can_be_copied_expanded_and_moved(prior: PopulationPrior) -> None:
     copied.to("meta")
     assert copied.mean.device.type == "meta"
     assert PopulationPrior(Population()).mean.device.type == "cpu"
-
-
-def test_a_prior_made_in_inference_mode_has_a_density_with_gradients() -> None:
-    with torch.inference_mode():
-        prior = PopulationPrior()
-    theta = torch.tensor([60.0, 280.0], requires_grad=True)
-    prior.log_prob(theta).backward()
-    assert theta.grad is not None
-    step = torch.tensor([[0.0, 0.05], [0.0, -0.05]]).double()
-    ends = prior.log_prob(theta.detach().double() + step)
-    slope = float(ends[0] - ends[1]) / 0.1
-    assert float(theta.grad[1]) == pytest.approx(slope, rel=0.05)
-
-
-def test_prior_validates_values_if_asked() -> None:
-    prior = PopulationPrior(validate_args=True)
-    with pytest.raises(ValueError, match="support"):
-        prior.log_prob(torch.tensor([60.0, 400.0]))
-    with pytest.raises(InvalidInputError, match="population"):
-        PopulationPrior("population")  # type: ignore[arg-type]

@@ -1,9 +1,7 @@
 """Cancer and stromal cells."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,15 +9,12 @@ import torch
 from scipy.stats import ks_2samp
 from torch import Tensor
 
-from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.cs import (
     CancerStroma,
     CancerStromaSimulator,
     batched_statistics,
     tissue_statistics,
 )
-from sbi_rope.tasks.splits import DrawnPairs
-from tests.tasks import accepted
 
 NECROSIS = CancerStromaSimulator(necrosis_probability=0.75)
 # Means and standard deviations of 1500 draws of an independent implementation, under
@@ -198,14 +193,6 @@ def test_tissues_simulated_together_follow_the_law_of_single_ones(
         assert ks_2samp(a, b).pvalue > 1e-3
 
 
-@pytest.mark.medium
-def test_rows_of_a_batch_belong_to_their_parameters() -> None:
-    theta = torch.tensor([[1400.0, 5.0, 15.0], [250.0, 5.0, 15.0]]).repeat(100, 1)
-    num_cells = CancerStromaSimulator(batched=True)(theta)[:, :2].sum(dim=1)
-    assert (num_cells[::2] > 1000).all()
-    assert (num_cells[1::2] < 500).all()
-
-
 def test_the_number_of_cells_is_poisson_with_the_rate_of_theta() -> None:
     theta = torch.tensor([[500.0, 5.0, 15.0]]).expand(1000, -1)
     num_cells = CancerStromaSimulator()(theta)[:, :2].sum(dim=1)
@@ -244,35 +231,6 @@ def test_statistics_that_are_not_defined_are_nan(batched: bool) -> None:
     assert CancerStromaSimulator(batched=batched)(theta[:1]).isnan().all()
 
 
-def test_pairs_that_are_not_defined_are_replaced_together() -> None:
-    def draw_theta(n: int) -> Tensor:
-        rate = torch.where(torch.rand(n) < 0.3, 2.0, 200.0 + 1300.0 * torch.rand(n))
-        return torch.stack([rate, 10 + 0 * rate, 15 + 0 * rate], dim=1)
-
-    pairs = DrawnPairs(draw_theta=draw_theta, observe=CancerStromaSimulator())
-    with pytest.warns(UserWarning, match="Replaced"):
-        theta, x = pairs.take(150, seed=0, part="test")
-    assert theta[:, 0].min() >= 200.0
-    z = (x[:, :2].sum(dim=1) - theta[:, 0]) / theta[:, 0].sqrt()
-    assert z.abs().max() < 5.0
-
-
-@pytest.mark.parametrize("batched", [False, True])
-def test_the_simulator_takes_batches_of_any_size(batched: bool) -> None:
-    for n in (0, 1, 300):
-        theta = torch.tensor([[200.0, 3.0, 10.0]], dtype=torch.float64).expand(n, -1)
-        x = CancerStromaSimulator(batched=batched)(theta)
-        assert x.shape == (n, 4)
-        assert x.dtype == torch.float64
-        assert x.isfinite().all()
-
-
-def test_rates_out_of_range_are_refused() -> None:
-    for rate in (-1.0, 2e6):
-        with pytest.raises(InvalidInputError, match=r"from 0 to 1e\+06"):
-            CancerStromaSimulator()(torch.tensor([[500.0, rate, 15.0]]))
-
-
 # The task ----------------------------------------------------------------------------
 
 
@@ -285,23 +243,12 @@ def test_density_and_quantiles_of_the_prior_are_analytic() -> None:
     torch.testing.assert_close(CancerStroma().prior_quantiles(theta), expected)
 
 
-def test_without_necrosis_the_task_is_well_specified() -> None:
-    exact = CancerStroma(necrosis_probability=0.0).get_test_set(50)
-    expected = CancerStroma(variant="well_specified").get_test_set(50)
-    assert torch.equal(exact[0], expected[0])
-    assert torch.equal(exact[1], expected[1])
-
-
 def test_options_reach_the_real_process_only() -> None:
     strong = CancerStroma(necrosis_probability=1.0, necrosis_radius=1.0)
     _, x = strong.get_test_set(200)
     _, default = CancerStroma().get_test_set(200)
     assert x[:, 1].mean() < 0.5 * default[:, 1].mean()
     assert strong.get_simulator() == CancerStroma().get_simulator()
-    assert (CancerStroma().necrosis_probability, CancerStroma().necrosis_radius) == (
-        0.75,
-        0.8,
-    )
 
 
 def test_network_has_the_widths_of_the_paper() -> None:
@@ -309,23 +256,6 @@ def test_network_has_the_widths_of_the_paper() -> None:
         net = CancerStroma().get_embedding_net(light=light)
         widths = [layer.out_features for layer in net if hasattr(layer, "out_features")]
         assert widths == [12, 48, 48, 36, 9]
-
-
-def test_options_out_of_range_or_without_effect_are_refused() -> None:
-    def make(**options: Any) -> Callable[[], object]:
-        return lambda: CancerStroma(**options)
-
-    assert not accepted(
-        {
-            "p": (make(necrosis_probability=1.1), "necrosis_probability"),
-            "radius": (make(necrosis_radius=-0.1), "necrosis_radius"),
-            "nan": (make(necrosis_radius=math.nan), "necrosis_radius"),
-            "without effect": (
-                make(variant="well_specified", necrosis_radius=0.5),
-                "no effect",
-            ),
-        }
-    )
 
 
 def seeded(simulator: CancerStromaSimulator, theta: Tensor) -> Tensor:

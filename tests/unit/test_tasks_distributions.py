@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from torch.distributions import Beta, biject_to
+from torch.distributions import Beta
 
 from sbi_rope.tasks.distributions import Arcsine, UniformDistance, box
 
@@ -74,38 +74,6 @@ def test_mean_and_standard_deviation_are_those_of_draws(law: Law) -> None:
     torch.testing.assert_close(draws.std(dim=0), some.stddev, rtol=0.02, atol=0.0)
 
 
-@LAWS
-def test_draws_are_differentiable_in_the_width(law: Law) -> None:
-    width = torch.tensor([2.0], requires_grad=True)
-    draws = law(width).rsample(torch.Size((100,)))
-    draws.sum().backward()
-    assert width.grad is not None
-    torch.testing.assert_close(width.grad, draws.detach().sum(dim=0) / 2)
-
-
-@LAWS
-def test_values_outside_are_refused_when_arguments_are_validated(law: Law) -> None:
-    some = law(torch.tensor([1.0]), validate_args=True)
-    with pytest.raises(ValueError, match="support"):
-        some.log_prob(torch.tensor([2.0]))
-    for width in (-1.0, 0.0):
-        with pytest.raises(ValueError, match="width"):
-            law(torch.tensor([width]), validate_args=True)
-
-
-def test_support_has_a_bijection_from_the_real_line(distance: UniformDistance) -> None:
-    constrained = biject_to(distance.support)(torch.tensor([-2.0, 0.0, 2.0]))
-    assert distance.support.check(constrained).all()
-    assert constrained[1] == 20.0
-
-
-@LAWS
-def test_expanding_repeats_the_width(law: Law) -> None:
-    expanded = law(torch.tensor([1.0]), validate_args=False).expand((3,))
-    assert expanded.batch_shape == (3,)
-    assert expanded.sample(torch.Size((2,))).shape == (2, 3)
-
-
 # Arcsine -----------------------------------------------------------------------------
 
 
@@ -121,13 +89,6 @@ def test_arcsine_is_a_beta_of_one_half() -> None:
     torch.testing.assert_close(malus.log_prob(alpha), beta.log_prob(alpha))
     torch.testing.assert_close(malus.mean, beta.mean.reshape(1))
     torch.testing.assert_close(malus.variance, beta.variance.reshape(1))
-
-
-def test_arcsine_density_scales_with_the_width() -> None:
-    alpha = torch.linspace(0.01, 0.99, 20)
-    wide, unit = Arcsine(torch.tensor([40.0])), Arcsine(torch.tensor([1.0]))
-    expected = unit.log_prob(alpha) - torch.tensor(40.0).log()
-    torch.testing.assert_close(wide.log_prob(40 * alpha), expected)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -1,10 +1,8 @@
 """The embedding networks of the tasks."""
 
-import pytest
 import torch
 from torch import nn
 
-from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.networks import SeriesEmbedding, fully_connected
 
 
@@ -43,27 +41,6 @@ def test_layers_are_those_of_the_paper() -> None:
     twice = [*once, *once, nn.AvgPool1d]
     expected = [*twice, *twice, *twice, *once, nn.Flatten]
     assert [type(layer) for layer in net.features] == expected
-
-
-def test_series_of_less_than_73_steps_need_more_padding_than_the_paper_has() -> None:
-    with pytest.raises(InvalidInputError, match=r"`num_steps`.*got 50.*`padding`"):
-        SeriesEmbedding(num_steps=50)
-    assert SeriesEmbedding(num_steps=50, padding=2)(torch.randn(2, 50)).shape == (2, 10)
-    SeriesEmbedding(num_steps=73)
-    with pytest.raises(InvalidInputError, match="got 72"):
-        SeriesEmbedding(num_steps=72)
-
-
-def test_series_of_another_shape_are_refused() -> None:
-    for shape in ((3, 100), (200,), (3, 1, 200)):
-        with pytest.raises(InvalidInputError, match=r"`x` of shape \(n, 200\)"):
-            SeriesEmbedding()(torch.zeros(shape))
-
-
-def test_sizes_of_a_network_must_be_positive() -> None:
-    for option in ("num_steps", "output_dim", "padding"):
-        with pytest.raises(InvalidInputError, match=option):
-            SeriesEmbedding(**{option: 0})
 
 
 def test_fully_connected_has_relu_between_layers_only() -> None:

@@ -1,13 +1,11 @@
 """The pendulum."""
 
 import math
-from functools import partial
 
 import pytest
 import torch
 
 from sbi_rope.tasks.pendulum import Pendulum, PendulumSimulator
-from tests.tasks import accepted
 
 
 def test_prior_log_density_is_analytic() -> None:
@@ -68,14 +66,6 @@ def test_without_friction_the_simulator_is_exact() -> None:
     torch.testing.assert_close(x_o.std(dim=0), x_s.std(dim=0), rtol=0.1, atol=0.0)
 
 
-def test_the_noise_asked_for_is_on_simulations_and_on_real_series() -> None:
-    task = Pendulum(noise_std=3.0, max_damping=0.0)
-    theta, x_o = task.get_test_set(300)
-    for x in (x_o, task.get_simulator()(theta)):
-        # Neighbouring positions are nearly equal, so their difference is noise.
-        assert x.diff(dim=1).std() / 2**0.5 == pytest.approx(3.0, rel=0.05)
-
-
 def test_the_weight_is_the_share_of_the_tighter_distribution() -> None:
     low, high = torch.tensor([1.0, 3.0]), torch.tensor([2.0, 6.0])
     for weight in (0.0, 0.3, 1.0):
@@ -90,25 +80,3 @@ def test_the_weight_is_the_share_of_the_tighter_distribution() -> None:
     assert draws.max(dim=0).values.tolist() == pytest.approx([3.0, 10.0], abs=0.01)
     assert Pendulum(variant="misspecified_prior").misspecification_weight == 0.5
     assert Pendulum().misspecification_weight == 0.0
-
-
-def test_network_has_2048_features_and_ten_outputs() -> None:
-    net = Pendulum().get_embedding_net()
-    assert net.num_features == 2048
-    assert net(torch.randn(4, 200)).shape == (4, 10)
-
-
-def test_options_out_of_range_or_without_effect_are_refused() -> None:
-    misspecified = partial(Pendulum, variant="misspecified_prior")
-    assert not accepted(
-        {
-            "no variant": (
-                partial(Pendulum, misspecification_weight=0.5),
-                "no effect",
-            ),
-            "weight": (partial(misspecified, misspecification_weight=1.5), "[0, 1]"),
-            "noise": (partial(Pendulum, noise_std=0.0), "noise_std"),
-            "damping": (partial(Pendulum, max_damping=-0.1), "max_damping"),
-            "nan": (partial(Pendulum, max_damping=math.nan), "max_damping"),
-        }
-    )

@@ -2,7 +2,6 @@
 
 import datetime
 import math
-from functools import partial
 
 import numpy as np
 import pytest
@@ -10,7 +9,6 @@ import torch
 from scipy.integrate import solve_ivp
 from torch import Tensor
 
-from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.sir import (
     MONDAYS,
     SATURDAYS,
@@ -21,7 +19,6 @@ from sbi_rope.tasks.sir import (
     integrate,
     summarise,
 )
-from tests.tasks import accepted
 
 # Means and standard deviations of 20 000 draws of an independent implementation,
 # under the prior, with steps of 0.1 days.
@@ -71,8 +68,8 @@ def test_without_noise_the_numbers_solve_the_ordinary_equations() -> None:
         ]
     )
     coarse, fine = (
-        SIRSimulator(volatility=0.0, time_step=step).infections(theta).numpy()
-        for step in (0.1, 0.05)
+        SIRSimulator(volatility=0.0, steps_per_day=steps).infections(theta).numpy()
+        for steps in (10, 20)
     )
     error, half = (np.abs(np.log(x / 1e5) - expected).max() for x in (coarse, fine))
     assert error < 0.5
@@ -124,20 +121,6 @@ def test_numpy_and_torch_give_the_same_epidemics() -> None:
     days = torch.stack(list(integrate(theta, noise, volatility=0.05)))
     arrays = list(integrate(theta.numpy(), noise.numpy(), volatility=0.05))
     np.testing.assert_allclose(days.numpy(), arrays, rtol=1e-10)
-
-
-def test_an_epidemic_starts_with_one_person_in_a_thousand_infected() -> None:
-    x = SIRSimulator().infections(SIR().get_prior().sample((10,)))
-    assert x.shape == (10, 365)
-    assert x.dtype == torch.float64
-    torch.testing.assert_close(x[:, 0], torch.full((10,), 100.0, dtype=torch.float64))
-
-
-def test_a_large_batch_has_the_rows_of_small_ones() -> None:
-    theta = SIR().get_prior().sample((1003,))
-    simulator = SIRSimulator(volatility=0.0, time_step=1.0)
-    expected = torch.cat([simulator.infections(part) for part in theta.split(101)])
-    torch.testing.assert_close(simulator.infections(theta), expected)
 
 
 # The delay of reports ----------------------------------------------------------------
@@ -206,29 +189,11 @@ def test_the_delay_of_reports_changes_the_autocorrelation_only() -> None:
 # The simulator -----------------------------------------------------------------------
 
 
-def test_the_simulator_takes_batches_of_any_size() -> None:
-    for n in (0, 1, 1500):
-        theta = SIR().get_prior().sample((n,)).double().requires_grad_()
-        x = SIRSimulator(time_step=1.0)(theta)
-        assert x.shape == (n, 6)
-        assert x.dtype == torch.float64
-        assert x.isfinite().all()
-
-
 def test_corners_of_the_prior_have_finite_statistics() -> None:
     corners = [[0.5, 0.0], [0.5, 0.5], [1e-6, 1e-6], [0.0, 0.0], [0.5, 1e-30]]
     x = SIRSimulator()(torch.tensor(corners))
     # With both rates at 0 the series is constant and has no correlation.
     assert x.isfinite().all(dim=1).tolist() == [True, True, True, False, True]
-
-
-def test_time_steps_and_rates_that_the_scheme_cannot_take_are_refused() -> None:
-    for time_step in (0.3, 2.0, 0.0, -0.1, math.nan, "day"):
-        with pytest.raises(InvalidInputError, match="time_step"):
-            SIRSimulator(time_step=time_step)  # type: ignore[arg-type]
-    for rate in (-0.1, 10.5):
-        with pytest.raises(InvalidInputError, match="from 0 to 10 per day"):
-            SIRSimulator()(torch.tensor([[0.2, rate]]))
 
 
 # The task ----------------------------------------------------------------------------
@@ -243,38 +208,11 @@ def test_density_and_quantiles_of_the_prior_are_analytic() -> None:
     torch.testing.assert_close(SIR().prior_quantiles(edges), expected)
 
 
-def test_without_delay_the_task_is_well_specified() -> None:
-    exact = SIR(reported_fraction=1.0).get_test_set(50)
-    expected = SIR(variant="well_specified").get_test_set(50)
-    assert torch.equal(exact[0], expected[0])
-    assert torch.equal(exact[1], expected[1])
-
-
-def test_reported_fraction_is_the_strength_of_the_misspecification() -> None:
-    correlations = [
-        SIR(reported_fraction=fraction).get_test_set(100)[1][:, 5]
-        for fraction in (0.0, 0.5, 0.95, 1.0)
-    ]
-    assert (torch.stack(correlations).diff(dim=0) > 0).all()
-    assert torch.equal(correlations[2], SIR().get_test_set(100)[1][:, 5])
-
-
 def test_network_has_the_widths_of_the_paper() -> None:
     for light in (False, True):
         net = SIR().get_embedding_net(light=light)
         widths = [layer.out_features for layer in net if hasattr(layer, "out_features")]
         assert widths == [8, 32, 32, 24, 6]
-
-
-def test_options_out_of_range_or_without_effect_are_refused() -> None:
-    exact = partial(SIR, variant="well_specified")
-    assert not accepted(
-        {
-            "above": (partial(SIR, reported_fraction=1.1), "reported_fraction"),
-            "below": (partial(SIR, reported_fraction=-0.1), "reported_fraction"),
-            "exact": (partial(exact, reported_fraction=0.9), "no effect"),
-        }
-    )
 
 
 def seeded(simulator: SIRSimulator, theta: Tensor) -> Tensor:

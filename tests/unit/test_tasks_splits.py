@@ -1,7 +1,6 @@
 """Pairs that share no observation."""
 
 from concurrent.futures import ThreadPoolExecutor
-from typing import get_args
 
 import pytest
 import torch
@@ -9,7 +8,6 @@ from torch import Tensor
 
 from sbi_rope.errors import InvalidInputError, RoPEWarning, SimulationError
 from sbi_rope.tasks.splits import (
-    BLOCK_SIZE,
     MAX_SEED,
     DrawnPairs,
     Part,
@@ -44,30 +42,6 @@ def test_streams_of_all_seeds_and_uses_differ() -> None:
     streams = {stream_of(seed, use) for seed in SEEDS for use in uses}
     assert len(streams) == 4 * len(SEEDS)
     assert all(0 <= stream < 2**32 for stream in streams)
-
-
-def test_sets_of_all_seeds_and_parts_differ() -> None:
-    first = [
-        tuple(drawn().take(1, seed=seed, part=part)[0].flatten().tolist())
-        for seed in SEEDS
-        for part in get_args(Part)
-    ]
-    assert len(set(first)) == 3 * len(SEEDS)
-
-
-def test_drawn_pairs_are_as_many_as_asked_for() -> None:
-    for n in (1, BLOCK_SIZE, BLOCK_SIZE + 1):
-        theta, x = drawn().take(n, seed=0, part="test")
-        assert theta.shape == (n, 2)
-        assert x.shape == (n, 3)
-    theta, _ = drawn().take(2 * BLOCK_SIZE, seed=0, part="test")
-    assert not torch.equal(theta[:BLOCK_SIZE], theta[BLOCK_SIZE:])
-
-
-def test_pairs_are_drawn_on_the_cpu_whatever_the_default_device() -> None:
-    with torch.device("meta"):
-        theta, _ = drawn().take(3, seed=0, part="test")
-    assert theta.device.type == "cpu"
 
 
 def test_the_random_state_survives_an_error() -> None:
@@ -134,12 +108,6 @@ def test_sets_drawn_in_several_threads_are_those_of_one_thread() -> None:
 # Recorded pairs ----------------------------------------------------------------------
 
 
-def test_recorded_pairs_stay_together() -> None:
-    theta, x = recorded(100).take(20, seed=0, part="test")
-    assert torch.equal(x, 10 * theta)
-    assert len(theta.unique()) == 20
-
-
 def test_parts_are_a_partition_that_does_not_depend_on_the_seed() -> None:
     def rows(n: int, seed: int, part: Part) -> set[float]:
         theta, _ = recorded(20).take(n, seed=seed, part=part)
@@ -150,29 +118,10 @@ def test_parts_are_a_partition_that_does_not_depend_on_the_seed() -> None:
     assert calibration == rows(6, 2, "calibration")
 
 
-def test_the_seed_decides_which_rows_of_a_part_are_taken() -> None:
-    first, second = (
-        recorded(300).take(10, seed=seed, part="calibration")[0] for seed in (0, 1)
-    )
-    assert set(first.flatten().tolist()) != set(second.flatten().tolist())
-
-
 def test_the_split_does_not_follow_the_order_of_the_file() -> None:
     rows = torch.tensor(recorded(3000).rows_of("calibration"))
     assert rows.double().mean() == pytest.approx(1500, abs=100)
     assert rows.double().std() == pytest.approx(3000 / 12**0.5, rel=0.05)
-
-
-def test_only_the_chosen_rows_are_read() -> None:
-    read: list[int] = []
-
-    def read_x(rows: list[int]) -> Tensor:
-        read.extend(rows)
-        return torch.zeros(len(rows), 1)
-
-    pairs = RecordedPairs(theta=torch.rand(90, 1), read_x=read_x)
-    pairs.take(5, seed=0, part="test")
-    assert len(read) == 5
 
 
 def test_recorded_rows_without_a_chance_are_left_out() -> None:

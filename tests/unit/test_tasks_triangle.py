@@ -97,19 +97,3 @@ def test_triangle_can_be_copied_expanded_and_moved(triangle: UniformTriangle) ->
     assert expanded.log_prob(draws[:3]).shape == (3,)
     copied.to("meta")
     assert copied.sample().device.type == copied.mean.device.type == "meta"
-
-
-def test_triangle_draws_are_differentiable_in_its_size() -> None:
-    high = torch.tensor(2.0, requires_grad=True)
-    draws = UniformTriangle(high).rsample((100,))
-    draws.sum().backward()
-    assert high.grad is not None
-    torch.testing.assert_close(high.grad, draws.detach().sum() / 2)
-
-
-def test_triangle_refuses_values_outside_when_arguments_are_validated() -> None:
-    triangle = UniformTriangle(torch.tensor(0.5), validate_args=True)
-    with pytest.raises(ValueError, match="support"):
-        triangle.log_prob(torch.tensor([0.1, 0.2]))
-    with pytest.raises(ValueError, match="high"):
-        UniformTriangle(torch.tensor(-1.0), validate_args=True)

@@ -1,43 +1,30 @@
 """The wind tunnel: model, closed-form posterior, recorded data and stand-in."""
 
 import math
-import sys
-import types
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from sbi.inference import NPE
 from sbi.neural_nets import posterior_nn
-from torch import Tensor, nn
+from torch import Tensor
 from torch.distributions import Normal
 
-from sbi_rope import CalibrationFinetuner, RoPE
-from sbi_rope.errors import DataNotFoundError, InvalidInputError
-from sbi_rope.tasks.splits import RecordedPairs
+from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.wind_tunnel import DATASET, EXPERIMENT, WindTunnel
 from sbi_rope.tasks.wind_tunnel_model import (
     SAMPLE_TIMES,
     WindTunnelSimulator,
     pressure_ratio,
 )
-from tests.tasks import accepted
 
-PAGE = (
-    "https://github.com/juangamella/causal-chamber/tree/main/datasets/"
-    "wt_intake_impulse_v1"
-)
 # The published columns around those that are read.
 HEADER = (
     "timestamp,counter,flag,intervention,hatch,load_in,load_out,osr_downwind,"
     "pressure_downwind,pressure_upwind,pressure_ambient"
 )
 AMBIENT = 95_742.9
-# The files of these tests are shorter than the published ones.
-pytestmark = pytest.mark.usefixtures("shorter_files")
 
 WriteImpulses = Callable[..., Path]
 Schedule = tuple[tuple[float, int, int], ...]  # learning rate, batch, epochs
@@ -141,16 +128,6 @@ def test_pressure_at_known_timing_is_that_of_causalchamber() -> None:
             )
 
 
-def test_simulated_samples_are_taken_at_the_recorded_times() -> None:
-    times = torch.tensor(SAMPLE_TIMES, dtype=torch.float64)
-    assert times.shape == (50,)
-    assert times[[5, 24, 25, 49]].tolist() == [0.78639, 3.66501, 3.94014, 7.58541]
-    # About seven a second, and a break when the load changes.
-    steps = times.diff()
-    assert steps[24] == pytest.approx(0.27513)
-    assert ((steps > 0.15) & (steps < 0.18)).sum() == 48
-
-
 def test_pressure_is_linear_in_the_hatch_with_the_published_factor() -> None:
     theta = torch.linspace(0, 45, 10, dtype=torch.float64).unsqueeze(1)
     shift = torch.full((10,), 0.123, dtype=torch.float64)
@@ -172,19 +149,6 @@ def test_interpolated_pressures_are_exact_to_2e_5_pascal() -> None:
         x = simulator.pressure(theta, onset_shift=shift)
         direct = 74.82473949999999 * 0.25 * pressure_ratio(shift)
         torch.testing.assert_close(x, direct, rtol=0.0, atol=2e-5)
-
-
-def test_an_impulse_begins_and_ends_with_its_shift() -> None:
-    shift = torch.tensor([-0.2, 0.0, 0.2], dtype=torch.float64)
-    steps = pressure_ratio(shift).diff(dim=1)
-    times = torch.tensor(SAMPLE_TIMES, dtype=torch.float64)[1:]
-    for row, delta in zip(steps, shift, strict=True):
-        begun = times > 0.61425 + delta
-        ended = times > 3.66501 + delta + 0.16
-        # Faster by the load's torque at once, and slower at its end.
-        assert row[begun][0] > row[~begun][-1]
-        assert (row[begun & ~ended][1:-2] > 0.01).all()
-        assert (row[ended] < 0).all()
 
 
 def test_before_the_impulse_the_fans_follow_the_equation_of_motion() -> None:
@@ -235,39 +199,6 @@ def test_shifts_are_uniform_up_to_the_jitter() -> None:
     )
 
 
-def test_batches_of_any_size_keep_their_dtype_and_draws() -> None:
-    for jitter in (0.0, 0.3):
-        for num, dtype in ((0, torch.float32), (1, torch.float32), (9, torch.float64)):
-            theta = 45 * torch.rand(num, 1, dtype=dtype)
-            x = WindTunnelSimulator(onset_jitter=jitter)(theta)
-            assert x.shape == (num, 50)
-            assert x.dtype == dtype
-            assert torch.isfinite(x).all()
-    theta = 45 * torch.rand(5, 1)
-    torch.manual_seed(1)
-    single = WindTunnelSimulator()(theta)
-    torch.manual_seed(1)
-    assert torch.equal(single, WindTunnelSimulator()(theta.double()).float())
-
-
-@pytest.mark.medium
-def test_gradients_exist_even_if_the_first_call_was_in_inference_mode() -> None:
-    simulator = WindTunnelSimulator(onset_jitter=0.0, exhaust_offset=0.0125)
-    with torch.inference_mode():
-        simulator(torch.zeros(2, 1))
-    theta = torch.full((2, 1), 10.0, requires_grad=True)
-    simulator(theta).sum().backward()
-    slope = -0.249415798333 * float(pressure_ratio(known_timing()).sum())
-    assert theta.grad is not None
-    assert theta.grad[0, 0] == pytest.approx(slope, abs=0.05)
-
-
-def test_a_shift_beyond_the_jitter_is_refused() -> None:
-    shift = torch.tensor([0.1, -0.31], dtype=torch.float64)
-    with pytest.raises(InvalidInputError, match=r"onset_jitter=0\.3.*0\.31"):
-        WindTunnelSimulator().pressure(torch.zeros(2, 1), onset_shift=shift)
-
-
 # The posterior at known timing -------------------------------------------------------
 
 
@@ -312,22 +243,6 @@ def distance_from_the_oracle(npe: NPE, task: WindTunnel) -> float:
     return float(Oracle().log_prob(theta, x).mean() - log_prob.double().mean())
 
 
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:Maximum number of epochs")
-def test_npe_on_the_estimate_of_least_squares_reaches_the_closed_form() -> None:
-    task = WindTunnel(variant="well_specified", onset_jitter=0.0)
-    oracle = Oracle()
-    net = nn.Linear(50, 1).requires_grad_(requires_grad=False)
-    weight = oracle.ratio / oracle.ratio.square().sum() / oracle.per_degree / 13
-    net.weight.copy_(weight.unsqueeze(0))
-    net.bias.fill_((-oracle.at_zero / oracle.per_degree - 22.5) / 13)
-    build = posterior_nn(
-        "nsf", embedding_net=net, num_transforms=1, hidden_features=30, z_score_x="none"
-    )
-    npe = train_npe(task, 4000, build, ((5e-3, 100, 10), (5e-4, 200, 5)))
-    assert distance_from_the_oracle(npe, task) == pytest.approx(0.0, abs=0.1)
-
-
 @pytest.mark.filterwarnings("ignore:Maximum number of epochs")
 @pytest.mark.slow
 def test_npe_with_the_light_network_reaches_the_closed_form() -> None:
@@ -357,47 +272,6 @@ def test_prior_log_density_is_analytic() -> None:
     torch.testing.assert_close(quantiles, theta / 45)
 
 
-def test_options_reach_the_simulator_and_default_to_the_published_noise() -> None:
-    published = WindTunnelSimulator(noise_std=0.2, onset_jitter=0.3)
-    assert WindTunnelSimulator() == published
-    assert WindTunnel().get_simulator() == published
-    task = WindTunnel(noise_std=0.5, onset_jitter=0.0)
-    assert task.get_simulator() == WindTunnelSimulator(noise_std=0.5, onset_jitter=0.0)
-
-
-def test_the_networks_return_ten_statistics() -> None:
-    for light in (True, False):
-        net = WindTunnel().get_embedding_net(light=light)
-        assert net(torch.randn(4, 50)).shape == (4, 10)
-
-
-def test_options_out_of_range_or_without_effect_are_refused() -> None:
-    strength, experiment = "misspecification_strength", {"experiment": EXPERIMENT}
-    exact = {"variant": "well_specified"}
-    cases: list[tuple[dict[str, Any], str]] = [
-        ({"download": True}, "`root`"),
-        ({"noise_std": 0.0}, "noise_std"),
-        *(
-            ({"onset_jitter": jitter}, "onset_jitter")
-            for jitter in (-0.1, 0.61, math.nan, "0.1")
-        ),
-        ({"variant": "shifted"}, "variant"),
-        ({"stand_in": "yes"}, "stand_in"),
-        ({strength: 0.5}, "no effect without"),
-        ({strength: 1.1, "stand_in": True}, "[0, 1]"),
-        (experiment | {"stand_in": True}, "read no data"),
-        (experiment | {"variant": "synthetic"}, "read no data"),
-        (exact | {strength: 0.5, "stand_in": True}, "no effect"),
-        (exact | experiment, "no effect"),
-    ]
-    assert not accepted(
-        {
-            str(options): (partial(WindTunnel, **options), word)
-            for options, word in cases
-        }
-    )
-
-
 # The stand-in ------------------------------------------------------------------------
 
 
@@ -415,7 +289,7 @@ def test_files_are_needed_unless_there_is_a_stand_in_or_nothing_to_read() -> Non
 
 
 def test_the_stand_in_has_other_fans_and_correlated_noise() -> None:
-    stand_in = WindTunnel(variant="synthetic")._stand_in_simulator()
+    stand_in = WindTunnel(variant="synthetic")._stand_in
     assert stand_in == WindTunnelSimulator(
         noise_correlation=0.6,
         max_pressure=0.95 * 74.82473949999999,
@@ -434,33 +308,6 @@ def test_to_the_simulator_the_stand_in_looks_like_a_hatch_that_is_open_wider() -
     assert float(error[half_open].mean()) == pytest.approx(7.5, abs=1.5)
 
 
-@pytest.mark.medium
-def test_the_stand_in_has_correlated_noise() -> None:
-    theta, x = WindTunnel(variant="synthetic", onset_jitter=0.0).get_test_set(2000)
-    # At known timing a pressure is a straight line in the hatch, plus noise.
-    line = torch.cat([torch.ones_like(theta), theta], dim=1).double()
-    noise = x.double() - line @ torch.linalg.lstsq(line, x.double()).solution
-    assert float(noise.std()) == pytest.approx(0.2, rel=0.02)
-    products = noise[:, 1:] * noise[:, :-1]
-    assert float(products.mean()) / 0.04 == pytest.approx(0.6, abs=0.02)
-
-
-@pytest.mark.medium
-def test_strength_zero_makes_the_simulator_exact() -> None:
-    task = WindTunnel(
-        variant="synthetic", misspecification_strength=0.0, onset_jitter=0.0
-    )
-    theta, x = task.get_test_set(2000)
-    error = Oracle().estimate(x) - theta[:, 0]
-    assert float(error.mean()) == pytest.approx(0.0, abs=0.04)
-    assert float(error.std()) == pytest.approx(Oracle().std, rel=0.06)
-
-
-def test_prior_shift_opens_the_hatch_by_half_and_more() -> None:
-    theta, _ = WindTunnel(variant="prior_shift", stand_in=True).get_test_set(500)
-    assert theta.min() > 22.5
-
-
 # Recorded data -----------------------------------------------------------------------
 
 
@@ -474,157 +321,22 @@ def test_each_impulse_becomes_a_hatch_and_a_curve(
     torch.testing.assert_close(x[order], expected, rtol=0.0, atol=1e-6)
 
 
-def test_the_split_of_the_recorded_rows_is_fixed(write_impulses: WriteImpulses) -> None:
-    task = WindTunnel(root=write_impulses(tuple(range(9))))
-    assert isinstance(task._real_process("test"), RecordedPairs)
-    with pytest.raises(InvalidInputError, match="at most 3"):
-        task.get_calibration_set(4)
-    with pytest.raises(InvalidInputError, match="at most 6"):
-        task.get_test_set(7)
-    parts = (task.get_calibration_set(3)[0], task.get_test_set(6)[0])
-    assert sorted(torch.cat(parts).flatten().tolist()) == list(range(9))
-
-
-def test_another_experiment_can_be_chosen(write_impulses: WriteImpulses) -> None:
-    write_impulses((1.0,) * 3)
-    root = write_impulses((2.0,) * 3, experiment="load_out_1_osr_downwind_4")
-    task = WindTunnel(root=root, experiment="load_out_1_osr_downwind_4")
-    assert task.get_test_set(2)[0].flatten().tolist() == [2.0, 2.0]
-
-
-def test_a_missing_file_is_named_with_the_ways_to_do_without(
-    write_impulses: WriteImpulses, tmp_path: Path
-) -> None:
-    task = WindTunnel()
-    assert task.get_simulations(3)[1].shape == (3, 50)
-    with pytest.raises(DataNotFoundError, match=r"`root`.*`download=True`") as error:
-        task.get_test_set(1)
-    message = str(error.value)
-    assert f"{DATASET}/{EXPERIMENT}.csv" in message
-    assert PAGE in message
-    assert "stand_in=True" in message
-    with pytest.raises(DataNotFoundError) as error:
-        WindTunnel(root=tmp_path).get_calibration_set(1)
-    assert str(tmp_path / DATASET / f"{EXPERIMENT}.csv") in str(error.value)
-    assert PAGE in str(error.value)
-    task = WindTunnel(root=write_impulses(), experiment="load_out_2")
-    with pytest.raises(DataNotFoundError, match=rf"load_out_2.*\['{EXPERIMENT}'\]"):
-        task.get_test_set(1)
-
-
-DAMAGES: list[tuple[Callable[[list[str]], list[str]], str | None]] = [
-    (
-        lambda rows: [rows[0].replace("hatch", "door"), *rows[1:]],
-        r"\['hatch'\] are missing.*again",
-    ),
-    (lambda rows: rows[:1], "to have rows"),
-    (
-        lambda rows: rows[:-1],
-        r"impulse 2 has a block of 49 rows from row 100\..*again",
-    ),
-    (
-        lambda rows: rows[:60] + rows[61:-3],
-        "impulse 1 has a block of 49 rows from row 50",
-    ),
-    (
-        lambda rows: rows[:1] + rows[2:51] + rows[1:2] + rows[51:],
-        None,
-    ),
-    (
-        lambda rows: rows + rows[1:51],
-        "impulse 0 has a block of 50 rows from row 150 and one before",
-    ),
-    (
-        lambda rows: rows[:51] + rows[51:52] + rows[51:],
-        "impulse 1 has a block of 51 rows",
-    ),
-    (
-        lambda rows: change(rows, 60, 4, "13.0"),
-        r"constant `hatch`.*during 1 of 3 \(first: impulse 1\).*again",
-    ),
-    (
-        lambda rows: rows[:101] + [r.replace(",45.0,", ",45.5,") for r in rows[101:]],
-        rf"{EXPERIMENT}.*support of the prior",
-    ),
-    (
-        lambda rows: change(rows, 7, 8, "nan"),
-        r"finite.*row 6 .*'pressure_downwind'",
-    ),
-    (
-        lambda rows: change(rows, 7, 10, ""),
-        r"finite.*row 6 .*'pressure_ambient'",
-    ),
-    (
-        lambda rows: change(rows, 7, 2, "six"),
-        r"finite.*row 6 .*'six'.*'flag'",
-    ),
-    (
-        lambda rows: change(rows, 7, 10, "1e39"),
-        "row 6 has '1e.39'",
-    ),
-    (lambda rows: change(rows, 7, 9, "nan"), None),
-]
-
-
-def test_a_damaged_file_is_refused_with_the_place_of_the_damage(
+def test_impulses_that_a_recording_cuts_are_left_out(
     write_impulses: WriteImpulses,
 ) -> None:
-    for edit, match in DAMAGES:
-        task = WindTunnel(root=write_impulses(edit=edit))
-        if match is None:
-            assert task.get_test_set(2)[1].shape == (2, 50)
-            continue
-        with pytest.raises(InvalidInputError, match=match):
-            task.get_test_set(1)
-
-
-def test_a_download_fetches_a_missing_data_set(
-    write_impulses: WriteImpulses, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    def dataset(name: str, *, root: object, download: bool) -> None:
-        folder = Path(str(root), name)
-        write_impulses()
-        (tmp_path / DATASET).rename(folder)
-
-    module = types.ModuleType("causalchamber.datasets")
-    module.Dataset = dataset  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "causalchamber", types.ModuleType("causalchamber"))
-    monkeypatch.setitem(sys.modules, "causalchamber.datasets", module)
-    task = WindTunnel(root=tmp_path / "new", download=True)
-    assert task.get_test_set(2)[1].shape == (2, 50)
-    assert task.has_data
+    # The first impulse has lost its beginning, the last one its end.
+    root = write_impulses(tuple(range(5)), edit=lambda rows: rows[:1] + rows[9:-3])
+    theta, x = all_recorded(WindTunnel(root=root), 3)
+    assert sorted(theta.flatten().tolist()) == [1.0, 2.0, 3.0]
+    first = x[theta.flatten().tolist().index(1.0)]
+    expected = torch.arange(50, 100) / 97
+    torch.testing.assert_close(first, expected, rtol=0.0, atol=1e-6)
+    task = WindTunnel(root=write_impulses((50.0, 1.0, 2.0)))
+    with pytest.raises(InvalidInputError, match="support of the prior"):
+        task.get_test_set(1)
 
 
 # From a file to a repaired posterior -------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:Maximum number of epochs")
-def test_rope_repairs_a_posterior_with_recorded_pairs(
-    write_impulses: WriteImpulses,
-) -> None:
-    # Eighteen impulses: six to calibrate with, twelve to test on.
-    theta, x = WindTunnel(variant="synthetic").get_test_set(18)
-    hatches = tuple(theta.flatten().tolist())
-    task = WindTunnel(root=write_impulses(hatches, pressures=x))
-    build = posterior_nn("nsf", embedding_net=task.get_embedding_net(light=True))
-    npe = train_npe(task, 500, build, ((1e-3, 50, 3),))
-
-    rope = RoPE(
-        npe.build_posterior(),
-        simulator=task.get_simulator(),
-        finetuner=CalibrationFinetuner(max_num_epochs=50),
-    )
-    rope.append_calibration(*task.get_calibration_set(6))
-    rope.train(seed=0, show_progress_bars=False)
-    theta_o, x_o = task.get_test_set(12)
-    with pytest.warns(match="batch of 12"):
-        posterior = rope.build_posterior(x_o, num_simulations=200, seed=0)
-    samples = posterior.sample_batched((100,), x=x_o, show_progress_bars=False)
-    assert samples.shape == (100, 12, 1)
-    assert ((samples >= 0) & (samples <= 45)).all()
-    log_prob = posterior.log_prob_batched(theta_o.unsqueeze(0), x=x_o)
-    assert torch.isfinite(log_prob).all()
 
 
 def all_recorded(task: WindTunnel, num: int) -> tuple[Tensor, Tensor]:
@@ -632,10 +344,3 @@ def all_recorded(task: WindTunnel, num: int) -> tuple[Tensor, Tensor]:
     parts = (task.get_calibration_set(third), task.get_test_set(num - third))
     theta, x = zip(*parts, strict=True)
     return torch.cat(theta), torch.cat(x)
-
-
-def change(rows: list[str], row: int, column: int, value: str) -> list[str]:
-    """Replace one value of a file; row 0 is the header."""
-    values = rows[row].split(",")
-    values[column] = value
-    return [*rows[:row], ",".join(values), *rows[row + 1 :]]

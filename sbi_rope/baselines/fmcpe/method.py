@@ -19,7 +19,6 @@ from sbi_rope._training import History, epochs_on_pairs, shuffled
 from sbi_rope.baselines.fmcpe.pushed_forward import PushedForward
 from sbi_rope.baselines.fmcpe.standardise import Standardise
 from sbi_rope.baselines.fmcpe.to_simulations import ToSimulations
-from sbi_rope.baselines.fmcpe.unbounded import Unbounded
 from sbi_rope.baselines.fmcpe.velocity import VelocityField
 from sbi_rope.baselines.networks import fresh_copy
 from sbi_rope.baselines.statistics import frozen_statistics
@@ -131,7 +130,6 @@ class FMCPE(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidInputError: If an argument has the wrong type.
         InvalidInputError: If sbi knows no estimator of that name, an argument is
             outside its range, or the prior has neither a support nor moments that sbi's
             ``mcmc_transform`` knows.
@@ -173,14 +171,12 @@ class FMCPE(Method):
         device: str | torch.device = "cpu",
     ) -> None:
         check("space", space, Literal["input", "embedding"])
-        if noise is not None:
-            check("noise", noise, Positive)
+        check("noise", noise, Positive | None)
         check("num_draws", num_draws, Count)
         check("simulations_per_pair", simulations_per_pair, Count)
         check("training", training, Training | None)
         npe = StartingNPE(density_estimator, npe_training)
         super().__init__(prior, npe=npe, simulator=simulator, device=device)
-        Unbounded(self._prior)  # early, for its error
         self.space: Space = space
         self.noise = noise
         self.num_draws = num_draws

@@ -62,7 +62,7 @@ class PushedForward(ConditionalDensityEstimator):
         theta = theta.expand(count, num_rows, -1)
         c = self.field.condition(condition)
         c = c.expand(num_rows, -1).repeat(count, 1)
-        u, log_scale, inside = self.unbounded.checked(theta.flatten(0, 1))
+        u, log_scale, inside = self.unbounded.transformed_inside(theta.flatten(0, 1))
         u_start, divergence = follow_back(self.field, u, c)
         start = self.unbounded.inverse(u_start)
         usable = self.unbounded.contains(start)

@@ -12,7 +12,6 @@ from sbi_rope._bounds import bounds_of
 from sbi_rope._random import seeded
 from sbi_rope._sbi import copy_of_prior
 from sbi_rope.baselines.fmcpe.standardise import Standardise
-from sbi_rope.errors import InvalidInputError
 
 __all__ = ["Unbounded"]
 
@@ -31,9 +30,6 @@ class Unbounded(nn.Module):
 
     Args:
         prior: A torch distribution over parameters of shape ``(d,)``.
-
-    Raises:
-        InvalidInputError: If sbi knows no transform of its support.
     """
 
     low: Tensor
@@ -56,16 +52,8 @@ class Unbounded(nn.Module):
     def _set_transform(self, device: torch.device) -> None:
         if hasattr(self.prior, "to"):
             self.prior.to(device)
-        try:
-            with seeded(0):  # sbi draws from the prior to look at it
-                transform = mcmc_transform(self.prior, device=str(device))
-        except Exception as error:  # sbi raises all kinds
-            raise InvalidInputError(
-                "Expected a prior whose `support` torch's `biject_to` knows, or which "
-                f"has a `mean` and a `stddev`; of this {type(self.prior).__name__} "
-                f"`mcmc_transform` says {type(error).__name__}: {error}"
-            ) from error
-        self._transform: Any = transform
+        with seeded(0):  # sbi draws from the prior to look at it
+            self._transform: Any = mcmc_transform(self.prior, device=str(device))
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:  # noqa: FBT001, FBT002
         before = self.unit.mean.device
@@ -87,14 +75,14 @@ class Unbounded(nn.Module):
 
     def contains(self, theta: Tensor) -> Tensor:
         """Tell which parameters ``(n, d)`` can be transformed."""
-        return self.checked(theta)[2]
+        return self.transformed_inside(theta)[2]
 
     def replaced(self, theta: Tensor) -> Tensor:
         """Replace parameters outside the prior's support by draws of the prior."""
         prior = self.prior.sample(torch.Size((len(theta),))).to(theta)
         return torch.where(self.contains(theta)[:, None], theta, prior)
 
-    def checked(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def transformed_inside(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Transform parameters that may be outside the prior's support.
 
         Returns:

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from sbi_rope._random import seeded
 from sbi_rope._sbi import (
-    embed,
     embedding_of,
     estimator_of,
     headless,
@@ -23,15 +22,12 @@ from sbi_rope.baselines.hvae.model import FrozenNPE, HybridVAE
 from sbi_rope.baselines.hvae.networks import (
     ConditionalUNet,
     LatentEncoder,
-    check_event_shape,
 )
 from sbi_rope.baselines.hvae.prior import ContinuedPrior
-from sbi_rope.baselines.hvae.reparametrisation import check_differentiable
 from sbi_rope.baselines.hvae.training import train_hybrid
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture import MixtureEstimator, Part
 from sbi_rope.settings import Count, NotNegative, check
-from sbi_rope.tensors import as_batch, as_numbers
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
 from sbi_rope.trainers.training import EstimatorBuilder, Training
@@ -49,8 +45,6 @@ DEFAULT_TRAINING = Training(
 START_LOG_VARIANCE = -9.0
 # Draws of z behind the loss on the held-out pairs.
 NUM_LATENTS_HELD_OUT = 8
-# Draws of the prior on which the physics is tried.
-NUM_DRAWS_CHECKED = 3
 
 
 class HVAE(Method):
@@ -112,8 +106,8 @@ class HVAE(Method):
         prior: A torch distribution over parameters of shape ``(d,)``, its support a
             box, whose sides may be infinite.
         density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns; a
-            normalizing flow. An embedding net inside it is copied, never trained in
-            place.
+            normalizing flow of nflows or zuko. An embedding net inside it is copied,
+            never trained in place.
         physics: f, from theta ``(n, d)`` to ``(n, *event)``: the simulator without
             noise and nuisances, differentiable by torch.
         npe_training: How NPE is trained; ``Training()`` if None.
@@ -131,12 +125,9 @@ class HVAE(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidInputError: If an argument has the wrong type.
         InvalidInputError: If an argument is outside its range, sbi knows no estimator
-            of that name, or the prior's support is not a box. In ``train``, if
-            observations are neither series nor images with sides of 16 or more, or if
-            the physics does not return differentiable ones.
-        UnsupportedPosteriorError: In ``train``, if the estimator is not a flow.
+            of that name, or the prior's support is not a box. In ``train``, if the
+            physics is not differentiable.
     """
 
     sees = frozenset({"simulations", "calibration", "observations"})
@@ -159,16 +150,10 @@ class HVAE(Method):
         device: str | torch.device = "cpu",
     ) -> None:
         check("training", training, Training | None)
-        if not callable(physics):
-            raise InvalidInputError(
-                "Expected `physics` to be callable, a differentiable function from "
-                f"theta (n, d) to (n, *event); got {type(physics).__name__}."
-            )
         check("width", width, Count)
         check("latent_dim", latent_dim, Count)
         check("num_latents", num_latents, Count)
-        if calibration_weight is not None:
-            check("calibration_weight", calibration_weight, NotNegative)
+        check("calibration_weight", calibration_weight, NotNegative | None)
         npe = StartingNPE(density_estimator, npe_training)
         super().__init__(prior, npe=npe, device=device)
         ContinuedPrior(self._prior)  # early, for its error
@@ -181,25 +166,14 @@ class HVAE(Method):
         self.residual = residual
         self.noisy = noisy
 
-    def _check_data(self) -> None:
-        # Before NPE is trained, which takes a while.
-        super()._check_data()
-        assert self._data.event_shape is not None
-        check_event_shape(tuple(self._data.event_shape))
-        with seeded(0):
-            theta = self._prior.sample(torch.Size((NUM_DRAWS_CHECKED,)))
-        theta = theta.to(self._device, torch.float32).requires_grad_()
-        x = as_numbers("physics(theta)", self.physics(theta))
-        as_batch("physics(theta)", x, self._data.event_shape)
-        if len(x) != len(theta) or not x.requires_grad:
-            raise InvalidInputError(
-                "Expected `physics` to be differentiable, with one result for each "
-                f"row of theta; got {len(x)} for {len(theta)} rows, with "
-                f"requires_grad={x.requires_grad}. Write it in torch, without "
-                "`detach`, `torch.no_grad` and conversions to NumPy."
-            )
-
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
+        with seeded(0):
+            theta = self._prior.sample(torch.Size((1,))).to(self._device, torch.float32)
+            if not self.physics(theta.requires_grad_()).requires_grad:
+                raise InvalidInputError(
+                    "Expected `physics` to be differentiable by torch; got a result "
+                    "without gradients."
+                )
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
         estimator = (
             copy.deepcopy(estimator_of(npe)).eval().requires_grad_(requires_grad=False)
@@ -244,7 +218,6 @@ class HVAE(Method):
     def _model(self, estimator: Any) -> HybridVAE:
         x = torch.cat([self._data.observations, self._data.calibration[1]])
         npe = FrozenNPE(embedding_of(estimator), headless(estimator))
-        check_differentiable(npe.flow, embed(npe.embedding, x[:2]))
         # One number a channel: pixels that never change have no standard deviation. Nor
         # has a channel that only rounding changes.
         channels = x.transpose(0, 1).flatten(1) if x.ndim == 4 else x.reshape(1, -1)

@@ -7,10 +7,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from sbi_rope.baselines.networks import embedding_with_head
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.settings import Count, check
 
-__all__ = ["ConditionalUNet", "LatentEncoder", "bounded", "check_event_shape"]
+__all__ = ["ConditionalUNet", "LatentEncoder", "bounded"]
 
 NUM_POOLINGS = 4
 MIN_SIZE = 2**NUM_POOLINGS
@@ -51,9 +49,6 @@ class ConditionalUNet(nn.Module):
         residual: Whether the mean starts at the input.
         log_variance: Where the log-variance starts, in standardised units.
 
-    Raises:
-        InvalidInputError: If events are neither series nor images, or too short.
-
     Example:
         >>> net = ConditionalUNet((50,), 5, width=4)
         >>> mean, log_variance = net(torch.randn(3, 50), torch.randn(3, 5))
@@ -76,9 +71,6 @@ class ConditionalUNet(nn.Module):
         log_variance: float = 0.0,
     ) -> None:
         super().__init__()
-        check_event_shape(event_shape)
-        check("latent_dim", latent_dim, Count)
-        check("width", width, Count)
         # A series is an image of one channel with one side.
         self.shape = event_shape if len(event_shape) == 3 else (1, *event_shape)
         self.residual = residual
@@ -175,18 +167,6 @@ class LatentEncoder(nn.Module):
 def bounded(log_variance: Tensor) -> Tensor:
     """Return log-variances in (-10, 10), nearly the same about 0."""
     return LOG_VARIANCE_BOUND * torch.tanh(log_variance / LOG_VARIANCE_BOUND)
-
-
-def check_event_shape(event_shape: tuple[int, ...]) -> None:
-    """Raise unless observations are series or images that can be halved four times."""
-    sides = event_shape[1:] if len(event_shape) == 3 else event_shape
-    if len(event_shape) not in (1, 3) or min(sides) < MIN_SIZE:
-        raise InvalidInputError(
-            f"Expected observations that are series of at least {MIN_SIZE} steps, "
-            "shape (n, length), or images of at least as many pixels a side, shape "
-            f"(n, channels, height, width); got (n, {', '.join(map(str, event_shape))})"
-            ". HVAE works on raw series and images, not on summary statistics."
-        )
 
 
 def _block(before: int, after: int, *, is_series: bool) -> nn.Sequential:

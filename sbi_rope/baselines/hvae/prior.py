@@ -57,9 +57,7 @@ class ContinuedPrior:
         bounds = bounds_of_prior(prior)
         if not bounds.are_all:
             raise InvalidInputError(
-                "Expected a prior whose support is a box, so that parameters outside "
-                f"of it can be brought back; got the {type(prior).__name__} {prior}. "
-                "HVAE does not apply to this prior."
+                f"Expected a prior whose support is a box; got {type(prior).__name__}."
             )
         self.std = std.to(device, torch.float32)
         self.low = bounds.low.to(self.std) + MARGIN * self.std

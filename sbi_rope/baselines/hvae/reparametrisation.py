@@ -5,9 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sbi_rope.errors import UnsupportedPosteriorError
-
-__all__ = ["check_differentiable", "reparametrised_sample"]
+__all__ = ["reparametrised_sample"]
 
 
 def reparametrised_sample(flow: Any, condition: Tensor) -> Tensor:
@@ -45,28 +43,3 @@ def reparametrised_sample(flow: Any, condition: Tensor) -> Tensor:
     # Zero, but for its gradient.
     step = torch.linalg.solve(jacobian, (noise - noise.detach()).unsqueeze(2))
     return theta - step.squeeze(2)
-
-
-def check_differentiable(flow: Any, condition: Tensor) -> None:
-    """Raise unless draws have a gradient with respect to the condition.
-
-    Args:
-        flow: An estimator of sbi without embedding net.
-        condition: Some of its conditions, shape ``(n, l)``.
-
-    Raises:
-        UnsupportedPosteriorError: If they have none, which is so for estimators other
-            than normalizing flows.
-    """
-    condition = condition.detach().requires_grad_()
-    try:
-        theta = reparametrised_sample(flow, condition)
-        torch.autograd.grad(theta.sum(), condition)
-    except (AttributeError, NotImplementedError, RuntimeError) as error:
-        raise UnsupportedPosteriorError(
-            "Expected a normalizing flow, whose draws have a gradient with respect to "
-            f"x; got {type(flow).__name__}. HVAE supports sbi's flows of nflows "
-            "('maf', 'maf_rqs', 'nsf') and of zuko ('zuko_maf', 'zuko_nsf', "
-            "'zuko_unaf', ...), but neither 'made', mixture density networks and mixed "
-            "estimators nor FMPE and NPSE."
-        ) from error

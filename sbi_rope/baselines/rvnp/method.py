@@ -19,12 +19,12 @@ from sbi_rope.baselines.rvnp.likelihood import ErrorModel, fit_surrogate
 from sbi_rope.baselines.statistics import (
     NoiseOn,
     SoftClip,
-    check_statistics,
     split_at_statistics,
     standardisation_of_statistics,
     with_clip,
 )
 from sbi_rope.settings import NotNegative, Range, check
+from sbi_rope.tensors import as_batch
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
 from sbi_rope.trainers.training import EstimatorBuilder, Training, train_network
@@ -121,7 +121,6 @@ class RVNP(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidInputError: If an argument has the wrong type.
         InvalidInputError: If sbi knows no estimator of that name, an option is outside
             its range, or, in ``train``, no statistic varies or one is missing (NaN).
         UnsupportedPosteriorError: In ``train``, if the estimator has no density.
@@ -186,7 +185,7 @@ class RVNP(Method):
         theta, x = self._data.simulations
         simulated, observed = embed(net, x), embed(net, self._data.observations)
         standardise = standardisation_of_statistics(simulated)
-        check_statistics("x_o", observed)
+        observed = as_batch("statistics of x_o", observed)
         clip = SoftClip(simulated)
         density, estimator = with_clip(estimator, clip, self.noise_on)
         s = standardise(simulated)

@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sbi_rope.errors import InvalidInputError, RoPEError
+from sbi_rope.errors import RoPEError
 from sbi_rope.tasks.hemodynamics.dataset import BeatSet, load
 from sbi_rope.tasks.hemodynamics.population import PROCESSES, Population
 from sbi_rope.tasks.hemodynamics.subject import NUM_SEGMENTS, Physics
@@ -202,10 +202,7 @@ def _draw(path: Path) -> None:
         f"The same {NUM_DRAWN} people in both processes, 25 (dark) to 75 years (bright)"
     )
     path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        figure.savefig(path, dpi=120)
-    except ValueError as error:  # of matplotlib, for a file name without a format
-        raise InvalidInputError(f"Cannot write {path}: {error}") from error
+    figure.savefig(path, dpi=120)
     print(f"\nWritten to {path}.")
 
 

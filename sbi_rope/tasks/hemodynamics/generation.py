@@ -4,25 +4,24 @@ import json
 import os
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from dataclasses import asdict
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 
+from sbi_rope._files import write_atomically
 from sbi_rope._processes import end_with
 from sbi_rope._progress import progress_bar
-from sbi_rope._validation import check_path
 from sbi_rope.errors import InvalidInputError, SimulationError
-from sbi_rope.settings import Count, Range, Whole, check, one_of
+from sbi_rope.settings import Count, Whole, check, one_of
 from sbi_rope.tasks.hemodynamics.chunks import Simulate, Work, read_part, run_chunk
 from sbi_rope.tasks.hemodynamics.dataset import (
     COLUMNS,
     FORMAT_VERSION,
     BeatSet,
-    describe_population,
-    differences,
     load,
 )
 from sbi_rope.tasks.hemodynamics.population import (
@@ -31,13 +30,12 @@ from sbi_rope.tasks.hemodynamics.population import (
     Population,
     Process,
 )
-from sbi_rope.tasks.hemodynamics.store import read_json, write_arrays, write_json
+from sbi_rope.tasks.hemodynamics.store import write_arrays
 from sbi_rope.tasks.hemodynamics.subject import Physics
 
 __all__ = ["generate"]
 
 CHUNK_SIZE = 20  # people in a file of the working folder, some ten seconds of work
-MAX_PEOPLE = 10**8  # a year of work for a thousand cores
 # A process that rejects this many more people than it accepts is not worth the wait.
 MAX_REJECTED = 200
 
@@ -84,20 +82,12 @@ def generate(
         SimulationError: If nearly nobody can be simulated.
         ImportError: If numba is not installed.
     """
-    path = Path(str(check_path("path", path)))
-    _check_free(path)
-    check("n", n, Annotated[int, Range(1, MAX_PEOPLE)])
+    path = Path(path).expanduser()
+    if path.exists():
+        raise InvalidInputError(f"Expected no file {path} yet; got one.")
+    check("n", n, Count)
     check("seed", seed, Whole)
     check("process", process, one_of(PROCESSES))
-    check("population", population, Population | None)
-    check("physics", physics, Physics | None)
-    if simulate is not None and not callable(simulate):
-        raise InvalidInputError(
-            "Expected `simulate` to be a function of a subject and its physics; got "
-            f"{type(simulate).__name__}."
-        )
-    if jobs is not None and jobs != -1:
-        check("jobs", jobs, Count)
     work = Work(
         process=process,
         seed=int(seed),
@@ -113,12 +103,14 @@ def generate(
         "process": process,
         "n": int(n),
         "seed": int(seed),
-        "population": describe_population(work.population, process),
-        "physics": work.physics.as_dict(),
+        # The lengths of arteries only matter for the real process.
+        "population": asdict(work.population)
+        if process == "real"
+        else {"prior": work.population.prior},
+        "physics": asdict(work.physics),
     }
     _claim(work.folder, settings)
     parts = _simulate_all(work, n, jobs, progress=progress)
-    _check_free(path)
     write_arrays(path, _assemble(parts, n, settings))
     _remove(work.folder)
     return load(path)
@@ -194,10 +186,7 @@ def _parallel(
     calls: Iterator[Any] = (
         joblib.delayed(_run_chunk_for)(os.getpid(), work, chunk) for chunk in chunks
     )
-    try:
-        parallel = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")
-    except ValueError:  # some backends only return everything at once
-        parallel = joblib.Parallel(n_jobs=jobs)
+    parallel = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")
     return parallel(calls)  # type: ignore[return-value]
 
 
@@ -209,30 +198,18 @@ def _run_chunk_for(parent: int, work: Work, chunk: range) -> tuple[int, int]:
 # Files -------------------------------------------------------------------------------
 
 
-def _check_free(path: Path) -> None:
-    if path.exists():
-        raise InvalidInputError(
-            f"Expected no file {path} yet. Remove it, or choose another name."
-        )
-
-
 def _claim(folder: Path, settings: dict[str, Any]) -> None:
     """Begin a working folder, or make sure that it is one of the same work."""
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / "settings.json"
     if not file.exists():
-        write_json(file, settings)
-    try:
-        found = read_json(file)
-        wrong = differences(found, settings)
-    except (ValueError, AttributeError) as error:
+        with write_atomically(file) as temporary:
+            temporary.write_text(json.dumps(settings, indent=1), encoding="utf-8")
+    found = json.loads(file.read_text(encoding="utf-8"))
+    if found != settings:
         raise InvalidInputError(
-            f"Expected {file} to hold settings; {error}. Remove {folder}."
-        ) from error
-    if wrong:
-        raise InvalidInputError(
-            f"Expected the unfinished work in {folder} to have the same settings; "
-            f"{wrong}. Go on with its settings, remove it, or choose another name."
+            f"Expected the unfinished work in {folder} to be of {settings}; got "
+            f"{found}. Remove it, or choose another name."
         )
 
 

@@ -6,7 +6,6 @@ import numpy as np
 from scipy.optimize import brentq
 
 from sbi_rope.errors import SimulationError
-from sbi_rope.settings import check
 from sbi_rope.tasks.hemodynamics import arteries
 from sbi_rope.tasks.hemodynamics.arteries import MMHG
 from sbi_rope.tasks.hemodynamics.subject import Physics, Subject
@@ -122,8 +121,6 @@ def build_network(subject: Subject, physics: Physics) -> Network:
     Raises:
         SimulationError: If no stiffness gives the subject's wave velocity.
     """
-    check("subject", subject, Subject)
-    check("physics", physics, Physics)
     columns = list(zip(*arteries.SEGMENTS, strict=True))
     inlet_node, outlet_node = np.array(columns[1]) - 1, np.array(columns[2]) - 1
     table_length = 1e-3 * np.array(columns[3])
@@ -217,10 +214,9 @@ def _solve_stiffness(
     low, high = np.log(STIFFNESS_RANGE)
     if femoral <= carotid or excess(low) > 0 or excess(high) < 0:
         raise SimulationError(
-            "Expected lengths of arteries that a pulse wave velocity between carotid "
-            f"and femoral artery of {subject.pulse_wave_velocity:g} m/s is possible "
-            f"with; got {carotid:.2g} m from the heart to the carotid and "
-            f"{femoral:.2g} m to the femoral artery. Look at `length_factors`."
+            "Expected arteries in which a pulse wave velocity of "
+            f"{subject.pulse_wave_velocity:g} m/s is possible; got {carotid:.2g} m "
+            f"from the heart to the carotid and {femoral:.2g} m to the femoral artery."
         )
     return float(np.exp(brentq(excess, low, high, xtol=1e-10)))  # type: ignore[arg-type]
 

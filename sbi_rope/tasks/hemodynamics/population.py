@@ -1,14 +1,13 @@
 """The law of the hearts and arteries of healthy men of 25 to 75 years."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.settings import NotNegative, Whole, check, one_of
+from sbi_rope.settings import Range, Settings
 from sbi_rope.tasks.hemodynamics import population_tables as tables
 from sbi_rope.tasks.hemodynamics.subject import NUM_SEGMENTS, Subject
 
@@ -48,7 +47,7 @@ PROXIMAL_AORTA = (0, 1)  # indices of ascending aorta and first part of the arch
 
 
 @dataclass(frozen=True, kw_only=True)
-class Population:
+class Population(Settings):
     r"""The joint law of a person's heart, arteries and microvasculature.
 
     Age is uniform from 25 to 75 years. Given the age, stroke volume :math:`V`, heart
@@ -94,38 +93,17 @@ class Population:
             :math:`\mathcal{N}(282, 23.3^2)`, cut at two standard deviations, whatever
             the age and the heart rate.
 
-    Raises:
-        InvalidInputError: If a scatter is out of range, or the prior unknown.
-
     Example:
         >>> person = Population().draw("simulator", seed=0, index=0)
         >>> 25 < person.age < 75 and set(person.length_factors) == {1.0}
         True
     """
 
-    height_sd: float = 0.10
-    segment_sd: float = 0.15
+    # At larger scatters, some arteries are all but gone and others metres long.
+    height_sd: Annotated[float, Range(0, 0.4)] = 0.10
+    segment_sd: Annotated[float, Range(0, 0.5)] = 0.15
     proximal_aorta: bool = True
     prior: Literal["population", "independent"] = "population"
-
-    def __post_init__(self) -> None:
-        # At larger scatters, some arteries are all but gone and others metres long.
-        for name, largest in (("height_sd", 0.4), ("segment_sd", 0.5)):
-            value = getattr(self, name)
-            check(name, value, NotNegative)
-            if value > largest:
-                raise InvalidInputError(
-                    f"Expected `{name}` from 0 to {largest}; got {value!r}."
-                )
-        check("proximal_aorta", self.proximal_aorta, bool)
-        check("prior", self.prior, Literal["population", "independent"])
-
-    def as_dict(self) -> dict[str, float | bool | str]:
-        """Return all settings by name, as stored with a data set."""
-        scatters = {
-            name: float(getattr(self, name)) for name in ("height_sd", "segment_sd")
-        }
-        return asdict(self) | scatters
 
     def draw(self, process: Process, seed: int, index: int) -> Subject:
         """Return one person, always the same for the same arguments.
@@ -135,13 +113,7 @@ class Population:
             seed: Number of the cohort.
             index: Number of the person in the cohort. Persons are independent of each
                 other, within and between processes.
-
-        Raises:
-            InvalidInputError: If an argument is none of these.
         """
-        check("process", process, one_of(PROCESSES))
-        check("seed", seed, Whole)
-        check("index", index, Whole)
         entropy = [seed, PROCESSES.index(process), index]
         rng = np.random.default_rng(np.random.SeedSequence(entropy))
         age, stroke_volume, heart_rate, ejection_time = self._draw_heart(rng)

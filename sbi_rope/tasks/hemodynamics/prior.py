@@ -9,7 +9,6 @@ from torch.distributions import Distribution, biject_to, constraints
 from torch.distributions.transforms import IndependentTransform, Transform
 from torch.nn.functional import logsigmoid
 
-from sbi_rope.settings import check
 from sbi_rope.tasks.hemodynamics.population import Population
 from sbi_rope.tasks.hemodynamics.prior_table import Band, prior_table
 
@@ -57,17 +56,14 @@ class PopulationPrior(Distribution):
         *,
         validate_args: bool | None = None,
     ) -> None:
-        check("population", population, Population | None)
         table = prior_table((population or Population()).prior)
         self._band = table.band
-        # A caller's inference mode would make tensors that later gradients refuse.
-        with torch.inference_mode(mode=False):
-            self._density = torch.from_numpy(table.density.copy())
-            self._marginal_grid = torch.from_numpy(table.marginal_grid.copy())
-            self._marginal_cdf = torch.from_numpy(table.marginal_cdf.copy())
-            self._moments = torch.tensor(
-                [table.mean, table.variance], dtype=torch.float32, device="cpu"
-            )
+        self._density = torch.from_numpy(table.density.copy())
+        self._marginal_grid = torch.from_numpy(table.marginal_grid.copy())
+        self._marginal_cdf = torch.from_numpy(table.marginal_cdf.copy())
+        self._moments = torch.tensor(
+            [table.mean, table.variance], dtype=torch.float32, device="cpu"
+        )
         super().__init__(
             batch_shape=Size(), event_shape=Size((2,)), validate_args=validate_args
         )

@@ -6,10 +6,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import check_device
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.settings import NotNegative, check
-from sbi_rope.tensors import as_batch, as_numbers, check_same_length
+from sbi_rope.settings import NotNegative, Settings
 
 __all__ = ["NUM_STEPS", "SAMPLE_RATE", "Recorder"]
 
@@ -23,7 +20,7 @@ Normalisation = Literal["per_record", "global"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recorder:
+class Recorder(Settings):
     r"""Turns beats into normalised, noisy recordings that begin at any time.
 
     With a beat :math:`p` of period :math:`T`, repeated for ever,
@@ -46,12 +43,8 @@ class Recorder:
         torch.Size([3, 1000])
     """
 
-    noise_std: float = 0.05
+    noise_std: NotNegative = 0.05
     normalisation: Normalisation = "per_record"
-
-    def __post_init__(self) -> None:
-        check("noise_std", self.noise_std, NotNegative)
-        check("normalisation", self.normalisation, Literal["per_record", "global"])
 
     def __call__(
         self, beat: Tensor, period: Tensor, *, generator: torch.Generator | None = None
@@ -66,8 +59,6 @@ class Recorder:
         Returns:
             Recordings, shape ``(n, 1000)``, with the dtype of ``beat``.
         """
-        _check_beats(beat, period)
-        check("generator", generator, torch.Generator | None)
         like = {"dtype": beat.dtype, "device": beat.device}
         start = torch.rand((len(beat),), generator=generator, **like)
         noise = torch.randn((len(beat), NUM_STEPS), generator=generator, **like)
@@ -79,28 +70,7 @@ class Recorder:
             mean, scale = GLOBAL_SCALE
             return (pressure - mean) / scale
         centred = pressure - pressure.mean(dim=1, keepdim=True)
-        if not centred.any(dim=1).all():
-            raise InvalidInputError(
-                "Expected every `beat` to vary; got one with a single pressure, which "
-                "has no scale. Pass `normalisation='global'`, or leave it out."
-            )
         return centred / centred.square().mean(dim=1, keepdim=True).sqrt()
-
-
-def _check_beats(beat: Tensor, period: Tensor) -> None:
-    if as_numbers("beat", beat).ndim != 2 or not beat.is_floating_point():
-        raise InvalidInputError(
-            "Expected `beat` of shape (n, m), floating-point numbers; got "
-            f"{tuple(beat.shape)}, {beat.dtype}."
-        )
-    as_batch("beat", beat, beat.shape[1:], empty=True)
-    as_batch("period", period, (), empty=True)
-    check_same_length("beat", beat, "period", period)
-    check_device("period", period, beat.device, where="`beat`")
-    if not (period > 0).all():
-        raise InvalidInputError(
-            f"Expected `period` to be positive; got {float(period.min())}."
-        )
 
 
 def play(beat: Tensor, period: Tensor, *, start: Tensor) -> Tensor:

@@ -1,16 +1,14 @@
-"""Writes arrays and settings to files, whole or not at all, always the same bytes."""
+"""Writes arrays to files, whole or not at all, always the same bytes."""
 
-import json
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sbi_rope._files import write_atomically
 
-__all__ = ["read_json", "write_arrays", "write_json"]
+__all__ = ["write_arrays"]
 
 FIXED_DATE = (1980, 1, 1, 0, 0, 0)  # equal arrays make equal files
 
@@ -27,18 +25,3 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
                 np.lib.format.write_array(
                     file, np.asarray(array, order="C"), allow_pickle=False
                 )
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write settings to a file that is there once it is whole."""
-    with write_atomically(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=1), encoding="utf-8")
-
-
-def read_json(path: Path) -> Any:
-    """Read settings.
-
-    Raises:
-        ValueError: If the file does not hold any.
-    """
-    return json.loads(path.read_text(encoding="utf-8"))

@@ -1,35 +1,19 @@
 """A person in the model of the circulation, and settings to solve it with."""
 
-from dataclasses import dataclass, fields
-from typing import Annotated, Any
+from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
-from sbi_rope.errors import InvalidInputError, shown
-from sbi_rope.settings import Number, Positive, Range, UnitInterval, check
+from sbi_rope.settings import Positive, Range, Settings, UnitInterval
 
 __all__ = ["NUM_SEGMENTS", "Beat", "Physics", "Subject"]
 
 NUM_SEGMENTS = 116
-# Beyond these, a number is taken for a mistake, of units most likely.
-PHYSIOLOGICAL = {
-    "age": (18.0, 100.0),
-    "heart_rate": (30.0, 200.0),
-    "stroke_volume": (10.0, 200.0),
-    "ejection_time": (100.0, 600.0),
-    "peak_flow_time": (20.0, 300.0),
-    "regurgitant_volume": (0.0, 20.0),
-    "mean_pressure": (50.0, 180.0),
-    "diastolic_pressure": (30.0, 140.0),
-    "outflow_pressure": (0.0, 50.0),
-    "pulse_wave_velocity": (3.0, 20.0),
-    "diameter_factor": (0.5, 2.0),
-    "compliance_factor": (0.05, 5.0),
-}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Subject:
+class Subject(Settings):
     """A person's heart, arteries and microvasculature.
 
     Attributes:
@@ -52,46 +36,20 @@ class Subject:
         length_factors: Length of each of the 116 segments relative to the table.
     """
 
-    age: float
-    heart_rate: float
-    stroke_volume: float
-    ejection_time: float
-    peak_flow_time: float
-    regurgitant_volume: float
-    mean_pressure: float
-    diastolic_pressure: float
-    outflow_pressure: float
-    pulse_wave_velocity: float
-    diameter_factor: float
-    compliance_factor: float
+    # Beyond these, a number is taken for a mistake, of units most likely.
+    age: Annotated[float, Range(18, 100)]
+    heart_rate: Annotated[float, Range(30, 200)]
+    stroke_volume: Annotated[float, Range(10, 200)]
+    ejection_time: Annotated[float, Range(100, 600)]
+    peak_flow_time: Annotated[float, Range(20, 300)]
+    regurgitant_volume: Annotated[float, Range(0, 20)]
+    mean_pressure: Annotated[float, Range(50, 180)]
+    diastolic_pressure: Annotated[float, Range(30, 140)]
+    outflow_pressure: Annotated[float, Range(0, 50)]
+    pulse_wave_velocity: Annotated[float, Range(3, 20)]
+    diameter_factor: Annotated[float, Range(0.5, 2)]
+    compliance_factor: Annotated[float, Range(0.05, 5)]
     length_factors: tuple[float, ...]
-
-    def __post_init__(self) -> None:
-        for name, (low, high) in PHYSIOLOGICAL.items():
-            value = getattr(self, name)
-            check(name, value, Number)
-            if not low <= value <= high:
-                raise InvalidInputError(
-                    f"Expected `{name}` from {low:g} to {high:g}; got {value!r}. Units "
-                    "are years, beats per minute, ml, ms, mmHg and m/s."
-                )
-        if self.ejection_time >= 1000 * self.period:
-            raise InvalidInputError(
-                f"Expected `ejection_time` below the length of a beat, "
-                f"{1000 * self.period:.0f} ms at this heart rate; got "
-                f"{self.ejection_time:g} ms."
-            )
-        if self.peak_flow_time >= self.ejection_time:
-            raise InvalidInputError(
-                f"Expected `peak_flow_time` below `ejection_time`; got "
-                f"{self.peak_flow_time:g} and {self.ejection_time:g} ms."
-            )
-        if self.outflow_pressure >= self.mean_pressure:
-            raise InvalidInputError(
-                f"Expected `outflow_pressure` below `mean_pressure`; got "
-                f"{self.outflow_pressure:g} and {self.mean_pressure:g} mmHg."
-            )
-        _check_factors(self.length_factors)
 
     @property
     def period(self) -> float:
@@ -100,7 +58,7 @@ class Subject:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Physics:
+class Physics(Settings):
     """Settings with which the equations of blood flow are solved.
 
     Attributes:
@@ -116,45 +74,14 @@ class Physics:
         max_period_error: Largest difference between the last two beats, in mmHg.
     """
 
-    cell_length: float = 0.01
-    min_segment_length: float = 0.01
-    courant: float = 0.6
-    fallback_courant: float = 0.4
-    num_cycles: int = 10
+    cell_length: Positive = 0.01
+    min_segment_length: Positive = 0.01
+    courant: UnitInterval = 0.6
+    fallback_courant: UnitInterval = 0.4
+    num_cycles: Annotated[int, Range(2)] = 10
     viscoelastic: bool = True
-    convection: float = 4 / 3
-    max_period_error: float = 0.3
-
-    def __post_init__(self) -> None:
-        lengths = ("cell_length", "min_segment_length", "max_period_error")
-        for name in (*lengths, "convection"):
-            check(name, getattr(self, name), Positive)
-        for name in ("courant", "fallback_courant"):
-            check(name, getattr(self, name), Positive)
-            check(name, getattr(self, name), UnitInterval)
-        check("num_cycles", self.num_cycles, Annotated[int, Range(2)])
-        check("viscoelastic", self.viscoelastic, bool)
-
-    def as_dict(self) -> dict[str, float | int | bool]:
-        """Return all settings by name, as stored with a data set."""
-        # Plain numbers, whatever kind they were given as.
-        kinds = {"num_cycles": int, "viscoelastic": bool}
-        return {
-            field.name: kinds.get(field.name, float)(getattr(self, field.name))
-            for field in fields(self)
-        }
-
-
-def _check_factors(factors: Any) -> None:
-    try:
-        values = np.asarray(factors, dtype=float)
-    except (TypeError, ValueError, OverflowError):
-        values = np.full(0, np.nan)
-    if values.shape != (NUM_SEGMENTS,) or not ((values > 0) & (values < np.inf)).all():
-        raise InvalidInputError(
-            f"Expected `length_factors` to be {NUM_SEGMENTS} positive numbers; got "
-            f"{shown(factors)}."
-        )
+    convection: Positive = 4 / 3
+    max_period_error: Positive = 0.3
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,18 +9,17 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._validation import check_path
 from sbi_rope.errors import InvalidInputError
-from sbi_rope.settings import Positive, check
-from sbi_rope.tasks.base import Task, check_parameters, check_theta
-from sbi_rope.tasks.hemodynamics.dataset import BeatSet, differences, load
+from sbi_rope.settings import check
+from sbi_rope.tasks.base import Task
+from sbi_rope.tasks.hemodynamics.dataset import BeatSet, load
 from sbi_rope.tasks.hemodynamics.population import Population, Process
 from sbi_rope.tasks.hemodynamics.prior import PopulationPrior
 from sbi_rope.tasks.hemodynamics.records import NUM_STEPS, Normalisation, Recorder
 from sbi_rope.tasks.networks import SeriesEmbedding, light_series_embedding
 from sbi_rope.tasks.settings import PaperSettings
 from sbi_rope.tasks.splits import DrawnPairs, Part, RecordedPairs, generator_of
-from sbi_rope.tensors import check_in_support
+from sbi_rope.tensors import as_batch, check_in_support
 
 __all__ = ["Hemodynamics", "NearestBeatSimulator"]
 
@@ -59,7 +58,7 @@ class NearestBeatSimulator:
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, 2)``, to shape ``(n, 1000)``."""
-        theta = check_theta(theta, 2)
+        theta = as_batch("theta", theta, (2,), empty=True)
         device = theta.device
         scale = self.theta_std.to(device)
         stored = self.theta.to(device) / scale
@@ -168,12 +167,10 @@ class Hemodynamics(Task):
         normalisation: Normalisation = "per_record",
     ) -> None:
         super().__init__(variant=variant, root=root, label_noise=label_noise)
-        check("noise_std", noise_std, Positive)
         check("prior", prior, Literal["population", "independent"])
         self.prior: Literal["population", "independent"] = prior
-        self.simulations = check_path("simulations", simulations, optional=True)
-        observations = check_path("observations", observations, optional=True)
-        self.observations = self._option("observations", observations, None)
+        self.simulations = simulations
+        self.observations = observations
         self.recorder = Recorder(noise_std=noise_std, normalisation=normalisation)
 
     def get_prior(self) -> PopulationPrior:
@@ -182,8 +179,7 @@ class Hemodynamics(Task):
 
     def prior_quantiles(self, theta: Tensor) -> Tensor:
         """Return the distribution functions of both parameters, ``(n, 2)``."""
-        prior = self.get_prior()
-        return prior.marginal_cdf(check_parameters(theta, prior))
+        return self.get_prior().marginal_cdf(theta)
 
     def get_simulator(self) -> NearestBeatSimulator:
         """Return the simulator that looks simulated people up."""
@@ -199,7 +195,6 @@ class Hemodynamics(Task):
 
     def get_embedding_net(self, *, light: bool = False) -> nn.Module:
         """Return the paper's convolutional network or a light one, of five outputs."""
-        check("light", light, bool)
         if light:
             return light_series_embedding(num_steps=NUM_STEPS, output_dim=5)
         pools = ((4, 2), (4, 2), (4, 1))
@@ -214,11 +209,10 @@ class Hemodynamics(Task):
     def _real_process(self, part: Part) -> RecordedPairs:
         people = self._load(self.observations, "real")
         simulated = self._load(self.simulations, "simulator")
-        wrong = differences(people.settings["physics"], simulated.settings["physics"])
-        if wrong:
+        if people.settings["physics"] != simulated.settings["physics"]:
             raise InvalidInputError(
-                f"Expected `observations` made with the physics of `simulations`; "
-                f"{wrong}. Make one of them again with the other's settings."
+                "Expected `observations` made with the physics of `simulations`; got "
+                f"{people.settings['physics']} and {simulated.settings['physics']}."
             )
         return self._recorded(people)
 
@@ -236,15 +230,15 @@ class Hemodynamics(Task):
         read_x = partial(_record_once, self.recorder, beat, period, keys)
         return RecordedPairs(theta=people.theta[chosen], read_x=read_x)
 
-    def _load(self, path: Path | None, process: Process) -> BeatSet:
+    def _load(self, path: str | Path | None, process: Process) -> BeatSet:
         if path is None:
-            path = Path(str(files(SHIPPED) / f"{process}.npz"))
+            path = str(files(SHIPPED) / f"{process}.npz")
         people = load(path, process=process)
         made_with = people.settings["population"]["prior"]
         if made_with != self.prior:
             raise InvalidInputError(
                 f"Expected people of the prior {self.prior!r} in {path}; got those of "
-                f"{made_with!r}. Pass `prior={made_with!r}`, or other files."
+                f"{made_with!r}. Pass `prior={made_with!r}`."
             )
         check_in_support(f"theta of {path}", people.theta, self.get_prior())
         return people

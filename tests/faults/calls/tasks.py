@@ -33,7 +33,7 @@ CALLS = [
     Call(
         name="get_task",
         run=lambda name="pendulum", **options: get_task(name, **options).theta_dim,
-        options={"name": "choice", "variant": "choice", "root": "path"},
+        options={"name": "choice", "variant": "choice"},
     ),
     *(
         Call(
@@ -45,25 +45,6 @@ CALLS = [
         )
         for name in WITH_SETS
         for method in ("get_calibration_set", "get_test_set", "get_simulations")
-    ),
-    *(
-        Call(
-            name=f"num_recorded({name})",
-            run=lambda part="test", seed=0, name=name: made(name).num_recorded(
-                part, seed=seed
-            ),
-            options={"part": "choice", "seed": "seed"},
-        )
-        for name in WITH_SETS
-    ),
-    *(
-        Call(
-            name=f"prior_quantiles({name})",
-            run=lambda theta, name=name: made(name).prior_quantiles(theta),
-            tensors={"theta": some_theta(name)},
-            accepts=("theta: one row less", "theta: no rows", *OTHER_DTYPES),
-        )
-        for name in NAMES
     ),
     *(
         Call(
