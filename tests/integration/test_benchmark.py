@@ -205,7 +205,7 @@ def test_a_failing_method_does_not_stop_the_others_and_is_no_success(
         assert main([*command, *more]) == 1
         printed = capsys.readouterr().out
         assert counts in printed
-        assert "failed: sir HVAE n_c=10 #0: AttributeError: " in printed
+        assert "failed: sir HVAE n_c=10 #0: " in printed
     assert main([*command, "--method", "prior"]) == 0
 
 
