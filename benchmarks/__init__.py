@@ -8,9 +8,7 @@ In the order of the work:
 - `cases.py`: the data of a cell, and the NPE that methods share.
 - `scoring.py`: scores of cells, and what they cost.
 - `runner.py`: runs cells in parallel. `store.py` keeps what they gave.
-- `schema.py` and `table.py`: the table of a suite, and how it is checked.
-- `report.py`, `figures.py`, `stacks.py`: the page of a suite.
-- `published.py`, `statements.py`, `other_suites.py`, `summary.py`: the page of all.
+- `published.py`: selects and compares results; `pages.py` and `figures.py` show them.
 - `__main__.py`: the command.
 
 What is measured beside it is in `experiments/`, one module for each question.

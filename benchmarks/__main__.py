@@ -3,15 +3,14 @@
     python -m benchmarks run smoke
     python -m benchmarks run main --task pendulum --jobs 2 --root FOLDER
     python -m benchmarks status
-    python -m benchmarks restore
-    python -m benchmarks report
+    python -m benchmarks figures
     python -m benchmarks summary
-    python -m benchmarks claims
 
-Cells that are finished are kept, whichever suite asked for them, and are not computed
-again. Cells that failed are kept with their error; `--retry` computes them again. `run`
-ends with status 1 if one of its cells failed or has no result. `restore` makes cells of
-the committed tables, so that `run` computes only what these do not hold.
+`run` keeps each result in `OUT/SUITE` as soon as it is there, and computes only what is
+missing; `--retry` also what failed. It ends with status 1 if a cell failed. `status`
+counts cells, `figures` draws the pictures of suites, and `summary` writes the tables of
+README, of `benchmarks/results/README.md` and of pages of docs. With
+`--out benchmarks/results` it goes on from the committed results.
 """
 
 import argparse
@@ -19,18 +18,13 @@ import contextlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from benchmarks.blocks import pages_with_blocks
 from benchmarks.cases import Sources
-from benchmarks.cells import Suite, list_suites, load_suite
-from benchmarks.claims import claims, missing_claims
-from benchmarks.prices import Prices
+from benchmarks.cells import list_suites, load_suite
+from benchmarks.figures import draw_all, draw_overview
+from benchmarks.pages import pages_with_blocks, write_pages
 from benchmarks.published import Published
-from benchmarks.report import write_report
-from benchmarks.runner import run_cells
-from benchmarks.store import Workplace
-from benchmarks.summary import write_summary
-from benchmarks.table import COUNTED, Table, read_table, restore_cells, write_table
-from sbi_rope.errors import InvalidInputError, RoPEError
+from benchmarks.runner import Workplace, run_cells
+from benchmarks.store import Results
 
 DEFAULT_OUT = Path("results/benchmark")
 PUBLISHED = Path(__file__).parent / "results"
@@ -46,31 +40,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     run = commands.add_parser("run", help="run the cells of a suite")
-    run.set_defaults(command=_run)
+    run.set_defaults(command=_run, out=DEFAULT_OUT)
     run.add_argument("suite", help=f"one of {', '.join(list_suites())}, or a TOML file")
-    run.add_argument(
-        "--task", nargs="+", action="extend", dest="tasks", help="these tasks only"
-    )
-    run.add_argument(
-        "--method",
-        nargs="+",
-        action="extend",
-        dest="methods",
-        help="these methods only",
-    )
-    run.add_argument(
-        "--repetition",
-        nargs="+",
-        action="extend",
-        type=int,
-        dest="repetitions",
-        help="these only",
-    )
+    for name, kind in (("task", str), ("method", str), ("repetition", int)):
+        run.add_argument(
+            f"--{name}",
+            nargs="+",
+            action="extend",
+            type=kind,
+            dest=f"{name}s",
+            help="these only",
+        )
     run.add_argument("--jobs", type=int, default=1, help="at a time; -1: all cores")
     run.add_argument(
         "--backend",
         default="loky",
-        choices=["loky", "multiprocessing", "threading", "sequential", "dask"],
+        choices=["loky", "sequential", "dask"],
         help="backend of joblib (%(default)s)",
     )
     run.add_argument("--scheduler", help="address of a dask scheduler")
@@ -81,59 +66,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     run.add_argument("--again", action="store_true", help="also what is finished")
     run.add_argument("--retry", action="store_true", help="also what failed")
-    _add_out(run, DEFAULT_OUT)
-
-    status = commands.add_parser("status", help="count cells, price those not run")
-    status.set_defaults(command=_status)
-    _add_out(status, DEFAULT_OUT)
-
-    restore = commands.add_parser("restore", help="take over what is committed")
-    restore.set_defaults(command=_restore)
-    restore.add_argument(
-        "--tables", type=Path, default=PUBLISHED, help="folder of tables (%(default)s)"
-    )
-    _add_out(restore, DEFAULT_OUT)
-
-    report = commands.add_parser("report", help="write tables and figures again")
-    report.set_defaults(command=_report)
-    report.add_argument("suites", nargs="*", help="all that have results if none")
-    _add_out(report, PUBLISHED)
-
-    summary = commands.add_parser("summary", help="write what all suites say together")
-    summary.set_defaults(command=_summary)
-    summary.add_argument(
-        "--pages",
-        type=Path,
-        nargs="+",
-        help="files with places for blocks of results (README and pages of docs)",
-    )
-    _add_out(summary, PUBLISHED)
-
-    claims = commands.add_parser("claims", help="check sentences of docs that count")
-    claims.set_defaults(command=_claims)
-    _add_out(claims, PUBLISHED)
+    status = commands.add_parser("status", help="count cells")
+    status.set_defaults(command=_status, out=DEFAULT_OUT)
+    figures = commands.add_parser("figures", help="draw the pictures of suites")
+    figures.set_defaults(command=_figures, out=PUBLISHED)
+    figures.add_argument("suites", nargs="*", help="all if none")
+    summary = commands.add_parser("summary", help="write the tables of all pages")
+    summary.set_defaults(command=_summary, out=PUBLISHED)
+    for command in (run, status, figures, summary):
+        out = command.get_default("out")
+        command.add_argument("--out", type=Path, default=out, help="(%(default)s)")
     args = parser.parse_args(arguments)
-    try:
-        return args.command(args)
-    except RoPEError as error:
-        # What the user can put right: the message says how, a traceback would hide it.
-        raise SystemExit(f"{type(error).__name__}: {error}") from error
-
-
-def _add_out(parser: argparse.ArgumentParser, default: Path) -> None:
-    parser.add_argument("--out", type=Path, default=default, help="(%(default)s)")
+    return args.command(args)
 
 
 def _run(args: argparse.Namespace) -> int:
-    if args.jobs == 0:
-        raise InvalidInputError("Expected `--jobs` of 1 or more, or -1; got 0.")
-    if args.scheduler and args.backend != "dask":
-        raise InvalidInputError("Expected `--backend dask` with `--scheduler`.")
     suite = load_suite(args.suite)
     cells = suite.select(
         tasks=args.tasks, methods=args.methods, repetitions=args.repetitions
     )
-    workplace = Workplace(
+    results = Results(args.out / suite.name)
+    place = Workplace(
         folder=args.out,
         sources=Sources(root=args.root, hemodynamics=args.hemodynamics),
         device=args.device,
@@ -141,26 +94,24 @@ def _run(args: argparse.Namespace) -> int:
     with _scheduler(args):
         counts = run_cells(
             cells,
-            workplace,
+            results,
+            place,
             jobs=args.jobs,
             backend=args.backend,
             again=args.again,
             retry=args.retry,
         )
+    results.tidy(suite.cells)
+    draw_all(suite, results)
+    rows = results.rows.loc[cells]
+    table = rows.pivot_table("lpp_z", "method", ["task", "n_calibration"], sort=False)
+    print(table.round(2).to_string(na_rep="-"))
+    failed = rows["error"][rows["status"] == "failed"]
+    for cell, error in failed.items():
+        print(f"failed: {cell}: {error.splitlines()[0][:150]}")
     print(", ".join(f"{count} {what}" for what, count in counts.items()))
-    folder = args.out / suite.name
-    table = write_table(suite, workplace.results, folder)
-    path = write_report(suite, table, folder)
-    print(f"Written: {path}")
-    unfinished = 0
-    for cell, status in zip(cells, table.statuses(cells), strict=True):
-        if status == "not run":
-            print(f"no result: {cell}")
-        elif status == "failed":
-            error = table.rows["error"][cell].splitlines()[0]
-            print(f"failed: {cell}: {error[:150]}")
-        unfinished += status != "finished"
-    return 1 if unfinished else 0
+    print(f"Written: {results.path}")
+    return 1 if len(failed) else 0
 
 
 @contextlib.contextmanager
@@ -181,65 +132,28 @@ def _scheduler(args: argparse.Namespace) -> Iterator[None]:
 
 
 def _status(args: argparse.Namespace) -> int:
-    results = Workplace(folder=args.out, sources=Sources()).results
-    suites = [load_suite(name) for name in list_suites()]
-    cells = dict.fromkeys(cell for suite in suites for cell in suite.cells)
-    rows = {cell: row for cell in cells if (row := results.read(cell)) is not None}
-    table = Table.of(rows, {})
-    prices = Prices([table.finished])
-    counts = "".join(f"{what:>10}" for what in ("cells", *COUNTED))
-    print(f"{'suite':<14}{counts}  hours of a core")
-    for suite in suites:
-        statuses = table.statuses(suite.cells)
-        numbers = len(statuses), *(statuses.count(what) for what in COUNTED)
-        counts = "".join(f"{number:>10}" for number in numbers)
-        print(f"{suite.name:<14}{counts}  {prices.of(table.not_run(suite))}")
-    print("? stands for what a cell of a method takes that was never run.")
+    print(f"{'suite':<14}{'cells':>10}{'finished':>10}{'failed':>10}{'not run':>10}")
+    for name in list_suites():
+        cells = load_suite(name).cells
+        known = Results(args.out / name).rows["status"].to_dict()
+        found = [known.get(cell, "not run") for cell in cells]
+        counts = [found.count(what) for what in ("finished", "failed", "not run")]
+        print(f"{name:<14}" + "".join(f"{n:>10}" for n in (len(cells), *counts)))
     return 0
 
 
-def _restore(args: argparse.Namespace) -> int:
-    results = Workplace(folder=args.out, sources=Sources()).results
-    for name in _with_tables(args.tables):
-        table = read_table(load_suite(name), args.tables / name)
-        print(f"{name}: {restore_cells(table, results)} cells restored")
-    return 0
-
-
-def _with_tables(folder: Path) -> list[str]:
-    """Return the suites that a folder holds tables of."""
-    names = [name for name in list_suites() if (folder / name / "results.csv").exists()]
-    if not names:
-        raise SystemExit(f"No results in {folder}. Use `run` first, or another folder.")
-    return names
-
-
-def _report(args: argparse.Namespace) -> int:
-    for name in args.suites or _with_tables(args.out):
-        suite: Suite = load_suite(name)
-        folder = args.out / suite.name
-        if not (folder / "results.csv").exists():
-            raise SystemExit(f"No results of {suite.name} in {args.out}.")
-        print(f"Written: {write_report(suite, read_table(suite, folder), folder)}")
+def _figures(args: argparse.Namespace) -> int:
+    for name in args.suites or list_suites():
+        print(*draw_all(load_suite(name), Results(args.out / name)), sep="\n")
     return 0
 
 
 def _summary(args: argparse.Namespace) -> int:
-    pages = args.pages or pages_with_blocks(ROOT)
-    page = write_summary(args.out, pages=pages)
-    print(f"Written: {', '.join(map(str, (page, *pages)))}")
+    published, pages = Published.read(args.out), pages_with_blocks(ROOT)
+    write_pages(published, pages)
+    draw_overview(published, args.out)
+    print(f"Written: {', '.join(map(str, pages))}")
     return 0
-
-
-def _claims(args: argparse.Namespace) -> int:
-    found = claims(Published.read(args.out))
-    missing = missing_claims(found, ROOT)
-    for claim in missing:
-        print(f"{claim.page} does not say: {claim.text}")
-    print(
-        f"{len(found) - len(missing)} of {len(found)} sentences are as they should be."
-    )
-    return 1 if missing else 0
 
 
 if __name__ == "__main__":

@@ -17,11 +17,11 @@ from torch import Tensor
 
 from benchmarks.cells import Cell
 from benchmarks.presets import PRESETS, Settings
-from benchmarks.store import Cache
+from benchmarks.store import written_whole
 from sbi_rope.baselines import PlainNPE
 from sbi_rope.tasks import Task, get_task
 
-__all__ = ["Case", "CountingSimulator", "Sources", "posterior_with", "state_of"]
+__all__ = ["Case", "Sources", "posterior_with", "state_of"]
 
 Pairs = tuple[Tensor, Tensor]
 
@@ -57,6 +57,26 @@ class Sources:
         )
 
 
+def cached(folder: Path, kind: str, content: Any, compute: Callable[[], Any]) -> Any:
+    """Return what cells share: tensors and numbers, and collections of these.
+
+    This is not joblib's ``Memory``, because reading a pickle can run code.
+
+    Args:
+        folder: Where it is kept.
+        kind: First part of the file's name.
+        content: What it depends on, as JSON.
+        compute: Returns it.
+    """
+    text = json.dumps(content, sort_keys=True)
+    path = folder / f"{kind}-{hashlib.sha256(text.encode()).hexdigest()[:20]}.pt"
+    if not path.exists():
+        value = compute()
+        with written_whole(path) as temporary:
+            torch.save(value, temporary)
+    return torch.load(path, weights_only=True)
+
+
 class CountingSimulator:
     """A simulator that knows how many simulations it made."""
 
@@ -80,11 +100,11 @@ class Case:
     task: Task
     settings: Settings
     cell: Cell
-    cache: Cache
+    cache: Path
     device: str
 
     @classmethod
-    def of(cls, cell: Cell, sources: Sources, cache: Cache, device: str) -> "Case":
+    def of(cls, cell: Cell, sources: Sources, cache: Path, device: str) -> "Case":
         """Return the case of a cell."""
         task = sources.task(cell)
         return cls(
@@ -136,7 +156,7 @@ class Case:
                 "number": self.settings.num_simulations,
                 "seed": self.seed,
             }
-            pairs = self.cache.get("simulations", content, draw, unpack=_as_pairs)
+            pairs = cached(self.cache, "simulations", content, draw)
         return {
             name: (theta.to(self.device), x.to(self.device))
             for name, (theta, x) in pairs.items()
@@ -207,26 +227,8 @@ class Case:
             )
             npe.append_simulations(*self.simulations)
             npe.train(seed=self.seed, show_progress_bars=False)
-            return {
-                "posterior": npe.build_posterior(),
-                "seconds": time.perf_counter() - start,
-            }
-
-        def pack(entry: dict[str, Any]) -> dict[str, Any]:
-            return {
-                "state": state_of(entry["posterior"]),
-                "seconds": entry["seconds"],
-            }
-
-        def unpack(kept: dict[str, Any]) -> dict[str, Any]:
-            posterior = posterior_with(
-                kept["state"],
-                prior=self.task.get_prior(),
-                build=self.builder,
-                simulations=self.simulations,
-                device=self.device,
-            )
-            return {"posterior": posterior, "seconds": float(kept["seconds"])}
+            seconds = time.perf_counter() - start
+            return {"state": state_of(npe.build_posterior()), "seconds": seconds}
 
         # By their content: variants that change real data only share an NPE.
         content = {
@@ -237,15 +239,15 @@ class Case:
             "light_net": self.settings.light_net,
             "device": self.device,
         }
-        return self.cache.get("npe", content, train, pack=pack, unpack=unpack)
-
-
-def _as_pairs(kept: dict[str, Pairs]) -> dict[str, Pairs]:
-    """Return stored pairs if they are pairs, and raise an error if they are not."""
-    pairs = {str(name): (theta, x) for name, (theta, x) in kept.items()}
-    if not pairs or any(len(theta) != len(x) for theta, x in pairs.values()):
-        raise ValueError("it holds no pairs of parameters and simulations.")
-    return pairs
+        kept = cached(self.cache, "npe", content, train)
+        posterior = posterior_with(
+            kept["state"],
+            prior=self.task.get_prior(),
+            build=self.builder,
+            simulations=self.simulations,
+            device=self.device,
+        )
+        return {"posterior": posterior, "seconds": kept["seconds"]}
 
 
 def digest(tensor: Tensor) -> str:

@@ -1,8 +1,8 @@
-"""The figures of a suite."""
+"""The figures of a suite, and those of all tasks together."""
 
 import json
 import math
-from collections.abc import Iterator
+import re
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +12,12 @@ import torch
 from matplotlib.figure import Figure
 
 from benchmarks.cells import Cell, Suite, data_in_words
-from benchmarks.methods import METHODS
-from benchmarks.schema import WHERE
-from benchmarks.table import Table
+from benchmarks.methods import METHODS, STACK
+from benchmarks.published import LETTERS, Published, finished, relative_ranks
+from benchmarks.store import WHERE, Results, written_whole
 from sbi_rope import plots
-from sbi_rope._files import write_atomically
 
-__all__ = ["LPPAxis", "curves", "draw_all", "save"]
+__all__ = ["LPPAxis", "curves", "draw_all", "draw_overview", "rank_figure"]
 
 # With the distances as they are, as in the paper.
 UNSCALED = {"RoPE": "#003050", "OT-only": "#2A6F97"}
@@ -34,6 +33,21 @@ LEGEND_LINES = 4.5
 SHOWN_PAIRS = 50
 # Methods in corner plots.
 CORNERS = ("NPE", "RoPE", "stack", "prior")
+# The methods of the picture of all tasks: what a user starts from, what is tuned on
+# pairs, the rivals of 2025 and 2026, the paper's method and our default.
+SHOWN = (
+    "prior",
+    "SBI",
+    "NPE",
+    "fine-tuned NPE",
+    "fine-tuned NPE (averaged)",
+    "FMCPE (embedding)",
+    "FRISBI (distilled)",
+    "RoPE",
+    STACK,
+)
+# Panels side by side, so that they can be read at the width of a page.
+SHOWN_COLUMNS = 4
 # More parameters than these make a corner plot that nobody can read.
 MAX_PARAMETERS = 6
 
@@ -62,26 +76,30 @@ class LPPAxis:
         return self.prior + self.unit * np.where(height >= 0, height, below)
 
 
-def draw_all(suite: Suite, table: Table, folder: Path) -> list[tuple[str, str]]:
-    """Draw the figures of a suite; return their files and what they show."""
-    rows = table.finished
+def draw_all(suite: Suite, results: Results) -> list[Path]:
+    """Draw the figures of a suite beside its table; return their files."""
+    rows = finished(results.rows)
     if not len(rows):
         return []
-    drawn = []
-    for name, what, figure in (
-        (
-            f"{suite.x_axis}.png",
-            f"LPP and ACAUC against {suite.x_axis}",
-            curves(suite.x_axis, rows),
-        ),
-        ("calibration.png", "Coverage of central intervals", _coverage(table)),
-        *_corners(table),
-    ):
-        if figure is None:
-            continue
-        save(figure, folder / name)
-        drawn.append((name, what))
-    return drawn
+    arrays = results.arrays()
+    figures = {suite.x_axis: curves(suite.x_axis, rows)}
+    figures["calibration"] = _coverage(rows, arrays)
+    figures |= _corners(rows, arrays)
+    for name, figure in figures.items():
+        _save(figure, results.folder / f"{name}.png")
+    return [results.folder / f"{name}.png" for name in figures]
+
+
+def draw_overview(published: Published, folder: Path) -> None:
+    """Draw scores on all tasks, and ranks over tasks, into a folder."""
+    rows = finished(published.main)
+    shown = rows[rows["method"].isin(SHOWN)]
+    order = [*LETTERS]
+    shown = shown.iloc[shown["task"].map(order.index).argsort(kind="stable")]
+    figure = curves("n_calibration", shown, max_columns=SHOWN_COLUMNS)
+    _save(figure, folder / "methods.png")
+    ranks = relative_ranks(published.main, beside=STACK)
+    _save(rank_figure(ranks), folder / "ranks.png")
 
 
 def _grid(count: int, max_columns: int = MAX_COLUMNS) -> tuple[int, int]:
@@ -90,9 +108,9 @@ def _grid(count: int, max_columns: int = MAX_COLUMNS) -> tuple[int, int]:
     return rows, math.ceil(count / rows)
 
 
-def save(figure: Figure, path: Path) -> None:
+def _save(figure: Figure, path: Path) -> None:
     """Write a figure without metadata, so that the same table gives the same bytes."""
-    with write_atomically(path) as temporary:
+    with written_whole(path) as temporary:
         figure.savefig(temporary, format="png", dpi=90, metadata={"Software": None})
 
 
@@ -256,15 +274,20 @@ def _is_option(axis: str) -> bool:
 # Calibration curves and corner plots ------------------------------------------------
 
 
-def _shown(table: Table, array: str) -> dict[tuple[str, ...], dict[str, Cell]]:
+Arrays = dict[Cell, dict[str, np.ndarray]]
+
+
+def _shown(
+    rows: pd.DataFrame, arrays: Arrays, name: str
+) -> dict[tuple[str, ...], dict[str, Cell]]:
     """By task: a cell of each method, all with about as many calibration pairs."""
     shown: dict[tuple[str, ...], dict[str, Cell]] = {}
-    for where, rows in table.finished.groupby(WHERE, sort=False):
+    for where, there in rows.groupby(WHERE, sort=False):
         nearest = {
-            name: min(part.index, key=_distance)
-            for name, part in rows.groupby("method", sort=False)
+            method: min(part.index, key=_distance)
+            for method, part in there.groupby("method", sort=False)
         }
-        shown[where] = {n: c for n, c in nearest.items() if array in table.arrays[c]}
+        shown[where] = {n: c for n, c in nearest.items() if name in arrays[c]}
     return {where: cells for where, cells in shown.items() if cells}
 
 
@@ -273,10 +296,8 @@ def _distance(cell: Cell) -> tuple[Any, ...]:
     return pairs, cell.cost_scale != "simulated", -(cell.tau or 0), cell.repetition
 
 
-def _coverage(table: Table) -> Any:
-    shown = _shown(table, "coverage")
-    if not shown:
-        return None
+def _coverage(rows: pd.DataFrame, arrays: Arrays) -> Figure:
+    shown = _shown(rows, arrays, "coverage")
     bands, columns = _grid(len(shown))
     height = 3.4 + 4.2 * (bands - 1)
     figure = Figure(figsize=(3.0 * columns + 1.9, height), layout="constrained")
@@ -289,7 +310,7 @@ def _coverage(table: Table) -> Any:
         part.plot([0, 1], [0, 1], color="0.6", lw=0.8)
         for name, cell in cells.items():
             colour, line, _ = _style(cell)
-            curve = table.arrays[cell]["coverage"]
+            curve = arrays[cell]["coverage"]
             (handle,) = part.plot(levels, curve, color=colour, ls=line, lw=1.4)
             seen.setdefault(name, handle)
         part.set(xlim=(0, 1), ylim=(0, 1), box_aspect=1)
@@ -301,25 +322,54 @@ def _coverage(table: Table) -> Any:
     return figure
 
 
-def _corners(table: Table) -> Iterator[tuple[str, str, Any]]:
-    for where, cells in _shown(table, "samples").items():
-        arrays = {name: table.arrays[c] for name, c in cells.items() if name in CORNERS}
-        if "RoPE" not in arrays:
+def _corners(rows: pd.DataFrame, arrays: Arrays) -> dict[str, Figure]:
+    figures = {}
+    for where, cells in _shown(rows, arrays, "samples").items():
+        if "RoPE" not in cells:
             continue
-        scores = table.rows["acauc_per_parameter"][cells["RoPE"]].split("; ")
+        scores = rows["acauc_per_parameter"][cells["RoPE"]].split("; ")
         names = [score.split("=")[0] for score in scores]
         shown = slice(MAX_PARAMETERS)
         samples = {
-            n: torch.from_numpy(a["samples"])[:, shown] for n, a in arrays.items()
+            name: torch.from_numpy(arrays[cell]["samples"])[:, shown]
+            for name, cell in cells.items()
+            if name in CORNERS
         }
         prior = samples.pop("prior", None)
-        theta = torch.from_numpy(arrays["RoPE"]["theta"])[shown]
-        name = "-".join(data_in_words(*where))
-        name = "".join(c if c.isalnum() or c in "-_." else "_" for c in name)
-        figure = plots.pair_plot(
+        theta = torch.from_numpy(arrays[cells["RoPE"]]["theta"])[shown]
+        file = re.sub(r"[^\w.-]", "_", "-".join(data_in_words(*where)))
+        figures[f"corner-{file}"] = plots.pair_plot(
             samples, theta, prior=prior, parameter_names=names[shown]
         )
-        what = f"Posteriors of one observation, {name}"
-        if len(names) > MAX_PARAMETERS:
-            what += f", the first {MAX_PARAMETERS} of {len(names)} parameters"
-        yield f"corner-{name}.png", what, figure
+    return figures
+
+
+# Ranks -------------------------------------------------------------------------------
+
+
+def rank_figure(ranks: pd.DataFrame) -> Figure:
+    """Draw means over tasks with bootstrap intervals; see `relative_ranks`."""
+    mean = ranks.mean(axis=1).sort_values(ascending=False)
+    values = ranks.loc[mean.index].to_numpy()
+    num_tasks = values.shape[1]
+    draws = np.random.default_rng(0).integers(num_tasks, size=(2000, num_tasks))
+    resampled = values[:, draws]
+    # A draw may have none of the tasks that a method was run on.
+    known = np.isfinite(resampled)
+    sums, counts = np.where(known, resampled, 0.0).sum(axis=2), known.sum(axis=2)
+    means = np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
+    tail = (1 - 0.95) / 2
+    low, high = np.nanquantile(means, [tail, 1 - tail], axis=1)
+    figure = Figure(figsize=(7, 0.28 * len(mean) + 1), layout="constrained")
+    axes = figure.subplots()
+    names = []
+    for height, (name, value) in enumerate(mean.items()):
+        colour = METHODS[str(name)].style[0]
+        axes.plot([low[height], high[height]], [height] * 2, c=colour)
+        axes.plot(value, height, "o", color=colour)
+        run = int(np.isfinite(values[height]).sum())
+        names.append(f"{name}" if run == num_tasks else f"{name} [{run} tasks]")
+    axes.set_yticks(range(len(mean)), names)
+    axes.set_xlabel(f"mean rank over {num_tasks} tasks: 0 is best, 1 last or failed")
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure

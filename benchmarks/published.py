@@ -1,52 +1,52 @@
-"""Committed tables, in the words that the summary speaks of them."""
+"""Committed results, as the pages and pictures select and compare them."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cached_property, partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import pandas as pd
+from scipy.stats import t as student
 
-from benchmarks.cells import Cell, Suite, list_suites, load_suite
-from benchmarks.table import Table, markdown, number_text, read_table, with_numbers
+from benchmarks.cells import Suite, list_suites, load_suite
+from benchmarks.methods import METHODS, STACK, STACKS
+from benchmarks.store import Results
 
 __all__ = [
     "FIXED",
     "LETTERS",
-    "MISSING",
+    "MAX_PAIRS",
     "PAPER",
     "SIZE",
-    "TASKS",
+    "Comparison",
     "Published",
     "Setting",
-    "acauc_text",
-    "both_texts",
-    "entry",
-    "gap",
-    "lpp_text",
+    "against_candidates",
+    "compare",
+    "finished",
+    "half_width",
     "mean",
     "num_repetitions",
-    "runs_of",
-    "table",
+    "relative_ranks",
 ]
 
-table = partial(markdown, rule=" --- ")
-
 SIZE = 50
-MISSING = "-"
-
 # The paper's letters; G is ours.
-TASKS = {
-    "A": "cs",
-    "B": "sir",
-    "C": "pendulum",
-    "D": "hemodynamics",
-    "E": "light_tunnel",
-    "F": "wind_tunnel",
-    "G": "light_tunnel_sensors",
+LETTERS = {
+    "cs": "A",
+    "sir": "B",
+    "pendulum": "C",
+    "hemodynamics": "D",
+    "light_tunnel": "E",
+    "wind_tunnel": "F",
+    "light_tunnel_sensors": "G",
 }
-LETTERS = {task: letter for letter, task in TASKS.items()}
+# "SBI" is no method, and other stacks are compared apart.
+NO_RIVALS = ("SBI", *STACKS)
+# The goals, fixed beforehand, are for up to so many pairs, in nats.
+MAX_PAIRS, NEAR = 200, 0.1
+CONFIDENCE = 0.95
 
 
 class Setting(NamedTuple):
@@ -56,49 +56,35 @@ class Setting(NamedTuple):
     tau: float
     cost_scale: str
 
-    @classmethod
-    def of(cls, cell: Cell) -> "Setting":
-        """Return the setting of a cell."""
-        return cls(cell.gamma or 0.0, cell.tau or 0.0, cell.cost_scale)
-
     def __str__(self) -> str:
         scale = " of the embedding" if self.cost_scale == "none" else ""
         return f"gamma {self.gamma:g}{scale}, tau {self.tau:g}"
 
 
+# RoPE and OT-only compete in the first, fixed beforehand.
 FIXED = Setting(0.1, 1.0, "simulated")
 PAPER = Setting(0.5, 1.0, "none")
 
 
 @dataclass(frozen=True)
 class Published:
-    """The suites, and the tables of those that were run."""
+    """The suites, and the rows of each by its name, read from a folder."""
 
+    folder: Path
     suites: dict[str, Suite]
-    tables: dict[str, Table]
+    rows: dict[str, pd.DataFrame]
 
     @classmethod
     def read(cls, folder: Path) -> "Published":
-        """Read the tables in a folder of suites."""
+        """Read the tables in a folder; a suite without one has no rows."""
         suites = {name: load_suite(name) for name in list_suites()}
-        there = [name for name in suites if (folder / name / "results.csv").exists()]
+        # Of suites that are gone, too.
+        there = {path.parent.name for path in folder.glob("*/results.csv")}
         if not there:
             raise SystemExit(f"No results in {folder}. Use `run` first, or --out.")
-        return cls(
-            suites, {name: read_table(suites[name], folder / name) for name in there}
-        )
-
-    @cached_property
-    def rows(self) -> dict[str, pd.DataFrame]:
-        """Rows by suite, of all repetitions that were run."""
-        none = Table.of({}, {})
-        return {
-            name: with_numbers(self.tables.get(name, none).rows) for name in self.suites
-        }
-
-    @cached_property
-    def _by_method(self) -> dict[str, dict[str, list[Cell]]]:
-        return {name: rows.groupby("method").groups for name, rows in self.rows.items()}
+        names = sorted({*suites, *there})
+        rows = {name: Results(folder / name).rows for name in names}
+        return cls(folder, suites, rows)
 
     def select(
         self,
@@ -109,83 +95,35 @@ class Published:
         setting: Setting = FIXED,
         **fields: str,
     ) -> pd.DataFrame:
-        """Return the rows of a method, one a repetition."""
-        cells = self._cells(method, suite=suite, size=size, setting=setting, **fields)
-        return self.rows[suite].loc[cells]
+        """Return the rows of a method with so many pairs or none, one a repetition."""
+        rows = self.rows[suite]
+        chosen = (rows["method"] == method) & rows["n_calibration"].isin([0, size])
+        for name, value in fields.items():
+            chosen &= rows[name] == value
+        return rows[chosen & _with_setting(rows, setting)]
 
-    def _cells(
-        self, method: str, *, suite: str, size: int, setting: Setting, **fields: str
-    ) -> list[Cell]:
-        return [
-            cell
-            for cell in self._by_method[suite].get(method, [])
-            if cell.n_calibration in (0, size)
-            and (cell.gamma is None or Setting.of(cell) == setting)
-            and all(getattr(cell, name) == value for name, value in fields.items())
-        ]
-
-    @cached_property
-    def _scores(self) -> dict[str, dict[Cell, float]]:
-        return {
-            name: _finished(rows)["lpp_z"].to_dict() for name, rows in self.rows.items()
-        }
-
-    def above(
-        self,
-        method: str,
-        other: str,
-        *,
-        suite: str = "main",
-        size: int = SIZE,
-        setting: Setting = FIXED,
-        **fields: str,
-    ) -> float | None:
-        """Return how far the LPP of a method is above that of another."""
-        # Thousands of these are asked for, and a row of pandas takes a millisecond.
-        scores = self._scores[suite]
-        of_each = [
-            {
-                cell.repetition: scores[cell]
-                for cell in self._cells(
-                    name, suite=suite, size=size, setting=setting, **fields
-                )
-                if cell in scores
-            }
-            for name in (method, other)
-        ]
-        return _mean_difference(*of_each)
-
-    def sizes(self, task: str, *, suite: str = "main") -> list[int]:
-        """Return the numbers of calibration pairs that a task is to be run with."""
-        cells = self.suites[suite].cells
-        return sorted({c.n_calibration for c in cells if c.task == task} - {0})
-
-    def letter(self, task: str, *, suite: str = "main") -> str:
-        """Return a task's letter, marked if a model stands in for recorded data."""
-        return LETTERS[task] + (" (stand-in)" if task in self._stand_ins[suite] else "")
-
-    @cached_property
-    def _stand_ins(self) -> dict[str, set[str]]:
-        """Tasks by suite, of which a model stands in for recorded data."""
-        return {
-            name: {*rows["task"][rows["stand_in"] == True]}  # noqa: E712
-            for name, rows in self.rows.items()
-        }
+    @property
+    def main(self) -> pd.DataFrame:
+        """What was run in the suite `main`, with one setting of the couplings."""
+        rows = self.rows["main"]
+        return rows[_with_setting(rows, FIXED) & rows["task"].isin([*LETTERS])]
 
     def name(self, task: str, *, suite: str = "main") -> str:
-        """Name a task with its letter, marked if a model stands in for it."""
-        return self.letter(task, suite=suite).replace(
-            LETTERS[task], f"{LETTERS[task]} {task}", 1
-        )
+        """Name a task with its letter, marked if a model stands in for real data."""
+        rows = self.rows[suite]
+        stands_in = (rows["stand_in"][rows["task"] == task] == True).any()  # noqa: E712
+        return f"{LETTERS[task]} {task}" + (" (stand-in)" if stands_in else "")
 
 
-def runs_of(suite: Suite) -> dict[tuple[str, str], list[list[Cell]]]:
-    """Return the cells of each repetition, by task and variant."""
-    runs: dict[tuple[str, str], dict[int, list[Cell]]] = {}
-    for cell in suite.cells:
-        where = runs.setdefault((cell.task, cell.variant), {})
-        where.setdefault(cell.repetition, []).append(cell)
-    return {where: [*parts.values()] for where, parts in runs.items()}
+def _with_setting(rows: pd.DataFrame, setting: Setting) -> pd.Series:
+    gamma, tau, scale = setting
+    same = (rows["gamma"] == gamma) & (rows["tau"] == tau)
+    return rows["gamma"].isna() | (same & (rows["cost_scale"] == scale))
+
+
+def finished(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows that have scores."""
+    return rows[rows["status"] == "finished"].infer_objects()
 
 
 def num_repetitions(parts: Iterable[pd.DataFrame]) -> int:
@@ -193,70 +131,154 @@ def num_repetitions(parts: Iterable[pd.DataFrame]) -> int:
     return len({repetition for part in parts for repetition in part["repetition"]})
 
 
-def _finished(rows: pd.DataFrame) -> pd.DataFrame:
-    return rows[rows["status"] == "finished"]
-
-
 def mean(rows: pd.DataFrame, column: str = "lpp_z") -> float | None:
     """Return the mean over repetitions; None of no rows."""
-    values = _finished(rows)[column]
+    values = finished(rows)[column]
     return float(values.mean()) if len(values) else None
 
 
-def gap(ours: pd.DataFrame, theirs: pd.DataFrame) -> float | None:
-    """Return the mean difference in LPP over the repetitions that both have."""
-    finished = (_finished(rows) for rows in (ours, theirs))
-    return _mean_difference(
-        *(
-            dict(zip(rows["repetition"], rows["lpp_z"], strict=True))
-            for rows in finished
-        )
-    )
+# A method against all others ----------------------------------------------------------
 
 
-def _mean_difference(a: dict[int, float], b: dict[int, float]) -> float | None:
-    # Two that are -inf do not differ.
-    differences = [0.0 if a[k] == b[k] else a[k] - b[k] for k in a if k in b]
-    return sum(differences) / len(differences) if differences else None
+class Comparison(NamedTuple):
+    """A method on a task with so many pairs, and how far it is above all others."""
+
+    task: str
+    size: int
+    rows: pd.DataFrame
+    gaps: dict[str, pd.Series]
+
+    def best(self, *, ours: bool = True, unlabelled: bool = True) -> str | None:
+        """Return the method that it is least above; None if there is no other.
+
+        Args:
+            ours: Whether methods of this package are among the others.
+            unlabelled: Whether those that see the test observations are.
+        """
+        others = [
+            name
+            for name in self.gaps
+            if (ours or not METHODS[name].ours)
+            and (unlabelled or not METHODS[name].observations)
+        ]
+        return min(others, key=self.gap, default=None)
+
+    def gap(self, name: str) -> float:
+        """Return how far it is above a method, as a mean over their repetitions."""
+        return float(self.gaps[name].mean())
+
+    def is_near(self, name: str) -> bool:
+        """Tell whether it is above a method, or hardly below it."""
+        return self.gap(name) >= -NEAR
+
+    def is_above(self, name: str) -> bool:
+        """Tell whether it is above a method beyond the interval over repetitions."""
+        return self.gap(name) > half_width(self.gaps[name].to_numpy())
 
 
-# Texts ------------------------------------------------------------------------------
-
-
-def entry(
-    rows: pd.DataFrame,
-    text: Callable[[pd.DataFrame], str],
-    *,
-    out_of: int | None = None,
-) -> str:
-    """Return scores as text, with what failed.
+def compare(rows: pd.DataFrame, method: str = STACK) -> list[Comparison]:
+    """Compare a method with all others, by task and number of pairs.
 
     Args:
-        rows: One a repetition.
-        text: Makes a text of those that were finished.
-        out_of: The number of repetitions of what it stands beside. If there are fewer
-            rows, the entry says of how many it is.
+        rows: Finished rows of `main`, with one setting of each method.
+        method: Its name.
     """
-    scored = _finished(rows)
-    if not len(scored):
-        return "failed" if len(rows) else MISSING
-    failed = len(rows) - len(scored)
-    fewer = f" [{len(rows)}]" if out_of is not None and len(rows) < out_of else ""
-    failures = f" ({failed} of {len(rows)} failed)" if failed else ""
-    return text(scored) + fewer + failures
+    compared = []
+    ours = rows[rows["method"] == method]
+    for task in LETTERS:
+        of_task = rows[rows["task"] == task]
+        for size in sorted(ours["n_calibration"][ours["task"] == task].unique()):
+            there = of_task[of_task["n_calibration"].isin([0, size])]
+            scores = {
+                name: part.groupby("repetition", sort=False)["lpp_z"].mean()
+                for name, part in there.groupby("method", sort=False)
+            }
+            gaps = {
+                name: _gap(scores[method], scores[name])
+                for name in scores
+                if name not in (*NO_RIVALS, method)
+            }
+            gaps = {name: gap for name, gap in gaps.items() if len(gap)}
+            if gaps:
+                own = there[there["method"] == method]
+                compared.append(Comparison(task, int(size), own, gaps))
+    return compared
 
 
-def lpp_text(rows: pd.DataFrame) -> str:
-    """Return the LPP over repetitions, and whether a coupling has not converged."""
-    text = number_text(rows["lpp_z"], ".2f")
-    return text + ("" if rows["converged"].all() else " (not converged)")
+def _gap(first: pd.Series, second: pd.Series) -> pd.Series:
+    """Return how far one method is above another; 0 where both are -inf."""
+    common = first.index[first.index.isin(second.index)]
+    one, other = first[common], second[common]
+    return (one - other).where(one != other, 0.0)
 
 
-def acauc_text(rows: pd.DataFrame) -> str:
-    """Return the ACAUC over repetitions."""
-    return number_text(rows["acauc"], "+.3f")
+def half_width(values: np.ndarray) -> float:
+    """Return how far an interval over repetitions reaches; inf of a single one."""
+    if len(values) < 2 or not np.isfinite(values).all():
+        return np.inf
+    quantile = student.ppf(0.5 + CONFIDENCE / 2, len(values) - 1)
+    return float(quantile * values.std(ddof=1) / len(values) ** 0.5)
 
 
-def both_texts(rows: pd.DataFrame) -> str:
-    """Return the mean LPP with the mean ACAUC in brackets."""
-    return f"{mean(rows):.2f} ({mean(rows, 'acauc'):+.2f})"
+def relative_ranks(rows: pd.DataFrame, *, beside: str) -> pd.DataFrame:
+    """Return the rank of each method among those that were run on the same data.
+
+    It is 0 for the best and 1 for the last. A method that failed is the last.
+
+    Args:
+        rows: Those of a suite, with one setting of each method.
+        beside: A method. Data on which it was not run are left out.
+
+    Returns:
+        A line for each method, a column for each task: the mean over numbers of pairs
+        and repetitions. NaN where a method was not run.
+    """
+    competing = (rows["method"] == beside) | ~rows["method"].isin(NO_RIVALS)
+    rows = rows[competing]
+    scores = rows["lpp_z"].where(rows["status"] == "finished", -np.inf)
+    rows = rows.assign(score=scores)
+    of_each: dict[tuple[Any, ...], pd.Series] = {}
+    for _, one in rows[rows["method"] == beside].iterrows():
+        if one["n_calibration"] > MAX_PAIRS:
+            continue
+        there = rows[
+            (rows["task"] == one["task"])
+            & rows["n_calibration"].isin([0, one["n_calibration"]])
+            & (rows["repetition"] == one["repetition"])
+        ].set_index("method")["score"]
+        if len(there) > 1:
+            ranks = there.rank(ascending=False)
+            data = one["task"], one["n_calibration"], one["repetition"]
+            of_each[data] = (ranks - 1) / (len(there) - 1)
+    return pd.DataFrame(of_each).T.groupby(level=0).mean().T
+
+
+# A stack against its candidates -------------------------------------------------------
+
+
+def against_candidates(results: Results) -> pd.DataFrame:
+    """Compare the stacks of a suite with their candidates, in LPP of the test set.
+
+    Returns:
+        A line for each stack: its `size`, how far it is above the `best` of its
+        candidates *chosen on the test set*, above the better of prior and NPE
+        (`basics`), and above its own `held_out` score, in standard errors of that.
+    """
+    rows, found = finished(results.rows), []
+    for cell, arrays in results.arrays().items():
+        if cell.method != STACK or "candidates" not in arrays:
+            continue
+        lpp = rows["lpp_z"][cell]
+        names = [str(name) for name in arrays["candidates"]]
+        test = dict(zip(names, arrays["test"].tolist(), strict=False))
+        basics = [test[name] for name in ("prior", "NPE") if name in test]
+        held_out, error = arrays["held_out"][-1], arrays["held_out_error"][-1]
+        found.append(
+            {
+                "size": cell.n_calibration,
+                "best": lpp - max(test.values()),
+                "basics": lpp - max(basics, default=-np.inf),
+                "held_out": (lpp - held_out) / error,
+            }
+        )
+    return pd.DataFrame(found, columns=["size", "best", "basics", "held_out"])

@@ -1,13 +1,13 @@
 """Runs cells, in parallel, and keeps what is finished."""
 
+import contextlib
 import functools
 import itertools
-import os
 import subprocess
 import time
 import traceback
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -18,16 +18,14 @@ import torch
 from sbi.utils.metrics import c2st
 from tqdm.auto import tqdm
 
-from benchmarks.cases import Case
+from benchmarks.cases import Case, Sources
 from benchmarks.cells import Cell
 from benchmarks.machine import forget_peak, peak_memory
-from benchmarks.methods import METHODS
 from benchmarks.scoring import Failure, Score, scores
-from benchmarks.store import Workplace
-from sbi_rope._processes import end_with
+from benchmarks.store import Result, Results
 from sbi_rope.metrics import draw_samples
 
-__all__ = ["PACKAGES", "git_commit", "run_cells"]
+__all__ = ["Workplace", "run_cells"]
 
 PACKAGES = ("torch", "sbi", "POT", "numpy")
 # Samples behind the comparison with a posterior in closed form.
@@ -36,8 +34,28 @@ C2ST_SAMPLES = 500
 KEPT_SAMPLES = 300
 
 
+@dataclass(frozen=True, kw_only=True)
+class Workplace:
+    """Where a run reads and writes, and what it runs on.
+
+    Attributes:
+        folder: A folder for each suite, and for what cells share.
+        sources: Where recorded data are.
+        device: Where networks are trained.
+    """
+
+    folder: Path
+    sources: Sources = field(default_factory=Sources)
+    device: str = "cpu"
+
+    def case(self, cell: Cell) -> Case:
+        """Return the data of a cell."""
+        return Case.of(cell, self.sources, self.folder / "cache", self.device)
+
+
 def run_cells(
     cells: Sequence[Cell],
+    results: Results,
     workplace: Workplace,
     *,
     jobs: int = 1,
@@ -49,87 +67,43 @@ def run_cells(
 
     Args:
         cells: What to run.
-        workplace: Where results are kept.
-        jobs: Cells, or sweeps over gamma and tau, computed at a time.
-        backend: Name of a backend of joblib.
+        results: Where results are kept, each as soon as it is there.
+        workplace: What cells are run on.
+        jobs: Cells, or those that share a training, computed at a time.
+        backend: Name of a backend of joblib. Each job needs a process of its own.
         again: Whether to compute finished cells anew.
         retry: Whether to compute failed cells anew.
 
     Returns:
         The number of cells that were ``"kept"``, ``"finished"`` and ``"failed"``.
-
-    Raises:
-        InvalidInputError: If another run is at work in the folder.
-        NotWritableError: If nothing can be written to it.
-        SystemExit: If it holds results of other data, devices or settings.
     """
-    if backend == "threading":
-        raise SystemExit("Threads share random numbers; use loky or another backend.")
-    with workplace.claimed():
-        workplace.results.set_damaged_aside(cells)
-        waiting = {
-            cell
-            for cell in cells
-            if again or _is_missing(workplace.results.read(cell), retry=retry)
-        }
-        counts = {"kept": len(cells) - len(waiting), "finished": 0, "failed": 0}
-        for status in _run(cells, waiting, workplace, jobs=jobs, backend=backend):
-            counts[status] += 1
-    return counts
-
-
-def _run(
-    cells: Sequence[Cell],
-    waiting: set[Cell],
-    workplace: Workplace,
-    *,
-    jobs: int,
-    backend: str,
-) -> list[str]:
-    """Run those that wait, and return how each ended."""
-    # Whole groups, also where only some of their cells are missing: a sweep starts each
-    # coupling from its neighbour, and a resumed run must pass by the same ones.
-    groups = [group for group in _grouped(cells) if waiting & set(group)]
+    results.take_over(cells)
+    known = {} if again else results.rows["status"].to_dict()
+    kept = {
+        cell for cell, status in known.items() if not (retry and status == "failed")
+    }
+    groups = _grouped([cell for cell in cells if cell not in kept])
+    waiting = sum(map(len, groups))
+    counts = {"kept": len(cells) - waiting, "finished": 0, "failed": 0}
     # What methods share is made first, so that no two jobs make it at the same time.
     shared = {group[0].group[:5]: group[0] for group in groups}
-    _parallel(jobs, backend, [(prepare, cell, workplace) for cell in shared.values()])
-    calls = [
-        (run_group, group, [cell for cell in group if cell in waiting], workplace)
-        for group in groups
-    ]
-    with tqdm(total=len(waiting), desc="Cells", smoothing=0.1) as bar:
-        ended = _parallel(jobs, backend, calls, bar=bar)
-    return [status for statuses in ended for status in statuses]
-
-
-def _parallel(
-    jobs: int, backend: str, calls: list[tuple[Any, ...]], bar: Any = None
-) -> list[Any]:
-    """Return the results of calls, in the order in which they end.
-
-    Args:
-        jobs: Calls at a time.
-        backend: Name of a backend of joblib.
-        calls: Functions, each with its arguments.
-        bar: A progress bar that counts what the results hold.
-    """
-    # Dask watches over its own workers, which may be on other machines.
-    watch = {"initializer": end_with, "initargs": (os.getpid(),)}
-    results = []
-    # The way that knows external backends, dask's among them.
-    with joblib.parallel_config(
-        backend=backend, n_jobs=jobs, **(watch if backend == "loky" else {})
+    with (
+        joblib.parallel_config(backend=backend, n_jobs=jobs),
+        tqdm(total=waiting, desc="Cells", smoothing=0.1) as bar,
     ):
         run = joblib.Parallel(return_as="generator_unordered", batch_size=1)
-        for result in run(joblib.delayed(call[0])(*call[1:]) for call in calls):
-            results.append(result)
-            if bar is not None:
-                bar.update(len(result))
-    return results
-
-
-def _is_missing(row: dict[str, Any] | None, *, retry: bool) -> bool:
-    return row is None or (retry and row["status"] == "failed")
+        for _ in run(
+            joblib.delayed(prepare)(cell, workplace) for cell in shared.values()
+        ):
+            pass
+        for found in run(
+            joblib.delayed(run_group)(group, workplace) for group in groups
+        ):
+            results.add(found)
+            for result in found:
+                counts[result.row["status"]] += 1
+            bar.update(len(found))
+    return counts
 
 
 def _grouped(cells: Sequence[Cell]) -> list[list[Cell]]:
@@ -142,58 +116,35 @@ def _grouped(cells: Sequence[Cell]) -> list[list[Cell]]:
 def prepare(cell: Cell, workplace: Workplace) -> None:
     """Draw the simulations and train the NPE of a cell, if they are not there yet."""
     _use_one_thread()
-    try:
-        case = Case.of(cell, workplace.sources, workplace.cache, workplace.device)
-        _ = case.npe
-    except Exception:
-        return
+    # An error comes again when the cell is run.
+    with contextlib.suppress(Exception):
+        _ = workplace.case(cell).npe
 
 
-def run_group(group: list[Cell], cells: list[Cell], workplace: Workplace) -> list[str]:
-    """Run cells that share all but gamma and tau; write each when it is finished.
-
-    Args:
-        group: All of them, for the way the couplings of a sweep follow each other.
-        cells: Those to run.
-        workplace: Where results are kept.
-    """
+def run_group(cells: Sequence[Cell], workplace: Workplace) -> list[Result]:
+    """Run cells that share all but gamma and tau."""
     _use_one_thread()
-    git_commit()  # now, not when a cell is finished hours later
-    statuses = []
-    left = list(cells)
-
-    def fail(cell: Cell, error: Exception) -> None:
-        row = {
-            **asdict(cell),
-            "status": "failed",
-            "error": f"{type(error).__name__}: {error}",
-            "traceback": "".join(traceback.format_exception(error)),
-        }
-        workplace.results.write(cell, row, {})
-        statuses.append("failed")
-
+    _git_commit()  # now, not when a cell is finished hours later
+    results: dict[Cell, Result] = {}
     try:
-        case = Case.of(cells[0], workplace.sources, workplace.cache, workplace.device)
-        _check_data(case)
+        case = workplace.case(cells[0])
         forget_peak()
-        for score in scores(case, cells, group):
+        for score in scores(case, cells):
             if isinstance(score, Failure):
-                fail(score.cell, score.error)
+                results[score.cell] = _failed(score.cell, score.error)
             else:
-                workplace.results.write(score.cell, _row(case, score), _arrays(score))
-                statuses.append("finished")
-            left.remove(score.cell)
+                results[score.cell] = Result(_row(case, score), _arrays(score))
             forget_peak()
     except Exception as error:
-        for cell in left:
-            fail(cell, error)
-    return statuses
+        traceback.print_exc()
+        for cell in cells:
+            results.setdefault(cell, _failed(cell, error))
+    return [*results.values()]
 
 
-def _check_data(case: Case) -> None:
-    tasks = METHODS[case.cell.method].tasks
-    if tasks is not None and case.cell.task not in tasks:
-        raise ValueError(f"{case.cell.method} is only for {', '.join(tasks)}.")
+def _failed(cell: Cell, error: Exception) -> Result:
+    text = f"{type(error).__name__}: {error}"
+    return Result({**asdict(cell), "status": "failed", "error": text}, {})
 
 
 def _use_one_thread() -> None:
@@ -224,7 +175,7 @@ def _row(case: Case, score: Score) -> dict[str, Any]:
         "peak_memory_mb": peak_memory(),
         "device": case.device,
         "versions": "; ".join(f"{name} {version(name)}" for name in PACKAGES),
-        "git_commit": git_commit(),
+        "git_commit": _git_commit(),
         "finished_at": time.strftime("%Y-%m-%dT%H:%M:%S"),
     }
 
@@ -271,7 +222,7 @@ def _shortened(values: np.ndarray) -> np.ndarray:
 
 
 @functools.cache
-def git_commit() -> str:
+def _git_commit() -> str:
     """Return the commit the code is at, with a plus if it was changed since."""
     folder = Path(__file__).parent
 

@@ -1,6 +1,5 @@
 """Scores of cells on the test set, and what they cost."""
 
-import itertools
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -12,7 +11,6 @@ import torch
 from benchmarks.cases import Case, Pairs
 from benchmarks.cells import Cell
 from benchmarks.methods import (
-    COUPLED_STACK,
     GIVEN_PRIOR_STACK,
     METHODS,
     RVNP_STACK,
@@ -24,9 +22,8 @@ from sbi_rope import RoPE, SinkhornCoupler
 from sbi_rope.baselines import ReferenceNPE
 from sbi_rope.metrics import Evaluation, evaluate
 from sbi_rope.stacking import StackedPosterior, default_candidates, stack
-from sbi_rope.sweep import sweep
 
-__all__ = ["Failure", "Score", "evaluate_on", "rope_of", "scores"]
+__all__ = ["Failure", "Score", "scores"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,13 +67,8 @@ class Failure:
     error: Exception
 
 
-def scores(
-    case: Case, cells: Sequence[Cell], group: Sequence[Cell]
-) -> Iterator[Score | Failure]:
+def scores(case: Case, cells: Sequence[Cell]) -> Iterator[Score | Failure]:
     """Score cells that differ in gamma and tau only, each when it is asked for.
-
-    The sweep over gamma and tau passes by all of ``group``, of which ``cells`` are a
-    part.
 
     A posterior that cannot be scored is a failure of its cell alone.
 
@@ -85,7 +77,7 @@ def scores(
     """
     method = case.cell.method
     if METHODS[method].couples:
-        yield from _coupled_scores(case, cells, group)
+        yield from _coupled_scores(case, cells)
     else:
         score = _stack_score if method in STACKS else _score
         for cell in cells:
@@ -121,44 +113,47 @@ def _score(case: Case, cell: Cell) -> Score:
     )
 
 
-def _coupled_scores(
-    case: Case, cells: Sequence[Cell], group: Sequence[Cell]
-) -> Iterator[Score | Failure]:
+def _coupled_scores(case: Case, cells: Sequence[Cell]) -> Iterator[Score | Failure]:
     count = _Count(case)
     start = time.perf_counter()
     rope = _trained_rope(case)
     train_seconds = time.perf_counter() - start
-    wanted = {(cell.gamma, cell.tau): cell for cell in cells}
-    # One sweep over all, from large gammas to small: it simulates and normalises once.
-    gammas = sorted({cell.gamma for cell in group if cell.gamma}, reverse=True)
-    taus = sorted({cell.tau for cell in group if cell.tau is not None}, reverse=True)
-    start = time.perf_counter()
-    posteriors = sweep(
-        rope,
-        case.test_set[1],
-        gammas=gammas,
-        taus=taus,
-        coupler=SinkhornCoupler(cost_scale=case.cell.cost_scale),  # type: ignore[arg-type]
-        seed=case.seed,
-        require_convergence=False,
-        show_progress_bars=False,
-    )
-    used = len(case.simulations[0]) + count.new
-    settings = itertools.product(gammas, taus)
-    for setting, posterior in zip(settings, posteriors, strict=True):
-        couple_seconds = time.perf_counter() - start
-        cell = wanted.get(setting)
-        if cell is not None:
-            yield _scored_or_failed(
+    trained = count.new
+    for cell in cells:
+        before, start = count.new, time.perf_counter()
+        try:
+            posterior = _coupled(rope, case, cell)
+            couple_seconds = time.perf_counter() - start
+            used = len(case.simulations[0]) + trained + count.new - before
+            yield _scored(
                 case,
                 cell,
                 posterior,
+                case.test_set,
                 train_seconds=train_seconds,
                 couple_seconds=couple_seconds,
                 num_simulations=used,
                 converged=posterior.coupling.converged,
             )
-        start = time.perf_counter()
+        except Exception as error:  # such as no mass inside the prior's support
+            yield Failure(cell=cell, error=error)
+
+
+def _coupled(rope: RoPE, case: Case, cell: Cell) -> Any:
+    assert cell.gamma is not None
+    assert cell.tau is not None
+    coupler = SinkhornCoupler(
+        gamma=cell.gamma,
+        tau=cell.tau,
+        cost_scale=cell.cost_scale,  # type: ignore[arg-type]
+    )
+    return rope.build_posterior(
+        case.test_set[1],
+        coupler=coupler,
+        seed=case.seed,
+        require_convergence=False,
+        show_progress_bars=False,
+    )
 
 
 def _trained_rope(case: Case) -> RoPE:
@@ -168,11 +163,11 @@ def _trained_rope(case: Case) -> RoPE:
         method: Any = build(case)
         append_data(method, case.cell.method, case)
         return method.build_rope()
-    rope = rope_of(case).append_calibration(*case.calibration)
+    rope = _rope_of(case).append_calibration(*case.calibration)
     return rope.train(seed=case.seed, show_progress_bars=False)
 
 
-def rope_of(case: Case) -> RoPE:
+def _rope_of(case: Case) -> RoPE:
     """Return RoPE on a case, without calibration pairs."""
     return RoPE(
         case.npe,
@@ -183,18 +178,16 @@ def rope_of(case: Case) -> RoPE:
 
 
 def _stack_score(case: Case, cell: Cell) -> Score:
-    x_o = case.test_set[1]
     count = _Count(case)
     start = time.perf_counter()
-    rope = rope_of(case).append_calibration(*case.calibration)
+    rope = _rope_of(case).append_calibration(*case.calibration)
     candidates = None
     if cell.method == GIVEN_PRIOR_STACK:
         candidates = default_candidates(rope, learn_prior=False)
     elif cell.method == RVNP_STACK:
-        candidates = default_candidates(rope, x_o)
+        candidates = default_candidates(rope, case.test_set[1])
     posterior = stack(
         rope,
-        x_o if cell.method == COUPLED_STACK else None,
         candidates=candidates,
         num_folds=case.settings.num_folds,
         seed=case.seed,
@@ -242,22 +235,17 @@ class _Count:
         return 0 if self.simulator is None else self.simulator.count - self.before
 
 
-def evaluate_on(case: Case, posterior: Any, pairs: Pairs) -> Evaluation:
-    """Score a posterior with the settings of a case."""
-    return evaluate(
+def _scored(
+    case: Case, cell: Cell, posterior: Any, pairs: Pairs, **costs: Any
+) -> Score:
+    start = time.perf_counter()
+    evaluation = evaluate(
         posterior,
         *pairs,
         theta_std=case.task.prior_std.to(pairs[0]),
         num_samples=case.settings.num_samples,
         seed=case.seed,
     )
-
-
-def _scored(
-    case: Case, cell: Cell, posterior: Any, pairs: Pairs, **costs: Any
-) -> Score:
-    start = time.perf_counter()
-    evaluation = evaluate_on(case, posterior, pairs)
     return Score(
         cell=cell,
         posterior=posterior,
@@ -266,12 +254,3 @@ def _scored(
         test_seconds=time.perf_counter() - start,
         **costs,
     )
-
-
-def _scored_or_failed(
-    case: Case, cell: Cell, posterior: Any, **costs: Any
-) -> Score | Failure:
-    try:
-        return _scored(case, cell, posterior, case.test_set, **costs)
-    except Exception as error:  # such as no mass inside the prior's support
-        return Failure(cell=cell, error=error)

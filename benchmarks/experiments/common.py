@@ -1,11 +1,10 @@
 """What the experiments share: options, data, and how a table is printed."""
 
 import argparse
-import csv
 import json
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +12,14 @@ import torch
 
 from benchmarks.machine import describe_machine
 
-# Nothing of the package is imported here: `mixture` and `training` choose later which
+# Nothing of the package is imported here: `mixture` and `stacking` choose later which
 # version of it is measured.
 
 __all__ = [
     "BEFORE",
     "Options",
     "Row",
-    "add_task",
     "begin",
-    "kept_rows",
     "measured",
     "show",
     "versions",
@@ -33,7 +30,7 @@ ROOT = Path(__file__).resolve().parents[2]
 # Options of the command line, with what argparse is to know of them.
 Options = dict[str, Mapping[str, Any]]
 Row = Mapping[str, object]
-# Of experiments that compare two versions of the package.
+# To compare two versions of the package.
 BEFORE: Options = {
     "--before": {"type": Path, "help": "another checkout to measure too"}
 }
@@ -63,19 +60,6 @@ def begin(
     return args
 
 
-def add_task(options: Options, **task: Any) -> Options:
-    """Return the options of an experiment on a task, with those that they share."""
-    return {
-        "--task": {"required": True, **task},
-        "--variant": {"default": ""},
-        "--root": {"type": Path, "help": "folder of recorded data"},
-        "--hemodynamics": {"type": Path, "help": "folder of stored people"},
-        "--preset": {"default": "standard", "help": "settings, see presets.py"},
-        "--out": {"type": Path, "default": Path("results/experiments")},
-        **options,
-    }
-
-
 def versions(before: Path | None) -> dict[str, Path]:
     """Return the checkouts to measure, by the name of the version."""
     earlier = {} if before is None else {"before": before.resolve()}
@@ -101,38 +85,6 @@ def measured(experiment: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     if done.returncode:
         raise RuntimeError(done.stderr)
     return json.loads(done.stdout.splitlines()[-1])
-
-
-def kept_rows(
-    path: Path,
-    columns: Sequence[str],
-    rows: Iterable[tuple[tuple[str, ...], Callable[[], Row]]],
-) -> Iterator[Row]:
-    """Yield rows of a table; those of an earlier run are read from a file.
-
-    Args:
-        path: The file.
-        columns: The names of all columns.
-        rows: The first columns of each row, and a function that returns the others.
-    """
-    done: dict[tuple[str, ...], Row] = {}
-    if path.exists():
-        with path.open(newline="", encoding="utf-8") as file:
-            done = {tuple(row.values()): row for row in csv.DictReader(file)}
-    for head, compute in rows:
-        known = [row for key, row in done.items() if key[: len(head)] == head]
-        if known:
-            yield known[0]
-            continue
-        row = {**dict(zip(columns, head, strict=False)), **compute()}
-        path.parent.mkdir(parents=True, exist_ok=True)
-        is_new = not path.exists()
-        with path.open("a", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, columns)
-            if is_new:
-                writer.writeheader()
-            writer.writerow(row)
-        yield row
 
 
 def show(rows: Iterable[Row]) -> None:

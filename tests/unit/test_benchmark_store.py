@@ -1,10 +1,6 @@
-"""What a run of the benchmark keeps: files, results of cells, caches."""
+"""What a run of the benchmark keeps: rows, arrays, and what cells share."""
 
-import hashlib
-import io
-import multiprocessing
-import os
-import warnings
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,19 +10,27 @@ import pytest
 import torch
 from sbi.inference.posteriors import DirectPosterior
 
-from benchmarks.cases import Case, Sources, posterior_with, state_of
+from benchmarks.cases import cached, posterior_with, state_of
 from benchmarks.cells import Cell
 from benchmarks.presets import PRESETS
-from benchmarks.store import Cache, Results
-from sbi_rope._files import set_aside, write_atomically
+from benchmarks.store import Result, Results, written_whole
 from sbi_rope._sbi import embedding_of
-from sbi_rope.errors import NotWritableError, RoPEWarning
 from sbi_rope.tasks import get_task
-from tests.results import empty, fill_with_garbage, remove, result_of, truncate
+from tests.results import result_of
 
-FINISHED = Cell(task="linear_gaussian", method="prior")
-
-# Files ------------------------------------------------------------------------------
+CELLS = [
+    Cell(task="cs", method="prior"),
+    Cell(
+        task="cs",
+        method="RoPE",
+        n_calibration=10,
+        gamma=0.1,
+        tau=1.0,
+        cost_scale="simulated",
+    ),
+    Cell(task="cs", method="MLP", n_calibration=50, options='{"label_noise": 0.1}'),
+]
+COMMITTED = Path(__file__).parents[2] / "benchmarks" / "results"
 
 
 def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path) -> None:
@@ -34,7 +38,7 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path) -> None:
     path.write_text("old")
 
     def interrupted() -> None:
-        with write_atomically(path) as temporary:
+        with written_whole(path) as temporary:
             temporary.write_text("ne")
             raise KeyboardInterrupt
 
@@ -44,145 +48,82 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_files_can_be_read_by_whoever_can_read_others(tmp_path: Path) -> None:
-    plain, path = tmp_path / "plain.txt", tmp_path / "file.txt"
-    plain.write_text("text")
-    with write_atomically(path) as temporary:
-        temporary.write_text("text")
-    assert path.stat().st_mode == plain.stat().st_mode
-
-
-def test_the_cache_computes_once_and_again_if_the_entry_is_damaged(
-    tmp_path: Path,
-) -> None:
-    cache, calls = Cache(tmp_path), []
-
-    def compute() -> list[int]:
-        calls.append(1)
-        return [1, 2]
-
-    for _ in range(2):
-        assert cache.get("thing", {"seed": 0}, compute) == [1, 2]
-    assert len(calls) == 1
-    cache.get("thing", {"seed": 1}, compute)
-    assert len(calls) == 2
-    for path in tmp_path.glob("thing-*"):
-        data = bytearray(path.read_bytes())
-        data[-10] ^= 1
-        path.write_bytes(bytes(data))
-    with pytest.warns(UserWarning, match="damaged"):
-        assert cache.get("thing", {"seed": 0}, compute) == [1, 2]
-    assert len(calls) == 3
-    assert cache.get("thing", {"seed": 0}, compute) == [1, 2]
-    assert len(calls) == 3
-
-
-def write_many(folder: Path, number: int) -> None:
-    results = Results(folder)
-    for _ in range(30):
-        for repetition in range(3):
-            cell = Cell(task="a", method="prior", repetition=repetition)
-            row = {"status": "failed", "error": "no", "value": [number] * 1000}
-            results.write(cell, row, {"x": np.full(9, number)})
-
-
-def test_two_processes_on_one_folder_leave_whole_files(tmp_path: Path) -> None:
-    context = multiprocessing.get_context("fork")
-    processes = [
-        context.Process(target=write_many, args=(tmp_path, number)) for number in (1, 2)
+def test_results_survive_being_written_and_read(tmp_path: Path) -> None:
+    results = Results(tmp_path / "tiny")
+    assert len(results.rows) == 0
+    made = [
+        result_of(cell, score)
+        for cell, score in zip(CELLS, (-math.inf, 1 / 3, "failed"), strict=True)
     ]
-    for process in processes:
-        process.start()
-    for process in processes:
-        process.join()
-        assert process.exitcode == 0
-    results = Results(tmp_path)
-    for repetition in range(3):
-        cell = Cell(task="a", method="prior", repetition=repetition)
-        row = results.read(cell)
-        assert row is not None
-        assert len(set(row["value"])) == 1
-        assert len(set(results.read_arrays(cell)["x"])) == 1
-    assert len(list(tmp_path.iterdir())) == 6
+    results.add(made[1:])
+    results.add(made[:1])
+    rows = results.rows
+    assert [*rows.index] == [CELLS[1], CELLS[2], CELLS[0]]
+    assert rows["lpp_z"][CELLS[0]] == -math.inf
+    assert rows["lpp_z"][CELLS[1]] == 1 / 3
+    assert rows["error"].to_dict() == {
+        CELLS[0]: "",
+        CELLS[1]: "",
+        CELLS[2]: "ValueError: no",
+    }
+    before = results.path.read_text().splitlines()
+    results.tidy(CELLS)
+    after = results.path.read_text().splitlines()
+    assert [*results.rows.index] == CELLS
+    # To the letter, in another order.
+    assert sorted(before) == sorted(after)
+    assert sorted(path.name for path in results.folder.iterdir()) == [
+        "arrays.npz",
+        "results.csv",
+    ]
+    for cell, (_, arrays) in zip(CELLS, made, strict=True):
+        read = results.arrays()[cell]
+        assert read.keys() == arrays.keys()
+        assert all(np.array_equal(read[name], arrays[name]) for name in arrays)
 
 
-def replace_by_another(path: Path) -> None:
-    """Put the file of another cell in its place."""
-    other = replace(FINISHED, repetition=1)
-    results = Results(path.parent)
-    # Nothing but its cell tells the row from the one it replaces.
-    log_probs = [-1.0, -2.0] if path.suffix == ".json" else [-1.0, -1.0]
-    results.write(other, *result_of(other, log_probs))
-    path.write_bytes((path.parent / f"{other.key}{path.suffix}").read_bytes())
-
-
-def test_a_damaged_result_counts_as_not_run_and_is_set_aside(tmp_path: Path) -> None:
-    damages = (truncate, empty, fill_with_garbage, replace_by_another)
-    cases = [(end, damage) for end in ("json", "npz") for damage in damages]
-    for number, (end, damage) in enumerate([*cases, ("npz", remove)]):
-        results = Results(tmp_path / str(number))
-        results.write(FINISHED, *result_of(FINISHED, [-1.0, -2.0]))
-        assert results.read(FINISHED) is not None
-        path = results.folder / f"{FINISHED.key}.{end}"
-        damage(path)
-        content = path.read_bytes() if path.exists() else None
-        with pytest.warns(RoPEWarning, match="damaged and counts as not run"):
-            assert results.read(FINISHED) is None
-        with pytest.warns(RoPEWarning, match="damaged and is computed again"):
-            results.set_damaged_aside([FINISHED])
-        assert not path.exists()
-        if content is not None:
-            assert path.with_name(f"{path.name}.damaged-1").read_bytes() == content
-        # Now it is as if it had never been run.
-        with warnings.catch_warnings(action="error"):
-            assert results.read(FINISHED) is None
-            results.set_damaged_aside([FINISHED])
-
-
-def test_what_is_set_aside_replaces_nothing(tmp_path: Path) -> None:
-    for number in (1, 2):
-        path = tmp_path / "cell.json"
-        path.write_text(str(number))
-        assert set_aside(path) == tmp_path / f"cell.json.damaged-{number}"
-    assert (tmp_path / "cell.json.damaged-1").read_text() == "1"
-    assert set_aside(path) is None
-
-
-def test_a_result_with_a_score_that_is_not_its_own_is_damaged(tmp_path: Path) -> None:
-    results = Results(tmp_path)
-    row, arrays = result_of(FINISHED, [-1.0, -2.0])
-    results.write(FINISHED, row | {"lpp_z": row["lpp_z"] + 0.01}, arrays)
-    with pytest.warns(RoPEWarning, match="column lpp_z: expected -1.5"):
-        assert results.read(FINISHED) is None
-
-
-def test_a_file_whose_folder_cannot_be_written_to_is_refused_in_words(
+def test_a_later_result_of_a_cell_takes_the_place_of_the_earlier_one(
     tmp_path: Path,
 ) -> None:
-    (tmp_path / "file").write_text("no folder")
-    with (
-        pytest.raises(NotWritableError, match=r"can be written to.*Use another"),
-        write_atomically(tmp_path / "file" / "new.txt"),
-    ):
-        pass
+    results = Results(tmp_path / "tiny")
+    results.add([result_of(CELLS[0], "failed"), result_of(CELLS[1], -2.0)])
+    results.tidy(CELLS)
+    row, arrays = result_of(CELLS[1], -1.0)
+    new = {name: values + 1.0 for name, values in arrays.items()}
+    results.add([result_of(CELLS[0], -1.0), Result(row, new)])
+    assert results.rows["lpp_z"].to_dict() == dict.fromkeys(CELLS[:2], -1.0)
+    assert len(results.arrays()[CELLS[0]]) > 1
+    assert np.array_equal(results.arrays()[CELLS[1]]["theta"], new["theta"])
+    results.add([result_of(CELLS[1], "failed")])
+    results.tidy(CELLS)
+    assert results.arrays()[CELLS[1]] == {}
 
 
-def test_a_file_is_on_the_disk_before_it_gets_its_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path, synced = tmp_path / "file.txt", []
-
-    def fsync(descriptor: int) -> None:
-        synced.append((os.fstat(descriptor).st_ino, path.exists()))
-
-    monkeypatch.setattr(os, "fsync", fsync)
-    with write_atomically(path) as temporary:
-        temporary.write_text("text")
-    # The file while it had its first name, and the folder with the new one.
-    assert synced == [(path.stat().st_ino, False), (tmp_path.stat().st_ino, True)]
+def test_results_of_another_suite_are_taken_over(tmp_path: Path) -> None:
+    first, second = Results(tmp_path / "first"), Results(tmp_path / "second")
+    first.add(result_of(cell, -1.0) for cell in CELLS)
+    first.tidy(CELLS)
+    second.add([result_of(CELLS[1], -2.0)])
+    second.take_over(CELLS[:2])
+    assert second.rows["lpp_z"].to_dict() == {CELLS[1]: -2.0, CELLS[0]: -1.0}
+    assert {*second.rows["suite"]} == {"second"}
+    assert second.arrays()[CELLS[0]].keys() == first.arrays()[CELLS[0]].keys()
 
 
-# Trained estimators -------------------------------------------------------------------
+def test_every_finished_committed_cell_has_its_arrays() -> None:
+    results = Results(COMMITTED / "failures")
+    arrays = results.arrays()
+    rows = results.rows
+    assert len(rows) > 100
+    for cell, status in rows["status"].items():
+        log_probs = arrays[cell].get("log_probs")
+        assert (log_probs is not None) == (status == "finished")
+        if log_probs is not None:
+            average = log_probs.astype(float).mean()
+            assert rows["lpp"][cell] == pytest.approx(average, rel=1e-5)
+
+
+# What cells share ---------------------------------------------------------------------
 
 
 class Thief:
@@ -195,40 +136,24 @@ class Thief:
         return Path.write_text, (self.path, "code was run")
 
 
-def put_pickle(path: Path, content: Any) -> None:
-    """Write an entry as older versions did: any object, with a right checksum."""
-    buffer = io.BytesIO()
-    torch.save(content, buffer)
-    payload = buffer.getvalue()
-    path.write_bytes(hashlib.sha256(payload).digest() + payload)
+def test_what_is_shared_is_computed_once_and_runs_no_code(tmp_path: Path) -> None:
+    calls: list[int] = []
 
+    def compute() -> dict[str, torch.Tensor]:
+        calls.append(1)
+        return {"x": torch.ones(2)}
 
-def test_the_cache_runs_no_code_of_what_it_reads(tmp_path: Path) -> None:
-    cache = Cache(tmp_path)
-    cache.get("thing", {}, lambda: [1])
-    (path,) = tmp_path.glob("thing-*")
-    put_pickle(path, Thief(tmp_path / "proof"))
-    with pytest.warns(RoPEWarning, match="not opened, because that could run code"):
-        assert cache.get("thing", {}, lambda: [2]) == [2]
+    for _ in range(2):
+        found = cached(tmp_path, "thing", {"seed": 0}, compute)
+        assert torch.equal(found["x"], torch.ones(2))
+    assert len(calls) == 1
+    cached(tmp_path, "thing", {"seed": 1}, compute)
+    assert len(calls) == 2
+    for path in tmp_path.glob("thing-*"):
+        torch.save(Thief(tmp_path / "proof"), path)
+    with pytest.raises(Exception, match="Weights only load failed"):
+        cached(tmp_path, "thing", {"seed": 0}, compute)
     assert not (tmp_path / "proof").exists()
-    assert path.with_name(f"{path.name}.damaged-1").exists()
-    assert cache.get("thing", {}, lambda: [3]) == [2]
-
-
-def test_a_cached_estimator_of_other_weights_is_computed_anew(tmp_path: Path) -> None:
-    cell = Cell(task="linear_gaussian", preset="smoke", method="NPE")
-
-    def npe() -> Any:
-        return Case.of(cell, Sources(), Cache(tmp_path), "cpu").npe
-
-    first = npe()
-    (path,) = tmp_path.glob("npe-*")
-    put_pickle(path, {"state": {"weight": torch.ones(1)}, "seconds": 1.0})
-    with pytest.warns(RoPEWarning, match="damaged and is computed anew"):
-        again = npe()
-    x = torch.zeros(1, *first.posterior_estimator.condition_shape)
-    theta = torch.zeros(1, *first.posterior_estimator.input_shape)
-    assert torch.equal(first.log_prob(theta, x=x), again.log_prob(theta, x=x))
 
 
 @pytest.mark.parametrize(
@@ -262,3 +187,8 @@ def test_a_rebuilt_estimator_is_the_trained_one(task: str, preset: str) -> None:
     assert any(
         weights.any() for weights in embedding_of(builder(theta, x)).parameters()
     )
+
+
+def test_cells_that_differ_have_different_names() -> None:
+    cells = [*CELLS, replace(CELLS[0], repetition=1), replace(CELLS[1], gamma=0.2)]
+    assert len({cell.key for cell in cells}) == len(cells)

@@ -5,11 +5,7 @@ its own. With ``--before`` each row is measured on another checkout of the packa
 in turns; compare within a run. The last column is the density that the stack gives to
 its own pairs: it shows whether all rows train the same networks.
 
-    python -m benchmarks.experiments.training --before ../old-checkout
-    python -m benchmarks.experiments.training --estimator mdn --workers 1 2
-
-The time of the processor is that of the first process alone, so that it is not given if
-there are several.
+    python -m benchmarks.experiments.stacking --before ../old-checkout
 """
 
 import argparse
@@ -30,20 +26,13 @@ from torch import Tensor, nn
 from benchmarks.experiments.common import BEFORE, Row, begin, measured, show, versions
 
 COLUMNS = (
-    "estimator",
-    "pairs",
-    "repeat",
-    "version",
-    "workers",
-    "CPU s",
-    "s",
+    *("estimator", "pairs", "repeat", "version", "CPU s", "s"),
     "mean log density",
 )
 OPTIONS = {
     "--estimator": {"nargs": "+", "default": ["mdn", "nsf"]},
     "--n-calibration": {"type": int, "default": 20},
     "--repeats": {"type": int, "default": 2},
-    "--workers": {"type": int, "nargs": "+", "default": [1]},
     **BEFORE,
 }
 PRIOR = BoxUniform(-torch.ones(2), torch.ones(2))
@@ -56,17 +45,15 @@ def simulate(theta: Tensor) -> Tensor:
 
 
 def rows(args: argparse.Namespace) -> Iterator[Row]:
-    """Yield one row for each estimator, repetition, version and number of workers."""
-    for estimator, repeat in itertools.product(args.estimator, range(args.repeats)):
-        for (version, root), workers in itertools.product(
-            versions(args.before).items(), args.workers
-        ):
-            settings = {"estimator": estimator, "pairs": args.n_calibration}
-            settings |= {"repeat": repeat, "version": version, "root": root}
-            settings |= {"workers": workers}
-            settings |= {"threads": args.threads}
-            row = settings | measured("training", settings)
-            yield {column: row[column] for column in COLUMNS}
+    """Yield one row for each estimator, repetition and version."""
+    for estimator, repeat, (version, root) in itertools.product(
+        args.estimator, range(args.repeats), versions(args.before).items()
+    ):
+        settings = {"estimator": estimator, "pairs": args.n_calibration}
+        settings |= {"repeat": repeat, "version": version, "root": root}
+        settings |= {"threads": args.threads}
+        row = settings | measured("stacking", settings)
+        yield {column: row[column] for column in COLUMNS}
 
 
 def measure(settings: dict[str, Any]) -> None:
@@ -86,13 +73,10 @@ def measure(settings: dict[str, Any]) -> None:
     x = 1.1 * simulate(theta) + 0.1
     rope = RoPE(npe.build_posterior(), simulator=simulate)
     rope.append_calibration(theta, x)
-    workers = settings["workers"]
-    # An older checkout may not have this argument.
-    several = {"num_workers": workers} if workers > 1 else {}
     start, start_cpu = time.perf_counter(), time.process_time()
-    posterior = stack(rope, seed=0, show_progress_bars=False, **several)
+    posterior = stack(rope, seed=0, show_progress_bars=False)
     seconds = time.perf_counter() - start
-    of_cpu = "-" if several else f"{time.process_time() - start_cpu:.0f}"
+    of_cpu = f"{time.process_time() - start_cpu:.0f}"
     log_probs = posterior.log_prob_batched(theta[None], x, norm_posterior=False)
     density = f"{float(log_probs.mean()):.6f}"
     times = {"CPU s": of_cpu, "s": f"{seconds:.0f}"}
