@@ -82,7 +82,6 @@ class Settings:
     """Base of settings: a frozen dataclass whose fields fit their type hints."""
 
     def __post_init__(self) -> None:
-        """Check every field."""
         kinds = get_type_hints(type(self), include_extras=True)
         for field in fields(self):
             check(field.name, getattr(self, field.name), kinds[field.name])

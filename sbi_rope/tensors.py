@@ -49,10 +49,6 @@ def as_batch(
     Returns:
         A tensor without gradients. A floating-point tensor keeps its dtype, and all
         else becomes float32.
-
-    Raises:
-        InvalidInputError: If it holds no numbers, or their shape, device or values do
-            not fit.
     """
     numbers = as_numbers(name, value, device=device, names=names)
     shape = tuple(numbers.shape)

@@ -237,6 +237,12 @@ for _name in CALLS:
             MEANS[f"{_name}({_argument}: {_bad})"] = lambda found: True
 
 
+# Only the user's net knows which shape it reads, so that torch may refuse another one.
+LEFT_TO_TORCH = {
+    f"CalibrationFinetuner.finetune(x: {bad})" for bad in ("ndim", "width")
+}
+
+
 def good_tensors(call: Call) -> dict[str, Tensor]:
     found = {n: p.default for n, p in inspect.signature(call).parameters.items()}
     found = {"real": X_O, "simulated": X_S} if "real" in found else found
@@ -256,7 +262,8 @@ each_argument = pytest.mark.parametrize(
 def verdict(name: str, argument: str, label: str, bad: Any) -> str:
     """What a call does wrong with a bad argument; nothing if it refuses it by name."""
     good = good_tensors(CALLS[name])
-    means = MEANS.get(f"{name}({argument}: {label})")
+    case = f"{name}({argument}: {label})"
+    means = MEANS.get(case)
     try:
         found = CALLS[name](**{**good, argument: bad})
     except RoPEError as error:
@@ -264,6 +271,8 @@ def verdict(name: str, argument: str, label: str, bad: Any) -> str:
         is_named = any(f"`{one}" in str(error) for one in names)
         return "" if is_named and len(str(error)) < 400 else str(error)
     except Exception as error:
+        if isinstance(error, RuntimeError) and case in LEFT_TO_TORCH:
+            return ""
         return f"{type(error).__name__}: {error}"
     return "" if label == "device" or (means and means(found)) else "accepted"
 
