@@ -1,10 +1,10 @@
 """Settings that are checked once, against the type hints that they are written with."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from numbers import Integral, Real
-from types import UnionType
+from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from sbi_rope.errors import InvalidInputError, shown
@@ -29,7 +29,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Range:
-    """What a number may be: from ``low`` to ``high``, or only between them if open."""
+    """The finite numbers from ``low`` to ``high``, without these two if open."""
 
     low: float = -math.inf
     high: float = math.inf
@@ -38,14 +38,12 @@ class Range:
     def __contains__(self, value: float) -> bool:
         if self.open:
             return self.low < value < self.high
-        return self.low <= value <= self.high and math.isfinite(value)
+        return self.low <= value <= self.high and -math.inf < value < math.inf
 
     def __str__(self) -> str:
         if self.high < math.inf:
-            between = "between" if self.open else "from"
-            return (
-                f"{between} {self.low:g} {'and' if self.open else 'to'} {self.high:g}"
-            )
+            words = ("between", "and") if self.open else ("from", "to")
+            return f"{words[0]} {self.low:g} {words[1]} {self.high:g}"
         if self.low == -math.inf:
             return "that is finite"
         return f"{'above' if self.open else 'of at least'} {self.low:g}"
@@ -62,15 +60,10 @@ Seed = Whole | None
 
 
 def check(name: str, value: Any, kind: Any) -> None:
-    """Raise unless a value is of the kind that a type hint says.
+    """Raise :class:`InvalidInputError` unless a value fits a type hint.
 
-    Args:
-        name: What the argument is called.
-        value: What the user gave.
-        kind: A class, a ``Literal``, a number with a :class:`Range`, or a union.
-
-    Raises:
-        InvalidInputError: If it is not.
+    A hint is a class, a ``Literal``, a number with a :class:`Range`, a ``Sequence`` of
+    such, or a union.
 
     Example:
         >>> check("tau", 2, UnitInterval)
@@ -86,74 +79,66 @@ got 2.
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Base of settings: a frozen dataclass whose fields are what their hints say."""
+    """Base of settings: a frozen dataclass whose fields fit their type hints."""
 
     def __post_init__(self) -> None:
-        """Check every field."""
         kinds = get_type_hints(type(self), include_extras=True)
         for field in fields(self):
             check(field.name, getattr(self, field.name), kinds[field.name])
 
 
 def one_of(choices: Iterable[Any]) -> Any:
-    """Return the kind of values that are one of the choices."""
+    """Return the type hint of a value that is one of the choices."""
     return Literal[tuple(choices)]
 
 
 def names_of(value: Any, count: int) -> tuple[str, ...]:
-    """Return ``count`` names of parameters, no two of which are equal.
-
-    Raises:
-        InvalidInputError: If they are not.
-    """
-    names = () if isinstance(value, str) else tuple(value)
+    """Return ``count`` names of parameters; raise unless they are all different."""
+    is_list = isinstance(value, Iterable) and not isinstance(value, str)
+    names = tuple(map(str, value)) if is_list else ()
     if len(names) != count or len(set(names)) != count:
         raise InvalidInputError(
             f"Expected `parameter_names` to be {count} different names, one for each "
             f"parameter; got {shown(value)}."
         )
-    return tuple(str(name) for name in names)
+    return names
 
 
 def default_names(count: int) -> tuple[str, ...]:
-    """Return the names of parameters that have none of their own.
-
-    Example:
-        >>> default_names(2)
-        ('theta_1', 'theta_2')
-    """
+    """Return the names theta_1, theta_2, ... of parameters that have none."""
     return tuple(f"theta_{k + 1}" for k in range(count))
 
 
 def _fits(value: Any, kind: Any) -> bool:
-    origin = get_origin(kind)
+    origin, parts = get_origin(kind), get_args(kind)
     if kind is Any:
         return True
     if origin in (Union, UnionType):
-        return any(_fits(value, one) for one in get_args(kind))
-    if origin is Literal:
-        return any(
-            type(value) is type(choice) and value == choice for choice in get_args(kind)
-        )
+        return any(_fits(value, part) for part in parts)
+    if origin is Literal:  # True is not the number 1, but NumPy's 64 is 64
+        return any(_fits(value, type(part)) and value == part for part in parts)
     if origin is Annotated:
-        number, allowed = get_args(kind)
-        return _fits(value, number) and float(value) in allowed
+        return _fits(value, parts[0]) and value in parts[1]
+    if origin in (Sequence, tuple):
+        is_list = isinstance(value, origin) and not isinstance(value, str)
+        return is_list and len(value) > 0 and all(_fits(v, parts[0]) for v in value)
     if kind in (int, float):
         number = Integral if kind is int else Real
         return isinstance(value, number) and not isinstance(value, bool)
-    return isinstance(value, type(None) if kind is None else origin or kind)
+    return isinstance(value, origin or kind or NoneType)
 
 
 def _in_words(kind: Any) -> str:
-    origin = get_origin(kind)
+    origin, parts = get_origin(kind), get_args(kind)
     if origin in (Union, UnionType):
-        return " or ".join(_in_words(one) for one in get_args(kind))
+        return " or ".join(map(_in_words, parts))
     if origin is Literal:
-        return f"one of {list(get_args(kind))}"
+        return f"one of {list(parts)}"
     if origin is Annotated:
-        number, allowed = get_args(kind)
-        return f"{_in_words(number)} {allowed}"
-    if kind in (None, type(None)):
+        return f"{_in_words(parts[0])} {parts[1]}"
+    if origin in (Sequence, tuple):
+        return f"a list with each entry {_in_words(parts[0])}"
+    if kind in (None, NoneType):
         return "None"
     names = {int: "an integer", float: "a number", bool: "True or False"}
     return names.get(kind, f"a {getattr(origin or kind, '__name__', kind)}")

@@ -42,28 +42,22 @@ def as_batch(
         rows: The number of rows; any if None.
         device: Where the tensor has to be, and where arrays and lists are moved.
         names: Names of columns. A table that has them in another order is put in order.
-        finite: Whether NaN and Inf are errors. Numbers that are too large for float32
-            are infinite there.
+        finite: Whether NaN and Inf are errors. An array or a list becomes float32, in
+            which numbers beyond 3e38 are infinite.
         empty: Whether n may be 0.
 
     Returns:
         A tensor without gradients. A floating-point tensor keeps its dtype, and all
         else becomes float32.
-
-    Raises:
-        InvalidInputError: If it holds no numbers, or their shape, device or values do
-            not fit.
     """
     numbers = as_numbers(name, value, device=device, names=names)
     shape = tuple(numbers.shape)
-    wrong = numbers.ndim == 0 or (
-        event_shape is not None and shape[1:] != tuple(event_shape)
-    )
-    if wrong or (rows is not None and shape[0] != rows):
-        sizes = shape[1:] if event_shape is None else event_shape
+    event = shape[1:] if event_shape is None else tuple(event_shape)
+    if not shape or shape[1:] != event or rows not in (None, shape[0]):
+        sizes = ", ".join(map(str, ("n" if rows is None else rows, *event)))
         raise InvalidInputError(
-            f"Expected `{name}` of shape {_in_words(rows, sizes)}; got {shape}."
-            + ("" if event_shape is None else _hint(name, shape, tuple(event_shape)))
+            f"Expected `{name}` of shape ({sizes}{'' if event else ','}); got {shape}."
+            + _hint(name, shape, event)
         )
     if not (empty or shape[0]) or 0 in shape[1:]:
         raise InvalidInputError(
@@ -84,34 +78,31 @@ def as_numbers(
     names: Sequence[str] | None = None,
 ) -> Tensor:
     """Return a user's data as a tensor of any shape, see :func:`as_batch`."""
-    if names is not None and sorted(names) == sorted(column_names(value) or ()):
+    if names and sorted(names) == sorted(column_names(value) or ()):
         value = value[list(names)]
-    if not isinstance(value, Tensor):
-        try:
-            array = as_array(value)
-            if array.dtype.kind not in "iuf":
-                raise TypeError(f"numbers, not {array.dtype}")
-        except (TypeError, ValueError) as error:
+    if isinstance(value, Tensor) and not value.is_complex():
+        if device not in (None, value.device):
             raise InvalidInputError(
-                f"Expected `{name}` to be a tensor, an array, a table or a list of "
-                f"numbers; got {type(value).__name__} ({error})."
-            ) from error
-        return torch.from_numpy(array.astype(np.float32)).to(device)
-    if device is not None and value.device != device:
-        raise InvalidInputError(f"Expected `{name}` on {device}; got {value.device}.")
-    return value.detach() if value.is_floating_point() else value.detach().float()
+                f"Expected `{name}` on {device}; got {value.device}."
+            )
+        value = value.detach()
+        return value if value.is_floating_point() else value.float()
+    try:
+        array = as_array(value)
+        if array.dtype.kind not in "biuf":
+            raise TypeError(f"its type is {array.dtype}")
+        with np.errstate(over="ignore"):  # Inf is found as such
+            return torch.from_numpy(array.astype(np.float32)).to(device)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InvalidInputError(
+            f"Expected `{name}` to be a tensor, an array, a table or a list of "
+            f"numbers; got {type(value).__name__} ({error})."
+        ) from error
 
 
 def as_array(value: Any) -> np.ndarray:
-    """Return ``value`` as an array; masked numbers become NaN.
-
-    NumPy itself drops the mask, and would use what is under it.
-
-    Example:
-        >>> as_array(np.ma.masked_equal([[1, -9]], -9))
-        array([[ 1., nan]])
-    """
-    array = np.ma.asarray(value)
+    """Return ``value`` as an array in which masked numbers are NaN."""
+    array = np.ma.asarray(value)  # NumPy alone would use what is under the mask
     if np.ma.is_masked(array) and array.dtype.kind in "biuf":
         return np.ma.filled(array.astype(np.float64), np.nan)
     return array.data
@@ -120,21 +111,14 @@ def as_array(value: Any) -> np.ndarray:
 def column_names(value: Any) -> tuple[str, ...] | None:
     """Return the names of the columns of a table; None if they have none."""
     names = tuple(getattr(value, "columns", ()))
-    is_named = len(names) > 0 and all(isinstance(name, str) for name in names)
-    return names if is_named and len(set(names)) == len(names) else None
+    are_names = all(isinstance(name, str) for name in names)
+    return names if names and are_names and len(set(names)) == len(names) else None
 
 
 def check_in_support(
     name: str, theta: Tensor, prior: Any, *, rows: Tensor | None = None
 ) -> None:
-    """Raise if a row of ``theta`` is outside the prior's support.
-
-    Args:
-        name: What the argument is called.
-        theta: Parameters, shape ``(n, d)``.
-        prior: The prior.
-        rows: Which rows are checked, shape ``(n,)``; all if None.
-    """
+    """Raise if a row of ``theta``, or one of those ``rows``, has no prior density."""
     if rows is None:
         rows = torch.ones(len(theta), dtype=torch.bool, device=theta.device)
     outside = torch.zeros_like(rows)
@@ -164,19 +148,13 @@ def rows_with(bad: Tensor) -> str:
     return f"{int(rows.sum())} of {rows.numel()} rows (first: {first})"
 
 
-def _in_words(rows: int | None, sizes: Sequence[int]) -> str:
-    return f"({', '.join(map(str, ['n' if rows is None else rows, *sizes]))})".replace(
-        "(n)", "(n,)"
-    )
-
-
 def _hint(name: str, shape: tuple[int, ...], event: tuple[int, ...]) -> str:
-    """Say how to change a batch so that it fits; nothing if that is not known."""
+    """Say which call makes the batch fit; nothing if that is not known."""
     if shape == event:
-        return f" For a single one pass `{name}[None]`."
+        return f" For a single row pass `{name}[None]`."
     if len(shape) == 1 and event == (1,):
         return f" For one number in each row pass `{name}[:, None]`."
-    if shape[1:] and math.prod(shape[1:]) == math.prod(event):
+    if event != shape[1:] and event and math.prod(shape[1:]) == math.prod(event):
         sizes = ", ".join(map(str, event))
         return f" If the order of the entries fits, pass `{name}.reshape(-1, {sizes})`."
     return ""

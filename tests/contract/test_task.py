@@ -2,7 +2,7 @@
 
 Its labelled sets are in ``test_task_sets.py``, the variants that all tasks have in
 ``test_task_variants.py``, files of published data in ``test_task_recorded.py``. Bad
-arguments of the simulators are tried in ``tests/faults``.
+arguments of the simulators are tried in ``tests/integration/test_bad_inputs.py``.
 """
 
 import copy

@@ -94,36 +94,21 @@ def test_sbc_accepts_calibrated_posteriors_and_notices_shifted_ones(
     assert check_uniformity_frequentist(shifted, 200).max() < 1e-3
 
 
-def test_sbc_works_without_batched_sampling(
-    posterior: MixturePosterior, theta: Tensor
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_sbc_works_without_batched_sampling_and_in_other_processes(
+    posterior: MixturePosterior, theta: Tensor, workers: int
 ) -> None:
     ranks, _ = run_sbc(
         theta[:4],
         posterior.x_o[:4],
         posterior,
         num_posterior_samples=50,
+        num_workers=workers,
         use_batched_sampling=False,
         show_progress_bar=False,
     )
     assert ranks.shape == (4, 2)
-    assert (ranks >= 0).all()
-    assert (ranks <= 50).all()
-
-
-@pytest.mark.slow
-def test_sbc_runs_in_other_processes(
-    posterior: MixturePosterior, theta: Tensor
-) -> None:
-    ranks, _ = run_sbc(
-        theta[:4],
-        posterior.x_o[:4],
-        posterior,
-        num_posterior_samples=50,
-        num_workers=2,
-        use_batched_sampling=False,
-        show_progress_bar=False,
-    )
-    assert ranks.shape == (4, 2)
+    assert ((ranks >= 0) & (ranks <= 50)).all()
 
 
 def test_expected_coverage_is_nominal_for_calibrated_posteriors(

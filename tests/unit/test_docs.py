@@ -1,6 +1,5 @@
 """Links of the README, of the documentation, and of what the code says of them."""
 
-import ast
 import re
 from collections import Counter
 from pathlib import Path
@@ -56,24 +55,6 @@ def test_links_between_pages_lead_to_files_and_headings_that_exist(page: Path) -
     assert broken_links(page) == []
 
 
-def test_no_page_holds_the_place_of_something_that_is_still_to_come() -> None:
-    places = re.compile(r"@@|\b(TODO|TBD|FIXME|XXX)\b")
-    assert [str(page) for page in PAGES if places.search(prose(page))] == []
-
-
-def test_a_link_to_a_file_or_a_heading_that_is_not_there_is_found(
-    tmp_path: Path,
-) -> None:
-    page = tmp_path / "page.md"
-    page.write_text(
-        "# A `title`, twice\n## A title twice\n"
-        "[here](#a-title-twice-1) [self](page.md#a-title-twice) [out](https://x.org)\n"
-        "```text\n[code](nowhere.md)\n```\n"
-        "[no file](gone.md) ![no picture](gone.png) [no heading](page.md#other)\n"
-    )
-    assert broken_links(page) == ["gone.md", "gone.png", "page.md#other"]
-
-
 def test_pages_that_the_code_names_exist() -> None:
     named = {
         name
@@ -89,19 +70,3 @@ def test_the_reference_describes_all_that_the_package_exports() -> None:
     page = (ROOT / "docs/reference/sbi_rope.md").read_text()
     described = re.findall(r"^\.\. auto\w+:: (\w+)$", page, flags=re.MULTILINE)
     assert sorted(described) == sorted(sbi_rope.__all__)
-
-
-@pytest.mark.medium
-def test_no_docstring_of_a_property_starts_with_a_type() -> None:
-    """Napoleon takes what stands before a colon in it for the type of the property."""
-    wrong = []
-    for path in sorted((ROOT / "sbi_rope").rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if not isinstance(node, ast.FunctionDef):
-                continue
-            names = {ast.unparse(decorator) for decorator in node.decorator_list}
-            first = (ast.get_docstring(node) or "").split("\n")[0]
-            # The colon of a role, such as :meth:`of`, is followed by no space.
-            if names & {"property", "cached_property"} and ": " in first:
-                wrong.append(f"{path.name}: {node.name}: {first}")
-    assert wrong == []

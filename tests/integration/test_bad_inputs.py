@@ -1,0 +1,335 @@
+"""Bad inputs at the public entry points are refused, and the argument is named.
+
+A bad input that means something to a call is listed with the value that is right.
+"""
+
+import functools
+import inspect
+import itertools
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from sbi.inference import DirectPosterior
+from sbi.utils import BoxUniform
+from torch import Tensor
+
+from sbi_rope import (
+    CalibrationFinetuner,
+    RoPE,
+    SinkhornCoupler,
+    baselines,
+    diagnose,
+    load,
+    metrics,
+    save,
+    stack,
+)
+from sbi_rope.discrepancy import DiscrepancyModel, DiscrepancyNPE
+from sbi_rope.errors import RoPEError
+from sbi_rope.stacking import default_candidates
+from sbi_rope.tasks import get_task
+from tests import gaussian
+
+pytestmark = pytest.mark.filterwarnings("ignore")
+
+Call = Callable[..., Any]
+PRIOR = BoxUniform(-4 * torch.ones(2), 4 * torch.ones(2))
+
+
+def draw(seed: int, *shape: int) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+
+
+THETA, THETA_S, X_O = draw(0, 20, 2), draw(1, 60, 2), 1.4 * draw(4, 20, 2) + 0.7
+X, X_S = 1.4 * (THETA + 0.5 * draw(2, 20, 2)) + 0.7, THETA_S + 0.5 * draw(3, 60, 2)
+
+ONES = torch.ones(20, 2)
+SAMPLES, LEVELS = draw(6, 50, 20, 2), torch.linspace(0.01, 0.99, 40).reshape(20, 2)
+
+
+# --- objects that are made once ---
+
+
+@functools.cache
+def npe() -> Any:
+    return DirectPosterior(gaussian.GaussianEstimator(), PRIOR)
+
+
+def untrained(**options: Any) -> RoPE:
+    finetuner = CalibrationFinetuner(max_num_epochs=2)
+    return RoPE(npe(), simulator=gaussian.simulator, finetuner=finetuner, **options)
+
+
+@functools.cache
+def trained() -> RoPE:
+    return untrained().append_calibration(THETA, X).train(seed=0)
+
+
+@functools.cache
+def coupled() -> Any:
+    return trained().build_posterior(X_O, num_simulations=30, seed=0)
+
+
+@functools.cache
+def stacked() -> Any:
+    candidates = [c for c in default_candidates() if c.name in ("prior", "NPE")]
+    return stack(trained(), candidates=candidates, num_folds=2, seed=0)
+
+
+# --- the public calls, each with good tensors as defaults ---
+
+
+def of_posterior(kind: str, make: Callable[[], Any]) -> dict[str, Call]:
+    drawn = {"num_samples": 20, "seed": 0}
+    return {
+        f"{kind}.sample": lambda x=X_O[:1]: make().sample((5,), x=x),
+        f"{kind}.sample_batched": lambda x=X_O: make().sample_batched((5,), x=x),
+        f"{kind}.log_prob": lambda theta=THETA, x=X_O[:1]: make().log_prob(theta, x=x),
+        f"{kind}.log_prob_batched": lambda theta=THETA, x=X_O: make().log_prob_batched(
+            theta, x=x
+        ),
+        f"{kind}.credible_intervals": lambda x=X_O[:1]: make().credible_intervals(
+            0.9, x, **drawn
+        ),
+        f"{kind}.credible_intervals_batched": lambda x=X_O: (
+            make().credible_intervals_batched(0.9, x, **drawn)
+        ),
+        f"{kind}.credible_set.contains": lambda theta=THETA: (
+            make().credible_set(0.9, X_O[0], **drawn).contains(theta)
+        ),
+    }
+
+
+def of_method(make: Callable[..., Any]) -> dict[str, Call]:
+    """The calls of a method that is used like a trainer of sbi."""
+    kind = make if isinstance(make, type) else make.func  # type: ignore[attr-defined]
+    calls: dict[str, Call] = {
+        "simulations": lambda theta=THETA_S, x=X_S: (
+            make(PRIOR).append_simulations(theta, x)._data.simulations[1]
+        ),
+        "calibration": lambda theta=THETA, x=X: (
+            make(PRIOR).append_calibration(theta, x)._data.calibration[1]
+        ),
+        "observations": lambda x_o=X_O: make(PRIOR).append_observations(x_o),
+    }
+    return {
+        f"{kind.__name__}.append_{what}": call
+        for what, call in calls.items()
+        if what in kind.sees
+    }
+
+
+def with_simulations(theta: Tensor = THETA_S, x: Tensor = X_S) -> Tensor:
+    rope = RoPE(npe(), simulations=(theta, x))
+    return rope.embed(X_O, seed=0).simulated
+
+
+def finetuned(x: Tensor = X, targets: Tensor = THETA) -> Any:
+    net = npe().posterior_estimator.embedding_net
+    return CalibrationFinetuner(max_num_epochs=2).finetune(net, x, lambda n: targets)
+
+
+METHODS = (
+    baselines.PlainNPE,  # learns from simulations
+    baselines.FinetunedNPE,
+    baselines.CalibrationMLP,  # learns from calibration pairs
+    baselines.RVNP,  # learns from observations
+    functools.partial(baselines.OTOnly, simulator=gaussian.simulator),
+    functools.partial(baselines.HVAE, physics=lambda theta: theta),
+    DiscrepancyNPE,
+)
+CALLS: dict[str, Call] = {
+    "RoPE": with_simulations,
+    "RoPE.append_calibration": lambda theta=THETA, x=X: (
+        untrained().append_calibration(theta, x).calibration[0]
+    ),
+    "RoPE.append_calibration(noise)": lambda theta_std=ONES: (
+        untrained().append_calibration(THETA, X, theta_std=theta_std)
+    ),
+    "RoPE.append_calibration(weights)": lambda weights=ONES[:, 0]: (
+        untrained().append_calibration(THETA, X, weights=weights)
+    ),
+    "RoPE.build_posterior": lambda x_o=X_O: trained().build_posterior(x_o),
+    "CalibrationFinetuner.finetune": finetuned,
+    "SinkhornCoupler.couple": SinkhornCoupler().couple,
+    "stack": lambda x_o=X_O: stack(trained(), x_o),
+    "diagnose": lambda x_o=X_O: diagnose(trained(), x_o, num_folds=None),
+    **of_posterior("MixturePosterior", coupled),
+    **of_posterior("StackedPosterior", stacked),
+    "a set with a guarantee": lambda theta=THETA: (
+        stacked().credible_set(0.5, X_O[0], guaranteed=True, seed=0).contains(theta)
+    ),
+    "lpp": lambda theta=THETA, x=X: metrics.lpp(stacked(), theta, x),
+    "acauc": lambda theta=THETA, x=X: metrics.acauc(stacked(), theta, x),
+    "evaluate": lambda theta=THETA, x=X: metrics.evaluate(stacked(), theta, x),
+    "acauc_of": lambda levels=LEVELS: metrics.acauc_of(levels).value,
+    "mid_ranks": lambda samples=SAMPLES, theta=THETA: metrics.mid_ranks(samples, theta),
+    **{
+        f"simulator of {name}": lambda theta=theta, name=name: get_task(
+            name
+        ).get_simulator()(theta)
+        for name, theta in (
+            ("pendulum", torch.tensor([[1.0, 2.0]] * 5)),
+            ("linear_gaussian", THETA),
+        )
+    },
+    **{name: call for make in METHODS for name, call in of_method(make).items()},
+    "PriorPosterior.log_prob": lambda theta=THETA: baselines.PriorPosterior(
+        PRIOR
+    ).log_prob(theta),
+}
+
+
+# --- the bad inputs ---
+
+
+def spoilt(good: Tensor, value: float) -> Tensor:
+    """A copy with another value in the middle."""
+    bad = good.clone()
+    bad.view(-1)[bad.numel() // 2] = value
+    return bad
+
+
+BAD: dict[str, Callable[[Tensor], Any]] = {
+    "ndim": lambda good: good[..., None],
+    "width": lambda good: torch.cat([good, good[..., :1]], dim=-1),
+    "empty": lambda good: good[:0],
+    "NaN": lambda good: spoilt(good, math.nan),
+    "Inf": lambda good: spoilt(good, math.inf),
+    "text": lambda good: "x",
+}
+
+
+def finite(found: Any) -> bool:
+    return bool(torch.isfinite(torch.as_tensor(found)).all())
+
+
+def shape(*sizes: int) -> Callable[[Tensor], bool]:
+    return lambda found: tuple(found.shape) == sizes
+
+
+# What some bad inputs mean to some calls, as a condition on the result.
+MEANS: dict[str, Callable[[Any], bool]] = {
+    # A parameter that was not measured is imputed.
+    "RoPE.append_calibration(theta: NaN)": finite,
+    "acauc_of(levels: width)": finite,
+    # These have a rank.
+    "mid_ranks(samples: Inf)": finite,
+    "mid_ranks(theta: Inf)": finite,
+    "simulator of pendulum(theta: empty)": shape(0, 200),
+    "simulator of linear_gaussian(theta: empty)": shape(0, 2),
+}
+for _name in CALLS:
+    if "log_prob" in _name:  # one of the parameters is impossible
+        MEANS[f"{_name}(theta: Inf)"] = lambda found: int(found.isneginf().sum()) == 1
+    for _bad in ("NaN", "Inf"):
+        if _name == "RoPE":  # a simulation is dropped
+            MEANS[f"RoPE(theta: {_bad})"] = MEANS[f"RoPE(x: {_bad})"] = shape(59, 2)
+        if _name.endswith("append_simulations"):
+            MEANS[f"{_name}(x: {_bad})"] = shape(59, 2)
+    if ".append_" in _name and not _name.startswith("RoPE"):
+        # The first x says which shape an observation has.
+        for _argument, _bad in itertools.product(("x", "x_o"), ("ndim", "width")):
+            MEANS[f"{_name}({_argument}: {_bad})"] = lambda found: True
+
+
+# Only the user's net knows which shape it reads, so that torch may refuse another one.
+LEFT_TO_TORCH = {
+    f"CalibrationFinetuner.finetune(x: {bad})" for bad in ("ndim", "width")
+}
+
+
+def good_tensors(call: Call) -> dict[str, Tensor]:
+    found = {n: p.default for n, p in inspect.signature(call).parameters.items()}
+    found = {"real": X_O, "simulated": X_S} if "real" in found else found
+    return {name: good for name, good in found.items() if isinstance(good, Tensor)}
+
+
+each_argument = pytest.mark.parametrize(
+    ("name", "argument"),
+    [
+        (name, argument)
+        for name, call in CALLS.items()
+        for argument in good_tensors(call)
+    ],
+)
+
+
+def verdict(name: str, argument: str, label: str, bad: Any) -> str:
+    """What a call does wrong with a bad argument; nothing if it refuses it by name."""
+    good = good_tensors(CALLS[name])
+    case = f"{name}({argument}: {label})"
+    means = MEANS.get(case)
+    try:
+        found = CALLS[name](**{**good, argument: bad})
+    except RoPEError as error:
+        names = (*good, "simulations") if name == "RoPE" else good
+        is_named = any(f"`{one}" in str(error) for one in names)
+        return "" if is_named and len(str(error)) < 400 else str(error)
+    except Exception as error:
+        if isinstance(error, RuntimeError) and case in LEFT_TO_TORCH:
+            return ""
+        return f"{type(error).__name__}: {error}"
+    return "" if label == "device" or (means and means(found)) else "accepted"
+
+
+@pytest.mark.medium
+@each_argument
+def test_a_bad_tensor_is_refused_or_means_something(name: str, argument: str) -> None:
+    good = good_tensors(CALLS[name])[argument]
+    for label, spoil in BAD.items():
+        wrong = verdict(name, argument, label, spoil(good))
+        assert not wrong, label
+
+
+@pytest.mark.gpu
+@each_argument
+def test_a_tensor_on_another_device_is_refused_or_moved(
+    name: str, argument: str
+) -> None:
+    bad = good_tensors(CALLS[name])[argument].to("cuda")
+    assert not verdict(name, argument, "device", bad)
+
+
+# --- settings ---
+
+
+SETTINGS: dict[str, Callable[..., Any]] = {
+    "num_simulations": lambda **bad: untrained(**bad),
+    "gamma": SinkhornCoupler,
+    "tau": SinkhornCoupler,
+    "max_iterations": SinkhornCoupler,
+    "learning_rate": CalibrationFinetuner,
+    "max_num_epochs": CalibrationFinetuner,
+    "rehearsal": CalibrationFinetuner,
+    "num_folds": lambda **bad: stack(trained(), **bad),
+    "seed": lambda **bad: trained().build_posterior(X_O, **bad),
+    "level": lambda **bad: stacked().credible_set(x=X_O[0], **bad),
+    "num_samples": lambda **bad: metrics.evaluate(stacked(), THETA, X, **bad),
+    "num_steps": lambda **bad: DiscrepancyNPE(PRIOR, **bad),
+    "probability_of_none": DiscrepancyModel,
+    "training_batch_size": baselines.Training,
+    "clip_max_norm": baselines.Training,
+    "spike_std": baselines.SpikeAndSlab,
+    "n": lambda **bad: get_task("pendulum").get_calibration_set(**bad, seed=0),
+}
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+@pytest.mark.parametrize("value", [-1, math.nan, "x"])
+def test_a_bad_setting_is_refused(name: str, value: Any) -> None:
+    with pytest.raises(RoPEError, match=f"`{name}`.*; got {value!r}"):
+        SETTINGS[name](**{name: value})
+
+
+def test_what_is_no_posterior_is_not_saved_and_not_loaded(tmp_path: Path) -> None:
+    with pytest.raises(RoPEError, match="`posterior`"):
+        save("x", tmp_path / "posterior.pt")  # type: ignore[arg-type]
+    path = tmp_path / "text.pt"
+    path.write_text("not a posterior")
+    with pytest.raises(RoPEError, match=r"text\.pt"):
+        load(path)
