@@ -19,7 +19,7 @@ from sbi_rope._training import (
     shuffled,
 )
 from sbi_rope.errors import InvalidInputError, warn_user
-from sbi_rope.settings import Count, Positive, check
+from sbi_rope.settings import Count, Level, Positive, Settings, check
 
 __all__ = [
     "FINETUNING",
@@ -38,7 +38,7 @@ MIN_SIMULATIONS = 20
 
 
 @dataclass(frozen=True, kw_only=True)
-class Training:
+class Training(Settings):
     """How a network is trained, in the words of sbi's ``train``; Adam throughout.
 
     Args:
@@ -55,27 +55,12 @@ class Training:
         InvalidInputError: If an argument is outside its range.
     """
 
-    training_batch_size: int = 200
-    learning_rate: float = 5e-4
-    validation_fraction: float = 0.1
-    stop_after_epochs: int = 20
-    max_num_epochs: int = 2**31 - 1
-    clip_max_norm: float | None = 5.0
-
-    def __post_init__(self) -> None:
-        """Check the ranges of all fields."""
-        check("training_batch_size", self.training_batch_size, Count)
-        check("learning_rate", self.learning_rate, Positive)
-        check("validation_fraction", self.validation_fraction, Positive)
-        if self.validation_fraction > 0.5:
-            raise InvalidInputError(
-                "Expected `validation_fraction` in (0, 0.5]; got "
-                f"{self.validation_fraction!r}."
-            )
-        check("stop_after_epochs", self.stop_after_epochs, Count)
-        check("max_num_epochs", self.max_num_epochs, Count)
-        if self.clip_max_norm is not None:
-            check("clip_max_norm", self.clip_max_norm, Positive)
+    training_batch_size: Count = 200
+    learning_rate: Positive = 5e-4
+    validation_fraction: Level = 0.1
+    stop_after_epochs: Count = 20
+    max_num_epochs: Count = 2**31 - 1
+    clip_max_norm: Positive | None = 5.0
 
 
 # How NPE is fine-tuned on pairs, chosen on calibration data: see benchmarks/choices.md.
@@ -94,16 +79,11 @@ def estimator_builder(density_estimator: Any) -> EstimatorBuilder:
     then changes it. Ours builds from a copy, so that several methods can share one.
 
     Raises:
-        InvalidInputError: If it is neither a name nor callable.
         InvalidInputError: If sbi knows no estimator of that name.
     """
+    check("density_estimator", density_estimator, str | Callable)
     if isinstance(density_estimator, str):
         _builder_of_name(density_estimator)
-    elif not callable(density_estimator):
-        raise InvalidInputError(
-            "Expected `density_estimator` to be a name such as 'nsf', or what sbi's "
-            f"`posterior_nn(...)` returns; got {type(density_estimator).__name__}."
-        )
     return _CopyingBuilder(density_estimator)
 
 
@@ -149,8 +129,8 @@ def _builder_of_name(name: str) -> EstimatorBuilder:
             builder(some, some)
     except Exception as error:
         raise InvalidInputError(
-            "Expected `density_estimator` to be the name of an estimator for "
-            f"continuous parameters that sbi's `posterior_nn` knows; got {name!r}."
+            "Expected `density_estimator` to be one for continuous parameters that "
+            f"`posterior_nn` knows; got {name!r}."
         ) from error
     return builder
 
@@ -273,11 +253,8 @@ def rows_with_density(
     missing = sum(int((~of_part).sum()) for of_part in finite)
     if missing:
         warn_user(
-            f"{missing} calibration pair(s) have no density under NPE before it is "
-            "trained on them, and are left out of this training. Their parameters may "
-            "be exactly on a bound of the prior, where some density estimators are "
-            "zero. If they are rounded, `RoPE.append_calibration` can be told by how "
-            "much, with `theta_std`."
+            f"{missing} calibration pair(s) have no density under NPE, and are left "
+            "out of this training. Are they exactly on a bound of the prior?"
         )
     return tuple(
         rows[of_part] if of_part.any() else rows
