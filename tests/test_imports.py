@@ -25,17 +25,14 @@ DEPENDENCIES = "import ot, numpy, torch, tqdm.auto, sbi.inference, sbi.utils"
 # A module imports from layers below its own, and from its own package. Those of one
 # layer do not know each other.
 LAYERS = [
-    # They know nothing of inference: errors, means, results in notebooks and tables,
-    # progress, processes, slices.
+    # They know nothing of inference: errors, means, progress, processes, slices.
     {
         "errors",
         "_means",
-        "_notebooks",
         "_permutation",
         "_progress",
         "_processes",
         "_slices",
-        "_tables",
     },
     # They raise errors: of seeds, of files and of functions that cannot be pickled.
     {"_random", "_files", "_pickling"},
