@@ -7,13 +7,14 @@ from torch import Tensor
 
 from sbi_rope.plots._figures import PRIOR, empty_figure, hide_frame, line_styles
 from sbi_rope.plots._samples import (
-    check_samples,
+    as_drawn,
+    as_samples,
+    central_interval,
     draw_contours,
     draw_edges,
     draw_marginal,
     edges_crossed,
     label_with_share,
-    prior_interval,
     robust_limits,
     shade_prior,
 )
@@ -52,15 +53,15 @@ def pair_plot(
 
     Raises:
         InvalidInputError: If the shapes differ, or a sample is not finite.
-        ImportError: If matplotlib is not installed.
     """
-    draws, truth, names = check_samples(samples, theta, parameter_names)
+    draws, truth, names = as_samples(samples, theta, parameter_names)
     dim = len(names)
     figure = empty_figure(2.0 * dim + 0.8, 2.0 * dim + 1.0)
-    interval = (
-        None if prior is None else prior_interval(prior, draws[next(iter(draws))])
-    )
-    edges = None if prior is None else edges_crossed(prior, list(draws.values()))
+    interval = edges = None
+    if prior is not None:
+        prior = as_drawn("prior", prior, (dim,))
+        interval = central_interval(prior)
+        edges = edges_crossed(prior, list(draws.values()))
     limits = robust_limits(list(draws.values()), truth, interval)
     for row in range(dim):
         for column in range(row + 1):

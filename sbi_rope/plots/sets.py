@@ -10,9 +10,8 @@ from sbi_rope.errors import InvalidInputError, warn_user
 from sbi_rope.mixture import MixturePosterior
 from sbi_rope.plots._figures import BLUE, GREY, ORANGE, empty_figure, hide_frame
 from sbi_rope.plots._samples import (
+    as_samples,
     central_interval,
-    check_samples,
-    check_truth,
     draw_marginal,
     with_margin,
 )
@@ -26,6 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = ["credible_set"]
 
+NUM_SAMPLES = 2000
 CREDIBLE, GUARANTEED = "of the posterior", "guaranteed"
 STYLES: dict[str, dict[str, Any]] = {
     CREDIBLE: {"color": BLUE, "linestyle": "-"},
@@ -40,8 +40,6 @@ def credible_set(
     *,
     level: float = 0.9,
     parameter_names: Sequence[str] | None = None,
-    num_samples: int = 2000,
-    seed: int | None = 0,
 ) -> "Figure":
     """Draw the credible set of an observation, and of a stack that with a guarantee.
 
@@ -60,21 +58,15 @@ def credible_set(
         level: The level of the sets and intervals.
         parameter_names: A label for each parameter, with its unit. If None, the names
             that ``RoPE`` was given.
-        num_samples: The number of draws, as in ``posterior.credible_set``.
-        seed: Seed of the draws.
 
     Returns:
         The figure, with d rows and columns and the intervals on the diagonal.
 
     Raises:
-        InvalidInputError: If the posterior is another one.
-        InvalidInputError: If an argument is outside its range.
-        ImportError: If matplotlib is not installed.
+        InvalidInputError: If the posterior is another one, or an argument does not fit.
     """
     check("posterior", posterior, MixturePosterior)
-    if theta is not None:  # before the sets, which take a while
-        theta = check_truth(theta, posterior.posterior_estimator.input_shape[0])
-    options: dict[str, Any] = {"num_samples": num_samples, "seed": seed}
+    options: dict[str, Any] = {"num_samples": NUM_SAMPLES, "seed": 0}
     sets = {CREDIBLE: posterior.credible_set(level, x, **options)}
     intervals = {CREDIBLE: posterior.credible_intervals(level, x, **options)}
     if isinstance(posterior, StackedPosterior):
@@ -90,7 +82,7 @@ def credible_set(
         name: points[found.contains(points)]
         for name, found in sorted(sets.items(), key=lambda item: -item[1].volume)
     }
-    draws, truth, labels = check_samples(
+    draws, truth, labels = as_samples(
         {"posterior": sets[CREDIBLE].draws, **members},
         theta,
         posterior.parameter_names if parameter_names is None else parameter_names,
