@@ -1,19 +1,20 @@
 """Draw posterior samples in a panel: limits of axes, histograms, contours."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from sbi_rope.plots._figures import GREY, PRIOR
+from sbi_rope.plots._figures import GREY, PRIOR, hide_frame
 from sbi_rope.settings import names_of
 from sbi_rope.tensors import as_batch
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # How far beyond their core the axes may reach, in widths of the core.
 REACH = 1.0
@@ -115,6 +116,57 @@ def _width(low: Tensor, high: Tensor) -> Tensor:
     size = torch.maximum(low.abs(), high.abs())
     visible = torch.where(size > 0, size, torch.ones_like(size))
     return torch.where(high - low > 1e-9 * size, high - low, visible)
+
+
+def corner_panels(
+    figure: "Figure", names: Sequence[str], limits: Tensor, truth: Tensor | None
+) -> Iterator[tuple["Axes", list[int]]]:
+    """Add a panel for each parameter and each pair, and yield each before its truth.
+
+    Args:
+        figure: An empty figure.
+        names: The labels of the parameters.
+        limits: The limits of the axes, shape ``(2, d)``.
+        truth: The true parameter, shape ``(d,)``.
+
+    Yields:
+        A panel, and the one or two parameters that it shows.
+    """
+    dim = len(names)
+    for row in range(dim):
+        for column in range(row + 1):
+            axes = figure.add_subplot(dim, dim, row * dim + column + 1)
+            hide_frame(axes)
+            axes.set_xlim(*limits[:, column].tolist())
+            if row == column:
+                yield axes, [row]
+                axes.spines["left"].set_visible(False)
+                axes.set_yticks([])
+                axes.set_ylim(bottom=0)
+                if truth is not None:
+                    axes.axvline(float(truth[row]), color="black", lw=1.2)
+            else:
+                axes.set_ylim(*limits[:, row].tolist())
+                yield axes, [column, row]
+                if truth is not None:
+                    pair = truth[[column, row]].tolist()
+                    axes.plot(*pair, "o", color="black", ms=4, zorder=5)
+            axes.tick_params(labelbottom=row == dim - 1, labelleft=column == 0)
+            if row == dim - 1:
+                axes.set_xlabel(names[column])
+            if column == 0 and row > 0:
+                axes.set_ylabel(names[row])
+
+
+def corner_legend(figure: "Figure", handles: list[Any], truth: Tensor | None) -> None:
+    """Add a legend in the empty half of the figure, or above a single panel."""
+    from matplotlib.lines import Line2D
+
+    if truth is not None:
+        style: dict[str, Any] = {"color": "black", "lw": 1.2, "marker": "o", "ms": 4}
+        handles = [*handles, Line2D([], [], label="truth", **style)]
+    place = "upper right" if len(figure.axes) > 1 else "outside upper center"
+    figure.legend(handles=handles, loc=place, frameon=False)
 
 
 def shade_prior(axes: "Axes", interval: Tensor) -> None:

@@ -8,10 +8,12 @@ from torch import Tensor
 
 from sbi_rope.errors import InvalidInputError, warn_user
 from sbi_rope.mixture import MixturePosterior
-from sbi_rope.plots._figures import BLUE, GREY, ORANGE, empty_figure, hide_frame
+from sbi_rope.plots._figures import BLUE, GREY, ORANGE, empty_figure
 from sbi_rope.plots._samples import (
     as_samples,
     central_interval,
+    corner_legend,
+    corner_panels,
     draw_marginal,
     with_margin,
 )
@@ -20,7 +22,6 @@ from sbi_rope.settings import check
 from sbi_rope.stacking import StackedPosterior
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["credible_set"]
@@ -102,22 +103,24 @@ def _drawn(
     limits = _limits(draws, intervals, truth)
     samples = draws.pop("posterior")
     figure = empty_figure(2.0 * dim + 0.8, 2.0 * dim + 1.0)
-    for row in range(dim):
-        for column in range(row + 1):
-            axes = figure.add_subplot(dim, dim, row * dim + column + 1)
-            hide_frame(axes)
-            axes.set_xlim(*limits[:, column].tolist())
-            if row == column:
-                _draw_intervals(axes, samples[:, row], intervals, truth, row)
-            else:
-                axes.set_ylim(*limits[:, row].tolist())
-                _draw_sets(axes, draws, truth, [column, row])
-            axes.tick_params(labelbottom=row == dim - 1, labelleft=column == 0)
-            if row == dim - 1:
-                axes.set_xlabel(labels[column])
-            if column == 0 and row > 0:
-                axes.set_ylabel(labels[row])
-    _add_legend(figure, intervals, truth, level=level)
+    for axes, pair in corner_panels(figure, labels, limits, truth):
+        if len(pair) == 1:
+            draw_marginal(axes, samples[:, pair[0]], {"color": GREY})
+            for name, found in intervals.items():
+                for end in (found.low[pair[0]], found.high[pair[0]]):
+                    axes.axvline(float(end), **STYLES[name], lw=1.8)
+            continue
+        for name, value in draws.items():
+            colour, (x, y) = STYLES[name]["color"], value[:, pair].T.numpy()
+            axes.scatter(x, y, s=5, color=colour, lw=0, rasterized=True)
+    from matplotlib.lines import Line2D
+
+    styles = {name: {**STYLES[name], "marker": "o", "ms": 4} for name in intervals}
+    handles = [
+        Line2D([], [], label=f"{100 * level:.4g} %, {name}", **style)
+        for name, style in styles.items()
+    ]
+    corner_legend(figure, handles, truth)
     return figure
 
 
@@ -140,65 +143,3 @@ def _limits(
         spans.append(truth.expand(2, -1))
     low, high = torch.stack(spans).nan_to_num(posinf=0.0, neginf=0.0).unbind(dim=1)
     return with_margin(low.amin(dim=0), high.amax(dim=0))
-
-
-def _draw_intervals(
-    axes: "Axes",
-    samples: Tensor,
-    intervals: Mapping[str, CredibleIntervals],
-    truth: Tensor | None,
-    number: int,
-) -> None:
-    draw_marginal(axes, samples, {"color": GREY})
-    for name, found in intervals.items():
-        for end in (found.low[number], found.high[number]):
-            axes.axvline(float(end), **STYLES[name], lw=1.8)
-    axes.spines["left"].set_visible(False)
-    axes.set_yticks([])
-    axes.set_ylim(bottom=0)
-    if truth is not None:
-        axes.axvline(float(truth[number]), color="black", lw=1.2)
-
-
-def _draw_sets(
-    axes: "Axes", members: Mapping[str, Tensor], truth: Tensor | None, pair: list[int]
-) -> None:
-    for name, value in members.items():
-        axes.scatter(
-            *value[:, pair].T.numpy(),
-            s=5,
-            color=STYLES[name]["color"],
-            lw=0,
-            rasterized=True,
-        )
-    if truth is not None:
-        axes.plot(*truth[pair].tolist(), "o", color="black", ms=4, zorder=5)
-
-
-def _add_legend(
-    figure: "Figure",
-    intervals: Mapping[str, CredibleIntervals],
-    truth: Tensor | None,
-    *,
-    level: float,
-) -> None:
-    from matplotlib.lines import Line2D
-
-    handles = [
-        Line2D(
-            [],
-            [],
-            **STYLES[name],
-            marker="o",
-            ms=4,
-            label=f"{100 * level:.4g} %, {name}",
-        )
-        for name in intervals
-    ]
-    if truth is not None:
-        handles.append(
-            Line2D([], [], color="black", lw=1.2, marker="o", ms=4, label="truth")
-        )
-    # The legend is in the empty half of the figure, or above a single panel.
-    place = "upper right" if len(figure.axes) > 1 else "outside upper center"
-    figure.legend(handles=handles, loc=place, frameon=False)

@@ -265,7 +265,7 @@ class Method(ABC):
             seen = [DATA[one][0] for one in DATA if one in self.sees]
             raise InvalidInputError(
                 f"Expected a method that sees {DATA[kind][0]}; {type(self).__name__} "
-                f"sees only {' and '.join(seen) or 'the prior'}."
+                f"sees {'only ' + ' and '.join(seen) if seen else 'no data'}."
             )
         getattr(self._data, f"append_{kind}")(*data)
         self._posterior = self._history = None

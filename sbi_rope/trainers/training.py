@@ -188,45 +188,31 @@ def train_network(
     loss: Callable[..., Tensor],
     training: Training,
     *,
-    validation_loss: Callable[[], Tensor] | None,
     max_num_epochs: int | None = None,
-    in_training_mode: bool = True,
-    decay: bool = False,
-    label: str,
-    show_progress_bars: bool,
+    **options: Any,
 ) -> History:
-    """Train a module by any loss, in place.
+    """Train a module by any loss, in place, with the settings of a training.
 
     Args:
         module: The module.
         batches: Given the number of the epoch, the batches to pass over.
         loss: Of a batch, its mean loss.
         training: Learning rate and so on; ``batches`` has the size of the batches.
-        validation_loss: The loss over the held-out data, if there are any.
         max_num_epochs: Instead of that of ``training``.
-        in_training_mode: Whether dropout and batch statistics are active in training.
-        decay: Whether the step size falls to zero, along a cosine over all epochs.
-        label: What the progress bar and warnings call it.
-        show_progress_bars: Whether to show the course of the loss.
+        **options: Other arguments of ``_training.fit``.
 
     Returns:
         The losses and the epoch that was kept.
     """
-    if max_num_epochs is None:
-        max_num_epochs = training.max_num_epochs
     return fit(
         module,
         batches,
         loss,
-        validation_loss=validation_loss,
         learning_rate=training.learning_rate,
-        max_num_epochs=max_num_epochs,
+        max_num_epochs=max_num_epochs or training.max_num_epochs,
         stop_after_epochs=training.stop_after_epochs,
         clip_max_norm=training.clip_max_norm,
-        in_training_mode=in_training_mode,
-        decay=decay,
-        label=label,
-        show_progress_bars=show_progress_bars,
+        **options,
     )
 
 

@@ -403,10 +403,9 @@ def test_options_of_another_type_are_refused() -> None:
                 with pytest.raises(InvalidInputError, match=f"`{option}`"):
                     make(name, first_task(name), **{option: {"max_num_epochs": 3}})
         if "density_estimator" in known:
-            with pytest.raises(InvalidInputError, match=r"`density_estimator`.*int"):
-                make(name, first_task(name), density_estimator=3)
-            with pytest.raises(InvalidInputError, match=r"`density_estimator`.*fancy"):
-                make(name, first_task(name), density_estimator="fancy")
+            for value in (3, "fancy"):
+                with pytest.raises(InvalidInputError, match="`density_estimator`"):
+                    make(name, first_task(name), density_estimator=value)
 
 
 @pytest.mark.medium

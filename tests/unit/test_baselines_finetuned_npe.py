@@ -16,8 +16,6 @@ from sbi_rope.baselines import FinetunedNPE, PlainNPE, Training
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import (
     InvalidInputError,
-    NotReadyError,
-    RoPEWarning,
 )
 from sbi_rope.mixture import MixturePosterior
 from sbi_rope.tasks import get_task
@@ -138,26 +136,6 @@ def test_people_are_held_out_as_a_whole() -> None:
     difference = (losses - kept).abs()
     assert difference.amin(dim=0).max() < 1e-4
     assert sorted(difference.argmin(dim=0).tolist()) == list(range(6))
-
-
-def test_of_fewer_than_five_pairs_none_is_held_out() -> None:
-    pairs = PAIRS[0][:4], PAIRS[1][:4]
-    with pytest.warns(RoPEWarning, match="Only 4 calibration pair"):
-        several = finetuned(npe(), pairs, num_holdouts=3)
-    with pytest.warns(RoPEWarning, match="Only 4 calibration pair"):
-        one = finetuned(npe(), pairs)
-    assert several.histories == (one.history,)
-    expected = log_probs(one.build_posterior())
-    posterior = several.build_posterior()
-    assert isinstance(posterior, MixturePosterior)
-    assert torch.allclose(log_probs(posterior), expected, atol=1e-4)
-
-
-def test_losses_of_an_old_training_are_gone_with_new_pairs() -> None:
-    method = finetuned(npe(), num_holdouts=3)
-    method.append_calibration(*PAIRS)
-    with pytest.raises(NotReadyError):
-        _ = method.histories
 
 
 # A corrected start.

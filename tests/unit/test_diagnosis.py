@@ -176,21 +176,6 @@ def test_a_narrow_batch_like_its_pairs_is_narrower_than_the_prior_only() -> None
     assert "No sign that the batch differs" in diagnosis[UNLIKE].sentence
 
 
-@pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
-def test_too_few_observations_or_pairs_leave_comparisons_of_them_out() -> None:
-    torch.manual_seed(29)
-    rope = conductor(finetuner=QUICK)
-    rope.append_calibration(*gaussian.labelled(3)).train(
-        seed=0, show_progress_bars=False
-    )
-    diagnosis = look(rope, gaussian.real_process(parameters(30)), num_simulations=200)
-    names = {finding.name for finding in diagnosis.findings}
-    assert names.isdisjoint({*NARROW, UNLIKE})
-    left_out = ("residuals depend", "narrower range", "like the calibration pairs")
-    for what in left_out:
-        assert any(what in n and "was not tested" in n for n in diagnosis.notes)
-
-
 @pytest.mark.medium
 def test_a_single_outlier_is_flagged(tuned: RoPE) -> None:
     torch.manual_seed(5)
@@ -640,16 +625,6 @@ def test_pairs_with_the_same_parameters_count_once() -> None:
 
 
 # --- residuals ---
-
-
-@pytest.mark.slow
-def test_p_values_of_the_residual_test_are_uniform_without_dependence() -> None:
-    torch.manual_seed(19)
-    values = [
-        dependence(torch.randn(20, 3).double(), torch.randn(20, 2).double()).p_value
-        for _ in range(60)
-    ]
-    assert kstest(values, "uniform").pvalue > 0.01
 
 
 @pytest.mark.medium

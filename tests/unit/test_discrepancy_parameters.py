@@ -159,17 +159,6 @@ def test_weighted_simulations_have_the_mean_and_spread_of_the_pairs() -> None:
         assert one.effective_sample_size == pytest.approx(expected)
 
 
-def test_normal_scores_do_not_depend_on_the_scale_of_a_parameter() -> None:
-    for prior in PRIORS:
-        reference, theta = prior(1000), prior(20)
-        scores = normal_scores(theta, reference)
-        other = normal_scores(theta.double().exp(), reference.double().exp())
-        assert torch.equal(other, scores), prior.__name__
-        for j in range(theta.shape[1]):  # they keep the order, and ties
-            order = theta[:, j].argsort()
-            assert (scores[order, j].diff() >= 0).all(), prior.__name__
-
-
 def test_discrete_parameters_are_left_out() -> None:
     n = 20_000
     theta = torch.stack([torch.rand(n), (torch.arange(n) < n // 20).float()], dim=1)

@@ -200,14 +200,6 @@ def test_rows_have_the_numbers_of_the_text() -> None:
         assert f"{interval.median:.3g} [{interval.low:.3g}, " in str(found)
 
 
-def test_a_report_can_be_given_other_names_of_summaries() -> None:
-    found = report_discrepancy(*pairs(20), simulated(500), model=ONE_SETTING)
-    named = found.renamed(NAMES)
-    assert named["shade"].gain == found["x[1]"].gain
-    with pytest.raises(InvalidInputError, match="`names`"):
-        found.renamed(NAMES[:3])
-
-
 def method(**options: Any) -> DiscrepancyNPE:
     return DiscrepancyNPE(problems.box(2), num_simulations=2000, **options)
 

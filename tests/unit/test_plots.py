@@ -76,14 +76,6 @@ def test_pair_plot_names_methods_and_marks_the_truth() -> None:
     assert marks == pytest.approx([0.25])
 
 
-def test_pair_plot_limits_ignore_extremes_but_hold_the_truth() -> None:
-    samples = two_posteriors()
-    samples["NPE"][0] = 1e6
-    low, high = plots.pair_plot(samples, torch.tensor([-9.0, 0.0])).axes[0].get_xlim()
-    assert low < -9.0
-    assert high < 10.0
-
-
 def test_samples_that_do_not_fit_are_refused() -> None:
     good = {"a": torch.zeros(5, 2)}
     cases: list[tuple[Any, dict[str, Any], str]] = [
@@ -117,7 +109,7 @@ def test_axes_of_a_pair_plot_reach_at_most_one_width_of_the_prior_beyond_it() ->
     low, high = figure.axes[0].get_xlim()
     assert -1.5 < low < -0.5
     assert 1.5 < high < 2.5
-    assert legend_texts(figure.legends[0])[-1] == "prior"
+    assert "prior" in legend_texts(figure.legends[0])
     assert ends_of(figure.axes[0].patches[0]) == pytest.approx((0.0, 1.0), abs=0.05)
 
 
@@ -161,19 +153,6 @@ def test_the_area_of_a_histogram_is_the_share_of_samples_that_it_shows() -> None
     values, edges, _ = plots.pair_plot({"a": samples}).axes[0].patches[0].get_data()
     area = float((values * (edges[1:] - edges[:-1])).sum())
     assert area == pytest.approx(0.99, abs=0.005)
-
-
-def test_a_method_has_the_same_colour_in_every_picture() -> None:
-    pair = plots.pair_plot({"RoPE": torch.randn(50, 1), "NPE": torch.randn(50, 1)})
-    lines = plots.calibration_curves(
-        {name: curve() for name in ("prior", "NPE", "OT-only", "RoPE")}
-    )
-    drawn = {line.get_label(): line.get_color() for line in lines.axes[0].lines}
-    legend = {
-        line.get_label(): line.get_color() for line in pair.legends[0].get_lines()
-    }
-    assert legend == {name: drawn[name] for name in ("RoPE", "NPE")}
-    assert len({drawn[name] for name in ("prior", "NPE", "OT-only", "RoPE")}) == 4
 
 
 def test_calibration_curves_draw_each_average_against_its_level() -> None:
@@ -292,58 +271,7 @@ def test_overview_shows_the_parameters_asked_for() -> None:
             assert mix.lines[-1].get_ydata()[0] == truth[labels[1]]
 
 
-def test_overview_shades_the_prior() -> None:
-    prior = 8.0 * torch.rand(2000, 3) - 4.0
-    mix = plots.overview(**three_steps(prior=prior, parameters=(0,))).axes[2]
-    bar = mix.patches[0]
-    assert ends_of(bar) == pytest.approx((-4.0, 4.0), abs=0.15)
-    mix = plots.overview(**three_steps(prior=prior, parameters=(0, 1))).axes[2]
-    corners = mix.collections[0].get_paths()[0].vertices
-    for column in (0, 1):
-        ends = (corners[:, column].min(), corners[:, column].max())
-        assert ends == pytest.approx((-4.0, 4.0), abs=0.15)
-    assert legend_texts(mix.get_legend())[0] == "prior"
-
-
-def test_overview_axes_ignore_extreme_embeddings_and_samples() -> None:
-    data = three_steps()
-    data["simulated"][0] = 1e6
-    data["before"][0] = -1e6
-    data["samples"]["NPE"][0] = 1e6
-    for axes in plots.overview(**data).axes:
-        assert max(abs(x) for x in (*axes.get_xlim(), *axes.get_ylim())) < 100.0
-
-
-def test_overview_spreads_out_one_dimensional_embeddings() -> None:
-    data = three_steps()
-    for name in ("simulated", "before", "after"):
-        data[name] = data[name][:, :1]
-    tune = plots.overview(**data).axes[0]
-    assert tune.get_xlabel() == "embedding"
-    points = torch.as_tensor(dots(tune)[0].get_offsets().data)
-    assert torch.allclose(points[:, 0], data["simulated"][:, 0].double())
-    assert points[:, 1].std() > 0.2
-
-
 # Observations ------------------------------------------------------------------------
-
-
-def test_statistics_are_drawn_as_a_histogram_each() -> None:
-    figure = plots.real_and_simulated(
-        torch.randn(100, 5), torch.randn(100, 5) + 1, x_names=list("abcde")
-    )
-    assert [axes.get_xlabel() for axes in figure.axes] == list("abcde")
-    assert legend_texts(figure.legends[0]) == ["simulated", "real"]
-
-
-def test_series_are_drawn_in_pairs() -> None:
-    x_o, x_s = torch.randn(3, 50), torch.randn(3, 50)
-    figure = plots.real_and_simulated(x_o, x_s)
-    assert len(figure.axes) == 3
-    for i, axes in enumerate(figure.axes):
-        lines = {line.get_label(): line.get_ydata() for line in axes.lines}
-        assert lines["real"] == pytest.approx(x_o[i].numpy())
-        assert lines["simulated"] == pytest.approx(x_s[i].numpy())
 
 
 def test_images_are_drawn_real_above_simulated() -> None:
@@ -408,15 +336,3 @@ def test_discrepancy_draws_shifts_on_one_scale_and_writes_their_numbers() -> Non
     assert drawn[1] == pytest.approx([0.1, 0.2])
     texts = [(text.get_text(), text.xy[1]) for text in numbers.texts]
     assert texts == [("-150 [-200, 100]", 0), ("0.0015 [0.001, 0.002]", 1)]
-
-
-def test_discrepancy_draws_twenty_summaries_and_counts_the_others() -> None:
-    summaries = tuple(summary(f"x[{k}]") for k in range(23))
-    figure = plots.discrepancy(
-        DiscrepancyReport(summaries=summaries, num_pairs=7, constant=("dead",))
-    )
-    labels = [label.get_text() for label in figure.axes[0].get_yticklabels()]
-    assert labels == [f"x[{k}]" for k in range(20)]
-    note = figure.get_supxlabel()
-    assert "; 3 summaries that are less off not shown" in note
-    assert "1 the same in all simulations" in note

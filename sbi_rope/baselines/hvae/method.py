@@ -31,7 +31,7 @@ from sbi_rope.baselines.hvae.training import train_hybrid
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture import MixtureEstimator, Part
 from sbi_rope.settings import Count, NotNegative, check
-from sbi_rope.tensors import as_batch, as_numbers
+from sbi_rope.tensors import as_batch
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
 from sbi_rope.trainers.training import EstimatorBuilder, Training
@@ -189,7 +189,7 @@ class HVAE(Method):
         with seeded(0):
             theta = self._prior.sample(torch.Size((NUM_DRAWS_CHECKED,)))
         theta = theta.to(self._device, torch.float32).requires_grad_()
-        x = as_numbers("physics(theta)", self.physics(theta))
+        x = self.physics(theta)
         as_batch("physics(theta)", x, self._data.event_shape)
         if len(x) != len(theta) or not x.requires_grad:
             raise InvalidInputError(
