@@ -103,10 +103,9 @@ def fit_discrepancy(
     Args:
         z: The representations of the real observations, shape ``(n, l)``.
         moments: The moments of simulations at the parameters of the pairs.
-        standardisation: The mean and standard deviation of z over simulations from the
-            prior.
+        standardisation: That of z over simulations from the prior.
         model: The model of the discrepancy.
-        weights: How many pairs each pair counts as, shape ``(n,)``; one if None.
+        weights: How many pairs each pair counts as, shape ``(n,)``.
         groups: A number for each pair, the same for recordings of one person.
 
     Raises:

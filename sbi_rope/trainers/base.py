@@ -37,8 +37,7 @@ class Method(ABC):
     """A method of inference: construct, append data, ``train``, ``build_posterior``.
 
     What is passed in is copied or only read. Appending data after a training asks for
-    another one, which starts anew. No method takes the parameters of the observations
-    to be inferred.
+    another one, which starts anew.
 
     A subclass says which data it ``sees`` and returns a posterior from ``_fit``.
 

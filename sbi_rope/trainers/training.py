@@ -158,12 +158,6 @@ def train_on_simulations(
         change_x: Applied to the x of every batch before its loss is taken.
         penalty: Of the estimator, a term that is added to the loss of every training
             batch; None adds nothing.
-
-    Returns:
-        The trained estimator, in evaluation mode, and its losses epoch by epoch.
-
-    Raises:
-        InvalidInputError: If there are too few simulations to hold some out.
     """
     if len(x) < MIN_SIMULATIONS:
         raise InvalidInputError(
@@ -223,12 +217,8 @@ def rows_with_density(
     """Return the rows of pairs whose loss is finite, after a warning of the others.
 
     A single infinite loss would end the training of all pairs. A label exactly on a
-    bound of the prior has one if the estimator's density is zero there. Where a part
-    has no other rows it stays as it is, and its training says so.
-
-    Args:
-        losses: Of rows, the loss of each.
-        splits: The rows of each part of the pairs.
+    bound of the prior has one if the estimator's density is zero there. A part of which
+    all rows have one stays as it is, and its training says so.
     """
     finite = [
         torch.cat([torch.isfinite(losses(some)) for some in rows.split(100)])
@@ -261,19 +251,8 @@ def train_on_pairs(
 ) -> History:
     """Train an estimator on calibration pairs alone, in place.
 
-    Args:
-        estimator: A density estimator of sbi.
-        theta: Parameters, shape ``(n, d)``.
-        x: Real observations, shape ``(n, *event)``.
-        split: The rows to train on and those held out; without the latter, training
-            stops early.
-        training: Batch size, learning rate and so on.
-        in_training_mode: Whether dropout and batch statistics are active in training.
-        label: What the progress bar and warnings call it.
-        show_progress_bars: Whether to show the course of the loss.
-
-    Returns:
-        The losses and the epoch that was kept.
+    The split has the rows to train on and those held out. Without the latter, training
+    stops early. Returned are the losses and the epoch that was kept.
     """
     estimator.eval()
     train, held_out = rows_with_density(
