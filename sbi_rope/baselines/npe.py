@@ -138,7 +138,7 @@ class ReferenceNPE(Method):
         Raises:
             SimulationError: If the simulator fails.
         """
-        theta = self._data.checked_theta("theta", theta)
+        theta = self._data.read_theta(theta)
         if self._data.event_shape is None:
             raise NotReadyError(
                 "The shape of a simulation is not known yet. Call "

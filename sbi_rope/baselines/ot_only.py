@@ -87,7 +87,7 @@ class OTOnly(Method):
                 "`OTOnly.from_posterior(posterior)`."
             )
         if self.needs_simulations:
-            self._check_some("simulations")
+            self._check_data("simulations")
         npe, _ = self._trained_npe(show_progress_bars=False)
         return self._rope_of(npe)
 

@@ -35,12 +35,9 @@ __all__ = ["diagnose"]
 
 # With fewer simulations the thresholds cannot be estimated.
 FEWEST_SIMULATIONS = 100
+Folds = Annotated[int, Range(2)]
 # So many draws of the prior make a smooth histogram.
 NUM_DRAWN = 20_000
-LEFT_OUT = (
-    "Pass what `stack` or `rope.build_posterior` returns, or leave it out: then all "
-    "alarms are counted."
-)
 NO_STANDARDISATION = (
     "Whether an entry of x is far from all simulations was not tested, because NPE "
     "does not standardise x entry by entry (as for sets of trials)."
@@ -114,24 +111,15 @@ def diagnose(
         :func:`sbi_rope.plots.implied_parameters`.
 
     Raises:
-        InvalidInputError: If an argument has the wrong type.
-        InvalidInputError: If x_o has the wrong shape or device, is empty, or not
-            finite; if an argument is out of range; or if there are fewer than 100
-            simulations.
+        InvalidInputError: If x_o has the wrong shape or is not finite, an argument is
+            out of range, or there are fewer than 100 simulations.
         CouplingError: If the embeddings cannot be coupled.
         SimulationError: If the simulator fails.
     """
     check("rope", rope, RoPE)
     check("coupler", coupler, SinkhornCoupler | None)
     check("posterior", posterior, MixturePosterior | None)
-    if num_simulations is not None:
-        check(
-            "num_simulations",
-            num_simulations,
-            Annotated[int, Range(FEWEST_SIMULATIONS)],
-        )
-    if num_folds is not None:
-        check("num_folds", num_folds, Annotated[int, Range(2)])
+    check("num_folds", num_folds, Folds | None)
     tuned = len(rope.calibration[0]) > 0
     if tuned and not rope.is_trained:
         rope = rope.with_pairs(torch.arange(len(rope.calibration[0])))
@@ -146,7 +134,11 @@ def diagnose(
         names = rope.parameter_names or default_names(dim)
         if parameter_names is not None:
             names = names_of(parameter_names, dim)
-        _check_enough(batch.theta)
+        if len(batch.theta) < FEWEST_SIMULATIONS:
+            raise InvalidInputError(
+                f"Expected at least {FEWEST_SIMULATIONS} simulations, to estimate the "
+                f"thresholds; got {len(batch.theta)}."
+            )
         coupling = batch.couple(coupler or rope.coupler)
         before = batch.npe.embed("x_o", batch.x_o, batch.npe.h)
         simulations = Simulations(
@@ -286,12 +278,3 @@ def _labelled_findings(
 
 def _moved(values: Tensor) -> Tensor:
     return values.detach().cpu().double()
-
-
-def _check_enough(theta: Tensor) -> None:
-    if len(theta) < FEWEST_SIMULATIONS:
-        raise InvalidInputError(
-            f"Expected at least {FEWEST_SIMULATIONS} simulations, to estimate the "
-            f"thresholds; got {len(theta)}. Give RoPE a simulator, or more "
-            "`simulations`."
-        )

@@ -7,8 +7,6 @@ from typing import Any, Literal
 
 from torch import Tensor
 
-from sbi_rope._notebooks import shown_as_text
-
 __all__ = [
     "IN_BRIEF",
     "OF_OTHERS",
@@ -110,7 +108,6 @@ class Finding:
         )
 
 
-@shown_as_text
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Diagnosis:
     r"""Findings about a batch of real observations, and the arrays behind them.

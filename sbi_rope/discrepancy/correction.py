@@ -26,7 +26,6 @@ from sbi_rope.errors import InvalidInputError
 __all__ = [
     "Correction",
     "Space",
-    "check_complete",
     "correct_npe",
     "fit_discrepancy",
     "network_of",
@@ -79,32 +78,10 @@ def network_of(estimator: ConditionalEstimator, space: Space) -> nn.Module:
         return embedding_of(estimator)
     if len(estimator.condition_shape) != 1:
         raise InvalidInputError(
-            "Expected observations of shape (n, l) with space='input'; got (n, "
-            f"{', '.join(map(str, estimator.condition_shape))}). Use "
-            "space='embedding'."
+            "Expected observations of shape (n, l) with space='input'; got those of "
+            f"shape {tuple(estimator.condition_shape)}. Use space='embedding'."
         )
     return nn.Identity()
-
-
-def check_complete(name: str, x: Tensor, *, instead: str) -> None:
-    """Raise if entries of x are missing: what is not there cannot be corrected.
-
-    Args:
-        name: What x is called.
-        x: Observations, shape ``(n, l)``.
-        instead: What to do instead, as a sentence.
-
-    Raises:
-        InvalidInputError: If an entry is not finite.
-    """
-    missing = ~torch.isfinite(x)
-    if missing.any():
-        columns = missing.any(dim=0).nonzero().flatten()
-        raise InvalidInputError(
-            f"Expected {name} without missing entries, because each entry of x is "
-            f"corrected; got NaN or Inf in {len(columns)} of {x.shape[1]} entries "
-            f"(first: {columns[:5].tolist()}). {instead}"
-        )
 
 
 def fit_discrepancy(
@@ -126,10 +103,9 @@ def fit_discrepancy(
     Args:
         z: The representations of the real observations, shape ``(n, l)``.
         moments: The moments of simulations at the parameters of the pairs.
-        standardisation: The mean and standard deviation of z over simulations from the
-            prior.
+        standardisation: That of z over simulations from the prior.
         model: The model of the discrepancy.
-        weights: How many pairs each pair counts as, shape ``(n,)``; one if None.
+        weights: How many pairs each pair counts as, shape ``(n,)``.
         groups: A number for each pair, the same for recordings of one person.
 
     Raises:
@@ -139,8 +115,7 @@ def fit_discrepancy(
     if not varies.any():
         raise InvalidInputError(
             "Expected simulations that differ from each other; got the same embedding "
-            "(or the same x) for all of them. Train NPE longer, or with another "
-            "embedding net."
+            "(or the same x) for all of them."
         )
     std = standardisation.std[varies]
     covariances = moments.covariance[:, varies][:, :, varies] / std / std[:, None]

@@ -3,22 +3,20 @@ r"""A Bayesian linear model of how real observations differ from simulations."""
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from sbi_rope._groups import groups_of
 from sbi_rope._random import seeded
-from sbi_rope._validation import check_groups, check_pair_weights
 from sbi_rope.discrepancy.conditional import Conditional
 from sbi_rope.discrepancy.correlation import GroupErrors, independent_pairs
 from sbi_rope.discrepancy.imputation import impute
 from sbi_rope.discrepancy.posterior import Discrepancy
 from sbi_rope.discrepancy.regression import SMALLEST_NOISE, Regressions
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.settings import Positive, UnitInterval, check
-from sbi_rope.tensors import as_batch, as_numbers, check_same_length
+from sbi_rope.settings import Settings, UnitInterval
+from sbi_rope.tensors import as_batch
 
 __all__ = ["DiscrepancyModel"]
 
@@ -30,7 +28,7 @@ PRIOR_OF_RATIOS = (1 / 30,) * 5 + (1 / 6,) * 5
 
 
 @dataclass(frozen=True, kw_only=True)
-class DiscrepancyModel:
+class DiscrepancyModel(Settings):
     r"""How real observations follow from simulations: a gain, an offset and an error.
 
     Let z be the representation of an observation, such as its embedding. With
@@ -88,8 +86,8 @@ class DiscrepancyModel:
         probability_of_none: The prior probability that the simulator is right.
 
     Raises:
-        InvalidInputError: If one of the first three is not a list.
-        InvalidInputError: If a list is empty or a number is outside its range.
+        InvalidInputError: If one of the first three is no list, or the probability is
+            outside its range.
 
     Example:
         >>> z_s = torch.linspace(-1.0, 1.0, 20)[:, None]
@@ -105,21 +103,7 @@ class DiscrepancyModel:
     gain_precisions: Sequence[float] = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 1000.0)
     error_scales: Sequence[float] = (0.01, 0.03, 0.05, 0.1, 0.2, 0.4, 0.8)
     degrees_of_freedom: Sequence[float] = (1.0, 3.0, 10.0, 30.0, 100.0, 1000.0)
-    probability_of_none: float = 0.5
-
-    def __post_init__(self) -> None:
-        """Check the ranges of all fields."""
-        for name in ("gain_precisions", "error_scales", "degrees_of_freedom"):
-            values = getattr(self, name)
-            if not isinstance(values, Sequence):
-                raise InvalidInputError(
-                    f"Expected `{name}` to be a list of numbers; got {values!r}."
-                )
-            if not len(values):
-                raise InvalidInputError(f"Expected at least one of `{name}`; got none.")
-            for value in values:
-                check(name, value, Positive)
-        check("probability_of_none", self.probability_of_none, UnitInterval)
+    probability_of_none: UnitInterval = 0.5
 
     def fit(
         self,
@@ -161,15 +145,19 @@ class DiscrepancyModel:
             The posterior, in float64.
 
         Raises:
-            InvalidInputError: If the shapes do not fit, a value is not finite, a weight
-                is not positive, or ``covariance`` is not a covariance matrix.
+            InvalidInputError: If the shapes do not fit, or a value is not finite.
         """
-        z, mean, covariance = _checked(z, mean, covariance)
+        width = np.shape(z)[-1:]
+        z = as_batch("z", z, width).double()
+        possible = np.shape(mean)[1:-1][:1]
+        mean = as_batch("mean", mean, (*possible, *width), rows=len(z)).to(z)
+        covariance = as_batch("covariance", covariance, width, rows=width[0]).to(z)
         noise = covariance + SMALLEST_NOISE**2 * torch.eye(z.shape[1]).to(z)
         if weights is not None:
-            weights = check_pair_weights(weights, "z", z).to(z)
+            weights = as_batch("weights", weights, (), rows=len(z)).to(z)
         if groups is not None:
-            groups = groups_of(check_groups(groups, "z", z)).to(z.device)
+            groups = as_batch("groups", groups, (), rows=len(z))
+            groups = groups_of(groups).to(z.device)
             if len(groups.unique()) == len(groups):
                 groups = None
 
@@ -226,31 +214,3 @@ class DiscrepancyModel:
     @property
     def _settings(self) -> list[tuple[float, float]]:
         return list(itertools.product(self.error_scales, self.degrees_of_freedom))
-
-
-def _checked(z: Any, mean: Any, covariance: Any) -> tuple[Tensor, Tensor, Tensor]:
-    """Check the arguments of ``fit`` and return them in float64."""
-    z = as_numbers("z", z).double()
-    if z.ndim != 2:
-        raise InvalidInputError(
-            f"Expected `z` of shape (n, l); got {tuple(z.shape)}. Flatten it first."
-        )
-    width = z.shape[1]
-    z = as_batch("z", z, (width,))
-    possible = as_numbers("mean", mean).shape[1:-1]
-    mean = as_batch("mean", mean, (*possible[:1], width)).to(z)
-    check_same_length("z", z, "mean", mean)
-    covariance = as_batch("covariance", covariance, (width,)).to(z)
-    if len(covariance) != width:
-        raise InvalidInputError(
-            f"Expected `covariance` of shape {(width, width)}; got "
-            f"{tuple(covariance.shape)}."
-        )
-    smallest = torch.linalg.eigvalsh(covariance)[0]
-    margin = 1e-8 * covariance.diagonal().abs().max()
-    if smallest < -margin or not torch.allclose(covariance, covariance.mT):
-        raise InvalidInputError(
-            "Expected `covariance` to be symmetric without negative eigenvalues; the "
-            f"smallest is {float(smallest):.3g}."
-        )
-    return z, mean, covariance

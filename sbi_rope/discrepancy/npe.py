@@ -21,26 +21,18 @@ from sbi_rope._sbi import (
 from sbi_rope._simulations import Moments, SimulationSource
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._training import History
-from sbi_rope._validation import check_finite, check_names
-from sbi_rope.discrepancy.correction import (
-    Space,
-    check_complete,
-    correct_npe,
-    network_of,
-)
+from sbi_rope.discrepancy.correction import Space, correct_npe, network_of
 from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.parameters import learn_parameters
 from sbi_rope.discrepancy.posterior import Discrepancy
 from sbi_rope.discrepancy.report import DiscrepancyReport, report_discrepancy
 from sbi_rope.discrepancy.summaries import Summaries
 from sbi_rope.discrepancy.tuning import TUNING, cross_fitted_nets
-from sbi_rope.errors import (
-    InvalidInputError,
-    NotReadyError,
-)
+from sbi_rope.errors import InvalidInputError, NotReadyError
 from sbi_rope.finetuning import CalibrationFinetuner
 from sbi_rope.mixture import MixtureEstimator, MixturePosterior, OwnEmbeddings, Part
 from sbi_rope.settings import Count, Positive, Range, check
+from sbi_rope.tensors import as_batch
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
 from sbi_rope.trainers.training import EstimatorBuilder, Training
@@ -50,11 +42,7 @@ if TYPE_CHECKING:
 
 __all__ = ["DiscrepancyNPE"]
 
-# The error of the discrepancy cannot be estimated from fewer pairs.
-MIN_PAIRS = 2
-GIVE_SUMMARIES = (
-    "Pass `summaries=`, a function from x to a few numbers for each observation."
-)
+Several = Annotated[int, Range(2)]
 
 
 class DiscrepancyNPE(Method):
@@ -113,7 +101,6 @@ class DiscrepancyNPE(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidInputError: If an argument has the wrong type.
         InvalidInputError: If an argument is outside its range. In ``train``, if x is
             not a vector, or has missing entries, with ``space="input"``.
         SimulationError: In ``train``, if the simulator fails.
@@ -122,6 +109,7 @@ class DiscrepancyNPE(Method):
     sees = frozenset({"simulations", "calibration"})
     starts_from_npe = True
     simulates = True
+    min_pairs = 2  # fewer do not show the error of the discrepancy
 
     def __init__(
         self,
@@ -144,13 +132,11 @@ class DiscrepancyNPE(Method):
         check("space", space, Literal["embedding", "input", "tuned"])
         check("learn_prior", learn_prior, bool)
         check("model", model, DiscrepancyModel | None)
-        check("num_simulations", num_simulations, Annotated[int, Range(2)])
-        check("simulations_per_pair", simulations_per_pair, Annotated[int, Range(2)])
-        if num_steps is not None:
-            check("num_steps", num_steps, Count)
-        if learning_rate is not None:
-            check("learning_rate", learning_rate, Positive)
-        check("num_folds", num_folds, Annotated[int, Range(2)])
+        check("num_simulations", num_simulations, Several)
+        check("simulations_per_pair", simulations_per_pair, Several)
+        check("num_steps", num_steps, Count | None)
+        check("learning_rate", learning_rate, Positive | None)
+        check("num_folds", num_folds, Several)
         check("finetuner", finetuner, CalibrationFinetuner | None)
         npe = StartingNPE(density_estimator, npe_training)
         super().__init__(prior, npe=npe, simulator=simulator, device=device)
@@ -185,16 +171,11 @@ class DiscrepancyNPE(Method):
 
         Raises:
             UnsupportedPosteriorError: If the posterior is not a plain amortised one.
-            InvalidInputError: If an option would have no effect.
         """
         method = super().from_posterior(posterior, **options)
         if simulations is not None:
             method.append_simulations(*simulations)
         return method
-
-    @property
-    def _ignores_simulations(self) -> bool:
-        return False  # with a simulator too, they are what NPE is trained on
 
     @property
     def discrepancy(self) -> Discrepancy:
@@ -239,59 +220,36 @@ class DiscrepancyNPE(Method):
 
         Raises:
             NotReadyError: If there are fewer than two pairs, or no simulations.
-            InvalidInputError: If ``summaries`` is no function, or returns no numbers.
-            InvalidInputError: If x is not a vector or has missing entries and no
-                summaries are given, if these have another shape or are not finite, or
-                the names do not fit.
+            InvalidInputError: If x is not a vector and no summaries are given, if these
+                have another shape or are not finite, or the names do not fit.
             SimulationError: If the simulator fails.
         """
-        if x_names is not None:
-            x_names = check_names("x_names", x_names)
+        self._check_data("calibration")
         if self._simulator is None:
-            self._check_some("simulations")
-        self._check_pairs()
-        _, x = self._data.calibration
+            self._check_data("simulations")
+        theta, x = self._data.calibration
         if x.ndim != 2 and summaries is None:
             raise InvalidInputError(
-                "Expected observations of shape (n, l), with a summary in each column; "
-                f"got {tuple(x.shape)}. Pass `summaries=`, a function from x to a few "
-                "numbers for each observation, shape (n, k)."
+                f"Expected observations of shape (n, l); got {tuple(x.shape)}. Pass "
+                "`summaries=`, a function from x to shape (n, k)."
             )
         show = is_shown(show_progress_bars)
         net = nn.Identity() if summaries is None else Summaries(summaries)
         with seeded(seed):
             source = self._source()
             _, simulated = source.kept(self.num_simulations, progress=show)
-            if summaries is None:
-                for name, values in (("pairs", x), ("simulations", simulated)):
-                    check_complete(name, values, instead=GIVE_SUMMARIES)
-            else:
-                x, simulated = embed(net, x), embed(net, simulated)
-                check_finite("summaries of the pairs", x)
-                check_finite("summaries of simulations", simulated)
+            x = as_batch("summaries of the pairs", embed(net, x))
+            simulated = as_batch("summaries of simulations", embed(net, simulated))
             moments = self._moments(source, net, show)
-        check_finite("summaries of simulations at the pairs", moments.mean)
         return report_discrepancy(
             x,
             moments,
             simulated,
             model=self.model,
-            groups=groups_of(self._data.calibration[0]),
+            groups=groups_of(theta),
             x_names=x_names,
             show_progress_bars=show,
         )
-
-    def _check_data(self) -> None:
-        super()._check_data()
-        self._check_pairs()
-
-    def _check_pairs(self) -> None:
-        count = self._data.count("calibration")
-        if count < MIN_PAIRS:
-            raise NotReadyError(
-                f"DiscrepancyNPE needs at least {MIN_PAIRS} calibration pairs; got "
-                f"{count}. Call `append_calibration(theta, x)` first."
-            )
 
     def _moments(
         self,
@@ -322,8 +280,8 @@ class DiscrepancyNPE(Method):
         moments = self._moments(source, net, show_progress_bars)
         theta_s, x_s = self._bank(source, show_progress_bars)
         if self.space == "input":
-            for name, values in (("pairs", x), ("simulations", x_s)):
-                check_complete(name, values, instead="Use space='embedding'.")
+            as_batch("x", x)
+            as_batch("x of simulations", x_s)
         nets, z = [net], embed(net, x)
         if self.space == "tuned":
             nets, z = cross_fitted_nets(

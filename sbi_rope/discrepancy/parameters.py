@@ -4,13 +4,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
-from sbi_rope._validation import check_pair_weights
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.tensors import as_batch, as_numbers
+from sbi_rope.tensors import as_batch
 
 __all__ = ["ParameterDistribution", "is_improbable", "learn_parameters"]
 
@@ -93,21 +92,13 @@ def learn_parameters(
         The probabilities of the simulations.
 
     Raises:
-        InvalidInputError: If an argument is not a tensor.
-        InvalidInputError: If the shapes do not fit, a value is not finite, or a weight
-            is not positive.
+        InvalidInputError: If the shapes do not fit, or a value is not finite.
     """
-    theta = as_numbers("theta", theta)
-    if theta.ndim != 2 or len(theta) < 2:
-        raise InvalidInputError(
-            "Expected `theta` of shape (n, d), with n of two or more; got "
-            f"{tuple(theta.shape)}."
-        )
-    theta = as_batch("theta", theta, theta.shape[1:])
-    several = as_numbers("theta_cal", theta_cal).shape[1:-1][:1]
+    theta = as_batch("theta", theta, np.shape(theta)[-1:])
+    several = np.shape(theta_cal)[1:-1][:1]
     theta_cal = as_batch("theta_cal", theta_cal, (*several, theta.shape[1]))
     if weights is not None:
-        weights = check_pair_weights(weights, "theta_cal", theta_cal)
+        weights = as_batch("weights", weights, (), rows=len(theta_cal))
         weights = weights.to(theta_cal.device, torch.double)
     is_continuous = [not _is_discrete(column) for column in theta.T]
     if not any(is_continuous):

@@ -1,6 +1,5 @@
 """The posterior of gain, offset and error, and draws from it."""
 
-import math
 from dataclasses import dataclass, field
 
 import torch
@@ -8,7 +7,6 @@ from torch import Tensor
 from torch.distributions import Chi2
 
 from sbi_rope._random import seeded
-from sbi_rope.settings import Count, NotNegative, check
 from sbi_rope.tensors import as_batch
 
 __all__ = ["Discrepancy", "DiscrepancyDraws", "Term"]
@@ -41,9 +39,7 @@ class Term:
         like = self.error_factor
         # The Bartlett decomposition: T T' follows a Wishart distribution, so that
         # L (T T')^-1 L' follows an inverse Wishart distribution with scale L L'.
-        # Pickles of earlier versions hold the degrees as a number.
-        degrees = torch.as_tensor(self.degrees).to(like)[..., None]
-        degrees = degrees - torch.arange(width).to(like)
+        degrees = self.degrees[..., None] - torch.arange(width).to(like)
         triangle = torch.randn(count, *batch, width, width).to(like).tril(-1)
         triangle = triangle + torch.diag_embed(Chi2(degrees).sample((count,)).sqrt())
         identity = torch.eye(width).to(like).expand_as(triangle)
@@ -70,8 +66,7 @@ class Discrepancy:
         log_evidence_of_none: The same if the simulator is right.
         num_pairs: The number of calibration pairs.
         num_independent: How many independent pairs these count as: the sum of their
-            weights, less if pairs of the same group have errors in common. NaN in
-            pickles of earlier versions.
+            weights, less if pairs of the same group have errors in common.
     """
 
     terms: tuple[Term, ...] = field(repr=False)
@@ -81,7 +76,7 @@ class Discrepancy:
     log_evidence: float
     log_evidence_of_none: float
     num_pairs: int
-    num_independent: float = math.nan
+    num_independent: float
 
     @torch.no_grad()
     def sample(
@@ -106,12 +101,7 @@ class Discrepancy:
 
         Returns:
             The draws.
-
-        Raises:
-            InvalidInputError: If an argument is outside its range.
         """
-        check("num_draws", num_draws, Count)
-        check("smallest_error", smallest_error, NotNegative)
         none = self.probability_of_none
         shares = torch.cat([(1 - none) * self.shares, self.shares.new_tensor([none])])
         with seeded(seed):

@@ -3,10 +3,11 @@
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from torch import Tensor, nn
 
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.tensors import as_batch, as_numbers
+from sbi_rope.settings import check
+from sbi_rope.tensors import as_batch
 
 __all__ = ["Summaries"]
 
@@ -24,26 +25,16 @@ class Summaries(nn.Module):
 
     def __init__(self, function: Callable[[Tensor], Any]) -> None:
         super().__init__()
-        if not callable(function):
-            raise InvalidInputError(
-                "Expected `summaries` to be callable, from x (n, *event) to (n, k); "
-                f"got {type(function).__name__}."
-            )
+        check("summaries", function, Callable)
         self._function = function
 
     def forward(self, x: Tensor) -> Tensor:
         """Return the summaries, which may not be finite.
 
         Raises:
-            InvalidInputError: If the function does not return numbers.
-            InvalidInputError: If what it returns has another shape.
+            InvalidInputError: If the function does not return numbers, ``(n, k)``.
         """
-        found = as_numbers("summaries(x)", self._function(x))
-        if found.ndim != 2 or len(found) != len(x):
-            raise InvalidInputError(
-                f"Expected `summaries(x)` of shape ({len(x)}, k) for x of shape "
-                f"{tuple(x.shape)}; got {tuple(found.shape)}."
-            )
-        return as_batch("summaries(x)", found, found.shape[1:], finite=False).to(
-            x.device
-        )
+        found = self._function(x)
+        width = np.shape(found)[-1:]
+        found = as_batch("summaries(x)", found, width, rows=len(x), finite=False)
+        return found.to(x.device)

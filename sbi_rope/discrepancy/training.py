@@ -61,17 +61,12 @@ def train_on_corrected(
         z: A simulation of each, shape ``(n, l)``.
         draws: Draws of the discrepancy, in the units of ``standardisation``.
         standardisation: The mean and standard deviation of z.
-        probabilities: The probability of each simulation to be drawn; None makes them
-            equal.
+        probabilities: The probability of each simulation; equal if None.
         num_steps: Gradient steps of a course.
         min_gain: The nats by which a course has to lower the loss for another to
             follow. A density that is much too narrow at the start needs several.
-        learning_rate: Learning rate of Adam at the start of a course. It falls to zero
-            along a cosine.
+        learning_rate: Learning rate of Adam, which falls to zero in each course.
         show_progress_bars: Whether to show the loss during training.
-
-    Returns:
-        The losses, averaged over 20 steps each.
     """
     density.requires_grad_().eval()
     z = standardisation(z.double())

@@ -52,9 +52,8 @@ def cross_fitted_nets(
     groups = groups_of(theta)
     if int(groups.max()) == 0:
         raise InvalidInputError(
-            "Expected calibration pairs of different parameters with space='tuned', "
-            f"so that some can be held out; all {len(theta)} have the same. Use "
-            "space='embedding'."
+            "Expected calibration pairs of different parameters with space='tuned'; "
+            f"all {len(theta)} have the same. Use space='embedding'."
         )
     folds = split_groups(groups, num_folds)
     targets = moments.mean.to(x)

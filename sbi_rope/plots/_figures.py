@@ -29,12 +29,7 @@ def new_figure(width: float, height: float) -> "tuple[Figure, Axes]":
 
 def empty_figure(width: float, height: float) -> "Figure":
     """Return a figure without a panel."""
-    try:
-        from matplotlib.figure import Figure
-    except ModuleNotFoundError as error:
-        raise ImportError(
-            "matplotlib is not installed. Run `pip install sbi-rope[benchmarks]`."
-        ) from error
+    from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
 

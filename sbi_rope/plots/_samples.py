@@ -1,81 +1,61 @@
-"""Draw posterior samples in a panel: checks, limits of axes, histograms, contours."""
+"""Draw posterior samples in a panel: limits of axes, histograms, contours."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import check_mapping, check_names
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.plots._figures import GREY, PRIOR
-from sbi_rope.tensors import as_batch, as_numbers
+from sbi_rope.plots._figures import GREY, PRIOR, hide_frame
+from sbi_rope.settings import names_of
+from sbi_rope.tensors import as_batch
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # How far beyond their core the axes may reach, in widths of the core.
 REACH = 1.0
 # The shares of the samples that contours enclose.
 LEVELS = (0.9, 0.5)
-# The largest number that can be drawn. For larger ones matplotlib's own arithmetic
-# overflows or divides by zero, for instance when it computes a margin.
-LARGEST = 1e100
 # The number of grid points on each axis for contours.
 GRID = 100
 # The edge of the prior is drawn if this share of a posterior is beyond it.
 CROSSED = 0.01
 
 
-def check_samples(
+def as_samples(
     samples: Mapping[str, Tensor],
     theta: Tensor | None,
     parameter_names: Sequence[str] | None,
 ) -> tuple[dict[str, Tensor], Tensor | None, list[str]]:
-    """Check samples, the truth and names of parameters.
+    """Return samples by method, the truth, and a name for each parameter.
 
-    Returns:
-        The samples by method and the truth, on the CPU in float64, and a name for each
-        parameter.
+    Raises:
+        InvalidInputError: If the samples are no numbers of one width ``(n, d)``, or the
+            truth or the names do not fit.
     """
-    check_mapping("samples", samples, like="posterior samples")
-    first = as_numbers("samples", next(iter(samples.values())))
-    if first.ndim != 2:
-        raise InvalidInputError(
-            "Expected `samples` of shape (num_samples, d) each; got "
-            f"{tuple(first.shape)}."
-        )
-    width = first.shape[1:]
+    width = np.shape(next(iter(samples.values())))[-1:]
     draws = {
-        name: drawable(
-            f"samples[{name!r}]", as_batch(f"samples[{name!r}]", value, width)
-        )
+        name: as_drawn(f"samples[{name!r}]", value, width)
         for name, value in samples.items()
     }
-    names = [f"$\\theta_{j + 1}$" for j in range(width[0])]
+    dim = width[0]
+    names = [f"$\\theta_{j + 1}$" for j in range(dim)]
     if parameter_names is not None:
-        names = check_names("parameter_names", parameter_names, width[0])
+        names = list(names_of(parameter_names, dim))
     if theta is None:
         return draws, None, names
-    return draws, drawable("theta", check_truth(theta, width[0])), names
+    return draws, as_drawn("theta", theta, (), rows=dim), names
 
 
-def check_truth(theta: Any, dim: int) -> Tensor:
-    """Return the true parameters of one observation, shape ``(d,)``."""
-    row = as_numbers("theta", theta).reshape(1, -1)
-    return as_batch("theta", row, (dim,))[0]
-
-
-def drawable(name: str, value: Tensor) -> Tensor:
-    """Return a tensor on the CPU in float64; raise if its numbers cannot be drawn."""
-    value = value.detach().cpu().double()
-    if value.numel() and value.abs().max() > LARGEST:
-        raise InvalidInputError(
-            f"Expected `{name}` with numbers up to {LARGEST:g} to draw; got "
-            f"{float(value.abs().max()):g}. Use other units."
-        )
-    return value
+def as_drawn(
+    name: str, value: Any, event_shape: Sequence[int], rows: int | None = None
+) -> Tensor:
+    """Return a batch of a user on the CPU in float64, see ``tensors.as_batch``."""
+    return as_batch(name, value, event_shape, rows=rows).cpu().double()
 
 
 def central_interval(values: Tensor) -> Tensor:
@@ -138,9 +118,55 @@ def _width(low: Tensor, high: Tensor) -> Tensor:
     return torch.where(high - low > 1e-9 * size, high - low, visible)
 
 
-def prior_interval(prior: Any, like: Tensor) -> Tensor:
-    """Check samples of the prior and return their central 99 %, shape ``(2, d)``."""
-    return central_interval(drawable("prior", as_batch("prior", prior, like.shape[1:])))
+def corner_panels(
+    figure: "Figure", names: Sequence[str], limits: Tensor, truth: Tensor | None
+) -> Iterator[tuple["Axes", list[int]]]:
+    """Add a panel for each parameter and each pair, and yield each before its truth.
+
+    Args:
+        figure: An empty figure.
+        names: The labels of the parameters.
+        limits: The limits of the axes, shape ``(2, d)``.
+        truth: The true parameter, shape ``(d,)``.
+
+    Yields:
+        A panel, and the one or two parameters that it shows.
+    """
+    dim = len(names)
+    for row in range(dim):
+        for column in range(row + 1):
+            axes = figure.add_subplot(dim, dim, row * dim + column + 1)
+            hide_frame(axes)
+            axes.set_xlim(*limits[:, column].tolist())
+            if row == column:
+                yield axes, [row]
+                axes.spines["left"].set_visible(False)
+                axes.set_yticks([])
+                axes.set_ylim(bottom=0)
+                if truth is not None:
+                    axes.axvline(float(truth[row]), color="black", lw=1.2)
+            else:
+                axes.set_ylim(*limits[:, row].tolist())
+                yield axes, [column, row]
+                if truth is not None:
+                    pair = truth[[column, row]].tolist()
+                    axes.plot(*pair, "o", color="black", ms=4, zorder=5)
+            axes.tick_params(labelbottom=row == dim - 1, labelleft=column == 0)
+            if row == dim - 1:
+                axes.set_xlabel(names[column])
+            if column == 0 and row > 0:
+                axes.set_ylabel(names[row])
+
+
+def corner_legend(figure: "Figure", handles: list[Any], truth: Tensor | None) -> None:
+    """Add a legend in the empty half of the figure, or above a single panel."""
+    from matplotlib.lines import Line2D
+
+    if truth is not None:
+        style: dict[str, Any] = {"color": "black", "lw": 1.2, "marker": "o", "ms": 4}
+        handles = [*handles, Line2D([], [], label="truth", **style)]
+    place = "upper right" if len(figure.axes) > 1 else "outside upper center"
+    figure.legend(handles=handles, loc=place, frameon=False)
 
 
 def shade_prior(axes: "Axes", interval: Tensor) -> None:
@@ -153,13 +179,12 @@ def shade_prior(axes: "Axes", interval: Tensor) -> None:
         axes.fill_between([low[0], high[0]], low[1], high[1], **style)
 
 
-def edges_crossed(prior: Any, draws: Sequence[Tensor]) -> Tensor:
+def edges_crossed(prior: Tensor, draws: Sequence[Tensor]) -> Tensor:
     """Return the ends of the prior's draws that samples are beyond, shape ``(2, d)``.
 
     An end is NaN unless one in a hundred samples of a posterior is beyond it.
     """
-    values = drawable("prior", prior)
-    low, high = values.amin(dim=0), values.amax(dim=0)
+    low, high = prior.amin(dim=0), prior.amax(dim=0)
     below, above = (
         torch.stack([beyond(value).double().mean(dim=0) for value in draws]).amax(dim=0)
         for beyond in (lambda value: value < low, lambda value: value > high)

@@ -41,7 +41,6 @@ def implied_parameters(diagnosis: Diagnosis) -> "Figure":
 
     Raises:
         InvalidInputError: If the argument is no diagnosis.
-        ImportError: If matplotlib is not installed.
     """
     check("diagnosis", diagnosis, Diagnosis)
     theta, names = diagnosis.theta, diagnosis.parameter_names

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from sbi_rope._validation import check_mapping, check_names
 from sbi_rope.coupling import Coupling
 from sbi_rope.finetuning import History
 from sbi_rope.metrics import CoverageByEstimate, CoverageCurve
@@ -21,8 +20,7 @@ from sbi_rope.plots._figures import (
     line_styles,
     new_figure,
 )
-from sbi_rope.settings import check, default_names
-from sbi_rope.tensors import as_batch
+from sbi_rope.settings import check, default_names, names_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -58,11 +56,8 @@ def calibration_curves(curves: Mapping[str, CoverageCurve]) -> "Figure":
         The figure.
 
     Raises:
-        InvalidInputError: If there is no curve.
-        InvalidInputError: If the curves are no dictionary of coverage curves.
-        ImportError: If matplotlib is not installed.
+        InvalidInputError: If one of them is no coverage curve.
     """
-    check_mapping("curves", curves, like="coverage curves")
     for name, curve in curves.items():
         check(f"curves[{name!r}]", curve, CoverageCurve)
     figure, axes = new_figure(7.4, 4.2)
@@ -102,15 +97,13 @@ def ranks_by_estimate(
         The figure.
 
     Raises:
-        InvalidInputError: If the argument is something else.
-        InvalidInputError: If the names do not fit.
-        ImportError: If matplotlib is not installed.
+        InvalidInputError: If the argument is something else, or the names do not fit.
     """
     check("found", found, CoverageByEstimate)
     count = len(found.p_values)
-    names: Sequence[str] = default_names(count)
+    names = default_names(count)
     if parameter_names is not None:
-        names = check_names("parameter_names", parameter_names, count)
+        names = names_of(parameter_names, count)
     shown = min(count, MAX_PANELS)
     columns = min(shown, 3)
     rows = math.ceil(shown / columns)
@@ -157,23 +150,15 @@ def finetuning_history(history: History) -> "Figure":
 
     Raises:
         InvalidInputError: If the argument is no history.
-        InvalidInputError: If the losses are not finite.
-        ImportError: If matplotlib is not installed.
     """
     check("history", history, History)
-    training, validation = (
-        as_batch(f"history.{name}", torch.tensor(losses), (), empty=True)
-        for name, losses in (
-            ("training_loss", history.training_loss),
-            ("validation_loss", history.validation_loss),
-        )
-    )
+    training, validation = history.training_loss, history.validation_loss
     figure, axes = new_figure(6.0, 3.6)
     from matplotlib.ticker import MaxNLocator
 
     axes.plot(training, label="training pairs", color=BLUE, lw=1.2)
     kept = training
-    if len(validation) > 0:
+    if validation:
         axes.plot(validation, label="held-out pairs", color=VERMILLION, lw=1.2)
         kept = validation
     step = history.best_epoch
@@ -181,7 +166,7 @@ def finetuning_history(history: History) -> "Figure":
     axes.axvline(step, color=GREY, lw=0.8)
     axes.plot(
         [step],
-        [float(kept[step])],
+        [kept[step]],
         "o",
         color="black",
         ms=5,
@@ -213,7 +198,6 @@ def effective_sample_sizes(coupling: Coupling) -> "Figure":
 
     Raises:
         InvalidInputError: If the argument is no coupling.
-        ImportError: If matplotlib is not installed.
     """
     check("coupling", coupling, Coupling)
     sizes = coupling.effective_sample_size.detach().cpu().double()

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import check_names
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.plots._figures import (
     BLUE,
@@ -15,8 +15,7 @@ from sbi_rope.plots._figures import (
     empty_figure,
     hide_frame,
 )
-from sbi_rope.plots._samples import drawable
-from sbi_rope.tensors import as_batch, as_numbers, check_same_length
+from sbi_rope.plots._samples import as_drawn
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,54 +46,28 @@ def real_and_simulated(
             ``(n, length)``, or images, shape ``(n, 3, height, width)``, with values in
             [0, 1].
         x_s: Simulations with the parameters of the real observations, same shape.
-        x_names: A name for each of the l statistics. Without names, a tensor with two
-            dimensions is taken for series.
+        x_names: A name for each of the l statistics. Without names, x with two
+            dimensions are taken for series.
         labels: The names of real observations and simulations in the legend.
 
     Returns:
         The figure.
 
     Raises:
-        InvalidInputError: If the shapes differ or are none of these, or the number of
-            names is not that of the statistics.
-        ImportError: If matplotlib is not installed.
+        InvalidInputError: If the shapes differ or are none of these.
     """
-    x_o = as_numbers("x_o", x_o)
-    as_batch("x_o", x_o, x_o.shape[1:])
-    as_batch("x_s", x_s, x_o.shape[1:])
-    check_same_length("x_o", x_o, "x_s", x_s)
-    check_names("labels", labels, 2)
-    names = check_names("x_names", () if x_names is None else x_names)
-    if names and (x_o.ndim != 2 or len(names) != x_o.shape[1]):
-        raise InvalidInputError(
-            f"Expected as many `x_names` as statistics in `x_o`; got {len(names)} for "
-            f"`x_o` of shape {tuple(x_o.shape)}."
-        )
-    drawn = slice(None if names else NUM_SHOWN)
-    x_o, x_s = drawable("x_o", x_o[drawn]), drawable("x_s", x_s[drawn])
-    if names:
-        return _histograms(x_o, x_s, names, labels)
+    x_o = as_drawn("x_o", x_o, np.shape(x_o)[1:])
+    x_s = as_drawn("x_s", x_s, x_o.shape[1:], rows=len(x_o))
+    if x_names:
+        return _histograms(x_o, x_s, x_names, labels)
     if x_o.ndim == 2:
         return _series(x_o, x_s, labels)
     if x_o.ndim == 4 and x_o.shape[1] == 3:
-        _check_brightness("x_o", x_o)
-        _check_brightness("x_s", x_s)
         return _images(x_o, x_s, labels)
     raise InvalidInputError(
         "Expected `x_o` of shape (n, l), (n, length) or (n, 3, height, width); got "
         f"{tuple(x_o.shape)}."
     )
-
-
-def _check_brightness(name: str, images: Tensor) -> None:
-    # Noisy images may leave [0, 1] a little and are cut off there. Images with integer
-    # values up to 255 would be white.
-    if images.min() < -1 or images.max() > 2:
-        raise InvalidInputError(
-            f"Expected images `{name}` with values in [0, 1]; got "
-            f"{float(images.min()):g} to {float(images.max()):g}. Divide 8-bit images "
-            "by 255."
-        )
 
 
 def _histograms(
@@ -103,7 +76,7 @@ def _histograms(
     columns = min(len(names), NUM_COLUMNS)
     figure, panels = _panels(len(names), columns, width=2.6, height=2.2)
     for k, (axes, name) in enumerate(zip(panels, names, strict=True)):
-        values = torch.cat([x_o[:, k], x_s[:, k]]).double()
+        values = torch.cat([x_o[:, k], x_s[:, k]])
         tail = TAIL if len(values) * TAIL > 1 else 0.0
         low, high = (torch.quantile(values, q).item() for q in (tail, 1 - tail))
         if low == high:

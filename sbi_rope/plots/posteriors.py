@@ -5,21 +5,23 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
-from sbi_rope.plots._figures import PRIOR, empty_figure, hide_frame, line_styles
+from sbi_rope.plots._figures import PRIOR, empty_figure, line_styles
 from sbi_rope.plots._samples import (
-    check_samples,
+    as_drawn,
+    as_samples,
+    central_interval,
+    corner_legend,
+    corner_panels,
     draw_contours,
     draw_edges,
     draw_marginal,
     edges_crossed,
     label_with_share,
-    prior_interval,
     robust_limits,
     shade_prior,
 )
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["pair_plot"]
@@ -52,92 +54,35 @@ def pair_plot(
 
     Raises:
         InvalidInputError: If the shapes differ, or a sample is not finite.
-        ImportError: If matplotlib is not installed.
     """
-    draws, truth, names = check_samples(samples, theta, parameter_names)
+    draws, truth, names = as_samples(samples, theta, parameter_names)
     dim = len(names)
     figure = empty_figure(2.0 * dim + 0.8, 2.0 * dim + 1.0)
-    interval = (
-        None if prior is None else prior_interval(prior, draws[next(iter(draws))])
-    )
-    edges = None if prior is None else edges_crossed(prior, list(draws.values()))
+    interval = edges = None
+    if prior is not None:
+        prior = as_drawn("prior", prior, (dim,))
+        interval = central_interval(prior)
+        edges = edges_crossed(prior, list(draws.values()))
     limits = robust_limits(list(draws.values()), truth, interval)
-    for row in range(dim):
-        for column in range(row + 1):
-            axes = figure.add_subplot(dim, dim, row * dim + column + 1)
-            pair = [column] if row == column else [column, row]
-            _draw_panel(
-                axes,
-                {name: value[:, pair] for name, value in draws.items()},
-                None if truth is None else truth[pair],
-                limits[:, pair],
-                None if interval is None else interval[:, pair],
-            )
-            if edges is not None:
-                draw_edges(axes, edges[:, pair])
-            axes.tick_params(labelbottom=row == dim - 1, labelleft=column == 0)
-            if row == dim - 1:
-                axes.set_xlabel(names[column])
-            if column == 0 and row > 0:
-                axes.set_ylabel(names[row])
-    _add_legend(figure, draws, truth, limits, shaded=interval is not None)
-    return figure
-
-
-def _draw_panel(
-    axes: "Axes",
-    draws: Mapping[str, Tensor],
-    truth: Tensor | None,
-    limits: Tensor,
-    interval: Tensor | None,
-) -> None:
-    """Draw one parameter, or a pair of parameters."""
-    hide_frame(axes)
-    is_marginal = limits.shape[1] == 1
-    axes.set_xlim(*limits[:, 0].tolist())
-    if not is_marginal:
-        axes.set_ylim(*limits[:, 1].tolist())
-    if interval is not None:
-        shade_prior(axes, interval)
-    for name, style in line_styles(draws).items():
-        if is_marginal:
-            draw_marginal(axes, draws[name][:, 0], style)
-        else:
-            draw_contours(axes, draws[name], style)
-    if is_marginal:
-        axes.spines["left"].set_visible(False)
-        axes.set_yticks([])
-        axes.set_ylim(bottom=0)
-    if truth is not None and is_marginal:
-        axes.axvline(float(truth[0]), color="black", lw=1.2)
-    elif truth is not None:
-        axes.plot(*truth.tolist(), "o", color="black", ms=4, zorder=5)
-
-
-def _add_legend(
-    figure: "Figure",
-    draws: Mapping[str, Tensor],
-    truth: Tensor | None,
-    limits: Tensor,
-    *,
-    shaded: bool,
-) -> None:
+    styles = line_styles(draws)
+    for axes, pair in corner_panels(figure, names, limits, truth):
+        if interval is not None:
+            shade_prior(axes, interval[:, pair])
+        for name, style in styles.items():
+            if len(pair) == 1:
+                draw_marginal(axes, draws[name][:, pair[0]], style)
+            else:
+                draw_contours(axes, draws[name][:, pair], style)
+        if edges is not None:
+            draw_edges(axes, edges[:, pair])
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    styles = line_styles(draws)
     handles: list[Any] = [
         Line2D([], [], label=label_with_share(name, value, limits), **styles[name])
         for name, value in draws.items()
     ]
-    if truth is not None:
-        handles.append(
-            Line2D([], [], color="black", lw=1.2, marker="o", ms=4, label="truth")
-        )
-    if shaded:
+    if interval is not None:
         handles.append(Patch(color=PRIOR, label="prior"))
-    # The legend is in the empty half of the figure, or above a single panel.
-    if limits.shape[1] > 1:
-        figure.legend(handles=handles, loc="upper right", frameon=False)
-    else:
-        figure.legend(handles=handles, loc="outside upper center", frameon=False)
+    corner_legend(figure, handles, truth)
+    return figure

@@ -8,11 +8,12 @@ from torch import Tensor
 
 from sbi_rope.errors import InvalidInputError, warn_user
 from sbi_rope.mixture import MixturePosterior
-from sbi_rope.plots._figures import BLUE, GREY, ORANGE, empty_figure, hide_frame
+from sbi_rope.plots._figures import BLUE, GREY, ORANGE, empty_figure
 from sbi_rope.plots._samples import (
+    as_samples,
     central_interval,
-    check_samples,
-    check_truth,
+    corner_legend,
+    corner_panels,
     draw_marginal,
     with_margin,
 )
@@ -21,11 +22,11 @@ from sbi_rope.settings import check
 from sbi_rope.stacking import StackedPosterior
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["credible_set"]
 
+NUM_SAMPLES = 2000
 CREDIBLE, GUARANTEED = "of the posterior", "guaranteed"
 STYLES: dict[str, dict[str, Any]] = {
     CREDIBLE: {"color": BLUE, "linestyle": "-"},
@@ -40,8 +41,6 @@ def credible_set(
     *,
     level: float = 0.9,
     parameter_names: Sequence[str] | None = None,
-    num_samples: int = 2000,
-    seed: int | None = 0,
 ) -> "Figure":
     """Draw the credible set of an observation, and of a stack that with a guarantee.
 
@@ -60,21 +59,15 @@ def credible_set(
         level: The level of the sets and intervals.
         parameter_names: A label for each parameter, with its unit. If None, the names
             that ``RoPE`` was given.
-        num_samples: The number of draws, as in ``posterior.credible_set``.
-        seed: Seed of the draws.
 
     Returns:
         The figure, with d rows and columns and the intervals on the diagonal.
 
     Raises:
-        InvalidInputError: If the posterior is another one.
-        InvalidInputError: If an argument is outside its range.
-        ImportError: If matplotlib is not installed.
+        InvalidInputError: If the posterior is another one, or an argument does not fit.
     """
     check("posterior", posterior, MixturePosterior)
-    if theta is not None:  # before the sets, which take a while
-        theta = check_truth(theta, posterior.posterior_estimator.input_shape[0])
-    options: dict[str, Any] = {"num_samples": num_samples, "seed": seed}
+    options: dict[str, Any] = {"num_samples": NUM_SAMPLES, "seed": 0}
     sets = {CREDIBLE: posterior.credible_set(level, x, **options)}
     intervals = {CREDIBLE: posterior.credible_intervals(level, x, **options)}
     if isinstance(posterior, StackedPosterior):
@@ -90,7 +83,7 @@ def credible_set(
         name: points[found.contains(points)]
         for name, found in sorted(sets.items(), key=lambda item: -item[1].volume)
     }
-    draws, truth, labels = check_samples(
+    draws, truth, labels = as_samples(
         {"posterior": sets[CREDIBLE].draws, **members},
         theta,
         posterior.parameter_names if parameter_names is None else parameter_names,
@@ -110,22 +103,24 @@ def _drawn(
     limits = _limits(draws, intervals, truth)
     samples = draws.pop("posterior")
     figure = empty_figure(2.0 * dim + 0.8, 2.0 * dim + 1.0)
-    for row in range(dim):
-        for column in range(row + 1):
-            axes = figure.add_subplot(dim, dim, row * dim + column + 1)
-            hide_frame(axes)
-            axes.set_xlim(*limits[:, column].tolist())
-            if row == column:
-                _draw_intervals(axes, samples[:, row], intervals, truth, row)
-            else:
-                axes.set_ylim(*limits[:, row].tolist())
-                _draw_sets(axes, draws, truth, [column, row])
-            axes.tick_params(labelbottom=row == dim - 1, labelleft=column == 0)
-            if row == dim - 1:
-                axes.set_xlabel(labels[column])
-            if column == 0 and row > 0:
-                axes.set_ylabel(labels[row])
-    _add_legend(figure, intervals, truth, level=level)
+    for axes, pair in corner_panels(figure, labels, limits, truth):
+        if len(pair) == 1:
+            draw_marginal(axes, samples[:, pair[0]], {"color": GREY})
+            for name, found in intervals.items():
+                for end in (found.low[pair[0]], found.high[pair[0]]):
+                    axes.axvline(float(end), **STYLES[name], lw=1.8)
+            continue
+        for name, value in draws.items():
+            colour, (x, y) = STYLES[name]["color"], value[:, pair].T.numpy()
+            axes.scatter(x, y, s=5, color=colour, lw=0, rasterized=True)
+    from matplotlib.lines import Line2D
+
+    styles = {name: {**STYLES[name], "marker": "o", "ms": 4} for name in intervals}
+    handles = [
+        Line2D([], [], label=f"{100 * level:.4g} %, {name}", **style)
+        for name, style in styles.items()
+    ]
+    corner_legend(figure, handles, truth)
     return figure
 
 
@@ -148,65 +143,3 @@ def _limits(
         spans.append(truth.expand(2, -1))
     low, high = torch.stack(spans).nan_to_num(posinf=0.0, neginf=0.0).unbind(dim=1)
     return with_margin(low.amin(dim=0), high.amax(dim=0))
-
-
-def _draw_intervals(
-    axes: "Axes",
-    samples: Tensor,
-    intervals: Mapping[str, CredibleIntervals],
-    truth: Tensor | None,
-    number: int,
-) -> None:
-    draw_marginal(axes, samples, {"color": GREY})
-    for name, found in intervals.items():
-        for end in (found.low[number], found.high[number]):
-            axes.axvline(float(end), **STYLES[name], lw=1.8)
-    axes.spines["left"].set_visible(False)
-    axes.set_yticks([])
-    axes.set_ylim(bottom=0)
-    if truth is not None:
-        axes.axvline(float(truth[number]), color="black", lw=1.2)
-
-
-def _draw_sets(
-    axes: "Axes", members: Mapping[str, Tensor], truth: Tensor | None, pair: list[int]
-) -> None:
-    for name, value in members.items():
-        axes.scatter(
-            *value[:, pair].T.numpy(),
-            s=5,
-            color=STYLES[name]["color"],
-            lw=0,
-            rasterized=True,
-        )
-    if truth is not None:
-        axes.plot(*truth[pair].tolist(), "o", color="black", ms=4, zorder=5)
-
-
-def _add_legend(
-    figure: "Figure",
-    intervals: Mapping[str, CredibleIntervals],
-    truth: Tensor | None,
-    *,
-    level: float,
-) -> None:
-    from matplotlib.lines import Line2D
-
-    handles = [
-        Line2D(
-            [],
-            [],
-            **STYLES[name],
-            marker="o",
-            ms=4,
-            label=f"{100 * level:.4g} %, {name}",
-        )
-        for name in intervals
-    ]
-    if truth is not None:
-        handles.append(
-            Line2D([], [], color="black", lw=1.2, marker="o", ms=4, label="truth")
-        )
-    # The legend is in the empty half of the figure, or above a single panel.
-    place = "upper right" if len(figure.axes) > 1 else "outside upper center"
-    figure.legend(handles=handles, loc=place, frameon=False)

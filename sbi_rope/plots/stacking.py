@@ -58,7 +58,6 @@ def stacking_report(report: StackingReport) -> "Figure":
 
     Raises:
         InvalidInputError: If the argument is no report.
-        ImportError: If matplotlib is not installed.
     """
     check("report", report, StackingReport)
     curve = report.learning_curve

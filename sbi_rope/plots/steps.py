@@ -2,13 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import check_finite, check_names
-from sbi_rope.errors import InvalidInputError, shown
 from sbi_rope.plots._figures import (
     BLUE,
     PRIOR,
@@ -18,19 +17,16 @@ from sbi_rope.plots._figures import (
     line_styles,
 )
 from sbi_rope.plots._samples import (
+    as_drawn,
+    as_samples,
     central_interval,
-    check_samples,
     draw_contours,
     draw_marginal,
-    drawable,
     label_with_share,
-    prior_interval,
     robust_limits,
     shade_prior,
     with_margin,
 )
-from sbi_rope.settings import Range, check
-from sbi_rope.tensors import as_batch, as_numbers, check_same_length
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -79,7 +75,6 @@ def overview(
     samples: Mapping[str, Tensor],
     theta: Tensor,
     parameter_names: Sequence[str],
-    index: int = 0,
     parameters: Sequence[int] | None = None,
     prior: Tensor | None = None,
 ) -> "Figure":
@@ -87,11 +82,11 @@ def overview(
 
     1. *Tune* shows the embeddings of real observations before and after tuning, in the
        plane of the first two principal components of the simulations' embeddings.
-       Contours enclose 90 % of the observations. The arrow shows how far observation
-       ``index`` moves.
+       Contours enclose 90 % of the observations. The arrow shows how far the first one
+       moves.
     2. *Couple* shows the simulations in the same plane. The larger and darker a
-       simulation is, the larger is its weight in the posterior of observation
-       ``index``, which is the star.
+       simulation is, the larger is its weight in the posterior of the first
+       observation, which is the star.
     3. *Mix* shows the posterior of that observation. Contours enclose 50 % and 90 % of
        the samples.
 
@@ -103,13 +98,12 @@ def overview(
             ``posterior.coupling.simulated``.
         before: Embeddings :math:`h(x_o)` before tuning, shape ``(n_o, l)``.
         after: Embeddings :math:`g(x_o)` after tuning, shape ``(n_o, l)``.
-        weights: The weights of the simulations for the observation, shape ``(n_s,)``,
-            such as ``posterior.weights[index]``.
-        samples: Samples of the observation's posterior by method name, each of shape
+        weights: The weights of the simulations for the first observation, shape
+            ``(n_s,)``, such as ``posterior.weights[0]``.
+        samples: Samples of its posterior by method name, each of shape
             ``(num_samples, d)``.
-        theta: The observation's true parameter, shape ``(d,)``.
+        theta: Its true parameter, shape ``(d,)``.
         parameter_names: A label for each parameter, with its unit.
-        index: The row of the observation in ``before`` and ``after``.
         parameters: The one or two parameters to show. None shows the first two.
         prior: Samples of the prior, shape ``(n, d)``. Their central 99 % is shown in
             grey.
@@ -118,31 +112,29 @@ def overview(
         The figure, with three panels.
 
     Raises:
-        InvalidInputError: If shapes do not fit, a value is not finite, or an index is
-            out of range.
-        ImportError: If matplotlib is not installed.
+        InvalidInputError: If shapes do not fit, or a value is not finite.
     """
-    before, after, simulated, weights = _check_embeddings(
-        before, after, simulated, weights
+    width = np.shape(simulated)[-1:]
+    plane = _plane(
+        as_drawn("simulated", simulated, width),
+        as_drawn("before", before, width),
+        as_drawn("after", after, width),
     )
-    check("index", index, Annotated[int, Range(0, len(before) - 1)])
-    as_numbers("theta", theta)
-    check_names("parameter_names", parameter_names)
-    draws, truth, names = check_samples(samples, theta, parameter_names)
+    weights = as_drawn("weights", weights, (), rows=len(plane.simulated))
+    draws, truth, names = as_samples(samples, theta, parameter_names)
     assert truth is not None
-    chosen = _check_parameters(parameters, len(names))
+    chosen = list(range(len(names))[:2] if parameters is None else parameters)
     interval = None
     if prior is not None:
-        interval = prior_interval(prior, truth.unsqueeze(0))[:, chosen]
+        interval = central_interval(as_drawn("prior", prior, truth.shape))[:, chosen]
 
     figure = empty_figure(9.6, 3.9)
     figure.set_layout_engine("none")
     tune, couple, mix = figure.subplots(1, 3, gridspec_kw=LAYOUT)
     for axes in (tune, couple, mix):
         hide_frame(axes)
-    plane = _plane(simulated, before, after)
-    _draw_tuning(tune, plane, index)
-    _draw_coupling(couple, plane, weights, index)
+    _draw_tuning(tune, plane)
+    _draw_coupling(couple, plane, weights)
     _draw_posteriors(
         mix,
         {name: value[:, chosen] for name, value in draws.items()},
@@ -153,10 +145,9 @@ def overview(
     return figure
 
 
-def _draw_tuning(axes: "Axes", plane: _Plane, index: int) -> None:
-    _set_up_plane(
-        axes, plane, [plane.simulated, plane.before, plane.after], plane.after[index]
-    )
+def _draw_tuning(axes: "Axes", plane: _Plane) -> None:
+    clouds = [plane.simulated, plane.before, plane.after]
+    _set_up_plane(axes, plane, clouds, plane.after[0])
     _scatter(axes, plane.simulated, s=9, color=SIMULATED)
     for points, colour, line in (
         (plane.before, VERMILLION, "--"),
@@ -166,7 +157,7 @@ def _draw_tuning(axes: "Axes", plane: _Plane, index: int) -> None:
         if not plane.flat:
             style = {"color": colour, "linestyle": line, "linewidth": 1.8}
             draw_contours(axes, points, style, bounded=False, shares=[0.9])
-    start, end = plane.before[index], plane.after[index]
+    start, end = plane.before[0], plane.after[0]
     axes.plot(*end.tolist(), **STAR)
     axes.annotate(
         "",
@@ -184,8 +175,8 @@ def _draw_tuning(axes: "Axes", plane: _Plane, index: int) -> None:
     axes.set_title("1.  Tune: real data move\n     onto simulations", **TITLE)
 
 
-def _draw_coupling(axes: "Axes", plane: _Plane, weights: Tensor, index: int) -> None:
-    star = plane.after[index]
+def _draw_coupling(axes: "Axes", plane: _Plane, weights: Tensor) -> None:
+    star = plane.after[0]
     _set_up_plane(axes, plane, [plane.simulated], star)
     relative = weights / weights.max()
     _scatter(axes, plane.simulated, s=9, color=SIMULATED)
@@ -317,54 +308,3 @@ def _spread_out(points: Tensor) -> Tensor:
     """Give one-dimensional embeddings a second coordinate that depends on the row."""
     golden = torch.arange(len(points), dtype=points.dtype) * 0.6180339887498949
     return torch.cat([points, golden.frac().unsqueeze(1)], dim=1)
-
-
-def _check_embeddings(
-    before: Tensor, after: Tensor, simulated: Tensor, weights: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Check embeddings and weights, and return them on the CPU in float64."""
-    if as_numbers("simulated", simulated).ndim != 2:
-        raise InvalidInputError(
-            f"Expected `simulated` of shape (n_s, l); got {tuple(simulated.shape)}."
-        )
-    event = simulated.shape[1:]
-    as_batch("simulated", simulated, event)
-    as_batch("before", before, event)
-    as_batch("after", after, event)
-    check_same_length("before", before, "after", after)
-    if as_numbers("weights", weights).shape != simulated.shape[:1]:
-        raise InvalidInputError(
-            f"Expected `weights` of shape ({len(simulated)},), one for each row of "
-            f"`simulated`; got {tuple(weights.shape)}. Pass one row of the coupling, "
-            "`weights[index]`."
-        )
-    check_finite("weights", weights)
-    if (weights < 0).any() or not (weights > 0).any():
-        raise InvalidInputError(
-            "Expected `weights` of at least 0, not all of them 0; got "
-            f"{float(weights.min()):.3g} to {float(weights.max()):.3g}."
-        )
-    return (
-        drawable("before", before),
-        drawable("after", after),
-        drawable("simulated", simulated),
-        weights.detach().cpu().double(),
-    )
-
-
-def _check_parameters(parameters: Sequence[int] | None, dim: int) -> list[int]:
-    if parameters is None:
-        return list(range(min(dim, 2)))
-    is_list = isinstance(parameters, Sequence) and not isinstance(parameters, str)
-    if not is_list or len(parameters) not in (1, 2):
-        raise InvalidInputError(
-            f"Expected `parameters` to be one or two different indices from 0 to "
-            f"{dim - 1}; got {shown(parameters)}."
-        )
-    for j in parameters:
-        check("parameters", j, Annotated[int, Range(0, dim - 1)])
-    if len({*parameters}) != len(parameters):
-        raise InvalidInputError(
-            f"Expected different `parameters`; got {shown(parameters)}."
-        )
-    return list(parameters)

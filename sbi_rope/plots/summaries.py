@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from sbi_rope.discrepancy import DiscrepancyReport, Interval, SummaryDiscrepancy
-from sbi_rope.errors import InvalidInputError
 from sbi_rope.plots._figures import BLUE, GREY, empty_figure, hide_frame
 from sbi_rope.settings import check
 
@@ -41,12 +40,8 @@ def discrepancy(report: DiscrepancyReport) -> "Figure":
 
     Raises:
         InvalidInputError: If the argument is no report.
-        InvalidInputError: If the report has no summary.
-        ImportError: If matplotlib is not installed.
     """
     check("report", report, DiscrepancyReport)
-    if not report.summaries:
-        raise InvalidInputError("Expected `report` of at least one summary; got none.")
     shown = list(report.summaries[:MAX_SUMMARIES])
     figure = empty_figure(8.6, 1.5 + 0.3 * len(shown))
     widths = [1.0, 1.1, 0.95, 0.8]

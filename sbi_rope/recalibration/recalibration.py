@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from sbi_rope._means import Counts, counts_of, interval_of_mean, mean_and_error
-from sbi_rope._notebooks import shown_as_text
 from sbi_rope._random import seeded
 from sbi_rope.metrics.calibration import (
     ACAUC_IN_WORDS,
@@ -19,7 +18,6 @@ from sbi_rope.recalibration.factors import HeldOutGrid, HeldOutMixture
 __all__ = ["Recalibration", "recalibrate"]
 
 
-@shown_as_text
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Recalibration:
     """By which factors a posterior was made narrower or wider, and what it gained.

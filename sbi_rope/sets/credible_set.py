@@ -8,7 +8,6 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from sbi_rope._notebooks import shown_as_text
 from sbi_rope._validation import KnownColumns, check_tables
 from sbi_rope.sets.conformal import DIGITS
 from sbi_rope.sets.guarantee import Guarantee
@@ -25,7 +24,6 @@ class Rule(Protocol):
         ...
 
 
-@shown_as_text
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CredibleSet:
     r"""A set of parameters that are credible given one observation.

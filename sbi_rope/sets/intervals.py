@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sbi_rope._notebooks import shown_as_text
 from sbi_rope._validation import KnownColumns, check_names, check_tables
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.sets.guarantee import Guarantee
@@ -22,7 +21,6 @@ __all__ = ["CredibleIntervals", "central_intervals"]
 MAX_PRINTED = 20
 
 
-@shown_as_text
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CredibleIntervals:
     """An interval for each parameter given one observation, or each of a batch.

@@ -8,8 +8,6 @@ from typing import Any
 from torch import Tensor
 
 from sbi_rope._groups import groups_of, one_of_each_group
-from sbi_rope._notebooks import shown_as_text
-from sbi_rope._tables import as_dataframe
 from sbi_rope._two_sample import TwoSampleTest
 from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.metrics import (
@@ -32,7 +30,6 @@ from sbi_rope.stacking.words import LEVEL, REFERENCES, lines_of
 __all__ = ["StackingReport"]
 
 
-@shown_as_text
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StackingReport:
     """How well a stack predicts held-out pairs, which methods it uses, and coverage.
@@ -193,14 +190,6 @@ class StackingReport:
         """
         rows = self.cross_validation.as_rows()
         return sorted(rows, key=lambda row: -row["score"])
-
-    def to_dataframe(self) -> Any:
-        """Return :meth:`as_rows` as a pandas table.
-
-        Raises:
-            ImportError: If pandas is not installed.
-        """
-        return as_dataframe(self.as_rows())
 
     def to_html(
         self,

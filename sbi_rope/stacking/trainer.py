@@ -14,7 +14,7 @@ from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._validation import check_default_dtype, check_path, check_prior
 from sbi_rope.coupling.coupler import SMALL_BATCH
 from sbi_rope.discrepancy import DiscrepancyReport
-from sbi_rope.discrepancy.correction import check_complete, network_of
+from sbi_rope.discrepancy.correction import network_of
 from sbi_rope.errors import (
     InvalidInputError,
     warn_user,
@@ -44,6 +44,7 @@ from sbi_rope.stacking.unlabelled_candidates import RVNPCandidate
 from sbi_rope.stacking.versions import Versions, train_version
 from sbi_rope.stacking.workbench import NUM_FOLDS, Workbench, check_pairs, draw_seeds
 from sbi_rope.stacking.workers import check_sendable, train_versions
+from sbi_rope.tensors import as_batch
 
 __all__ = ["StackTrainer"]
 
@@ -140,11 +141,8 @@ class StackTrainer:
         if any(candidate.space == "input" for candidate in corrected):
             # Raises for images and series, before any candidate is trained.
             network_of(estimator_of(self.bench.npe), "input")
-            for name, x in (
-                ("pairs", self.bench.x),
-                ("simulations", self.bench.simulations[1]),
-            ):
-                check_complete(name, x, instead="Leave out candidates with 'input'.")
+            as_batch("x", self.bench.x)
+            as_batch("x of simulations", self.bench.simulations[1])
         coupled = any(isinstance(c, CouplingCandidate) for c in chosen)
         if coupled and self.x_o is None:
             raise InvalidInputError(

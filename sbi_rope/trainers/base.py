@@ -13,16 +13,10 @@ from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import copy_of_prior, device_of, embedding_of, estimator_of
 from sbi_rope._simulations import SimulationSource
-from sbi_rope._simulator import check_callable, source_of
+from sbi_rope._simulator import source_of
 from sbi_rope._training import History
-from sbi_rope._validation import (
-    check_default_dtype,
-    check_prior,
-    check_simulated_columns,
-    columns_of,
-    usable_device,
-)
-from sbi_rope.errors import InvalidInputError, NotReadyError, warn_user
+from sbi_rope.errors import InvalidInputError, NotReadyError
+from sbi_rope.settings import check
 from sbi_rope.trainers.data import Data, Kind
 from sbi_rope.trainers.starting_npe import StartingNPE
 
@@ -43,8 +37,7 @@ class Method(ABC):
     """A method of inference: construct, append data, ``train``, ``build_posterior``.
 
     What is passed in is copied or only read. Appending data after a training asks for
-    another one, which starts anew. No method takes the parameters of the observations
-    to be inferred.
+    another one, which starts anew.
 
     A subclass says which data it ``sees`` and returns a posterior from ``_fit``.
 
@@ -56,6 +49,7 @@ class Method(ABC):
             needs simulations also beside a trained NPE.
         simulates: Whether it makes simulations of its own. Without a simulator it looks
             them up among those that were appended.
+        min_pairs: The number of calibration pairs that it needs, if it sees them.
 
     Args:
         prior: A torch distribution over parameters of shape ``(d,)``.
@@ -64,14 +58,14 @@ class Method(ABC):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidInputError: If the prior is not a torch distribution, or the simulator
-            cannot be called.
+        InvalidInputError: If the prior is no torch distribution over vectors.
     """
 
     sees: ClassVar[frozenset[Kind]]
     starts_from_npe: ClassVar[bool] = False
     trains_on_statistics: ClassVar[bool] = False
     simulates: ClassVar[bool] = False
+    min_pairs: ClassVar[int] = 1
 
     def __init__(
         self,
@@ -81,22 +75,18 @@ class Method(ABC):
         simulator: Callable[[Any], Any] | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
-        check_prior(prior)
-        check_default_dtype()
+        check("prior", prior, Distribution)
+        if len(prior.event_shape) != 1:
+            raise InvalidInputError(
+                "Expected `prior` over vectors, with event shape (d,); got event shape "
+                f"{tuple(prior.event_shape)}."
+            )
         self._prior: Distribution = copy_of_prior(prior)
-        self._device = usable_device(device)
+        self._device = torch.empty(0, device=device).device  # with its number
         if hasattr(self._prior, "to"):
             self._prior.to(self._device)  # type: ignore[attr-defined]
-        elif (of_prior := _device_of_draws(self._prior)) != self._device:
-            raise InvalidInputError(
-                f"Cannot move the prior from {of_prior} to {self._device}: a "
-                f"{type(prior).__name__} has no method `to`. Use a prior of sbi, such "
-                "as BoxUniform, or make the prior there."
-            )
         self._data = Data(self._prior, self._device)
         self._npe = npe
-        if simulator is not None:
-            check_callable(simulator)
         self._simulator = simulator
         self._posterior: Any = None
         self._history: History | None = None
@@ -113,30 +103,22 @@ class Method(ABC):
 
         Returns:
             The method. If its ``needs_simulations`` is False, simulations that are
-            appended have no effect, and earn a warning.
+            appended have no effect.
 
         Raises:
             UnsupportedPosteriorError: If it is not a plain amortised posterior.
-            InvalidInputError: If an option would have no effect, or the method does not
-                start from NPE.
+            InvalidInputError: If the method does not start from NPE.
         """
         if not cls.starts_from_npe:
             raise InvalidInputError(
-                f"Expected a method that starts from NPE; {cls.__name__} makes no use "
-                f"of a trained posterior. Construct it with `{cls.__name__}(prior)`."
+                f"Expected a method that starts from NPE; got {cls.__name__}. Call "
+                f"`{cls.__name__}(prior)`."
             )
-        for name in ("density_estimator", "npe_training"):
-            if name in options:
-                raise InvalidInputError(
-                    f"Expected no `{name}` beside a trained posterior; it would have "
-                    "no effect."
-                )
         estimator = estimator_of(posterior)
         method = cls(posterior.prior, device=device_of(estimator), **options)
         assert method._npe is not None
         method._npe.replace_by(posterior)
         method._data.event_shape = estimator.condition_shape
-        method._data.columns = columns_of(posterior)
         method._data.embedding_net = copy.deepcopy(embedding_of(estimator))
         return method
 
@@ -154,20 +136,10 @@ class Method(ABC):
             Itself, so that calls can be chained.
 
         Raises:
-            InvalidInputError: If one of them holds no numbers.
-            InvalidInputError: If the method does not see simulations, shapes or row
-                counts do not fit, a theta is not in the support of the prior, or the
-                columns of a table are in another order than those of an earlier one.
-                Nothing is added then.
+            InvalidInputError: If the method does not see simulations, shapes do not
+                fit, or a theta is outside the prior's support. Nothing is added then.
         """
-        self._check_seen("simulations")
-        if self._ignores_simulations:
-            warn_user(
-                f"{type(self).__name__} starts from a trained posterior and makes no "
-                "use of simulations."
-            )
-        self._data.append_simulations(theta, x)
-        return self._untrained()
+        return self._append("simulations", theta, x)
 
     def append_calibration(self, theta: Tensor, x: Tensor) -> "Self":
         """Add real observations with known parameters; may be called repeatedly.
@@ -180,15 +152,11 @@ class Method(ABC):
             Itself, so that calls can be chained.
 
         Raises:
-            InvalidInputError: If one of them holds no numbers.
-            InvalidInputError: If the method does not see calibration pairs, shapes or
-                row counts do not fit, a value is not finite, a theta is outside the
-                prior's support, or the columns of a table are in another order than
-                those of an earlier one. Nothing is added then.
+            InvalidInputError: If the method does not see calibration pairs, shapes do
+                not fit, a value is not finite, or a theta is outside the prior's
+                support. Nothing is added then.
         """
-        self._check_seen("calibration")
-        self._data.append_calibration(theta, x)
-        return self._untrained()
+        return self._append("calibration", theta, x)
 
     def append_observations(self, x_o: Tensor) -> "Self":
         """Add real observations without labels; may be called repeatedly.
@@ -200,14 +168,10 @@ class Method(ABC):
             Itself, so that calls can be chained.
 
         Raises:
-            InvalidInputError: If it holds no numbers.
             InvalidInputError: If the method does not see observations, the shape does
-                not fit, a value is not finite, or the columns of a table are in another
-                order than those of an earlier one.
+                not fit, or a value is not finite.
         """
-        self._check_seen("observations")
-        self._data.append_observations(x_o)
-        return self._untrained()
+        return self._append("observations", x_o)
 
     def train(
         self, *, seed: int | None = None, show_progress_bars: bool | None = None
@@ -224,8 +188,7 @@ class Method(ABC):
             Itself, so that calls can be chained.
 
         Raises:
-            NotReadyError: If data that the method needs was not appended, or in
-                torch's inference mode.
+            NotReadyError: If data that the method needs was not appended.
         """
         self._check_data()
         # Whatever the caller's own setting of gradients.
@@ -246,10 +209,7 @@ class Method(ABC):
                 f"{type(self).__name__} is not trained, or data was appended since. "
                 "Call `train()` first."
             )
-        posterior = copy.deepcopy(self._posterior)
-        # Those of sbi do not look at it, but `evaluate` and `draw_samples` do.
-        posterior.columns = dict(self._data.columns)
-        return posterior
+        return copy.deepcopy(self._posterior)
 
     @property
     def history(self) -> History:
@@ -264,11 +224,6 @@ class Method(ABC):
         looks_up = self.simulates and self._simulator is None
         used_anyway = looks_up or self.trains_on_statistics
         return "simulations" in self.sees and (used_anyway or not self._has_npe)
-
-    @property
-    def _ignores_simulations(self) -> bool:
-        """Whether simulations that are appended have no effect."""
-        return not self.needs_simulations
 
     @property
     def _has_npe(self) -> bool:
@@ -295,7 +250,7 @@ class Method(ABC):
         """Return the simulator, or the appended simulations where there is none."""
         event_shape = self._data.event_shape
         assert event_shape is not None
-        source = source_of(
+        return source_of(
             self._prior,
             simulator=self._simulator,
             simulations=self._looked_up,
@@ -303,39 +258,28 @@ class Method(ABC):
             like=torch.empty(0, *self._prior.event_shape, device=self._device),
             readable=self._data.readable,
         )
-        columns = self._data.columns
-        columns["x"] = check_simulated_columns(source.x_columns, columns["x"])
-        return source
 
-    def _check_data(self) -> None:
-        """Raise unless all data that is needed was appended."""
-        for kind in reversed(DATA):
-            if kind in self.sees and (kind != "simulations" or self.needs_simulations):
-                self._check_some(kind)
-
-    def _check_some(self, kind: Kind) -> None:
-        what, call = DATA[kind]
-        if not self._data.count(kind):
-            raise NotReadyError(
-                f"{type(self).__name__} needs {what}. Call `{call}` first."
+    def _append(self, kind: Kind, *data: Any) -> "Self":
+        if kind not in self.sees:
+            seen = [DATA[one][0] for one in DATA if one in self.sees]
+            raise InvalidInputError(
+                f"Expected a method that sees {DATA[kind][0]}; {type(self).__name__} "
+                f"sees {'only ' + ' and '.join(seen) if seen else 'no data'}."
             )
-
-    def _check_seen(self, kind: Kind) -> None:
-        if kind in self.sees:
-            return
-        what, call = DATA[kind]
-        seen = [name for other, (name, _) in DATA.items() if other in self.sees]
-        sees = f"only {' and '.join(seen)}" if seen else "no data"
-        raise InvalidInputError(
-            f"Expected a method that sees {what}; {type(self).__name__} sees "
-            f"{sees}. Leave out `{call}`, or use another method."
-        )
-
-    def _untrained(self) -> "Self":
+        getattr(self._data, f"append_{kind}")(*data)
         self._posterior = self._history = None
         return self
 
-
-def _device_of_draws(prior: Distribution) -> torch.device:
-    with seeded(0):
-        return prior.sample((1,)).device
+    def _check_data(self, *kinds: Kind) -> None:
+        """Raise unless there are the data of these kinds, or of all, that it needs."""
+        for kind in kinds or tuple(reversed(DATA)):
+            what, call = DATA[kind]
+            is_needed = kind != "simulations" or self.needs_simulations
+            least = self.min_pairs if kind == "calibration" else 1
+            if not is_needed or kind not in self.sees:
+                continue
+            if (count := self._data.count(kind)) < least:
+                raise NotReadyError(
+                    f"{type(self).__name__} needs at least {least} {what}; got "
+                    f"{count}. Call `{call}` first."
+                )

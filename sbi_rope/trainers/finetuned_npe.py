@@ -18,7 +18,6 @@ from sbi_rope._sbi import (
 )
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._training import History, best_of_learning_rates
-from sbi_rope._validation import columns_of
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture import (
     MixtureEstimator,
@@ -26,7 +25,7 @@ from sbi_rope.mixture import (
     OwnEmbeddings,
     part_of,
 )
-from sbi_rope.settings import Count, Positive, check
+from sbi_rope.settings import Count, check
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
 from sbi_rope.trainers.training import (
@@ -92,9 +91,7 @@ class FinetunedNPE(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidInputError: If an argument has the wrong type.
-        InvalidInputError: If sbi knows no estimator of that name, a learning rate is
-            not positive, or ``num_holdouts`` is not.
+        InvalidInputError: If an argument is of the wrong kind.
         UnsupportedPosteriorError: In ``train``, if the estimator has no density.
     """
 
@@ -114,13 +111,6 @@ class FinetunedNPE(Method):
     ) -> None:
         check("num_holdouts", num_holdouts, Count)
         check("training", training, Training | None)
-        check("learning_rates", learning_rates, tuple)
-        if not learning_rates:
-            raise InvalidInputError(
-                "Expected at least one of `learning_rates`; got ()."
-            )
-        for rate in learning_rates:
-            check("learning_rates", rate, Positive)
         npe = StartingNPE(density_estimator, npe_training)
         super().__init__(prior, npe=npe, device=device)
         self.num_holdouts = num_holdouts
@@ -144,8 +134,7 @@ class FinetunedNPE(Method):
 
         Raises:
             UnsupportedPosteriorError: If it is none of these.
-            InvalidInputError: If an option would have no effect, or ``num_holdouts`` is
-                not the number of embedding nets.
+            InvalidInputError: If ``num_holdouts`` is not the number of embedding nets.
         """
         starts = _averaged(posterior)
         if not starts:
@@ -153,13 +142,11 @@ class FinetunedNPE(Method):
         if options.setdefault("num_holdouts", len(starts)) != len(starts):
             raise InvalidInputError(
                 f"Expected `num_holdouts` of {len(starts)}, one for each embedding net "
-                f"that the posterior averages over; got {options['num_holdouts']!r}. "
-                "Leave it out."
+                f"of the posterior; got {options['num_holdouts']!r}. Leave it out."
             )
         first = posterior_from(posterior, starts[0])
         method = super().from_posterior(first, **options)
         method._starts = copy.deepcopy(starts)
-        method._data.columns = columns_of(posterior)
         return method
 
     @property

@@ -33,7 +33,6 @@ class StartingNPE:
         training: How NPE is trained; ``Training()`` if None.
 
     Raises:
-        InvalidInputError: If an argument has the wrong type.
         InvalidInputError: If sbi knows no estimator of that name.
     """
 

@@ -19,7 +19,7 @@ from sbi_rope._training import (
     shuffled,
 )
 from sbi_rope.errors import InvalidInputError, warn_user
-from sbi_rope.settings import Count, Positive, check
+from sbi_rope.settings import Count, Level, Positive, Settings, check
 
 __all__ = [
     "FINETUNING",
@@ -38,7 +38,7 @@ MIN_SIMULATIONS = 20
 
 
 @dataclass(frozen=True, kw_only=True)
-class Training:
+class Training(Settings):
     """How a network is trained, in the words of sbi's ``train``; Adam throughout.
 
     Args:
@@ -55,27 +55,12 @@ class Training:
         InvalidInputError: If an argument is outside its range.
     """
 
-    training_batch_size: int = 200
-    learning_rate: float = 5e-4
-    validation_fraction: float = 0.1
-    stop_after_epochs: int = 20
-    max_num_epochs: int = 2**31 - 1
-    clip_max_norm: float | None = 5.0
-
-    def __post_init__(self) -> None:
-        """Check the ranges of all fields."""
-        check("training_batch_size", self.training_batch_size, Count)
-        check("learning_rate", self.learning_rate, Positive)
-        check("validation_fraction", self.validation_fraction, Positive)
-        if self.validation_fraction > 0.5:
-            raise InvalidInputError(
-                "Expected `validation_fraction` in (0, 0.5]; got "
-                f"{self.validation_fraction!r}."
-            )
-        check("stop_after_epochs", self.stop_after_epochs, Count)
-        check("max_num_epochs", self.max_num_epochs, Count)
-        if self.clip_max_norm is not None:
-            check("clip_max_norm", self.clip_max_norm, Positive)
+    training_batch_size: Count = 200
+    learning_rate: Positive = 5e-4
+    validation_fraction: Level = 0.1
+    stop_after_epochs: Count = 20
+    max_num_epochs: Count = 2**31 - 1
+    clip_max_norm: Positive | None = 5.0
 
 
 # How NPE is fine-tuned on pairs, chosen on calibration data: see benchmarks/choices.md.
@@ -94,16 +79,11 @@ def estimator_builder(density_estimator: Any) -> EstimatorBuilder:
     then changes it. Ours builds from a copy, so that several methods can share one.
 
     Raises:
-        InvalidInputError: If it is neither a name nor callable.
         InvalidInputError: If sbi knows no estimator of that name.
     """
+    check("density_estimator", density_estimator, str | Callable)
     if isinstance(density_estimator, str):
         _builder_of_name(density_estimator)
-    elif not callable(density_estimator):
-        raise InvalidInputError(
-            "Expected `density_estimator` to be a name such as 'nsf', or what sbi's "
-            f"`posterior_nn(...)` returns; got {type(density_estimator).__name__}."
-        )
     return _CopyingBuilder(density_estimator)
 
 
@@ -149,8 +129,8 @@ def _builder_of_name(name: str) -> EstimatorBuilder:
             builder(some, some)
     except Exception as error:
         raise InvalidInputError(
-            "Expected `density_estimator` to be the name of an estimator for "
-            f"continuous parameters that sbi's `posterior_nn` knows; got {name!r}."
+            "Expected `density_estimator` to be one for continuous parameters that "
+            f"`posterior_nn` knows; got {name!r}."
         ) from error
     return builder
 
@@ -178,12 +158,6 @@ def train_on_simulations(
         change_x: Applied to the x of every batch before its loss is taken.
         penalty: Of the estimator, a term that is added to the loss of every training
             batch; None adds nothing.
-
-    Returns:
-        The trained estimator, in evaluation mode, and its losses epoch by epoch.
-
-    Raises:
-        InvalidInputError: If there are too few simulations to hold some out.
     """
     if len(x) < MIN_SIMULATIONS:
         raise InvalidInputError(
@@ -208,45 +182,31 @@ def train_network(
     loss: Callable[..., Tensor],
     training: Training,
     *,
-    validation_loss: Callable[[], Tensor] | None,
     max_num_epochs: int | None = None,
-    in_training_mode: bool = True,
-    decay: bool = False,
-    label: str,
-    show_progress_bars: bool,
+    **options: Any,
 ) -> History:
-    """Train a module by any loss, in place.
+    """Train a module by any loss, in place, with the settings of a training.
 
     Args:
         module: The module.
         batches: Given the number of the epoch, the batches to pass over.
         loss: Of a batch, its mean loss.
         training: Learning rate and so on; ``batches`` has the size of the batches.
-        validation_loss: The loss over the held-out data, if there are any.
         max_num_epochs: Instead of that of ``training``.
-        in_training_mode: Whether dropout and batch statistics are active in training.
-        decay: Whether the step size falls to zero, along a cosine over all epochs.
-        label: What the progress bar and warnings call it.
-        show_progress_bars: Whether to show the course of the loss.
+        **options: Other arguments of ``_training.fit``.
 
     Returns:
         The losses and the epoch that was kept.
     """
-    if max_num_epochs is None:
-        max_num_epochs = training.max_num_epochs
     return fit(
         module,
         batches,
         loss,
-        validation_loss=validation_loss,
         learning_rate=training.learning_rate,
-        max_num_epochs=max_num_epochs,
+        max_num_epochs=max_num_epochs or training.max_num_epochs,
         stop_after_epochs=training.stop_after_epochs,
         clip_max_norm=training.clip_max_norm,
-        in_training_mode=in_training_mode,
-        decay=decay,
-        label=label,
-        show_progress_bars=show_progress_bars,
+        **options,
     )
 
 
@@ -257,12 +217,8 @@ def rows_with_density(
     """Return the rows of pairs whose loss is finite, after a warning of the others.
 
     A single infinite loss would end the training of all pairs. A label exactly on a
-    bound of the prior has one if the estimator's density is zero there. Where a part
-    has no other rows it stays as it is, and its training says so.
-
-    Args:
-        losses: Of rows, the loss of each.
-        splits: The rows of each part of the pairs.
+    bound of the prior has one if the estimator's density is zero there. A part of which
+    all rows have one stays as it is, and its training says so.
     """
     finite = [
         torch.cat([torch.isfinite(losses(some)) for some in rows.split(100)])
@@ -273,11 +229,8 @@ def rows_with_density(
     missing = sum(int((~of_part).sum()) for of_part in finite)
     if missing:
         warn_user(
-            f"{missing} calibration pair(s) have no density under NPE before it is "
-            "trained on them, and are left out of this training. Their parameters may "
-            "be exactly on a bound of the prior, where some density estimators are "
-            "zero. If they are rounded, `RoPE.append_calibration` can be told by how "
-            "much, with `theta_std`."
+            f"{missing} calibration pair(s) have no density under NPE, and are left "
+            "out of this training. Are they exactly on a bound of the prior?"
         )
     return tuple(
         rows[of_part] if of_part.any() else rows
@@ -298,19 +251,8 @@ def train_on_pairs(
 ) -> History:
     """Train an estimator on calibration pairs alone, in place.
 
-    Args:
-        estimator: A density estimator of sbi.
-        theta: Parameters, shape ``(n, d)``.
-        x: Real observations, shape ``(n, *event)``.
-        split: The rows to train on and those held out; without the latter, training
-            stops early.
-        training: Batch size, learning rate and so on.
-        in_training_mode: Whether dropout and batch statistics are active in training.
-        label: What the progress bar and warnings call it.
-        show_progress_bars: Whether to show the course of the loss.
-
-    Returns:
-        The losses and the epoch that was kept.
+    The split has the rows to train on and those held out. Without the latter, training
+    stops early. Returned are the losses and the epoch that was kept.
     """
     estimator.eval()
     train, held_out = rows_with_density(

@@ -2,7 +2,6 @@
 
 import copy
 import inspect
-import warnings
 from typing import Any
 
 import pytest
@@ -90,9 +89,8 @@ def test_data_that_a_method_does_not_see_are_refused(name: str) -> None:
     }
     method, data = make(name, first_task(name)), data_of(first_task(name))
     for kind in set(KINDS) - method.sees:
-        with pytest.raises(InvalidInputError, match=f"sees {sees[name]}") as caught:
+        with pytest.raises(InvalidInputError, match=f"sees {sees[name]}"):
             append(method, kind, data)
-        assert f"append_{kind}(" in str(caught.value)
 
 
 # NPE trained beforehand.

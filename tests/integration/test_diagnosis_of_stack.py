@@ -11,7 +11,6 @@ from torch import Tensor
 from sbi_rope import RoPE, StackedPosterior, diagnose
 from sbi_rope.diagnosis import Diagnosis
 from sbi_rope.diagnosis.in_use import read_for, stack_in_use
-from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture import MixturePosterior
 from tests import problems
 from tests.stacks import FITTED, NPE, NUM_PAIRS, PRIOR, QUIET, problem, rope_of, stacked
@@ -115,14 +114,6 @@ def test_the_verdict_for_the_stack_comes_first_and_what_does_not_concern_it_last
     assert "posterior=posterior" not in text
 
 
-def test_without_a_posterior_all_is_counted_and_the_text_says_how_to_give_one(
-    of_anyone: Diagnosis,
-) -> None:
-    assert of_anyone.others == ()
-    assert of_anyone[AFTER] in of_anyone.unexpected
-    assert "`diagnose(rope, x_o, posterior=posterior)` counts only" in str(of_anyone)
-
-
 def test_a_shift_that_the_pairs_do_not_show_is_an_alarm_about_the_stack(
     rope: RoPE, stack: StackedPosterior
 ) -> None:
@@ -176,13 +167,6 @@ def test_all_findings_concern_posteriors_with_couplings(
     found = read_for(of_stack, with_couplings)
     assert AFTER in names(found.unexpected)
     assert names(found.expected) >= SHIFTS
-
-
-def test_what_is_no_posterior_of_this_package_is_refused(
-    rope: RoPE, x_o: Tensor
-) -> None:
-    with pytest.raises(InvalidInputError, match="`posterior` to be a MixturePosterior"):
-        look(rope, x_o, rope.npe)
 
 
 @pytest.mark.medium

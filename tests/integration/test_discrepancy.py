@@ -18,7 +18,6 @@ from sbi_rope._random import seeded
 from sbi_rope.baselines import PlainNPE, Training
 from sbi_rope.discrepancy import Discrepancy, DiscrepancyDraws, DiscrepancyModel
 from sbi_rope.discrepancy.npe import DiscrepancyNPE
-from sbi_rope.tasks import get_task
 from tests import gaussian
 
 pytestmark = [
@@ -229,21 +228,3 @@ def test_where_the_simulator_is_right_the_loss_against_npe_is_small() -> None:
         before, after = (log_probs(p, theta, x) for p in (npe(), posterior))
         lost.append(float((before - after).mean()))
     assert sum(lost) / 2 < 0.05
-
-
-@pytest.mark.slow
-def test_the_linear_gaussian_task_is_solved_with_fifty_pairs() -> None:
-    task: Any = get_task("linear_gaussian")
-    builder = posterior_nn("mdn", hidden_features=20, num_components=1)
-    method = DiscrepancyNPE(
-        task.get_prior(),
-        builder,
-        simulator=task.get_simulator(),
-        npe_training=TRAINING,
-    )
-    method.append_simulations(*task.get_simulations(3000))
-    method.append_calibration(*task.get_calibration_set(50)).train(seed=0, **QUIET)
-    theta, x = task.get_test_set(1000)
-    exact = task.get_true_posterior(x).log_prob(theta.double()).mean()
-    reached = log_probs(method.build_posterior(), theta, x).mean()
-    assert float(exact - reached) < 0.1

@@ -1,7 +1,6 @@
 """The report of a stack, against the numbers that it is made of."""
 
 import math
-import sys
 import warnings
 from dataclasses import replace
 from typing import Any
@@ -385,17 +384,12 @@ def test_calibration_is_that_of_held_out_pairs() -> None:
     assert f"90% intervals hold {inside:.0%} of the parameters" in str(report)
 
 
-def test_rows_are_sorted_and_make_a_table(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_are_sorted() -> None:
     report = the_coupled_stack().report
     rows = report.as_rows()
     scores = [row["score"] for row in rows]
     assert scores == sorted(scores, reverse=True)
     assert {row["candidate"] for row in rows} == {*report.cross_validation.names}
-    pandas = pytest.importorskip("pandas")
-    assert isinstance(report.to_dataframe(), pandas.DataFrame)
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(ImportError, match="pip install pandas"):
-        report.to_dataframe()
 
 
 def test_recordings_with_the_same_parameters_count_once() -> None:

@@ -10,18 +10,14 @@ import torch
 from sbi.neural_nets import posterior_nn
 from torch import Tensor, nn
 
-from sbi_rope import RoPE, SinkhornCoupler
 from sbi_rope._groups import split_groups, split_pairs
 from sbi_rope._random import seeded
 from sbi_rope.baselines import FinetunedNPE, PlainNPE, Training
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import (
     InvalidInputError,
-    NotReadyError,
-    RoPEWarning,
-    UnsupportedPosteriorError,
 )
-from sbi_rope.mixture import MixturePosterior, OwnEmbeddings
+from sbi_rope.mixture import MixturePosterior
 from sbi_rope.tasks import get_task
 from sbi_rope.trainers.training import train_on_pairs
 
@@ -142,32 +138,6 @@ def test_people_are_held_out_as_a_whole() -> None:
     assert sorted(difference.argmin(dim=0).tolist()) == list(range(6))
 
 
-def test_of_fewer_than_five_pairs_none_is_held_out() -> None:
-    pairs = PAIRS[0][:4], PAIRS[1][:4]
-    with pytest.warns(RoPEWarning, match="Only 4 calibration pair"):
-        several = finetuned(npe(), pairs, num_holdouts=3)
-    with pytest.warns(RoPEWarning, match="Only 4 calibration pair"):
-        one = finetuned(npe(), pairs)
-    assert several.histories == (one.history,)
-    expected = log_probs(one.build_posterior())
-    posterior = several.build_posterior()
-    assert isinstance(posterior, MixturePosterior)
-    assert torch.allclose(log_probs(posterior), expected, atol=1e-4)
-
-
-def test_losses_of_an_old_training_are_gone_with_new_pairs() -> None:
-    method = finetuned(npe(), num_holdouts=3)
-    method.append_calibration(*PAIRS)
-    with pytest.raises(NotReadyError):
-        _ = method.histories
-
-
-def test_what_is_no_number_of_holdouts_is_refused() -> None:
-    for count in [0, 1.5, "2", None]:
-        with pytest.raises(InvalidInputError, match="`num_holdouts`"):
-            FinetunedNPE(TASK.get_prior(), num_holdouts=count)
-
-
 # A corrected start.
 
 STILL = Training(learning_rate=1e-9, max_num_epochs=1, validation_fraction=0.2)
@@ -203,40 +173,8 @@ def test_each_network_starts_from_one_of_the_tuned_nets() -> None:
     )
 
 
-def test_networks_from_tuned_nets_are_tuned_apart_from_each_other() -> None:
-    start = discrepancy("tuned")
-    before = log_probs(start)
-    method = finetuned(start)
-    parts = method.build_posterior().posterior_estimator.parts
-    assert len(parts) == 3
-    for part, other in ((parts[0], parts[1]), (parts[1], parts[2])):
-        assert isinstance(part.mixing, OwnEmbeddings)
-        densities = zip(
-            part.density.parameters(), other.density.parameters(), strict=True
-        )
-        assert any(not torch.equal(one, two) for one, two in densities)
-    assert torch.equal(log_probs(start), before)
-
-
-def test_of_fewer_than_five_pairs_all_tuned_nets_are_kept() -> None:
-    pairs = PAIRS[0][:3], PAIRS[1][:3]
-    with pytest.warns(RoPEWarning, match="Only 3 calibration pair"):
-        method = finetuned(discrepancy("tuned"), pairs)
-    assert len(method.histories) == 3
-
-
 def test_another_number_of_holdouts_than_tuned_nets_is_refused() -> None:
     start = discrepancy("tuned")
     with pytest.raises(InvalidInputError, match="`num_holdouts` of 3"):
         FinetunedNPE.from_posterior(start, num_holdouts=5)
     assert FinetunedNPE.from_posterior(start, num_holdouts=3).num_holdouts == 3
-
-
-def test_other_mixtures_are_refused() -> None:
-    rope = RoPE(npe(), simulator=TASK.get_simulator())
-    coupled = rope.build_posterior(
-        TEST[1], coupler=SinkhornCoupler(gamma=1.0), num_simulations=50, seed=0
-    )
-    for posterior in (coupled, finetuned(npe(), num_holdouts=3).build_posterior()):
-        with pytest.raises(UnsupportedPosteriorError, match="it was built from"):
-            FinetunedNPE.from_posterior(posterior)

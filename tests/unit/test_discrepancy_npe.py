@@ -14,19 +14,18 @@ from sbi.neural_nets import posterior_nn
 from torch import Tensor, nn
 
 from sbi_rope import CalibrationFinetuner
-from sbi_rope._sbi import embedding_of, estimator_of, with_embedding
+from sbi_rope._sbi import embedding_of, estimator_of
 from sbi_rope._simulations import Moments, StoredSimulations, stored
 from sbi_rope._simulator import Simulator
 from sbi_rope._standardisation import Standardisation
 from sbi_rope.baselines import Training
-from sbi_rope.discrepancy import DiscrepancyModel, DiscrepancyNPE
+from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.discrepancy.posterior import DiscrepancyDraws
 from sbi_rope.discrepancy.training import UNTIL_SETTLED, train_on_corrected
 from sbi_rope.discrepancy.tuning import cross_fitted_nets
 from sbi_rope.errors import (
     InvalidInputError,
     NotReadyError,
-    RoPEWarning,
     SimulationError,
     UnsupportedPosteriorError,
 )
@@ -154,20 +153,6 @@ def test_mixed_parameters_keep_their_categories() -> None:
         assert set(samples[:, 3].tolist()) <= {0.0, 1.0}, space
 
 
-def test_images_are_corrected_behind_their_embedding() -> None:
-    theta = problems.box(2).sample((12,))
-    x = problems.simulate_image(theta)
-    for space in ("embedding", "tuned"):
-        made = method(
-            problems.npe_posterior(embedding="cnn"),
-            simulator=problems.simulate_image,
-            space=space,
-        )
-        posterior = made.append_calibration(theta, x).train(**QUIET).build_posterior()
-        samples = posterior.sample_batched((4,), x[:3], show_progress_bars=False)
-        assert samples.shape == (4, 3, 2), space
-
-
 def states() -> tuple[Any, ...]:
     return torch.get_rng_state().tolist(), np.random.get_state()[1].tolist(), random.getstate()  # noqa: E501, NPY002  # fmt: skip
 
@@ -203,15 +188,6 @@ def test_nothing_that_is_passed_in_is_changed() -> None:
         assert all(torch.equal(v, state[k]) for k, v in net.state_dict().items())
         assert [m.training for m in net.modules()] == modes, space
         assert [p.requires_grad for p in net.parameters()] == flags, space
-
-
-@pytest.mark.medium
-def test_training_again_starts_anew() -> None:
-    for space in SPACES:
-        made = trained(space=space)
-        first = log_probs(made.build_posterior())
-        again = log_probs(made.train(**QUIET).build_posterior())
-        assert torch.equal(again, first), space
 
 
 def test_correcting_an_embedding_leaves_its_net_and_correcting_x_does_not() -> None:
@@ -263,14 +239,6 @@ def test_learned_parameters_move_the_posterior_to_those_of_the_pairs() -> None:
     assert 0.6 < means[1] < 0.9
 
 
-@pytest.mark.medium
-@pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
-def test_two_pairs_are_enough() -> None:
-    for space in SPACES:
-        made = method(space=space).append_calibration(*labelled(2)).train(**QUIET)
-        assert log_probs(made.build_posterior()).isfinite().all(), space
-
-
 def constant(theta: Tensor) -> Tensor:
     """One reading never varies in simulations."""
     return torch.cat([problems.simulate(theta), torch.full((len(theta), 1), 2.0)], 1)
@@ -316,32 +284,6 @@ def test_entries_that_are_constant_in_simulations_do_not_change_the_posterior() 
         assert torch.equal(*densities), space
 
 
-def test_entries_that_are_constant_in_an_embedding_are_so_in_tuned_nets() -> None:
-    theta, x = far_labelled()
-    made = with_a_constant_reading("tuned")
-    net = nn.Sequential(nn.Linear(4, 4), nn.ReLU())
-    net[0].weight.data[3] = net[0].bias.data[3] = 0.0  # one unit is dead in h
-    npe = estimator_of(made._trained_npe(show_progress_bars=False)[0])
-    made = DiscrepancyNPE.from_posterior(
-        DirectPosterior(with_embedding(npe, net), problems.box(2)),
-        simulator=constant,
-        space="tuned",
-        **SMALL,
-    )
-    posterior = made.append_calibration(theta, x).train(**QUIET).build_posterior()
-    part = posterior.posterior_estimator.parts[0]
-    for g in part.mixing.nets:
-        g[0][0].bias.data[3] = 1e3  # and alive in g
-        assert (g(x)[:, 3] == 0).all()
-
-
-def test_simulations_that_are_all_the_same_are_refused() -> None:
-    flat = method(simulator=lambda theta: torch.ones(len(theta), 3), space="input")
-    flat.append_calibration(*labelled())
-    with pytest.raises(InvalidInputError, match="simulations that differ"):
-        flat.train(**QUIET)
-
-
 def identity_draws(width: int) -> DiscrepancyDraws:
     zeros = torch.zeros(1, width, width).double()
     return DiscrepancyDraws(
@@ -349,20 +291,6 @@ def identity_draws(width: int) -> DiscrepancyDraws:
         offset=torch.zeros(1, width).double(),
         error_factor=zeros,
     )
-
-
-class Exploding(nn.Module):
-    """A density whose gradient is not a number every other time."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.bias = nn.Parameter(torch.zeros(2))
-        self.count = 0
-
-    def loss(self, theta: Tensor, condition: Tensor) -> Tensor:
-        self.count += 1
-        factor = torch.nan if self.count % 2 else 1.0
-        return factor * (theta - self.bias).square().sum(dim=1)
 
 
 def settle(density: nn.Module, **options: Any) -> Any:
@@ -381,13 +309,13 @@ def settle(density: nn.Module, **options: Any) -> Any:
     )
 
 
-def test_gradients_that_are_not_finite_are_skipped() -> None:
-    density = Exploding()
-    settle(density)
-    assert (density.bias > 0.5).all()
+class Slow(nn.Module):
+    """A density that approaches its optimum step by step."""
 
+    def __init__(self) -> None:
+        super().__init__()
+        self.bias = nn.Parameter(torch.zeros(2))
 
-class Slow(Exploding):
     def loss(self, theta: Tensor, condition: Tensor) -> Tensor:
         return (theta - self.bias).square().sum(dim=1)
 
@@ -410,7 +338,7 @@ def test_courses_are_added_until_the_loss_has_settled() -> None:
 def test_only_simulations_with_a_probability_are_drawn() -> None:
     seen = []
 
-    class Recording(Exploding):
+    class Recording(Slow):
         def loss(self, theta: Tensor, condition: Tensor) -> Tensor:
             seen.append((theta, condition))
             return (theta - self.bias).square().sum(dim=1)
@@ -436,30 +364,6 @@ def test_only_simulations_with_a_probability_are_drawn() -> None:
     assert torch.allclose(
         conditions[first], x[7].expand(int(first.sum()), 3), atol=1e-5
     )
-
-
-def test_wide_embeddings_have_fewer_draws_of_the_discrepancy(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    counts = []
-
-    class Counting(DiscrepancyModel):
-        def fit(self, *arguments: Any, **options: Any) -> Any:
-            discrepancy = super().fit(*arguments, **options)
-            sample = type(discrepancy).sample
-
-            def counted(self: Any, count: int, **options: Any) -> Any:
-                counts.append(count)
-                return sample(self, count, **options)
-
-            monkeypatch.setattr(type(discrepancy), "sample", counted)
-            return discrepancy
-
-    trained(model=Counting())
-    monkeypatch.setattr("sbi_rope.discrepancy.correction.MAX_ENTRIES", 160)
-    trained(model=Counting())
-    assert counts[0] == 2000
-    assert counts[-1] == 10  # an embedding of four entries
 
 
 def simulator_of(function: Callable[[Tensor], Tensor]) -> Simulator:
@@ -600,23 +504,6 @@ def test_few_distances_at_once_give_the_same_nearest_simulations(
     assert all(torch.equal(one, nearest) for one in found)
 
 
-def test_few_stored_simulations_take_the_slope_of_all() -> None:
-    theta = torch.tensor([[-1.0, 0.0], [0.0, 1.0], [1.0, 0.5], [0.2, -0.7]])
-    x = theta @ torch.tensor([[2.0], [1.0]]) + 0.5
-    stored = StoredSimulations(
-        (theta, x),
-        problems.box(2, -2, 2),
-        theta_shape=torch.Size((2,)),
-        event_shape=torch.Size((1,)),
-        like=theta,
-    )
-    at = torch.tensor([[0.1, 0.1], [1.5, -1.5]])
-    moments = stored.moments(at, 10, lambda x: x, progress=False)
-    expected = (at @ torch.tensor([[2.0], [1.0]]) + 0.5).double()
-    assert torch.allclose(moments.mean, expected, atol=1e-4)
-    assert moments.covariance.abs().max() < 1e-6
-
-
 def test_training_asks_for_the_data_that_it_lacks() -> None:
     with pytest.raises(NotReadyError, match="append_calibration"):
         method().train(**QUIET)
@@ -627,16 +514,31 @@ def test_training_asks_for_the_data_that_it_lacks() -> None:
         without.append_calibration(*labelled()).train(**QUIET)
 
 
-def test_images_are_refused_as_input_to_be_corrected() -> None:
-    theta = problems.box(2).sample((12,))
-    made = method(
-        problems.npe_posterior(embedding="cnn"),
-        simulator=problems.simulate_image,
-        space="input",
+def test_pairs_that_cannot_be_corrected_are_refused() -> None:
+    theta, x = labelled()
+    with pytest.raises(InvalidInputError, match="all 12 have the same"):
+        method(space="tuned").append_calibration(theta[:1].expand(12, 2), x).train()
+    flat = method(simulator=lambda theta: torch.ones(len(theta), 3), space="input")
+    with pytest.raises(InvalidInputError, match="simulations that differ"):
+        flat.append_calibration(theta, x).train(**QUIET)
+    net = problems.npe_posterior(embedding="cnn")
+    images = method(net, simulator=problems.simulate_image, space="input")
+    images.append_calibration(theta, problems.simulate_image(theta))
+    with pytest.raises(InvalidInputError, match="Use space='embedding'"):
+        images.train(**QUIET)
+
+
+def test_tables_are_put_into_the_order_of_the_first_one() -> None:
+    pandas = pytest.importorskip("pandas")
+    theta, x = labelled()
+    tables = (
+        pandas.DataFrame(theta.numpy(), columns=["a", "b"]),
+        pandas.DataFrame(x.numpy(), columns=["u", "v", "w"]),
     )
-    made.append_calibration(theta, problems.simulate_image(theta))
-    with pytest.raises(InvalidInputError, match=r"\(n, 1, 8, 8\). Use space='embed"):
-        made.train(**QUIET)
+    made = method().append_calibration(*tables)
+    made.append_calibration(tables[0][["b", "a"]], tables[1][["w", "u", "v"]])
+    for found, given in zip(made._data.calibration, (theta, x), strict=True):
+        assert torch.equal(found, given.repeat(2, 1))
 
 
 class Remembering(nn.Module):
@@ -672,13 +574,6 @@ def test_pairs_are_embedded_by_a_net_that_was_tuned_on_all_others() -> None:
     assert [float(net(x).sum()) for net in nets] == [8, 8, 8]
 
 
-def test_tuning_needs_pairs_with_different_parameters() -> None:
-    theta, x = labelled()
-    made = method(space="tuned").append_calibration(theta[:1].expand(12, 2), x)
-    with pytest.raises(InvalidInputError, match="all 12 have the same"):
-        made.train(**QUIET)
-
-
 def test_appended_simulations_are_trained_on_in_place_of_new_ones() -> None:
     made = method()
     assert not made.needs_simulations
@@ -692,10 +587,3 @@ def test_appended_simulations_are_trained_on_in_place_of_new_ones() -> None:
         made.append_simulations(*simulations(77)).append_calibration(*labelled())
         with pytest.raises(pytest.fail.Exception, match="trained on 77"):
             made.train(**QUIET)
-
-
-def test_a_warning_says_how_many_simulations_are_dropped() -> None:
-    theta, x = simulations()
-    x[:3] = torch.nan
-    with pytest.warns(RoPEWarning, match="Dropped 3 of 300"):
-        method(simulations=(theta, x))

@@ -1,6 +1,5 @@
 """Pictures show the numbers that they are given, with the right labels."""
 
-import builtins
 from typing import Any
 
 import pytest
@@ -12,7 +11,7 @@ from sbi_rope.discrepancy import DiscrepancyReport, Interval, SummaryDiscrepancy
 from sbi_rope.errors import RoPEWarning
 from sbi_rope.finetuning import History
 from sbi_rope.metrics import CoverageCurve, coverage_curve_of
-from tests import problems, stacks
+from tests import stacks
 from tests.refusals import assert_refused
 
 pytest.importorskip("matplotlib")
@@ -40,12 +39,12 @@ def two_posteriors() -> dict[str, Tensor]:
 def test_a_stack_has_a_credible_set_and_one_with_a_guarantee() -> None:
     stack, x = stacks.small_stack(), stacks.observed()[0]
     truth: Any = [0.0, 0.0]  # or an array, as everywhere
-    figure = plots.credible_set(stack, x, truth, num_samples=40)
+    figure = plots.credible_set(stack, x, truth)
     assert len(figure.axes) == 3
     texts = ["90 %, of the posterior", "90 %, guaranteed", "truth"]
     assert legend_texts(figure.legends[0]) == texts
     intervals = stack.credible_intervals(
-        0.9, x, guaranteed=True, num_samples=40, seed=0
+        0.9, x, guaranteed=True, num_samples=2000, seed=0
     )
     ends = [line.get_xdata()[0] for line in figure.axes[0].lines[2:4]]
     assert ends == pytest.approx([float(intervals.low[0]), float(intervals.high[0])])
@@ -58,17 +57,8 @@ def test_a_stack_has_a_credible_set_and_one_with_a_guarantee() -> None:
 def test_a_stack_with_too_few_pairs_for_a_guarantee_is_drawn_without_it() -> None:
     stack, x = stacks.small_stack(), stacks.observed()[0]
     with pytest.warns(RoPEWarning, match="No set with a guarantee is drawn"):
-        figure = plots.credible_set(stack, x, level=0.99, num_samples=200)
+        figure = plots.credible_set(stack, x, level=0.99)
     assert legend_texts(figure.legends[0]) == ["99 %, of the posterior"]
-    assert_refused("`level`", plots.credible_set, stack, x, level=1.5)
-
-
-def test_a_posterior_that_is_no_stack_has_the_set_of_highest_density_only() -> None:
-    posterior = problems.gaussian_posterior(dim=1)[0]
-    figure = plots.credible_set(posterior, level=0.5, num_samples=40)
-    assert legend_texts(figure.legends[0]) == ["50 %, of the posterior"]
-    assert len(figure.axes) == 1
-    assert_refused("MixturePosterior", plots.credible_set, problems.box(2))
 
 
 def test_pair_plot_has_a_panel_for_each_parameter_and_pair() -> None:
@@ -86,31 +76,11 @@ def test_pair_plot_names_methods_and_marks_the_truth() -> None:
     assert marks == pytest.approx([0.25])
 
 
-def test_pair_plot_limits_ignore_extremes_but_hold_the_truth() -> None:
-    samples = two_posteriors()
-    samples["NPE"][0] = 1e6
-    low, high = plots.pair_plot(samples, torch.tensor([-9.0, 0.0])).axes[0].get_xlim()
-    assert low < -9.0
-    assert high < 10.0
-
-
-def test_pair_plot_leaves_no_open_figure() -> None:
-    from matplotlib import pyplot
-
-    before = pyplot.get_fignums()
-    plots.pair_plot(two_posteriors())
-    assert pyplot.get_fignums() == before
-
-
-def test_pair_plot_says_what_is_wrong_with_its_arguments() -> None:
+def test_samples_that_do_not_fit_are_refused() -> None:
     good = {"a": torch.zeros(5, 2)}
     cases: list[tuple[Any, dict[str, Any], str]] = [
-        ({}, {}, "at least one entry"),
         ({"a": torch.zeros(5, 2), "b": torch.zeros(5, 3)}, {}, "'b'"),
-        ([torch.zeros(5, 2)], {}, "dictionary"),
-        ({1: torch.zeros(5, 2)}, {}, "keys of samples"),
-        ({"a": torch.zeros(5, 0)}, {}, "one number"),
-        ({"a": 1e300 * torch.ones(5, 2).double()}, {}, "1e.100"),
+        ({"a": torch.full((5, 2), torch.nan)}, {}, "finite"),
         (good, {"parameter_names": ["x"]}, "parameter_names"),
         (good, {"theta": torch.zeros(3)}, "theta"),
         (good, {"prior": torch.zeros(5, 3)}, "prior"),
@@ -133,20 +103,13 @@ def test_pair_plot_says_that_a_posterior_far_from_the_truth_is_outside() -> None
     assert texts == ["NPE (100 % outside)", "RoPE", "truth"]
 
 
-def test_pair_plot_shows_all_posteriors_if_none_has_the_truth_inside() -> None:
-    samples = {"NPE": torch.randn(400, 2) + 50.0, "RoPE": torch.randn(400, 2) + 9.0}
-    low, high = plots.pair_plot(samples, torch.zeros(2)).axes[0].get_xlim()
-    assert low < 0.0
-    assert high > 52.0
-
-
 def test_axes_of_a_pair_plot_reach_at_most_one_width_of_the_prior_beyond_it() -> None:
     samples = {"NPE": 30.0 * torch.randn(400, 2), "RoPE": torch.rand(400, 2)}
     figure = plots.pair_plot(samples, torch.full((2,), 0.5), prior=torch.rand(500, 2))
     low, high = figure.axes[0].get_xlim()
     assert -1.5 < low < -0.5
     assert 1.5 < high < 2.5
-    assert legend_texts(figure.legends[0])[-1] == "prior"
+    assert "prior" in legend_texts(figure.legends[0])
     assert ends_of(figure.axes[0].patches[0]) == pytest.approx((0.0, 1.0), abs=0.05)
 
 
@@ -192,34 +155,6 @@ def test_the_area_of_a_histogram_is_the_share_of_samples_that_it_shows() -> None
     assert area == pytest.approx(0.99, abs=0.005)
 
 
-def test_the_error_without_matplotlib_says_what_to_install(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    original = builtins.__import__
-
-    def without(name: str, *args: Any, **kwargs: Any) -> Any:
-        if name.startswith("matplotlib"):
-            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
-        return original(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(ImportError, match=r"matplotlib.*sbi-rope\[benchmarks\]"):
-        plots.pair_plot(two_posteriors())
-
-
-def test_a_method_has_the_same_colour_in_every_picture() -> None:
-    pair = plots.pair_plot({"RoPE": torch.randn(50, 1), "NPE": torch.randn(50, 1)})
-    lines = plots.calibration_curves(
-        {name: curve() for name in ("prior", "NPE", "OT-only", "RoPE")}
-    )
-    drawn = {line.get_label(): line.get_color() for line in lines.axes[0].lines}
-    legend = {
-        line.get_label(): line.get_color() for line in pair.legends[0].get_lines()
-    }
-    assert legend == {name: drawn[name] for name in ("RoPE", "NPE")}
-    assert len({drawn[name] for name in ("prior", "NPE", "OT-only", "RoPE")}) == 4
-
-
 def test_calibration_curves_draw_each_average_against_its_level() -> None:
     curves = {"RoPE": curve(), "NPE": curve(power=0.3)}
     figure = plots.calibration_curves(curves)
@@ -236,16 +171,6 @@ def test_calibration_band_is_that_of_the_smallest_test_set() -> None:
     corners = figure.axes[0].collections[0].get_paths()[0].vertices
     middle = corners[abs(corners[:, 0] - 0.5) < 1e-6, 1]
     assert middle.max() - 0.5 == pytest.approx(1.96 * 0.05, abs=1e-4)
-
-
-def test_curves_and_losses_that_cannot_be_drawn_are_refused() -> None:
-    for curves in ({}, [1], {"a": None}, {"a": torch.rand(3)}):
-        assert_refused("curves", plots.calibration_curves, curves)
-    for losses, match in (
-        (([2.0, float("nan")], []), "training_loss.*finite"),
-        (([2.0, 1.0], [1.0, float("inf")]), "validation_loss.*finite"),
-    ):
-        assert_refused(match, plots.finetuning_history, History(*losses, 0, 1e-3))
 
 
 def test_finetuning_history_marks_the_kept_step() -> None:
@@ -290,7 +215,6 @@ def three_steps(**changes: Any) -> dict[str, Any]:
         "samples": {"NPE": torch.randn(200, 3) + 1.0, "RoPE": torch.randn(200, 3)},
         "theta": torch.tensor([0.25, 0.5, 0.75]),
         "parameter_names": ["a", "b", "c"],
-        "index": 4,
     } | changes
 
 
@@ -301,17 +225,6 @@ def dots(axes: Any) -> list[Any]:
 
 def stars(axes: Any) -> Any:
     return [line.get_xydata()[0] for line in axes.lines if line.get_marker() == "*"]
-
-
-def test_overview_has_three_panels_with_their_legends() -> None:
-    figure = plots.overview(**three_steps())
-    titles = [axes.get_title(loc="left") for axes in figure.axes]
-    assert [title.split()[1] for title in titles] == ["Tune:", "Couple:", "Mix:"]
-    tune, couple, mix = (legend_texts(axes.get_legend()) for axes in figure.axes)
-    assert tune == ["simulations", "real, before tuning", "real, after tuning"]
-    assert couple == ["one real observation", "its 2 or so simulations"]
-    assert mix == ["NPE", "RoPE", "truth"]
-    figure.draw_without_rendering()
 
 
 def test_overview_projects_embeddings_to_components_of_the_simulations() -> None:
@@ -328,14 +241,14 @@ def test_overview_projects_embeddings_to_components_of_the_simulations() -> None
     assert len(simulated) == 200
 
 
-def test_overview_follows_the_observation_of_the_index() -> None:
+def test_overview_follows_the_first_observation() -> None:
     data = three_steps()
     tune, couple, _ = plots.overview(**data).axes
-    after = dots(tune)[2].get_offsets()[4]
+    after = dots(tune)[2].get_offsets()[0]
     assert stars(tune)[0] == pytest.approx(after)
     assert stars(couple)[0] == pytest.approx(after)
     assert tune.texts[0].xy == pytest.approx(tuple(after))
-    assert tune.texts[0].xyann == pytest.approx(tuple(dots(tune)[1].get_offsets()[4]))
+    assert tune.texts[0].xyann == pytest.approx(tuple(dots(tune)[1].get_offsets()[0]))
 
 
 def test_overview_draws_heavier_simulations_larger_and_darker() -> None:
@@ -358,93 +271,7 @@ def test_overview_shows_the_parameters_asked_for() -> None:
             assert mix.lines[-1].get_ydata()[0] == truth[labels[1]]
 
 
-def test_overview_shades_the_prior() -> None:
-    prior = 8.0 * torch.rand(2000, 3) - 4.0
-    mix = plots.overview(**three_steps(prior=prior, parameters=(0,))).axes[2]
-    bar = mix.patches[0]
-    assert ends_of(bar) == pytest.approx((-4.0, 4.0), abs=0.15)
-    mix = plots.overview(**three_steps(prior=prior, parameters=(0, 1))).axes[2]
-    corners = mix.collections[0].get_paths()[0].vertices
-    for column in (0, 1):
-        ends = (corners[:, column].min(), corners[:, column].max())
-        assert ends == pytest.approx((-4.0, 4.0), abs=0.15)
-    assert legend_texts(mix.get_legend())[0] == "prior"
-
-
-def test_overview_axes_ignore_extreme_embeddings_and_samples() -> None:
-    data = three_steps()
-    data["simulated"][0] = 1e6
-    data["before"][0] = -1e6
-    data["samples"]["NPE"][0] = 1e6
-    for axes in plots.overview(**data).axes:
-        assert max(abs(x) for x in (*axes.get_xlim(), *axes.get_ylim())) < 100.0
-
-
-def test_overview_holds_an_observation_far_from_the_simulations() -> None:
-    data = three_steps()
-    data["after"][4] = 100.0
-    couple = plots.overview(**data).axes[1]
-    low, high = couple.get_xlim()
-    assert low < stars(couple)[0][0] < high
-
-
-def test_overview_spreads_out_one_dimensional_embeddings() -> None:
-    data = three_steps()
-    for name in ("simulated", "before", "after"):
-        data[name] = data[name][:, :1]
-    tune = plots.overview(**data).axes[0]
-    assert tune.get_xlabel() == "embedding"
-    points = torch.as_tensor(dots(tune)[0].get_offsets().data)
-    assert torch.allclose(points[:, 0], data["simulated"][:, 0].double())
-    assert points[:, 1].std() > 0.2
-
-
-@pytest.mark.medium
-def test_overview_says_what_is_wrong_with_its_arguments() -> None:
-    cases: list[tuple[dict[str, Any], str]] = [
-        ({"simulated": torch.zeros(200)}, "simulated"),
-        ({"before": torch.zeros(60, 3)}, "before"),
-        ({"after": torch.zeros(59, 4)}, "same number"),
-        ({"after": torch.full((60, 4), torch.nan)}, "finite"),
-        ({"weights": torch.ones(60, 200)}, "one row"),
-        ({"weights": -torch.ones(200)}, "at least 0"),
-        ({"weights": torch.zeros(200)}, "not all"),
-        ({"samples": {}}, "at least one entry"),
-        ({"theta": torch.zeros(2)}, "theta"),
-        ({"parameter_names": ["a"]}, "parameter_names"),
-        ({"prior": torch.zeros(9, 2)}, "prior"),
-        ({"index": 60}, "from 0 to 59"),
-        ({"index": True}, "from 0 to 59"),
-        ({"parameters": (0, 3)}, "from 0 to 2"),
-        ({"parameters": (0, 0)}, "different"),
-        ({"parameters": ()}, "one or two"),
-        ({"parameters": (0, 1, 2)}, "one or two"),
-        ({"parameters": 0}, "one or two"),
-        ({"parameters": (0.0, 1)}, "`parameters`"),
-    ]
-    for changes, match in cases:
-        assert_refused(match, plots.overview, **three_steps(**changes))
-
-
 # Observations ------------------------------------------------------------------------
-
-
-def test_statistics_are_drawn_as_a_histogram_each() -> None:
-    figure = plots.real_and_simulated(
-        torch.randn(100, 5), torch.randn(100, 5) + 1, x_names=list("abcde")
-    )
-    assert [axes.get_xlabel() for axes in figure.axes] == list("abcde")
-    assert legend_texts(figure.legends[0]) == ["simulated", "real"]
-
-
-def test_series_are_drawn_in_pairs() -> None:
-    x_o, x_s = torch.randn(3, 50), torch.randn(3, 50)
-    figure = plots.real_and_simulated(x_o, x_s)
-    assert len(figure.axes) == 3
-    for i, axes in enumerate(figure.axes):
-        lines = {line.get_label(): line.get_ydata() for line in axes.lines}
-        assert lines["real"] == pytest.approx(x_o[i].numpy())
-        assert lines["simulated"] == pytest.approx(x_s[i].numpy())
 
 
 def test_images_are_drawn_real_above_simulated() -> None:
@@ -455,29 +282,6 @@ def test_images_are_drawn_real_above_simulated() -> None:
     for i in range(6):
         assert torch.equal(shown[i], x_o[i].permute(1, 2, 0))
         assert torch.equal(shown[6 + i], x_s[i].permute(1, 2, 0))
-
-
-def test_constant_statistics_are_drawn_too() -> None:
-    plots.real_and_simulated(torch.ones(5, 1), torch.ones(5, 1), x_names=["a"])
-
-
-def test_observations_that_cannot_be_drawn_are_refused() -> None:
-    two, images = torch.rand(5, 2), torch.rand(5, 3, 4, 4)
-    cases: list[tuple[Tensor, Tensor, Any, str]] = [
-        (two, torch.rand(5, 3), ["a", "b"], "x_s"),
-        (two, two[:4], ["a", "b"], "same number"),
-        (two, two, ["a"], "names"),
-        (two, two, "ab", "names"),
-        (two, two, 3, "names"),
-        (two[:, 0], two[:, 0], [], r"\(n, l\)"),
-        (200 * images, images, [], "255"),
-        (images, images, ["a", "b", "c"], "names"),
-        (images[:, :1], images[:, :1], [], "height"),
-    ]
-    for x_o, x_s, names, match in cases:
-        assert_refused(match, plots.real_and_simulated, x_o, x_s, x_names=names)
-    for labels in ("ab", ["a"]):
-        assert_refused("labels", plots.real_and_simulated, two, two, labels=labels)
 
 
 # Discrepancies -----------------------------------------------------------------------
@@ -532,40 +336,3 @@ def test_discrepancy_draws_shifts_on_one_scale_and_writes_their_numbers() -> Non
     assert drawn[1] == pytest.approx([0.1, 0.2])
     texts = [(text.get_text(), text.xy[1]) for text in numbers.texts]
     assert texts == [("-150 [-200, 100]", 0), ("0.0015 [0.001, 0.002]", 1)]
-
-
-def test_discrepancy_marks_the_values_that_mean_no_discrepancy() -> None:
-    report = DiscrepancyReport(summaries=(summary("a"),), num_pairs=7)
-    size, shift, _, gain = plots.discrepancy(report).axes
-    marks = [axes.lines[-1].get_xdata()[0] for axes in (size, shift, gain)]
-    assert marks == [0.0, 0.0, 1.0]
-
-
-def test_summaries_without_a_sign_of_a_discrepancy_have_another_colour() -> None:
-    fine = summary("b", probability_of_none=0.8)
-    figure = plots.discrepancy(
-        DiscrepancyReport(summaries=(summary("a"), fine), num_pairs=7)
-    )
-    for axes in (figure.axes[0], figure.axes[1], figure.axes[3]):
-        colours = [lines_at(axes, position)[0].get_color() for position in range(2)]
-        assert colours[0] != colours[1]
-    texts = legend_texts(figure.legends[0])
-    assert texts == [
-        "a discrepancy is more probable than none",
-        "no sign of a discrepancy",
-    ]
-    alone = plots.discrepancy(DiscrepancyReport(summaries=(fine,), num_pairs=7))
-    assert legend_texts(alone.legends[0]) == texts[1:]
-    assert lines_at(alone.axes[0], 0)[0].get_color() == colours[1]
-
-
-def test_discrepancy_draws_twenty_summaries_and_counts_the_others() -> None:
-    summaries = tuple(summary(f"x[{k}]") for k in range(23))
-    figure = plots.discrepancy(
-        DiscrepancyReport(summaries=summaries, num_pairs=7, constant=("dead",))
-    )
-    labels = [label.get_text() for label in figure.axes[0].get_yticklabels()]
-    assert labels == [f"x[{k}]" for k in range(20)]
-    note = figure.get_supxlabel()
-    assert "; 3 summaries that are less off not shown" in note
-    assert "1 the same in all simulations" in note

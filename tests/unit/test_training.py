@@ -306,10 +306,9 @@ class TestTraining:
             ("learning_rate", 0.0),
             ("learning_rate", math.inf),
             ("validation_fraction", 0.0),
-            ("validation_fraction", 0.6),
+            ("validation_fraction", 1.0),
             ("stop_after_epochs", 0),
             ("max_num_epochs", 0),
-            ("max_num_epochs", True),
             ("clip_max_norm", 0.0),
             ("clip_max_norm", "5"),
         ]:
