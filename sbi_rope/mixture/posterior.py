@@ -250,10 +250,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             overwrite: Whether to replace a file that exists.
 
         Raises:
-            InvalidInputError: If an argument has the wrong type.
-            InvalidInputError: If the posterior holds something that cannot be
-                described, such as a lambda.
-            NotWritableError: If the file exists, or cannot be written.
+            FileExistsError: If the file exists.
         """
         save(self, path, overwrite=overwrite)
 

@@ -162,10 +162,7 @@ class PriorPosterior(NeuralPosterior):
             overwrite: Whether to replace a file that exists.
 
         Raises:
-            InvalidInputError: If an argument has the wrong type.
-            InvalidInputError: If the posterior holds something that cannot be
-                described, such as a lambda.
-            NotWritableError: If the file exists, or cannot be written.
+            FileExistsError: If the file exists.
         """
         save(self, path, overwrite=overwrite)
 
