@@ -16,7 +16,6 @@ from scipy.stats import rankdata
 from torch import Tensor
 
 from sbi_rope._means import Counts, means_of_pairs
-from sbi_rope._notebooks import shown_as_text
 from sbi_rope._permutation import permutation_test
 from sbi_rope._random import seeded
 from sbi_rope._validation import check_device
@@ -43,7 +42,6 @@ NUM_PARTS = 3
 FEWEST = 10
 
 
-@shown_as_text
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CoverageByEstimate:
     """The coverage of central intervals where estimates are low, middling and high.

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from sbi_rope._means import standard_error_of_mean
-from sbi_rope._notebooks import shown_as_text
 from sbi_rope._validation import check_not_nan
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.metrics.calls import CHUNK_SIZE, check_test_set, evaluate_log_probs
@@ -17,7 +16,6 @@ from sbi_rope.tensors import as_batch, as_numbers, check_same_length
 __all__ = ["LPPScore", "check_scales", "check_theta_std", "lpp"]
 
 
-@shown_as_text
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LPPScore:
     r"""Log-probabilities of the true parameters under the posterior. Higher is better.

@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sbi_rope._notebooks import shown_as_text
 from sbi_rope._random import seeded
 from sbi_rope._units import std_of_prior
 from sbi_rope.metrics.by_estimate import (
@@ -46,7 +45,6 @@ GIVEN_UNITS = "units of `theta_std`"
 PRIOR_UNITS = "standard deviations of the prior"
 
 
-@shown_as_text
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Evaluation:
     """All scores of one posterior on one test set, from one set of samples.

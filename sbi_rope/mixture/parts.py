@@ -4,6 +4,7 @@ import copy
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -18,6 +19,7 @@ from sbi_rope._sbi import (
     readable,
 )
 from sbi_rope.errors import InvalidInputError, SamplingError
+from sbi_rope.tensors import as_numbers
 
 __all__ = [
     "DTYPE",
@@ -28,6 +30,7 @@ __all__ = [
     "Rows",
     "equal_rows",
     "has_entries",
+    "parameters_of",
     "part_of",
 ]
 
@@ -107,8 +110,6 @@ class OwnEmbeddings(Mixing):
     """
 
     def __init__(self, nets: Sequence[nn.Module], event_shape: Sequence[int]) -> None:
-        if not len(nets):
-            raise InvalidInputError("Expected at least one embedding net; got none.")
         super().__init__(event_shape, len(nets))
         self.nets = nn.ModuleList(nets)
 
@@ -202,10 +203,8 @@ class Part(nn.Module):
             return self.density.sample(torch.Size((1,)), embeddings)[0]
         except ValueError as error:  # of sbi's mixtures of Gaussians
             raise SamplingError(
-                "Expected a density that can be sampled given all observations; its "
-                f"network fails at one of them ({error}). Leave out observations that "
-                "are far from all simulations, of which there was a warning or "
-                "`diagnose(rope, x_o)` tells."
+                "Expected a density that can be sampled given all observations; got "
+                f"{error}. Leave out observations that are far from all simulations."
             ) from error
 
 
@@ -222,3 +221,31 @@ def part_of(estimator: ConditionalEstimator) -> Part:
     own = copy.deepcopy(estimator).requires_grad_(requires_grad=False)
     embeddings = OwnEmbeddings([embedding_of(own)], estimator.condition_shape)
     return Part(headless(own), embeddings).eval()
+
+
+def parameters_of(
+    theta: Any, dim: int, *, batched: bool, names: Sequence[str] | None = None
+) -> Tensor:
+    """Return the parameters whose density is asked for, in float32.
+
+    A bound of the prior is one in float32 only: 0.1 of float64 is below the 0.1 of a
+    prior.
+
+    Args:
+        theta: What the user gave, shape ``(n, d)`` or ``(d,)``.
+        dim: The number of parameters, d.
+        batched: Whether theta belongs to a batch of B observations. Its shape is then
+            ``(B, d)``, or ``(S, B, d)`` for S parameters of each observation.
+        names: The names of the parameters.
+
+    Raises:
+        InvalidInputError: If the shape does not fit, or a number is NaN.
+    """
+    theta = as_numbers("theta", theta, names=names)
+    shape = tuple(theta.shape)
+    if theta.ndim not in ((2, 3) if batched else (1, 2)) or shape[-1] != dim:
+        expected = f"(B, {dim}) or (S, B, {dim})" if batched else f"(n, {dim})"
+        raise InvalidInputError(f"Expected `theta` of shape {expected}; got {shape}.")
+    if torch.isnan(theta).any() or not len(theta):
+        raise InvalidInputError("Expected `theta` with numbers; got NaN or none.")
+    return theta.to(DTYPE)

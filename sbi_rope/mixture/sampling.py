@@ -156,11 +156,8 @@ class BlockSampler:
             numbers = (hopeless.nonzero().flatten()[:5] + self.first_row).tolist()
             raise SamplingError(
                 f"Less than one in {int(1 / MIN_ACCEPTANCE)} draws lies inside the "
-                f"support of the prior for the observations in rows {numbers} of `x`: "
-                "the densities in the mixture have nearly all of their mass outside. "
-                "Leave these observations out (`leakage(x).mass` has the mass inside "
-                "for each of a batch), or train NPE longer or with "
-                "z_score_theta='transform_to_unconstrained', or pass "
+                f"support of the prior for rows {numbers} of `x`. Leave these "
+                "observations out, train NPE longer, or pass "
                 "reject_outside_prior=False."
             )
 
@@ -176,8 +173,7 @@ def check_time(deadline: float, missing: int, total: int) -> None:
     if missing and time.monotonic() > deadline:
         raise SamplingError(
             f"Sampling took longer than `max_sampling_time`: {missing} of {total} "
-            "draws that were made together are missing. Give it more time, ask for "
-            "fewer draws, or pass reject_outside_prior=False."
+            "draws are missing."
         )
 
 

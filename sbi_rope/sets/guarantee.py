@@ -2,13 +2,11 @@
 
 from dataclasses import dataclass
 
-from sbi_rope._notebooks import shown_as_text
 from sbi_rope.sets.conformal import promised_coverage
 
 __all__ = ["Guarantee"]
 
 
-@shown_as_text
 @dataclass(frozen=True, kw_only=True)
 class Guarantee:
     r"""The promise of a set or interval, for observations drawn as the pairs were.
