@@ -14,6 +14,7 @@ from sbi_rope.errors import InvalidInputError, shown
 from sbi_rope.mixture.estimator import MixtureEstimator
 from sbi_rope.mixture.parts import part_of
 from sbi_rope.mixture.posterior import MixturePosterior
+from sbi_rope.settings import check
 
 __all__ = ["average"]
 
@@ -65,6 +66,7 @@ def average(
         >>> posterior.sample((5,), x=torch.ones(1)).shape
         torch.Size([5, 1])
     """
+    check("posteriors", posteriors, list | tuple)
     if not posteriors:
         raise InvalidInputError("Expected at least one of `posteriors`; got none.")
     shares = [1.0 / len(posteriors)] * len(posteriors)

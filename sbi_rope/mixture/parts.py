@@ -241,7 +241,8 @@ def parameters_of(
     Raises:
         InvalidInputError: If the shape does not fit, or a number is NaN.
     """
-    theta = as_numbers("theta", theta, names=names)
+    numbers = as_numbers("theta", theta, names=names)
+    theta = theta if isinstance(theta, Tensor) else numbers  # which has gradients
     shape = tuple(theta.shape)
     if theta.ndim not in ((2, 3) if batched else (1, 2)) or shape[-1] != dim:
         expected = f"(B, {dim}) or (S, B, {dim})" if batched else f"(n, {dim})"

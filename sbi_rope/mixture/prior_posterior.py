@@ -14,7 +14,6 @@ from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture.parts import parameters_of
 from sbi_rope.mixture.prior import prior_log_prob, prior_sample
 from sbi_rope.saving import save
-from sbi_rope.settings import check
 from sbi_rope.tensors import as_batch
 
 __all__ = ["PriorPosterior"]
@@ -52,7 +51,11 @@ class PriorPosterior(NeuralPosterior):
     """
 
     def __init__(self, prior: Any) -> None:
-        check("prior", prior, Distribution)
+        if not isinstance(prior, Distribution) or len(prior.event_shape) != 1:
+            raise InvalidInputError(
+                "Expected `prior` to be a torch distribution over vectors; got "
+                f"{type(prior).__name__}. Use `sbi.utils.process_prior(prior)[0]`."
+            )
         prior = copy_of_prior(prior)
         transform, self._reason_without_map = None, ""
         with seeded(0):  # both draw from the prior to look at it

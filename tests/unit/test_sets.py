@@ -481,19 +481,19 @@ def test_a_level_that_the_pairs_cannot_give_is_refused(
     )
     for call in calls:
         call(0.95, x, guaranteed=True, num_samples=10)
-        with pytest.raises(InvalidInputError, match=r"n / \(n \+ 1\) = 0\.952.*99"):
+        with pytest.raises(InvalidInputError, match=r"0\.952.*99"):
             call(0.99, x, guaranteed=True)
         with pytest.raises(InvalidInputError, match=r"at least 0\.5"):
             call(0.4, x, guaranteed=True)
         for level in (0.0, 1.0, -0.1, 90):
-            with pytest.raises(InvalidInputError, match="above 0 and below 1"):
+            with pytest.raises(InvalidInputError, match="`level`"):
                 call(level, x)
 
 
 def test_only_a_stack_gives_a_guarantee(x: Tensor) -> None:
     with pytest.raises(InvalidInputError, match=r"stack\(rope\)"):
         exact().credible_set(0.9, X, guaranteed=True)
-    with pytest.raises(InvalidInputError, match="held-out"):
+    with pytest.raises(InvalidInputError, match="stack"):
         problems.gaussian_posterior()[0].credible_intervals(guaranteed=True)
 
 
@@ -542,7 +542,7 @@ def test_of_pairs_with_the_same_parameters_one_counts(x: Tensor) -> None:
     found = posterior.credible_set(0.9, x, guaranteed=True, seed=0)
     assert found.guarantee is not None
     assert found.guarantee.num_pairs == 12
-    with pytest.raises(InvalidInputError, match="n = 12 calibration pairs"):
+    with pytest.raises(InvalidInputError, match="12 exact labels"):
         posterior.credible_set(0.95, x, guaranteed=True)
 
 
