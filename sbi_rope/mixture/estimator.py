@@ -16,7 +16,7 @@ from sbi_rope.mixture.block import Block
 from sbi_rope.mixture.chunks import blocks, flow_batch, keep_freed_memory
 from sbi_rope.mixture.coupled import CoupledEmbeddings
 from sbi_rope.mixture.density import block_log_prob
-from sbi_rope.mixture.parts import DTYPE, OwnEmbeddings, Part
+from sbi_rope.mixture.parts import DTYPE, Part
 from sbi_rope.mixture.sampling import Accept, BlockSampler, deadline_after
 from sbi_rope.mixture.truncation import (
     LEAKAGE_DRAWS,
@@ -108,21 +108,16 @@ class MixtureEstimator(MixtureDensity):
         """Return the same mixture for one observation of the batch.
 
         It shares its densities with this mixture, and holds no other observation.
-        Embedding nets are left out, unless the coupling can be extended to others.
 
         Args:
             index: The number of the observation in ``x_o``.
         """
-        extends = any(mixing.unseen == "extend" for mixing in self.coupled)
-        parts = []
-        for part in self.parts:
-            mixing = part.mixing
-            if isinstance(mixing, CoupledEmbeddings):
-                part = Part(part.density, mixing.restricted_to(index))
-            elif isinstance(mixing, OwnEmbeddings) and not extends:
-                x = self.coupled[0].x_o[[index]]
-                part = Part(part.density, mixing.restricted_to(x))
-            parts.append(part)
+        parts = [
+            Part(part.density, part.mixing.restricted_to(index))
+            if isinstance(part.mixing, CoupledEmbeddings)
+            else part
+            for part in self.parts
+        ]
         return MixtureEstimator(parts, self.weights, tail_mass=self.tail_mass)
 
     # --- density ---
@@ -142,11 +137,11 @@ class MixtureEstimator(MixtureDensity):
             t times the largest density among the terms left out.
 
         Raises:
-            InvalidInputError: If shapes do not fit or theta is NaN.
+            InvalidInputError: If the numbers of rows do not fit.
             InvalidInputError: If an x is not in the batch of a coupled part with
                 ``unseen="raise"``.
         """
-        theta, x = self._checked_theta(input), self.checked_x(condition)
+        theta, x = self._as_samples(input), self.checked_x(condition)
         num_rows = max(theta.shape[1], len(x))
         if {theta.shape[1], len(x)} - {1, num_rows}:
             raise InvalidInputError(
@@ -183,9 +178,9 @@ class MixtureEstimator(MixtureDensity):
             ``(n, K)``, float64.
 
         Raises:
-            InvalidInputError: If shapes do not fit or theta is NaN.
+            InvalidInputError: If the numbers of rows do not fit.
         """
-        pairs, x = self._checked_theta(theta), self.checked_x(x)
+        pairs, x = self._as_samples(theta), self.checked_x(x)
         log_probs = pairs.new_empty(len(x), len(self.parts), dtype=torch.double)
         for number, part in enumerate(self.parts):
             for rows, block in _blocks([part], [1.0], x):
@@ -203,17 +198,9 @@ class MixtureEstimator(MixtureDensity):
         ]
         return [part for part, _ in used], [share for _, share in used]
 
-    def _checked_theta(self, theta: Tensor) -> Tensor:
+    def _as_samples(self, theta: Tensor) -> Tensor:
         """Return theta as ``(S, B, d)``."""
-        if theta.shape[-len(self.input_shape) :] != self.input_shape:
-            raise InvalidInputError(
-                f"Expected `theta` of shape (..., {self.input_shape[0]}); got "
-                f"{tuple(theta.shape)}."
-            )
-        if torch.isnan(theta).any():
-            raise InvalidInputError("Expected `theta` without NaN.")
-        if theta.ndim == len(self.input_shape) + 1:
-            theta = theta[None]
+        theta = theta[None] if theta.ndim == 2 else theta
         return theta.to(self.weights.device, DTYPE)
 
     def checked_x(self, x: Tensor) -> Tensor:

@@ -23,7 +23,6 @@ from sbi_rope.tensors import as_numbers
 
 __all__ = [
     "DTYPE",
-    "KeptEmbeddings",
     "Mixing",
     "OwnEmbeddings",
     "Part",
@@ -124,37 +123,6 @@ class OwnEmbeddings(Mixing):
     def readable(self, x: Tensor) -> Tensor:
         """Tell which observations all nets can read."""
         return torch.stack([readable(net, x) for net in self.nets]).all(dim=0)
-
-    def restricted_to(self, x: Tensor) -> "KeptEmbeddings":
-        """Return the embeddings of one observation ``(1, *event)``, without nets."""
-        return KeptEmbeddings(self.embed(x), self.event_shape)
-
-
-class KeptEmbeddings(Mixing):
-    """The embeddings of a single observation, whose nets are no longer needed.
-
-    Args:
-        kept: The embeddings of the observation, shape ``(1, K, l)``.
-        event_shape: Shape of one observation.
-    """
-
-    kept: Tensor
-
-    def __init__(self, kept: Tensor, event_shape: Sequence[int]) -> None:
-        super().__init__(event_shape, kept.shape[1])
-        self.register_buffer("kept", kept)
-
-    def embed(self, x: Tensor) -> Tensor:
-        """Return the embeddings of the one observation for each x, ``(n, K, l)``."""
-        return self.kept.expand(len(x), -1, -1)
-
-    def rows(self, embedded: Tensor) -> Rows:
-        """Weigh all embeddings equally."""
-        return equal_rows(embedded)
-
-    def readable(self, x: Tensor) -> Tensor:
-        """Tell which observations have some entry, because no net has to read them."""
-        return has_entries(x)
 
 
 def has_entries(x: Tensor) -> Tensor:

@@ -162,6 +162,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         Raises:
             InvalidInputError: If there are several couplings.
         """
+        self._coupled("weights")
         return self.coupling.weights
 
     def _coupled(self, name: str) -> CoupledEmbeddings:

@@ -101,7 +101,7 @@ class RecalibratedEstimator(MixtureEstimator):
             InvalidInputError: As in :meth:`MixtureEstimator.log_prob`.
             UnseenObservationError: As in :meth:`MixtureEstimator.log_prob`.
         """
-        theta, x = self._checked_theta(input), self.checked_x(condition)
+        theta, x = self._as_samples(input), self.checked_x(condition)
         if not theta.numel():
             return self.log_prob_before(theta, x)
         inside = self._inside(theta)

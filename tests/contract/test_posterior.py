@@ -137,22 +137,6 @@ def test_sampling_gives_up_after_the_time_that_it_is_given() -> None:
             sample((3,), x, max_sampling_time=-1.0, **QUIET)
 
 
-def test_several_observations_need_the_batched_methods() -> None:
-    posterior = gaussian_posterior()
-    x = posterior.x_o[:2]
-    with pytest.raises(ValueError, match="batched"):
-        posterior.sample((2,), x=x, **QUIET)
-    with pytest.raises(ValueError, match="batched"):
-        posterior.log_prob(torch.zeros(1, 2), x=x)
-
-
-def test_an_x_of_another_shape_is_refused() -> None:
-    posterior = gaussian_posterior()
-    for x in (torch.zeros(4), torch.zeros(2, 4), torch.zeros(2, 3, 1)):
-        with pytest.raises(InvalidInputError, match=r"`x` of shape \(n, 3\)"):
-            posterior.sample_batched((2,), x, **QUIET)
-
-
 def test_without_a_default_x_an_x_is_needed() -> None:
     posterior = gaussian_posterior()
     with pytest.raises(InvalidInputError, match="default x"):
@@ -200,13 +184,6 @@ def test_gradients_of_potential_and_log_prob_are_those_of_finite_differences() -
             shift = step * torch.eye(2)[k]
             change = (function(theta + shift) - function(theta - shift)) / (2 * step)
             assert torch.allclose(gradient[:, k], change, atol=0.02, rtol=0.02)
-
-
-def test_gradients_are_not_tracked_unless_asked_for() -> None:
-    posterior = gaussian_posterior()
-    theta = torch.zeros(1, 2, requires_grad=True)
-    assert not posterior.log_prob(theta, x=posterior.x_o[0]).requires_grad
-    assert not posterior.potential(theta, x=posterior.x_o[0]).requires_grad
 
 
 @pytest.mark.medium
@@ -303,16 +280,6 @@ def test_the_posterior_of_one_observation_changes_no_other_posterior() -> None:
     assert second._map is None
 
 
-def test_weights_and_batch_are_attributes_and_the_text_tells_their_sizes() -> None:
-    posterior = gaussian_posterior()
-    assert posterior.weights is posterior.coupling.weights
-    assert posterior.weights.shape == (5, 12)
-    assert posterior.x_o.shape == (5, 3)
-    assert "12 simulated posteriors" in str(posterior)
-    assert "5 real observations" in str(posterior)
-    assert "MixturePosterior" in repr(posterior)
-
-
 # --- copies ---
 
 
@@ -339,14 +306,6 @@ def test_a_copy_has_the_same_density_and_samples(index: int | None) -> None:
             assert torch.equal(
                 other.log_prob(theta[:, 0]), posterior.log_prob(theta[:, 0])
             )
-
-
-def test_the_default_x_of_a_copy_is_its_own() -> None:
-    posterior = gaussian_posterior()
-    posterior.set_default_x(posterior.x_o[0])
-    for make_copy in COPIES:
-        make_copy(posterior).set_default_x(posterior.x_o[1])
-        assert torch.equal(posterior.default_x, posterior.x_o[:1])
 
 
 def test_a_copy_of_an_extending_posterior_extends() -> None:

@@ -425,16 +425,6 @@ def test_the_posterior_of_one_observation_answers_as_the_whole(unseen: str) -> N
         assert torch.allclose(found, posterior.log_prob(theta, x=other), atol=1e-5)
 
 
-def test_the_posterior_of_one_observation_needs_no_nets_unless_it_is_extended() -> None:
-    kept, extended = (
-        three_parts(unseen=unseen)[2].posterior_estimator
-        for unseen in ("raise", "extend")
-    )
-    assert not [module for module in kept.modules() if isinstance(module, nn.Linear)]
-    nets = [module for module in extended.modules() if isinstance(module, nn.Linear)]
-    assert len(nets) == 3  # one of the coupled part, two of the other
-
-
 def test_the_posterior_of_one_observation_forgets_who_was_asked_for_before() -> None:
     posterior = three_parts(unseen="extend")
     posterior.potential(torch.zeros(1, DIM), posterior.x_o[0])
@@ -556,14 +546,6 @@ def test_moving_a_mixture_moves_couplings_and_prior() -> None:
     assert not posterior.prior.sample((1,)).is_meta
 
 
-def test_moving_the_density_of_a_prior_moves_a_copy_of_the_prior() -> None:
-    # One is of sbi, which can move it, and the other of torch.
-    for prior in (problems.box(DIM), problems.standard_normal(DIM)):
-        part: Any = part_of_prior(prior, (3,)).to("meta")
-        assert part.density.prior.sample((1,)).is_meta
-        assert not prior.sample(Size((1,))).is_meta
-
-
 # --- the prior ---
 
 
@@ -595,13 +577,6 @@ def test_a_prior_that_sbi_cannot_transform_can_be_a_part() -> None:
     assert found.tolist() == [0.0, -torch.inf]
     samples = estimator.sample(Size((50,)), torch.zeros(2, 3))
     assert ((samples >= 0) & (samples <= 1)).all()
-
-
-def test_the_density_of_the_prior_leaves_the_random_state_alone() -> None:
-    part = part_of_prior(problems.box(DIM), (3,))
-    state = torch.get_rng_state()
-    part.log_prob(3 * torch.ones(4, DIM), torch.empty(4, 0))
-    assert torch.equal(torch.get_rng_state(), state)
 
 
 # --- what other modules see, and errors ---
