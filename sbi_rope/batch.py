@@ -14,7 +14,6 @@ from sbi_rope.coupling import Coupling, SinkhornCoupler
 from sbi_rope.errors import CouplingError
 from sbi_rope.mixture import (
     CoupledEmbeddings,
-    CoupledNet,
     MixtureEstimator,
     MixturePosterior,
     Part,
@@ -115,8 +114,10 @@ class EmbeddedBatch:
         """
         # Each posterior has copies of its own of net and density. Moving one to another
         # device then leaves the others where they are.
-        net = CoupledNet(copy.deepcopy(self.embedding_net), [coupling])
-        mixing = CoupledEmbeddings(self.simulated, self.x_o, [net], unseen=unseen)
+        net = copy.deepcopy(self.embedding_net)
+        mixing = CoupledEmbeddings(
+            self.simulated, self.x_o, net, coupling, unseen=unseen
+        )
         mixture = MixtureEstimator(
             [Part(self.npe.density(), mixing)], [1.0], tail_mass=tail_mass
         )
@@ -124,7 +125,6 @@ class EmbeddedBatch:
             mixture,
             copy.deepcopy(self.npe.prior),
             enable_transform=self.npe.enable_transform,
-            shared=shared,
         )
         posterior.parameter_names = self.npe.parameter_names
         posterior.columns = dict(self.columns)

@@ -20,7 +20,6 @@ from torch.distributions import Bernoulli, Binomial, Distribution, MultivariateN
 from sbi_rope.coupling import Coupling
 from sbi_rope.mixture import (
     CoupledEmbeddings,
-    CoupledNet,
     MixtureEstimator,
     MixturePosterior,
     Part,
@@ -312,8 +311,7 @@ def coupled_mixture(
     tail_mass: float = 1e-3,
 ) -> MixtureEstimator:
     """The mixture of RoPE: one part, one net, one coupling."""
-    net = CoupledNet(embedding_net, [coupling])
-    mixing = CoupledEmbeddings(embeddings, x_o, [net], unseen=unseen)
+    mixing = CoupledEmbeddings(embeddings, x_o, embedding_net, coupling, unseen=unseen)
     return MixtureEstimator([Part(density, mixing)], [1.0], tail_mass=tail_mass)
 
 

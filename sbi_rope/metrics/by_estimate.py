@@ -18,14 +18,13 @@ from torch import Tensor
 from sbi_rope._means import Counts, means_of_pairs
 from sbi_rope._permutation import permutation_test
 from sbi_rope._random import seeded
-from sbi_rope._validation import check_device
 from sbi_rope.metrics.calibration import (
     ROUNDING,
-    central_levels,
     random_ranks,
+    read_unit_interval,
 )
 from sbi_rope.settings import Level, check, default_names
-from sbi_rope.tensors import as_batch, as_numbers, check_same_length
+from sbi_rope.tensors import as_batch
 
 __all__ = [
     "CoverageByEstimate",
@@ -128,7 +127,6 @@ def coverage_by_estimate(
         the same for the same input.
 
     Raises:
-        InvalidInputError: If an argument has the wrong type.
         InvalidInputError: If a shape does not fit, a rank is not in [0, 1], or an
             estimate is not finite.
 
@@ -142,12 +140,8 @@ def coverage_by_estimate(
         (True,)
     """
     check("level", level, Level)
-    as_batch("estimates", estimates, as_numbers("estimates", estimates).shape[-1:])
-    as_batch("ranks", ranks, estimates.shape[1:], finite=False)
-    check_same_length("ranks", ranks, "estimates", estimates)
-    check_device("ranks", ranks, estimates.device, where="`estimates`")
-    known = ranks[~torch.isnan(ranks)] if allow_missing else ranks
-    central_levels(known)  # checks that they are in [0, 1]
+    ranks = read_unit_interval("ranks", ranks, allow_missing=allow_missing)
+    estimates = as_batch("estimates", estimates, ranks.shape[1:], rows=len(ranks))
     return coverage_by_estimate_of_pairs(ranks, estimates, level=level)
 
 

@@ -20,7 +20,6 @@ from sbi_rope._means import (
     means_of_pairs,
     standard_error_of_mean,
 )
-from sbi_rope._validation import check_device, check_not_nan
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.tensors import as_batch, as_numbers
 
@@ -39,6 +38,7 @@ __all__ = [
     "expected_coverage_error_of",
     "mid_ranks",
     "random_ranks",
+    "read_unit_interval",
 ]
 
 # Levels and ranks are ratios of integers. Those that are equal before rounding must
@@ -150,7 +150,6 @@ def mid_ranks(samples: Tensor, theta: Tensor) -> Tensor:
         The ranks, strictly between 0 and 1, float64, shape ``(n, d)``.
 
     Raises:
-        InvalidInputError: If an argument is no tensor of real numbers.
         InvalidInputError: If a shape does not fit, there is no sample, or an entry is
             NaN, which cannot be ranked. Infinite entries can be.
 
@@ -158,17 +157,11 @@ def mid_ranks(samples: Tensor, theta: Tensor) -> Tensor:
         >>> mid_ranks(torch.tensor([[[0.0]], [[1.0]], [[1.0]]]), torch.tensor([[1.0]]))
         tensor([[0.6250]], dtype=torch.float64)
     """
-    as_numbers("samples", samples)
-    as_batch("theta", theta, as_numbers("theta", theta).shape[-1:], finite=False)
-    if samples.ndim != 3 or samples.shape[1:] != theta.shape or not len(samples):
-        raise InvalidInputError(
-            f"Expected `samples` of shape (M, {theta.shape[0]}, {theta.shape[1]}) with "
-            f"M >= 1, for `theta` of shape {tuple(theta.shape)}; got "
-            f"{tuple(samples.shape)}."
-        )
-    check_device("theta", theta, samples.device, where="`samples`")
-    check_not_nan("samples", samples)
-    check_not_nan("theta", theta)
+    theta = as_numbers("theta", theta)
+    theta = as_batch("theta", theta, theta.shape[-1:], finite=False)
+    samples = as_batch("samples", samples, theta.shape, finite=False)
+    if torch.isnan(samples).any() or torch.isnan(theta).any():
+        raise InvalidInputError("Expected `samples` and `theta` without NaN.")
     return count_ranks(samples, theta)
 
 
@@ -212,11 +205,9 @@ def central_levels(ranks: Tensor) -> Tensor:
         The levels, in the same shape.
 
     Raises:
-        InvalidInputError: If the ranks are no tensor of real numbers.
         InvalidInputError: If a rank is not in [0, 1].
     """
-    _check_unit_range("ranks", as_numbers("ranks", ranks))
-    return (2.0 * ranks - 1.0).abs()
+    return (2.0 * _in_unit_interval("ranks", as_numbers("ranks", ranks)) - 1.0).abs()
 
 
 def acauc_of(levels: Tensor, *, allow_missing: bool = False) -> ACAUCScore:
@@ -251,14 +242,15 @@ def acauc_of(levels: Tensor, *, allow_missing: bool = False) -> ACAUCScore:
         The score with its standard error.
 
     Raises:
-        InvalidInputError: If the levels are no tensor of real numbers.
         InvalidInputError: If they have another shape, or a level is not in [0, 1].
 
     Example:
         >>> acauc_of(torch.tensor([[0.5], [1.0]])).value
         0.25
     """
-    return acauc_of_pairs(_checked_levels(levels, allow_missing=allow_missing))
+    return acauc_of_pairs(
+        read_unit_interval("levels", levels, allow_missing=allow_missing)
+    )
 
 
 def acauc_of_pairs(
@@ -301,10 +293,11 @@ def coverage_curve_of(levels: Tensor, *, allow_missing: bool = False) -> Coverag
         The curve at .01, .02, ..., .99.
 
     Raises:
-        InvalidInputError: If the levels are no tensor of real numbers.
         InvalidInputError: If they have another shape, or a level is not in [0, 1].
     """
-    return coverage_curve_of_pairs(_checked_levels(levels, allow_missing=allow_missing))
+    return coverage_curve_of_pairs(
+        read_unit_interval("levels", levels, allow_missing=allow_missing)
+    )
 
 
 def coverage_curve_of_pairs(
@@ -355,10 +348,11 @@ def expected_coverage_error_of(
         The score with its standard error.
 
     Raises:
-        InvalidInputError: If the levels are no tensor of real numbers.
         InvalidInputError: If they have another shape, or a level is not in [0, 1].
     """
-    return coverage_error_of_pairs(_checked_levels(levels, allow_missing=allow_missing))
+    return coverage_error_of_pairs(
+        read_unit_interval("levels", levels, allow_missing=allow_missing)
+    )
 
 
 def coverage_error_of_pairs(
@@ -413,30 +407,25 @@ def _mean_over_pairs(
     return *mean_and_error(values, counts), counts.effective_number
 
 
-def _checked_levels(levels: Tensor, *, allow_missing: bool) -> Tensor:
-    """Return levels, shape ``(n, d)``, without gradients and in 32 bits or more."""
-    shape = as_numbers("levels", levels).shape
-    if levels.ndim != 2:
-        raise InvalidInputError(
-            f"Expected `levels` of shape (n, d); got {tuple(shape)}."
-        )
-    as_batch("levels", levels, shape[1:], finite=False)
-    known = levels[~torch.isnan(levels)] if allow_missing else levels
-    _check_unit_range("levels", known)
-    levels = levels.detach()
+def read_unit_interval(name: str, values: Tensor, *, allow_missing: bool) -> Tensor:
+    """Return levels or ranks, shape ``(n, d)``, in 32 bits or more."""
+    numbers = as_numbers(name, values)
+    numbers = as_batch(name, numbers, numbers.shape[-1:], finite=False)
+    _in_unit_interval(
+        name, numbers[~torch.isnan(numbers)] if allow_missing else numbers
+    )
     # In 16 bits, the nominal levels that they are compared with would be rounded too.
-    is_coarse = levels.dtype in (torch.float16, torch.bfloat16)
-    return levels.float() if is_coarse else levels
+    return numbers if numbers.dtype == torch.double else numbers.float()
 
 
-def _check_unit_range(name: str, values: Tensor) -> None:
+def _in_unit_interval(name: str, values: Tensor) -> Tensor:
     outside = ~((values >= 0) & (values <= 1 + ROUNDING_OF_LEVELS))  # NaN included
     if outside.any():
         raise InvalidInputError(
-            f"Expected `{name}` in [0, 1]; got NaN or numbers outside in "
-            f"{int(outside.sum())} of {values.numel()} places, such as "
-            f"{float(values[outside][0])}."
+            f"Expected `{name}` in [0, 1]; got {float(values[outside][0])} and "
+            f"{int(outside.sum()) - 1} others."
         )
+    return values
 
 
 def _nominal_levels(like: Tensor) -> Tensor:

@@ -24,32 +24,24 @@ from torch import Tensor, nn
 from sbi_rope._progress import progress_bar
 from sbi_rope._sbi import MixtureDensity, NeuralPosterior, is_bounded, readable
 from sbi_rope._slices import slices
-from sbi_rope._validation import (
-    as_float32,
-    check_device,
-    check_not_swapped,
-    check_readable,
-    check_row_order,
-    check_tables,
-)
 from sbi_rope.errors import (
     InvalidInputError,
     LogProbUnavailableError,
 )
 from sbi_rope.metrics.calibration import count_ranks, random_ranks
 from sbi_rope.settings import Count, Range, check
-from sbi_rope.tensors import as_batch, as_numbers, check_same_length
+from sbi_rope.tensors import as_batch, as_numbers, rows_with
 
 __all__ = [
     "CHUNK_SIZE",
-    "check_num_samples",
-    "check_test_set",
+    "NumSamples",
     "draw_chunks",
     "draw_joint_levels",
     "draw_ranks",
     "draw_samples",
     "evaluate_log_probs",
     "is_normalised",
+    "read_test_set",
 ]
 
 # How many observations a posterior is called with at a time, unless the user says.
@@ -62,6 +54,8 @@ MAX_SAMPLES = 10**8
 # The fewest draws for one observation by which calibration is judged. By a single draw
 # all posteriors look calibrated whose draws are too large as often as too small.
 MIN_SAMPLES = 20
+
+NumSamples = Annotated[int, Range(MIN_SAMPLES, MAX_SAMPLES)]
 
 # How many draws of each observation have their density evaluated in one call. It is
 # small because some flows embed x once for every draw.
@@ -76,21 +70,10 @@ EXPECTED_WARNINGS = (
 )
 
 
-def check_num_samples(num_samples: Any) -> None:
-    """Raise unless calibration can be judged by a number of draws."""
-    check("num_samples", num_samples, Annotated[int, Range(1, MAX_SAMPLES)])
-    if num_samples < MIN_SAMPLES:
-        raise InvalidInputError(
-            f"Expected `num_samples` of at least {MIN_SAMPLES}, so that a draw is "
-            f"beyond each end of a 90 % interval; got {num_samples}. By a few draws an "
-            "over-confident posterior looks calibrated."
-        )
-
-
-def check_test_set(
+def read_test_set(
     posterior: Any, theta: Tensor, x: Tensor, chunk_size: int
 ) -> tuple[Tensor, Tensor]:
-    """Check a test set and return it in the dtype of the posterior.
+    """Return a test set in the dtype of the posterior.
 
     Args:
         posterior: The posterior to be scored.
@@ -102,41 +85,29 @@ def check_test_set(
         InvalidInputError: If a shape does not fit or an entry is not finite.
     """
     check("chunk_size", chunk_size, Count)
-    check_tables(posterior, theta=theta, x=x)
-    check_row_order(theta=theta, x=x)
-    theta, x = _as_tensor("theta", theta), _as_tensor("x", x)
-    theta_shape = theta.shape[1:]
+    theta = as_numbers(
+        "theta", theta, names=getattr(posterior, "parameter_names", None)
+    )
+    theta_shape = theta.shape[-1:]
     if isinstance(posterior, DirectPosterior):
-        estimator = posterior.posterior_estimator
-        theta_shape = estimator.input_shape
-        check_not_swapped(theta, x, theta_shape, estimator.condition_shape)
-    if len(theta_shape) != 1:
-        raise InvalidInputError(
-            f"Expected `theta` of shape (n, d); got {tuple(theta.shape)}. For one "
-            "parameter pass `theta[:, None]`."
-        )
-    as_batch("theta", theta, theta_shape)
-    _check_x(posterior, x)
-    check_same_length("theta", theta, "x", x)
+        theta_shape = posterior.posterior_estimator.input_shape
+    theta = as_batch("theta", theta, theta_shape)
     if isinstance(posterior, NeuralPosterior):  # sbi's estimators use float32
-        return as_float32("theta", theta), as_float32("x", x)
-    return theta, x
+        theta = theta.float()
+    return theta, _read_x(posterior, x, rows=len(theta))
 
 
 def evaluate_log_probs(
     posterior: Any, theta: Tensor, x: Tensor, *, chunk_size: int, show: bool
 ) -> Tensor:
     """Return the log density of each true parameter, float64, shape ``(n,)``."""
-    _require_log_prob(posterior)
+    log_prob_batched = _log_prob_of(posterior)
     arguments = {"norm_posterior": False} if _is_unbounded_direct(posterior) else {}
     parts = []
     for rows in _chunks(theta.shape[0], chunk_size, "Evaluating log_prob", show=show):
         with torch.no_grad():
-            part = _returned(
-                "log_prob_batched",
-                # A copy of x, because an embedding net may change its argument.
-                posterior.log_prob_batched(theta[rows], x=x[rows].clone(), **arguments),
-            )
+            # A copy of x, because an embedding net may change its argument.
+            part = log_prob_batched(theta[rows], x=x[rows].clone(), **arguments)
         if part.numel() != theta[rows].shape[0]:
             raise InvalidInputError(
                 f"Expected `log_prob_batched` to return one value for each of "
@@ -145,7 +116,7 @@ def evaluate_log_probs(
         parts.append(part.reshape(-1).double())
     log_probs = torch.cat(parts)
     bad = torch.isnan(log_probs) | torch.isposinf(log_probs)
-    _refuse("log-probabilities that are NaN or +Inf", bad)
+    _require_none(bad, "log-probabilities that are NaN or +Inf")
     return log_probs
 
 
@@ -192,7 +163,7 @@ def draw_joint_levels(
 
     The regions are those of highest posterior density (HPD).
     """
-    _require_log_prob(posterior)
+    _log_prob_of(posterior)
     parts = []
     chunks = draw_chunks(
         posterior, theta, x, num_samples=num_samples, chunk_size=chunk_size, show=show
@@ -206,7 +177,7 @@ def draw_joint_levels(
             ]
         )
         bad = torch.isnan(densities).any(dim=0)
-        _refuse("NaN log-probabilities", bad, start=rows.start)
+        _require_none(bad, "NaN log-probabilities", start=rows.start)
         # The rank of -log p counts the draws whose density is higher than theta's.
         parts.append(count_ranks(-densities[1:, :, None], -densities[0, :, None]))
     return torch.cat(parts)
@@ -236,11 +207,7 @@ def draw_samples(posterior: Any, x: Tensor, *, num_samples: int) -> Tensor:
             from 1 to 10^8.
     """
     check("num_samples", num_samples, Annotated[int, Range(1, MAX_SAMPLES)])
-    check_tables(posterior, x=x)
-    x = _as_tensor("x", x)
-    _check_x(posterior, x)
-    if isinstance(posterior, NeuralPosterior):
-        x = as_float32("x", x)
+    x = _read_x(posterior, x)
     samples = _sample(posterior, x, num_samples)
     if samples.ndim != 3 or samples.shape[:2] != (num_samples, len(x)):
         raise InvalidInputError(
@@ -250,42 +217,36 @@ def draw_samples(posterior: Any, x: Tensor, *, num_samples: int) -> Tensor:
     return samples
 
 
-def _as_tensor(name: str, value: Any) -> Tensor:
-    """Return a tensor as it is; arrays and lists of numbers become float32."""
-    numbers = as_numbers(name, value)
-    return numbers if numbers is value else as_float32(name, numbers)
-
-
-def _check_x(posterior: Any, x: Tensor) -> None:
-    """Raise if observations do not fit, or are not finite and cannot be read so."""
+def _read_x(posterior: Any, x: Any, rows: int | None = None) -> Tensor:
+    """Return observations that the posterior can read."""
     estimator = getattr(posterior, "posterior_estimator", None)
-    event_shape = getattr(estimator, "condition_shape", x.shape[1:])
-    as_batch("x", x, event_shape, finite=False)
+    event_shape = getattr(estimator, "condition_shape", None)
+    names = getattr(posterior, "x_names", None)
+    x = as_batch("x", x, event_shape, rows=rows, names=names, finite=False)
+    if isinstance(posterior, NeuralPosterior):
+        x = x.float()
     if isinstance(estimator, MixtureDensity):
-        return  # it checks that itself
+        return x  # it refuses what it cannot read
     net = getattr(estimator, "embedding_net", None)
-    if not isinstance(net, nn.Module) or torch.isfinite(x).all():
-        net = nn.Identity()
-    check_readable("x", x, readable(net, x))
+    unread = ~readable(net if isinstance(net, nn.Module) else nn.Identity(), x)
+    if unread.any():
+        raise InvalidInputError(
+            f"Expected `x` that can be read; got NaN or Inf in {rows_with(unread)}."
+        )
+    return x
 
 
 def _sample(posterior: Any, x: Tensor, num_samples: int) -> Tensor:
-    if not callable(getattr(posterior, "sample_batched", None)):
-        raise InvalidInputError(
-            "Expected `posterior` with a method `sample_batched`, such as one of sbi; "
-            f"got {type(posterior).__name__}."
-        )
     arguments = {"reject_outside_prior": False} if _is_unbounded(posterior) else {}
     with torch.no_grad(), warnings.catch_warnings():
         for message in EXPECTED_WARNINGS:
             warnings.filterwarnings("ignore", message=message)
-        samples = posterior.sample_batched(
+        return posterior.sample_batched(
             torch.Size((num_samples,)),
             x=x.clone(),
             show_progress_bars=False,
             **arguments,
         )
-    return _returned("sample_batched", samples)
 
 
 def _draw(
@@ -296,12 +257,10 @@ def _draw(
     if tuple(samples.shape) != expected:
         raise InvalidInputError(
             f"Expected samples of shape {expected}; `sample_batched` returned "
-            f"{tuple(samples.shape)}. Check that `theta` has one row for each"
-            f" observation and one column for each parameter."
+            f"{tuple(samples.shape)}."
         )
-    check_device("theta", theta, samples.device, where="what the posterior draws")
     bad = torch.isnan(samples).any(dim=0).any(dim=-1)
-    _refuse("NaN samples", bad, start=rows.start)
+    _require_none(bad, "NaN samples", start=rows.start)
     return samples
 
 
@@ -317,23 +276,12 @@ def _density(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:
             # estimator gives the density that the draws really have.
             return posterior.posterior_estimator.log_prob(theta, condition=x)
         density = posterior.log_prob_batched(theta, x=x)
-    if tuple(_returned("log_prob_batched", density).shape) != tuple(theta.shape[:2]):
+    if density.shape != theta.shape[:2]:
         raise InvalidInputError(
-            f"Expected `log_prob_batched` to return one value for each draw, shape "
-            f"{tuple(theta.shape[:2])}; got {tuple(density.shape)}."
+            f"Expected `log_prob_batched` of shape {tuple(theta.shape[:2])}; got "
+            f"{tuple(density.shape)}."
         )
     return density
-
-
-def _returned(method: str, value: Any) -> Tensor:
-    """Return what a method of the posterior returned, if it is a tensor of numbers."""
-    if not isinstance(value, Tensor):
-        raise InvalidInputError(
-            f"Expected `{method}` of the posterior to return a torch.Tensor; got "
-            f"{type(value).__name__}. Wrap the posterior in a class whose `{method}` "
-            "returns a tensor, with the dtype and device of `x`."
-        )
-    return value
 
 
 def _is_unbounded(posterior: Any) -> bool:
@@ -359,27 +307,22 @@ def _is_unbounded_direct(posterior: Any) -> bool:
     return isinstance(posterior, DirectPosterior) and _is_unbounded(posterior)
 
 
-def _require_log_prob(posterior: Any) -> None:
-    if not callable(getattr(posterior, "log_prob_batched", None)):
-        instead = (
-            "Score what its `build_posterior` returns."
-            if hasattr(posterior, "build_posterior")
-            else "You can still score its calibration with `acauc` (kinds 'central' "
-            "and 'rank') and `coverage_curve`."
-        )
+def _log_prob_of(posterior: Any) -> Any:
+    """Return the method that gives densities, before anything is drawn."""
+    if not hasattr(posterior, "log_prob_batched"):
         raise LogProbUnavailableError(
             "Expected `posterior` with a method `log_prob_batched`; got "
-            f"{type(posterior).__name__}. {instead}"
+            f"{type(posterior).__name__}."
         )
+    return posterior.log_prob_batched
 
 
-def _refuse(what: str, bad: Tensor, *, start: int = 0) -> None:
-    """Raise if the posterior returned something bad for any observation."""
+def _require_none(bad: Tensor, what: str, *, start: int = 0) -> None:
     if bad.any():
         first = (bad.nonzero().flatten()[:5] + start).tolist()
         raise InvalidInputError(
-            f"The posterior returned {what} for at least {int(bad.sum())} observations "
-            f"(first: {first}). Remove these observations, or repair the posterior."
+            f"Expected a posterior with finite results; got {what} for "
+            f"{int(bad.sum())} observations (first: {first})."
         )
 
 

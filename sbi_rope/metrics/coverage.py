@@ -17,10 +17,10 @@ from sbi_rope.metrics.calibration import (
 )
 from sbi_rope.metrics.calls import (
     CHUNK_SIZE,
-    check_num_samples,
-    check_test_set,
+    NumSamples,
     draw_joint_levels,
     draw_ranks,
+    read_test_set,
 )
 from sbi_rope.settings import Count, check, one_of
 
@@ -93,12 +93,12 @@ def acauc(
             ``log_prob_batched``.
     """
     check("kind", kind, one_of(list(DEFAULT_NUM_SAMPLES)))
-    theta, x = check_test_set(posterior, theta, x, chunk_size)
+    theta, x = read_test_set(posterior, theta, x, chunk_size)
     if num_samples is None:
         num_samples = DEFAULT_NUM_SAMPLES[kind]
     if num_observations is None:
         num_observations = MAX_JOINT_OBSERVATIONS if kind == "hpd" else theta.shape[0]
-    check_num_samples(num_samples)
+    check("num_samples", num_samples, NumSamples)
     check("num_observations", num_observations, Count)
     theta, x = _thin(theta, x, num_observations)
     draw = draw_joint_levels if kind == "hpd" else draw_ranks
@@ -210,8 +210,8 @@ def _central_levels(
     chunk_size: int,
     show: bool,
 ) -> Tensor:
-    theta, x = check_test_set(posterior, theta, x, chunk_size)
-    check_num_samples(num_samples)
+    theta, x = read_test_set(posterior, theta, x, chunk_size)
+    check("num_samples", num_samples, NumSamples)
     with seeded(seed):
         ranks = draw_ranks(
             posterior,

@@ -7,13 +7,11 @@ import torch
 from torch import Tensor
 
 from sbi_rope._means import standard_error_of_mean
-from sbi_rope._validation import check_not_nan
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.metrics.calls import CHUNK_SIZE, check_test_set, evaluate_log_probs
+from sbi_rope.metrics.calls import CHUNK_SIZE, evaluate_log_probs, read_test_set
 from sbi_rope.settings import Positive, check
-from sbi_rope.tensors import as_batch, as_numbers, check_same_length
+from sbi_rope.tensors import as_batch
 
-__all__ = ["LPPScore", "check_scales", "check_theta_std", "lpp"]
+__all__ = ["LPPScore", "lpp", "read_units"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -26,15 +24,6 @@ class LPPScore:
     """
 
     log_probs: Tensor = field(repr=False)
-
-    def __post_init__(self) -> None:
-        as_numbers("log_probs", self.log_probs)
-        as_batch("log_probs", self.log_probs, (), finite=False)
-        check_not_nan("log_probs", self.log_probs)
-        if torch.isposinf(self.log_probs).any():
-            raise InvalidInputError(
-                "Expected `log_probs` below infinity; got +Inf, which no density has."
-            )
 
     def __str__(self) -> str:
         return f"{self.mean:.2f} +- {self.standard_error:.2f}"
@@ -68,8 +57,7 @@ class LPPScore:
         Args:
             theta_std: The units :math:`s`, positive, shape ``(d,)``.
         """
-        check_scales(theta_std)
-        shift = theta_std.to(self.log_probs).log().sum()
+        shift = read_units(theta_std).to(self.log_probs).log().sum()
         return LPPScore(log_probs=self.log_probs + shift)
 
 
@@ -123,8 +111,9 @@ def lpp(
         >>> score.mean
         0.0
     """
-    theta, x = check_test_set(posterior, theta, x, chunk_size)
-    check_theta_std(theta_std, theta)
+    theta, x = read_test_set(posterior, theta, x, chunk_size)
+    if theta_std is not None:
+        theta_std = read_units(theta_std, theta.shape[1])
     score = LPPScore(
         log_probs=evaluate_log_probs(
             posterior, theta, x, chunk_size=chunk_size, show=show_progress_bars
@@ -133,14 +122,8 @@ def lpp(
     return score if theta_std is None else score.standardised(theta_std)
 
 
-def check_theta_std(theta_std: Tensor | None, theta: Tensor) -> None:
-    """Raise unless the units are None, or positive and one for each parameter."""
-    if theta_std is not None:
-        check_scales(theta_std)
-        check_same_length("theta_std", theta_std, "theta.T", theta.T)
-
-
-def check_scales(theta_std: Tensor) -> None:
-    """Raise unless the units are positive."""
-    as_batch("theta_std", theta_std, ())
-    check("theta_std", float(theta_std.min()), Positive)
+def read_units(theta_std: Tensor, count: int | None = None) -> Tensor:
+    """Return the unit of each parameter, which is positive."""
+    units = as_batch("theta_std", theta_std, (), rows=count)
+    check("theta_std", float(units.min()), Positive)
+    return units

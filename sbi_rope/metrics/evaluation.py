@@ -30,14 +30,14 @@ from sbi_rope.metrics.calibration import (
 )
 from sbi_rope.metrics.calls import (
     CHUNK_SIZE,
-    check_num_samples,
-    check_test_set,
+    NumSamples,
     draw_chunks,
     evaluate_log_probs,
     is_normalised,
+    read_test_set,
 )
-from sbi_rope.metrics.density import LPPScore, check_theta_std
-from sbi_rope.settings import default_names
+from sbi_rope.metrics.density import LPPScore, read_units
+from sbi_rope.settings import check, default_names
 
 __all__ = ["Evaluation", "evaluate"]
 
@@ -194,12 +194,13 @@ def evaluate(
             posterior returns NaN.
         LogProbUnavailableError: If the posterior has no ``log_prob_batched``.
     """
-    theta, x = check_test_set(posterior, theta, x, chunk_size)
-    check_num_samples(num_samples)
-    check_theta_std(theta_std, theta)
+    theta, x = read_test_set(posterior, theta, x, chunk_size)
+    check("num_samples", num_samples, NumSamples)
     unit_z = GIVEN_UNITS
     if theta_std is None:
         unit_z, theta_std = PRIOR_UNITS, _std_of_prior(posterior, theta)
+    else:
+        theta_std = read_units(theta_std, theta.shape[1])
     with seeded(seed):
         natural = LPPScore(
             log_probs=evaluate_log_probs(
@@ -238,8 +239,6 @@ def evaluate(
 def _std_of_prior(posterior: Any, theta: Tensor) -> Tensor | None:
     """Return the standard deviations of a posterior's prior, if they can be known."""
     try:
-        std = std_of_prior(posterior.prior).cpu()
-        check_theta_std(std, theta)
+        return read_units(std_of_prior(posterior.prior).cpu(), theta.shape[1])
     except Exception:  # posteriors of users, which need not have a prior to sample
         return None
-    return std

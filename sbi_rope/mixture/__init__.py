@@ -2,7 +2,6 @@
 
 from sbi_rope.mixture.average import average
 from sbi_rope.mixture.coupled import CoupledEmbeddings
-from sbi_rope.mixture.coupled_net import CoupledNet
 from sbi_rope.mixture.estimator import MixtureEstimator
 from sbi_rope.mixture.parts import (
     Mixing,
@@ -19,7 +18,6 @@ from sbi_rope.mixture.truncation import Leakage
 
 __all__ = [
     "CoupledEmbeddings",
-    "CoupledNet",
     "Leakage",
     "Mixing",
     "MixtureEstimator",

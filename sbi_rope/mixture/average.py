@@ -1,6 +1,7 @@
 """The average of posteriors, such as those repaired from the members of an ensemble."""
 
 import copy
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,11 +10,11 @@ from sbi.utils import within_support
 
 from sbi_rope._random import seeded
 from sbi_rope._sbi import estimator_of
-from sbi_rope._validation import check_weights, columns_of, joined_columns
-from sbi_rope.errors import InvalidInputError
+from sbi_rope.errors import InvalidInputError, shown
 from sbi_rope.mixture.estimator import MixtureEstimator
 from sbi_rope.mixture.parts import part_of
 from sbi_rope.mixture.posterior import MixturePosterior
+from sbi_rope.settings import check
 
 __all__ = ["average"]
 
@@ -44,12 +45,9 @@ def average(
         The average. It belongs to a batch if one of the posteriors does.
 
     Raises:
-        InvalidInputError: If it is no list of posteriors.
         InvalidInputError: If there is no posterior, shapes, batches or priors differ,
-            two know the columns of tables in different orders, or the weights do not
-            fit.
-        UnsupportedPosteriorError: If one of them has no density or no embedding of x,
-            or is a recalibrated stack.
+            or the weights do not fit.
+        UnsupportedPosteriorError: If one of them has no density or no embedding of x.
 
     Example:
         >>> import torch
@@ -68,16 +66,18 @@ def average(
         >>> posterior.sample((5,), x=torch.ones(1)).shape
         torch.Size([5, 1])
     """
-    if not isinstance(posteriors, list | tuple):
-        raise InvalidInputError(
-            "Expected `posteriors` to be a list of posteriors; got "
-            f"{type(posteriors).__name__}."
-        )
-    if not len(posteriors):
+    check("posteriors", posteriors, list | tuple)
+    if not posteriors:
         raise InvalidInputError("Expected at least one of `posteriors`; got none.")
-    if weights is None:
-        weights = [1.0 / len(posteriors)] * len(posteriors)
-    shares = check_weights("weights", weights, len(posteriors))
+    shares = [1.0 / len(posteriors)] * len(posteriors)
+    if weights is not None:
+        shares = [float(weight) for weight in weights]
+        fits = len(shares) == len(posteriors) and min(shares) >= 0
+        if not fits or not math.isclose(sum(shares), 1.0, abs_tol=1e-6):
+            raise InvalidInputError(
+                f"Expected {len(posteriors)} `weights` from 0 on with a sum of 1; got "
+                f"{shown(weights)}."
+            )
     estimators = [_mixture_of(posterior) for posterior in posteriors]
     parts, of_parts = [], []
     for share, estimator in zip(shares, estimators, strict=True):
@@ -89,40 +89,30 @@ def average(
         of_parts,
         tail_mass=min(estimator.tail_mass for estimator in estimators),
     )
-    _check_same_prior([posterior.prior for posterior in posteriors])
     first = posteriors[0]
+    with seeded(0):
+        theta = first.prior.sample(torch.Size((NUM_FROM_PRIOR,)))
+    for number, prior in enumerate(one.prior for one in posteriors):
+        # Outside its support a prior of torch has no density, but an error.
+        if not bool(within_support(prior, theta).all()) or not torch.allclose(
+            prior.log_prob(theta), first.prior.log_prob(theta), atol=1e-3
+        ):
+            raise InvalidInputError(
+                "Expected `posteriors` with the same prior; got another one in "
+                f"posteriors[{number}]."
+            )
     averaged = MixturePosterior(
         mixture, copy.deepcopy(first.prior), enable_transform=first.enable_transform
     )
-    averaged.parameter_names = _common_names(posteriors)
-    known = [columns_of(posterior) for posterior in posteriors]
-    averaged.columns = {
-        name: joined_columns(name, [columns[name] for columns in known])
-        for name in ("theta", "x")
-    }
+    averaged.parameter_names = _common("parameter_names", posteriors)
+    averaged.x_names = _common("x_names", posteriors)
     return averaged
 
 
-def _check_same_prior(priors: Sequence[Any]) -> None:
-    """Raise if draws of the first prior have another density under another."""
-    with seeded(0):
-        theta = priors[0].sample(torch.Size((NUM_FROM_PRIOR,)))
-    for number, prior in enumerate(priors[1:], start=1):
-        # Outside its support a prior of torch has no density, but an error.
-        if not bool(within_support(prior, theta).all()) or not torch.allclose(
-            prior.log_prob(theta), priors[0].log_prob(theta), atol=1e-3
-        ):
-            raise InvalidInputError(
-                "Expected `posteriors` with the same prior; got another prior in "
-                f"posteriors[{number}] than in posteriors[0]. Train all of them with "
-                "one prior."
-            )
-
-
-def _common_names(posteriors: Sequence[Any]) -> tuple[str, ...] | None:
-    """Return the names of the parameters if all posteriors have the same."""
-    first, *others = (getattr(one, "parameter_names", None) for one in posteriors)
-    return first if all(names == first for names in others) else None
+def _common(names: str, posteriors: Sequence[Any]) -> tuple[str, ...] | None:
+    """Return the names that all posteriors have; None if they differ."""
+    first, *others = (getattr(one, names, None) for one in posteriors)
+    return first if all(other == first for other in others) else None
 
 
 def _mixture_of(posterior: Any) -> MixtureEstimator:

@@ -11,13 +11,12 @@ from torch import Tensor, nn
 
 from sbi_rope._progress import progress_bar
 from sbi_rope._sbi import MixtureDensity
-from sbi_rope._validation import check_readable, check_weights
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture.block import Block
 from sbi_rope.mixture.chunks import blocks, flow_batch, keep_freed_memory
 from sbi_rope.mixture.coupled import CoupledEmbeddings
 from sbi_rope.mixture.density import block_log_prob
-from sbi_rope.mixture.parts import DTYPE, OwnEmbeddings, Part
+from sbi_rope.mixture.parts import DTYPE, Part
 from sbi_rope.mixture.sampling import Accept, BlockSampler, deadline_after
 from sbi_rope.mixture.truncation import (
     LEAKAGE_DRAWS,
@@ -26,10 +25,11 @@ from sbi_rope.mixture.truncation import (
     own_mass,
     shared_mass,
 )
-from sbi_rope.settings import UnitInterval, check
-from sbi_rope.tensors import as_batch, check_same_length
+from sbi_rope.tensors import as_batch, rows_with
 
 __all__ = ["MixtureEstimator"]
+
+TAIL_MASS = 1e-3
 
 
 class MixtureEstimator(MixtureDensity):
@@ -52,8 +52,8 @@ class MixtureEstimator(MixtureDensity):
             such as the simulations of a coupling. 0 evaluates all.
 
     Raises:
-        InvalidInputError: If there is no part, shapes of theta or x differ between
-            parts, or an argument is outside its range.
+        InvalidInputError: If shapes of theta or x differ between parts, or parts belong
+            to different batches.
     """
 
     weights: Tensor
@@ -63,10 +63,8 @@ class MixtureEstimator(MixtureDensity):
         parts: Sequence[Part],
         weights: Sequence[float] | Tensor,
         *,
-        tail_mass: float = 1e-3,
+        tail_mass: float = TAIL_MASS,
     ) -> None:
-        if not len(parts):
-            raise InvalidInputError("Expected at least one part; got none.")
         first = parts[0]
         super().__init__(
             nn.Identity(), first.density.input_shape, first.mixing.event_shape
@@ -79,15 +77,12 @@ class MixtureEstimator(MixtureDensity):
                     f"{tuple(self.condition_shape)}, as the first; got theta "
                     f"{tuple(shapes[0])} given x {tuple(shapes[1])}."
                 )
-        check("tail_mass", tail_mass, UnitInterval)
         self.tail_mass = tail_mass
         self._parts = nn.ModuleList(parts)
         tensors = chain(self._parts.buffers(), self._parts.parameters())
         device = next(tensors, torch.empty(0)).device
-        checked = check_weights("weights", weights, len(parts))
-        self.register_buffer(
-            "weights", torch.tensor(checked, dtype=torch.double, device=device)
-        )
+        shares = torch.as_tensor(weights, dtype=torch.double, device=device)
+        self.register_buffer("weights", shares)
         for other in self.coupled[1:]:
             if not torch.equal(other.x_o, self.coupled[0].x_o):
                 raise InvalidInputError(
@@ -100,11 +95,7 @@ class MixtureEstimator(MixtureDensity):
         return cast("list[Part]", list(self._parts))
 
     def taken_apart(self) -> tuple[list[Part], list[float]]:
-        """Return copies of the parts, and their weights, for another mixture.
-
-        Raises:
-            UnsupportedPosteriorError: If the mixture is more than its parts.
-        """
+        """Return copies of the parts, and their weights, for another mixture."""
         return copy.deepcopy(self).parts, self.weights.tolist()
 
     @property
@@ -117,21 +108,16 @@ class MixtureEstimator(MixtureDensity):
         """Return the same mixture for one observation of the batch.
 
         It shares its densities with this mixture, and holds no other observation.
-        Embedding nets are left out, unless the coupling can be extended to others.
 
         Args:
             index: The number of the observation in ``x_o``.
         """
-        extends = any(mixing.unseen == "extend" for mixing in self.coupled)
-        parts = []
-        for part in self.parts:
-            mixing = part.mixing
-            if isinstance(mixing, CoupledEmbeddings):
-                part = Part(part.density, mixing.restricted_to(index))
-            elif isinstance(mixing, OwnEmbeddings) and not extends:
-                x = self.coupled[0].x_o[[index]]
-                part = Part(part.density, mixing.restricted_to(x))
-            parts.append(part)
+        parts = [
+            Part(part.density, part.mixing.restricted_to(index))
+            if isinstance(part.mixing, CoupledEmbeddings)
+            else part
+            for part in self.parts
+        ]
         return MixtureEstimator(parts, self.weights, tail_mass=self.tail_mass)
 
     # --- density ---
@@ -151,11 +137,11 @@ class MixtureEstimator(MixtureDensity):
             t times the largest density among the terms left out.
 
         Raises:
-            InvalidInputError: If shapes do not fit or theta is NaN.
-            UnseenObservationError: If an x is not in the batch of a coupled part with
+            InvalidInputError: If the numbers of rows do not fit.
+            InvalidInputError: If an x is not in the batch of a coupled part with
                 ``unseen="raise"``.
         """
-        theta, x = self._checked_theta(input), self.checked_x(condition)
+        theta, x = self._as_samples(input), self.checked_x(condition)
         num_rows = max(theta.shape[1], len(x))
         if {theta.shape[1], len(x)} - {1, num_rows}:
             raise InvalidInputError(
@@ -181,7 +167,7 @@ class MixtureEstimator(MixtureDensity):
     def part_log_probs(self, theta: Tensor, x: Tensor) -> Tensor:
         r"""Return the log density of each part by itself at pairs of theta and x.
 
-        It does not depend on ``tail_mass`` or the weights of the parts.
+        It does not depend on the weights of the parts, and leaves nothing out.
 
         Args:
             theta: Parameters, shape ``(n, d)``.
@@ -192,11 +178,9 @@ class MixtureEstimator(MixtureDensity):
             ``(n, K)``, float64.
 
         Raises:
-            InvalidInputError: If shapes do not fit or theta is NaN.
-            UnseenObservationError: As in :meth:`log_prob`.
+            InvalidInputError: If the numbers of rows do not fit.
         """
-        pairs, x = self._checked_theta(theta), self.checked_x(x)
-        check_same_length("theta", pairs[0], "x", x)
+        pairs, x = self._as_samples(theta), self.checked_x(x)
         log_probs = pairs.new_empty(len(x), len(self.parts), dtype=torch.double)
         for number, part in enumerate(self.parts):
             for rows, block in _blocks([part], [1.0], x):
@@ -214,17 +198,9 @@ class MixtureEstimator(MixtureDensity):
         ]
         return [part for part, _ in used], [share for _, share in used]
 
-    def _checked_theta(self, theta: Tensor) -> Tensor:
+    def _as_samples(self, theta: Tensor) -> Tensor:
         """Return theta as ``(S, B, d)``."""
-        if theta.shape[-len(self.input_shape) :] != self.input_shape:
-            raise InvalidInputError(
-                f"Expected `theta` of shape (..., {self.input_shape[0]}); got "
-                f"{tuple(theta.shape)}."
-            )
-        if torch.isnan(theta).any():
-            raise InvalidInputError("Expected `theta` without NaN.")
-        if theta.ndim == len(self.input_shape) + 1:
-            theta = theta[None]
+        theta = theta[None] if theta.ndim == 2 else theta
         return theta.to(self.weights.device, DTYPE)
 
     def checked_x(self, x: Tensor) -> Tensor:
@@ -238,7 +214,12 @@ class MixtureEstimator(MixtureDensity):
         x = x.to(self.weights.device, DTYPE)
         if not torch.isfinite(x).all():
             can_read = torch.stack([part.mixing.readable(x) for part in self._used[0]])
-            check_readable("x", x, can_read.all(dim=0))
+            unread = ~can_read.all(dim=0)
+            if unread.any():
+                raise InvalidInputError(
+                    "Expected `x` that the embedding net can read; got NaN or Inf in "
+                    f"{rows_with(unread)}."
+                )
         return x
 
     # --- samples ---
@@ -273,7 +254,6 @@ class MixtureEstimator(MixtureDensity):
         Raises:
             SamplingError: If hardly any draw is accepted for some observation, or the
                 time is over.
-            UnseenObservationError: As in :meth:`log_prob`.
         """
         deadline = deadline_after(max_sampling_time)
         x = self.checked_x(condition)

@@ -4,6 +4,7 @@ import copy
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -18,16 +19,17 @@ from sbi_rope._sbi import (
     readable,
 )
 from sbi_rope.errors import InvalidInputError, SamplingError
+from sbi_rope.tensors import as_numbers
 
 __all__ = [
     "DTYPE",
-    "KeptEmbeddings",
     "Mixing",
     "OwnEmbeddings",
     "Part",
     "Rows",
     "equal_rows",
     "has_entries",
+    "parameters_of",
     "part_of",
 ]
 
@@ -107,8 +109,6 @@ class OwnEmbeddings(Mixing):
     """
 
     def __init__(self, nets: Sequence[nn.Module], event_shape: Sequence[int]) -> None:
-        if not len(nets):
-            raise InvalidInputError("Expected at least one embedding net; got none.")
         super().__init__(event_shape, len(nets))
         self.nets = nn.ModuleList(nets)
 
@@ -123,37 +123,6 @@ class OwnEmbeddings(Mixing):
     def readable(self, x: Tensor) -> Tensor:
         """Tell which observations all nets can read."""
         return torch.stack([readable(net, x) for net in self.nets]).all(dim=0)
-
-    def restricted_to(self, x: Tensor) -> "KeptEmbeddings":
-        """Return the embeddings of one observation ``(1, *event)``, without nets."""
-        return KeptEmbeddings(self.embed(x), self.event_shape)
-
-
-class KeptEmbeddings(Mixing):
-    """The embeddings of a single observation, whose nets are no longer needed.
-
-    Args:
-        kept: The embeddings of the observation, shape ``(1, K, l)``.
-        event_shape: Shape of one observation.
-    """
-
-    kept: Tensor
-
-    def __init__(self, kept: Tensor, event_shape: Sequence[int]) -> None:
-        super().__init__(event_shape, kept.shape[1])
-        self.register_buffer("kept", kept)
-
-    def embed(self, x: Tensor) -> Tensor:
-        """Return the embeddings of the one observation for each x, ``(n, K, l)``."""
-        return self.kept.expand(len(x), -1, -1)
-
-    def rows(self, embedded: Tensor) -> Rows:
-        """Weigh all embeddings equally."""
-        return equal_rows(embedded)
-
-    def readable(self, x: Tensor) -> Tensor:
-        """Tell which observations have some entry, because no net has to read them."""
-        return has_entries(x)
 
 
 def has_entries(x: Tensor) -> Tensor:
@@ -202,10 +171,8 @@ class Part(nn.Module):
             return self.density.sample(torch.Size((1,)), embeddings)[0]
         except ValueError as error:  # of sbi's mixtures of Gaussians
             raise SamplingError(
-                "Expected a density that can be sampled given all observations; its "
-                f"network fails at one of them ({error}). Leave out observations that "
-                "are far from all simulations, of which there was a warning or "
-                "`diagnose(rope, x_o)` tells."
+                "Expected a density that can be sampled given all observations; got "
+                f"{error}. Leave out observations that are far from all simulations."
             ) from error
 
 
@@ -222,3 +189,32 @@ def part_of(estimator: ConditionalEstimator) -> Part:
     own = copy.deepcopy(estimator).requires_grad_(requires_grad=False)
     embeddings = OwnEmbeddings([embedding_of(own)], estimator.condition_shape)
     return Part(headless(own), embeddings).eval()
+
+
+def parameters_of(
+    theta: Any, dim: int, *, batched: bool, names: Sequence[str] | None = None
+) -> Tensor:
+    """Return the parameters whose density is asked for, in float32.
+
+    A bound of the prior is one in float32 only: 0.1 of float64 is below the 0.1 of a
+    prior.
+
+    Args:
+        theta: What the user gave, shape ``(n, d)`` or ``(d,)``.
+        dim: The number of parameters, d.
+        batched: Whether theta belongs to a batch of B observations. Its shape is then
+            ``(B, d)``, or ``(S, B, d)`` for S parameters of each observation.
+        names: The names of the parameters.
+
+    Raises:
+        InvalidInputError: If the shape does not fit, or a number is NaN.
+    """
+    numbers = as_numbers("theta", theta, names=names)
+    theta = theta if isinstance(theta, Tensor) else numbers  # which has gradients
+    shape = tuple(theta.shape)
+    if theta.ndim not in ((2, 3) if batched else (1, 2)) or shape[-1] != dim:
+        expected = f"(B, {dim}) or (S, B, {dim})" if batched else f"(n, {dim})"
+        raise InvalidInputError(f"Expected `theta` of shape {expected}; got {shape}.")
+    if torch.isnan(theta).any() or not len(theta):
+        raise InvalidInputError("Expected `theta` with numbers; got NaN or none.")
+    return theta.to(DTYPE)

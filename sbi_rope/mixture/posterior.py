@@ -16,12 +16,11 @@ from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import BaseDirectPosterior, MixedDensity, describe
 from sbi_rope._standardisation import warn_of_far_entries
-from sbi_rope._validation import as_shape, check_tables, check_theta, usable_device
 from sbi_rope.coupling import Coupling
 from sbi_rope.errors import InvalidInputError, SamplingError
 from sbi_rope.mixture.coupled import CoupledEmbeddings
 from sbi_rope.mixture.estimator import MixtureEstimator
-from sbi_rope.mixture.parts import DTYPE
+from sbi_rope.mixture.parts import DTYPE, parameters_of
 from sbi_rope.mixture.sampling import Accept
 from sbi_rope.mixture.truncation import Leakage, is_unbounded
 from sbi_rope.saving import save
@@ -76,9 +75,6 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         prior: The prior NPE was trained with.
         enable_transform: Whether ``map()`` searches in an unbounded space, as in sbi.
             For mixed discrete and continuous parameters it never does.
-        shared: A dictionary in which the posterior keeps the masses :math:`Z_j` that it
-            estimates. Posteriors of the same prior and the same parts, in the same
-            order, may share it, whatever their weights and couplings are.
         warns: Whether an amortised posterior warns of observations whose entries are
             far from the simulations of NPE, if NPE standardises them. Those with which
             a stack scores the pairs do not, because RoPE has warned of these.
@@ -94,7 +90,6 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         prior: Distribution,
         *,
         enable_transform: bool = True,
-        shared: dict[int, Tensor] | None = None,
         warns: bool = True,
     ) -> None:
         # A category that sbi has standardised and put back may differ by rounding, and
@@ -111,7 +106,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             )
         self.posterior_estimator: MixtureEstimator = estimator
         # Posteriors of single observations share it, so that all is estimated once.
-        self._cache: dict[int, Tensor] = {} if shared is None else shared
+        self._cache: dict[int, Tensor] = {}
         self.warns = warns
         describe(self, _purpose(estimator))
 
@@ -141,7 +136,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         """All couplings of the batch with simulations."""
         self._coupled("couplings")
         coupled = self.posterior_estimator.coupled
-        return tuple(coupling for part in coupled for coupling in part.couplings)
+        return tuple(part.coupling for part in coupled)
 
     @property
     def coupling(self) -> Coupling:
@@ -154,8 +149,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         coupling, *others = self.couplings
         if others:
             raise InvalidInputError(
-                f"Expected a single coupling; got a posterior of {1 + len(others)}. "
-                "Use `couplings`; `weights` has the rows of them all."
+                f"Expected a single coupling; got {1 + len(others)}. Use `couplings`."
             )
         return coupling
 
@@ -166,21 +160,15 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         They are the weights within the coupled part, whatever the other parts weigh.
 
         Raises:
-            InvalidInputError: If there are several coupled parts.
+            InvalidInputError: If there are several couplings.
         """
-        coupled = self._coupled("weights")
-        if len(self.posterior_estimator.coupled) > 1:
-            raise InvalidInputError(
-                "Expected a single coupled part; got several. Use the `weights` of "
-                "each of `posterior.posterior_estimator.coupled`."
-            )
-        return coupled.weights
+        self._coupled("weights")
+        return self.coupling.weights
 
     def _coupled(self, name: str) -> CoupledEmbeddings:
         if self.is_amortised:
             raise InvalidInputError(
-                f"This posterior is amortised: it belongs to no batch and has no "
-                f"`{name}`. Pass the observation, as in `sample((1000,), x=x)`."
+                f"Expected a posterior of a batch for `{name}`; got an amortised one."
             )
         return self.posterior_estimator.coupled[0]
 
@@ -196,11 +184,6 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         It does not know the other observations of the batch.
         """
         self._coupled("[i]")
-        if isinstance(index, bool) or not hasattr(index, "__index__"):
-            raise InvalidInputError(
-                f"Expected the number of an observation; got {index!r}. For several, "
-                "use the `_batched` methods with their x."
-            )
         estimator = self.posterior_estimator.restricted_to(operator.index(index))
         view = copy.copy(self)
         view.posterior_estimator = estimator
@@ -223,17 +206,14 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         them again after moving.
 
         Raises:
-            InvalidInputError: If the prior cannot be moved, or there is no such
-                device. Nothing is moved then.
+            InvalidInputError: If the prior cannot be moved. Nothing is moved then.
         """
-        device = usable_device(device)
         if not hasattr(self.prior, "to"):
             raise InvalidInputError(
-                f"Cannot move a posterior whose prior has no method `to`: "
-                f"{type(self.prior).__name__}. Use a prior of sbi, such as BoxUniform."
+                "Expected a prior with a method `to`, such as sbi's BoxUniform; got "
+                f"{type(self.prior).__name__}."
             )
-        # A new dictionary: the posteriors of a sweep share the old one, and stay on
-        # their device.
+        # A new dictionary: posteriors of single observations share the old one.
         self._cache = {k: mass.to(device) for k, mass in self._cache.items()}
         self._latest = None
         with seeded(0):  # sbi draws from the prior to find out about it
@@ -250,10 +230,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             overwrite: Whether to replace a file that exists.
 
         Raises:
-            InvalidInputError: If an argument has the wrong type.
-            InvalidInputError: If the posterior holds something that cannot be
-                described, such as a lambda.
-            NotWritableError: If the file exists, or cannot be written.
+            FileExistsError: If the file exists.
         """
         save(self, path, overwrite=overwrite)
 
@@ -284,7 +261,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             Shape ``(*sample_shape, d)``.
 
         Raises:
-            UnseenObservationError: If x is not in the batch and ``unseen="raise"``.
+            InvalidInputError: If x is not in the batch and ``unseen="raise"``.
             SamplingError: As in :meth:`sample_batched`.
         """
         x = self._one_x(x)
@@ -330,8 +307,8 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             Shape ``(*sample_shape, B, d)``.
 
         Raises:
-            InvalidInputError: If an argument is outside its range.
-            UnseenObservationError: If an x is not in the batch and ``unseen="raise"``.
+            InvalidInputError: If an argument is outside its range, or an x is not in
+                the batch and ``unseen="raise"``.
             SamplingError: If hardly any mass lies inside the prior's support, or the
                 time is over.
         """
@@ -339,14 +316,13 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             check("max_sampling_time", max_sampling_time, Positive)
         if return_partial_on_timeout:
             raise InvalidInputError(
-                "Expected `return_partial_on_timeout=False`: observations are drawn "
-                "for one after the other, so that some would have no draw. Ask for "
-                "fewer draws at a time and keep those."
+                "Expected `return_partial_on_timeout=False`: some observations would "
+                "have no draw."
             )
         if max_sampling_batch_size is not None:
             check("max_sampling_batch_size", max_sampling_batch_size, Count)
         return self.posterior_estimator.sample(
-            as_shape("sample_shape", sample_shape),
+            torch.Size(sample_shape),
             self._warned_of(self._batch_of_x(x)),
             accept=self._inside if reject_outside_prior else None,
             batch_size=max_sampling_batch_size,
@@ -386,25 +362,26 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         x = self.default_x if x is None else x
         if x is None:
             raise InvalidInputError(
-                "Expected an observation `x`, or a default x that was set with "
-                "`set_default_x(x)`; got neither."
+                "Expected an observation `x`, or a default x; got neither."
             )
         batch = self._batch_of_x(x)
         if len(batch) > 1:
             raise InvalidInputError(
-                f"Expected one observation; got {len(batch)}. For several, use "
-                "`sample_batched`, `log_prob_batched` and "
-                "`credible_intervals_batched`. Sets are made for one at a time."
+                f"Expected one observation; got {len(batch)}. For several, use the "
+                "`_batched` methods."
             )
         return batch
 
     def _batch_of_x(self, x: Tensor) -> Tensor:
-        check_tables(self, x=x)
         event_shape = self.posterior_estimator.condition_shape
-        x = as_numbers("x", x).to(torch.float32)
+        x = as_numbers("x", x, names=self.x_names).to(DTYPE)
         if x.shape == event_shape:
             x = x[None]
         return self.posterior_estimator.checked_x(x).to(x.device)
+
+    def _parameters(self, theta: Tensor, *, batched: bool = False) -> Tensor:
+        dim = self.posterior_estimator.input_shape[0]
+        return parameters_of(theta, dim, batched=batched, names=self.parameter_names)
 
     def _warned_of(self, x: Tensor) -> Tensor:
         """Return observations, after a warning if entries are far from simulations."""
@@ -435,11 +412,10 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
 
         Raises:
             InvalidInputError: If shapes do not fit, x is not finite or theta is NaN.
-            UnseenObservationError: If x is not in the batch and ``unseen="raise"``.
+            InvalidInputError: If x is not in the batch and ``unseen="raise"``.
             SamplingError: If the mixture has no mass inside the prior's support.
         """
-        check_tables(self, theta=theta)
-        theta = check_theta(theta, self.posterior_estimator.input_shape, batched=False)
+        theta = self._parameters(theta)
         safe, inside = self._moved_inside(theta)
         log_prob = super().log_prob(
             safe,
@@ -468,10 +444,8 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
 
         Raises:
             InvalidInputError: As in :meth:`log_prob`.
-            UnseenObservationError: As in :meth:`log_prob`.
         """
-        check_tables(self, theta=theta)
-        theta = check_theta(theta, self.posterior_estimator.input_shape, batched=False)
+        theta = self._parameters(theta)
         return super().potential(theta, self._one_x(x), track_gradients)
 
     def log_prob_batched(
@@ -497,11 +471,10 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
 
         Raises:
             InvalidInputError: If shapes do not fit or theta is NaN.
-            UnseenObservationError: If an x is not in the batch and ``unseen="raise"``.
+            InvalidInputError: If an x is not in the batch and ``unseen="raise"``.
             SamplingError: If a mixture has no mass inside the prior's support.
         """
-        check_tables(self, theta=theta)
-        theta = check_theta(theta, self.posterior_estimator.input_shape, batched=True)
+        theta = self._parameters(theta, batched=True)
         safe, inside = self._moved_inside(theta)
         log_prob = super().log_prob_batched(
             safe,
@@ -539,13 +512,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
 
         Returns:
             Shape ``(1, d)``.
-
-        Raises:
-            InvalidInputError: If a number is outside its range.
         """
-        check("num_iter", num_iter, Count)
-        check("num_to_optimize", num_to_optimize, Count)
-        check("num_init_samples", num_init_samples, Count)
         with torch.enable_grad():  # the caller may have switched gradients off
             return super().map(
                 x=x,
@@ -600,18 +567,15 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         if kwargs:
             raise InvalidInputError(
                 "Expected no `leakage_correction_params` but `show_progress_bars`; got "
-                f"{sorted(kwargs)}. The mass inside the prior's support is estimated "
-                "from 1024 draws."
+                f"{sorted(kwargs)}."
             )
         leakage = self.leakage(x, show_progress_bars=show_progress_bars)
         mass = leakage.mass.to(DTYPE)
         if not (mass > 0).all():
             rows = (mass <= 0).nonzero().flatten()
             raise SamplingError(
-                f"The mixtures of {len(rows)} of {len(mass)} observations (rows "
-                f"{rows[:5].tolist()}) have no mass inside the support of the prior. "
-                "Leave these observations out, train NPE longer, or pass "
-                "norm_posterior=False."
+                f"The mixtures of rows {rows[:5].tolist()} of `x` have no mass inside "
+                "the support of the prior. Leave them out, or train NPE longer."
             )
         return mass
 

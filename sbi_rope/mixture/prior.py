@@ -11,7 +11,6 @@ from torch.distributions import Distribution
 from sbi_rope._bounds import moved_inside, off_bounds
 from sbi_rope._random import seeded
 from sbi_rope._sbi import ConditionalDensityEstimator, move_distribution_to_device
-from sbi_rope._validation import check_prior
 from sbi_rope.mixture.parts import Mixing, Part, Rows, has_entries
 
 __all__ = ["PriorDensity", "part_of_prior", "prior_log_prob", "prior_sample"]
@@ -23,12 +22,7 @@ def part_of_prior(prior: Distribution, event_shape: Sequence[int]) -> Part:
     Args:
         prior: A torch distribution over parameters of shape ``(d,)``; it is copied.
         event_shape: Shape of one observation.
-
-    Raises:
-        InvalidInputError: If the prior is not a torch distribution.
-        InvalidInputError: If the parameters are not vectors.
     """
-    check_prior(prior)
     density = PriorDensity(copy.deepcopy(prior))
     return Part(density, NoEmbedding(event_shape, device=density.placeholder.device))
 

@@ -10,11 +10,11 @@ from torch.distributions import Distribution
 
 from sbi_rope._random import seeded
 from sbi_rope._sbi import BasePotential, NeuralPosterior, copy_of_prior, describe
-from sbi_rope._validation import as_shape, check_prior, check_theta, usable_device
 from sbi_rope.errors import InvalidInputError
+from sbi_rope.mixture.parts import parameters_of
 from sbi_rope.mixture.prior import prior_log_prob, prior_sample
 from sbi_rope.saving import save
-from sbi_rope.tensors import as_batch, as_numbers
+from sbi_rope.tensors import as_batch
 
 __all__ = ["PriorPosterior"]
 
@@ -51,7 +51,11 @@ class PriorPosterior(NeuralPosterior):
     """
 
     def __init__(self, prior: Any) -> None:
-        check_prior(prior)
+        if not isinstance(prior, Distribution) or len(prior.event_shape) != 1:
+            raise InvalidInputError(
+                "Expected `prior` to be a torch distribution over vectors; got "
+                f"{type(prior).__name__}. Use `sbi.utils.process_prior(prior)[0]`."
+            )
         prior = copy_of_prior(prior)
         transform, self._reason_without_map = None, ""
         with seeded(0):  # both draw from the prior to look at it
@@ -75,7 +79,7 @@ class PriorPosterior(NeuralPosterior):
         **kwargs: Any,
     ) -> Tensor:
         """Draw from the prior, ``(*sample_shape, d)``; other arguments are ignored."""
-        return prior_sample(self.prior, as_shape("sample_shape", sample_shape))
+        return prior_sample(self.prior, torch.Size(sample_shape))
 
     def sample_batched(
         self,
@@ -89,8 +93,7 @@ class PriorPosterior(NeuralPosterior):
         Options of other posteriors' samplers are accepted and ignored, as sbi's base
         class asks.
         """
-        shape = as_shape("sample_shape", sample_shape)
-        shape = torch.Size((*shape, _number_of_rows(x)))
+        shape = torch.Size((*sample_shape, len(as_batch("x", x, finite=False))))
         return prior_sample(self.prior, shape)
 
     def log_prob(
@@ -100,7 +103,7 @@ class PriorPosterior(NeuralPosterior):
         track_gradients: bool = False,  # noqa: FBT001, FBT002
     ) -> Tensor:
         r"""Return the log density, :math:`-\infty` outside the support, ``(n,)``."""
-        theta = check_theta(theta, self.prior.event_shape, batched=False)
+        theta = parameters_of(theta, self.prior.event_shape[0], batched=False)
         return self.potential_fn(
             torch.atleast_2d(theta), track_gradients=track_gradients
         )
@@ -125,8 +128,8 @@ class PriorPosterior(NeuralPosterior):
         Raises:
             InvalidInputError: If the shapes do not fit.
         """
-        theta = check_theta(theta, self.prior.event_shape, batched=True)
-        count = _number_of_rows(x)
+        theta = parameters_of(theta, self.prior.event_shape[0], batched=True)
+        count = len(as_batch("x", x, finite=False))
         if theta.shape[-2] not in (1, count):
             raise InvalidInputError(
                 f"Expected as many rows of `theta` as observations, {count}; got "
@@ -144,11 +147,8 @@ class PriorPosterior(NeuralPosterior):
         """
         if self._reason_without_map:
             raise InvalidInputError(
-                "Expected a prior that sbi can transform to an unbounded space, where "
-                f"`map()` searches; got {type(self.prior).__name__}, of which sbi's "
-                f"`mcmc_transform` says {self._reason_without_map}. Give the prior a "
-                "`support` that torch's `biject_to` knows, or a `mean` and a `stddev`; "
-                "or look for the mode among samples by their `log_prob`."
+                "Expected a prior that sbi can transform to an unbounded space; got "
+                f"{type(self.prior).__name__} ({self._reason_without_map})."
             )
         return super().map(*args, **kwargs)
 
@@ -162,26 +162,17 @@ class PriorPosterior(NeuralPosterior):
             overwrite: Whether to replace a file that exists.
 
         Raises:
-            InvalidInputError: If an argument has the wrong type.
-            InvalidInputError: If the posterior holds something that cannot be
-                described, such as a lambda.
-            NotWritableError: If the file exists, or cannot be written.
+            FileExistsError: If the file exists.
         """
         save(self, path, overwrite=overwrite)
 
     def to(self, device: str | torch.device) -> None:
         """Move the prior and the default x to a device."""
-        device = usable_device(device)
         self.potential_fn.to(device)
         default_x = self.default_x
         self.__init__(self.potential_fn.prior)
         if default_x is not None:
             self.set_default_x(default_x)
-
-
-def _number_of_rows(x: Any) -> int:
-    x = as_numbers("x", x)
-    return len(as_batch("x", x, x.shape[1:], finite=False))
 
 
 class _PriorPotential(BasePotential):

@@ -17,7 +17,6 @@ __all__ = [
     "MIN_PROPOSALS",
     "Accept",
     "BlockSampler",
-    "check_time",
     "deadline_after",
 ]
 
@@ -116,7 +115,11 @@ class BlockSampler:
         still_open = torch.ones(len(slots), dtype=torch.bool, device=slots.device)
         rate = 1.0
         while (open_slots := still_open.nonzero().flatten()).numel():
-            check_time(self.deadline, len(open_slots), len(slots))
+            if time.monotonic() > self.deadline:
+                raise SamplingError(
+                    "Sampling took longer than `max_sampling_time`: "
+                    f"{len(open_slots)} of {len(slots)} draws are missing."
+                )
             proposals = open_slots.repeat_interleave(_repeats(len(open_slots), rate))
             rows = slots[proposals]
             draws = self._propose(rows)
@@ -156,29 +159,10 @@ class BlockSampler:
             numbers = (hopeless.nonzero().flatten()[:5] + self.first_row).tolist()
             raise SamplingError(
                 f"Less than one in {int(1 / MIN_ACCEPTANCE)} draws lies inside the "
-                f"support of the prior for the observations in rows {numbers} of `x`: "
-                "the densities in the mixture have nearly all of their mass outside. "
-                "Leave these observations out (`leakage(x).mass` has the mass inside "
-                "for each of a batch), or train NPE longer or with "
-                "z_score_theta='transform_to_unconstrained', or pass "
+                f"support of the prior for rows {numbers} of `x`. Leave these "
+                "observations out, train NPE longer, or pass "
                 "reject_outside_prior=False."
             )
-
-
-def check_time(deadline: float, missing: int, total: int) -> None:
-    """Raise if draws are missing, and it is too late to go on.
-
-    Args:
-        deadline: In seconds of ``time.monotonic()``.
-        missing: The number of draws that are missing.
-        total: The number of draws that were asked for.
-    """
-    if missing and time.monotonic() > deadline:
-        raise SamplingError(
-            f"Sampling took longer than `max_sampling_time`: {missing} of {total} "
-            "draws that were made together are missing. Give it more time, ask for "
-            "fewer draws, or pass reject_outside_prior=False."
-        )
 
 
 def deadline_after(seconds: float | None) -> float:

@@ -14,7 +14,6 @@ from sbi_rope.mixture.sampling import (
     MIN_ACCEPTANCE,
     MIN_PROPOSALS,
     Accept,
-    check_time,
     deadline_after,
 )
 from sbi_rope.mixture.truncation import LEAKAGE_DRAWS, Leakage
@@ -102,7 +101,7 @@ class RecalibratedEstimator(MixtureEstimator):
             InvalidInputError: As in :meth:`MixtureEstimator.log_prob`.
             UnseenObservationError: As in :meth:`MixtureEstimator.log_prob`.
         """
-        theta, x = self._checked_theta(input), self.checked_x(condition)
+        theta, x = self._as_samples(input), self.checked_x(condition)
         if not theta.numel():
             return self.log_prob_before(theta, x)
         inside = self._inside(theta)
@@ -175,7 +174,6 @@ class RecalibratedEstimator(MixtureEstimator):
         proposed = torch.full_like(missing, len(theta))
         accepted = proposed - missing
         while missing.any():
-            check_time(deadline, int(missing.sum()), outside.numel())
             rows = missing.nonzero().flatten()
             share = (accepted / proposed)[rows]
             hopeless = (proposed[rows] >= MIN_PROPOSALS) & (share < MIN_ACCEPTANCE)

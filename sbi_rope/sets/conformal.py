@@ -68,15 +68,13 @@ def check_enough(level: float, n: int) -> None:
     if level < LOWEST_LEVEL:
         raise InvalidInputError(
             f"Expected `level` of at least {LOWEST_LEVEL} for a set with a guarantee; "
-            f"got {level:g}. Pass guaranteed=False for smaller sets."
+            f"got {level:g}."
         )
     if rank_needed(level, n) > n:
         fewest = math.ceil(round(level / (1 - level), DIGITS))
         raise InvalidInputError(
-            f"Expected `level` of at most n / (n + 1) = {n / (n + 1):.3g} for a set "
-            f"with a guarantee, because there are n = {n} calibration pairs with exact "
-            f"labels of different parameters (or groups); got {level:g}. Ask for a "
-            f"smaller level, or add pairs: this level needs {fewest}."
+            f"Expected `level` of at most {n / (n + 1):.3g} with {n} exact labels of "
+            f"different groups; got {level:g}, which needs {fewest} labels."
         )
 
 

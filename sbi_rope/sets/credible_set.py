@@ -1,14 +1,12 @@
 """A set of parameters that are credible given one observation."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import KnownColumns, check_tables
 from sbi_rope.sets.conformal import DIGITS
 from sbi_rope.sets.guarantee import Guarantee
 from sbi_rope.tensors import as_batch, as_numbers
@@ -44,7 +42,6 @@ class CredibleSet:
         draws: The parameters that the volume was estimated from, shape ``(m, d)``.
         inside: Which of the draws are in the set, shape ``(m,)``.
         rule: What tells which parameters are in the set.
-        columns: The names of columns of tables of "theta" in orders that are known.
     """
 
     level: float
@@ -55,7 +52,6 @@ class CredibleSet:
     draws: Tensor = field(repr=False)
     inside: Tensor = field(repr=False)
     rule: Rule = field(repr=False)
-    columns: Mapping[str, KnownColumns] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(
@@ -107,16 +103,12 @@ class CredibleSet:
             Shape ``(*batch)``, bool.
 
         Raises:
-            InvalidInputError: If theta holds no numbers.
-            InvalidInputError: If theta has another number of parameters, or is not
-                finite.
+            InvalidInputError: If theta has another shape, or is not finite.
         """
-        check_tables(self, theta=theta)
-        theta = as_numbers("theta", theta, device=self.draws.device)
+        theta = as_numbers("theta", theta)
         shape = theta.shape[:-1]
-        width = self.draws.shape[1:]
         rows = theta[None] if theta.ndim < 2 else theta.flatten(0, -2)
-        rows = as_batch("theta", rows, width).detach().to(self.draws)
+        rows = as_batch("theta", rows, self.draws.shape[1:]).to(self.draws)
         return self.rule.contains(rows).reshape(shape)
 
     def __str__(self) -> str:

@@ -1,17 +1,16 @@
 """An interval for each parameter given one observation, or given each of a batch."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import KnownColumns, check_names, check_tables
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.sets.guarantee import Guarantee
-from sbi_rope.settings import default_names
+from sbi_rope.settings import default_names, names_of
 from sbi_rope.tensors import as_batch, as_numbers
 
 __all__ = ["CredibleIntervals", "central_intervals"]
@@ -35,7 +34,6 @@ class CredibleIntervals:
         level: The level of each interval.
         guarantee: The guarantee of each interval; None if there is none.
         parameter_names: One name for each parameter; None if they have none.
-        columns: The names of columns of tables of "theta" in orders that are known.
     """
 
     low: Tensor = field(repr=False)
@@ -43,7 +41,6 @@ class CredibleIntervals:
     level: float
     guarantee: Guarantee | None
     parameter_names: tuple[str, ...] | None = None
-    columns: Mapping[str, KnownColumns] = field(default_factory=dict, repr=False)
 
     @classmethod
     def joined(cls, parts: "Sequence[CredibleIntervals]") -> "CredibleIntervals":
@@ -67,8 +64,7 @@ class CredibleIntervals:
         """
         if not self._is_batch:
             raise InvalidInputError(
-                "Expected intervals of a batch, as `credible_intervals_batched` makes "
-                "them; got those of one observation. Their ends are `low` and `high`."
+                "Expected intervals of a batch; got those of one observation."
             )
         return replace(self, low=self.low[index], high=self.high[index])
 
@@ -87,17 +83,15 @@ class CredibleIntervals:
             The shape of ``theta``, bool.
 
         Raises:
-            InvalidInputError: If theta holds no numbers.
             InvalidInputError: If the shape does not fit, or a number is not finite.
         """
         event = self.low.shape
-        check_tables(self, theta=theta)
-        theta = as_numbers("theta", theta, device=self.low.device)
+        theta = as_numbers("theta", theta, names=self.parameter_names)
         shape = theta.shape
         rows = theta[None] if theta.ndim == len(event) else theta
         if rows.ndim > len(event):
             rows = rows.flatten(0, rows.ndim - 1 - len(event))
-        rows = as_batch("theta", rows, event).detach().to(self.low)
+        rows = as_batch("theta", rows, event).to(self.low)
         return ((self.low <= rows) & (rows <= self.high)).reshape(shape)
 
     def as_rows(
@@ -117,7 +111,7 @@ class CredibleIntervals:
         count = self.low.shape[-1]
         names = self.parameter_names or default_names(count)
         if parameter_names is not None:
-            names = tuple(check_names("parameter_names", parameter_names, count))
+            names = names_of(parameter_names, count)
         if self._is_batch:
             return [
                 {"observation": number, **row}

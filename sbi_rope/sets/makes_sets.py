@@ -2,10 +2,8 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from types import MappingProxyType
 from typing import Annotated, Any
 
 from torch import Tensor
@@ -13,7 +11,6 @@ from torch.distributions import Distribution
 
 from sbi_rope._random import seeded
 from sbi_rope._units import log_unit_of
-from sbi_rope._validation import KnownColumns
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.sets.conformal import DIGITS
 from sbi_rope.sets.credible_set import CredibleSet, highest_density_set
@@ -36,8 +33,8 @@ class MakesSets(ABC):
     prior: Distribution
     # One name for each parameter, where they have names.
     parameter_names: tuple[str, ...] | None = None
-    # The names of columns of "theta" and "x" in the orders of tables that were used.
-    columns: Mapping[str, KnownColumns] = MappingProxyType({})
+    # The names of the columns of tables of x, which are put in this order.
+    x_names: tuple[str, ...] | None = None
 
     def credible_set(
         self,
@@ -71,25 +68,23 @@ class MakesSets(ABC):
             The set, which tells its volume and which parameters it contains.
 
         Raises:
-            InvalidInputError: If an argument is outside its range. With ``guaranteed``,
-                also if this is no stack, or if it has too few pairs for the level.
-            UnseenObservationError: If x is not in the batch and ``unseen="raise"``.
+            InvalidInputError: If an argument is outside its range, or x is not in the
+                batch and ``unseen="raise"``. With ``guaranteed``, also if this is no
+                stack, or if it has too few pairs for the level.
             SamplingError: If hardly any mass lies inside the prior's support.
         """
         _check(level, guaranteed=guaranteed, num_samples=num_samples, num_ends=1)
         with seeded(seed):
             x = self._one_x(x)
             if guaranteed:
-                found = self._held_out_sets().credible_set(level, x, num_samples)
-            else:
-                found = highest_density_set(
-                    self,
-                    x,
-                    level=level,
-                    num_samples=num_samples,
-                    log_unit=log_unit_of(self.prior),
-                )
-        return replace(found, columns=self.columns)
+                return self._held_out_sets().credible_set(level, x, num_samples)
+            return highest_density_set(
+                self,
+                x,
+                level=level,
+                num_samples=num_samples,
+                log_unit=log_unit_of(self.prior),
+            )
 
     def credible_intervals(
         self,
@@ -119,7 +114,6 @@ class MakesSets(ABC):
 
         Raises:
             InvalidInputError: As in :meth:`credible_set`.
-            UnseenObservationError: As in :meth:`credible_set`.
             SamplingError: As in :meth:`credible_set`.
         """
         intervals = self.credible_intervals_batched(
@@ -154,7 +148,6 @@ class MakesSets(ABC):
 
         Raises:
             InvalidInputError: As in :meth:`credible_set`.
-            UnseenObservationError: As in :meth:`credible_set`.
             SamplingError: As in :meth:`credible_set`.
         """
         _check(level, guaranteed=guaranteed, num_samples=num_samples, num_ends=2)
@@ -164,16 +157,13 @@ class MakesSets(ABC):
                 make = self._held_out_sets().credible_intervals
             blocks = self._batch_of_x(x).split(max(1, MAX_DRAWS // num_samples))
             found = CredibleIntervals.joined([make(level, block) for block in blocks])
-        return replace(
-            found, parameter_names=self.parameter_names, columns=self.columns
-        )
+        return replace(found, parameter_names=self.parameter_names)
 
     def _held_out_sets(self) -> Any:
         """Return what makes sets with a guarantee. Only a stack has it."""
         raise InvalidInputError(
-            "Expected a stack for a set with a guarantee, because only a stack has "
-            f"scores on held-out calibration pairs; got {type(self).__name__}. Make "
-            "one with `stack(rope)`, or pass guaranteed=False."
+            "Expected a stack for a set with a guarantee; got "
+            f"{type(self).__name__}. Make one with `stack(rope)`."
         )
 
     @abstractmethod

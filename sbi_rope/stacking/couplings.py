@@ -14,7 +14,7 @@ from sbi_rope.batch import parameters_named
 from sbi_rope.coupling import Coupling
 from sbi_rope.coupling.coupler import without_warning_of_small_batch
 from sbi_rope.errors import CouplingError
-from sbi_rope.mixture import CoupledEmbeddings, CoupledNet, Part
+from sbi_rope.mixture import CoupledEmbeddings, Part
 from sbi_rope.mixture.chunks import flow_batch
 from sbi_rope.mixture.density import without_nan
 from sbi_rope.rope import MIN_SIMULATIONS, RoPE

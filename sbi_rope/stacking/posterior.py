@@ -12,7 +12,6 @@ from sbi_rope._sbi import describe
 from sbi_rope._validation import check_tables
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture import MixturePosterior
-from sbi_rope.mixture.sharing import share_equal_tensors
 from sbi_rope.stacking.guaranteed import HeldOutSets
 from sbi_rope.stacking.recalibrating import recalibrated
 from sbi_rope.stacking.report import StackingReport
@@ -64,7 +63,6 @@ class StackedPosterior(MixturePosterior):
         estimator = recalibrated(
             versions.estimator(weights), report.recalibration, prior
         )
-        share_equal_tensors(estimator)
         if versions.couplings is not None:
             # The same object as in the estimator, so that both move to a device
             # together.

@@ -154,7 +154,6 @@ def _stack_scores(
             versions.estimator(weights[number], [number]),
             bench.npe.prior,
             enable_transform=False,
-            shared=shared,
             warns=False,
         )
         if of_labels is None:

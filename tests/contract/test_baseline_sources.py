@@ -138,19 +138,3 @@ def test_a_posterior_trained_beforehand_fixes_the_shape_of_x() -> None:
         longer = torch.cat([data.x, data.x], dim=-1)
         with pytest.raises(InvalidInputError, match=r"`x` of shape"):
             method.append_simulations(data.theta, longer)
-
-
-def test_simulations_that_are_not_needed_earn_a_warning() -> None:
-    of_use = {name for name in BUILDERS if METHODS[name].kind is DiscrepancyNPE}
-    of_use |= {"nnpe", "rnpe", "rvnp", "rvnp_offset"}
-    # These look simulations up, because they have no simulator here.
-    of_use |= {name for name in BUILDERS if name.startswith(("fmcpe", "frisbi"))}
-    of_use |= {"tuning_only"}
-    for name in BUILDERS:
-        data = data_of(first_task(name))
-        method = given(name, result("npe", first_task(name)))
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            method.append_simulations(data.theta, data.x)
-        warned = any("makes no use of simulations" in str(w.message) for w in caught)
-        assert warned is (name not in of_use), name

@@ -85,13 +85,13 @@ def test_what_cannot_be_averaged_is_refused() -> None:
     member = problems.gaussian_posterior()
     with pytest.raises(InvalidInputError, match="at least one"):
         average([])
-    with pytest.raises(InvalidInputError, match="a list of posteriors"):
+    with pytest.raises(InvalidInputError, match="`posteriors`"):
         average(ensemble())  # type: ignore[arg-type]
     with pytest.raises(UnsupportedPosteriorError, match="got NoneType"):
         average([member, None])
     with pytest.raises(UnsupportedPosteriorError, match="density"):
         average([problems.vector_field_posterior("fmpe")])
-    with pytest.raises(InvalidInputError, match="`weights` to be 1 numbers"):
+    with pytest.raises(InvalidInputError, match="`weights`"):
         average([member], weights=[0.5, 0.5])
     with pytest.raises(InvalidInputError, match="same `x_o`"):
         average([member, problems.gaussian_posterior()])
@@ -113,23 +113,20 @@ def test_posteriors_with_other_priors_are_not_averaged() -> None:
     same = copy.deepcopy(narrow)
     assert average([narrow, same]).prior is not narrow.prior
     for members in ([narrow, wide], [wide, narrow]):
-        with pytest.raises(
-            InvalidInputError, match=r"another prior in posteriors\[1\]"
-        ):
+        with pytest.raises(InvalidInputError, match=r"posteriors\[1\]"):
             average(members)
 
 
-def test_an_average_knows_names_and_orders_of_columns_that_its_members_know() -> None:
+def test_an_average_knows_the_names_that_its_members_know() -> None:
     first, second = single(problems.box(2)), single(problems.box(2))
-    first.columns = {"x": {("u", "v", "w"): "the pairs"}}
+    first.x_names = second.x_names = ("u", "v", "w")
     first.parameter_names = second.parameter_names = ("a", "b")
     posterior = average([first, second])
-    table = pd.DataFrame(torch.zeros(1, 3).numpy(), columns=["v", "u", "w"])
-    with pytest.raises(InvalidInputError, match="in the order of the pairs"):
-        posterior.sample((1,), x=table)
+    table = pd.DataFrame([[0.0, 1.0, 2.0]], columns=["v", "u", "w"])
+    theta, x = torch.zeros(1, 2), torch.tensor([[1.0, 0.0, 2.0]])
+    found = posterior.log_prob(theta, x=table)
+    assert torch.equal(found, posterior.log_prob(theta, x=x))
+    assert not torch.equal(found, posterior.log_prob(theta, x=x[:, [1, 0, 2]]))
     assert posterior.parameter_names == ("a", "b")
     second.parameter_names = ("b", "a")
     assert average([first, second]).parameter_names is None
-    second.columns = {"x": {("v", "u", "w"): "the pairs"}}
-    with pytest.raises(InvalidInputError, match="columns of `x` in one order"):
-        average([first, second])

@@ -244,8 +244,8 @@ def test_bad_arguments_are_refused() -> None:
     gap = estimates.where(torch.arange(2) == 0, torch.nan)
     assert_refused("level", coverage_by_estimate, ranks, estimates, level=1.0)
     assert_refused("estimates", coverage_by_estimate, ranks, gap)
-    assert_refused("ranks", coverage_by_estimate, ranks[:, :1], estimates)
-    assert_refused("ranks", coverage_by_estimate, ranks[:10], estimates)
+    assert_refused("estimates", coverage_by_estimate, ranks[:, :1], estimates)
+    assert_refused("estimates", coverage_by_estimate, ranks[:10], estimates)
     assert_refused("ranks", coverage_by_estimate, ranks + 1, estimates)
     assert_refused(
         "ranks", coverage_by_estimate, "ranks", estimates, error=InvalidInputError

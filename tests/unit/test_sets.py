@@ -12,20 +12,19 @@ import torch
 from scipy.stats import chi2
 from torch import Tensor
 
-from sbi_rope import MixturePosterior, StackedPosterior, load
+from sbi_rope import MixturePosterior, StackedPosterior
 from sbi_rope._bounds import bounds_of
 from sbi_rope._random import seeded
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.metrics import coverage_curve_of
 from sbi_rope.mixture import MixtureEstimator, part_of
-from sbi_rope.sets import CredibleIntervals, Guarantee
+from sbi_rope.sets import Guarantee
 from sbi_rope.sets.conformal import (
     interval_of,
     is_held,
     joint_scores,
     marginal_ends,
     marginal_scores,
-    rank_needed,
 )
 from sbi_rope.stacking import StackingReport
 from sbi_rope.stacking.cross_validation import fold_weights
@@ -123,40 +122,6 @@ def test_intervals_of_a_batch_are_those_of_each_observation() -> None:
         found.contains(middle[0])
 
 
-def test_intervals_of_a_batch_say_which_observation_they_are_of() -> None:
-    x = X * torch.linspace(-1, 1, 30)[:, None]
-    found = exact().credible_intervals_batched(0.9, x, num_samples=20, seed=0)
-    assert len(list(found)) == 30
-    rows = found.as_rows(["a", "b"])
-    assert [row["observation"] for row in rows[:3]] == [0, 0, 1]
-    assert [row["parameter"] for row in rows[:3]] == ["a", "b", "a"]
-    assert rows[-1]["high"] == pytest.approx(float(found.high[-1, 1]))
-    assert "observation 9, theta_2:" in str(found)
-    assert "20 more observations" in str(found)
-    assert "observation" not in str(found[0])
-    with pytest.raises(InvalidInputError, match="intervals of a batch"):
-        found[0][0]
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "text"),
-    [
-        (-0.12345, 1.2345, "-0.1235 to 1.234"),
-        (2021.8249, 2022.6149, "2021.82 to 2022.61"),
-        (101325.24, 101331.93, "101325.2 to 101331.9"),
-        (1.5e-9, 1.52e-9, "1.5e-09 to 1.52e-09"),
-        (2.0, 2.0, "2 to 2"),
-        (-math.inf, 3.0, "-inf to 3"),
-    ],
-)
-def test_printed_ends_show_how_wide_an_interval_is(
-    low: float, high: float, text: str
-) -> None:
-    ends = torch.tensor([[low], [high]], dtype=torch.double)
-    found = CredibleIntervals(low=ends[0], high=ends[1], level=0.9, guarantee=None)
-    assert f"theta_1: {text}\n" in str(found)
-
-
 def test_the_default_x_and_the_seed_are_used() -> None:
     posterior = exact().set_default_x(X)
     one, same = posterior.credible_set(seed=3), posterior.credible_set(0.9, X, seed=3)
@@ -190,15 +155,6 @@ def test_contains_keeps_the_shape_of_a_batch() -> None:
     no_numbers: Any = "x"
     with pytest.raises(InvalidInputError, match="theta"):
         found.contains(no_numbers)
-
-
-def test_a_set_of_a_batch_is_that_of_one_observation() -> None:
-    posterior = problems.gaussian_posterior()
-    one = posterior[2].credible_set(0.8, seed=0)
-    same = posterior.credible_set(0.8, posterior.x_o[2], seed=0)
-    assert one.volume == pytest.approx(same.volume)
-    with pytest.raises(InvalidInputError, match="one observation"):
-        posterior.credible_set(0.8, posterior.x_o)
 
 
 def test_bounds_are_those_of_each_part_of_a_prior() -> None:
@@ -286,13 +242,6 @@ def test_intervals_contain_the_set_of_counting_the_pairs() -> None:
         assert not (held & ~inside).any()
         # The interval is no larger than the hull of the set needs.
         assert inside.sum() <= held.sum() + 0.1 * len(theta)
-
-
-def test_the_rank_is_rounded_up_and_not_by_rounding_errors() -> None:
-    assert rank_needed(0.9, 9) == 9
-    assert rank_needed(1 - 0.1, 19) == 18
-    assert rank_needed(0.95, 19) == 19
-    assert rank_needed(0.9, 10) == 10
 
 
 # --- coverage ---
@@ -481,19 +430,19 @@ def test_a_level_that_the_pairs_cannot_give_is_refused(
     )
     for call in calls:
         call(0.95, x, guaranteed=True, num_samples=10)
-        with pytest.raises(InvalidInputError, match=r"n / \(n \+ 1\) = 0\.952.*99"):
+        with pytest.raises(InvalidInputError, match=r"0\.952.*99"):
             call(0.99, x, guaranteed=True)
         with pytest.raises(InvalidInputError, match=r"at least 0\.5"):
             call(0.4, x, guaranteed=True)
         for level in (0.0, 1.0, -0.1, 90):
-            with pytest.raises(InvalidInputError, match="above 0 and below 1"):
+            with pytest.raises(InvalidInputError, match="`level`"):
                 call(level, x)
 
 
 def test_only_a_stack_gives_a_guarantee(x: Tensor) -> None:
     with pytest.raises(InvalidInputError, match=r"stack\(rope\)"):
         exact().credible_set(0.9, X, guaranteed=True)
-    with pytest.raises(InvalidInputError, match="held-out"):
+    with pytest.raises(InvalidInputError, match="stack"):
         problems.gaussian_posterior()[0].credible_intervals(guaranteed=True)
 
 
@@ -542,23 +491,8 @@ def test_of_pairs_with_the_same_parameters_one_counts(x: Tensor) -> None:
     found = posterior.credible_set(0.9, x, guaranteed=True, seed=0)
     assert found.guarantee is not None
     assert found.guarantee.num_pairs == 12
-    with pytest.raises(InvalidInputError, match="n = 12 calibration pairs"):
+    with pytest.raises(InvalidInputError, match="12 exact labels"):
         posterior.credible_set(0.95, x, guaranteed=True)
-
-
-@pytest.mark.medium
-def test_a_saved_stack_gives_the_same_sets(
-    stack: StackedPosterior, x: Tensor, tmp_path: Any
-) -> None:
-    stack.save(tmp_path / "stack.pt")
-    for again in (load(tmp_path / "stack.pt"), pickle.loads(pickle.dumps(stack))):
-        assert isinstance(again, StackedPosterior)
-        one, other = (
-            posterior.credible_set(0.9, x, guaranteed=True, seed=0)
-            for posterior in (stack, again)
-        )
-        assert one.volume == other.volume
-        assert torch.equal(one.inside, other.inside)
 
 
 @pytest.mark.medium

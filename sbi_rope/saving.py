@@ -1,0 +1,259 @@
+"""Posteriors in files that are loaded without running code from the file.
+
+Torch reads the file with ``weights_only=True``, which allows only what is listed:
+classes that derive from one of our bases and are defined in one of a few packages, and
+a few functions of tensors. None of these imports by name, evaluates text, opens a file
+or unpickles, as for example some networks of ``torch`` do.
+
+Torch calls what is listed with arguments of the file. A class is therefore replaced by
+a shell, which makes empty objects and has no constructor. Only distributions and
+transforms are listed themselves, because zuko calls them.
+"""
+
+import functools
+import importlib
+import pickle
+from collections.abc import Sequence
+from dataclasses import is_dataclass
+from pathlib import Path
+from types import FunctionType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import sbi
+import torch
+from torch import Tensor, nn
+from torch.distributions import Distribution, Transform
+from torch.distributions.constraints import Constraint
+from torch.serialization import get_unsafe_globals_in_checkpoint, safe_globals
+
+from sbi_rope._files import write_atomically
+from sbi_rope._sbi import (
+    BasePotential,
+    DirectPosterior,
+    NeuralPosterior,
+    VectorFieldPosterior,
+)
+from sbi_rope.errors import DataNotFoundError, FileFormatError
+from sbi_rope.settings import check
+
+__all__ = ["load", "save"]
+
+LAWS = (Distribution, Transform)
+# Other posteriors of sbi run more code when they are loaded.
+BASES = (
+    *(nn.Module, *LAWS, Constraint),
+    *(DirectPosterior, VectorFieldPosterior, BasePotential),
+)
+ROOMS = (
+    *("torch.nn.modules.", "torch.distributions.", "zuko."),
+    *("nflows.distributions.", "nflows.flows.", "nflows.nn.", "nflows.transforms."),
+    *("sbi.inference.posteriors.", "sbi.inference.potentials.", "sbi.neural_nets."),
+    *("sbi.samplers.ode_solvers.", "sbi.utils.", "sbi_rope."),
+)
+# Functions of zuko that make transforms, and a class of nflows that holds tensors.
+OTHERS = (
+    "zuko.flows.polynomial.ShiftedSOSPTransform",
+    "zuko.flows.spline.CircularRQSTransform",
+    "nflows.transforms.linear.LinearCache",
+)
+ACTIVATIONS = (
+    *("celu", "elu", "hardswish", "hardtanh", "leaky_relu", "mish", "relu", "relu6"),
+    *("selu", "silu", "softmax", "softsign", "tanhshrink"),
+)
+# Pickle finds these as attributes: functions of torch, and methods of vector fields.
+OF_TORCH = ("exp", "relu", "selu", "sigmoid", "sin", "tanh")
+METHODS = (
+    *("ode_fn", "_f_condition_last", "_identity_weight_fn"),
+    *("_max_likelihood_weight_fn", "_variance_weight_fn"),
+)
+
+
+def save(posterior: Any, path: str | Path, *, overwrite: bool = False) -> None:
+    """Write a posterior to a file that :func:`load` reads.
+
+    The file is written completely or not at all.
+
+    Args:
+        posterior: A posterior of this package, or a ``DirectPosterior`` or
+            ``VectorFieldPosterior`` of sbi, which several trainers return.
+        path: The file. Its folder is made if there is none.
+        overwrite: Whether to replace a file that exists.
+
+    Raises:
+        InvalidInputError: If it is no posterior.
+        FileExistsError: If the file exists.
+
+    Example:
+        >>> import tempfile, torch
+        >>> from sbi.utils import BoxUniform
+        >>> from sbi_rope.mixture import PriorPosterior
+        >>> posterior = PriorPosterior(BoxUniform(torch.zeros(2), torch.ones(2)))
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     save(posterior, f"{folder}/posterior.pt")
+        ...     again = load(f"{folder}/posterior.pt")
+        >>> again.sample((5,)).shape
+        torch.Size([5, 2])
+    """
+    check("posterior", posterior, NeuralPosterior)
+    path = Path(path).expanduser()
+    if path.exists() and not overwrite:
+        raise FileExistsError(f"{path} exists. Pass overwrite=True to replace it.")
+    content = {"versions": _versions(), "posterior": posterior}
+    pickler = SimpleNamespace(__name__="pickle", Pickler=_Pickler)
+    with write_atomically(path) as temporary:
+        torch.save(content, temporary, pickle_module=pickler)
+
+
+def load(path: str | Path, *, trusted: Sequence[Any] = ()) -> Any:
+    """Read a posterior that was saved, without running code from the file.
+
+    A file may hold networks, distributions and transforms of torch, nflows, zuko and
+    sbi, and classes of this package. All others have to be named. The posterior is on
+    the CPU, wherever it was when it was saved; ``posterior.to("cuda")`` moves it.
+
+    Args:
+        path: The file.
+        trusted: Your own classes and functions that the posterior needs, such as the
+            class of an embedding net or prior. Their code may run.
+
+    Returns:
+        The posterior. Samples with a seed and densities are those of the posterior that
+        was saved.
+
+    Raises:
+        DataNotFoundError: If there is no such file.
+        FileFormatError: If it is not a file of :func:`save`, is damaged, was written by
+            other versions of the packages, or needs a class that is not trusted.
+    """
+    path = Path(path).expanduser()
+    if not path.is_file():
+        raise DataNotFoundError(f"Expected a file at {path}; got none.")
+    for one in trusted:
+        check("trusted", one, type | FunctionType)
+    # What was defined in a notebook or script may have moved to a module since.
+    known = {f"__main__.{one.__qualname__}": one for one in trusted}
+    known |= {f"{one.__module__}.{one.__qualname__}": one for one in trusted}
+    made: list[tuple[Any, type]] = []
+    try:
+        needed = {
+            name: known[name] if name in known else _found(name)
+            for name in get_unsafe_globals_in_checkpoint(path)
+        }
+        if unknown := sorted(name for name in needed if needed[name] is None):
+            names = ", ".join(name.rpartition(".")[2] for name in unknown)
+            raise FileFormatError(
+                f"{path} needs {', '.join(unknown)}, which could run anything. If you "
+                f"trust its author, import it and pass `trusted=[{names}]`."
+            )
+        allowed: list[Any] = [
+            (value if name in known else _shell(value, made), name)
+            for name, value in needed.items()
+        ]
+        with safe_globals(allowed):
+            content = torch.load(path, map_location="cpu", weights_only=True)
+        for instance, kind in made:
+            object.__setattr__(instance, "__class__", kind)
+        posterior, versions = content["posterior"], content["versions"]
+        assert isinstance(posterior, NeuralPosterior)
+    except FileFormatError:
+        raise
+    except Exception as error:  # a damaged file may lead to any
+        raise FileFormatError(
+            f"Expected a whole file of `save`; {path} is none or is damaged "
+            f"({type(error).__name__}). No code in it was run."
+        ) from error
+    if versions != _versions():
+        raise FileFormatError(
+            f"Expected a file of {_versions()}; {path} is of {versions}. Install these "
+            "versions, or build the posterior and save it again."
+        )
+    if torch.device(posterior._device).type != "cpu":
+        posterior.to("cpu")  # type: ignore[attr-defined]
+    return posterior
+
+
+class _Pickler(pickle.Pickler):
+    """Writes what NumPy holds as tensors, because its own pickles name functions."""
+
+    def reducer_override(self, obj: Any) -> Any:
+        if isinstance(obj, np.ndarray | np.number | np.bool_):
+            return _from_tensor, (torch.as_tensor(obj),)
+        return NotImplemented
+
+
+def _from_tensor(value: Tensor) -> Any:
+    return value.numpy()[()]
+
+
+def _attribute(owner: Any, name: str) -> Any:
+    """Stand for ``getattr``, which would find any attribute."""
+    if owner == "torch" and name in OF_TORCH:
+        return getattr(torch, name)
+    if isinstance(owner, nn.Module) and name in METHODS:
+        return getattr(owner, name)
+    raise FileFormatError(f"A file must not ask for the attribute {name!r}.")
+
+
+LISTED = {
+    **{f"torch.nn.functional.{k}": getattr(nn.functional, k) for k in ACTIVATIONS},
+    "torch._C._nn.gelu": nn.functional.gelu,
+    "torch._C._nn.log_sigmoid": nn.functional.logsigmoid,
+    "torch._C._nn.softplus": nn.functional.softplus,
+    "torch._C._VariableFunctionsClass": "torch",
+    "functools.partial": functools.partial,
+    "builtins.range": range,
+    "builtins.getattr": _attribute,
+    f"{__name__}._from_tensor": _from_tensor,
+}
+
+
+def _found(name: str) -> Any:
+    """Return what a file may name without being trusted; None if it is not known."""
+    if name in LISTED or not name.startswith(ROOMS):
+        return LISTED.get(name)
+    module, _, attribute = name.rpartition(".")
+    try:
+        found = getattr(importlib.import_module(module), attribute, None)
+    except ImportError:
+        return None
+    if getattr(found, "__module__", None) != module:
+        return None  # a module may use what is harmful, but not define it
+    if name in OTHERS:
+        return found
+    ours = name.startswith("sbi_rope.")
+    # Some dataclasses of the tasks run programs.
+    is_result = is_dataclass(found) and (
+        not name.startswith("sbi_rope.tasks.") or ".prior_table." in name
+    )
+    bases = (*BASES, NeuralPosterior) if ours else BASES
+    is_known = isinstance(found, type) and issubclass(found, bases)
+    return found if is_known or (ours and is_result) else None
+
+
+def _shell(kind: Any, made: list[tuple[Any, type]]) -> Any:
+    """Return a class whose objects are empty, to become objects of another class.
+
+    Args:
+        kind: The other class. Its constructor is not called. Functions, and classes
+            that zuko calls, are returned as they are.
+        made: Where objects are kept, with the class that they shall have.
+    """
+    if not isinstance(kind, type) or kind in LISTED.values():
+        return kind
+    if issubclass(kind, LAWS) and kind.__module__.startswith(("torch.", "zuko.")):
+        return kind
+
+    def new(shell: type) -> Any:
+        made.append((object.__new__(shell), kind))
+        return made[-1][0]
+
+    members = {"__slots__": (), "__new__": new, "__init__": lambda _: None}
+    return type.__call__(type(kind), kind.__name__, (kind,), members)
+
+
+def _versions() -> dict[str, str]:
+    """Return the versions whose classes have the same attributes."""
+    ours = importlib.import_module("sbi_rope").__version__
+    versions = {"sbi": sbi.__version__, "sbi_rope": ours}
+    return {name: ".".join(v.split(".")[:2]) for name, v in versions.items()}
