@@ -168,7 +168,7 @@ def load(path: str | Path, *, trusted: Sequence[Any] = ()) -> Any:
             f"Expected a file of {_versions()}; {path} is of {versions}. Install these "
             "versions, or build the posterior and save it again."
         )
-    if torch.device(posterior._device).type != "cpu":
+    if torch.device(posterior.potential_fn.device).type != "cpu":
         posterior.to("cpu")  # type: ignore[attr-defined]
     return posterior
 

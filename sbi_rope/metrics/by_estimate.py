@@ -88,6 +88,8 @@ class CoverageByEstimate:
             return f"not tested, with fewer than {FEWEST} independent observations"
         return "\n".join(in_words(self, default_names(len(self.p_values))))
 
+    __repr__ = __str__  # which notebooks show
+
 
 def coverage_by_estimate(
     ranks: Tensor,

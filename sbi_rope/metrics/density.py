@@ -28,6 +28,8 @@ class LPPScore:
     def __str__(self) -> str:
         return f"{self.mean:.2f} +- {self.standard_error:.2f}"
 
+    __repr__ = __str__  # which notebooks show
+
     @property
     def mean(self) -> float:
         r"""The LPP. It is :math:`-\infty` if a single true parameter is excluded."""

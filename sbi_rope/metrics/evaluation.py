@@ -110,6 +110,8 @@ class Evaluation:
         ]
         return "\n".join(lines)
 
+    __repr__ = __str__  # which notebooks show
+
     def _verdict(self) -> str:
         value, (low, high) = f"ACAUC {self.acauc.value:+.3f}", self.acauc.interval
         if len(self.ranks) < FEWEST:

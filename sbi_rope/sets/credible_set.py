@@ -129,6 +129,8 @@ class CredibleSet:
             f"{self.volume_error:.1g}{unit}.\n{promise}"
         )
 
+    __repr__ = __str__  # which notebooks show
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class HighestDensity:

@@ -70,3 +70,5 @@ class Guarantee:
 
     def __str__(self) -> str:
         return self.says("it holds the true parameters")
+
+    __repr__ = __str__  # which notebooks show

@@ -144,6 +144,8 @@ class CredibleIntervals:
             [f"{100 * self.level:.4g} % intervals, one by one:", *lines, promise]
         )
 
+    __repr__ = __str__  # which notebooks show
+
 
 def _ends_in_words(low: float, high: float) -> str:
     """Return both ends, with digits enough to see how wide the interval is."""
