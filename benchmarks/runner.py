@@ -2,7 +2,6 @@
 
 import functools
 import itertools
-import os
 import subprocess
 import time
 import traceback
@@ -24,7 +23,6 @@ from benchmarks.machine import forget_peak, peak_memory
 from benchmarks.methods import METHODS
 from benchmarks.scoring import Failure, Score, scores
 from benchmarks.store import Workplace
-from sbi_rope._processes import end_with
 from sbi_rope.metrics import draw_samples
 
 __all__ = ["PACKAGES", "git_commit", "run_cells"]
@@ -113,13 +111,9 @@ def _parallel(
         calls: Functions, each with its arguments.
         bar: A progress bar that counts what the results hold.
     """
-    # Dask watches over its own workers, which may be on other machines.
-    watch = {"initializer": end_with, "initargs": (os.getpid(),)}
     results = []
     # The way that knows external backends, dask's among them.
-    with joblib.parallel_config(
-        backend=backend, n_jobs=jobs, **(watch if backend == "loky" else {})
-    ):
+    with joblib.parallel_config(backend=backend, n_jobs=jobs):
         run = joblib.Parallel(return_as="generator_unordered", batch_size=1)
         for result in run(joblib.delayed(call[0])(*call[1:]) for call in calls):
             results.append(result)

@@ -26,19 +26,18 @@ DEPENDENCIES = "import ot, numpy, torch, tqdm.auto, sbi.inference, sbi.utils"
 # layer do not know each other.
 LAYERS = [
     # They know nothing of inference: errors, means, results in notebooks and tables,
-    # progress, processes, slices.
+    # progress, slices.
     {
         "errors",
         "_means",
         "_notebooks",
         "_permutation",
         "_progress",
-        "_processes",
         "_slices",
         "_tables",
     },
-    # They raise errors: of seeds, of files and of functions that cannot be pickled.
-    {"_random", "_files", "_pickling"},
+    # They raise errors: of seeds and of files.
+    {"_random", "_files"},
     # Groups are held out at random, with a seed.
     {"_groups"},
     # They raise errors and warn: of arguments, and of a training that goes wrong. Units
@@ -55,14 +54,13 @@ LAYERS = [
         "metrics",
         "_focus",
         "_npe",
-        "_simulations",
         "_standardisation",
         "_two_sample",
         "sets",
+        "simulate",
     },
-    # A mixture has the couplings of a batch as weights. A simulator is a source of
-    # simulations like stored ones.
-    {"mixture", "_simulator"},
+    # A mixture has the couplings of a batch as weights.
+    {"mixture"},
     # A batch is coupled, and its couplings make a mixture. Trainers train networks, and
     # average them in a mixture. Tasks have simulators. Labels have a density under a
     # posterior and its prior. A mixture is recalibrated by its density.

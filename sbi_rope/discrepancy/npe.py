@@ -18,7 +18,6 @@ from sbi_rope._sbi import (
     headless,
     posterior_from,
 )
-from sbi_rope._simulations import Moments, SimulationSource
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._training import History
 from sbi_rope._validation import check_finite, check_names
@@ -41,6 +40,7 @@ from sbi_rope.errors import (
 from sbi_rope.finetuning import CalibrationFinetuner
 from sbi_rope.mixture import MixtureEstimator, MixturePosterior, OwnEmbeddings, Part
 from sbi_rope.settings import Count, Positive, Range, check
+from sbi_rope.simulate import Moments, SimulationSource
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
 from sbi_rope.trainers.training import EstimatorBuilder, Training

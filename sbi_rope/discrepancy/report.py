@@ -10,13 +10,13 @@ from torch import Tensor
 
 from sbi_rope._notebooks import shown_as_text
 from sbi_rope._progress import progress_bar
-from sbi_rope._simulations import Moments
 from sbi_rope._standardisation import Standardisation
 from sbi_rope._tables import as_dataframe
 from sbi_rope._validation import check_names
 from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.posterior import Discrepancy
 from sbi_rope.errors import InvalidInputError, shown
+from sbi_rope.simulate import Moments
 
 __all__ = [
     "DiscrepancyReport",

@@ -12,17 +12,15 @@ from torch.distributions import Distribution
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import copy_of_prior, device_of, embedding_of, estimator_of
-from sbi_rope._simulations import SimulationSource
-from sbi_rope._simulator import check_callable, source_of
 from sbi_rope._training import History
 from sbi_rope._validation import (
     check_default_dtype,
     check_prior,
-    check_simulated_columns,
     columns_of,
     usable_device,
 )
 from sbi_rope.errors import InvalidInputError, NotReadyError, warn_user
+from sbi_rope.simulate import SimulationSource, source_of
 from sbi_rope.trainers.data import Data, Kind
 from sbi_rope.trainers.starting_npe import StartingNPE
 
@@ -95,8 +93,6 @@ class Method(ABC):
             )
         self._data = Data(self._prior, self._device)
         self._npe = npe
-        if simulator is not None:
-            check_callable(simulator)
         self._simulator = simulator
         self._posterior: Any = None
         self._history: History | None = None
@@ -295,7 +291,7 @@ class Method(ABC):
         """Return the simulator, or the appended simulations where there is none."""
         event_shape = self._data.event_shape
         assert event_shape is not None
-        source = source_of(
+        return source_of(
             self._prior,
             simulator=self._simulator,
             simulations=self._looked_up,
@@ -303,9 +299,6 @@ class Method(ABC):
             like=torch.empty(0, *self._prior.event_shape, device=self._device),
             readable=self._data.readable,
         )
-        columns = self._data.columns
-        columns["x"] = check_simulated_columns(source.x_columns, columns["x"])
-        return source
 
     def _check_data(self) -> None:
         """Raise unless all data that is needed was appended."""

@@ -20,7 +20,6 @@ from sbi_rope._labels import (
     parameters_of,
     reference_of,
 )
-from sbi_rope._simulator import Simulator
 from sbi_rope.discrepancy import DiscrepancyModel, learn_parameters
 from sbi_rope.discrepancy.imputation import expected_means
 from sbi_rope.errors import (
@@ -29,6 +28,7 @@ from sbi_rope.errors import (
     SimulationError,
 )
 from sbi_rope.metrics import acauc_of, coverage_curve_of, expected_coverage_error_of
+from sbi_rope.simulate import Simulator
 from sbi_rope.stacking import stacking_weights
 from sbi_rope.stacking.label_scores import label_levels
 from sbi_rope.stacking.workbench import Workbench

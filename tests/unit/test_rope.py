@@ -1,7 +1,6 @@
 """RoPE: the order of its steps, what is used again, and what is refused."""
 
 import copy
-import io
 import itertools
 import pickle
 import sys
@@ -544,7 +543,7 @@ def test_stored_simulations_are_chosen_at_random() -> None:
     ]
     assert torch.equal(chosen[0], chosen[1])
     assert not torch.equal(chosen[0], chosen[2])
-    first = (gaussian.GAIN * conductor._source.x[:30]).double()
+    first = (gaussian.GAIN * conductor._source._made(progress=False)[1][:30]).double()
     assert not torch.allclose(chosen[0], first)
 
 
@@ -553,14 +552,6 @@ def test_trying_a_simulator_keeps_the_random_state_of_the_caller() -> None:
     state = torch.get_rng_state()
     RoPE(npe, simulator=gaussian.simulator)
     assert torch.equal(torch.get_rng_state(), state)
-
-
-def test_the_same_noise_in_a_whole_batch_is_warned_about() -> None:
-    with pytest.warns(RoPEWarning, match="the same noise"):
-        rope(simulator=lambda theta: theta + torch.randn(2))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        rope(simulator=lambda theta: 2 * theta)  # no noise at all is fine
 
 
 def test_moving_our_posterior_moves_nothing_else() -> None:
@@ -832,53 +823,3 @@ def test_a_trainer_is_refused_in_place_of_its_posterior() -> None:
         UnsupportedPosteriorError, match=r"call `\.train\(\)`, then pass"
     ):
         RoPE(NPE(gaussian.prior()), simulator=gaussian.simulator)
-
-
-# --- pickles ---
-
-
-def through_pickle(conductor: RoPE) -> RoPE:
-    return pickle.loads(pickle.dumps(conductor))
-
-
-def through_torch(conductor: RoPE) -> RoPE:
-    buffer = io.BytesIO()
-    torch.save(conductor, buffer)
-    buffer.seek(0)
-    return torch.load(buffer, weights_only=False)
-
-
-def through_joblib(conductor: RoPE) -> RoPE:
-    # What joblib pickles for its workers with; older versions have a copy of their own.
-    cloudpickle = pytest.importorskip("cloudpickle")
-    return pickle.loads(cloudpickle.dumps(conductor))
-
-
-@pytest.mark.medium
-@pytest.mark.parametrize(
-    "copied", [through_pickle, through_torch, through_joblib, copy.deepcopy]
-)
-def test_a_rope_of_a_lambda_can_be_pickled_and_simulates_as_before(
-    copied: Callable[[RoPE], RoPE],
-) -> None:
-    noise = gaussian.NOISE_STD
-    conductor = trained(simulator=lambda theta: theta + noise * torch.randn_like(theta))
-    expected = conductor.build_posterior(X_O, seed=3, num_simulations=100).weights
-    # A copy can be copied again.
-    for other in (copied(conductor), copied(copied(conductor))):
-        found = other.build_posterior(X_O, seed=3, num_simulations=100).weights
-        assert torch.equal(found, expected)
-
-
-def test_a_simulator_that_cannot_be_pickled_is_named_and_can_be_copied() -> None:
-    lock = threading.Lock()
-
-    def locked(theta: Tensor) -> Tensor:
-        with lock:
-            return gaussian.simulator(theta)
-
-    conductor = rope(simulator=locked)
-    with pytest.raises(InvalidInputError, match=r"locked refers to .*in a module"):
-        pickle.dumps(conductor)
-    # A copy in the same process needs no pickle, and calls the same function.
-    assert len(copy.deepcopy(conductor).build_posterior(X_O).x_o) == len(X_O)

@@ -15,13 +15,13 @@ from scipy.integrate import odeint
 from torch import Tensor
 
 from sbi_rope import CalibrationFinetuner, RoPE, parallel
-from sbi_rope._simulator import Simulator
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import (
     InvalidInputError,
     RoPEWarning,
     SimulationError,
 )
+from sbi_rope.simulate import Simulator
 from tests import gaussian, problems
 
 QUICK = CalibrationFinetuner(max_num_epochs=2)
