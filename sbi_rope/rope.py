@@ -103,10 +103,9 @@ class RoPE:
             :func:`~sbi_rope.parallel` calls it in several processes.
         simulations: Instead of a simulator, stored pairs (theta, x) with theta drawn
             from the prior. Fine-tuning then uses those with the nearest parameters.
-            A warning says if their parameters are not distributed like the prior.
-            There is a warning if there are fewer than 1000. If theta or x is a table
-            whose columns have names, a later table with the same names in another order
-            is refused.
+            A warning says if their parameters are not distributed like the prior. If
+            theta or x is a table whose columns have names, a later table with the same
+            names in another order is refused.
         num_simulations: For a simulator that takes long: how many simulations it makes
             in all, at draws of the prior, when they are first needed. They are then
             used as stored simulations are. If None, the simulator is called as often as

@@ -166,35 +166,6 @@ def test_tables_with_known_columns_are_those_of_tensors() -> None:
     assert len(rope.labels) == 48
 
 
-def tabled(theta: Tensor) -> pd.DataFrame:
-    return pd.DataFrame(gaussian.simulator(theta), columns=CHANNELS)
-
-
-def tabled_one(theta: Any) -> pd.Series:
-    low, high = theta  # so that it takes no batch
-    return tabled(torch.tensor([[float(low), float(high)]])).iloc[0]
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"simulator": tabled},
-        {"simulator": tabled_one},
-        {"simulator": tabled, "num_simulations": 1000},
-    ],
-    ids=["batches", "one by one", "limited"],
-)
-def test_columns_of_a_simulator_are_known(options: dict[str, Any]) -> None:
-    rope = of_tables(**options)
-    with refused(CHANNELS, "the tables that `simulator` returns"):
-        rope.append_calibration(THETA, SWAPPED[1])
-    rope.append_calibration(THETA, X)
-    method = DiscrepancyNPE.from_posterior(gaussian.posterior(), **options)
-    method.append_calibration(THETA, SWAPPED[1])
-    with pytest.raises(InvalidInputError, match=r"Expected `simulator\(.*Return `df"):
-        method.train(**QUIET)
-
-
 def test_columns_whose_names_are_not_strings_or_not_unique_keep_their_order() -> None:
     for names in ([0, 1], [("a", 1), ("a", 2)]):
         theta, x = THETA.set_axis(names, axis=1), X.set_axis(names, axis=1)

@@ -101,9 +101,7 @@ def sources() -> dict[str, Callable[..., DiscrepancyNPE]]:
 
 
 @pytest.mark.medium
-@pytest.mark.filterwarnings(
-    "error::sbi_rope.errors.RoPEWarning", "ignore:Only 300 simulations"
-)
+@pytest.mark.filterwarnings("error::sbi_rope.errors.RoPEWarning")
 @pytest.mark.parametrize("space", SPACES)
 def test_every_source_of_simulations_gives_a_posterior_of_sbi(space: str) -> None:
     expected = MixturePosterior if space == "tuned" else DirectPosterior
