@@ -1,5 +1,6 @@
 """Simulations: those of a user's simulator, or pairs that were stored beforehand."""
 
+import functools
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -224,11 +225,10 @@ def _simulate_piece(way: _Way, theta: Tensor, seed: int) -> Simulated:
 
 
 class Simulator:
-    """A user's simulator as a source of simulations.
+    """A user's simulator, called in the first way in which it returns the right shape.
 
     Args:
-        function: The simulator, batched or not, of tensors or NumPy arrays. The first
-            way to call it is taken in which it returns the right shape.
+        function: The simulator, batched or not, of tensors or NumPy arrays.
         prior: The prior, from which parameters are drawn.
         event_shape: Shape of one simulation.
         like: A tensor with the dtype and device of parameters and simulations.
@@ -237,9 +237,6 @@ class Simulator:
     Attributes:
         num_dropped: How many simulations were dropped so far.
         num_calls: How many rows were simulated so far.
-
-    Raises:
-        SimulationError: If the simulator returns simulations in no way.
     """
 
     def __init__(
@@ -278,13 +275,8 @@ class Simulator:
     ) -> tuple[Tensor, Tensor]:
         """Return parameters from the prior, and the embedding of one simulation each.
 
-        Args:
-            count: The number of simulations; ``at_least`` if None.
-            at_least: See ``count``.
-            embed: The embedding of simulations.
-            progress: Whether to show progress.
-            finished: Parts that an interrupted call with the same arguments has
-                simulated. They are not simulated again, and others are added.
+        There are ``count`` of them, or ``at_least`` if that is None. Parts that are
+        ``finished`` are not simulated again, and others are added there.
         """
         count = at_least if count is None else count
         theta = self._prior.sample(torch.Size((count,))).to(self._like)
@@ -334,11 +326,8 @@ class Simulator:
     ) -> tuple[Tensor, Tensor]:
         """Simulate once at each of several parameters of each pair, ``(n, R, d)``.
 
-        A simulation that failed is replaced by that of other parameters of the pair,
-        and its parameters are replaced by these.
-
-        Returns:
-            The parameters, shape ``(n, R, d)``, and the embeddings, ``(n, R, l)``.
+        A simulation that failed is replaced by that of other parameters of the pair.
+        These are returned with the embeddings ``(n, R, l)``.
         """
         embedded = self._at(theta, embed, progress=progress)
         failed = embedded.isnan().all(dim=2)
@@ -528,13 +517,14 @@ class StoredSimulations:
         check_in_support("simulations[0]", theta, prior)
         with seeded(0):
             drawn = prior.sample(torch.Size((NUM_FROM_PRIOR,)))
-        unlike = []
-        for number, (stored, of_prior) in enumerate(zip(theta.T, drawn.T, strict=True)):
-            test: Any = ks_2samp(
-                np.asarray(stored.cpu()), np.asarray(of_prior.cpu()), method="asymp"
+        compare: Any = functools.partial(ks_2samp, method="asymp")
+        unlike = [
+            number
+            for number, pair in enumerate(
+                zip(theta.T.cpu(), drawn.T.cpu(), strict=True)
             )
-            if test.pvalue < NOT_FROM_PRIOR:
-                unlike.append(number)
+            if compare(*map(np.asarray, pair)).pvalue < NOT_FROM_PRIOR
+        ]
         if unlike:
             warn_user(
                 f"The parameters {unlike} of `simulations` (counted from 0) are not "
