@@ -183,16 +183,6 @@ def test_sbis_net_is_accepted_with_one_column_for_each_trial() -> None:
     assert readable(net, x).all()
 
 
-def test_the_number_of_trials_is_mended_with_nan() -> None:
-    x = labelled(10)[1]
-    few, many = x[:, :3], torch.cat([x, x], dim=1)
-    for trials, match in ((few, "Pad with NaN to 4 trials"), (many, "on 4 trials")):
-        with pytest.raises(InvalidInputError, match=match):
-            rope().checked_observations(trials)
-    with pytest.raises(InvalidInputError, match=r"rows of 2 to 4 entries.*pad them"):
-        rope().checked_observations([x[0, :2].tolist(), x[1].tolist()])  # type: ignore[arg-type]
-
-
 def test_missing_numbers_of_a_vector_are_embedded_but_not_corrected() -> None:
     npe = problems.npe_posterior()
     net = nn.Sequential(problems.Filled(), *embedding_of(npe.posterior_estimator))
