@@ -360,7 +360,7 @@ class Simulator:
         sizes = {*self._prior.event_shape, *self._event_shape}
         # A number of rows that is no number of parameters or of readings.
         num_rows = next(n for n in range(3, 4 + len(sizes)) if n not in sizes)
-        error = None
+        errors: list[Exception] = []
         for theta in self._prior.sample(torch.Size((TRIES,))).to(self._like):
             for batched in (True, False):
                 given = theta.repeat(num_rows, 1) if batched else theta
@@ -375,7 +375,7 @@ class Simulator:
                             result = way.result(given)
                         way.fitted(result, given)
                     except Exception as raised:  # any error of the user's code
-                        error = raised
+                        errors.append(raised)
                         continue
                     if arrays or isinstance(result, Tensor):
                         return way
@@ -384,9 +384,9 @@ class Simulator:
                     return second_best
         raise SimulationError(
             "Expected `simulator` to map theta (n, d) to x (n, *event), or one (d,) to "
-            f"one (*event), where *event is {tuple(self._event_shape)}; it raised "
-            f"{error!r}."
-        ) from error
+            f"one (*event), where *event is {tuple(self._event_shape)}; a batch "
+            f"of tensors gave {errors[0]!r}, and one array {errors[-1]!r}."
+        ) from errors[-1]
 
     def _at(self, theta: Tensor, embed: Embedding, *, progress: bool) -> Tensor:
         """Simulate at several parameters of each pair, ``(n, R, d)`` to ``(n, R, l)``.

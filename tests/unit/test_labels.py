@@ -710,5 +710,5 @@ def test_a_failed_simulation_is_replaced_by_another_one_of_the_same_label() -> N
         counts = used[row].unique(dim=0, return_counts=True)[1]
         assert int(counts.max() - counts.min()) <= 1
     theta[2, :, 0] = 0.5
-    with pytest.raises(SimulationError, match=r"\(1 pairs in all\)"):
+    with pytest.raises(SimulationError, match=r"parameters \[\[0\.5.* failed"):
         source.once_at(theta, lambda x: x, progress=False)
