@@ -13,7 +13,6 @@ __all__ = [
     "deviations",
     "leave_out_constants",
     "warn_of_far_entries",
-    "warn_of_unseen_gaps",
 ]
 
 # An entry is far if it is more than so many standard deviations away from simulations.
@@ -67,58 +66,21 @@ def leave_out_constants(embedding_net: nn.Module, x: Tensor) -> None:
     mean_and_std[1].masked_fill_(constant, torch.inf)
     entries = constant.flatten().nonzero().flatten().tolist()
     warn_user(
-        f"{len(entries)} of the {constant.numel()} entries of the calibration `x` are "
-        f"the same in all pairs that are trained on (first: {entries[:5]}). They say "
-        "nothing about the parameters and are left out."
+        f"Left out {len(entries)} of the {constant.numel()} entries of the calibration "
+        f"`x` (first: {entries[:5]}), which are the same in all pairs."
     )
 
 
 def warn_of_far_entries(name: str, x: Tensor, embedding_net: nn.Module) -> None:
     """Warn of entries of ``x`` that are far from all simulations NPE was trained on."""
     far = deviations(embedding_net, x)
-    if far is None or not (far > FAR).any():
-        return
-    far = far.flatten(1)
-    rows = (far > FAR).any(dim=1).nonzero().flatten()
-    columns = (far > FAR).any(dim=0).nonzero().flatten()
-    warn_user(
-        f"{len(columns)} of the {far.shape[1]} entries of `{name}` (first: "
-        f"{columns[:5].tolist()}) are up to {float(far.max()):.1g} standard deviations "
-        f"away from simulations, in {len(rows)} of {len(far)} rows (first: "
-        f"{rows[:5].tolist()}). NPE was not trained on such numbers, so its posteriors "
-        "for these rows cannot be trusted. Check the units. Leave out entries that do "
-        "not vary in simulations, or train NPE with z_score_x='structured', which uses "
-        "one standard deviation for all entries."
-    )
-
-
-def warn_of_unseen_gaps(name: str, x: Tensor, seen: Tensor) -> None:
-    """Warn of entries that are missing (NaN) in reality, but in no simulation.
-
-    Entries of vectors are compared one by one. Which trials of a set are missing, or
-    which pixels of an image, does not matter.
-
-    Args:
-        name: What the user calls ``x``.
-        x: Real observations, shape ``(n, *event_shape)``.
-        seen: Which entries are missing in some simulation, shape ``(*event_shape)``.
-    """
-    if x.ndim > 2:
-        seen = seen.any()
-    unseen = x.isnan() & ~seen
-    if not unseen.any():
-        return
-    entries = unseen.any(dim=0)
-    rows = unseen.flatten(1).any(dim=1).nonzero().flatten()
-    which = f", in {len(rows)} of {len(x)} rows (first: {rows[:5].tolist()})"
-    if x.ndim == 2:
-        which = f" (first: {entries.nonzero().flatten()[:5].tolist()}){which}"
-    warn_user(
-        f"{int(entries.sum())} of the {entries.numel()} entries of `{name}` are "
-        f"missing (NaN){which}, but in no simulation. The embedding net of NPE has not "
-        "learned what to do without them. Train NPE on simulations whose entries are "
-        "missing as in reality, or leave these rows out."
-    )
+    if far is not None and (far > FAR).any():
+        entries = (far > FAR).any(dim=0).flatten().nonzero().flatten()
+        warn_user(
+            f"{len(entries)} of the {far[0].numel()} entries of `{name}` (first: "
+            f"{entries[:5].tolist()}) are up to {float(far.max()):.1g} standard "
+            "deviations away from simulations. Check the units."
+        )
 
 
 class Standardisation(nn.Module):

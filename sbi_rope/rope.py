@@ -21,16 +21,12 @@ from sbi_rope._labels.checks import (
     warn_of_labels_on_bounds,
 )
 from sbi_rope._npe import TrainedNPE
-from sbi_rope._pickling import picklable
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed
-from sbi_rope._simulations import SimulationSource
-from sbi_rope._simulator import source_of
 from sbi_rope._standardisation import (
     Standardisation,
     warn_of_far_entries,
-    warn_of_unseen_gaps,
 )
 from sbi_rope._validation import (
     KnownColumns,
@@ -40,7 +36,6 @@ from sbi_rope._validation import (
     check_parameter_order,
     check_row_order,
     check_rows,
-    check_simulated_columns,
     column_names,
     columns_of,
 )
@@ -56,6 +51,7 @@ from sbi_rope.errors import (
 from sbi_rope.finetuning import CalibrationFinetuner, History
 from sbi_rope.mixture import MixturePosterior
 from sbi_rope.settings import Count, UnitInterval, check
+from sbi_rope.simulate import SimulationSource, source_of
 from sbi_rope.tensors import as_batch, as_numbers, check_same_length
 
 __all__ = ["RoPE"]
@@ -101,17 +97,15 @@ class RoPE:
         simulator: Maps parameters ``(n, d)`` to simulations ``(n, *event)``, or one
             ``(d,)`` to one ``(*event)``. It may take tensors or NumPy arrays (of
             float64), and return either, lists, or numbers. A row of x may depend on the
-            same row of theta only. The simulator is tried on about thirty parameters
-            to find that out, and a fast one that takes batches and has a random
-            generator of its own on some seven hundred. Simulations with NaN or Inf, and
-            those for which the simulator raises, are dropped and counted.
+            same row of theta only, with noise drawn anew for each row from the global
+            generator of torch, NumPy or Python. Simulations with NaN or Inf, and those
+            for which the simulator raises, are dropped and counted.
             :func:`~sbi_rope.parallel` calls it in several processes.
         simulations: Instead of a simulator, stored pairs (theta, x) with theta drawn
             from the prior. Fine-tuning then uses those with the nearest parameters.
-            A warning says if their parameters are not distributed like the prior.
-            There is a warning if there are fewer than 1000. If theta or x is a table
-            whose columns have names, a later table with the same names in another order
-            is refused.
+            A warning says if their parameters are not distributed like the prior. If
+            theta or x is a table whose columns have names, a later table with the same
+            names in another order is refused.
         num_simulations: For a simulator that takes long: how many simulations it makes
             in all, at draws of the prior, when they are first needed. They are then
             used as stored simulations are. If None, the simulator is called as often as
@@ -170,7 +164,6 @@ class RoPE:
         check("finetuner", finetuner, CalibrationFinetuner | None)
         check("coupler", coupler, SinkhornCoupler | None)
         check_default_dtype()
-        simulator = picklable(simulator)
         self._npe = TrainedNPE(posterior, parameter_names)
         self._source = source_of(
             self._npe.prior,
@@ -190,8 +183,7 @@ class RoPE:
         theta_s, x_s = (None, None) if simulations is None else simulations
         check_row_order(**{"simulations[0]": theta_s, "simulations[1]": x_s})
         self._theta_columns = check_columns("simulations[0]", theta_s, known)
-        known = check_columns("simulations[1]", x_s, earlier["x"])
-        self._x_columns = check_simulated_columns(self._source.x_columns, known)
+        self._x_columns = check_columns("simulations[1]", x_s, earlier["x"])
         if names is None:
             self._npe.parameter_names = column_names(theta_s) or None
         self.finetuner = CalibrationFinetuner() if finetuner is None else finetuner
@@ -440,8 +432,7 @@ class RoPE:
         Returns:
             :math:`g(x_o)` (:math:`h(x_o)` without calibration pairs), parameters drawn
             from the prior, and :math:`h(x_s)` of one simulation at each of them.
-            Simulations that are not finite are left out. There is a warning of entries
-            of x_o that are missing (NaN), but in no simulation.
+            Simulations that are not finite are left out.
 
         Raises:
             NotReadyError: If calibration pairs were appended after the last training.
@@ -460,20 +451,13 @@ class RoPE:
         real = self._npe.embed("x_o", x_o, net)
         if num_simulations is not None:
             check("num_simulations", num_simulations, Count)
-        gaps = torch.zeros_like(x_o[0], dtype=torch.bool)
-
-        def represent(x: Tensor) -> Tensor:
-            gaps.logical_or_(x.isnan().any(dim=0))
-            return self._embed_simulations(x)
-
         with seeded(seed):
             theta, simulated = self._source.from_prior(
                 num_simulations,
                 max(len(x_o), MIN_SIMULATIONS),
-                represent,
+                self._embed_simulations,
                 progress=is_shown(show_progress_bars),
             )
-        warn_of_unseen_gaps("x_o", x_o, gaps)
         if not self._was_looked_at:
             self._was_looked_at = True
             warn_if_focused(self._npe.density(), self._npe.prior, theta, simulated)
@@ -682,9 +666,8 @@ class RoPE:
     def num_simulator_calls(self) -> int:
         """How many rows of theta the simulator has simulated so far.
 
-        Up to thirty are simulated when RoPE is constructed, to find out how the
-        simulator is called (some seven hundred if it is fast, takes batches and has a
-        random generator of its own). :meth:`train` simulates 100 for each label (and
+        A few are simulated when RoPE is constructed, to find out how the simulator is
+        called. :meth:`train` simulates 100 for each label (and
         2000 with rehearsal), :meth:`build_posterior` ``max(n_o, 1000)`` for each batch,
         and :func:`~sbi_rope.stack` 20,000 from the prior and 100 for each label, and
         with a batch 2000 and ``max(n_o, 1000)`` more. The argument ``num_simulations``

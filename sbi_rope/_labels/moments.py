@@ -4,13 +4,7 @@ import torch
 from torch import Tensor
 
 from sbi_rope._labels.parameters import LabelledParameters
-from sbi_rope._simulations import (
-    Embedding,
-    Moments,
-    SimulationSource,
-    check_targets,
-    draw_targets,
-)
+from sbi_rope.simulate import Embedding, Moments, SimulationSource
 
 __all__ = ["labelled_moments", "labelled_targets"]
 
@@ -84,16 +78,14 @@ def labelled_targets(
 ) -> Tensor:
     r"""Return the targets of the tuning, :math:`E[h(S(\theta)) \mid y_i]`.
 
-    For exact labels see :func:`~sbi_rope._simulations.draw_targets`. Otherwise the
-    expectation is also over the parameters that the label leaves possible, with
-    ``simulations_per_target`` simulations at draws of these.
+    Where labels are not exact, the expectation is also over the parameters that they
+    leave possible, with ``simulations_per_target`` simulations at draws of these.
 
     Raises:
-        SimulationError: If the simulator fails, or an embedding is not finite.
+        SimulationError: If the simulator fails.
     """
     if parameters.are_exact:
-        return draw_targets(
-            source,
+        return source.targets(
             parameters.mean,
             embed,
             simulations_per_target=simulations_per_target,
@@ -103,7 +95,7 @@ def labelled_targets(
     num_draws = parameters.draws.shape[1]
     theta = parameters.draws[:, torch.arange(simulations_per_target) % num_draws]
     _, embedded = source.once_at(theta, embed, progress=progress)
-    return check_targets(embedded.mean(dim=1), parameters.mean)
+    return embedded.mean(dim=1)
 
 
 def _features(theta: Tensor) -> list[Tensor]:

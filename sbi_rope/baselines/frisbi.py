@@ -9,7 +9,6 @@ from torch import Tensor, nn
 
 from sbi_rope._groups import split_pairs
 from sbi_rope._sbi import copy_of_prior, embed
-from sbi_rope._simulations import draw_targets
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._training import History, epochs_on_pairs, shuffled
 from sbi_rope.baselines.statistics import frozen_statistics
@@ -195,8 +194,7 @@ class FRISBI(Method):
         _, simulated = source.from_prior(
             None, self.num_simulations, embedding, progress=show_progress_bars
         )
-        targets = draw_targets(
-            source,
+        targets = source.targets(
             self._data.calibration[0],
             embedding,
             simulations_per_target=self.simulations_per_target,

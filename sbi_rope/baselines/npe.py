@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from sbi_rope._random import seeded
-from sbi_rope._simulator import Simulator
 from sbi_rope._training import History
 from sbi_rope.errors import NotReadyError
+from sbi_rope.simulate import Simulator
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
 from sbi_rope.trainers.training import EstimatorBuilder, Training

@@ -10,7 +10,6 @@ from torch import Tensor, nn
 from sbi_rope._groups import groups_of
 from sbi_rope._means import Counts
 from sbi_rope._sbi import ConditionalEstimator, embedding_of, headless, with_embedding
-from sbi_rope._simulations import Moments
 from sbi_rope._standardisation import Standardisation
 from sbi_rope._training import History
 from sbi_rope.discrepancy.model import DiscrepancyModel
@@ -22,6 +21,7 @@ from sbi_rope.discrepancy.training import (
     train_on_corrected,
 )
 from sbi_rope.errors import InvalidInputError
+from sbi_rope.simulate import Moments
 
 __all__ = [
     "Correction",

@@ -18,7 +18,6 @@ from sbi_rope._sbi import (
     headless,
     posterior_from,
 )
-from sbi_rope._simulations import Moments, SimulationSource
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._training import History
 from sbi_rope.discrepancy.correction import Space, correct_npe, network_of
@@ -32,6 +31,7 @@ from sbi_rope.errors import InvalidInputError, NotReadyError
 from sbi_rope.finetuning import CalibrationFinetuner
 from sbi_rope.mixture import MixtureEstimator, MixturePosterior, OwnEmbeddings, Part
 from sbi_rope.settings import Count, Positive, Range, check
+from sbi_rope.simulate import Moments, SimulationSource
 from sbi_rope.tensors import as_batch
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE

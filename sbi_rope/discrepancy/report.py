@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from sbi_rope._progress import progress_bar
-from sbi_rope._simulations import Moments
 from sbi_rope._standardisation import Standardisation
 from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.posterior import Discrepancy
 from sbi_rope.errors import InvalidInputError
+from sbi_rope.simulate import Moments
 
 __all__ = [
     "DiscrepancyReport",

@@ -3,11 +3,11 @@
 from torch import Tensor
 
 from sbi_rope._random import seeded
-from sbi_rope._simulations import Moments
 from sbi_rope._standardisation import Standardisation
 from sbi_rope.discrepancy.correction import fit_discrepancy
 from sbi_rope.discrepancy.imputation import expected_means
 from sbi_rope.discrepancy.model import DiscrepancyModel
+from sbi_rope.simulate import Moments
 
 __all__ = ["tuning_targets"]
 

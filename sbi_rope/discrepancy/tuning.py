@@ -5,9 +5,9 @@ from torch import Tensor, nn
 
 from sbi_rope._groups import groups_of, split_groups
 from sbi_rope._sbi import embed
-from sbi_rope._simulations import Moments
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.finetuning import CalibrationFinetuner
+from sbi_rope.simulate import Moments
 
 __all__ = ["TUNING", "cross_fitted_nets"]
 

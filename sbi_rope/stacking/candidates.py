@@ -9,7 +9,6 @@ from typing import Any, Literal
 import torch
 
 from sbi_rope._sbi import check_density, estimator_of
-from sbi_rope._simulator import LimitedSimulator
 from sbi_rope.errors import (
     InvalidInputError,
     RoPEError,
@@ -25,6 +24,7 @@ from sbi_rope.mixture import (
 )
 from sbi_rope.rope import RoPE
 from sbi_rope.settings import NotNegative, Positive, UnitInterval, check
+from sbi_rope.simulate import LimitedSimulator
 from sbi_rope.stacking.folds import Fold
 from sbi_rope.stacking.workbench import Workbench
 

@@ -13,9 +13,7 @@ from sbi_rope._groups import split_groups
 from sbi_rope._labels import labelled_moments
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed, estimator_of, headless
-from sbi_rope._simulations import Moments
-from sbi_rope._simulator import Simulator
-from sbi_rope._standardisation import Standardisation, warn_of_unseen_gaps
+from sbi_rope._standardisation import Standardisation
 from sbi_rope._training import without_warning_of_few_pairs
 from sbi_rope.discrepancy.correction import Space
 from sbi_rope.discrepancy.model import DiscrepancyModel
@@ -26,6 +24,7 @@ from sbi_rope.discrepancy.tuning import TUNING
 from sbi_rope.errors import NotReadyError
 from sbi_rope.finetuning import CalibrationFinetuner
 from sbi_rope.rope import RoPE
+from sbi_rope.simulate import Moments, Simulator
 
 __all__ = ["Workbench", "check_pairs", "draw_seeds"]
 
@@ -120,7 +119,6 @@ class Workbench:
     def embedded(self) -> Tensor:
         """The embeddings h(x) of :attr:`simulations`, shape ``(n_s, l)``."""
         theta, x = self.simulations
-        warn_of_unseen_gaps("calibration x", self.x, x.isnan().any(dim=0))
         embedded = embed(self.embedding_net, x)
         density = headless(estimator_of(self.npe))
         warn_if_focused(density, self.npe.prior, theta, embedded)

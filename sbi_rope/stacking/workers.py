@@ -4,13 +4,13 @@ import pickle
 import traceback
 import warnings
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass
+from typing import Any
 
+import joblib
 import torch
 
-from sbi_rope._pickling import packed
-from sbi_rope._processes import WORKER_ERRORS, in_workers
 from sbi_rope._random import seeded
 from sbi_rope.errors import InvalidInputError, RoPEError, RoPEWarning, warn_user
 from sbi_rope.mixture import Part
@@ -21,6 +21,11 @@ from sbi_rope.stacking.versions import train_version
 from sbi_rope.stacking.workbench import Workbench
 
 __all__ = ["check_sendable", "train_versions"]
+
+
+def packed(thing: Any) -> bytes:
+    """Return the pickle of anything, functions without a name of their own included."""
+    return pickle.dumps(joblib.wrap_non_picklable_objects(thing, keep_wrapper=False))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -105,11 +110,12 @@ def train_versions(
     tasks = ((sent, number, torch.get_num_threads()) for number in range(len(folds)))
     versions = []
     try:
-        with closing(in_workers(_train_version, tasks, num_workers)) as received:
-            for version in received:
-                versions.append(_unpacked(version, bench))
-                advance(len(candidates))
-    except WORKER_ERRORS as error:
+        options: Any = {"backend": "loky", "return_as": "generator"}
+        run: Any = joblib.Parallel(n_jobs=num_workers, **options)
+        for version in run(joblib.delayed(_train_version)(*task) for task in tasks):
+            versions.append(_unpacked(version, bench))
+            advance(len(candidates))
+    except (BrokenExecutor, pickle.PicklingError) as error:
         raise InvalidInputError(
             f"Expected candidates that can be trained in {num_workers} processes; got "
             f"{type(error).__name__}: {error}\nEach process has a copy of the "
@@ -157,7 +163,10 @@ def _train_version(sent: bytes, number: int, num_threads: int) -> bytes:
 def _unpacked(version: bytes, bench: Workbench) -> dict[str, list[Part]]:
     """Do in this process what a worker would have done: count, and warn."""
     trained: _Trained = pickle.loads(version)
-    bench.rope.source.add_counts(trained.num_calls, trained.num_dropped)
+    source: Any = bench.rope.source
+    source = getattr(source, "simulator", source)
+    source.num_calls += trained.num_calls
+    source.num_dropped += trained.num_dropped
     for text, category, filename, line in trained.warned:
         if issubclass(category, RoPEWarning):
             warn_user(text)

@@ -12,11 +12,10 @@ from torch.distributions import Distribution
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import copy_of_prior, device_of, embedding_of, estimator_of
-from sbi_rope._simulations import SimulationSource
-from sbi_rope._simulator import source_of
 from sbi_rope._training import History
 from sbi_rope.errors import InvalidInputError, NotReadyError
 from sbi_rope.settings import check
+from sbi_rope.simulate import SimulationSource, source_of
 from sbi_rope.trainers.data import Data, Kind
 from sbi_rope.trainers.starting_npe import StartingNPE
 

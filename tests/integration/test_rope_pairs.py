@@ -10,7 +10,6 @@ from torch import Tensor
 from sbi_rope import CalibrationFinetuner, RoPE
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed
-from sbi_rope._simulations import draw_targets
 from sbi_rope.errors import InvalidInputError, NotReadyError
 from tests import gaussian, problems
 from tests.stacks import (
@@ -38,8 +37,7 @@ ALL = torch.arange(NUM_PAIRS)
 def targets_of(rope: RoPE, rows: Tensor, *, seed: int | None = 0) -> Tensor:
     h, finetuner = rope.embedding_net, rope.finetuner
     with seeded(seed):
-        return draw_targets(
-            rope.source,
+        return rope.source.targets(
             rope.calibration[0][rows],
             lambda x: embed(h, x),
             simulations_per_target=finetuner.simulations_per_target,

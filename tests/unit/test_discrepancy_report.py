@@ -8,7 +8,6 @@ import torch
 from scipy import stats
 from torch import Tensor, nn
 
-from sbi_rope._simulations import Moments
 from sbi_rope.discrepancy import (
     DiscrepancyModel,
     DiscrepancyNPE,
@@ -17,6 +16,7 @@ from sbi_rope.discrepancy import (
 )
 from sbi_rope.discrepancy.report import report_discrepancy
 from sbi_rope.errors import InvalidInputError, NotReadyError
+from sbi_rope.simulate import Moments
 from sbi_rope.tasks import get_task
 from tests import problems
 

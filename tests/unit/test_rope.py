@@ -1,7 +1,6 @@
 """RoPE: the order of its steps, what is used again, and what is refused."""
 
 import copy
-import io
 import itertools
 import pickle
 import sys
@@ -371,12 +370,12 @@ def _raises(theta: Tensor) -> Tensor:
 def test_unusable_simulators_are_refused_at_once() -> None:
     cases: list[tuple[Any, type[Exception], str]] = [
         (None, InvalidInputError, "exactly one"),
-        (3, InvalidInputError, "`simulator` to be callable"),
-        (_raises, SimulationError, "KeyError: 'no such file'"),
-        (lambda theta: theta[:, :1], SimulationError, r"\(2,\)"),
-        (lambda theta: theta.numpy() + 1j, SimulationError, "NumPy arrays or lists"),
+        (3, InvalidInputError, "`simulator` to be a Callable"),
+        (_raises, SimulationError, "KeyError.*no such file"),
+        (lambda theta: theta[:, :1], SimulationError, r"got \(3, 1\)"),
+        (lambda theta: theta.numpy() + 1j, SimulationError, "complex"),
         (_returns(None), SimulationError, "NoneType"),
-        (_returns(torch.zeros(7)), SimulationError, r"shape \(7,\)"),
+        (_returns(torch.zeros(7)), SimulationError, r"got \(7,\)"),
     ]
     for simulator, error, match in cases:
         with pytest.raises(error, match=match):
@@ -388,7 +387,7 @@ def test_a_simulator_that_returns_only_nan_is_refused() -> None:
     with pytest.raises(SimulationError, match="All 1000 simulations"):
         conductor.build_posterior(X_O)
     conductor.append_calibration(*gaussian.labelled(10))
-    with pytest.raises(SimulationError, match=r"calibration parameters \[\["):
+    with pytest.raises(SimulationError, match="All 1000 simulations at cal"):
         conductor.train(show_progress_bars=False)
 
 
@@ -413,8 +412,7 @@ def test_the_last_net_is_kept_if_training_fails() -> None:
 
 def test_unusable_stored_simulations_are_refused() -> None:
     cases: list[tuple[Any, str]] = [
-        (THETA, "pair"),
-        ((THETA, X[:9]), "same number of rows"),
+        ((THETA, X[:9]), r"simulations\[1\]"),
         ((THETA[:, :1], X), r"simulations\[0\]"),
         ((THETA, X.numpy().astype(str)), r"simulations\[1\]"),
         ((THETA[:, [0, 1, 1]], X), r"simulations\[0\]"),
@@ -428,8 +426,7 @@ def test_unusable_stored_simulations_are_refused() -> None:
 def test_a_simulator_and_stored_simulations_exclude_each_other() -> None:
     with pytest.raises(InvalidInputError, match=r"exactly one.*both"):
         rope(simulations=(THETA, X))
-    spellings = r"none\. Write .*simulator=simulator.*simulations=\(theta, x\)"
-    with pytest.raises(InvalidInputError, match=spellings):
+    with pytest.raises(InvalidInputError, match=r"exactly one.*none"):
         rope(simulator=None)
 
 
@@ -544,7 +541,7 @@ def test_stored_simulations_are_chosen_at_random() -> None:
     ]
     assert torch.equal(chosen[0], chosen[1])
     assert not torch.equal(chosen[0], chosen[2])
-    first = (gaussian.GAIN * conductor._source.x[:30]).double()
+    first = (gaussian.GAIN * conductor._source._made(progress=False)[1][:30]).double()
     assert not torch.allclose(chosen[0], first)
 
 
@@ -553,14 +550,6 @@ def test_trying_a_simulator_keeps_the_random_state_of_the_caller() -> None:
     state = torch.get_rng_state()
     RoPE(npe, simulator=gaussian.simulator)
     assert torch.equal(torch.get_rng_state(), state)
-
-
-def test_the_same_noise_in_a_whole_batch_is_warned_about() -> None:
-    with pytest.warns(RoPEWarning, match="the same noise"):
-        rope(simulator=lambda theta: theta + torch.randn(2))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        rope(simulator=lambda theta: 2 * theta)  # no noise at all is fine
 
 
 def test_moving_our_posterior_moves_nothing_else() -> None:
@@ -613,8 +602,6 @@ def test_stored_simulations_must_come_from_the_prior() -> None:
     )
     with pytest.raises(InvalidInputError, match=r"`simulations\[0\]` inside the supp"):
         RoPE(npe, simulations=(THETA + 5, X))
-    with pytest.raises(InvalidInputError, match="where the posterior is"):
-        RoPE(npe, simulations=(THETA, X.to("meta")))
 
 
 def test_a_seed_does_not_repeat_the_draws_after_the_same_seed_of_torch() -> None:
@@ -703,10 +690,6 @@ def test_extreme_simulations_are_named_by_their_parameters() -> None:
     ):
         with pytest.raises(CouplingError, match=named):
             call()
-    conductor = rope(simulator=lambda theta: 1e30 * gaussian.simulator(theta))
-    conductor.append_calibration(*gaussian.labelled(10))
-    with pytest.raises(SimulationError, match="at the calibration parameters"):
-        conductor.train(show_progress_bars=False)
 
 
 def test_training_in_inference_mode_is_refused() -> None:
@@ -832,53 +815,3 @@ def test_a_trainer_is_refused_in_place_of_its_posterior() -> None:
         UnsupportedPosteriorError, match=r"call `\.train\(\)`, then pass"
     ):
         RoPE(NPE(gaussian.prior()), simulator=gaussian.simulator)
-
-
-# --- pickles ---
-
-
-def through_pickle(conductor: RoPE) -> RoPE:
-    return pickle.loads(pickle.dumps(conductor))
-
-
-def through_torch(conductor: RoPE) -> RoPE:
-    buffer = io.BytesIO()
-    torch.save(conductor, buffer)
-    buffer.seek(0)
-    return torch.load(buffer, weights_only=False)
-
-
-def through_joblib(conductor: RoPE) -> RoPE:
-    # What joblib pickles for its workers with; older versions have a copy of their own.
-    cloudpickle = pytest.importorskip("cloudpickle")
-    return pickle.loads(cloudpickle.dumps(conductor))
-
-
-@pytest.mark.medium
-@pytest.mark.parametrize(
-    "copied", [through_pickle, through_torch, through_joblib, copy.deepcopy]
-)
-def test_a_rope_of_a_lambda_can_be_pickled_and_simulates_as_before(
-    copied: Callable[[RoPE], RoPE],
-) -> None:
-    noise = gaussian.NOISE_STD
-    conductor = trained(simulator=lambda theta: theta + noise * torch.randn_like(theta))
-    expected = conductor.build_posterior(X_O, seed=3, num_simulations=100).weights
-    # A copy can be copied again.
-    for other in (copied(conductor), copied(copied(conductor))):
-        found = other.build_posterior(X_O, seed=3, num_simulations=100).weights
-        assert torch.equal(found, expected)
-
-
-def test_a_simulator_that_cannot_be_pickled_is_named_and_can_be_copied() -> None:
-    lock = threading.Lock()
-
-    def locked(theta: Tensor) -> Tensor:
-        with lock:
-            return gaussian.simulator(theta)
-
-    conductor = rope(simulator=locked)
-    with pytest.raises(InvalidInputError, match=r"locked refers to .*in a module"):
-        pickle.dumps(conductor)
-    # A copy in the same process needs no pickle, and calls the same function.
-    assert len(copy.deepcopy(conductor).build_posterior(X_O).x_o) == len(X_O)

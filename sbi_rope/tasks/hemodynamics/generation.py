@@ -1,7 +1,6 @@
 """Makes data sets of many people in parallel, and goes on after an interrupt."""
 
 import json
-import os
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict
@@ -13,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from sbi_rope._files import write_atomically
-from sbi_rope._processes import end_with
 from sbi_rope._progress import progress_bar
 from sbi_rope.errors import InvalidInputError, SimulationError
 from sbi_rope.settings import Count, Whole, check, one_of
@@ -183,16 +181,9 @@ def _parallel(
 ) -> Iterable[tuple[int, int]]:
     import joblib
 
-    calls: Iterator[Any] = (
-        joblib.delayed(_run_chunk_for)(os.getpid(), work, chunk) for chunk in chunks
-    )
+    calls: Iterator[Any] = (joblib.delayed(run_chunk)(work, chunk) for chunk in chunks)
     parallel = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")
     return parallel(calls)  # type: ignore[return-value]
-
-
-def _run_chunk_for(parent: int, work: Work, chunk: range) -> tuple[int, int]:
-    end_with(parent)
-    return run_chunk(work, chunk)
 
 
 # Files -------------------------------------------------------------------------------
