@@ -47,20 +47,17 @@ class EmbeddedBatch:
     embedding_net: nn.Module
     columns: Mapping[str, KnownColumns] = field(default_factory=dict)
 
-    def couple(self, coupler: SinkhornCoupler, *, seed: int | None = None) -> Coupling:
+    def couple(self, coupler: SinkhornCoupler) -> Coupling:
         """Couple the observations with the simulations.
 
         Args:
             coupler: Settings of the transport.
-            seed: As in :meth:`SinkhornCoupler.couple
-                <sbi_rope.SinkhornCoupler.couple>`.
 
         Raises:
-            CouplingError: If the embeddings cannot be coupled. It names the parameters
-                of the simulations that are to blame.
+            CouplingError: If the embeddings cannot be coupled.
         """
         with parameters_named(self.theta):
-            return coupler.couple(self.real, self.simulated, seed=seed)
+            return coupler.couple(self.real, self.simulated)
 
     def sweep(
         self,

@@ -7,7 +7,6 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._focus import warn_if_focused
 from sbi_rope._labels import (
     LabelledParameters,
     Labels,
@@ -203,7 +202,6 @@ class RoPE:
         self._targets: Tensor | None = None
         self._g: nn.Module | None = None
         self._history: History | None = None
-        self._was_looked_at = False
 
     def append_calibration(
         self,
@@ -474,9 +472,6 @@ class RoPE:
                 progress=is_shown(show_progress_bars),
             )
         warn_of_unseen_gaps("x_o", x_o, gaps)
-        if not self._was_looked_at:
-            self._was_looked_at = True
-            warn_if_focused(self._npe.density(), self._npe.prior, theta, simulated)
         return EmbeddedBatch(
             x_o=x_o,
             real=real,
@@ -541,7 +536,7 @@ class RoPE:
             show_progress_bars=show_progress_bars,
         )
         warn_of_far_entries("x_o", batch.x_o, self._npe.h)
-        coupling = batch.couple(coupler, seed=seed)
+        coupling = batch.couple(coupler)
         if require_convergence:
             check_converged(coupling, coupler)
         return batch.posterior(coupling, unseen=unseen, tail_mass=tail_mass)

@@ -34,7 +34,6 @@ LAYERS = [
         "_permutation",
         "_progress",
         "_processes",
-        "_slices",
         "_tables",
     },
     # They raise errors: of seeds, of files and of functions that cannot be pickled.
@@ -53,7 +52,6 @@ LAYERS = [
         "coupling",
         "finetuning",
         "metrics",
-        "_focus",
         "_npe",
         "_simulations",
         "_standardisation",

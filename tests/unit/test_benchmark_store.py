@@ -3,7 +3,6 @@
 import hashlib
 import io
 import multiprocessing
-import os
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +19,7 @@ from benchmarks.presets import PRESETS
 from benchmarks.store import Cache, Results
 from sbi_rope._files import set_aside, write_atomically
 from sbi_rope._sbi import embedding_of
-from sbi_rope.errors import NotWritableError, RoPEWarning
+from sbi_rope.errors import RoPEWarning
 from sbi_rope.tasks import get_task
 from tests.results import empty, fill_with_garbage, remove, result_of, truncate
 
@@ -154,32 +153,6 @@ def test_a_result_with_a_score_that_is_not_its_own_is_damaged(tmp_path: Path) ->
     results.write(FINISHED, row | {"lpp_z": row["lpp_z"] + 0.01}, arrays)
     with pytest.warns(RoPEWarning, match="column lpp_z: expected -1.5"):
         assert results.read(FINISHED) is None
-
-
-def test_a_file_whose_folder_cannot_be_written_to_is_refused_in_words(
-    tmp_path: Path,
-) -> None:
-    (tmp_path / "file").write_text("no folder")
-    with (
-        pytest.raises(NotWritableError, match=r"can be written to.*Use another"),
-        write_atomically(tmp_path / "file" / "new.txt"),
-    ):
-        pass
-
-
-def test_a_file_is_on_the_disk_before_it_gets_its_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path, synced = tmp_path / "file.txt", []
-
-    def fsync(descriptor: int) -> None:
-        synced.append((os.fstat(descriptor).st_ino, path.exists()))
-
-    monkeypatch.setattr(os, "fsync", fsync)
-    with write_atomically(path) as temporary:
-        temporary.write_text("text")
-    # The file while it had its first name, and the folder with the new one.
-    assert synced == [(path.stat().st_ino, False), (tmp_path.stat().st_ino, True)]
 
 
 # Trained estimators -------------------------------------------------------------------

@@ -618,11 +618,6 @@ def test_a_file_is_replaced_only_when_asked_to(tmp_path: Path) -> None:
     PriorPosterior(problems.box(3)).save(link, overwrite=True)
     assert link.is_symlink()
     assert load(path).sample((2,)).shape == (2, 3)
-    pipe = tmp_path / "pipe"
-    os.mkfifo(pipe)
-    with pytest.raises(NotWritableError, match="a device"):
-        posterior.save(pipe, overwrite=True)
-    assert pipe.is_fifo()
     with pytest.raises(DataNotFoundError, match="Check `path`"):
         load(tmp_path / "nothing.pt")
 
