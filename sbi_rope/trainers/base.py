@@ -11,7 +11,7 @@ from torch.distributions import Distribution
 
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
-from sbi_rope._sbi import copy_of_prior, device_of, embedding_of, estimator_of
+from sbi_rope._sbi import device_of, embedding_of, estimator_of
 from sbi_rope._simulations import SimulationSource
 from sbi_rope._simulator import check_callable, source_of
 from sbi_rope._training import History
@@ -83,7 +83,7 @@ class Method(ABC):
     ) -> None:
         check_prior(prior)
         check_default_dtype()
-        self._prior: Distribution = copy_of_prior(prior)
+        self._prior: Distribution = copy.deepcopy(prior)
         self._device = usable_device(device)
         if hasattr(self._prior, "to"):
             self._prior.to(self._device)  # type: ignore[attr-defined]
