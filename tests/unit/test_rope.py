@@ -608,7 +608,7 @@ def test_values_too_large_for_the_estimator_are_refused() -> None:
         conductor.append_calibration(THETA, huge)
     x = X.clone()
     x[4] = 3e38
-    with pytest.raises(InvalidInputError, match=r"`x` with a finite embed.*\[4\]"):
+    with pytest.raises(InvalidInputError, match=r"`x` with finite embed.*\[4\]"):
         conductor.append_calibration(THETA, x)
     assert not len(conductor.calibration[0])
 
