@@ -14,9 +14,6 @@ from torch import Tensor
 
 from sbi_rope import SinkhornCoupler
 from sbi_rope.coupling import Coupling
-from sbi_rope.coupling.cost import Cost
-from sbi_rope.coupling.kernel import Kernel
-from sbi_rope.coupling.pot import solve_pot
 from sbi_rope.errors import CouplingError, InvalidInputError, RoPEWarning
 from tests import oracles
 from tests.modes import MODES, coupled, raw_coupler
@@ -70,13 +67,6 @@ def test_rows_equal_those_of_the_oracle(mode: str) -> None:
         assert distance < 1e-6, (ratio, tau)
 
 
-def test_the_default_tolerance_leaves_the_rows_near_the_oracle() -> None:
-    real, simulated, gamma, expected, _ = solved_by_the_oracle(0.1, 0.9)
-    coupling = raw_coupler(gamma=gamma, tau=0.9).couple(real, simulated)
-    assert coupling.marginal_error <= 1e-6
-    assert worst_total_variation(coupling.weights, expected) < 1e-4
-
-
 def test_the_plan_minimises_the_objective_of_the_paper() -> None:
     real, simulated = clouds(8, 6)
     cost = cost_of(real, simulated)
@@ -110,13 +100,6 @@ def test_the_marginal_error_measures_the_optimality_conditions() -> None:
             assert error == pytest.approx(float(expected), abs=1e-14)
 
 
-def test_a_large_gamma_and_equal_points_give_uniform_rows() -> None:
-    coupling = raw_coupler(gamma=1e8).couple(*clouds(30, 40))
-    assert (coupling.weights - 1 / 40).abs().max() < 1e-8
-    ones = torch.ones(20, 2)
-    assert (raw_coupler().couple(ones, ones).weights - 1 / 20).abs().max() < 1e-8
-
-
 def test_tau_zero_is_the_row_softmax_of_the_cost() -> None:
     real, simulated = clouds(30, 40)
     coupling = raw_coupler(gamma=0.3, tau=0.0).couple(real, simulated)
@@ -127,11 +110,6 @@ def test_tau_zero_is_the_row_softmax_of_the_cost() -> None:
     assert torch.allclose(nearly.weights, expected, atol=1e-5)
 
 
-def test_tau_one_has_uniform_column_marginals() -> None:
-    coupling = raw_coupler(gamma=0.3, tau=1.0, tolerance=1e-10).couple(*clouds(30, 40))
-    assert (coupling.weights.mean(dim=0) - 1 / 40).abs().sum() < 1e-10
-
-
 def test_permuting_the_inputs_permutes_the_weights() -> None:
     real, simulated = clouds(30, 40)
     coupler = raw_coupler(gamma=0.3, tau=0.9, tolerance=1e-12)
@@ -139,17 +117,6 @@ def test_permuting_the_inputs_permutes_the_weights() -> None:
     permuted = coupler.couple(real[rows], simulated[columns]).weights
     expected = coupler.couple(real, simulated).weights[rows][:, columns]
     assert torch.allclose(permuted, expected, atol=1e-9)
-
-
-def test_scaling_cost_and_gamma_together_changes_nothing() -> None:
-    real, simulated = clouds(30, 40)
-    coupler = raw_coupler(gamma=0.3, tau=0.9, tolerance=1e-12)
-    scaled = raw_coupler(gamma=30.0, tau=0.9, tolerance=1e-12)
-    assert torch.allclose(
-        coupler.couple(real, simulated).weights,
-        scaled.couple(100 * real, 100 * simulated).weights,
-        atol=1e-9,
-    )
 
 
 def test_with_the_simulated_cost_scale_gamma_has_no_unit() -> None:
@@ -363,21 +330,3 @@ def test_each_call_of_pot_starts_where_the_last_one_ended() -> None:
     assert coupling.solver == "pot"
     assert coupling.num_iterations > 1000
     assert coupling.converged
-
-
-def test_iterations_are_limited_when_the_solver_changes_on_the_way() -> None:
-    torch.manual_seed(4)  # clouds whose scalings overflow after some iterations
-    real, simulated = clouds()
-    gamma = 1.7e-4 * float(cost_of(real, simulated).max())
-    cost = Cost(real, simulated, stored=True)
-    solution, healthy = solve_pot(
-        cost,
-        gamma,
-        Kernel(cost, gamma, stored=True),
-        torch.zeros(60, dtype=torch.float64),
-        tau=1.0,
-        tolerance=1e-6,
-        max_iterations=300,
-    )
-    assert not healthy
-    assert 0 < solution.num_iterations < 300

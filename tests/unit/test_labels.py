@@ -20,13 +20,11 @@ from sbi_rope._labels import (
     parameters_of,
     reference_of,
 )
-from sbi_rope._simulator import Simulator
 from sbi_rope.discrepancy import DiscrepancyModel, learn_parameters
 from sbi_rope.discrepancy.imputation import expected_means
 from sbi_rope.errors import (
     InvalidInputError,
     RoPEWarning,
-    SimulationError,
 )
 from sbi_rope.metrics import acauc_of, coverage_curve_of, expected_coverage_error_of
 from sbi_rope.stacking import stacking_weights
@@ -581,15 +579,6 @@ def test_labels_on_a_bound_are_inside() -> None:
         assert float(draws[:, 0].std()) > 0.05
 
 
-def test_a_covariance_may_be_nan_where_a_parameter_was_not_measured() -> None:
-    theta, x = gaussian.labelled(4)
-    theta[:, 0] = NAN
-    covariance = torch.tensor([[NAN, NAN], [NAN, 0.04]])
-    labels = rope().append_calibration(theta, x, theta_cov=covariance).labels
-    expected = torch.tensor([[0.0, 0.0], [0.0, 0.04]]).double()
-    assert torch.allclose(labels.covariance, expected)
-
-
 def test_targets_of_noisy_labels_are_means_of_as_many_simulations_as_asked_for() -> (
     None
 ):
@@ -636,34 +625,3 @@ def test_several_labels_exactly_on_a_bound_of_the_prior_are_named() -> None:
         appended(3, 8, 20, theta_std=0.1)
         theta, x = gaussian.labelled(20)  # a prior without bounds
         rope().append_calibration(theta, x)
-
-
-def test_a_failed_simulation_is_replaced_by_another_one_of_the_same_label() -> None:
-    """A label is lost only if all simulations at its possible parameters failed."""
-
-    def simulator(theta: Tensor) -> Tensor:
-        x = theta.clone()
-        x[theta[:, 0] > 0] = NAN  # known parameters fail, so that rows can be compared
-        return x
-
-    source = Simulator(
-        simulator,
-        BoxUniform(-torch.ones(2), torch.ones(2)),
-        event_shape=torch.Size((2,)),
-        like=torch.zeros(1, 2),
-    )
-    theta = 2 * torch.rand(6, 50, 2) - 1
-    with pytest.warns(RoPEWarning, match="Dropped"):
-        used, x = source.once_at(theta, lambda x: x, progress=False)
-    assert torch.equal(used, x)
-    usable = theta[..., 0] <= 0
-    assert torch.equal(used[usable], theta[usable])
-    for row in range(6):
-        known = {tuple(one) for one in theta[row][usable[row]].tolist()}
-        assert {tuple(one) for one in used[row].tolist()} == known
-        # All of them are used about equally often.
-        counts = used[row].unique(dim=0, return_counts=True)[1]
-        assert int(counts.max() - counts.min()) <= 1
-    theta[2, :, 0] = 0.5
-    with pytest.raises(SimulationError, match=r"\(1 pairs in all\)"):
-        source.once_at(theta, lambda x: x, progress=False)

@@ -1,7 +1,6 @@
 """RoPE: the order of its steps, what is used again, and what is refused."""
 
 import copy
-import io
 import itertools
 import pickle
 import threading
@@ -64,18 +63,6 @@ def test_calibration_may_be_appended_in_parts() -> None:
         for conductor in (once, twice)
     ]
     assert torch.equal(nets[0](x), nets[1](x))
-
-
-def test_the_text_of_a_rope_counts_its_pairs() -> None:
-    theta, x = gaussian.labelled(3)
-    conductor = rope()
-    assert ", 0 calibration pairs, not" in repr(conductor)
-    conductor.append_calibration(theta[:1], x[:1])
-    assert ", 1 calibration pair, not" in repr(conductor)
-    conductor.append_calibration(theta[:1], x[1:2])
-    assert ", 2 calibration pairs in 1 group, not" in repr(conductor)
-    conductor.append_calibration(theta[1:2], x[2:])
-    assert ", 3 calibration pairs in 2 groups, not" in repr(conductor)
 
 
 def test_without_calibration_g_is_h() -> None:
@@ -321,19 +308,6 @@ def test_training_works_with_one_calibration_pair() -> None:
     assert torch.isfinite(conductor.build_posterior(X_O).weights).all()
 
 
-def test_observations_in_float64_are_found_in_the_batch() -> None:
-    posterior = trained().build_posterior(X_O.double() / 3, seed=0)
-    assert posterior.x_o.dtype == torch.float32
-    theta = torch.zeros(30, 2)
-    log_prob = posterior.log_prob_batched(theta, (X_O.double() / 3))
-    assert torch.isfinite(log_prob).all()
-
-
-def test_a_trained_rope_can_be_pickled() -> None:
-    conductor = pickle.loads(pickle.dumps(trained()))
-    assert conductor.build_posterior(X_O, seed=0).weights.shape == (30, 1000)
-
-
 THETA, X = torch.zeros(10, 2), torch.zeros(10, 2)
 NAN = torch.full((10, 2), torch.nan)
 
@@ -481,31 +455,6 @@ def test_a_net_whose_embedding_depends_on_other_rows_is_refused() -> None:
         RoPE(posterior, simulator=gaussian.simulator)
 
 
-def test_later_changes_of_the_users_posterior_have_no_effect() -> None:
-    """Moving a posterior of sbi moves its prior and its estimator in place."""
-    posterior = gaussian.posterior()
-    before = torch.get_rng_state()
-    conductor = RoPE(posterior, simulator=gaussian.simulator, finetuner=QUICK)
-    assert torch.equal(torch.get_rng_state(), before)
-    conductor.append_calibration(*gaussian.labelled(20))
-    conductor.train(seed=0, show_progress_bars=False)
-    posterior.prior.loc.fill_(100.0)  # type: ignore[union-attr]
-    posterior.posterior_estimator.log_std.data.fill_(3.0)  # type: ignore[union-attr]
-    posterior.enable_transform = False
-    expected = gaussian.posterior()
-    theta = torch.randn(30, 2)
-    for ours in (conductor.npe, conductor.tuned_posterior()):
-        assert torch.equal(ours.prior.log_prob(theta), expected.prior.log_prob(theta))
-        assert ours.enable_transform
-    assert torch.equal(
-        conductor.npe.log_prob_batched(theta, X_O),
-        expected.log_prob_batched(theta, X_O),
-    )
-    mixture = conductor.build_posterior(X_O, seed=0)
-    # With a transform, map() searches in units of the prior.
-    assert "Affine" in str(mixture.theta_transform)
-
-
 def test_the_default_x_of_the_users_posterior_is_ignored() -> None:
     npe = gaussian.posterior().set_default_x(torch.zeros(1, 2))
     with warnings.catch_warnings():
@@ -569,13 +518,6 @@ def test_stored_simulations_are_chosen_at_random() -> None:
     assert not torch.equal(chosen[0], chosen[2])
     first = (gaussian.GAIN * conductor._source.x[:30]).double()
     assert not torch.allclose(chosen[0], first)
-
-
-def test_trying_a_simulator_keeps_the_random_state_of_the_caller() -> None:
-    npe = gaussian.posterior()
-    state = torch.get_rng_state()
-    RoPE(npe, simulator=gaussian.simulator)
-    assert torch.equal(torch.get_rng_state(), state)
 
 
 def test_the_same_noise_in_a_whole_batch_is_warned_about() -> None:
@@ -699,15 +641,6 @@ def test_an_embedding_net_that_works_in_place_changes_no_data() -> None:
     assert torch.equal(x_o, x)
 
 
-def test_a_default_x_is_a_copy() -> None:
-    posterior = rope().build_posterior(X_O, seed=0)
-    x, theta = X_O[3].clone(), torch.zeros(4, 2)
-    posterior.set_default_x(x)
-    before = posterior.log_prob(theta)
-    x.zero_()
-    assert torch.equal(posterior.log_prob(theta), before)
-
-
 def test_training_and_the_mode_work_where_gradients_are_off() -> None:
     with torch.no_grad(), quick():
         conductor = trained()
@@ -725,13 +658,6 @@ def through_pickle(conductor: RoPE) -> RoPE:
     return pickle.loads(pickle.dumps(conductor))
 
 
-def through_torch(conductor: RoPE) -> RoPE:
-    buffer = io.BytesIO()
-    torch.save(conductor, buffer)
-    buffer.seek(0)
-    return torch.load(buffer, weights_only=False)
-
-
 def through_joblib(conductor: RoPE) -> RoPE:
     # What joblib pickles for its workers with; older versions have a copy of their own.
     cloudpickle = pytest.importorskip("cloudpickle")
@@ -739,9 +665,7 @@ def through_joblib(conductor: RoPE) -> RoPE:
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize(
-    "copied", [through_pickle, through_torch, through_joblib, copy.deepcopy]
-)
+@pytest.mark.parametrize("copied", [through_pickle, through_joblib, copy.deepcopy])
 def test_a_rope_of_a_lambda_can_be_pickled_and_simulates_as_before(
     copied: Callable[[RoPE], RoPE],
 ) -> None:

@@ -10,11 +10,8 @@ from sbi.inference import (
     NPE,
     DirectPosterior,
     EnsemblePosterior,
-    ImportanceSamplingPosterior,
     MCMCPosterior,
-    RejectionPosterior,
     VectorFieldPosterior,
-    VIPosterior,
 )
 from sbi.inference.posteriors import NPE_A_Posterior
 from sbi.inference.posteriors.filtered_direct_posterior import FilteredDirectPosterior
@@ -67,15 +64,6 @@ def test_the_estimator_of_a_vector_field_posterior_is_the_trained_one(
     ("make", "name"),
     [
         pytest.param(lambda: bare(MCMCPosterior), "MCMCPosterior", id="mcmc"),
-        pytest.param(lambda: bare(VIPosterior), "VIPosterior", id="vi"),
-        pytest.param(
-            lambda: bare(ImportanceSamplingPosterior),
-            "ImportanceSamplingPosterior",
-            id="importance",
-        ),
-        pytest.param(
-            lambda: bare(RejectionPosterior), "RejectionPosterior", id="rejection"
-        ),
         pytest.param(lambda: bare(NPE_A_Posterior), "NPE_A_Posterior", id="npe-a"),
         pytest.param(
             lambda: bare(FilteredDirectPosterior),
@@ -99,7 +87,6 @@ def test_the_estimator_of_a_vector_field_posterior_is_the_trained_one(
             "NFlowsFlow",
             id="estimator",
         ),
-        pytest.param(lambda: problems.box(2), "BoxUniform", id="prior"),
         pytest.param(lambda: None, "NoneType", id="none"),
     ],
 )
