@@ -314,16 +314,11 @@ class RoPE:
 
         Args:
             simulations_per_target: The number of simulations for each pair.
-            show_progress_bars: Whether to show the progress of slow simulations, as in
-                :meth:`train`.
+            show_progress_bars: As in :meth:`train`.
 
         Returns:
             :math:`E[h(S(\theta)) \mid y_i]`, shape ``(n_c, l)``. Over labels that are
-            not exact it averages the parameters, too. :meth:`train` tunes to averages
-            that are also given x there.
-
-        Raises:
-            SimulationError: If the simulator fails, or an embedding is not finite.
+            not exact it averages the parameters, too.
         """
         return labelled_targets(
             self._source,
@@ -364,27 +359,12 @@ class RoPE:
         With the same ``num_simulations`` and ``seed``, :meth:`build_posterior` couples
         with the same simulations.
 
-        Args:
-            x_o: Real observations, shape ``(n_o, *event)``.
-            num_simulations: n_s; ``max(n_o, 1000)`` if None (or all stored
-                simulations, if there are fewer).
-            seed: Seed of the simulations, for torch, NumPy and Python; None uses their
-                states.
-            show_progress_bars: Whether to show the progress of slow simulations, as in
-                :meth:`train`.
+        The arguments are those of :meth:`build_posterior`.
 
         Returns:
             :math:`g(x_o)` (:math:`h(x_o)` without calibration pairs), parameters drawn
             from the prior, and :math:`h(x_s)` of one simulation at each of them.
-            Simulations that are not finite are left out. There is a warning of entries
-            of x_o that are missing (NaN), but in no simulation.
-
-        Raises:
-            NotReadyError: If calibration pairs were appended after the last training.
-            InvalidInputError: If x_o has the wrong shape or device or is empty, if it
-                or its embedding is not finite, or if there are fewer stored simulations
-                than asked for.
-            SimulationError: If the simulator fails.
+            Simulations that are not finite are left out.
         """
         if len(self._x_cal) and self._g is None:
             raise NotReadyError(
@@ -446,16 +426,15 @@ class RoPE:
             unseen: What the posterior does with an x outside the batch: ``"raise"`` an
                 error, or ``"extend"`` the coupling by one row.
             require_convergence: Whether a coupling that has not converged is an error.
-            show_progress_bars: Whether to show the progress of slow simulations, as in
-                :meth:`train`.
+            show_progress_bars: As in :meth:`train`.
 
         Returns:
             The posteriors of the batch.
 
         Raises:
             NotReadyError: If calibration pairs were appended after the last training.
-            InvalidInputError: If x_o has the wrong shape or device, is empty, or not
-                finite.
+            InvalidInputError: If the net cannot read x_o, or there are fewer stored
+                simulations than asked for.
             CouplingError: If the coupling has not converged.
             SimulationError: If the simulator fails.
         """

@@ -238,5 +238,5 @@ def test_other_mixtures_are_refused() -> None:
         TEST[1], coupler=SinkhornCoupler(gamma=1.0), num_simulations=50, seed=0
     )
     for posterior in (coupled, finetuned(npe(), num_holdouts=3).build_posterior()):
-        with pytest.raises(UnsupportedPosteriorError, match="it was built from"):
+        with pytest.raises(UnsupportedPosteriorError, match="got MixturePosterior"):
             FinetunedNPE.from_posterior(posterior)

@@ -248,12 +248,6 @@ def test_networks_of_torch_and_sbi_can_be_saved(
     assert torch.equal(found, expected)
 
 
-@pytest.mark.medium
-def test_settings_may_be_numbers_of_numpy(tmp_path: Path) -> None:
-    posterior = rope_posterior(tail_mass=np.float64(1e-2))
-    assert_same(posterior, saved_and_loaded(posterior, tmp_path), stacks.observed()[:3])
-
-
 def test_a_description_does_not_depend_on_the_order_of_a_set() -> None:
     # They have the same hash in a small set, as texts may have in another process.
     one, other = set((0, 8)), set((8, 0))
