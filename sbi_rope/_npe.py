@@ -6,14 +6,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._random import seeded
 from sbi_rope._sbi import (
     ConditionalDensityEstimator,
     MixedDensity,
     VectorFieldDensity,
     check_rows_apart,
-    check_weights_of,
-    copy_of_prior,
     device_of,
     dtype_of,
     embed,
@@ -22,12 +19,12 @@ from sbi_rope._sbi import (
     headless,
     posterior_from,
     readable,
+    standardisation_of,
     with_embedding,
 )
-from sbi_rope._validation import check_readable
-from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError
+from sbi_rope.errors import InvalidInputError
 from sbi_rope.settings import names_of
-from sbi_rope.tensors import as_batch, as_numbers
+from sbi_rope.tensors import as_batch, rows_with
 
 __all__ = ["TrainedNPE"]
 
@@ -50,35 +47,23 @@ class TrainedNPE:
         h: The embedding net of the copy, with sbi's standardising layer.
         like: An empty tensor of shape ``(0, d)`` with the dtype and device of the
             estimator.
-        parameter_names: The names; None if there are none.
+        parameter_names: The names of the parameters; None if there are none.
+        x_names: The names of the columns of tables of x; None if they are not known.
 
     Raises:
-        UnsupportedPosteriorError: If the posterior has no embedding to work with, is
-            not in float32, has weights that are not finite, or embeds a row of a batch
-            differently among other rows.
-        InvalidInputError: If the names are not strings.
-        InvalidInputError: If there are not as many names as parameters, or two are
-            equal, or the prior has another number of parameters than the estimator.
+        UnsupportedPosteriorError: If the posterior has no embedding to work with, has
+            weights that are not finite, or embeds a row of a batch differently among
+            other rows.
+        InvalidInputError: If there are not as many different names as parameters.
     """
 
     def __init__(self, posterior: Any, parameter_names: Any = None) -> None:
-        estimator = estimator_of(posterior)
-        embedding_of(estimator)
-        check_weights_of(estimator)
-        if dtype_of(estimator) != torch.float32:
-            raise UnsupportedPosteriorError(
-                f"Expected an estimator in float32; got {dtype_of(estimator)}. sbi "
-                "converts every x to float32; convert the estimator with `.float()`."
-            )
-        self.estimator = (
-            copy.deepcopy(estimator).eval().requires_grad_(requires_grad=False)
-        )
-        self._posterior: Any = posterior_from(posterior, self.estimator)
-        self.prior = copy_of_prior(posterior.prior)
-        _check_size_of_prior(self.prior, estimator.input_shape)
-        self.h = embedding_of(self.estimator)
-        self._q = headless(self.estimator)
-        check_rows_apart(self.h, self.event_shape, device_of(estimator))
+        estimator = copy.deepcopy(estimator_of(posterior)).eval()
+        self.estimator = estimator.requires_grad_(requires_grad=False)
+        self.h = embedding_of(estimator)
+        self._q = headless(estimator)
+        self._posterior: Any = posterior_from(posterior, estimator)
+        self.prior = copy.deepcopy(posterior.prior)
         self.like = torch.empty(
             0,
             *estimator.input_shape,
@@ -88,6 +73,11 @@ class TrainedNPE:
         self.parameter_names: tuple[str, ...] | None = None
         if parameter_names is not None:
             self.parameter_names = names_of(parameter_names, self.like.shape[1])
+        self.x_names: tuple[str, ...] | None = None
+        generator = torch.Generator().manual_seed(0)
+        x = torch.randn(4, *self.event_shape, generator=generator).to(self.like)
+        mean, std = standardisation_of(self.h) or (0.0, 1.0)
+        check_rows_apart(self.h, mean + std * x)
 
     @property
     def event_shape(self) -> torch.Size:
@@ -130,46 +120,36 @@ class TrainedNPE:
             InvalidInputError: If an embedding, or its length, is not finite.
         """
         embedded = embed(embedding_net, x)
-        usable = torch.isfinite(torch.linalg.vector_norm(embedded, dim=1))
-        if not usable.all():
-            rows = (~usable).nonzero().flatten()
-            largest = float(x[rows[0]].abs().max())
+        bad = ~torch.isfinite(torch.linalg.vector_norm(embedded, dim=1))
+        if bad.any():
             raise InvalidInputError(
-                f"Expected `{name}` with a finite embedding; got NaN, Inf or numbers "
-                f"too large to compare for {len(rows)} of {len(x)} rows (first: "
-                f"{rows[:5].tolist()}, with values of up to {largest:.2g}). Remove or "
-                "repair these rows."
+                f"Expected `{name}` with finite embeddings; got NaN, Inf or too large "
+                f"numbers in {rows_with(bad)}."
             )
         return embedded
 
-    def checked_x(self, name: str, x: Any) -> Tensor:
-        """Return a copy of a user's observations, in the estimator's dtype."""
-        x = self._checked(name, x, self.event_shape)
-        check_readable(name, x, self.readable(x))
+    def as_x(self, name: str, x: Any) -> Tensor:
+        """Return a copy of a user's observations, if the embedding net can read them.
+
+        Raises:
+            InvalidInputError: If they hold no numbers, their shape or device does not
+                fit, or h cannot read them.
+        """
+        x = as_batch(
+            name,
+            x,
+            self.event_shape,
+            device=self.like.device,
+            names=self.x_names,
+            finite=False,
+        ).to(self.like.dtype, copy=True)
+        if not (can_read := self.readable(x)).all():
+            raise InvalidInputError(
+                f"Expected `{name}` that the embedding net of NPE can read; got NaN or "
+                f"Inf in {rows_with(~can_read)}."
+            )
         return x
 
     def readable(self, x: Tensor) -> Tensor:
         """Tell which observations h can read, ``(n,)``; some nets can read NaN."""
         return readable(self.h, x)
-
-    def _checked(self, name: str, value: Any, event_shape: torch.Size) -> Tensor:
-        value = as_batch(
-            name,
-            as_numbers(name, value, device=self.like.device),
-            event_shape,
-            finite=False,
-        )
-        # Numbers that float32 cannot hold become Inf.
-        return value.detach().to(self.like.dtype, copy=True)
-
-
-def _check_size_of_prior(prior: Any, input_shape: torch.Size) -> None:
-    """Raise unless draws of the prior have the shape of the estimator's parameters."""
-    with seeded(0):
-        shape = prior.sample(torch.Size((1,))).shape[1:]
-    if tuple(shape) != tuple(input_shape):
-        raise InvalidInputError(
-            f"Expected a prior of {input_shape.numel()} parameters, as NPE was trained "
-            f"with; got one whose draws have shape {tuple(shape)}. Pass the prior of "
-            "the simulations to `NPE(prior)`, or to `build_posterior(prior=...)`."
-        )

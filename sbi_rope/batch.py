@@ -1,15 +1,13 @@
 """A batch of real observations and the simulations that it is coupled with."""
 
 import copy
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 from torch import Tensor, nn
 
 from sbi_rope._npe import TrainedNPE
-from sbi_rope._validation import KnownColumns
 from sbi_rope.coupling import Coupling, SinkhornCoupler
 from sbi_rope.errors import CouplingError
 from sbi_rope.mixture import (
@@ -19,7 +17,10 @@ from sbi_rope.mixture import (
     Part,
 )
 
-__all__ = ["EmbeddedBatch", "check_converged", "parameters_named"]
+__all__ = ["EmbeddedBatch", "check_converged"]
+
+# The share of the weights that ``log_prob`` may leave out.
+TAIL_MASS = 1e-3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -35,7 +36,6 @@ class EmbeddedBatch:
         simulated: The embeddings :math:`h(x_s)` of the simulations, shape ``(n_s, l)``.
         npe: The NPE that the embeddings belong to.
         embedding_net: g, or h if nothing was tuned.
-        columns: The names of columns of "theta" and "x" in orders that are known.
     """
 
     x_o: Tensor
@@ -44,22 +44,17 @@ class EmbeddedBatch:
     simulated: Tensor
     npe: TrainedNPE
     embedding_net: nn.Module
-    columns: Mapping[str, KnownColumns] = field(default_factory=dict)
 
-    def couple(self, coupler: SinkhornCoupler, *, seed: int | None = None) -> Coupling:
+    def couple(self, coupler: SinkhornCoupler) -> Coupling:
         """Couple the observations with the simulations.
 
         Args:
             coupler: Settings of the transport.
-            seed: As in :meth:`SinkhornCoupler.couple
-                <sbi_rope.SinkhornCoupler.couple>`.
 
         Raises:
-            CouplingError: If the embeddings cannot be coupled. It names the parameters
-                of the simulations that are to blame.
+            CouplingError: If the embeddings cannot be coupled.
         """
-        with parameters_named(self.theta):
-            return coupler.couple(self.real, self.simulated, seed=seed)
+        return coupler.couple(self.real, self.simulated)
 
     def sweep(
         self,
@@ -78,29 +73,21 @@ class EmbeddedBatch:
             coupler: Settings other than gamma and tau.
             gammas: Values of gamma, in any order.
             taus: Values of tau, in any order.
-            seed: Seed of the choice of ``num_fitted`` observations.
+            seed: Has no effect.
 
         Raises:
             InvalidInputError: If a gamma or tau is outside its range, or there is none.
             CouplingError: As in :meth:`couple`.
         """
-        with parameters_named(self.theta):
-            couplings = coupler.sweep(
-                self.real, self.simulated, gammas=gammas, taus=taus, seed=seed
-            )
-
-        def named() -> Iterator[Coupling]:
-            with parameters_named(self.theta):
-                yield from couplings
-
-        return named()
+        return coupler.sweep(
+            self.real, self.simulated, gammas=gammas, taus=taus, seed=seed
+        )
 
     def posterior(
         self,
         coupling: Coupling,
         *,
         unseen: Literal["raise", "extend"] = "raise",
-        tail_mass: float = 1e-3,
         shared: dict[int, Tensor] | None = None,
     ) -> MixturePosterior:
         """Return the mixture of simulated posteriors that a coupling gives.
@@ -108,7 +95,6 @@ class EmbeddedBatch:
         Args:
             coupling: What :meth:`couple` returned.
             unseen: As in :meth:`~sbi_rope.RoPE.build_posterior`.
-            tail_mass: As in :meth:`~sbi_rope.RoPE.build_posterior`.
             shared: A dictionary that posteriors of the same simulations may share, as
                 in :class:`~sbi_rope.MixturePosterior`.
         """
@@ -119,7 +105,7 @@ class EmbeddedBatch:
             self.simulated, self.x_o, net, coupling, unseen=unseen
         )
         mixture = MixtureEstimator(
-            [Part(self.npe.density(), mixing)], [1.0], tail_mass=tail_mass
+            [Part(self.npe.density(), mixing)], [1.0], tail_mass=TAIL_MASS
         )
         posterior = MixturePosterior(
             mixture,
@@ -127,29 +113,8 @@ class EmbeddedBatch:
             enable_transform=self.npe.enable_transform,
         )
         posterior.parameter_names = self.npe.parameter_names
-        posterior.columns = dict(self.columns)
+        posterior.x_names = self.npe.x_names
         return posterior
-
-
-@contextmanager
-def parameters_named(theta: Tensor) -> Iterator[None]:
-    """Rephrase errors of a coupling in the terms that a user of RoPE knows.
-
-    Users do not know the rows of the simulations, because RoPE has drawn them. The
-    error names their parameters instead.
-
-    Args:
-        theta: The parameters of the simulations, shape ``(n_s, d)``.
-    """
-    try:
-        yield
-    except CouplingError as error:
-        reason = error.reason.replace("`real`", "`x_o`")
-        reason = reason.replace("`simulated`", "the simulations")
-        if error.simulated_rows:
-            rows = list(error.simulated_rows[:5])
-            reason += f" Their parameters are {theta[rows].tolist()}."
-        raise CouplingError(reason) from error
 
 
 def check_converged(coupling: Coupling, coupler: SinkhornCoupler) -> None:
@@ -159,7 +124,6 @@ def check_converged(coupling: Coupling, coupler: SinkhornCoupler) -> None:
     raise CouplingError(
         f"The coupling has not converged: marginal error {coupling.marginal_error:.1e} "
         f"after {coupling.num_iterations} iterations, tolerance "
-        f"{coupler.tolerance:.1e}. Use a larger gamma (now {coupler.gamma}), tau < 1 "
-        f"(now {coupler.tau}), more max_iterations, or accept it with "
+        f"{coupler.tolerance:.1e}. Use a larger gamma, more max_iterations, or "
         "require_convergence=False."
     )

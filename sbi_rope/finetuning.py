@@ -4,7 +4,7 @@ import copy
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated
 
 import torch
 from torch import Tensor, nn
@@ -12,17 +12,11 @@ from torch import Tensor, nn
 from sbi_rope._groups import split_pairs
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
-from sbi_rope._sbi import embed, readable
+from sbi_rope._sbi import embed
 from sbi_rope._training import History, best_of_learning_rates, epochs_on_pairs, fit
-from sbi_rope._validation import (
-    check_finite,
-    check_groups,
-    check_pair_weights,
-    check_readable,
-)
 from sbi_rope.errors import InvalidInputError
-from sbi_rope.settings import Count, NotNegative, Positive, check
-from sbi_rope.tensors import as_batch, as_numbers
+from sbi_rope.settings import Count, NotNegative, Positive, Range, Settings, check
+from sbi_rope.tensors import as_batch, rows_with
 
 __all__ = ["CalibrationFinetuner", "FinetuneResult", "History"]
 
@@ -45,7 +39,7 @@ class FinetuneResult:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CalibrationFinetuner:
+class CalibrationFinetuner(Settings):
     r"""Tunes a copy g of the embedding net h on calibration pairs.
 
     It minimises, with the norm not squared,
@@ -97,40 +91,21 @@ class CalibrationFinetuner:
         num_neighbors: With stored simulations instead of a simulator, the expectation
             is estimated by the mean over this many simulations with the nearest
             parameters.
-        validation_fraction: The share of the pairs that is held out, in (0, 0.5].
+        validation_fraction: The share of the pairs that is held out, at most 0.5.
         rehearsal: :math:`\lambda`, not negative. The default is 0, as in the paper.
 
     Raises:
         InvalidInputError: If an argument is outside its range.
     """
 
-    learning_rate: float | tuple[float, ...] = (1e-4, 1e-3)
-    max_num_epochs: int = 1000
-    stop_after_epochs: int = 200
-    simulations_per_target: int = 100
+    learning_rate: Positive | tuple[Positive, ...] = (1e-4, 1e-3)
+    max_num_epochs: Count = 1000
+    stop_after_epochs: Count = 200
+    simulations_per_target: Count = 100
     resample_targets: bool = False
-    num_neighbors: int = 1
-    validation_fraction: float = 0.2
-    rehearsal: float = 0.0
-
-    def __post_init__(self) -> None:
-        """Check the ranges of all fields."""
-        if not self._learning_rates:
-            raise InvalidInputError("Expected at least one `learning_rate`; got ().")
-        for rate in self._learning_rates:
-            check("learning_rate", rate, Positive)
-        check("max_num_epochs", self.max_num_epochs, Count)
-        check("stop_after_epochs", self.stop_after_epochs, Count)
-        check("simulations_per_target", self.simulations_per_target, Count)
-        check("num_neighbors", self.num_neighbors, Count)
-        check("resample_targets", self.resample_targets, bool)
-        check("rehearsal", self.rehearsal, NotNegative)
-        check("validation_fraction", self.validation_fraction, Positive)
-        if self.validation_fraction > 0.5:
-            raise InvalidInputError(
-                "Expected `validation_fraction` in (0, 0.5]; got "
-                f"{self.validation_fraction!r}."
-            )
+    num_neighbors: Count = 1
+    validation_fraction: Annotated[float, Range(0, 0.5)] = 0.2
+    rehearsal: NotNegative = 0.0
 
     @property
     def _learning_rates(self) -> tuple[float, ...]:
@@ -172,25 +147,24 @@ class CalibrationFinetuner:
 
         Raises:
             InvalidInputError: If shapes do not fit or a value is not finite.
-            NotReadyError: In torch's inference mode.
         """
         check("embedding_net", embedding_net, nn.Module)
-        x = _checked_inputs("x", x, embedding_net)
+        x = as_batch("x", x, finite=False).to(_dtype_of(embedding_net))
         if groups is None:
             groups = torch.arange(len(x))
-        groups = check_groups(groups, "x", x)
+        groups = as_batch("groups", groups, (), rows=len(x))
         if weights is not None:
-            weights = check_pair_weights(weights, "x", x).to(x)
+            weights = as_batch("weights", weights, (), rows=len(x)).to(x)
         show = is_shown(show_progress_bars)
         with seeded(seed):
             embedded = _embedded("x", x, embedding_net)
 
-            def checked_targets() -> Tensor:
+            def new_targets() -> Tensor:
                 targets = draw_targets(self.simulations_per_target)
-                return _checked_targets(targets, embedded)
+                width = embedded.shape[1:]
+                return as_batch("targets", targets, width, rows=len(x))
 
-            targets = checked_targets()
-            _check_start(embedded, targets)
+            targets = new_targets()
             keep = self._rehearsed(embedding_net, draw_simulations)
             train, held_out = split_pairs(groups, self.validation_fraction)
             max_num_epochs = epochs_on_pairs(groups, held_out, self.max_num_epochs)
@@ -206,7 +180,7 @@ class CalibrationFinetuner:
                     learning_rate=learning_rate,
                     max_num_epochs=max_num_epochs,
                     keep=keep,
-                    draw_targets=checked_targets if self.resample_targets else None,
+                    draw_targets=new_targets if self.resample_targets else None,
                     show_progress_bars=show,
                 )
 
@@ -229,9 +203,9 @@ class CalibrationFinetuner:
         if draw_simulations is None:
             raise InvalidInputError(
                 f"Expected `draw_simulations` with rehearsal={self.rehearsal}; got "
-                "None. Give a function of a number k that returns up to k simulations."
+                "None."
             )
-        simulations = _checked_inputs("simulations", draw_simulations(NUM_REHEARSED), h)
+        simulations = draw_simulations(NUM_REHEARSED).to(_dtype_of(h))
         return simulations, _embedded("simulations", simulations, h)
 
     def _optimise(
@@ -304,53 +278,21 @@ def trainable_copy(embedding_net: nn.Module, embeddings: Tensor) -> nn.Module:
     return net.eval()
 
 
-def _checked_inputs(name: str, x: Any, net: nn.Module) -> Tensor:
-    """Return what a net is to embed, in the dtype of its parameters."""
-    x = as_numbers(name, x)
-    if x.ndim < 2:
-        raise InvalidInputError(
-            f"Expected `{name}` of shape (n, *event); got {tuple(x.shape)}."
-        )
-    as_batch(name, x, x.shape[1:], finite=False)
+def _dtype_of(net: nn.Module) -> torch.dtype:
+    """Return the dtype of the parameters and buffers of a net."""
     known = itertools.chain(net.parameters(), net.buffers())
-    dtypes = [values.dtype for values in known if values.is_floating_point()]
-    x = x.detach().to(dtypes[0] if dtypes else torch.float32)
-    # Numbers that this dtype cannot hold have become Inf.
-    check_readable(name, x, readable(net, x))
-    return x
+    dtypes = (values.dtype for values in known if values.is_floating_point())
+    return next(dtypes, torch.float32)
 
 
 def _embedded(name: str, x: Tensor, net: nn.Module) -> Tensor:
-    try:
-        return embed(net, x)
-    except RuntimeError as error:
+    embedded = embed(net, x)
+    if (bad := ~torch.isfinite(embedded)).any():
         raise InvalidInputError(
-            f"Expected `{name}` of a shape and on a device that the embedding net "
-            f"takes; for {tuple(x.shape)} on {x.device} it raised: {error}"
-        ) from error
-
-
-def _checked_targets(targets: Tensor, embedded: Tensor) -> Tensor:
-    """Return targets that have exactly the shape of the embeddings."""
-    targets = as_numbers("targets", targets)
-    if targets.shape != embedded.shape:
-        raise InvalidInputError(
-            "Expected `targets` with one for each pair, as wide as the embedding, "
-            f"shape {tuple(embedded.shape)}; got {tuple(targets.shape)}."
+            f"Expected `{name}` with finite embeddings; got NaN or Inf in "
+            f"{rows_with(bad)}."
         )
-    check_finite("targets", targets)
-    return targets
-
-
-def _check_start(embedded: Tensor, targets: Tensor) -> None:
-    distance = torch.linalg.vector_norm(embedded - targets, dim=1)
-    if not torch.isfinite(distance).all():
-        rows = (~torch.isfinite(distance)).nonzero().flatten()[:5].tolist()
-        raise InvalidInputError(
-            f"The embedding net returns NaN or Inf for the observations `x` of the "
-            f"calibration pairs {rows}, or values too large to compare. Remove or "
-            "repair these pairs."
-        )
+    return embedded
 
 
 def _mean_distance(

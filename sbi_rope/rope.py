@@ -7,18 +7,14 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._focus import warn_if_focused
 from sbi_rope._labels import (
     LabelledParameters,
     Labels,
+    given_labels,
     labelled_moments,
     labelled_targets,
+    on_bounds,
     parameters_of,
-)
-from sbi_rope._labels.checks import (
-    checked_labels,
-    warn_of_ambiguous,
-    warn_of_labels_on_bounds,
 )
 from sbi_rope._npe import TrainedNPE
 from sbi_rope._progress import is_shown
@@ -27,17 +23,6 @@ from sbi_rope._sbi import embed
 from sbi_rope._standardisation import (
     Standardisation,
     warn_of_far_entries,
-)
-from sbi_rope._validation import (
-    KnownColumns,
-    check_columns,
-    check_default_dtype,
-    check_not_swapped,
-    check_parameter_order,
-    check_row_order,
-    check_rows,
-    column_names,
-    columns_of,
 )
 from sbi_rope.batch import EmbeddedBatch, check_converged
 from sbi_rope.coupling import SinkhornCoupler
@@ -50,17 +35,12 @@ from sbi_rope.errors import (
 )
 from sbi_rope.finetuning import CalibrationFinetuner, History
 from sbi_rope.mixture import MixturePosterior
-from sbi_rope.settings import Count, UnitInterval, check
+from sbi_rope.settings import Count, check
 from sbi_rope.simulate import SimulationSource, source_of
-from sbi_rope.tensors import as_batch, as_numbers, check_same_length
+from sbi_rope.tensors import as_numbers, check_same_length, column_names, rows_with
 
 __all__ = ["RoPE"]
 
-# How to make the RoPE that functions ask for.
-HOW_TO_MAKE = (
-    "Make one from the posterior of NPE with `rope = RoPE(posterior, "
-    "simulator=simulator)` and `rope.append_calibration(theta_cal, x_cal)`."
-)
 # The number of simulations to couple with if the batch has fewer observations.
 MIN_SIMULATIONS = 1000
 
@@ -89,11 +69,8 @@ class RoPE:
 
     Args:
         posterior: What ``NPE(...).build_posterior()`` returns, or the posterior of
-            MNPE, FMPE or NPSE (the last two have no ``log_prob``). Its default x is
-            ignored. It must be amortised. A posterior trained over several rounds fits
-            one observation only, and sbi keeps no trace of the rounds in it. There is a
-            warning if it does not fit simulations from the prior, and one whose prior
-            was truncated (TSNPE) is refused.
+            MNPE, FMPE or NPSE (the last two have no ``log_prob``). It must be trained
+            in one round: a posterior of several rounds fits one observation only.
         simulator: Maps parameters ``(n, d)`` to simulations ``(n, *event)``, or one
             ``(d,)`` to one ``(*event)``. It may take tensors or NumPy arrays (of
             float64), and return either, lists, or numbers. A row of x may depend on the
@@ -104,8 +81,7 @@ class RoPE:
         simulations: Instead of a simulator, stored pairs (theta, x) with theta drawn
             from the prior. Fine-tuning then uses those with the nearest parameters.
             A warning says if their parameters are not distributed like the prior. If
-            theta or x is a table whose columns have names, a later table with the same
-            names in another order is refused.
+            x is a table, later tables of x are put into the order of its columns.
         num_simulations: For a simulator that takes long: how many simulations it makes
             in all, at draws of the prior, when they are first needed. They are then
             used as stored simulations are. If None, the simulator is called as often as
@@ -114,20 +90,14 @@ class RoPE:
         coupler: Settings of step 2; ``SinkhornCoupler()`` if None.
         parameter_names: One name for each parameter, for reports and intervals. If
             None, the columns of a table of parameters in ``simulations``, or "theta_1"
-            and so on. Tables of parameters with the same names in another order are
-            refused.
+            and so on. Tables of parameters are put into the order of these names.
 
     Raises:
         UnsupportedPosteriorError: If the posterior has no embedding to work with, or
             one that embeds a row of a batch differently among other rows, or a weight
             of its networks is not finite.
-        InvalidInputError: If both or none of simulator and simulations are given,
-            their shapes do not fit the posterior, ``num_simulations`` is given
-            without a simulator, the names are not as many different ones as there
-            are parameters, or they, or the columns of stored simulations, are in
-            another order than those that the posterior was trained on.
-        InvalidInputError: If an argument has the wrong type.
-        NotReadyError: If torch's default dtype is not float32.
+        InvalidInputError: If both or none of simulator and simulations are given, or
+            their shapes do not fit the posterior.
         SimulationError: If the simulator raises or returns something unusable.
 
     Example:
@@ -163,8 +133,14 @@ class RoPE:
     ) -> None:
         check("finetuner", finetuner, CalibrationFinetuner | None)
         check("coupler", coupler, SinkhornCoupler | None)
-        check_default_dtype()
+        x_names = None
+        if simulations is not None:
+            theta, x = simulations
+            x_names = column_names(x)
+            parameter_names = parameter_names or column_names(theta)
+            simulations = (as_numbers("theta", theta, names=parameter_names), x)
         self._npe = TrainedNPE(posterior, parameter_names)
+        self._npe.x_names = x_names
         self._source = source_of(
             self._npe.prior,
             simulator=simulator,
@@ -174,18 +150,6 @@ class RoPE:
             like=self._npe.like,
             readable=self._npe.readable,
         )
-        names = self._npe.parameter_names
-        earlier = columns_of(posterior)
-        known = earlier["theta"]
-        if names is not None:
-            check_parameter_order(names, known)
-            known = {names: "`parameter_names`", **known}
-        theta_s, x_s = (None, None) if simulations is None else simulations
-        check_row_order(**{"simulations[0]": theta_s, "simulations[1]": x_s})
-        self._theta_columns = check_columns("simulations[0]", theta_s, known)
-        self._x_columns = check_columns("simulations[1]", x_s, earlier["x"])
-        if names is None:
-            self._npe.parameter_names = column_names(theta_s) or None
         self.finetuner = CalibrationFinetuner() if finetuner is None else finetuner
         self.coupler = SinkhornCoupler() if coupler is None else coupler
         self._labels = Labels.exact(self._npe.like)
@@ -195,7 +159,6 @@ class RoPE:
         self._targets: Tensor | None = None
         self._g: nn.Module | None = None
         self._history: History | None = None
-        self._was_looked_at = False
 
     def append_calibration(
         self,
@@ -213,13 +176,9 @@ class RoPE:
         :math:`y \sim \mathcal N(\theta, R)` of some or all of the parameters, and what
         needs the parameters averages over :math:`p(\theta \mid y)` under the prior.
 
-        Tensors, NumPy arrays and lists of numbers are taken here and wherever
-        parameters and observations of a user are passed. They are copied to the dtype
-        of NPE, and arrays and lists to its device. What was computed from them, such as
-        embeddings and samples, has to be a tensor. A table whose columns have names is
-        refused if those that RoPE knows are the same in another order: the parameter
-        names, and the columns of stored simulations, of the tables that the simulator
-        returns, and of pairs appended before.
+        Tensors, arrays, tables and lists of numbers are taken here and wherever
+        parameters and observations of a user are passed. A table whose columns have the
+        names that RoPE knows is put into their order.
 
         Args:
             theta: Parameters, shape ``(n, d)``, inside the prior's support. NaN stands
@@ -235,32 +194,19 @@ class RoPE:
             groups: A number or a name for each pair, n of them. Pairs with the same
                 are recordings of one person or specimen, also if they were appended by
                 different calls. They are held out together, and count once where they
-                are scored. None if pairs with equal labels are these. If a label that
-                lacks some parameters agrees with another one in the rest, there is a
-                warning, because the two are taken for different specimens.
+                are scored. None if pairs with equal labels are these.
 
         Returns:
             Itself, so that calls can be chained.
 
         Raises:
-            InvalidInputError: If an argument does not hold numbers.
             InvalidInputError: If shapes, numbers of rows or devices do not fit, a value
-                is not finite, an exact theta is outside the prior's support, no
-                parameters inside it fit a label, or the columns or rows of a table are
-                in another order. Nothing is added then.
+                is not finite, an exact theta is outside the prior's support, or no
+                parameters inside it fit a label. Nothing is added then.
             UnsupportedPosteriorError: If labels are not exact and some parameters are
-                discrete, or if values of x are missing (NaN) and the embedding net
-                takes their number from another row.
+                discrete.
         """
-        check_not_swapped(theta, x, self._npe.like.shape[1:], self._npe.event_shape)
-        check_row_order(
-            theta=theta, x=x, theta_std=theta_std, weights=weights, groups=groups
-        )
-        theta_columns = check_columns("theta", theta, self._theta_columns)
-        check_columns("theta_std", theta_std, theta_columns)
-        check_columns("theta_cov", theta_cov, theta_columns, how="df.loc[{0}, {0}]")
-        x_columns = check_columns("x", x, self._x_columns)
-        labels = checked_labels(
+        labels = given_labels(
             theta,
             theta_std=theta_std,
             theta_cov=theta_cov,
@@ -268,13 +214,15 @@ class RoPE:
             groups=groups,
             like=self._npe.like,
             prior=self._npe.prior,
+            names=self.parameter_names,
         )
-        x = self._npe.checked_x("x", x)
+        x_names = self.x_names or column_names(x)
+        x = self._npe.as_x("x", x)
         check_same_length("theta", labels.theta, "x", x)
         if self._npe.is_mixed and not labels.are_exact:
             raise UnsupportedPosteriorError(
                 "Expected exact labels, because some parameters are discrete (MNPE); "
-                f"got {labels}. Leave out pairs whose parameters are not all known."
+                f"got {labels}."
             )
         self._npe.embed("x", x, self._npe.h)
         warn_of_far_entries("x", x, self._npe.h)
@@ -285,19 +233,26 @@ class RoPE:
             )
         if not known.all():
             warn_user(
-                f"{int((~known).sum())} of {len(known)} labels say nothing about any "
-                "parameter, and are left out (first rows: "
-                f"{(~known).nonzero().flatten()[:5].tolist()}). Reports number the "
-                "pairs that are left."
+                "Labels that say nothing about any parameter are left out: "
+                f"{rows_with(~known)}."
             )
             labels, x = labels[known], x[known]
         labels = self._labels.appended(labels) if len(self._labels) else labels
         parameters = parameters_of(labels, self._npe.prior)
-        warn_of_ambiguous(labels)
-        warn_of_labels_on_bounds(labels, self._npe.prior, self.parameter_names)
+        total = float(labels.weights.sum())
+        if total < labels.effective_number / 2:
+            warn_user(
+                f"The weights of {len(labels)} pairs sum to {total:.3g}, and all "
+                "together count as so many pairs; do not normalise them."
+            )
+        if found := on_bounds(labels, self._npe.prior, self.parameter_names):
+            warn_user(
+                f"{', '.join(found)} lie exactly on the prior's bound; if they are "
+                "censored, pass theta_std."
+            )
         self._parameters = parameters
         self._labels, self._x_cal = labels, torch.cat([self._x_cal, x])
-        self._theta_columns, self._x_columns = theta_columns, x_columns
+        self._npe.x_names = x_names
         self._g, self._history, self._targets = None, None, None
         return self
 
@@ -321,15 +276,13 @@ class RoPE:
             Itself, so that calls can be chained.
 
         Raises:
-            NotReadyError: If no calibration pairs were appended, or in torch's
-                inference mode.
+            NotReadyError: If no calibration pairs were appended.
             SimulationError: If the simulator fails at the calibration parameters.
         """
-        check("finetuner", self.finetuner, CalibrationFinetuner)
-        self._check_pairs(
-            "Or call `build_posterior(x_o)` without training, which then couples with "
-            "the embedding net of NPE (OT-only)."
-        )
+        if not len(self._x_cal):
+            raise NotReadyError(
+                "No calibration pairs; call `append_calibration(theta, x)` first."
+            )
         known = None if self.finetuner.resample_targets else self._targets
         show = is_shown(show_progress_bars)
 
@@ -360,20 +313,12 @@ class RoPE:
 
         Args:
             simulations_per_target: The number of simulations for each pair.
-            show_progress_bars: Whether to show the progress of slow simulations, as in
-                :meth:`train`.
+            show_progress_bars: As in :meth:`train`.
 
         Returns:
             :math:`E[h(S(\theta)) \mid y_i]`, shape ``(n_c, l)``. Over labels that are
-            not exact it averages the parameters, too. :meth:`train` tunes to averages
-            that are also given x there.
-
-        Raises:
-            NotReadyError: If no calibration pairs were appended.
-            SimulationError: If the simulator fails, or an embedding is not finite.
+            not exact it averages the parameters, too.
         """
-        check("simulations_per_target", simulations_per_target, Count)
-        self._check_pairs("Targets are those of pairs.")
         return labelled_targets(
             self._source,
             self._parameters,
@@ -382,13 +327,6 @@ class RoPE:
             num_neighbors=self.finetuner.num_neighbors,
             progress=is_shown(show_progress_bars),
         )
-
-    def _check_pairs(self, hint: str) -> None:
-        if not len(self._x_cal):
-            raise NotReadyError(
-                "No calibration pairs to train on. Call `append_calibration(theta, "
-                f"x)` first. {hint}"
-            )
 
     def _targets_of_labels(self, *, progress: bool) -> Tensor:
         """Return targets, ``(n_c, l)``, where some labels leave parameters open."""
@@ -420,34 +358,20 @@ class RoPE:
         With the same ``num_simulations`` and ``seed``, :meth:`build_posterior` couples
         with the same simulations.
 
-        Args:
-            x_o: Real observations, shape ``(n_o, *event)``.
-            num_simulations: n_s; ``max(n_o, 1000)`` if None (or all stored
-                simulations, if there are fewer).
-            seed: Seed of the simulations, for torch, NumPy and Python; None uses their
-                states.
-            show_progress_bars: Whether to show the progress of slow simulations, as in
-                :meth:`train`.
+        The arguments are those of :meth:`build_posterior`.
 
         Returns:
             :math:`g(x_o)` (:math:`h(x_o)` without calibration pairs), parameters drawn
             from the prior, and :math:`h(x_s)` of one simulation at each of them.
             Simulations that are not finite are left out.
-
-        Raises:
-            NotReadyError: If calibration pairs were appended after the last training.
-            InvalidInputError: If x_o has the wrong shape or device or is empty, if it
-                or its embedding is not finite, or if there are fewer stored simulations
-                than asked for.
-            SimulationError: If the simulator fails.
         """
         if len(self._x_cal) and self._g is None:
             raise NotReadyError(
-                f"{len(self._x_cal)} calibration pairs were appended, but `train()` "
-                "was not called after that. Call `train()` first."
+                f"{len(self._x_cal)} calibration pairs were appended; call `train()` "
+                "first."
             )
         net = self._npe.h if self._g is None else self._g
-        x_o = self.checked_observations(x_o)
+        x_o = self._npe.as_x("x_o", x_o)
         real = self._npe.embed("x_o", x_o, net)
         if num_simulations is not None:
             check("num_simulations", num_simulations, Count)
@@ -458,9 +382,6 @@ class RoPE:
                 self._embed_simulations,
                 progress=is_shown(show_progress_bars),
             )
-        if not self._was_looked_at:
-            self._was_looked_at = True
-            warn_if_focused(self._npe.density(), self._npe.prior, theta, simulated)
         return EmbeddedBatch(
             x_o=x_o,
             real=real,
@@ -468,7 +389,6 @@ class RoPE:
             simulated=simulated,
             npe=self._npe,
             embedding_net=net,
-            columns=self.columns,
         )
 
     def build_posterior(
@@ -480,7 +400,6 @@ class RoPE:
         seed: int | None = None,
         unseen: Literal["raise", "extend"] = "raise",
         require_convergence: bool = True,
-        tail_mass: float = 1e-3,
         show_progress_bars: bool | None = None,
     ) -> MixturePosterior:
         """Couple a batch of real observations with simulations.
@@ -499,25 +418,21 @@ class RoPE:
             unseen: What the posterior does with an x outside the batch: ``"raise"`` an
                 error, or ``"extend"`` the coupling by one row.
             require_convergence: Whether a coupling that has not converged is an error.
-            tail_mass: The share of the weights that ``log_prob`` may leave out, in
-                [0, 1].
-            show_progress_bars: Whether to show the progress of slow simulations, as in
-                :meth:`train`.
+            show_progress_bars: As in :meth:`train`.
 
         Returns:
             The posteriors of the batch.
 
         Raises:
             NotReadyError: If calibration pairs were appended after the last training.
-            InvalidInputError: If x_o has the wrong shape or device, is empty, or not
-                finite.
+            InvalidInputError: If the net cannot read x_o, or there are fewer stored
+                simulations than asked for.
             CouplingError: If the coupling has not converged.
             SimulationError: If the simulator fails.
         """
         coupler = self.coupler if coupler is None else coupler
         check("coupler", coupler, SinkhornCoupler)
         check("unseen", unseen, Literal["raise", "extend"])
-        check("tail_mass", tail_mass, UnitInterval)
         batch = self.embed(
             x_o,
             num_simulations=num_simulations,
@@ -525,10 +440,10 @@ class RoPE:
             show_progress_bars=show_progress_bars,
         )
         warn_of_far_entries("x_o", batch.x_o, self._npe.h)
-        coupling = batch.couple(coupler, seed=seed)
+        coupling = batch.couple(coupler)
         if require_convergence:
             check_converged(coupling, coupler)
-        return batch.posterior(coupling, unseen=unseen, tail_mass=tail_mass)
+        return batch.posterior(coupling, unseen=unseen)
 
     def tuned_posterior(self) -> Any:
         r"""Return the flow on the tuned embedding, :math:`q(\theta \mid g(x))`.
@@ -544,18 +459,8 @@ class RoPE:
         return self._npe.posterior(self._g)
 
     def checked_observations(self, x_o: Tensor) -> Tensor:
-        """Return a copy of a batch, in the dtype of NPE, if it can be embedded.
-
-        Args:
-            x_o: Real observations, shape ``(n_o, *event)``.
-
-        Raises:
-            InvalidInputError: If x_o has the wrong shape or device, is empty, or not
-                finite, or is a table whose columns are those of simulations or pairs
-                in another order.
-        """
-        check_columns("x_o", x_o, self._x_columns)
-        return self._npe.checked_x("x_o", x_o)
+        """Return a copy of a batch ``(n_o, *event)``, if it can be embedded."""
+        return self._npe.as_x("x_o", x_o)
 
     def with_pairs(
         self,
@@ -574,19 +479,7 @@ class RoPE:
                 that :meth:`train` does not simulate again. Simulated if None, or if the
                 finetuner draws new targets in every step.
             finetuner: Settings of the tuning; those of this object if None.
-
-        Raises:
-            InvalidInputError: If an argument has the wrong type.
-            InvalidInputError: If a row is not the number of a pair, or there are not as
-                many targets as rows.
         """
-        check_rows("rows", rows, len(self._x_cal))
-        check("finetuner", finetuner, CalibrationFinetuner | None)
-        if targets is not None:
-            targets = as_numbers("targets", targets)
-            as_batch("targets", targets, targets.shape[1:])
-            check_same_length("rows", rows, "targets", targets)
-            targets = targets.clone()
         part = copy.copy(self)
         part.finetuner = self.finetuner if finetuner is None else finetuner
         part._labels, part._parameters = self._labels[rows], self._parameters[rows]
@@ -619,9 +512,9 @@ class RoPE:
         return self._npe.parameter_names
 
     @property
-    def columns(self) -> dict[str, KnownColumns]:
-        """The names of columns of "theta" and "x" in orders that are known."""
-        return {"theta": self._theta_columns, "x": self._x_columns}
+    def x_names(self) -> tuple[str, ...] | None:
+        """The names of the columns of tables of x; None if they are not known."""
+        return self._npe.x_names
 
     @property
     def labels(self) -> Labels:
@@ -667,11 +560,11 @@ class RoPE:
         """How many rows of theta the simulator has simulated so far.
 
         A few are simulated when RoPE is constructed, to find out how the simulator is
-        called. :meth:`train` simulates 100 for each label (and
-        2000 with rehearsal), :meth:`build_posterior` ``max(n_o, 1000)`` for each batch,
-        and :func:`~sbi_rope.stack` 20,000 from the prior and 100 for each label, and
-        with a batch 2000 and ``max(n_o, 1000)`` more. The argument ``num_simulations``
-        of this class sets a number for all of these together.
+        called. :meth:`train` simulates 100 for each label (and 2000 with rehearsal),
+        :meth:`build_posterior` ``max(n_o, 1000)`` for each batch, and
+        :func:`~sbi_rope.stack` 20,000 from the prior and 100 for each label. The
+        argument ``num_simulations`` of this class sets a number for all of these
+        together.
         """
         return self._source.num_calls
 

@@ -13,7 +13,7 @@ from sbi_rope.batch import check_converged
 from sbi_rope.coupling import SinkhornCoupler
 from sbi_rope.mixture import MixturePosterior
 from sbi_rope.rope import RoPE
-from sbi_rope.settings import UnitInterval, check
+from sbi_rope.settings import check
 
 __all__ = ["sweep"]
 
@@ -29,7 +29,6 @@ def sweep(
     seed: int | None = None,
     unseen: Literal["raise", "extend"] = "raise",
     require_convergence: bool = True,
-    tail_mass: float = 1e-3,
     show_progress_bars: bool | None = None,
 ) -> Iterator[MixturePosterior]:
     """Couple a batch at every gamma and every tau, with the same simulations.
@@ -50,7 +49,6 @@ def sweep(
         seed: As in :meth:`~sbi_rope.RoPE.build_posterior`.
         unseen: As in :meth:`~sbi_rope.RoPE.build_posterior`.
         require_convergence: As in :meth:`~sbi_rope.RoPE.build_posterior`.
-        tail_mass: As in :meth:`~sbi_rope.RoPE.build_posterior`.
         show_progress_bars: As in :meth:`~sbi_rope.RoPE.build_posterior`.
 
     Returns:
@@ -69,7 +67,6 @@ def sweep(
     check("coupler", settings, SinkhornCoupler)
     gammas, taus = check_numbers("gammas", gammas), check_numbers("taus", taus)
     check("unseen", unseen, Literal["raise", "extend"])
-    check("tail_mass", tail_mass, UnitInterval)
     batch = rope.embed(
         x_o,
         num_simulations=num_simulations,
@@ -86,8 +83,6 @@ def sweep(
         for (gamma, tau), coupling in zip(pairs, couplings, strict=True):
             if require_convergence:
                 check_converged(coupling, replace(settings, gamma=gamma, tau=tau))
-            yield batch.posterior(
-                coupling, unseen=unseen, tail_mass=tail_mass, shared=shared
-            )
+            yield batch.posterior(coupling, unseen=unseen, shared=shared)
 
     return posteriors()

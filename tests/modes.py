@@ -3,28 +3,25 @@
 from typing import Any
 
 import pytest
-import torch
+from torch import Tensor
 
 from sbi_rope import SinkhornCoupler
+from sbi_rope.coupling import Coupling
 
-__all__ = ["MODES", "digits", "raw_coupler"]
+__all__ = ["MODES", "coupled", "raw_coupler"]
 
-# Settings of SinkhornCoupler.
-MODES = [
-    pytest.param(
-        {"solver": solver, "dtype": dtype, "blocked": blocked},
-        id=f"{solver}-{str(dtype).removeprefix('torch.')}{'-blocked' * blocked}",
-    )
-    for solver, blocked in [("own", False), ("own", True), ("pot", False)]
-    for dtype in (torch.float64, torch.float32)
-]
-
-
-def digits(mode: dict[str, Any], *, double: float, single: float) -> float:
-    """Return the tolerance for the dtype of a mode."""
-    return double if mode["dtype"] == torch.float64 else single
+MODES = ("own", "blocked", "pot")
 
 
 def raw_coupler(**settings: Any) -> SinkhornCoupler:
     """A coupler of distances as they are, with the paper's gamma unless it is given."""
     return SinkhornCoupler(**{"gamma": 0.5, "cost_scale": "none", **settings})
+
+
+def coupled(mode: str, real: Tensor, simulated: Tensor, **settings: Any) -> Coupling:
+    """Couple in one of the modes."""
+    solver = "pot" if mode == "pot" else "own"
+    with pytest.MonkeyPatch.context() as patch:
+        if mode == "blocked":
+            patch.setattr("sbi_rope.coupling.coupler.MAX_STORED", 0)
+        return raw_coupler(solver=solver, **settings).couple(real, simulated)

@@ -251,8 +251,6 @@ def coupling_of(
         gamma=0.5,
         tau=1.0,
         marginal_error=0.0,
-        batch_error=0.0,
-        num_fitted=len(weights),
         num_iterations=0,
         converged=True,
         solver="none",

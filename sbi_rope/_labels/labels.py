@@ -77,14 +77,11 @@ class Labels:
         if counts[0] != counts[1]:
             raise InvalidInputError(
                 "Expected labels with as many draws as those appended before, "
-                f"{counts[0]}; got {counts[1]}. Repeat an exact label as often as "
-                "there are draws of the others."
+                f"{counts[0]}; got {counts[1]}."
             )
         if (self.names is None) != (others.names is None):
-            missing = "these" if others.names is None else "those appended before"
             raise InvalidInputError(
-                "Expected `groups` of all calibration pairs, or of none; they are "
-                f"missing for {missing}."
+                "Expected `groups` of all calibration pairs, or of none; got some."
             )
         samples, names = self.samples, self.names
         if samples is not None and others.samples is not None:

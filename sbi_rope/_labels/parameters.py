@@ -162,9 +162,7 @@ def _draw(labels: Labels, prior: Any, reference: Reference, *, first: int) -> Te
         rows = (lost.nonzero().flatten()[:5] + first).tolist()
         raise InvalidInputError(
             "Expected labels that some parameters inside the support of the prior "
-            f"fit; found none for {int(lost.sum())} labels (first: {rows} of all pairs "
-            "appended so far, without those that say nothing). Check their units and "
-            "their standard deviations, or train NPE with a wider prior."
+            f"fit; got {int(lost.sum())} others (first: {rows}). Check the units."
         )
     shares = torch.softmax(log_weights, dim=1)
     size = 1.0 / shares.square().sum(dim=1)
@@ -173,9 +171,8 @@ def _draw(labels: Labels, prior: Any, reference: Reference, *, first: int) -> Te
     if bool((size < SMALLEST_SIZE).any()):
         rows = ((size < SMALLEST_SIZE).nonzero().flatten()[:5] + first).tolist()
         warn_user(
-            f"The parameters that fit the labels {rows} are known from fewer than "
-            f"{SMALLEST_SIZE:.0f} effective draws. Check whether these labels are "
-            "plausible under the prior."
+            f"The labels {rows} are hardly plausible under the prior: fewer than "
+            f"{SMALLEST_SIZE:.0f} effective draws fit."
         )
     chosen = _systematic(shares, NUM_DRAWS)
     return nodes.theta.gather(

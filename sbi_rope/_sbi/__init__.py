@@ -32,15 +32,13 @@ from sbi_rope._sbi.mmd import squared_mmd
 from sbi_rope._sbi.posteriors import (
     BaseDirectPosterior,
     check_density,
-    copy_of_prior,
     describe,
     direct_posterior,
     estimator_of,
     is_bounded,
     posterior_from,
 )
-from sbi_rope._sbi.reading import check_rows_apart, readable, reads_missing
-from sbi_rope._sbi.refusals import check_weights_of
+from sbi_rope._sbi.reading import check_rows_apart, readable
 from sbi_rope._sbi.trainer import train_npe
 
 __all__ = [
@@ -59,8 +57,6 @@ __all__ = [
     "build_zuko_unconditional_flow",
     "check_density",
     "check_rows_apart",
-    "check_weights_of",
-    "copy_of_prior",
     "describe",
     "device_of",
     "direct_posterior",
@@ -74,7 +70,6 @@ __all__ = [
     "move_distribution_to_device",
     "posterior_from",
     "readable",
-    "reads_missing",
     "squared_mmd",
     "standardisation_of",
     "train_npe",

@@ -44,17 +44,15 @@ def embedding_of(estimator: ConditionalEstimator) -> nn.Module:
     if isinstance(estimator, TabPFNFlow):
         raise UnsupportedPosteriorError(
             "Expected an estimator whose embedding of x was trained; got TabPFNFlow "
-            "(NPE-PFN), which compares x with stored simulations instead and has "
-            "nothing to tune. Train NPE on the same simulations and pass its posterior."
+            "(NPE-PFN)."
         )
     if isinstance(estimator, MixedDensityEstimator):
         return _embedding_of_mixed(estimator)
     embedding = getattr(estimator, "embedding_net", None)
     if not isinstance(embedding, nn.Module) or not _paths_to(estimator, embedding):
         raise UnsupportedPosteriorError(
-            f"Cannot separate the embedding net of a {type(estimator).__name__} from "
-            "its density. Supported: the mixture density networks, nflows and zuko "
-            "flows, mixed estimators (MNPE), and vector fields of sbi."
+            "Expected an estimator of sbi's posterior_nn with an embedding net; got "
+            f"{type(estimator).__name__}."
         )
     return embedding
 
@@ -65,9 +63,8 @@ def _embedding_of_mixed(estimator: MixedDensityEstimator) -> nn.Module:
     embedding = estimator.condition_embedding
     if estimator.discrete_net.net.embedding_net is not embedding:
         raise UnsupportedPosteriorError(
-            "Expected a MixedDensityEstimator whose discrete and continuous parts "
-            "share one embedding net; got two. Build it with "
-            "`posterior_nn('mnpe', embedding_net=...)`."
+            "Expected a MixedDensityEstimator whose two parts share one embedding net; "
+            "got two. Use `posterior_nn('mnpe', embedding_net=...)`."
         )
     return embedding
 

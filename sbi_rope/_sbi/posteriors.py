@@ -3,6 +3,7 @@
 import copy
 from typing import Any
 
+import torch
 from sbi.inference.posteriors.base_posterior import NeuralPosterior
 from sbi.inference.posteriors.direct_posterior import DirectPosterior
 from sbi.inference.posteriors.filtered_direct_posterior import FilteredDirectPosterior
@@ -13,19 +14,18 @@ from sbi.neural_nets.estimators.base import (
     ConditionalEstimator,
     ConditionalVectorFieldEstimator,
 )
+from sbi.utils.sbiutils import ImproperEmpirical
 from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_rope._random import seeded
 from sbi_rope._sbi.densities import MixtureDensity
 from sbi_rope._sbi.embedding import device_of
-from sbi_rope._sbi.refusals import check_prior_of, refuse
-from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError
+from sbi_rope.errors import UnsupportedPosteriorError
 
 __all__ = [
     "BaseDirectPosterior",
     "check_density",
-    "copy_of_prior",
     "describe",
     "direct_posterior",
     "estimator_of",
@@ -38,18 +38,44 @@ def estimator_of(posterior: Any) -> ConditionalEstimator:
     """Return the trained estimator inside an sbi posterior.
 
     Raises:
-        UnsupportedPosteriorError: If the posterior is not a plain amortised posterior
-            of NPE, FMPE or NPSE.
+        UnsupportedPosteriorError: If the posterior is no plain amortised posterior of
+            NPE, FMPE or NPSE, knows no prior or a truncated one, or has weights that
+            are not finite.
     """
-    check_prior_of(posterior)
+    prior = getattr(posterior, "prior", None)
+    if isinstance(prior, ImproperEmpirical):
+        raise UnsupportedPosteriorError(
+            "Expected a posterior that knows its prior; got none. Use "
+            "`npe.build_posterior(prior=prior)`."
+        )
+    # One that leaves out parameters whose simulations fail is no hindrance.
+    accepts = getattr(getattr(prior, "_accept_reject_fn", None), "__qualname__", "")
+    if accepts.startswith("get_density_thresholder."):
+        raise UnsupportedPosteriorError(
+            "Expected a posterior trained on the whole prior; got a prior truncated "
+            "around one observation (TSNPE)."
+        )
     if isinstance(posterior, VectorFieldPosterior):
-        return posterior.vector_field_estimator
-    plain = isinstance(posterior, DirectPosterior) and not isinstance(
-        posterior, FilteredDirectPosterior | NPE_A_Posterior
-    )
-    if not plain or isinstance(posterior.posterior_estimator, MixtureDensity):
-        raise refuse(posterior)
-    return posterior.posterior_estimator
+        estimator: Any = posterior.vector_field_estimator
+    else:
+        estimator = getattr(posterior, "posterior_estimator", None)
+        if (
+            not isinstance(posterior, DirectPosterior)
+            or isinstance(posterior, FilteredDirectPosterior | NPE_A_Posterior)
+            or isinstance(estimator, MixtureDensity)
+        ):
+            raise UnsupportedPosteriorError(
+                "Expected `posterior` to be what `NPE(...).build_posterior()` returns, "
+                "or the posterior of MNPE, FMPE or NPSE; got "
+                f"{type(posterior).__name__}."
+            )
+    for name, weights in estimator.named_parameters():
+        if not torch.isfinite(weights).all():
+            raise UnsupportedPosteriorError(
+                f"Expected an NPE with finite weights; got NaN or Inf in `{name}`, so "
+                "that its training has failed."
+            )
+    return estimator
 
 
 def check_density(
@@ -100,27 +126,11 @@ def posterior_from(
     with seeded(0):  # sbi draws from the prior to look at it
         return VectorFieldPosterior(
             estimator,
-            copy_of_prior(posterior.prior),
+            copy.deepcopy(posterior.prior),
             device=device_of(estimator),
             enable_transform=posterior.enable_transform,
             sample_with=posterior.sample_with,
         )
-
-
-def copy_of_prior(prior: Any) -> Any:
-    """Copy a prior, which sbi moves to devices in place.
-
-    Raises:
-        InvalidInputError: If it cannot be copied.
-    """
-    try:
-        return copy.deepcopy(prior)
-    except Exception as error:  # of whatever it holds
-        raise InvalidInputError(
-            f"Expected a prior that can be copied; `copy.deepcopy` of this "
-            f"{type(prior).__name__} raised {type(error).__name__}: {error}. Detach "
-            "its tensors from their graph, and leave out what cannot be copied."
-        ) from error
 
 
 def direct_posterior(
@@ -133,7 +143,7 @@ def direct_posterior(
     with seeded(0):  # sbi draws from the prior to look at it
         return DirectPosterior(
             estimator,
-            copy_of_prior(prior),
+            copy.deepcopy(prior),
             device=device_of(estimator),
             enable_transform=enable_transform,
         )

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from sbi_rope._groups import split_pairs
-from sbi_rope._sbi import copy_of_prior, embed
+from sbi_rope._sbi import embed
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._training import History, epochs_on_pairs, shuffled
 from sbi_rope.baselines.statistics import frozen_statistics
@@ -180,7 +180,7 @@ class FRISBI(Method):
         if self.distilled:
             part = self._distilled(part, g, show_progress_bars=show_progress_bars)
         mixture = MixtureEstimator([part], [1.0]).eval()
-        return MixturePosterior(mixture, copy_of_prior(self._prior)), history
+        return MixturePosterior(mixture(self._prior)), history
 
     def _simulated(
         self, h: nn.Module, *, show_progress_bars: bool

@@ -3,9 +3,7 @@
 import torch
 from torch import Tensor
 
-from sbi_rope._slices import slices
-
-__all__ = ["Cost", "Distances", "row_blocks", "widest"]
+__all__ = ["Cost", "Distances", "row_blocks"]
 
 # Entries of a block: few enough for the caches of a CPU core, and enough to occupy a
 # GPU. Blocks also bound the memory of everything that is not stored.
@@ -21,8 +19,7 @@ class Distances:
     error of about 1e-16 R^2 / d, and the distance of equal points one of 1e-8 R. That
     is less than the rounding of a network's embeddings in float32. Where it is not
     enough, ``direct`` sums squared differences, which takes 1.4 times as long in ten
-    dimensions and 7 times as long in 64. On a device without float64 everything is in
-    float32, with errors of 1e-7 R^2 / d and 3e-4 R.
+    dimensions and 7 times as long in 64.
 
     Args:
         points: The fixed points, shape ``(n_s, l)``; the distances have their dtype.
@@ -31,10 +28,9 @@ class Distances:
 
     def __init__(self, points: Tensor, *, direct: bool = False) -> None:
         # The median, because a single far point must not move the centre.
-        self._wide = widest(points.device)
-        self.centre = points.to(self._wide).median(dim=0).values
+        self.centre = points.double().median(dim=0).values
         self.direct = direct
-        self._centred = points.to(self._wide) - self.centre
+        self._centred = points.double() - self.centre
         self._dtype = points.dtype
         squares = self._centred.square().sum(dim=1, keepdim=True)
         self._largest_norm = self._centred.norm(dim=1).max()
@@ -44,7 +40,7 @@ class Distances:
 
     def __call__(self, points: Tensor, columns: Tensor | None = None) -> Tensor:
         """Return the distances of points ``(n, l)`` from all or some fixed points."""
-        centred = points.to(self._wide) - self.centre
+        centred = points.double() - self.centre
         if self.direct:
             fixed = self._centred if columns is None else self._centred[columns]
             mode = "donot_use_mm_for_euclid_dist"
@@ -56,7 +52,7 @@ class Distances:
 
     def bound(self, points: Tensor) -> float:
         """Return an upper bound of the distances of these points."""
-        largest = (points.to(self._wide) - self.centre).norm(dim=1).max()
+        largest = (points.double() - self.centre).norm(dim=1).max()
         return float(self._largest_norm + largest)
 
 
@@ -104,17 +100,8 @@ class Cost:
         return row_blocks(self.real, num_columns or len(self.simulated), scale=scale)
 
 
-def has_float64(device: torch.device) -> bool:
-    """Tell whether a device can compute in float64; Apple's GPUs cannot."""
-    return device.type != "mps"
-
-
-def widest(device: torch.device) -> torch.dtype:
-    """Return the dtype with the most digits on a device, float64 or float32."""
-    return torch.float64 if has_float64(device) else torch.float32
-
-
 def row_blocks(real: Tensor, num_columns: int, *, scale: int = 1) -> list[slice]:
     """Cut rows into blocks of a bounded number of entries, at least one row each."""
     limit = CPU_BLOCK if real.device.type == "cpu" else GPU_BLOCK
-    return slices(len(real), max(1, scale * limit // num_columns))
+    size = max(1, scale * limit // num_columns)
+    return [slice(first, first + size) for first in range(0, len(real), size)]

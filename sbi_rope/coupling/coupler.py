@@ -1,6 +1,7 @@
 """Semi-balanced entropic optimal transport, with its settings."""
 
 import itertools
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
@@ -9,17 +10,15 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from sbi_rope._random import seeded
 from sbi_rope._validation import check_numbers
-from sbi_rope.coupling.cost import widest
 from sbi_rope.coupling.fixed_point import Solution, solve_fixed_point
-from sbi_rope.coupling.kernel import marginal_error
 from sbi_rope.coupling.pot import solve_pot
-from sbi_rope.coupling.problem import Problem, checked_embeddings, median_distance
+from sbi_rope.coupling.problem import LARGEST_EXPONENT, Problem, median_distance
 from sbi_rope.coupling.result import Coupling
 from sbi_rope.coupling.warm_start import warm_start
-from sbi_rope.errors import InvalidInputError, warn_user, without_warning
-from sbi_rope.settings import Count, Positive, UnitInterval, Whole, check, one_of
+from sbi_rope.errors import CouplingError, warn_user, without_warning
+from sbi_rope.settings import Count, Positive, Settings, UnitInterval
+from sbi_rope.tensors import as_batch
 
 __all__ = ["SMALL_BATCH", "SinkhornCoupler", "without_warning_of_small_batch"]
 
@@ -36,7 +35,7 @@ def without_warning_of_small_batch() -> AbstractContextManager[None]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SinkhornCoupler:
+class SinkhornCoupler(Settings):
     r"""Semi-balanced entropic optimal transport between two sets of embeddings.
 
     With :math:`C_{ij} = \lVert g(x_{o,i}) - h(x_{s,j}) \rVert_2` it solves
@@ -74,18 +73,6 @@ class SinkhornCoupler:
         tolerance: The largest ``marginal_error`` that counts as converged.
         max_iterations: The largest number of iterations. If they are not enough,
             ``converged`` is False.
-        dtype: ``torch.float64`` (the default) or ``torch.float32``, which takes half
-            the memory and less time. Devices without float64 (MPS) need
-            ``torch.float32``.
-        blocked: Whether to compute the distances again in every iteration, block by
-            block. That is slower, but no matrix of size n_o x n_s is ever held. None
-            (the default) does so for more than 50 million distances (7,000 observations
-            and as many simulations).
-        num_fitted: The number of observations, chosen at random, that the potential is
-            fitted to; None (the default) fits it to all. ``batch_error`` of the
-            coupling tells how far off it then is over the whole batch.
-        anderson_memory: The number of last steps that Anderson acceleration combines; 0
-            switches it off.
 
     Raises:
         InvalidInputError: If an argument is outside its range.
@@ -101,64 +88,35 @@ class SinkhornCoupler:
         True
     """
 
-    gamma: float = 0.1
-    tau: float = 1.0
+    gamma: Positive = 0.1
+    tau: UnitInterval = 1.0
     cost_scale: Literal["none", "simulated"] = "simulated"
     solver: Literal["own", "pot"] = "own"
-    tolerance: float = 1e-6
-    max_iterations: int = 10_000
-    dtype: torch.dtype = torch.float64
-    blocked: bool | None = None
-    num_fitted: int | None = None
-    anderson_memory: int = 5
+    tolerance: Positive = 1e-6
+    max_iterations: Count = 10_000
 
-    def __post_init__(self) -> None:
-        """Check the ranges of all fields."""
-        check("gamma", self.gamma, Positive)
-        check("tau", self.tau, UnitInterval)
-        check("cost_scale", self.cost_scale, Literal["none", "simulated"])
-        check("solver", self.solver, Literal["own", "pot"])
-        check("tolerance", self.tolerance, Positive)
-        check("max_iterations", self.max_iterations, Count)
-        check("dtype", self.dtype, one_of((torch.float64, torch.float32)))
-        check("blocked", self.blocked, one_of((None, True, False)))
-        if self.num_fitted is not None:
-            check("num_fitted", self.num_fitted, Count)
-        check("anderson_memory", self.anderson_memory, Whole)
-        if self.solver == "pot" and self.blocked:
-            raise InvalidInputError(
-                "Expected `blocked` to be None or False with solver='pot', which needs "
-                "all distances at once; got True. Use solver='own'."
-            )
-
-    def couple(
-        self, real: Tensor, simulated: Tensor, *, seed: int | None = None
-    ) -> Coupling:
+    def couple(self, real: Tensor, simulated: Tensor) -> Coupling:
         """Couple the embeddings of real observations with those of simulations.
 
         Args:
             real: :math:`g(x_o)`, shape ``(n_o, l)``.
             simulated: :math:`h(x_s)`, shape ``(n_s, l)``; n_s may differ from n_o.
-            seed: Seed of the choice of ``num_fitted`` observations; None uses torch's
-                state.
 
         Returns:
             The coupling, on the device of the embeddings. Its ``converged`` is False if
             the tolerance was not met.
 
         Raises:
-            InvalidInputError: If the shapes do not fit, a set is empty, a value is
-                not finite, or the device of the embeddings has no float64 but
-                ``dtype`` asks for it.
+            InvalidInputError: If the shapes do not fit, a set is empty, or a value is
+                not finite.
             CouplingError: If the distances overflow, gamma is too small for the digits
-                of the dtype, or with ``cost_scale="simulated"`` the median distance
+                of float64, or with ``cost_scale="simulated"`` the median distance
                 between simulations is zero.
         """
         # Our own solver needs the distances about once for a single solution.
         problem, scale = self._set_up(
             real,
             simulated,
-            seed,
             gamma=self.gamma,
             tau=self.tau,
             reused=self.solver == "pot",
@@ -206,7 +164,7 @@ class SinkhornCoupler:
             replace(self, gamma=gamma, tau=tau)
         smallest = min(gamma for gamma, _ in settings)
         problem, scale = self._set_up(
-            real, simulated, seed, gamma=smallest, tau=max(taus), reused=True
+            real, simulated, gamma=smallest, tau=max(taus), reused=True
         )
         return self._sweep(problem, scale, settings)
 
@@ -231,86 +189,55 @@ class SinkhornCoupler:
             yield waiting[setting] if again else waiting.pop(setting)
 
     def _set_up(
-        self,
-        real: Tensor,
-        simulated: Tensor,
-        seed: int | None,
-        *,
-        gamma: float,
-        tau: float,
-        reused: bool,
+        self, real: Tensor, simulated: Tensor, *, gamma: float, tau: float, reused: bool
     ) -> tuple[Problem, float]:
-        real, simulated = checked_embeddings(real, simulated)
-        if self.dtype == torch.float64 and widest(real.device) != torch.float64:
-            raise InvalidInputError(
-                f"float64 is not available on {real.device.type}; pass "
-                "SinkhornCoupler(dtype=torch.float32) or move the posterior to the CPU."
-            )
-        num_fitted = min(len(real), self.num_fitted or len(real))
+        simulated = as_batch("simulated", simulated)
+        real = as_batch("real", real, simulated.shape[1:], device=simulated.device)
+        n_o = len(real)
         # With a tau of 0, no observation depends on the others.
-        if num_fitted < SMALL_BATCH and tau > 0.0:
-            self._warn_small_batch(num_fitted, len(real), tau)
-        real, simulated = real.to(self.dtype), simulated.to(self.dtype)
-        fitted = None
-        if num_fitted < len(real):
-            with seeded(seed):
-                fitted = torch.randperm(len(real))[:num_fitted].to(real.device)
-        blocked = self.blocked
-        if blocked is None:
-            blocked = self.solver == "own" and num_fitted * len(simulated) > MAX_STORED
+        if n_o < SMALL_BATCH and tau > 0.0:
+            consequence = "these few decide how much weight each simulation gets"
+            if n_o == 1 and tau == 1.0:
+                consequence = "its row is uniform and the posterior is the prior"
+            warn_user(
+                f"Coupling a batch of {n_o} real observation(s), tau={tau}: "
+                f"{consequence}. Use at least {SMALL_BATCH} observations, a smaller "
+                "tau, or the rows of a larger batch (`unseen='extend'`)."
+            )
+        real, simulated = real.double(), simulated.double()
+        blocked = self.solver == "own" and n_o * len(simulated) > MAX_STORED
         scale = 1.0 if self.cost_scale == "none" else median_distance(simulated)
         problem = Problem(
             real,
             simulated,
-            fitted=fitted,
             blocked=blocked,
             stored=reused and not blocked,
             smallest_gamma=gamma * scale,
         )
         return problem, scale
 
-    def _warn_small_batch(self, num_fitted: int, n_o: int, tau: float) -> None:
-        if num_fitted < n_o:
-            warn_user(
-                f"The coupling is fitted to num_fitted={num_fitted} of {n_o} real "
-                "observations. These few decide how much weight each simulation gets. "
-                f"Use a num_fitted of at least {SMALL_BATCH}, or None for all."
-            )
-            return
-        consequence = (
-            "its row is uniform and the posterior is the prior. "
-            if n_o == 1 and tau == 1.0
-            else "these few decide how much weight each simulation gets. "
-        )
-        warn_user(
-            f"Coupling a batch of {n_o} real observation(s), tau={tau}: "
-            + consequence
-            + f"Use a batch of at least {SMALL_BATCH}, a smaller tau, or the rows of a "
-            "posterior built for a larger batch (`unseen='extend'`)."
-        )
-
     def _solve(self, problem: Problem, gamma: float, start: Tensor) -> Coupling:
         """Solve at this coupler's tau and a gamma in units of the embeddings."""
-        problem.check_gamma(gamma)
+        cost = problem.cost
+        smallest = max(cost.bound / LARGEST_EXPONENT, torch.finfo(torch.double).tiny)
+        if gamma < smallest:
+            raise CouplingError(
+                f"Expected a gamma of at least {smallest:.1e} in units of the "
+                f"embeddings, so that float64 tells distances apart; got {gamma:.1e}."
+            )
         solution, solver = self._solution(problem, gamma, start)
-        batch_error = solution.marginal_error
-        if not problem.all_fitted:
-            log_q = problem.kernel_of_all(gamma)(solution.potential)
-            batch_error = marginal_error(log_q, solution.potential, self.tau)
         return Coupling(
             potential=solution.potential,
-            real=problem.real,
-            simulated=problem.simulated,
+            real=cost.real,
+            simulated=cost.simulated,
             gamma=gamma,
             tau=self.tau,
             marginal_error=solution.marginal_error,
-            batch_error=batch_error,
-            num_fitted=problem.cost.shape[0],
             num_iterations=solution.num_iterations,
             converged=solution.marginal_error <= self.tolerance,
             solver=solver,
             direct=problem.direct,
-            blocked=problem.blocked or problem.size > MAX_STORED,
+            blocked=math.prod(cost.shape) > MAX_STORED,
         )
 
     def _solution(
@@ -339,8 +266,6 @@ class SinkhornCoupler:
             tau=self.tau,
             tolerance=self.tolerance,
             max_iterations=self.max_iterations - made,
-            memory=self.anderson_memory,
-            eps=torch.finfo(self.dtype).eps,
         )
         iterations = made + solution.num_iterations
         return solution._replace(num_iterations=iterations), "own"

@@ -20,6 +20,8 @@ from sbi_rope.coupling.kernel import marginal_error
 
 __all__ = ["Solution", "solve_fixed_point"]
 
+# The last steps that Anderson acceleration combines.
+MEMORY = 5
 # An accelerated step is taken back if its error exceeds the last one by this factor.
 LARGEST_GROWTH = 2.0
 # After PATIENCE accelerated steps without a new best error, plain steps are made
@@ -28,8 +30,8 @@ PATIENCE, FIRST_PAUSE = 100, 50
 # Keeps the least-squares problem of nearly parallel differences solvable.
 RIDGE = 1e-10
 # The digits are exhausted after STALLED iterations without a new best error, if the
-# error is below ROUNDINGS rounding errors.
-STALLED, ROUNDINGS = 500, 100.0
+# error is below 100 rounding errors.
+STALLED, EXHAUSTED = 500, 100.0 * torch.finfo(torch.float64).eps
 
 
 class Solution(NamedTuple):
@@ -47,12 +49,10 @@ def solve_fixed_point(
     tau: float,
     tolerance: float,
     max_iterations: int,
-    memory: int,
-    eps: float,
 ) -> Solution:
     r"""Iterate w to the fixed point, accelerated by Anderson's method.
 
-    The next iterate combines the images T(w) of the last ``memory`` + 1 iterates, with
+    The next iterate combines the images T(w) of the last six iterates, with
     the coefficients that make the same combination of the residuals T(w) - w smallest.
     If that makes the marginal error grow, the plain step T(w) is made instead, and the
     memory is cleared. If it makes no progress for long, the plain iteration takes over
@@ -60,12 +60,10 @@ def solve_fixed_point(
 
     Args:
         kernel: Returns log q of a potential.
-        start: The first potential, shape ``(n_s,)``, float64 if the device has it.
+        start: The first potential, shape ``(n_s,)``.
         tau: The trust in the prior, in (0, 1].
         tolerance: The marginal error to reach.
         max_iterations: The largest number of evaluations of the kernel.
-        memory: The number of differences to remember; 0 for the plain iteration.
-        eps: The relative rounding error of the kernel.
 
     Returns:
         The potential with the smallest error, shifted to mean zero, its error, and the
@@ -74,26 +72,26 @@ def solve_fixed_point(
     log_b = -math.log(len(start))
     potential = start - start.mean()
     best, best_at, iteration = Solution(potential, math.inf, 0), 0, 0
-    steps = _Steps(memory, potential) if memory else None
+    steps = _Steps(potential)
     for iteration in range(1, max_iterations + 1):
         log_q = kernel(potential)
         error = marginal_error(log_q, potential, tau)
         if error < best.marginal_error:
             best, best_at = Solution(potential, error, iteration), iteration
-        exhausted = iteration - best_at > STALLED and error < ROUNDINGS * eps
+        exhausted = iteration - best_at > STALLED and error < EXHAUSTED
         if error <= tolerance or exhausted:
             break
         image = tau * (potential + log_b - log_q)
         image = image - image.mean()
-        potential = image if steps is None else steps.next(potential, image, error)
+        potential = steps.next(potential, image, error)
     return best._replace(num_iterations=iteration)
 
 
 class _Steps:
     """Accelerated steps, and plain steps where acceleration does not help."""
 
-    def __init__(self, memory: int, start: Tensor) -> None:
-        self._history = _History(memory, start)
+    def __init__(self, start: Tensor) -> None:
+        self._history = _History(start)
         self._best_error = self._last_error = math.inf
         self._without_progress = 0
         self._plain_left, self._pause = 0, FIRST_PAUSE
@@ -132,10 +130,10 @@ class _Steps:
 class _History:
     """The last iterates and residuals, and Anderson's combination of them."""
 
-    def __init__(self, memory: int, like: Tensor) -> None:
+    def __init__(self, like: Tensor) -> None:
         # Differences of images and of residuals. The oldest are overwritten first.
-        self._image_steps = like.new_zeros(memory, len(like))
-        self._residual_steps = like.new_zeros(memory, len(like))
+        self._image_steps = like.new_zeros(MEMORY, len(like))
+        self._residual_steps = like.new_zeros(MEMORY, len(like))
         self.clear()
 
     def clear(self) -> None:
@@ -145,10 +143,9 @@ class _History:
 
     def combine(self, potential: Tensor, image: Tensor) -> Tensor | None:
         """Add an iterate and its image; return the next iterate, or None."""
-        memory = len(self._residual_steps)
         residual = image - potential
         if self._last is not None:
-            slot = self._num_steps % memory
+            slot = self._num_steps % MEMORY
             torch.sub(image, self._last[0], out=self._image_steps[slot])
             torch.sub(residual, self._last[1], out=self._residual_steps[slot])
             self._num_steps += 1

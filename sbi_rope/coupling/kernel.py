@@ -9,7 +9,6 @@ with any :math:`m_i`. The mean of the rows is the column marginal :math:`q`.
 """
 
 import math
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,23 +18,13 @@ from sbi_rope.coupling.cost import Cost
 __all__ = ["Kernel", "marginal_error"]
 
 
-class _Range(NamedTuple):
-    """The exponents that a dtype can hold."""
-
-    # Smaller exponents are raised to this one, because denormal numbers make products
-    # ten times slower.
-    lowest: float
-    # If no exponent is larger than this, neither a shift nor a floor is needed.
-    free: float
-    # How far w may move from the potential that a kernel was computed with.
-    reach: float
-
-
-RANGE = {
-    torch.float32: _Range(lowest=-69.0, free=45.0, reach=20.0),
-    torch.float64: _Range(lowest=-660.0, free=450.0, reach=200.0),
-}
-
+# Smaller exponents are raised to this one, because denormal numbers make products ten
+# times slower.
+LOWEST = -660.0
+# If no exponent is larger than this, neither a shift nor a floor is needed.
+FREE = 450.0
+# How far w may move from the potential that a kernel was computed with.
+REACH = 200.0
 # Products of stored blocks need no memory for intermediate results, so that larger
 # blocks are faster.
 STORED_BLOCK = 8
@@ -46,8 +35,8 @@ class Kernel:
 
     The matrix is :math:`e^{w^0_j - C_{ij} / \gamma - m_i}`, where :math:`w^0` is the
     last potential that was absorbed into it. For another potential w its columns are
-    multiplied by :math:`e^{w - w^0}`. When these factors leave the range of the dtype,
-    w is absorbed.
+    multiplied by :math:`e^{w - w^0}`. When these factors leave the range of float64, w
+    is absorbed.
 
     Args:
         cost: The distances.
@@ -62,23 +51,18 @@ class Kernel:
         self.cost = cost
         self.gamma = gamma
         self.num_absorptions = 0
-        self._dtype = cost.real.dtype
         self._matrix = cost.real.new_empty(cost.shape) if stored else None
         self._shift = cost.real.new_zeros(len(cost.real))
         self._absorbed: Tensor | None = None
         self._exact = True
 
     def __call__(self, potential: Tensor) -> Tensor:
-        """Return log q of a potential, both of shape ``(n_s,)``.
-
-        Both are in float64, or in float32 on a device without it.
-        """
+        """Return log q of a potential, both of shape ``(n_s,)``."""
         absorbed = self._absorbed
-        reach = RANGE[self._dtype].reach
-        if absorbed is None or float((potential - absorbed).abs().max()) > reach:
+        if absorbed is None or float((potential - absorbed).abs().max()) > REACH:
             absorbed = self._absorb(potential)
         scaling = (potential - absorbed).exp()
-        row_sums, columns = self._products(scaling.to(self._dtype))
+        row_sums, columns = self._products(scaling)
         log_q = (scaling * columns / len(row_sums)).log()
         if not self._exact:
             lost = _lost(columns, row_sums)
@@ -88,15 +72,13 @@ class Kernel:
 
     def _absorb(self, potential: Tensor) -> Tensor:
         self.num_absorptions += 1
-        # The absorbed potential is rounded to the dtype of the matrix.
-        w = potential.to(self._dtype)
-        self._absorbed = w.to(potential.dtype)
-        spread = float(w.abs().max()) + self.cost.bound / self.gamma
-        self._exact = spread <= RANGE[self._dtype].free
+        self._absorbed = potential
+        spread = float(potential.abs().max()) + self.cost.bound / self.gamma
+        self._exact = spread <= FREE
         if self._matrix is not None:
             for rows in self.cost.row_blocks():
-                self._exponentials(rows, w, out=self._matrix[rows])
-        return self._absorbed
+                self._exponentials(rows, potential, out=self._matrix[rows])
+        return potential
 
     def _exponentials(
         self, rows: slice, w: Tensor, out: Tensor | None = None
@@ -107,21 +89,21 @@ class Kernel:
         if self._exact:
             return block.exp_()
         shift = self._shift[rows] = block.amax(dim=1)
-        lowest = RANGE[self._dtype].lowest
-        return block.sub_(shift[:, None]).clamp_min_(lowest).exp_()
+        return block.sub_(shift[:, None]).clamp_min_(LOWEST).exp_()
 
     def _products(self, scaling: Tensor) -> tuple[Tensor, Tensor]:
-        """Return K v, and the product of K^T with its reciprocal in the dtype of w."""
+        """Return K v, and the product of K^T with its reciprocal."""
         assert self._absorbed is not None
-        w = self._absorbed.to(self._dtype)
         row_sums = self._shift.new_empty(len(self._shift))
         columns = torch.zeros_like(self._absorbed)
-        # Each block is used twice while it is in the cache. Adding up the blocks in
-        # float64 keeps the rounding errors of float32 small for any number of rows.
+        # Each block is used twice while it is in the cache.
         scale = 1 if self._matrix is None else STORED_BLOCK
         for rows in self.cost.row_blocks(scale=scale):
             matrix = self._matrix
-            block = self._exponentials(rows, w) if matrix is None else matrix[rows]
+            if matrix is None:
+                block = self._exponentials(rows, self._absorbed)
+            else:
+                block = matrix[rows]
             sums = torch.mv(block, scaling, out=row_sums[rows])
             columns += block.T @ sums.reciprocal()
         return row_sums, columns
@@ -133,13 +115,13 @@ class Kernel:
         index = lost.nonzero().flatten()
         if not len(index):
             return
-        w = potential[index].to(self._dtype)
+        w = potential[index]
         total = torch.full_like(w, -math.inf)
         for rows in self.cost.row_blocks(len(index)):
             exponents = w - self.cost.block(rows, index) / self.gamma
             exponents -= row_log_sums[rows, None]
             total = torch.logaddexp(total, torch.logsumexp(exponents, dim=0))
-        log_q[index] = total.to(log_q.dtype) - math.log(len(row_log_sums))
+        log_q[index] = total - math.log(len(row_log_sums))
 
 
 def marginal_error(log_q: Tensor, potential: Tensor, tau: float) -> float:
@@ -153,5 +135,4 @@ def marginal_error(log_q: Tensor, potential: Tensor, tau: float) -> float:
 def _lost(columns: Tensor, row_sums: Tensor) -> Tensor:
     """Tell in which columns the entries that were raised to the floor may matter."""
     eps = torch.finfo(row_sums.dtype).eps
-    floor = math.exp(RANGE[row_sums.dtype].lowest)
-    return floor * float(row_sums.to(columns.dtype).reciprocal().sum()) > eps * columns
+    return math.exp(LOWEST) * float(row_sums.reciprocal().sum()) > eps * columns

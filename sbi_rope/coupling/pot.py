@@ -70,7 +70,7 @@ def solve_pot(
                 method="sinkhorn",
                 reg_type="kl",
                 # POT computes u from v first, so that u may start at zero.
-                warmstart=(scaled.new_zeros(n_o), potential.to(scaled)),
+                warmstart=(scaled.new_zeros(n_o), potential),
                 numItermax=burst,
                 stopThr=0.0,
                 log=True,
@@ -79,8 +79,7 @@ def solve_pot(
         iterations += done
         if not (log["logu"].isfinite().all() and log["logv"].isfinite().all()):
             return best._replace(num_iterations=iterations), False
-        potential = log["logv"].to(start.dtype)
-        potential = potential - potential.mean()
+        potential = log["logv"] - log["logv"].mean()
         error = marginal_error(kernel(potential), potential, tau)
         # If the error does not fall, POT has lost entries of the kernel to underflow,
         # or iterations hardly help in this problem. If POT stopped before the end, it

@@ -7,7 +7,6 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import check_rows, usable_device
 from sbi_rope.coupling.cost import Distances, row_blocks
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.tensors import as_batch
@@ -35,12 +34,9 @@ class Coupling:
             ``cost_scale``.
         tau: The trust in the prior.
         marginal_error: :math:`\lVert q - q^*(w) \rVert_1`, where :math:`q` is the mean
-            of the rows of the observations that the potential was fitted to, and
-            :math:`q^*_j \propto b_j e^{-w_j (1 - \tau) / \tau}` is what it should be
-            by the optimality conditions. It is 0 at a solution and at most 2.
-        batch_error: The same for the mean over all observations. It shows how far off
-            a potential is that was fitted to some of them only.
-        num_fitted: The number of observations the potential was fitted to.
+            of the rows, and :math:`q^*_j \propto b_j e^{-w_j (1 - \tau) / \tau}` is
+            what it should be by the optimality conditions. It is 0 at a
+            solution and at most 2.
         num_iterations: Sinkhorn iterations, over all solvers that were used.
         converged: Whether ``marginal_error`` reached the tolerance.
         solver: The solver that finished: ``"own"``, ``"pot"``, or ``"none"`` at tau =
@@ -59,8 +55,6 @@ class Coupling:
     gamma: float
     tau: float
     marginal_error: float
-    batch_error: float
-    num_fitted: int
     num_iterations: int
     converged: bool
     solver: Literal["own", "pot", "none"]
@@ -101,11 +95,7 @@ class Coupling:
         Returns:
             Shape ``(n, n_s)``. Another coupling with the same ``simulated`` and
             ``direct`` has the same distances.
-
-        Raises:
-            InvalidInputError: If the shape does not fit, or a value is not finite.
         """
-        real = as_batch("real", real, self.simulated.shape[1:])
         return self._distances(real.to(self.simulated))
 
     def rows(self, real: Tensor, *, distances: Tensor | None = None) -> Tensor:
@@ -145,20 +135,11 @@ class Coupling:
         """Return the coupling of some observations of the batch, by their numbers.
 
         Its errors and ``converged`` remain those of the whole batch.
-
-        Raises:
-            InvalidInputError: If a row is not the number of an observation.
         """
-        check_rows("rows", rows, len(self.real))
         return replace(self, real=self.real[rows])
 
     def to(self, device: str | torch.device) -> "Coupling":
-        """Return the same coupling on another device.
-
-        Raises:
-            InvalidInputError: If there is no such device.
-        """
-        device = usable_device(device)
+        """Return the same coupling on another device."""
         return replace(
             self,
             potential=self.potential.to(device),

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sbi_rope._slices import slices
 from sbi_rope.coupling import Coupling, SinkhornCoupler
 from sbi_rope.diagnosis.simulations import Simulations
 
@@ -64,7 +63,8 @@ def implied_by(
     order, where = _points(theta)
     total = torch.zeros(len(theta), dtype=torch.float64)
     functions, means = [], []
-    for block in slices(len(real), CHUNK):
+    for first in range(0, len(real), CHUNK):
+        block = slice(first, first + CHUNK)
         weights = coupling.rows(real[block])
         if own is not None:
             rows = torch.arange(len(weights))

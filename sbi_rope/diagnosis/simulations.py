@@ -6,7 +6,6 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from sbi_rope._slices import slices
 from sbi_rope._units import divisors
 
 __all__ = ["Simulations", "nearest_distances"]
@@ -96,10 +95,10 @@ def nearest_distances(points: Tensor, among: Tensor, *, others: bool = False) ->
         others: Whether the two sets are the same, and no point is its own neighbour.
     """
     nearest = []
-    for block in slices(len(points), CHUNK):
-        distance = torch.cdist(points[block], among)
+    for first in range(0, len(points), CHUNK):
+        distance = torch.cdist(points[first : first + CHUNK], among)
         if others:
             own = torch.arange(len(distance))
-            distance[own, block.start + own] = torch.inf
+            distance[own, first + own] = torch.inf
         nearest.append(distance.amin(dim=1))
     return torch.cat(nearest)

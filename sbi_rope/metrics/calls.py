@@ -23,7 +23,6 @@ from torch import Tensor, nn
 
 from sbi_rope._progress import progress_bar
 from sbi_rope._sbi import MixtureDensity, NeuralPosterior, is_bounded, readable
-from sbi_rope._slices import slices
 from sbi_rope.errors import (
     InvalidInputError,
     LogProbUnavailableError,
@@ -327,4 +326,5 @@ def _require_none(bad: Tensor, what: str, *, start: int = 0) -> None:
 
 
 def _chunks(length: int, size: int, text: str, *, show: bool) -> Iterable[slice]:
-    return progress_bar(slices(length, size), show=show, desc=text)
+    chunks = [slice(first, first + size) for first in range(0, length, size)]
+    return progress_bar(chunks, show=show, desc=text)

@@ -2,8 +2,6 @@
 
 import torch
 
-from sbi_rope._slices import slices
-
 __all__ = ["blocks", "flow_batch", "keep_freed_memory", "num_fitting"]
 
 # The largest number of weights, terms of the density, or proposals held at a time: a
@@ -28,7 +26,9 @@ def num_fitting(num_columns: int) -> int:
 
 def blocks(num_rows: int, num_columns: int) -> list[slice]:
     """Cut rows of ``num_columns`` entries into blocks that are held at a time."""
-    return slices(num_rows, num_fitting(num_columns))
+    size = num_fitting(num_columns)
+    starts = range(0, num_rows, size)
+    return [slice(start, min(start + size, num_rows)) for start in starts]
 
 
 def keep_freed_memory(device: torch.device) -> None:

@@ -1,5 +1,6 @@
 """The prior in the form of an sbi posterior."""
 
+import copy
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_rope._random import seeded
-from sbi_rope._sbi import BasePotential, NeuralPosterior, copy_of_prior, describe
+from sbi_rope._sbi import BasePotential, NeuralPosterior, describe
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.mixture.parts import parameters_of
 from sbi_rope.mixture.prior import prior_log_prob, prior_sample
@@ -56,7 +57,7 @@ class PriorPosterior(NeuralPosterior):
                 "Expected `prior` to be a torch distribution over vectors; got "
                 f"{type(prior).__name__}. Use `sbi.utils.process_prior(prior)[0]`."
             )
-        prior = copy_of_prior(prior)
+        prior = copy.deepcopy(prior)
         transform, self._reason_without_map = None, ""
         with seeded(0):  # both draw from the prior to look at it
             device = prior.sample(torch.Size((1,))).device

@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed, estimator_of, headless
-from sbi_rope.batch import parameters_named
 from sbi_rope.coupling import Coupling
 from sbi_rope.coupling.coupler import without_warning_of_small_batch
 from sbi_rope.errors import CouplingError
@@ -163,7 +162,7 @@ def fit_couplings(
     bench = versions[0].bench
     # The same number of simulations as RoPE would couple the batch with.
     with seeded(seed):
-        theta, simulated = bench.rope.source.from_prior(
+        _, simulated = bench.rope.source.from_prior(
             num_simulations,
             max(len(x_o), MIN_SIMULATIONS),
             lambda x: embed(bench.embedding_net, x),
@@ -173,8 +172,7 @@ def fit_couplings(
     nets, settings = [], []
     for key, net in _nets(candidates, versions).items():
         of_net = [c for c in candidates if (c.tuned, c.rehearsal) == key[:2]]
-        with parameters_named(theta):
-            couplings = _couple(of_net, embed(net, batch), simulated, bench.rope)
+        couplings = _couple(of_net, embed(net, batch), simulated, bench.rope)
         share = 1.0 / len(couplings)
         nets.append(CoupledNet(net, couplings, [share] * len(couplings)))
         settings += [(candidate.name, key[2]) for candidate in of_net]

@@ -195,7 +195,7 @@ def stack(
         enable_transform=trainer.bench.npe.enable_transform,
     )
     posterior.parameter_names = rope.parameter_names
-    posterior.columns = rope.columns
+    posterior.x_names = rope.x_names
     return posterior
 
 

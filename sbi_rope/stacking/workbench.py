@@ -8,11 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._focus import warn_if_focused
 from sbi_rope._groups import split_groups
 from sbi_rope._labels import labelled_moments
 from sbi_rope._random import seeded
-from sbi_rope._sbi import embed, estimator_of, headless
+from sbi_rope._sbi import embed
 from sbi_rope._standardisation import Standardisation
 from sbi_rope._training import without_warning_of_few_pairs
 from sbi_rope.discrepancy.correction import Space
@@ -118,11 +117,7 @@ class Workbench:
     @cached_property
     def embedded(self) -> Tensor:
         """The embeddings h(x) of :attr:`simulations`, shape ``(n_s, l)``."""
-        theta, x = self.simulations
-        embedded = embed(self.embedding_net, x)
-        density = headless(estimator_of(self.npe))
-        warn_if_focused(density, self.npe.prior, theta, embedded)
-        return embedded
+        return embed(self.embedding_net, self.simulations[1])
 
     @cached_property
     def embedding_net(self) -> nn.Module:

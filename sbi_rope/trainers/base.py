@@ -11,7 +11,7 @@ from torch.distributions import Distribution
 
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
-from sbi_rope._sbi import copy_of_prior, device_of, embedding_of, estimator_of
+from sbi_rope._sbi import device_of, embedding_of, estimator_of
 from sbi_rope._training import History
 from sbi_rope.errors import InvalidInputError, NotReadyError
 from sbi_rope.settings import check
@@ -80,7 +80,7 @@ class Method(ABC):
                 "Expected `prior` over vectors, with event shape (d,); got event shape "
                 f"{tuple(prior.event_shape)}."
             )
-        self._prior: Distribution = copy_of_prior(prior)
+        self._prior: Distribution = copy.deepcopy(prior)
         self._device = torch.empty(0, device=device).device  # with its number
         if hasattr(self._prior, "to"):
             self._prior.to(self._device)  # type: ignore[attr-defined]

@@ -6,7 +6,6 @@ from typing import Any
 from torch.distributions import Distribution
 
 from sbi_rope._sbi import (
-    check_weights_of,
     direct_posterior,
     estimator_of,
     posterior_from,
@@ -51,9 +50,8 @@ class StartingNPE:
 
     def replace_by(self, posterior: Any) -> None:
         """Take a copy of a trained posterior of sbi instead of training one."""
-        estimator = estimator_of(posterior)
-        check_weights_of(estimator)
-        self._given = posterior_from(posterior, copy.deepcopy(estimator))
+        estimator = copy.deepcopy(estimator_of(posterior))
+        self._given = posterior_from(posterior, estimator)
 
     def posterior(
         self, prior: Distribution, data: Data, *, show_progress_bars: bool

@@ -125,7 +125,7 @@ def test_what_an_array_masks_is_missing() -> None:
     x_masked = np.ma.masked_array(x, mask=np.zeros_like(x))
     x_masked[::3, 0] = np.ma.masked
     x_masked.data[::3, 0] = -9.0
-    with pytest.raises(InvalidInputError, match="got NaN in 4 of 12 rows"):
+    with pytest.raises(InvalidInputError, match="got NaN or Inf in 4 of 12"):
         rope((theta, x_masked))
     with pytest.raises(InvalidInputError, match="NaN"):
         rope((theta, list(x_masked)))

@@ -95,8 +95,8 @@ def test_at_tau_one_the_mean_posterior_is_the_mean_of_the_simulated_ones() -> No
         x_o,
         coupler=SinkhornCoupler(gamma=0.2, tau=1.0, tolerance=1e-10),
         num_simulations=150,
-        tail_mass=0.0,
     )
+    posterior.posterior_estimator.tail_mass = 0.0
     grid = torch.linspace(-3, 3, 7)
     theta = torch.cartesian_prod(grid, grid)
     batch = posterior.log_prob_batched(

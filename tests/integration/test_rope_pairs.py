@@ -10,7 +10,7 @@ from torch import Tensor
 from sbi_rope import CalibrationFinetuner, RoPE
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed
-from sbi_rope.errors import InvalidInputError, NotReadyError
+from sbi_rope.errors import NotReadyError
 from tests import gaussian, problems
 from tests.stacks import (
     NUM_OBSERVED,
@@ -209,5 +209,3 @@ def test_another_finetuner_gives_another_net_and_leaves_the_first() -> None:
     )
     nets = (other.tuned_embedding_net, expected.tuned_embedding_net)
     assert same(parameters(nets[0]), parameters(nets[1]))
-    with pytest.raises(InvalidInputError, match="finetuner"):
-        rope.with_pairs(ALL, finetuner=QUIET)  # type: ignore[arg-type]

@@ -25,7 +25,6 @@ from sbi_rope.discrepancy.imputation import expected_means
 from sbi_rope.errors import (
     InvalidInputError,
     RoPEWarning,
-    SimulationError,
 )
 from sbi_rope.metrics import acauc_of, coverage_curve_of, expected_coverage_error_of
 from sbi_rope.simulate import Simulator
@@ -313,7 +312,7 @@ def rope() -> RoPE:
 def test_labels_that_say_nothing_are_left_out() -> None:
     theta, x = gaussian.labelled(6)
     theta[2:4] = NAN
-    with pytest.warns(RoPEWarning, match=r"2 of 6 labels say .* rows: \[\d, \d\]"):
+    with pytest.warns(RoPEWarning, match=r"left out: 2 of 6 rows"):
         conductor = rope().append_calibration(theta, x)
     keep = torch.tensor([0, 1, 4, 5])
     assert torch.equal(conductor.calibration[0], theta[keep])
@@ -347,14 +346,13 @@ STD = torch.tensor([0.1, 0.1])
         ({"theta_std": STD, "theta_cov": torch.eye(2)}, "got both"),
         ({"theta_std": torch.tensor([0.1, NAN])}, "finite and not negative"),
         ({"theta_cov": torch.eye(3)}, r"\(2, 2\) or \(10, 2, 2\)"),
-        ({"theta_cov": -torch.eye(2)}, "without negative eigenvalues"),
-        ({"theta_cov": torch.tensor([[1.0, 0.5], [0.0, 1.0]])}, "symmetric"),
-        ({"theta_cov": torch.ones(2, 2)}, "singular"),
+        ({"theta_cov": -torch.eye(2)}, "positive definite"),
+        ({"theta_cov": torch.tensor([[1.0, 0.5], [0.0, 1.0]])}, "positive definite"),
+        ({"theta_cov": torch.ones(2, 2)}, "positive definite"),
         ({"weights": torch.zeros(10)}, "positive"),
-        ({"weights": torch.ones(9)}, "same number of rows"),
-        ({"weights": torch.ones(10, 2)}, r"shape \(n,\)"),
+        ({"weights": torch.ones(9)}, "`weights` of shape"),
+        ({"weights": torch.ones(10, 2)}, "`weights` of shape"),
         ({"groups": [1, 2]}, "each of 10 pairs; got 2"),
-        ({"groups": [NAN] * 10}, "NaN; got it in row 0"),
     ],
 )
 def test_labels_that_make_no_sense_are_refused(
@@ -381,12 +379,10 @@ def test_draws_of_labels_are_checked() -> None:
     conductor = rope().append_calibration(draws, x)
     assert torch.allclose(conductor.calibration[0], draws.mean(dim=1), atol=1e-5)
     assert str(conductor.labels) == "4 labels, each given as 20 draws"
-    with pytest.raises(InvalidInputError, match="neither `theta_std` nor"):
+    with pytest.raises(InvalidInputError, match="draws of all parameters"):
         rope().append_calibration(draws, x, theta_std=0.1)
-    with pytest.raises(InvalidInputError, match="got NaN"):
+    with pytest.raises(InvalidInputError, match="draws of all parameters"):
         rope().append_calibration(draws.where(draws > 0, NAN), x)
-    with pytest.raises(InvalidInputError, match="two draws"):
-        rope().append_calibration(draws[:, :1], x)
 
 
 def test_a_label_that_fits_no_parameters_of_the_prior_is_named() -> None:
@@ -395,7 +391,7 @@ def test_a_label_that_fits_no_parameters_of_the_prior_is_named() -> None:
     box = BoxUniform(-torch.ones(2), torch.ones(2))
     npe = DirectPosterior(gaussian.GaussianEstimator(), box)
     theta = torch.tensor([[0.0, 0.0], [0.5, 90.0]])
-    with pytest.raises(InvalidInputError, match=r"found none for 1 labels.*\[1\]"):
+    with pytest.raises(InvalidInputError, match=r"fit; got 1 others .*\[1\]"):
         RoPE(npe, simulator=gaussian.simulator).append_calibration(
             theta, theta, theta_std=0.1
         )
@@ -427,19 +423,16 @@ def test_groups_are_numbers_or_names_of_all_pairs() -> None:
         assert named.labels.groups.tolist() == [0, 0, 1, 2]
     named = named.append_calibration(theta, x, groups=["mouse", 2, "rat", "mouse"])
     assert named.labels.groups.tolist() == [0, 0, 1, 2, 3, 1, 4, 3]
-    with pytest.raises(InvalidInputError, match="missing for these"):
+    with pytest.raises(InvalidInputError, match="or of none"):
         named.append_calibration(theta, x)
     assert len(named.labels) == 8
-    with pytest.raises(InvalidInputError, match="missing for those"):
+    with pytest.raises(InvalidInputError, match="or of none"):
         rope().append_calibration(theta, x).append_calibration(theta, x, groups=numbers)
     table = pd.DataFrame({"specimen": ["a", "a", "b", "c"]})
-    with pytest.raises(InvalidInputError, match=r"shape \(4, 1\).* a single column"):
+    with pytest.raises(InvalidInputError, match="each of 4 pairs; got 1"):
         rope().append_calibration(theta, x, groups=table)  # type: ignore[arg-type]
     named = rope().append_calibration(theta, x, groups=table["specimen"])
     assert named.labels.groups.tolist() == [0, 0, 1, 2]
-    for wrong in ("abcd", 3, [None] * 4, [[1]] * 4):
-        with pytest.raises(InvalidInputError, match="groups"):
-            rope().append_calibration(theta, x, groups=wrong)  # type: ignore[arg-type]
 
 
 # Labels that are nearly exact, and labels near bounds --------------------------------
@@ -587,15 +580,6 @@ def test_labels_on_a_bound_are_inside() -> None:
         assert float(draws[:, 0].std()) > 0.05
 
 
-def test_a_covariance_may_be_nan_where_a_parameter_was_not_measured() -> None:
-    theta, x = gaussian.labelled(4)
-    theta[:, 0] = NAN
-    covariance = torch.tensor([[NAN, NAN], [NAN, 0.04]])
-    labels = rope().append_calibration(theta, x, theta_cov=covariance).labels
-    expected = torch.tensor([[0.0, 0.0], [0.0, 0.04]]).double()
-    assert torch.allclose(labels.covariance, expected)
-
-
 def test_targets_of_noisy_labels_are_means_of_as_many_simulations_as_asked_for() -> (
     None
 ):
@@ -615,46 +599,14 @@ def test_targets_of_noisy_labels_are_means_of_as_many_simulations_as_asked_for()
 # What may be meant differently -------------------------------------------------------
 
 
-def test_weights_that_were_normalised_and_equal_labels_that_are_noisy_are_named() -> (
-    None
-):
+def test_weights_that_were_normalised_are_warned_of() -> None:
     theta, x = gaussian.labelled(12)
-    rope = RoPE(gaussian.posterior(), simulator=gaussian.simulator)
-    with pytest.warns(RoPEWarning, match=r"12 calibration pairs sum to 1, so that"):
-        rope.append_calibration(theta, x, weights=torch.full((12,), 1 / 12))
-    assert "and counted as 1" in str(rope.labels)
-    rope = RoPE(gaussian.posterior(), simulator=gaussian.simulator)
-    with pytest.warns(RoPEWarning, match="12 labels .* have 5 different values"):
-        rope.append_calibration(theta[torch.arange(12) % 5], x, theta_std=0.1)
-    assert len(rope.labels.groups.unique()) == 5
-    equal = theta[torch.arange(12) % 5]
+    with pytest.warns(RoPEWarning, match="12 pairs sum to 1, .* do not normalise"):
+        conductor = rope().append_calibration(theta, x, weights=torch.ones(12) / 12)
+    assert "and counted as 1" in str(conductor.labels)
     with warnings.catch_warnings():
         warnings.simplefilter("error", RoPEWarning)
-        rope = RoPE(gaussian.posterior(), simulator=gaussian.simulator)
-        rope.append_calibration(theta, x, weights=torch.linspace(0.5, 1.5, 12))
-        rope = RoPE(gaussian.posterior(), simulator=gaussian.simulator)
-        rope.append_calibration(equal, x)
-        rope = RoPE(gaussian.posterior(), simulator=gaussian.simulator)
-        rope.append_calibration(equal, x, theta_std=0.1, groups=range(12))
-    assert len(rope.labels.groups.unique()) == 12
-
-
-def test_partial_labels_that_may_be_those_of_another_pair_are_named() -> None:
-    theta, x = gaussian.labelled(9)
-    theta[4:7] = theta[0]
-    theta[5, 0] = theta[6, 1] = theta[8, 1] = NAN
-    match = r"2 of 9 labels lack .* \(first rows: \[5, 6\]\).* Pass `groups`"
-    with pytest.warns(RoPEWarning, match=match):
-        rope().append_calibration(theta, x)
-    with pytest.warns(RoPEWarning, match=match):  # also if they come one by one
-        rope().append_calibration(theta[:5], x[:5]).append_calibration(theta[5:], x[5:])
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", RoPEWarning)
-        rope().append_calibration(theta, x, groups=[0, 1, 2, 3, 0, 0, 0, 7, 8])
-        # Those that measure different parameters have nothing to agree in.
-        rope().append_calibration(theta[5:], x[5:])
-        # Equal labels are one group already.
-        rope().append_calibration(theta[[5, 5, 8, 2]], x[:4])
+        rope().append_calibration(theta, x, weights=torch.linspace(0.5, 1.5, 12))
 
 
 @pytest.mark.medium
@@ -665,7 +617,7 @@ def test_several_labels_exactly_on_a_bound_of_the_prior_are_named() -> None:
         made = rope_of((theta[:0], x[:0]), parameter_names=("height", "harvest"))
         made.append_calibration(theta, x, **options)
 
-    match = r"on a bound of the prior: 3 of 40 of harvest\. .* `guaranteed=True`"
+    match = "3 of 40 labels of harvest lie exactly on the prior's bound"
     with pytest.warns(RoPEWarning, match=match):
         appended(3, 8, 20)
     with warnings.catch_warnings():
@@ -674,13 +626,6 @@ def test_several_labels_exactly_on_a_bound_of_the_prior_are_named() -> None:
         appended(3, 8, 20, theta_std=0.1)
         theta, x = gaussian.labelled(20)  # a prior without bounds
         rope().append_calibration(theta, x)
-
-
-def test_a_label_without_a_column_for_each_parameter_says_what_stands_for_one() -> None:
-    theta, x = gaussian.labelled(9)
-    match = r"each of the 2 parameters of NPE; got \(9, 1\). NaN stands for a param"
-    with pytest.raises(InvalidInputError, match=match):
-        rope().append_calibration(theta[:, :1], x)
 
 
 def test_a_failed_simulation_is_replaced_by_another_one_of_the_same_label() -> None:

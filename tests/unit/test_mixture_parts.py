@@ -48,8 +48,6 @@ def coupling(real: Tensor, simulated: Tensor, **options: Any) -> Coupling:
         simulated=simulated.double(),
         tau=1.0,
         marginal_error=0.0,
-        batch_error=0.0,
-        num_fitted=len(real),
         num_iterations=0,
         converged=True,
         solver="none",

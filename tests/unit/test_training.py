@@ -252,51 +252,6 @@ class TestFit:
         assert ("best" in printed.err) is show
         assert printed.out == ""
 
-    def test_a_terminal_sees_less_than_every_step(
-        self, terminal: pytest.CaptureFixture[str]
-    ) -> None:
-        """Ten refreshes a second: two hundred take twenty seconds."""
-        module = Number()
-        run(
-            module,
-            towards(module, 1),
-            None,
-            show_progress_bars=True,
-            max_num_epochs=1000,
-            stop_after_epochs=1001,
-        )
-        assert terminal.readouterr().err.count("Numbers") < 200
-
-    def test_a_file_gets_a_few_lines_only(
-        self, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        module = Number()
-        run(
-            module,
-            towards(module, 1),
-            None,
-            show_progress_bars=True,
-            max_num_epochs=1000,
-            stop_after_epochs=1001,
-        )
-        assert 0 < capsys.readouterr().err.count("Numbers") < 20
-
-    def test_training_without_a_limit_shows_no_total(
-        self, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        module = Number()
-        run(
-            module,
-            towards(module, 1),
-            towards(module, 1),
-            show_progress_bars=True,
-            max_num_epochs=2**31 - 1,
-            stop_after_epochs=5,
-        )
-        text = capsys.readouterr().err
-        assert "Numbers" in text
-        assert "2147483648" not in text
-
 
 class TestTraining:
     def test_values_outside_their_range_are_refused(self) -> None:

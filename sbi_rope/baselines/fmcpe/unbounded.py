@@ -1,5 +1,6 @@
 """Parameters as vectors without bounds."""
 
+import copy
 from collections.abc import Callable
 from typing import Any
 
@@ -10,7 +11,6 @@ from torch.distributions import Distribution
 
 from sbi_rope._bounds import bounds_of
 from sbi_rope._random import seeded
-from sbi_rope._sbi import copy_of_prior
 from sbi_rope.baselines.fmcpe.standardise import Standardise
 
 __all__ = ["Unbounded"]
@@ -37,7 +37,7 @@ class Unbounded(nn.Module):
 
     def __init__(self, prior: Distribution) -> None:
         super().__init__()
-        self.prior = copy_of_prior(prior)
+        self.prior = copy.deepcopy(prior)
         with seeded(0):
             draws = self.prior.sample(torch.Size((NUM_DRAWS,))).float()
         self._set_transform(draws.device)
