@@ -12,8 +12,6 @@ import torch
 from torch import Tensor
 
 from sbi_rope import RoPE, diagnose, load, stack
-from sbi_rope.baselines import FRISBI
-from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.metrics import draw_samples, evaluate
 from sbi_rope.sweep import sweep
@@ -109,21 +107,6 @@ def test_the_array_of_a_user_is_not_changed_or_shared() -> None:
     assert rope.calibration[1].isfinite().all()
 
 
-def test_swapped_arguments_are_named_where_shapes_tell() -> None:
-    theta, x = map(array, PAIRS)
-    npe = problems.npe_posterior("mdn")
-    method = FinetunedNPE.from_posterior(npe)
-    method.append_calibration(theta, x)
-    for call in (
-        lambda: rope((x, theta)),
-        lambda: RoPE(npe, simulations=(x, theta)),
-        lambda: method.append_calibration(x, theta),
-        lambda: evaluate(npe, x, theta),
-    ):
-        with pytest.raises(InvalidInputError, match="Did you swap them"):
-            call()
-
-
 # Tables ------------------------------------------------------------------------------
 
 NAMES, CHANNELS = ["Vmax", "Km"], ["blue", "red"]
@@ -173,70 +156,6 @@ def tabled(theta: Tensor) -> pd.DataFrame:
 def tabled_one(theta: Any) -> pd.Series:
     low, high = theta  # so that it takes no batch
     return tabled(torch.tensor([[float(low), float(high)]])).iloc[0]
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"simulator": tabled},
-        {"simulator": tabled_one},
-        {"simulator": tabled, "num_simulations": 1000},
-    ],
-    ids=["batches", "one by one", "limited"],
-)
-def test_columns_of_a_simulator_are_known(options: dict[str, Any]) -> None:
-    rope = of_tables(**options)
-    with refused(CHANNELS, "the tables that `simulator` returns"):
-        rope.append_calibration(THETA, SWAPPED[1])
-    rope.append_calibration(THETA, X)
-    method = DiscrepancyNPE.from_posterior(gaussian.posterior(), **options)
-    method.append_calibration(THETA, SWAPPED[1])
-    with pytest.raises(InvalidInputError, match=r"Expected `simulator\(.*Return `df"):
-        method.train(**QUIET)
-
-
-def test_columns_whose_names_are_not_strings_or_not_unique_keep_their_order() -> None:
-    for names in ([0, 1], [("a", 1), ("a", 2)]):
-        theta, x = THETA.set_axis(names, axis=1), X.set_axis(names, axis=1)
-        known = of_tables(simulator=gaussian.simulator).append_calibration(theta, x)
-        for swapped in ((theta[names[::-1]], x), (theta, x[names[::-1]])):
-            with pytest.raises(InvalidInputError, match="columns in the order of the"):
-                known.append_calibration(*swapped)
-        known.append_calibration(theta, x)
-    method = FRISBI(gaussian.posterior(3).prior, simulator=gaussian.simulator)
-    doubled = pd.DataFrame(torch.zeros(4, 3), columns=["a", "a", "b"])
-    method.append_simulations(doubled, doubled)
-    with pytest.raises(InvalidInputError, match="columns in the order of the"):
-        method.append_simulations(doubled.iloc[:, [0, 2, 1]], doubled)
-
-
-def test_tables_whose_rows_are_in_different_orders_are_refused() -> None:
-    rows = [f"plot {k}" for k in range(12)]
-    theta, x = (table.set_axis(rows, axis=0) for table in (THETA, X))
-    other, weights = x.iloc[::-1], theta["Km"].abs()[::-1]
-    rope = of_tables(simulator=gaussian.simulator)
-    method = FRISBI(gaussian.posterior().prior, simulator=gaussian.simulator)
-    hint = re.escape(
-        "row 'plot 0' of `theta` and row 'plot 11' of `x` in place 0. Pass"
-    )
-    for call in (
-        lambda: rope.append_calibration(theta, other),
-        lambda: method.append_calibration(theta, other),
-        lambda: method.append_simulations(theta, other),
-        lambda: evaluate(gaussian.posterior(), theta, other),
-    ):
-        with pytest.raises(InvalidInputError, match=hint):
-            call()
-    with pytest.raises(
-        InvalidInputError, match=r"`theta` and `weights` with their row"
-    ):
-        rope.append_calibration(theta, x, weights=weights)
-    with pytest.raises(InvalidInputError, match=r"`simulations\[1\]` with their rows"):
-        of_tables(simulations=(THETA_S, X_S.iloc[::-1]))
-    # Rows of which at least one table says nothing are paired by position.
-    rope.append_calibration(theta, X).append_calibration(theta.to_numpy(), other)
-    rope.append_calibration(theta, other.loc[rows], weights=weights.loc[rows])
-    assert len(rope.labels) == 36
 
 
 def test_the_parameters_of_a_table_of_simulations_have_its_names() -> None:
@@ -352,55 +271,6 @@ def test_observations_in_another_order_than_earlier_ones_are_refused() -> None:
     with pytest.raises(InvalidInputError):
         other.append_calibration(THETA, SWAPPED[1][:3])
     other.append_calibration(THETA, X)
-
-
-def test_trainers_refuse_tables_in_another_order_than_earlier_ones() -> None:
-    method = FRISBI(gaussian.posterior().prior, simulator=gaussian.simulator)
-    with pytest.raises(InvalidInputError):  # which leaves no names behind
-        method.append_simulations(SWAPPED[0], SWAPPED[1][:3])
-    method.append_simulations(THETA_S, X_S)
-    for append in (method.append_simulations, method.append_calibration):
-        with refused(CHANNELS, "the earlier table `x`"):
-            append(THETA, SWAPPED[1])
-        with refused(NAMES, "the earlier table `theta`"):
-            append(SWAPPED[0], X)
-        append(THETA, X)
-    with refused(CHANNELS, "the earlier table `x`"):
-        method.append_observations(SWAPPED[1])
-    method.append_observations(X)
-
-
-@pytest.mark.medium
-def test_posteriors_of_trainers_know_the_columns_of_the_pairs() -> None:
-    method = FinetunedNPE.from_posterior(
-        gaussian.posterior(), training=Training(max_num_epochs=1)
-    )
-    method.append_calibration(THETA, X)
-    posterior = method.train(seed=0, **QUIET).build_posterior()
-    with refused(NAMES, "the earlier table `theta`"):
-        evaluate(posterior, SWAPPED[0], X)
-    with refused(CHANNELS, "the earlier table `x`"):
-        draw_samples(posterior, SWAPPED[1], num_samples=2)
-    assert draw_samples(posterior, X, num_samples=2).shape == (2, 12, 2)
-    # What starts from them knows the columns, too.
-    corrected = DiscrepancyNPE.from_posterior(
-        gaussian.posterior(),
-        simulator=gaussian.simulator,
-        num_simulations=100,
-        simulations_per_pair=3,
-        num_steps=2,
-        space="tuned",
-    ).append_calibration(THETA, X)
-    averaged = corrected.train(seed=0, **QUIET).build_posterior()
-    for start in (posterior, averaged):
-        again = FinetunedNPE.from_posterior(start)
-        with refused(NAMES, "the earlier table `theta`"):
-            again.append_calibration(SWAPPED[0], X)
-    repaired = RoPE(posterior, simulator=gaussian.simulator, parameter_names=NAMES)
-    with refused(CHANNELS, "the earlier table `x`"):
-        repaired.append_calibration(THETA, SWAPPED[1])
-    with pytest.raises(InvalidInputError, match="`parameter_names` in the order of"):
-        RoPE(posterior, simulator=gaussian.simulator, parameter_names=NAMES[::-1])
 
 
 def test_what_an_array_masks_is_missing() -> None:
