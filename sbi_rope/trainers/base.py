@@ -118,6 +118,7 @@ class Method(ABC):
         assert method._npe is not None
         method._npe.replace_by(posterior)
         method._data.event_shape = estimator.condition_shape
+        method._data.x_names = getattr(posterior, "x_names", None)
         method._data.embedding_net = copy.deepcopy(embedding_of(estimator))
         return method
 
@@ -208,7 +209,10 @@ class Method(ABC):
                 f"{type(self).__name__} is not trained, or data was appended since. "
                 "Call `train()` first."
             )
-        return copy.deepcopy(self._posterior)
+        posterior = copy.deepcopy(self._posterior)
+        if hasattr(posterior, "x_names"):  # those of sbi read no tables
+            posterior.x_names = self._data.x_names
+        return posterior
 
     @property
     def history(self) -> History:

@@ -450,7 +450,7 @@ def test_names_and_a_diagnosis_that_do_not_fit_are_refused(
     report, path = the_stack().report, tmp_path / "report.html"
     with pytest.raises(InvalidInputError, match="`parameter_names` of length 2"):
         report.to_html(path, parameter_names=("a",))
-    with pytest.raises(InvalidInputError, match="different names"):
+    with pytest.raises(InvalidInputError, match="Expected `names`"):
         report.to_html(path, x_names=("a", "b"))
     with pytest.raises(InvalidInputError, match="Expected no `x_names`"):
         replace(report, discrepancy=None).to_html(path, x_names=("a", "b", "c"))

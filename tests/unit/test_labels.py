@@ -22,10 +22,7 @@ from sbi_rope._labels import (
 )
 from sbi_rope.discrepancy import DiscrepancyModel, learn_parameters
 from sbi_rope.discrepancy.imputation import expected_means
-from sbi_rope.errors import (
-    InvalidInputError,
-    RoPEWarning,
-)
+from sbi_rope.errors import InvalidInputError, RoPEWarning, SimulationError
 from sbi_rope.metrics import acauc_of, coverage_curve_of, expected_coverage_error_of
 from sbi_rope.simulate import Simulator
 from sbi_rope.stacking import stacking_weights
