@@ -1,7 +1,7 @@
 """A batch of real observations and the simulations that it is coupled with."""
 
 import copy
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Literal
@@ -62,47 +62,12 @@ class EmbeddedBatch:
         with parameters_named(self.theta):
             return coupler.couple(self.real, self.simulated, seed=seed)
 
-    def sweep(
-        self,
-        coupler: SinkhornCoupler,
-        *,
-        gammas: Sequence[float],
-        taus: Sequence[float],
-        seed: int | None = None,
-    ) -> Iterator[Coupling]:
-        """Couple at every gamma and every tau, each coupling when it is needed.
-
-        The order is that of :meth:`SinkhornCoupler.sweep
-        <sbi_rope.SinkhornCoupler.sweep>`.
-
-        Args:
-            coupler: Settings other than gamma and tau.
-            gammas: Values of gamma, in any order.
-            taus: Values of tau, in any order.
-            seed: Seed of the choice of ``num_fitted`` observations.
-
-        Raises:
-            InvalidInputError: If a gamma or tau is outside its range, or there is none.
-            CouplingError: As in :meth:`couple`.
-        """
-        with parameters_named(self.theta):
-            couplings = coupler.sweep(
-                self.real, self.simulated, gammas=gammas, taus=taus, seed=seed
-            )
-
-        def named() -> Iterator[Coupling]:
-            with parameters_named(self.theta):
-                yield from couplings
-
-        return named()
-
     def posterior(
         self,
         coupling: Coupling,
         *,
         unseen: Literal["raise", "extend"] = "raise",
         tail_mass: float = 1e-3,
-        shared: dict[int, Tensor] | None = None,
     ) -> MixturePosterior:
         """Return the mixture of simulated posteriors that a coupling gives.
 
@@ -110,8 +75,6 @@ class EmbeddedBatch:
             coupling: What :meth:`couple` returned.
             unseen: As in :meth:`~sbi_rope.RoPE.build_posterior`.
             tail_mass: As in :meth:`~sbi_rope.RoPE.build_posterior`.
-            shared: A dictionary that posteriors of the same simulations may share, as
-                in :class:`~sbi_rope.MixturePosterior`.
         """
         # Each posterior has copies of its own of net and density. Moving one to another
         # device then leaves the others where they are.
@@ -124,7 +87,6 @@ class EmbeddedBatch:
             mixture,
             copy.deepcopy(self.npe.prior),
             enable_transform=self.npe.enable_transform,
-            shared=shared,
         )
         posterior.parameter_names = self.npe.parameter_names
         posterior.columns = dict(self.columns)

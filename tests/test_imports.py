@@ -65,15 +65,13 @@ LAYERS = [
     {"mixture", "_simulator"},
     # A batch is coupled, and its couplings make a mixture. Trainers train networks, and
     # average them in a mixture. Tasks have simulators. Labels have a density under a
-    # posterior and its prior. A mixture is recalibrated by its density.
-    {"_labels", "batch", "trainers", "tasks", "recalibration"},
+    # posterior and its prior.
+    {"_labels", "batch", "trainers", "tasks"},
     # The NPE that knows the discrepancy is a trainer.
     {"discrepancy"},
     # RoPE conducts fine-tuning, coupling and mixture. The discrepancy tells what labels
     # that are not exact are tuned to.
     {"rope"},
-    # A sweep asks RoPE for many mixtures.
-    {"sweep"},
     # Baselines are trainers, two of which are stages of RoPE. The diagnosis looks at
     # the parts of RoPE.
     {"baselines", "diagnosis"},

@@ -76,9 +76,6 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         prior: The prior NPE was trained with.
         enable_transform: Whether ``map()`` searches in an unbounded space, as in sbi.
             For mixed discrete and continuous parameters it never does.
-        shared: A dictionary in which the posterior keeps the masses :math:`Z_j` that it
-            estimates. Posteriors of the same prior and the same parts, in the same
-            order, may share it, whatever their weights and couplings are.
         warns: Whether an amortised posterior warns of observations whose entries are
             far from the simulations of NPE, if NPE standardises them. Those with which
             a stack scores the pairs do not, because RoPE has warned of these.
@@ -94,7 +91,6 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         prior: Distribution,
         *,
         enable_transform: bool = True,
-        shared: dict[int, Tensor] | None = None,
         warns: bool = True,
     ) -> None:
         # A category that sbi has standardised and put back may differ by rounding, and
@@ -111,7 +107,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             )
         self.posterior_estimator: MixtureEstimator = estimator
         # Posteriors of single observations share it, so that all is estimated once.
-        self._cache: dict[int, Tensor] = {} if shared is None else shared
+        self._cache: dict[int, Tensor] = {}
         self.warns = warns
         describe(self, _purpose(estimator))
 
@@ -232,8 +228,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
                 f"Cannot move a posterior whose prior has no method `to`: "
                 f"{type(self.prior).__name__}. Use a prior of sbi, such as BoxUniform."
             )
-        # A new dictionary: the posteriors of a sweep share the old one, and stay on
-        # their device.
+        # A new dictionary: posteriors of single observations share the old one.
         self._cache = {k: mass.to(device) for k, mass in self._cache.items()}
         self._latest = None
         with seeded(0):  # sbi draws from the prior to find out about it

@@ -86,7 +86,6 @@ def calibration_section(report: StackingReport, names: Sequence[str]) -> str:
             kind="note",
         ),
         *_sets(report),
-        *_recalibration(report),
         picture(
             drawn,
             caption="The share of known parameters inside intervals of each level. "
@@ -138,17 +137,6 @@ def _by_estimate(report: StackingReport, names: Sequence[str]) -> list[str]:
             "above are the shares inside.",
             wide=len(names) > 2,
         ),
-    ]
-
-
-def _recalibration(report: StackingReport) -> list[str]:
-    if report.recalibration is None:
-        return []
-    return [
-        paragraph(
-            f"{report.recalibration} The table above is about the stack before it.",
-            kind="note",
-        )
     ]
 
 

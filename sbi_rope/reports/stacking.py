@@ -88,8 +88,7 @@ def write_stacking_report(
     check_target(target)
     if diagnosis is not None:
         # The page is about this stack, whichever posterior the diagnosis was made for.
-        used = stack_in_use(report, is_amortised=report.is_amortised)
-        diagnosis = read_for(diagnosis, used)
+        diagnosis = read_for(diagnosis, stack_in_use(report))
     parts = [
         paragraph(_what_was_done(report)),
         list_of(verdict_of(report, diagnosis, names), kind="verdict"),

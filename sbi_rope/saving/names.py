@@ -83,7 +83,6 @@ ROOMS: dict[str, tuple[type, ...]] = {
     "sbi_rope.discrepancy": (*_KINDS, *_POSTERIORS),
     "sbi_rope.metrics": (),
     "sbi_rope.mixture": (*_KINDS, *_POSTERIORS),
-    "sbi_rope.recalibration": (nn.Module,),
     "sbi_rope.stacking": _POSTERIORS,
     "sbi_rope.tasks.hemodynamics.prior_table": (),
     "sbi_rope.tasks": _KINDS,
@@ -93,7 +92,7 @@ RESULTS = tuple(
     f"sbi_rope.{room}"
     for room in (
         *("_two_sample", "baselines", "coupling", "discrepancy", "metrics"),
-        *("recalibration", "stacking", "tasks.hemodynamics.prior_table"),
+        *("stacking", "tasks.hemodynamics.prior_table"),
     )
 )
 # It derives from none of these, and holds tensors.

@@ -22,8 +22,7 @@ from sbi_rope.sets.conformal import (
     marginal_ends,
     rank_needed,
 )
-from sbi_rope.stacking.cross_validation import CrossValidation
-from sbi_rope.stacking.held_out import SetScores
+from sbi_rope.stacking.cross_validation import CrossValidation, SetScores
 from sbi_rope.stacking.versions import Versions
 
 __all__ = ["HeldOutSets"]

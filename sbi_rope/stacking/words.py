@@ -11,8 +11,7 @@ from sbi_rope.discrepancy.parameters import is_improbable
 from sbi_rope.metrics.by_estimate import in_words
 from sbi_rope.metrics.calibration import ACAUC_IN_WORDS, FEWEST
 from sbi_rope.settings import default_names
-from sbi_rope.stacking.cross_validation import Difference
-from sbi_rope.stacking.learning_curve import LearningCurve
+from sbi_rope.stacking.cross_validation import Difference, LearningCurve
 
 if TYPE_CHECKING:
     from sbi_rope.stacking.report import StackingReport
@@ -84,10 +83,6 @@ IF_MOSTLY_PRIOR = "Check that theta and x of the pairs belong together, row by r
 IN_WORDS = {
     "prior": "the prior, which learns nothing from x",
     "NPE": "NPE as it was trained on simulations",
-    "OT-only": "observations are coupled with simulations, without tuning",
-    "tuning-only": "the embedding net was tuned on the labels, without coupling",
-    "RoPE": "the embedding net was tuned on the labels, and observations are coupled "
-    "with simulations",
     "fine-tuned NPE": "the labels train NPE further",
     "discrepancy": "NPE of simulations that a linear model, learnt from the labels, "
     "has corrected",
@@ -127,7 +122,6 @@ def lines_of(report: "StackingReport") -> list[str]:
         *_weights(report),
         *_parameters(report),
         *_calibration(report),
-        *_recalibration(report),
         *_more_labels(report),
         *_what_it_took(report),
     ]
@@ -335,14 +329,6 @@ def _by_estimate(report: "StackingReport") -> list[str]:
             line, 88, initial_indent="    ", subsequent_indent="      "
         )
     ]
-
-
-def _recalibration(report: "StackingReport") -> list[str]:
-    if report.recalibration is None:
-        return []
-    return textwrap.wrap(
-        str(report.recalibration), 88, initial_indent="  ", subsequent_indent="    "
-    )
 
 
 def _sets(report: "StackingReport") -> list[str]:

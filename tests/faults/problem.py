@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sbi_rope import CalibrationFinetuner, RoPE, diagnose, stack
 from sbi_rope.discrepancy import DiscrepancyModel, DiscrepancyNPE
-from sbi_rope.stacking import CouplingCandidate, default_candidates
+from sbi_rope.stacking import default_candidates
 from tests import gaussian
 
 QUIET: dict[str, Any] = {"show_progress_bars": False}
@@ -62,20 +62,6 @@ CANDIDATES = default_candidates()[:2]
 @functools.cache
 def stacked() -> Any:
     return stack(trained(), candidates=CANDIDATES, num_folds=2, seed=0, **QUIET)
-
-
-@functools.cache
-def stacked_batch() -> Any:
-    candidates = [*CANDIDATES, CouplingCandidate(gamma=0.5, tau=0.5, tuned=False)]
-    return stack(
-        trained(),
-        X_O,
-        candidates=candidates,
-        num_folds=2,
-        num_simulations=30,
-        seed=0,
-        **QUIET,
-    )
 
 
 @functools.cache

@@ -17,7 +17,6 @@ from sbi_rope.diagnosis import Diagnosis, Finding
 from sbi_rope.diagnosis.in_use import read_for, stack_in_use
 from sbi_rope.diagnosis.labelled import UNLIKE_PAIRS
 from sbi_rope.errors import InvalidInputError, NotWritableError
-from sbi_rope.recalibration import Recalibration
 from sbi_rope.reports.numbers import number, percent
 from sbi_rope.stacking import LearningCurve, StackingReport
 from tests.stacks import (
@@ -222,24 +221,8 @@ def test_the_page_says_how_large_sets_with_a_guarantee_are(source: str) -> None:
 
 
 @pytest.mark.medium
-def test_the_page_says_what_more_labels_and_a_recalibration_add(
-    source: str, tmp_path: Path
-) -> None:
+def test_the_page_says_what_more_labels_add(source: str) -> None:
     assert "10 more labels might add" in Page(source).text
-    assert "Recalibration" not in source
-    levels = torch.rand(20, 2, generator=torch.Generator().manual_seed(0))
-    recalibration = Recalibration(
-        factors=torch.tensor([0.71, 1.24]),
-        gain=0.09,
-        interval=(0.02, 0.16),
-        is_used=True,
-        levels_before=0.5 * levels,
-        levels_after=levels,
-    )
-    report = replace(the_stack().report, recalibration=recalibration)
-    text = Page(written(report, tmp_path)).text
-    assert "the spread of the parameters by 0.71, 1.24: +0.09 nats" in text
-    assert f"ACAUC {recalibration.before.value:+.3f} before" in text
 
 
 def test_the_page_says_what_a_diagnosis_found(
@@ -247,8 +230,7 @@ def test_the_page_says_what_a_diagnosis_found(
 ) -> None:
     text = Page(source).text
     assert "Diagnosis of the batch" in text
-    used = stack_in_use(the_stack().report, is_amortised=True)
-    shown = read_for(diagnosis, used)
+    shown = read_for(diagnosis, stack_in_use(the_stack().report))
     for finding in shown.findings:
         sentence = finding.sentence.replace(" %", "\N{NO-BREAK SPACE}%")
         is_told = finding.alarming and finding not in shown.others

@@ -1,9 +1,8 @@
-"""Blocks, sweeps and subsets: large couplings equal small ones done the long way."""
+"""Blocks and subsets: large couplings equal small ones done the long way."""
 
 import functools
 import itertools
 import math
-import weakref
 from dataclasses import replace
 from typing import Any
 
@@ -402,103 +401,6 @@ def test_exhausted_digits_end_the_iteration() -> None:
     assert 1e-14 < solution.marginal_error < 1e-5
 
 
-# --- sweeps ---
-
-GAMMAS, TAUS = [0.1, 1.0, 0.3], [0.5, 1.0, 0.0, 0.9]
-
-
-@pytest.mark.medium
-@pytest.mark.parametrize("mode", MODES)
-def test_a_sweep_yields_single_solutions_in_the_order_asked_for(
-    mode: dict[str, Any],
-) -> None:
-    real, simulated = clouds(100, 80)
-    tolerance = digits(mode, double=1e-10, single=1e-6)
-    coupler = raw_coupler(tolerance=tolerance, **mode)
-    sweep = list(coupler.sweep(real, simulated, gammas=GAMMAS, taus=TAUS))
-    assert [(c.gamma, c.tau) for c in sweep] == list(itertools.product(GAMMAS, TAUS))
-    for coupling in sweep:
-        single = replace(coupler, gamma=coupling.gamma, tau=coupling.tau)
-        expected = single.couple(real, simulated)
-        assert coupling.converged
-        assert coupling.solver == expected.solver
-        difference = total_variation(coupling.weights, expected.weights).max()
-        assert difference < digits(mode, double=1e-8, single=1e-4)
-
-
-def test_warm_starts_save_iterations() -> None:
-    real, simulated = clouds()
-    gammas, taus = [1.0, 0.5, 0.3, 0.2, 0.15, 0.1], [0.9, 1.0]
-    for solver in ("own", "pot"):
-        coupler = raw_coupler(solver=solver)
-        sweep = coupler.sweep(real, simulated, gammas=gammas, taus=taus)
-        warm = sum(coupling.num_iterations for coupling in sweep)
-        cold = 0
-        for gamma, tau in itertools.product(gammas, taus):
-            single = replace(coupler, gamma=gamma, tau=tau)
-            cold += single.couple(real, simulated).num_iterations
-        assert warm < 0.85 * cold, solver
-
-
-def test_a_sweep_computes_only_what_was_asked_for_so_far(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    real, simulated = clouds()
-    solved = []
-    solve_one = SinkhornCoupler._solve
-
-    def spy(self: SinkhornCoupler, *arguments: Any) -> Any:
-        solved.append((self.gamma, self.tau))
-        return solve_one(self, *arguments)
-
-    monkeypatch.setattr(SinkhornCoupler, "_solve", spy)
-    sweep = raw_coupler().sweep(real, simulated, gammas=[1.0, 0.5], taus=[1.0, 0.5])
-    assert solved == []
-    next(sweep)
-    assert solved == [(1.0, 1.0)]
-    list(sweep)
-    assert solved == [(1.0, 1.0), (1.0, 0.5), (0.5, 1.0), (0.5, 0.5)]
-
-
-def test_a_sweep_keeps_no_coupling_that_it_has_handed_out() -> None:
-    sweep = raw_coupler().sweep(*clouds(), gammas=[1.0, 0.5, 1.0], taus=[1.0])
-    first, second = next(sweep), next(sweep)
-    again = next(sweep)
-    assert again is first  # asked for twice
-    handed_out = [weakref.ref(coupling) for coupling in (first, second)]
-    del first, second, again
-    assert [reference() for reference in handed_out] == [None, None]
-
-
-def test_a_sweep_scales_gamma_like_a_single_coupling() -> None:
-    real, simulated = clouds()
-    coupler = SinkhornCoupler(gamma=0.2, cost_scale="simulated")
-    (swept,) = coupler.sweep(real, simulated, gammas=[0.2], taus=[1.0])
-    single = coupler.couple(real, simulated)
-    assert swept.gamma == single.gamma
-    assert torch.allclose(swept.weights, single.weights, atol=1e-6)
-
-
-def test_settings_of_a_sweep_are_checked_before_anything_is_solved() -> None:
-    for gammas, taus, match in (
-        ([], [1.0], "at least one"),
-        ([0.5], [], "at least one"),
-        ([0.5, -1.0], [1.0], "`gamma` to be positive"),
-        ([0.5], [1.0, 1.5], r"`tau` in \[0, 1\]"),
-    ):
-        with pytest.raises(InvalidInputError, match=match):
-            raw_coupler().sweep(*clouds(), gammas=gammas, taus=taus)
-
-
-def test_a_sweep_refuses_a_gamma_too_small_for_the_digits_when_it_gets_there() -> None:
-    sweep = raw_coupler(dtype=torch.float32).sweep(
-        *clouds(), gammas=[1.0, 1e-9], taus=[1.0]
-    )
-    assert next(sweep).converged
-    with pytest.raises(CouplingError, match="gamma of at least"):
-        next(sweep)
-
-
 # --- potentials fitted to some of the observations ---
 
 
@@ -621,9 +523,7 @@ def test_a_device_without_float64_couples_in_float32(
         coupling = coupler.couple(real, simulated, seed=0)
         weights, rows = coupling.weights, coupling.rows(real[:10])
         assert coupling.effective_sample_size.isfinite().all()
-        (swept,) = coupler.sweep(real, simulated, gammas=[0.1], taus=[tau], seed=0)
     assert coupling.converged
-    assert swept.converged
     assert coupling.potential.dtype == weights.dtype == torch.float32
     assert total_variation(weights, expected.weights).max() < 1e-3
     assert torch.equal(rows, weights[:10])

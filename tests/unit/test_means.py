@@ -12,8 +12,7 @@ from sbi_rope.metrics.calibration import (
     coverage_curve_of_pairs,
     coverage_error_of_pairs,
 )
-from sbi_rope.stacking.cross_validation import CrossValidation
-from sbi_rope.stacking.learning_curve import LearningCurve
+from sbi_rope.stacking import CrossValidation, LearningCurve
 
 torch.manual_seed(0)
 VALUES = torch.randn(12, dtype=torch.double)

@@ -2,7 +2,6 @@
 
 import copy
 import io
-import itertools
 import pickle
 import sys
 import threading
@@ -35,7 +34,6 @@ from sbi_rope.errors import (
 )
 from sbi_rope.metrics import evaluate
 from sbi_rope.stacking import default_candidates
-from sbi_rope.sweep import sweep
 from tests import gaussian, problems
 from tests.stacks import quick
 
@@ -630,53 +628,6 @@ def test_a_seed_does_not_repeat_the_draws_after_the_same_seed_of_torch() -> None
     assert not torch.isin(drawn[-1], theta).any()
 
 
-def test_a_sweep_gives_the_posteriors_of_single_couplings() -> None:
-    conductor = trained()
-    theta = torch.randn(30, 2)
-    gammas, taus = (0.5, 0.1), (1.0, 0.8)
-    swept = list(sweep(conductor, X_O, gammas=gammas, taus=taus, seed=3))
-    settings = itertools.product(gammas, taus)
-    for posterior, (gamma, tau) in zip(swept, settings, strict=True):
-        single = conductor.build_posterior(
-            X_O, coupler=SinkhornCoupler(gamma=gamma, tau=tau), seed=3
-        )
-        assert torch.allclose(posterior.weights, single.weights, atol=1e-5)
-        ours, theirs = (p.log_prob_batched(theta, X_O) for p in (posterior, single))
-        assert torch.allclose(ours, theirs, atol=1e-3)
-    assert not torch.allclose(swept[0].weights, swept[2].weights, atol=1e-3)
-
-
-def test_a_sweep_checks_its_settings_at_once_and_its_couplings_on_the_way() -> None:
-    conductor = rope()
-    with pytest.raises(InvalidInputError, match="at least one number"):
-        sweep(conductor, X_O, gammas=(), taus=(1.0,))
-    with pytest.raises(InvalidInputError, match="`tau`"):
-        sweep(conductor, X_O, gammas=(0.5,), taus=(1.5,))
-    with pytest.raises(InvalidInputError, match="`x_o`"):
-        sweep(conductor, X_O[:, :1], gammas=(0.5,), taus=(1.0,))
-    coupler = SinkhornCoupler(max_iterations=1)
-    posteriors = sweep(conductor, X_O, gammas=(0.01,), taus=(1.0,), coupler=coupler)
-    with pytest.raises(CouplingError, match=r"now 0\.01"):
-        next(posteriors)
-
-
-def test_a_posterior_of_a_sweep_can_be_moved_without_the_others() -> None:
-    conductor = RoPE(problems.npe_posterior(), simulator=problems.simulate)
-    x_o, theta = 0.3 * torch.randn(30, 3), torch.rand(30, 2) - 0.5
-    options: dict[str, Any] = {"num_simulations": 100, "seed": 3}
-    posteriors = sweep(conductor, x_o, gammas=iter((0.5, 0.1)), taus=(1.0,), **options)
-    first = next(posteriors)
-    first.log_prob_batched(theta, x_o)
-    first.to("cpu")
-    second = next(posteriors)
-    # What was moved belongs to the first alone.
-    first._cache[0] = 0.5 * first._cache[0]
-    coupler = SinkhornCoupler(gamma=0.1)
-    expected = conductor.build_posterior(x_o, coupler=coupler, **options)
-    ours, theirs = (p.log_prob_batched(theta, x_o) for p in (second, expected))
-    assert torch.allclose(ours, theirs, atol=1e-3)
-
-
 def _with(x: Tensor, row: int, value: float) -> Tensor:
     changed = x.clone()
     changed[row] = value
@@ -698,7 +649,6 @@ def test_extreme_simulations_are_named_by_their_parameters() -> None:
     named = rf"1 of the simulations\. .* are \[\[{str(theta[9, 0].item())[:6]}"
     for call in (
         lambda: stored.build_posterior(X_O, seed=0),
-        lambda: next(sweep(stored, X_O, gammas=[0.5], taus=[1.0], seed=0)),
         lambda: diagnose(stored, X_O, seed=0),
     ):
         with pytest.raises(CouplingError, match=named):

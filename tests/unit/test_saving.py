@@ -43,10 +43,7 @@ from sbi_rope.mixture import MixtureEstimator, PriorPosterior, part_of
 from sbi_rope.saving.description import Description
 from sbi_rope.saving.memory import unpacked
 from sbi_rope.saving.names import ROOMS, find_class, find_value
-from sbi_rope.stacking.trained_candidates import (
-    DiscrepancyCandidate,
-    FinetunedCandidate,
-)
+from sbi_rope.stacking import DiscrepancyCandidate, FinetunedCandidate
 from sbi_rope.tasks.hemodynamics.prior import PopulationPrior
 from sbi_rope.tasks.triangle import UniformTriangle
 from tests import problems, stacks
@@ -70,21 +67,16 @@ def rope_posterior(embedding: str = "linear", **options: Any) -> MixturePosterio
 
 
 @functools.cache
-def stack_of(*, coupled: bool) -> StackedPosterior:
+def stack_of() -> StackedPosterior:
     """Return a stack of few candidates, for reading only."""
     trained_ones = (
         DiscrepancyCandidate(space="tuned"),
         FinetunedCandidate(),
         stacks.FITTED,
     )
-    options: dict[str, Any] = {"num_folds": 3, "unseen": "raise"}
     candidates = [stacks.PRIOR, stacks.NPE, *trained_ones]
     with torch.random.fork_rng():
-        rope = stacks.rope_of()
-        if not coupled:
-            return stacks.stacked(rope, candidates=candidates, **options)
-        candidates += [stacks.ROPE, stacks.OT_ONLY]
-        return stacks.stacked(rope, stacks.observed(), candidates=candidates, **options)
+        return stacks.stacked(stacks.rope_of(), candidates=candidates)
 
 
 def numbers(posterior: Any, x: Tensor, *, truncated: bool = True) -> list[Tensor]:
@@ -131,11 +123,7 @@ assert not [name for name in sys.modules if name.split(".")[0] == "tests"]
 
 @pytest.mark.medium
 def test_another_process_loads_the_same_posteriors(tmp_path: Path) -> None:
-    batch, stack, coupled = (
-        rope_posterior(),
-        stack_of(coupled=False),
-        stack_of(coupled=True),
-    )
+    batch, stack = rope_posterior(), stack_of()
     tuned = trained("discrepancy_tuned", "linear_gaussian").build_posterior()
     prior = PriorPosterior(problems.box(2))
     x_o = stacks.observed()
@@ -143,8 +131,6 @@ def test_another_process_loads_the_same_posteriors(tmp_path: Path) -> None:
         (batch, x_o[:5]),
         (batch[3], x_o[3:4]),
         (stack, x_o[:4]),
-        (coupled, x_o[:4]),
-        (coupled[2], x_o[2:3]),
         (tuned, data_of("linear_gaussian").x_o[:3]),
         (prior, x_o[:2]),
     ]
@@ -161,7 +147,6 @@ def test_another_process_loads_the_same_posteriors(tmp_path: Path) -> None:
     )
     assert result.returncode == 0, result.stderr
     assert str(stack.report) in result.stdout
-    assert result.stdout.count(str(coupled.report)) == 2
 
 
 @pytest.mark.medium
@@ -267,7 +252,7 @@ def test_a_description_does_not_depend_on_the_order_of_a_set() -> None:
 
 @pytest.mark.medium
 def test_a_stack_keeps_its_report_and_its_candidates(tmp_path: Path) -> None:
-    stack, x = stack_of(coupled=True), stacks.observed()[:4]
+    stack, x = stack_of(), stacks.observed()[:4]
     loaded = saved_and_loaded(stack, tmp_path)
     assert str(loaded.report) == str(stack.report)
     assert loaded.report.as_rows() == stack.report.as_rows()
@@ -275,10 +260,6 @@ def test_a_stack_keeps_its_report_and_its_candidates(tmp_path: Path) -> None:
     theta = problems.box(2).sample((4,))
     found = loaded.candidate_log_probs(theta, x)
     assert torch.equal(found, stack.candidate_log_probs(theta, x))
-    # Its candidates are still the parts of the mixture, as before.
-    couplings = loaded.versions.couplings
-    assert couplings is not None
-    assert couplings.embeddings is loaded.posterior_estimator.coupled[0]
 
 
 @pytest.mark.medium
@@ -382,19 +363,6 @@ def tensors_in(path: Path) -> list[Tensor]:
     with np.load(path) as arrays:
         rows = json.loads(arrays["description"].tobytes())["tensors"]
         return list(unpacked(arrays["memory"], rows))
-
-
-def test_one_observation_of_a_stack_needs_no_embedding_net(tmp_path: Path) -> None:
-    posterior = stack_of(coupled=True)
-    one = posterior[2]
-    nets = [m for m in one.posterior_estimator.modules() if isinstance(m, nn.Dropout)]
-    inside = posterior.posterior_estimator.modules()
-    assert len(nets) < sum(isinstance(m, nn.Dropout) for m in inside)
-    assert_same(one, saved_and_loaded(one, tmp_path), posterior.x_o[2:3])
-    theta = problems.box(2).sample((4,))
-    found = one.log_prob(theta)
-    expected = posterior.log_prob(theta, x=posterior.x_o[2])
-    assert torch.allclose(found, expected, rtol=1e-5, atol=1e-5)
 
 
 # --- what is refused ---

@@ -11,7 +11,6 @@ from tests.faults.problem import (
     X_O,
     posterior,
     stacked,
-    stacked_batch,
 )
 
 CALLS = [
@@ -66,7 +65,6 @@ CALLS += [
     for kind, make, x in (
         ("MixturePosterior", posterior, X_O),
         ("StackedPosterior", stacked, X_O),
-        ("StackedPosterior of a batch", stacked_batch, X_O),
     )
     for call in (
         Call(

@@ -3,7 +3,6 @@
 import torch
 
 from sbi_rope import CalibrationFinetuner, SinkhornCoupler, parallel
-from sbi_rope.sweep import sweep
 from tests import gaussian
 from tests.faults.outcomes import Call
 from tests.faults.problem import (
@@ -157,24 +156,6 @@ CALLS = [
         accepts=FEWER_X_O,
     ),
     Call(
-        name="sweep",
-        run=lambda x_o=X_O, gammas=(0.5, 1.0), taus=(1.0, 0.5): [
-            one.weights
-            for one in sweep(
-                trained(),
-                x_o,
-                gammas=gammas,
-                taus=taus,
-                num_simulations=30,
-                seed=0,
-                **QUIET,
-            )
-        ],
-        tensors={"x_o": X_O},
-        options={"gammas": "numbers", "taus": "numbers"},
-        accepts=FEWER_X_O,
-    ),
-    Call(
         name="CalibrationFinetuner",
         run=lambda **options: repr(CalibrationFinetuner(**options)),
         options={
@@ -253,18 +234,6 @@ CALLS = [
             SinkhornCoupler(num_fitted=20).couple(X_O, X_S, seed=seed).weights
         ),
         options={"seed": "seed"},
-    ),
-    Call(
-        name="SinkhornCoupler.sweep",
-        run=lambda real=X_O, simulated=X_S, gammas=(0.5,), taus=(1.0,): [
-            one.weights
-            for one in SinkhornCoupler().sweep(
-                real, simulated, gammas=gammas, taus=taus
-            )
-        ],
-        tensors=COUPLED,
-        options={"gammas": "numbers", "taus": "numbers"},
-        accepts=("real: one row less", "simulated: one row less"),
     ),
     Call(
         name="Coupling.distances",

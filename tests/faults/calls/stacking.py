@@ -8,7 +8,6 @@ from torch import Tensor
 
 from sbi_rope import StackedPosterior, diagnose, stack
 from sbi_rope.stacking import (
-    CouplingCandidate,
     DensityCandidate,
     DiscrepancyCandidate,
     FinetunedCandidate,
@@ -62,26 +61,17 @@ CALLS = [
         options={
             "candidates": "instance",
             "num_folds": "count",
-            "pseudo_count": "not negative",
-            "unseen": "choice",
-            "tail_mass": "share",
-            "require_convergence": "instance",
             "seed": "seed",
-            "num_workers": "count",
-            "checkpoints": "path",
         },
     ),
     Call(
         name="stack(x_o)",
-        run=lambda x_o=X_O, num_simulations=30: (
+        run=lambda x_o=X_O: (
             stacked_anew(
-                x_o,
-                candidates=[CouplingCandidate(gamma=0.5, tau=0.5, tuned=False)],
-                num_simulations=num_simulations,
+                x_o, candidates=CANDIDATES
             ).report.cross_validation.stack_scores
         ),
         tensors={"x_o": X_O},
-        options={"num_simulations": "count"},
         accepts=("x_o: None", *FEWER_X_O),
     ),
     Call(
@@ -101,21 +91,15 @@ CALLS = [
         options={
             "num_training_folds": "count",
             "seed": "seed",
-            "num_workers": "count",
-            "checkpoints": "path",
         },
     ),
     Call(
         name="default_candidates",
-        run=lambda **options: repr(default_candidates(couplings=True, **options)),
+        run=lambda **options: repr(default_candidates(**options)),
         options={
             "rope": "instance",
             "learn_prior": "instance",
-            "gammas": "numbers",
-            "taus": "numbers",
-            "rehearsal": "not negative",
         },
-        accepts=("rehearsal: None",),
     ),
     Call(
         name="default_candidates(x_o)",
@@ -127,20 +111,6 @@ CALLS = [
         name="RVNPCandidate",
         run=lambda **options: repr(RVNPCandidate(X_O, **options)),
         options={"space": "choice"},
-    ),
-    Call(
-        name="CouplingCandidate",
-        run=lambda gamma=0.5, tau=0.5, **options: repr(
-            CouplingCandidate(gamma=gamma, tau=tau, **options)
-        ),
-        options={
-            "gamma": "positive",
-            "tau": "share",
-            "cost_scale": "choice",
-            "tuned": "instance",
-            "rehearsal": "not negative",
-        },
-        accepts=("rehearsal: None",),
     ),
     Call(
         name="stacking_weights",
