@@ -48,7 +48,8 @@ def average(
         InvalidInputError: If there is no posterior, shapes, batches or priors differ,
             two know the columns of tables in different orders, or the weights do not
             fit.
-        UnsupportedPosteriorError: If one of them has no density or no embedding of x.
+        UnsupportedPosteriorError: If one of them has no density or no embedding of x,
+            or is a recalibrated stack.
 
     Example:
         >>> import torch

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from sbi_rope._sbi import check_density, estimator_of, headless, with_embedding
-from sbi_rope.discrepancy.correction import Space, check_complete, network_of
+from sbi_rope.discrepancy.correction import Space, network_of
 from sbi_rope.errors import (
     InvalidInputError,
     RoPEError,
@@ -33,7 +33,7 @@ from sbi_rope.rope import RoPE
 from sbi_rope.settings import Settings, check
 from sbi_rope.stacking.finetuning import finetune_without
 from sbi_rope.stacking.workbench import NUM_FOLDS, Fold, Workbench
-from sbi_rope.tensors import as_numbers
+from sbi_rope.tensors import as_batch, as_numbers
 
 __all__ = [
     "AmortisedCandidate",
@@ -58,14 +58,11 @@ class AmortisedCandidate(ABC):
         name: Its name in the report.
         fixed: Whether it does not depend on the calibration pairs. It is trained once.
         learns_prior: Whether it learns from the pairs how parameters are distributed.
-        space: What it corrects, if anything. Those that correct the "input" need an x
-            without missing entries.
     """
 
     name: str
     fixed: bool = False
     learns_prior: bool = False
-    space: Space | None = None
 
     @property
     def family(self) -> str:
@@ -528,9 +525,9 @@ def checked_candidates(
             "Expected `candidates` with different names, none of them 'stack'; got "
             f"{names}."
         )
-    if any(candidate.space == "input" for candidate in candidates):
+    if any(getattr(one, "space", None) == "input" for one in candidates):
         # Raises for images and series, before any candidate is trained.
         network_of(estimator_of(bench.npe), "input")
-        for name, x in (("pairs", bench.x), ("simulations", bench.simulations[1])):
-            check_complete(name, x, instead="Leave out candidates with 'input'.")
+        as_batch("x", bench.x)
+        as_batch("x of simulations", bench.simulations[1])
     return tuple(candidates)

@@ -123,18 +123,17 @@ class CrossValidation:
             normalised inside the support of the prior as the stack's ``log_prob`` is.
         levels: The levels of the stack's central intervals that end at the true
             parameters, shape ``(n, d)``. They are uniform if the stack is calibrated.
-        estimates: The means of the stack at each pair, shape ``(n, d)``; None in files
-            of earlier versions.
+        estimates: The means of the stack at each pair, shape ``(n, d)``.
         ranks: The ranks of the true parameters in the stack, shape ``(n, d)``. They
             come from other draws than the means, see
-            :func:`~sbi_rope.metrics.coverage_by_estimate`. None in files of earlier
-            versions.
+            :func:`~sbi_rope.metrics.coverage_by_estimate`. They are NaN where the
+            levels are.
         log_unit: The sum of the logs of the prior's standard deviations; NaN if it is
             unknown. Scores with theta in these units are higher by this number. With
             partial labels it is that of each pair, the sum over measured parameters,
             shape ``(n,)``.
-        set_scores: The scores that sets with a guarantee are made from; None in files
-            of earlier versions, and if no label is exact.
+        set_scores: The scores that sets with a guarantee are made from; None if no
+            label is exact.
         pair_weights: How many pairs each pair counts as, shape ``(n,)``. Pairs of one
             group share the weight of one. None if all count as one.
         groups: A number for each pair, the same for pairs of one person or specimen,
@@ -156,8 +155,8 @@ class CrossValidation:
     num_trained_on: int
     stack_scores: Tensor = field(repr=False)
     levels: Tensor = field(repr=False)
-    estimates: Tensor | None = field(default=None, repr=False)
-    ranks: Tensor | None = field(default=None, repr=False)
+    estimates: Tensor = field(repr=False)
+    ranks: Tensor = field(repr=False)
     log_unit: float | Tensor = float("nan")
     pair_weights: Tensor | None = field(default=None, repr=False)
     groups: Tensor | None = field(default=None, repr=False)

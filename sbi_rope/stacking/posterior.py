@@ -8,7 +8,6 @@ from torch.distributions import Distribution
 
 from sbi_rope._sbi import describe
 from sbi_rope.mixture import MixturePosterior
-from sbi_rope.mixture.sharing import share_equal_tensors
 from sbi_rope.stacking.guaranteed import HeldOutSets
 from sbi_rope.stacking.report import StackingReport
 from sbi_rope.stacking.versions import Versions
@@ -56,10 +55,10 @@ class StackedPosterior(MixturePosterior):
         enable_transform: bool = True,
     ) -> None:
         weights = report.cross_validation.weights.weights
-        estimator = versions.estimator(weights)
-        share_equal_tensors(estimator)
         super().__init__(
-            estimator, copy.deepcopy(prior), enable_transform=enable_transform
+            versions.estimator(weights),
+            copy.deepcopy(prior),
+            enable_transform=enable_transform,
         )
         self.versions = versions
         self.report = report

@@ -12,8 +12,6 @@ from typing import Any
 from torch import Tensor
 
 from sbi_rope._groups import groups_of, one_of_each_group
-from sbi_rope._notebooks import shown_as_text
-from sbi_rope._tables import as_dataframe
 from sbi_rope._two_sample import TwoSampleTest
 from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.metrics import (
@@ -94,7 +92,6 @@ class Provenance:
         )
 
 
-@shown_as_text
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StackingReport:
     """How well a stack predicts held-out pairs, which methods it uses, and coverage.
@@ -136,7 +133,7 @@ class StackingReport:
             wide that those of d calibrated parameters all hold 0 in at least 95 % of
             the cases (Bonferroni).
         by_estimate: Whether the coverage of the stack's 90 % intervals depends on the
-            estimate. None in files of earlier versions.
+            estimate.
         probability_of_prior: The probability that the parameters of the pairs were
             drawn from the prior, see :func:`~sbi_rope.discrepancy.learn_parameters`;
             None if it is not known.
@@ -155,12 +152,12 @@ class StackingReport:
     coverage_error: CoverageErrorScore
     share_inside: float
     score_z: tuple[float, float]
+    acauc_of_parameters: tuple[ACAUCScore, ...]
+    by_estimate: CoverageByEstimate
     joint_sets: tuple[float, float] | None = None
     batch: TwoSampleTest | None = None
     discrepancy: DiscrepancyReport | None = None
     provenance: Provenance | None = None
-    acauc_of_parameters: tuple[ACAUCScore, ...] = ()
-    by_estimate: CoverageByEstimate | None = None
     probability_of_prior: float | None = None
     learns_prior: bool = True
     parameter_names: tuple[str, ...] | None = None
@@ -227,14 +224,6 @@ class StackingReport:
         rows = self.cross_validation.as_rows()
         return sorted(rows, key=lambda row: -row["score"])
 
-    def to_dataframe(self) -> Any:
-        """Return :meth:`as_rows` as a pandas table.
-
-        Raises:
-            ImportError: If pandas is not installed.
-        """
-        return as_dataframe(self.as_rows())
-
     def to_html(
         self,
         path: str | PathLike[str],
@@ -252,19 +241,15 @@ class StackingReport:
         Args:
             path: The file. Its folder is made if there is none. A report of this
                 package that is there already is replaced, and no other file.
-            diagnosis: What :func:`sbi_rope.diagnose` says about the batch, if the
-                report should hold it. The page counts the alarms that concern this
-                stack, whichever posterior the diagnosis was made for.
+            diagnosis: What :func:`sbi_rope.diagnose` says about a batch, if the report
+                should hold it.
             parameter_names: A name for each parameter. If None, those that ``RoPE`` was
                 given, those of the diagnosis, or "theta_1" and so on.
             x_names: A name for each entry of x; "x[0]" and so on if None.
 
         Raises:
-            InvalidInputError: If an argument has the wrong type.
-            InvalidInputError: If the path is a folder or a file of something else, or
-                the names do not fit.
-            NotWritableError: If the folder cannot be written to.
-            ImportError: If matplotlib is not installed.
+            InvalidInputError: If an argument has the wrong type, the names do not fit,
+                or the path is a folder or a file of something else.
         """
         # This room draws with `plots`, which draws this report: it is above both.
         from sbi_rope.reports import write_stacking_report
@@ -290,9 +275,7 @@ def _acauc_of_parameters(scores: CrossValidation) -> tuple[ACAUCScore, ...]:
     )
 
 
-def _by_estimate(scores: CrossValidation) -> CoverageByEstimate | None:
-    if scores.ranks is None or scores.estimates is None:
-        return None
+def _by_estimate(scores: CrossValidation) -> CoverageByEstimate:
     chosen = None
     if scores.groups is not None:
         chosen = one_of_each_group(groups_of(scores.groups), seed=0)

@@ -184,14 +184,6 @@ def _stack_scores(
 ) -> FoldScores:
     """Return the scores of the stack at each pair, normalised in the support.
 
-    Args:
-        bench: The pairs and their folds.
-        versions: The candidates.
-        weights: The weights of the stack that scores each fold, ``(F, K)``.
-        of_labels: The densities at labels that are not exact; None if all are.
-        seed: Seed of the draws.
-        advance: Called after each fold, for a progress bar.
-
     Returns:
         The scores, their Monte-Carlo errors (zero for exact labels), and the levels of
         the central intervals that end at the labels.
@@ -274,13 +266,6 @@ def score_fold(
 ) -> FoldScores:
     """Score the posterior of a fold at the pairs of the fold.
 
-    Args:
-        posterior: A posterior that has not seen the pairs.
-        theta: Parameters, shape ``(n, d)``.
-        x: Their observations, shape ``(n, *event)``.
-        num_samples: The number of draws for each pair.
-        seed: Seed of the draws.
-
     Raises:
         SamplingError: If the posterior has almost no mass inside the prior's support.
     """
@@ -334,11 +319,6 @@ def _score_labels(bench: Workbench, versions: Versions, number: int) -> LabelSco
 
     Nodes come from the samples of each candidate, so that none is scored at parameters
     that only others consider plausible.
-
-    Args:
-        bench: What all candidates share.
-        versions: The candidates.
-        number: The number of the fold, and of the version.
     """
     rows = bench.folds[number]
     x, size = bench.x[rows], torch.Size((NUM_REFERENCES,))
@@ -367,15 +347,6 @@ def _score_labelled_fold(
     seed: int,
 ) -> FoldScores:
     """Score the posterior of a fold at labels that are not exact.
-
-    Args:
-        posterior: A posterior that has not seen the labels.
-        scores: The densities of its candidates at the labels.
-        weights: The weights of the candidates, shape ``(K,)``.
-        labels: The labels.
-        x: Their observations, shape ``(n, *event)``.
-        num_samples: The number of draws for each label.
-        seed: Seed of the draws.
 
     Returns:
         The scores. Those of sets are NaN where a label is not exact: a set that holds

@@ -187,7 +187,8 @@ class _Trainer:
         show: bool,
     ) -> None:
         check("rope", rope, RoPE)
-        check("num_folds", num_folds, Annotated[int, Range(2)] | None)
+        num_folds = NUM_FOLDS if num_folds is None else num_folds
+        check("num_folds", num_folds, Annotated[int, Range(2)])
         if x_o is not None:
             x_o = rope.checked_observations(x_o)
             warn_of_far_entries("x_o", x_o, rope.embedding_net)
@@ -196,7 +197,7 @@ class _Trainer:
         of_folds, _, self.seed = draw_seeds(seed, 3)
         self.bench = Workbench(
             rope,
-            num_folds=NUM_FOLDS if num_folds is None else num_folds,
+            num_folds=num_folds,
             seed=of_folds,
             show_progress_bars=show,
         )

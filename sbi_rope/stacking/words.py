@@ -270,17 +270,12 @@ def parameters_off(
     """Say which parameters are not calibrated by themselves.
 
     It says nothing about a single parameter, whose verdict is that of the stack.
-
-    Args:
-        report: The report of a stack.
-        names: A name for each parameter. If None, those of the report, or "theta_1"
-            and so on.
     """
     scores = report.acauc_of_parameters
     names = names or report.parameter_names or default_names(len(scores))
     few = report.cross_validation.effective_number < FEWEST
     unknown = report.acauc.verdict == "unknown"  # that of labels given as draws
-    if few or unknown or len(scores) < 2:  # reports of older files have none
+    if few or unknown or len(scores) < 2:
         return []
     lines = []
     for name, score in zip(names, scores, strict=True):
@@ -297,22 +292,14 @@ def parameters_off(
 
 def depends_on_estimate(report: "StackingReport") -> bool:
     """Whether the coverage of a parameter depends on its estimate, as far as known."""
-    return report.by_estimate is not None and any(report.by_estimate.depends)
+    return any(report.by_estimate.depends)
 
 
 def coverage_by_estimate(
     report: "StackingReport", names: Sequence[str] | None = None
 ) -> list[str]:
-    """Say for which parameters the coverage depends on the estimate, or for none.
-
-    Args:
-        report: The report of a stack.
-        names: A name for each parameter. If None, those of the report, or "theta_1"
-            and so on.
-    """
+    """Say for which parameters the coverage depends on the estimate, or for none."""
     found = report.by_estimate
-    if found is None:
-        return []
     names = names or report.parameter_names or default_names(len(found.p_values))
     known = "measured values" if is_measured(report) else "parameters"
     return in_words(found, names, known=known)

@@ -158,16 +158,6 @@ def test_copies_and_small_pickles_have_the_same_densities() -> None:
             assert {*map(id, parts)} <= shown
 
 
-def test_a_stack_holds_equal_tensors_once() -> None:
-    estimator = the_stack().posterior_estimator
-    # Of NPE itself and of what was tuned without changing it.
-    for tensors in (list(estimator.parameters()), list(estimator.buffers())):
-        assert len(tensors) > 5
-        for i, one in enumerate(tensors):
-            for other in tensors[:i]:
-                assert one.shape != other.shape or not torch.equal(one, other)
-
-
 def test_a_stack_of_candidates_that_lambdas_built_can_be_pickled() -> None:
     candidates = [
         DensityCandidate(name="mine", build=lambda rope, seed: rope.npe),

@@ -98,6 +98,8 @@ def test_recordings_with_the_same_parameters_do_not_make_a_report_more_certain()
             num_trained_on=8,
             stack_scores=VALUES.repeat_interleave(times),
             levels=LEVELS.repeat_interleave(times, dim=0),
+            estimates=torch.zeros(12 * times, LEVELS.shape[1]),
+            ranks=LEVELS.repeat_interleave(times, dim=0),
             pair_weights=torch.full((12 * times,), 1 / times) if times > 1 else None,
             groups=groups if times > 1 else None,
         )
