@@ -19,7 +19,6 @@ from torch import Tensor
 from sbi_rope import RoPE, SinkhornCoupler, diagnose, plots, stack
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.metrics import draw_samples, evaluate
-from sbi_rope.sweep import sweep
 from sbi_rope.tasks import get_task
 
 if TYPE_CHECKING:
@@ -131,8 +130,9 @@ def gammas(rope: RoPE, theta: Tensor, x_o: Tensor) -> "Figure":
     """Draw posteriors of one observation at several gammas."""
     values = (1.0, 0.1, 0.02)
     samples = {}
-    batches = sweep(rope, x_o, gammas=values, taus=[1.0], seed=0, **QUIET)
-    for gamma, posterior in zip(values, batches, strict=True):
+    batch = rope.embed(x_o, seed=0, **QUIET)
+    for gamma in values:
+        posterior = batch.posterior(batch.couple(SinkhornCoupler(gamma=gamma)))
         draws = posterior[OBSERVED].sample((2000,), **QUIET)
         samples[f"gamma {gamma:g}"] = draws[:, SHOWN]
     return plots.pair_plot(samples, theta[SHOWN], parameter_names=NAMES)

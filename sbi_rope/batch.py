@@ -1,7 +1,6 @@
 """A batch of real observations and the simulations that it is coupled with."""
 
 import copy
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -56,47 +55,17 @@ class EmbeddedBatch:
         """
         return coupler.couple(self.real, self.simulated)
 
-    def sweep(
-        self,
-        coupler: SinkhornCoupler,
-        *,
-        gammas: Sequence[float],
-        taus: Sequence[float],
-        seed: int | None = None,
-    ) -> Iterator[Coupling]:
-        """Couple at every gamma and every tau, each coupling when it is needed.
-
-        The order is that of :meth:`SinkhornCoupler.sweep
-        <sbi_rope.SinkhornCoupler.sweep>`.
-
-        Args:
-            coupler: Settings other than gamma and tau.
-            gammas: Values of gamma, in any order.
-            taus: Values of tau, in any order.
-            seed: Has no effect.
-
-        Raises:
-            InvalidInputError: If a gamma or tau is outside its range, or there is none.
-            CouplingError: As in :meth:`couple`.
-        """
-        return coupler.sweep(
-            self.real, self.simulated, gammas=gammas, taus=taus, seed=seed
-        )
-
     def posterior(
         self,
         coupling: Coupling,
         *,
         unseen: Literal["raise", "extend"] = "raise",
-        shared: dict[int, Tensor] | None = None,
     ) -> MixturePosterior:
         """Return the mixture of simulated posteriors that a coupling gives.
 
         Args:
             coupling: What :meth:`couple` returned.
             unseen: As in :meth:`~sbi_rope.RoPE.build_posterior`.
-            shared: A dictionary that posteriors of the same simulations may share, as
-                in :class:`~sbi_rope.MixturePosterior`.
         """
         # Each posterior has copies of its own of net and density. Moving one to another
         # device then leaves the others where they are.

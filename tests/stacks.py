@@ -15,7 +15,6 @@ from sbi_rope.baselines import FinetunedNPE, PriorPosterior
 from sbi_rope.discrepancy import DiscrepancyModel
 from sbi_rope.discrepancy.training import ONE_COURSE
 from sbi_rope.stacking import (
-    CouplingCandidate,
     CrossValidation,
     DensityCandidate,
     cross_validate,
@@ -27,8 +26,9 @@ from sbi_rope.trainers.training import FINETUNING, Training
 from tests import problems
 
 QUIET: dict[str, Any] = {"show_progress_bars": False}
-NUM_PAIRS, NUM_OBSERVED, NUM_SIMULATED = 20, 25, 60
+NUM_PAIRS, NUM_OBSERVED = 20, 25
 NUM_FOLDS = 3  # more would take longer, and are no different
+DEFAULTS: dict[str, Any] = {"num_folds": NUM_FOLDS, "seed": 0, **QUIET}
 
 
 @contextmanager
@@ -45,7 +45,7 @@ def quick() -> Iterator[None]:
         "sbi_rope.stacking.workbench.TUNING": tuning,
         "sbi_rope.stacking.workbench.DiscrepancyModel": lambda: model,
         "sbi_rope.stacking.scoring.NUM_SAMPLES": 40,
-        "sbi_rope.stacking.folds.IN_A_STACK": ONE_COURSE,
+        "sbi_rope.stacking.workbench.IN_A_STACK": ONE_COURSE,
         "sbi_rope.discrepancy.correction.NUM_STEPS": steps,
         "sbi_rope.discrepancy.correction.NUM_DRAWS": 50,
         "sbi_rope.discrepancy.training.BATCH_SIZE": 50,
@@ -67,24 +67,8 @@ QUICK = CalibrationFinetuner(
     max_num_epochs=6, simulations_per_target=3, learning_rate=0.03
 )
 PRIOR, NPE = (c for c in default_candidates() if c.name in ("prior", "NPE"))
-OT_ONLY = CouplingCandidate(gamma=0.2, tau=0.5, tuned=False)
-ROPE = CouplingCandidate(gamma=0.2, tau=1.0)
-COUPLINGS = (
-    ROPE,
-    CouplingCandidate(gamma=0.4, tau=0.5),
-    OT_ONLY,
-    CouplingCandidate(gamma=0.3, tau=0.9, tuned=False, cost_scale="none"),
-    CouplingCandidate(gamma=0.2, tau=0.5, rehearsal=20.0),
-)
-# All kinds of default candidates, with couplings at a few settings.
-CANDIDATES = (
-    *COUPLINGS,
-    *(
-        candidate
-        for candidate in default_candidates(couplings=True)
-        if not isinstance(candidate, CouplingCandidate)
-    ),
-)
+# All kinds of default candidates.
+CANDIDATES = default_candidates()
 
 
 def finetuned(rope: RoPE, seed: int) -> Any:
@@ -157,31 +141,19 @@ def observed(n: int = NUM_OBSERVED) -> Tensor:
 
 def stacked(rope: RoPE, x_o: Tensor | None = None, **options: Any) -> StackedPosterior:
     with quick():
-        return stack(rope, x_o, **_options(x_o, options))
+        return stack(rope, x_o, **{**DEFAULTS, **options})
 
 
 def validated(rope: RoPE, x_o: Tensor | None = None, **options: Any) -> CrossValidation:
     with quick():
-        return cross_validate(rope, x_o, **_options(x_o, options))
-
-
-def _options(x_o: Tensor | None, options: dict[str, Any]) -> dict[str, Any]:
-    defaults = {
-        "num_simulations": NUM_SIMULATED,
-        "num_folds": NUM_FOLDS,
-        "seed": 0,
-        **QUIET,
-    }
-    if x_o is not None:
-        defaults["candidates"] = CANDIDATES
-    return {**defaults, **options}
+        return cross_validate(rope, x_o, **{**DEFAULTS, **options})
 
 
 @functools.cache
 def the_stack() -> StackedPosterior:
     """Return a stack for any observation. Tests share it and must not change it."""
     with torch.random.fork_rng():
-        return stacked(rope_of(), tail_mass=0.0)
+        return stacked(rope_of())
 
 
 @functools.cache
@@ -192,18 +164,6 @@ def small_stack() -> StackedPosterior:
     """
     with torch.random.fork_rng():
         return stacked(rope_of(), candidates=[PRIOR, NPE, FITTED], num_folds=5)
-
-
-@functools.cache
-def the_coupled_stack() -> StackedPosterior:
-    """Return a stack for a batch. Tests share it and must not change it."""
-    with torch.random.fork_rng():
-        return stacked(rope_of(), observed(), tail_mass=0.0, unseen="extend")
-
-
-def in_this_process(train: Any, tasks: Any, num_workers: int) -> Iterator[Any]:
-    """Stand for `in_workers`, whose processes take seconds to start."""
-    yield from (train(*task) for task in tasks)
 
 
 def unnormalised(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:

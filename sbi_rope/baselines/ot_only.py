@@ -74,8 +74,7 @@ class OTOnly(Method):
     def build_rope(self) -> RoPE:
         """Return RoPE without calibration pairs, to couple at many settings.
 
-        :func:`~sbi_rope.sweep.sweep` takes it, and couples any batch at every gamma and
-        every tau. The appended observations and ``coupler.gamma`` play no part in it.
+        The appended observations and ``coupler.gamma`` play no part in it.
 
         Raises:
             NotReadyError: If it does not start from a trained posterior, or needs

@@ -1,21 +1,17 @@
 """Semi-balanced entropic optimal transport, with its settings."""
 
-import itertools
 import math
-from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import check_numbers
 from sbi_rope.coupling.fixed_point import Solution, solve_fixed_point
 from sbi_rope.coupling.pot import solve_pot
 from sbi_rope.coupling.problem import LARGEST_EXPONENT, Problem, median_distance
 from sbi_rope.coupling.result import Coupling
-from sbi_rope.coupling.warm_start import warm_start
 from sbi_rope.errors import CouplingError, warn_user, without_warning
 from sbi_rope.settings import Count, Positive, Settings, UnitInterval
 from sbi_rope.tensors import as_batch
@@ -122,71 +118,6 @@ class SinkhornCoupler(Settings):
             reused=self.solver == "pot",
         )
         return self._solve(problem, self.gamma * scale, problem.zero_potential())
-
-    def sweep(
-        self,
-        real: Tensor,
-        simulated: Tensor,
-        *,
-        gammas: Sequence[float],
-        taus: Sequence[float],
-        seed: int | None = None,
-    ) -> Iterator[Coupling]:
-        r"""Couple the same embeddings at every gamma and every tau.
-
-        This takes fewer iterations than separate calls of :meth:`couple`, because the
-        solution at one gamma starts from those at larger ones: :math:`\gamma w`, the
-        potential in units of the cost, changes slowly with gamma. The coupler's own
-        gamma and tau are not used.
-
-        Args:
-            real: As in :meth:`couple`.
-            simulated: As in :meth:`couple`.
-            gammas: Values of gamma, in any order.
-            taus: Values of tau, in any order.
-            seed: As in :meth:`couple`. All settings are fitted to the same
-                observations.
-
-        Returns:
-            An iterator over the couplings. It returns all taus of the first gamma, then
-            of the second, and so on. Each coupling is computed when it is needed, and
-            from large to small gamma. If the gammas ascend, the first coupling
-            therefore has to wait for all others.
-
-        Raises:
-            InvalidInputError: If there is no gamma or tau, one is outside its range, or
-                as in :meth:`couple`.
-            CouplingError: As in :meth:`couple`.
-        """
-        gammas, taus = check_numbers("gammas", gammas), check_numbers("taus", taus)
-        settings = list(itertools.product(gammas, taus))
-        for gamma, tau in settings:
-            replace(self, gamma=gamma, tau=tau)
-        smallest = min(gamma for gamma, _ in settings)
-        problem, scale = self._set_up(
-            real, simulated, gamma=smallest, tau=max(taus), reused=True
-        )
-        return self._sweep(problem, scale, settings)
-
-    def _sweep(
-        self, problem: Problem, scale: float, settings: list[tuple[float, float]]
-    ) -> Iterator[Coupling]:
-        # All taus of one gamma follow each other, because they share the kernel.
-        path = iter(sorted(set(settings), reverse=True))
-        start = problem.zero_potential()
-        potentials: dict[tuple[float, float], Tensor] = {}
-        waiting: dict[tuple[float, float], Coupling] = {}
-        for position, setting in enumerate(settings):
-            while setting not in waiting:
-                gamma, tau = next(path)
-                waiting[gamma, tau] = replace(self, gamma=gamma, tau=tau)._solve(
-                    problem, gamma * scale, warm_start(potentials, gamma, tau, start)
-                )
-                potentials[gamma, tau] = waiting[gamma, tau].potential
-            # A coupling may hold its weights. It is not kept here after it was yielded,
-            # unless it is asked for again.
-            again = setting in settings[position + 1 :]
-            yield waiting[setting] if again else waiting.pop(setting)
 
     def _set_up(
         self, real: Tensor, simulated: Tensor, *, gamma: float, tau: float, reused: bool

@@ -28,27 +28,20 @@ def use_of(posterior: MixturePosterior) -> PosteriorInUse:
     """Return what a diagnosis has to know of a posterior.
 
     Args:
-        posterior: A stack, which has a ``report``, or another posterior. Without
-            couplings and without a report it may still use a tuned embedding net, so
-            that all findings concern it.
+        posterior: A stack, which has a ``report``, or another posterior, which all
+            findings concern.
     """
     report: Any = getattr(posterior, "report", None)
     if not hasattr(report, "learns_prior"):
         return PosteriorInUse(name="this posterior")
-    return stack_in_use(report, is_amortised=posterior.is_amortised)
+    return stack_in_use(report)
 
 
-def stack_in_use(report: ReportOfStack, *, is_amortised: bool | None) -> PosteriorInUse:
-    """Return what a diagnosis has to know of a stack.
-
-    Args:
-        report: The report of the stack.
-        is_amortised: Whether the stack has no couplings. If None it is not known, and
-            all findings concern it.
-    """
+def stack_in_use(report: ReportOfStack) -> PosteriorInUse:
+    """Return what a diagnosis has to know of a stack, from its report."""
     return PosteriorInUse(
         name="this stack",
-        has_couplings=not is_amortised,
+        has_couplings=False,
         has_learned_parameters=(
             report.learns_prior and is_improbable(report.probability_of_prior)
         ),

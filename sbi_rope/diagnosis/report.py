@@ -24,19 +24,17 @@ UNLIKE_PAIRS = "batch unlike the calibration pairs"
 # Whom an alarm concerns, in words. Those that concern most come last.
 IN_WORDS: dict[Concerned, str] = {
     "NPE": "NPE as it was trained, before any repair",
-    "RoPE": "the posteriors of RoPE and of `stack(rope, x_o)`, and not about that of "
-    "`stack(rope)`, which has no couplings",
+    "RoPE": "the posterior of RoPE, and not about that of `stack`, which has no "
+    "couplings",
     "stack and RoPE": "the posterior of `stack` and that of RoPE",
 }
 IN_BRIEF: dict[Concerned, str] = {
     "NPE": "NPE",
-    "RoPE": "RoPE, stack(rope, x_o)",
+    "RoPE": "RoPE",
     "stack and RoPE": "RoPE and any stack",
 }
 # The heading of findings that do not concern the posterior in use.
-OF_OTHERS = (
-    "about RoPE and stacks with couplings, and not about this stack, which has none"
-)
+OF_OTHERS = "about RoPE, and not about this stack, which has no couplings"
 HOW_TO_COUNT = (
     "`diagnose(rope, x_o, posterior=posterior)` counts only the alarms that concern "
     "the posterior that you use."

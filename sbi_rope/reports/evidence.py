@@ -23,8 +23,15 @@ from sbi_rope.plots import (
     implied_parameters,
     ranks_by_estimate,
 )
-from sbi_rope.reports.numbers import number, percent
-from sbi_rope.reports.page import finding, paragraph, picture, section, table
+from sbi_rope.reports.page import (
+    finding,
+    number,
+    paragraph,
+    percent,
+    picture,
+    section,
+    table,
+)
 from sbi_rope.stacking import StackingReport
 from sbi_rope.stacking.words import (
     IF_IT_DEPENDS,
@@ -86,7 +93,6 @@ def calibration_section(report: StackingReport, names: Sequence[str]) -> str:
             kind="note",
         ),
         *_sets(report),
-        *_recalibration(report),
         picture(
             drawn,
             caption="The share of known parameters inside intervals of each level. "
@@ -100,7 +106,7 @@ def calibration_section(report: StackingReport, names: Sequence[str]) -> str:
 def _by_estimate(report: StackingReport, names: Sequence[str]) -> list[str]:
     """Return whether coverage is the same for low and for high estimates."""
     found = report.by_estimate
-    if found is None or not found.num_tested:
+    if not found.num_tested:
         return []
     inside, rows, alarming = percent(found.level), [], []
     for name, shares, p_value, depends in zip(
@@ -138,17 +144,6 @@ def _by_estimate(report: StackingReport, names: Sequence[str]) -> list[str]:
             "above are the shares inside.",
             wide=len(names) > 2,
         ),
-    ]
-
-
-def _recalibration(report: StackingReport) -> list[str]:
-    if report.recalibration is None:
-        return []
-    return [
-        paragraph(
-            f"{report.recalibration} The table above is about the stack before it.",
-            kind="note",
-        )
     ]
 
 
@@ -252,13 +247,7 @@ def no_discrepancy_section(report: StackingReport) -> str:
 
 
 def diagnosis_section(diagnosis: Diagnosis, names: Sequence[str]) -> str:
-    """Return the findings about a batch.
-
-    Args:
-        diagnosis: The findings.
-        names: The names of the parameters on the rest of the page. The sentences of the
-            diagnosis have those that it was made with.
-    """
+    """Return the findings about a batch."""
     shown = (*diagnosis.unexpected, *diagnosis.expected)
     return section(
         "Diagnosis of the batch",

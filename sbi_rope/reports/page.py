@@ -1,26 +1,27 @@
-"""The parts of an HTML page that needs no other file: text, tables and pictures."""
+"""The parts of an HTML page that needs no other file; every text in it is escaped."""
 
 import base64
 import io
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sbi_rope._files import write_atomically
 from sbi_rope.errors import InvalidInputError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
-    "check_target",
     "definitions",
     "finding",
     "list_of",
+    "number",
     "page",
     "paragraph",
+    "percent",
     "picture",
     "section",
     "table",
@@ -68,22 +69,12 @@ dd { margin: 0; }
 
 
 def paragraph(text: str, *, kind: str = "") -> str:
-    """Return a paragraph.
-
-    Args:
-        text: Its text, which is escaped.
-        kind: Its class in the style sheet, if it has one.
-    """
+    """Return a paragraph."""
     return f"<p{_class(kind)}>{_text(text)}</p>"
 
 
 def list_of(texts: Iterable[tuple[str, bool]], *, kind: str = "") -> str:
-    """Return a list of sentences, each with whether it is alarming.
-
-    Args:
-        texts: The sentences, which are escaped.
-        kind: The class of the list in the style sheet, if it has one.
-    """
+    """Return a list of sentences, each with whether it is alarming."""
     lines = [
         f"<li{_class('alarm' if alarming else '')}>{_text(text)}</li>"
         for text, alarming in texts
@@ -137,14 +128,7 @@ def table(
 
 
 def picture(figure: "Figure", *, caption: str, wide: bool = False) -> str:
-    """Return a picture as part of the page.
-
-    Args:
-        figure: What to draw.
-        caption: What it shows; also its text for readers who do not see it.
-        wide: Whether it has several panels, so that it scrolls by itself on a narrow
-            screen.
-    """
+    """Return a picture as part of the page."""
     buffer = io.BytesIO()
     # By default matplotlib would write a link to its own site into the file.
     figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
@@ -157,14 +141,7 @@ def picture(figure: "Figure", *, caption: str, wide: bool = False) -> str:
 
 
 def finding(name: str, value: str, text: str, *, alarming: bool) -> str:
-    """Return the result of a test: its name and number, and what it says.
-
-    Args:
-        name: The name of the test, which is escaped as all texts are.
-        value: The number and its threshold.
-        text: What it says.
-        alarming: Whether it is marked.
-    """
+    """Return the result of a test: its name and number, and what it says."""
     mark = "Alarming: " if alarming else ""
     return (
         f"<div{_class('finding alarm' if alarming else 'finding')}>"
@@ -197,32 +174,35 @@ def page(title: str, *parts: str) -> str:
     return "\n".join([*head, *parts, "</body>", "</html>", ""])
 
 
-def check_target(path: Path) -> None:
-    """Raise unless there is no such file, or it is a page of this package.
-
-    Raises:
-        InvalidInputError: If the path is a folder or another file.
-    """
-    if not path.exists():
-        return
-    if path.is_file():
-        with path.open("rb") as file:
-            if GENERATOR.encode() in file.read(1000):
-                return
-    raise InvalidInputError(
-        "Expected `path` to be a new file, or a report of this package, which is "
-        f"replaced; got {path}, which is something else. Choose another name."
-    )
-
-
 def write_page(path: Path, text: str) -> None:
-    """Write a page so that nobody finds half of it.
+    """Write a page, and replace no file but another page of this package."""
+    if path.exists() and not (path.is_file() and GENERATOR.encode() in _start(path)):
+        raise InvalidInputError(
+            "Expected `path` to be a new file or an earlier report, which is replaced; "
+            f"got {path}."
+        )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
 
-    Raises:
-        NotWritableError: If the folder cannot be written to.
-    """
-    with write_atomically(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+
+def _start(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(1000)
+
+
+def number(value: float, *, sign: bool = False, digits: int = 2) -> str:
+    """Return a number with a true minus sign, or "unknown" for NaN."""
+    if math.isnan(value):
+        return "unknown"
+    text = f"{value:+.{digits}f}" if sign else f"{value:.{digits}f}"
+    return text.replace("-", "\N{MINUS SIGN}").replace("inf", "infinite")
+
+
+def percent(share: float) -> str:
+    """Return a share in per cent, "below 1 %" included."""
+    if 0 < share < 0.005:
+        return "<1 %"
+    return f"{100 * share:.0f} %"
 
 
 def _text(text: str) -> str:

@@ -2,9 +2,9 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from os import PathLike
+from pathlib import Path
 
-from sbi_rope._validation import check_names, check_path
 from sbi_rope.diagnosis import Diagnosis
 from sbi_rope.diagnosis.in_use import read_for, stack_in_use
 from sbi_rope.discrepancy import DiscrepancyReport
@@ -17,20 +17,20 @@ from sbi_rope.reports.evidence import (
     discrepancy_section,
     no_discrepancy_section,
 )
-from sbi_rope.reports.numbers import number, percent
 from sbi_rope.reports.page import (
-    check_target,
     definitions,
     list_of,
+    number,
     page,
     paragraph,
+    percent,
     picture,
     section,
     table,
     write_page,
 )
 from sbi_rope.reports.verdict import verdict_of
-from sbi_rope.settings import check, default_names
+from sbi_rope.settings import check, default_names, names_of
 from sbi_rope.stacking import StackingReport
 from sbi_rope.stacking.words import (
     IF_MOSTLY_PRIOR,
@@ -68,7 +68,7 @@ GLOSSARY = {
 
 def write_stacking_report(
     report: StackingReport,
-    path: Any,
+    path: str | PathLike[str],
     *,
     diagnosis: Diagnosis | None = None,
     parameter_names: Sequence[str] | None = None,
@@ -81,15 +81,11 @@ def write_stacking_report(
     """
     check("report", report, StackingReport)
     check("diagnosis", diagnosis, Diagnosis | None)
-    target = check_path("path", path)
-    assert target is not None
     names = _parameter_names(report, diagnosis, parameter_names)
     discrepancy = _named(report.discrepancy, x_names)
-    check_target(target)
     if diagnosis is not None:
         # The page is about this stack, whichever posterior the diagnosis was made for.
-        used = stack_in_use(report, is_amortised=report.is_amortised)
-        diagnosis = read_for(diagnosis, used)
+        diagnosis = read_for(diagnosis, stack_in_use(report))
     parts = [
         paragraph(_what_was_done(report)),
         list_of(verdict_of(report, diagnosis, names), kind="verdict"),
@@ -106,7 +102,7 @@ def write_stacking_report(
     if diagnosis is not None:
         parts.append(diagnosis_section(diagnosis, names))
     parts += [_provenance_section(report), _glossary()]
-    write_page(target, page(TITLE, *parts))
+    write_page(Path(path).expanduser(), page(TITLE, *parts))
 
 
 def _parameter_names(
@@ -121,7 +117,7 @@ def _parameter_names(
             f"has; got {len(diagnosis.parameter_names)}."
         )
     if names is not None:
-        return check_names("parameter_names", names, count)
+        return list(names_of(names, count))
     if report.parameter_names is not None:
         return list(report.parameter_names)
     if diagnosis is not None:
@@ -134,12 +130,10 @@ def _named(
 ) -> DiscrepancyReport | None:
     if names is None:
         return discrepancy
-    names = check_names("x_names", names)
     if discrepancy is None:
         raise InvalidInputError(
             "Expected no `x_names`, because this report does not compare the entries "
-            f"of x; got {shown(names)}. Only a stack with a discrepancy among its "
-            "candidates, and with x a short vector, does."
+            f"of x; got {shown(names)}."
         )
     return discrepancy.renamed(names)
 

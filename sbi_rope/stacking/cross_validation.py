@@ -1,4 +1,4 @@
-"""The scores of candidates on calibration pairs that they were not trained on."""
+"""Held-out scores of candidates and of their stack, and what follows from them."""
 
 import math
 from collections.abc import Sequence
@@ -15,11 +15,17 @@ from torch import Tensor
 from sbi_rope._means import Counts, counts_of, interval_of_mean, mean_and_error
 from sbi_rope.metrics import CoverageCurve
 from sbi_rope.metrics.calibration import coverage_curve_of_pairs
-from sbi_rope.settings import check, one_of
-from sbi_rope.stacking.held_out import SetScores
+from sbi_rope.sets.conformal import check_enough, rank_needed
+from sbi_rope.settings import Count, check, one_of
 from sbi_rope.stacking.weights import StackingWeights, stacking_weights
 
-__all__ = ["CrossValidation", "Difference"]
+__all__ = [
+    "CrossValidation",
+    "Difference",
+    "LearningCurve",
+    "SetScores",
+    "fold_weights",
+]
 
 NUM_BOOTSTRAP = 2000
 # Means of resampled pairs are never outside the range of the pairs. With two, three and
@@ -52,6 +58,51 @@ class Difference:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class SetScores:
+    """The held-out scores that sets with a guarantee are made from.
+
+    Attributes:
+        joint: The level of the smallest set of highest density that contains the true
+            parameters, shape ``(n,)``. It is above 1 if their density is lower than
+            that of all draws, see :func:`sbi_rope.sets.conformal.joint_scores`.
+        marginal: The level of the smallest central interval of each parameter that
+            contains the true one, shape ``(n, d)``. It is above 1 beyond all draws, see
+            :func:`sbi_rope.sets.conformal.marginal_scores`.
+        is_counted: The pairs that count, shape ``(n,)``. Those of one group are not
+            exchangeable one by one. One of them counts, chosen at random. Pairs whose
+            label is not exact do not count, and their scores are NaN.
+        weights: The weights of the stack that scored each fold, shape ``(F, K)``.
+        num_draws: The number of draws that the scores were computed from.
+    """
+
+    joint: Tensor
+    marginal: Tensor
+    is_counted: Tensor
+    weights: Tensor
+    num_draws: int
+
+    def __len__(self) -> int:
+        return int(self.is_counted.sum())
+
+    def share_held(self, level: float) -> float:
+        """Return the share of pairs in their sets of highest density of a level."""
+        return float((self.joint[self.is_counted] <= level).double().mean())
+
+    def level_needed(self, level: float) -> float:
+        """Return the level of the sets of highest density that a guarantee needs.
+
+        A set with a guarantee is about as large as a set of highest density of this
+        level. Above 1 it reaches further than all draws.
+
+        Raises:
+            InvalidInputError: If there are too few pairs for the level.
+        """
+        check_enough(level, len(self))
+        rank = rank_needed(level, len(self))
+        return float(self.joint[self.is_counted].kthvalue(rank).values)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class CrossValidation:
     """The scores of candidates on held-out calibration pairs.
 
@@ -72,19 +123,17 @@ class CrossValidation:
             normalised inside the support of the prior as the stack's ``log_prob`` is.
         levels: The levels of the stack's central intervals that end at the true
             parameters, shape ``(n, d)``. They are uniform if the stack is calibrated.
-        estimates: The means of the stack at each pair, shape ``(n, d)``; None in files
-            of earlier versions.
+        estimates: The means of the stack at each pair, shape ``(n, d)``.
         ranks: The ranks of the true parameters in the stack, shape ``(n, d)``. They
             come from other draws than the means, see
-            :func:`~sbi_rope.metrics.coverage_by_estimate`. None in files of earlier
-            versions.
-        pseudo_count: As in :func:`stacking_weights`.
+            :func:`~sbi_rope.metrics.coverage_by_estimate`. They are NaN where the
+            levels are.
         log_unit: The sum of the logs of the prior's standard deviations; NaN if it is
             unknown. Scores with theta in these units are higher by this number. With
             partial labels it is that of each pair, the sum over measured parameters,
             shape ``(n,)``.
-        set_scores: The scores that sets with a guarantee are made from; None in files
-            of earlier versions, and if no label is exact.
+        set_scores: The scores that sets with a guarantee are made from; None if no
+            label is exact.
         pair_weights: How many pairs each pair counts as, shape ``(n,)``. Pairs of one
             group share the weight of one. None if all count as one.
         groups: A number for each pair, the same for pairs of one person or specimen,
@@ -106,9 +155,8 @@ class CrossValidation:
     num_trained_on: int
     stack_scores: Tensor = field(repr=False)
     levels: Tensor = field(repr=False)
-    estimates: Tensor | None = field(default=None, repr=False)
-    ranks: Tensor | None = field(default=None, repr=False)
-    pseudo_count: float = 1.0
+    estimates: Tensor = field(repr=False)
+    ranks: Tensor = field(repr=False)
     log_unit: float | Tensor = float("nan")
     pair_weights: Tensor | None = field(default=None, repr=False)
     groups: Tensor | None = field(default=None, repr=False)
@@ -127,11 +175,7 @@ class CrossValidation:
     @cached_property
     def weights(self) -> StackingWeights:
         """The weights of the candidates, fitted to all pairs."""
-        return stacking_weights(
-            self.log_scores,
-            pair_weights=self.pair_weights,
-            pseudo_count=self.pseudo_count,
-        )
+        return stacking_weights(self.log_scores, pair_weights=self.pair_weights)
 
     @property
     def counts(self) -> Counts | None:
@@ -171,10 +215,7 @@ class CrossValidation:
         compared.
         """
         weights = fold_weights(
-            self.log_scores,
-            self.fold,
-            self.pseudo_count,
-            pair_weights=self.pair_weights,
+            self.log_scores, self.fold, pair_weights=self.pair_weights
         )
         return torch.logsumexp(self.log_scores + weights[self.fold].log(), dim=1)
 
@@ -291,7 +332,6 @@ def _expanded_tail(n: float) -> float:
 def fold_weights(
     log_scores: Tensor,
     fold: Tensor,
-    pseudo_count: float,
     *,
     pair_weights: Tensor | None = None,
 ) -> Tensor:
@@ -304,8 +344,101 @@ def fold_weights(
                 pair_weights=(
                     None if pair_weights is None else pair_weights[fold != number]
                 ),
-                pseudo_count=pseudo_count,
             ).weights.to(log_scores)
             for number in numbers
         ]
     )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LearningCurve:
+    """The held-out score of the stack when it is trained on fewer pairs.
+
+    Attributes:
+        num_pairs: The numbers of pairs that the candidates were trained on, ascending.
+        pair_scores: The log score of the stack at each of n held-out pairs, for each
+            number of pairs, with theta in its own units, shape ``(P, n)``.
+        pair_weights: How many pairs each held-out pair counts as, shape ``(n,)``; None
+            if all count as one.
+        groups: As in :class:`CrossValidation`.
+    """
+
+    num_pairs: tuple[int, ...]
+    pair_scores: Tensor = field(repr=False)
+    pair_weights: Tensor | None = field(default=None, repr=False)
+    groups: Tensor | None = field(default=None, repr=False)
+
+    @classmethod
+    def of(cls, parts: Sequence[CrossValidation]) -> "LearningCurve":
+        """Return the curve of cross-validations with increasing training sets."""
+        return cls(
+            num_pairs=tuple(part.num_trained_on for part in parts),
+            pair_scores=torch.stack([part.stack_scores.double() for part in parts]),
+            pair_weights=parts[0].pair_weights,
+            groups=parts[0].groups,
+        )
+
+    @property
+    def scores(self) -> tuple[float, ...]:
+        """The mean held-out score at each number of pairs."""
+        return tuple(mean for mean, _ in map(self._mean_and_error, self.pair_scores))
+
+    @property
+    def standard_errors(self) -> tuple[float, ...]:
+        """The standard error of each mean score.
+
+        All scores are means over the same pairs, so that their differences have smaller
+        errors.
+        """
+        return tuple(error for _, error in map(self._mean_and_error, self.pair_scores))
+
+    def gain(self, num_more: int) -> Difference:
+        r"""Return how much more labels would add to the mean score, with an interval.
+
+        The curve :math:`s_i(n) = a_i - b_i / n` is fitted to the scores of each
+        held-out pair i. A stack of n labels is the average of posteriors that were
+        each trained on N of them, as the last point was. With m more labels each is
+        trained on N (n + m) / n, and the gain is
+
+        .. math:: \bar b \left( \frac{1}{N} - \frac{n}{N (n + m)} \right) .
+
+        The 95 % interval is that of Student's t for the mean slope :math:`\bar b`. It
+        takes the pairs that were trained on as given, and the form of the curve as
+        right.
+
+        Args:
+            num_more: m, the number of labels to add. If pairs belong to groups, such as
+                recordings of one person, n and m are numbers of groups.
+
+        Returns:
+            The gain in nats a pair; NaN if the curve has a single point or a score is
+            not finite.
+
+        Raises:
+            InvalidInputError: If the number is below 1.
+        """
+        check("num_more", num_more, Count)
+        if len(self.num_pairs) < 2 or not torch.isfinite(self.pair_scores).all():
+            return Difference(mean=float("nan"), low=float("nan"), high=float("nan"))
+        inverse = torch.tensor(self.num_pairs).to(self.pair_scores).reciprocal()
+        centred = inverse - inverse.mean()
+        slopes = -(centred @ self.pair_scores) / centred.square().sum()
+        last = self.num_pairs[-1]
+        n = self.num_labels
+        scale = 1 / last - n / (last * (n + num_more))
+        mean, low, high = interval_of_mean(scale * slopes, self._counts)
+        return Difference(mean=mean, low=low, high=high)
+
+    @property
+    def num_labels(self) -> int:
+        """The number of pairs, or of their groups."""
+        if self.groups is None:
+            return self.pair_scores.shape[1]
+        return len(self.groups.unique())
+
+    @property
+    def _counts(self) -> Counts | None:
+        return counts_of(self.pair_weights, self.groups)
+
+    def _mean_and_error(self, values: Tensor) -> tuple[float, float]:
+        return mean_and_error(values, self._counts)

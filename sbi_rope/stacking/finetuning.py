@@ -11,7 +11,7 @@ from torch import Tensor
 from sbi_rope._labels import Nodes
 from sbi_rope._sbi import embedding_of, headless
 from sbi_rope._training import History, best_of_learning_rates, shuffled
-from sbi_rope.stacking.folds import Fold
+from sbi_rope.stacking.workbench import Fold
 from sbi_rope.trainers.training import FINETUNING, rows_with_density, train_network
 
 __all__ = ["finetune_without"]

@@ -22,8 +22,7 @@ from sbi_rope.sets.conformal import (
     marginal_ends,
     rank_needed,
 )
-from sbi_rope.stacking.cross_validation import CrossValidation
-from sbi_rope.stacking.held_out import SetScores
+from sbi_rope.stacking.cross_validation import CrossValidation, SetScores
 from sbi_rope.stacking.versions import Versions
 
 __all__ = ["HeldOutSets"]
@@ -144,17 +143,10 @@ class HeldOutSets:
     def _scores(self, level: float) -> tuple[SetScores, Guarantee]:
         """Return the scores and what they promise; raise if there are too few."""
         scores = self._validation.set_scores
-        if scores is None and self._validation.score_errors is not None:
-            raise InvalidInputError(
-                "Expected some exact labels for a set with a guarantee; got "
-                f"{self._validation.labels}. A set that holds a measurement need not "
-                "hold the parameters. Use guaranteed=False, or add pairs whose "
-                "parameters are all known."
-            )
         if scores is None:
             raise InvalidInputError(
-                "Expected a stack with scores for sets with a guarantee; got one "
-                "without, as files of earlier versions hold. Make the stack again."
+                "Expected some exact labels for a set with a guarantee; got "
+                f"{self._validation.labels}."
             )
         check_enough(level, len(scores))
         guarantee = Guarantee(

@@ -1,7 +1,11 @@
 """The report of a stack: whether calibration helped, and how well it is calibrated."""
 
+import platform
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import datetime, timezone
+from importlib import import_module
 from os import PathLike
 from typing import Any
 
@@ -18,16 +22,74 @@ from sbi_rope.metrics import (
 )
 from sbi_rope.metrics.by_estimate import coverage_by_estimate_of_pairs
 from sbi_rope.metrics.calibration import acauc_of_pairs, coverage_error_of_pairs
-from sbi_rope.recalibration import Recalibration
 from sbi_rope.sets.conformal import rank_needed
 from sbi_rope.settings import check
-from sbi_rope.stacking.cross_validation import CrossValidation, Difference
-from sbi_rope.stacking.held_out import SetScores
-from sbi_rope.stacking.learning_curve import LearningCurve
-from sbi_rope.stacking.provenance import Provenance
+from sbi_rope.stacking.cross_validation import (
+    CrossValidation,
+    Difference,
+    LearningCurve,
+    SetScores,
+)
 from sbi_rope.stacking.words import LEVEL, REFERENCES, lines_of
 
-__all__ = ["StackingReport"]
+__all__ = ["Provenance", "StackingReport"]
+
+
+# Modules, which all know their version, and the names of their packages.
+PACKAGES = {
+    "sbi_rope": "sbi-rope",
+    "sbi": "sbi",
+    "torch": "torch",
+    "numpy": "numpy",
+    "scipy": "scipy",
+    "ot": "POT",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Provenance:
+    """How a stack was made.
+
+    Attributes:
+        seed: The seed that was given; None if the states of torch, NumPy and Python
+            were used.
+        seconds: How long it took.
+        num_simulator_calls: How many simulations the simulator made for it; 0 if all
+            were there already.
+        finished: When it was finished, in UTC, such as "2026-01-31 12:00 UTC".
+        versions: The versions of Python and of packages, by name.
+    """
+
+    seed: int | None
+    seconds: float
+    num_simulator_calls: int
+    finished: str
+    versions: dict[str, str]
+
+    @classmethod
+    def since(
+        cls, start: float, *, seed: int | None, num_simulator_calls: int
+    ) -> "Provenance":
+        """Return how a stack was made that is finished now.
+
+        Args:
+            start: What ``time.perf_counter()`` returned when it was begun.
+            seed: The seed that the user gave.
+            num_simulator_calls: How many simulations were made for it.
+        """
+        return cls(
+            seed=None if seed is None else int(seed),
+            seconds=time.perf_counter() - start,
+            num_simulator_calls=num_simulator_calls,
+            finished=datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
+            versions={
+                "Python": platform.python_version(),
+                **{
+                    package: str(import_module(module).__version__)
+                    for module, package in PACKAGES.items()
+                },
+            },
+        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -62,26 +124,22 @@ class StackingReport:
         joint_sets: Share of the pairs that are in their 90 % sets of highest density,
             and the level of such sets that are as large as those of 90 % with a
             guarantee. None if there are too few pairs for it.
-        batch: How the batch of the stack compares with the observations of the pairs;
-            None without a batch, or with fewer than five of either.
+        batch: How ``x_o`` compares with the observations of the pairs; None without
+            it, or with fewer than five of either.
         discrepancy: What the pairs say about each entry of x. None if the stack has no
             discrepancy among its candidates, or x is not a short vector.
         provenance: The seed, the seconds and the versions, if they are known.
-        recalibration: By which factors the stack was made narrower or wider, if it was
-            asked for. The other numbers are those of the stack before it.
         acauc_of_parameters: ACAUC of each parameter by itself. The intervals are so
             wide that those of d calibrated parameters all hold 0 in at least 95 % of
             the cases (Bonferroni).
         by_estimate: Whether the coverage of the stack's 90 % intervals depends on the
-            estimate. None in files of earlier versions.
+            estimate.
         probability_of_prior: The probability that the parameters of the pairs were
             drawn from the prior, see :func:`~sbi_rope.discrepancy.learn_parameters`;
             None if it is not known.
         learns_prior: Whether a candidate learns from the pairs how parameters are
             distributed.
         parameter_names: One name for each parameter; None if they have none.
-        is_amortised: Whether the stack has no couplings, and answers any x; None if it
-            is not known.
     """
 
     cross_validation: CrossValidation
@@ -94,47 +152,29 @@ class StackingReport:
     coverage_error: CoverageErrorScore
     share_inside: float
     score_z: tuple[float, float]
+    acauc_of_parameters: tuple[ACAUCScore, ...]
+    by_estimate: CoverageByEstimate
     joint_sets: tuple[float, float] | None = None
     batch: TwoSampleTest | None = None
     discrepancy: DiscrepancyReport | None = None
     provenance: Provenance | None = None
-    recalibration: Recalibration | None = None
-    acauc_of_parameters: tuple[ACAUCScore, ...] = ()
-    by_estimate: CoverageByEstimate | None = None
     probability_of_prior: float | None = None
     learns_prior: bool = True
     parameter_names: tuple[str, ...] | None = None
-    is_amortised: bool | None = None
 
     @classmethod
     def of(
         cls,
         cross_validation: CrossValidation,
         learning_curve: LearningCurve | None = None,
-        *,
-        batch: TwoSampleTest | None = None,
-        discrepancy: DiscrepancyReport | None = None,
-        provenance: Provenance | None = None,
-        recalibration: Recalibration | None = None,
-        probability_of_prior: float | None = None,
-        learns_prior: bool = True,
-        parameter_names: tuple[str, ...] | None = None,
-        is_amortised: bool | None = None,
+        **others: Any,
     ) -> "StackingReport":
         """Compute the report of a stack.
 
         Args:
             cross_validation: The scores of its candidates.
             learning_curve: The learning curve of the stack, if it was asked for.
-            batch: How its batch compares with the pairs.
-            discrepancy: What the pairs say about each entry of x.
-            provenance: How the stack was made.
-            recalibration: By which factors it was made narrower or wider.
-            probability_of_prior: The probability that the parameters of the pairs were
-                drawn from the prior.
-            learns_prior: Whether a candidate learns how parameters are distributed.
-            parameter_names: One name for each parameter, if they have names.
-            is_amortised: Whether it has no couplings.
+            **others: The attributes that do not follow from these scores.
         """
         check("cross_validation", cross_validation, CrossValidation)
         check("learning_curve", learning_curve, LearningCurve | None)
@@ -160,16 +200,9 @@ class StackingReport:
             coverage_error=coverage_error_of_pairs(levels, scores.counts),
             share_inside=float(scores.coverage.average[round(100 * LEVEL) - 1]),
             joint_sets=_joint_sets(scores.set_scores),
-            batch=batch,
-            discrepancy=discrepancy,
-            provenance=provenance,
-            recalibration=recalibration,
             acauc_of_parameters=_acauc_of_parameters(scores),
             by_estimate=_by_estimate(scores),
-            probability_of_prior=probability_of_prior,
-            learns_prior=learns_prior,
-            parameter_names=parameter_names,
-            is_amortised=is_amortised,
+            **others,
         )
 
     @property
@@ -208,19 +241,15 @@ class StackingReport:
         Args:
             path: The file. Its folder is made if there is none. A report of this
                 package that is there already is replaced, and no other file.
-            diagnosis: What :func:`sbi_rope.diagnose` says about the batch, if the
-                report should hold it. The page counts the alarms that concern this
-                stack, whichever posterior the diagnosis was made for.
+            diagnosis: What :func:`sbi_rope.diagnose` says about a batch, if the report
+                should hold it.
             parameter_names: A name for each parameter. If None, those that ``RoPE`` was
                 given, those of the diagnosis, or "theta_1" and so on.
             x_names: A name for each entry of x; "x[0]" and so on if None.
 
         Raises:
-            InvalidInputError: If an argument has the wrong type.
-            InvalidInputError: If the path is a folder or a file of something else, or
-                the names do not fit.
-            NotWritableError: If the folder cannot be written to.
-            ImportError: If matplotlib is not installed.
+            InvalidInputError: If an argument has the wrong type, the names do not fit,
+                or the path is a folder or a file of something else.
         """
         # This room draws with `plots`, which draws this report: it is above both.
         from sbi_rope.reports import write_stacking_report
@@ -246,9 +275,7 @@ def _acauc_of_parameters(scores: CrossValidation) -> tuple[ACAUCScore, ...]:
     )
 
 
-def _by_estimate(scores: CrossValidation) -> CoverageByEstimate | None:
-    if scores.ranks is None or scores.estimates is None:
-        return None
+def _by_estimate(scores: CrossValidation) -> CoverageByEstimate:
     chosen = None
     if scores.groups is not None:
         chosen = one_of_each_group(groups_of(scores.groups), seed=0)

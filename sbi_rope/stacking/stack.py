@@ -1,53 +1,48 @@
 """Make a stack from a RoPE with calibration pairs, in one call."""
 
+import time
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Literal
+from typing import Annotated
 
+import torch
 from torch import Tensor
 
-from sbi_rope.discrepancy.parameters import is_improbable
-from sbi_rope.errors import warn_user
+from sbi_rope._progress import is_shown, progress_bar
+from sbi_rope._random import seeded
+from sbi_rope._sbi import check_density, embed, estimator_of
+from sbi_rope._standardisation import warn_of_far_entries
+from sbi_rope._two_sample import TwoSampleTest, compare_with_pairs
+from sbi_rope.discrepancy import DiscrepancyReport
+from sbi_rope.errors import InvalidInputError, warn_user
+from sbi_rope.mixture import Part
 from sbi_rope.rope import RoPE
-from sbi_rope.settings import UnitInterval, check
-from sbi_rope.stacking.batch import compare_batch
-from sbi_rope.stacking.candidates import Candidate
-from sbi_rope.stacking.cross_validation import CrossValidation
-from sbi_rope.stacking.learning_curve import LearningCurve
+from sbi_rope.settings import Count, Range, check
+from sbi_rope.stacking.candidates import (
+    AmortisedCandidate,
+    checked_candidates,
+    suitable_candidates,
+)
+from sbi_rope.stacking.cross_validation import CrossValidation, LearningCurve
 from sbi_rope.stacking.posterior import StackedPosterior
-from sbi_rope.stacking.provenance import Stopwatch
-from sbi_rope.stacking.recalibrating import check_recalibration
-from sbi_rope.stacking.report import StackingReport
-from sbi_rope.stacking.trainer import StackTrainer
+from sbi_rope.stacking.report import Provenance, StackingReport
+from sbi_rope.stacking.scoring import score_versions
+from sbi_rope.stacking.versions import Versions
+from sbi_rope.stacking.workbench import NUM_FOLDS, Fold, Workbench, draw_seeds
 
 __all__ = ["cross_validate", "stack"]
 
 # The learning curve trains on these shares of the folds, and on all folds but one.
 SMALLER = (0.25, 0.5)
-RECALIBRATES_FOR_PAIRS = (
-    "The parameters of the pairs are not distributed like the prior, which all "
-    "candidates keep. `recalibrate` makes the stack fit the pairs, and it can become "
-    "over-confident about other parameters. Leave it out, unless the observations are "
-    "drawn like the pairs."
-)
 
 
 def stack(
     rope: RoPE,
     x_o: Tensor | None = None,
     *,
-    candidates: Sequence[Candidate] | None = None,
+    candidates: Sequence[AmortisedCandidate] | None = None,
     num_folds: int | None = None,
-    num_simulations: int | None = None,
-    pseudo_count: float = 1.0,
     learning_curve: bool = False,
-    recalibrate: bool = False,
-    unseen: Literal["raise", "extend"] = "raise",
-    tail_mass: float = 1e-3,
-    require_convergence: bool = True,
     seed: int | None = None,
-    num_workers: int = 1,
-    checkpoints: str | Path | None = None,
     show_progress_bars: bool | None = None,
 ) -> StackedPosterior:
     r"""Mix candidate posteriors with the weights that score best on held-out pairs.
@@ -55,16 +50,13 @@ def stack(
     The calibration pairs are divided into folds. Every candidate is trained without
     each fold and scored on that fold, and the posterior is the mixture of the
     candidates with the weights that score best
-    (:func:`~sbi_rope.stacking.stacking_weights`).
+    (:func:`~sbi_rope.stacking.stacking_weights`). It answers any x.
 
     The stack is made of the models that were scored. Each candidate is the average of
     its versions: one for each fold, trained on the other folds, and one trained on all
     pairs. The held-out score is that of single versions. By Jensen's inequality their
     average has a higher expected score, for observations like those of the pairs. The
     version trained on all pairs is not scored.
-
-    Without ``x_o`` the stack answers any observation. With ``x_o``, RoPE and OT-only at
-    many values of gamma and tau take part, and the stack is for that batch only.
 
     The weights, the scores and the calibration in the report hold for observations like
     those of the pairs. With ``x_o`` the two are compared by an energy test of their
@@ -75,46 +67,20 @@ def stack(
         rope: A RoPE with calibration pairs. It need not be trained, and it is not
             changed, except that it counts calls of the simulator, and the simulations
             that are dropped.
-        x_o: A batch of real observations, shape ``(n_o, *event)``. With None the
-            posterior answers any x.
-        candidates: What to stack. If None,
-            :func:`~sbi_rope.stacking.default_candidates`: the prior, NPE, fine-tuned
-            NPE and discrepancy models, and with ``x_o`` also tuning-only, RoPE, RoPE
-            tuned with rehearsal and OT-only at four gammas and three taus, and RVNP if
-            there are a hundred observations of at most 20 statistics. For a stack that
-            has learned from ``x_o`` and answers any x, pass
-            ``default_candidates(rope, x_o)`` here and no ``x_o``.
+        x_o: Real observations without labels, shape ``(n_o, *event)``, other than those
+            of the pairs. If there are a hundred of at most 20 statistics, the default
+            candidates have RVNP among them, which learns from ``x_o``.
+        candidates: What to stack;
+            :func:`default_candidates(rope, x_o)
+            <sbi_rope.stacking.default_candidates>` if None: the prior, NPE, fine-tuned
+            NPE and discrepancy models.
         num_folds: The number of folds, 5 if None, and at most the number of groups.
             Pairs with equal labels, or of the same of the ``groups`` that were
             appended, are in the same fold.
-        num_simulations: The number of simulations to couple with, as in
-            :meth:`~sbi_rope.RoPE.build_posterior`. Candidates are trained on others:
-            the simulator makes 20,000 from the prior and 100 for each label. To have
-            fewer, give RoPE itself a number, ``RoPE(..., num_simulations=2000)``.
-        pseudo_count: Strength of the Dirichlet prior of the weights, in pairs.
         learning_curve: Whether to train on fewer folds too, so that the report can
             estimate what more labels would add. It takes about twice the time.
-        recalibrate: Whether to make the stack narrower or wider around its centre, as
-            held-out pairs say; ``report.recalibration`` tells by how much. Further
-            versions are trained for this, ten with five folds, which takes up to three
-            times as long.
-        unseen: What the posterior of a batch does with an x outside the batch:
-            ``"raise"`` an error, or ``"extend"`` each coupling by one row.
-        tail_mass: As in :meth:`~sbi_rope.RoPE.build_posterior`.
-        require_convergence: Whether a coupling that has not converged is an error.
         seed: Seed of everything random; None uses the states of torch, NumPy and
             Python.
-        num_workers: The number of processes that train versions of the candidates. With
-            five folds there are six versions. Each process has a copy of the
-            simulations in its memory. The numbers are those of one process, up to
-            rounding, which grows in the course of a training.
-        checkpoints: A folder in which trained candidates are kept. The same call, with
-            the same ``seed``, data and folder, goes on where another was interrupted,
-            and returns what that one would have. Simulations are made again, and
-            nothing is taken over if they differ. They are the same if the simulator
-            draws from torch, NumPy or Python alone, and from no generator of its own.
-            Couplings and candidates of your own are trained again. Nobody else should
-            be able to write to the folder. It can be removed afterwards.
         show_progress_bars: Whether to show how many trainings and scores are done.
             None does so in a terminal or a notebook, but not in a file.
 
@@ -125,47 +91,21 @@ def stack(
     Raises:
         NotReadyError: If there are fewer than two groups of pairs.
         InvalidInputError: If an argument is outside its range or has the wrong shape,
-            if there are couplings among the candidates but no batch, if there are
-            ``checkpoints`` but no seed, or an NPE that cannot be described in a file,
-            if entries of x are missing (NaN) that a candidate with ``space="input"``
-            corrects, or if something cannot be sent to ``num_workers`` processes, or
-            one of them dies.
-        UnsupportedPosteriorError: If NPE or a candidate has no density, or the
-            posterior cannot be recalibrated.
-        CouplingError: If a coupling has not converged.
+            or if entries of x are missing (NaN) that a candidate with
+            ``space="input"`` corrects.
+        UnsupportedPosteriorError: If NPE or a candidate has no density.
         SamplingError: If the candidates have almost no mass inside the support of the
             prior at a held-out observation.
         SimulationError: If the simulator fails.
-        NotWritableError: If the folder of ``checkpoints`` cannot be made.
     """
-    check("unseen", unseen, Literal["raise", "extend"])
-    check("tail_mass", tail_mass, UnitInterval)
-    check("rope", rope, RoPE)
-    check("recalibrate", recalibrate, bool)
     check("learning_curve", learning_curve, bool)
-    stopwatch = Stopwatch(rope)
-    trainer = StackTrainer(
-        rope,
-        x_o,
-        candidates=candidates,
-        num_folds=num_folds,
-        num_simulations=num_simulations,
-        pseudo_count=pseudo_count,
-        unseen=unseen,
-        tail_mass=tail_mass,
-        require_convergence=require_convergence,
-        seed=seed,
-        num_workers=num_workers,
-        checkpoints=checkpoints,
-        show_progress_bars=show_progress_bars,
+    trainer = _Trainer(
+        rope, x_o, candidates, num_folds, seed, show=is_shown(show_progress_bars)
     )
-    if recalibrate:
-        check_recalibration(trainer.bench)
+    start, calls = time.perf_counter(), rope.num_simulator_calls
+    bench = trainer.bench
     # This comes first, so that nobody waits for the training to hear of it.
-    batch = None if trainer.x_o is None else compare_batch(trainer.bench, trainer.x_o)
-    probability = trainer.bench.probability_of_prior()
-    if recalibrate and not trainer.learns_prior and is_improbable(probability):
-        warn_user(RECALIBRATES_FOR_PAIRS)
+    batch = None if trainer.x_o is None else _compare_batch(bench, trainer.x_o)
     versions, scores = trainer.cross_validate(with_refit=True)
     curve = None
     if learning_curve:
@@ -176,23 +116,25 @@ def stack(
             if 1 <= count < scores.num_folds - 1
         ]
         curve = LearningCurve.of([*smaller, scores])
+    report = StackingReport.of(
+        scores,
+        curve,
+        batch=batch,
+        discrepancy=trainer.discrepancy(),
+        probability_of_prior=bench.probability_of_prior(),
+        learns_prior=any(
+            one.learns_prior and not one.fixed for one in trainer.candidates
+        ),
+        parameter_names=rope.parameter_names,
+        provenance=Provenance.since(
+            start, seed=seed, num_simulator_calls=rope.num_simulator_calls - calls
+        ),
+    )
     posterior = StackedPosterior(
         versions,
-        trainer.prior,
-        report=StackingReport.of(
-            scores,
-            curve,
-            batch=batch,
-            discrepancy=trainer.discrepancy(),
-            probability_of_prior=probability,
-            learns_prior=trainer.learns_prior,
-            is_amortised=versions.couplings is None,
-            parameter_names=rope.parameter_names,
-            recalibration=trainer.recalibration(scores) if recalibrate else None,
-            # This comes last, because it counts what came before.
-            provenance=stopwatch.provenance(seed),
-        ),
-        enable_transform=trainer.bench.npe.enable_transform,
+        bench.npe.prior,
+        report=report,
+        enable_transform=bench.npe.enable_transform,
     )
     posterior.parameter_names = rope.parameter_names
     posterior.x_names = rope.x_names
@@ -203,15 +145,10 @@ def cross_validate(
     rope: RoPE,
     x_o: Tensor | None = None,
     *,
-    candidates: Sequence[Candidate] | None = None,
+    candidates: Sequence[AmortisedCandidate] | None = None,
     num_folds: int | None = None,
     num_training_folds: int | None = None,
-    num_simulations: int | None = None,
-    pseudo_count: float = 1.0,
-    require_convergence: bool = True,
     seed: int | None = None,
-    num_workers: int = 1,
-    checkpoints: str | Path | None = None,
     show_progress_bars: bool | None = None,
 ) -> CrossValidation:
     """Score candidates on calibration pairs that they were not trained on.
@@ -224,37 +161,153 @@ def cross_validate(
         num_training_folds: The number of folds to train on for each held-out fold;
             all others if None. A smaller number shows how the candidates would score
             with fewer pairs.
-        num_simulations: As in :func:`stack`.
-        pseudo_count: As in :func:`stack`.
-        require_convergence: As in :func:`stack`.
         seed: As in :func:`stack`.
-        num_workers: As in :func:`stack`.
-        checkpoints: As in :func:`stack`.
         show_progress_bars: As in :func:`stack`.
 
     Returns:
-        The score of each candidate at each pair.
-
-    Raises:
-        NotReadyError: As in :func:`stack`.
-        InvalidInputError: As in :func:`stack`.
-        UnsupportedPosteriorError: As in :func:`stack`.
-        CouplingError: As in :func:`stack`.
-        SamplingError: As in :func:`stack`.
-        SimulationError: As in :func:`stack`.
-        NotWritableError: As in :func:`stack`.
+        The score of each candidate at each pair. It raises what :func:`stack` does.
     """
-    trainer = StackTrainer(
-        rope,
-        x_o,
-        candidates=candidates,
-        num_folds=num_folds,
-        num_simulations=num_simulations,
-        pseudo_count=pseudo_count,
-        require_convergence=require_convergence,
-        seed=seed,
-        num_workers=num_workers,
-        checkpoints=checkpoints,
-        show_progress_bars=show_progress_bars,
+    trainer = _Trainer(
+        rope, x_o, candidates, num_folds, seed, show=is_shown(show_progress_bars)
     )
     return trainer.cross_validate(num_training_folds=num_training_folds)[1]
+
+
+class _Trainer:
+    """Trains and scores all candidates. The arguments are those of :func:`stack`."""
+
+    def __init__(
+        self,
+        rope: RoPE,
+        x_o: Tensor | None,
+        candidates: Sequence[AmortisedCandidate] | None,
+        num_folds: int | None,
+        seed: int | None,
+        *,
+        show: bool,
+    ) -> None:
+        check("rope", rope, RoPE)
+        num_folds = NUM_FOLDS if num_folds is None else num_folds
+        check("num_folds", num_folds, Annotated[int, Range(2)])
+        if x_o is not None:
+            x_o = rope.checked_observations(x_o)
+            warn_of_far_entries("x_o", x_o, rope.embedding_net)
+        self.x_o = x_o
+        # The second one is not used, and leaves the third as it is.
+        of_folds, _, self.seed = draw_seeds(seed, 3)
+        self.bench = Workbench(
+            rope,
+            num_folds=num_folds,
+            seed=of_folds,
+            show_progress_bars=show,
+        )
+        check_density(
+            estimator_of(self.bench.npe),
+            what="a RoPE of a posterior",
+            because="candidates are scored by the density of held-out parameters",
+        )
+        if candidates is None:
+            self.candidates = suitable_candidates(self.bench, x_o)
+        else:
+            self.candidates = checked_candidates(candidates, self.bench)
+        self._fixed: dict[str, list[Part]] = {}
+
+    @torch.enable_grad()  # in case the caller has switched gradients off
+    def cross_validate(
+        self, *, num_training_folds: int | None = None, with_refit: bool = False
+    ) -> tuple[Versions, CrossValidation]:
+        """Train on the folds that follow each fold, and score on the fold itself.
+
+        Args:
+            num_training_folds: The number of folds to train on; all others if None.
+            with_refit: Whether to add a version that is trained on all pairs. This
+                version is not scored.
+        """
+        bench, num_folds = self.bench, len(self.bench.folds)
+        if num_training_folds is None:
+            num_training_folds = num_folds - 1
+        check("num_training_folds", num_training_folds, Count)
+        if num_training_folds >= num_folds:
+            raise InvalidInputError(
+                f"Expected `num_training_folds` below the number of folds, {num_folds};"
+                f" got {num_training_folds}."
+            )
+        folds = [
+            Fold(bench, [(k + 1 + j) % num_folds for j in range(num_training_folds)])
+            for k in range(num_folds)
+        ]
+        if with_refit:
+            folds.append(Fold(bench, range(num_folds)))
+        versions = self._train(folds)
+        scores = score_versions(
+            bench,
+            versions,
+            self.candidates,
+            num_training_folds=num_training_folds,
+            seed=self.seed,
+        )
+        return versions, scores
+
+    def _train(self, folds: Sequence[Fold]) -> Versions:
+        # These come first, because they show the progress of their own training, and
+        # because what a user passed to them may be refused.
+        for candidate in self.candidates:
+            if candidate.fixed and candidate.name not in self._fixed:
+                fold = Fold(self.bench, [0])
+                self._fixed[candidate.name] = _trained(candidate, fold)
+        others = [candidate for candidate in self.candidates if not candidate.fixed]
+        versions = []
+        with progress_bar(
+            show=self.bench.show,
+            desc=f"Training {len(others)} candidates in {len(folds)} folds",
+            total=len(others) * len(folds),
+        ) as bar:
+            for fold in folds:
+                version = {}
+                for candidate in others:
+                    version[candidate.name] = _trained(candidate, fold)
+                    bar.update()
+                versions.append(version)
+        return Versions(
+            names=tuple(candidate.name for candidate in self.candidates),
+            fixed=self._fixed,
+            trained=tuple(versions),
+        )
+
+    def discrepancy(self) -> DiscrepancyReport | None:
+        """Return what the pairs say about each entry of x, if a candidate uses it."""
+        is_used = any(
+            "discrepancy" in candidate.family for candidate in self.candidates
+        )
+        if is_used and self.bench.compares_entries:
+            return self.bench.discrepancy()
+        return None
+
+
+def _trained(candidate: AmortisedCandidate, fold: Fold) -> list[Part]:
+    # A candidate that ignores its seed still does not change the caller's random state.
+    with seeded(fold.seed):
+        parts = list(candidate.parts(fold))
+    if not parts:
+        raise InvalidInputError(
+            f"Expected at least one density of {candidate.name!r}; got none."
+        )
+    return parts
+
+
+def _compare_batch(bench: Workbench, x_o: Tensor) -> TwoSampleTest | None:
+    """Compare observations with those of the pairs, and warn if they clearly differ.
+
+    Returns:
+        An energy test of the embeddings h(x), with the pairs as the first set, or None
+        if there are too few observations or pairs.
+    """
+    net = bench.embedding_net
+    test = compare_with_pairs(embed(net, bench.x), bench.groups, embed(net, x_o))
+    if test is not None and test.is_different:
+        warn_user(
+            f"`x_o` differs from the observations of the calibration pairs (p = "
+            f"{test.p_value:.3f}), so that the report need not hold for it. Look at "
+            "`diagnose(rope, x_o)`."
+        )
+    return test

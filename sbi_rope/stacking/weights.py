@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sbi_rope._validation import check_pair_weights
 from sbi_rope.errors import InvalidInputError, warn_user
 from sbi_rope.settings import Count, NotNegative, Positive, check
+from sbi_rope.tensors import as_batch, as_numbers
 
 __all__ = ["StackingWeights", "stacking_weights"]
 
@@ -76,9 +76,8 @@ def stacking_weights(
         The weights.
 
     Raises:
-        InvalidInputError: If the scores are not a tensor.
-        InvalidInputError: If the shape does not fit, a score is NaN or plus infinity,
-            or an argument is outside its range.
+        InvalidInputError: If a shape does not fit, a score is NaN or plus infinity, or
+            an argument is outside its range.
 
     Example:
         >>> log_scores = torch.tensor([[0.0, -9.0], [0.0, -9.0], [-9.0, 0.0]])
@@ -100,9 +99,7 @@ def stacking_weights(
     for iteration in range(max_iterations + 1):
         # The derivative of the objective by the weight of each candidate.
         ratio = density / (density @ weights)[:, None]
-        gradient = (ratio if pair_weights is None else ratio * of_pairs[:, None]).sum(
-            dim=0
-        )
+        gradient = (ratio * of_pairs[:, None]).sum(dim=0)
         if share:
             gradient = gradient + share / weights
         # The objective is concave, so that it lies below its tangent everywhere.
@@ -114,46 +111,36 @@ def stacking_weights(
     mixed = torch.logsumexp(scores + weights.log(), dim=1)
     return StackingWeights(
         weights=weights,
-        score=_weighted_mean(mixed, pair_weights, of_pairs),
+        score=float((of_pairs * mixed).sum() / of_pairs.sum()),  # NaN of none
         gap=max(gap, 0.0),
         num_iterations=iteration,
         converged=gap <= tolerance,
     )
 
 
-def _weighted_mean(
-    scores: Tensor, pair_weights: Tensor | None, of_pairs: Tensor
-) -> float:
-    if pair_weights is None:
-        return float(scores.mean())  # NaN of none
-    return float((of_pairs * scores).sum() / of_pairs.sum())
-
-
 def _checked_scores(
     log_scores: Tensor, pair_weights: Tensor | None
 ) -> tuple[Tensor, Tensor]:
     """Return the scores and weights of the pairs that a candidate does not exclude."""
-    scores = log_scores.detach().double()
+    scores = as_numbers("log_scores", log_scores).double()
     if scores.ndim != 2 or not scores.shape[1]:
         raise InvalidInputError(
-            "Expected `log_scores` of shape (pairs, candidates), with one candidate at "
-            f"least; got {tuple(scores.shape)}."
+            f"Expected `log_scores` of shape (n, K); got {tuple(scores.shape)}."
         )
-    if bool(torch.isnan(scores).any()) or bool(torch.isposinf(scores).any()):
-        raise InvalidInputError(
-            "Expected `log_scores` without NaN and plus infinity. Leave out the "
-            "candidate that returns them."
-        )
-    known = ~torch.isneginf(scores).all(dim=1)
+    if bool((scores.isnan() | scores.isposinf()).any()):
+        raise InvalidInputError("Expected `log_scores` below infinity; got NaN or Inf.")
+    of_pairs = scores.new_ones(len(scores))
+    if pair_weights is not None:
+        of_pairs = as_batch("pair_weights", pair_weights, (), rows=len(scores))
+        if not bool((of_pairs > 0).all()):
+            raise InvalidInputError(
+                f"Expected positive `pair_weights`; got {float(of_pairs.min())}."
+            )
+    known = ~scores.isneginf().all(dim=1)
     if not known.all():
         warn_user(
             f"{int((~known).sum())} of {len(scores)} held-out pairs have density zero "
             "under every candidate and are left out of the weights. Add the prior as a "
             "candidate."
         )
-    if pair_weights is None:
-        return scores[known], scores.new_ones(int(known.sum()))
-    of_pairs = check_pair_weights(
-        pair_weights, "log_scores", scores, weights_name="pair_weights"
-    ).to(scores)
-    return scores[known], of_pairs[known]
+    return scores[known], of_pairs.to(scores)[known]

@@ -11,8 +11,7 @@ from sbi_rope.discrepancy.parameters import is_improbable
 from sbi_rope.metrics.by_estimate import in_words
 from sbi_rope.metrics.calibration import ACAUC_IN_WORDS, FEWEST
 from sbi_rope.settings import default_names
-from sbi_rope.stacking.cross_validation import Difference
-from sbi_rope.stacking.learning_curve import LearningCurve
+from sbi_rope.stacking.cross_validation import Difference, LearningCurve
 
 if TYPE_CHECKING:
     from sbi_rope.stacking.report import StackingReport
@@ -84,10 +83,6 @@ IF_MOSTLY_PRIOR = "Check that theta and x of the pairs belong together, row by r
 IN_WORDS = {
     "prior": "the prior, which learns nothing from x",
     "NPE": "NPE as it was trained on simulations",
-    "OT-only": "observations are coupled with simulations, without tuning",
-    "tuning-only": "the embedding net was tuned on the labels, without coupling",
-    "RoPE": "the embedding net was tuned on the labels, and observations are coupled "
-    "with simulations",
     "fine-tuned NPE": "the labels train NPE further",
     "discrepancy": "NPE of simulations that a linear model, learnt from the labels, "
     "has corrected",
@@ -127,7 +122,6 @@ def lines_of(report: "StackingReport") -> list[str]:
         *_weights(report),
         *_parameters(report),
         *_calibration(report),
-        *_recalibration(report),
         *_more_labels(report),
         *_what_it_took(report),
     ]
@@ -276,17 +270,12 @@ def parameters_off(
     """Say which parameters are not calibrated by themselves.
 
     It says nothing about a single parameter, whose verdict is that of the stack.
-
-    Args:
-        report: The report of a stack.
-        names: A name for each parameter. If None, those of the report, or "theta_1"
-            and so on.
     """
     scores = report.acauc_of_parameters
     names = names or report.parameter_names or default_names(len(scores))
     few = report.cross_validation.effective_number < FEWEST
     unknown = report.acauc.verdict == "unknown"  # that of labels given as draws
-    if few or unknown or len(scores) < 2:  # reports of older files have none
+    if few or unknown or len(scores) < 2:
         return []
     lines = []
     for name, score in zip(names, scores, strict=True):
@@ -303,22 +292,14 @@ def parameters_off(
 
 def depends_on_estimate(report: "StackingReport") -> bool:
     """Whether the coverage of a parameter depends on its estimate, as far as known."""
-    return report.by_estimate is not None and any(report.by_estimate.depends)
+    return any(report.by_estimate.depends)
 
 
 def coverage_by_estimate(
     report: "StackingReport", names: Sequence[str] | None = None
 ) -> list[str]:
-    """Say for which parameters the coverage depends on the estimate, or for none.
-
-    Args:
-        report: The report of a stack.
-        names: A name for each parameter. If None, those of the report, or "theta_1"
-            and so on.
-    """
+    """Say for which parameters the coverage depends on the estimate, or for none."""
     found = report.by_estimate
-    if found is None:
-        return []
     names = names or report.parameter_names or default_names(len(found.p_values))
     known = "measured values" if is_measured(report) else "parameters"
     return in_words(found, names, known=known)
@@ -335,14 +316,6 @@ def _by_estimate(report: "StackingReport") -> list[str]:
             line, 88, initial_indent="    ", subsequent_indent="      "
         )
     ]
-
-
-def _recalibration(report: "StackingReport") -> list[str]:
-    if report.recalibration is None:
-        return []
-    return textwrap.wrap(
-        str(report.recalibration), 88, initial_indent="  ", subsequent_indent="    "
-    )
 
 
 def _sets(report: "StackingReport") -> list[str]:

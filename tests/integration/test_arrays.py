@@ -11,13 +11,11 @@ from torch import Tensor
 from sbi_rope import RoPE, diagnose
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.metrics import draw_samples, evaluate
-from sbi_rope.sweep import sweep
 from sbi_rope.trainers import FinetunedNPE
 from sbi_rope.trainers.training import Training
 from tests import gaussian, problems
 from tests.stacks import (
     NPE,
-    OT_ONLY,
     PRIOR,
     QUICK,
     QUIET,
@@ -52,9 +50,6 @@ def test_pairs_and_observations_are_those_of_tensors(convert: Any) -> None:
     given.train(seed=0, **QUIET)
     posterior = given.build_posterior(x_o, **QUICKLY)
     assert torch.equal(posterior.x_o, OBSERVED[1])
-    assert (
-        next(iter(sweep(given, x_o, gammas=[0.5], taus=[1.0], **QUICKLY))) is not None
-    )
     # The posterior knows an observation again, in whatever form it comes.
     log_prob = posterior.log_prob_batched(theta_o, x=x_o)
     assert torch.allclose(log_prob.float(), posterior.log_prob_batched(*OBSERVED))
@@ -71,7 +66,7 @@ def test_pairs_and_observations_are_those_of_tensors(convert: Any) -> None:
 def test_a_stack_and_its_diagnosis_take_arrays() -> None:
     x_o = array(OBSERVED[1])
     posterior = stacked(
-        rope(map(array, PAIRS)), x_o, candidates=[PRIOR, NPE, OT_ONLY], num_folds=2
+        rope(map(array, PAIRS)), x_o, candidates=[PRIOR, NPE], num_folds=2
     )
     assert posterior.sample_batched((2,), x=x_o, **QUIET).shape == (2, 25, 2)
     trained = rope(PAIRS).train(seed=0, **QUIET)

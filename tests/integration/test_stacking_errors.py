@@ -5,10 +5,9 @@ from typing import Any
 import pytest
 import torch
 
-from sbi_rope import CalibrationFinetuner, RoPE, SinkhornCoupler
+from sbi_rope import CalibrationFinetuner, RoPE
 from sbi_rope.baselines import PriorPosterior
 from sbi_rope.errors import (
-    CouplingError,
     InvalidInputError,
     NotReadyError,
     SamplingError,
@@ -17,7 +16,6 @@ from sbi_rope.errors import (
 )
 from sbi_rope.stacking import (
     AmortisedCandidate,
-    CouplingCandidate,
     DensityCandidate,
     DiscrepancyCandidate,
     cross_validate,
@@ -25,20 +23,17 @@ from sbi_rope.stacking import (
 )
 from tests import gaussian, problems
 from tests.stacks import (
-    COUPLINGS,
     FITTED,
     NPE,
-    OT_ONLY,
     PRIOR,
     QUIET,
-    ROPE,
     finetuned,
     observed,
     problem,
     rope_of,
     stacked,
-    the_coupled_stack,
     the_stack,
+    trained,
     uneven,
     validated,
 )
@@ -52,35 +47,26 @@ def test_too_few_pairs_are_refused() -> None:
     one = rope_of((theta[:1], x[:1]))
     none = one.with_pairs(torch.arange(0))
     same = rope_of((theta[:1].expand(6, -1), x))
-    match = r"at least 2 calibration pairs with different parameters.*got {}"
+    match = r"at least 2 calibration pairs with different parameters or groups; got {}"
     for rope, count in ((none, 0), (one, 1), (same, 1)):
         for call in (validated, stacked):
             with pytest.raises(NotReadyError, match=match.format(count)):
                 call(rope)
 
 
-def test_couplings_and_a_batch_belong_together() -> None:
-    for call in (validated, stacked):
-        with pytest.raises(InvalidInputError, match="`x_o`, a batch"):
-            call(rope_of(), candidates=[OT_ONLY, NPE])
-        with pytest.raises(InvalidInputError, match="Leave `x_o` out"):
-            call(rope_of(), observed(), candidates=[NPE])
-
-
 def test_bad_lists_of_candidates_are_refused() -> None:
     twice = DensityCandidate(name="NPE", build=finetuned)
-    bad: list[tuple[Any, type[Exception], str]] = [
-        ([], InvalidInputError, "at least one candidate"),
-        ([OT_ONLY, OT_ONLY], InvalidInputError, "names that differ"),
-        ([OT_ONLY, NPE, twice], InvalidInputError, "names that differ"),
-        ([OT_ONLY, "NPE"], InvalidInputError, "got str"),
-        ([OT_ONLY, PriorPosterior(problems.box(2))], InvalidInputError, "Wrap"),
-        (OT_ONLY, InvalidInputError, "candidates"),
+    bad: list[tuple[Any, str]] = [
+        ([], r"got \[\]"),
+        ([PRIOR, NPE, twice], "different names"),
+        ([PRIOR, "NPE"], "AmortisedCandidate; got"),
+        ([PRIOR, PriorPosterior(problems.box(2))], "AmortisedCandidate; got"),
+        (PRIOR, "candidates"),
     ]
     rope = rope_of()
-    for candidates, error, match in bad:
-        with pytest.raises(error, match=match):
-            stacked(rope, observed(), candidates=candidates)
+    for candidates, match in bad:
+        with pytest.raises(InvalidInputError, match=match):
+            stacked(rope, candidates=candidates)
 
 
 class Own(AmortisedCandidate):
@@ -94,7 +80,7 @@ class Own(AmortisedCandidate):
 
 
 def test_a_candidate_of_a_user_needs_a_name_of_its_own_and_a_density() -> None:
-    with pytest.raises(InvalidInputError, match="another name"):
+    with pytest.raises(InvalidInputError, match="none of them 'stack'"):
         stacked(rope_of(), candidates=[Own("stack")])
     with pytest.raises(InvalidInputError, match="at least one density of 'empty'"):
         stacked(rope_of(), candidates=[Own("empty")])
@@ -106,9 +92,9 @@ def test_posteriors_without_a_density_to_score_are_refused() -> None:
         (problems.npe_posterior("mdn", dim=1), r"and theta \(1,\)"),
         (problems.npe_posterior("mdn", "cnn"), r"got x \(1, 8, 8\)"),
         (PriorPosterior(gaussian.prior(3)), r"theta \(3,\)"),
-        (the_coupled_stack(), "to be amortised"),
-        (the_stack(), "equal weights"),
-        (stacked(rope_of(), candidates=[FITTED]), "has seen the pairs"),
+        (trained().build_posterior(observed(), seed=0), "to answer any x"),
+        (the_stack(), "equal weight"),
+        (stacked(rope_of(), candidates=[FITTED]), "equal weight"),
         (None, "NoneType"),
     ]
     rope = rope_of()
@@ -138,23 +124,10 @@ def test_a_rope_of_a_stack_is_refused() -> None:
         RoPE(the_stack(), simulator=uneven)
 
 
-def test_a_coupling_that_has_not_converged_is_an_error_unless_it_is_accepted() -> None:
-    coupler = SinkhornCoupler(max_iterations=1, tolerance=1e-9)
-    candidates = [*COUPLINGS[:3], PRIOR]
-    rope = rope_of(coupler=coupler)
-    for call in (validated, stacked):
-        with pytest.raises(CouplingError, match=r"have not converged.*max_iterations"):
-            call(rope, observed(), candidates=candidates)
-    posterior = stacked(
-        rope, observed(), candidates=candidates, require_convergence=False
-    )
-    assert not all(coupling.converged for coupling in posterior.couplings)
-
-
 def test_candidates_without_mass_in_the_prior_raise_advice_to_add_the_prior() -> None:
     far = PriorPosterior(problems.BoxUniform(torch.ones(2) * 5, torch.ones(2) * 6))
     candidate = DensityCandidate(name="far", build=lambda rope, seed: far, fixed=True)
-    with pytest.raises(SamplingError, match="Add the prior to the candidates"):
+    with pytest.raises(SamplingError, match="add the prior to the candidates"):
         stacked(rope_of(), candidates=[candidate])
     assert stacked(rope_of(), candidates=[candidate, PRIOR]).candidate_weights
 
@@ -176,14 +149,9 @@ def test_the_folds_to_train_on_must_be_fewer_than_all() -> None:
         validated(rope_of(), candidates=[NPE], num_training_folds=3)
 
 
-def test_rehearsal_without_tuning_is_refused() -> None:
-    with pytest.raises(InvalidInputError, match="`rehearsal` of None without tuning"):
-        CouplingCandidate(gamma=0.1, tau=1.0, rehearsal=1.0, tuned=False)
-
-
 def test_anything_but_a_rope_is_refused() -> None:
     for call in (cross_validate, stack):
-        match = r"`rope` to be a RoPE; got DirectPosterior\. Make one .*RoPE\(posterior"
+        match = "`rope` to be a RoPE; got"
         with pytest.raises(InvalidInputError, match=match):
             call(problems.npe_posterior("mdn"))  # type: ignore[arg-type]
 
@@ -202,6 +170,5 @@ def test_fewer_stored_simulations_than_pairs_are_enough() -> None:
         simulations=(theta, problems.simulate(theta)),
         finetuner=CalibrationFinetuner(max_num_epochs=2, num_neighbors=3),
     )
-    candidates = [ROPE, DiscrepancyCandidate(space="tuned")]
-    posterior = stacked(rope, observed(3), candidates=candidates, num_simulations=None)
+    posterior = stacked(rope, candidates=[DiscrepancyCandidate(space="tuned")])
     assert posterior.report.cross_validation.log_scores.isfinite().all()

@@ -17,7 +17,6 @@ from sbi_rope.stacking import CrossValidation, default_candidates
 from tests import gaussian
 from tests.stacks import (
     CANDIDATES,
-    COUPLINGS,
     NPE,
     NUM_PAIRS,
     PRIOR,
@@ -109,21 +108,6 @@ def test_coverage_of_labels_that_are_not_exact_is_that_of_measured_values() -> N
     for options, what in (({"theta_std": 0.1}, "measured values"), ({}, "parameters")):
         report = stacked(labelled(THETA, **options), candidates=[PRIOR, NPE]).report
         assert f"of the {what}\n" in str(report)
-
-
-@pytest.mark.medium
-def test_couplings_are_scored_on_labels_that_are_not_exact() -> None:
-    scores = validated(
-        labelled(PARTIAL), observed(), candidates=[*COUPLINGS[:2], PRIOR, NPE]
-    )
-    exact = validated(
-        labelled(THETA), observed(), candidates=[*COUPLINGS[:2], PRIOR, NPE]
-    )
-    assert torch.isfinite(scores.log_scores).all()
-    # Labels of all parameters are scored as exact ones are, but for the tuned nets.
-    known = torch.isfinite(PARTIAL).all(dim=1)
-    difference = scores.log_scores[known, 2:] - exact.log_scores[known, 2:]
-    assert float(difference.abs().max()) < 1e-5
 
 
 def test_labels_of_vanishing_noise_are_scored_like_exact_ones() -> None:

@@ -29,15 +29,12 @@ from tests import problems
 from tests.stacks import (
     FITTED,
     NPE,
-    OT_ONLY,
     PRIOR,
-    ROPE,
     observed,
     problem,
     quick,
     rope_of,
     stacked,
-    the_coupled_stack,
     the_stack,
 )
 
@@ -45,24 +42,26 @@ from tests.stacks import (
 pytestmark = pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
 
 DISCREPANCY = DiscrepancyCandidate(space="embedding")
-NAMES = ("prior", "NPE", "RoPE (gamma 0.1, tau 1)", "RoPE (gamma 0.1, tau 0)")
+NAMES = ("prior", "NPE", "discrepancy", "discrepancy (tuned)")
 
 
 def made_up(
-    *, n: int = 12, npe: float = -4.0, coupled: float = -1.0, leak: float = 0.2
+    *, n: int = 12, npe: float = -4.0, best: float = -1.0, leak: float = 0.2
 ) -> StackingReport:
     """A report of made-up numbers."""
     generator = torch.Generator().manual_seed(0)
-    means = torch.tensor([-2.0, npe, coupled, coupled], dtype=torch.double)
+    means = torch.tensor([-2.0, npe, best, best], dtype=torch.double)
     log_scores = means + 0.3 * torch.randn(n, 4, generator=generator).double()
     scores = CrossValidation(
         names=NAMES,
-        families=("prior", "NPE", "RoPE", "RoPE"),
+        families=("prior", "NPE", "discrepancy", "discrepancy"),
         log_scores=log_scores,
         fold=torch.arange(n) % 3,
         num_trained_on=2 * n // 3,
         stack_scores=log_scores[:, 2] + leak,
         levels=torch.rand(n, 2, generator=generator),
+        estimates=torch.zeros(n, 2),
+        ranks=torch.full((n, 2), torch.nan),
     )
     return StackingReport.of(scores)
 
@@ -165,16 +164,15 @@ def test_the_unit_of_a_prior_is_estimated_from_draws_or_unknown() -> None:
 def test_weights_of_families_are_summed_and_explained() -> None:
     report = made_up()
     weights = report.family_weights
-    assert next(iter(weights)) == "RoPE"
-    assert set(weights) == {"prior", "NPE", "RoPE"}
+    assert next(iter(weights)) == "discrepancy"
+    assert set(weights) == {"prior", "NPE", "discrepancy"}
     found = report.cross_validation.weights.weights
-    assert weights["RoPE"] == pytest.approx(float(found[2:].sum()))
+    assert weights["discrepancy"] == pytest.approx(float(found[2:].sum()))
     assert math.isclose(sum(weights.values()), 1.0, rel_tol=1e-9)
     assert list(weights.values()) == sorted(weights.values(), reverse=True)
-    assert "mostly RoPE: the embedding net was tuned on the labels" in str(report)
-    # Two settings of RoPE are candidates, so that the counts agree with each other.
-    assert f"RoPE {weights['RoPE']:.0%} (2 candidates)" in str(report)
-    torn = replace(report, family_weights={"prior": 0.4, "NPE": 0.3, "RoPE": 0.3})
+    assert "mostly discrepancy: NPE of simulations that a linear model" in str(report)
+    assert f"discrepancy {weights['discrepancy']:.0%} (2 candidates)" in str(report)
+    torn = replace(report, family_weights={"prior": 0.4, "NPE": 0.3, "RVNP": 0.3})
     assert "no method has half of the weight: prior 40%" in str(torn)
 
 
@@ -245,7 +243,6 @@ def test_a_parameter_whose_coverage_depends_on_its_estimate_is_named(
     off[high, 1] = ranks[high, 1].round() * 0.98 + 0.01
     scores = replace(scores, ranks=off)
     found = StackingReport.of(scores, parameter_names=("slope", "size"))
-    assert found.by_estimate is not None
     assert found.by_estimate.depends == (False, True)
     low, middle, high_share = found.by_estimate.shares[1].tolist()
     assert high_share == 0.0
@@ -301,14 +298,14 @@ def test_the_text_names_what_calibration_assumes_about_a_batch() -> None:
 
 @pytest.mark.medium
 def test_a_batch_unlike_the_pairs_gives_a_warning() -> None:
-    options = {"candidates": [OT_ONLY, PRIOR]}
+    options = {"candidates": [NPE, PRIOR]}
     corner = observed() + 1.0
     with pytest.warns(RoPEWarning, match="differs from the observations of the cal"):
         report = stacked(rope_of(), corner, **options).report
     assert report.batch is not None
     assert report.batch.is_different
     with warnings.catch_warnings():
-        warnings.filterwarnings("error", message="The batch `x_o` differs")
+        warnings.filterwarnings("error", message="`x_o` differs")
         like = stacked(rope_of(), observed(), **options).report
     assert like.batch is not None
     assert not like.batch.is_different
@@ -348,9 +345,7 @@ def test_a_report_names_pairs_whose_parameters_do_not_follow_the_prior() -> None
 def test_a_stack_that_keeps_the_prior_says_what_holds_for_the_pairs_only() -> None:
     theta = 0.2 * problem(20, seed=1)[0]
     middle = rope_of((theta, problems.simulate(theta) + 0.4))
-    options: dict[str, Any] = {"candidates": [PRIOR, NPE], "num_folds": 3}
-    with pytest.warns(RoPEWarning, match="`recalibrate` makes the stack fit the pairs"):
-        kept = stacked(middle, recalibrate=True, **options).report
+    kept = stacked(middle, candidates=[PRIOR, NPE]).report
     assert not kept.learns_prior
     assert "not distributed like the prior" in str(kept)
     assert "The stack keeps the prior." in str(kept)
@@ -359,10 +354,6 @@ def test_a_stack_that_keeps_the_prior_says_what_holds_for_the_pairs_only() -> No
     mixed = stacked(middle, candidates=[PRIOR, NPE, FITTED]).report
     assert mixed.learns_prior
     assert "The stack has learned where they are." in str(mixed)
-    with warnings.catch_warnings():
-        warnings.filterwarnings("error", message="The parameters of the pairs are not")
-        stacked(rope_of(), recalibrate=True, **options)
-        stacked(middle, **options)
 
 
 def test_a_report_knows_how_it_was_made() -> None:
@@ -375,7 +366,7 @@ def test_a_report_knows_how_it_was_made() -> None:
 
 
 def test_calibration_is_that_of_held_out_pairs() -> None:
-    report = the_coupled_stack().report
+    report = the_stack().report
     levels = report.cross_validation.levels
     assert torch.equal(levels, report.levels)
     assert report.coverage.num_observations == 20
@@ -385,7 +376,7 @@ def test_calibration_is_that_of_held_out_pairs() -> None:
 
 
 def test_rows_are_sorted() -> None:
-    report = the_coupled_stack().report
+    report = the_stack().report
     rows = report.as_rows()
     scores = [row["score"] for row in rows]
     assert scores == sorted(scores, reverse=True)
@@ -472,11 +463,10 @@ def test_recordings_of_a_named_specimen_count_once_whatever_their_labels_are() -
 
 @pytest.mark.medium
 def test_the_learning_curve_has_a_point_for_one_two_and_four_folds() -> None:
-    candidates = [ROPE, OT_ONLY, PRIOR, FITTED]
+    candidates = [NPE, PRIOR, FITTED]
     report, without = (
         stacked(
             rope_of(),
-            observed(),
             candidates=candidates,
             num_folds=5,
             learning_curve=curve,
@@ -574,7 +564,7 @@ def test_a_score_far_below_the_others_is_an_arrow_with_its_number() -> None:
 
 
 def test_printing_a_report_computes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    report = the_coupled_stack().report
+    report = the_stack().report
     state = torch.get_rng_state()
 
     def refuse(*args: object, **kwargs: object) -> None:
@@ -591,7 +581,7 @@ def test_printing_a_report_computes_nothing(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_a_cross_validation_holds_only_numbers_and_names() -> None:
-    held = dict(vars(the_coupled_stack().report.cross_validation))
+    held = dict(vars(the_stack().report.cross_validation))
     held |= vars(held.pop("set_scores"))
     for value in held.values():
         assert isinstance(value, torch.Tensor | tuple | int | float | str) or (

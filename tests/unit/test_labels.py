@@ -26,7 +26,7 @@ from sbi_rope.errors import InvalidInputError, RoPEWarning, SimulationError
 from sbi_rope.metrics import acauc_of, coverage_curve_of, expected_coverage_error_of
 from sbi_rope.simulate import Simulator
 from sbi_rope.stacking import stacking_weights
-from sbi_rope.stacking.label_scores import label_levels
+from sbi_rope.stacking.scoring import label_levels
 from sbi_rope.stacking.workbench import Workbench
 from tests import gaussian
 from tests.stacks import problem, rope_of

@@ -12,8 +12,7 @@ from sbi_rope.metrics.calibration import (
     coverage_curve_of_pairs,
     coverage_error_of_pairs,
 )
-from sbi_rope.stacking.cross_validation import CrossValidation
-from sbi_rope.stacking.learning_curve import LearningCurve
+from sbi_rope.stacking import CrossValidation, LearningCurve
 
 torch.manual_seed(0)
 VALUES = torch.randn(12, dtype=torch.double)
@@ -99,6 +98,8 @@ def test_recordings_with_the_same_parameters_do_not_make_a_report_more_certain()
             num_trained_on=8,
             stack_scores=VALUES.repeat_interleave(times),
             levels=LEVELS.repeat_interleave(times, dim=0),
+            estimates=torch.zeros(12 * times, LEVELS.shape[1]),
+            ranks=LEVELS.repeat_interleave(times, dim=0),
             pair_weights=torch.full((12 * times,), 1 / times) if times > 1 else None,
             groups=groups if times > 1 else None,
         )

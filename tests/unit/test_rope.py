@@ -1,7 +1,6 @@
 """RoPE: the order of its steps, what is used again, and what is refused."""
 
 import copy
-import itertools
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -31,7 +30,6 @@ from sbi_rope.errors import (
 )
 from sbi_rope.metrics import evaluate
 from sbi_rope.stacking import default_candidates
-from sbi_rope.sweep import sweep
 from tests import gaussian, problems
 from tests.stacks import quick
 
@@ -573,39 +571,6 @@ def test_a_seed_does_not_repeat_the_draws_after_the_same_seed_of_torch() -> None
 
     rope(simulator=simulator).build_posterior(X_O, seed=3)
     assert not torch.isin(drawn[-1], theta).any()
-
-
-def test_a_sweep_gives_the_posteriors_of_single_couplings() -> None:
-    conductor = trained()
-    theta = torch.randn(30, 2)
-    gammas, taus = (0.5, 0.1), (1.0, 0.8)
-    swept = list(sweep(conductor, X_O, gammas=gammas, taus=taus, seed=3))
-    settings = itertools.product(gammas, taus)
-    for posterior, (gamma, tau) in zip(swept, settings, strict=True):
-        single = conductor.build_posterior(
-            X_O, coupler=SinkhornCoupler(gamma=gamma, tau=tau), seed=3
-        )
-        assert torch.allclose(posterior.weights, single.weights, atol=1e-5)
-        ours, theirs = (p.log_prob_batched(theta, X_O) for p in (posterior, single))
-        assert torch.allclose(ours, theirs, atol=1e-3)
-    assert not torch.allclose(swept[0].weights, swept[2].weights, atol=1e-3)
-
-
-def test_a_posterior_of_a_sweep_can_be_moved_without_the_others() -> None:
-    conductor = RoPE(problems.npe_posterior(), simulator=problems.simulate)
-    x_o, theta = 0.3 * torch.randn(30, 3), torch.rand(30, 2) - 0.5
-    options: dict[str, Any] = {"num_simulations": 100, "seed": 3}
-    posteriors = sweep(conductor, x_o, gammas=iter((0.5, 0.1)), taus=(1.0,), **options)
-    first = next(posteriors)
-    first.log_prob_batched(theta, x_o)
-    first.to("cpu")
-    second = next(posteriors)
-    # What was moved belongs to the first alone.
-    first._cache[0] = 0.5 * first._cache[0]
-    coupler = SinkhornCoupler(gamma=0.1)
-    expected = conductor.build_posterior(x_o, coupler=coupler, **options)
-    ours, theirs = (p.log_prob_batched(theta, x_o) for p in (second, expected))
-    assert torch.allclose(ours, theirs, atol=1e-3)
 
 
 class ChangesItsArgument(torch.nn.Module):

@@ -24,10 +24,7 @@ from sbi_rope import MixturePosterior, StackedPosterior, load, save
 from sbi_rope.errors import DataNotFoundError, FileFormatError, InvalidInputError
 from sbi_rope.mixture import MixtureEstimator, PriorPosterior, part_of
 from sbi_rope.saving import ROOMS, _found
-from sbi_rope.stacking.trained_candidates import (
-    DiscrepancyCandidate,
-    FinetunedCandidate,
-)
+from sbi_rope.stacking import DiscrepancyCandidate, FinetunedCandidate
 from sbi_rope.tasks.hemodynamics.prior import PopulationPrior
 from sbi_rope.tasks.triangle import UniformTriangle
 from tests import problems, stacks

@@ -317,7 +317,7 @@ def test_scores_of_pairs_are_those_of_stacks_that_have_not_seen_them(
     scores = known.set_scores
     assert scores is not None
     theta, x_cal = stacks.problem(20, seed=1)
-    weights = fold_weights(known.log_scores, known.fold, known.pseudo_count)
+    weights = fold_weights(known.log_scores, known.fold)
     for number in range(known.num_folds):
         rows = known.fold == number
         estimator = stack.versions.estimator(weights[number], [number])
@@ -348,7 +348,7 @@ def test_a_guaranteed_set_is_that_of_counting_the_held_out_scores(
     at_theta = joint_scores(log_prob, rule.draws)
     assert rule.draws.shape == (5, 40)
     known = stack.report.cross_validation
-    weights = fold_weights(known.log_scores, known.fold, known.pseudo_count)
+    weights = fold_weights(known.log_scores, known.fold)
     near = (theta.abs() <= 1).all(dim=1)
     for number in range(5):
         each = stack.versions.log_probs(theta, x.expand(200, -1), [number])
