@@ -355,7 +355,8 @@ class Simulator:
         """Try batches before single parameters, and tensors before arrays.
 
         A simulator that makes something else than a tensor from tensors is given arrays
-        if it takes them, because it was written for these.
+        if it takes them, because it was written for these. One that was written for a
+        single theta may take a batch, and add the same noise to all rows.
         """
         sizes = {*self._prior.event_shape, *self._event_shape}
         # A number of rows that is no number of parameters or of readings.
@@ -373,7 +374,13 @@ class Simulator:
                             # NumPy warns of tensors, which may not be the right way.
                             warnings.simplefilter("ignore")
                             result = way.result(given)
-                        way.fitted(result, given)
+                            x = way.fitted(result, given)
+                            if batched and bool((x == x[0]).all()):
+                                self.num_calls += num_rows
+                                if not torch.equal(way.simulate(given)[0], x):
+                                    raise SimulationError(
+                                        "All rows of a batch have the same noise."
+                                    )
                     except Exception as raised:  # any error of the user's code
                         errors.append(raised)
                         continue

@@ -180,7 +180,7 @@ class FRISBI(Method):
         if self.distilled:
             part = self._distilled(part, g, show_progress_bars=show_progress_bars)
         mixture = MixtureEstimator([part], [1.0]).eval()
-        return MixturePosterior(mixture(self._prior)), history
+        return MixturePosterior(mixture, copy.deepcopy(self._prior)), history
 
     def _simulated(
         self, h: nn.Module, *, show_progress_bars: bool

@@ -40,6 +40,16 @@ RETURNS: dict[str, Callable[[Any], Any]] = {
 }
 
 
+def test_a_simulator_that_draws_noise_for_one_theta_is_called_row_by_row() -> None:
+    """It takes a batch, but all rows would have the same noise."""
+    for draw in (torch.randn, lambda d: np.random.standard_normal(d)):  # noqa: NPY002
+        x = simulator_of(lambda theta: theta + draw(2))(torch.zeros(50, 2))  # noqa: B023
+        assert len(x.unique(dim=0)) == 50
+    calls = []
+    simulator_of(lambda theta: calls.append(theta.ndim) or 2 * theta)(THETA)
+    assert set(calls) == {2}  # what has no noise is called in batches
+
+
 @pytest.mark.parametrize("returns", RETURNS)
 def test_simulators_take_and_return_what_their_authors_prefer(returns: str) -> None:
     for kind, ndim in itertools.product((Tensor, np.ndarray), (1, 2)):

@@ -51,7 +51,7 @@ class Unbounded(nn.Module):
 
     def _set_transform(self, device: torch.device) -> None:
         if hasattr(self.prior, "to"):
-            self.prior.to(device)
+            self.prior.to(device)  # type: ignore[attr-defined]
         with seeded(0):  # sbi draws from the prior to look at it
             self._transform: Any = mcmc_transform(self.prior, device=str(device))
 
@@ -91,7 +91,8 @@ class Unbounded(nn.Module):
             have zeros.
         """
         try:
-            inside = self.prior.support.check(theta)
+            support: Any = self.prior.support
+            inside = support.check(theta)
         except (AttributeError, NotImplementedError):
             inside = torch.ones_like(theta[:, 0], dtype=torch.bool)
         if inside.ndim == 2:
