@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.distributions import Gamma, Independent
 
 from sbi_rope import RoPE
-from sbi_rope._labels.checks import checked_labels
+from sbi_rope._labels import given_labels
 from sbi_rope._labels.nodes import place_nodes, reference_of
 from sbi_rope.baselines import FinetunedNPE
 from sbi_rope.errors import RoPEWarning
@@ -127,7 +127,7 @@ def test_parameters_that_were_not_measured_do_not_stop_fine_tuning() -> None:
 def test_what_labels_leave_possible_is_inside_the_support() -> None:
     theta = labels()
     theta[::3, 0] = torch.nan
-    of_labels = checked_labels(
+    of_labels = given_labels(
         theta,
         theta_std=0.5,
         theta_cov=None,
@@ -135,6 +135,7 @@ def test_what_labels_leave_possible_is_inside_the_support() -> None:
         groups=None,
         like=theta[:0],
         prior=PRIOR,
+        names=None,
     )
     draws = 0.1 + torch.randn(50, 24, 2)
     nodes = place_nodes(of_labels, [reference_of(draws)], PRIOR, num_nodes=40)

@@ -156,13 +156,6 @@ def test_anything_but_a_rope_is_refused() -> None:
             call(problems.npe_posterior("mdn"))  # type: ignore[arg-type]
 
 
-def test_rows_that_are_no_pairs_are_refused() -> None:
-    rope = rope_of()
-    for rows in ([20], [-1], [0.0], 1):
-        with pytest.raises(InvalidInputError, match="rows"):
-            rope.with_pairs(torch.tensor(rows))
-
-
 def test_fewer_stored_simulations_than_pairs_are_enough() -> None:
     theta = problems.box(2).sample((10,))
     rope = rope_of(

@@ -223,7 +223,7 @@ def test_missing_numbers_of_observations_put_the_errors_in_the_embedding() -> No
     method = RVNP.from_posterior(reads_missing, noise_on="input")
     theta = problems.box(2).sample((50,))
     method.append_simulations(theta, problems.simulate(theta)).append_observations(x_o)
-    with pytest.raises(InvalidInputError, match=r"`x_o` without missing.*1 of 120"):
+    with pytest.raises(InvalidInputError, match=r"x_o` to be finite.*1 of 120"):
         method.train(show_progress_bars=False)
 
 

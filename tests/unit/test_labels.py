@@ -277,8 +277,6 @@ def test_the_distribution_is_learned_from_pairs_that_count_several_times() -> No
     assert not torch.allclose(
         found.probabilities, learn_parameters(pairs, theta).probabilities, rtol=0.01
     )
-    with pytest.raises(InvalidInputError, match="positive `weights`"):
-        learn_parameters(pairs, theta, weights=-weights)
 
 
 # Calibration --------------------------------------------------------------------------
@@ -295,7 +293,7 @@ def test_levels_that_are_not_known_are_left_out() -> None:
     assert torch.allclose(curve.per_parameter[:, 49], half)
     assert 0 < expected_coverage_error_of(levels, allow_missing=True).value < 0.5
     for score_of in (acauc_of, coverage_curve_of, expected_coverage_error_of):
-        with pytest.raises(InvalidInputError, match="NaN"):
+        with pytest.raises(InvalidInputError, match="nan"):
             score_of(levels)
 
 

@@ -470,13 +470,6 @@ def with_scores(stack: StackedPosterior, scores: Any) -> StackedPosterior:
     return changed
 
 
-def test_a_stack_of_an_earlier_version_has_to_be_made_again(
-    stack: StackedPosterior, x: Tensor
-) -> None:
-    with pytest.raises(InvalidInputError, match="Make the stack again"):
-        with_scores(stack, None).credible_set(0.9, x, guaranteed=True)
-
-
 def test_of_pairs_with_the_same_parameters_one_counts(x: Tensor) -> None:
     theta, x_cal = stacks.problem(12, seed=1)
     pairs = torch.cat([theta, theta[:8]]), torch.cat([x_cal, x_cal[:8] + 0.1])
