@@ -6,7 +6,7 @@ that both ``except RoPEError`` and, for instance, ``except ValueError`` catch it
 
 import inspect
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -17,14 +17,11 @@ __all__ = [
     "InvalidInputError",
     "LogProbUnavailableError",
     "NotReadyError",
-    "NotWritableError",
     "RoPEError",
     "RoPEWarning",
     "SamplingError",
     "SimulationError",
-    "UnseenObservationError",
     "UnsupportedPosteriorError",
-    "UntrustedError",
     "in_digits",
     "shown",
     "warn_user",
@@ -60,27 +57,11 @@ class SimulationError(RoPEError, RuntimeError):
 
 
 class CouplingError(RoPEError, RuntimeError):
-    """The optimal transport problem could not be solved as asked.
-
-    Attributes:
-        reason: The message, without the rows.
-        simulated_rows: Rows of the simulations that caused the error, if it is known
-            that some did.
-    """
-
-    def __init__(self, reason: str, *, simulated_rows: Sequence[int] = ()) -> None:
-        self.reason, self.simulated_rows = reason, tuple(simulated_rows)
-        if self.simulated_rows:
-            reason += f" Rows of `simulated`: {list(self.simulated_rows[:5])}."
-        super().__init__(reason)
+    """The optimal transport problem could not be solved as asked."""
 
 
 class SamplingError(RoPEError, RuntimeError):
     """Rejection sampling found too little mass inside the prior's support."""
-
-
-class UnseenObservationError(RoPEError, ValueError):
-    """An observation does not belong to the batch the posterior was built for."""
 
 
 class LogProbUnavailableError(RoPEError, NotImplementedError):
@@ -91,16 +72,8 @@ class DataNotFoundError(RoPEError, FileNotFoundError):
     """The files of a data set are not where they were looked for."""
 
 
-class NotWritableError(RoPEError, OSError):
-    """A folder or file for results cannot be written to."""
-
-
 class FileFormatError(RoPEError, ValueError):
     """A file is no saved posterior, is damaged, or is of other versions."""
-
-
-class UntrustedError(RoPEError, ValueError):
-    """A file needs a class or function that is not known to be harmless."""
 
 
 class RoPEWarning(UserWarning):
