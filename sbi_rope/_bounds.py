@@ -9,28 +9,16 @@ The map is
 if parameter j has no bound, the lower bound a, the upper bound b, or both.
 """
 
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 from sbi.utils import within_support
 from torch import Tensor
 from torch.distributions import constraints
-from torch.nn.functional import softplus
 
 from sbi_rope._random import seeded
 
-__all__ = [
-    "Bounds",
-    "bounds_of",
-    "bounds_of_prior",
-    "log_slope",
-    "moved_inside",
-    "off_bounds",
-    "support_of",
-    "to_box",
-    "to_line",
-]
+__all__ = ["bounds_of", "box_of", "moved_inside", "off_bounds", "support_of"]
 
 # Parameters that are nearer to a bound than float32 rounds are taken for on the bound.
 ROUNDING = torch.finfo(torch.float32).eps
@@ -38,44 +26,15 @@ ROUNDING = torch.finfo(torch.float32).eps
 NUM_DRAWS = 256
 
 
-@dataclass(frozen=True, eq=False)
-class Bounds:
-    """The bounds of each parameter.
-
-    Attributes:
-        low: The lower bounds, minus infinity where there is none, shape ``(d,)``.
-        high: The upper bounds, infinity where there is none, shape ``(d,)``.
-        are_all: Whether the support holds everything inside the bounds, so that it is a
-            box.
-    """
-
-    low: Tensor
-    high: Tensor
-    are_all: bool
-
-    def hold(self, theta: Tensor) -> Tensor:
-        """Return whether parameters ``(n, d)`` are inside, and not on a bound.
-
-        Example:
-            >>> bounds = Bounds(torch.zeros(1), torch.ones(1), are_all=True)
-            >>> bounds.hold(torch.tensor([[0.0], [0.5]]))
-            tensor([False,  True])
-        """
-        margin = _margin(self.low, self.high)
-        theta = theta.to(self.low)
-        inside = (theta - self.low > margin) & (self.high - theta > margin)
-        return inside.all(dim=-1)
-
-
-def bounds_of_prior(prior: Any) -> Bounds:
-    """Return the bounds of a prior's support, float64."""
+def box_of(prior: Any) -> tuple[Tensor, Tensor] | None:
+    """Return the bounds of a prior, float64; None if its support is no whole box."""
     with seeded(0):
         theta = prior.sample((NUM_DRAWS,)).double()
     low, high = bounds_of(prior, theta[0])
-    line = to_line(theta, low, high)
+    line = _to_line(theta, low, high)
     wider = 2.0 * line - line.mean(dim=0)
-    inside = within_support(prior, to_box(wider, low, high))
-    return Bounds(low, high, are_all=bool(inside.all()))
+    inside = within_support(prior, _to_box(wider, low, high))
+    return (low, high) if bool(inside.all()) else None
 
 
 def bounds_of(prior: Any, like: Tensor) -> tuple[Tensor, Tensor]:
@@ -174,52 +133,26 @@ def _bounds(support: Any, like: Tensor) -> tuple[Tensor, Tensor]:
     return low, high
 
 
-def to_line(theta: Tensor, low: Tensor, high: Tensor) -> Tensor:
+def _to_line(theta: Tensor, low: Tensor, high: Tensor) -> Tensor:
     r"""Return :math:`\phi(\theta)` of parameters ``(..., d)`` inside the bounds.
 
     Parameters on a bound are taken for some next to it, in a box for those that float32
     can tell from the bound.
-
-    Example:
-        >>> low, high = torch.tensor([0.0, 0.0]), torch.tensor([torch.inf, 1.0])
-        >>> to_line(torch.tensor([1.0, 0.5]), low, high)
-        tensor([0., 0.])
     """
     has_low, has_high = torch.isfinite(low), torch.isfinite(high)
     least = _margin(low, high).clamp_min(torch.finfo(theta.dtype).tiny)
-    # Infinite bounds are replaced first, because gradients go through both branches.
-    above = (theta - low.where(has_low, 0.0)).maximum(least).log()
-    below = (high.where(has_high, 0.0) - theta).maximum(least).log()
-    line = above.where(has_low, 0.0) - below.where(has_high, 0.0)
-    return line.where(has_low | has_high, theta)
+    above = (theta - low).maximum(least).log().where(has_low, 0.0)
+    below = (high - theta).maximum(least).log().where(has_high, 0.0)
+    return (above - below).where(has_low | has_high, theta)
 
 
-def to_box(line: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Return the parameters inside the bounds that :func:`to_line` maps to a line.
-
-    Example:
-        >>> low, high = torch.tensor([0.0, 0.0]), torch.tensor([torch.inf, 1.0])
-        >>> to_box(torch.tensor([0.0, 0.0]), low, high)
-        tensor([1.0000, 0.5000])
-    """
+def _to_box(line: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """Return the parameters inside the bounds that are mapped to a line."""
     has_low, has_high = torch.isfinite(low), torch.isfinite(high)
-    a, b = low.where(has_low, 0.0), high.where(has_high, 0.0)
-    above = a + line.where(has_low & ~has_high, 0.0).exp()
-    below = b - (-line).where(has_high & ~has_low, 0.0).exp()
-    inside = a + (b - a) * line.sigmoid()
-    one_sided = above.where(has_low, below)
+    one_sided = (low + line.exp()).where(has_low, high - (-line).exp())
+    inside = low + (high - low) * line.sigmoid()
     bounded = inside.where(has_low & has_high, one_sided)
     return bounded.where(has_low | has_high, line)
-
-
-def log_slope(line: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    r"""Return :math:`\log |d \theta_j / d \phi_j|` of each parameter, ``(..., d)``."""
-    has_low, has_high = torch.isfinite(low), torch.isfinite(high)
-    width = (high - low).where(has_low & has_high, 1.0)
-    inside = width.log() - softplus(line) - softplus(-line)
-    slope = inside.where(has_high, line)
-    slope = slope.where(has_low, -line)
-    return slope.where(has_low | has_high, 0.0)
 
 
 def _margin(low: Tensor, high: Tensor) -> Tensor:

@@ -1,7 +1,6 @@
-"""Write files completely or not at all, read arrays, and put damaged files aside."""
+"""Write files completely or not at all, and read arrays."""
 
 import contextlib
-import itertools
 import secrets
 import zipfile
 import zlib
@@ -10,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-__all__ = ["read_arrays", "set_aside", "write_atomically"]
+__all__ = ["read_arrays", "write_atomically"]
 
 # What numpy and zipfile raise for a file that is cut off or is no archive of arrays.
 # They raise an AttributeError for a file with a single array.
@@ -51,21 +50,3 @@ def write_atomically(path: Path) -> Iterator[Path]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
-
-
-def set_aside(path: Path) -> Path | None:
-    """Rename a damaged file, so that it is not read again but not lost either.
-
-    Returns:
-        The new path, which is ``<path>.damaged-1`` or the next number that is free, or
-        None if the file is no longer there.
-    """
-    others = (
-        path.with_name(f"{path.name}.damaged-{number}") for number in itertools.count(1)
-    )
-    other = next(other for other in others if not other.exists())
-    try:
-        path.rename(other)
-    except FileNotFoundError:  # another process has renamed it already
-        return None
-    return other

@@ -18,9 +18,6 @@ from sbi_rope.mixture import (
 
 __all__ = ["EmbeddedBatch", "check_converged"]
 
-# The share of the weights that ``log_prob`` may leave out.
-TAIL_MASS = 1e-3
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class EmbeddedBatch:
@@ -73,9 +70,7 @@ class EmbeddedBatch:
         mixing = CoupledEmbeddings(
             self.simulated, self.x_o, net, coupling, unseen=unseen
         )
-        mixture = MixtureEstimator(
-            [Part(self.npe.density(), mixing)], [1.0], tail_mass=TAIL_MASS
-        )
+        mixture = MixtureEstimator([Part(self.npe.density(), mixing)], [1.0])
         posterior = MixturePosterior(
             mixture,
             copy.deepcopy(self.npe.prior),

@@ -218,7 +218,7 @@ class RoPE:
         )
         x_names = self.x_names or column_names(x)
         x = self._npe.as_x("x", x)
-        check_same_length("theta", labels.theta, "x", x)
+        check_same_length(labels.theta, x)
         if self._npe.is_mixed and not labels.are_exact:
             raise UnsupportedPosteriorError(
                 "Expected exact labels, because some parameters are discrete (MNPE); "
@@ -467,7 +467,6 @@ class RoPE:
         rows: Tensor,
         *,
         targets: Tensor | None = None,
-        finetuner: CalibrationFinetuner | None = None,
     ) -> "RoPE":
         """Return an untrained RoPE with the same NPE and simulator and some pairs only.
 
@@ -478,10 +477,8 @@ class RoPE:
             targets: The targets of the tuning for these pairs, shape ``(m, l)``, so
                 that :meth:`train` does not simulate again. Simulated if None, or if the
                 finetuner draws new targets in every step.
-            finetuner: Settings of the tuning; those of this object if None.
         """
         part = copy.copy(self)
-        part.finetuner = self.finetuner if finetuner is None else finetuner
         part._labels, part._parameters = self._labels[rows], self._parameters[rows]
         part._x_cal = self._x_cal[rows]
         part._targets = targets

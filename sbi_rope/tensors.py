@@ -132,12 +132,12 @@ def check_in_support(
         )
 
 
-def check_same_length(name_a: str, a: Tensor, name_b: str, b: Tensor) -> None:
-    """Raise if two batches have different numbers of rows."""
-    if len(a) != len(b):
+def check_same_length(theta: Tensor, x: Tensor) -> None:
+    """Raise if parameters and observations have different numbers of rows."""
+    if len(theta) != len(x):
         raise InvalidInputError(
-            f"Expected `{name_a}` and `{name_b}` to have the same number of rows; got "
-            f"{len(a)} and {len(b)}."
+            "Expected `theta` and `x` to have the same number of rows; got "
+            f"{len(theta)} and {len(x)}."
         )
 
 

@@ -238,16 +238,14 @@ class TableCoupling(Coupling):
         return replace(super().to(device), table=self.table.to(device))
 
 
-def coupling_of(
-    weights: Tensor, simulated: Tensor, *, dtype: torch.dtype = torch.float64
-) -> TableCoupling:
+def coupling_of(weights: Tensor, simulated: Tensor) -> TableCoupling:
     """A coupling with weights chosen by hand; the embedding of x_o is its number."""
-    numbers = torch.arange(len(weights), dtype=dtype, device=weights.device)
+    numbers = torch.arange(len(weights), dtype=torch.double, device=weights.device)
     return TableCoupling(
-        table=weights.to(dtype),
+        table=weights.double(),
         potential=torch.linspace(-1, 1, len(simulated), dtype=torch.float64),
         real=numbers[:, None].repeat(1, simulated.shape[1]),
-        simulated=simulated.to(dtype),
+        simulated=simulated.double(),
         gamma=0.5,
         tau=1.0,
         marginal_error=0.0,
@@ -275,7 +273,6 @@ def gaussian_posterior(
     x_o: Tensor | None = None,
     unseen: Any = "raise",
     tail_mass: float = 0.0,
-    dtype: torch.dtype = torch.float64,
 ) -> MixturePosterior:
     """A mixture of analytic Gaussians with three readings in x_o and a linear g."""
     if embeddings is None:
@@ -289,7 +286,7 @@ def gaussian_posterior(
     estimator = coupled_mixture(
         Gaussians(dim),
         embeddings,
-        coupling_of(weights, embeddings, dtype=dtype),
+        coupling_of(weights, embeddings),
         x_o,
         embedding_net=nn.Linear(x_o[0].numel(), 2 * dim),
         unseen=unseen,

@@ -3,14 +3,13 @@
 from sbi_rope._labels.given import given_labels, on_bounds
 from sbi_rope._labels.labels import Labels
 from sbi_rope._labels.moments import labelled_moments, labelled_targets
-from sbi_rope._labels.nodes import Nodes, Reference, reference_of
+from sbi_rope._labels.nodes import Nodes, reference_of
 from sbi_rope._labels.parameters import LabelledParameters, nodes_of, parameters_of
 
 __all__ = [
     "LabelledParameters",
     "Labels",
     "Nodes",
-    "Reference",
     "given_labels",
     "labelled_moments",
     "labelled_targets",

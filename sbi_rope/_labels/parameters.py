@@ -14,7 +14,7 @@ from sbi_rope._random import seeded
 from sbi_rope.errors import InvalidInputError, warn_user
 from sbi_rope.mixture.prior import prior_log_prob, prior_sample
 
-__all__ = ["LabelledParameters", "nodes_of", "parameters_of", "prior_reference"]
+__all__ = ["LabelledParameters", "nodes_of", "parameters_of"]
 
 # Draws from the prior, for its moments.
 NUM_PRIOR_DRAWS = 5000
@@ -72,7 +72,7 @@ def parameters_of(labels: Labels, prior: Any) -> LabelledParameters:
         return LabelledParameters(draws=_shuffled(labels.samples))
     if labels.are_exact:
         return LabelledParameters(draws=labels.theta[:, None])
-    reference = prior_reference(prior, labels.theta)
+    reference = _prior_reference(prior, labels.theta)
     parts = []
     for number, rows in enumerate(torch.arange(len(labels)).split(CHUNK_SIZE)):
         # Other proposals for each chunk, so that their errors average out.
@@ -100,7 +100,7 @@ def nodes_of(
         log_prior = prior_log_prob(prior, labels.samples).double()
         return Nodes(theta=labels.samples, log_weights=-log_prior)
     n = len(labels)
-    one = prior_reference(prior, labels.theta)
+    one = _prior_reference(prior, labels.theta)
     wide = Reference(
         mean=one.mean.expand(n, -1), covariance=one.covariance.expand(n, -1, -1)
     )
@@ -142,7 +142,7 @@ def _proposals(labels: Labels, wide: Reference, prior: Any) -> tuple[Nodes, Tens
     return nodes, prior_log_prob(prior, nodes.theta).double()
 
 
-def prior_reference(prior: Any, like: Tensor) -> Reference:
+def _prior_reference(prior: Any, like: Tensor) -> Reference:
     """Return the mean and the covariance of the prior, for one label."""
     with seeded(0):
         samples = prior_sample(prior, torch.Size((NUM_PRIOR_DRAWS,))).to(like)

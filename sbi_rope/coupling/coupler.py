@@ -1,33 +1,36 @@
 """Semi-balanced entropic optimal transport, with its settings."""
 
 import math
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from torch import Tensor
 
+from sbi_rope.coupling.cost import Cost, Distances
 from sbi_rope.coupling.fixed_point import Solution, solve_fixed_point
+from sbi_rope.coupling.kernel import Kernel
 from sbi_rope.coupling.pot import solve_pot
-from sbi_rope.coupling.problem import LARGEST_EXPONENT, Problem, median_distance
 from sbi_rope.coupling.result import Coupling
-from sbi_rope.errors import CouplingError, warn_user, without_warning
+from sbi_rope.errors import CouplingError, warn_user
 from sbi_rope.settings import Count, Positive, Settings, UnitInterval
 from sbi_rope.tensors import as_batch
 
-__all__ = ["SMALL_BATCH", "SinkhornCoupler", "without_warning_of_small_batch"]
+__all__ = ["SinkhornCoupler"]
 
 # With fewer observations than this, few of them decide how the coupling is balanced.
 SMALL_BATCH = 20
 # The largest number of distances to store: 0.4 GB in float64, and as much again for the
 # kernel.
 MAX_STORED = 50_000_000
-
-
-def without_warning_of_small_batch() -> AbstractContextManager[None]:
-    """Couple a batch whose size the user did not choose."""
-    return without_warning("Coupling a batch of")
+# The median distance is computed from this many simulations at most.
+MAX_FOR_MEDIAN = 2000
+# If exponents C / gamma are larger than this, rounding hides the differences between
+# them.
+LARGEST_EXPONENT = 1e12
+# If distances / gamma are larger than this, the rounding of a matrix product would show
+# in the weights.
+LARGEST_BY_PRODUCT = 1e3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,78 +112,66 @@ class SinkhornCoupler(Settings):
                 of float64, or with ``cost_scale="simulated"`` the median distance
                 between simulations is zero.
         """
-        # Our own solver needs the distances about once for a single solution.
-        problem, scale = self._set_up(
-            real,
-            simulated,
-            gamma=self.gamma,
-            tau=self.tau,
-            reused=self.solver == "pot",
-        )
-        return self._solve(problem, self.gamma * scale, problem.zero_potential())
-
-    def _set_up(
-        self, real: Tensor, simulated: Tensor, *, gamma: float, tau: float, reused: bool
-    ) -> tuple[Problem, float]:
         simulated = as_batch("simulated", simulated)
         real = as_batch("real", real, simulated.shape[1:], device=simulated.device)
-        n_o = len(real)
-        # With a tau of 0, no observation depends on the others.
-        if n_o < SMALL_BATCH and tau > 0.0:
-            consequence = "these few decide how much weight each simulation gets"
-            if n_o == 1 and tau == 1.0:
-                consequence = "its row is uniform and the posterior is the prior"
-            warn_user(
-                f"Coupling a batch of {n_o} real observation(s), tau={tau}: "
-                f"{consequence}. Use at least {SMALL_BATCH} observations, a smaller "
-                "tau, or the rows of a larger batch (`unseen='extend'`)."
-            )
+        self._warn_of_small_batch(len(real))
         real, simulated = real.double(), simulated.double()
-        blocked = self.solver == "own" and n_o * len(simulated) > MAX_STORED
-        scale = 1.0 if self.cost_scale == "none" else median_distance(simulated)
-        problem = Problem(
-            real,
-            simulated,
-            blocked=blocked,
-            stored=reused and not blocked,
-            smallest_gamma=gamma * scale,
-        )
-        return problem, scale
-
-    def _solve(self, problem: Problem, gamma: float, start: Tensor) -> Coupling:
-        """Solve at this coupler's tau and a gamma in units of the embeddings."""
-        cost = problem.cost
-        smallest = max(cost.bound / LARGEST_EXPONENT, torch.finfo(torch.double).tiny)
+        scaled = self.cost_scale == "simulated"
+        gamma = self.gamma * (_median_distance(simulated) if scaled else 1.0)
+        bound = Distances(simulated).bound(real)
+        if not bound < 0.1 * torch.finfo(torch.double).max ** 0.5:
+            raise CouplingError(
+                f"The distances between embeddings overflow (up to {bound:.0e}); check "
+                "the scale of the embedding net's outputs."
+            )
+        smallest = max(bound / LARGEST_EXPONENT, torch.finfo(torch.double).tiny)
         if gamma < smallest:
             raise CouplingError(
                 f"Expected a gamma of at least {smallest:.1e} in units of the "
                 f"embeddings, so that float64 tells distances apart; got {gamma:.1e}."
             )
-        solution, solver = self._solution(problem, gamma, start)
+        direct = bound > LARGEST_BY_PRODUCT * gamma
+        # Our own solver needs the distances about once.
+        cost = Cost(real, simulated, stored=self.solver == "pot", direct=direct)
+        solution, solver = self._solution(cost, gamma)
         return Coupling(
             potential=solution.potential,
-            real=cost.real,
-            simulated=cost.simulated,
+            real=real,
+            simulated=simulated,
             gamma=gamma,
             tau=self.tau,
             marginal_error=solution.marginal_error,
             num_iterations=solution.num_iterations,
             converged=solution.marginal_error <= self.tolerance,
             solver=solver,
-            direct=problem.direct,
+            direct=direct,
             blocked=math.prod(cost.shape) > MAX_STORED,
         )
 
+    def _warn_of_small_batch(self, n_o: int) -> None:
+        # With a tau of 0, no observation depends on the others.
+        if n_o >= SMALL_BATCH or self.tau == 0.0:
+            return
+        consequence = "these few decide how much weight each simulation gets"
+        if n_o == 1 and self.tau == 1.0:
+            consequence = "its row is uniform and the posterior is the prior"
+        warn_user(
+            f"Coupling a batch of {n_o} real observation(s), tau={self.tau}: "
+            f"{consequence}. Use at least {SMALL_BATCH} observations, a smaller "
+            "tau, or the rows of a larger batch (`unseen='extend'`)."
+        )
+
     def _solution(
-        self, problem: Problem, gamma: float, start: Tensor
+        self, cost: Cost, gamma: float
     ) -> tuple[Solution, Literal["own", "pot", "none"]]:
+        start, made = cost.simulated.new_zeros(cost.shape[1]), 0
         if self.tau == 0.0:
-            return Solution(torch.zeros_like(start), 0.0, 0), "none"
-        kernel = problem.kernel(gamma)
-        made = 0
+            return Solution(start, 0.0, 0), "none"
+        blocked = self.solver == "own" and math.prod(cost.shape) > MAX_STORED
+        kernel = Kernel(cost, gamma, stored=not blocked)
         if self.solver == "pot":
             solution, healthy = solve_pot(
-                problem.cost,
+                cost,
                 gamma,
                 kernel,
                 start,
@@ -200,3 +191,15 @@ class SinkhornCoupler(Settings):
         )
         iterations = made + solution.num_iterations
         return solution._replace(num_iterations=iterations), "own"
+
+
+def _median_distance(simulated: Tensor) -> float:
+    """Return the median distance between the embeddings of simulations."""
+    subset = simulated[:MAX_FOR_MEDIAN]
+    median = torch.nn.functional.pdist(subset).median() if len(subset) > 1 else 0.0
+    if float(median) == 0.0:
+        raise CouplingError(
+            "Expected simulations whose embeddings differ for cost_scale='simulated'; "
+            f"got a median distance of zero between {len(subset)} of them."
+        )
+    return float(median)

@@ -201,9 +201,8 @@ def draw_samples(posterior: Any, x: Tensor, *, num_samples: int) -> Tensor:
         lie outside the prior.
 
     Raises:
-        InvalidInputError: If the posterior cannot be sampled, or returns no tensor.
-        InvalidInputError: If ``x`` is empty or not finite, or ``num_samples`` is not
-            from 1 to 10^8.
+        InvalidInputError: If the posterior cannot be sampled or returns no tensor,
+            ``x`` is empty or not finite, or ``num_samples`` is not from 1 to 10^8.
     """
     check("num_samples", num_samples, Annotated[int, Range(1, MAX_SAMPLES)])
     x = _read_x(posterior, x)

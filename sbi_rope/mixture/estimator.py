@@ -137,9 +137,8 @@ class MixtureEstimator(MixtureDensity):
             t times the largest density among the terms left out.
 
         Raises:
-            InvalidInputError: If the numbers of rows do not fit.
-            InvalidInputError: If an x is not in the batch of a coupled part with
-                ``unseen="raise"``.
+            InvalidInputError: If the numbers of rows do not fit, or an x is not in the
+                batch of a coupled part with ``unseen="raise"``.
         """
         theta, x = self._as_samples(input), self.checked_x(condition)
         num_rows = max(theta.shape[1], len(x))

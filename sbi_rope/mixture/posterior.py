@@ -411,8 +411,8 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             Shape ``(n,)``; minus infinity outside the prior's support.
 
         Raises:
-            InvalidInputError: If shapes do not fit, x is not finite or theta is NaN.
-            InvalidInputError: If x is not in the batch and ``unseen="raise"``.
+            InvalidInputError: If shapes do not fit, x is not finite, theta is NaN, or x
+                is not in the batch and ``unseen="raise"``.
             SamplingError: If the mixture has no mass inside the prior's support.
         """
         theta = self._parameters(theta)
@@ -470,8 +470,8 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             Shape ``(1, B)`` or ``(S, B)``; minus infinity outside the prior's support.
 
         Raises:
-            InvalidInputError: If shapes do not fit or theta is NaN.
-            InvalidInputError: If an x is not in the batch and ``unseen="raise"``.
+            InvalidInputError: If shapes do not fit, x is not finite, theta is NaN, or
+                an x is not in the batch and ``unseen="raise"``.
             SamplingError: If a mixture has no mass inside the prior's support.
         """
         theta = self._parameters(theta, batched=True)

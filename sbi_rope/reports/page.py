@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 __all__ = [
     "definitions",
     "finding",
-    "list_of",
     "number",
     "page",
     "paragraph",
@@ -25,6 +24,7 @@ __all__ = [
     "picture",
     "section",
     "table",
+    "verdict",
     "write_page",
 ]
 
@@ -73,13 +73,13 @@ def paragraph(text: str, *, kind: str = "") -> str:
     return f"<p{_class(kind)}>{_text(text)}</p>"
 
 
-def list_of(texts: Iterable[tuple[str, bool]], *, kind: str = "") -> str:
-    """Return a list of sentences, each with whether it is alarming."""
+def verdict(texts: Iterable[tuple[str, bool]]) -> str:
+    """Return the box of the verdict, of sentences that are alarming or not."""
     lines = [
         f"<li{_class('alarm' if alarming else '')}>{_text(text)}</li>"
         for text, alarming in texts
     ]
-    return "\n".join([f"<div{_class(kind)}>", "<ul>", *lines, "</ul>", "</div>"])
+    return "\n".join(['<div class="verdict">', "<ul>", *lines, "</ul>", "</div>"])
 
 
 def definitions(words: Mapping[str, str]) -> str:

@@ -19,7 +19,6 @@ from sbi_rope.reports.evidence import (
 )
 from sbi_rope.reports.page import (
     definitions,
-    list_of,
     number,
     page,
     paragraph,
@@ -27,6 +26,7 @@ from sbi_rope.reports.page import (
     picture,
     section,
     table,
+    verdict,
     write_page,
 )
 from sbi_rope.reports.verdict import verdict_of
@@ -88,7 +88,7 @@ def write_stacking_report(
         diagnosis = read_for(diagnosis, stack_in_use(report))
     parts = [
         paragraph(_what_was_done(report)),
-        list_of(verdict_of(report, diagnosis, names), kind="verdict"),
+        verdict(verdict_of(report, diagnosis, names)),
         _score_section(report),
         _weight_section(report),
     ]

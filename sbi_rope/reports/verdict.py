@@ -107,7 +107,7 @@ def _compared_batches(
     if report.batch is not None:
         test = report.batch
         found.append(
-            ("The batch that the stack was made for", test.p_value, test.is_different)
+            ("The batch of unlabelled measurements", test.p_value, test.is_different)
         )
     if diagnosis is not None and UNLIKE_PAIRS in diagnosis:
         finding = diagnosis[UNLIKE_PAIRS]

@@ -1,7 +1,7 @@
 """Stacking: candidate posteriors, weighted by their scores on held-out pairs."""
 
 from sbi_rope.stacking.candidates import (
-    AmortisedCandidate,
+    Candidate,
     DensityCandidate,
     DiscrepancyCandidate,
     FinetunedCandidate,
@@ -21,7 +21,7 @@ from sbi_rope.stacking.stack import cross_validate, stack
 from sbi_rope.stacking.weights import StackingWeights, stacking_weights
 
 __all__ = [
-    "AmortisedCandidate",
+    "Candidate",
     "CrossValidation",
     "DensityCandidate",
     "Difference",

@@ -1,7 +1,7 @@
 """The candidates that a stack can be made of, and those that it is made of by default.
 
-A candidate is a class with a name and :meth:`AmortisedCandidate.parts`, which trains on
-the pairs of a fold and returns densities. Nothing else knows its type.
+A candidate is a class with a name and :meth:`Candidate.parts`, which trains on the
+pairs of a fold and returns densities. Nothing else knows its type.
 """
 
 import copy
@@ -36,7 +36,7 @@ from sbi_rope.stacking.workbench import NUM_FOLDS, Fold, Workbench
 from sbi_rope.tensors import as_batch, as_numbers
 
 __all__ = [
-    "AmortisedCandidate",
+    "Candidate",
     "DensityCandidate",
     "DiscrepancyCandidate",
     "FinetunedCandidate",
@@ -48,7 +48,7 @@ __all__ = [
 ]
 
 
-class AmortisedCandidate(ABC):
+class Candidate(ABC):
     """A candidate whose density is defined for any observation.
 
     To implement one, give it a name and define :meth:`parts`. Random numbers that
@@ -79,7 +79,7 @@ class AmortisedCandidate(ABC):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DensityCandidate(Settings, AmortisedCandidate):
+class DensityCandidate(Settings, Candidate):
     """A posterior of your own, trained on calibration pairs or not.
 
     Args:
@@ -162,7 +162,7 @@ def _parts_of(name: str, posterior: Any, rope: RoPE) -> list[Part]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DiscrepancyCandidate(Settings, AmortisedCandidate):
+class DiscrepancyCandidate(Settings, Candidate):
     """NPE trained on corrected simulations, as learned from the pairs.
 
     See :class:`~sbi_rope.discrepancy.DiscrepancyNPE`.
@@ -223,7 +223,7 @@ LEARNING_RATES = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class FinetunedCandidate(Settings, AmortisedCandidate):
+class FinetunedCandidate(Settings, Candidate):
     """NPE, unchanged or corrected, whose parameters are then trained on the pairs.
 
     It is the average of several nets. Each of them holds out another part of the
@@ -296,7 +296,7 @@ MIN_TO_REHEARSE = 100
 
 
 @dataclass(frozen=True, kw_only=True)
-class RehearsedCandidate(AmortisedCandidate):
+class RehearsedCandidate(Candidate):
     r"""NPE whose parameters are trained on the pairs and on simulations alike.
 
     It starts from NPE and minimises what :class:`~sbi_rope.baselines.JointNPE`
@@ -349,7 +349,7 @@ MAX_OBSERVATIONS = 1000
 
 
 @dataclass(frozen=True, eq=False)
-class RVNPCandidate(AmortisedCandidate):
+class RVNPCandidate(Candidate):
     """NPE with an error model that is learned from observations without labels.
 
     See :class:`~sbi_rope.baselines.RVNP`. It is trained once, because it does not see
@@ -422,7 +422,7 @@ def default_candidates(
     x_o: Tensor | None = None,
     *,
     learn_prior: bool = True,
-) -> tuple[AmortisedCandidate, ...]:
+) -> tuple[Candidate, ...]:
     """Return the prior, NPE, fine-tuned NPE, discrepancy models, and RVNP with x_o.
 
     NPE is fine-tuned on the pairs alone, and from discrepancy models, and on pairs and
@@ -457,7 +457,7 @@ def default_candidates(
 
 def suitable_candidates(
     bench: Workbench, x_o: Tensor | None, *, learn_prior: bool = True
-) -> tuple[AmortisedCandidate, ...]:
+) -> tuple[Candidate, ...]:
     """Return the default candidates that the data allow; warn if x_o adds none."""
     chosen = tuple(
         candidate
@@ -472,10 +472,8 @@ def suitable_candidates(
     return chosen
 
 
-def _all_candidates(
-    x_o: Tensor | None, *, learn_prior: bool
-) -> tuple[AmortisedCandidate, ...]:
-    candidates: tuple[AmortisedCandidate, ...] = (
+def _all_candidates(x_o: Tensor | None, *, learn_prior: bool) -> tuple[Candidate, ...]:
+    candidates: tuple[Candidate, ...] = (
         DensityCandidate(name="prior", build=_prior, fixed=True),
         DensityCandidate(name="NPE", build=_npe, fixed=True),
         FinetunedCandidate(),
@@ -508,8 +506,8 @@ def _npe(rope: RoPE, seed: int) -> Any:
 
 
 def checked_candidates(
-    candidates: Sequence[AmortisedCandidate], bench: Workbench
-) -> tuple[AmortisedCandidate, ...]:
+    candidates: Sequence[Candidate], bench: Workbench
+) -> tuple[Candidate, ...]:
     """Return the candidates of a user, if they can be trained on these pairs.
 
     Raises:
@@ -518,7 +516,7 @@ def checked_candidates(
     """
     check("candidates", candidates, Sequence)
     for candidate in candidates:
-        check("candidates[...]", candidate, AmortisedCandidate)
+        check("candidates[...]", candidate, Candidate)
     names = [candidate.name for candidate in candidates]
     if not names or len(set(names)) < len(names) or "stack" in names:
         raise InvalidInputError(

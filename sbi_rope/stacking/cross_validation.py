@@ -237,34 +237,30 @@ class CrossValidation:
         check("name", name, one_of((*self.names, "stack")))
         return self.log_scores[:, self.names.index(name)]
 
-    def difference(self, name: str, other: str, *, seed: int = 0) -> Difference:
+    def difference(self, name: str, other: str) -> Difference:
         """Return by how much one candidate scores higher than another.
 
         Args:
             name: A candidate, or "stack".
             other: Another candidate, or "stack".
-            seed: Seed of the bootstrap over pairs.
 
         Raises:
             InvalidInputError: If there is no candidate of that name.
         """
-        return self._difference(self.scores_of(name) - self.scores_of(other), seed)
+        return self._difference(self.scores_of(name) - self.scores_of(other))
 
-    def gain_over_prior(self, *, seed: int = 0) -> Difference:
+    def gain_over_prior(self) -> Difference:
         """Return by how much the normalised stack scores higher than the prior.
 
         No density of the prior is outside the prior, so that the stack can be compared
         with it as it is. Other candidates are not normalised; see :meth:`difference`.
 
-        Args:
-            seed: Seed of the bootstrap over pairs.
-
         Raises:
             InvalidInputError: If "prior" is not among the candidates.
         """
-        return self._difference(self.stack_scores - self.scores_of("prior"), seed)
+        return self._difference(self.stack_scores - self.scores_of("prior"))
 
-    def _difference(self, difference: Tensor, seed: int) -> Difference:
+    def _difference(self, difference: Tensor) -> Difference:
         # Where both scores are minus infinity, neither candidate is better.
         difference = difference.nan_to_num(nan=0.0, posinf=torch.inf, neginf=-torch.inf)
         mean, low, high = interval_of_mean(difference, self.counts)
@@ -285,7 +281,7 @@ class CrossValidation:
                 n_resamples=NUM_BOOTSTRAP,
                 paired=len(data) > 1,
                 method="percentile",
-                rng=np.random.default_rng(seed),
+                rng=np.random.default_rng(0),
             ).bootstrap_distribution
         # SciPy's own interval interpolates between two means, of which one may be
         # infinite. These quantiles are always one of the means.

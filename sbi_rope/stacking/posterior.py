@@ -97,7 +97,7 @@ class StackedPosterior(MixturePosterior):
             names=self.parameter_names,
         )
         x = self._batch_of_x(x)
-        check_same_length("theta", theta, "x", x)
+        check_same_length(theta, x)
         return self.versions.log_probs(theta, x)
 
     def _held_out_sets(self) -> HeldOutSets:

@@ -19,7 +19,7 @@ from sbi_rope.metrics.calibration import central_levels, count_ranks, random_ran
 from sbi_rope.metrics.calls import draw_chunks, draw_samples
 from sbi_rope.mixture import MixturePosterior
 from sbi_rope.sets.conformal import joint_scores, marginal_scores
-from sbi_rope.stacking.candidates import AmortisedCandidate
+from sbi_rope.stacking.candidates import Candidate
 from sbi_rope.stacking.cross_validation import (
     CrossValidation,
     SetScores,
@@ -95,7 +95,7 @@ class LabelScores:
 def score_versions(
     bench: Workbench,
     versions: Versions,
-    candidates: Sequence[AmortisedCandidate],
+    candidates: Sequence[Candidate],
     *,
     num_training_folds: int,
     seed: int,

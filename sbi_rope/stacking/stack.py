@@ -18,7 +18,7 @@ from sbi_rope.mixture import Part
 from sbi_rope.rope import RoPE
 from sbi_rope.settings import Count, Range, check
 from sbi_rope.stacking.candidates import (
-    AmortisedCandidate,
+    Candidate,
     checked_candidates,
     suitable_candidates,
 )
@@ -39,7 +39,7 @@ def stack(
     rope: RoPE,
     x_o: Tensor | None = None,
     *,
-    candidates: Sequence[AmortisedCandidate] | None = None,
+    candidates: Sequence[Candidate] | None = None,
     num_folds: int | None = None,
     learning_curve: bool = False,
     seed: int | None = None,
@@ -145,7 +145,7 @@ def cross_validate(
     rope: RoPE,
     x_o: Tensor | None = None,
     *,
-    candidates: Sequence[AmortisedCandidate] | None = None,
+    candidates: Sequence[Candidate] | None = None,
     num_folds: int | None = None,
     num_training_folds: int | None = None,
     seed: int | None = None,
@@ -180,7 +180,7 @@ class _Trainer:
         self,
         rope: RoPE,
         x_o: Tensor | None,
-        candidates: Sequence[AmortisedCandidate] | None,
+        candidates: Sequence[Candidate] | None,
         num_folds: int | None,
         seed: int | None,
         *,
@@ -284,7 +284,7 @@ class _Trainer:
         return None
 
 
-def _trained(candidate: AmortisedCandidate, fold: Fold) -> list[Part]:
+def _trained(candidate: Candidate, fold: Fold) -> list[Part]:
     # A candidate that ignores its seed still does not change the caller's random state.
     with seeded(fold.seed):
         parts = list(candidate.parts(fold))

@@ -16,7 +16,7 @@ from sbi_rope.discrepancy.training import ONE_COURSE
 from sbi_rope.metrics import acauc_of
 from sbi_rope.mixture import MixtureEstimator, MixturePosterior, part_of
 from sbi_rope.stacking import (
-    AmortisedCandidate,
+    Candidate,
     CrossValidation,
     DensityCandidate,
     FinetunedCandidate,
@@ -570,7 +570,7 @@ def test_a_cross_validation_is_that_of_the_stack_with_the_same_seed() -> None:
 
 
 def test_a_candidate_that_ignores_its_seed_is_seeded_all_the_same() -> None:
-    class Careless(AmortisedCandidate):
+    class Careless(Candidate):
         name = "careless"
 
         def parts(self, fold: Any) -> Any:

@@ -31,9 +31,6 @@ from tests.stacks import (
 pytestmark = pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
 
 
-ALL = torch.arange(NUM_PAIRS)
-
-
 def targets_of(rope: RoPE, rows: Tensor, *, seed: int | None = 0) -> Tensor:
     h, finetuner = rope.embedding_net, rope.finetuner
     with seeded(seed):
@@ -189,23 +186,7 @@ def test_stored_simulations_can_be_rehearsed() -> None:
     theta = problems.box(2).sample((50,))  # fewer than a simulator would be asked for
     simulations = (theta, problems.simulate(theta))
     rope = rope_of(simulations=simulations).train(seed=0, **QUIET)
-    other = rope.with_pairs(ALL, finetuner=replace(QUICK, rehearsal=1.0))
+    other = rope_of(simulations=simulations, finetuner=replace(QUICK, rehearsal=1.0))
     other.train(seed=0, **QUIET)
     nets = (rope.tuned_embedding_net, other.tuned_embedding_net)
     assert not same(parameters(nets[0]), parameters(nets[1]))
-
-
-def test_another_finetuner_gives_another_net_and_leaves_the_first() -> None:
-    rope = trained()
-    net = rope.tuned_embedding_net
-    other = rope.with_pairs(ALL, finetuner=replace(QUICK, max_num_epochs=3))
-    with pytest.raises(NotReadyError):
-        other.build_posterior(observed())
-    other.train(seed=0, **QUIET)
-    assert same(parameters(rope.tuned_embedding_net), parameters(net))
-    assert rope.finetuner == QUICK
-    expected = rope_of(finetuner=replace(QUICK, max_num_epochs=3)).train(
-        seed=0, **QUIET
-    )
-    nets = (other.tuned_embedding_net, expected.tuned_embedding_net)
-    assert same(parameters(nets[0]), parameters(nets[1]))

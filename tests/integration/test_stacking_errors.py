@@ -15,7 +15,7 @@ from sbi_rope.errors import (
     UnsupportedPosteriorError,
 )
 from sbi_rope.stacking import (
-    AmortisedCandidate,
+    Candidate,
     DensityCandidate,
     DiscrepancyCandidate,
     cross_validate,
@@ -59,8 +59,8 @@ def test_bad_lists_of_candidates_are_refused() -> None:
     bad: list[tuple[Any, str]] = [
         ([], r"got \[\]"),
         ([PRIOR, NPE, twice], "different names"),
-        ([PRIOR, "NPE"], "AmortisedCandidate; got"),
-        ([PRIOR, PriorPosterior(problems.box(2))], "AmortisedCandidate; got"),
+        ([PRIOR, "NPE"], "Candidate; got"),
+        ([PRIOR, PriorPosterior(problems.box(2))], "Candidate; got"),
         (PRIOR, "candidates"),
     ]
     rope = rope_of()
@@ -69,7 +69,7 @@ def test_bad_lists_of_candidates_are_refused() -> None:
             stacked(rope, candidates=candidates)
 
 
-class Own(AmortisedCandidate):
+class Own(Candidate):
     """A candidate of a user that returns nothing."""
 
     def __init__(self, name: str) -> None:

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_rope._bounds import bounds_of_prior
+from sbi_rope._bounds import box_of
 from sbi_rope._random import seeded
 from sbi_rope.errors import InvalidInputError
 
@@ -54,14 +54,14 @@ class ContinuedPrior:
         self._prior = prior
         with seeded(0):
             std = prior.sample(torch.Size((NUM_DRAWS,))).std(dim=0)
-        bounds = bounds_of_prior(prior)
-        if not bounds.are_all:
+        box = box_of(prior)
+        if box is None:
             raise InvalidInputError(
                 f"Expected a prior whose support is a box; got {type(prior).__name__}."
             )
         self.std = std.to(device, torch.float32)
-        self.low = bounds.low.to(self.std) + MARGIN * self.std
-        self.high = bounds.high.to(self.std) - MARGIN * self.std
+        self.low = box[0].to(self.std) + MARGIN * self.std
+        self.high = box[1].to(self.std) - MARGIN * self.std
 
     def nearest(self, theta: Tensor) -> Tensor:
         """Return the nearest points in the box, ``(n, d)``."""
