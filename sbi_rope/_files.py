@@ -1,38 +1,11 @@
-"""Write files completely or not at all, read arrays, and put damaged files aside."""
+"""Write files completely or not at all."""
 
 import contextlib
-import itertools
 import secrets
-import zipfile
-import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-
-__all__ = ["read_arrays", "set_aside", "write_atomically"]
-
-# What numpy and zipfile raise for a file that is cut off or is no archive of arrays.
-# They raise an AttributeError for a file with a single array.
-BROKEN = (
-    *(OSError, ValueError, KeyError, EOFError, AttributeError, NotImplementedError),
-    *(RuntimeError, zipfile.BadZipFile, zlib.error),
-)
-
-
-def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Read all arrays of an npz file. No code that the file may hold is executed.
-
-    Raises:
-        ValueError: If the file is no npz file or is damaged.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except BROKEN as error:
-        raise ValueError(
-            f"expected whole arrays; got {type(error).__name__}: {error}"
-        ) from error
+__all__ = ["write_atomically"]
 
 
 @contextlib.contextmanager
@@ -51,21 +24,3 @@ def write_atomically(path: Path) -> Iterator[Path]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
-
-
-def set_aside(path: Path) -> Path | None:
-    """Rename a damaged file, so that it is not read again but not lost either.
-
-    Returns:
-        The new path, which is ``<path>.damaged-1`` or the next number that is free, or
-        None if the file is no longer there.
-    """
-    others = (
-        path.with_name(f"{path.name}.damaged-{number}") for number in itertools.count(1)
-    )
-    other = next(other for other in others if not other.exists())
-    try:
-        path.rename(other)
-    except FileNotFoundError:  # another process has renamed it already
-        return None
-    return other
