@@ -17,7 +17,7 @@ from torch import Tensor
 
 from benchmarks.cells import Cell
 from benchmarks.presets import PRESETS, Settings
-from benchmarks.store import written_whole
+from sbi_rope._files import write_atomically
 from sbi_rope.baselines import PlainNPE
 from sbi_rope.tasks import Task, get_task
 
@@ -72,7 +72,7 @@ def cached(folder: Path, kind: str, content: Any, compute: Callable[[], Any]) ->
     path = folder / f"{kind}-{hashlib.sha256(text.encode()).hexdigest()[:20]}.pt"
     if not path.exists():
         value = compute()
-        with written_whole(path) as temporary:
+        with write_atomically(path) as temporary:
             torch.save(value, temporary)
     return torch.load(path, weights_only=True)
 

@@ -14,8 +14,9 @@ from matplotlib.figure import Figure
 from benchmarks.cells import Cell, Suite, data_in_words
 from benchmarks.methods import METHODS, STACK
 from benchmarks.published import LETTERS, Published, finished, relative_ranks
-from benchmarks.store import WHERE, Results, written_whole
+from benchmarks.store import WHERE, Results
 from sbi_rope import plots
+from sbi_rope._files import write_atomically
 
 __all__ = ["LPPAxis", "curves", "draw_all", "draw_overview", "rank_figure"]
 
@@ -110,7 +111,7 @@ def _grid(count: int, max_columns: int = MAX_COLUMNS) -> tuple[int, int]:
 
 def _save(figure: Figure, path: Path) -> None:
     """Write a figure without metadata, so that the same table gives the same bytes."""
-    with written_whole(path) as temporary:
+    with write_atomically(path) as temporary:
         figure.savefig(temporary, format="png", dpi=90, metadata={"Software": None})
 
 

@@ -36,7 +36,8 @@ from benchmarks.published import (
     mean,
     num_repetitions,
 )
-from benchmarks.store import WHERE, Results, written_whole
+from benchmarks.store import WHERE, Results
+from sbi_rope._files import write_atomically
 
 __all__ = ["BLOCK", "BLOCKS", "pages_with_blocks", "write_pages"]
 
@@ -79,7 +80,7 @@ def write_pages(published: Published, pages: Sequence[Path]) -> None:
             ),
             text,
         )
-        with written_whole(page) as temporary:
+        with write_atomically(page) as temporary:
             temporary.write_text(new, encoding="utf-8")
 
 

@@ -4,10 +4,8 @@ A folder of results holds a folder for each suite, with `results.csv`, a row for
 cell, and `arrays.npz`, where an array is named by its cell (`KEY/log_probs`).
 """
 
-import os
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,8 +14,9 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.cells import Cell
+from sbi_rope._files import write_atomically
 
-__all__ = ["WHERE", "Result", "Results", "written_whole"]
+__all__ = ["WHERE", "Result", "Results"]
 
 CELL_COLUMNS = [field.name for field in fields(Cell)]
 COLUMNS = [
@@ -45,18 +44,6 @@ class Result(NamedTuple):
 
     row: dict[str, Any]
     arrays: Arrays
-
-
-@contextmanager
-def written_whole(path: Path) -> Iterator[Path]:
-    """Give a path to write to, which takes the place of the file at the end."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{os.getpid()}-{path.name}")
-    try:
-        yield temporary
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 class Results:
@@ -148,7 +135,7 @@ class Results:
         return texts.set_index(_cells_of(texts))
 
     def _write(self, texts: pd.DataFrame) -> None:
-        with written_whole(self.path) as path:
+        with write_atomically(self.path) as path:
             texts.to_csv(path, index=False, lineterminator="\r\n")
 
 
@@ -185,5 +172,5 @@ def _write_arrays(path: Path, arrays: dict[Cell, Arrays]) -> None:
         for cell, parts in arrays.items()
         for name, values in parts.items()
     }
-    with written_whole(path) as temporary, temporary.open("wb") as file:
+    with write_atomically(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, **flat)  # type: ignore[arg-type]

@@ -1,12 +1,15 @@
+<<<<<<< HEAD
 """Write files completely or not at all, and read arrays."""
+=======
+"""Write files completely or not at all."""
+>>>>>>> review-saving
 
 import contextlib
 import secrets
-import zipfile
-import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
+<<<<<<< HEAD
 import numpy as np
 
 __all__ = ["read_arrays", "write_atomically"]
@@ -32,6 +35,9 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         raise ValueError(
             f"expected whole arrays; got {type(error).__name__}: {error}"
         ) from error
+=======
+__all__ = ["write_atomically"]
+>>>>>>> review-saving
 
 
 @contextlib.contextmanager

@@ -5,14 +5,16 @@ classes that derive from one of our bases and are defined in one of a few packag
 a few functions of tensors. None of these imports by name, evaluates text, opens a file
 or unpickles, as for example some networks of ``torch`` do.
 
-Torch calls what is listed with arguments of the file. A class is therefore replaced by
-a shell, which makes empty objects and has no constructor. Only distributions and
-transforms are listed themselves, because zuko calls them.
+Torch calls what is listed with arguments of the file. In the place of a class it
+therefore finds what makes empty objects only. Only distributions and transforms are
+listed themselves, because zuko calls them.
 """
 
 import functools
 import importlib
 import pickle
+import threading
+import zipfile
 from collections.abc import Sequence
 from dataclasses import is_dataclass
 from pathlib import Path
@@ -28,28 +30,29 @@ from torch.distributions.constraints import Constraint
 from torch.serialization import get_unsafe_globals_in_checkpoint, safe_globals
 
 from sbi_rope._files import write_atomically
-from sbi_rope._sbi import (
-    BasePotential,
-    DirectPosterior,
-    NeuralPosterior,
-    VectorFieldPosterior,
-)
+from sbi_rope._sbi import BasePotential, NeuralPosterior
 from sbi_rope.errors import DataNotFoundError, FileFormatError
 from sbi_rope.settings import check
 
 __all__ = ["load", "save"]
 
 LAWS = (Distribution, Transform)
+BASES = (nn.Module, *LAWS, Constraint, NeuralPosterior, BasePotential)
 # Other posteriors of sbi run more code when they are loaded.
-BASES = (
-    *(nn.Module, *LAWS, Constraint),
-    *(DirectPosterior, VectorFieldPosterior, BasePotential),
-)
 ROOMS = (
     *("torch.nn.modules.", "torch.distributions.", "zuko."),
     *("nflows.distributions.", "nflows.flows.", "nflows.nn.", "nflows.transforms."),
-    *("sbi.inference.posteriors.", "sbi.inference.potentials.", "sbi.neural_nets."),
-    *("sbi.samplers.ode_solvers.", "sbi.utils.", "sbi_rope."),
+    "sbi.inference.posteriors.direct_posterior.",
+    "sbi.inference.posteriors.npe_a_posterior.",
+    "sbi.inference.posteriors.vector_field_posterior.",
+    *("sbi.inference.potentials.", "sbi.neural_nets.", "sbi.samplers.ode_solvers."),
+    *("sbi.utils.", "sbi_rope."),
+)
+# Dataclasses of these rooms are results. Others call what they hold, or run programs.
+RESULTS = (
+    *("sbi_rope._two_sample.", "sbi_rope.baselines.", "sbi_rope.coupling."),
+    *("sbi_rope.discrepancy.", "sbi_rope.metrics.", "sbi_rope.stacking."),
+    "sbi_rope.tasks.hemodynamics.prior_table.",
 )
 # Functions of zuko that make transforms, and a class of nflows that holds tensors.
 OTHERS = (
@@ -62,11 +65,14 @@ ACTIVATIONS = (
     *("selu", "silu", "softmax", "softsign", "tanhshrink"),
 )
 # Pickle finds these as attributes: functions of torch, and methods of vector fields.
+# Some other methods write files.
 OF_TORCH = ("exp", "relu", "selu", "sigmoid", "sin", "tanh")
 METHODS = (
     *("ode_fn", "_f_condition_last", "_identity_weight_fn"),
     *("_max_likelihood_weight_fn", "_variance_weight_fn"),
 )
+# Torch has one list of what files may name, for all threads.
+ONE_AT_A_TIME = threading.RLock()
 
 
 def save(posterior: Any, path: str | Path, *, overwrite: bool = False) -> None:
@@ -115,7 +121,8 @@ def load(path: str | Path, *, trusted: Sequence[Any] = ()) -> Any:
     Args:
         path: The file.
         trusted: Your own classes and functions that the posterior needs, such as the
-            class of an embedding net or prior. Their code may run.
+            class of an embedding net or prior. Their code may run. What was passed to
+            ``torch.serialization.add_safe_globals`` is trusted, too.
 
     Returns:
         The posterior. Samples with a seed and densities are those of the posterior that
@@ -134,28 +141,11 @@ def load(path: str | Path, *, trusted: Sequence[Any] = ()) -> Any:
     # What was defined in a notebook or script may have moved to a module since.
     known = {f"__main__.{one.__qualname__}": one for one in trusted}
     known |= {f"{one.__module__}.{one.__qualname__}": one for one in trusted}
-    made: list[tuple[Any, type]] = []
     try:
-        needed = {
-            name: known[name] if name in known else _found(name)
-            for name in get_unsafe_globals_in_checkpoint(path)
-        }
-        if unknown := sorted(name for name in needed if needed[name] is None):
-            names = ", ".join(name.rpartition(".")[2] for name in unknown)
-            raise FileFormatError(
-                f"{path} needs {', '.join(unknown)}, which could run anything. If you "
-                f"trust its author, import it and pass `trusted=[{names}]`."
-            )
-        allowed: list[Any] = [
-            (value if name in known else _shell(value, made), name)
-            for name, value in needed.items()
-        ]
-        with safe_globals(allowed):
-            content = torch.load(path, map_location="cpu", weights_only=True)
-        for instance, kind in made:
-            object.__setattr__(instance, "__class__", kind)
+        content = _content(path, known)
         posterior, versions = content["posterior"], content["versions"]
-        assert isinstance(posterior, NeuralPosterior)
+        if not isinstance(posterior, NeuralPosterior):
+            raise TypeError("it holds no posterior")
     except FileFormatError:
         raise
     except Exception as error:  # a damaged file may lead to any
@@ -171,6 +161,29 @@ def load(path: str | Path, *, trusted: Sequence[Any] = ()) -> Any:
     if torch.device(posterior.potential_fn.device).type != "cpu":
         posterior.to("cpu")  # type: ignore[attr-defined]
     return posterior
+
+
+def _content(path: Path, known: dict[str, Any]) -> Any:
+    with zipfile.ZipFile(path) as archive:
+        if archive.testzip() is not None:  # torch does not compare check sums
+            raise ValueError("a check sum is wrong")
+    with ONE_AT_A_TIME:
+        names = get_unsafe_globals_in_checkpoint(path)
+        needed = {name: known.get(name) or _found(name) for name in names}
+        if unknown := sorted(name for name in names if needed[name] is None):
+            classes = ", ".join(name.rpartition(".")[2] for name in unknown)
+            raise FileFormatError(
+                f"{path} needs {', '.join(unknown)}, which could run anything. If you "
+                f"trust its author, import it and pass `trusted=[{classes}]`."
+            )
+        allowed: list[Any] = []
+        for name, value in needed.items():
+            is_called = name in known or _may_be_called(value)
+            allowed.append((value if is_called else _Maker(value), name))
+            # Torch fills objects only if their class is listed. No file can name this.
+            allowed.append((value, f"{name}\n"))
+        with safe_globals(allowed):
+            return torch.load(path, map_location="cpu", weights_only=True)
 
 
 class _Pickler(pickle.Pickler):
@@ -221,35 +234,23 @@ def _found(name: str) -> Any:
         return None  # a module may use what is harmful, but not define it
     if name in OTHERS:
         return found
-    ours = name.startswith("sbi_rope.")
-    # Some dataclasses of the tasks run programs.
-    is_result = is_dataclass(found) and (
-        not name.startswith("sbi_rope.tasks.") or ".prior_table." in name
-    )
-    bases = (*BASES, NeuralPosterior) if ours else BASES
-    is_known = isinstance(found, type) and issubclass(found, bases)
-    return found if is_known or (ours and is_result) else None
+    is_result = name.startswith(RESULTS) and is_dataclass(found)
+    is_known = isinstance(found, type) and (is_result or issubclass(found, BASES))
+    return found if is_known else None
 
 
-def _shell(kind: Any, made: list[tuple[Any, type]]) -> Any:
-    """Return a class whose objects are empty, to become objects of another class.
+def _may_be_called(value: Any) -> bool:
+    if not isinstance(value, type) or value in LISTED.values():
+        return True
+    return issubclass(value, LAWS) and value.__module__.startswith(("torch.", "zuko."))
 
-    Args:
-        kind: The other class. Its constructor is not called. Functions, and classes
-            that zuko calls, are returned as they are.
-        made: Where objects are kept, with the class that they shall have.
-    """
-    if not isinstance(kind, type) or kind in LISTED.values():
-        return kind
-    if issubclass(kind, LAWS) and kind.__module__.startswith(("torch.", "zuko.")):
-        return kind
 
-    def new(shell: type) -> Any:
-        made.append((object.__new__(shell), kind))
-        return made[-1][0]
+class _Maker:
+    """Makes empty objects of a class, and cannot be called as its constructor can."""
 
-    members = {"__slots__": (), "__new__": new, "__init__": lambda _: None}
-    return type.__call__(type(kind), kind.__name__, (kind,), members)
+    def __init__(self, kind: type) -> None:
+        # Torch calls what it takes for the `__new__` of a class.
+        vars(self)["__new__"] = lambda _: object.__new__(kind)
 
 
 def _versions() -> dict[str, str]:

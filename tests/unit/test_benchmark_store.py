@@ -13,7 +13,8 @@ from sbi.inference.posteriors import DirectPosterior
 from benchmarks.cases import cached, posterior_with, state_of
 from benchmarks.cells import Cell
 from benchmarks.presets import PRESETS
-from benchmarks.store import Result, Results, written_whole
+from benchmarks.store import Result, Results
+from sbi_rope._files import write_atomically
 from sbi_rope._sbi import embedding_of
 from sbi_rope.tasks import get_task
 from tests.results import result_of
@@ -38,7 +39,7 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path) -> None:
     path.write_text("old")
 
     def interrupted() -> None:
-        with written_whole(path) as temporary:
+        with write_atomically(path) as temporary:
             temporary.write_text("ne")
             raise KeyboardInterrupt
 

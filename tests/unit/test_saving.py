@@ -9,6 +9,7 @@ import pkgutil
 import subprocess
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -346,10 +347,12 @@ def test_calls_in_a_file_are_refused(value: Calls, tmp_path: Path) -> None:
         "sbi_rope.saving.load",
         "sbi_rope.saving.importlib.import_module",
         "sbi_rope.saving.pickle.loads",
-        "sbi_rope.saving._shell",
+        "sbi_rope.saving._Maker",
+        "sbi_rope.simulate.ParallelSimulator",
         "sbi_rope.saving._Pickler",
         "sbi_rope.rope.RoPE",
         "sbi_rope.tasks.hemodynamics.openbf.OpenBFCase",
+        "sbi_rope.trainers.training.FINETUNING",
         "sbi_rope.nowhere.Net",
         "zuko.nn.nowhere",
     ],
@@ -367,15 +370,16 @@ def test_classes_that_run_code_when_loaded_are_the_ones_that_were_read() -> None
     for room in ROOMS:
         package = importlib.import_module(room.rstrip("."))
         paths = getattr(package, "__path__", ())
-        for info in pkgutil.walk_packages(paths, room):
-            if info.name.endswith("__main__"):
+        inside = [info.name for info in pkgutil.walk_packages(paths, room)]
+        for name in [room.rstrip("."), *inside]:
+            if name.endswith("__main__"):
                 continue
             try:
-                members = vars(importlib.import_module(info.name)).values()
+                members = vars(importlib.import_module(name)).values()
             except ImportError:  # of what is not installed
                 continue
             kinds = [kind for kind in members if inspect.isclass(kind)]
-            known |= {k for k in kinds if _found(f"{info.name}.{k.__name__}") is k}
+            known |= {k for k in kinds if _found(f"{name}.{k.__name__}") is k}
     assert len(known) > 200
     owners = {
         owner
@@ -457,8 +461,10 @@ def test_damaged_and_foreign_files_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "x.pt"
     PriorPosterior(problems.box(2)).save(path)
     whole = path.read_bytes()
-    place = whole.index(b"NeuralPosterior") if b"NeuralPosterior" in whole else 400
-    flipped = whole[:place] + bytes([whole[place] ^ 255]) + whole[place + 1 :]
+    number = torch.ones(2).numpy().tobytes()  # the upper bound of the prior
+    flipped = whole.replace(number, torch.tensor([1.0, 2.0]).numpy().tobytes())
+    assert len(flipped) == len(whole)
+    assert flipped != whole
     for damaged in (b"", b"text", whole[:-20], whole[:200], flipped):
         path.write_bytes(damaged)
         with pytest.raises(FileFormatError):
@@ -467,6 +473,18 @@ def test_damaged_and_foreign_files_are_refused(tmp_path: Path) -> None:
         torch.save(foreign, path)
         with pytest.raises(FileFormatError):
             load(path)
+
+
+def test_threads_load_at_the_same_time(tmp_path: Path) -> None:
+    priors = {"box": problems.box(2), "law": Independent(Exponential(torch.ones(2)), 1)}
+    for name, prior in priors.items():
+        save(PriorPosterior(prior), tmp_path / name)
+    names = [*priors] * 20
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda name: load(tmp_path / name), names))
+    assert all(type(posterior) is PriorPosterior for posterior in found)
+    kinds = [type(priors[name]) for name in names]
+    assert [type(posterior.prior) for posterior in found] == kinds
 
 
 def test_files_of_other_versions_are_refused(

@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from sbi_rope._files import read_arrays
 from sbi_rope.errors import SimulationError
 from sbi_rope.tasks.hemodynamics.dataset import COLUMNS
 from sbi_rope.tasks.hemodynamics.population import NUISANCES, Population, Process
-from sbi_rope.tasks.hemodynamics.store import write_arrays
+from sbi_rope.tasks.hemodynamics.store import read_arrays, write_arrays
 from sbi_rope.tasks.hemodynamics.subject import Beat, Physics, Subject
 
 __all__ = ["Simulate", "Work", "read_part", "run_chunk"]

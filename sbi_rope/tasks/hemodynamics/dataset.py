@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sbi_rope._files import read_arrays
 from sbi_rope.errors import DataNotFoundError, InvalidInputError
 from sbi_rope.tasks.hemodynamics.population import NUISANCES, Process
+from sbi_rope.tasks.hemodynamics.store import read_arrays
 
 __all__ = ["COLUMNS", "FORMAT_VERSION", "BeatSet", "load"]
 
