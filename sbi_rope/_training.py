@@ -2,8 +2,9 @@
 
 import copy
 import math
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -12,7 +13,7 @@ from torch import Tensor, nn
 
 from sbi_rope._groups import MIN_PAIRS_FOR_HOLDOUT, too_few_pairs
 from sbi_rope._progress import progress_bar
-from sbi_rope.errors import warn_user, without_warning
+from sbi_rope.errors import RoPEWarning, warn_user
 
 __all__ = [
     "EPOCHS_WITHOUT_HOLDOUT",
@@ -90,9 +91,12 @@ def epochs_on_pairs(
     return min(max_num_epochs, EPOCHS_WITHOUT_HOLDOUT)
 
 
-def without_warning_of_few_pairs() -> AbstractContextManager[None]:
+@contextmanager
+def without_warning_of_few_pairs() -> Iterator[None]:
     """Train on some of the user's pairs, whose number the user did not choose."""
-    return without_warning("Only .* none is held out")
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Only .* none is held out", RoPEWarning)
+        yield
 
 
 def shuffled(

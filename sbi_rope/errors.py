@@ -6,8 +6,6 @@ that both ``except RoPEError`` and, for instance, ``except ValueError`` catch it
 
 import inspect
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 __all__ = [
@@ -111,15 +109,3 @@ def warn_user(message: str) -> None:
             break
         level, frame = level + 1, frame.f_back
     warnings.warn(message, RoPEWarning, stacklevel=level)
-
-
-@contextmanager
-def without_warning(message: str) -> Iterator[None]:
-    """Silence a :class:`RoPEWarning` about something that the user did not choose.
-
-    Args:
-        message: A regular expression for the start of the warning.
-    """
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=message, category=RoPEWarning)
-        yield
