@@ -89,8 +89,8 @@ class RoPE:
         finetuner: Settings of step 1; ``CalibrationFinetuner()`` if None.
         coupler: Settings of step 2; ``SinkhornCoupler()`` if None.
         parameter_names: One name for each parameter, for reports and intervals. If
-            None, the columns of a table of parameters in ``simulations``, or "theta_1"
-            and so on. Tables of parameters are put into the order of these names.
+            None, the columns of the first table of parameters, or "theta_1" and so on.
+            Tables of parameters are put into the order of these names.
 
     Raises:
         UnsupportedPosteriorError: If the posterior has no embedding to work with, or
@@ -178,7 +178,8 @@ class RoPE:
 
         Tensors, arrays, tables and lists of numbers are taken here and wherever
         parameters and observations of a user are passed. A table whose columns have the
-        names that RoPE knows is put into their order.
+        names that RoPE knows is put into their order. The rows of theta and x are
+        paired as they stand, whatever their labels are.
 
         Args:
             theta: Parameters, shape ``(n, d)``, inside the prior's support. NaN stands
@@ -206,6 +207,7 @@ class RoPE:
             UnsupportedPosteriorError: If labels are not exact and some parameters are
                 discrete.
         """
+        names = self.parameter_names or column_names(theta)
         labels = given_labels(
             theta,
             theta_std=theta_std,
@@ -214,7 +216,7 @@ class RoPE:
             groups=groups,
             like=self._npe.like,
             prior=self._npe.prior,
-            names=self.parameter_names,
+            names=names,
         )
         x_names = self.x_names or column_names(x)
         x = self._npe.as_x("x", x)
@@ -245,14 +247,14 @@ class RoPE:
                 f"The weights of {len(labels)} pairs sum to {total:.3g}, and all "
                 "together count as so many pairs; do not normalise them."
             )
-        if found := on_bounds(labels, self._npe.prior, self.parameter_names):
+        if found := on_bounds(labels, self._npe.prior, names):
             warn_user(
                 f"{', '.join(found)} lie exactly on the prior's bound; if they are "
                 "censored, pass theta_std."
             )
         self._parameters = parameters
         self._labels, self._x_cal = labels, torch.cat([self._x_cal, x])
-        self._npe.x_names = x_names
+        self._npe.parameter_names, self._npe.x_names = names, x_names
         self._g, self._history, self._targets = None, None, None
         return self
 

@@ -109,8 +109,9 @@ def as_array(value: Any) -> np.ndarray:
 
 
 def column_names(value: Any) -> tuple[str, ...] | None:
-    """Return the names of the columns of a table; None if they have none."""
-    names = tuple(getattr(value, "columns", ()))
+    """Return the names of the columns of a table or of one of its rows, or None."""
+    found = getattr(value, "columns", getattr(value, "index", ()))
+    names = () if callable(found) else tuple(found)  # lists have a method `index`
     are_names = all(isinstance(name, str) for name in names)
     return names if names and are_names and len(set(names)) == len(names) else None
 

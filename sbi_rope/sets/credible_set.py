@@ -42,6 +42,7 @@ class CredibleSet:
         draws: The parameters that the volume was estimated from, shape ``(m, d)``.
         inside: Which of the draws are in the set, shape ``(m,)``.
         rule: What tells which parameters are in the set.
+        parameter_names: One name for each parameter; None if they have none.
     """
 
     level: float
@@ -52,6 +53,7 @@ class CredibleSet:
     draws: Tensor = field(repr=False)
     inside: Tensor = field(repr=False)
     rule: Rule = field(repr=False)
+    parameter_names: tuple[str, ...] | None = None
 
     @classmethod
     def of(
@@ -105,7 +107,7 @@ class CredibleSet:
         Raises:
             InvalidInputError: If theta has another shape, or is not finite.
         """
-        theta = as_numbers("theta", theta)
+        theta = as_numbers("theta", theta, names=self.parameter_names)
         shape = theta.shape[:-1]
         rows = theta[None] if theta.ndim < 2 else theta.flatten(0, -2)
         rows = as_batch("theta", rows, self.draws.shape[1:]).to(self.draws)

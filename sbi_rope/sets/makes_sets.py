@@ -77,14 +77,16 @@ class MakesSets(ABC):
         with seeded(seed):
             x = self._one_x(x)
             if guaranteed:
-                return self._held_out_sets().credible_set(level, x, num_samples)
-            return highest_density_set(
-                self,
-                x,
-                level=level,
-                num_samples=num_samples,
-                log_unit=log_unit_of(self.prior),
-            )
+                found = self._held_out_sets().credible_set(level, x, num_samples)
+            else:
+                found = highest_density_set(
+                    self,
+                    x,
+                    level=level,
+                    num_samples=num_samples,
+                    log_unit=log_unit_of(self.prior),
+                )
+        return replace(found, parameter_names=self.parameter_names)
 
     def credible_intervals(
         self,

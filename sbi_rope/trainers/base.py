@@ -118,6 +118,7 @@ class Method(ABC):
         assert method._npe is not None
         method._npe.replace_by(posterior)
         method._data.event_shape = estimator.condition_shape
+        method._data.theta_names = getattr(posterior, "parameter_names", None)
         method._data.x_names = getattr(posterior, "x_names", None)
         method._data.embedding_net = copy.deepcopy(embedding_of(estimator))
         return method
@@ -211,6 +212,7 @@ class Method(ABC):
             )
         posterior = copy.deepcopy(self._posterior)
         if hasattr(posterior, "x_names"):  # those of sbi read no tables
+            posterior.parameter_names = self._data.theta_names
             posterior.x_names = self._data.x_names
         return posterior
 

@@ -147,6 +147,7 @@ class FinetunedNPE(Method):
         first = posterior_from(posterior, starts[0])
         method = super().from_posterior(first, **options)
         method._starts = copy.deepcopy(starts)
+        method._data.theta_names = getattr(posterior, "parameter_names", None)
         method._data.x_names = getattr(posterior, "x_names", None)
         return method
 

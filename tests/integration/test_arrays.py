@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from sbi_rope import RoPE, diagnose
+from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.metrics import draw_samples, evaluate
 from sbi_rope.trainers import FinetunedNPE
@@ -113,6 +114,40 @@ def test_tables_are_those_of_tensors() -> None:
         assert torch.equal(ours, theirs)
     found, wanted = (one.source.kept(20, progress=False)[1] for one in (rope, expected))
     assert torch.equal(found, wanted)
+
+
+@pytest.mark.medium
+def test_a_table_is_put_in_the_order_of_the_first_one() -> None:
+    def table(numbers: Tensor, names: str) -> Any:
+        return pd.DataFrame(numbers.numpy(), columns=list(names))
+
+    theta, x = gaussian.labelled(12)
+    first, x_first = table(theta, "ab"), table(x, "cd")
+    second, x_second = first[["b", "a"]], x_first[["d", "c"]]
+    rope = RoPE(gaussian.posterior(), simulator=gaussian.simulator, finetuner=QUICK)
+    noise = first.assign(a=0.1, b=0.2)[["b", "a"]]
+    rope.append_calibration(first, x_first, theta_std=noise)
+    rope.append_calibration(second, x_second, theta_std=noise.iloc[0])
+    assert torch.equal(rope.labels.theta, torch.cat([theta, theta]))
+    assert torch.equal(rope.calibration[1], torch.cat([x, x]))
+    variance = rope.labels.covariance.diagonal(dim1=1, dim2=2)
+    assert torch.allclose(variance.sqrt().float(), torch.tensor([0.1, 0.2]))
+    method = DiscrepancyNPE.from_posterior(
+        gaussian.posterior(), simulator=gaussian.simulator, space="tuned", num_steps=2
+    )
+    method.append_calibration(first, x_first).train(seed=0, **QUIET)
+    tuned = method.build_posterior()
+    again = FinetunedNPE.from_posterior(tuned, training=Training(max_num_epochs=1))
+    again.append_calibration(second, x_second).train(seed=0, **QUIET)
+    stack = stacked(rope, candidates=[PRIOR, NPE], num_folds=2)
+    for posterior in (tuned, again.build_posterior(), stack):
+        expected = posterior.log_prob_batched(theta, x)
+        assert torch.equal(posterior.log_prob_batched(second, x_second), expected)
+        found = posterior.log_prob(second, x_second.iloc[0])  # a row is a series
+        assert torch.equal(found, posterior.log_prob(theta, x[0]))
+        found_set = posterior.credible_set(0.5, x_second.iloc[0], seed=0)
+        drawn = table(found_set.draws, "ab")[["b", "a"]]
+        assert torch.equal(found_set.contains(drawn), found_set.inside)
 
 
 def test_what_an_array_masks_is_missing() -> None:
