@@ -259,7 +259,9 @@ def tolerance(quantity: str, runs: dict[str, dict[str, Numbers]]) -> float:
     kind = quantity.split(" of ")[0]
     differences = [
         first[name] - second[name]
-        for first, second in (list(by_seed.values())[:2] for by_seed in runs.values())
+        for first, second in (
+            list(by_seed.values()) for by_seed in runs.values() if len(by_seed) == 2
+        )
         for name in first.keys() & second.keys()
         if name.split(" of ")[0] == kind
     ]
