@@ -13,13 +13,13 @@ import pytest
 ROOT = Path(__file__).parents[1]
 # The most lines of all files of a kind in a folder, docstrings included.
 BUDGETS = {
-    "sbi_rope/*.py": 39_500,
-    "tests/*.py": 33_000,
-    "benchmarks/*.py": 6_600,
-    "docs/*.md": 4_437,
+    "sbi_rope/*.py": 36_000,
+    "tests/*.py": 29_000,
+    "benchmarks/*.py": 4_000,
+    "docs/*.md": 4_000,
 }
 # Checks live at the boundary: in settings, tensors, and where a posterior is split.
-MOST_CHECKS, CHECKS = 60, ("check", "warn", "refuse")
+MOST_CHECKS, CHECKS = 25, ("check", "warn", "refuse")
 
 
 def lines_of(place: str) -> int:
