@@ -2,9 +2,9 @@
 
     python -m tests.test_goldens    # writes tests/data/goldens.json
 
-Numbers of trained networks are recorded with several seeds. They agree if they differ
-by at most two standard errors of a difference of two runs, whose variance is pooled
-over problems, and by the tolerance below where that is larger.
+Numbers of trained networks are recorded with two seeds, of four problems with one. They
+agree if they differ by at most two standard errors of a difference of two runs, whose
+variance is pooled over problems, and by the floor below where that is larger.
 """
 
 import contextlib
