@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from sbi_rope._training import History
 from sbi_rope.baselines import (
     FMCPE,
     FRISBI,
@@ -30,6 +29,7 @@ from sbi_rope.baselines import (
 )
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.discrepancy.correction import Space
+from sbi_rope.fit import History
 
 if TYPE_CHECKING:
     from benchmarks.cases import Case

@@ -45,8 +45,9 @@ exclude_patterns = ["_build", "**/sbi-logs"]
 nitpicky = True
 OTHERS = r"(abc|collections|os|pathlib|sbi|torch)\..*|Figure|DirectPosterior"
 # What signatures name and users never make themselves.
-UNDOCUMENTED = "PosteriorInUse|Rule|StartingNPE|Term|Versions"
-INSIDE = rf"sbi_rope\.(_.*|.*\.({UNDOCUMENTED})|(simulate|tasks)\..*)"
+UNDOCUMENTED = "Found|PosteriorInUse|Rule|StartingNPE|Term|Versions"
+ROOMS = "data|ensemble|labels|moments|simulate|tasks"
+INSIDE = rf"sbi_rope\.(_.*|.*\.({UNDOCUMENTED})|({ROOMS})\..*)"
 nitpick_ignore_regex = [("py:.*", f"{OTHERS}|{INSIDE}")]
 
 myst_enable_extensions = ["dollarmath", "colon_fence"]

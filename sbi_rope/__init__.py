@@ -1,9 +1,9 @@
 """Robust posterior estimation for misspecified simulators, on top of sbi."""
 
 from sbi_rope.coupling import Coupling, SinkhornCoupler
+from sbi_rope.density import MixturePosterior
 from sbi_rope.diagnosis import Diagnosis, diagnose
 from sbi_rope.finetuning import CalibrationFinetuner
-from sbi_rope.mixture import MixturePosterior
 from sbi_rope.rope import RoPE
 from sbi_rope.saving import load, save
 from sbi_rope.simulate import parallel

@@ -1,13 +1,12 @@
 """Weighted means over calibration pairs, with their errors and intervals."""
 
-from dataclasses import dataclass
-
 import torch
 from scipy.stats import t as student
 from torch import Tensor
 
+from sbi_rope.data import Counts
+
 __all__ = [
-    "Counts",
     "counts_of",
     "interval_of_mean",
     "mean_and_error",
@@ -15,58 +14,6 @@ __all__ = [
     "means_of_pairs",
     "standard_error_of_mean",
 ]
-
-
-@dataclass(frozen=True, eq=False)
-class Counts:
-    """How many pairs each pair counts as, and which of them belong together.
-
-    Attributes:
-        weights: How many pairs each counts as, shape ``(n,)``.
-        groups: A number for each pair, shape ``(n,)``. Pairs with the same number are
-            not independent, so that errors are those of means of groups. None if all
-            pairs are independent.
-    """
-
-    weights: Tensor
-    groups: Tensor | None = None
-
-    def __getitem__(self, rows: Tensor) -> "Counts":
-        groups = None if self.groups is None else self.groups[rows]
-        return Counts(self.weights[rows], groups)
-
-    def of_groups(self, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the weighted mean of each group, and the weight of the group.
-
-        Args:
-            values: A number or vector for each pair, shape ``(n, ...)``.
-
-        Returns:
-            Shapes ``(G, ...)`` and ``(G,)``.
-
-        Example:
-            >>> import torch
-            >>> counts = Counts(torch.tensor([0.5, 0.5, 1.0]), torch.tensor([0, 0, 1]))
-            >>> counts.of_groups(torch.tensor([1.0, 3.0, 5.0]))
-            (tensor([2., 5.]), tensor([1., 1.]))
-        """
-        weights = self.weights.to(values)
-        if self.groups is None:
-            return values, weights
-        numbers, place = self.groups.to(values.device).unique(return_inverse=True)
-        if len(numbers) == len(values):
-            return values, weights
-        total = weights.new_zeros(len(numbers)).index_add(0, place, weights)
-        shares = weights / total[place]
-        shares = shares.reshape(-1, *[1] * (values.ndim - 1))
-        sums = values.new_zeros(len(numbers), *values.shape[1:])
-        return sums.index_add(0, place, shares * values), total
-
-    @property
-    def effective_number(self) -> float:
-        """The number of independent pairs of equal weight with the same precision."""
-        _, weights = self.of_groups(self.weights.double())
-        return float(weights.sum().square() / weights.square().sum())
 
 
 def counts_of(weights: Tensor | None, groups: Tensor | None) -> Counts | None:

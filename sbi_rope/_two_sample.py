@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sbi_rope._groups import one_of_each_group
 from sbi_rope._random import seeded
+from sbi_rope.data import one_of_each_group
 
 __all__ = ["LEVEL", "TwoSampleTest", "compare_with_pairs", "two_sample_test"]
 

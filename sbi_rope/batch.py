@@ -8,13 +8,8 @@ from torch import Tensor, nn
 
 from sbi_rope._npe import TrainedNPE
 from sbi_rope.coupling import Coupling, SinkhornCoupler
+from sbi_rope.density import Coupled, MixturePosterior
 from sbi_rope.errors import CouplingError
-from sbi_rope.mixture import (
-    CoupledEmbeddings,
-    MixtureEstimator,
-    MixturePosterior,
-    Part,
-)
 
 __all__ = ["EmbeddedBatch", "check_converged"]
 
@@ -67,12 +62,11 @@ class EmbeddedBatch:
         # Each posterior has copies of its own of net and density. Moving one to another
         # device then leaves the others where they are.
         net = copy.deepcopy(self.embedding_net)
-        mixing = CoupledEmbeddings(
-            self.simulated, self.x_o, net, coupling, unseen=unseen
+        density = Coupled(
+            self.npe.density(), self.simulated, self.x_o, net, coupling, unseen=unseen
         )
-        mixture = MixtureEstimator([Part(self.npe.density(), mixing)], [1.0])
         posterior = MixturePosterior(
-            mixture,
+            density,
             copy.deepcopy(self.npe.prior),
             enable_transform=self.npe.enable_transform,
         )

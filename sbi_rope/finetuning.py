@@ -2,19 +2,23 @@
 
 import copy
 import itertools
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._groups import split_pairs
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed
-from sbi_rope._training import History, best_of_learning_rates, epochs_on_pairs, fit
-from sbi_rope.errors import InvalidInputError
+from sbi_rope.data import split_pairs
+from sbi_rope.density.flow import Flow
+from sbi_rope.ensemble import Ensemble, embedded
+from sbi_rope.errors import InvalidInputError, warn_user
+from sbi_rope.fit import History, Training, epochs_on_pairs, fit
+from sbi_rope.labels import Nodes
 from sbi_rope.settings import Count, NotNegative, Positive, Range, Settings, check
 from sbi_rope.tensors import as_batch, rows_with
 
@@ -157,42 +161,127 @@ class CalibrationFinetuner(Settings):
             weights = as_batch("weights", weights, (), rows=len(x)).to(x)
         show = is_shown(show_progress_bars)
         with seeded(seed):
-            embedded = _embedded("x", x, embedding_net)
+            z = _embedded("x", x, embedding_net)
 
             def new_targets() -> Tensor:
                 targets = draw_targets(self.simulations_per_target)
-                width = embedded.shape[1:]
-                return as_batch("targets", targets, width, rows=len(x))
+                return as_batch("targets", targets, z.shape[1:], rows=len(x))
 
-            targets = new_targets()
-            keep = self._rehearsed(embedding_net, draw_simulations)
-            train, held_out = split_pairs(groups, self.validation_fraction)
-            max_num_epochs = epochs_on_pairs(groups, held_out, self.max_num_epochs)
-
-            def tuned(learning_rate: float) -> tuple[nn.Module, History]:
-                return self._optimise(
-                    trainable_copy(embedding_net, targets),
-                    x,
-                    targets,
-                    train.to(x.device),
-                    held_out.to(x.device),
-                    weights=weights,
-                    learning_rate=learning_rate,
-                    max_num_epochs=max_num_epochs,
-                    keep=keep,
-                    draw_targets=new_targets if self.resample_targets else None,
-                    show_progress_bars=show,
-                )
-
-            # The careful rate for a net, the larger for an affine map.
-            is_net = any(True for _ in embedding_net.parameters())
-            net, history = best_of_learning_rates(
-                tuned,
-                self._learning_rates,
-                num_held_out=len(held_out),
-                otherwise=(min if is_net else max)(self._learning_rates),
+            nets, [history] = self.tuned(
+                embedding_net,
+                x,
+                [new_targets()],
+                [torch.arange(len(x))],
+                groups=groups,
+                weights=weights,
+                draw_simulations=draw_simulations,
+                draw_targets=new_targets if self.resample_targets else None,
+                show_progress_bars=show,
             )
-        return FinetuneResult(net, history)
+        return FinetuneResult(nets.member(0), history)
+
+    def tuned(
+        self,
+        h: nn.Module,
+        x: Tensor,
+        targets: Sequence[Tensor],
+        sets: Sequence[Tensor],
+        *,
+        groups: Tensor,
+        weights: Tensor | None = None,
+        draw_simulations: Callable[[int], Tensor] | None = None,
+        draw_targets: Callable[[], Tensor] | None = None,
+        show_progress_bars: bool = False,
+    ) -> tuple[Ensemble, list[History]]:
+        """Tune a copy of h on each of several sets of pairs, all at once.
+
+        Args:
+            h: The embedding net of NPE.
+            x: The observations of all pairs, shape ``(n, *event)``.
+            targets: The targets of each copy at all pairs, shape ``(n, l)``.
+            sets: The rows of the pairs that each copy may see.
+            groups: As in :meth:`finetune`.
+            weights: As in :meth:`finetune`.
+            draw_simulations: As in :meth:`finetune`.
+            draw_targets: Draws new targets in every epoch, if they are drawn anew.
+            show_progress_bars: Whether to show the losses.
+
+        Returns:
+            The copies, and the losses of each.
+        """
+        kept = self._rehearsed(h, draw_simulations)
+        splits = []
+        for rows in sets:
+            parts = split_pairs(groups[rows.cpu()], self.validation_fraction)
+            splits.append(tuple(rows[part.to(rows.device)] for part in parts))
+        fewest = min(splits, key=lambda split: len(split[1]))
+        max_num_epochs = epochs_on_pairs(
+            groups[fewest[0].cpu()], fewest[1], self.max_num_epochs
+        )
+        if not len(fewest[1]):
+            # The careful rate for a net, the larger for an affine map.
+            is_net = any(True for _ in h.parameters())
+            rates = [(min if is_net else max)(self._learning_rates)]
+            splits = [(rows, rows[:0]) for rows in sets]
+        else:
+            rates = list(self._learning_rates)
+        count = len(rates)
+        nets = Ensemble(
+            [trainable_copy(h, targets[0])] * (count * len(sets)), embedded, (x[:3],)
+        )
+        fixed = torch.stack([one for one in targets for _ in rates])
+        newest, every = fixed, [split for split in splits for _ in rates]
+        train, held_out = (
+            Padded.of(rows, weights) for rows in zip(*every, strict=True)
+        )
+
+        def distances(x: Tensor, targets: Tensor) -> Tensor:
+            z = nets.answer(embedded, x.flatten(0, 1)).unflatten(0, x.shape[:2])
+            return torch.linalg.vector_norm(z - targets, dim=2)
+
+        def mean_distance(rows: Padded, targets: Tensor) -> Tensor:
+            return rows.mean(distances(x[rows.index], rows.of_each(targets)))
+
+        def loss() -> Tensor:
+            found = mean_distance(train, newest)
+            if kept is None:
+                return found
+            size = len(nets), REHEARSED_IN_EPOCH
+            some = torch.randint(len(kept[0]), size).to(x.device)
+            rehearsed = distances(kept[0][some], kept[1][some]).mean(dim=1)
+            return found + self.rehearsal * rehearsed
+
+        def steps(epoch: int) -> list[tuple[()]]:
+            nonlocal newest
+            if draw_targets is not None and epoch:
+                newest = draw_targets().expand_as(fixed)
+            return [()]
+
+        histories = fit(
+            nets,
+            steps,
+            loss,
+            self.training,
+            validation_loss=(
+                (lambda: mean_distance(held_out, fixed)) if len(held_out) else None
+            ),
+            learning_rates=rates * len(sets),
+            max_num_epochs=max_num_epochs,
+            in_training_mode=False,
+            label="Fine-tuning",
+            show_progress_bars=show_progress_bars,
+        )
+        best = best_rates(histories, count)
+        return nets[best], [histories[k] for k in best]
+
+    @property
+    def training(self) -> Training:
+        """How each net is trained."""
+        return Training(
+            max_num_epochs=self.max_num_epochs,
+            stop_after_epochs=self.stop_after_epochs,
+            clip_max_norm=None,
+        )
 
     def _rehearsed(
         self, h: nn.Module, draw_simulations: Callable[[int], Tensor] | None
@@ -208,56 +297,210 @@ class CalibrationFinetuner(Settings):
         simulations = draw_simulations(NUM_REHEARSED).to(_dtype_of(h))
         return simulations, _embedded("simulations", simulations, h)
 
-    def _optimise(
-        self,
-        net: nn.Module,
-        x: Tensor,
-        targets: Tensor,
-        train: Tensor,
-        held_out: Tensor,
-        *,
-        weights: Tensor | None,
-        learning_rate: float,
-        max_num_epochs: int,
-        keep: tuple[Tensor, Tensor] | None,
-        draw_targets: Callable[[], Tensor] | None,
-        show_progress_bars: bool,
-    ) -> tuple[nn.Module, History]:
-        has_holdout = held_out.numel() > 0
-        newest = targets
 
-        def all_pairs(epoch: int) -> list[tuple[Tensor]]:
-            nonlocal newest
-            if draw_targets is not None and 0 < epoch < max_num_epochs:
-                newest = draw_targets()
-            return [(train,)]
+# With rehearsal, g embeds simulations as h does, so that the density can interpret
+# them. The rate and the patience take an eighth of the time of the finetuner's defaults
+# and did not increase the distances on calibration data.
+TUNING = CalibrationFinetuner(rehearsal=1.0, learning_rate=3e-3, stop_after_epochs=50)
 
-        def distance(rows: Tensor, targets: Tensor) -> Tensor:
-            of_rows = None if weights is None else weights[rows]
-            return _mean_distance(net(x[rows]), targets[rows], of_rows)
 
-        def loss(rows: Tensor) -> Tensor:
-            if keep is None:
-                return distance(rows, newest)
-            some = torch.randint(len(keep[0]), (REHEARSED_IN_EPOCH,)).to(x.device)
-            kept = _mean_distance(net(keep[0][some]), keep[1][some])
-            return distance(rows, newest) + self.rehearsal * kept
+def best_rates(histories: Sequence[History], count: int) -> list[int]:
+    """Return which of each ``count`` networks has the lowest loss on its hold-out."""
+    loss = [history.kept_validation_loss for history in histories]
+    return [
+        min(range(start, start + count), key=loss.__getitem__)
+        for start in range(0, len(loss), count)
+    ]
 
-        history = fit(
-            net,
-            all_pairs,
-            loss,
-            validation_loss=(
-                (lambda: distance(held_out, targets)) if has_holdout else None
-            ),
-            learning_rate=learning_rate,
-            max_num_epochs=max_num_epochs,
-            stop_after_epochs=self.stop_after_epochs,
-            in_training_mode=False,
-            label="Fine-tuning",
-            show_progress_bars=show_progress_bars,
+
+# How NPE is fine-tuned on pairs, chosen on calibration data: see benchmarks/choices.md.
+FINETUNING = Training(
+    training_batch_size=100,
+    validation_fraction=0.2,
+    stop_after_epochs=50,
+    max_num_epochs=500,
+)
+# Of training NPE with rehearsal: pairs in a batch, as many simulations as pairs, and
+# steps in an epoch, after each of which the held-out part is scored.
+PAIRS_IN_BATCH, STEPS_IN_EPOCH = 50, 100
+
+
+def finetune_flow(
+    flow: Flow,
+    labels: Sequence[Nodes],
+    x: Tensor,
+    splits: Sequence[tuple[Tensor, Tensor]],
+    *,
+    training: Training,
+    learning_rates: Sequence[float] | None = None,
+    max_num_epochs: int | None = None,
+    weights: Tensor | None = None,
+    rehearsed: tuple[Tensor, Tensor] | None = None,
+    only_densities: bool = False,
+    show_progress_bars: bool = False,
+) -> list[History]:
+    r"""Train flows in place on pairs, all at once, each until its hold-out says stop.
+
+    .. math::
+        \min_q \; \sum_{i \in \text{train}} -\log q(\theta_i \mid x_i)
+        \quad\text{until}\quad
+        \sum_{i \in \text{held out}} -\log q(\theta_i \mid x_i)
+        \quad\text{does not fall any more}
+
+    With rehearsal the mean over the pairs and that over simulations count half each.
+    The density of a label that is not exact is an average over its nodes.
+
+    Args:
+        flow: The flows, E of them, which are trained in evaluation mode.
+        labels: The nodes of the labels of all pairs, for each flow.
+        x: The observations of all pairs, shape ``(n, *event)``.
+        splits: The rows that each flow is trained on, and those that it holds out.
+        training: Batch size and when to stop.
+        learning_rates: One for each flow; that of ``training`` if None.
+        max_num_epochs: Instead of that of ``training``.
+        weights: How many pairs each pair counts as, shape ``(n,)``; one if None.
+        rehearsed: Simulations (theta, x) to train on, too. A large net that keeps
+            seeing them learns more from the pairs before it overfits.
+        only_densities: Whether the net, which all flows share, stays as it is.
+        show_progress_bars: Whether to show the losses.
+
+    Returns:
+        The losses of each flow, and the epoch that was kept.
+    """
+    network = flow.densities if only_densities else flow
+    fixed = flow.embed(x)[:, 0] if only_densities else None
+    different = list({id(one): one for one in labels}.values())
+    place = torch.tensor(
+        [[one is other for other in different].index(True) for one in labels]
+    )
+    theta = torch.stack([one.theta for one in different])
+    log_weights = torch.stack([one.log_weights for one in different])
+    place = place[:, None].to(x.device)
+
+    def losses(rows: Tensor) -> Tensor:
+        """Return the negative log densities of labels, ``(E, B)`` to ``(E, B)``."""
+        nodes, of_nodes = theta[place, rows], log_weights[place, rows]
+        z = flow.embeddings(x[rows]) if fixed is None else fixed[rows]
+        count = nodes.shape[2]
+        log_q = -flow.losses_given(
+            nodes.flatten(1, 2), z.repeat_interleave(count, dim=1)
         )
-        return net.requires_grad_(requires_grad=False), history
+        log_q = log_q.unflatten(1, (-1, count)).double()
+        terms = torch.where(torch.isneginf(of_nodes), of_nodes, log_q + of_nodes)
+        return math.log(count) - terms.logsumexp(dim=2)
+
+    split = [_with_density(losses, rows) for rows in zip(*splits, strict=True)]
+    train, held_out = (Padded.of(rows, weights) for rows in split)
+
+    def batches(epoch: int) -> Iterator[tuple[Padded]]:
+        if rehearsed is None:
+            yield from ((one,) for one in train.shuffled(training.training_batch_size))
+            return
+        for _ in range(STEPS_IN_EPOCH):
+            yield (train.drawn(PAIRS_IN_BATCH),)
+
+    def loss(rows: Padded) -> Tensor:
+        found = rows.mean(losses(rows.index))
+        if rehearsed is None:
+            return found
+        some = torch.randint(len(rehearsed[0]), rows.index.shape).to(x.device)
+        theta_s, x_s = (one[some] for one in rehearsed)
+        return 0.5 * found + 0.5 * flow.losses(theta_s, x_s).mean(dim=1)
+
+    return fit(
+        network,
+        batches,
+        loss,
+        training,
+        validation_loss=(
+            (lambda: held_out.mean(losses(held_out.index))) if len(held_out) else None
+        ),
+        learning_rates=learning_rates,
+        max_num_epochs=max_num_epochs,
+        in_training_mode=False,
+        label="Fine-tuning NPE",
+        show_progress_bars=show_progress_bars,
+    )
+
+
+@torch.no_grad()
+def _with_density(
+    losses: Callable[[Tensor], Tensor], rows: Sequence[Tensor]
+) -> list[Tensor]:
+    """Return the rows of each flow whose loss is finite, after a warning of the others.
+
+    A single infinite loss would end the training. A label exactly on a bound of the
+    prior has one if the density is zero there.
+    """
+    padded = Padded.of(rows, None)
+    if not len(padded):
+        return list(rows)
+    parts = [losses(some) for some in padded.index.split(100, dim=1)]
+    finite = torch.isfinite(torch.cat(parts, dim=1)) | (padded.share == 0)
+    if not finite.all():
+        lost = padded.index[~finite].unique()
+        warn_user(
+            f"{len(lost)} calibration pair(s) have no density under NPE, and are left "
+            "out of this training. Are they exactly on a bound of the prior?"
+        )
+    kept = [one[ok[: len(one)]] for one, ok in zip(rows, finite, strict=True)]
+    return [some if len(some) else one for some, one in zip(kept, rows, strict=True)]
+
+
+@dataclass(frozen=True, eq=False)
+class Padded:
+    """Rows of pairs for each member of an ensemble, side by side.
+
+    Attributes:
+        index: The rows, shape ``(E, m)``; members with fewer repeat their first.
+        share: The share of each in the mean of its member, which is zero for repeated
+            ones, shape ``(E, m)``.
+    """
+
+    index: Tensor
+    share: Tensor
+
+    @classmethod
+    def of(cls, rows: Sequence[Tensor], weights: Tensor | None) -> "Padded":
+        """Put rows side by side, with shares in proportion to the weights of pairs."""
+        most = max(map(len, rows))
+        index = torch.stack(
+            [torch.cat([one, one[:1].expand(most - len(one))]) for one in rows]
+        )
+        share = torch.ones_like(index, dtype=torch.double)
+        if weights is not None:
+            share = weights[index].double()
+        for number, one in enumerate(rows):
+            share[number, len(one) :] = 0.0
+        return cls(index, share)
+
+    def __len__(self) -> int:
+        return self.index.shape[1]
+
+    def mean(self, values: Tensor) -> Tensor:
+        """Return the weighted mean of each member, ``(E, m)`` to ``(E,)``."""
+        share = self.share.to(values)
+        values = values.where(share > 0, 0.0)  # a repeated one may not be finite
+        return (share * values).sum(dim=1) / share.sum(dim=1).clamp_min(1e-30)
+
+    def of_each(self, values: Tensor) -> Tensor:
+        """Return the values of the rows of each member, ``(E, n, ...)``."""
+        return values[torch.arange(len(self.index))[:, None], self.index]
+
+    def shuffled(self, size: int) -> "Iterator[Padded]":
+        """Pass over the rows of all members in random order, in batches."""
+        if len(self) <= size:
+            yield self
+            return
+        order = torch.rand(self.index.shape).argsort(dim=1).to(self.index.device)
+        for some in order.split(size, dim=1):
+            yield Padded(self.index.gather(1, some), self.share.gather(1, some))
+
+    def drawn(self, size: int) -> "Padded":
+        """Draw rows of each member, with replacement."""
+        counts = (self.share > 0).sum(dim=1, keepdim=True)
+        some = (torch.rand(len(self.index), size).to(counts.device) * counts).long()
+        return Padded(self.index.gather(1, some), self.share.gather(1, some))
 
 
 def trainable_copy(embedding_net: nn.Module, embeddings: Tensor) -> nn.Module:
@@ -286,19 +529,10 @@ def _dtype_of(net: nn.Module) -> torch.dtype:
 
 
 def _embedded(name: str, x: Tensor, net: nn.Module) -> Tensor:
-    embedded = embed(net, x)
-    if (bad := ~torch.isfinite(embedded)).any():
+    z = embed(net, x)
+    if (bad := ~torch.isfinite(z)).any():
         raise InvalidInputError(
             f"Expected `{name}` with finite embeddings; got NaN or Inf in "
             f"{rows_with(bad)}."
         )
-    return embedded
-
-
-def _mean_distance(
-    embeddings: Tensor, targets: Tensor, weights: Tensor | None = None
-) -> Tensor:
-    distances = torch.linalg.vector_norm(embeddings - targets, dim=1)
-    if weights is None:
-        return distances.mean()
-    return (weights * distances).sum() / weights.sum()
+    return z

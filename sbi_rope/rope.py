@@ -1,21 +1,13 @@
 """Robust posterior estimation: the class that runs its three steps."""
 
 import copy
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._labels import (
-    LabelledParameters,
-    Labels,
-    given_labels,
-    labelled_moments,
-    labelled_targets,
-    on_bounds,
-    parameters_of,
-)
 from sbi_rope._npe import TrainedNPE
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
@@ -26,6 +18,8 @@ from sbi_rope._standardisation import (
 )
 from sbi_rope.batch import EmbeddedBatch, check_converged
 from sbi_rope.coupling import SinkhornCoupler
+from sbi_rope.data import Counts, Pairs
+from sbi_rope.density import MixturePosterior
 from sbi_rope.discrepancy.targets import tuning_targets
 from sbi_rope.errors import (
     InvalidInputError,
@@ -34,9 +28,16 @@ from sbi_rope.errors import (
     warn_user,
 )
 from sbi_rope.finetuning import CalibrationFinetuner, History
-from sbi_rope.mixture import MixturePosterior
+from sbi_rope.labels import (
+    draws_of,
+    given_groups,
+    given_labels,
+    given_weights,
+    on_bounds,
+)
+from sbi_rope.moments import moments, targets
 from sbi_rope.settings import Count, check
-from sbi_rope.simulate import SimulationSource, source_of
+from sbi_rope.simulate import Source, Stored, source_of
 from sbi_rope.tensors import as_numbers, check_same_length, column_names, rows_with
 
 __all__ = ["RoPE"]
@@ -141,7 +142,7 @@ class RoPE:
             simulations = (as_numbers("theta", theta, names=parameter_names), x)
         self._npe = TrainedNPE(posterior, parameter_names)
         self._npe.x_names = x_names
-        self._source = source_of(
+        self._source: Source = source_of(
             self._npe.prior,
             simulator=simulator,
             simulations=simulations,
@@ -152,11 +153,9 @@ class RoPE:
         )
         self.finetuner = CalibrationFinetuner() if finetuner is None else finetuner
         self.coupler = SinkhornCoupler() if coupler is None else coupler
-        self._labels = Labels.exact(self._npe.like)
-        self._parameters = parameters_of(self._labels, self._npe.prior)
-        self._x_cal = self._npe.like.new_empty(0, *self._npe.event_shape)
-        # The folds of a stack share their simulations, so their targets are known.
-        self._targets: Tensor | None = None
+        x = self._npe.like.new_empty(0, *self._npe.event_shape)
+        self._pairs = Pairs.exact(self._npe.like, x)
+        self._names: tuple[Hashable, ...] = ()
         self._g: nn.Module | None = None
         self._history: History | None = None
 
@@ -208,27 +207,27 @@ class RoPE:
                 discrete.
         """
         names = self.parameter_names or column_names(theta)
-        labels = given_labels(
+        label = given_labels(
             theta,
             theta_std=theta_std,
             theta_cov=theta_cov,
-            weights=weights,
-            groups=groups,
             like=self._npe.like,
             prior=self._npe.prior,
             names=names,
         )
+        weight = given_weights(weights, len(label), self._npe.like.device)
+        of_rows = given_groups(groups, len(label))
         x_names = self.x_names or column_names(x)
         x = self._npe.as_x("x", x)
-        check_same_length(labels.theta, x)
-        if self._npe.is_mixed and not labels.are_exact:
+        check_same_length(label.y, x)
+        if self._npe.is_mixed and not label.are_exact:
             raise UnsupportedPosteriorError(
                 "Expected exact labels, because some parameters are discrete (MNPE); "
-                f"got {labels}."
+                "got others."
             )
         self._npe.embed("x", x, self._npe.h)
         warn_of_far_entries("x", x, self._npe.h)
-        known = labels.says_something
+        known = label.is_measured.any(dim=1)
         if not known.any():
             raise InvalidInputError(
                 "Expected labels of at least one parameter in one pair; got NaN only."
@@ -238,24 +237,38 @@ class RoPE:
                 "Labels that say nothing about any parameter are left out: "
                 f"{rows_with(~known)}."
             )
-            labels, x = labels[known], x[known]
-        labels = self._labels.appended(labels) if len(self._labels) else labels
-        parameters = parameters_of(labels, self._npe.prior)
-        total = float(labels.weights.sum())
-        if total < labels.effective_number / 2:
+            label, weight, x = label[known], weight[known], x[known]
+            of_rows = tuple(itertools.compress(of_rows, known.tolist()))
+        if len(self._pairs) and bool(self._names) != bool(of_rows):
+            raise InvalidInputError(
+                "Expected `groups` of all calibration pairs, or of none; got some."
+            )
+        label, of_rows = self._pairs.label + label, self._names + of_rows
+        group = label.group
+        if of_rows:
+            numbers = {name: k for k, name in enumerate(dict.fromkeys(of_rows))}
+            group = torch.tensor([numbers[name] for name in of_rows]).to(group)
+        pairs = Pairs(
+            theta=draws_of(label, self._npe.prior),
+            x=torch.cat([self._pairs.x, x]),
+            group=group,
+            weight=torch.cat([self._pairs.weight, weight]),
+            label=label,
+        )
+        total = float(pairs.weight.sum())
+        if total < Counts(pairs.weight).effective_number / 2:
             warn_user(
-                f"The weights of {len(labels)} pairs sum to {total:.3g}, and all "
+                f"The weights of {len(pairs)} pairs sum to {total:.3g}, and all "
                 "together count as so many pairs; do not normalise them."
             )
-        if found := on_bounds(labels, self._npe.prior, names):
+        if found := on_bounds(label, self._npe.prior, names):
             warn_user(
                 f"{', '.join(found)} lie exactly on the prior's bound; if they are "
                 "censored, pass theta_std."
             )
-        self._parameters = parameters
-        self._labels, self._x_cal = labels, torch.cat([self._x_cal, x])
+        self._pairs, self._names = pairs, of_rows
         self._npe.parameter_names, self._npe.x_names = names, x_names
-        self._g, self._history, self._targets = None, None, None
+        self._g, self._history = None, None
         return self
 
     def train(
@@ -281,27 +294,24 @@ class RoPE:
             NotReadyError: If no calibration pairs were appended.
             SimulationError: If the simulator fails at the calibration parameters.
         """
-        if not len(self._x_cal):
+        if not len(self._pairs):
             raise NotReadyError(
                 "No calibration pairs; call `append_calibration(theta, x)` first."
             )
-        known = None if self.finetuner.resample_targets else self._targets
-        show = is_shown(show_progress_bars)
+        show, pairs = is_shown(show_progress_bars), self._pairs
 
-        def targets(count: int) -> Tensor:
-            if known is not None:
-                return known
-            if self._labels.are_exact:
+        def drawn(count: int) -> Tensor:
+            if pairs.are_exact:
                 return self.draw_targets(count, show_progress_bars=show)
             return self._targets_of_labels(progress=show)
 
         result = self.finetuner.finetune(
             self._npe.h,
-            self._x_cal,
-            targets,
-            draw_simulations=lambda count: self._source.kept(count, progress=show)[1],
-            groups=self._labels.groups,
-            weights=self._labels.pair_weights,
+            pairs.x,
+            drawn,
+            draw_simulations=lambda count: self._simulations(count, progress=show),
+            groups=pairs.group,
+            weights=pairs.weight,
             seed=seed,
             show_progress_bars=show,
         )
@@ -321,31 +331,35 @@ class RoPE:
             :math:`E[h(S(\theta)) \mid y_i]`, shape ``(n_c, l)``. Over labels that are
             not exact it averages the parameters, too.
         """
-        return labelled_targets(
+        return targets(
             self._source,
-            self._parameters,
+            self._pairs,
+            simulations_per_target,
             self._embed_simulations,
-            simulations_per_target=simulations_per_target,
             num_neighbors=self.finetuner.num_neighbors,
             progress=is_shown(show_progress_bars),
         )
 
     def _targets_of_labels(self, *, progress: bool) -> Tensor:
         """Return targets, ``(n_c, l)``, where some labels leave parameters open."""
-        _, simulated = self._source.kept(MIN_SIMULATIONS, progress=progress)
+        simulated = self._simulations(MIN_SIMULATIONS, progress=progress)
         return tuning_targets(
-            embed(self._npe.h, self._x_cal),
-            labelled_moments(
+            embed(self._npe.h, self._pairs.x),
+            moments(
                 self._source,
-                self._parameters,
+                self._pairs,
                 self.finetuner.simulations_per_target,
                 self._embed_simulations,
                 progress=progress,
             ),
             Standardisation(self._embed_simulations(simulated).double()),
-            weights=self._labels.pair_weights,
-            groups=self._labels.groups,
+            weights=self._pairs.weight,
+            groups=self._pairs.group,
         )
+
+    def _simulations(self, count: int, *, progress: bool) -> Tensor:
+        """Return up to ``count`` simulations from the prior, always the same."""
+        return self._source.from_prior(count, seed=0, progress=progress)[1]
 
     def embed(
         self,
@@ -367,9 +381,9 @@ class RoPE:
             from the prior, and :math:`h(x_s)` of one simulation at each of them.
             Simulations that are not finite are left out.
         """
-        if len(self._x_cal) and self._g is None:
+        if len(self._pairs) and self._g is None:
             raise NotReadyError(
-                f"{len(self._x_cal)} calibration pairs were appended; call `train()` "
+                f"{len(self._pairs)} calibration pairs were appended; call `train()` "
                 "first."
             )
         net = self._npe.h if self._g is None else self._g
@@ -379,10 +393,14 @@ class RoPE:
             check("num_simulations", num_simulations, Count)
         with seeded(seed):
             theta, simulated = self._source.from_prior(
-                num_simulations,
-                max(len(x_o), MIN_SIMULATIONS),
+                num_simulations or max(len(x_o), MIN_SIMULATIONS),
                 self._embed_simulations,
                 progress=is_shown(show_progress_bars),
+            )
+        if isinstance(self._source, Stored) and len(theta) < (num_simulations or 0):
+            raise InvalidInputError(
+                f"Expected `num_simulations` of at most {len(theta)}, the number of "
+                f"stored simulations; got {num_simulations}."
             )
         return EmbeddedBatch(
             x_o=x_o,
@@ -464,32 +482,14 @@ class RoPE:
         """Return a copy of a batch ``(n_o, *event)``, if it can be embedded."""
         return self._npe.as_x("x_o", x_o)
 
-    def with_pairs(
-        self,
-        rows: Tensor,
-        *,
-        targets: Tensor | None = None,
-    ) -> "RoPE":
-        """Return an untrained RoPE with the same NPE and simulator and some pairs only.
-
-        This object does not change. The folds of a stack are made in this way.
-
-        Args:
-            rows: Numbers of the calibration pairs to keep, shape ``(m,)``.
-            targets: The targets of the tuning for these pairs, shape ``(m, l)``, so
-                that :meth:`train` does not simulate again. Simulated if None, or if the
-                finetuner draws new targets in every step.
-        """
-        part = copy.copy(self)
-        part._labels, part._parameters = self._labels[rows], self._parameters[rows]
-        part._x_cal = self._x_cal[rows]
-        part._targets = targets
-        part._g, part._history = None, None
-        return part
+    @property
+    def pairs(self) -> Pairs:
+        """The calibration pairs appended so far, with draws of their parameters."""
+        return self._pairs
 
     @property
-    def source(self) -> SimulationSource:
-        """The source of simulations; it is shared with :meth:`with_pairs`."""
+    def source(self) -> Source:
+        """Where simulations come from."""
         return self._source
 
     @property
@@ -503,7 +503,7 @@ class RoPE:
 
         Of labels that are not exact, theta is the mean given the label.
         """
-        return self._parameters.mean.clone(), self._x_cal.clone()
+        return self._pairs.mean.clone(), self._pairs.x.clone()
 
     @property
     def parameter_names(self) -> tuple[str, ...] | None:
@@ -514,16 +514,6 @@ class RoPE:
     def x_names(self) -> tuple[str, ...] | None:
         """The names of the columns of tables of x; None if they are not known."""
         return self._npe.x_names
-
-    @property
-    def labels(self) -> Labels:
-        """What is known about the parameters of the calibration pairs."""
-        return self._labels
-
-    @property
-    def labelled_parameters(self) -> LabelledParameters:
-        """Draws of the parameters of the calibration pairs, given their labels."""
-        return self._parameters
 
     @property
     def embedding_net(self) -> nn.Module:
@@ -561,7 +551,7 @@ class RoPE:
         A few are simulated when RoPE is constructed, to find out how the simulator is
         called. :meth:`train` simulates 100 for each label (and 2000 with rehearsal),
         :meth:`build_posterior` ``max(n_o, 1000)`` for each batch, and
-        :func:`~sbi_rope.stack` 20,000 from the prior and 100 for each label. The
+        :func:`~sbi_rope.stack` 10,000 from the prior and 100 for each label. The
         argument ``num_simulations`` of this class sets a number for all of these
         together.
         """
@@ -570,7 +560,7 @@ class RoPE:
     def __repr__(self) -> str:
         name = type(self._npe.estimator).__name__
         state = "trained" if self.is_trained else "not trained"
-        num_pairs, num_groups = len(self._x_cal), self._labels.num_groups
+        num_pairs, num_groups = len(self._pairs), self._pairs.num_groups
         pairs = f"{num_pairs} calibration pair{'' if num_pairs == 1 else 's'}"
         if num_groups < num_pairs:
             pairs += f" in {num_groups} group{'' if num_groups == 1 else 's'}"

@@ -93,7 +93,7 @@ def save(posterior: Any, path: str | Path, *, overwrite: bool = False) -> None:
     Example:
         >>> import tempfile, torch
         >>> from sbi.utils import BoxUniform
-        >>> from sbi_rope.mixture import PriorPosterior
+        >>> from sbi_rope.density import PriorPosterior
         >>> posterior = PriorPosterior(BoxUniform(torch.zeros(2), torch.ones(2)))
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     save(posterior, f"{folder}/posterior.pt")

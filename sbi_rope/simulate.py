@@ -1,15 +1,14 @@
-"""Simulations: those of a user's simulator, or pairs that were stored beforehand."""
+"""Sources of simulations: a user's simulator, or pairs (theta, x) that were stored."""
 
-import functools
+import itertools
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import joblib
-import numpy as np
 import torch
-from scipy.stats import ks_2samp
+from scipy.stats import kstest
 from torch import Tensor
 from torch.distributions import Distribution
 
@@ -21,22 +20,21 @@ from sbi_rope.settings import Count, check
 from sbi_rope.tensors import as_batch, as_numbers, check_in_support
 
 __all__ = [
-    "Embedding",
-    "LimitedSimulator",
-    "Moments",
     "ParallelSimulator",
-    "Readable",
-    "SimulationSource",
-    "Simulator",
-    "StoredSimulations",
+    "Simulated",
+    "Source",
+    "Stored",
     "all_finite",
     "parallel",
     "source_of",
 ]
 
-Embedding = Callable[[Tensor], Tensor]
+Embed = Callable[[Tensor], Tensor]
 # Tells which simulations an embedding net can read, ``(n, *event)`` to ``(n,)``.
 Readable = Callable[[Tensor], Tensor]
+# Simulations ``(n, *event)`` with NaN where the simulator raised, the number of rows
+# that were simulated for them, and the first error.
+Result = tuple[Tensor, int, Exception | None]
 
 # A simulator may fail at some parameters, so that it is tried at so many.
 TRIES = 5
@@ -45,15 +43,14 @@ TRIES = 5
 BATCHED_CHUNK, SINGLE_CHUNK, PARALLEL_CHUNK, ROWS_OF_WORKER = 1000, 10, 100, 100
 # A progress bar appears after this many seconds.
 DELAY = 2.0
-# The largest number of entries of simulations that are kept for training.
-MAX_KEPT = 2**27
-# How many stored simulations count as simulations at a theta, and around it.
-NUM_NEAR, NUM_AROUND = 10, 50
+# The most numbers in simulations that are kept, in distances that are computed at once,
+# and in the simulations that planes are fitted to at once.
+MAX_KEPT, MAX_DISTANCES, MAX_NUMBERS = 2**27, 50_000_000, 2**24
+# The plane at a theta is fitted to so many stored simulations, at least.
+NUM_AROUND = 50
 # Draws of the prior that stored parameters are compared with, and the p-value below
 # which they differ.
 NUM_FROM_PRIOR, NOT_FROM_PRIOR = 10_000, 1e-6
-# So many distances are computed at once.
-MAX_DISTANCES = 50_000_000
 
 
 def all_finite(x: Tensor) -> Tensor:
@@ -61,55 +58,11 @@ def all_finite(x: Tensor) -> Tensor:
     return torch.isfinite(x).flatten(1).all(dim=1)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Moments:
-    """Mean and covariance of the embeddings of simulations at given parameters.
-
-    Attributes:
-        mean: Shape ``(n, l)``, float64.
-        covariance: Shape ``(n, l, l)``, float64.
-        possible: Where labels are not exact, means at R parameters that each of them
-            leaves possible, shape ``(n, R, l)``; ``mean`` is their average. None for
-            exact labels.
-    """
-
-    mean: Tensor
-    covariance: Tensor
-    possible: Tensor | None = None
-
-    def __getitem__(self, rows: Tensor) -> "Moments":
-        return Moments(
-            mean=self.mean[rows],
-            covariance=self.covariance[rows],
-            possible=None if self.possible is None else self.possible[rows],
-        )
-
-    @classmethod
-    def joined(cls, parts: Sequence["Moments"]) -> "Moments":
-        """Return the moments of several sets of parameters, one after the other."""
-        possible = [part.possible for part in parts if part.possible is not None]
-        return cls(
-            mean=torch.cat([part.mean for part in parts]),
-            covariance=torch.cat([part.covariance for part in parts]),
-            possible=torch.cat(possible) if possible else None,
-        )
-
-    def columns(self, columns: slice) -> "Moments":
-        """Return the moments of some entries of the embeddings."""
-        possible = self.possible
-        return Moments(
-            mean=self.mean[:, columns],
-            covariance=self.covariance[:, columns, columns],
-            possible=None if possible is None else possible[..., columns],
-        )
-
-    @property
-    def means(self) -> Tensor:
-        """The possible means, ``(n, R, l)``, or the only ones, ``(n, l)``."""
-        return self.mean if self.possible is None else self.possible
+def _itself(x: Tensor) -> Tensor:
+    return x
 
 
-# A user's simulator ------------------------------------------------------------------
+# A user's simulator -------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -160,36 +113,28 @@ def parallel(
     return ParallelSimulator(simulator, int(num_workers))
 
 
-# Simulations ``(n, *event)`` with NaN where the simulator raised, the number of rows
-# that were simulated for them, and the first error.
-Simulated = tuple[Tensor, int, Exception | None]
-
-
 @dataclass(frozen=True, eq=False)
 class _Way:
     """A way to call a simulator: with a batch or one theta, as tensors or arrays."""
 
     function: Callable[[Any], Any]
     batched: bool
-    arrays: bool
+    kind: Literal["tensor to tensor", "array", "tensor"]
     event_shape: torch.Size
     like: Tensor
 
-    def result(self, theta: Tensor) -> Any:
-        """Call the simulator with a copy of theta, because it may change it.
+    def x_of(self, theta: Tensor) -> Tensor:
+        """Return x, in which dimensions of size one may be missing, as a tensor.
 
+        Theta and x are copied, because the simulator may change or use them again.
         Arrays hold float64, as solvers of SciPy expect.
         """
-        if self.arrays:
-            return self.function(theta.to("cpu", torch.float64, copy=True).numpy())
-        return self.function(theta.clone())
-
-    def fitted(self, result: Any, theta: Tensor) -> Tensor:
-        """Return a copy of what theta ``(n, d)`` or ``(d,)`` gave as a tensor.
-
-        Dimensions of size one may be missing. The simulator may use the memory of its
-        result again.
-        """
+        if self.kind == "array":
+            result = self.function(theta.to("cpu", torch.float64, copy=True).numpy())
+        else:
+            result = self.function(theta.clone())
+        if self.kind == "tensor to tensor" and not isinstance(result, Tensor):
+            raise SimulationError("A tensor gave something else than a tensor.")
         x = as_numbers("simulator(theta)", result)
         expected = (*theta.shape[:-1], *self.event_shape)
         if [n for n in x.shape if n != 1] != [n for n in expected if n != 1]:
@@ -199,44 +144,47 @@ class _Way:
             )
         return x.reshape(expected).to(self.like, copy=True)
 
-    def simulate(self, theta: Tensor) -> Simulated:
+    def simulate(self, theta: Tensor) -> Result:
         """Simulate theta ``(n, d)``; if a batch raises, its rows one by one."""
         error, num_calls, rows = None, len(theta), []
         if self.batched:
             try:
-                return self.fitted(self.result(theta), theta), num_calls, None
+                return self.x_of(theta), num_calls, None
             except Exception as raised:  # any error of the user's code
                 error, num_calls = raised, 2 * num_calls
         for one in theta.split(1) if self.batched else theta:
             try:
-                x = self.fitted(self.result(one), one).reshape(self.event_shape)
+                x = self.x_of(one).reshape(self.event_shape)
             except Exception as raised:
                 error = error or raised
                 x = self.like.new_full(self.event_shape, torch.nan)
             rows.append(x)
         return torch.stack(rows), num_calls, error
 
+    def simulate_in_worker(self, theta: Tensor, seed: int) -> Result:
+        """Simulate with an error that can be sent to another process."""
+        with seeded(seed):
+            x, num_calls, error = self.simulate(theta)
+        named = error and SimulationError(f"{type(error).__name__}: {error}")
+        return x, num_calls, named
 
-def _simulate_piece(way: _Way, theta: Tensor, seed: int) -> Simulated:
-    """Simulate in a worker, with an error that can be sent from there."""
-    with seeded(seed):
-        x, num_calls, error = way.simulate(theta)
-    return x, num_calls, error and SimulationError(f"{type(error).__name__}: {error}")
 
-
-class Simulator:
+class Simulated:
     """A user's simulator, called in the first way in which it returns the right shape.
+
+    Simulations that are not finite are left out, counted and warned of. What is random
+    follows a seed, or the generators of torch, NumPy and Python.
 
     Args:
         function: The simulator, batched or not, of tensors or NumPy arrays.
         prior: The prior, from which parameters are drawn.
         event_shape: Shape of one simulation.
         like: A tensor with the dtype and device of parameters and simulations.
-        readable: Tells which simulations are of use. The others are dropped.
+        readable: Tells which simulations are of use.
 
     Attributes:
-        num_dropped: How many simulations were dropped so far.
         num_calls: How many rows were simulated so far.
+        num_dropped: How many simulations were left out so far.
     """
 
     def __init__(
@@ -255,7 +203,7 @@ class Simulator:
         self._prior, self._event_shape, self._like = prior, event_shape, like
         self._readable = readable
         self.num_dropped = self.num_calls = 0
-        self._kept: dict[int, tuple[Tensor, Tensor]] = {}
+        self._kept: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}
         # With a seed of its own, so that no result depends on it.
         with seeded(0):
             self._way = self._working_way(function)
@@ -266,143 +214,51 @@ class Simulator:
 
     def from_prior(
         self,
-        count: int | None,
-        at_least: int,
-        embed: Embedding,
+        n: int,
+        embed: Embed = _itself,
         *,
-        progress: bool,
-        finished: list[Simulated] | None = None,
+        seed: int | None = None,
+        progress: bool = False,
     ) -> tuple[Tensor, Tensor]:
-        """Return parameters from the prior, and the embedding of one simulation each.
+        """Return parameters from the prior, and the embedding of a simulation of each.
 
-        There are ``count`` of them, or ``at_least`` if that is None. Parts that are
-        ``finished`` are not simulated again, and others are added there.
+        There are n of them, without those that failed. With a seed they are simulated
+        once and kept, and as many as memory allows.
         """
-        count = at_least if count is None else count
-        theta = self._prior.sample(torch.Size((count,))).to(self._like)
+        if seed is None:
+            return self.drawn(n, embed, progress=progress)
+        n = min(n, max(1, MAX_KEPT // self._event_shape.numel()))
+        if (n, seed) not in self._kept:
+            with seeded(seed):
+                self._kept[n, seed] = self.drawn(n, _itself, progress=progress)
+        theta, x = self._kept[n, seed]
+        return theta, embed(x)
+
+    def drawn(
+        self,
+        n: int,
+        embed: Embed,
+        *,
+        finished: list[Result] | None = None,
+        progress: bool,
+    ) -> tuple[Tensor, Tensor]:
+        """Simulate at n draws; parts that are finished are not simulated again."""
+        theta = self._prior.sample(torch.Size((n,))).to(self._like)
         embedded, valid = self._embedded(
             theta, embed, "from the prior", progress=progress, finished=finished
         )
         return theta[valid], embedded[valid]
 
-    def targets(
-        self,
-        theta: Tensor,
-        embed: Embedding,
-        *,
-        simulations_per_target: int,
-        num_neighbors: int,
-        progress: bool,
-    ) -> Tensor:
-        r"""Return :math:`E_\varepsilon[h(S(\theta_i))]`, ``(n, l)``.
-
-        A simulator makes ``simulations_per_target`` simulations at each theta. Of
-        stored simulations, those with the ``num_neighbors`` nearest parameters count.
-        """
-        repeated = theta[:, None].expand(-1, simulations_per_target, -1)
-        return self._at(repeated, embed, progress=progress).nanmean(dim=1)
-
-    def moments(
-        self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
-    ) -> Moments:
-        """Simulate ``count`` times at each theta; with one the covariance is zero."""
-        repeated = theta[:, None].expand(-1, count, -1)
-        embedded = self._at(repeated, embed, progress=progress).double()
-        mean = embedded.nanmean(dim=1)
-        centred = (embedded - mean[:, None]).nan_to_num(0.0)
-        number = (~embedded.isnan().all(dim=2)).sum(dim=1)[:, None, None]
-        covariance = centred.mT @ centred / (number - 1).clamp_min(1)
-        return Moments(mean=mean, covariance=covariance)
-
-    def draws(
-        self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
-    ) -> Tensor:
-        """Simulate ``count`` times at each theta, ``(n, count, l)``."""
-        repeated = theta[:, None].expand(-1, count, -1)
-        return self.once_at(repeated, embed, progress=progress)[1]
-
-    def once_at(
-        self, theta: Tensor, embed: Embedding, *, progress: bool
-    ) -> tuple[Tensor, Tensor]:
-        """Simulate once at each of several parameters of each pair, ``(n, R, d)``.
-
-        A simulation that failed is replaced by that of other parameters of the pair.
-        These are returned with the embeddings ``(n, R, l)``.
-        """
-        embedded = self._at(theta, embed, progress=progress)
-        failed = embedded.isnan().all(dim=2)
-        numbers = torch.arange(theta.shape[1], device=theta.device).expand(failed.shape)
-        # The k-th that failed is replaced by the k-th that is there.
-        usable = failed.int().argsort(dim=1, stable=True)
-        place = (failed.cumsum(dim=1) - 1).clamp_min(0)
-        place = place % (~failed).sum(dim=1, keepdim=True)
-        chosen = numbers.where(~failed, usable.gather(1, place))
-        rows = torch.arange(len(theta), device=theta.device)[:, None]
-        return theta[rows, chosen], embedded[rows, chosen]
-
-    def kept(self, count: int, *, progress: bool) -> tuple[Tensor, Tensor]:
-        """Return up to ``count`` pairs (theta, x) from the prior, always the same."""
-        count = min(count, max(1, MAX_KEPT // self._event_shape.numel()))
-        if count not in self._kept:
-            # With a seed of their own, they do not depend on who asks first.
-            with seeded(0):
-                self._kept[count] = self.from_prior(
-                    count, count, lambda x: x, progress=progress
-                )
-        return self._kept[count]
-
-    def _working_way(self, function: Callable[[Any], Any]) -> _Way:
-        """Try batches before single parameters, and tensors before arrays.
-
-        A simulator that makes something else than a tensor from tensors is given arrays
-        if it takes them, because it was written for these. One that was written for a
-        single theta may take a batch, and add the same noise to all rows.
-        """
-        sizes = {*self._prior.event_shape, *self._event_shape}
-        # A number of rows that is no number of parameters or of readings.
-        num_rows = next(n for n in range(3, 4 + len(sizes)) if n not in sizes)
-        errors: list[Exception] = []
-        for theta in self._prior.sample(torch.Size((TRIES,))).to(self._like):
-            for batched in (True, False):
-                given = theta.repeat(num_rows, 1) if batched else theta
-                second_best = None
-                for arrays in (False, True):
-                    way = _Way(function, batched, arrays, self._event_shape, self._like)
-                    self.num_calls += num_rows if batched else 1
-                    try:
-                        with warnings.catch_warnings():
-                            # NumPy warns of tensors, which may not be the right way.
-                            warnings.simplefilter("ignore")
-                            result = way.result(given)
-                            x = way.fitted(result, given)
-                            if batched and bool((x == x[0]).all()):
-                                self.num_calls += num_rows
-                                if not torch.equal(way.simulate(given)[0], x):
-                                    raise SimulationError(
-                                        "All rows of a batch have the same noise."
-                                    )
-                    except Exception as raised:  # any error of the user's code
-                        errors.append(raised)
-                        continue
-                    if arrays or isinstance(result, Tensor):
-                        return way
-                    second_best = way
-                if second_best is not None:
-                    return second_best
-        raise SimulationError(
-            "Expected `simulator` to map theta (n, d) to x (n, *event), or one (d,) to "
-            f"one (*event), where *event is {tuple(self._event_shape)}; a batch "
-            f"of tensors gave {errors[0]!r}, and one array {errors[-1]!r}."
-        ) from errors[-1]
-
-    def _at(self, theta: Tensor, embed: Embedding, *, progress: bool) -> Tensor:
-        """Simulate at several parameters of each pair, ``(n, R, d)`` to ``(n, R, l)``.
+    def at(self, theta: Tensor, embed: Embed, *, progress: bool = False) -> Tensor:
+        """Simulate at parameters of n pairs, ``(n, S, d)`` to ``(n, S, l)``.
 
         Embeddings of simulations that failed are NaN.
+
+        Raises:
+            SimulationError: If all simulations of a pair failed.
         """
-        where = "at calibration parameters"
         embedded, valid = self._embedded(
-            theta.flatten(0, 1), embed, where, progress=progress
+            theta.flatten(0, 1), embed, "at calibration parameters", progress=progress
         )
         empty = ~valid.reshape(theta.shape[:2]).any(dim=1)
         if empty.any():
@@ -414,16 +270,57 @@ class Simulator:
         embedded = embedded.where(valid[:, None], torch.nan)
         return embedded.reshape(*theta.shape[:2], -1)
 
+    def _working_way(self, function: Callable[[Any], Any]) -> _Way:
+        """Try batches before single parameters, and tensors before arrays.
+
+        A simulator that makes something else than a tensor from tensors is given arrays
+        if it takes them, because it was written for these. One that was written for a
+        single theta may take a batch, and add the same noise to all rows.
+        """
+        sizes = {*self._prior.event_shape, *self._event_shape}
+        # A number of rows that is no number of parameters or of readings.
+        num_rows = next(n for n in range(3, 4 + len(sizes)) if n not in sizes)
+        kinds = ("tensor to tensor", "array", "tensor")
+        errors: dict[Any, Exception] = {}
+        for theta in self._prior.sample(torch.Size((TRIES,))).to(self._like):
+            for batched, kind in itertools.product((True, False), kinds):
+                way = _Way(function, batched, kind, self._event_shape, self._like)
+                given = theta.repeat(num_rows, 1) if batched else theta
+                rows = num_rows if batched else 1
+                self.num_calls += rows
+                try:
+                    with warnings.catch_warnings():
+                        # NumPy warns of tensors, which may not be the right way.
+                        warnings.simplefilter("ignore")
+                        x = way.x_of(given)
+                        if batched and bool((x == x[0]).all()):
+                            self.num_calls += rows
+                            if not torch.equal(way.simulate(given)[0], x):
+                                raise SimulationError("All rows have the same noise.")
+                except Exception as raised:  # any error of the user's code
+                    errors[batched, kind] = raised
+                    continue
+                return way
+        of_array = errors[False, "array"]
+        raise SimulationError(
+            "Expected `simulator` to map theta (n, d) to x (n, *event), or one (d,) to "
+            f"one (*event), where *event is {tuple(self._event_shape)}; a batch of "
+            f"tensors gave {errors[True, 'tensor']!r}, and one array {of_array!r}."
+        ) from of_array
+
     def _embedded(
         self,
         theta: Tensor,
-        embed: Embedding,
+        embed: Embed,
         where: str,
         *,
         progress: bool,
-        finished: list[Simulated] | None = None,
+        finished: list[Result] | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Return embeddings ``(n, l)`` of simulations, and which of them are finite."""
+        """Return embeddings ``(n, l)`` of simulations, and which of them are finite.
+
+        Parts that are ``finished`` are not simulated again, and others are added there.
+        """
         embeddings, valid, error = [], [], None
         chunk = PARALLEL_CHUNK if self._num_workers else SINGLE_CHUNK
         parts = theta.split(BATCHED_CHUNK if self._way.batched else chunk)
@@ -467,7 +364,7 @@ class Simulator:
             )
         return torch.cat(embeddings), ok
 
-    def _simulate(self, theta: Tensor) -> Simulated:
+    def _simulate(self, theta: Tensor) -> Result:
         """Simulate rows, in this process or in workers, and count them."""
         if self._num_workers is None:
             results = [self._way.simulate(theta)]
@@ -477,7 +374,7 @@ class Simulator:
             # A seeded block waits for those of other threads, so that these do not do.
             run: Any = joblib.Parallel(n_jobs=self._num_workers, backend="loky")
             results = run(
-                joblib.delayed(_simulate_piece)(self._way, piece, seed)
+                joblib.delayed(self._way.simulate_in_worker)(piece, seed)
                 for piece, seed in zip(pieces, seeds, strict=True)
             )
         xs, num_calls, errors = zip(*results, strict=True)
@@ -485,182 +382,118 @@ class Simulator:
         return torch.cat(xs), sum(num_calls), next(filter(None, errors), None)
 
 
-# Stored simulations ------------------------------------------------------------------
+# Stored simulations -------------------------------------------------------------------
 
 
-class StoredSimulations:
-    """Pairs (theta, x), with theta from the prior, without those that are not finite.
+class Stored:
+    """Stored pairs (theta, x), with theta from the prior, all of them finite.
 
-    The methods and the other arguments are those of :class:`Simulator`.
+    Args:
+        theta: Shape ``(N, d)``.
+        x: Shape ``(N, *event)``.
     """
 
-    num_calls: int = 0
-    num_dropped: int = 0
+    def __init__(self, theta: Tensor, x: Tensor) -> None:
+        self._pairs: tuple[Tensor, Tensor] | None = (theta, x)
+        self._dropped = 0
+        self._budget: tuple[Simulated, int] | None = None
+        self._finished: list[Result] = []
 
-    def __init__(
-        self,
-        simulations: tuple[Tensor, Tensor],
-        prior: Distribution,
-        *,
-        event_shape: torch.Size,
-        like: Tensor,
-        readable: Readable = all_finite,
-    ) -> None:
-        theta, x = simulations
-        options: Any = {"device": like.device, "finite": False}
-        theta = as_batch("simulations[0]", theta, prior.event_shape, **options)
-        x = as_batch("simulations[1]", x, event_shape, rows=len(theta), **options)
-        theta, x = theta.to(like), x.to(like)
-        valid = torch.isfinite(theta).all(dim=1) & readable(x)
-        if not valid.any():
-            raise SimulationError("All stored simulations contain NaN or Inf.")
-        self.num_dropped = int((~valid).sum())
-        if self.num_dropped:
-            warn_user(
-                f"Dropped {self.num_dropped} of {len(valid)} stored simulations "
-                f"({self.num_dropped / len(valid):.1%}), which are not finite."
-            )
-        theta, x = theta[valid], x[valid]
-        check_in_support("simulations[0]", theta, prior)
-        with seeded(0):
-            drawn = prior.sample(torch.Size((NUM_FROM_PRIOR,)))
-        compare: Any = functools.partial(ks_2samp, method="asymp")
-        unlike = [
-            number
-            for number, pair in enumerate(
-                zip(theta.T.cpu(), drawn.T.cpu(), strict=True)
-            )
-            if compare(*map(np.asarray, pair)).pvalue < NOT_FROM_PRIOR
-        ]
-        if unlike:
-            warn_user(
-                f"The parameters {unlike} of `simulations` (counted from 0) are not "
-                "distributed like the prior, as whose draws they are used."
-            )
-        self._pairs = theta, x
+    @classmethod
+    def made_by(cls, simulated: Simulated, n: int) -> "Stored":
+        """Return n simulations from the prior that are made when first needed.
+
+        If that is interrupted, the next call goes on where it was.
+        """
+        stored = cls(torch.empty(0), torch.empty(0))
+        stored._pairs, stored._budget = None, (simulated, n)
+        return stored
+
+    @property
+    def num_calls(self) -> int:
+        """How many rows the simulator has simulated, if there is one."""
+        return 0 if self._budget is None else self._budget[0].num_calls
+
+    @property
+    def num_dropped(self) -> int:
+        """How many simulations were not finite."""
+        return self._dropped if self._budget is None else self._budget[0].num_dropped
 
     def from_prior(
-        self, count: int | None, at_least: int, embed: Embedding, *, progress: bool
+        self,
+        n: int,
+        embed: Embed = _itself,
+        *,
+        seed: int | None = None,
+        progress: bool = False,
     ) -> tuple[Tensor, Tensor]:
-        """Embed a random subset; without a count, up to ``at_least`` of them."""
-        theta, x = self._made(progress=progress)
-        if count is not None and count > len(x):
-            raise InvalidInputError(
-                f"Expected `num_simulations` of at most {len(x)}, the number of stored "
-                f"simulations; got {count}."
-            )
-        chosen = torch.randperm(len(x))[: at_least if count is None else count]
-        chosen = chosen.to(x.device)
+        """Return up to n pairs, chosen at random."""
+        theta, x = self._all(progress=progress)
+        with seeded(seed):
+            chosen = torch.randperm(len(x))[:n].to(x.device)
         return theta[chosen], embed(x[chosen])
 
-    def targets(
-        self,
-        theta: Tensor,
-        embed: Embedding,
-        *,
-        simulations_per_target: int,
-        num_neighbors: int,
-        progress: bool,
-    ) -> Tensor:
-        """Average over the stored simulations with the nearest parameters."""
-        return self._near(theta, num_neighbors, embed, progress=progress).mean(dim=1)
+    def at(self, theta: Tensor, embed: Embed, *, progress: bool = False) -> Tensor:
+        r"""Return stored simulations near the parameters, moved to them.
 
-    def moments(
-        self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
-    ) -> Moments:
-        """Fit a plane to the embeddings of the stored simulations around each theta.
+        A plane is fitted to the embeddings z of the K simulations nearest to theta: 50
+        or, with many parameters, five for each coefficient. Simulations are moved along
+        the plane from their own parameters to theta (regression adjustment),
 
-        The mean is the height of the plane at theta, and the covariance is that of the
-        residuals. ``count`` has no effect: the number of stored simulations around a
-        theta depends on the number of parameters.
+        .. math:: z(\theta) + c\, r_k, \qquad c^2 = (K - 1) / (K - d - 1),
+
+        where c makes up for what the plane takes from the residuals r. The s-th theta
+        of a pair takes the s-th nearest simulation, so that residuals do not repeat.
+
+        References:
+            | Approximate Bayesian Computation in Population Genetics (Beaumont et al.,
+              2002)
+            | https://doi.org/10.1093/genetics/162.4.2025
         """
-        stored, x = self._made(progress=progress)
-        number = min(len(x), max(NUM_AROUND, 5 * (theta.shape[1] + 1)))
-        nearest, stored, theta = _nearest(stored, theta, number)
-        embedded = embed(x[nearest.flatten()]).double()
-        embedded = embedded.reshape(*nearest.shape, -1)
-        offsets = stored[nearest].double() - theta.double()[:, None]
-        # The ridge keeps the plane level if the parameters around theta do not vary.
-        design = torch.cat([torch.ones_like(offsets[..., :1]), offsets], dim=-1)
-        ridge = torch.full((design.shape[-1],), 1e-6).to(design)
+        stored, x = self._all(progress=progress)
+        n, count, d = theta.shape
+        number = min(len(x), max(NUM_AROUND, 5 * (d + 1)))
+        # Exact parameters are the same for all s.
+        at, place = theta.flatten(0, 1).unique(dim=0, return_inverse=True)
+        nearest, stored, at = _nearest(stored, at, number)
+        used, row = nearest.unique(return_inverse=True)
+        z = torch.cat([embed(x[some]) for some in used.split(BATCHED_CHUNK)])
+        turn = (torch.arange(count) % number).repeat(n).to(place)
+        # The ridge keeps the plane level where parameters do not vary.
+        ridge = torch.full((d + 1,), 1e-6).to(at).double()
         ridge[0] = 0.0
-        normal = design.mT @ design + ridge.diag()
-        plane = torch.linalg.solve(normal, design.mT @ embedded)
-        left_over = embedded - design @ plane
-        freedom = max(1, number - design.shape[-1])
-        return Moments(mean=plane[:, 0], covariance=left_over.mT @ left_over / freedom)
+        scale = ((number - 1) / max(1, number - d - 1)) ** 0.5
+        chunk, moved = max(1, MAX_NUMBERS // (number * z[0].numel())), []
+        for of, k in zip(place.split(chunk), turn.split(chunk), strict=True):
+            offsets = stored[nearest[of]].double() - at[of].double()[:, None]
+            design = torch.cat([torch.ones_like(offsets[..., :1]), offsets], dim=-1)
+            around = z[row[of]].double()
+            normal = design.mT @ design + ridge.diag()
+            plane = torch.linalg.solve(normal, design.mT @ around)
+            each = torch.arange(len(of)).to(of)
+            residual = around[each, k] - (design[each, None, k] @ plane)[:, 0]
+            moved.append((plane[:, 0] + scale * residual).to(z))
+        return torch.cat(moved).reshape(n, count, -1)
 
-    def draws(
-        self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
+    def near(
+        self, theta: Tensor, count: int, embed: Embed, *, progress: bool = False
     ) -> Tensor:
-        """Embed the simulations with the nearest parameters, at most ten."""
-        return self._near(theta, min(count, NUM_NEAR), embed, progress=progress)
+        """Embed the simulations nearest to each theta, ``(n, d)`` to ``(n, K, l)``."""
+        stored, x = self._all(progress=progress)
+        rows, _, _ = _nearest(stored, theta, min(count, len(x)))
+        return embed(x[rows.flatten()]).reshape(*rows.shape, -1)
 
-    def once_at(
-        self, theta: Tensor, embed: Embedding, *, progress: bool
-    ) -> tuple[Tensor, Tensor]:
-        """Embed the stored simulation with the nearest parameters."""
-        embedded = self._near(theta.flatten(0, 1), 1, embed, progress=progress)
-        return theta, embedded.reshape(*theta.shape[:2], -1)
-
-    def kept(self, count: int, *, progress: bool) -> tuple[Tensor, Tensor]:
-        """Return stored pairs, chosen at random because they may be sorted."""
-        theta, x = self._made(progress=progress)
-        with seeded(0):
-            chosen = torch.randperm(len(x))[:count].to(x.device)
-        return theta[chosen], x[chosen]
-
-    def _made(self, *, progress: bool) -> tuple[Tensor, Tensor]:
-        """Return all pairs."""
-        return self._pairs
-
-    def _near(
-        self, theta: Tensor, count: int, embed: Embedding, *, progress: bool
-    ) -> Tensor:
-        """Embed the ``count`` simulations near each theta, ``(n, count, l)``."""
-        stored, x = self._made(progress=progress)
-        nearest, _, _ = _nearest(stored, theta, min(count, len(x)))
-        return embed(x[nearest.flatten()]).reshape(*nearest.shape, -1)
-
-
-class LimitedSimulator(StoredSimulations):
-    """Simulations that are made when they are first needed, and then are stored ones.
-
-    If that is interrupted, the next call goes on where it was.
-    """
-
-    def __init__(self, simulator: Simulator, num_simulations: int) -> None:
-        self.num_simulations = num_simulations
-        self.simulator = simulator
-        self._finished: list[Simulated] = []
-        self._all: tuple[Tensor, Tensor] | None = None
-
-    @property
-    def num_calls(self) -> int:  # type: ignore[override]
-        """How many rows the simulator has simulated."""
-        return self.simulator.num_calls
-
-    @property
-    def num_dropped(self) -> int:  # type: ignore[override]
-        """How many simulations were dropped."""
-        return self.simulator.num_dropped
-
-    def _made(self, *, progress: bool) -> tuple[Tensor, Tensor]:
-        if self._all is None:
+    def _all(self, *, progress: bool) -> tuple[Tensor, Tensor]:
+        if self._pairs is None:
+            assert self._budget is not None
+            simulated, n = self._budget
             # With a seed of their own, they do not depend on who asks first.
             with seeded(0):
-                self._all = self.simulator.from_prior(
-                    self.num_simulations,
-                    self.num_simulations,
-                    lambda x: x,
-                    progress=progress,
-                    finished=self._finished,
+                self._pairs = simulated.drawn(
+                    n, _itself, finished=self._finished, progress=progress
                 )
             self._finished = []
-        return self._all
-
-
-SimulationSource = Simulator | StoredSimulations
+        return self._pairs
 
 
 def _nearest(
@@ -672,12 +505,15 @@ def _nearest(
     """
     mean, std = stored.mean(dim=0), divisors(stored.double().std(dim=0)).to(stored)
     stored, theta = (stored - mean) / std, (theta - mean) / std
-    # Imperfect labels have many possible parameters each, too many for one matrix.
+    # Labels that are not exact have many parameters each, too many for one matrix.
     rows = [
         torch.cdist(some, stored).topk(count, dim=1, largest=False).indices
         for some in theta.split(max(1, MAX_DISTANCES // len(stored)))
     ]
     return torch.cat(rows), stored, theta
+
+
+Source = Simulated | Stored
 
 
 def source_of(
@@ -689,10 +525,10 @@ def source_of(
     event_shape: torch.Size,
     like: Tensor,
     readable: Readable = all_finite,
-) -> SimulationSource:
+) -> Source:
     """Return a simulator, called ``num_simulations`` times at most, or stored pairs.
 
-    The other arguments are those of :class:`Simulator` and :class:`StoredSimulations`.
+    The other arguments are those of :class:`Simulated`.
     """
     check("num_simulations", num_simulations, Count | None)
     if (simulator is None) == (simulations is None):
@@ -700,12 +536,42 @@ def source_of(
             "Expected exactly one of `simulator` and `simulations`; got "
             f"{'none' if simulator is None else 'both'}."
         )
-    options: Any = {"event_shape": event_shape, "like": like, "readable": readable}
-    if simulations is not None:
-        if num_simulations is not None:
-            raise InvalidInputError("Expected `num_simulations` with a simulator only.")
-        return StoredSimulations(simulations, prior, **options)
-    source = Simulator(simulator, prior, **options)
-    return (
-        source if num_simulations is None else LimitedSimulator(source, num_simulations)
-    )
+    if simulations is None:
+        source = Simulated(
+            simulator, prior, event_shape=event_shape, like=like, readable=readable
+        )
+        if num_simulations is None:
+            return source
+        return Stored.made_by(source, num_simulations)
+    if num_simulations is not None:
+        raise InvalidInputError("Expected `num_simulations` with a simulator only.")
+    theta, x = simulations
+    options: Any = {"device": like.device, "finite": False}
+    theta = as_batch("simulations[0]", theta, prior.event_shape, **options)
+    x = as_batch("simulations[1]", x, event_shape, rows=len(theta), **options)
+    theta, x = theta.to(like), x.to(like)
+    valid = torch.isfinite(theta).all(dim=1) & readable(x)
+    if not valid.any():
+        raise SimulationError("All stored simulations contain NaN or Inf.")
+    stored = Stored(theta[valid], x[valid])
+    stored._dropped = int((~valid).sum())
+    if stored.num_dropped:
+        warn_user(
+            f"Dropped {stored.num_dropped} of {len(valid)} stored simulations "
+            f"({stored.num_dropped / len(valid):.1%}), which are not finite."
+        )
+    check_in_support("simulations[0]", theta[valid], prior)
+    with seeded(0):
+        drawn = prior.sample(torch.Size((NUM_FROM_PRIOR,)))
+    unlike = [
+        number
+        for number, column in enumerate(theta[valid].T.cpu().numpy())
+        if kstest(column, drawn[:, number].cpu().numpy(), method="asymp").pvalue
+        < NOT_FROM_PRIOR
+    ]
+    if unlike:
+        warn_user(
+            f"The parameters {unlike} of `simulations` (counted from 0) are not "
+            "distributed like the prior, as whose draws they are used."
+        )
+    return stored

@@ -18,12 +18,7 @@ from torch import Size, Tensor, nn
 from torch.distributions import Bernoulli, Binomial, Distribution, MultivariateNormal
 
 from sbi_rope.coupling import Coupling
-from sbi_rope.mixture import (
-    CoupledEmbeddings,
-    MixtureEstimator,
-    MixturePosterior,
-    Part,
-)
+from sbi_rope.density import Coupled, MixturePosterior
 
 # Names of `posterior_nn` for continuous parameters, and for mixed ones.
 FAMILIES = [
@@ -283,57 +278,37 @@ def gaussian_posterior(
         weights = (2 * torch.randn(len(x_o), len(embeddings))).double().softmax(dim=1)
     if prior is None:
         prior = box(dim)
-    estimator = coupled_mixture(
+    density = Coupled(
         Gaussians(dim),
         embeddings,
-        coupling_of(weights, embeddings),
         x_o,
-        embedding_net=nn.Linear(x_o[0].numel(), 2 * dim),
+        nn.Linear(x_o[0].numel(), 2 * dim),
+        coupling_of(weights, embeddings),
         unseen=unseen,
         tail_mass=tail_mass,
     )
-    return MixturePosterior(estimator, prior)
+    return MixturePosterior(density, prior)
 
 
-def coupled_mixture(
-    density: ConditionalDensityEstimator,
-    embeddings: Tensor,
-    coupling: Coupling,
-    x_o: Tensor,
-    *,
-    embedding_net: nn.Module,
-    unseen: Any = "raise",
-    tail_mass: float = 1e-3,
-) -> MixtureEstimator:
-    """The mixture of RoPE: one part, one net, one coupling."""
-    mixing = CoupledEmbeddings(embeddings, x_o, embedding_net, coupling, unseen=unseen)
-    return MixtureEstimator([Part(density, mixing)], [1.0], tail_mass=tail_mass)
-
-
-def simulated_of(posterior: MixturePosterior) -> Tensor:
-    """The embeddings of the simulations behind a posterior, (n_s, l)."""
-    return posterior.posterior_estimator.coupled[0].simulated
-
-
-def rows_of(posterior: MixturePosterior, x: Tensor) -> Tensor:
+def rows_of(posterior: Any, x: Tensor) -> Tensor:
     """The weights of the simulations for some observations, (n, n_s)."""
-    mixing = posterior.posterior_estimator.coupled[0]
-    return mixing.rows(mixing.embed(x)).weights
+    density = posterior.posterior_estimator
+    return density.rows(density.embed(x))
 
 
 def standard_normal(dim: int) -> MultivariateNormal:
     return MultivariateNormal(torch.zeros(dim), torch.eye(dim))
 
 
-def brute_force_log_prob(posterior: MixturePosterior, theta: Tensor) -> Tensor:
+def brute_force_log_prob(posterior: Any, theta: Tensor) -> Tensor:
     """log sum_j alpha_ij q(theta | s_j) over all i and j, (S, n_o) from (S, n_o, d).
 
     One component at a time, in float64; no support, no tail.
     """
-    estimator = posterior.posterior_estimator
-    density = estimator.parts[0].density
+    coupled = posterior.posterior_estimator
+    density = coupled.density
     columns = []
-    for embedding in estimator.coupled[0].simulated:
+    for embedding in coupled.simulated:
         flat = theta.reshape(-1, theta.shape[-1])
         condition = embedding[None].expand(len(flat), -1)
         log_q = density.log_prob(flat[None], condition)[0]

@@ -1,28 +1,27 @@
 """Small stacks that tests share, and their candidates and data."""
 
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from typing import Any
 from unittest.mock import patch
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from sbi_rope import CalibrationFinetuner, RoPE, StackedPosterior
-from sbi_rope.baselines import FinetunedNPE, PriorPosterior
+from sbi_rope.density import Density, Prior
 from sbi_rope.discrepancy import DiscrepancyModel
-from sbi_rope.discrepancy.training import ONE_COURSE
+from sbi_rope.finetuning import FINETUNING
 from sbi_rope.stacking import (
+    Candidate,
     CrossValidation,
-    DensityCandidate,
-    cross_validate,
+    StackData,
     default_candidates,
     stack,
 )
-from sbi_rope.stacking.finetuning import REHEARSED
-from sbi_rope.trainers.training import FINETUNING, Training
+from sbi_rope.stacking.candidates import REHEARSED
 from tests import problems
 
 QUIET: dict[str, Any] = {"show_progress_bars": False}
@@ -38,23 +37,23 @@ def quick() -> Iterator[None]:
         gain_precisions=(1.0,), error_scales=(0.1,), degrees_of_freedom=(3.0,)
     )
     tuning = CalibrationFinetuner(rehearsal=1.0, learning_rate=0.02, max_num_epochs=3)
-    steps = dict.fromkeys(("embedding", "tuned", "input"), 4)
+    room = "sbi_rope.stacking."
     constants = {
-        "sbi_rope.stacking.workbench.NUM_SIMULATIONS": 300,
-        "sbi_rope.stacking.workbench.SIMULATIONS_PER_PAIR": 5,
-        "sbi_rope.stacking.workbench.TUNING": tuning,
-        "sbi_rope.stacking.workbench.DiscrepancyModel": lambda: model,
-        "sbi_rope.stacking.scoring.NUM_SAMPLES": 40,
-        "sbi_rope.stacking.workbench.IN_A_STACK": ONE_COURSE,
-        "sbi_rope.discrepancy.correction.NUM_STEPS": steps,
-        "sbi_rope.discrepancy.correction.NUM_DRAWS": 50,
-        "sbi_rope.discrepancy.training.BATCH_SIZE": 50,
-        "sbi_rope.discrepancy.training.NUM_COMPARED": 50,
-        "sbi_rope.stacking.finetuning.FINETUNING": replace(
-            FINETUNING, max_num_epochs=2
+        room + "data.NUM_SIMULATIONS": 300,
+        room + "data.SIMULATIONS_PER_PAIR": 5,
+        room + "data.DiscrepancyModel": lambda: model,
+        room + "scoring.NUM_SAMPLES": 40,
+        room + "candidates.TUNING": tuning,
+        room + "candidates.FINETUNING": replace(FINETUNING, max_num_epochs=2),
+        room + "candidates.REHEARSED": replace(REHEARSED, max_num_epochs=1),
+        "sbi_rope.finetuning.STEPS_IN_EPOCH": 3,
+        "sbi_rope.discrepancy.correction.NUM_STEPS": dict.fromkeys(
+            ("embedding", "tuned", "input"), 4
         ),
-        "sbi_rope.stacking.finetuning.REHEARSED": replace(REHEARSED, max_num_epochs=1),
-        "sbi_rope.stacking.finetuning.STEPS": 3,
+        "sbi_rope.discrepancy.correction.NUM_DRAWS": 50,
+        "sbi_rope.discrepancy.correction.BATCH_SIZE": 50,
+        "sbi_rope.discrepancy.correction.NUM_COMPARED": 50,
+        "sbi_rope.fit.MAX_LOWERED": 0,
     }
     with ExitStack() as patches:
         for name, value in constants.items():
@@ -66,32 +65,25 @@ def quick() -> Iterator[None]:
 QUICK = CalibrationFinetuner(
     max_num_epochs=6, simulations_per_target=3, learning_rate=0.03
 )
-PRIOR, NPE = (c for c in default_candidates() if c.name in ("prior", "NPE"))
 # All kinds of default candidates.
 CANDIDATES = default_candidates()
+PRIOR, NPE = CANDIDATES[:2]
 
 
-def finetuned(rope: RoPE, seed: int) -> Any:
-    method = FinetunedNPE.from_posterior(
-        rope.npe,
-        training=Training(max_num_epochs=2, training_batch_size=100),
-        learning_rates=(1e-2,),
-    )
-    method.append_calibration(*rope.calibration)
-    return method.train(seed=seed, **QUIET).build_posterior()
+class Box(Candidate):
+    """A box around the parameters of the pairs: a candidate in ten lines."""
+
+    name = "box"
+
+    def fit(self, data: StackData, versions: Sequence[Tensor]) -> list[Density]:
+        theta = data.pairs.mean
+        widths = [theta[rows].abs().amax(dim=0) + 0.1 for rows in versions]
+        boxes = [problems.BoxUniform(-width, width) for width in widths]
+        return [Prior(box, data.pairs.x.shape[1:]) for box in boxes]
 
 
-def fitted_prior(rope: RoPE, seed: int) -> PriorPosterior:
-    """Return a box around the parameters of the pairs."""
-    theta, _ = rope.calibration
-    width = theta.abs().max(dim=0).values + 0.1
-    box = problems.BoxUniform(-width, width)
-    return PriorPosterior(box)
-
-
-# These candidates depend on the pairs and are quick to train.
-FINETUNED = DensityCandidate(name="mine", build=finetuned)
-FITTED = DensityCandidate(name="fitted prior", build=fitted_prior)
+# This candidate depends on the pairs and is quick to train.
+BOX = Box()
 
 
 def uneven(theta: Tensor) -> Tensor:
@@ -139,14 +131,17 @@ def observed(n: int = NUM_OBSERVED) -> Tensor:
     return problem(n, seed=2)[1]
 
 
+def data_of(rope: RoPE, *, num_folds: int = 4) -> StackData:
+    return StackData(rope, num_folds=num_folds, seed=0, **QUIET)
+
+
 def stacked(rope: RoPE, x_o: Tensor | None = None, **options: Any) -> StackedPosterior:
     with quick():
         return stack(rope, x_o, **{**DEFAULTS, **options})
 
 
 def validated(rope: RoPE, x_o: Tensor | None = None, **options: Any) -> CrossValidation:
-    with quick():
-        return cross_validate(rope, x_o, **{**DEFAULTS, **options})
+    return stacked(rope, x_o, **options).report.cross_validation
 
 
 @functools.cache
@@ -163,16 +158,8 @@ def small_stack() -> StackedPosterior:
     Tests share it and must not change it.
     """
     with torch.random.fork_rng():
-        return stacked(rope_of(), candidates=[PRIOR, NPE, FITTED], num_folds=5)
+        return stacked(rope_of(), candidates=[PRIOR, NPE, BOX], num_folds=5)
 
 
 def unnormalised(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:
     return posterior.log_prob_batched(theta, x, norm_posterior=False).detach()
-
-
-def same(a: list[Tensor], b: list[Tensor]) -> bool:
-    return len(a) == len(b) and all(map(torch.equal, a, b))
-
-
-def parameters(net: nn.Module) -> list[Tensor]:
-    return [value.detach() for value in net.state_dict().values()]

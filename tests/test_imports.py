@@ -16,11 +16,12 @@ PACKAGE = Path(sbi_rope.__file__).parent
 # The rooms by layer, the lowest first. A room imports from its own layer and from lower
 # ones. One that is new needs a place.
 LAYERS = [
-    """errors settings tensors _bounds _files _groups _means _permutation _progress
-    _random _training _units""",
-    """simulate coupling saving mixture finetuning sets metrics _npe _sbi
+    """errors settings tensors _bounds _files _means _permutation _progress
+    _random _units data ensemble""",
+    """fit simulate moments labels coupling saving density finetuning sets metrics _npe
+    _sbi
     _standardisation _two_sample""",
-    "rope discrepancy trainers batch tasks _labels",
+    "rope discrepancy trainers batch tasks",
     "stacking diagnosis baselines",
     "plots",
     "reports",
@@ -29,7 +30,7 @@ LAYER = {room: k for k, rooms in enumerate(LAYERS) for room in rooms.split()}
 # A method belongs where users look for it. When it is called, it may import from above.
 CALLS_UPWARDS = {("stacking", "reports")}
 # Tasks are problems for any method.
-UNKNOWN_TO_TASKS = {"rope", "mixture", "coupling", "discrepancy", "trainers"}
+UNKNOWN_TO_TASKS = {"rope", "density", "coupling", "discrepancy", "trainers"}
 # sbi keeps its promises for what these export. One room reaches deeper.
 PUBLIC_OF_SBI = {"", "inference", "neural_nets", "utils", "diagnostics", "analysis"}
 

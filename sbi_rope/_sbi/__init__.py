@@ -15,7 +15,6 @@ from sbi.utils.user_input_checks_utils import move_distribution_to_device
 
 from sbi_rope._sbi.densities import (
     MixedDensity,
-    MixtureDensity,
     VectorFieldDensity,
     gaussians_of,
 )
@@ -48,7 +47,6 @@ __all__ = [
     "ConditionalEstimator",
     "DirectPosterior",
     "MixedDensity",
-    "MixtureDensity",
     "NeuralPosterior",
     "SliceSamplerVectorized",
     "UnconditionalDensityEstimator",

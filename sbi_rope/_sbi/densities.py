@@ -21,20 +21,12 @@ from sbi_rope.errors import LogProbUnavailableError
 
 __all__ = [
     "MixedDensity",
-    "MixtureDensity",
     "VectorFieldDensity",
     "gaussians_of",
 ]
 
 # What sbi adds to the precision of each Gaussian that it mixes.
 SMALLEST_PRECISION = 1e-4
-
-
-class MixtureDensity(ConditionalDensityEstimator):
-    """A density that mixes others given several contexts of an observation.
-
-    So it has no single embedding of x, which could be tuned or taken off.
-    """
 
 
 class MixedDensity(ConditionalDensityEstimator):

@@ -19,7 +19,6 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_rope._random import seeded
-from sbi_rope._sbi.densities import MixtureDensity
 from sbi_rope._sbi.embedding import device_of
 from sbi_rope.errors import UnsupportedPosteriorError
 
@@ -62,7 +61,7 @@ def estimator_of(posterior: Any) -> ConditionalEstimator:
         if (
             not isinstance(posterior, DirectPosterior)
             or isinstance(posterior, FilteredDirectPosterior | NPE_A_Posterior)
-            or isinstance(estimator, MixtureDensity)
+            or hasattr(estimator, "log_q")  # a density of this package
         ):
             raise UnsupportedPosteriorError(
                 "Expected `posterior` to be what `NPE(...).build_posterior()` returns, "

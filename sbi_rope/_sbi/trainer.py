@@ -9,9 +9,9 @@ from sbi.neural_nets.estimators.base import ConditionalDensityEstimator
 from torch import Tensor
 from torch.utils.data import DataLoader, SubsetRandomSampler
 
-from sbi_rope._groups import groups_to_hold_out
 from sbi_rope._progress import progress_bar
-from sbi_rope._training import History
+from sbi_rope.data import groups_to_hold_out
+from sbi_rope.fit import History
 
 __all__ = ["SimulationTrainer", "train_npe"]
 

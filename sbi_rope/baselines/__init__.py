@@ -14,7 +14,7 @@ from sbi_rope.baselines.prior import PriorBaseline
 from sbi_rope.baselines.rnpe import RNPE
 from sbi_rope.baselines.rvnp import RVNP
 from sbi_rope.baselines.tuning_only import TuningOnly
-from sbi_rope.mixture import PriorPosterior
+from sbi_rope.density import PriorPosterior
 from sbi_rope.trainers import FinetunedNPE, Method, Training
 
 __all__ = [

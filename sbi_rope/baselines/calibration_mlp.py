@@ -6,21 +6,16 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._groups import split_pairs
 from sbi_rope._random import seeded
 from sbi_rope._sbi import ConditionalDensityEstimator, direct_posterior, embedding_of
 from sbi_rope._standardisation import leave_out_constants
-from sbi_rope._training import History
 from sbi_rope.baselines.networks import embedding_with_head
+from sbi_rope.data import split_pairs
 from sbi_rope.errors import InvalidInputError
+from sbi_rope.fit import History, Training, fit_on_pairs
 from sbi_rope.settings import check
 from sbi_rope.trainers.base import Method
-from sbi_rope.trainers.training import (
-    EstimatorBuilder,
-    Training,
-    estimator_builder,
-    train_on_pairs,
-)
+from sbi_rope.trainers.training import EstimatorBuilder, estimator_builder
 
 __all__ = ["CalibrationMLP", "DiagonalGaussian"]
 
@@ -201,7 +196,7 @@ class CalibrationMLP(Method):
             )
         train, held_out = split_pairs(theta, self.training.validation_fraction)
         estimator = self._gaussian(theta[train], x[train]).to(self._device)
-        history = train_on_pairs(
+        history = fit_on_pairs(
             estimator,
             theta,
             x,

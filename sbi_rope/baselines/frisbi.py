@@ -7,29 +7,19 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._groups import split_pairs
-from sbi_rope._sbi import embed
+from sbi_rope._sbi import ConditionalDensityEstimator, embed
 from sbi_rope._standardisation import warn_of_far_entries
-from sbi_rope._training import History, epochs_on_pairs, shuffled
 from sbi_rope.baselines.statistics import frozen_statistics
+from sbi_rope.data import split_pairs
+from sbi_rope.density import Density, Flow, MixturePosterior, OverSimulations
+from sbi_rope.ensemble import Ensemble, embedded, log_density
 from sbi_rope.finetuning import trainable_copy
-from sbi_rope.mixture import (
-    Mixing,
-    MixtureEstimator,
-    MixturePosterior,
-    OwnEmbeddings,
-    Part,
-    Rows,
-)
+from sbi_rope.fit import History, Training, epochs_on_pairs, fit, fit_on_pairs, shuffled
+from sbi_rope.moments import targets
 from sbi_rope.settings import Count, Positive, check
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
-from sbi_rope.trainers.training import (
-    EstimatorBuilder,
-    Training,
-    train_network,
-    train_on_pairs,
-)
+from sbi_rope.trainers.training import EstimatorBuilder
 
 __all__ = ["FRISBI"]
 
@@ -171,16 +161,15 @@ class FRISBI(Method):
         simulated, targets = self._simulated(h, show_progress_bars=show_progress_bars)
         g = trainable_copy(h, targets)
         event_shape = self._data.observations.shape[1:]
-        mixing = AlignedEmbeddings(
-            g, torch.cat([simulated, targets]), event_shape, self.gamma
+        aligned = Aligned(
+            density, g, torch.cat([simulated, targets]), event_shape, self.gamma
         )
-        history = self._train(mixing, targets, show_progress_bars=show_progress_bars)
+        history = self._train(aligned, targets, show_progress_bars=show_progress_bars)
         g.requires_grad_(requires_grad=False)
-        part = Part(density, mixing)
+        found: Density = aligned.eval()
         if self.distilled:
-            part = self._distilled(part, g, show_progress_bars=show_progress_bars)
-        mixture = MixtureEstimator([part], [1.0]).eval()
-        return MixturePosterior(mixture, copy.deepcopy(self._prior)), history
+            found = self._distilled(aligned, show_progress_bars=show_progress_bars)
+        return MixturePosterior(found, copy.deepcopy(self._prior)), history
 
     def _simulated(
         self, h: nn.Module, *, show_progress_bars: bool
@@ -192,19 +181,19 @@ class FRISBI(Method):
             return embed(h, x)
 
         _, simulated = source.from_prior(
-            None, self.num_simulations, embedding, progress=show_progress_bars
+            self.num_simulations, embedding, progress=show_progress_bars
         )
-        targets = source.targets(
-            self._data.calibration[0],
+        return simulated, targets(
+            source,
+            self._data.pairs,
+            self.simulations_per_target,
             embedding,
-            simulations_per_target=self.simulations_per_target,
             num_neighbors=NUM_NEIGHBORS,
             progress=show_progress_bars,
         )
-        return simulated, targets
 
     def _train(
-        self, mixing: "AlignedEmbeddings", targets: Tensor, *, show_progress_bars: bool
+        self, aligned: "Aligned", targets: Tensor, *, show_progress_bars: bool
     ) -> History:
         theta, x = self._data.calibration
         x_o = self._data.observations
@@ -213,17 +202,17 @@ class FRISBI(Method):
         max_num_epochs = epochs_on_pairs(theta, held_out, self.training.max_num_epochs)
 
         def error(rows: Tensor) -> Tensor:
-            return (mixing.g(x[rows]) - targets[rows]).square().mean()
+            return (aligned.g(x[rows]) - targets[rows]).square().mean()
 
         def loss(some: Tensor) -> Tensor:
-            return error(train) + mixing.transport_cost(x_o[some])
+            return error(train) + aligned.transport_cost(x_o[some])
 
         def batches(epoch: int) -> Any:
             every = torch.arange(len(x_o), device=x_o.device)
             return zip(shuffled(every, self.training.training_batch_size), strict=True)
 
-        return train_network(
-            mixing.g,
+        [history] = fit(
+            aligned.g,
             batches,
             loss,
             self.training,
@@ -233,18 +222,18 @@ class FRISBI(Method):
             label="FRISBI",
             show_progress_bars=show_progress_bars,
         )
+        return history
 
-    def _distilled(self, part: Part, g: nn.Module, *, show_progress_bars: bool) -> Part:
+    def _distilled(self, aligned: "Aligned", *, show_progress_bars: bool) -> Flow:
         """Return a density given g(x) that is trained on draws of the mixture."""
         x_o = self._data.observations
-        mixture = MixtureEstimator([part], [1.0])
-        theta = mixture.sample(torch.Size((self.num_draws,)), x_o)
+        theta = aligned.sample(torch.Size((self.num_draws,)), x_o)
         observation = torch.arange(len(x_o)).repeat(self.num_draws)
-        density = copy.deepcopy(part.density).requires_grad_()
-        train_on_pairs(
+        density = copy.deepcopy(aligned.density).requires_grad_()
+        fit_on_pairs(
             density,
             theta.flatten(0, 1),
-            embed(g, x_o)[observation.to(x_o.device)],
+            embed(aligned.g, x_o)[observation.to(x_o.device)],
             # No observation is both trained on and held out.
             split_pairs(observation, DISTILLING.validation_fraction),
             training=DISTILLING,
@@ -253,46 +242,49 @@ class FRISBI(Method):
             show_progress_bars=show_progress_bars,
         )
         density.requires_grad_(requires_grad=False)
-        return Part(density, OwnEmbeddings([g], x_o.shape[1:]))
+        return Flow(
+            Ensemble([aligned.g], embedded, ()),
+            Ensemble([density], log_density, ()),
+            input_shape=aligned.input_shape,
+            condition_shape=aligned.condition_shape,
+        )
 
 
-class AlignedEmbeddings(Mixing):
-    r"""Embeddings of simulations, weighted by their distance from an observation.
+class Aligned(OverSimulations):
+    r"""A mixture over simulations, weighted by their distance from an observation.
 
     .. math::
         \alpha_j(x) \propto \exp\bigl(-\lVert g(x) - s_j \rVert^2
         / (l \gamma)\bigr)
 
     Args:
+        density: :math:`q(\theta \mid s)`.
         g: The embedding net of observations.
-        simulated: :math:`s_j`, shape ``(c, l)``.
+        simulated: :math:`s_j`, shape ``(n_s, l)``.
         event_shape: Shape of one observation.
         gamma: :math:`\gamma`.
     """
 
-    simulated: Tensor
-
     def __init__(
-        self, g: nn.Module, simulated: Tensor, event_shape: torch.Size, gamma: float
+        self,
+        density: ConditionalDensityEstimator,
+        g: nn.Module,
+        simulated: Tensor,
+        event_shape: torch.Size,
+        gamma: float,
     ) -> None:
-        super().__init__(event_shape, len(simulated))
+        super().__init__(density, simulated, event_shape)
         self.g = g
         self.gamma = gamma
-        self.register_buffer("simulated", simulated)
-
-    @property
-    def embeddings(self) -> Tensor:
-        """The embeddings of the simulations, shape ``(c, l)``."""
-        return self.simulated
 
     def embed(self, x: Tensor) -> Tensor:
         """Embed observations, ``(n, *event)`` to ``(n, l)``."""
         return embed(self.g, x)
 
-    def rows(self, embedded: Tensor) -> Rows:
-        """Return the weights of the simulations for a block of observations."""
-        cost = self._cost(embedded.double(), self.simulated.double())
-        return Rows(torch.softmax(-cost / self.gamma, dim=1), self.simulated)
+    def rows(self, z: Tensor) -> Tensor:
+        """Return the weights of the simulations, ``(b, n_s)``; rows sum to one."""
+        cost = self._cost(z.double(), self.simulated.double())
+        return torch.softmax(-cost / self.gamma, dim=1)
 
     def transport_cost(self, x: Tensor) -> Tensor:
         """Return the mean cost of a coupling of observations, with its gradient."""

@@ -6,19 +6,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sbi_rope._groups import split_pairs, too_few_pairs
 from sbi_rope._sbi import direct_posterior, embedding_of
 from sbi_rope._standardisation import warn_of_far_entries
-from sbi_rope._training import History
+from sbi_rope.data import split_pairs, too_few_pairs
 from sbi_rope.errors import warn_user
+from sbi_rope.fit import History, Training, fit
 from sbi_rope.settings import check
 from sbi_rope.trainers.base import Method
-from sbi_rope.trainers.training import (
-    EstimatorBuilder,
-    Training,
-    estimator_builder,
-    train_network,
-)
+from sbi_rope.trainers.training import EstimatorBuilder, estimator_builder
 
 __all__ = ["JointNPE"]
 
@@ -119,7 +114,7 @@ class JointNPE(Method):
         def loss(theta: Tensor, x: Tensor) -> Tensor:
             return estimator.loss(theta, condition=x).mean()
 
-        history = train_network(
+        [history] = fit(
             estimator,
             batches,
             loss,

@@ -11,7 +11,6 @@ from sbi_rope._sbi import (
     estimator_of,
     posterior_from,
 )
-from sbi_rope._training import History
 from sbi_rope.baselines.error_model import SpikeAndSlab
 from sbi_rope.baselines.statistics import (
     NoiseOn,
@@ -19,14 +18,11 @@ from sbi_rope.baselines.statistics import (
     split_at_statistics,
     with_clip,
 )
+from sbi_rope.fit import History, Training
 from sbi_rope.settings import check
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
-from sbi_rope.trainers.training import (
-    EstimatorBuilder,
-    Training,
-    train_on_simulations,
-)
+from sbi_rope.trainers.training import EstimatorBuilder, train_on_simulations
 
 __all__ = ["NNPE"]
 

@@ -7,12 +7,12 @@ import torch
 from torch import Tensor
 
 from sbi_rope._random import seeded
-from sbi_rope._training import History
 from sbi_rope.errors import NotReadyError
-from sbi_rope.simulate import Simulator
+from sbi_rope.fit import History, Training
+from sbi_rope.simulate import Simulated
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
-from sbi_rope.trainers.training import EstimatorBuilder, Training
+from sbi_rope.trainers.training import EstimatorBuilder
 
 __all__ = ["PlainNPE", "ReferenceNPE"]
 
@@ -145,7 +145,7 @@ class ReferenceNPE(Method):
                 "`append_simulations(theta, x)` first."
             )
         with seeded(seed):
-            x = Simulator(
+            x = Simulated(
                 simulator, self._prior, event_shape=self._data.event_shape, like=theta
             )(theta)
         valid = torch.isfinite(x).flatten(1).all(dim=1)

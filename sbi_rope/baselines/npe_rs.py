@@ -6,13 +6,12 @@ import torch
 from torch import Tensor
 
 from sbi_rope._sbi import direct_posterior, embedding_of
-from sbi_rope._training import History
 from sbi_rope.errors import warn_user
+from sbi_rope.fit import History, Training
 from sbi_rope.settings import Count, NotNegative, check
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.training import (
     EstimatorBuilder,
-    Training,
     estimator_builder,
     train_on_simulations,
 )

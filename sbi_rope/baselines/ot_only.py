@@ -6,13 +6,14 @@ from typing import Any
 import torch
 
 from sbi_rope.coupling import SinkhornCoupler
+from sbi_rope.density import MixturePosterior
 from sbi_rope.errors import NotReadyError
-from sbi_rope.mixture import MixturePosterior
+from sbi_rope.fit import Training
 from sbi_rope.rope import RoPE
 from sbi_rope.settings import Count, check
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
-from sbi_rope.trainers.training import EstimatorBuilder, Training
+from sbi_rope.trainers.training import EstimatorBuilder
 
 __all__ = ["OTOnly"]
 

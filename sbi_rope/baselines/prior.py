@@ -1,6 +1,6 @@
 """The prior in the place of a posterior."""
 
-from sbi_rope.mixture import PriorPosterior
+from sbi_rope.density import PriorPosterior
 from sbi_rope.trainers.base import Method
 
 __all__ = ["PriorBaseline"]

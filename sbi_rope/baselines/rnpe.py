@@ -6,9 +6,13 @@ import torch
 from torch import Tensor, nn
 
 from sbi_rope._random import seeded
-from sbi_rope._sbi import direct_posterior, embed, estimator_of
+from sbi_rope._sbi import (
+    ConditionalDensityEstimator,
+    direct_posterior,
+    embed,
+    estimator_of,
+)
 from sbi_rope._standardisation import Standardisation
-from sbi_rope._training import History
 from sbi_rope.baselines.error_model import ChainSettings, SpikeAndSlab, denoise
 from sbi_rope.baselines.statistics import (
     NoiseOn,
@@ -16,15 +20,17 @@ from sbi_rope.baselines.statistics import (
     split_at_statistics,
     standardisation_of_statistics,
 )
+from sbi_rope.density import Density, Flow
+from sbi_rope.ensemble import Ensemble, embedded, log_density
 from sbi_rope.errors import warn_user
-from sbi_rope.mixture import Mixing, MixtureEstimator, Part, Rows, equal_rows
+from sbi_rope.fit import History, Training
 from sbi_rope.settings import Count, Range, check
 from sbi_rope.tensors import as_batch
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
-from sbi_rope.trainers.training import EstimatorBuilder, Training
+from sbi_rope.trainers.training import EstimatorBuilder
 
-__all__ = ["RNPE", "DenoisedEmbeddings"]
+__all__ = ["RNPE", "Denoised"]
 
 # Chains that disagree by more have not converged.
 MAX_R_HAT = 1.1
@@ -32,17 +38,18 @@ MAX_R_HAT = 1.1
 NUM_STARTS = 5000
 
 
-class DenoisedEmbeddings(Mixing):
-    r"""Statistics that may be behind an observation, with equal weights.
+class Denoised(Flow):
+    r"""A density that is averaged over the statistics that may be behind x.
 
     .. math::
-        s_m \sim p(s \mid y), \quad m = 1, \ldots, M
+        \tfrac1M \sum_m q(\theta \mid s_m), \qquad s_m \sim p(s \mid y)
 
     An observation is denoised when it is first asked for and known by its values from
     then on, so that density and samples belong together. Its draws of s depend on those
     it is denoised together with, through the random numbers alone.
 
     Args:
+        density: :math:`q(\theta \mid s)`.
         net: From x to s.
         marginal: :math:`q(s)` of standardised statistics.
         statistics: Simulated statistics, shape ``(n_s, l)``.
@@ -56,6 +63,7 @@ class DenoisedEmbeddings(Mixing):
 
     def __init__(
         self,
+        density: ConditionalDensityEstimator,
         net: nn.Module,
         marginal: Any,
         statistics: Tensor,
@@ -65,8 +73,13 @@ class DenoisedEmbeddings(Mixing):
         settings: ChainSettings,
         seed: int,
     ) -> None:
-        super().__init__(event_shape, settings.num_draws)
-        self.net = net
+        super().__init__(
+            Ensemble([net], embedded, ()),
+            Ensemble([density], log_density, ()),
+            torch.full((settings.num_draws,), 1 / settings.num_draws).double(),
+            input_shape=density.input_shape,
+            condition_shape=event_shape,
+        )
         self.marginal = marginal
         self.standardisation = Standardisation(statistics)
         self.register_buffer("starts", self.standardisation(statistics[:NUM_STARTS]))
@@ -79,16 +92,14 @@ class DenoisedEmbeddings(Mixing):
         """Return the draws of s of each observation, ``(n, num_denoised, l)``."""
         return torch.stack([draws for draws, _ in self._lookup(x)]).to(self.starts)
 
-    def rows(self, embedded: Tensor) -> Rows:
-        """Weigh all draws of an observation equally."""
-        return equal_rows(embedded)
+    readable = Density.readable  # what is finite
 
     def r_hat(self, x: Tensor) -> Tensor:
         """Return the largest split-R-hat of each observation's chains, ``(n,)``."""
         return torch.stack([r_hat for _, r_hat in self._lookup(x)]).to(self.starts)
 
     def _lookup(self, x: Tensor) -> list[tuple[Tensor, Tensor]]:
-        x = as_batch("x", x, self.event_shape).to(self.starts)
+        x = as_batch("x", x, self.condition_shape).to(self.starts)
         keys = [row.tobytes() for row in (x.detach().cpu() + 0.0).numpy()]
         # Equal observations are denoised once.
         new = {key: i for i, key in enumerate(keys) if key not in self._denoised}
@@ -98,7 +109,7 @@ class DenoisedEmbeddings(Mixing):
 
     def _denoise(self, keys: list[bytes], x: Tensor) -> None:
         bound = self.error_model.bound
-        y = self.standardisation(embed(self.net, x)).clamp(-bound, bound)
+        y = self.standardisation(super().embed(x)[:, 0]).clamp(-bound, bound)
         with seeded(self.seed):
             draws, r_hats = denoise(
                 y,
@@ -133,7 +144,7 @@ class RNPE(Method):
     statistics are drawn by sbi's slice sampler, with the choice between spike and slab
     summed out, and kept with the posterior: the first call about an observation takes
     half a second for eight statistics, later ones little. Chains that disagree
-    are warned of, and ``posterior.posterior_estimator.parts[0].mixing.r_hat(x)`` tells
+    are warned of, and ``posterior.posterior_estimator.r_hat(x)`` tells
     by how much.
 
     Sees simulations. Assumes that statistics err independently of each other, any of
@@ -221,7 +232,8 @@ class RNPE(Method):
             training=self.training,
             show_progress_bars=show_progress_bars,
         )
-        denoised = DenoisedEmbeddings(
+        denoised = Denoised(
+            density,
             net,
             marginal,
             statistics,
@@ -230,5 +242,4 @@ class RNPE(Method):
             settings=self.settings,
             seed=int(torch.randint(2**31, ())),
         )
-        estimator = MixtureEstimator([Part(density, denoised)], [1.0], tail_mass=0.0)
-        return direct_posterior(estimator.eval(), self._prior), history
+        return direct_posterior(denoised.eval(), self._prior), history

@@ -6,7 +6,6 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._groups import split_pairs
 from sbi_rope._sbi import (
     ConditionalDensityEstimator,
     UnconditionalDensityEstimator,
@@ -18,9 +17,9 @@ from sbi_rope._sbi import (
     with_embedding,
 )
 from sbi_rope._standardisation import Standardisation
-from sbi_rope._training import History, shuffled
+from sbi_rope.data import split_pairs
+from sbi_rope.fit import History, Training, fit, shuffled
 from sbi_rope.tensors import as_batch
-from sbi_rope.trainers.training import Training, train_network
 
 __all__ = [
     "NoiseOn",
@@ -177,7 +176,7 @@ def fit_marginal(
     def loss(batch: Tensor) -> Tensor:
         return flow.loss(batch + jitter * torch.randn_like(batch)).mean()
 
-    history = train_network(
+    [history] = fit(
         flow,
         batches,
         loss,

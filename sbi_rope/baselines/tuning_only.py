@@ -5,13 +5,13 @@ from typing import Any
 
 import torch
 
-from sbi_rope._training import History
 from sbi_rope.finetuning import CalibrationFinetuner
+from sbi_rope.fit import History, Training
 from sbi_rope.rope import RoPE
 from sbi_rope.settings import check
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
-from sbi_rope.trainers.training import EstimatorBuilder, Training
+from sbi_rope.trainers.training import EstimatorBuilder
 
 __all__ = ["TuningOnly"]
 

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from sbi_rope._means import Counts
 from sbi_rope._npe import TrainedNPE
+from sbi_rope.data import Counts
 from sbi_rope.diagnosis.implied import Implied, couple_by_itself, implied_by
 from sbi_rope.diagnosis.prior_shift import PriorShift
 from sbi_rope.diagnosis.simulations import Simulations
@@ -29,10 +29,10 @@ def implied_by_pairs(rope: RoPE, npe: TrainedNPE, simulations: Simulations) -> I
     Returns:
         One row for each person or specimen.
     """
-    x = rope.calibration[1]
+    x, group = rope.pairs.x, rope.pairs.group
     embedded = npe.embed("x", x, rope.tuned_embedding_net).detach().cpu().double()
     found = implied_by(couple_by_itself(simulations), embedded, simulations)
-    people = Counts(torch.ones(len(x)), rope.labels.groups.cpu())
+    people = Counts(torch.ones(len(x)), group.cpu())
     return Implied(
         weights=found.weights,
         functions=people.of_groups(found.functions)[0],

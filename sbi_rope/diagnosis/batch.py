@@ -1,5 +1,6 @@
 """Diagnose a batch: run all tests and collect their findings."""
 
+import copy
 from collections.abc import Sequence
 from typing import Annotated
 
@@ -11,6 +12,7 @@ from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._two_sample import compare_with_pairs
 from sbi_rope.coupling import SinkhornCoupler
+from sbi_rope.density import MixturePosterior
 from sbi_rope.diagnosis.also_in_pairs import also_in_pairs, implied_by_pairs
 from sbi_rope.diagnosis.far_entries import far_findings
 from sbi_rope.diagnosis.in_use import read_for, use_of
@@ -27,7 +29,6 @@ from sbi_rope.diagnosis.simulations import Simulations
 from sbi_rope.diagnosis.spread import FEWEST, spread_of
 from sbi_rope.diagnosis.support import support_of
 from sbi_rope.errors import InvalidInputError
-from sbi_rope.mixture import MixturePosterior
 from sbi_rope.rope import RoPE
 from sbi_rope.settings import Range, check, default_names, names_of
 
@@ -120,9 +121,9 @@ def diagnose(
     check("coupler", coupler, SinkhornCoupler | None)
     check("posterior", posterior, MixturePosterior | None)
     check("num_folds", num_folds, Folds | None)
-    tuned = len(rope.calibration[0]) > 0
+    tuned = len(rope.pairs) > 0
     if tuned and not rope.is_trained:
-        rope = rope.with_pairs(torch.arange(len(rope.calibration[0])))
+        rope = copy.copy(rope)  # which shares all data
         rope.train(seed=seed, show_progress_bars=show_progress_bars)
     with seeded(seed):
         # This comes first, so that a posterior with the same seed has these
@@ -198,8 +199,7 @@ def _held_out(
     rope: RoPE, num_folds: int | None, *, show_progress_bars: bool
 ) -> tuple[CrossFitted | None, list[str]]:
     """Return the embeddings of held-out calibration pairs, or why there are none."""
-    theta, _ = rope.calibration
-    if not len(theta):
+    if not len(rope.pairs):
         note = (
             "There are no calibration pairs, so that nothing was tuned. The tests that "
             "need labels were left out (misspecification after tuning, residuals, "
@@ -211,7 +211,7 @@ def _held_out(
             "tuned embedding net can therefore look like a prior shift, or like a "
             "batch that is narrower than the prior."
         )
-    elif rope.labels.num_groups < 2:
+    elif rope.pairs.num_groups < 2:
         note = (
             "Residuals were left out, because all calibration pairs have the same "
             "parameters (or group), or there is only one."
@@ -231,7 +231,7 @@ def _spread_findings(
     notes: list[str],
 ) -> list[Finding]:
     # The means of labels that are not exact are narrower than their parameters.
-    theta = _moved(rope.labelled_parameters.draws[:, 0])
+    theta = _moved(rope.pairs.theta[:, 0])
     counts = [len(shift.batch.means)]
     if shift.held_out is not None:
         counts.append(len(shift.held_out.of_people(theta)))
@@ -262,10 +262,11 @@ def _labelled_findings(
     rope: RoPE, batch: Tensor, npe: TrainedNPE, notes: list[str]
 ) -> list[Finding]:
     """Compare h(x_o) with h of the calibration pairs, if there are any."""
-    _, x = rope.calibration
-    if not len(x):
+    pairs = rope.pairs
+    if not len(pairs):
         return []
-    test = compare_with_pairs(npe.embed("x", x, npe.h), rope.labels.groups, batch)
+    embedded = npe.embed("x", pairs.x, npe.h)
+    test = compare_with_pairs(embedded, pairs.group.cpu(), batch)
     if test is None:
         notes.append(
             "Whether the batch is like the calibration pairs was not tested, which "

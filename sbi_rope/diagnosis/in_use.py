@@ -3,9 +3,9 @@
 from dataclasses import replace
 from typing import Any, Protocol
 
+from sbi_rope.density import MixturePosterior
 from sbi_rope.diagnosis.report import UNLIKE_PAIRS, Diagnosis, PosteriorInUse
 from sbi_rope.discrepancy.parameters import is_improbable
-from sbi_rope.mixture import MixturePosterior
 
 __all__ = ["read_for", "stack_in_use", "use_of"]
 

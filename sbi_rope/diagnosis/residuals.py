@@ -5,15 +5,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sbi_rope._groups import one_of_each_group, split_groups
-from sbi_rope._means import Counts
 from sbi_rope._permutation import permutation_test
 from sbi_rope._progress import progress_bar
 from sbi_rope._sbi import embed
-from sbi_rope._training import without_warning_of_few_pairs
 from sbi_rope._units import divisors
+from sbi_rope.data import Counts, one_of_each_group
 from sbi_rope.diagnosis.report import Finding
 from sbi_rope.diagnosis.simulations import Simulations
+from sbi_rope.fit import without_warning_of_few_pairs
 from sbi_rope.rope import RoPE
 
 __all__ = [
@@ -95,24 +94,30 @@ def cross_fit(rope: RoPE, *, num_folds: int, show_progress_bars: bool) -> CrossF
             two at least.
         show_progress_bars: Whether to show how many folds are done.
     """
-    theta, x = rope.calibration
+    pairs, h = rope.pairs, rope.embedding_net
     targets = rope.draw_targets(
         rope.finetuner.simulations_per_target, show_progress_bars=False
     )
     embedded = torch.empty_like(targets)
     # Recordings of one person share a fold, as they do in a stack.
-    split = split_groups(rope.labels.groups, num_folds)
-    folds = [rows.to(theta.device) for rows in split]
+    folds = pairs.folds(num_folds)
     for held_out in progress_bar(folds, show=show_progress_bars, desc="Folds"):
         others = torch.cat([fold for fold in folds if fold is not held_out])
-        part = rope.with_pairs(others, targets=targets[others])
         with without_warning_of_few_pairs():
-            part.train(show_progress_bars=False)
-        embedded[held_out] = embed(part.tuned_embedding_net, x[held_out])
+            result = rope.finetuner.finetune(
+                h,
+                pairs.x[others],
+                lambda count, others=others: targets[others],
+                draw_simulations=lambda n: rope.source.from_prior(n, seed=0)[1],
+                groups=pairs.group[others],
+                weights=pairs.weight[others],
+                show_progress_bars=False,
+            )
+        embedded[held_out] = embed(result.embedding_net, pairs.x[held_out])
     return CrossFitted(
         embedded=embedded.cpu().double(),
         targets=targets.cpu().double(),
-        people=Counts(torch.ones(len(theta)), rope.labels.groups.cpu()),
+        people=Counts(torch.ones(len(pairs)), pairs.group.cpu()),
     )
 
 
@@ -156,11 +161,13 @@ def residual_findings(
         simulations: What is known about simulations.
         notes: Why there is no finding is appended to these.
     """
-    theta = rope.calibration[0].detach().cpu().double()
+    pairs = rope.pairs
+    theta = pairs.mean.detach().cpu().double()
     residuals = held_out.residuals
-    if rope.labels.vary_within_groups:
+    labels = torch.stack([pairs.group, pairs.label.group]).unique(dim=1)
+    if labels.shape[1] > pairs.num_groups:
         # The mean over parameters that differ would depend on them less.
-        chosen = one_of_each_group(rope.labels.groups, seed=0)
+        chosen = one_of_each_group(pairs.group.cpu(), seed=0)
         theta, residuals = theta[chosen], residuals[chosen]
     else:
         theta, residuals = held_out.of_people(theta), held_out.of_people(residuals)

@@ -1,32 +1,29 @@
 """Fit the discrepancy, and train a given NPE further on corrected simulations."""
 
-import copy
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._groups import groups_of
-from sbi_rope._means import Counts
-from sbi_rope._sbi import ConditionalEstimator, embedding_of, headless, with_embedding
+from sbi_rope._random import seeded
+from sbi_rope._sbi import ConditionalEstimator, embedding_of
 from sbi_rope._standardisation import Standardisation
-from sbi_rope._training import History
+from sbi_rope.data import Counts, groups_of
+from sbi_rope.density.flow import Flow
 from sbi_rope.discrepancy.model import DiscrepancyModel
-from sbi_rope.discrepancy.posterior import Discrepancy
+from sbi_rope.discrepancy.posterior import Discrepancy, DiscrepancyDraws
 from sbi_rope.discrepancy.regression import SMALLEST_NOISE
-from sbi_rope.discrepancy.training import (
-    ONE_COURSE,
-    UNTIL_SETTLED,
-    train_on_corrected,
-)
 from sbi_rope.errors import InvalidInputError
-from sbi_rope.simulate import Moments
+from sbi_rope.fit import Courses, History, Training, fit
+from sbi_rope.moments import Moments
 
 __all__ = [
     "Correction",
     "Space",
-    "correct_npe",
+    "correct_flow",
     "fit_discrepancy",
     "network_of",
     "surprise",
@@ -44,28 +41,34 @@ NUM_DRAWS, MAX_ENTRIES = 2000, 2**24
 SMALLEST_ERROR = {"embedding": 0.01, "tuned": 0.01, "input": 0.003}
 # More standard deviations than this refute that the simulator is right.
 LARGEST_SURPRISE = 5.0
-# Gradient steps of a course. The density behind an embedding net adapts within a
-# hundred steps; a whole network takes longer. Chosen on calibration data.
-NUM_STEPS = {"embedding": 150, "tuned": 150, "input": 400}
+# Gradient steps of a course, and simulations in each. The density behind an embedding
+# net adapts within a hundred steps; a whole network takes longer.
+NUM_STEPS = {"embedding": 200, "tuned": 200, "input": 400}
+BATCH_SIZE = 160
+# Corrected simulations on which the loss before and after a course is compared.
+NUM_COMPARED = 1920
 LEARNING_RATES = {"embedding": 5e-3, "tuned": 5e-3, "input": 2e-3}
+# Another course follows if one has lowered the loss by so many nats. In a stack, where
+# many versions are trained, it also has to fall by more in the last quarter of one,
+# and there are fewer: one course is enough for most, but not for images. Chosen on
+# calibration data, see benchmarks/choices.md.
+UNTIL_SETTLED, STILL_FALLING, MAX_IN_A_STACK = 0.01, 0.15, 3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Correction:
-    """An estimator trained on corrected simulations, and the discrepancy it knows.
+    """Copies of NPE that were trained on corrected simulations.
 
     Attributes:
-        estimator: An estimator of sbi for real observations x.
-        discrepancy: The posterior of gain, offset and error.
-        history: The losses of its training.
+        flow: All copies.
         constants: A layer that replaces entries without variation in simulations, to
-            put behind an embedding net of real observations. The estimator contains it.
+            put behind an embedding net of real observations. The flow contains it.
+        histories: The losses of the training of each copy.
     """
 
-    estimator: Any
-    discrepancy: Discrepancy
-    history: History
+    flow: Flow
     constants: nn.Module
+    histories: list[History]
 
 
 def network_of(estimator: ConditionalEstimator, space: Space) -> nn.Module:
@@ -178,82 +181,111 @@ def surprise(
     return float((w * excess).sum() / (w.square() * variance).sum().sqrt())
 
 
-def correct_npe(
+def correct_flow(
     estimator: ConditionalEstimator,
     simulations: tuple[Tensor, Tensor],
-    z: Tensor,
-    moments: Moments,
+    discrepancies: Sequence[Discrepancy],
     *,
     space: Space,
-    model: DiscrepancyModel,
-    weights: Tensor | None = None,
-    groups: Tensor | None = None,
-    probabilities: Tensor | None = None,
+    probabilities: Sequence[Tensor | None],
     num_steps: int | None = None,
-    min_gain: float = UNTIL_SETTLED,
     learning_rate: float | None = None,
+    in_a_stack: bool = False,
     show_progress_bars: bool = False,
 ) -> Correction:
-    """Fit a discrepancy to calibration pairs, and train NPE on corrected simulations.
+    r"""Train copies of NPE on simulations as they would be observed, all at once.
+
+    .. math::
+        \min_q \; \mathbb E_{(A, b, \Sigma') \mid \text{pairs}}\;
+        \mathbb E_{\theta, z_s} \mathbb E_{e \mid \Sigma'}
+        \bigl[-\log q(\theta \mid A z_s + b + e)\bigr]
+
+    The optimum is the posterior with the discrepancy integrated out. Every step draws
+    new rows, new corrections and new errors. A network of usual size does not overfit
+    them, so that no simulations are held out.
 
     Args:
         estimator: The estimator of NPE; it is not changed.
         simulations: Parameters from the prior, shape ``(n_s, d)``, and the
             representation of a simulation of each, shape ``(n_s, l)``.
-        z: The representations of the real observations of the pairs, ``(n_c, l)``.
-        moments: The moments of simulations at the parameters of the pairs.
-        space: What z is: embeddings h(x), x itself, or embeddings by tuned nets.
-        model: The model of the discrepancy.
-        weights: How many pairs each pair counts as, shape ``(n_c,)``; one if None.
-        groups: A number for each pair, the same for recordings of one person.
-        probabilities: The probabilities with which simulations are drawn; None makes
-            them equal.
+        discrepancies: The discrepancy of each copy, in standard deviations of these.
+        space: What is corrected. With ``"input"`` all of NPE is trained, otherwise the
+            density behind the embedding net alone.
+        probabilities: For each copy, the probabilities with which simulations are
+            drawn; None makes them equal.
         num_steps: Gradient steps of a single course. If None, courses follow each
             other, whose length depends on the space.
-        min_gain: The nats by which a course has to lower the loss for another to
-            follow, if ``num_steps`` is None.
-        learning_rate: Learning rate of Adam; it depends on the space if None.
+        learning_rate: Learning rate of Adam, which falls to zero in each course; it
+            depends on the space if None.
+        in_a_stack: Whether to stop earlier, because many copies are trained.
         show_progress_bars: Whether to show the loss during training.
 
     Returns:
-        The corrected estimator. With ``space="tuned"`` its embedding net is h. The
-        caller replaces h by a tuned net and the constants.
+        The trained copies. With ``space="tuned"`` their embedding net is h. The caller
+        replaces h by a tuned net and the constants.
     """
-    theta, z_s = simulations
-    standardisation = Standardisation(z_s.double())
-    discrepancy = fit_discrepancy(
-        z, moments, standardisation, model, weights=weights, groups=groups
+    theta, z = simulations
+    unit = Standardisation(z.double())
+    z, count = unit(z.double()), len(discrepancies)
+    constants = nn.Identity() if unit.varies.all() else SimulatedConstants(unit)
+    net = embedding_of(estimator)
+    if not unit.varies.all():
+        order = (constants, net) if space == "input" else (net, constants)
+        net = nn.Sequential(*order)
+    flow = Flow.of([estimator] * count, nets=[net] * (count if space == "input" else 1))
+    network = flow if space == "input" else flow.densities
+    losses = flow.losses if space == "input" else flow.losses_given
+    size = max(1, min(NUM_DRAWS, MAX_ENTRIES // z.shape[1] ** 2 // count))
+    draws = DiscrepancyDraws.joined(
+        [
+            one.sample(size, smallest_error=SMALLEST_ERROR[space])
+            for one in discrepancies
+        ]
     )
-    corrected = copy.deepcopy(estimator)
-    # The two share their parameters, so that training one trains the other.
-    density: Any = corrected if space == "input" else headless(corrected)
-    history = train_on_corrected(
-        density,
-        theta,
-        z_s,
-        discrepancy.sample(
-            min(NUM_DRAWS, max(1, MAX_ENTRIES // len(discrepancy.noise) ** 2)),
-            smallest_error=SMALLEST_ERROR[space],
+    equal = torch.full((len(theta),), 1.0 / len(theta), dtype=torch.double)
+    upper = torch.stack([equal if p is None else p.cpu() for p in probabilities])
+    upper = upper.double().cumsum(dim=1)
+
+    def batch(count: int) -> tuple[Tensor, Tensor]:
+        """Return theta and corrected z for each copy, ``(E, count, ...)``."""
+        uniform = torch.rand(len(upper), count, dtype=torch.double) * upper[:, -1:]
+        rows = torch.searchsorted(upper, uniform).clamp_max(len(theta) - 1)
+        rows = rows.to(z.device)
+        draw = torch.randint(size, rows.shape)
+        draw = (draw + size * torch.arange(len(rows))[:, None]).to(z.device)
+        corrected = draws.correct(z[rows.flatten()], draw.flatten())
+        corrected = unit.undo(corrected.unflatten(0, rows.shape))
+        return theta[rows], corrected.to(theta)
+
+    def mean_loss(theta: Tensor, z: Tensor) -> Tensor:
+        return losses(theta, z).mean(dim=1)
+
+    compared = [batch(BATCH_SIZE) for _ in range(NUM_COMPARED // BATCH_SIZE)]
+
+    def compared_loss() -> Tensor:
+        with seeded(0):  # the loss of a vector field draws random times
+            return torch.stack([mean_loss(*some) for some in compared]).mean(dim=0)
+
+    if num_steps:
+        courses = Courses(compared_loss, math.inf)
+    elif in_a_stack:
+        courses = Courses(compared_loss, UNTIL_SETTLED, STILL_FALLING, MAX_IN_A_STACK)
+    else:
+        courses = Courses(compared_loss, UNTIL_SETTLED)
+    histories = fit(
+        network,
+        lambda step: [batch(BATCH_SIZE)],
+        mean_loss,
+        Training(
+            learning_rate=learning_rate or LEARNING_RATES[space],
+            max_num_epochs=num_steps or NUM_STEPS[space],
         ),
-        standardisation,
-        probabilities=probabilities,
-        num_steps=NUM_STEPS[space] if num_steps is None else num_steps,
-        min_gain=min_gain if num_steps is None else ONE_COURSE,
-        learning_rate=(
-            LEARNING_RATES[space] if learning_rate is None else learning_rate
-        ),
+        courses=courses,
+        in_training_mode=False,
+        label="Correcting NPE",
         show_progress_bars=show_progress_bars,
     )
-    constants: nn.Module = nn.Identity()
-    if not standardisation.varies.all():
-        constants = SimulatedConstants(standardisation)
-        corrected = _with_constants(corrected, constants, space)
-    return Correction(
-        estimator=corrected.eval(),
-        discrepancy=discrepancy,
-        history=history,
-        constants=constants,
-    )
+    return Correction(flow=flow, constants=constants, histories=histories)
 
 
 class SimulatedConstants(nn.Module):
@@ -274,9 +306,3 @@ class SimulatedConstants(nn.Module):
     def forward(self, z: Tensor) -> Tensor:
         """Return z with these entries replaced, in the same shape."""
         return z.where(self.varies, self.values.to(z))
-
-
-def _with_constants(estimator: Any, constants: nn.Module, space: Space) -> Any:
-    net = embedding_of(estimator)
-    parts = (constants, net) if space == "input" else (net, constants)
-    return with_embedding(estimator, nn.Sequential(*parts))

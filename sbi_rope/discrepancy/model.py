@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sbi_rope._groups import groups_of
 from sbi_rope._random import seeded
+from sbi_rope.data import groups_of
 from sbi_rope.discrepancy.conditional import Conditional
 from sbi_rope.discrepancy.correlation import GroupErrors, independent_pairs
 from sbi_rope.discrepancy.imputation import impute
@@ -151,6 +151,8 @@ class DiscrepancyModel(Settings):
         z = as_batch("z", z, width).double()
         possible = np.shape(mean)[1:-1][:1]
         mean = as_batch("mean", mean, (*possible, *width), rows=len(z)).to(z)
+        if possible == (1,):
+            mean = mean[:, 0]
         covariance = as_batch("covariance", covariance, width, rows=width[0]).to(z)
         noise = covariance + SMALLEST_NOISE**2 * torch.eye(z.shape[1]).to(z)
         if weights is not None:

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._groups import groups_of
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import (
@@ -15,27 +14,32 @@ from sbi_rope._sbi import (
     embed,
     embedding_of,
     estimator_of,
-    headless,
     posterior_from,
 )
-from sbi_rope._standardisation import warn_of_far_entries
-from sbi_rope._training import History
-from sbi_rope.discrepancy.correction import Space, correct_npe, network_of
+from sbi_rope._standardisation import Standardisation, warn_of_far_entries
+from sbi_rope.density import MixturePosterior
+from sbi_rope.discrepancy.correction import (
+    Space,
+    correct_flow,
+    fit_discrepancy,
+    network_of,
+)
 from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.parameters import learn_parameters
 from sbi_rope.discrepancy.posterior import Discrepancy
 from sbi_rope.discrepancy.report import DiscrepancyReport, report_discrepancy
 from sbi_rope.discrepancy.summaries import Summaries
-from sbi_rope.discrepancy.tuning import TUNING, cross_fitted_nets
+from sbi_rope.ensemble import Ensemble
 from sbi_rope.errors import InvalidInputError, NotReadyError
-from sbi_rope.finetuning import CalibrationFinetuner
-from sbi_rope.mixture import MixtureEstimator, MixturePosterior, OwnEmbeddings, Part
+from sbi_rope.finetuning import TUNING, CalibrationFinetuner
+from sbi_rope.fit import History, Training
+from sbi_rope.moments import Moments, moments
 from sbi_rope.settings import Count, Positive, Range, check
-from sbi_rope.simulate import Moments, SimulationSource
+from sbi_rope.simulate import Source
 from sbi_rope.tensors import as_batch
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
-from sbi_rope.trainers.training import EstimatorBuilder, Training
+from sbi_rope.trainers.training import EstimatorBuilder
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -227,7 +231,7 @@ class DiscrepancyNPE(Method):
         self._check_data("calibration")
         if self._simulator is None:
             self._check_data("simulations")
-        theta, x = self._data.calibration
+        x = self._data.pairs.x
         if x.ndim != 2 and summaries is None:
             raise InvalidInputError(
                 f"Expected observations of shape (n, l); got {tuple(x.shape)}. Pass "
@@ -237,28 +241,31 @@ class DiscrepancyNPE(Method):
         net = nn.Identity() if summaries is None else Summaries(summaries)
         with seeded(seed):
             source = self._source()
-            _, simulated = source.kept(self.num_simulations, progress=show)
+            _, simulated = source.from_prior(
+                self.num_simulations, seed=0, progress=show
+            )
             x = as_batch("summaries of the pairs", embed(net, x))
             simulated = as_batch("summaries of simulations", embed(net, simulated))
-            moments = self._moments(source, net, show)
+            found = self._moments(source, net, show)
         return report_discrepancy(
             x,
-            moments,
+            found,
             simulated,
             model=self.model,
-            groups=groups_of(theta),
+            groups=self._data.pairs.group,
             x_names=x_names,
             show_progress_bars=show,
         )
 
     def _moments(
         self,
-        source: SimulationSource,
+        source: Source,
         net: nn.Module,
         show_progress_bars: bool,  # noqa: FBT001
     ) -> Moments:
-        return source.moments(
-            self._data.calibration[0],
+        return moments(
+            source,
+            self._data.pairs,
             self.simulations_per_pair,
             lambda x: embed(net, x),
             progress=show_progress_bars,
@@ -273,60 +280,89 @@ class DiscrepancyNPE(Method):
                 because="space='tuned' averages over nets",
                 instead="Choose space='embedding', or train NPE.",
             )
-        theta, x = self._data.calibration
-        warn_of_far_entries("x", x, embedding_of(estimator))
+        pairs = self._data.pairs
+        warn_of_far_entries("x", pairs.x, embedding_of(estimator))
         source = self._source()
         net = network_of(estimator, self.space)
-        moments = self._moments(source, net, show_progress_bars)
+        found = self._moments(source, net, show_progress_bars)
         theta_s, x_s = self._bank(source, show_progress_bars)
         if self.space == "input":
-            as_batch("x", x)
+            as_batch("x", pairs.x)
             as_batch("x of simulations", x_s)
-        nets, z = [net], embed(net, x)
+        z, nets = embed(net, pairs.x), None
         if self.space == "tuned":
-            nets, z = cross_fitted_nets(
-                net,
-                (theta, x),
-                moments,
-                x_s,
-                finetuner=self.finetuner,
-                num_folds=self.num_folds,
-                show_progress_bars=show_progress_bars,
-            )
+            targets = found.mean.to(z)
+            nets, z = self._cross_fitted(net, targets, x_s, show_progress_bars)
         probabilities = None
         if self.learn_prior:
-            probabilities = learn_parameters(theta, theta_s).probabilities
-        correction = correct_npe(
+            probabilities = learn_parameters(pairs.mean, theta_s).probabilities
+        z_s = embed(net, x_s)
+        unit = Standardisation(z_s.double())
+        self._discrepancy = fit_discrepancy(
+            z, found, unit, self.model, groups=pairs.group
+        )
+        correction = correct_flow(
             estimator,
-            (theta_s, embed(net, x_s)),
-            z,
-            moments,
+            (theta_s, z_s),
+            [self._discrepancy],
             space=self.space,
-            model=self.model,
-            groups=groups_of(theta),
-            probabilities=probabilities,
+            probabilities=[probabilities],
             num_steps=self.num_steps,
             learning_rate=self.learning_rate,
             show_progress_bars=show_progress_bars,
         )
-        self._discrepancy = correction.discrepancy
-        if self.space != "tuned":
-            return posterior_from(npe, correction.estimator), correction.history
+        [history], flow = correction.histories, correction.flow
+        if nets is None:
+            return posterior_from(npe, flow.estimator(estimator)), history
         # An entry that is constant in h can vary in g.
-        nets = [nn.Sequential(net, correction.constants) for net in nets]
-        return self._averaged(correction.estimator, nets), correction.history
+        members = [(number, 0) for number in range(len(nets))]
+        average = flow.made_of(members, nets.then(correction.constants))
+        return MixturePosterior(average, copy.deepcopy(self._prior)), history
+
+    def _cross_fitted(
+        self,
+        h: nn.Module,
+        targets: Tensor,
+        simulations: Tensor,
+        show_progress_bars: bool,  # noqa: FBT001
+    ) -> tuple[Ensemble, Tensor]:
+        """Tune a copy of h without each fold of the pairs, and embed the fold with it.
+
+        A net embeds the pairs that it was tuned on too close to their simulations. Only
+        other pairs show the discrepancy that remains.
+        """
+        pairs = self._data.pairs
+        if pairs.num_groups == 1:
+            raise InvalidInputError(
+                "Expected calibration pairs of different parameters with space='tuned';"
+                f" all {len(pairs)} have the same. Use space='embedding'."
+            )
+        every = torch.arange(len(pairs)).to(pairs.group)
+        folds = pairs.folds(self.num_folds)
+        # The simulations may be sorted, and rehearsal takes the first ones.
+        order = torch.randperm(len(simulations)).to(simulations.device)
+        nets, _ = self.finetuner.tuned(
+            h,
+            pairs.x,
+            [targets] * len(folds),
+            [every[~torch.isin(every, fold)] for fold in folds],
+            groups=pairs.group,
+            draw_simulations=lambda count: simulations[order[:count]],
+            show_progress_bars=show_progress_bars,
+        )
+        z = torch.empty_like(targets)
+        for number, fold in enumerate(folds):
+            z[fold] = embed(nets.member(number), pairs.x[fold])
+        return nets, z
 
     def _bank(
         self,
-        source: SimulationSource,
+        source: Source,
         show_progress_bars: bool,  # noqa: FBT001
     ) -> tuple[Tensor, Tensor]:
         """Return simulations from the prior: the appended ones, or else new ones."""
         if self._data.count("simulations"):
             return self._data.simulations
-        return source.kept(self.num_simulations, progress=show_progress_bars)
-
-    def _averaged(self, estimator: Any, nets: Sequence[nn.Module]) -> MixturePosterior:
-        embeddings = OwnEmbeddings(nets, estimator.condition_shape)
-        mixture = MixtureEstimator([Part(headless(estimator), embeddings)], [1.0])
-        return MixturePosterior(mixture, copy.deepcopy(self._prior))
+        return source.from_prior(
+            self.num_simulations, seed=0, progress=show_progress_bars
+        )

@@ -1,5 +1,6 @@
 """The posterior of gain, offset and error, and draws from it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -148,10 +149,19 @@ class DiscrepancyDraws:
     offset: Tensor
     error_factor: Tensor
 
+    @classmethod
+    def joined(cls, parts: "Sequence[DiscrepancyDraws]") -> "DiscrepancyDraws":
+        """Return all draws of several sets, one set after the other."""
+        return cls(
+            gain=torch.cat([part.gain for part in parts]),
+            offset=torch.cat([part.offset for part in parts]),
+            error_factor=torch.cat([part.error_factor for part in parts]),
+        )
+
     def __len__(self) -> int:
         return len(self.offset)
 
-    def correct(self, z_s: Tensor) -> Tensor:
+    def correct(self, z_s: Tensor, draw: Tensor | None = None) -> Tensor:
         """Return simulations as they would be observed in reality.
 
         Each simulation is corrected by a draw that is chosen at random, and gets an
@@ -160,6 +170,7 @@ class DiscrepancyDraws:
 
         Args:
             z_s: Simulations, shape ``(n, l)``.
+            draw: The number of the draw for each, shape ``(n,)``; random if None.
 
         Returns:
             Shape ``(n, l)``, float64.
@@ -168,7 +179,8 @@ class DiscrepancyDraws:
             InvalidInputError: If the shape does not fit or a value is not finite.
         """
         z_s = as_batch("z_s", z_s, self.offset.shape[1:])
-        draw = torch.randint(len(self), (len(z_s),)).to(z_s.device)
+        if draw is None:
+            draw = torch.randint(len(self), (len(z_s),)).to(z_s.device)
         noise = torch.randn(z_s.shape, dtype=torch.double).to(z_s.device)
         # A matrix for each simulation needs a lot of memory if z has many entries.
         size = max(1, MAX_ENTRIES // z_s.shape[1] ** 2)

@@ -13,7 +13,7 @@ from sbi_rope._standardisation import Standardisation
 from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.posterior import Discrepancy
 from sbi_rope.errors import InvalidInputError
-from sbi_rope.simulate import Moments
+from sbi_rope.moments import Moments
 
 __all__ = [
     "DiscrepancyReport",
@@ -335,10 +335,10 @@ def _summary(
     scale: float,
     seed: int,
 ) -> SummaryDiscrepancy:
-    """Return the discrepancy of one summary, with z and mean of shape ``(n, 1)``.
+    """Return the discrepancy of one summary, with z ``(n, 1)`` and mean ``(n, R, 1)``.
 
-    Where labels are not exact, mean has the shape ``(n, R, 1)``, and there are no
-    outliers: a residual may come from the label.
+    Where labels are not exact there are no outliers: a residual may come from the
+    label.
     """
     # The intervals assume that there is a discrepancy. Its probability is reported too.
     draws = replace(discrepancy, probability_of_none=0.0).sample(
@@ -348,8 +348,8 @@ def _summary(
     error = draws.error_factor[:, 0, 0].abs()
     size = ((gain - 1).square() + shift.square() + error.square()).sqrt()
     outliers: tuple[int, ...] = ()
-    if mean.ndim == 2:
-        residual = (z - gain.median() * mean - shift.median())[:, 0]
+    if mean.shape[1] == 1:
+        residual = (z - gain.median() * mean[:, 0] - shift.median())[:, 0]
         noise = float(gain.median().abs() * discrepancy.noise[0, 0].sqrt())
         outliers = _outliers(residual, noise)
     return SummaryDiscrepancy(

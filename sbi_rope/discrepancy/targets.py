@@ -7,7 +7,7 @@ from sbi_rope._standardisation import Standardisation
 from sbi_rope.discrepancy.correction import fit_discrepancy
 from sbi_rope.discrepancy.imputation import expected_means
 from sbi_rope.discrepancy.model import DiscrepancyModel
-from sbi_rope.simulate import Moments
+from sbi_rope.moments import Moments
 
 __all__ = ["tuning_targets"]
 

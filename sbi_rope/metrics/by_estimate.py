@@ -15,9 +15,10 @@ import torch
 from scipy.stats import rankdata
 from torch import Tensor
 
-from sbi_rope._means import Counts, means_of_pairs
+from sbi_rope._means import means_of_pairs
 from sbi_rope._permutation import permutation_test
 from sbi_rope._random import seeded
+from sbi_rope.data import Counts
 from sbi_rope.metrics.calibration import (
     ROUNDING,
     random_ranks,

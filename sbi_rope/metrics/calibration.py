@@ -14,12 +14,12 @@ from scipy.stats import t as student
 from torch import Tensor
 
 from sbi_rope._means import (
-    Counts,
     mean_and_error,
     mean_of_known,
     means_of_pairs,
     standard_error_of_mean,
 )
+from sbi_rope.data import Counts
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.tensors import as_batch, as_numbers
 

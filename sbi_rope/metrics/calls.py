@@ -22,7 +22,8 @@ from sbi.inference import DirectPosterior, EnsemblePosterior, VectorFieldPosteri
 from torch import Tensor, nn
 
 from sbi_rope._progress import progress_bar
-from sbi_rope._sbi import MixtureDensity, NeuralPosterior, is_bounded, readable
+from sbi_rope._sbi import NeuralPosterior, is_bounded, readable
+from sbi_rope.density import Density, MixturePosterior, PriorPosterior
 from sbi_rope.errors import (
     InvalidInputError,
     LogProbUnavailableError,
@@ -219,14 +220,19 @@ def _read_x(posterior: Any, x: Any, rows: int | None = None) -> Tensor:
     """Return observations that the posterior can read."""
     estimator = getattr(posterior, "posterior_estimator", None)
     event_shape = getattr(estimator, "condition_shape", None)
+    if isinstance(posterior, PriorPosterior):
+        event_shape = None  # it never reads x
     names = getattr(posterior, "x_names", None)
     x = as_batch("x", x, event_shape, rows=rows, names=names, finite=False)
     if isinstance(posterior, NeuralPosterior):
         x = x.float()
-    if isinstance(estimator, MixtureDensity):
+    if isinstance(posterior, MixturePosterior):
         return x  # it refuses what it cannot read
-    net = getattr(estimator, "embedding_net", None)
-    unread = ~readable(net if isinstance(net, nn.Module) else nn.Identity(), x)
+    if isinstance(estimator, Density):
+        unread = ~estimator.readable(x)
+    else:
+        net = getattr(estimator, "embedding_net", None)
+        unread = ~readable(net if isinstance(net, nn.Module) else nn.Identity(), x)
     if unread.any():
         raise InvalidInputError(
             f"Expected `x` that can be read; got NaN or Inf in {rows_with(unread)}."

@@ -107,7 +107,7 @@ def lpp(
 
     Example:
         >>> from sbi.utils import BoxUniform
-        >>> from sbi_rope.mixture import PriorPosterior
+        >>> from sbi_rope.density import PriorPosterior
         >>> prior = BoxUniform(torch.zeros(1), torch.ones(1))
         >>> score = lpp(PriorPosterior(prior), torch.rand(9, 1), torch.rand(9, 2))
         >>> score.mean

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from sbi_rope.density import MixturePosterior
 from sbi_rope.errors import InvalidInputError, warn_user
-from sbi_rope.mixture import MixturePosterior
 from sbi_rope.plots._figures import BLUE, GREY, ORANGE, empty_figure
 from sbi_rope.plots._samples import (
     as_samples,

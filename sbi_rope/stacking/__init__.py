@@ -2,10 +2,11 @@
 
 from sbi_rope.stacking.candidates import (
     Candidate,
-    DensityCandidate,
     DiscrepancyCandidate,
     FinetunedCandidate,
-    RehearsedCandidate,
+    GivenCandidate,
+    NPECandidate,
+    PriorCandidate,
     RVNPCandidate,
     default_candidates,
 )
@@ -15,27 +16,29 @@ from sbi_rope.stacking.cross_validation import (
     LearningCurve,
     SetScores,
 )
+from sbi_rope.stacking.data import StackData
 from sbi_rope.stacking.posterior import StackedPosterior
 from sbi_rope.stacking.report import Provenance, StackingReport
-from sbi_rope.stacking.stack import cross_validate, stack
+from sbi_rope.stacking.stack import stack
 from sbi_rope.stacking.weights import StackingWeights, stacking_weights
 
 __all__ = [
     "Candidate",
     "CrossValidation",
-    "DensityCandidate",
     "Difference",
     "DiscrepancyCandidate",
     "FinetunedCandidate",
+    "GivenCandidate",
     "LearningCurve",
+    "NPECandidate",
+    "PriorCandidate",
     "Provenance",
     "RVNPCandidate",
-    "RehearsedCandidate",
     "SetScores",
+    "StackData",
     "StackedPosterior",
     "StackingReport",
     "StackingWeights",
-    "cross_validate",
     "default_candidates",
     "stack",
     "stacking_weights",

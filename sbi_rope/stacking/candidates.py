@@ -1,164 +1,167 @@
 """The candidates that a stack can be made of, and those that it is made of by default.
 
-A candidate is a class with a name and :meth:`Candidate.parts`, which trains on the
-pairs of a fold and returns densities. Nothing else knows its type.
+A candidate is a class with a name and :meth:`Candidate.fit`. Nothing else knows its
+type.
 """
 
-import copy
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from sbi_rope._sbi import check_density, estimator_of, headless, with_embedding
-from sbi_rope.discrepancy.correction import Space, network_of
-from sbi_rope.errors import (
-    InvalidInputError,
-    RoPEError,
-    UnsupportedPosteriorError,
-    warn_user,
+from sbi_rope._sbi import NeuralPosterior, embed, estimator_of
+from sbi_rope._standardisation import Standardisation
+from sbi_rope.density import Density, Flow, Given, Prior, density_of
+from sbi_rope.discrepancy.correction import (
+    Correction,
+    Space,
+    correct_flow,
+    fit_discrepancy,
+    network_of,
 )
-from sbi_rope.mixture import (
-    MixturePosterior,
-    OwnEmbeddings,
-    Part,
-    PriorPosterior,
-    part_of,
-    part_of_prior,
-)
+from sbi_rope.ensemble import Ensemble
+from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError, warn_user
+from sbi_rope.finetuning import FINETUNING, TUNING, best_rates, finetune_flow
+from sbi_rope.fit import without_warning_of_few_pairs
 from sbi_rope.rope import RoPE
 from sbi_rope.settings import Settings, check
-from sbi_rope.stacking.finetuning import finetune_without
-from sbi_rope.stacking.workbench import NUM_FOLDS, Fold, Workbench
+from sbi_rope.stacking.data import NUM_FOLDS, StackData, key_of
 from sbi_rope.tensors import as_batch, as_numbers
 
 __all__ = [
     "Candidate",
-    "DensityCandidate",
     "DiscrepancyCandidate",
     "FinetunedCandidate",
+    "GivenCandidate",
     "RVNPCandidate",
-    "RehearsedCandidate",
-    "checked_candidates",
+    "chosen_candidates",
     "default_candidates",
     "suitable_candidates",
 ]
 
 
 class Candidate(ABC):
-    """A candidate whose density is defined for any observation.
-
-    To implement one, give it a name and define :meth:`parts`. Random numbers that
-    :meth:`parts` draws are seeded by the fold.
+    """A candidate of a stack, in ten lines: give it a name and define :meth:`fit`.
 
     Attributes:
         name: Its name in the report.
-        fixed: Whether it does not depend on the calibration pairs. It is trained once.
-        learns_prior: Whether it learns from the pairs how parameters are distributed.
+        family: The name of its method, by which weights are added up in the report;
+            that of the candidate if it has none.
+        learns_prior: Whether it learns from the pairs how parameters are distributed,
+            as all training on them does.
     """
 
     name: str
-    fixed: bool = False
-    learns_prior: bool = False
+    family: str = ""
+    learns_prior: bool = True
 
-    @property
-    def family(self) -> str:
-        """The name of its method; that of the candidate unless overridden."""
-        return self.name
-
-    def applies_to(self, bench: Workbench) -> bool:
+    def suits(self, data: StackData) -> bool:
         """Tell whether the data allow it. The default stack leaves it out if not."""
         return True
 
+    def check(self, data: StackData) -> None:
+        """Raise if it cannot be trained, before any candidate is."""
+        return
+
     @abstractmethod
-    def parts(self, fold: Fold) -> list[Part]:
-        """Train on the pairs of a fold; return densities with equal shares."""
+    def fit(self, data: StackData, versions: Sequence[Tensor]) -> list[Density]:
+        """Train all versions at once.
+
+        Args:
+            data: The pairs and simulations.
+            versions: For each version, the rows of the pairs that it may see.
+
+        Returns:
+            For each version a density, or anything else that :class:`GivenCandidate`
+            takes. One that sees no pairs may be that of all versions.
+        """
 
 
-@dataclass(frozen=True, kw_only=True)
-class DensityCandidate(Settings, Candidate):
-    """A posterior of your own, trained on calibration pairs or not.
+class PriorCandidate(Candidate):
+    """The prior, which learns nothing from x."""
+
+    name = "prior"
+    learns_prior = False
+
+    def fit(self, data: StackData, versions: Sequence[Tensor]) -> list[Density]:
+        """Return the prior for all versions."""
+        return [Prior(data.prior, data.pairs.x.shape[1:])] * len(versions)
+
+
+class NPECandidate(Candidate):
+    """NPE as it is."""
+
+    name = "NPE"
+    learns_prior = False
+
+    def fit(self, data: StackData, versions: Sequence[Tensor]) -> list[Density]:
+        """Return NPE for all versions."""
+        return [Flow.of([data.estimator])] * len(versions)
+
+
+class GivenCandidate(Candidate):
+    """A density that is there already, and has not seen the calibration pairs.
 
     Args:
-        name: Its name in the report; any name but "stack".
-        build: A function of a RoPE and a seed that returns an sbi posterior of NPE.
-            The RoPE is tuned on the pairs that may be used, ``rope.calibration``. The
-            trained NPE is ``rope.npe``.
-        fixed: Whether the posterior does not depend on the calibration pairs. It is
-            then built once, with a RoPE that has no pairs. Do not use it for a
-            posterior that was trained on the calibration pairs: it would be scored by
-            labels that it has seen.
-        learns_prior: Whether the pairs may teach it how parameters are distributed, as
-            all training on them does. It has no effect if ``fixed``.
-
-    Example:
-        Another trained posterior:
-
-        >>> another = object()  # NPE(...).build_posterior()
-        >>> candidate = DensityCandidate(
-        ...     name="older NPE", build=lambda rope, seed: another, fixed=True
-        ... )
+        density: An amortised posterior of NPE or of this package, a
+            :class:`~sbi_rope.density.Density`, or anything with its methods
+            ``log_prob(theta, x)``, shapes ``(S, B, d)`` and ``(B, *event)`` to
+            ``(S, B)``, and ``sample((n,), x)``, shape ``(n, B, d)``.
+        name: Its name in the report; that of its class if None.
     """
 
-    name: str
-    build: Callable[[RoPE, int], Any]
-    fixed: bool = False
-    learns_prior: bool = True
+    learns_prior = False
 
-    def parts(self, fold: Fold) -> list[Part]:
-        """Build the posterior, and return its densities."""
-        # A copy, because `build` may train it anew.
-        rope = (
-            fold.bench.rope.with_pairs(torch.arange(0))
-            if self.fixed
-            else copy.copy(fold.rope)
-        )
-        try:
-            posterior = self.build(rope, fold.seed)
-        except RoPEError:
-            raise
-        except Exception as error:
-            raise InvalidInputError(
-                f"The `build` of the candidate {self.name!r} raised "
-                f"{type(error).__name__}: {error}"
-            ) from error
-        return _parts_of(self.name, posterior, rope)
+    def __init__(self, density: Any, name: str | None = None) -> None:
+        self.density = density
+        self.name = type(density).__name__ if name is None else name
+
+    def check(self, data: StackData) -> None:
+        """Try the density on two pairs."""
+        as_density(self.density, data, self.name)
+
+    def fit(self, data: StackData, versions: Sequence[Tensor]) -> list[Density]:
+        """Return the density for all versions."""
+        return [as_density(self.density, data, self.name)] * len(versions)
 
 
-def _parts_of(name: str, posterior: Any, rope: RoPE) -> list[Part]:
-    """Return the densities of a posterior of NPE, of an average of them, or of a prior.
+def as_densities(found: Sequence[Any], data: StackData, name: str) -> list[Density]:
+    """Return what a candidate returned as densities; equal ones stay one object."""
+    different = {id(one): as_density(one, data, name) for one in found}
+    return [different[id(one)] for one in found]
+
+
+def as_density(own: Any, data: StackData, name: str) -> Density:
+    """Return a posterior or anything else as a density, tried on two pairs.
 
     Raises:
-        UnsupportedPosteriorError: If it has no density, or if its parameters or
-            observations have other shapes than those of RoPE.
+        InvalidInputError: If the shapes of what it returns do not fit.
+        UnsupportedPosteriorError: If it has no density, belongs to a batch, or has
+            other shapes of theta or x.
     """
-    theta, x = rope.calibration
-    if isinstance(posterior, PriorPosterior):
-        parts = [part_of_prior(posterior.prior, x.shape[1:])]
-    elif isinstance(posterior, MixturePosterior):
-        weights = posterior.posterior_estimator.weights
-        is_stack = hasattr(posterior, "report")
-        if is_stack or len(weights.unique()) > 1 or not posterior.is_amortised:
+    theta, x = data.pairs.mean[:2], data.pairs.x[:2]
+    if isinstance(own, NeuralPosterior):
+        if not getattr(own, "is_amortised", True):
             raise UnsupportedPosteriorError(
-                f"Expected the candidate {name!r} to answer any x with densities of "
-                f"equal weight; got {type(posterior).__name__}."
+                f"Expected the candidate {name!r} to answer any x; got a posterior "
+                "that belongs to a batch."
             )
-        parts = posterior.posterior_estimator.taken_apart()[0]
-    else:
-        estimator = estimator_of(posterior)
-        parts = [part_of(check_density(estimator, what=f"the candidate {name!r}"))]
-    for part in parts:
-        shapes = (part.density.input_shape, part.mixing.event_shape)
-        if shapes != (theta.shape[1:], x.shape[1:]):
-            raise UnsupportedPosteriorError(
-                f"Expected the candidate {name!r} to map x {tuple(x.shape[1:])} to "
-                f"theta {tuple(theta.shape[1:])}; got x {tuple(shapes[1])} and theta "
-                f"{tuple(shapes[0])}."
-            )
-    return parts
+        own = density_of(own, what=f"the candidate {name!r}")
+    if isinstance(own, Prior):
+        return Prior(own.prior, x.shape[1:])  # that of no observation in particular
+    if not isinstance(own, Density):
+        return Given(own, theta, x)
+    shapes = own.condition_shape, own.input_shape
+    if shapes != (x.shape[1:], theta.shape[1:]):
+        raise UnsupportedPosteriorError(
+            f"Expected the candidate {name!r} to map x {tuple(x.shape[1:])} to theta "
+            f"{tuple(theta.shape[1:])}; got x {tuple(shapes[0])} and theta "
+            f"{tuple(shapes[1])}."
+        )
+    return own
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,6 +180,7 @@ class DiscrepancyCandidate(Settings, Candidate):
 
     space: Space = "embedding"
     learn_prior: bool = True
+    family = "discrepancy"
 
     @property
     def name(self) -> str:  # type: ignore[override]
@@ -185,29 +189,136 @@ class DiscrepancyCandidate(Settings, Candidate):
         return f"discrepancy{space}" + ("" if self.learn_prior else ", given prior")
 
     @property
-    def family(self) -> str:
-        """The method that it is a setting of."""
-        return "discrepancy"
-
-    @property
     def learns_prior(self) -> bool:  # type: ignore[override]
         """Whether it learns from the pairs how parameters are distributed."""
         return self.learn_prior
 
-    def applies_to(self, bench: Workbench) -> bool:
-        """Tell whether x is a short vector, or there are enough folds to tune."""
-        if self.space == "input":
-            return bench.reads_summaries
-        return self.space == "embedding" or len(bench.folds) > 2
+    def suits(self, data: StackData) -> bool:
+        """Tell whether x is a short vector, or else there are folds enough to tune.
 
-    def parts(self, fold: Fold) -> list[Part]:
-        """Train NPE on corrected simulations; return its density."""
-        corrected = fold.corrected(self.space, learn_prior=self.learn_prior)
-        estimator = corrected.estimator
+        A short vector is corrected as it is, so that tuned nets add nothing.
+        """
         if self.space == "input":
-            return [part_of(estimator)]
-        embeddings = OwnEmbeddings(corrected.nets, fold.bench.x.shape[1:])
-        return [Part(headless(estimator), embeddings)]
+            return data.reads_summaries
+        return self.space == "embedding" or _tunes(data)
+
+    def check(self, data: StackData) -> None:
+        """Raise for images, series and missing entries with ``space="input"``."""
+        if self.space == "input":
+            _check_input(data)
+
+    def fit(self, data: StackData, versions: Sequence[Tensor]) -> list[Density]:
+        """Train NPE on corrected simulations."""
+        nets = tuned(data, versions) if self.space == "tuned" else None
+        found = corrected(data, versions, self.space, learn_prior=self.learn_prior)
+        if nets is None:
+            return [found.flow[[version]] for version in range(len(versions))]
+        behind = nets.nets.then(found.constants)
+        return [
+            found.flow.made_of([(net, version) for net in nets.of(rows, data)], behind)
+            for version, rows in enumerate(versions)
+        ]
+
+
+def _check_input(data: StackData) -> None:
+    network_of(data.estimator, "input")  # raises unless x is a vector
+    as_batch("x", data.pairs.x)
+    as_batch("x of simulations", data.simulations[1])
+
+
+def _tunes(data: StackData) -> bool:
+    return not data.reads_summaries and len(data.folds) > 2
+
+
+def corrected(
+    data: StackData, versions: Sequence[Tensor], space: Space, *, learn_prior: bool
+) -> Correction:
+    """Return NPE trained on corrected simulations, a copy for each version."""
+    key = space, learn_prior, key_of(versions)
+    if key not in data.kept:
+        z_s = data.simulated(space)
+        if space == "tuned":
+            nets = tuned(data, versions)
+            z = [nets.held_out(rows, data) for rows in versions]
+        else:
+            net = network_of(data.estimator, space)
+            z = [embed(net, data.pairs.x[rows]) for rows in versions]
+        discrepancies = [
+            fit_discrepancy(
+                of_rows,
+                data.moments(rows, space),
+                Standardisation(z_s.double()),
+                data.model,
+                weights=data.pairs.weight[rows],
+                groups=data.pairs.group[rows],
+            )
+            for of_rows, rows in zip(z, versions, strict=True)
+        ]
+        data.kept[key] = correct_flow(
+            data.estimator,
+            (data.simulations[0], z_s),
+            discrepancies,
+            space=space,
+            probabilities=[
+                data.probabilities(rows) if learn_prior else None for rows in versions
+            ],
+            in_a_stack=True,
+            show_progress_bars=data.show,
+        )
+    return data.kept[key]
+
+
+@dataclass(frozen=True, eq=False)
+class Tuned:
+    """Embedding nets that are tuned on sets of pairs.
+
+    Attributes:
+        nets: The nets.
+        number: The number of the net that was tuned on a set of rows.
+    """
+
+    nets: Ensemble
+    number: dict[Any, int]
+
+    def of(self, rows: Tensor, data: StackData) -> list[int]:
+        """Return the numbers of the nets that do not see each part of some rows."""
+        return [self.number[key_of([seen])] for seen, _ in _seen(rows, data)]
+
+    def held_out(self, rows: Tensor, data: StackData) -> Tensor:
+        """Return the embeddings of pairs by nets that have not seen them."""
+        z = data.embedded.new_empty(len(data), data.embedded.shape[1])
+        for number, (_, part) in zip(
+            self.of(rows, data), _seen(rows, data), strict=True
+        ):
+            z[part] = embed(self.nets.member(number), data.pairs.x[part])
+        return z[rows]
+
+
+def _seen(rows: Tensor, data: StackData) -> list[tuple[Tensor, Tensor]]:
+    """Return what is seen and what is not; one person alone is both."""
+    return data.holdouts(rows) or [(rows, rows)]
+
+
+def tuned(data: StackData, versions: Sequence[Tensor]) -> Tuned:
+    """Return nets tuned on each version without each of its parts, with rehearsal."""
+    key = "tuned", key_of(versions)
+    if key not in data.kept:
+        sets = {
+            key_of([seen]): seen for rows in versions for seen, _ in _seen(rows, data)
+        }
+        with without_warning_of_few_pairs():
+            nets, _ = TUNING.tuned(
+                data.embedding_net,
+                data.pairs.x,
+                [data.targets(rows) for rows in sets.values()],
+                list(sets.values()),
+                groups=data.pairs.group,
+                weights=data.pairs.weight,
+                draw_simulations=lambda count: data.simulations[1][:count],
+                show_progress_bars=data.show,
+            )
+        data.kept[key] = Tuned(nets, {rows: number for number, rows in enumerate(sets)})
+    return data.kept[key]
 
 
 # Learning rates of fine-tuning, by what was corrected in the net that it starts from.
@@ -216,128 +327,118 @@ class DiscrepancyCandidate(Settings, Candidate):
 # calibration data, see benchmarks/choices.md.
 LEARNING_RATES = {
     None: (1e-3,),
-    "embedding": (1e-4, 1e-3),
+    "embedding": (1e-3,),
     "tuned": (1e-3,),
     "input": (3e-4,),
 }
-
-
-@dataclass(frozen=True, kw_only=True)
-class FinetunedCandidate(Settings, Candidate):
-    """NPE, unchanged or corrected, whose parameters are then trained on the pairs.
-
-    It is the average of several nets. Each of them holds out another part of the
-    pairs, to know when to stop training.
-
-    Args:
-        space: None starts from the unchanged NPE. Otherwise, what is corrected in the
-            NPE that it starts from.
-    """
-
-    space: Space | None = None
-    learns_prior = True
-
-    @property
-    def name(self) -> str:  # type: ignore[override]
-        """The name of the method and its setting."""
-        if self.space is None:
-            return "fine-tuned NPE"
-        return f"{DiscrepancyCandidate(space=self.space).name}, fine-tuned"
-
-    @property
-    def family(self) -> str:
-        """The method that it is a setting of."""
-        return "fine-tuned NPE" if self.space is None else "discrepancy, fine-tuned"
-
-    def applies_to(self, bench: Workbench) -> bool:
-        """Tell whether there are parts to hold out, and the starting NPE applies.
-
-        The embedding is corrected first where x itself is not.
-        """
-        if self.space is None:
-            starts = True
-        elif self.space == "embedding":
-            starts = not bench.reads_summaries
-        else:
-            starts = DiscrepancyCandidate(space=self.space).applies_to(bench)
-        return starts and len(bench.folds) > 2
-
-    def parts(self, fold: Fold) -> list[Part]:
-        """Train one net without each part of the pairs."""
-        if len(fold.parts) < 2:
-            # Nothing can be held out, so that NPE is used as it starts.
-            if self.space is None:
-                return [part_of(estimator_of(fold.bench.npe))]
-            return DiscrepancyCandidate(space=self.space).parts(fold)
-        rates = LEARNING_RATES[self.space]
-        return [
-            part_of(
-                finetune_without(
-                    self._start(fold, number), fold, number, learning_rates=rates
-                )
-            )
-            for number in fold.parts
-        ]
-
-    def _start(self, fold: Fold, number: int) -> Any:
-        if self.space is None:
-            return estimator_of(fold.bench.npe)
-        corrected = fold.corrected(self.space, learn_prior=True)
-        if self.space != "tuned":
-            return corrected.estimator
-        # This net has not seen the part that is held out.
-        net = corrected.nets[list(fold.parts).index(number)]
-        return with_embedding(corrected.estimator, copy.deepcopy(net))
-
-
+# Training with rehearsal stops after so many epochs without improvement. No other
+# number was tried. What it gains on calibration data is in benchmarks/choices.md.
+REHEARSED = replace(FINETUNING, stop_after_epochs=10)
 # Pairs with different parameters. On calibration data it was worse than fine-tuned NPE
 # with 50, and better with 200; nothing between was tried.
 MIN_TO_REHEARSE = 100
 
 
 @dataclass(frozen=True, kw_only=True)
-class RehearsedCandidate(Candidate):
-    r"""NPE whose parameters are trained on the pairs and on simulations alike.
+class FinetunedCandidate(Settings, Candidate):
+    r"""NPE, unchanged or corrected, whose parameters are then trained on the pairs.
 
-    It starts from NPE and minimises what :class:`~sbi_rope.baselines.JointNPE`
-    minimises from scratch. It is for images, series and sets of trials, where the
-    embedding net has to learn what simulations do not show. A version holds out one
-    part of its pairs, to know when to stop training.
+    It is the average of several nets. Each of them holds out another part of the
+    pairs, to know when to stop training. Behind a corrected embedding h(x) only the
+    density is trained.
+
+    Args:
+        space: None starts from the unchanged NPE. Otherwise, what is corrected in the
+            NPE that it starts from.
+        rehearse: Whether to train on simulations, too, so as to minimise what
+            :class:`~sbi_rope.baselines.JointNPE` minimises from scratch. It is for
+            images, series and sets of trials, where the embedding net has to learn what
+            simulations do not show. A version then holds out a single part.
     """
 
-    name = "fine-tuned NPE, rehearsed"
-    learns_prior = True
+    space: Space | None = None
+    rehearse: bool = False
 
     @property
-    def family(self) -> str:
+    def name(self) -> str:  # type: ignore[override]
+        """The name of the method and its setting."""
+        name = "fine-tuned NPE"
+        if self.space is not None:
+            name = f"{DiscrepancyCandidate(space=self.space).name}, fine-tuned"
+        return f"{name}, rehearsed" if self.rehearse else name
+
+    @property
+    def family(self) -> str:  # type: ignore[override]
         """The method that it is a setting of."""
-        return FinetunedCandidate().name
+        return "fine-tuned NPE" if self.space is None else "discrepancy, fine-tuned"
 
-    def applies_to(self, bench: Workbench) -> bool:
-        """Tell whether x is no short vector, and there are pairs and folds enough."""
-        enough = int(bench.groups.max()) + 1 >= MIN_TO_REHEARSE
-        return enough and not bench.is_short and len(bench.folds) > 2
+    def suits(self, data: StackData) -> bool:
+        """Tell whether there are parts to hold out, and the starting NPE applies.
 
-    def parts(self, fold: Fold) -> list[Part]:
-        """Train one net without one part of the pairs."""
-        start = estimator_of(fold.bench.npe)
-        if len(fold.parts) < 2:  # nothing can be held out
-            return [part_of(start)]
-        # The part after the one that the version does not see, so that the versions
-        # that are scored hold out different parts.
-        others = list(fold.parts)
-        unseen = set(range(len(fold.bench.folds))) - fold.used
-        after = [number for number in others if number > min(unseen, default=-1)]
+        The embedding is corrected first where x itself is not.
+        """
+        if len(data.folds) < 3:
+            return False
+        if self.rehearse:
+            return data.pairs.num_groups >= MIN_TO_REHEARSE and not data.is_short
+        if self.space == "embedding":
+            return not data.reads_summaries
+        return self.space is None or DiscrepancyCandidate(space=self.space).suits(data)
+
+    def check(self, data: StackData) -> None:
+        """Raise for images, series and missing entries with ``space="input"``."""
+        if self.space == "input":
+            _check_input(data)
+
+    def fit(self, data: StackData, versions: Sequence[Tensor]) -> list[Density]:
+        """Train one net without each part of the pairs of each version."""
+        nets = tuned(data, versions) if self.space == "tuned" else None
+        if self.space is None:
+            start, behind = Flow.of([data.estimator]), None
+        else:
+            found = corrected(data, versions, self.space, learn_prior=True)
+            start = found.flow
+            behind = None if nets is None else nets.nets.then(found.constants)
+        rates = LEARNING_RATES[self.space]
+        starts, jobs = [], []
+        for version, rows in enumerate(versions):
+            # Numbers of net and density. Versions may share either.
+            of_parts = [min(version, len(start.nets) - 1)] * len(_seen(rows, data))
+            if nets is not None:
+                of_parts = nets.of(rows, data)
+            density = min(version, len(start.densities) - 1)
+            members = [(net, density) for net in of_parts]
+            starts.append(start.made_of(members, behind))
+            nodes = data.nodes(rows, starts[-1])
+            own = list(zip(members, data.holdouts(rows), strict=False))  # or none
+            if self.rehearse:
+                own = own[version % max(1, len(own)) :][:1]
+            jobs += [(version, *job, nodes) for job in own for _ in rates]
+        if not jobs:
+            return starts
+        of_version, members, splits, labels = zip(*jobs, strict=True)
+        # The net h has not changed, so that the density behind it is enough to train.
+        only_densities = self.space == "embedding"
+        flow = start.made_of(members, behind)
+        if only_densities:
+            flow = start.behind_one_net([density for _, density in members])
+        histories = finetune_flow(
+            flow,
+            labels,
+            data.pairs.x,
+            splits,
+            training=REHEARSED if self.rehearse else FINETUNING,
+            learning_rates=list(rates) * (len(jobs) // len(rates)),
+            weights=data.pairs.weight,
+            rehearsed=data.simulations if self.rehearse else None,
+            only_densities=only_densities,
+            show_progress_bars=data.show,
+        )
+        best = best_rates(histories, len(rates))
+        chosen = [[k for k in best if of_version[k] == v] for v in range(len(versions))]
         return [
-            part_of(
-                finetune_without(
-                    start,
-                    fold,
-                    (after or others)[0],
-                    learning_rates=LEARNING_RATES[None],
-                    rehearse=True,
-                )
-            )
+            flow[numbers] if numbers else one
+            for numbers, one in zip(chosen, starts, strict=True)
         ]
 
 
@@ -372,7 +473,8 @@ class RVNPCandidate(Candidate):
 
     x_o: Tensor = field(repr=False)
     space: Literal["embedding", "input"] = field(default="embedding", kw_only=True)
-    fixed = True
+    family = "RVNP"
+    learns_prior = False
 
     def __post_init__(self) -> None:
         """Check the space, and take a copy of the observations."""
@@ -384,37 +486,41 @@ class RVNPCandidate(Candidate):
         """The name of the method and its setting."""
         return "RVNP" if self.space == "embedding" else "RVNP (input)"
 
-    @property
-    def family(self) -> str:
-        """The method that it is a setting of."""
-        return "RVNP"
-
-    def applies_to(self, bench: Workbench) -> bool:
+    def suits(self, data: StackData) -> bool:
         """Tell whether there are enough observations of a few statistics."""
         if len(self.x_o) < MIN_OBSERVATIONS:
             return False
-        reads_x = bench.reads_summaries and bool(torch.isfinite(self.x_o).all())
+        reads_x = data.reads_summaries and bool(torch.isfinite(self.x_o).all())
         if self.space != ("input" if reads_x else "embedding"):
             return False
-        statistics = bench.simulations[1] if reads_x else bench.embedded
+        statistics = data.simulations[1] if reads_x else data.embedded
         varies = bool((statistics != statistics[0]).any())
         return varies and statistics.shape[1] <= MAX_STATISTICS
 
-    def parts(self, fold: Fold) -> list[Part]:
-        """Train errors and posterior on the observations; return the density."""
+    def check(self, data: StackData) -> None:
+        """Raise for observations of another shape, and those that are not finite."""
+        x_o = data.rope.checked_observations(self.x_o)
+        if self.space == "input":
+            _check_input(data)
+            as_batch("x_o", x_o)
+
+    def fit(self, data: StackData, versions: Sequence[Tensor]) -> list[Density]:
+        """Train errors and posterior on the observations, once for all versions."""
+        if self not in data.kept:
+            data.kept[self] = self._trained(data)
+        return [data.kept[self]] * len(versions)
+
+    def _trained(self, data: StackData) -> Flow:
         # Importing the package does not load the baselines.
         from sbi_rope.baselines.rvnp import RVNP
 
-        bench = fold.bench
-        method = RVNP.from_posterior(bench.npe, noise_on=self.space)
-        # The fold has seeded the random numbers.
+        method = RVNP.from_posterior(data.npe, noise_on=self.space)
         x_o = self.x_o
         if len(x_o) > MAX_OBSERVATIONS:
             x_o = x_o[torch.randperm(len(x_o))[:MAX_OBSERVATIONS]]
-        # What a user passed is checked before anything is simulated.
-        method.append_observations(x_o).append_simulations(*bench.simulations)
-        method.train(show_progress_bars=bench.show)
-        return [part_of(estimator_of(method.build_posterior()))]
+        method.append_observations(x_o).append_simulations(*data.simulations)
+        method.train(show_progress_bars=data.show)
+        return Flow.of([estimator_of(method.build_posterior())])
 
 
 def default_candidates(
@@ -451,18 +557,18 @@ def default_candidates(
         return _all_candidates(x_o, learn_prior=learn_prior)
     check("rope", rope, RoPE)
     x_o = None if x_o is None else rope.checked_observations(x_o)
-    bench = Workbench(rope, num_folds=NUM_FOLDS, seed=0, show_progress_bars=False)
-    return suitable_candidates(bench, x_o, learn_prior=learn_prior)
+    data = StackData(rope, num_folds=NUM_FOLDS, seed=0, show_progress_bars=False)
+    return suitable_candidates(data, x_o, learn_prior=learn_prior)
 
 
 def suitable_candidates(
-    bench: Workbench, x_o: Tensor | None, *, learn_prior: bool = True
+    data: StackData, x_o: Tensor | None, *, learn_prior: bool = True
 ) -> tuple[Candidate, ...]:
     """Return the default candidates that the data allow; warn if x_o adds none."""
     chosen = tuple(
         candidate
         for candidate in _all_candidates(x_o, learn_prior=learn_prior)
-        if candidate.applies_to(bench)
+        if candidate.suits(data)
     )
     if x_o is not None and not any(isinstance(one, RVNPCandidate) for one in chosen):
         warn_user(
@@ -474,8 +580,8 @@ def suitable_candidates(
 
 def _all_candidates(x_o: Tensor | None, *, learn_prior: bool) -> tuple[Candidate, ...]:
     candidates: tuple[Candidate, ...] = (
-        DensityCandidate(name="prior", build=_prior, fixed=True),
-        DensityCandidate(name="NPE", build=_npe, fixed=True),
+        PriorCandidate(),
+        NPECandidate(),
         FinetunedCandidate(),
         DiscrepancyCandidate(space="embedding", learn_prior=learn_prior),
         DiscrepancyCandidate(space="input", learn_prior=learn_prior),
@@ -483,49 +589,37 @@ def _all_candidates(x_o: Tensor | None, *, learn_prior: bool) -> tuple[Candidate
         FinetunedCandidate(space="embedding"),
         FinetunedCandidate(space="input"),
         FinetunedCandidate(space="tuned"),
-        RehearsedCandidate(),
+        FinetunedCandidate(rehearse=True),
     )
     if not learn_prior:
-        candidates = tuple(
-            one for one in candidates if one.fixed or not one.learns_prior
-        )
+        candidates = tuple(one for one in candidates if not one.learns_prior)
     if x_o is not None:
         candidates += (RVNPCandidate(x_o), RVNPCandidate(x_o, space="input"))
     return candidates
 
 
-# These are functions and not lambdas, so that a stack can be pickled.
-
-
-def _prior(rope: RoPE, seed: int) -> PriorPosterior:
-    return PriorPosterior(rope.npe.prior)
-
-
-def _npe(rope: RoPE, seed: int) -> Any:
-    return rope.npe
-
-
-def checked_candidates(
-    candidates: Sequence[Candidate], bench: Workbench
+def chosen_candidates(
+    candidates: Sequence[Any] | None, data: StackData, x_o: Tensor | None
 ) -> tuple[Candidate, ...]:
-    """Return the candidates of a user, if they can be trained on these pairs.
+    """Return the candidates of a user, or those by default.
 
     Raises:
-        InvalidInputError: If one of them is not a candidate, there is none, two have
-            the same name, or entries of x are missing that one of them corrects.
+        InvalidInputError: If there is none, two have the same name, or entries of x are
+            missing that one of them corrects.
+        UnsupportedPosteriorError: If one that is given cannot be used.
     """
+    if candidates is None:
+        return suitable_candidates(data, x_o)
     check("candidates", candidates, Sequence)
-    for candidate in candidates:
-        check("candidates[...]", candidate, Candidate)
-    names = [candidate.name for candidate in candidates]
+    chosen = tuple(
+        one if isinstance(one, Candidate) else GivenCandidate(one) for one in candidates
+    )
+    names = [candidate.name for candidate in chosen]
     if not names or len(set(names)) < len(names) or "stack" in names:
         raise InvalidInputError(
             "Expected `candidates` with different names, none of them 'stack'; got "
-            f"{names}."
+            f"{names}. Name a density with `GivenCandidate(density, name)`."
         )
-    if any(getattr(one, "space", None) == "input" for one in candidates):
-        # Raises for images and series, before any candidate is trained.
-        network_of(estimator_of(bench.npe), "input")
-        as_batch("x", bench.x)
-        as_batch("x of simulations", bench.simulations[1])
-    return tuple(candidates)
+    for one in chosen:
+        one.check(data)
+    return chosen

@@ -12,7 +12,8 @@ from scipy.stats import bootstrap, norm
 from scipy.stats import t as student
 from torch import Tensor
 
-from sbi_rope._means import Counts, counts_of, interval_of_mean, mean_and_error
+from sbi_rope._means import counts_of, interval_of_mean, mean_and_error
+from sbi_rope.data import Counts
 from sbi_rope.metrics import CoverageCurve
 from sbi_rope.metrics.calibration import coverage_curve_of_pairs
 from sbi_rope.sets.conformal import check_enough, rank_needed

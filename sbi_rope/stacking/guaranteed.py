@@ -10,9 +10,9 @@ from torch import Tensor
 from sbi_rope._bounds import bounds_of
 from sbi_rope._sbi import MixedDensity
 from sbi_rope._units import log_unit_of
+from sbi_rope.density import MixturePosterior
+from sbi_rope.density.prior import prior_log_prob, prior_sample
 from sbi_rope.errors import InvalidInputError
-from sbi_rope.mixture import MixturePosterior
-from sbi_rope.mixture.prior import prior_log_prob, prior_sample
 from sbi_rope.sets import CredibleIntervals, CredibleSet, Guarantee
 from sbi_rope.sets.conformal import (
     check_enough,
@@ -23,7 +23,7 @@ from sbi_rope.sets.conformal import (
     rank_needed,
 )
 from sbi_rope.stacking.cross_validation import CrossValidation, SetScores
-from sbi_rope.stacking.versions import Versions
+from sbi_rope.stacking.versions import fold_posterior, mixture_of
 
 __all__ = ["HeldOutSets"]
 
@@ -71,11 +71,10 @@ class HeldOutSets:
 
     Args:
         posterior: The stack.
-        versions: Its candidates in all versions.
     """
 
-    def __init__(self, posterior: Any, versions: Versions) -> None:
-        self._posterior, self._versions = posterior, versions
+    def __init__(self, posterior: Any) -> None:
+        self._posterior = posterior
         self._validation: CrossValidation = posterior.report.cross_validation
 
     @torch.no_grad()
@@ -159,11 +158,9 @@ class HeldOutSets:
     def _posteriors(self, scores: SetScores) -> tuple[MixturePosterior, ...]:
         """Return the stack that has not seen each fold."""
         return tuple(
-            MixturePosterior(
-                self._versions.estimator(weights, [number]),
+            fold_posterior(
+                mixture_of(self._posterior.versions, weights, version=number),
                 self._posterior.prior,
-                enable_transform=False,
-                warns=False,
             )
             for number, weights in enumerate(scores.weights)
         )
@@ -178,8 +175,8 @@ class HeldOutSets:
         parameters are not stretched, because they would be between the categories.
         """
         posterior, prior = self._posterior, self._posterior.prior
-        parts = posterior.posterior_estimator.parts
-        is_mixed = any(isinstance(part.density, MixedDensity) for part in parts)
+        modules = posterior.posterior_estimator.modules()
+        is_mixed = any(isinstance(module, MixedDensity) for module in modules)
         stretches = STRETCHES[:1] if is_mixed else STRETCHES
         count = math.ceil(num_samples / (1 + len(stretches)))
         draws = posterior.sample((count,), x=x, show_progress_bars=False)

@@ -1,16 +1,17 @@
 """The stack of candidates, as an sbi posterior."""
 
 import copy
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_rope._sbi import describe
-from sbi_rope.mixture import MixturePosterior
+from sbi_rope.density import MixturePosterior
 from sbi_rope.stacking.guaranteed import HeldOutSets
 from sbi_rope.stacking.report import StackingReport
-from sbi_rope.stacking.versions import Versions
+from sbi_rope.stacking.versions import Versions, mixture_of
 from sbi_rope.tensors import as_batch, check_same_length
 
 __all__ = ["StackedPosterior"]
@@ -40,7 +41,7 @@ class StackedPosterior(MixturePosterior):
         | https://arxiv.org/abs/1704.02030
 
     Args:
-        versions: The candidates in all versions.
+        versions: Each candidate in all its versions.
         prior: The prior NPE was trained with.
         report: The held-out scores of the stack and its candidates.
         enable_transform: As in sbi, for ``map()``.
@@ -48,7 +49,7 @@ class StackedPosterior(MixturePosterior):
 
     def __init__(
         self,
-        versions: Versions,
+        versions: Sequence[Versions],
         prior: Distribution,
         *,
         report: StackingReport,
@@ -56,11 +57,11 @@ class StackedPosterior(MixturePosterior):
     ) -> None:
         weights = report.cross_validation.weights.weights
         super().__init__(
-            versions.estimator(weights),
+            mixture_of(versions, weights),
             copy.deepcopy(prior),
             enable_transform=enable_transform,
         )
-        self.versions = versions
+        self.versions = list(versions)
         self.report = report
         describe(
             self,
@@ -98,7 +99,9 @@ class StackedPosterior(MixturePosterior):
         )
         x = self._batch_of_x(x)
         check_same_length(theta, x)
-        return self.versions.log_probs(theta, x)
+        x = x.to(self.posterior_estimator.device)
+        log_probs = [one.average.log_prob(theta[None], x)[0] for one in self.versions]
+        return torch.stack(log_probs, dim=1).double()
 
     def _held_out_sets(self) -> HeldOutSets:
-        return HeldOutSets(self, self.versions)
+        return HeldOutSets(self)

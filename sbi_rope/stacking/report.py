@@ -11,8 +11,8 @@ from typing import Any
 
 from torch import Tensor
 
-from sbi_rope._groups import groups_of, one_of_each_group
 from sbi_rope._two_sample import TwoSampleTest
+from sbi_rope.data import groups_of, one_of_each_group
 from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.metrics import (
     ACAUCScore,

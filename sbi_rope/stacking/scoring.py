@@ -1,23 +1,22 @@
 """Score the candidates of a stack, and the stack itself, on the folds held out."""
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from sbi_rope._groups import groups_of, one_of_each_group
-from sbi_rope._labels import Labels, Nodes, nodes_of, reference_of
-from sbi_rope._progress import progress_bar
 from sbi_rope._random import seeded
 from sbi_rope._units import log_units_of
+from sbi_rope.data import Labels, groups_of, one_of_each_group
+from sbi_rope.density import Density, Mixture, MixturePosterior
+from sbi_rope.density.base import without_nan
 from sbi_rope.errors import SamplingError, warn_user
+from sbi_rope.labels import Nodes, nodes_of, reference_of
 from sbi_rope.metrics.by_estimate import estimates_and_ranks
 from sbi_rope.metrics.calibration import central_levels, count_ranks, random_ranks
 from sbi_rope.metrics.calls import draw_chunks, draw_samples
-from sbi_rope.mixture import MixturePosterior
 from sbi_rope.sets.conformal import joint_scores, marginal_scores
 from sbi_rope.stacking.candidates import Candidate
 from sbi_rope.stacking.cross_validation import (
@@ -25,14 +24,14 @@ from sbi_rope.stacking.cross_validation import (
     SetScores,
     fold_weights,
 )
-from sbi_rope.stacking.versions import Versions
-from sbi_rope.stacking.workbench import Workbench
+from sbi_rope.stacking.data import StackData
+from sbi_rope.stacking.versions import fold_posterior
 
-__all__ = ["FoldScores", "LabelScores", "label_levels", "score_fold", "score_versions"]
+__all__ = ["FoldScores", "LabelScores", "label_levels", "score_fold", "score_folds"]
 
 # Samples at each held-out pair, from which the calibration of the stack is computed,
 # and for how many observations at a time they are drawn.
-NUM_SAMPLES, MAX_OBSERVATIONS = 500, 500
+NUM_SAMPLES, MAX_OBSERVATIONS = 250, 500
 # Of labels that are not exact: samples of each candidate at each observation, from
 # which nodes are placed, and the nodes of each label.
 NUM_REFERENCES, NUM_NODES = 200, 512
@@ -92,10 +91,10 @@ class LabelScores:
         return self.nodes.log_mean(log_q), self.nodes.standard_error(log_q)
 
 
-def score_versions(
-    bench: Workbench,
-    versions: Versions,
+def score_folds(
+    data: StackData,
     candidates: Sequence[Candidate],
+    fitted: Sequence[Sequence[Density]],
     *,
     num_training_folds: int,
     seed: int,
@@ -103,153 +102,123 @@ def score_versions(
     """Score what was trained without each fold on the pairs of the fold.
 
     Args:
-        bench: The pairs and their folds.
-        versions: The candidates, trained without each fold.
+        data: The pairs and their folds.
         candidates: What the columns of the scores are called.
-        num_training_folds: The number of folds that each version was trained on.
+        fitted: The densities of each candidate, of which number k has not seen fold k.
+        num_training_folds: The number of folds that each was trained on.
         seed: Seed of the draws at the held-out pairs.
     """
-    # Samples of a flow can take longer than its training did.
-    with progress_bar(
-        show=bench.show,
-        desc=f"Scoring the candidates and the stack on {len(bench.folds)} folds",
-        total=2 * len(bench.folds),
-    ) as bar:
-        of_labels, log_scores, fold = _log_scores(bench, versions, bar.update)
-        weights = fold_weights(
-            log_scores, fold, pair_weights=bench.labels.score_weights
-        )
-        of_stack = _stack_scores(
-            bench, versions, weights, of_labels, seed=seed, advance=bar.update
-        )
+    pairs, weight = data.pairs, data.pairs.counts.weights
+    of_folds = [[one[k] for one in fitted] for k in range(len(data.folds))]
+    log_scores = weight.new_empty(len(data), len(fitted))
+    fold = torch.empty_like(pairs.group)
+    of_labels = [_score_labels(data, of_one, k) for k, of_one in enumerate(of_folds)]
+    for k, rows in enumerate(data.folds):
+        fold[rows], log_scores[rows] = k, of_labels[k].of_candidates
+    weights = fold_weights(log_scores, fold, pair_weights=weight)
+    of_stack = _joined(
+        [
+            _score_fold(data, of_folds[k], weights[k], of_labels[k], k, seed=seed)
+            for k in range(len(data.folds))
+        ],
+        torch.cat(data.folds).argsort(),
+    )
+    is_simple = pairs.are_exact and bool((pairs.weight == 1).all())
     scores = CrossValidation(
         names=tuple(candidate.name for candidate in candidates),
-        families=tuple(candidate.family for candidate in candidates),
+        families=tuple(one.family or one.name for one in candidates),
         log_scores=log_scores,
         fold=fold,
-        num_trained_on=len(fold) * num_training_folds // len(bench.folds),
+        num_trained_on=len(fold) * num_training_folds // len(data.folds),
         stack_scores=of_stack.log_prob,
         levels=of_stack.levels,
         estimates=of_stack.estimates,
         ranks=of_stack.ranks,
-        set_scores=_set_scores(bench, of_stack, weights, seed=seed),
-        log_unit=_log_unit(bench),
-        pair_weights=bench.labels.score_weights,
-        groups=bench.labels.shared_groups,
-        score_errors=None if bench.labels.are_exact else of_stack.errors,
-        labels="" if bench.labels.are_simple else str(bench.labels),
+        set_scores=_set_scores(data, of_stack, weights, seed=seed),
+        log_unit=_log_unit(data),
+        pair_weights=weight if bool((weight != 1).any()) else None,
+        groups=pairs.group if pairs.num_groups < len(pairs) else None,
+        score_errors=None if pairs.are_exact else of_stack.errors,
+        labels="" if is_simple else str(pairs),
     )
     if not scores.weights.converged:
-        counted = bench.labels.score_weights
-        total = len(fold) if counted is None else float(counted.sum())
         warn_user(
             "The weights of the stack have not converged: the held-out score could "
-            f"be better by up to {scores.weights.gap / total:.3f} nats a "
+            f"be better by up to {scores.weights.gap / float(weight.sum()):.3f} nats a "
             "pair. Leave out candidates that are nearly the same."
         )
     return scores
 
 
-def _log_scores(
-    bench: Workbench, versions: Versions, advance: Callable[[], Any]
-) -> tuple[list[LabelScores] | None, Tensor, Tensor]:
-    """Return the score of each candidate at each pair, and the folds.
-
-    The first entry has the densities at labels that are not exact. It is None if all
-    are.
-    """
-    theta, x = bench.theta, bench.x
-    log_scores = theta.new_empty(len(theta), len(versions.names), dtype=torch.double)
-    fold = torch.empty(len(theta), dtype=torch.long, device=theta.device)
-    of_labels = None if bench.labels.are_exact else []
-    for number, rows in enumerate(bench.folds):
-        fold[rows] = number
-        if of_labels is None:
-            log_scores[rows] = versions.log_probs(theta[rows], x[rows], [number])
-        else:
-            of_labels.append(_score_labels(bench, versions, number))
-            log_scores[rows] = of_labels[number].of_candidates
-        advance()
-    return of_labels, log_scores, fold
-
-
-def _stack_scores(
-    bench: Workbench,
-    versions: Versions,
+def _score_fold(
+    data: StackData,
+    densities: Sequence[Density],
     weights: Tensor,
-    of_labels: Sequence[LabelScores] | None,
+    of_labels: LabelScores,
+    number: int,
     *,
     seed: int,
-    advance: Callable[[], Any],
 ) -> FoldScores:
-    """Return the scores of the stack at each pair, normalised in the support.
-
-    Returns:
-        The scores, their Monte-Carlo errors (zero for exact labels), and the levels of
-        the central intervals that end at the labels.
-    """
-    theta, x = bench.theta, bench.x
-    of_folds = []
-    for number, rows in enumerate(bench.folds):
-        posterior = MixturePosterior(
-            versions.estimator(weights[number], [number]),
-            bench.npe.prior,
-            enable_transform=False,
-            warns=False,
+    """Score the stack that has not seen a fold at the pairs of the fold."""
+    rows = data.folds[number]
+    posterior = fold_posterior(Mixture(densities, weights), data.prior)
+    if data.pairs.are_exact:
+        return score_fold(
+            posterior,
+            data.pairs.mean[rows],
+            data.pairs.x[rows],
+            num_samples=NUM_SAMPLES,
+            seed=seed,
         )
-        if of_labels is None:
-            scores = score_fold(
-                posterior, theta[rows], x[rows], num_samples=NUM_SAMPLES, seed=seed
-            )
-        else:
-            scores = _score_labelled_fold(
-                posterior,
-                of_labels[number],
-                weights[number],
-                bench.labels[rows],
-                x[rows],
-                num_samples=NUM_SAMPLES,
-                seed=seed,
-            )
-        of_folds.append(scores)
-        advance()
-    order = torch.cat(bench.folds).argsort()
+    return _score_labelled_fold(
+        posterior,
+        of_labels,
+        weights,
+        data.pairs.label[rows],
+        data.pairs.x[rows],
+        num_samples=NUM_SAMPLES,
+        seed=seed,
+    )
+
+
+def _joined(parts: Sequence[FoldScores], order: Tensor) -> FoldScores:
+    """Return the scores of all folds in the order of the pairs."""
     return FoldScores(
         **{
-            entry.name: torch.cat([getattr(one, entry.name) for one in of_folds])[order]
+            entry.name: torch.cat([getattr(one, entry.name) for one in parts])[order]
             for entry in fields(FoldScores)
         }
     )
 
 
 def _set_scores(
-    bench: Workbench, of_stack: FoldScores, weights: Tensor, *, seed: int
+    data: StackData, of_stack: FoldScores, weights: Tensor, *, seed: int
 ) -> SetScores | None:
     """Return what sets with a guarantee are made from; None without exact labels.
 
     Labels that are not exact do not count: a set that holds a noisy label need not hold
     the parameters.
     """
-    is_counted = bench.labels.is_exact.cpu()
+    is_counted = data.pairs.label.is_exact.cpu()
     if not is_counted.any():
         return None
-    groups = groups_of(bench.groups[is_counted])
+    groups = groups_of(data.pairs.group.cpu()[is_counted])
     is_counted[is_counted.clone()] = one_of_each_group(groups, seed=seed)
     return SetScores(
         joint=of_stack.joint,
         marginal=of_stack.marginal,
-        is_counted=is_counted.to(bench.theta.device),
+        is_counted=is_counted.to(data.pairs.x.device),
         weights=weights,
         num_draws=NUM_SAMPLES,
     )
 
 
-def _log_unit(bench: Workbench) -> float | Tensor:
+def _log_unit(data: StackData) -> float | Tensor:
     """Return by how much scores are higher in the prior's standard deviations."""
-    labels = bench.labels
-    if labels.samples is not None:
+    labels = data.pairs.label
+    if labels.are_drawn:
         return 0.0  # these scores are relative to the prior
-    units = log_units_of(bench.npe.prior)
+    units = log_units_of(data.prior)
     if labels.are_exact:
         return float(units.sum())
     return labels.is_measured.to(units) @ units
@@ -314,25 +283,29 @@ def _explained() -> Iterator[None]:
         ) from error
 
 
-def _score_labels(bench: Workbench, versions: Versions, number: int) -> LabelScores:
+@torch.no_grad()
+def _score_labels(
+    data: StackData, densities: Sequence[Density], number: int
+) -> LabelScores:
     """Score all candidates on the labels of a fold that they were not trained on.
 
     Nodes come from the samples of each candidate, so that none is scored at parameters
     that only others consider plausible.
     """
-    rows = bench.folds[number]
-    x, size = bench.x[rows], torch.Size((NUM_REFERENCES,))
-    with seeded(bench.seed_of(frozenset([number]))):
-        samples = [one.sample(size, x) for one in versions.estimators(number)]
-        nodes = nodes_of(
-            bench.labels[rows],
-            [reference_of(of_one) for of_one in samples],
-            bench.npe.prior,
-            num_nodes=NUM_NODES,
-        )
-    return LabelScores(
-        nodes=nodes, log_q=versions.node_log_probs(nodes.theta, x, number)
-    )
+    rows = data.folds[number]
+    x, nodes = data.pairs.x[rows], Nodes.exact(data.pairs.mean[rows])
+    if not data.pairs.are_exact:
+        size = torch.Size((NUM_REFERENCES,))
+        with seeded(data.seed_of(rows)):
+            nodes = nodes_of(
+                data.pairs.label[rows],
+                [reference_of(one.sample(size, x)) for one in densities],
+                data.prior,
+                num_nodes=NUM_NODES,
+            )
+    theta = nodes.theta.movedim(1, 0)
+    log_q = [without_nan(one.log_prob(theta, x)).double().T for one in densities]
+    return LabelScores(nodes=nodes, log_q=torch.stack(log_q, dim=2))
 
 
 @torch.no_grad()
@@ -361,11 +334,11 @@ def _score_labelled_fold(
         levels, estimates, ranks = label_levels(
             posterior, labels, x, num_samples=num_samples
         )
-    marginal = torch.full_like(labels.theta, torch.nan)
+    marginal = torch.full_like(labels.y, torch.nan)
     joint = torch.full_like(log_prob, torch.nan)
     if (exact := labels.is_exact).any():
         known = score_fold(
-            posterior, labels.theta[exact], x[exact], num_samples=num_samples, seed=seed
+            posterior, labels.y[exact], x[exact], num_samples=num_samples, seed=seed
         )
         joint[exact], marginal[exact] = known.joint, known.marginal.to(marginal)
     return FoldScores(
@@ -399,16 +372,16 @@ def label_levels(
         shape ``(n, d)``. Levels and ranks are NaN for parameters that were not
         measured, and for labels given as draws.
     """
-    unknown = torch.full_like(labels.theta, torch.nan)
-    if labels.samples is not None:
+    unknown = torch.full_like(labels.y, torch.nan)
+    if labels.are_drawn:
         return unknown, unknown, unknown
     samples = draw_samples(posterior, x, num_samples=num_samples)
     std = labels.covariance.diagonal(dim1=1, dim2=2).sqrt().to(samples)
     measured = samples + std * torch.randn_like(samples)
-    levels = central_levels(count_ranks(measured, labels.theta)).to(labels.theta)
-    estimates, ranks = estimates_and_ranks(measured, labels.theta)
+    levels = central_levels(count_ranks(measured, labels.y)).to(labels.y)
+    estimates, ranks = estimates_and_ranks(measured, labels.y)
     return (
         levels.where(labels.is_measured, torch.nan),
-        estimates.to(labels.theta),
-        ranks.to(labels.theta).where(labels.is_measured, torch.nan),
+        estimates.to(labels.y),
+        ranks.to(labels.y).where(labels.is_measured, torch.nan),
     )

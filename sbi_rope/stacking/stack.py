@@ -2,34 +2,34 @@
 
 import time
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
 
-from sbi_rope._progress import is_shown, progress_bar
+from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
-from sbi_rope._sbi import check_density, embed, estimator_of
+from sbi_rope._sbi import check_density, embed
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._two_sample import TwoSampleTest, compare_with_pairs
+from sbi_rope.density import Density
 from sbi_rope.discrepancy import DiscrepancyReport
-from sbi_rope.errors import InvalidInputError, warn_user
-from sbi_rope.mixture import Part
+from sbi_rope.errors import warn_user
 from sbi_rope.rope import RoPE
-from sbi_rope.settings import Count, Range, check
+from sbi_rope.settings import Range, check
 from sbi_rope.stacking.candidates import (
     Candidate,
-    checked_candidates,
-    suitable_candidates,
+    as_densities,
+    chosen_candidates,
 )
 from sbi_rope.stacking.cross_validation import CrossValidation, LearningCurve
+from sbi_rope.stacking.data import NUM_FOLDS, StackData, draw_seeds
 from sbi_rope.stacking.posterior import StackedPosterior
 from sbi_rope.stacking.report import Provenance, StackingReport
-from sbi_rope.stacking.scoring import score_versions
+from sbi_rope.stacking.scoring import score_folds
 from sbi_rope.stacking.versions import Versions
-from sbi_rope.stacking.workbench import NUM_FOLDS, Fold, Workbench, draw_seeds
 
-__all__ = ["cross_validate", "stack"]
+__all__ = ["stack"]
 
 # The learning curve trains on these shares of the folds, and on all folds but one.
 SMALLER = (0.25, 0.5)
@@ -39,8 +39,8 @@ def stack(
     rope: RoPE,
     x_o: Tensor | None = None,
     *,
-    candidates: Sequence[Candidate] | None = None,
-    num_folds: int | None = None,
+    candidates: Sequence[Any] | None = None,
+    num_folds: int = NUM_FOLDS,
     learning_curve: bool = False,
     seed: int | None = None,
     show_progress_bars: bool | None = None,
@@ -73,16 +73,18 @@ def stack(
         candidates: What to stack;
             :func:`default_candidates(rope, x_o)
             <sbi_rope.stacking.default_candidates>` if None: the prior, NPE, fine-tuned
-            NPE and discrepancy models.
-        num_folds: The number of folds, 5 if None, and at most the number of groups.
-            Pairs with equal labels, or of the same of the ``groups`` that were
-            appended, are in the same fold.
+            NPE and discrepancy models. A posterior, or a density of your own, that has
+            not seen the pairs is taken as it is, see
+            :class:`~sbi_rope.stacking.GivenCandidate`.
+        num_folds: The number of folds, at most the number of groups. Pairs with equal
+            labels, or of the same of the ``groups`` that were appended, are in the same
+            fold.
         learning_curve: Whether to train on fewer folds too, so that the report can
             estimate what more labels would add. It takes about twice the time.
         seed: Seed of everything random; None uses the states of torch, NumPy and
             Python.
-        show_progress_bars: Whether to show how many trainings and scores are done.
-            None does so in a terminal or a notebook, but not in a file.
+        show_progress_bars: Whether to show the course of each training. None does so in
+            a terminal or a notebook, but not in a file.
 
     Returns:
         The stack, an sbi posterior. Its ``report`` holds the held-out scores, and
@@ -98,212 +100,95 @@ def stack(
             prior at a held-out observation.
         SimulationError: If the simulator fails.
     """
+    check("rope", rope, RoPE)
+    check("num_folds", num_folds, Annotated[int, Range(2)])
     check("learning_curve", learning_curve, bool)
-    trainer = _Trainer(
-        rope, x_o, candidates, num_folds, seed, show=is_shown(show_progress_bars)
-    )
     start, calls = time.perf_counter(), rope.num_simulator_calls
-    bench = trainer.bench
-    # This comes first, so that nobody waits for the training to hear of it.
-    batch = None if trainer.x_o is None else _compare_batch(bench, trainer.x_o)
-    versions, scores = trainer.cross_validate(with_refit=True)
-    curve = None
-    if learning_curve:
-        wanted = [int(share * scores.num_folds) for share in SMALLER]
-        smaller = [
-            trainer.cross_validate(num_training_folds=count)[1]
-            for count in dict.fromkeys(wanted)
-            if 1 <= count < scores.num_folds - 1
-        ]
-        curve = LearningCurve.of([*smaller, scores])
+    if x_o is not None:
+        x_o = rope.checked_observations(x_o)
+        warn_of_far_entries("x_o", x_o, rope.embedding_net)
+    of_data, of_scores = draw_seeds(seed, 2)
+    data = StackData(
+        rope,
+        num_folds=num_folds,
+        seed=of_data,
+        show_progress_bars=is_shown(show_progress_bars),
+    )
+    check_density(
+        data.estimator,
+        what="a RoPE of a posterior",
+        because="candidates are scored by the density of held-out parameters",
+    )
+    # These come first, so that nobody waits for the training to hear of it.
+    stacked = chosen_candidates(candidates, data, x_o)
+    batch = None if x_o is None else _compare_batch(data, x_o)
+    numbers = range(len(data.folds))
+    points: list[CrossValidation] = []
+    fitted: list[list[Density]] = []
+    for count in _numbers_of_folds(len(numbers), curve=learning_curve):
+        versions = [data.without(k, count) for k in numbers]
+        if not fitted:
+            versions.append(data.every)
+        found = []
+        for candidate in stacked:
+            # With the same seed for all, nothing depends on the order of candidates.
+            # The caller may have switched gradients off.
+            with seeded(data.seed), torch.enable_grad():
+                densities = candidate.fit(data, versions)
+            found.append(as_densities(densities, data, candidate.name))
+        fitted = fitted or found
+        points.append(
+            score_folds(data, stacked, found, num_training_folds=count, seed=of_scores)
+        )
+    scores = points[0]
     report = StackingReport.of(
         scores,
-        curve,
+        LearningCurve.of(points[::-1]) if learning_curve else None,
         batch=batch,
-        discrepancy=trainer.discrepancy(),
-        probability_of_prior=bench.probability_of_prior(),
-        learns_prior=any(
-            one.learns_prior and not one.fixed for one in trainer.candidates
-        ),
+        discrepancy=_discrepancy(stacked, data),
+        probability_of_prior=data.probability_of_prior(),
+        learns_prior=any(one.learns_prior for one in stacked),
         parameter_names=rope.parameter_names,
         provenance=Provenance.since(
             start, seed=seed, num_simulator_calls=rope.num_simulator_calls - calls
         ),
     )
     posterior = StackedPosterior(
-        versions,
-        bench.npe.prior,
+        [Versions.of(one) for one in fitted],
+        data.prior,
         report=report,
-        enable_transform=bench.npe.enable_transform,
+        enable_transform=data.npe.enable_transform,
     )
-    posterior.parameter_names = rope.parameter_names
-    posterior.x_names = rope.x_names
+    posterior.parameter_names, posterior.x_names = rope.parameter_names, rope.x_names
     return posterior
 
 
-def cross_validate(
-    rope: RoPE,
-    x_o: Tensor | None = None,
-    *,
-    candidates: Sequence[Candidate] | None = None,
-    num_folds: int | None = None,
-    num_training_folds: int | None = None,
-    seed: int | None = None,
-    show_progress_bars: bool | None = None,
-) -> CrossValidation:
-    """Score candidates on calibration pairs that they were not trained on.
-
-    Args:
-        rope: As in :func:`stack`.
-        x_o: As in :func:`stack`.
-        candidates: As in :func:`stack`.
-        num_folds: As in :func:`stack`.
-        num_training_folds: The number of folds to train on for each held-out fold;
-            all others if None. A smaller number shows how the candidates would score
-            with fewer pairs.
-        seed: As in :func:`stack`.
-        show_progress_bars: As in :func:`stack`.
-
-    Returns:
-        The score of each candidate at each pair. It raises what :func:`stack` does.
-    """
-    trainer = _Trainer(
-        rope, x_o, candidates, num_folds, seed, show=is_shown(show_progress_bars)
-    )
-    return trainer.cross_validate(num_training_folds=num_training_folds)[1]
+def _numbers_of_folds(num_folds: int, *, curve: bool) -> list[int]:
+    """Return on how many folds versions are trained, all but one first."""
+    most = num_folds - 1
+    smaller = {int(share * num_folds) for share in SMALLER} if curve else set()
+    return [most, *sorted((n for n in smaller if 0 < n < most), reverse=True)]
 
 
-class _Trainer:
-    """Trains and scores all candidates. The arguments are those of :func:`stack`."""
-
-    def __init__(
-        self,
-        rope: RoPE,
-        x_o: Tensor | None,
-        candidates: Sequence[Candidate] | None,
-        num_folds: int | None,
-        seed: int | None,
-        *,
-        show: bool,
-    ) -> None:
-        check("rope", rope, RoPE)
-        num_folds = NUM_FOLDS if num_folds is None else num_folds
-        check("num_folds", num_folds, Annotated[int, Range(2)])
-        if x_o is not None:
-            x_o = rope.checked_observations(x_o)
-            warn_of_far_entries("x_o", x_o, rope.embedding_net)
-        self.x_o = x_o
-        # The second one is not used, and leaves the third as it is.
-        of_folds, _, self.seed = draw_seeds(seed, 3)
-        self.bench = Workbench(
-            rope,
-            num_folds=num_folds,
-            seed=of_folds,
-            show_progress_bars=show,
-        )
-        check_density(
-            estimator_of(self.bench.npe),
-            what="a RoPE of a posterior",
-            because="candidates are scored by the density of held-out parameters",
-        )
-        if candidates is None:
-            self.candidates = suitable_candidates(self.bench, x_o)
-        else:
-            self.candidates = checked_candidates(candidates, self.bench)
-        self._fixed: dict[str, list[Part]] = {}
-
-    @torch.enable_grad()  # in case the caller has switched gradients off
-    def cross_validate(
-        self, *, num_training_folds: int | None = None, with_refit: bool = False
-    ) -> tuple[Versions, CrossValidation]:
-        """Train on the folds that follow each fold, and score on the fold itself.
-
-        Args:
-            num_training_folds: The number of folds to train on; all others if None.
-            with_refit: Whether to add a version that is trained on all pairs. This
-                version is not scored.
-        """
-        bench, num_folds = self.bench, len(self.bench.folds)
-        if num_training_folds is None:
-            num_training_folds = num_folds - 1
-        check("num_training_folds", num_training_folds, Count)
-        if num_training_folds >= num_folds:
-            raise InvalidInputError(
-                f"Expected `num_training_folds` below the number of folds, {num_folds};"
-                f" got {num_training_folds}."
-            )
-        folds = [
-            Fold(bench, [(k + 1 + j) % num_folds for j in range(num_training_folds)])
-            for k in range(num_folds)
-        ]
-        if with_refit:
-            folds.append(Fold(bench, range(num_folds)))
-        versions = self._train(folds)
-        scores = score_versions(
-            bench,
-            versions,
-            self.candidates,
-            num_training_folds=num_training_folds,
-            seed=self.seed,
-        )
-        return versions, scores
-
-    def _train(self, folds: Sequence[Fold]) -> Versions:
-        # These come first, because they show the progress of their own training, and
-        # because what a user passed to them may be refused.
-        for candidate in self.candidates:
-            if candidate.fixed and candidate.name not in self._fixed:
-                fold = Fold(self.bench, [0])
-                self._fixed[candidate.name] = _trained(candidate, fold)
-        others = [candidate for candidate in self.candidates if not candidate.fixed]
-        versions = []
-        with progress_bar(
-            show=self.bench.show,
-            desc=f"Training {len(others)} candidates in {len(folds)} folds",
-            total=len(others) * len(folds),
-        ) as bar:
-            for fold in folds:
-                version = {}
-                for candidate in others:
-                    version[candidate.name] = _trained(candidate, fold)
-                    bar.update()
-                versions.append(version)
-        return Versions(
-            names=tuple(candidate.name for candidate in self.candidates),
-            fixed=self._fixed,
-            trained=tuple(versions),
-        )
-
-    def discrepancy(self) -> DiscrepancyReport | None:
-        """Return what the pairs say about each entry of x, if a candidate uses it."""
-        is_used = any(
-            "discrepancy" in candidate.family for candidate in self.candidates
-        )
-        if is_used and self.bench.compares_entries:
-            return self.bench.discrepancy()
-        return None
+def _discrepancy(
+    candidates: Sequence[Candidate], data: StackData
+) -> DiscrepancyReport | None:
+    """Return what the pairs say about each entry of x, if a candidate uses it."""
+    is_used = any("discrepancy" in candidate.family for candidate in candidates)
+    return data.discrepancy() if is_used and data.compares_entries else None
 
 
-def _trained(candidate: Candidate, fold: Fold) -> list[Part]:
-    # A candidate that ignores its seed still does not change the caller's random state.
-    with seeded(fold.seed):
-        parts = list(candidate.parts(fold))
-    if not parts:
-        raise InvalidInputError(
-            f"Expected at least one density of {candidate.name!r}; got none."
-        )
-    return parts
-
-
-def _compare_batch(bench: Workbench, x_o: Tensor) -> TwoSampleTest | None:
+def _compare_batch(data: StackData, x_o: Tensor) -> TwoSampleTest | None:
     """Compare observations with those of the pairs, and warn if they clearly differ.
 
     Returns:
         An energy test of the embeddings h(x), with the pairs as the first set, or None
         if there are too few observations or pairs.
     """
-    net = bench.embedding_net
-    test = compare_with_pairs(embed(net, bench.x), bench.groups, embed(net, x_o))
+    net = data.embedding_net
+    test = compare_with_pairs(
+        embed(net, data.pairs.x), data.pairs.group.cpu(), embed(net, x_o)
+    )
     if test is not None and test.is_different:
         warn_user(
             f"`x_o` differs from the observations of the calibration pairs (p = "

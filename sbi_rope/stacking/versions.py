@@ -1,116 +1,77 @@
-"""All candidates of a stack, in one version for each fold."""
+"""A candidate of a stack in all its versions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.distributions import Distribution
 
-from sbi_rope.mixture import MixtureEstimator, Part
-from sbi_rope.mixture.parts import DTYPE
+from sbi_rope.density import Density, Flow, Mixture, MixturePosterior
 
-__all__ = ["Versions"]
+__all__ = ["Versions", "fold_posterior", "mixture_of"]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class Versions:
-    """All candidates in all versions: trained without each fold, and on all pairs.
+    """The densities of a candidate, one for each version, and their average.
 
-    A stack is made of the models that were scored: each candidate is the average of its
-    versions, and the candidates are weighted by their held-out scores.
+    A stack is made of the models that were scored: the candidate is deployed as the
+    average of its versions. Flows are averaged in one network, from which each version
+    can be taken out.
 
     Attributes:
-        names: The names of the K candidates.
-        fixed: The densities of the candidates that are the same in all versions.
-        trained: For each version, the densities of the other candidates.
+        average: The average of all versions with equal weights.
+        place: The number of each version among those that differ.
+        sizes: How many flows of the average belong to each that differs.
     """
 
-    names: tuple[str, ...]
-    fixed: dict[str, list[Part]]
-    trained: tuple[dict[str, list[Part]], ...]
+    average: Density
+    place: list[int]
+    sizes: list[int]
 
-    def estimator(
-        self, weights: Tensor, numbers: Sequence[int] | None = None
-    ) -> MixtureEstimator:
-        """Return the mixture of some versions.
+    @classmethod
+    def of(cls, densities: Sequence[Density]) -> "Versions":
+        """Return the versions of a candidate; equal ones are one object."""
+        different = list({id(one): one for one in densities}.values())
+        place = [[one is other for other in different].index(True) for one in densities]
+        sizes = [1] * len(different)
+        if len(different) == 1:
+            return cls(different[0], place, sizes)
+        flows = [one for one in different if isinstance(one, Flow)]
+        if len(flows) == len(different):
+            sizes = [one.num_members for one in flows]
+            return cls(Flow.joined(flows), place, sizes)
+        return cls(Mixture(different, [1 / len(sizes)] * len(sizes)), place, sizes)
 
-        Args:
-            weights: The weights of the candidates, shape ``(K,)``; they sum to one.
-            numbers: The numbers of the versions, which have equal weights; all if None.
-        """
-        parts: list[Part] = []
-        shares: list[float] = []
-        for name, weight in zip(self.names, weights.tolist(), strict=True):
-            members, equal = self.parts_of(name, numbers)
-            parts += members
-            shares += [weight * share for share in equal]
-        total = sum(shares)
-        return MixtureEstimator(parts, [share / total for share in shares])
+    def __len__(self) -> int:
+        return len(self.place)
 
-    def parts_of(
-        self, name: str, numbers: Sequence[int] | None = None
-    ) -> tuple[list[Part], list[float]]:
-        """Return the densities of a candidate in some versions, and their shares.
+    def __getitem__(self, version: int) -> Density:
+        """Return the density of one version."""
+        number, average = self.place[version], self.average
+        if len(self.sizes) == 1:
+            return average
+        if isinstance(average, Flow):
+            start = sum(self.sizes[:number])
+            return average[torch.arange(start, start + self.sizes[number])]
+        assert isinstance(average, Mixture)
+        return average.parts[number]
 
-        Versions have equal shares, and so have the densities within each version.
-        """
-        numbers = range(len(self.trained)) if numbers is None else numbers
-        if name in self.fixed:
-            versions = [self.fixed[name]]
-        else:
-            versions = [self.trained[number][name] for number in numbers]
-        pairs = [
-            (part, 1.0 / len(versions) / len(of_one))
-            for of_one in versions
-            for part in of_one
-        ]
-        return [part for part, _ in pairs], [share for _, share in pairs]
 
-    @torch.no_grad()
-    def log_probs(
-        self, theta: Tensor, x: Tensor, numbers: Sequence[int] | None = None
-    ) -> Tensor:
-        """Return the log density of each candidate by itself at pairs.
+def mixture_of(
+    candidates: Sequence[Versions], weights: Tensor, version: int | None = None
+) -> Mixture:
+    """Return the mixture of candidates in one version, or in the average of all."""
+    parts = [one.average if version is None else one[version] for one in candidates]
+    return Mixture(parts, weights)
 
-        Args:
-            theta: Parameters, shape ``(n, d)``.
-            x: Their observations, shape ``(n, *event)``.
-            numbers: The numbers of the versions to average over; all if None.
 
-        Returns:
-            Shape ``(n, K)``, float64, not corrected for leakage.
+def fold_posterior(mixture: Mixture, prior: Distribution) -> MixturePosterior:
+    """Return the posterior of a stack that has not seen a fold.
 
-        Raises:
-            InvalidInputError: If shapes do not fit or a value is not finite.
-        """
-        scores = []
-        for name in self.names:
-            estimator = MixtureEstimator(*self.parts_of(name, numbers))
-            of_each = estimator.part_log_probs(theta.to(DTYPE), x)
-            scores.append((of_each + estimator.weights.log()).logsumexp(dim=1))
-        return torch.stack(scores, dim=1)
-
-    @torch.no_grad()
-    def node_log_probs(self, theta: Tensor, x: Tensor, number: int) -> Tensor:
-        """Return the log density of each candidate at several parameters of each pair.
-
-        Args:
-            theta: S parameters of each pair, shape ``(n, S, d)``.
-            x: The observations, shape ``(n, *event)``.
-            number: The number of the version.
-
-        Returns:
-            Shape ``(n, S, K)``, float64, not corrected for leakage.
-        """
-        scores = [
-            estimator.log_prob(theta.movedim(1, 0), x).double().T
-            for estimator in self.estimators(number)
-        ]
-        return torch.stack(scores, dim=2)
-
-    def estimators(self, number: int) -> list[MixtureEstimator]:
-        """Return the density of each candidate in one version."""
-        return [
-            MixtureEstimator(*self.parts_of(name, [number]), tail_mass=0.0)
-            for name in self.names
-        ]
+    It does not warn of observations that are far from simulations, because RoPE has.
+    """
+    posterior = MixturePosterior(mixture, prior, enable_transform=False)
+    posterior.warns = False
+    return posterior

@@ -12,10 +12,10 @@ from torch.distributions import Distribution
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import device_of, embedding_of, estimator_of
-from sbi_rope._training import History
 from sbi_rope.errors import InvalidInputError, NotReadyError
+from sbi_rope.fit import History
 from sbi_rope.settings import check
-from sbi_rope.simulate import SimulationSource, source_of
+from sbi_rope.simulate import Source, source_of
 from sbi_rope.trainers.data import Data, Kind
 from sbi_rope.trainers.starting_npe import StartingNPE
 
@@ -251,7 +251,7 @@ class Method(ABC):
         """The appended simulations, if there is no simulator to make others."""
         return self._data.simulations if self._simulator is None else None
 
-    def _source(self) -> SimulationSource:
+    def _source(self) -> Source:
         """Return the simulator, or the appended simulations where there is none."""
         event_shape = self._data.event_shape
         assert event_shape is not None

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 from torch.distributions import Distribution
 
 from sbi_rope._sbi import readable
+from sbi_rope.data import Pairs
 from sbi_rope.errors import InvalidInputError, warn_user
 from sbi_rope.tensors import as_batch, check_in_support, column_names, rows_with
 
@@ -53,6 +54,11 @@ class Data:
         """Theta ``(n, d)`` and the real x ``(n, *event)`` recorded at them."""
         theta, x = self._tensors["calibration"]
         return theta, x
+
+    @property
+    def pairs(self) -> Pairs:
+        """The calibration pairs, whose labels are exact."""
+        return Pairs.exact(*self.calibration)
 
     @property
     def observations(self) -> Tensor:

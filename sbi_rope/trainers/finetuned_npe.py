@@ -1,39 +1,27 @@
 """NPE fine-tuned on the calibration pairs (multi-fidelity NPE)."""
 
 import copy
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from sbi_rope._groups import MIN_PAIRS_FOR_HOLDOUT, groups_of, split_groups, split_pairs
 from sbi_rope._sbi import (
-    ConditionalDensityEstimator,
     check_density,
-    embedding_of,
     estimator_of,
     posterior_from,
-    with_embedding,
 )
 from sbi_rope._standardisation import warn_of_far_entries
-from sbi_rope._training import History, best_of_learning_rates
+from sbi_rope.data import MIN_PAIRS_FOR_HOLDOUT
+from sbi_rope.density import Flow, MixturePosterior
 from sbi_rope.errors import InvalidInputError
-from sbi_rope.mixture import (
-    MixtureEstimator,
-    MixturePosterior,
-    OwnEmbeddings,
-    part_of,
-)
+from sbi_rope.finetuning import FINETUNING, best_rates, finetune_flow
+from sbi_rope.fit import History, Training, epochs_on_pairs
+from sbi_rope.labels import Nodes
 from sbi_rope.settings import Count, check
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
-from sbi_rope.trainers.training import (
-    FINETUNING,
-    EstimatorBuilder,
-    Training,
-    train_on_pairs,
-)
+from sbi_rope.trainers.training import EstimatorBuilder
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -116,7 +104,7 @@ class FinetunedNPE(Method):
         self.num_holdouts = num_holdouts
         self.training = FINETUNING if training is None else training
         self.learning_rates = learning_rates
-        self._starts: list[ConditionalDensityEstimator] = []
+        self._start: Flow | None = None
         self._other_histories: tuple[History, ...] = ()
 
     @classmethod
@@ -136,17 +124,18 @@ class FinetunedNPE(Method):
             UnsupportedPosteriorError: If it is none of these.
             InvalidInputError: If ``num_holdouts`` is not the number of embedding nets.
         """
-        starts = _averaged(posterior)
-        if not starts:
+        flow = getattr(posterior, "posterior_estimator", None)
+        if not isinstance(flow, Flow):
             return super().from_posterior(posterior, **options)
-        if options.setdefault("num_holdouts", len(starts)) != len(starts):
+        count = flow.num_members
+        if options.setdefault("num_holdouts", count) != count:
             raise InvalidInputError(
-                f"Expected `num_holdouts` of {len(starts)}, one for each embedding net "
-                f"of the posterior; got {options['num_holdouts']!r}. Leave it out."
+                f"Expected `num_holdouts` of {count}, one for each embedding net of "
+                f"the posterior; got {options['num_holdouts']!r}. Leave it out."
             )
-        first = posterior_from(posterior, starts[0])
+        first = posterior_from(posterior, flow[[0]].estimator())
         method = super().from_posterior(first, **options)
-        method._starts = copy.deepcopy(starts)
+        method._start = copy.deepcopy(flow)
         method._data.theta_names = getattr(posterior, "parameter_names", None)
         method._data.x_names = getattr(posterior, "x_names", None)
         return method
@@ -163,84 +152,46 @@ class FinetunedNPE(Method):
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
-        starts = self._starts or [estimator_of(npe)]
-        warn_of_far_entries("x", self._data.calibration[1], embedding_of(starts[0]))
+        own = check_density(estimator_of(npe))
+        start = Flow.of([own]) if self._start is None else self._start
+        theta, x = self._data.calibration
+        warn_of_far_entries("x", x, start)
         splits = self._splits()
         # There is one start for all splits, or as many as splits. Where pairs are too
         # few for that, splits are used again.
-        tuned = [
-            self._tuned(
-                starts[k % len(starts)],
-                splits[k % len(splits)],
-                show_progress_bars=show_progress_bars,
-            )
-            for k in range(max(len(starts), len(splits)))
-        ]
-        (estimator, history), *others = tuned
-        self._other_histories = tuple(history for _, history in others)
-        if self.num_holdouts == 1:
-            return posterior_from(npe, estimator), history
-        average = MixtureEstimator(
-            [part_of(estimator) for estimator, _ in tuned],
-            [1.0 / len(tuned)] * len(tuned),
+        count = max(start.num_members, len(splits))
+        splits = [splits[k % len(splits)] for k in range(count)]
+        max_num_epochs = epochs_on_pairs(
+            theta, splits[0][1], self.training.max_num_epochs
         )
-        return MixturePosterior(average, copy.deepcopy(self._prior)), history
+        rates = self.learning_rates
+        if not len(splits[0][1]):
+            rates = (min(rates),)
+        members = [k % start.num_members for k in range(count) for _ in rates]
+        sizes = len(start.nets), len(start.densities)
+        flow = start.made_of([(k % sizes[0], k % sizes[1]) for k in members])
+        histories = finetune_flow(
+            flow,
+            [Nodes.exact(theta)] * len(members),
+            x,
+            [split for split in splits for _ in rates],
+            training=self.training,
+            learning_rates=list(rates) * count,
+            max_num_epochs=max_num_epochs,
+            show_progress_bars=show_progress_bars,
+        )
+        best = best_rates(histories, len(rates))
+        history, *others = (histories[k] for k in best)
+        self._other_histories = tuple(others)
+        if self.num_holdouts == 1:
+            return posterior_from(npe, flow[best].estimator(own)), history
+        return MixturePosterior(flow[best], copy.deepcopy(self._prior)), history
 
     def _splits(self) -> list[tuple[Tensor, Tensor]]:
         """Return the rows to train on and those held out, for each network."""
-        theta, _ = self._data.calibration
-        groups = groups_of(theta)
-        if self.num_holdouts == 1 or int(groups.max()) + 1 < MIN_PAIRS_FOR_HOLDOUT:
-            return [split_pairs(theta, self.training.validation_fraction)]
-        every = torch.arange(len(groups))
-        parts = split_groups(groups, self.num_holdouts)
-        return [(every[~torch.isin(every, rows)], rows) for rows in parts]
-
-    def _tuned(
-        self,
-        start: Any,
-        split: tuple[Tensor, Tensor],
-        *,
-        show_progress_bars: bool,
-    ) -> tuple[ConditionalDensityEstimator, History]:
-        """Tune a copy with each learning rate, and keep the best on the hold-out."""
-        check_density(start)
-
-        def tuned(
-            learning_rate: float,
-        ) -> tuple[ConditionalDensityEstimator, History]:
-            estimator = copy.deepcopy(start).requires_grad_()
-            history = train_on_pairs(
-                estimator,
-                *self._data.calibration,
-                split,
-                training=replace(self.training, learning_rate=learning_rate),
-                in_training_mode=False,
-                label="Fine-tuning NPE",
-                show_progress_bars=show_progress_bars,
-            )
-            return estimator, history
-
-        return best_of_learning_rates(
-            tuned,
-            self.learning_rates,
-            num_held_out=len(split[1]),
-            otherwise=min(self.learning_rates),
-        )
-
-
-def _averaged(posterior: Any) -> list[ConditionalDensityEstimator]:
-    """Return the estimators that a posterior averages over; none if it is no average.
-
-    They share the density.
-    """
-    if not isinstance(posterior, MixturePosterior):
-        return []
-    part, *others = posterior.posterior_estimator.parts
-    if others or not isinstance(part.mixing, OwnEmbeddings):
-        return []
-    shape = part.mixing.event_shape
-    return [
-        with_embedding(part.density, net, condition_shape=shape)
-        for net in part.mixing.nets
-    ]
+        pairs = self._data.pairs
+        if self.num_holdouts == 1 or pairs.num_groups < MIN_PAIRS_FOR_HOLDOUT:
+            return [pairs.split(self.training.validation_fraction)]
+        every = torch.arange(len(pairs)).to(pairs.group)
+        folds = pairs.folds(self.num_holdouts)
+        return [(every[~torch.isin(every, rows)], rows) for rows in folds]

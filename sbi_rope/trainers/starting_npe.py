@@ -10,12 +10,11 @@ from sbi_rope._sbi import (
     estimator_of,
     posterior_from,
 )
-from sbi_rope._training import History
+from sbi_rope.fit import History, Training
 from sbi_rope.settings import check
 from sbi_rope.trainers.data import Data
 from sbi_rope.trainers.training import (
     EstimatorBuilder,
-    Training,
     estimator_builder,
     train_on_simulations,
 )

@@ -18,13 +18,13 @@ from sbi_rope import load, save
 from sbi_rope.baselines import (
     CalibrationMLP,
 )
+from sbi_rope.density import MixturePosterior
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import (
     InvalidInputError,
     NotReadyError,
     RoPEWarning,
 )
-from sbi_rope.mixture import MixturePosterior
 from sbi_rope.trainers.data import Kind
 from tests import baselines
 from tests.baselines import (
@@ -174,7 +174,7 @@ def test_inside_a_bounded_prior_is_the_mass_that_the_samples_have_there(
     inside = within_support(prior, sample(posterior, (4000,), x)).double()
     error = (weights.var() / 20_000 + inside.var() / 4000).sqrt()
     if isinstance(posterior, MixturePosterior):  # which is divided by an estimate
-        mass = posterior.leakage(x)
+        mass = posterior.leakage(x[None])
         error = (error.square() + (mass.standard_error / mass.mass).square()).sqrt()
     assert float(error) < 0.1
     assert abs(float(weights.mean() - inside.mean())) < 5 * float(error) + 1e-6

@@ -1,9 +1,6 @@
 """MixturePosterior keeps the contract of sbi's posteriors, and adds a batch to it."""
 
-import copy
-import io
 import itertools
-import pickle
 from collections.abc import Callable
 from typing import Any
 
@@ -14,44 +11,16 @@ from sbi.inference import DirectPosterior
 from sbi.utils import BoxUniform
 from torch import Tensor, nn
 
+from sbi_rope.density import MixturePosterior, PriorPosterior
 from sbi_rope.errors import (
     InvalidInputError,
     RoPEError,
     SamplingError,
 )
-from sbi_rope.mixture import MixturePosterior
-from sbi_rope.mixture.prior_posterior import PriorPosterior
 from tests import problems
 from tests.problems import gaussian_posterior
 
 QUIET = {"show_progress_bars": False}
-
-
-def through_pickle(posterior: MixturePosterior) -> MixturePosterior:
-    return pickle.loads(pickle.dumps(posterior))
-
-
-def through_torch(posterior: MixturePosterior) -> MixturePosterior:
-    buffer = io.BytesIO()
-    torch.save(posterior, buffer)
-    buffer.seek(0)
-    return torch.load(buffer, weights_only=False)
-
-
-def to_cpu(posterior: MixturePosterior) -> MixturePosterior:
-    moved = copy.deepcopy(posterior)
-    moved.to("cpu")
-    return moved
-
-
-COPIES: tuple[Callable[[Any], MixturePosterior], ...] = (
-    copy.copy,
-    copy.deepcopy,
-    through_pickle,
-    through_torch,
-    to_cpu,
-    lambda posterior: through_pickle(copy.deepcopy(posterior)),
-)
 
 
 def image_posterior() -> MixturePosterior:
@@ -280,44 +249,6 @@ def test_the_posterior_of_one_observation_changes_no_other_posterior() -> None:
     assert second._map is None
 
 
-# --- copies ---
-
-
-@pytest.mark.medium
-@pytest.mark.parametrize("index", [None, 2])
-def test_a_copy_has_the_same_density_and_samples(index: int | None) -> None:
-    posterior: Any = gaussian_posterior(std=0.8)
-    if index is not None:
-        posterior = posterior[index]
-    theta = 2 * torch.rand(4, len(posterior), 2) - 1
-    early = [make_copy(posterior) for make_copy in COPIES]
-    expected = posterior.log_prob_batched(theta, posterior.x_o)
-    torch.manual_seed(1)
-    samples = posterior.sample_batched((3,), posterior.x_o, **QUIET)
-    late = [make_copy(posterior) for make_copy in COPIES]
-    for other in early + late:
-        assert type(other) is MixturePosterior
-        assert torch.equal(other.log_prob_batched(theta, posterior.x_o), expected)
-        torch.manual_seed(1)
-        again = other.sample_batched((3,), posterior.x_o, **QUIET)
-        assert torch.equal(again, samples)
-        if index is not None:
-            assert torch.equal(other.default_x, posterior.default_x)
-            assert torch.equal(
-                other.log_prob(theta[:, 0]), posterior.log_prob(theta[:, 0])
-            )
-
-
-def test_a_copy_of_an_extending_posterior_extends() -> None:
-    posterior = gaussian_posterior(unseen="extend")
-    other = through_pickle(posterior)
-    new, theta = torch.randn(3), torch.zeros(1, 2)
-    with pytest.warns(UserWarning, match="Extended"):
-        expected = posterior.log_prob(theta, x=new)
-    with pytest.warns(UserWarning, match="Extended"):
-        assert torch.equal(other.log_prob(theta, x=new), expected)
-
-
 def test_several_unseen_observations_in_turn_each_get_their_own_row() -> None:
     posterior = gaussian_posterior(unseen="extend")
     new, theta = torch.randn(2, 3), torch.zeros(1, 2)
@@ -327,21 +258,6 @@ def test_several_unseen_observations_in_turn_each_get_their_own_row() -> None:
         with pytest.warns(UserWarning, match="Extended"):
             one = posterior.log_prob(theta, x=new[i])
         assert torch.allclose(one, both[i], atol=1e-5)
-
-
-@pytest.mark.gpu
-def test_moving_to_a_gpu_and_back_changes_nothing() -> None:
-    posterior = gaussian_posterior(std=0.8)
-    theta = 2 * torch.rand(4, 5, 2) - 1
-    expected = posterior.log_prob_batched(theta, posterior.x_o)
-    x_o = posterior.x_o
-    posterior.to("cuda")
-    assert posterior.weights.device.type == "cuda"
-    moved = posterior.log_prob_batched(theta.cuda(), x_o.cuda())
-    assert torch.allclose(moved.cpu(), expected, atol=1e-4)
-    assert posterior.sample_batched((3,), x_o.cuda(), **QUIET).device.type == "cuda"
-    posterior.to("cpu")
-    assert torch.equal(posterior.log_prob_batched(theta, x_o), expected)
 
 
 def test_no_network_of_the_posterior_is_left_in_training_mode() -> None:
@@ -361,7 +277,7 @@ def test_dropout_in_the_components_does_not_blur_the_density() -> None:
             return super().log_prob(input, self.dropout(condition))
 
     posterior = gaussian_posterior()
-    posterior.posterior_estimator.parts[0].density = Noisy()
+    posterior.posterior_estimator.density = Noisy()
     theta = torch.zeros(1, 2)
     values = {
         float(posterior.log_prob(theta, x=posterior.x_o[0], norm_posterior=False))

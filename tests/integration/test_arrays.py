@@ -81,8 +81,8 @@ def test_stored_simulations_and_trainers_take_arrays() -> None:
     theta = problems.box(2).sample((1000,))
     x = problems.simulate(theta)
     npe = problems.npe_posterior("mdn")
-    theta_s, x_s = RoPE(npe, simulations=(array(theta), array(x))).source.kept(
-        2000, progress=False
+    theta_s, x_s = RoPE(npe, simulations=(array(theta), array(x))).source.from_prior(
+        2000
     )
     assert torch.equal(theta_s.sort(dim=0).values, theta.sort(dim=0).values)
     assert torch.equal(x_s.sort(dim=0).values, x.sort(dim=0).values)
@@ -112,7 +112,7 @@ def test_tables_are_those_of_tensors() -> None:
     expected.append_calibration(theta, x)
     for ours, theirs in zip(rope.calibration, expected.calibration, strict=True):
         assert torch.equal(ours, theirs)
-    found, wanted = (one.source.kept(20, progress=False)[1] for one in (rope, expected))
+    found, wanted = (one.source.from_prior(20, seed=0)[1] for one in (rope, expected))
     assert torch.equal(found, wanted)
 
 
@@ -128,9 +128,9 @@ def test_a_table_is_put_in_the_order_of_the_first_one() -> None:
     noise = first.assign(a=0.1, b=0.2)[["b", "a"]]
     rope.append_calibration(first, x_first, theta_std=noise)
     rope.append_calibration(second, x_second, theta_std=noise.iloc[0])
-    assert torch.equal(rope.labels.theta, torch.cat([theta, theta]))
+    assert torch.equal(rope.pairs.label.y, torch.cat([theta, theta]))
     assert torch.equal(rope.calibration[1], torch.cat([x, x]))
-    variance = rope.labels.covariance.diagonal(dim1=1, dim2=2)
+    variance = rope.pairs.label.covariance.diagonal(dim1=1, dim2=2)
     assert torch.allclose(variance.sqrt().float(), torch.tensor([0.1, 0.2]))
     method = DiscrepancyNPE.from_posterior(
         gaussian.posterior(), simulator=gaussian.simulator, space="tuned", num_steps=2
@@ -160,5 +160,5 @@ def test_what_an_array_masks_is_missing() -> None:
     with pytest.raises(InvalidInputError, match="NaN"):
         rope((theta, list(x_masked)))
     theta_masked = np.ma.masked_array(theta, mask=x_masked.mask[:, :2])
-    known = rope((theta_masked, x)).labels.is_measured
+    known = rope((theta_masked, x)).pairs.label.is_measured
     assert torch.equal(~known, torch.from_numpy(theta_masked.mask))

@@ -15,12 +15,11 @@ from torch import Tensor, nn
 from torch.distributions import Gamma, Independent
 
 from sbi_rope import RoPE
-from sbi_rope._labels import given_labels
-from sbi_rope._labels.nodes import place_nodes, reference_of
 from sbi_rope.baselines import FinetunedNPE
 from sbi_rope.errors import RoPEWarning
+from sbi_rope.finetuning import FINETUNING
+from sbi_rope.labels import given_labels, place_nodes, reference_of
 from sbi_rope.stacking import StackedPosterior, default_candidates, stack
-from sbi_rope.trainers.training import FINETUNING
 
 PRIOR = Independent(Gamma(1.5 * torch.ones(2), torch.ones(2)), 1)
 
@@ -131,8 +130,6 @@ def test_what_labels_leave_possible_is_inside_the_support() -> None:
         theta,
         theta_std=0.5,
         theta_cov=None,
-        weights=None,
-        groups=None,
         like=theta[:0],
         prior=PRIOR,
         names=None,

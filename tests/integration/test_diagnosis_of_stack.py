@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from sbi_rope import RoPE, StackedPosterior, diagnose
+from sbi_rope.density import MixturePosterior
 from sbi_rope.diagnosis import Diagnosis
 from sbi_rope.diagnosis.in_use import read_for, stack_in_use
-from sbi_rope.mixture import MixturePosterior
 from tests import problems
-from tests.stacks import FITTED, NPE, NUM_PAIRS, PRIOR, QUIET, problem, rope_of, stacked
+from tests.stacks import NPE, NUM_PAIRS, PRIOR, QUIET, Box, problem, rope_of, stacked
 
 # Batches and calibration sets are small here on purpose.
 pytestmark = pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
@@ -22,6 +22,12 @@ SHIFTS = {"prior shift: theta_1", "prior shift: theta_2"}
 NARROW = {"narrower than the prior: theta_1", "narrower than the prior: theta_2"}
 UNLIKE = "batch unlike the calibration pairs"
 AFTER = "misspecification after tuning"
+
+
+class Learned(Box):
+    """A box around the parameters of the pairs tells how they are distributed."""
+
+    learns_prior = True
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -46,7 +52,7 @@ def rope() -> RoPE:
 
 @pytest.fixture(scope="module")
 def stack(rope: RoPE) -> StackedPosterior:
-    return stacked(rope, candidates=[PRIOR, NPE, FITTED])
+    return stacked(rope, candidates=[PRIOR, NPE, Learned()])
 
 
 @pytest.fixture(scope="module")

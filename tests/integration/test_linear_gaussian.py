@@ -1,13 +1,16 @@
 """RoPE where the right answer is known in closed form."""
 
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
 
 from sbi_rope import CalibrationFinetuner, MixturePosterior, RoPE, SinkhornCoupler
+from sbi_rope._sbi import headless
+from sbi_rope.density import Coupled
 from sbi_rope.metrics import evaluate
-from sbi_rope.mixture import part_of
-from tests import gaussian, problems
+from tests import gaussian
 
 
 def with_exact_g(x_o: Tensor, n_s: int, coupler: SinkhornCoupler) -> MixturePosterior:
@@ -18,14 +21,8 @@ def with_exact_g(x_o: Tensor, n_s: int, coupler: SinkhornCoupler) -> MixturePost
     with torch.no_grad():
         simulated = h(gaussian.simulator(gaussian.prior().sample((n_s,))))
         coupling = coupler.couple(h(gaussian.undo(x_o)), simulated)
-    mixture = problems.coupled_mixture(
-        part_of(npe.posterior_estimator).density,
-        simulated,
-        coupling,
-        x_o,
-        embedding_net=h,
-        tail_mass=0.0,
-    )
+    density = headless(npe.posterior_estimator)
+    mixture = Coupled(density, simulated, x_o, h, coupling, tail_mass=0.0)
     return MixturePosterior(mixture, gaussian.prior())
 
 
@@ -96,15 +93,15 @@ def test_at_tau_one_the_mean_posterior_is_the_mean_of_the_simulated_ones() -> No
         coupler=SinkhornCoupler(gamma=0.2, tau=1.0, tolerance=1e-10),
         num_simulations=150,
     )
-    posterior.posterior_estimator.tail_mass = 0.0
+    coupled: Any = posterior.posterior_estimator
+    coupled.tail_mass = 0.0
     grid = torch.linspace(-3, 3, 7)
     theta = torch.cartesian_prod(grid, grid)
     batch = posterior.log_prob_batched(
         theta[:, None].expand(-1, 100, -1), x_o, norm_posterior=False
     )
-    density = posterior.posterior_estimator.parts[0].density
-    simulated = density.log_prob(
-        theta[:, None].expand(-1, 150, -1), problems.simulated_of(posterior)
+    simulated = coupled.density.log_prob(
+        theta[:, None].expand(-1, 150, -1), coupled.simulated
     )
     assert batch.exp().mean(dim=1).numpy() == pytest.approx(
         simulated.exp().mean(dim=1).detach().numpy(), abs=1e-6

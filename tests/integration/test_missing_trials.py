@@ -19,9 +19,9 @@ from sbi_rope.metrics import draw_samples, evaluate
 from sbi_rope.stacking import (
     DiscrepancyCandidate,
     FinetunedCandidate,
+    StackData,
     default_candidates,
 )
-from sbi_rope.stacking.workbench import Workbench
 from sbi_rope.trainers import FinetunedNPE
 from sbi_rope.trainers.training import Training
 from tests import problems
@@ -182,19 +182,19 @@ def test_missing_numbers_of_a_vector_are_embedded_but_not_corrected() -> None:
     x = problems.simulate(theta)
     x[0, 1] = torch.nan
     rope.append_calibration(theta, x)
-    bench = Workbench(rope, num_folds=2, seed=0, **QUIET)
-    assert torch.isfinite(bench.embedded).all()
+    data = StackData(rope, num_folds=2, seed=0, **QUIET)
+    assert torch.isfinite(data.embedded).all()
     untrained = RoPE(posterior_from(npe, estimator), simulator=problems.simulate)
     assert torch.isfinite(untrained.embed(x).real).all()
     for space, applies in (("embedding", True), ("input", False)):
-        assert DiscrepancyCandidate(space=space).applies_to(bench) is applies
-        assert not FinetunedCandidate(space=space).applies_to(bench)  # of two folds
+        assert DiscrepancyCandidate(space=space).suits(data) is applies
+        assert not FinetunedCandidate(space=space).suits(data)  # of two folds
     # What is fine-tuned is corrected in x if that can be, and else in the embedding.
     complete = rope_of()
     for one, in_x in ((rope, False), (complete, True)):
-        three = Workbench(one, num_folds=3, seed=0, **QUIET)
-        assert FinetunedCandidate(space="input").applies_to(three) is in_x
-        assert FinetunedCandidate(space="embedding").applies_to(three) is not in_x
+        three = StackData(one, num_folds=3, seed=0, **QUIET)
+        assert FinetunedCandidate(space="input").suits(three) is in_x
+        assert FinetunedCandidate(space="embedding").suits(three) is not in_x
     method = DiscrepancyNPE.from_posterior(
         posterior_from(npe, estimator), simulator=problems.simulate, space="input"
     )

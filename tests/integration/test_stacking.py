@@ -1,9 +1,10 @@
-"""Stacks of trained candidates: density, samples, copies and kinds of data."""
+"""Stacks of trained candidates: scores, density, samples, copies and kinds of data."""
 
 import copy
 import math
 import pickle
 import warnings
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,33 +12,44 @@ import torch
 from sbi.utils import BoxUniform
 from torch import Tensor, nn
 
-from sbi_rope import RoPE
+from sbi_rope import RoPE, load, stack
 from sbi_rope._sbi import DirectPosterior, estimator_of
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.mixture import MixturePosterior
+from sbi_rope.baselines import PriorPosterior
+from sbi_rope.density import Flow, MixturePosterior
+from sbi_rope.errors import (
+    InvalidInputError,
+    NotReadyError,
+    SamplingError,
+    SimulationError,
+    UnsupportedPosteriorError,
+)
+from sbi_rope.metrics import acauc_of
 from sbi_rope.stacking import (
-    DensityCandidate,
     DiscrepancyCandidate,
-    RehearsedCandidate,
+    FinetunedCandidate,
+    GivenCandidate,
+    StackedPosterior,
     default_candidates,
     stacking_weights,
 )
-from sbi_rope.stacking.workbench import Workbench
+from sbi_rope.stacking.versions import mixture_of
 from tests import gaussian, problems
 from tests.stacks import (
-    FINETUNED,
-    FITTED,
+    BOX,
     NPE,
-    NUM_FOLDS,
     NUM_OBSERVED,
     NUM_PAIRS,
     PRIOR,
     QUIET,
+    Box,
+    data_of,
     observed,
     problem,
     rope_of,
+    small_stack,
     stacked,
     the_stack,
+    trained,
     uneven,
     unnormalised,
     validated,
@@ -47,48 +59,144 @@ from tests.stacks import (
 pytestmark = pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
 
 
-# --- density ---
+# --- scores ---
 
 
-def test_a_stack_of_one_candidate_is_the_average_of_its_versions() -> None:
-    built: list[Any] = []
+def test_every_pair_is_held_out_once_and_trains_all_other_folds(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seen: list[list[Tensor]] = []
 
-    def build(rope: RoPE, seed: int) -> Any:
-        built.append(FINETUNED.build(rope, seed))
-        return built[-1]
+    def spied(self: Box, data: Any, versions: Any) -> Any:
+        seen.append(versions)
+        return PRIOR.fit(data, versions)
 
-    candidate = DensityCandidate(name="one", build=build)
-    posterior = stacked(rope_of(), candidates=[candidate])
-    assert len(built) == 4  # without each of three folds, and on all
-    x = observed()
-    theta = 3 * torch.rand(4, NUM_OBSERVED, 2) - 1.5
-    found = posterior.posterior_estimator.log_prob(theta, x)
-    with torch.no_grad():
-        versions = [p.posterior_estimator.log_prob(theta, x).exp() for p in built]
-    assert torch.allclose(found.exp(), sum(versions) / 4, atol=1e-5)
-    single = posterior.candidate_log_probs(theta[0], x)
-    assert torch.allclose(single[:, 0].float(), found[0], atol=1e-4)
+    monkeypatch.setattr(Box, "fit", spied)
+    # By default there are five folds, and never more folds than pairs.
+    for num_pairs, num_folds, sizes in (
+        (13, 5, [2, 2, 3, 3, 3]),
+        (4, 5, [1] * 4),
+        (9, 2, [4, 5]),
+    ):
+        pairs = problem(num_pairs, seed=1)
+        scores = validated(rope_of(pairs), candidates=[BOX], num_folds=num_folds)
+        assert sorted(scores.fold.bincount().tolist()) == sizes
+        assert scores.fold.tolist() != sorted(scores.fold.tolist())
+        *versions, last = seen.pop()
+        assert sorted(last.tolist()) == list(range(num_pairs))
+        for number, rows in enumerate(versions):
+            expected = (scores.fold != number).nonzero().flatten()
+            assert sorted(rows.tolist()) == expected.tolist()
 
 
 @pytest.mark.medium
-def test_the_density_is_the_weighted_sum_of_the_candidates() -> None:
+def test_scores_are_the_densities_of_the_versions_without_the_fold() -> None:
+    posterior = the_stack()
+    scores, (theta, x) = posterior.report.cross_validation, problem(NUM_PAIRS, seed=1)
+    for name, versions in zip(scores.names, posterior.versions, strict=True):
+        for number in range(scores.num_folds):
+            rows = scores.fold == number
+            expected = versions[number].log_prob(theta[rows][None], x[rows])[0].double()
+            found = scores.scores_of(name)[rows]
+            assert torch.allclose(found, expected, atol=1e-4), name
+
+
+@pytest.mark.medium
+def test_the_stack_that_scores_a_fold_is_weighted_by_the_others() -> None:
+    posterior = the_stack()
+    scores, (theta, x) = posterior.report.cross_validation, problem(NUM_PAIRS, seed=1)
+    for number in range(scores.num_folds):
+        rows = scores.fold == number
+        weights = stacking_weights(scores.log_scores[~rows]).weights
+        mixed = torch.logsumexp(scores.log_scores[rows] + weights.log(), dim=1)
+        assert torch.allclose(scores.scores_of("stack")[rows], mixed)
+        mixture = mixture_of(posterior.versions, weights, number)
+        without = MixturePosterior(mixture, posterior.prior)
+        leakage = without.leakage(x[rows])
+        expected = mixed - leakage.mass.log()
+        error = 6 * leakage.standard_error / leakage.mass
+        assert ((scores.stack_scores[rows] - expected).abs() < error + 1e-5).all()
+        samples = without.sample_batched((400,), x[rows], **QUIET)
+        below = (samples < theta[rows]).double().mean(dim=0)
+        found = scores.levels[rows].double()
+        # Four standard errors of 40 samples, two-sided.
+        assert torch.allclose(found, (2 * below - 1).abs(), atol=0.65)
+        assert ((found >= 0) & (found <= 1)).all()
+
+
+def test_the_stack_of_each_fold_is_normalised_by_its_own_mass(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its mass inside the prior differs from fold to fold."""
+
+    def fit(self: Box, data: Any, versions: Any) -> Any:
+        return [
+            type(PRIOR.fit(data, versions)[0])(problems.BoxUniform(-w, w), (3,))
+            for w in widths
+        ]
+
+    widths = [torch.full((2,), 1.5 + number) for number in range(4)]
+    monkeypatch.setattr(Box, "fit", fit)
+    scores = validated(rope_of(), candidates=[BOX])
+    # After normalisation all versions are uniform on the box of the prior.
+    box = torch.full((NUM_PAIRS,), math.log(0.25), dtype=torch.double)
+    raw = -2 * (2 * torch.stack(widths)[:, 0]).log().double()[scores.fold]
+    assert torch.allclose(scores.log_scores[:, 0], raw, atol=1e-5)
+    assert torch.allclose(scores.stack_scores, box, atol=0.7)
+    assert float((scores.stack_scores - box).mean()) == pytest.approx(0.0, abs=0.15)
+
+
+def test_rows_of_the_table_are_mean_error_and_weight_of_each_candidate() -> None:
+    scores = small_stack().report.cross_validation
+    rows = scores.as_rows()
+    assert [row["candidate"] for row in rows] == list(scores.names)
+    assert [row["family"] for row in rows] == list(scores.families)
+    for k, row in enumerate(rows):
+        column = scores.log_scores[:, k]
+        assert row["weight"] == float(scores.weights.weights[k])
+        assert row["score"] == pytest.approx(float(column.mean()))
+        error = float((column - column.mean()).square().sum() / (19 * 20)) ** 0.5
+        assert row["standard_error"] == pytest.approx(error, abs=1e-12)
+    assert math.isfinite(acauc_of(scores.levels).value)
+
+
+def test_differences_are_means_over_pairs_with_a_bootstrap_interval() -> None:
+    scores = small_stack().report.cross_validation
+    for name, other in (("NPE", "prior"), ("stack", "prior"), ("NPE", "NPE")):
+        pairs = scores.scores_of(name) - scores.scores_of(other)
+        found = scores.difference(name, other)
+        assert found.mean == pytest.approx(float(pairs.mean()))
+        error = float(pairs.std(correction=0)) / len(pairs) ** 0.5
+        assert found.low == pytest.approx(found.mean - 1.96 * error, abs=0.5 * error)
+        assert found.high == pytest.approx(found.mean + 1.96 * error, abs=0.5 * error)
+
+
+# --- density ---
+
+
+@pytest.mark.medium
+def test_the_density_is_the_weighted_sum_of_averages_of_versions() -> None:
     x, theta = observed(), problems.box(2).sample((NUM_OBSERVED,))
     posterior = the_stack()
     scores = posterior.report.cross_validation
     expected = stacking_weights(scores.log_scores).weights
     assert list(posterior.candidate_weights.values()) == expected.tolist()
     assert list(posterior.candidate_weights) == list(scores.names)
-    versions = posterior.versions
-    each = torch.stack(
-        [versions.log_probs(theta, x, [v]) for v in range(len(versions.trained))]
+    averaged = torch.stack(
+        [
+            torch.stack(
+                [of_one[v].log_prob(theta[None], x)[0].double() for v in range(4)]
+            ).logsumexp(dim=0)
+            - math.log(4)
+            for of_one in posterior.versions
+        ],
+        dim=1,
     )
-    averaged = each.exp().mean(dim=0)
     by_candidate = posterior.candidate_log_probs(theta, x)
-    assert torch.allclose(by_candidate.exp(), averaged, atol=1e-4)
-    found = unnormalised(posterior, theta, x)[0].exp()
-    mixed = (averaged @ expected).float()
-    # It may leave out the smallest weights, up to a thousandth.
-    assert torch.allclose(found, mixed, rtol=1e-3, atol=2e-3)
+    assert torch.allclose(by_candidate, averaged, atol=1e-4)
+    found = unnormalised(posterior, theta, x)[0].double()
+    mixed = (averaged + expected.log()).logsumexp(dim=1)
+    assert torch.allclose(found, mixed, atol=1e-4)
 
 
 @pytest.mark.medium
@@ -98,8 +206,7 @@ def test_the_normalised_density_has_mass_one_and_samples_follow_it() -> None:
     theta = torch.cartesian_prod(line, line)[:, None].expand(-1, 3, -1)
     posterior = the_stack()
     density = posterior.log_prob_batched(theta, x).exp().double()
-    mass = 4 * density.mean(dim=0)
-    assert torch.allclose(mass, torch.ones(3).double(), atol=0.05)
+    assert torch.allclose(4 * density.mean(dim=0), torch.ones(3).double(), atol=0.05)
     # They leak, or there would be nothing to normalise.
     assert (posterior.leakage(x).mass < 0.999).any()
     samples = posterior.sample_batched((draws,), x, **QUIET)
@@ -114,29 +221,32 @@ def test_the_normalised_density_has_mass_one_and_samples_follow_it() -> None:
 
 
 @pytest.mark.medium
-def test_an_observation_alone_has_the_density_that_it_has_among_others() -> None:
-    posterior = the_stack()
-    x = torch.cat([observed(), 3 * torch.randn(5, 3)])
-    theta = problems.box(2).sample((len(x),))
-    together = unnormalised(posterior, theta, x)[0]
-    normalised = posterior.log_prob_batched(theta, x)[0]
-    error = posterior.leakage(x)
-    for i in (0, 7, 27):
-        alone = posterior.log_prob(theta[i], x=x[i], norm_posterior=False)
-        assert torch.allclose(alone, together[i], atol=1e-5)
-        difference = posterior.log_prob(theta[i], x=x[i]) - normalised[i]
-        margin = 6 * float(error.standard_error[i] / error.mass[i])
-        assert abs(float(difference)) < margin
-    assert posterior.is_amortised
-    with pytest.raises(InvalidInputError, match="amortised"):
-        _ = posterior.x_o
+def test_many_theta_at_one_x_run_each_network_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    posterior, x, sizes = the_stack(), observed()[:1], []
+    flows = {id(one.average) for one in posterior.versions}
+    embed = Flow.embed
+
+    def counted(self: Flow, x: Tensor) -> Tensor:
+        assert id(self) in flows
+        sizes.append(len(x))
+        return embed(self, x)
+
+    monkeypatch.setattr(Flow, "embed", counted)
+    theta = problems.box(2).sample((3000,))
+    found = posterior.log_prob(theta, x=x)
+    assert sizes == [1] * (len(flows) - 1)  # the prior embeds nothing
+    assert torch.allclose(
+        found[:50], posterior.log_prob_batched(theta[:50, None], x)[:, 0], atol=1e-4
+    )
 
 
 # --- copies ---
 
 
 @pytest.mark.medium
-def test_copies_and_small_pickles_have_the_same_densities() -> None:
+def test_copies_pickles_and_files_have_the_same_densities(tmp_path: Path) -> None:
     x, theta = observed(), problems.box(2).sample((NUM_OBSERVED,))
     posterior = the_stack()
     expected = posterior.log_prob_batched(theta, x)
@@ -144,29 +254,37 @@ def test_copies_and_small_pickles_have_the_same_densities() -> None:
     file = pickle.dumps(posterior)
     assert len(file) < 3e6
     assert len(pickle.dumps(posterior.report)) < 2e4
-    for other in (pickle.loads(file), copy.deepcopy(posterior)):
+    posterior.save(tmp_path / "stack.pt")
+    loaded = load(tmp_path / "stack.pt")
+    for other in (pickle.loads(file), copy.deepcopy(posterior), loaded):
         assert torch.equal(other.log_prob_batched(theta, x), expected)
-        assert torch.equal(other.candidate_log_probs(theta, x), candidates)
         assert str(other.report) == str(posterior.report)
         other.to("cpu")
         assert torch.equal(other.candidate_log_probs(theta, x), candidates)
         # The density and the candidates share their parts, and so move together.
-        estimator = other.posterior_estimator
-        shown = {id(part) for part in estimator.parts}
-        for version in other.versions.trained:
-            parts = [part for of_one in version.values() for part in of_one]
-            assert {*map(id, parts)} <= shown
+        shown = {id(part) for part in other.posterior_estimator.parts}
+        assert {id(one.average) for one in other.versions} == shown
 
 
-def test_a_stack_of_candidates_that_lambdas_built_can_be_pickled() -> None:
-    candidates = [
-        DensityCandidate(name="mine", build=lambda rope, seed: rope.npe),
-        DensityCandidate(name="older", build=lambda rope, seed: rope.npe, fixed=True),
-    ]
-    posterior = stacked(rope_of(), candidates=candidates)
-    assert pickle.loads(pickle.dumps(posterior)).candidate_weights == (
-        posterior.candidate_weights
-    )
+def test_a_candidate_of_ten_lines_can_be_stacked_reported_and_kept(
+    tmp_path: Path,
+) -> None:
+    posterior = small_stack()
+    assert list(posterior.candidate_weights) == ["prior", "NPE", "box"]
+    assert "box" in str(posterior.report)
+    posterior.report.to_html(tmp_path / "report.html")
+    assert "box" in (tmp_path / "report.html").read_text()
+    theta, x = problem(9, seed=3)
+    expected = posterior.log_prob_batched(theta, x)
+    assert expected.isfinite().all()
+    posterior.save(tmp_path / "stack.pt")
+    for other in (
+        load(tmp_path / "stack.pt"),
+        pickle.loads(pickle.dumps(posterior)),
+    ):
+        assert torch.equal(other.log_prob_batched(theta, x), expected)
+    curve = stacked(rope_of(), candidates=[BOX], learning_curve=True, num_folds=5)
+    assert curve.report.learning_curve is not None
 
 
 @pytest.mark.gpu
@@ -174,12 +292,9 @@ def test_a_stack_and_its_candidates_move_to_a_gpu() -> None:
     posterior = copy.deepcopy(the_stack())
     x, theta = observed(), problems.box(2).sample((NUM_OBSERVED,))
     expected = posterior.candidate_log_probs(theta, x)
-    density = unnormalised(posterior, theta, x)
     posterior.to("cuda")
     found = posterior.candidate_log_probs(theta.cuda(), x.cuda()).cpu()
     assert torch.allclose(found, expected, atol=1e-3)
-    moved = unnormalised(posterior, theta.cuda(), x.cuda()).cpu()
-    assert torch.allclose(moved, density, atol=1e-3)
 
 
 # --- data of all kinds ---
@@ -190,6 +305,7 @@ def test_a_stack_and_its_candidates_move_to_a_gpu() -> None:
     ("family", "embedding"),
     [
         ("maf", "none"),
+        pytest.param("nsf", "linear", marks=pytest.mark.slow),
         pytest.param("zuko_maf", "linear", marks=pytest.mark.slow),
         pytest.param("mnpe", "linear", marks=pytest.mark.slow),
     ],
@@ -199,9 +315,7 @@ def test_every_family_can_be_stacked(family: str, embedding: str) -> None:
     theta = prior.sample((30,))
     x = problems.simulate(theta) + 0.4
     rope = rope_of((theta[:8], x[:8]), family=family, embedding=embedding)
-    # Without an embedding net there is nothing to tune.
-    candidates = default_candidates()[: 4 if embedding == "none" else 6]
-    posterior = stacked(rope, candidates=candidates)
+    posterior = stacked(rope)
     assert posterior.report.cross_validation.log_scores.isfinite().all()
     assert posterior.log_prob_batched(theta[8:], x[8:]).isfinite().all()
     samples = posterior.sample_batched((3,), x[8:], **QUIET)
@@ -232,26 +346,13 @@ def test_images_are_stacked_without_candidates_that_need_summaries() -> None:
         *names,
         "fine-tuned NPE, rehearsed",
     ]
-    scores = validated(rope, candidates=[RehearsedCandidate()])
-    assert scores.log_scores.isfinite().all()
-    assert not RehearsedCandidate().applies_to(workbench(rope, num_folds=2))
-    # A short vector is no series, also if one of its entries is missing.
-    bench = workbench(rope_of(problem(100, seed=1)), num_folds=5)
-    assert not RehearsedCandidate().applies_to(bench)
-    bench.x = bench.x.clone().index_fill(0, torch.tensor([3]), torch.nan)
-    assert not RehearsedCandidate().applies_to(bench)
-    candidates = [PRIOR, DensityCandidate(name="never", build=never)]
-    candidates += [DiscrepancyCandidate(space="input")]
+    rehearsed = FinetunedCandidate(rehearse=True)
+    assert validated(rope, candidates=[rehearsed]).log_scores.isfinite().all()
+    assert not rehearsed.suits(data_of(rope, num_folds=2))
+    # A short vector is no series.
+    assert not rehearsed.suits(data_of(rope_of(problem(100, seed=1)), num_folds=5))
     with pytest.raises(InvalidInputError, match="space='embedding'"):
-        stacked(rope, candidates=candidates)
-
-
-def workbench(rope: RoPE, *, num_folds: int) -> Workbench:
-    return Workbench(rope, num_folds=num_folds, seed=0, show_progress_bars=False)
-
-
-def never(rope: RoPE, seed: int) -> Any:
-    raise AssertionError("The candidate that cannot be trained was not found first.")
+        stacked(rope, candidates=[PRIOR, DiscrepancyCandidate(space="input")])
 
 
 def long_series(theta: Tensor) -> Tensor:
@@ -259,9 +360,7 @@ def long_series(theta: Tensor) -> Tensor:
 
 
 @pytest.mark.medium
-def test_moments_of_a_long_series_are_those_of_its_embedding_alone(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_moments_of_a_long_series_are_those_of_its_embedding_alone() -> None:
     estimator = gaussian.GaussianEstimator(2)
     estimator.net = nn.Sequential(nn.Linear(24, 2), estimator.net)
     estimator._condition_shape = torch.Size((24,))
@@ -269,34 +368,24 @@ def test_moments_of_a_long_series_are_those_of_its_embedding_alone(
     theta = problems.box(2).sample((8,))
     rope = RoPE(npe, simulator=long_series)
     rope.append_calibration(theta, long_series(theta))
-    seen: list[int] = []
-    moments = type(rope.source).moments
-
-    def spied(*args: Any, **options: Any) -> Any:
-        found = moments(*args, **options)
-        seen.append(found.covariance.shape[-1])
-        return found
-
-    monkeypatch.setattr(type(rope.source), "moments", spied)
+    data = data_of(rope)
+    assert data.moments(data.every, "embedding").covariance.shape == (8, 2, 2)
+    assert [key for key in data.kept if "moments" in key] == [
+        ("moments", k, False) for k in range(4)
+    ]
     names = stacked(rope).candidate_weights
-    assert set(seen) == {2}
     assert "discrepancy (input)" not in names
     # It is trained if the user asks for it.
-    stacked(rope, candidates=[DiscrepancyCandidate(space="input")])
-    assert 24 in seen
+    assert stacked(rope, candidates=[DiscrepancyCandidate(space="input")])
 
 
 @pytest.mark.slow
 def test_a_stack_can_use_stored_simulations() -> None:
     theta = problems.box(2).sample((200,))
     x = problems.simulate(theta)
-    cases: list[tuple[int, dict[str, Any]]] = [
-        (15, {}),
-        (200, {"candidates": [NPE, FINETUNED, DiscrepancyCandidate()]}),
-    ]
-    for count, options in cases:
+    for count in (10, 200):
         rope = rope_of(simulations=(theta[:count], x[:count]))
-        posterior = stacked(rope, **options)
+        posterior = stacked(rope)
         scores = posterior.report.cross_validation.log_scores
         assert scores.isfinite().all(), count
         samples = posterior.sample_batched((2,), observed(10), **QUIET)
@@ -314,13 +403,10 @@ class Untransformed(BoxUniform):
 @pytest.mark.slow
 def test_a_prior_that_sbi_cannot_transform_can_be_used() -> None:
     prior = Untransformed(-torch.ones(2), torch.ones(2))
-    npe = DirectPosterior(
-        estimator_of(problems.npe_posterior("mdn", "linear")),
-        prior,
-        enable_transform=False,
-    )
+    estimator = estimator_of(problems.npe_posterior("mdn", "linear"))
+    npe = DirectPosterior(estimator, prior, enable_transform=False)
     rope = RoPE(npe, simulator=uneven).append_calibration(*problem(8, seed=1))
-    posterior = stacked(rope, candidates=[PRIOR, FINETUNED], num_folds=3)
+    posterior = stacked(rope, candidates=[PRIOR, FinetunedCandidate()], num_folds=3)
     assert not posterior.enable_transform
     samples = posterior.sample_batched((5,), observed(4), **QUIET)
     assert (samples.abs() <= 1).all()
@@ -353,13 +439,11 @@ def test_a_stack_changes_nothing_that_it_is_given_and_follows_from_its_seed() ->
     nets = [npe.posterior_estimator, rope.tuned_embedding_net]
     before = [copy.deepcopy(net.state_dict()) for net in nets]
     held = [value.clone() for value in (x_o, *rope.calibration)]
-    coupler, finetuner = rope.coupler, rope.finetuner
     torch.manual_seed(5)
     state = torch.get_rng_state()
     posterior = stacked(rope)
     assert torch.equal(torch.get_rng_state(), state)
     assert all(map(torch.equal, (x_o, *rope.calibration), held))
-    assert (rope.coupler, rope.finetuner) == (coupler, finetuner)
     nets = [npe.posterior_estimator, rope.tuned_embedding_net]
     for net, old in zip(nets, before, strict=True):
         assert all(map(torch.equal, net.state_dict().values(), old.values()))
@@ -369,82 +453,160 @@ def test_a_stack_changes_nothing_that_it_is_given_and_follows_from_its_seed() ->
     assert torch.equal(found, expected)
 
 
-def test_a_stack_does_not_change_with_the_posteriors_it_was_made_of() -> None:
+def test_without_a_seed_the_state_of_torch_decides() -> None:
+    found = []
+    for state in (5, 5, 6):
+        torch.manual_seed(state)
+        scores = validated(rope_of(), candidates=[BOX], seed=None)
+        found.append((scores.fold, scores.log_scores))
+    assert torch.equal(found[0][1], found[1][1])
+    assert not torch.equal(found[0][0], found[2][0])
+
+
+class Wide:
+    """A density of a user: normal around zero, whatever x is."""
+
+    def log_prob(self, theta: Tensor, x: Tensor) -> Tensor:
+        return torch.distributions.Normal(0.0, 2.0).log_prob(theta).sum(dim=-1)
+
+    def sample(self, shape: torch.Size, x: Tensor) -> Tensor:
+        return 2.0 * torch.randn(*shape, len(x), 2)
+
+
+def test_densities_that_are_given_are_stacked_as_they_are() -> None:
     another = copy.deepcopy(problems.npe_posterior("maf", "linear"))
     another.posterior_estimator.train()  # scored in evaluation mode all the same
-    candidate = DensityCandidate(
-        name="older", build=lambda rope, seed: another, fixed=True
+    posterior = stacked(
+        rope_of(),
+        candidates=[GivenCandidate(another, "older"), Wide(), small_stack(), PRIOR],
     )
-    posterior = stacked(rope_of(), candidates=[candidate, PRIOR])
+    assert list(posterior.candidate_weights) == [
+        *("older", "Wide", "StackedPosterior", "prior")
+    ]
     theta, x = problem(NUM_PAIRS, seed=1)
-    scores = posterior.report.cross_validation.scores_of("older")
+    scores = posterior.report.cross_validation
     another.posterior_estimator.eval()
-    expected = unnormalised(another, theta, x)[0]
-    assert torch.allclose(scores.float(), expected, atol=1e-4)
+    for name, expected in (
+        ("older", unnormalised(another, theta, x)[0]),
+        ("Wide", Wide().log_prob(theta, x)),
+        ("StackedPosterior", unnormalised(small_stack(), theta, x)[0]),
+    ):
+        assert torch.allclose(scores.scores_of(name).float(), expected, atol=1e-4)
     before = unnormalised(posterior, theta, x)
     with torch.no_grad():
         for parameter in another.posterior_estimator.parameters():
             parameter += 0.1
     assert torch.equal(unnormalised(posterior, theta, x), before)
-
-
-@pytest.mark.medium
-def test_a_mixture_counts_as_one_version_regardless_of_its_number_of_parts() -> None:
-    sizes: list[int] = []
-    theirs: list[Any] = []
-
-    def build(rope: RoPE, seed: int) -> Any:
-        # One density in the first versions, three in the last, of the prior in part.
-        sizes.append(1 if len(sizes) < NUM_FOLDS else 3)
-        own = stacked(rope_of(), candidates=[NPE]).posterior_estimator.parts
-        prior = stacked(rope_of(), candidates=[PRIOR]).posterior_estimator.parts
-        parts = own if sizes[-1] == 1 else [*prior, *prior, *own]
-        mixture = type(the_stack().posterior_estimator)(
-            parts, [1 / sizes[-1]] * sizes[-1]
-        )
-        theirs.extend(mixture.parts)
-        return MixturePosterior(mixture, rope.npe.prior)
-
-    posterior = stacked(
-        rope_of(), candidates=[DensityCandidate(name="mixed", build=build)]
+    assert posterior.sample((40,), x=x[0], **QUIET).abs().max() <= 1
+    wide = stacked(rope_of(), candidates=[Wide()])
+    drawn = wide.sample((2000,), x=x[0], reject_outside_prior=False, **QUIET)
+    assert float(drawn.std()) == pytest.approx(2.0, rel=0.1)
+    assert torch.equal(
+        *(s.log_prob(theta[:3], x=x[0]) for s in (wide, copy.copy(wide)))
     )
-    assert sizes == [1] * NUM_FOLDS + [3]
-    assert not {*map(id, posterior.posterior_estimator.parts)} & {*map(id, theirs)}
-    x, theta = observed(), problems.box(2).sample((NUM_OBSERVED,))
-    npe = the_stack().candidate_log_probs(theta, x)[:, 1].exp()
-    expected = (NUM_FOLDS * npe + (2 * 0.25 + npe) / 3) / (NUM_FOLDS + 1)
-    found = posterior.candidate_log_probs(theta, x)[:, 0].exp()
-    assert torch.allclose(found, expected, atol=1e-5)
-    density = unnormalised(posterior, theta, x)[0].exp()
-    assert torch.allclose(density.double(), expected, atol=1e-4)
 
 
-def test_default_candidates_have_different_names() -> None:
+def test_default_candidates_have_different_names_and_can_keep_the_prior() -> None:
     assert [candidate.name for candidate in default_candidates()] == [
         *("prior", "NPE", "fine-tuned NPE", "discrepancy", "discrepancy (input)"),
         *("discrepancy (tuned)", "discrepancy, fine-tuned"),
         *("discrepancy (input), fine-tuned", "discrepancy (tuned), fine-tuned"),
         "fine-tuned NPE, rehearsed",
     ]
-
-
-def test_default_candidates_can_keep_the_prior_of_npe() -> None:
     kept = default_candidates(learn_prior=False)
     assert [candidate.name for candidate in kept] == [
         *("prior", "NPE", "discrepancy, given prior"),
         *("discrepancy (input), given prior", "discrepancy (tuned), given prior"),
     ]
-    assert all(candidate.fixed or not candidate.learns_prior for candidate in kept)
+    assert not any(candidate.learns_prior for candidate in kept)
 
 
-@pytest.mark.medium
-def test_without_a_seed_the_state_of_torch_decides() -> None:
-    found = []
-    for state in (5, 5, 6):
-        torch.manual_seed(state)
-        scores = validated(rope_of(), candidates=[FITTED], seed=None)
-        found.append((scores.fold, scores.log_scores))
-    assert torch.equal(found[0][1], found[1][1])
-    assert not torch.equal(found[0][0], found[2][0])
-    seeded = [validated(rope_of(), candidates=[FITTED], seed=s).fold for s in (0, 1)]
-    assert not torch.equal(*seeded)
+# --- what cannot be stacked is refused before anything is trained ---
+
+
+def test_too_few_pairs_are_refused() -> None:
+    theta, x = problem(6, seed=1)
+    match = r"at least 2 calibration pairs with different parameters or groups; got {}"
+    for rows, count in ((theta[:0], 0), (theta[:1], 1), (theta[:1].expand(6, -1), 1)):
+        rope = rope_of((rows, x[: len(rows)]))
+        with pytest.raises(NotReadyError, match=match.format(count)):
+            stacked(rope)
+
+
+@pytest.fixture
+def nothing_is_trained(monkeypatch: pytest.MonkeyPatch) -> None:
+    def never(*args: Any) -> Any:
+        raise AssertionError("What cannot be stacked was not found first.")
+
+    monkeypatch.setattr(Box, "fit", never)
+
+
+class Flat(Wide):
+    def log_prob(self, theta: Tensor, x: Tensor) -> Tensor:
+        return super().log_prob(theta, x).sum()
+
+
+@pytest.mark.usefixtures("nothing_is_trained")
+def test_bad_lists_of_candidates_are_refused() -> None:
+    bad: list[tuple[Any, str]] = [
+        ([], r"got \[\]"),
+        ([BOX, NPE, GivenCandidate(Wide(), "NPE")], "different names"),
+        ([BOX, GivenCandidate(Wide(), "stack")], "none of them 'stack'"),
+        ([BOX, Flat()], r"log_prob\(theta, x\) of shape \(1, 2\)"),
+        ([BOX, "NPE"], "log_prob"),
+        (PRIOR, "candidates"),
+    ]
+    for candidates, match in bad:
+        with pytest.raises(InvalidInputError, match=match):
+            stacked(rope_of(), candidates=candidates)
+
+
+@pytest.mark.usefixtures("nothing_is_trained")
+def test_posteriors_without_a_density_to_score_are_refused() -> None:
+    bad: list[tuple[Any, str]] = [
+        (problems.vector_field_posterior("fmpe"), "candidate 'bad' with a density"),
+        (problems.npe_posterior("mdn", dim=1), r"and theta \(1,\)"),
+        (problems.npe_posterior("mdn", "cnn"), r"got x \(1, 8, 8\)"),
+        (trained().build_posterior(observed(), seed=0), "to answer any x"),
+    ]
+    for posterior, match in bad:
+        with pytest.raises(UnsupportedPosteriorError, match=match):
+            stacked(rope_of(), candidates=[BOX, GivenCandidate(posterior, "bad")])
+
+
+def test_a_rope_of_a_vector_field_is_refused_before_anything_is_simulated() -> None:
+    rope = RoPE(problems.vector_field_posterior("fmpe"), simulator=problems.simulate)
+    rope.append_calibration(*problem(6, seed=1))
+    of_the_check = rope.num_simulator_calls
+    for x_o in (None, observed()):
+        with pytest.raises(UnsupportedPosteriorError, match="Train NPE instead"):
+            stack(rope, x_o, **QUIET)
+    assert rope.num_simulator_calls == of_the_check
+
+
+def test_a_rope_of_a_stack_and_a_stack_of_no_rope_are_refused() -> None:
+    with pytest.raises(UnsupportedPosteriorError, match="StackedPosterior"):
+        RoPE(small_stack(), simulator=uneven)
+    with pytest.raises(InvalidInputError, match="`rope` to be a RoPE; got"):
+        stack(problems.npe_posterior("mdn"))  # type: ignore[arg-type]
+    assert isinstance(small_stack(), StackedPosterior)
+
+
+def test_candidates_without_mass_in_the_prior_raise_advice_to_add_the_prior() -> None:
+    far = PriorPosterior(problems.BoxUniform(torch.ones(2) * 5, torch.ones(2) * 6))
+    candidate = GivenCandidate(far, "far")
+    with pytest.raises(SamplingError, match="add the prior to the candidates"):
+        stacked(rope_of(), candidates=[candidate])
+    assert stacked(rope_of(), candidates=[candidate, PRIOR]).candidate_weights
+
+
+def test_pairs_that_cannot_be_simulated_are_named_by_their_parameters() -> None:
+    theta, x = problem(6, seed=1)
+    bad = theta[4]
+
+    def fails(parameters: Tensor) -> Tensor:
+        missing = (parameters == bad).all(dim=1, keepdim=True)
+        return problems.simulate(parameters).where(~missing, torch.nan)
+
+    with pytest.raises(SimulationError, match=rf"\[\[{bad[0]:.4g}, {bad[1]:.4g}\]\]"):
+        stacked(rope_of((theta, x), simulator=fails))

@@ -13,7 +13,7 @@ from sbi_rope import RoPE, load, stack
 from sbi_rope._units import log_units_of
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.metrics import lpp
-from sbi_rope.stacking import CrossValidation, default_candidates
+from sbi_rope.stacking import CrossValidation
 from tests import gaussian
 from tests.stacks import (
     CANDIDATES,
@@ -44,7 +44,7 @@ PARTIAL[::2, 0] = math.nan
 @pytest.mark.medium
 def test_a_stack_is_scored_on_what_was_measured(tmp_path: Any) -> None:
     rope = labelled(PARTIAL, theta_std=0.1)
-    posterior = stacked(rope, candidates=default_candidates()[:4])
+    posterior = stacked(rope, candidates=CANDIDATES[:4])
     scores = posterior.report.cross_validation
     assert torch.isfinite(scores.log_scores).all()
     assert torch.equal(torch.isnan(scores.levels), torch.isnan(PARTIAL))

@@ -18,15 +18,14 @@ from sbi_rope._sbi import embedding_of, estimator_of, posterior_from, with_embed
 from sbi_rope.baselines import RVNP, Training
 from sbi_rope.baselines.rvnp.likelihood import fit_surrogate
 from sbi_rope.errors import InvalidInputError, RoPEWarning
-from sbi_rope.mixture import MixtureEstimator
 from sbi_rope.stacking import RVNPCandidate, default_candidates
-from sbi_rope.stacking.workbench import Fold, Workbench
 from tests import gaussian, problems
 from tests.stacks import (
-    FITTED,
+    BOX,
     NPE,
     NUM_PAIRS,
     PRIOR,
+    data_of,
     observed,
     problem,
     rope_of,
@@ -60,7 +59,7 @@ def short(request: pytest.FixtureRequest) -> Iterator[None]:
 
 def with_rvnp(**options: Any) -> list[Any]:
     x_o = observed(NUM_OBSERVATIONS)
-    return [PRIOR, NPE, FITTED, RVNPCandidate(x_o, **options)]
+    return [PRIOR, NPE, BOX, RVNPCandidate(x_o, **options)]
 
 
 @functools.cache
@@ -77,21 +76,20 @@ def other_x() -> Tensor:
 @pytest.mark.medium
 def test_it_is_rvnp_of_the_simulations_that_other_candidates_see() -> None:
     candidate = RVNPCandidate(observed(NUM_OBSERVATIONS), space="input")
-    with patch("sbi_rope.stacking.workbench.NUM_SIMULATIONS", 300):
-        bench = Workbench(rope_of(), num_folds=3, seed=4, show_progress_bars=False)
+    with patch("sbi_rope.stacking.data.NUM_SIMULATIONS", 300):
+        data = data_of(rope_of())
         with seeded(7):
-            (part,) = candidate.parts(Fold(bench, [0]))
-        method = RVNP.from_posterior(bench.npe, noise_on="input")
-        method.append_simulations(*bench.simulations)
+            [density] = candidate.fit(data, [data.without(0)])
+        method = RVNP.from_posterior(data.npe, noise_on="input")
+        method.append_simulations(*data.simulations)
     method.append_observations(candidate.x_o)
     with seeded(7):
         method.train(show_progress_bars=False)
     expected = estimator_of(method.build_posterior())
     theta, x = torch.zeros(1, 5, 2), other_x()
-    found = MixtureEstimator([part], [1.0]).log_prob(theta, x)
-    torch.testing.assert_close(found.float(), expected.log_prob(theta, x))
-    npe = estimator_of(bench.npe).log_prob(theta, x)
-    assert not torch.allclose(found.float(), npe)
+    found = density.log_prob(theta, x)
+    torch.testing.assert_close(found, expected.log_prob(theta, x))
+    assert not torch.allclose(found, data.estimator.log_prob(theta, x))
 
 
 @pytest.mark.medium
@@ -258,16 +256,11 @@ def test_errors_in_images_are_refused_before_anything_is_simulated() -> None:
 def test_wrong_observations_are_refused_before_anything_is_trained(
     x_o: Tensor, match: str
 ) -> None:
-    trained: list[int] = []
-
-    def build(rope: RoPE, seed: int) -> Any:
-        trained.append(seed)
-        return FITTED.build(rope, seed)
-
-    mine = type(FITTED)(name="mine", build=build)
-    with pytest.raises(InvalidInputError, match=match):
-        stacked(rope_of(), candidates=[mine, RVNPCandidate(x_o)])
-    assert not trained
+    with (
+        patch.object(type(BOX), "fit", side_effect=AssertionError("was trained")),
+        pytest.raises(InvalidInputError, match=match),
+    ):
+        stacked(rope_of(), candidates=[BOX, RVNPCandidate(x_o)])
     with pytest.raises(InvalidInputError, match=match):
         default_candidates(rope_of(), x_o)
     with pytest.raises(InvalidInputError, match="space"):

@@ -12,11 +12,11 @@ from torch.distributions import Distribution
 
 from sbi_rope import MixturePosterior, RoPE
 from sbi_rope._sbi import estimator_of
+from sbi_rope.density import Flow, average
 from sbi_rope.errors import (
     InvalidInputError,
     UnsupportedPosteriorError,
 )
-from sbi_rope.mixture import MixtureEstimator, average, part_of
 from tests import problems
 from tests.stacks import QUIET, unnormalised
 
@@ -74,8 +74,8 @@ def test_an_average_is_a_copy_and_has_equal_weights_by_default() -> None:
     member = problems.gaussian_posterior()
     posterior = average([member, member])
     assert posterior.posterior_estimator.weights.tolist() == [0.5, 0.5]
-    density = posterior.posterior_estimator.parts[0].density
-    assert density is not member.posterior_estimator.parts[0].density
+    part = posterior.posterior_estimator.parts[0]
+    assert part is not member.posterior_estimator
     # The members of an average may be averages.
     nested = average([posterior, member], weights=[0.2, 0.8])
     assert nested.posterior_estimator.weights.tolist() == pytest.approx([0.1, 0.1, 0.8])
@@ -100,9 +100,9 @@ def test_what_cannot_be_averaged_is_refused() -> None:
 
 
 def single(prior: Distribution) -> MixturePosterior:
-    """Return a mixture of one part, with any prior."""
-    part = part_of(estimator_of(problems.npe_posterior("mdn")))
-    return MixturePosterior(MixtureEstimator([part], [1.0]), prior)
+    """Return one density, with any prior."""
+    flow = Flow.of([estimator_of(problems.npe_posterior("mdn"))])
+    return MixturePosterior(flow, prior)
 
 
 def test_posteriors_with_other_priors_are_not_averaged() -> None:

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor, nn
 
 from sbi_rope.baselines import FRISBI, Training
-from sbi_rope.baselines.frisbi import AlignedEmbeddings
-from tests import gaussian
+from sbi_rope.baselines.frisbi import Aligned
+from tests import gaussian, problems
 
 QUIET: dict[str, Any] = {"seed": 0, "show_progress_bars": False}
 TRAINING = Training(
@@ -20,10 +20,12 @@ TRAINING = Training(
 )
 
 
-def aligned() -> tuple[nn.Linear, AlignedEmbeddings, Tensor]:
+def aligned() -> tuple[nn.Linear, Aligned, Tensor]:
     torch.manual_seed(0)
     g = nn.Linear(3, 2).double()
-    mixing = AlignedEmbeddings(g, torch.randn(7, 2).double(), torch.Size((3,)), 0.5)
+    mixing = Aligned(
+        problems.Gaussians(1), g, torch.randn(7, 2).double(), torch.Size((3,)), 0.5
+    )
     return g, mixing, torch.randn(4, 3).double()
 
 
@@ -41,7 +43,7 @@ def brute_force(g: nn.Module, simulated: Tensor, x: Tensor) -> tuple[Tensor, Ten
 def test_weights_and_cost_are_those_of_the_definition() -> None:
     g, mixing, x = aligned()
     rows, cost = brute_force(g, mixing.simulated, x)
-    torch.testing.assert_close(mixing.rows(mixing.embed(x)).weights, rows.detach())
+    torch.testing.assert_close(mixing.rows(mixing.embed(x)), rows.detach())
     torch.testing.assert_close(mixing.transport_cost(x), cost)
 
 
@@ -95,9 +97,9 @@ def test_it_undoes_most_of_a_linear_error_for_observations_it_has_not_seen(
 @pytest.mark.medium
 def test_its_mixture_is_the_stated_sum() -> None:
     posterior: Any = trained().build_posterior()
-    mixing = posterior.posterior_estimator.parts[0].mixing
+    mixing = posterior.posterior_estimator
     theta, x = gaussian.labelled(3)
-    weights = mixing.rows(mixing.embed(x)).weights
+    weights = mixing.rows(mixing.embed(x))
     law = gaussian.exact_posterior(mixing.simulated / gaussian.GAIN)
     log_q = law.log_prob(theta[:, None]).double()
     expected = (weights.log() + log_q).logsumexp(dim=1)

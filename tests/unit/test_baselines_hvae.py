@@ -18,7 +18,7 @@ from torch.distributions import (
 
 from sbi_rope._sbi import headless
 from sbi_rope.baselines.hvae import HVAE
-from sbi_rope.baselines.hvae.embeddings import LatentEmbeddings
+from sbi_rope.baselines.hvae.embeddings import OverLatents
 from sbi_rope.baselines.hvae.model import (
     FrozenNPE,
     HybridVAE,
@@ -28,7 +28,6 @@ from sbi_rope.baselines.hvae.reparametrisation import reparametrised_sample
 from sbi_rope.errors import (
     InvalidInputError,
 )
-from sbi_rope.mixture import MixtureEstimator, Part
 from sbi_rope.tasks.pendulum import PendulumSimulator
 from sbi_rope.trainers.training import Training
 
@@ -256,16 +255,15 @@ def test_physics_sees_parameters_inside_the_support_alone() -> None:
 # --- the posterior ---
 
 
-def mixture(num_latents: int = 7) -> MixtureEstimator:
+def mixture(num_latents: int = 7) -> OverLatents:
     torch.manual_seed(0)
     model = linear_model(shift=1.0, noisy=True, r2p_std=0.3)
-    contexts = LatentEmbeddings(
+    return OverLatents(
         model,
         torch.randn(num_latents, 1),
         torch.randn(num_latents, 4),
         torch.Size((4,)),
     )
-    return MixtureEstimator([Part(model.npe.flow, contexts)], [1.0], tail_mass=0.0)
 
 
 def test_density_is_the_mean_over_all_draws_of_the_latent() -> None:
@@ -273,8 +271,8 @@ def test_density_is_the_mean_over_all_draws_of_the_latent() -> None:
     x, theta = EVIDENCE.sample((3,)), torch.randn(5, 3, 2)
     mean, log_variance = Encoder(1.0)(x)
     expected = torch.zeros(5, 3)
-    mixing: Any = estimator.parts[0].mixing
-    for epsilon, eta in zip(mixing.z_noise, mixing.x_noise, strict=True):
+    assert estimator.x_noise is not None
+    for epsilon, eta in zip(estimator.z_noise, estimator.x_noise, strict=True):
         z = mean + (0.5 * log_variance).exp() * epsilon
         s = x - z @ B.T + 0.3 * eta
         expected += LinearFlow().log_prob(theta, s).exp() / 7
@@ -292,7 +290,7 @@ def test_density_does_not_depend_on_how_it_is_cut(
     for entries, pairs in ((4, 1), (8, 10), (56, 20), (100, 100)):
         module = "sbi_rope.baselines.hvae.embeddings"
         monkeypatch.setattr(f"{module}.MAX_ENTRIES", entries)
-        monkeypatch.setattr("sbi_rope.mixture.chunks.CPU_BATCH", pairs)
+        monkeypatch.setattr("sbi_rope.density.base.CPU_BATCH", pairs)
         torch.testing.assert_close(estimator.log_prob(theta, x), expected)
         assert estimator.sample(torch.Size((3,)), x).shape == (3, 11, 2)
 
@@ -416,10 +414,10 @@ def test_npe_is_left_as_it_was_and_is_not_trained_inside_either(npe: Any) -> Non
     for name, value in npe.posterior_estimator.state_dict().items():
         torch.testing.assert_close(value, before[name], rtol=0, atol=0)
     inside = headless(npe.posterior_estimator).state_dict()
-    for name, value in estimator.parts[0].density.state_dict().items():
+    for name, value in estimator.densities.member(0).state_dict().items():
         torch.testing.assert_close(value, inside[name], rtol=0, atol=0)
     for own, given in zip(
-        estimator.parts[0].mixing.embedding.parameters(),
+        estimator.nets.member(0).parameters(),
         npe.posterior_estimator.embedding_net.parameters(),
         strict=True,
     ):

@@ -9,7 +9,7 @@ import torch
 from torch.distributions import Normal
 
 from sbi_rope.baselines.error_model import SpikeAndSlab
-from sbi_rope.baselines.rnpe import RNPE, DenoisedEmbeddings
+from sbi_rope.baselines.rnpe import RNPE, Denoised
 from sbi_rope.baselines.statistics import fit_marginal
 from sbi_rope.errors import (
     InvalidInputError,
@@ -56,8 +56,8 @@ def quick_posterior(**options: Any) -> Any:
     return quick(**options).train(seed=0, show_progress_bars=False).build_posterior()
 
 
-def mixing_of(posterior: Any) -> DenoisedEmbeddings:
-    return posterior.posterior_estimator.parts[0].mixing
+def mixing_of(posterior: Any) -> Denoised:
+    return posterior.posterior_estimator
 
 
 def closed_form(x: float) -> tuple[float, float]:

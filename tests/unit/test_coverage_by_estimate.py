@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.distributions import Normal
 
 from sbi_rope import plots
-from sbi_rope._means import Counts
+from sbi_rope.data import Counts
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.metrics import CoverageByEstimate, coverage_by_estimate, evaluate
 from sbi_rope.metrics.by_estimate import (

@@ -11,8 +11,8 @@ from scipy.stats import kstest
 from torch import Tensor
 
 from sbi_rope import CalibrationFinetuner, RoPE, SinkhornCoupler
-from sbi_rope._means import Counts
 from sbi_rope._two_sample import compare_with_pairs, two_sample_test
+from sbi_rope.data import Counts
 from sbi_rope.diagnosis import Diagnosis, diagnose
 from sbi_rope.diagnosis.misspecification import mmd_test
 from sbi_rope.diagnosis.prior_shift import prior_shift
@@ -673,7 +673,7 @@ def test_the_bias_of_specimens_at_several_settings_is_that_of_single_pairs() -> 
     found = CrossFitted(
         embedded=residuals,
         targets=torch.zeros_like(residuals),
-        people=Counts(torch.ones(300), rope.labels.groups),
+        people=Counts(torch.ones(300), rope.pairs.group),
     )
     (finding,) = residual_findings(rope, found, known, [])
     # The means of three settings would have a bias that is smaller by 3 ** 0.5.

@@ -6,7 +6,7 @@ from torch import Tensor
 from sbi_rope._standardisation import Standardisation
 from sbi_rope.discrepancy import DiscrepancyModel
 from sbi_rope.discrepancy.correction import fit_discrepancy, surprise
-from sbi_rope.simulate import Moments
+from sbi_rope.moments import Moments
 
 WIDTH = 9
 
@@ -28,7 +28,7 @@ def pairs(n: int, *, error: float = 0.0, seed: int = 0) -> tuple[Tensor, Moments
     mean = torch.randn(n, WIDTH, generator=generator).double()
     noise = torch.randn(n, WIDTH, 1, generator=generator).double()
     z = mean + (1 + error**2) ** 0.5 * (factor @ noise)[..., 0]
-    return z, Moments(mean=mean, covariance=factor @ factor.mT)
+    return z, Moments(means=mean[:, None], covariance=factor @ factor.mT)
 
 
 def unit() -> Standardisation:
@@ -90,7 +90,7 @@ def test_people_who_differ_as_simulated_ones_do_not_refute_a_simulator() -> None
         part = torch.tensor([0.99] * 5 + [0.0] * (WIDTH - 5))
         recording = 0.3 * torch.randn(80, WIDTH)
         z = mean + part.sqrt() * person + (1 - part).sqrt() * recording
-        moments = Moments(mean=mean, covariance=noise.expand(80, -1, -1))
+        moments = Moments(means=mean[:, None], covariance=noise.expand(80, -1, -1))
         arguments = z, moments, unit(), DiscrepancyModel()
         apart.append(fit_discrepancy(*arguments).probability_of_none)
         found = fit_discrepancy(*arguments, groups=groups)

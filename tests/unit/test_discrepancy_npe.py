@@ -13,22 +13,19 @@ from sbi.inference import DirectPosterior, VectorFieldPosterior
 from sbi.neural_nets import posterior_nn
 from torch import Tensor, nn
 
-from sbi_rope import CalibrationFinetuner, simulate
+from sbi_rope import CalibrationFinetuner
 from sbi_rope._sbi import embedding_of, estimator_of
 from sbi_rope._standardisation import Standardisation
 from sbi_rope.baselines import Training
-from sbi_rope.discrepancy import DiscrepancyNPE
-from sbi_rope.discrepancy.posterior import DiscrepancyDraws
-from sbi_rope.discrepancy.training import UNTIL_SETTLED, train_on_corrected
-from sbi_rope.discrepancy.tuning import cross_fitted_nets
+from sbi_rope.density import Flow, MixturePosterior
+from sbi_rope.discrepancy import DiscrepancyModel, DiscrepancyNPE
+from sbi_rope.discrepancy.correction import correct_flow, fit_discrepancy
 from sbi_rope.errors import (
     InvalidInputError,
     NotReadyError,
-    SimulationError,
     UnsupportedPosteriorError,
 )
-from sbi_rope.mixture import MixturePosterior
-from sbi_rope.simulate import Moments, Simulator, StoredSimulations
+from sbi_rope.moments import Moments
 from tests import problems
 
 pytestmark = [
@@ -114,7 +111,7 @@ def test_every_source_of_simulations_gives_a_posterior_of_sbi(space: str) -> Non
         assert problems.box(2).support.check(samples).all(), name
         found = log_probs(posterior)
         assert found.isfinite().all(), name
-        assert len(made.history.training_loss) == 1, name
+        assert len(made.history.training_loss) >= 4, name
         assert made.discrepancy.num_pairs == 12, name
         assert not torch.equal(found, log_probs(problems.npe_posterior())), name
 
@@ -210,8 +207,8 @@ def test_discrepancy_and_history_are_those_of_the_last_training() -> None:
         with pytest.raises(NotReadyError, match=r"Call `train\(\)` first"):
             ask()
     assert made.train(**QUIET).discrepancy.num_pairs == 15
-    assert len(method(num_steps=45).append_calibration(*labelled()).train(**QUIET)
-               .history.training_loss) == 3  # fmt: skip
+    again = method(num_steps=45).append_calibration(*labelled()).train(**QUIET)
+    assert len(again.history.training_loss) >= 45
 
 
 @pytest.mark.slow
@@ -281,77 +278,34 @@ def test_entries_that_are_constant_in_simulations_do_not_change_the_posterior() 
         assert torch.equal(*densities), space
 
 
-def identity_draws(width: int) -> DiscrepancyDraws:
-    zeros = torch.zeros(1, width, width).double()
-    return DiscrepancyDraws(
-        gain=torch.eye(width).double()[None],
-        offset=torch.zeros(1, width).double(),
-        error_factor=zeros,
-    )
+def test_only_simulations_with_a_probability_are_drawn(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seen, losses = [], Flow.losses
 
+    def recorded(self: Flow, theta: Tensor, x: Tensor) -> Tensor:
+        seen.append((theta.flatten(0, 1), x.flatten(0, 1)))
+        return losses(self, theta, x)
 
-def settle(density: nn.Module, **options: Any) -> Any:
-    """Train on uncorrected simulations of parameters around five."""
-    theta, x = simulations()
-    settings: dict[str, Any] = {"num_steps": 40, "learning_rate": 0.1}
-    return train_on_corrected(
-        density,
-        theta + 5.0,
-        x,
-        identity_draws(3),
-        Standardisation(x.double()),
-        probabilities=None,
-        show_progress_bars=False,
-        **settings | options,
-    )
-
-
-class Slow(nn.Module):
-    """A density that approaches its optimum step by step."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.bias = nn.Parameter(torch.zeros(2))
-
-    def loss(self, theta: Tensor, condition: Tensor) -> Tensor:
-        return (theta - self.bias).square().sum(dim=1)
-
-
-@pytest.mark.medium
-def test_courses_are_added_until_the_loss_has_settled() -> None:
-    one, several = Slow(), Slow()
-    assert len(settle(one).training_loss) == 2
-    assert (one.bias < 3).all()
-    history = settle(several, min_gain=UNTIL_SETTLED)
-    assert 4 <= len(history.training_loss) < 24
-    assert torch.allclose(several.bias, torch.full((2,), 5.0), atol=0.2)
-    # From where it has settled one course is enough.
-    assert len(settle(several, min_gain=UNTIL_SETTLED).training_loss) == 2
-    # The loss is 51 nats at the start, and 18 after a first course.
-    assert len(settle(Slow(), min_gain=35.0).training_loss) == 2
-    assert len(settle(Slow(), min_gain=30.0).training_loss) == 4
-
-
-def test_only_simulations_with_a_probability_are_drawn() -> None:
-    seen = []
-
-    class Recording(Slow):
-        def loss(self, theta: Tensor, condition: Tensor) -> Tensor:
-            seen.append((theta, condition))
-            return (theta - self.bias).square().sum(dim=1)
-
+    monkeypatch.setattr(Flow, "losses", recorded)
     theta, x = simulations()
     probabilities = torch.zeros(300).index_fill(0, torch.tensor([7, 9]), 0.5)
-    train_on_corrected(
-        Recording(),
-        theta,
+    none = fit_discrepancy(
         x,
-        identity_draws(3),
+        Moments(
+            means=x.double()[:, None],
+            covariance=torch.eye(3).double().expand(300, 3, 3),
+        ),
         Standardisation(x.double()),
-        probabilities=probabilities,
+        DiscrepancyModel(probability_of_none=1.0),
+    )
+    correct_flow(
+        estimator_of(problems.npe_posterior()),
+        (theta, x),
+        [none],
+        space="input",
+        probabilities=[probabilities],
         num_steps=2,
-        learning_rate=0.1,
-        show_progress_bars=False,
     )
     drawn, conditions = (torch.cat(parts) for parts in zip(*seen, strict=True))
     first = (drawn == theta[7]).all(dim=1)
@@ -361,141 +315,6 @@ def test_only_simulations_with_a_probability_are_drawn() -> None:
     assert torch.allclose(
         conditions[first], x[7].expand(int(first.sum()), 3), atol=1e-5
     )
-
-
-def simulator_of(function: Callable[[Tensor], Tensor]) -> Simulator:
-    return Simulator(
-        function, problems.box(1), event_shape=torch.Size((2,)), like=torch.zeros(1)
-    )
-
-
-MIXING = torch.tensor([[1.0, 0.6], [0.0, 0.8]])
-
-
-def noisy(theta: Tensor) -> Tensor:
-    """Curved in theta, with noise of covariance MIXING' MIXING / 4."""
-    signal = torch.cat([3 * theta, theta.square()], dim=1)
-    return signal + 0.5 * torch.randn(len(theta), 2) @ MIXING
-
-
-def sometimes_nan(theta: Tensor) -> Tensor:
-    x = noisy(theta)
-    x[torch.rand(len(x)) < 0.3, 1] = torch.nan
-    return x
-
-
-@pytest.mark.filterwarnings("ignore:Dropped")
-def test_moments_of_a_simulator_are_those_of_finite_simulations() -> None:
-    theta = torch.tensor([[-0.5], [0.8]])
-    signal = torch.cat([3 * theta, theta.square()], dim=1).double()
-    expected = 0.25 * (MIXING.T @ MIXING).double()
-    for function in (noisy, sometimes_nan):
-        moments = simulator_of(function).moments(
-            theta, 20_000, lambda x: x, progress=False
-        )
-        assert torch.allclose(moments.mean, signal, atol=0.02)
-        assert torch.allclose(moments.covariance, expected.expand(2, 2, 2), atol=0.02)
-    assert torch.equal(moments[torch.tensor([1])].mean, moments.mean[1:])
-    assert moments.columns(slice(1, 2)).covariance.shape == (2, 1, 1)
-    single = simulator_of(noisy).moments(theta, 1, lambda x: x, progress=False)
-    assert (single.covariance == 0).all()
-
-
-def test_the_covariance_of_few_simulations_is_right_on_average() -> None:
-    theta = torch.zeros(5000, 1)
-    moments = simulator_of(noisy).moments(theta, 3, lambda x: x, progress=False)
-    expected = 0.25 * (MIXING.T @ MIXING).double()
-    # Divided by three instead of two, it would be off by a third.
-    assert torch.allclose(moments.covariance.mean(dim=0), expected, atol=0.02)
-
-
-def test_a_simulator_may_change_what_it_is_given_and_reuse_its_memory() -> None:
-    def in_place(theta: Tensor) -> Tensor:
-        theta *= 2
-        return theta.expand(-1, 2) + 0.01 * torch.randn(len(theta), 2)
-
-    theta, x = simulator_of(in_place).kept(500, progress=False)
-    assert (theta.abs() <= 1).all()
-    assert torch.allclose(x, 2 * theta.expand(-1, 2), atol=0.1)
-    memory = torch.zeros(2)
-
-    def one_at_a_time(theta: Tensor) -> Tensor:
-        memory[:] = float(theta)
-        return memory
-
-    theta, x = simulator_of(one_at_a_time).kept(50, progress=False)
-    assert torch.equal(x, theta.expand(-1, 2))
-
-
-def test_stored_simulations_are_returned_in_random_order() -> None:
-    theta = torch.linspace(-1, 1, 1000)[:, None]
-    stored = StoredSimulations(
-        (theta, noisy(theta)),
-        problems.box(1),
-        event_shape=torch.Size((2,)),
-        like=theta,
-    )
-    kept, _ = stored.kept(20_000, progress=False)
-    assert torch.equal(kept.sort(dim=0).values, theta)
-    assert abs(float(kept[:100].mean())) < 0.3
-
-
-@pytest.mark.filterwarnings("ignore:Dropped")
-def test_a_pair_without_any_finite_simulation_is_named() -> None:
-    def failing(theta: Tensor) -> Tensor:
-        return noisy(theta) / (theta < 0.5)
-
-    theta = torch.tensor([[0.0], [0.9]])
-    with pytest.raises(SimulationError, match=r"parameters \[\[0\.9\]\] failed"):
-        simulator_of(failing).moments(theta, 10, lambda x: x, progress=False)
-
-
-def test_moments_of_stored_simulations_follow_the_slope_around_a_parameter() -> None:
-    # A slope of 3: averaging around the edge of the box would miss its height.
-    theta = 2 * torch.rand(20_000, 1) - 1
-    at = torch.tensor([[-1.0], [0.3], [0.999]])
-    signal = torch.cat([3 * at, at.square()], dim=1).double()
-    expected = 0.25 * (MIXING.T @ MIXING).double()
-    for centre in (0.0, 1e4):
-        stored = StoredSimulations(
-            (theta + centre, noisy(theta)),
-            problems.box(1, centre - 1, centre + 1),
-            event_shape=torch.Size((2,)),
-            like=theta,
-        )
-        moments = stored.moments(at + centre, 10, lambda x: x, progress=False)
-        # Fifty are around; at an edge the height is as uncertain as of twelve.
-        assert torch.allclose(moments.mean, signal, atol=0.45), centre
-        found = moments.covariance.mean(dim=0)
-        assert torch.allclose(found, expected, atol=0.12), centre
-        targets = stored.targets(
-            at + centre,
-            lambda x: x,
-            simulations_per_target=1,
-            num_neighbors=50,
-            progress=False,
-        )
-        assert torch.allclose(targets[1].double(), signal[1], atol=0.3), centre
-
-
-def test_few_distances_at_once_give_the_same_nearest_simulations(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    theta = problems.box(2).sample((100,))
-    source = StoredSimulations(
-        (theta, theta),
-        problems.box(2),
-        event_shape=torch.Size((2,)),
-        like=theta,
-    )
-    at = problems.box(2).sample((7,))
-    found = []
-    for at_once in (10_000, 200, 1):
-        monkeypatch.setattr(simulate, "MAX_DISTANCES", at_once)
-        found.append(source.draws(at, 3, lambda x: x, progress=False))
-    distances = torch.cdist(at / theta.std(dim=0), theta / theta.std(dim=0))
-    nearest = theta[distances.argsort(dim=1)[:, :3]]
-    assert all(torch.equal(one, nearest) for one in found)
 
 
 def test_training_asks_for_the_data_that_it_lacks() -> None:
@@ -548,24 +367,18 @@ class Remembering(nn.Module):
 
 
 def test_pairs_are_embedded_by_a_net_that_was_tuned_on_all_others() -> None:
-    theta, x = labelled()
-    finetuner: Any = SimpleNamespace(
-        finetune=lambda h, x, *rest, **options: SimpleNamespace(
-            embedding_net=Remembering(x)
-        )
-    )
-    moments = Moments(mean=torch.zeros(12, 1), covariance=torch.zeros(12, 1, 1))
-    nets, z = cross_fitted_nets(
-        nn.Identity(),
-        (theta, x),
-        moments,
-        x,
-        finetuner=finetuner,
-        num_folds=3,
-        show_progress_bars=False,
-    )
+    made = method(space="tuned", num_folds=3).append_calibration(*labelled())
+    seen: list[Tensor] = []
+
+    def tuned(h: Any, x: Tensor, targets: Any, sets: Any, **options: Any) -> Any:
+        seen.extend(sets)
+        nets = [Remembering(x[rows]) for rows in sets]
+        return SimpleNamespace(member=nets.__getitem__), []
+
+    made.finetuner = SimpleNamespace(tuned=tuned)  # type: ignore[assignment]
+    _, z = made._cross_fitted(nn.Identity(), torch.ones(12, 1), simulations()[1], False)
     assert (z == 0).all()
-    assert [float(net(x).sum()) for net in nets] == [8, 8, 8]
+    assert [len(rows) for rows in seen] == [8, 8, 8]
 
 
 def test_appended_simulations_are_trained_on_in_place_of_new_ones() -> None:
@@ -573,7 +386,7 @@ def test_appended_simulations_are_trained_on_in_place_of_new_ones() -> None:
     assert not made.needs_simulations
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            "sbi_rope.discrepancy.npe.correct_npe",
+            "sbi_rope.discrepancy.npe.correct_flow",
             lambda estimator, simulations, *rest, **options: pytest.fail(
                 f"trained on {len(simulations[0])}"
             ),

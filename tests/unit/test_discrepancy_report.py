@@ -16,7 +16,7 @@ from sbi_rope.discrepancy import (
 )
 from sbi_rope.discrepancy.report import report_discrepancy
 from sbi_rope.errors import InvalidInputError, NotReadyError
-from sbi_rope.simulate import Moments
+from sbi_rope.moments import Moments
 from sbi_rope.tasks import get_task
 from tests import problems
 
@@ -46,7 +46,7 @@ def pairs(n: int) -> tuple[Tensor, Moments]:
     off = CENTRE[1] + SHIFT + GAIN * (x[:, 1] - CENTRE[1]) + ERROR * torch.randn(n)
     x[:, 1] = off
     covariance = NOISE.square().diag().expand(n, -1, -1)
-    return x, Moments(mean=mean, covariance=covariance)
+    return x, Moments(means=mean[:, None], covariance=covariance)
 
 
 def report(n: int = 40, *, model: DiscrepancyModel = MODEL) -> DiscrepancyReport:
@@ -104,7 +104,7 @@ def test_intervals_of_95_percent_hold_the_truth_in_95_percent_of_repetitions() -
         found = report_discrepancy(
             centre + scale * z,
             Moments(
-                mean=centre + scale * mean,
+                means=(centre + scale * mean)[:, None],
                 covariance=torch.full((n, 1, 1), noise * scale**2).double(),
             ),
             prior,
@@ -167,7 +167,9 @@ def test_pairs_that_fit_the_others_are_rarely_named() -> None:
 def test_summaries_are_sorted_by_size_and_those_without_discrepancy_are_last() -> None:
     mean = torch.randn(30, 3).double()
     x = mean + torch.tensor([0.0, 2.0, -5.0])
-    moments = Moments(mean=mean, covariance=0.01 * torch.eye(3).expand(30, 3, 3))
+    moments = Moments(
+        means=mean[:, None], covariance=0.01 * torch.eye(3).expand(30, 3, 3)
+    )
     found = report_discrepancy(x, moments, torch.randn(500, 3), model=MODEL)
     assert [summary.name for summary in found.summaries] == ["x[2]", "x[1]", "x[0]"]
     lines = str(found).split("\n")

@@ -14,9 +14,9 @@ from torch import Tensor, nn
 from sbi_rope import CalibrationFinetuner, RoPE, diagnose, stack
 from sbi_rope._standardisation import FAR, deviations
 from sbi_rope.baselines import CalibrationMLP, FinetunedNPE, Training
+from sbi_rope.density import average
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import RoPEWarning
-from sbi_rope.mixture import average
 from sbi_rope.stacking import default_candidates
 from sbi_rope.tasks import get_task
 from tests import problems

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from sbi_rope._groups import MIN_PAIRS_FOR_HOLDOUT, groups_of, split_groups, split_pairs
-from sbi_rope._training import EPOCHS_WITHOUT_HOLDOUT, epochs_on_pairs
+from sbi_rope.data import MIN_PAIRS_FOR_HOLDOUT, groups_of, split_groups, split_pairs
 from sbi_rope.errors import RoPEWarning
+from sbi_rope.fit import EPOCHS_WITHOUT_HOLDOUT, epochs_on_pairs
 
 
 class TestSplitPairs:

@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from sbi_rope._means import Counts, interval_of_mean, mean_and_error
+from sbi_rope._means import interval_of_mean, mean_and_error
+from sbi_rope.data import Counts
 from sbi_rope.metrics import acauc_of, coverage_curve_of, expected_coverage_error_of
 from sbi_rope.metrics.calibration import (
     acauc_of_pairs,

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from sbi_rope import SinkhornCoupler
-from sbi_rope._groups import split_groups, split_pairs
+from sbi_rope.data import split_groups, split_pairs
 from sbi_rope.discrepancy import DiscrepancyModel, learn_parameters
 from sbi_rope.errors import RoPEError
 from sbi_rope.metrics import acauc_of, central_levels, mid_ranks

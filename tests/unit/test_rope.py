@@ -19,6 +19,7 @@ from sbi_rope import (
     SinkhornCoupler,
     stack,
 )
+from sbi_rope.data import Pairs
 from sbi_rope.errors import (
     CouplingError,
     InvalidInputError,
@@ -29,6 +30,8 @@ from sbi_rope.errors import (
     UnsupportedPosteriorError,
 )
 from sbi_rope.metrics import evaluate
+from sbi_rope.moments import targets
+from sbi_rope.simulate import Stored
 from sbi_rope.stacking import default_candidates
 from tests import gaussian, problems
 from tests.stacks import quick
@@ -261,20 +264,10 @@ def test_the_nearest_parameters_are_found_in_units_of_their_standard_deviations(
 ) -> None:
     x = torch.tensor([[0.0, 0.0], [0.0, 50.0], [1.0, 0.0]]).repeat(5, 1)
     wide = unit * x
-    source = RoPE(
-        gaussian.posterior(), simulations=(wide, x)
-    )._source  # its neighbours are not public
     # In plain units (0, 50) is nearest. In standard deviations, about 0.5 and 24, 40 of
     # the second parameter count for less than 0.9 of the first.
     theta = unit * torch.tensor([[0.9, 40.0]])
-    target = source.targets(
-        theta,
-        lambda value: value,
-        simulations_per_target=9,
-        num_neighbors=1,
-        progress=False,
-    )
-    assert target.tolist() == [[1.0, 0.0]]
+    assert Stored(wide, x).near(theta, 1, lambda x: x).tolist() == [[[1.0, 0.0]]]
 
 
 def test_a_coupling_that_has_not_converged_is_an_error_unless_it_is_accepted() -> None:
@@ -342,9 +335,9 @@ def test_tables_are_put_into_the_order_of_the_names_that_rope_knows() -> None:
     conductor.append_calibration(
         named[["b", "a"]], named_x[["right", "left"]], theta_std=std[["b", "a"]]
     )
-    assert torch.equal(conductor.labels.theta, theta)
+    assert torch.equal(conductor.pairs.label.y, theta)
     assert torch.equal(conductor.calibration[1], x)
-    assert conductor.labels.is_noisy[:, 1].all()
+    assert conductor.pairs.label.is_noisy[:, 1].all()
     batch = conductor.train(show_progress_bars=False).embed(named_x[["right", "left"]])
     assert torch.equal(batch.x_o, x)
     # Without stored tables the first pairs say what the columns of x are called.
@@ -477,16 +470,10 @@ def test_targets_are_means_over_the_finite_simulations() -> None:
         return torch.where(fails, torch.nan, theta)
 
     theta = torch.tensor([[1.0, -1.0], [0.5, 2.0]])
-    source = rope(simulator=simulator)._source
+    source, pairs = rope(simulator=simulator).source, Pairs.exact(theta, theta)
     with pytest.warns(RoPEWarning, match="Dropped"):
-        target = source.targets(
-            theta,
-            lambda x: x,
-            simulations_per_target=50,
-            num_neighbors=1,
-            progress=False,
-        )
-    assert torch.allclose(target, theta)
+        found = targets(source, pairs, 50, lambda x: x, num_neighbors=1)
+    assert torch.allclose(found, theta)
     assert 20 < source.num_dropped < 80
 
 
@@ -502,17 +489,15 @@ def test_stored_parameters_that_are_no_draws_of_the_prior_are_warned_of() -> Non
 
 def test_stored_simulations_are_chosen_at_random() -> None:
     theta = gaussian.prior().sample((100,))
-    conductor = RoPE(
-        gaussian.posterior(), simulations=(theta, gaussian.simulator(theta))
-    )
+    x = gaussian.simulator(theta)
+    conductor = RoPE(gaussian.posterior(), simulations=(theta, x))
     chosen = [
         conductor.build_posterior(X_O, num_simulations=30, seed=seed).coupling.simulated
         for seed in (0, 0, 1)
     ]
     assert torch.equal(chosen[0], chosen[1])
     assert not torch.equal(chosen[0], chosen[2])
-    first = (gaussian.GAIN * conductor._source._made(progress=False)[1][:30]).double()
-    assert not torch.allclose(chosen[0], first)
+    assert not torch.allclose(chosen[0], (gaussian.GAIN * x[:30]).double())
 
 
 def test_trying_a_simulator_keeps_the_random_state_of_the_caller() -> None:

@@ -22,8 +22,8 @@ from torch import Tensor, nn
 from torch.distributions import Exponential, Gamma, Independent, LogNormal, Normal
 
 from sbi_rope import MixturePosterior, StackedPosterior, load, save
+from sbi_rope.density import Flow, Mixture, PriorPosterior
 from sbi_rope.errors import DataNotFoundError, FileFormatError, InvalidInputError
-from sbi_rope.mixture import MixtureEstimator, PriorPosterior, part_of
 from sbi_rope.saving import ROOMS, _found
 from sbi_rope.stacking import DiscrepancyCandidate, FinetunedCandidate
 from sbi_rope.tasks.hemodynamics.prior import PopulationPrior
@@ -39,7 +39,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def mixture_of(posterior: Any) -> MixturePosterior:
     """Return a mixture of one part, for any x."""
-    estimator = MixtureEstimator([part_of(posterior.posterior_estimator)], [1.0])
+    estimator = Flow.of([posterior.posterior_estimator])
     return MixturePosterior(estimator, posterior.prior)
 
 
@@ -52,7 +52,7 @@ def rope_posterior(**options: Any) -> MixturePosterior:
 def small_stack() -> StackedPosterior:
     """Return a stack of few candidates, for reading only."""
     trained_ones = (DiscrepancyCandidate(space="tuned"), FinetunedCandidate())
-    candidates = [stacks.PRIOR, stacks.NPE, *trained_ones, stacks.FITTED]
+    candidates = [stacks.PRIOR, stacks.NPE, *trained_ones, stacks.BOX]
     with torch.random.fork_rng():
         return stacks.stacked(stacks.rope_of(), candidates=candidates, num_folds=3)
 
@@ -314,7 +314,7 @@ def test_a_malicious_pickle_is_refused_and_not_executed(
         Calls(save, 1, "file"),
         # A class that is known is not constructed.
         Calls(nn.Linear, 1, 1),
-        Calls(MixtureEstimator, [], []),
+        Calls(Mixture, [], []),
         Calls(nn.Sequential, nn.Linear(1, 1)),
     ],
     ids=lambda value: f"{value.call[0].__name__}{len(value.call[1])}",

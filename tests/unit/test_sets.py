@@ -15,9 +15,9 @@ from torch import Tensor
 from sbi_rope import MixturePosterior, StackedPosterior
 from sbi_rope._bounds import bounds_of
 from sbi_rope._random import seeded
+from sbi_rope.density import Flow
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.metrics import coverage_curve_of
-from sbi_rope.mixture import MixtureEstimator, part_of
 from sbi_rope.sets import Guarantee
 from sbi_rope.sets.conformal import (
     interval_of,
@@ -28,6 +28,7 @@ from sbi_rope.sets.conformal import (
 )
 from sbi_rope.stacking import StackingReport
 from sbi_rope.stacking.cross_validation import fold_weights
+from sbi_rope.stacking.versions import fold_posterior, mixture_of
 from tests import gaussian, problems, stacks
 
 # Calibration sets are small here on purpose.
@@ -37,7 +38,7 @@ X = torch.tensor([0.5, -1.0])
 
 def exact(prior: Any = None) -> MixturePosterior:
     """Return N(0.8 x, 0.2 I), inside the support of a prior."""
-    estimator = MixtureEstimator([part_of(gaussian.GaussianEstimator())], [1.0])
+    estimator = Flow.of([gaussian.GaussianEstimator()])
     return MixturePosterior(estimator, gaussian.prior() if prior is None else prior)
 
 
@@ -320,8 +321,8 @@ def test_scores_of_pairs_are_those_of_stacks_that_have_not_seen_them(
     weights = fold_weights(known.log_scores, known.fold)
     for number in range(known.num_folds):
         rows = known.fold == number
-        estimator = stack.versions.estimator(weights[number], [number])
-        posterior = MixturePosterior(estimator, stack.prior)
+        density = mixture_of(stack.versions, weights[number], version=number)
+        posterior = fold_posterior(density, stack.prior)
         draws = posterior.sample_batched((2000,), x_cal[rows], **stacks.QUIET)
         log_prob = posterior.log_prob_batched(theta[rows], x_cal[rows]).T
         of_draws = posterior.log_prob_batched(draws, x_cal[rows]).T
@@ -351,8 +352,13 @@ def test_a_guaranteed_set_is_that_of_counting_the_held_out_scores(
     weights = fold_weights(known.log_scores, known.fold)
     near = (theta.abs() <= 1).all(dim=1)
     for number in range(5):
-        each = stack.versions.log_probs(theta, x.expand(200, -1), [number])
-        expected = (each + weights[number].log()).logsumexp(dim=1)
+        each = torch.stack(
+            [
+                one[number].log_prob(theta[:, None], x[None])[:, 0]
+                for one in stack.versions
+            ]
+        )
+        expected = (each + weights[number].log()[:, None]).logsumexp(dim=0)
         assert (log_prob[number] - expected)[near].abs().max() < 1e-3
     held = held_by_counting(rule.scores, rule.fold, at_theta, 0.8)
     assert 0 < sum(held) < len(held)

@@ -7,7 +7,6 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._groups import split_pairs
 from sbi_rope._random import seeded
 from sbi_rope._sbi import (
     ConditionalDensityEstimator,
@@ -15,18 +14,19 @@ from sbi_rope._sbi import (
     embed,
 )
 from sbi_rope._standardisation import warn_of_far_entries
-from sbi_rope._training import History, epochs_on_pairs, shuffled
 from sbi_rope.baselines.fmcpe.pushed_forward import PushedForward
 from sbi_rope.baselines.fmcpe.standardise import Standardise
 from sbi_rope.baselines.fmcpe.to_simulations import ToSimulations
 from sbi_rope.baselines.fmcpe.velocity import VelocityField
 from sbi_rope.baselines.networks import fresh_copy
 from sbi_rope.baselines.statistics import frozen_statistics
-from sbi_rope.mixture import MixtureEstimator, Part
+from sbi_rope.data import split_pairs
+from sbi_rope.fit import History, Training, epochs_on_pairs, fit, shuffled
+from sbi_rope.moments import draws
 from sbi_rope.settings import Count, Positive, check
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
-from sbi_rope.trainers.training import EstimatorBuilder, Training, train_network
+from sbi_rope.trainers.training import EstimatorBuilder
 
 __all__ = ["FMCPE"]
 
@@ -197,6 +197,7 @@ class FMCPE(Method):
         observed = embed(statistics, x).flatten(1)
         seen_in = Standardise(observed, shared=share) if len(x) > 1 else unit
         to_simulations = ToSimulations(
+            density,
             statistics,
             unit,
             self._field(x, seen_in, h, size=bank.shape[-1]),
@@ -205,9 +206,8 @@ class FMCPE(Method):
             noise=self.noise,
             num_draws=self.num_draws,
         ).to(self._device)
-        base = MixtureEstimator([Part(density, to_simulations)], [1.0])
         pushed = PushedForward(
-            base, self._prior, self._field(x, seen_in, h, size=theta.shape[1])
+            to_simulations, self._prior, self._field(x, seen_in, h, size=theta.shape[1])
         ).to(self._device)
         history = self._train(
             pushed, to_simulations, density, bank, show_progress_bars=show_progress_bars
@@ -216,13 +216,15 @@ class FMCPE(Method):
 
     def _bank(self, statistics: nn.Module, *, show_progress_bars: bool) -> Tensor:
         """Return flat simulations at the calibration parameters, ``(n, c, m)``."""
-        theta, x = self._data.calibration
-        return self._source().draws(
-            theta,
-            max(1, min(self.simulations_per_pair, MAX_KEPT // x.numel())),
+        pairs = self._data.pairs
+        _, bank = draws(
+            self._source(),
+            pairs,
+            max(1, min(self.simulations_per_pair, MAX_KEPT // pairs.x.numel())),
             lambda x: embed(statistics, x).flatten(1),
             progress=show_progress_bars,
         )
+        return bank
 
     def _field(
         self, x: Tensor, unit: Standardise, h: nn.Module, *, size: int
@@ -254,7 +256,9 @@ class FMCPE(Method):
 
         def loss(rows: Tensor) -> Tensor:
             some = torch.randint(bank.shape[1], (len(rows),)).to(bank.device)
-            of_simulations, simulated = to_simulations.loss(x[rows], bank[rows, some])
+            of_simulations, simulated = to_simulations.field_loss(
+                x[rows], bank[rows, some]
+            )
             with torch.no_grad():
                 start = density.sample(torch.Size((1,)), simulated)[0]
             start = pushed.unbounded.replaced(start)
@@ -269,7 +273,7 @@ class FMCPE(Method):
             with seeded(0):
                 return loss(held_out.repeat(repeats))
 
-        return train_network(
+        [history] = fit(
             nn.ModuleList([to_simulations.field, pushed.field]),
             batches,
             loss,
@@ -280,3 +284,4 @@ class FMCPE(Method):
             label="FMCPE",
             show_progress_bars=show_progress_bars,
         )
+        return history

@@ -14,8 +14,8 @@ from sbi_rope.baselines.fmcpe.velocity import (
     follow_back,
     matching_loss,
 )
-from sbi_rope.mixture import MixtureEstimator
-from sbi_rope.mixture.truncation import is_unbounded
+from sbi_rope.density import Density
+from sbi_rope.density.posterior import is_unbounded
 
 __all__ = ["PushedForward"]
 
@@ -35,7 +35,7 @@ class PushedForward(ConditionalDensityEstimator):
     """
 
     def __init__(
-        self, base: MixtureEstimator, prior: Distribution, field: VelocityField
+        self, base: Density, prior: Distribution, field: VelocityField
     ) -> None:
         super().__init__(nn.Identity(), base.input_shape, base.condition_shape)
         self.base = base
@@ -75,13 +75,13 @@ class PushedForward(ConditionalDensityEstimator):
     def _log_prob_at_start(self, start: Tensor, condition: Tensor) -> Tensor:
         """Return the log density before the map, ``(S, B)``."""
         prior = self.unbounded.prior
-        inside = None if is_unbounded(prior) else self.unbounded.contains
-        outside = 1 - self.base.mass(condition, accept=inside, cache={}).mass
-        replaced = prior.log_prob(start.flatten(0, 1))
-        return torch.logaddexp(
-            self.base.log_prob(start, condition),
-            outside.clamp_min(0).log().to(start) + replaced.reshape(start.shape[:2]),
-        )
+        z, num_rows = self.base.embed(condition), len(condition)
+        log_q = self.base.log_prob_given(start, z, num_rows).to(start)
+        if is_unbounded(prior):
+            return log_q
+        outside = 1 - self.base.mass(z, num_rows, self.unbounded.contains).mass
+        replaced = prior.log_prob(start.flatten(0, 1)).reshape(start.shape[:2])
+        return torch.logaddexp(log_q, outside.clamp_min(0).log().to(start) + replaced)
 
     @torch.no_grad()
     def sample(

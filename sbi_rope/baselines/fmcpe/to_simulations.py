@@ -1,12 +1,13 @@
-"""From observations to simulations with the same parameters."""
+"""NPE averaged over simulations with the same parameters as an observation."""
 
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._sbi import embed
+from sbi_rope._sbi import ConditionalDensityEstimator, embed
 from sbi_rope.baselines.fmcpe.standardise import Standardise
 from sbi_rope.baselines.fmcpe.velocity import VelocityField, follow, matching_loss
-from sbi_rope.mixture import Mixing, Rows, equal_rows
+from sbi_rope.density import Density, Flow
+from sbi_rope.ensemble import Ensemble, embedded, log_density
 
 __all__ = ["ToSimulations"]
 
@@ -14,14 +15,15 @@ __all__ = ["ToSimulations"]
 MAX_ENTRIES = 2**22
 
 
-class ToSimulations(Mixing):
-    r"""Simulations like an observation, by flow matching from K draws of noise.
+class ToSimulations(Flow):
+    r"""NPE averaged over simulations like an observation, of K draws of noise.
 
-    .. math:: s_k(x_o) = h\bigl(T_x(x_o + \epsilon\, \xi_k;\, x_o)\bigr)
-
-    All have equal weights.
+    .. math::
+        \tfrac1K \sum_k q(\theta \mid s_k), \qquad
+        s_k = h\bigl(T_x(x_o + \epsilon\, \xi_k;\, x_o)\bigr)
 
     Args:
+        density: :math:`q(\theta \mid s)`.
         statistics: What is mapped of an observation: itself, or its embedding.
         unit: Standardises what is mapped.
         field: The velocity field of the map.
@@ -35,6 +37,7 @@ class ToSimulations(Mixing):
 
     def __init__(
         self,
+        density: ConditionalDensityEstimator,
         statistics: nn.Module,
         unit: Standardise,
         field: VelocityField,
@@ -44,11 +47,16 @@ class ToSimulations(Mixing):
         noise: float | None,
         num_draws: int,
     ) -> None:
-        super().__init__(event_shape, num_draws)
+        super().__init__(
+            Ensemble([then], embedded, ()),
+            Ensemble([density], log_density, ()),
+            torch.full((num_draws,), 1 / num_draws).double(),
+            input_shape=density.input_shape,
+            condition_shape=event_shape,
+        )
         self.statistics = statistics
         self.unit = unit
         self.field = field
-        self.then = then
         self.noise = noise
         # On the CPU, so that a seed means the same on every device.
         noise_shape = num_draws, len(unit.mean)
@@ -56,7 +64,7 @@ class ToSimulations(Mixing):
         blank = unit.mean.new_zeros(1, *event_shape)
         self.shape = embed(statistics, blank).shape[1:]
 
-    def loss(self, x_o: Tensor, simulated: Tensor) -> tuple[Tensor, Tensor]:
+    def field_loss(self, x_o: Tensor, simulated: Tensor) -> tuple[Tensor, Tensor]:
         """Return the loss of the field, and the embedding of a simulation like each.
 
         Args:
@@ -77,7 +85,7 @@ class ToSimulations(Mixing):
         return torch.cat([self._like(part) for part in x.split(size)])
 
     def _like(self, x: Tensor) -> Tensor:
-        count = self.num_embeddings
+        count = self.num_members
         centre, scale = self._start(x)
         start = (centre[:, None] + scale * self.xi).flatten(0, 1)
         c = self.field.condition(x).repeat_interleave(count, dim=0)
@@ -91,9 +99,8 @@ class ToSimulations(Mixing):
             return torch.zeros_like(flat), 1.0
         return flat, self.noise
 
-    def rows(self, embedded: Tensor) -> Rows:
-        """Weigh all draws equally."""
-        return equal_rows(embedded)
+    readable = Density.readable  # what is finite
 
     def _embedded(self, z: Tensor) -> Tensor:
-        return embed(self.then, self.unit.inverse(z).reshape(len(z), *self.shape))
+        simulated = self.unit.inverse(z).reshape(len(z), *self.shape)
+        return super().embed(simulated)[:, 0]

@@ -1,26 +1,27 @@
-r"""What the posterior of the HVAE is mixed over: draws of the latent vector."""
+r"""The posterior of the HVAE: NPE averaged over draws of the latent vector."""
 
 import torch
 from torch import Tensor
 
 from sbi_rope.baselines.hvae.model import HybridVAE, drawn
-from sbi_rope.mixture import Mixing, Rows, equal_rows
+from sbi_rope.density import Density, Flow
+from sbi_rope.ensemble import Ensemble, embedded, log_density
 
-__all__ = ["LatentEmbeddings"]
+__all__ = ["OverLatents"]
 
 # Most entries of series or images that the U-Net sees at a time.
 MAX_ENTRIES = 2**18
 
 
-class LatentEmbeddings(Mixing):
-    r"""Embeddings of simulations like an observation, from S draws of the latent.
+class OverLatents(Flow):
+    r"""NPE averaged over simulations like an observation, of S draws of the latent.
 
     .. math::
-        s_k(x_o) = h(\tilde x_k), \quad
+        \tfrac1S \sum_k q(\theta \mid h(\tilde x_k)), \quad
         \tilde x_k = \mu(x_o, z_k) + \sigma(x_o, z_k) \, \eta_k, \quad
         z_k = m(x_o) + \sigma(x_o) \, \epsilon_k
 
-    All have equal weights. The noise is drawn once and is the same for all
+    The noise is drawn once and is the same for all
     observations, so that a density mixed over them is a function of theta and x_o.
 
     Args:
@@ -40,22 +41,26 @@ class LatentEmbeddings(Mixing):
         x_noise: Tensor | None,
         event_shape: torch.Size,
     ) -> None:
-        super().__init__(event_shape, len(z_noise))
+        flow = model.npe.flow
+        super().__init__(
+            Ensemble([model.npe.embedding], embedded, ()),
+            Ensemble([flow], log_density, ()),
+            torch.full((len(z_noise),), 1 / len(z_noise)).double(),
+            input_shape=flow.input_shape,
+            condition_shape=event_shape,
+        )
         self.encoder = model.encoder
         self.reality_to_physics = model.reality_to_physics
-        self.embedding = model.npe.embedding
         self.register_buffer("z_noise", z_noise)
         self.register_buffer("x_noise", x_noise)
 
-    def rows(self, embedded: Tensor) -> Rows:
-        """Weigh all draws equally."""
-        return equal_rows(embedded)
+    readable = Density.readable  # what is finite
 
     @torch.no_grad()
     def embed(self, x: Tensor) -> Tensor:
         """Return the embeddings, ``(n, *event)`` to ``(n, S, l)``."""
-        size = self.event_shape.numel()
-        draws = torch.arange(self.num_embeddings, device=self.z_noise.device)
+        size = self.condition_shape.numel()
+        draws = torch.arange(self.num_members, device=self.z_noise.device)
         num_rows = max(1, MAX_ENTRIES // (size * len(draws)))
         num_draws = max(1, MAX_ENTRIES // size)
         return torch.cat(
@@ -76,4 +81,5 @@ class LatentEmbeddings(Mixing):
             noise = self.x_noise[draws]
             noise = noise.expand(len(x_o), *noise.shape)
             x_s = drawn(x_s, log_variance, noise.flatten(0, 1))
-        return self.embedding(x_s).unflatten(0, (len(x_o), len(draws)))
+        z = self.nets.answer(embedded, x_s)
+        return z.unflatten(0, (len(x_o), len(draws)))

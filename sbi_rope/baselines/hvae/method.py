@@ -16,8 +16,7 @@ from sbi_rope._sbi import (
     posterior_from,
 )
 from sbi_rope._standardisation import ROUNDING
-from sbi_rope._training import History
-from sbi_rope.baselines.hvae.embeddings import LatentEmbeddings
+from sbi_rope.baselines.hvae.embeddings import OverLatents
 from sbi_rope.baselines.hvae.model import FrozenNPE, HybridVAE
 from sbi_rope.baselines.hvae.networks import (
     ConditionalUNet,
@@ -26,11 +25,11 @@ from sbi_rope.baselines.hvae.networks import (
 from sbi_rope.baselines.hvae.prior import ContinuedPrior
 from sbi_rope.baselines.hvae.training import train_hybrid
 from sbi_rope.errors import InvalidInputError
-from sbi_rope.mixture import MixtureEstimator, Part
+from sbi_rope.fit import History, Training
 from sbi_rope.settings import Count, NotNegative, check
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
-from sbi_rope.trainers.training import EstimatorBuilder, Training
+from sbi_rope.trainers.training import EstimatorBuilder
 
 __all__ = ["HVAE"]
 
@@ -205,15 +204,12 @@ class HVAE(Method):
 
     def _mixture(
         self, model: HybridVAE, z_noise: Tensor, x_noise: Tensor | None
-    ) -> MixtureEstimator:
-        """Return NPE mixed over draws of z, with the networks of the model."""
+    ) -> OverLatents:
+        """Return NPE averaged over draws of z, with the networks of the model."""
         if x_noise is not None:
             x_noise = x_noise[: len(z_noise)]
-        embeddings = LatentEmbeddings(
-            model, z_noise, x_noise, self._data.observations.shape[1:]
-        )
-        part = Part(model.npe.flow, embeddings)
-        return MixtureEstimator([part], [1.0], tail_mass=0.0).to(self._device)
+        event_shape = self._data.observations.shape[1:]
+        return OverLatents(model, z_noise, x_noise, event_shape).to(self._device)
 
     def _model(self, estimator: Any) -> HybridVAE:
         x = torch.cat([self._data.observations, self._data.calibration[1]])

@@ -6,20 +6,19 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from sbi_rope._groups import split_pairs, too_few_pairs
 from sbi_rope._random import seeded
-from sbi_rope._training import History
 from sbi_rope.baselines.hvae.model import HybridVAE
+from sbi_rope.data import split_pairs, too_few_pairs
+from sbi_rope.density import Density
 from sbi_rope.errors import warn_user
-from sbi_rope.mixture import MixtureEstimator
-from sbi_rope.trainers.training import Training, train_network
+from sbi_rope.fit import History, Training, fit
 
 __all__ = ["train_hybrid"]
 
 
 def train_hybrid(
     model: HybridVAE,
-    posterior: MixtureEstimator,
+    posterior: Density,
     x_o: Tensor,
     theta: Tensor,
     x: Tensor,
@@ -34,7 +33,7 @@ def train_hybrid(
 
     Args:
         model: What is trained.
-        posterior: A mixture that shares its networks, to score held-out pairs by.
+        posterior: A density that shares its networks, to score held-out pairs by.
         x_o: Observations without parameters, shape ``(n, *event)``.
         theta: Parameters of the calibration pairs, shape ``(m, d)``.
         x: Their observations, shape ``(m, *event)``.
@@ -67,7 +66,7 @@ def train_hybrid(
                 _with_same_draws, objective, x_o[held_out], *pairs
             )
         x_o = x_o[rows]
-    return train_network(
+    [history] = fit(
         model,
         partial(_batches, torch.cat([x_o, pairs[1]]), *pairs, training),
         objective,
@@ -76,6 +75,7 @@ def train_hybrid(
         label="HVAE",
         show_progress_bars=show_progress_bars,
     )
+    return history
 
 
 def _batches(
@@ -88,7 +88,7 @@ def _batches(
         yield unlabelled[rows], theta[pairs], x[pairs]
 
 
-def _held_out_loss(posterior: MixtureEstimator, theta: Tensor, x: Tensor) -> Tensor:
+def _held_out_loss(posterior: Density, theta: Tensor, x: Tensor) -> Tensor:
     return -posterior.log_prob(theta, x).mean()
 
 

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.distributions import Distribution
 
 from sbi_rope.baselines.rvnp.likelihood import ErrorModel, log_likelihood
-from sbi_rope.mixture.prior import prior_log_prob, prior_sample
+from sbi_rope.density.prior import prior_log_prob, prior_sample
 
 __all__ = ["Bound", "Terms"]
 

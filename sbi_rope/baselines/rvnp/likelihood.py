@@ -8,11 +8,10 @@ from torch import Tensor, nn
 from torch.distributions import Categorical, MixtureSameFamily, MultivariateNormal
 from torch.nn import functional
 
-from sbi_rope._groups import split_pairs
 from sbi_rope._sbi import gaussians_of
 from sbi_rope._standardisation import Standardisation
-from sbi_rope._training import shuffled
-from sbi_rope.trainers.training import Training, train_network
+from sbi_rope.data import split_pairs
+from sbi_rope.fit import Training, fit, shuffled
 
 __all__ = ["ErrorModel", "fit_surrogate", "log_likelihood"]
 
@@ -116,7 +115,7 @@ def fit_surrogate(
         noisy = s + JITTER * torch.randn_like(s)
         return surrogate.loss(noisy, condition=theta).mean()
 
-    train_network(
+    fit(
         surrogate,
         batches,
         loss,

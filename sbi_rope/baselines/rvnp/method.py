@@ -6,14 +6,12 @@ from typing import Annotated, Any, Literal
 import torch
 from torch import Tensor
 
-from sbi_rope._groups import split_pairs
 from sbi_rope._random import seeded
 from sbi_rope._sbi import (
     embed,
     estimator_of,
     posterior_from,
 )
-from sbi_rope._training import History, shuffled
 from sbi_rope.baselines.rvnp.bound import Bound
 from sbi_rope.baselines.rvnp.likelihood import ErrorModel, fit_surrogate
 from sbi_rope.baselines.statistics import (
@@ -23,11 +21,13 @@ from sbi_rope.baselines.statistics import (
     standardisation_of_statistics,
     with_clip,
 )
+from sbi_rope.data import split_pairs
+from sbi_rope.fit import History, Training, fit, shuffled
 from sbi_rope.settings import NotNegative, Range, check
 from sbi_rope.tensors import as_batch
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.starting_npe import StartingNPE
-from sbi_rope.trainers.training import EstimatorBuilder, Training, train_network
+from sbi_rope.trainers.training import EstimatorBuilder
 
 __all__ = ["RVNP"]
 
@@ -236,7 +236,7 @@ class RVNP(Method):
                 ]
             return -torch.cat(evidence).mean()
 
-        return train_network(
+        [history] = fit(
             bound,
             batches,
             loss,
@@ -246,3 +246,4 @@ class RVNP(Method):
             label="RVNP",
             show_progress_bars=show_progress_bars,
         )
+        return history

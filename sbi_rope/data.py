@@ -1,0 +1,368 @@
+"""Calibration pairs: what was measured, of whom, and how much each pair counts.
+
+Pairs of one person or specimen belong to one group. They are held out together, because
+a network can learn by heart whom it has met.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from sbi_rope._random import seeded
+from sbi_rope.errors import InvalidInputError
+
+__all__ = [
+    "MIN_PAIRS_FOR_HOLDOUT",
+    "Counts",
+    "Labels",
+    "Pairs",
+    "groups_of",
+    "groups_to_hold_out",
+    "one_of_each_group",
+    "split_groups",
+    "split_pairs",
+    "too_few_pairs",
+]
+
+# Fewer groups than this leave nothing to hold out.
+MIN_PAIRS_FOR_HOLDOUT = 5
+
+Table = TypeVar("Table")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Labels:
+    r"""What was measured of the parameters of pairs.
+
+    A label is a measurement of some or all parameters m, exact where R is zero,
+
+    .. math:: y_m \sim \mathcal N(\theta_m, R),
+
+    or draws of all parameters from :math:`p(\theta \mid \text{label})`, under the prior
+    of NPE.
+
+    Attributes:
+        y: The measurements, NaN where there are none, shape ``(n, d)``. Of a label
+            given as draws, their mean.
+        covariance: R, zero for exact and for missing parameters, float64, shape
+            ``(n, d, d)``.
+        draws: Shape ``(n, S, d)``; S is zero for measurements.
+    """
+
+    y: Tensor
+    covariance: Tensor
+    draws: Tensor
+
+    @classmethod
+    def exact(cls, theta: Tensor) -> "Labels":
+        """Return labels that are the true parameters, shape ``(n, d)``."""
+        n, d = theta.shape
+        covariance = theta.new_zeros(n, d, d, dtype=torch.double)
+        return cls(y=theta, covariance=covariance, draws=theta.new_empty(n, 0, d))
+
+    def __len__(self) -> int:
+        return len(self.y)
+
+    def __getitem__(self, rows: Tensor) -> "Labels":
+        return _map(lambda value: value[rows], self)
+
+    def __add__(self, others: "Labels") -> "Labels":
+        """Return these labels followed by others.
+
+        Raises:
+            InvalidInputError: If the numbers of draws differ.
+        """
+        if not len(self):
+            return others
+        if self.draws.shape[1] != others.draws.shape[1]:
+            raise InvalidInputError(
+                "Expected labels with as many draws as those appended before, "
+                f"{self.draws.shape[1]}; got {others.draws.shape[1]}."
+            )
+        return _map(lambda *values: torch.cat(values), self, others)
+
+    @property
+    def are_drawn(self) -> bool:
+        """Whether they are draws, and no measurements."""
+        return self.draws.shape[1] > 0
+
+    @property
+    def is_measured(self) -> Tensor:
+        """Which parameters were measured, exactly or with noise, shape ``(n, d)``."""
+        return ~torch.isnan(self.y)
+
+    @property
+    def is_noisy(self) -> Tensor:
+        """Which parameters were measured with noise, shape ``(n, d)``."""
+        return self.covariance.diagonal(dim1=1, dim2=2) > 0
+
+    @property
+    def is_exact(self) -> Tensor:
+        """Which labels know all parameters exactly, shape ``(n,)``."""
+        is_known = (self.is_measured & ~self.is_noisy).all(dim=1)
+        return is_known & (not self.are_drawn)
+
+    @property
+    def are_exact(self) -> bool:
+        """Whether all parameters of all labels are known exactly."""
+        return bool(self.is_exact.all())
+
+    @property
+    def group(self) -> Tensor:
+        """A number for each label, the same for equal labels, shape ``(n,)``."""
+        # NaN is not equal to itself.
+        parts = (self.y.nan_to_num(), self.is_measured, self.covariance, self.draws)
+        known = [part.double().flatten(1) for part in parts]
+        return groups_of(torch.cat(known, dim=1)).to(self.y.device)
+
+
+@dataclass(frozen=True, eq=False)
+class Counts:
+    """How many pairs each of some pairs counts as, and which of them belong together.
+
+    Attributes:
+        weights: Shape ``(n,)``.
+        groups: A number for each pair, shape ``(n,)``. Errors are those of means of
+            groups. None if all pairs are independent.
+    """
+
+    weights: Tensor
+    groups: Tensor | None = None
+
+    def __getitem__(self, rows: Tensor) -> "Counts":
+        return _map(lambda value: None if value is None else value[rows], self)
+
+    def of_groups(self, values: Tensor) -> tuple[Tensor, Tensor]:
+        """Return weighted means of the values of each group, and weights of groups.
+
+        Shapes ``(n, ...)`` to ``(G, ...)`` and ``(G,)``.
+
+        Example:
+            >>> import torch
+            >>> counts = Counts(torch.tensor([0.5, 0.5, 1.0]), torch.tensor([0, 0, 1]))
+            >>> counts.of_groups(torch.tensor([1.0, 3.0, 5.0]))
+            (tensor([2., 5.]), tensor([1., 1.]))
+        """
+        weights = self.weights.to(values)
+        if self.groups is None:
+            return values, weights
+        numbers, place = self.groups.to(values.device).unique(return_inverse=True)
+        if len(numbers) == len(values):
+            return values, weights
+        total = weights.new_zeros(len(numbers)).index_add(0, place, weights)
+        shares = (weights / total[place]).reshape(-1, *[1] * (values.ndim - 1))
+        sums = values.new_zeros(len(numbers), *values.shape[1:])
+        return sums.index_add(0, place, shares * values), total
+
+    @property
+    def effective_number(self) -> float:
+        r"""The number of independent pairs of equal weight with the same precision.
+
+        .. math:: \Bigl(\sum_g w_g\Bigr)^2 \Big/ \sum_g w_g^2
+        """
+        _, weights = self.of_groups(self.weights.double())
+        return float(weights.sum().square() / weights.square().sum())
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Pairs:
+    r"""Real observations with labels; all tensors are on the device of NPE.
+
+    Attributes:
+        theta: Draws from :math:`p(\theta \mid \text{label})` under the prior, shape
+            ``(n, S, d)``. S is 1 if all labels are exact.
+        x: Observations, shape ``(n, *event)``.
+        group: The number of the person or specimen of each pair, shape ``(n,)``.
+        weight: How many pairs each pair counts as, float64, shape ``(n,)``.
+        label: What was measured.
+    """
+
+    theta: Tensor
+    x: Tensor
+    group: Tensor
+    weight: Tensor
+    label: Labels
+
+    @classmethod
+    def exact(cls, theta: Tensor, x: Tensor) -> "Pairs":
+        """Return pairs of parameters ``(n, d)`` and x; equal ones share a group."""
+        label = Labels.exact(theta)
+        weight = theta.new_ones(len(theta), dtype=torch.double)
+        return cls(
+            theta=theta[:, None], x=x, group=label.group, weight=weight, label=label
+        )
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    def __getitem__(self, rows: Tensor) -> "Pairs":
+        return _map(lambda value: value[rows], self)
+
+    @property
+    def are_exact(self) -> bool:
+        """Whether all parameters are known exactly."""
+        return self.label.are_exact
+
+    @property
+    def mean(self) -> Tensor:
+        """The mean of the draws of each pair, shape ``(n, d)``."""
+        if self.theta.shape[1] == 1:
+            return self.theta[:, 0]
+        return self.theta.double().mean(dim=1).to(self.theta)
+
+    @property
+    def num_groups(self) -> int:
+        """The number of people or specimens."""
+        return len(self.group.unique())
+
+    @property
+    def counts(self) -> Counts:
+        """What each pair counts as where it is scored: a group as one pair."""
+        _, place, sizes = self.group.unique(return_inverse=True, return_counts=True)
+        return Counts(self.weight / sizes[place], self.group)
+
+    def folds(self, num_folds: int, *, seed: int | None = None) -> list[Tensor]:
+        """Return the rows of each fold, with a group in one fold, at random.
+
+        There are at most as many folds as groups, with equally many rows as far as the
+        groups allow. A seed of None uses the state of torch.
+        """
+        with seeded(seed):
+            rows = split_groups(self.group, num_folds)
+        return [fold.to(self.group.device) for fold in rows]
+
+    def split(
+        self, fraction: float, *, seed: int | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Return the rows to train on, and those of groups held out at random."""
+        with seeded(seed):
+            train, held_out = split_pairs(self.group, fraction)
+        return train.to(self.group.device), held_out.to(self.group.device)
+
+    def __str__(self) -> str:
+        """Say in one sentence what is known about the parameters."""
+        text = f"{len(self)} {'exact ' if self.are_exact else ''}labels"
+        if (num_groups := self.num_groups) < len(self):
+            text += f" in {num_groups} groups"
+        if self.label.are_drawn:
+            text += f", each given as {self.label.draws.shape[1]} draws"
+        elif not self.are_exact:
+            num_noisy = int(self.label.is_noisy.any(dim=1).sum())
+            num_partial = int((~self.label.is_measured).any(dim=1).sum())
+            text += f", {num_noisy} with noise and {num_partial} partial"
+        if (self.weight != 1).any():
+            number = Counts(self.weight).effective_number
+            text += (
+                f", weighted like {number:.1f} of equal weight, and counted as "
+                f"{float(self.weight.sum()):.3g}"
+            )
+        return text
+
+
+def groups_of(theta: Tensor) -> Tensor:
+    """Number rows so that equal ones share a number.
+
+    Args:
+        theta: Parameters, shape ``(n, d)``, or any numbers of groups, shape ``(n,)``.
+
+    Returns:
+        Numbers from 0 in the order of first appearance, on the CPU, shape ``(n,)``.
+    """
+    rows = theta.detach().tolist()
+    keys = [tuple(row) if isinstance(row, list) else row for row in rows]
+    numbers = {key: number for number, key in enumerate(dict.fromkeys(keys))}
+    return torch.tensor([numbers[key] for key in keys], dtype=torch.long)
+
+
+def one_of_each_group(groups: Tensor, *, seed: int) -> Tensor:
+    """Choose a row of each group at random, and tell whether each row was, ``(n,)``.
+
+    Example:
+        >>> one_of_each_group(torch.tensor([0, 1, 2]), seed=0)
+        tensor([True, True, True])
+    """
+    with seeded(seed):
+        order = torch.randperm(len(groups)).flip(0).to(groups.device)
+    # Of each group the last row in this order.
+    first = dict(zip(groups[order].tolist(), order.tolist(), strict=True))
+    chosen = torch.zeros_like(groups, dtype=torch.bool)
+    chosen[list(first.values())] = True
+    return chosen
+
+
+def split_pairs(
+    theta_or_groups: Tensor, validation_fraction: float
+) -> tuple[Tensor, Tensor]:
+    """Return the rows to train on and those held out, at random.
+
+    Groups are held out as a whole, in random order, as long as they bring the number of
+    rows nearer to the fraction asked for, or else the smallest. Of fewer than five
+    groups none is held out. The first argument is that of :func:`groups_of`.
+    """
+    groups = groups_of(theta_or_groups)
+    sizes = torch.bincount(groups)
+    order = torch.randperm(len(sizes))
+    # Without shared parameters this is `order` itself.
+    rows = order.argsort()[groups].argsort(stable=True)
+    is_held_out = torch.zeros(len(sizes), dtype=torch.bool)
+    if len(sizes) >= MIN_PAIRS_FOR_HOLDOUT:
+        wanted = max(1, round(validation_fraction * len(groups)))
+        is_held_out[order[groups_to_hold_out(wanted, sizes[order].tolist())]] = True
+    held_out = is_held_out[groups[rows]]
+    return rows[~held_out], rows[held_out]
+
+
+def split_groups(groups: Tensor, num_folds: int) -> list[Tensor]:
+    """Cut rows into folds at random, with the rows of a group in the same fold."""
+    # Not by scikit-learn's GroupKFold: it refuses fewer groups than folds, and in which
+    # order it takes groups of equal size depends on its version. Stored results depend
+    # on who was in which fold.
+    groups = groups_of(groups)
+    sizes = torch.bincount(groups)
+    order = torch.randperm(len(sizes))
+    num_folds = min(num_folds, len(order))
+    if len(order) == len(groups):
+        return list(order.tensor_split(num_folds))
+    fold_of, num_rows = torch.empty_like(order), [0] * num_folds
+    # The largest first, each to the fold with the fewest rows so far.
+    for group in order[sizes[order].argsort(descending=True, stable=True)].tolist():
+        fold = num_rows.index(min(num_rows))
+        fold_of[group] = fold
+        num_rows[fold] += int(sizes[group])
+    return [(fold_of[groups] == fold).nonzero()[:, 0] for fold in range(num_folds)]
+
+
+def groups_to_hold_out(wanted: int, sizes: list[int]) -> list[int]:
+    """Choose groups of these sizes, in this order, with about as many rows as wanted.
+
+    Some are chosen, but not all. If all groups are too large, it is the smallest.
+    """
+    chosen, total = [], 0
+    for index, size in enumerate(sizes):
+        if total + size - wanted <= wanted - total:
+            chosen.append(index)
+            total += size
+        if total >= wanted:
+            break
+    return chosen[: len(sizes) - 1] or [sizes.index(min(sizes))]
+
+
+def too_few_pairs(theta_or_groups: Tensor) -> str:
+    """Say in words, for a warning, that these pairs are too few to hold some out."""
+    groups = groups_of(theta_or_groups)
+    if (num_groups := len(groups.unique())) == len(groups):
+        return f"Only {len(groups)} calibration pair(s)"
+    return (
+        f"Only {num_groups} different parameters (or groups) among {len(groups)} "
+        "calibration pairs"
+    )
+
+
+def _map(function: Callable[..., Any], first: Table, *others: Table) -> Table:
+    """Apply a function to each field of dataclasses of one type."""
+    names = [field.name for field in fields(first)]  # type: ignore[arg-type]
+    columns = [[getattr(one, name) for one in (first, *others)] for name in names]
+    return type(first)(**{n: function(*c) for n, c in zip(names, columns, strict=True)})

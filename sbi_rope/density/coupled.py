@@ -1,0 +1,330 @@
+"""Mixtures over simulations, such as the posterior of RoPE."""
+
+import hashlib
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+
+from sbi_rope._random import seeded
+from sbi_rope._sbi import ConditionalDensityEstimator, embed, readable
+from sbi_rope._standardisation import warn_of_far_entries
+from sbi_rope.coupling import Coupling
+from sbi_rope.coupling.cost import row_blocks
+from sbi_rope.density.base import (
+    NUM_DRAWS,
+    Accept,
+    Density,
+    Mass,
+    batches,
+    normalising,
+    num_fitting,
+    variance_of_share,
+    without_nan,
+    without_nan_gradients,
+)
+from sbi_rope.ensemble import drawn, log_density
+from sbi_rope.errors import InvalidInputError, warn_user
+
+__all__ = ["Coupled", "OverSimulations"]
+
+TAIL_MASS = 1e-3
+
+
+class OverSimulations(Density):
+    r"""A density that is mixed over simulations, with weights that depend on x.
+
+    .. math:: \sum_j a_j(x)\, q(\theta \mid s_j)
+
+    A subclass defines :meth:`Density.embed` and :meth:`rows`. A matrix of the weights
+    of many observations is never held. The mass of each simulation inside the prior's
+    support is estimated once and kept, so that a density belongs to one prior.
+
+    Args:
+        density: :math:`q(\theta \mid s)`, an estimator conditioned on embeddings.
+        simulated: :math:`s_j`, shape ``(n_s, l)``.
+        condition_shape: Shape of one observation.
+        tail_mass: t. The smallest weights of an observation, which sum to at most this,
+            are left out of the density, which is then too small by at most t times the
+            largest density left out. 0 leaves out none.
+    """
+
+    simulated: Tensor
+
+    def __init__(
+        self,
+        density: ConditionalDensityEstimator,
+        simulated: Tensor,
+        condition_shape: Sequence[int],
+        *,
+        tail_mass: float = TAIL_MASS,
+    ) -> None:
+        super().__init__(density.input_shape, condition_shape)
+        self.density = density
+        self.tail_mass = tail_mass
+        self.register_buffer("simulated", simulated)
+        self._mass_of_each: dict[str, Tensor] = {}
+
+    @abstractmethod
+    def rows(self, z: Tensor) -> Tensor:
+        """Return the weights of the simulations, ``(b, n_s)``; rows sum to one."""
+
+    def log_q(self, theta: Tensor, z: Tensor) -> Tensor:
+        """Return the log density at theta ``(S, B, d)``, shape ``(S, B)``, float64."""
+        size = num_fitting(len(self.simulated))
+        blocks = zip(theta.split(size, dim=1), z.split(size), strict=True)
+        return torch.cat(
+            [self._log_q(points, self.rows(some)) for points, some in blocks], dim=1
+        )
+
+    def _log_q(self, theta: Tensor, weights: Tensor) -> Tensor:
+        row, column, log_weights = without_tail(weights, self.tail_mass)
+        return torch.cat(
+            [
+                _log_sum_exp(
+                    self._log_terms(some, row, column) + log_weights, row, len(weights)
+                )
+                for some in theta.split(num_fitting(len(row)))
+            ]
+        )
+
+    def _log_terms(self, theta: Tensor, row: Tensor, column: Tensor) -> Tensor:
+        """Evaluate K simulations at theta of their row, ``(S, b, d)`` to ``(S, K)``."""
+        log_terms = []
+        for pairs in batches(torch.arange(len(theta) * len(row), device=theta.device)):
+            sample, k = pairs // len(row), pairs % len(row)
+            points = without_nan_gradients(theta[sample, row[k]])
+            log_terms.append(
+                log_density(self.density, points, self.simulated[column[k]])
+            )
+        log_q = without_nan(torch.cat(log_terms)).double()
+        return log_q.reshape(len(theta), len(row))
+
+    @torch.no_grad()
+    def draw(self, z: Tensor, row: Tensor) -> Tensor:
+        """Draw once for each of n numbers of observations, ``(n, d)``."""
+        used, place = row.unique(return_inverse=True)
+        column, size = torch.empty_like(row), num_fitting(len(self.simulated))
+        for start, some in zip(
+            range(0, len(used), size), used.split(size), strict=True
+        ):
+            mine = (place >= start) & (place < start + size)
+            column[mine] = _chosen(self.rows(z[some]), place[mine] - start)
+        theta = [drawn(self.density, self.simulated[some]) for some in batches(column)]
+        return torch.cat(theta)
+
+    @torch.no_grad()
+    def mass(
+        self,
+        z: Tensor,
+        num_rows: int,
+        accept: Accept,
+        *,
+        show_progress_bars: bool = False,
+        **options: Any,
+    ) -> Mass:
+        r"""Return :math:`\sum_j a_j(x) Z_j`, with each :math:`Z_j` of 1024 draws."""
+        if "mass" not in self._mass_of_each:
+            self._mass_of_each["mass"] = self._estimated(accept, show_progress_bars)
+        of_each = self._mass_of_each["mass"]
+        variance = variance_of_share(of_each, NUM_DRAWS)
+        means, variances = [], []
+        for some in z.split(num_fitting(len(of_each))):
+            weights = self.rows(some).to(of_each)
+            means.append(weights @ of_each)
+            variances.append(weights.square() @ variance)
+        return Mass(torch.cat(means), torch.cat(variances))
+
+    def _estimated(self, accept: Accept, show_progress_bars: bool) -> Tensor:  # noqa: FBT001
+        """Return the mass of each simulation inside the support, ``(n_s,)``."""
+        mass = []
+        with seeded(0):
+            # Some densities take minutes here.
+            for some in normalising(
+                batches(self.simulated, share=NUM_DRAWS), show=show_progress_bars
+            ):
+                theta = self.density.sample(torch.Size((NUM_DRAWS,)), condition=some)
+                inside = accept(theta.reshape(-1, *self.input_shape))
+                mass.append(inside.reshape(NUM_DRAWS, -1).double().mean(dim=0))
+        return torch.cat(mass)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:  # noqa: FBT001, FBT002
+        moved = super()._apply(fn, recurse)
+        # Another dictionary: densities of single observations share the old one.
+        masses = self._mass_of_each.items()
+        self._mass_of_each = {k: mass.to(self.device) for k, mass in masses}
+        return moved
+
+
+class Coupled(OverSimulations):
+    r"""The mixture of RoPE, whose weights are the rows of a coupling.
+
+    .. math:: \sum_j \alpha_{ij}\, q(\theta \mid h(x_{s,j}))
+
+    An observation is found by its values. If several in the batch are equal, the row of
+    the first is used for all of them.
+
+    References:
+        | Addressing Misspecification in Simulation-based Inference through Data-driven
+          Calibration (Wehenkel et al., 2025), eq. 5
+        | https://arxiv.org/abs/2405.08719
+
+    Args:
+        density: :math:`q(\theta \mid s)`.
+        simulated: :math:`h(x_s)`, shape ``(n_s, l)``.
+        x_o: The real observations that were coupled, shape ``(n_o, *event)``.
+        net: The embedding net g of real observations, for unseen ones.
+        coupling: The coupling of :math:`g(x_o)` with the simulations.
+        unseen: What to do with an x outside the batch: ``"raise"`` an error, or
+            ``"extend"`` the coupling by a softmax row under the same potential.
+        tail_mass: t, as in :class:`OverSimulations`.
+    """
+
+    x_o: Tensor
+
+    def __init__(
+        self,
+        density: ConditionalDensityEstimator,
+        simulated: Tensor,
+        x_o: Tensor,
+        net: nn.Module,
+        coupling: Coupling,
+        *,
+        unseen: Literal["raise", "extend"] = "raise",
+        tail_mass: float = TAIL_MASS,
+    ) -> None:
+        super().__init__(density, simulated, x_o.shape[1:], tail_mass=tail_mass)
+        self.net = net
+        self.coupling = coupling
+        self.unseen: Literal["raise", "extend"] = unseen
+        self.register_buffer("x_o", x_o)
+        self._index: dict[bytes, int] = {}
+        for i, key in enumerate(_keys(x_o)):
+            self._index.setdefault(key, i)
+
+    @property
+    def coupled(self) -> list["Coupled"]:
+        """This density."""
+        return [self]
+
+    def embed(self, x: Tensor) -> Tensor:
+        """Embed observations, ``(n, *event)`` to ``(n, l)``.
+
+        Raises:
+            InvalidInputError: If an x is not in the batch and ``unseen="raise"``.
+        """
+        x = x.to(self.x_o)
+        found = [self._index.get(key, -1) for key in _keys(x)]
+        index = torch.tensor(found, dtype=torch.long, device=self.x_o.device)
+        z = self.coupling.real[index.clamp_min(0)]
+        new = index < 0
+        if new.any():
+            z[new] = self._extended(x[new])
+        return z
+
+    def _extended(self, x: Tensor) -> Tensor:
+        if self.unseen == "raise":
+            raise InvalidInputError(
+                f"Expected `x` of the batch that this posterior was built for; got "
+                f"{len(x)} others. Couple them with `rope.build_posterior(x)`."
+            )
+        warn_of_far_entries("x", x, self.net)
+        z = embed(self.net, x).to(self.coupling.real)
+        smallest = min(
+            float((1 / self.rows(some).square().sum(dim=1)).min())
+            for some in z.split(num_fitting(len(self.simulated)))
+        )
+        warn_user(
+            f"Extended the coupling to {len(x)} unseen observation(s). The smallest "
+            f"effective sample size is {smallest:.1f} of {len(self.simulated)} "
+            "simulations. If it is below about 50, couple the new batch instead."
+        )
+        return z
+
+    def readable(self, x: Tensor) -> Tensor:
+        """Tell which observations are in the batch, or can be read by the net."""
+        known = [key in self._index for key in _keys(x.to(self.x_o))]
+        return torch.tensor(known, device=x.device) | readable(self.net, x)
+
+    def rows(self, z: Tensor) -> Tensor:
+        """Return the weights of the simulations, ``(b, n_s)``; rows sum to one."""
+        weights = z.new_empty(len(z), len(self.simulated))
+        # Blocks of this size stay in the cache.
+        for block in row_blocks(z, len(self.simulated)):
+            distances = self.coupling.distances(z[block])
+            weights[block] = self.coupling.rows(z[block], distances=distances)
+        return weights
+
+    def restricted_to(self, index: int) -> "Coupled":
+        """Return the same density for one observation of the batch alone."""
+        row = torch.arange(len(self.x_o), device=self.x_o.device)[index][None]
+        one = Coupled(
+            self.density,
+            self.simulated,
+            self.x_o[row],
+            self.net if self.unseen == "extend" else nn.Identity(),
+            self.coupling.restricted_to(row),
+            unseen=self.unseen,
+            tail_mass=self.tail_mass,
+        )
+        one._mass_of_each = self._mass_of_each
+        return one
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:  # noqa: FBT001, FBT002
+        # `to` calls this for each module, but a coupling is not a module.
+        moved = super()._apply(fn, recurse)
+        self.coupling = self.coupling.to(self.x_o.device)
+        return moved
+
+
+def without_tail(weights: Tensor, tail_mass: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Return row, column and log weight of the entries of weights to evaluate.
+
+    The smallest weights of each row are left out, as long as they sum to at most
+    ``tail_mass``.
+    """
+    # The sum starts at the smallest weights, so that rounding does not lose them.
+    ascending, order = weights.sort(dim=1)
+    kept = (ascending.cumsum(dim=1, dtype=torch.double) > tail_mass) & (ascending > 0)
+    kept[:, -1] = True
+    return kept.nonzero()[:, 0], order[kept], ascending[kept].double().log()
+
+
+def _log_sum_exp(log_terms: Tensor, row: Tensor, num_rows: int) -> Tensor:
+    """Sum the terms ``(S, K)`` of each row, ``(S, num_rows)``."""
+    index = row.expand_as(log_terms)
+    largest = log_terms.new_full((len(log_terms), num_rows), -torch.inf)
+    largest = largest.scatter_reduce(1, index, log_terms.detach(), "amax")
+    largest = largest.where(torch.isfinite(largest), 0.0)
+    terms = (log_terms - largest.gather(1, index)).exp()
+    total = torch.zeros_like(largest).index_add(1, row, terms)
+    return total.log() + largest
+
+
+def _chosen(weights: Tensor, row: Tensor) -> Tensor:
+    """Draw a column of the weights ``(b, c)`` for each of n numbers of rows, ``(n,)``.
+
+    The cumulative weights of row i fill the interval [i, i + 1], so that one search
+    serves all rows. The offset i costs digits, hence the double precision.
+    """
+    count = weights.shape[1]
+    cumulative = weights.cumsum(dim=1, dtype=torch.double)
+    cumulative /= cumulative[:, -1:].clone()
+    cumulative += torch.arange(len(weights), device=row.device)[:, None]
+    # The last column of each row with a weight: rounding may carry a draw past it.
+    last = count - 1 - (weights > 0).flip(1).to(torch.int8).argmax(dim=1)
+    uniform = torch.rand(len(row), dtype=torch.double, device=row.device)
+    # right=True skips columns with a weight of zero.
+    found = torch.searchsorted(cumulative.flatten(), uniform + row, right=True)
+    return torch.minimum((found - row * count).clamp_min_(0), last[row])
+
+
+def _keys(x: Tensor) -> list[bytes]:
+    """Return a fingerprint of each row's values."""
+    # Adding zero turns -0.0 into 0.0. The two are equal, and so should their bytes be.
+    # The same holds for the NaN of missing entries, whose bits may differ.
+    rows = x.detach().cpu().flatten(1) + 0.0
+    rows = rows.where(~rows.isnan(), torch.nan).contiguous().numpy()
+    return [hashlib.blake2b(row.tobytes(), digest_size=16).digest() for row in rows]

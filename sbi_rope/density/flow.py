@@ -1,0 +1,290 @@
+r"""Trained flows behind their embedding nets, as one density."""
+
+import copy
+from collections.abc import Sequence
+from itertools import chain
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from sbi_rope._random import seeded
+from sbi_rope._sbi import (
+    ConditionalEstimator,
+    embedding_of,
+    headless,
+    readable,
+    with_embedding,
+)
+from sbi_rope.density.base import (
+    Density,
+    batches,
+    without_nan,
+    without_nan_gradients,
+)
+from sbi_rope.ensemble import Ensemble, drawn, embedded, log_density, loss_of
+
+__all__ = ["Flow"]
+
+# Observations in one call of the embedding nets.
+NET_BATCH = 1000
+
+
+class Flow(Density):
+    r"""The average of E flows, each behind an embedding net.
+
+    .. math:: \sum_e w_e\, q_e(\theta \mid h_e(x))
+
+    Flows of one architecture are trained, evaluated and sampled at once. They may share
+    one net, or the nets may share one density.
+
+    Args:
+        nets: The embedding nets, E or one.
+        densities: The densities behind them, E or one.
+        weights: w, which sum to one; equal if None.
+        input_shape: Shape of the parameters, ``(d,)``.
+        condition_shape: Shape of one observation.
+    """
+
+    weights: Tensor
+
+    def __init__(
+        self,
+        nets: Ensemble,
+        densities: Ensemble,
+        weights: Tensor | None = None,
+        *,
+        input_shape: Sequence[int],
+        condition_shape: Sequence[int],
+    ) -> None:
+        super().__init__(input_shape, condition_shape)
+        if len(nets) > 1 and not any(True for _ in nets.parameters()):
+            nets = nets[[0]]  # without parameters, all are the same
+        self.nets, self.densities = nets, densities
+        if weights is None:
+            count = max(len(nets), len(densities))
+            weights = torch.full((count,), 1.0 / count, dtype=torch.double)
+        stacks = chain(nets.parameters(), densities.parameters())
+        device = next((stack.device for stack in stacks), weights.device)
+        self.register_buffer("weights", weights.to(device))
+        self.eval().requires_grad_(requires_grad=False)
+
+    @classmethod
+    def of(
+        cls,
+        estimators: Sequence[ConditionalEstimator],
+        *,
+        nets: Sequence[nn.Module] | None = None,
+    ) -> "Flow":
+        """Return the average of estimators of one architecture; they are copied.
+
+        Args:
+            estimators: Estimators of sbi. The same one may appear several times.
+            nets: Embedding nets in the place of their own.
+
+        Raises:
+            UnsupportedPosteriorError: If one has no embedding of x.
+        """
+        first = estimators[0]
+        own = {id(one): embedding_of(one) for one in estimators}
+        nets = [own[id(one)] for one in estimators] if nets is None else nets
+        bare = {id(one): headless(one) for one in estimators}
+        densities = [bare[id(one)] for one in estimators]
+        with seeded(0), torch.no_grad():
+            x = torch.randn(3, *first.condition_shape).to(next(first.parameters()))
+            z = embedded(copy.deepcopy(nets[0]).eval(), x)
+            # A vector field cannot be drawn from here, but there is one only.
+            theta = drawn(densities[0], z) if len(densities) > 1 else z
+        return cls(
+            Ensemble(nets, embedded, (x,)),
+            Ensemble(densities, log_density, (theta, z)),
+            input_shape=first.input_shape,
+            condition_shape=first.condition_shape,
+        )
+
+    @classmethod
+    def joined(cls, flows: "Sequence[Flow]") -> "Flow":
+        """Return the average of flows that come from one NPE, with equal weights.
+
+        Where all have the same net, or the same density, the average has one, too.
+        """
+        parts = []
+        for of_each in zip(*((one.nets, one.densities) for one in flows), strict=True):
+            first = of_each[0]
+            if all(len(one) == 1 and _are_equal(one, first) for one in of_each):
+                parts.append(copy.deepcopy(first))
+                continue
+            full = [
+                one if len(one) > 1 else one[[0] * flow.num_members]
+                for one, flow in zip(of_each, flows, strict=True)
+            ]
+            parts.append(Ensemble.joined(full))
+        weights = torch.cat([one.weights / len(flows) for one in flows])
+        nets, densities = parts
+        return flows[0]._with(nets, densities, weights)
+
+    @property
+    def num_members(self) -> int:
+        """The number of flows, E."""
+        return len(self.weights)
+
+    def __getitem__(self, numbers: Tensor | Sequence[int]) -> "Flow":
+        """Return the average of copies of some of the flows."""
+        some = torch.as_tensor(numbers)
+        weights = self.weights[some]
+        return self._with(
+            self.nets[some] if len(self.nets) > 1 else copy.deepcopy(self.nets),
+            self.densities[some]
+            if len(self.densities) > 1
+            else copy.deepcopy(self.densities),
+            weights / weights.sum(),
+        )
+
+    def made_of(
+        self, members: Sequence[tuple[int, int]], nets: Ensemble | None = None
+    ) -> "Flow":
+        """Return the average of copies of some nets and densities, by their numbers.
+
+        Args:
+            members: For each flow, the number of its net and of its density.
+            nets: Nets in the place of those of this flow.
+        """
+        of_nets, of_densities = zip(*members, strict=True)
+        own = self.nets if nets is None else nets
+        return self._with(own[of_nets], self.densities[of_densities])
+
+    def behind_one_net(self, numbers: Sequence[int]) -> "Flow":
+        """Return the average of copies of some densities behind the net they share."""
+        return self._with(copy.deepcopy(self.nets), self.densities[numbers])
+
+    def _with(
+        self, nets: Ensemble, densities: Ensemble, weights: Tensor | None = None
+    ) -> "Flow":
+        return Flow(
+            nets,
+            densities,
+            weights,
+            input_shape=self.input_shape,
+            condition_shape=self.condition_shape,
+        )
+
+    def estimator(self, like: ConditionalEstimator | None = None) -> Any:
+        """Return the first flow as an estimator of sbi.
+
+        Args:
+            like: The estimator that it was made of, to get one of the same class.
+        """
+        density, net = self.densities.member(0), self.nets.member(0)
+        if like is None:
+            shape = self.condition_shape
+            return with_embedding(density, net, condition_shape=shape).eval()
+        copied = copy.deepcopy(like)
+        headless(copied).load_state_dict(density.state_dict())  # shares its tensors
+        return with_embedding(copied, net).eval()
+
+    # --- training ---
+
+    def losses(self, theta: Tensor, x: Tensor) -> Tensor:
+        """Return the losses of each flow at its own pairs.
+
+        Args:
+            theta: Parameters, shape ``(E, B, d)``.
+            x: Observations, shape ``(E, B, *event)``.
+
+        Returns:
+            Shape ``(E, B)``.
+        """
+        return self.losses_given(theta, self.embeddings(x))
+
+    def embeddings(self, x: Tensor) -> Tensor:
+        """Embed the observations of each flow, ``(E, B, *event)`` to ``(E, B, l)``."""
+        z = self.nets.answer(embedded, x.flatten(0, 1))
+        return z.unflatten(0, x.shape[:2])
+
+    def losses_given(self, theta: Tensor, z: Tensor) -> Tensor:
+        """Return the losses at embedded observations, shape ``(E, B, l)``."""
+        losses = self.densities.answer(loss_of, theta.flatten(0, 1), z.flatten(0, 1))
+        return losses.reshape(theta.shape[:2])
+
+    # --- density ---
+
+    @torch.no_grad()
+    def embed(self, x: Tensor) -> Tensor:
+        """Return the embeddings of observations, ``(B, E, l)`` or ``(B, 1, l)``."""
+        count = len(self.nets)
+        parts = []
+        for some in x.split(max(1, NET_BATCH // count)):
+            rows = some.repeat(count, *[1] * (x.ndim - 1))
+            parts.append(self.nets.answer(embedded, rows).unflatten(0, (count, -1)))
+        return torch.cat(parts, dim=1).transpose(0, 1)
+
+    def log_q(self, theta: Tensor, z: Tensor) -> Tensor:
+        """Return the log density at theta ``(S, B, d)``, shape ``(S, B)``, float64."""
+        return (self.log_probs(theta, z) + self.weights.log()[:, None, None]).logsumexp(
+            0
+        )
+
+    def log_probs(self, theta: Tensor, z: Tensor) -> Tensor:
+        """Return the log density of each flow at theta, ``(E, S, B)``, float64."""
+        shape, count = theta.shape[:2], self.num_members
+        theta = theta.flatten(0, 1)
+        row = torch.arange(shape[1], device=theta.device).repeat(shape[0])
+        parts = []
+        for pairs in batches(
+            torch.arange(len(theta), device=theta.device), share=count
+        ):
+            of_each = z[row[pairs]].expand(-1, count, -1).transpose(0, 1)
+            points = theta[pairs].expand(count, -1, -1).flatten(0, 1)
+            log_probs = self.densities.answer(
+                log_density, without_nan_gradients(points), of_each.flatten(0, 1)
+            )
+            parts.append(log_probs.double().reshape(count, -1))
+        return without_nan(torch.cat(parts, dim=1)).reshape(count, *shape)
+
+    @torch.no_grad()
+    def draw(self, z: Tensor, row: Tensor) -> Tensor:
+        """Draw once for each of n numbers of observations, ``(n, d)``."""
+        theta = []
+        for some in batches(row):
+            probabilities = self.weights.cpu()
+            member = torch.multinomial(probabilities, len(some), replacement=True)
+            theta.append(self._drawn(z, some, member.to(row.device)))
+        return torch.cat(theta) if theta else z.new_empty(0, *self.input_shape)
+
+    def _drawn(self, z: Tensor, row: Tensor, member: Tensor) -> Tensor:
+        """Draw from the flow of each number, in one network of padded rows."""
+        of_net = member if z.shape[1] > 1 else torch.zeros_like(member)
+        if len(self.densities) == 1:
+            return self.densities.answer(drawn, z[row, of_net])
+        counts = member.bincount(minlength=self.num_members)
+        order = member.argsort(stable=True)
+        place = torch.arange(len(row), device=row.device)
+        place = place - (counts.cumsum(0) - counts)[member[order]]
+        padded = row.new_zeros(self.num_members, int(counts.max()))
+        padded[member[order], place] = order
+        theta = self.densities.answer(drawn, z[row, of_net][padded].flatten(0, 1))
+        theta = theta.reshape(*padded.shape, -1)[member[order], place]
+        return theta[order.argsort()]
+
+    def readable(self, x: Tensor) -> Tensor:
+        """Tell which observations all nets can read."""
+        return readable(_SideBySide(self.nets), x)
+
+
+def _are_equal(one: Ensemble, other: Ensemble) -> bool:
+    pairs = zip(one.parameters(), other.parameters(), strict=True)
+    return one is other or all(torch.equal(*pair) for pair in pairs)
+
+
+class _SideBySide(nn.Module):
+    """All nets of an ensemble, side by side, as one net."""
+
+    def __init__(self, nets: Ensemble) -> None:
+        super().__init__()
+        self.nets = nets
+
+    def forward(self, x: Tensor) -> Tensor:
+        count = len(self.nets)
+        rows = x.repeat(count, *[1] * (x.ndim - 1))
+        z = self.nets.answer(embedded, rows).unflatten(0, (count, -1))
+        return z.transpose(0, 1).flatten(1)

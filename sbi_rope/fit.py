@@ -1,0 +1,417 @@
+"""The one loop in which all networks of this package are trained."""
+
+import math
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from sbi_rope._progress import progress_bar
+from sbi_rope.data import MIN_PAIRS_FOR_HOLDOUT, too_few_pairs
+from sbi_rope.errors import RoPEWarning, warn_user
+from sbi_rope.settings import Count, Level, Positive, Settings
+
+__all__ = [
+    "EPOCHS_WITHOUT_HOLDOUT",
+    "Courses",
+    "History",
+    "Training",
+    "epochs_on_pairs",
+    "fit",
+    "fit_on_pairs",
+    "shuffled",
+    "without_warning_of_few_pairs",
+]
+
+# Without a hold-out nothing says when to stop, so little is risked.
+EPOCHS_WITHOUT_HOLDOUT = 50
+# More epochs than this are no limit.
+LARGEST_LIMIT = 10**6
+# A course that made the loss worse is repeated from the better state with this share of
+# its rate, and not more often than so many times.
+LOWER, MAX_LOWERED = 0.3, 2
+# Of Adam, as in torch.
+BETAS, EPSILON = (0.9, 0.999), 1e-8
+
+
+@dataclass(frozen=True, kw_only=True)
+class Training(Settings):
+    """How a network is trained, in the words of sbi's ``train``; Adam throughout.
+
+    Args:
+        training_batch_size: Pairs behind each gradient step, at most all of them.
+        learning_rate: Step size of Adam.
+        validation_fraction: Share of the data that is held out.
+        stop_after_epochs: Epochs without improvement on the held-out data after which
+            to stop.
+        max_num_epochs: Most passes over the training data; sbi's trainers make two at
+            least.
+        clip_max_norm: Largest norm of a gradient; None does not clip.
+
+    Raises:
+        InvalidInputError: If an argument is outside its range.
+    """
+
+    training_batch_size: Count = 200
+    learning_rate: Positive = 5e-4
+    validation_fraction: Level = 0.1
+    stop_after_epochs: Count = 20
+    max_num_epochs: Count = 2**31 - 1
+    clip_max_norm: Positive | None = 5.0
+
+
+@dataclass(frozen=True)
+class History:
+    """The course of a training, for plotting.
+
+    An epoch is a pass over the training data. For ``CalibrationFinetuner`` it is one
+    gradient step over all pairs. What sbi's trainers report starts after the first
+    epoch, which is number 0 then.
+
+    Attributes:
+        training_loss: Mean loss over the training data during each epoch; of a
+            fine-tuning, the distance in units of the embedding, with rehearsal the
+            weighted sum of both distances.
+        validation_loss: Loss over the held-out data before each epoch and after the
+            last; empty without a hold-out.
+        best_epoch: Number of epochs after which the kept net was reached; 0 is the
+            starting point.
+        learning_rate: The learning rate of this course, the best of those tried.
+    """
+
+    training_loss: list[float] = field(repr=False)
+    validation_loss: list[float] = field(repr=False)
+    best_epoch: int
+    learning_rate: float
+
+    @property
+    def kept_validation_loss(self) -> float:
+        """The validation loss of the kept net; 0 without a hold-out, inf for NaN."""
+        loss = self.validation_loss[self.best_epoch] if self.validation_loss else 0.0
+        return math.inf if math.isnan(loss) else loss
+
+    def __repr__(self) -> str:
+        loss, what = self.validation_loss, "validation_loss"
+        if not loss:
+            loss, what = self.training_loss, "training_loss"
+        best = min(self.best_epoch, len(loss) - 1)
+        return (
+            f"History({what} {loss[0]:.3g} -> {loss[best]:.3g}, "
+            f"best_epoch={self.best_epoch}, learning_rate={self.learning_rate:g})"
+        )
+
+
+@dataclass(frozen=True)
+class Courses:
+    """Trainings that follow each other, each from the better of two states.
+
+    In a course the step size falls to zero. A course after which the loss is higher is
+    not kept: the member goes on from the better state with a smaller step size.
+
+    Attributes:
+        compared: The loss of each member, ``(E,)``, on data that is always the same.
+        min_gain: What a course has to gain for another to follow.
+        min_fall: How far the training loss has to fall from the third to the last
+            quarter of a course for another to follow.
+        max_num: The largest number of courses.
+    """
+
+    compared: Callable[[], Tensor]
+    min_gain: float
+    min_fall: float = -math.inf
+    max_num: int = 12
+
+
+def fit(
+    network: nn.Module,
+    batches: Callable[[int], Iterable[tuple[Any, ...]]],
+    loss: Callable[..., Tensor],
+    training: Training,
+    *,
+    validation_loss: Callable[[], Tensor] | None = None,
+    courses: Courses | None = None,
+    learning_rates: Sequence[float] | None = None,
+    max_num_epochs: int | None = None,
+    in_training_mode: bool = True,
+    decay: bool = False,
+    label: str,
+    show_progress_bars: bool,
+) -> list[History]:
+    """Train networks in place with Adam; leave each at its best on what it holds out.
+
+    The starting point competes, so that training never returns something worse than it
+    started from on the held-out data. Without a hold-out the last state is kept. A
+    member of an ensemble stops by itself, and a loss that is not finite stops only the
+    member whose loss it is.
+
+    Args:
+        network: What to train: a module, or E members whose parameters are stacked.
+            Parameters that require no gradient are left alone, unless none does.
+        batches: Given the number of the epoch, the batches to pass over.
+        loss: Of a batch, the mean loss of each member, ``(E,)``, or of the module.
+        training: Learning rate and so on; ``batches`` has the size of the batches.
+        validation_loss: The loss over the held-out data, if there are any.
+        courses: Instead of these, how courses of so many epochs are compared.
+        learning_rates: One for each member; that of ``training`` if None.
+        max_num_epochs: Instead of that of ``training``.
+        in_training_mode: Whether dropout and batch statistics are active in training.
+        decay: Whether the step size falls to zero, along a cosine over all epochs.
+        label: What the progress bar and warnings call it.
+        show_progress_bars: Whether to show the course of the loss.
+
+    Returns:
+        The losses of each member, and the epoch that was kept.
+    """
+    if not any(parameter.requires_grad for parameter in network.parameters()):
+        network.requires_grad_()
+    optimiser = _Adam(network, training.clip_max_norm)
+    state, E = [optimiser.values, *_buffers(network)], optimiser.num_members
+    given = learning_rates or [training.learning_rate] * E
+    rates = torch.tensor(given, dtype=torch.double)
+    length = max_num_epochs or training.max_num_epochs
+    last = length * courses.max_num if courses else length
+    scored, every = (courses.compared, length) if courses else (validation_loss, 1)
+    training_loss: list[Tensor] = []
+    scores: list[Tensor] = []
+    best = [value.clone() for value in state]
+    best_loss = torch.full((E,), math.inf, dtype=torch.double)
+    best_epoch, num_lowered = torch.zeros(2, E, dtype=torch.long)
+    going = torch.ones(E, dtype=torch.bool)
+    progress = progress_bar(
+        range(last + 1),
+        show=show_progress_bars,
+        # Training without a limit ends where the loss does not fall any more.
+        total=last if last < LARGEST_LIMIT else math.inf,
+        desc=label,
+    )
+    network.eval()
+    for epoch in progress:
+        if scored is not None and epoch % every == 0:
+            with torch.no_grad():
+                scores.append(scored().detach().double().cpu().reshape(E))
+            gain = best_loss - scores[-1]
+            better = going & (gain > 0)  # never for NaN
+            best_loss = scores[-1].where(better, best_loss)
+            best_epoch[better] = epoch
+            for kept, value in zip(best, state, strict=True):
+                kept[better] = value[better]
+            if courses is None:
+                going &= epoch - best_epoch < training.stop_after_epochs
+            elif epoch:
+                worse = going & ~better
+                for kept, value in zip(best, state, strict=True):
+                    value[worse] = kept[worse]
+                rates[worse] *= LOWER
+                num_lowered[worse] += 1
+                again = worse & (num_lowered <= MAX_LOWERED)
+                recent = torch.stack(training_loss[-length:])
+                quarter = max(1, length // 4)
+                fall = recent[-2 * quarter : -quarter].mean(0) - recent[-quarter:].mean(
+                    0
+                )
+                fall = fall.nan_to_num(torch.inf)  # of a single epoch
+                unsettled = (gain > courses.min_gain) & (fall > courses.min_fall)
+                going &= unsettled | again
+                optimiser.restart()
+        elif scored is None:
+            best_epoch[going] = epoch
+        if epoch == last or not going.any():
+            break
+        part = epoch % length / length if decay or courses else 0.0
+        factor = 0.5 * (1 + math.cos(math.pi * part))
+        of_batches = []
+        if in_training_mode:  # walking through the modules takes as long as a step
+            network.train()
+        with differentiable(network):
+            for batch in batches(epoch):
+                value = loss(*batch).reshape(E)
+                going &= torch.isfinite(value.detach()).cpu()
+                optimiser.step(value, factor * rates * going)
+                of_batches.append(value.detach())
+        if in_training_mode:
+            network.eval()
+        training_loss.append(torch.stack(of_batches).double().mean(dim=0).cpu())
+        progress.set_postfix(
+            loss=float((scores or training_loss)[-1].nanmean()), refresh=False
+        )
+    progress.close()
+    if training_loss and not (lost := torch.isfinite(training_loss[-1])).all():
+        warn_user(
+            f"{label}: the loss of {int((~lost).sum())} of {E} networks is not finite; "
+            "their best states before are kept. Use a smaller learning rate."
+        )
+    if scored is not None:
+        for kept, value in zip(best, state, strict=True):
+            value.copy_(kept)
+    optimiser.finish()
+    network.requires_grad_(requires_grad=False)
+    return [
+        History(
+            [float(losses[e]) for losses in training_loss],
+            [] if courses else [float(losses[e]) for losses in scores],
+            int(best_epoch[e]),
+            given[e],
+        )
+        for e in range(E)
+    ]
+
+
+def fit_on_pairs(
+    estimator: Any,
+    theta: Tensor,
+    x: Tensor,
+    split: tuple[Tensor, Tensor],
+    *,
+    training: Training,
+    in_training_mode: bool,
+    label: str,
+    show_progress_bars: bool,
+) -> History:
+    """Train an estimator on calibration pairs alone, in place.
+
+    The split has the rows to train on and those held out. Without the latter, training
+    stops early.
+    """
+    train, held_out = split
+
+    def batches(epoch: int) -> Iterator[tuple[Tensor]]:
+        return zip(shuffled(train, training.training_batch_size), strict=True)
+
+    def loss(rows: Tensor) -> Tensor:
+        return estimator.loss(theta[rows], condition=x[rows]).mean()
+
+    [history] = fit(
+        estimator,
+        batches,
+        loss,
+        training,
+        validation_loss=(lambda: loss(held_out)) if len(held_out) else None,
+        max_num_epochs=epochs_on_pairs(theta, held_out, training.max_num_epochs),
+        in_training_mode=in_training_mode,
+        label=label,
+        show_progress_bars=show_progress_bars,
+    )
+    return history
+
+
+class _Adam:
+    """Adam with a step size, and a limit on the gradient's norm, for each member.
+
+    While it is in use, the parameters are views of one tensor.
+
+    Attributes:
+        values: The parameters of each member, side by side, ``(E, P)``.
+    """
+
+    def __init__(self, network: nn.Module, clip_max_norm: float | None) -> None:
+        self.parameters = [one for one in network.parameters() if one.requires_grad]
+        self.clip_max_norm = clip_max_norm
+        self.num_members = getattr(network, "num_members", 1)
+        self.values = self._side_by_side(self.parameters).detach()
+        self._show(self.values)
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget all gradients."""
+        self.first = torch.zeros_like(self.values)
+        self.second = torch.zeros_like(self.values)
+        self.count = 0
+
+    def finish(self) -> None:
+        """Give each parameter memory of its own again."""
+        for parameter in self.parameters:
+            parameter.data = parameter.data.clone(memory_format=torch.contiguous_format)
+
+    def step(self, losses: Tensor, rates: Tensor) -> None:
+        """Lower the losses of all members, ``(E,)``, each with its step size."""
+        finite = torch.isfinite(losses.detach())
+        gradients = torch.autograd.grad(
+            losses[finite].sum(), self.parameters, allow_unused=True
+        )
+        with torch.no_grad():
+            gradient = self._side_by_side(
+                [
+                    torch.zeros_like(parameter) if one is None else one
+                    for one, parameter in zip(gradients, self.parameters, strict=True)
+                ]
+            )
+            self._update(gradient, rates.where(finite.cpu(), 0.0).to(gradient))
+
+    def _update(self, gradient: Tensor, rates: Tensor) -> None:
+        norm = gradient.norm(dim=1, keepdim=True)
+        if not torch.isfinite(norm).all():
+            norm = gradient.nan_to_num_(0.0, 0.0, 0.0).norm(dim=1, keepdim=True)
+        if self.clip_max_norm is not None:
+            gradient *= (self.clip_max_norm / (norm + 1e-6)).clamp(max=1.0)
+        self.count += 1
+        self.first.lerp_(gradient, 1 - BETAS[0])
+        self.second.mul_(BETAS[1]).addcmul_(gradient, gradient, value=1 - BETAS[1])
+        scale = self.second.sqrt().div_(math.sqrt(1 - BETAS[1] ** self.count))
+        size = rates / (1 - BETAS[0] ** self.count)
+        self.values -= self.first / scale.add_(EPSILON) * size[:, None]
+
+    def _side_by_side(self, tensors: Sequence[Tensor]) -> Tensor:
+        return torch.cat([one.reshape(self.num_members, -1) for one in tensors], dim=1)
+
+    def _show(self, values: Tensor) -> None:
+        """Make the parameters views of these values."""
+        sizes = [one.numel() // self.num_members for one in self.parameters]
+        for parameter, part in zip(
+            self.parameters, values.split(sizes, 1), strict=True
+        ):
+            parameter.data = part.view(parameter.shape)
+
+
+def _buffers(network: nn.Module) -> list[Tensor]:
+    """Return the buffers of a module, each ``(1, ...)``; members of ensembles share."""
+    stacked = hasattr(network, "num_members")
+    return [] if stacked else [buffer.detach()[None] for buffer in network.buffers()]
+
+
+@contextmanager
+def differentiable(module: nn.Module) -> Iterator[None]:
+    """Compute the gradients of a module, also where the caller has switched them off.
+
+    cuDNN has no gradients of recurrent nets in evaluation mode, which the slower code
+    of torch has.
+    """
+    is_recurrent = any(isinstance(part, nn.RNNBase) for part in module.modules())
+    is_slow = is_recurrent and not module.training
+    context = torch.backends.cudnn.flags(enabled=False) if is_slow else nullcontext()
+    with torch.enable_grad(), context:
+        yield
+
+
+def shuffled(rows: Tensor, size: int) -> Iterator[Tensor]:
+    """Pass over rows in random order, in batches of a size."""
+    yield from rows[torch.randperm(len(rows)).to(rows.device)].split(size)
+
+
+def epochs_on_pairs(
+    theta_or_groups: Tensor, held_out: Tensor, max_num_epochs: int
+) -> int:
+    """Return how many epochs to train on pairs for; few if none are held out.
+
+    Warns then, that nothing chooses the best net.
+    """
+    if len(held_out):
+        return max_num_epochs
+    warn_user(
+        f"{too_few_pairs(theta_or_groups)}: none is held out, and tuning stops after "
+        f"at most {EPOCHS_WITHOUT_HOLDOUT} epochs. Append at least "
+        f"{MIN_PAIRS_FOR_HOLDOUT} pairs of different parameters to choose the best net "
+        "on a hold-out."
+    )
+    return min(max_num_epochs, EPOCHS_WITHOUT_HOLDOUT)
+
+
+@contextmanager
+def without_warning_of_few_pairs() -> Iterator[None]:
+    """Train on some of the user's pairs, whose number the user did not choose."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Only .* none is held out", RoPEWarning)
+        yield

@@ -1,0 +1,788 @@
+"""What holds for every kind of density, and each kind against brute force."""
+
+import copy
+import math
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from sbi.inference import DirectPosterior
+from sbi.utils import MultipleIndependent
+from torch import Size, Tensor, nn
+from torch.distributions import Distribution, Gamma, Independent, Normal
+
+from sbi_rope import MixturePosterior, load
+from sbi_rope._sbi import embedding_of, estimator_of, headless, is_bounded
+from sbi_rope.density import (
+    Coupled,
+    Density,
+    Flow,
+    Mixture,
+    Prior,
+    base,
+    density_of,
+    rejection,
+)
+from sbi_rope.errors import (
+    InvalidInputError,
+    RoPEWarning,
+    SamplingError,
+    UnsupportedPosteriorError,
+)
+from tests import gaussian, problems
+
+QUIET: dict[str, Any] = {"show_progress_bars": False}
+FAMILIES = ["mdn", "maf", "nsf", "zuko_nsf"]
+
+
+def npe(family: str = "nsf") -> Any:
+    return estimator_of(problems.npe_posterior(family, dim=1))
+
+
+def moved(network: Any, seed: int) -> Any:
+    """A copy with other weights."""
+    other = copy.deepcopy(network)
+    with torch.random.fork_rng(), torch.no_grad():
+        torch.manual_seed(seed)
+        for weight in other.parameters():
+            weight.add_(0.05 * torch.randn_like(weight))
+    return other
+
+
+def several(family: str) -> Flow:
+    return Flow.of([npe(family), moved(npe(family), 1), moved(npe(family), 2)])
+
+
+def with_nets(family: str) -> Flow:
+    h = embedding_of(npe(family))
+    return Flow.of([npe(family)], nets=[h, moved(h, 1), moved(h, 2)])
+
+
+def batch() -> Tensor:
+    with torch.random.fork_rng():
+        torch.manual_seed(3)
+        return problems.simulate(problems.box(1).sample((4,))) + 0.2
+
+
+def coupled(family: str | None = None, **options: Any) -> Coupled:
+    """Four observations and nine simulations."""
+    with torch.random.fork_rng():
+        torch.manual_seed(4)
+        weights = (2 * torch.randn(4, 9)).double().softmax(dim=1)
+        if family is None:
+            density: Any = problems.Gaussians(1)
+            simulated = problems.embeddings_of(1, 9)
+        else:
+            density = headless(copy.deepcopy(npe(family)))
+            h = embedding_of(npe(family))
+            simulated = h(problems.simulate(problems.box(1).sample((9,)))).detach()
+        coupling = problems.coupling_of(weights, simulated)
+        net = nn.Linear(3, simulated.shape[1])
+    return Coupled(density, simulated, batch(), net, coupling, **options)
+
+
+def mixture(*weights: float) -> Mixture:
+    parts = [Prior(problems.box(1), (3,)), several("nsf"), coupled(tail_mass=0.0)]
+    return Mixture(parts, weights or (0.2, 0.5, 0.3))
+
+
+CASES: dict[str, Callable[[], Density]] = {
+    "prior": lambda: Prior(problems.box(1), (3,)),
+    **{f"one {name}": lambda name=name: Flow.of([npe(name)]) for name in FAMILIES},
+    **{f"several {name}": lambda name=name: several(name) for name in FAMILIES},
+    **{f"nets of {name}": lambda name=name: with_nets(name) for name in FAMILIES},
+    "coupled": coupled,
+    **{f"coupled {name}": lambda name=name: coupled(name) for name in FAMILIES},
+    "mixture": mixture,
+    "mixture of mixtures": lambda: Mixture([mixture(), several("maf")], [0.5, 0.5]),
+}
+every_kind = pytest.mark.parametrize("make", CASES.values(), ids=CASES)
+A_FEW = ["prior", "one mdn", "several nsf", "nets of maf", "coupled", "mixture"]
+a_few = pytest.mark.parametrize("make", [CASES[name] for name in A_FEW], ids=A_FEW)
+
+
+def posterior_of(density: Density) -> MixturePosterior:
+    return MixturePosterior(density, problems.box(1))
+
+
+def counted(target: Any, name: str, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Record the arguments of every call of a method."""
+    original, calls = getattr(target, name), []
+
+    def record(*arguments: Any, **options: Any) -> Any:
+        calls.append(arguments)
+        return original(*arguments, **options)
+
+    monkeypatch.setattr(target, name, record)
+    return calls
+
+
+# --- every kind ---
+
+
+@every_kind
+def test_it_integrates_to_one_and_samples_follow_it(
+    make: Callable[[], Density],
+) -> None:
+    posterior, x = posterior_of(make()), batch()
+    edges = torch.linspace(-1, 1, 401)
+    theta = (edges[1:] + edges[:-1])[:, None, None] / 2
+    density = posterior.log_prob_batched(theta.expand(-1, 4, -1), x).double().exp()
+    shares = density.reshape(8, 50, 4).sum(dim=1) / 200
+    error = posterior.leakage(x).standard_error / posterior.leakage(x).mass
+    assert ((shares.sum(dim=0) - 1).abs() < 4.5 * error + 0.01).all()
+    n = 3000
+    draws = posterior.sample_batched((n,), x, **QUIET)[..., 0]
+    bins = ((draws + 1) * 4).long().clamp(0, 7)
+    found = nn.functional.one_hot(bins, 8).double().mean(dim=0).T
+    shares = shares / shares.sum(dim=0)
+    deviation = (shares * (1 - shares) / n).sqrt()
+    assert ((found - shares).abs() < 4.5 * deviation + 0.005).all()
+
+
+@every_kind
+def test_a_row_does_not_depend_on_its_batch_or_on_how_it_is_cut(
+    make: Callable[[], Density], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    density, x = make(), batch()
+    theta = 1.8 * torch.rand(5, 4, 1) - 0.9
+    expected = density.log_prob(theta, x)
+    assert expected.shape == (5, 4)
+    for i in range(4):
+        alone = density.log_prob(theta[:, i : i + 1], x[i : i + 1])
+        assert torch.allclose(alone[:, 0], expected[:, i], atol=1e-4)
+    # One observation serves all theta, and one theta all observations.
+    many = density.log_prob(theta[:, :1].expand(-1, 4, -1), x[:1])
+    assert torch.allclose(many, expected[:, :1].expand(-1, 4), atol=1e-4)
+    for entries, pairs in ((1, 1), (20, 7)):
+        for module in (base, rejection):
+            monkeypatch.setattr(module, "MAX_ENTRIES", entries)
+        monkeypatch.setattr(base, "CPU_BATCH", pairs)
+        assert torch.allclose(density.log_prob(theta, x), expected, atol=1e-4)
+        draws = posterior_of(density).sample_batched((3,), x, **QUIET)
+        assert draws.shape == (3, 4, 1)
+        assert len(draws.flatten().unique()) == draws.numel()
+
+
+@every_kind
+def test_copies_and_files_answer_the_same(
+    make: Callable[[], Density], tmp_path: Path
+) -> None:
+    posterior, x = posterior_of(make()), batch()
+    theta = 1.8 * torch.rand(5, 4, 1) - 0.9
+    expected = posterior.log_prob_batched(theta, x)
+    torch.manual_seed(1)
+    draws = posterior.sample_batched((6,), x, **QUIET)
+    posterior.save(tmp_path / "posterior.pt")
+    trusted = (problems.Gaussians, problems.TableCoupling)
+    there = copy.deepcopy(posterior)
+    there.to("cpu")
+    for other in (
+        copy.deepcopy(posterior),
+        pickle.loads(pickle.dumps(posterior)),
+        load(tmp_path / "posterior.pt", trusted=trusted),
+        there,
+    ):
+        assert torch.equal(other.log_prob_batched(theta, x), expected)
+        torch.manual_seed(1)
+        assert torch.equal(other.sample_batched((6,), x, **QUIET), draws)
+
+
+@pytest.mark.gpu
+@every_kind
+def test_it_moves_to_a_gpu_and_back(make: Callable[[], Density]) -> None:
+    posterior, x = posterior_of(make()), batch()
+    theta = 1.8 * torch.rand(5, 4, 1) - 0.9
+    expected = posterior.log_prob_batched(theta, x, norm_posterior=False)
+    posterior.to("cuda")
+    found = posterior.log_prob_batched(theta.cuda(), x.cuda(), norm_posterior=False)
+    assert torch.allclose(found.cpu(), expected, atol=1e-3)
+    assert posterior.sample_batched((3,), x.cuda(), **QUIET).is_cuda
+    assert posterior.leakage(x.cuda()).mass.is_cuda
+    posterior.to("cpu")
+    again = posterior.log_prob_batched(theta, x, norm_posterior=False)
+    assert torch.equal(again, expected)
+
+
+@a_few
+def test_its_mass_is_the_share_of_its_draws_inside_and_keeps_the_random_state(
+    make: Callable[[], Density],
+) -> None:
+    density, x = make(), batch()
+    posterior = posterior_of(density)
+    state = torch.get_rng_state()
+    mass = posterior.leakage(x)
+    assert torch.equal(posterior.leakage(x).mass, mass.mass)
+    assert torch.equal(torch.get_rng_state(), state)
+    draws = density.sample(Size((4000,)), x)
+    share = (draws.abs() <= 1).double().mean(dim=(0, 2))
+    error = (mass.variance + share * (1 - share) / 4000).sqrt()
+    assert ((mass.mass - share).abs() < 4.5 * error + 1e-3).all()
+    assert (mass.standard_error < 0.02).all()
+    assert (posterior.sample_batched((500,), x, **QUIET).abs() <= 1).all()
+    theta = draws.clamp(-0.99, 0.99)[:5]
+    free = posterior.log_prob_batched(theta, x, norm_posterior=False)
+    found = free - posterior.log_prob_batched(theta, x)
+    assert torch.allclose(found, mass.mass.log().float().expand(5, -1), atol=1e-5)
+
+
+def calls_of_estimator(
+    density: Density, monkeypatch: pytest.MonkeyPatch
+) -> tuple[list[Any], list[Any]]:
+    """Count calls of the embedding nets, and of the densities behind them."""
+    embeds = counted(density, "embed", monkeypatch)
+    if isinstance(density, Coupled):
+        return embeds, counted(density.density, "log_prob", monkeypatch)
+    return embeds, counted(density.densities, "answer", monkeypatch)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("make", [lambda: several("nsf"), coupled], ids=["flow", "c"])
+def test_many_parameters_of_one_x_take_one_embedding_and_few_calls(
+    make: Callable[[], Density], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    density = make()
+    posterior = posterior_of(density)
+    embeds, calls = calls_of_estimator(density, monkeypatch)
+    theta = 2 * torch.rand(20_000, 1) - 1
+    posterior.log_prob(theta, x=batch()[0], norm_posterior=False)
+    assert len(embeds) == 1
+    pairs = 20_000 * (9 if isinstance(density, Coupled) else 3)
+    assert len(calls) <= pairs / base.CPU_BATCH + 1
+    posterior.log_prob(theta[:2], x=batch()[0])  # also with its normalisation
+    assert len(embeds) == 2
+
+
+def test_mixed_parameters_have_a_mass_of_one_over_all_categories() -> None:
+    estimator = estimator_of(problems.npe_posterior("mnpe", dim=1))
+    density = Mixture(
+        [Flow.of([estimator]), Flow.of([estimator, moved(estimator, 1)])], [0.5, 0.5]
+    )
+    prior = problems.mixed_prior(1)
+    posterior, x = MixturePosterior(density, prior), batch()
+    assert not posterior.enable_transform  # for `map`
+    line = torch.linspace(-1, 1, 401)[:, None]
+    line = (line[1:] + line[:-1]) / 2
+    total = torch.zeros(4)
+    for first in (0.0, 1.0, 2.0):
+        for second in (0.0, 1.0):
+            theta = torch.cat([line, line * 0 + first, line * 0 + second], dim=1)
+            of_each = posterior.log_prob_batched(theta[:, None].expand(-1, 4, -1), x)
+            total += of_each.exp().mean(dim=0) * 2
+    error = posterior.leakage(x).standard_error.float()
+    assert ((total - 1).abs() < 5 * error + 0.01).all()
+    draws = posterior.sample_batched((50,), x, **QUIET)
+    assert torch.isfinite(posterior.log_prob_batched(draws, x)).all()
+
+
+# --- against brute force ---
+
+
+@pytest.mark.parametrize("family", [None, *FAMILIES])
+def test_a_coupled_density_is_the_sum_over_all_simulations(family: str | None) -> None:
+    posterior = posterior_of(coupled(family, tail_mass=0.0))
+    theta = 1.8 * torch.rand(6, 4, 1) - 0.9
+    with torch.no_grad():
+        expected = problems.brute_force_log_prob(posterior, theta)
+    found = posterior.log_prob_batched(theta, posterior.x_o, norm_posterior=False)
+    assert torch.allclose(found.double(), expected, atol=1e-4, rtol=1e-5)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_flow_is_the_average_of_its_networks(family: str) -> None:
+    theta, x = 1.8 * torch.rand(6, 4, 1) - 0.9, batch()
+    estimators = [npe(family), moved(npe(family), 1), moved(npe(family), 2)]
+    h = embedding_of(npe(family))
+    bare = headless(npe(family))
+    with torch.no_grad():
+        alone = torch.stack([one.log_prob(theta, x) for one in estimators])
+        of_nets = torch.stack(
+            [bare.log_prob(theta, net(x)) for net in (h, moved(h, 1), moved(h, 2))]
+        )
+    for flow, each in ((several(family), alone), (with_nets(family), of_nets)):
+        assert torch.allclose(
+            flow.log_probs(theta, flow.embed(x)).float(), each, atol=1e-4
+        )
+        expected = each.logsumexp(dim=0) - math.log(3)
+        assert torch.allclose(flow.log_prob(theta, x), expected, atol=1e-4)
+        some = flow[[2, 0]].log_prob(theta, x)
+        expected = each[[2, 0]].logsumexp(dim=0) - math.log(2)
+        assert torch.allclose(some, expected, atol=1e-4)
+
+
+def test_a_mixture_is_the_weighted_sum_of_its_parts_and_their_draws() -> None:
+    density, x = mixture(), batch()
+    theta = 1.8 * torch.rand(6, 4, 1) - 0.9
+    log_probs = torch.stack([part.log_prob(theta, x) for part in density.parts])
+    weights = torch.tensor([0.2, 0.5, 0.3])
+    expected = torch.einsum("k,ksb->sb", weights, log_probs.exp()).log()
+    assert torch.allclose(density.log_prob(theta, x), expected, atol=1e-4)
+    nested = Mixture([density, density.parts[0]], [0.5, 0.5])
+    assert nested.weights.tolist() == pytest.approx([0.1, 0.25, 0.15, 0.5])
+    # Spikes at integers tell where draws come from.
+    spikes = torch.tensor([[0.0, -9.0], [1.0, -9.0]])
+    parts = [
+        problems.gaussian_posterior(
+            dim=1, embeddings=spikes, weights=torch.eye(2)[[k] * 4], x_o=x
+        ).posterior_estimator
+        for k in range(2)
+    ]
+    draws = Mixture(parts, [0.3, 0.7]).sample(Size((5000,)), x).round()
+    assert torch.allclose(draws.mean(dim=(0, 2)), torch.full((4,), 0.7), atol=0.03)
+
+
+def test_parts_of_weight_zero_are_not_evaluated(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    unused = [Prior(problems.box(1), (3,)), coupled()]
+    density = Mixture([*unused, several("nsf")], [0.0, 0.0, 1.0])
+    assert len(density.parts) == 1
+    calls = [
+        counted(part, name, monkeypatch)
+        for part in unused
+        for name in ("embed", "log_q", "draw", "mass")
+    ]
+    posterior, other = posterior_of(density), torch.randn(2, 3)  # of no batch
+    posterior.log_prob_batched(torch.zeros(2, 1), other)
+    posterior.sample_batched((3,), other, **QUIET)
+    assert not any(calls)
+
+
+def test_the_mass_of_a_part_takes_draws_in_proportion_to_its_weight(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    density = mixture(0.25, 0.25, 0.5)
+    draws = counted(density.parts[1], "draw", monkeypatch)
+    posterior_of(density).leakage(batch())
+    assert sum(len(row) for _, row in draws) == 4 * base.NUM_DRAWS / 4
+
+
+@pytest.mark.parametrize("tail_mass", [1e-3, 0.3, 1.0])
+def test_the_tail_left_out_obeys_the_bound_of_the_docstring(tail_mass: float) -> None:
+    torch.manual_seed(5)
+    weights = torch.softmax(3 * torch.randn(8, 60), dim=1)
+    embeddings = problems.embeddings_of(2, 60)
+    posterior: Any = problems.gaussian_posterior(
+        n_o=8, weights=weights, embeddings=embeddings
+    )
+    density, x = posterior.posterior_estimator, posterior.x_o
+    theta = 2 * torch.rand(50, 8, 2) - 1
+    full = density.log_prob(theta, x).double().exp()
+    density.tail_mass = tail_mass
+    missing = full - density.log_prob(theta, x).double().exp()
+    terms = density.density.log_prob(
+        theta[:, :, None].expand(-1, -1, 60, -1), embeddings
+    )
+    ascending, order = posterior.weights.sort(dim=1)
+    out = torch.zeros(8, 60, dtype=torch.bool)
+    out.scatter_(1, order, ascending.cumsum(dim=1) <= tail_mass)
+    out[torch.arange(8), order[:, -1]] = False
+    expected = (terms.double().exp() * posterior.weights * out).sum(dim=-1)
+    assert out.any(dim=1).all()
+    assert torch.allclose(missing, expected, atol=1e-6)
+
+
+# --- coupled densities ---
+
+
+def test_simulations_are_drawn_with_their_weights_and_never_with_weight_zero(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    spikes = torch.stack([torch.arange(6.0), torch.full((6,), -9.0)], dim=1)
+    weights = torch.tensor([[0, 0.5, 0, 0.3, 0.2, 0], [0.9, 0, 0, 0, 0, 0.1]])
+    posterior = problems.gaussian_posterior(
+        dim=1,
+        n_o=2,
+        weights=weights,
+        embeddings=spikes,
+        prior=problems.standard_normal(1),
+    )
+    n = 20_000
+    samples = posterior.sample_batched((n,), posterior.x_o, **QUIET).round().long()
+    for i in range(2):
+        found = samples[:, i, 0].bincount(minlength=6) / n
+        assert (found[weights[i] == 0] == 0).all()
+        error = (weights[i] * (1 - weights[i]) / n).sqrt()
+        assert ((found - weights[i]).abs() <= 4 * error).all()
+    # The ends of what torch.rand returns in double precision.
+    for uniform, expected in ((0.0, [1.0, 0.0]), (1 - 2**-53, [4.0, 5.0])):
+        monkeypatch.setattr(
+            torch,
+            "rand",
+            lambda *size, value=uniform, **options: torch.full(size, value, **options),
+        )
+        found = posterior.sample_batched((2,), posterior.x_o, **QUIET).round()
+        assert found[0, :, 0].tolist() == expected
+
+
+def test_the_mass_of_simulations_is_estimated_once_for_all_views(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    posterior: Any = posterior_of(coupled())
+    calls = counted(posterior.posterior_estimator.density, "sample", monkeypatch)
+    posterior[1].log_prob(torch.zeros(1, 1))
+    assert len(calls) == 1
+    posterior[3].log_prob(torch.zeros(1, 1))
+    found = posterior.leakage(posterior.x_o)
+    assert len(calls) == 1
+    mean, log_std = posterior.posterior_estimator.simulated.double().T
+    law = Normal(mean, log_std.exp())
+    inside = law.cdf(torch.tensor(1.0)) - law.cdf(torch.tensor(-1.0))
+    error = (posterior.weights.square() @ (inside * (1 - inside)) / 1024).sqrt()
+    assert ((found.mass - posterior.weights @ inside).abs() < 4.5 * error).all()
+    assert torch.allclose(found.standard_error, error, rtol=0.2)
+
+
+def test_no_more_weights_terms_or_proposals_are_held_than_documented(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    posterior: Any = problems.gaussian_posterior(n_o=30, n_s=12, std=2.0)
+    density, entries = posterior.posterior_estimator, []
+    x = posterior.x_o
+
+    def recorded(target: Any, name: str, size: Callable[..., int]) -> None:
+        original = getattr(target, name)
+
+        def record(*arguments: Any) -> Any:
+            result = original(*arguments)
+            entries.append(size(result))
+            return result
+
+        monkeypatch.setattr(target, name, record)
+
+    posterior.leakage(x)  # the draws behind it are cut by the flow's batch
+    recorded(density, "rows", Tensor.numel)
+    recorded(density, "_log_terms", Tensor.numel)
+    recorded(posterior, "_inside", len)
+    for module in (base, rejection):
+        monkeypatch.setattr(module, "MAX_ENTRIES", 100)
+    posterior.log_prob_batched(torch.zeros(9, 30, 2), x)
+    posterior.sample_batched((20,), x, **QUIET)
+    posterior.leakage(x)
+    assert max(entries) <= 100
+
+
+def test_an_observation_is_found_by_its_value() -> None:
+    x_o = torch.randn(6, 3)
+    x_o[4], x_o[2, 0] = x_o[1], 0.0
+    posterior = problems.gaussian_posterior(x_o=x_o)
+    rows = posterior.weights
+    assert torch.equal(problems.rows_of(posterior, x_o[[5, 0, 4]]), rows[[5, 0, 1]])
+    x = x_o[2:3].clone()
+    x[0, 0] = -0.0
+    assert torch.equal(problems.rows_of(posterior, x), rows[2:3])
+    theta = torch.zeros(2, 2)
+    expected = posterior.log_prob(theta, x=x_o[3])
+    others: Any = (x_o[3].double(), x_o[3].numpy(), x_o[3].tolist(), x_o[3:4])
+    for same in others:
+        assert torch.equal(posterior.log_prob(theta, x=same), expected)
+
+
+def test_an_unseen_observation_is_refused_or_extends_the_coupling() -> None:
+    new, theta = torch.randn(2, 3), torch.zeros(1, 2)
+    refusing: Any = problems.gaussian_posterior()
+    for call in (
+        lambda: refusing.sample((2,), x=new[:1], **QUIET),
+        lambda: refusing.log_prob_batched(theta, new),
+        lambda: refusing.leakage(new),
+        lambda: refusing.potential(theta, x=new[:1]),
+    ):
+        with pytest.raises(InvalidInputError, match=r"rope.build_posterior\(x\)"):
+            call()
+    posterior: Any = problems.gaussian_posterior(unseen="extend")
+    net = posterior.posterior_estimator.net
+    expected = posterior.coupling.rows(net(new).detach())
+    smallest = float((1 / expected.square().sum(dim=1)).min())
+    mixed = torch.cat([new[:1], posterior.x_o[2:3], new[1:]])
+    with pytest.warns(RoPEWarning, match=rf"2 unseen.*size is {smallest:.1f} of 12"):
+        rows = problems.rows_of(posterior, mixed)
+    assert torch.allclose(rows[[0, 2]], expected, atol=1e-12)
+    assert torch.equal(rows[1], posterior.weights[2])
+    for call in (
+        lambda: posterior.sample_batched((2,), new, **QUIET),
+        lambda: posterior.log_prob(theta, x=new[0]),
+    ):
+        with pytest.warns(RoPEWarning) as caught:
+            call()
+        assert [warning.filename for warning in caught] == [__file__]
+
+
+@pytest.mark.parametrize("unseen", ["raise", "extend"])
+def test_the_posterior_of_one_observation_answers_as_the_whole(unseen: Any) -> None:
+    parts = [Flow.of([npe()]), coupled(unseen=unseen)]
+    posterior = posterior_of(Mixture(parts, [0.5, 0.5]))
+    theta = 2 * torch.rand(6, 1) - 1
+    for i in (0, 3):
+        view = pickle.loads(pickle.dumps(posterior[i]))
+        x = posterior.x_o[i]
+        assert torch.equal(view.log_prob(theta), posterior.log_prob(theta, x=x))
+        torch.manual_seed(i)
+        samples = view.sample((20,), **QUIET)
+        torch.manual_seed(i)
+        assert torch.equal(samples, posterior.sample((20,), x=x, **QUIET))
+        assert torch.equal(view.weights, posterior.weights[i : i + 1])
+        assert len(view) == 1
+        assert torch.equal(view[0].log_prob(theta), view.log_prob(theta))
+
+
+def test_the_pickle_of_one_observation_does_not_grow_with_the_batch() -> None:
+    sizes = []
+    for n_o in (10, 500):
+        posterior = problems.gaussian_posterior(x_o=torch.randn(n_o, 1, 16, 16))
+        sizes.append(len(pickle.dumps(posterior[1])))
+    assert sizes[1] < min(sizes[0] + 1000, 60_000)
+
+
+# --- rejection ---
+
+
+def hopeless() -> MixturePosterior:
+    """All mass of the first observation lies far outside the prior."""
+    spikes = torch.tensor([[100.0, -3.0], [0.0, -3.0]])
+    return problems.gaussian_posterior(
+        dim=1, n_o=2, weights=torch.eye(2), embeddings=spikes
+    )
+
+
+def test_sampling_without_mass_inside_the_prior_names_the_observation(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    posterior: Any = hopeless()
+    draws = counted(posterior.posterior_estimator, "draw", monkeypatch)
+    with pytest.raises(SamplingError, match=r"rows \[0\] of `x`.*reject_outside_prior"):
+        posterior.sample_batched((1000,), posterior.x_o, **QUIET)
+    assert sum(len(row) for _, row in draws) < 2e7
+    assert posterior.sample((3,), x=posterior.x_o[1], **QUIET).shape == (3, 1)
+    options = {"reject_outside_prior": False} | QUIET
+    assert (posterior.sample((3,), x=posterior.x_o[0], **options) > 90).all()
+    with pytest.raises(SamplingError, match="no mass inside"):
+        posterior.log_prob(torch.zeros(1, 1), x=posterior.x_o[0])
+
+
+def test_little_mass_inside_the_prior_is_sampled_unless_it_takes_too_long() -> None:
+    spikes = torch.tensor([[100.0, -3.0], [0.0, -3.0]])
+    weights = torch.tensor([[1 - 4e-4, 4e-4], [0.0, 1.0]])
+    posterior = problems.gaussian_posterior(
+        dim=1, n_o=2, weights=weights, embeddings=spikes
+    )
+    draws = posterior.sample_batched((300,), posterior.x_o, **QUIET)
+    assert draws.std(dim=0).flatten().tolist() == pytest.approx(
+        [math.exp(-3)] * 2, rel=0.2
+    )
+    with pytest.raises(SamplingError, match=r"rows \[0\] of `x`.*Leave these"):
+        posterior.sample_batched((10_000,), posterior.x_o, **QUIET)
+
+
+def test_an_accepted_draw_is_kept_whole() -> None:
+    # Equal coordinates in every draw: a mixture of two draws would show. Most of the
+    # mass is outside the prior, so that each slot gets several proposals at a time.
+    class Diagonal(problems.Gaussians):
+        def sample(self, sample_shape: Size, condition: Tensor, **kw: Any) -> Tensor:
+            return super().sample(sample_shape, condition)[..., :1].expand(-1, -1, 2)
+
+    posterior: Any = problems.gaussian_posterior(dim=2, n_o=4, std=3.0)
+    posterior.posterior_estimator.density = Diagonal(2)
+    samples = posterior.sample_batched((5000,), posterior.x_o, **QUIET)
+    assert torch.equal(samples[..., 0], samples[..., 1])
+
+
+def test_sampling_batches_are_no_larger_than_asked_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    posterior: Any = problems.gaussian_posterior()
+    calls = counted(posterior.posterior_estimator.density, "sample", monkeypatch)
+    for size in (1, 7):
+        calls.clear()
+        samples = posterior.sample_batched(
+            (10,), posterior.x_o, max_sampling_batch_size=size, **QUIET
+        )
+        assert samples.shape == (10, 5, 2)
+        assert max(len(condition) for _, condition in calls) <= size
+
+
+# --- the prior, densities that fail, and what is refused ---
+
+
+def test_an_unbounded_prior_has_mass_one_without_draws(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    normal = Independent(Normal(torch.zeros(2), torch.ones(2)), 1)
+    for prior in (problems.standard_normal(2), normal):
+        posterior = problems.gaussian_posterior(prior=prior)
+        calls = counted(posterior.posterior_estimator, "mass", monkeypatch)
+        mass = posterior.leakage(posterior.x_o)
+        assert mass.mass.tolist() == [1.0] * 5
+        assert mass.standard_error.tolist() == [0.0] * 5
+        assert not calls
+
+
+class WithoutSupport(Distribution):
+    """A user's prior that says only through its density where it ends."""
+
+    arg_constraints = {}  # noqa: RUF012
+
+    def __init__(self) -> None:
+        super().__init__(Size(), Size((2,)), validate_args=False)
+
+    def sample(self, sample_shape: Size = Size()) -> Tensor:  # noqa: B008
+        return 2 * torch.rand(*sample_shape, 2) - 1
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        inside = (value.abs() <= 1).all(dim=-1)
+        return torch.where(inside, -math.log(4.0), -torch.inf)
+
+
+HALF_BOUNDED = MultipleIndependent(
+    [problems.box(1), Normal(torch.zeros(1), torch.ones(1))]
+)
+HALF_LINE = Independent(Gamma(torch.ones(2), torch.ones(2)), 1)
+
+
+@pytest.mark.filterwarnings("ignore:The passed")
+@pytest.mark.parametrize(
+    ("prior", "inside"),
+    [
+        (HALF_BOUNDED, lambda theta: theta[..., 0].abs() <= 1),
+        (HALF_LINE, lambda theta: (theta >= 0).all(dim=-1)),
+        (WithoutSupport(), lambda theta: (theta.abs() <= 1).all(dim=-1)),
+    ],
+    ids=["half bounded", "half line", "no support"],
+)
+def test_support_of_any_shape_bounds_samples_density_and_mass(
+    prior: Distribution, inside: Callable[[Tensor], Tensor]
+) -> None:
+    posterior = problems.gaussian_posterior(prior=prior, std=0.8)
+    x = posterior.x_o
+    assert inside(posterior.sample_batched((200,), x, **QUIET)).all()
+    free = posterior.sample_batched((8000,), x, reject_outside_prior=False, **QUIET)
+    log_prob = posterior.log_prob_batched(free[:50], x)
+    assert torch.equal(torch.isfinite(log_prob), inside(free[:50]))
+    mass = posterior.leakage(x)
+    error = (mass.variance + 0.25 / 8000).sqrt()
+    share = inside(free).double().mean(dim=0)
+    assert ((mass.mass - share).abs() < 4 * error).all()
+
+
+@pytest.mark.parametrize("kind", ["coupled", "flow"])
+def test_densities_of_nan_count_as_zero(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    density: Any = coupled(tail_mass=0.0) if kind == "coupled" else several("mdn")
+    theta, x = 1.8 * torch.rand(1, 4, 1) - 0.9, batch()
+    total = density.log_prob(theta, x).double().exp()
+    if kind == "coupled":
+        first, inside = density.simulated[0], density.density
+        share = inside.log_prob(theta, first.expand(4, -1)).double().exp()
+        share = share * density.coupling.table[:, 0]
+        original = inside.log_prob
+
+        def log_prob(input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
+            broken = (condition == first).all(dim=1)
+            # NaN that reaches the gradients, too.
+            return original(input, condition) + input.sum(-1) * torch.where(
+                broken, math.nan, 0.0
+            )
+
+        monkeypatch.setattr(inside, "log_prob", log_prob)
+    else:
+        share = density.log_probs(theta, density.embed(x))[0].exp() / 3
+        original = density.densities.answer
+
+        def answer(question: Any, *rows: Tensor) -> Tensor:
+            broken = torch.arange(len(rows[0])) < len(rows[0]) / 3
+            return original(question, *rows) + rows[0].sum(-1) * torch.where(
+                broken, math.nan, 0.0
+            )
+
+        monkeypatch.setattr(density.densities, "answer", answer)
+    theta.requires_grad_()
+    with pytest.warns(RoPEWarning, match=r"4 of (36|12) component densities are NaN"):
+        found = density.log_prob(theta, x)
+    assert torch.allclose(found.double().exp(), total - share, rtol=1e-4)
+    found.sum().backward()
+    assert theta.grad is not None
+    assert (theta.grad.isfinite() & (theta.grad != 0)).all()
+
+
+def test_an_observation_at_which_a_density_fails_gives_a_named_error() -> None:
+    estimator = copy.deepcopy(npe("mdn"))
+    with torch.no_grad():
+        for weight in headless(estimator).parameters():
+            weight.mul_(1e8)  # its numbers overflow, as those of others far away
+    x = torch.zeros(3, 3)
+    x[1] = 1e20
+    with pytest.raises(SamplingError, match="far from all simulations"):
+        Flow.of([estimator]).sample(Size((4,)), x)
+
+
+def test_a_flow_is_a_copy_in_evaluation_mode_without_gradients() -> None:
+    estimator = copy.deepcopy(npe("maf")).train()
+    flow = Flow.of([estimator])
+    assert not any(module.training for module in flow.modules())
+    assert not any(parameter.requires_grad for parameter in flow.parameters())
+    assert all(parameter.requires_grad for parameter in estimator.parameters())
+    theta, x = torch.zeros(1, 4, 1), batch()
+    before = flow.log_prob(theta, x)
+    with torch.no_grad():
+        for parameter in estimator.parameters():
+            parameter.add_(1.0)
+    assert torch.equal(flow.log_prob(theta, x), before)
+
+
+def test_an_amortised_posterior_has_no_batch() -> None:
+    posterior: Any = posterior_of(several("nsf"))
+    assert posterior.is_amortised
+    assert posterior  # although it has no length
+    for call, name in (
+        (lambda: posterior.x_o, "x_o"),
+        (lambda: posterior.coupling, "coupling"),
+        (lambda: posterior.couplings, "couplings"),
+        (lambda: posterior.weights, "weights"),
+        (lambda: len(posterior), r"len\(\)"),
+        (lambda: posterior[0], r"\[i\]"),
+    ):
+        with pytest.raises(InvalidInputError, match=rf"`{name}.*amortised"):
+            call()
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    one, field = Flow.of([npe()]), problems.vector_field_posterior("fmpe")
+    posterior = posterior_of(mixture())
+    x = batch()
+    calls: list[tuple[type[Exception], str, Callable[[], Any]]] = [
+        (
+            InvalidInputError,
+            "as the first",
+            lambda: Mixture([one, Flow.of([gaussian.GaussianEstimator(1)])], [1, 0]),
+        ),
+        (
+            InvalidInputError,
+            "same `x_o`",
+            lambda: Mixture(
+                [coupled(), problems.gaussian_posterior(dim=1).posterior_estimator],
+                [0.5, 0.5],
+            ),
+        ),
+        (
+            UnsupportedPosteriorError,
+            "Train NPE",
+            lambda: density_of(field),
+        ),
+        (
+            InvalidInputError,
+            "as many rows of `theta`",
+            lambda: posterior.log_prob_batched(torch.zeros(3, 1), x),
+        ),
+        (
+            UnsupportedPosteriorError,
+            "`posterior`",
+            lambda: estimator_of(DirectPosterior(one, problems.box(1))),
+        ),
+    ]
+    for error, match, call in calls:
+        with pytest.raises(error, match=match):
+            call()
+    assert is_bounded(posterior)
+    assert not is_bounded(DirectPosterior(one, problems.box(1)))

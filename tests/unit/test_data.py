@@ -1,0 +1,134 @@
+"""Calibration pairs: groups are held out together, and count once."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from sbi_rope.data import (
+    MIN_PAIRS_FOR_HOLDOUT,
+    Labels,
+    Pairs,
+    groups_of,
+    one_of_each_group,
+    split_groups,
+    split_pairs,
+    too_few_pairs,
+)
+from sbi_rope.errors import InvalidInputError
+
+NAN = math.nan
+
+
+def pairs_of(theta: Tensor) -> Pairs:
+    return Pairs.exact(theta, theta + 1)
+
+
+def test_rows_of_the_same_parameters_share_a_number() -> None:
+    theta = torch.tensor([[2.0, 1.0], [1.0, 2.0], [2.0, 1.0], [0.0, 0.0]])
+    assert groups_of(theta).tolist() == [0, 1, 0, 2]
+    assert groups_of(theta[:, 0]).tolist() == [0, 1, 0, 2]
+    assert groups_of(theta[:0]).tolist() == []
+    pairs = pairs_of(theta)
+    assert pairs.group.tolist() == [0, 1, 0, 2]
+    assert pairs.num_groups == 3
+    assert pairs.counts.weights.tolist() == [0.5, 1.0, 0.5, 1.0]
+    assert pairs.counts.effective_number == pytest.approx(3)
+    assert str(pairs) == "4 exact labels in 3 groups"
+
+
+def test_groups_of_labels_that_are_equal() -> None:
+    y = torch.tensor([[0.0, NAN], [1.0, 2.0], [0.0, NAN], [0.0, 3.0]])
+    labels = Labels.exact(y)
+    assert labels.group.tolist() == [0, 1, 0, 2]
+    noise = torch.tensor([0.0, 0, 1, 0])[:, None, None]
+    noisy = Labels(y=y, covariance=labels.covariance + noise, draws=labels.draws)
+    assert noisy.group.tolist() == [0, 1, 2, 3]
+    assert (labels + noisy).group.tolist() == [0, 1, 0, 2, 0, 1, 3, 2]
+    assert labels.is_exact.tolist() == [False, True, False, True]
+    drawn = Labels(y=y, covariance=labels.covariance, draws=torch.randn(4, 3, 2))
+    assert not drawn.is_exact.any()
+    with pytest.raises(InvalidInputError, match="as many draws"):
+        _ = labels + drawn
+
+
+def test_rows_of_pairs_keep_all_that_belongs_to_them() -> None:
+    pairs, rows = pairs_of(torch.randn(10, 2)), torch.tensor([7, 2])
+    some = pairs[rows]
+    assert len(some) == 2
+    assert some.are_exact
+    assert torch.equal(some.mean, pairs.mean[rows])
+    assert torch.equal(some.x, pairs.x[rows])
+    assert torch.equal(some.label.y, some.theta[:, 0])
+    assert some.group.tolist() == [7, 2]
+
+
+@pytest.mark.parametrize(
+    ("num_pairs", "fraction", "count"),
+    [(1, 0.2, 0), (4, 0.5, 0), (5, 0.2, 1), (5, 0.01, 1), (20, 0.2, 4), (7, 0.5, 4)],
+)
+def test_a_split_is_a_cut_through_a_permutation(
+    num_pairs: int, fraction: float, count: int
+) -> None:
+    theta = torch.randn(num_pairs, 2)
+    torch.manual_seed(3)
+    train, held_out = pairs_of(theta).split(fraction)
+    torch.manual_seed(3)
+    order = torch.randperm(num_pairs)
+    assert torch.equal(held_out, order[:count])
+    assert torch.equal(train, order[count:])
+
+
+def test_pairs_of_a_group_are_on_the_same_side() -> None:
+    for seed in range(5):
+        torch.manual_seed(seed)
+        theta = torch.randn(12, 2).repeat(5, 1)[torch.randperm(60)]
+        train, held_out = pairs_of(theta).split(0.25)
+        assert sorted([*train.tolist(), *held_out.tolist()]) == list(range(60))
+        assert len(held_out) == 15
+        assert not {*map(tuple, theta[train].tolist())} & {
+            *map(tuple, theta[held_out].tolist())
+        }
+
+
+def test_a_group_larger_than_what_is_held_out_is_trained_on() -> None:
+    groups = torch.tensor([0] * 60 + [1] * 10 + [2] * 10 + [3] * 10 + [4] * 10)
+    assert all(len(split_pairs(groups, 0.2)[1]) == 20 for _ in range(20))
+    # All are larger than twice the two rows asked for: the smallest is held out.
+    groups = torch.arange(5).repeat_interleave(torch.tensor([20, 20, 7, 20, 20]))
+    assert groups[split_pairs(groups, 0.02)[1]].tolist() == [2] * 7
+
+
+def test_of_few_groups_none_is_held_out() -> None:
+    theta = torch.randn(MIN_PAIRS_FOR_HOLDOUT - 1, 2).repeat(10, 1)
+    train, held_out = pairs_of(theta).split(0.2)
+    assert (len(train), len(held_out)) == (40, 0)
+    assert too_few_pairs(theta) == (
+        "Only 4 different parameters (or groups) among 40 calibration pairs"
+    )
+    assert too_few_pairs(theta[:4]) == "Only 4 calibration pair(s)"
+
+
+def test_folds_keep_groups_whole_and_have_rows_alike() -> None:
+    sizes = torch.tensor([9, 1, 1, 4, 2, 3, 6, 1, 1, 2])
+    groups = torch.arange(10).repeat_interleave(sizes)[torch.randperm(30)]
+    folds = split_groups(groups, 3)
+    assert sorted(torch.cat(folds).tolist()) == list(range(30))
+    assert [len(fold) for fold in folds] == [10, 10, 10]
+    of_fold = [set(groups[fold].tolist()) for fold in folds]
+    assert sum(map(len, of_fold)) == 10
+    assert sorted(map(len, split_groups(torch.tensor([0, 0, 0, 1, 1]), 4))) == [2, 3]
+    pairs = pairs_of(torch.randn(11, 2))
+    one, two, other = (pairs.folds(5, seed=seed) for seed in (1, 1, 2))
+    assert sorted(map(len, one)) == [2, 2, 2, 2, 3]
+    assert all(map(torch.equal, one, two))
+    assert not torch.equal(torch.cat(one), torch.cat(other))
+
+
+def test_one_row_of_each_group_is_chosen_at_random() -> None:
+    groups = torch.tensor([3, 0, 3, 3, 1, 0])
+    seen = torch.stack([one_of_each_group(groups, seed=seed) for seed in range(50)])
+    for chosen in seen:
+        assert groups[chosen].sort().values.tolist() == [0, 1, 3]
+    assert seen.any(dim=0).all()

@@ -1,0 +1,253 @@
+"""Networks trained at once are networks trained alone, to rounding."""
+
+import copy
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from sbi.neural_nets import posterior_nn
+from sbi.neural_nets.embedding_nets import (
+    CNNEmbedding,
+    FCEmbedding,
+    PermutationInvariantEmbedding,
+)
+from torch import Tensor, nn
+
+from sbi_rope._sbi import embedding_of, estimator_of, headless
+from sbi_rope.density import Flow
+from sbi_rope.ensemble import Ensemble, drawn, embedded, log_density
+from sbi_rope.fit import Training, fit
+from sbi_rope.tasks.networks import SeriesEmbedding, light_series_embedding
+from tests import problems
+
+ALONE: Any = {"label": "", "show_progress_bars": False}
+NUM_MEMBERS, NUM_ROWS = 3, 12
+
+
+class Transposed(nn.Module):
+    """Puts another dimension first, so that rows of members mix up."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.net = nn.Linear(2, 4)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.net(x.transpose(0, 1)).sum(dim=0)
+
+
+class Recurrent(nn.Module):
+    """The last state of a GRU."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.gru = nn.GRU(2, 4, batch_first=True)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.gru(x)[1][0]
+
+
+class Scaled(nn.Module):
+    """Holds a parameter of its own beside layers."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.scale = nn.Parameter(torch.ones(3))
+        self.layer = nn.Linear(3, 4)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.layer(self.scale * x)
+
+
+NETS: dict[str, tuple[Callable[[], nn.Module], tuple[int, ...]]] = {
+    "linear": (lambda: nn.Sequential(nn.Linear(3, 4), nn.Tanh()), (3,)),
+    "dropout": (lambda: nn.Sequential(nn.Linear(3, 4), nn.Dropout(0.5)), (3,)),
+    "own parameter": (Scaled, (3,)),
+    "fully connected": (lambda: FCEmbedding(3, output_dim=4, num_hiddens=8), (3,)),
+    "conv": (problems.SmallCNN, (1, 8, 8)),
+    "conv of sbi": (
+        lambda: CNNEmbedding((8, 8), output_dim=4, kernel_size=3),
+        (1, 8, 8),
+    ),
+    "recurrent": (Recurrent, (5, 2)),
+    "sets": (
+        lambda: PermutationInvariantEmbedding(
+            nn.Linear(2, 4), 4, num_hiddens=8, output_dim=4
+        ),
+        (5, 2),
+    ),
+    "trials": (problems.TrialsNet, (4, 2)),
+    "transposed": (Transposed, (5, 2)),
+}
+FAMILIES = problems.FAMILIES
+
+
+def estimator_behind(name: str) -> Any:
+    make, shape = NETS[name]
+    theta, x = torch.rand(60, 2), torch.randn(60, *shape)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        builder: Any = posterior_nn(
+            "maf", embedding_net=make(), hidden_features=8, num_transforms=2
+        )
+        return builder(theta, x).eval()
+
+
+def members(estimator: Any, count: int = NUM_MEMBERS) -> list[Any]:
+    """Copies with different weights."""
+    copies = [copy.deepcopy(estimator).eval() for _ in range(count)]
+    with torch.no_grad():
+        for one in copies[1:]:
+            for weight in one.parameters():
+                weight.add_(0.05 * torch.randn_like(weight))
+    return copies
+
+
+def pairs_for(estimator: Any) -> tuple[Tensor, Tensor]:
+    """For each member pairs of its own, (E, B, d) and (E, B, *event)."""
+    shape = NUM_MEMBERS, NUM_ROWS
+    theta = 1.8 * torch.rand(*shape, *estimator.input_shape) - 0.9
+    if estimator.input_shape[0] == 4:  # the last two are categories
+        theta[..., 2:] = torch.randint(0, 2, (*shape, 2)).float()
+    return theta, torch.randn(*shape, *estimator.condition_shape)
+
+
+def check_as_trained_alone(estimator: Any) -> None:
+    """Losses, gradients and an Adam step are those of members trained alone."""
+    alone = members(estimator)
+    flow = Flow.of(alone)
+    theta, x = pairs_for(estimator)
+    training = Training(
+        learning_rate=1e-2, max_num_epochs=2, stop_after_epochs=9, clip_max_norm=0.5
+    )
+    histories = fit(
+        flow,
+        lambda _: [(theta, x)],
+        lambda theta, x: flow.losses(theta, x).mean(dim=1),
+        training,
+        in_training_mode=False,
+        **ALONE,
+    )
+    for e, one in enumerate(alone):
+        optimiser = torch.optim.Adam(one.parameters(), lr=1e-2)
+        for epoch in range(2):
+            loss = -headless_log_prob(one, theta[e], x[e]).mean()
+            found = histories[e].training_loss[epoch]
+            assert found == pytest.approx(float(loss), rel=1e-3, abs=1e-4)
+            optimiser.zero_grad()
+            loss.backward()
+            nn.utils.clip_grad_norm_(one.parameters(), 0.5)
+            optimiser.step()
+        with torch.no_grad():
+            expected = headless_log_prob(one, theta[e], x[e])
+        of_each = flow.log_probs(theta[e][None], flow.embed(x[e]))[:, 0]
+        assert torch.allclose(of_each[e].float(), expected, rtol=2e-3, atol=2e-3)
+
+
+def headless_log_prob(estimator: Any, theta: Tensor, x: Tensor) -> Tensor:
+    z = embedding_of(estimator)(x)
+    return headless(estimator).log_prob(theta[None], z)[0]
+
+
+@pytest.mark.parametrize(
+    "family",
+    [
+        pytest.param(name, marks=[pytest.mark.medium] if "zuko" in name else [])
+        for name in [*FAMILIES, "mnpe"]
+    ],
+)
+def test_every_family_is_trained_at_once_as_alone(family: str) -> None:
+    check_as_trained_alone(estimator_of(problems.npe_posterior(family)))
+
+
+@pytest.mark.parametrize("name", NETS)
+def test_every_embedding_net_is_trained_at_once_as_alone(name: str) -> None:
+    check_as_trained_alone(estimator_behind(name))
+
+
+@pytest.mark.parametrize("family", [*FAMILIES, "mnpe"])
+def test_draws_of_each_member_are_those_of_its_density(family: str) -> None:
+    each = members(headless(estimator_of(problems.npe_posterior(family))))
+    z = torch.randn(1, each[0].condition_shape[0]).expand(NUM_MEMBERS * 400, -1)
+    ensemble = Ensemble(each, log_density, (drawn(each[0], z[:3]), z[:3]))
+    draws = ensemble.answer(drawn, z).unflatten(0, (NUM_MEMBERS, 400))
+    for of_member, alone in zip(draws, each, strict=True):
+        expected = alone.sample(torch.Size((400,)), z[:1])[:, 0]
+        error = (of_member.var(dim=0) + expected.var(dim=0)).div(400).sqrt()
+        difference = (of_member.mean(dim=0) - expected.mean(dim=0)).abs()
+        assert (difference < 4.5 * error + 1e-6).all()
+
+
+@pytest.mark.parametrize(
+    ("make", "shape"),
+    [
+        pytest.param(lambda: SeriesEmbedding(num_steps=80), (80,), id="series"),
+        pytest.param(
+            lambda: light_series_embedding(num_steps=40, output_dim=4),
+            (40,),
+            id="light",
+        ),
+    ],
+)
+def test_our_own_nets_embed_at_once_as_alone(
+    make: Callable[[], nn.Module], shape: tuple[int, ...]
+) -> None:
+    each = members(make())
+    x = torch.randn(NUM_MEMBERS, 7, *shape)
+    ensemble = Ensemble(each, embedded, (x[0],))
+    found = ensemble.answer(embedded, x.flatten(0, 1)).unflatten(0, (NUM_MEMBERS, 7))
+    for of_member, rows, net in zip(found, x, each, strict=True):
+        assert torch.allclose(of_member, net(rows), atol=1e-4)
+
+
+def test_a_member_whose_loss_is_nan_does_not_touch_the_others() -> None:
+    estimator = estimator_behind("linear")
+    theta, x = pairs_for(estimator)
+    training = Training(learning_rate=1e-2, max_num_epochs=3)
+    flows = []
+    for number in (math_nan := float("nan"), 0.0):
+        torch.manual_seed(0)
+        flow = Flow.of(members(estimator))
+        before = flow.nets.member(1)(x[1])
+        spoiled = torch.tensor([0.0, number, 0.0])
+
+        def loss(
+            theta: Tensor, x: Tensor, flow: Flow = flow, spoiled: Tensor = spoiled
+        ) -> Tensor:
+            return flow.losses(theta, x).mean(dim=1) + spoiled
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            fit(flow, lambda _: [(theta, x)], loss, training, **ALONE)
+        flows.append(flow)
+        if number is math_nan:
+            assert torch.equal(flow.nets.member(1)(x[1]), before)
+    for number in (0, 2):
+        spoiled, clean = (flow.nets.member(number)(x[0]) for flow in flows)
+        assert torch.equal(spoiled, clean)
+        assert not torch.equal(clean, flows[0].nets.member(1)(x[0]))
+
+
+@pytest.mark.parametrize("name", ["linear", "transposed", "conv"])
+def test_members_can_be_taken_out_and_joined(name: str) -> None:
+    make, shape = NETS[name]
+    each = members(make())
+    x = torch.randn(5, *shape)
+    ensemble = Ensemble(each, embedded, (x,))
+    for number, net in enumerate(each):
+        assert torch.allclose(ensemble.member(number)(x), net(x), atol=1e-5)
+    some = ensemble[[2, 0]]
+    found = some.answer(embedded, torch.cat([x, x]))
+    expected = torch.cat([each[2](x), each[0](x)])
+    assert len(some) == 2
+    assert torch.allclose(found, expected, atol=1e-5)
+    both = Ensemble.joined([some, ensemble])
+    assert len(both) == 5
+    found = both.answer(embedded, x.repeat(5, *[1] * (x.ndim - 1))).chunk(5)
+    for of_member, number in zip(found, (2, 0, 0, 1, 2), strict=True):
+        assert torch.allclose(of_member, each[number](x), atol=1e-5)
+    with torch.no_grad():  # copies
+        for weight in some.parameters():
+            weight.zero_()
+    assert torch.allclose(ensemble.member(2)(x), each[2](x), atol=1e-5)

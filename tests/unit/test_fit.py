@@ -1,0 +1,362 @@
+"""The one loop keeps the best network of each member and stops each by itself."""
+
+import math
+from collections.abc import Callable, Iterator
+from typing import Any, cast
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from sbi_rope.ensemble import Ensemble, embedded
+from sbi_rope.errors import RoPEWarning
+from sbi_rope.fit import (
+    EPOCHS_WITHOUT_HOLDOUT,
+    Courses,
+    History,
+    Training,
+    differentiable,
+    fit,
+    fit_on_pairs,
+)
+
+
+class Number(nn.Module):
+    """A number to be trained, from 0 on."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.value = nn.Parameter(torch.zeros(()))
+
+
+def no_data(step: int) -> Iterator[tuple[()]]:
+    yield ()
+
+
+def run(
+    module: nn.Module,
+    loss: Callable[..., Tensor],
+    validation_loss: Callable[[], Tensor] | None,
+    *,
+    batches: Callable[[int], Any] = no_data,
+    in_training_mode: bool = True,
+    **options: Any,
+) -> History:
+    settings = {"learning_rate": 0.1, "max_num_epochs": 30, "stop_after_epochs": 100}
+    [history] = fit(
+        module,
+        batches,
+        loss,
+        Training(**{**settings, **options}),
+        validation_loss=validation_loss,
+        in_training_mode=in_training_mode,
+        label="Numbers",
+        show_progress_bars=False,
+    )
+    return history
+
+
+def towards(module: Number, target: float) -> Callable[[], Tensor]:
+    return lambda: (module.value - target).square()
+
+
+def test_the_best_on_the_held_out_data_is_kept_and_not_the_last() -> None:
+    module = Number()
+    history = run(module, towards(module, 2.0), towards(module, 1.0))
+    assert len(history.training_loss) + 1 == len(history.validation_loss) == 31
+    best = history.best_epoch
+    assert 0 < best < 30
+    assert history.validation_loss[best] == min(history.validation_loss)
+    assert module.value.item() == pytest.approx(1.0, abs=0.06)
+    assert towards(module, 1.0)().item() == history.kept_validation_loss
+
+
+def test_any_number_improves_on_a_start_that_is_nan() -> None:
+    module = Number()
+
+    def validation_loss() -> Tensor:
+        distance = (module.value - 3).square()
+        return distance if module.value > 0 else distance * torch.nan
+
+    history = run(module, towards(module, 3.0), validation_loss)
+    assert math.isnan(history.validation_loss[0])
+    assert history.best_epoch > 0
+    assert History([1.0], [math.nan], 0, 0.1).kept_validation_loss == math.inf
+
+
+def test_what_is_frozen_is_left_alone_unless_all_of_it_is() -> None:
+    pair = nn.ModuleList([Number(), Number()])
+    first, second = (cast(Number, one) for one in pair)
+
+    def loss() -> Tensor:
+        return towards(first, 1.0)() + towards(second, 1.0)()
+
+    first.requires_grad_(requires_grad=False)
+    run(pair, loss, None)
+    assert (first.value == 0, second.value > 0.5) == (True, True)
+    run(pair, loss, None)
+    assert first.value > 0.5
+
+
+def test_the_start_competes_and_ties_are_won_by_the_earlier() -> None:
+    def constant() -> Tensor:
+        return torch.ones(())
+
+    for held_out in (0.0, None):
+        module = Number()
+        judged = constant if held_out is None else towards(module, held_out)
+        assert run(module, towards(module, 2.0), judged).best_epoch == 0
+        assert module.value.item() == 0.0
+
+
+def test_it_stops_when_its_patience_is_at_an_end() -> None:
+    module = Number()
+    history = run(module, towards(module, 2), towards(module, 0.5), stop_after_epochs=4)
+    assert len(history.validation_loss) == history.best_epoch + 1 + 4
+
+
+def test_without_held_out_data_the_last_is_kept() -> None:
+    module = Number()
+    history = run(module, towards(module, 10), None, max_num_epochs=7)
+    assert history.best_epoch == 7
+    assert history.validation_loss == []
+    assert module.value.item() == pytest.approx(0.7, rel=1e-2)
+    assert history.kept_validation_loss == 0.0
+
+
+@pytest.mark.parametrize("held_out", [True, False])
+def test_of_a_loss_that_ends_in_nan_the_best_before_is_kept(held_out: bool) -> None:
+    """log(1 - w) at w = 0, 0.3, 0.6, 0.9 and then 1.2, about."""
+    module = Number()
+    with pytest.warns(RoPEWarning, match="Numbers: .* of 1 of 1 networks is not"):
+        run(
+            module,
+            lambda: torch.log(1 - module.value),
+            (lambda: -module.value.clamp(max=1.0)) if held_out else None,
+            learning_rate=0.3,
+        )
+    assert math.isfinite(module.value.item())
+    assert 0.8 < module.value.item() < 1.4
+
+
+@pytest.mark.parametrize("clip_max_norm", [None, 0.5])
+def test_the_steps_are_those_of_adam_with_clipped_gradients(
+    clip_max_norm: float | None,
+) -> None:
+    """Adam remembers a gradient of 100 for long unless it is clipped."""
+    slopes = [100.0, 0.3, 0.2, 0.1]
+    module, twin = Number(), Number()
+    run(
+        module,
+        lambda slope: slope * module.value,
+        None,
+        batches=lambda step: [(slope,) for slope in slopes],
+        clip_max_norm=clip_max_norm,
+        max_num_epochs=1,
+    )
+    optimizer = torch.optim.Adam(twin.parameters(), lr=0.1)
+    for slope in slopes:
+        bound = math.inf if clip_max_norm is None else clip_max_norm
+        twin.value.grad = torch.tensor(min(slope, bound))
+        optimizer.step()
+    assert module.value.item() == pytest.approx(twin.value.item(), rel=1e-5)
+
+
+@pytest.mark.parametrize("in_training_mode", [True, False])
+def test_the_mode_is_the_one_asked_for_while_it_trains(in_training_mode: bool) -> None:
+    module = Number().train()
+    training, validation = [], []
+
+    def loss() -> Tensor:
+        training.append((module.training, torch.is_grad_enabled()))
+        return module.value.square()
+
+    def validation_loss() -> Tensor:
+        validation.append((module.training, torch.is_grad_enabled()))
+        return module.value.square()
+
+    run(
+        module,
+        loss,
+        validation_loss,
+        max_num_epochs=2,
+        in_training_mode=in_training_mode,
+    )
+    assert training == [(in_training_mode, True)] * 2
+    assert set(validation) == {(False, False)}
+    assert not module.training
+
+
+def test_the_training_loss_is_the_mean_over_the_batches() -> None:
+    module = Number()
+    history = run(
+        module,
+        lambda number: number + 0 * module.value,
+        None,
+        batches=lambda step: [(float(step),), (step + 3.0,)],
+        max_num_epochs=2,
+    )
+    assert history.training_loss == [1.5, 2.5]
+
+
+def test_buffers_are_kept_with_the_best() -> None:
+    module = nn.BatchNorm1d(1, affine=True)
+    values = iter([3.0, 1.0, 2.0, 2.0])
+    run(
+        module,
+        lambda x: module(x).mean(),
+        lambda: torch.tensor(next(values)),
+        batches=lambda step: [(torch.full((4, 1), 10.0 * (step + 1)),)],
+        max_num_epochs=3,
+    )
+    # Kept after one step: a tenth of the way from 0 to 10.
+    assert module.running_mean is not None
+    assert float(module.running_mean) == pytest.approx(1.0)
+
+
+# --- several members ---
+
+TARGETS = torch.tensor([0.1, 1.0, 5.0])
+
+
+def three() -> Ensemble:
+    one = nn.Linear(1, 1, bias=False)
+    nn.init.zeros_(one.weight)
+    return Ensemble([one] * 3, embedded, (torch.ones(2, 1),))
+
+
+def distances(ensemble: Ensemble) -> Tensor:
+    values = ensemble.answer(embedded, torch.ones(3, 1))[:, 0]
+    return (values - TARGETS).square()
+
+
+def fitted(ensemble: Ensemble, loss: Callable[[], Tensor], **options: Any) -> Any:
+    return fit(
+        ensemble,
+        no_data,
+        loss,
+        Training(learning_rate=0.1, max_num_epochs=40, stop_after_epochs=3),
+        in_training_mode=False,
+        label="Three",
+        show_progress_bars=False,
+        **options,
+    )
+
+
+def test_each_member_has_its_own_rate_and_stops_by_itself() -> None:
+    ensemble = three()
+    histories = fitted(
+        ensemble,
+        lambda: distances(ensemble),
+        validation_loss=lambda: distances(ensemble),
+        learning_rates=[0.1, 0.1, 0.01],
+    )
+    assert [history.learning_rate for history in histories] == pytest.approx(
+        [0.1, 0.1, 0.01]
+    )
+    best = [history.best_epoch for history in histories]
+    assert best[0] < best[1] < best[2] == 40
+    for number, history in enumerate(histories):
+        kept = float(distances(ensemble)[number])
+        assert kept == pytest.approx(min(history.validation_loss), abs=1e-5)
+
+
+def test_a_member_without_a_finite_loss_does_not_touch_the_others() -> None:
+    ensemble, alone = three(), three()
+    factor = torch.tensor([1.0, torch.nan, 1.0])
+    fitted(alone, lambda: distances(alone))
+    with pytest.warns(RoPEWarning, match="the loss of 1 of 3 networks"):
+        fitted(ensemble, lambda: distances(ensemble) * factor)
+    found, expected = (
+        net.answer(embedded, torch.ones(3, 1))[:, 0] for net in (ensemble, alone)
+    )
+    assert torch.equal(found[[0, 2]], expected[[0, 2]])
+    assert found[1] == 0.0
+
+
+# --- courses ---
+
+
+def settled(rate: float, min_gain: float) -> tuple[Ensemble, list[History]]:
+    ensemble = three()
+    histories = fit(
+        ensemble,
+        no_data,
+        lambda: distances(ensemble),
+        Training(learning_rate=rate, max_num_epochs=5),
+        courses=Courses(lambda: distances(ensemble), min_gain),
+        in_training_mode=False,
+        label="Three",
+        show_progress_bars=False,
+    )
+    return ensemble, histories
+
+
+def test_courses_go_on_while_they_gain_enough() -> None:
+    ensemble, histories = settled(0.1, min_gain=math.inf)
+    assert len(histories[2].training_loss) == 5
+    assert float(distances(ensemble)[2].detach()) > 15
+    ensemble, histories = settled(0.1, min_gain=0.5)
+    assert len(histories[2].training_loss) > 25
+
+
+def test_a_course_that_made_the_loss_worse_is_not_kept() -> None:
+    """The first member starts at .01, which steps of 2 overshoot by far."""
+    ensemble, histories = settled(2.0, min_gain=math.inf)
+    after = distances(ensemble).detach()
+    assert after[0] <= 0.01
+    assert after[2] < 5
+    # It was tried again from the better state with smaller steps.
+    assert len(histories[0].training_loss) > 5
+
+
+# --- pairs ---
+
+
+class Constant(nn.Module):
+    """An estimator of sbi whose loss is the distance of theta from a number."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.value = nn.Parameter(torch.zeros(1))
+
+    def loss(self, theta: Tensor, condition: Tensor) -> Tensor:
+        return (theta - self.value).square()[:, 0]
+
+
+def on_pairs(n: int, held_out: int, **options: Any) -> History:
+    theta, rows = torch.ones(n, 1), torch.arange(n)
+    return fit_on_pairs(
+        Constant(),
+        theta,
+        theta,
+        (rows[held_out:], rows[:held_out]),
+        training=Training(training_batch_size=8, **options),
+        in_training_mode=True,
+        label="Pairs",
+        show_progress_bars=False,
+    )
+
+
+def test_the_validation_loss_is_the_mean_over_the_held_out_rows() -> None:
+    assert on_pairs(20, 4, max_num_epochs=1).validation_loss[0] == pytest.approx(1.0)
+
+
+def test_without_a_hold_out_it_stops_early_and_warns() -> None:
+    with pytest.warns(RoPEWarning, match="Only 1 different parameters"):
+        assert on_pairs(4, 0).best_epoch == EPOCHS_WITHOUT_HOLDOUT
+    with pytest.warns(RoPEWarning):
+        assert on_pairs(2, 0, max_num_epochs=3).best_epoch == 3
+
+
+def test_recurrent_nets_in_evaluation_mode_do_not_use_cudnn() -> None:
+    # cuDNN has no gradients for them. On a CPU only the flag can be seen.
+    before = torch.backends.cudnn.enabled
+    for net, is_off in (
+        (nn.Sequential(nn.GRU(1, 2)).eval(), True),
+        (nn.Sequential(nn.GRU(1, 2)).train(), False),
+        (nn.Linear(1, 2).eval(), False),
+    ):
+        with differentiable(net):
+            assert torch.backends.cudnn.enabled == (before and not is_off)
+        assert torch.backends.cudnn.enabled == before

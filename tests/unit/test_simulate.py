@@ -1,0 +1,497 @@
+"""Simulators and stored simulations: how they are called, where they fail, moments."""
+
+import itertools
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import odeint
+from torch import Tensor
+
+from sbi_rope import CalibrationFinetuner, RoPE, parallel, simulate
+from sbi_rope.data import Pairs
+from sbi_rope.discrepancy import DiscrepancyNPE
+from sbi_rope.errors import InvalidInputError, RoPEWarning, SimulationError
+from sbi_rope.moments import Moments, draws, moments, targets
+from sbi_rope.simulate import Simulated, Source, Stored, source_of
+from tests import gaussian, problems
+
+QUICK = CalibrationFinetuner(max_num_epochs=2)
+THETA = torch.tensor([[0.3, 0.4], [0.6, -0.8], [-0.1, 0.9]])
+
+
+def simulated(function: Callable[[Any], Any], *shape: int, dim: int = 2) -> Simulated:
+    return Simulated(
+        function,
+        problems.box(dim),
+        event_shape=torch.Size(shape or (2,)),
+        like=torch.zeros(1),
+    )
+
+
+def itself(x: Tensor) -> Tensor:
+    return x
+
+
+def pairs_at(theta: Tensor) -> Pairs:
+    return Pairs.exact(theta, torch.zeros(len(theta), 2))
+
+
+def moments_at(source: Source, theta: Tensor, count: int) -> Moments:
+    return moments(source, pairs_at(theta), count, itself)
+
+
+# --- tensors and arrays, batches and single parameters ---
+
+RETURNS: dict[str, Callable[[Any], Any]] = {
+    "a tensor": torch.as_tensor,
+    "an array": np.asarray,
+    "a list": lambda x: x.tolist(),
+    "a list of parts": list,
+}
+
+
+@pytest.mark.parametrize("returns", RETURNS)
+def test_simulators_take_and_return_what_their_authors_prefer(returns: str) -> None:
+    for kind, ndim in itertools.product((Tensor, np.ndarray), (1, 2)):
+
+        def doubles(theta: Any) -> Any:
+            assert isinstance(theta, kind)  # noqa: B023
+            assert theta.ndim == ndim  # noqa: B023
+            return RETURNS[returns](2 * theta)
+
+        x = simulated(doubles)(THETA)
+        assert x.dtype == torch.float32
+        assert torch.equal(x, 2 * THETA)
+
+
+def test_a_simulator_that_draws_noise_for_one_theta_is_called_row_by_row() -> None:
+    """It takes a batch, but all rows would have the same noise."""
+    for draw in (torch.randn, lambda d: np.random.standard_normal(d)):  # noqa: NPY002
+        x = simulated(lambda theta: theta + draw(2))(torch.zeros(50, 2))  # noqa: B023
+        assert len(x.unique(dim=0)) == 50
+
+
+@pytest.mark.parametrize("shape", [(1,), (2,), (1, 4, 5)])
+def test_dimensions_of_size_one_may_be_missing(shape: tuple[int, ...]) -> None:
+    numbers = torch.arange(torch.Size(shape).numel()).reshape(shape)
+
+    def batched(theta: Tensor) -> Tensor:
+        return (theta[:, 0].reshape(-1, *[1] * len(shape)) + numbers).squeeze()
+
+    def single(theta: Tensor) -> Any:
+        assert theta.ndim == 1
+        x = (theta[0] + numbers).squeeze()
+        return float(x) if x.ndim == 0 else x
+
+    for function, count in itertools.product((batched, single), (3, 1)):
+        expected = torch.stack([row[0] + numbers for row in THETA[:count]])
+        assert torch.equal(simulated(function, *shape)(THETA[:count]), expected)
+
+
+def test_arguments_and_results_are_copies() -> None:
+    buffer = torch.zeros(2)
+
+    def reuses(theta: Tensor) -> Tensor:
+        assert theta.ndim == 1
+        return buffer.copy_(theta)
+
+    def changes(theta: Tensor) -> Tensor:
+        x = theta.clone()
+        theta.mul_(0)
+        return x
+
+    theta = THETA.clone()
+    for function in (reuses, changes):
+        assert torch.equal(simulated(function)(theta), THETA)
+    assert torch.equal(theta, THETA)
+
+
+def test_a_solver_of_scipy_gets_arrays_and_its_noise_follows_the_seed() -> None:
+    def decays(theta: Any) -> Any:
+        assert theta.dtype == np.float64
+        times = np.linspace(0.0, 1.0, 2)
+        path = odeint(lambda y, t: theta[1] - theta[0] * y, 1.0, times)
+        return path[:, 0] + 0.01 * np.random.standard_normal(2)  # noqa: NPY002
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rope = RoPE(gaussian.posterior(), simulator=decays)
+    one, two = (rope.embed(THETA, num_simulations=20, seed=1) for _ in range(2))
+    assert torch.equal(one.simulated, two.simulated)
+
+
+# --- simulators that fail ---
+
+
+def fails_at_times(theta: Any) -> Any:
+    if theta[0] > 0.5:
+        raise ArithmeticError("no solution")
+    return np.array([theta[0], theta[1]])
+
+
+def fails_in_batches(theta: Tensor) -> Tensor:
+    if (theta[:, 0] > 0.5).any():
+        raise ArithmeticError("no solution")
+    return theta.clone()
+
+
+def has_gaps(theta: Tensor) -> Tensor:
+    return theta.where(theta[:, :1] <= 0.5, torch.inf)
+
+
+@pytest.mark.parametrize("function", [fails_at_times, fails_in_batches, has_gaps])
+def test_rows_that_fail_are_dropped_and_counted(function: Any) -> None:
+    source = simulated(function)
+    x = source(THETA)
+    assert not x[1].isfinite().any()
+    assert torch.equal(x[[0, 2]], THETA[[0, 2]])
+    match = r"Dropped (\d+) of 200 .* from the prior \(\d+\.\d%\)"
+    with pytest.warns(RoPEWarning, match=match) as caught:
+        theta, x = source.from_prior(200)
+    (warning,) = caught
+    if function is not has_gaps:
+        assert "ArithmeticError('no solution')" in str(warning.message)
+    assert torch.equal(theta, x)
+    assert (theta[:, 0] <= 0.5).all()
+    assert source.num_dropped == 200 - len(theta) > 20
+
+
+def test_a_failed_simulation_is_replaced_by_another_one_of_the_pair() -> None:
+    theta = torch.stack([THETA, -THETA.flip(0)])  # 1 and 0 of 3 fail
+    pairs = Pairs(
+        theta=theta,
+        x=torch.zeros(2, 2),
+        group=torch.arange(2),
+        weight=torch.ones(2),
+        label=pairs_at(theta[:, 0]).label,
+    )
+    source = simulated(fails_at_times)
+    with pytest.warns(RoPEWarning, match="Dropped 1 of 6"):
+        at, x = draws(source, pairs, 1, itself)
+    assert torch.equal(at, x)
+    assert torch.equal(at[0], THETA[[0, 0, 2]])
+    assert torch.equal(at[1], theta[1])
+    with pytest.warns(RoPEWarning):
+        assert source.at(theta, itself).isnan().sum() == 2
+    with (
+        pytest.raises(SimulationError, match=r"parameters \[\[0\.6.*\]\] failed"),
+        pytest.warns(RoPEWarning, match="Dropped 4 of 12"),
+    ):
+        moments_at(source, THETA, 4)
+    with pytest.raises(SimulationError, match="All 4 simulations") as caught:
+        moments_at(source, THETA[1:2], 4)
+    assert isinstance(caught.value.__cause__, ArithmeticError)
+
+
+def test_a_simulator_is_tried_at_several_parameters_and_refused_with_its_error() -> (
+    None
+):
+    calls = 0
+
+    def fails_first(theta: Any) -> Any:
+        nonlocal calls
+        calls += 1
+        if calls < 9:
+            raise ArithmeticError("no solution")
+        return [float(theta[0]), float(theta[1])]
+
+    assert torch.equal(simulated(fails_first)(THETA), THETA)
+
+    def never_works(theta: Any) -> Any:
+        raise ArithmeticError(f"no solution for {type(theta).__name__} {theta.shape}")
+
+    with pytest.raises(SimulationError, match=r"no solution for ndarray \(2,\)") as it:
+        simulated(never_works)
+    assert isinstance(it.value.__cause__, ArithmeticError)
+    with pytest.raises(SimulationError, match=r"shape \(2,\) .*; got \(3,\)"):
+        simulated(lambda theta: np.zeros(3))
+
+
+# --- worker processes ---
+
+
+class TwoArgumentsError(Exception):
+    """An error that cannot be sent to another process."""
+
+    def __init__(self, first: str, second: str) -> None:
+        super().__init__(f"{first} {second}")
+
+
+def fails_with_noise(theta: Any) -> Any:
+    if theta[0] > 0.9:
+        raise TwoArgumentsError("no", "solution")
+    noise = np.random.standard_normal() + float(torch.randn(()))  # noqa: NPY002
+    return [float(theta[0]) + noise, float(theta[1])]
+
+
+@pytest.mark.medium
+@pytest.mark.filterwarnings("ignore:Dropped")
+def test_a_seed_gives_the_same_simulations_with_any_number_of_workers() -> None:
+    drawn = []
+    for num_workers in (1, 2):
+        source = simulated(parallel(fails_with_noise, num_workers=num_workers))
+        tried = source.num_calls
+        torch.manual_seed(0)
+        drawn.append(source.from_prior(60))
+        assert source.num_calls == tried + 60
+    assert all(map(torch.equal, *drawn))
+    theta, x = drawn[0]
+    assert len((x - theta)[:, 0].unique()) == len(theta) < 60
+    with pytest.raises(SimulationError, match="TwoArgumentsError: no solution"):
+        source.at(torch.tensor([[[0.95, 0.1]]]), itself)
+    # A batch is cut into pieces, and each has noise of its own.
+    batched = simulated(parallel(lambda theta: theta + torch.randn_like(theta)))
+    assert len(batched(THETA.repeat(100, 1)).unique(dim=0)) == 300
+
+
+def test_methods_take_a_simulator_that_runs_in_parallel() -> None:
+    method = DiscrepancyNPE.from_posterior(
+        gaussian.posterior(),
+        simulator=parallel(lambda theta: theta.numpy() + 0.1),
+        num_simulations=50,
+        simulations_per_pair=2,
+    ).append_calibration(*gaussian.labelled(10))
+    assert len(method.report(show_progress_bars=False).summaries) == 2
+    with pytest.raises(InvalidInputError, match="`simulator`"):
+        parallel(3)  # type: ignore[arg-type]
+    with pytest.raises(InvalidInputError, match="`num_workers`"):
+        parallel(fails_at_times, num_workers=0)
+
+
+# --- how often the simulator is called ---
+
+
+def counted(function: Callable[[Any], Any]) -> tuple[Callable[[Any], Any], list[int]]:
+    """Return a simulator, and the list of the numbers of rows it is called with."""
+    rows: list[int] = []
+
+    def count(theta: Any) -> Any:
+        rows.append(len(theta) if theta.ndim == 2 else 1)
+        return function(theta)
+
+    return count, rows
+
+
+@pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
+def test_calls_of_the_simulator_are_counted_from_the_first_on() -> None:
+    theta, x = gaussian.labelled(10)
+    for function in (gaussian.simulator, fails_in_batches):
+        count, rows = counted(function)
+        rope = RoPE(gaussian.posterior(), simulator=count)
+        assert 0 < rope.num_simulator_calls == sum(rows) < 40
+        rope.embed(x, num_simulations=30)
+        assert rope.num_simulator_calls == sum(rows)
+    rope = RoPE(gaussian.posterior(), simulator=gaussian.simulator, finetuner=QUICK)
+    tried = rope.num_simulator_calls
+    rope.append_calibration(theta, x).train()
+    assert rope.num_simulator_calls == tried + 1000
+    rope.build_posterior(x)
+    assert rope.num_simulator_calls == tried + 2000
+
+
+def test_simulations_of_a_seed_are_made_once() -> None:
+    count, rows = counted(gaussian.simulator)
+    source = simulated(count)
+    first = source.from_prior(50, seed=3)
+    before = sum(rows)
+    assert all(map(torch.equal, first, source.from_prior(50, seed=3)))
+    assert sum(rows) == before
+    other, _ = source.from_prior(50, seed=4)
+    assert not torch.equal(other, first[0])
+
+
+@pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
+def test_a_budget_is_simulated_once_and_then_used_as_stored_simulations_are() -> None:
+    theta, x = gaussian.labelled(10)
+    count, rows = counted(gaussian.simulator)
+    rope = RoPE(
+        gaussian.posterior(), simulator=count, num_simulations=1200, finetuner=QUICK
+    )
+    tried = sum(rows)
+    rope.append_calibration(theta, x).train(seed=0)
+    found = rope.build_posterior(x, seed=0, num_simulations=1200)
+    assert sum(rows) == rope.num_simulator_calls == tried + 1200
+    stored = RoPE(
+        gaussian.posterior(),
+        simulations=rope.source.from_prior(1200),
+        finetuner=QUICK,
+    )
+    stored.append_calibration(theta, x).train(seed=0)
+    expected = stored.build_posterior(x, seed=0, num_simulations=1200)
+    assert torch.allclose(found.weights.sort().values, expected.weights.sort().values)
+    assert rope.build_posterior(x).weights.shape == (10, 1000)
+    assert stored.num_simulator_calls == 0
+    with pytest.raises(InvalidInputError, match="at most 1200"):
+        rope.build_posterior(x, num_simulations=1201)
+    with pytest.raises(InvalidInputError, match="`num_simulations` with a simulator"):
+        RoPE(gaussian.posterior(), simulations=(theta, x), num_simulations=10)
+
+
+def test_the_noise_of_a_budget_does_not_repeat_its_parameters() -> None:
+    def simulator(theta: Tensor) -> Tensor:
+        return theta + torch.randn(theta.shape)  # from which the prior draws, too
+
+    rope = RoPE(gaussian.posterior(), simulator=simulator, num_simulations=200)
+    theta, x = rope.source.from_prior(200)
+    correlation = torch.cat([theta, x - theta], dim=1).T.corrcoef()[:2, 2:]
+    assert correlation.abs().max() < 0.3  # four standard errors
+
+
+@pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
+@pytest.mark.parametrize("num_workers", [None, 1])
+def test_simulations_that_were_interrupted_go_on_where_they_were(
+    num_workers: int | None,
+) -> None:
+    calls, broken = [], []
+
+    def one(theta: Tensor) -> Tensor:
+        assert theta.shape == (2,)
+        if len(calls) in broken:
+            raise KeyboardInterrupt
+        calls.append(theta)
+        return theta + torch.randn(2)
+
+    simulator = one if num_workers is None else parallel(one, num_workers=num_workers)
+
+    def rope() -> RoPE:
+        made = RoPE(gaussian.posterior(), simulator=simulator, num_simulations=350)
+        return made.append_calibration(*pairs)
+
+    pairs = gaussian.labelled(5)
+    undisturbed = rope().draw_targets(1)
+    interrupted = rope()
+    # Within the third part, which has ten simulations, or a hundred of processes.
+    done, size = (20, 10) if num_workers is None else (200, 100)
+    broken.append(len(calls) + done + size // 2)
+    with pytest.raises(KeyboardInterrupt):
+        interrupted.draw_targets(1)
+    broken.clear()
+    before = len(calls)
+    for _ in range(2):
+        assert torch.equal(interrupted.draw_targets(1), undisturbed)
+        assert len(calls) - before == 350 - done
+
+
+def test_the_bar_of_a_slow_simulator_says_how_often_it_is_called(
+    terminal: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sbi_rope.simulate.DELAY", 0.0)
+    rope = RoPE(gaussian.posterior(), simulator=gaussian.simulator)
+    rope.embed(THETA)
+    assert "Calling the simulator 1,000 times: 100%" in terminal.readouterr().err
+
+
+# --- moments and targets ---
+
+MIXING = torch.tensor([[1.0, 0.6], [0.0, 0.8]])
+NOISE = 0.25 * (MIXING.T @ MIXING).double()
+
+
+def noisy(theta: Tensor) -> Tensor:
+    """Curved in theta, with noise of covariance NOISE."""
+    return signal(theta) + 0.5 * torch.randn(len(theta), 2) @ MIXING
+
+
+def signal(theta: Tensor) -> Tensor:
+    return torch.cat([3 * theta, theta.square()], dim=1)
+
+
+def sometimes_nan(theta: Tensor) -> Tensor:
+    return noisy(theta).where(torch.rand(len(theta), 1) < 0.7, torch.nan)
+
+
+@pytest.mark.filterwarnings("ignore:Dropped")
+def test_moments_of_a_simulator_are_those_of_finite_simulations() -> None:
+    theta = torch.tensor([[-0.5], [0.8]])
+    for function in (noisy, sometimes_nan):
+        found = moments_at(simulated(function, dim=1), theta, 20_000)
+        assert torch.allclose(found.mean, signal(theta).double(), atol=0.02)
+        assert torch.allclose(found.covariance, NOISE.expand(2, 2, 2), atol=0.02)
+    assert found.means.shape == (2, 1, 2)
+    assert torch.equal(found[torch.tensor([1])].mean, found.mean[1:])
+    assert found.columns(slice(1, 2)).covariance.shape == (2, 1, 1)
+    single = moments_at(simulated(noisy, dim=1), theta, 1)
+    assert (single.covariance == 0).all()
+    # Divided by three instead of two, it would be off by a third.
+    few = moments_at(simulated(noisy, dim=1), torch.zeros(5000, 1), 3)
+    assert torch.allclose(few.covariance.mean(dim=0), NOISE, atol=0.02)
+
+
+def stored(theta: Tensor, x: Tensor, centre: float = 0.0) -> Source:
+    return source_of(
+        problems.box(theta.shape[1], centre - 1, centre + 1),
+        simulator=None,
+        simulations=(theta, x),
+        event_shape=x.shape[1:],
+        like=theta,
+    )
+
+
+def test_stored_simulations_come_in_random_order_and_as_many_as_there_are() -> None:
+    theta = torch.linspace(-1, 1, 1000)[:, None]
+    found, _ = stored(theta, noisy(theta)).from_prior(20_000, seed=0)
+    assert torch.equal(found.sort(dim=0).values, theta)
+    assert abs(float(found[:100].mean())) < 0.3
+
+
+def test_moments_of_stored_simulations_follow_the_slope_around_a_parameter() -> None:
+    # A slope of 3: averaging around the edge of the box would miss its height.
+    theta = 2 * torch.rand(20_000, 1) - 1
+    at = torch.tensor([[-1.0], [0.3], [0.999]])
+    expected = signal(at).double()
+    for centre in (0.0, 1e4):
+        source = stored(theta + centre, noisy(theta), centre)
+        found = moments_at(source, at + centre, 100)
+        # Fifty are around; at an edge the height is as uncertain as of twelve.
+        assert torch.allclose(found.mean, expected, atol=0.45), centre
+        assert torch.allclose(found.covariance.mean(dim=0), NOISE, atol=0.12), centre
+        pairs = pairs_at(at + centre)
+        mean = targets(source, pairs, 1, itself, num_neighbors=50)
+        assert torch.allclose(mean[1].double(), expected[1], atol=0.3), centre
+
+
+def test_stored_simulations_at_parameters_are_like_those_of_the_simulator() -> None:
+    """Regression adjustment keeps mean, slope and noise, of which 50 are near."""
+    theta = problems.box(2).sample((4000,))
+    source = Stored(theta, theta + 0.5 * torch.randn(4000, 2) @ MIXING)
+    at = 0.5 * problems.box(2).sample((20, 50))
+    residual = source.at(at, itself) - at
+    assert residual.shape == (20, 50, 2)
+    assert float(residual.mean(dim=(0, 1)).abs().max()) < 0.1
+    covariance = residual.double().reshape(-1, 2).T.cov()
+    assert torch.allclose(covariance, NOISE, atol=0.05)
+    # The mean at one parameter is the height of the plane through its neighbours.
+    distances = torch.cdist(at[:1, 0] / theta.std(dim=0), theta / theta.std(dim=0))
+    near = distances[0].argsort()[:50]
+    x = source.from_prior(4000, seed=0)
+    rows = torch.cdist(theta[near], x[0]).argmin(dim=1)
+    design = torch.cat([torch.ones(50, 1), x[0][rows] - at[0, 0]], dim=1)
+    height = torch.linalg.lstsq(design, x[1][rows]).solution[0]
+    found = source.at(at[:1, :1].expand(1, 50, 2), itself).mean(dim=1)
+    assert torch.allclose(found[0], height, atol=1e-4)
+
+
+def test_few_distances_at_once_give_the_same_nearest_simulations(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    theta, at = problems.box(2).sample((100,)), problems.box(2).sample((7,))
+    source, found = Stored(theta, theta), []
+    for at_once in (10_000, 200, 1):
+        monkeypatch.setattr(simulate, "MAX_DISTANCES", at_once)
+        found.append(source.near(at, 3, itself))
+    distances = torch.cdist(at / theta.std(dim=0), theta / theta.std(dim=0))
+    nearest = theta[distances.argsort(dim=1)[:, :3]]
+    assert all(torch.equal(one, nearest) for one in found)
+
+
+def test_targets_are_mean_embeddings_at_the_parameters_of_the_pairs() -> None:
+    theta, x = gaussian.labelled(6)
+    rope = RoPE(gaussian.posterior(), simulator=gaussian.simulator)
+    found = rope.append_calibration(theta, x).draw_targets(4000)
+    # h(S(theta)) = 0.8 (theta + 0.5 eps).
+    error = gaussian.GAIN * gaussian.NOISE_STD / 4000**0.5
+    assert torch.allclose(found, gaussian.GAIN * theta, atol=5 * error)
