@@ -1,15 +1,17 @@
-"""Make the pictures of the documentation from fifty labelled measurements.
+"""Make the pictures of the documentation, most from fifty labelled measurements.
 
     python docs/make_pictures.py
 
-The measurements are the extract of the light tunnel's sensors that the tests use. It
-takes about ten minutes, and writes PNG files into ``docs/pictures``.
+The measurements are the extract of the light tunnel's sensors that the tests use. One
+picture shows simulated beats of the heart, and needs numba. It takes about ten minutes,
+and writes PNG files into ``docs/pictures``.
 """
 
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import matplotlib.pyplot as plt
 import pandas as pd
 import torch
 from sbi.inference import NPE
@@ -20,6 +22,8 @@ from sbi_rope import RoPE, SinkhornCoupler, diagnose, plots, stack
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.metrics import draw_samples, evaluate
 from sbi_rope.tasks import get_task
+from sbi_rope.tasks.hemodynamics.population import PROCESSES, Population
+from sbi_rope.tasks.hemodynamics.waveforms import SITES, simulate_beat
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -174,6 +178,27 @@ def arranged(figure: "Figure", *, columns: int, size: tuple[float, float]) -> "F
     return figure
 
 
+def hemodynamics() -> "Figure":
+    """Draw beats of ten people without and with arteries of their own lengths."""
+    figure = plt.figure(figsize=(10, 6), layout="constrained")
+    grid = figure.subplots(len(PROCESSES), len(SITES), sharex=True, sharey=True)
+    for index in range(10):
+        real = Population().draw("real", seed=0, index=index)
+        people = (replace(real, length_factors=(1.0,) * len(real.length_factors)), real)
+        for row, subject in zip(grid, people, strict=True):
+            beat = simulate_beat(subject)
+            for ax, site in zip(row, reversed(SITES), strict=True):
+                wave = beat.pressure[site]
+                time = beat.period * torch.arange(len(wave)) / len(wave)
+                color = plt.get_cmap("viridis")((real.age - 25.0) / 50.0)
+                ax.plot(time, wave, color=color, linewidth=1.0)
+    for row, process in zip(grid, PROCESSES, strict=True):
+        row[0].set_ylabel("pressure [mmHg]")
+        for ax, site in zip(row, reversed(SITES), strict=True):
+            ax.set(title=f"{site}, {process}", xlabel="time [s]")
+    return figure
+
+
 def save(figure: "Figure", name: str) -> None:
     """Write a picture and say how large it is."""
     path = DOCS / "pictures" / f"{name}.png"
@@ -191,6 +216,7 @@ def main() -> None:
     rope = RoPE(npe, simulator=simulator, coupler=SinkhornCoupler(gamma=0.1))
     rope.append_calibration(theta_cal, x_cal).train(seed=0, **QUIET)
 
+    save(hemodynamics(), "hemodynamics")
     save(overview(rope, npe, theta_o[0], x_o), "overview")
     save(discrepancy(npe, simulator, theta_cal, x_cal), "discrepancy")
     save(gammas(rope, theta_o[OBSERVED], x_o), "gammas")

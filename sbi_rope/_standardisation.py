@@ -28,15 +28,9 @@ def deviations(embedding_net: nn.Module, x: Tensor) -> Tensor | None:
 
     .. math:: |x - \bar x_s| / \operatorname{sd}(x_s)
 
-    Args:
-        embedding_net: The embedding net of a trained estimator, which starts with sbi's
-            standardising layer.
-        x: Observations, shape ``(n, *event_shape)``.
-
-    Returns:
-        The distances in standard deviations of the simulations, shape
-        ``(n, *event_shape)``, or None if NPE does not standardise x. Missing entries
-        (NaN) have a distance of zero.
+    It has the shape of x, ``(n, *event)``, and is zero for missing entries (NaN). The
+    mean and standard deviation are those of sbi's standardising layer, with which the
+    net of a trained estimator starts. Without this layer it is None.
     """
     mean_and_std = standardisation_of(embedding_net)
     if mean_and_std is None:
@@ -50,12 +44,8 @@ def leave_out_constants(embedding_net: nn.Module, x: Tensor) -> None:
     """Make a net ignore the entries that are the same in all calibration pairs.
 
     sbi divides an entry that does not vary by 1e-7. In an observation where it does
-    vary, it would then be much larger than all other entries.
-
-    Args:
-        embedding_net: A net with sbi's standardising layer, which is changed.
-        x: The calibration x that gave the layer its mean and standard deviation, shape
-            ``(n, *event_shape)``.
+    vary, it would then be much larger than all other entries. The standardising layer
+    of the net, whose mean and standard deviation are those of x, is changed.
     """
     mean_and_std = standardisation_of(embedding_net)
     if mean_and_std is None or mean_and_std[1].shape != x.shape[1:]:
@@ -86,12 +76,8 @@ def warn_of_far_entries(name: str, x: Tensor, embedding_net: nn.Module) -> None:
 class Standardisation(nn.Module):
     """Divide statistics by their standard deviation over simulations, and undo it.
 
-    Statistics that are the same in all simulations have no such unit. They are left out
-    of the standardised statistics, and get their simulated value back from
-    :meth:`undo`.
-
-    Args:
-        simulated: Statistics of simulations, shape ``(n, l)``.
+    Statistics that are the same in all simulations ``(n, l)`` have no such unit. They
+    are left out, and get their simulated value back from :meth:`undo`.
     """
 
     mean: Tensor

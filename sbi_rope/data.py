@@ -4,6 +4,7 @@ Pairs of one person or specimen belong to one group. They are held out together,
 a network can learn by heart whom it has met.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any, TypeVar
@@ -18,6 +19,7 @@ __all__ = [
     "MIN_PAIRS_FOR_HOLDOUT",
     "Counts",
     "Labels",
+    "Nodes",
     "Pairs",
     "groups_of",
     "groups_to_hold_out",
@@ -70,11 +72,7 @@ class Labels:
         return _map(lambda value: value[rows], self)
 
     def __add__(self, others: "Labels") -> "Labels":
-        """Return these labels followed by others.
-
-        Raises:
-            InvalidInputError: If the numbers of draws differ.
-        """
+        """Return these labels followed by others with as many draws."""
         if not len(self):
             return others
         if self.draws.shape[1] != others.draws.shape[1]:
@@ -139,12 +137,6 @@ class Counts:
         """Return weighted means of the values of each group, and weights of groups.
 
         Shapes ``(n, ...)`` to ``(G, ...)`` and ``(G,)``.
-
-        Example:
-            >>> import torch
-            >>> counts = Counts(torch.tensor([0.5, 0.5, 1.0]), torch.tensor([0, 0, 1]))
-            >>> counts.of_groups(torch.tensor([1.0, 3.0, 5.0]))
-            (tensor([2., 5.]), tensor([1., 1.]))
         """
         weights = self.weights.to(values)
         if self.groups is None:
@@ -220,16 +212,12 @@ class Pairs:
 
     @property
     def counts(self) -> Counts:
-        """What each pair counts as where it is scored: a group as one pair."""
+        """How much each pair counts where it is scored. A group counts as one pair."""
         _, place, sizes = self.group.unique(return_inverse=True, return_counts=True)
         return Counts(self.weight / sizes[place], self.group)
 
     def folds(self, num_folds: int, *, seed: int | None = None) -> list[Tensor]:
-        """Return the rows of each fold, with a group in one fold, at random.
-
-        There are at most as many folds as groups, with equally many rows as far as the
-        groups allow. A seed of None uses the state of torch.
-        """
+        """Return the rows of each fold, drawn at random. A group is in one fold."""
         with seeded(seed):
             rows = split_groups(self.group, num_folds)
         return [fold.to(self.group.device) for fold in rows]
@@ -237,7 +225,7 @@ class Pairs:
     def split(
         self, fraction: float, *, seed: int | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Return the rows to train on, and those of groups held out at random."""
+        """Return the rows to train on, and those held out: whole groups, at random."""
         with seeded(seed):
             train, held_out = split_pairs(self.group, fraction)
         return train.to(self.group.device), held_out.to(self.group.device)
@@ -262,14 +250,63 @@ class Pairs:
         return text
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Nodes:
+    r"""Parameters and weights that turn a density of theta into one of the label.
+
+    .. math:: p(y_i \mid x_i) \approx \frac1S \sum_s u_{is}\, q(\theta_{is} \mid x_i)
+
+    Attributes:
+        theta: Shape ``(n, S, d)``, in the dtype of the labels. All are inside the
+            support of the prior, so that those with no weight do no harm to gradients.
+        log_weights: :math:`\log u`, minus infinity outside the support of the prior,
+            shape ``(n, S)``, float64.
+    """
+
+    theta: Tensor
+    log_weights: Tensor
+
+    @classmethod
+    def exact(cls, theta: Tensor) -> "Nodes":
+        """Return the nodes of exact labels ``(n, d)``: the labels themselves."""
+        log_weights = theta.new_zeros(len(theta), 1, dtype=torch.double)
+        return cls(theta=theta[:, None], log_weights=log_weights)
+
+    def __len__(self) -> int:
+        return len(self.theta)
+
+    def __getitem__(self, rows: Tensor) -> "Nodes":
+        return _map(lambda value: value[rows], self)
+
+    def log_mean(self, log_q: Tensor) -> Tensor:
+        r"""Return the log density of each label, ``(n,)`` or ``(n, K)``.
+
+        ``log_q`` is :math:`\log q(\theta_{is} \mid x_i)`, of K posteriors ``(n, S, K)``
+        or of one ``(n, S)``.
+        """
+        terms = self._terms(log_q)
+        return terms.logsumexp(dim=1) - math.log(terms.shape[1])
+
+    def standard_error(self, log_q: Tensor) -> Tensor:
+        """Return the Monte-Carlo error of :meth:`log_mean`, to first order."""
+        terms = self._terms(log_q)
+        largest = terms.amax(dim=1, keepdim=True)
+        ratio = (terms - largest.clamp_min(-1e300)).exp()
+        mean = ratio.mean(dim=1).clamp_min(1e-300)
+        return ratio.std(dim=1) / mean / terms.shape[1] ** 0.5
+
+    def _terms(self, log_q: Tensor) -> Tensor:
+        weights = self.log_weights if log_q.ndim == 2 else self.log_weights[..., None]
+        # Where the weight is zero, the density may be anything.
+        return torch.where(
+            torch.isneginf(weights), weights, log_q.to(weights) + weights
+        )
+
+
 def groups_of(theta: Tensor) -> Tensor:
-    """Number rows so that equal ones share a number.
+    """Number rows ``(n, d)``, or numbers ``(n,)``, so that equal ones share a number.
 
-    Args:
-        theta: Parameters, shape ``(n, d)``, or any numbers of groups, shape ``(n,)``.
-
-    Returns:
-        Numbers from 0 in the order of first appearance, on the CPU, shape ``(n,)``.
+    Numbers start at 0, in the order of first appearance, on the CPU, shape ``(n,)``.
     """
     rows = theta.detach().tolist()
     keys = [tuple(row) if isinstance(row, list) else row for row in rows]
@@ -278,12 +315,7 @@ def groups_of(theta: Tensor) -> Tensor:
 
 
 def one_of_each_group(groups: Tensor, *, seed: int) -> Tensor:
-    """Choose a row of each group at random, and tell whether each row was, ``(n,)``.
-
-    Example:
-        >>> one_of_each_group(torch.tensor([0, 1, 2]), seed=0)
-        tensor([True, True, True])
-    """
+    """Choose a row of each group at random, and tell whether each row was, ``(n,)``."""
     with seeded(seed):
         order = torch.randperm(len(groups)).flip(0).to(groups.device)
     # Of each group the last row in this order.
@@ -316,7 +348,11 @@ def split_pairs(
 
 
 def split_groups(groups: Tensor, num_folds: int) -> list[Tensor]:
-    """Cut rows into folds at random, with the rows of a group in the same fold."""
+    """Cut rows into folds at random, with the rows of a group in the same fold.
+
+    There are at most as many folds as groups, with equally many rows as far as the
+    groups allow.
+    """
     # Not by scikit-learn's GroupKFold: it refuses fewer groups than folds, and in which
     # order it takes groups of equal size depends on its version. Stored results depend
     # on who was in which fold.

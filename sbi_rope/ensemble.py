@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from sbi_rope._random import seeded
 from sbi_rope.errors import SamplingError
 
-__all__ = ["Ensemble", "drawn", "embedded", "log_density", "loss_of"]
+__all__ = ["Ensemble", "drawn", "embedded", "log_density", "loss_of", "resize"]
 
 # What is asked of a network: its answers to rows. The first argument is the network.
 Question = Callable[..., Tensor]
@@ -44,11 +44,7 @@ def loss_of(density: Any, theta: Tensor, z: Tensor) -> Tensor:
 
 
 def drawn(density: Any, z: Tensor) -> Tensor:
-    """Draw once given each condition, ``(n, l)`` to ``(n, d)``.
-
-    Raises:
-        SamplingError: If the density is not finite given a condition.
-    """
+    """Draw once given each condition, ``(n, l)`` to ``(n, d)``."""
     try:
         return density.sample(torch.Size((1,)), z)[0]
     except ValueError as error:  # of sbi's mixtures of Gaussians
@@ -103,7 +99,7 @@ class _Linear(_Stacked):
         if bias:
             y = torch.baddbmm(bias[0][:, None], rows, weight.mT)
         else:
-            y = torch.bmm(rows, weight.mT)
+            y = rows @ weight.mT
         return y.reshape(*x.shape[:-1], weight.shape[1])
 
 
@@ -128,18 +124,11 @@ class _LULinear(_Stacked):
         one: Any = self._one[0]
         values = dict(zip(self.names, self.stacks, strict=True))
         diagonal = F.softplus(values["unconstrained_upper_diag"]) + one.eps
-        zeros = diagonal.new_zeros(*diagonal.shape, diagonal.shape[1])
-        lower, upper = zeros.clone(), torch.diag_embed(diagonal)
+        lower = torch.diag_embed(torch.ones_like(diagonal))
         lower[:, one.lower_indices[0], one.lower_indices[1]] = values["lower_entries"]
-        lower = lower + torch.eye(diagonal.shape[1]).to(lower)
-        upper = upper + _placed(zeros, one.upper_indices, values["upper_entries"])
+        upper = torch.diag_embed(diagonal)
+        upper[:, one.upper_indices[0], one.upper_indices[1]] = values["upper_entries"]
         return lower, upper, diagonal.log().sum(dim=1), values["bias"]
-
-
-def _placed(zeros: Tensor, indices: Any, values: Tensor) -> Tensor:
-    matrix = zeros.clone()
-    matrix[:, indices[0], indices[1]] = values
-    return matrix
 
 
 class _Loop(_Stacked):
@@ -150,9 +139,7 @@ class _Loop(_Stacked):
     _each: Sequence[nn.Module] = ()
 
     def forward(self, *rows: Any, **options: Any) -> Any:
-        return self.answer(
-            lambda module, *args, **more: module(*args, **more), *rows, **options
-        )
+        return self.answer(nn.Module.__call__, *rows, **options)
 
     def answer(self, question: Question, *rows: Any, **options: Any) -> Any:
         count, E = len(rows[0]), self.num_members
@@ -174,8 +161,9 @@ class _Loop(_Stacked):
         return type(answers[0])(map(torch.cat, zip(*answers, strict=True)))
 
     def _modules_of_each(self) -> Sequence[nn.Module]:
-        if len(self._each) != self.num_members:
+        if len(self._each) < self.num_members:
             self._each = [copy.deepcopy(self._one[0]) for _ in range(self.num_members)]
+        self._each = self._each[: self.num_members]
         for name, stack in zip(self.names, self.stacks, strict=True):
             path, _, leaf = name.rpartition(".")
             for module, value in zip(self._each, stack.unbind(), strict=True):
@@ -287,6 +275,13 @@ class Ensemble(nn.Module):
     def layers(self) -> list[_Stacked]:
         """Return the modules that hold the parameters, in the order of the network."""
         return [part for part in self.net.modules() if isinstance(part, _Stacked)]
+
+
+def resize(network: nn.Module, old: int, new: int) -> None:
+    """Tell the ensembles in a network that their stacks hold another number now."""
+    for part in network.modules():
+        if isinstance(part, Ensemble | _Stacked) and part.num_members == old:
+            part.num_members = new
 
 
 def _stacked(members: Sequence[nn.Module]) -> Any:

@@ -20,7 +20,6 @@ __all__ = [
     "SamplingError",
     "SimulationError",
     "UnsupportedPosteriorError",
-    "in_digits",
     "shown",
     "warn_user",
 ]
@@ -28,8 +27,6 @@ __all__ = [
 
 # The most characters of a value that a message shows.
 LONGEST_TEXT = 200
-# The most rows of a matrix.
-NUM_ROWS = 5
 # Warnings point at no line of these packages.
 PASSED_OVER = ("sbi_rope", "sbi", "torch", "contextlib", "functools")
 
@@ -80,20 +77,10 @@ class RoPEWarning(UserWarning):
 
 def shown(value: Any) -> str:
     """Return a value as it is written in code, shortened if it is long."""
-    try:
-        text = repr(value)
-    except Exception:  # a `repr` may raise anything, and that of huge integers does
-        return f"a value of type {type(value).__name__}"
+    text = repr(value)
     if len(text) <= LONGEST_TEXT:
         return text
     return f"{text[:LONGEST_TEXT]}... (of type {type(value).__name__})"
-
-
-def in_digits(rows: Any) -> str:
-    """Return the first rows of a matrix as text, with four digits of each number."""
-    first = [", ".join(f"{float(v):.4g}" for v in row) for row in rows[:NUM_ROWS]]
-    more = ", ..." if len(rows) > len(first) else ""
-    return f"[{', '.join(f'[{row}]' for row in first)}{more}]"
 
 
 def warn_user(message: str) -> None:

@@ -1,11 +1,11 @@
 """Fine-tuning the embedding net on real observations with known parameters."""
 
 import copy
-import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from functools import partial
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor, nn
@@ -13,14 +13,13 @@ from torch import Tensor, nn
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed
-from sbi_rope.data import split_pairs
+from sbi_rope.data import Nodes, split_pairs
 from sbi_rope.density.flow import Flow
 from sbi_rope.ensemble import Ensemble, embedded
 from sbi_rope.errors import InvalidInputError, warn_user
 from sbi_rope.fit import History, Training, epochs_on_pairs, fit
-from sbi_rope.labels import Nodes
 from sbi_rope.settings import Count, NotNegative, Positive, Range, Settings, check
-from sbi_rope.tensors import as_batch, rows_with
+from sbi_rope.tensors import as_batch
 
 __all__ = ["CalibrationFinetuner", "FinetuneResult", "History"]
 
@@ -97,9 +96,6 @@ class CalibrationFinetuner(Settings):
             parameters.
         validation_fraction: The share of the pairs that is held out, at most 0.5.
         rehearsal: :math:`\lambda`, not negative. The default is 0, as in the paper.
-
-    Raises:
-        InvalidInputError: If an argument is outside its range.
     """
 
     learning_rate: Positive | tuple[Positive, ...] = (1e-4, 1e-3)
@@ -110,11 +106,6 @@ class CalibrationFinetuner(Settings):
     num_neighbors: Count = 1
     validation_fraction: Annotated[float, Range(0, 0.5)] = 0.2
     rehearsal: NotNegative = 0.0
-
-    @property
-    def _learning_rates(self) -> tuple[float, ...]:
-        rates = self.learning_rate
-        return rates if isinstance(rates, tuple) else (rates,)
 
     def finetune(
         self,
@@ -145,23 +136,16 @@ class CalibrationFinetuner(Settings):
             seed: Seed of the split and of the simulations; None uses torch's state.
             show_progress_bars: Whether to show the losses during training. None does so
                 in a terminal or a notebook, but not in a file.
-
-        Returns:
-            The tuned net and its history.
-
-        Raises:
-            InvalidInputError: If shapes do not fit or a value is not finite.
         """
         check("embedding_net", embedding_net, nn.Module)
-        x = as_batch("x", x, finite=False).to(_dtype_of(embedding_net))
-        if groups is None:
-            groups = torch.arange(len(x))
+        x = as_batch("x", x, finite=False)
+        groups = torch.arange(len(x)) if groups is None else groups
         groups = as_batch("groups", groups, (), rows=len(x))
         if weights is not None:
             weights = as_batch("weights", weights, (), rows=len(x)).to(x)
         show = is_shown(show_progress_bars)
         with seeded(seed):
-            z = _embedded("x", x, embedding_net)
+            z = as_batch("x", embed(embedding_net, x))
 
             def new_targets() -> Tensor:
                 targets = draw_targets(self.simulations_per_target)
@@ -195,21 +179,23 @@ class CalibrationFinetuner(Settings):
     ) -> tuple[Ensemble, list[History]]:
         """Tune a copy of h on each of several sets of pairs, all at once.
 
-        Args:
-            h: The embedding net of NPE.
-            x: The observations of all pairs, shape ``(n, *event)``.
-            targets: The targets of each copy at all pairs, shape ``(n, l)``.
-            sets: The rows of the pairs that each copy may see.
-            groups: As in :meth:`finetune`.
-            weights: As in :meth:`finetune`.
-            draw_simulations: As in :meth:`finetune`.
-            draw_targets: Draws new targets in every epoch, if they are drawn anew.
-            show_progress_bars: Whether to show the losses.
-
-        Returns:
-            The copies, and the losses of each.
+        Of each copy, ``targets`` has the targets at all pairs, shape ``(n, l)``, and
+        ``sets`` the rows of the pairs that it may see. If targets are drawn anew in
+        every epoch, ``draw_targets`` does so. Other arguments are as in
+        :meth:`finetune`.
         """
-        kept = self._rehearsed(h, draw_simulations)
+        kept = None
+        if self.rehearsal:
+            if draw_simulations is None:
+                raise InvalidInputError(
+                    f"Expected `draw_simulations` with rehearsal={self.rehearsal}; got "
+                    "None."
+                )
+            simulations = draw_simulations(NUM_REHEARSED).to(x.dtype)
+            kept = (
+                simulations,
+                as_batch("embeddings of simulations", embed(h, simulations)),
+            )
         splits = []
         for rows in sets:
             parts = split_pairs(groups[rows.cpu()], self.validation_fraction)
@@ -218,21 +204,19 @@ class CalibrationFinetuner(Settings):
         max_num_epochs = epochs_on_pairs(
             groups[fewest[0].cpu()], fewest[1], self.max_num_epochs
         )
+        rates = self.learning_rate
+        rates = list(rates) if isinstance(rates, tuple) else [rates]
         if not len(fewest[1]):
             # The careful rate for a net, the larger for an affine map.
             is_net = any(True for _ in h.parameters())
-            rates = [(min if is_net else max)(self._learning_rates)]
+            rates = [min(rates) if is_net else max(rates)]
             splits = [(rows, rows[:0]) for rows in sets]
-        else:
-            rates = list(self._learning_rates)
-        count = len(rates)
-        nets = Ensemble(
-            [trainable_copy(h, targets[0])] * (count * len(sets)), embedded, (x[:3],)
-        )
+        count, num_nets = len(rates), len(rates) * len(sets)
+        nets = Ensemble([trainable_copy(h, targets[0])] * num_nets, embedded, (x[:3],))
         fixed = torch.stack([one for one in targets for _ in rates])
         newest, every = fixed, [split for split in splits for _ in rates]
         train, held_out = (
-            Padded.of(rows, weights) for rows in zip(*every, strict=True)
+            Padded.of(some, weights) for some in zip(*every, strict=True)
         )
 
         def distances(x: Tensor, targets: Tensor) -> Tensor:
@@ -242,29 +226,33 @@ class CalibrationFinetuner(Settings):
         def mean_distance(rows: Padded, targets: Tensor) -> Tensor:
             return rows.mean(distances(x[rows.index], rows.of_each(targets)))
 
-        def loss() -> Tensor:
-            found = mean_distance(train, newest)
-            if kept is None:
-                return found
-            size = len(nets), REHEARSED_IN_EPOCH
-            some = torch.randint(len(kept[0]), size).to(x.device)
-            rehearsed = distances(kept[0][some], kept[1][some]).mean(dim=1)
-            return found + self.rehearsal * rehearsed
-
-        def steps(epoch: int) -> list[tuple[()]]:
+        def batches(epoch: int) -> list[tuple[Any, ...]]:
             nonlocal newest
             if draw_targets is not None and epoch:
                 newest = draw_targets().expand_as(fixed)
-            return [()]
+            if kept is None:
+                return [(train, newest)]
+            some = torch.randint(len(kept[0]), (num_nets, REHEARSED_IN_EPOCH))
+            return [(train, newest, some.to(x.device))]
+
+        def loss(rows: Padded, targets: Tensor, some: Tensor | None = None) -> Tensor:
+            found = mean_distance(rows, targets)
+            if kept is None:
+                return found
+            rehearsed = distances(kept[0][some], kept[1][some]).mean(dim=1)
+            return found + self.rehearsal * rehearsed
 
         histories = fit(
             nets,
-            steps,
+            batches,
             loss,
-            self.training,
-            validation_loss=(
-                (lambda: mean_distance(held_out, fixed)) if len(held_out) else None
+            Training(
+                max_num_epochs=self.max_num_epochs,
+                stop_after_epochs=self.stop_after_epochs,
+                clip_max_norm=None,
             ),
+            validation_loss=mean_distance if len(held_out) else None,
+            held_out=(held_out, fixed),
             learning_rates=rates * len(sets),
             max_num_epochs=max_num_epochs,
             in_training_mode=False,
@@ -273,29 +261,6 @@ class CalibrationFinetuner(Settings):
         )
         best = best_rates(histories, count)
         return nets[best], [histories[k] for k in best]
-
-    @property
-    def training(self) -> Training:
-        """How each net is trained."""
-        return Training(
-            max_num_epochs=self.max_num_epochs,
-            stop_after_epochs=self.stop_after_epochs,
-            clip_max_norm=None,
-        )
-
-    def _rehearsed(
-        self, h: nn.Module, draw_simulations: Callable[[int], Tensor] | None
-    ) -> tuple[Tensor, Tensor] | None:
-        """Return simulations and their embeddings by h; None without rehearsal."""
-        if not self.rehearsal:
-            return None
-        if draw_simulations is None:
-            raise InvalidInputError(
-                f"Expected `draw_simulations` with rehearsal={self.rehearsal}; got "
-                "None."
-            )
-        simulations = draw_simulations(NUM_REHEARSED).to(_dtype_of(h))
-        return simulations, _embedded("simulations", simulations, h)
 
 
 # With rehearsal, g embeds simulations as h does, so that the density can interpret
@@ -347,25 +312,12 @@ def finetune_flow(
         \sum_{i \in \text{held out}} -\log q(\theta_i \mid x_i)
         \quad\text{does not fall any more}
 
-    With rehearsal the mean over the pairs and that over simulations count half each.
-    The density of a label that is not exact is an average over its nodes.
-
-    Args:
-        flow: The flows, E of them, which are trained in evaluation mode.
-        labels: The nodes of the labels of all pairs, for each flow.
-        x: The observations of all pairs, shape ``(n, *event)``.
-        splits: The rows that each flow is trained on, and those that it holds out.
-        training: Batch size and when to stop.
-        learning_rates: One for each flow; that of ``training`` if None.
-        max_num_epochs: Instead of that of ``training``.
-        weights: How many pairs each pair counts as, shape ``(n,)``; one if None.
-        rehearsed: Simulations (theta, x) to train on, too. A large net that keeps
-            seeing them learns more from the pairs before it overfits.
-        only_densities: Whether the net, which all flows share, stays as it is.
-        show_progress_bars: Whether to show the losses.
-
-    Returns:
-        The losses of each flow, and the epoch that was kept.
+    For each flow there are the nodes of all labels, of whose densities the mean is
+    taken, and the rows that it is trained on and holds out. All see the same x,
+    ``(n, *event)``. With ``only_densities`` the net, which all flows share, stays as it
+    is. A large net that keeps seeing ``rehearsed`` simulations (theta, x) learns more
+    from the pairs before it overfits. The mean over the pairs and that over simulations
+    count half each then.
     """
     network = flow.densities if only_densities else flow
     fixed = flow.embed(x)[:, 0] if only_densities else None
@@ -377,7 +329,7 @@ def finetune_flow(
     log_weights = torch.stack([one.log_weights for one in different])
     place = place[:, None].to(x.device)
 
-    def losses(rows: Tensor) -> Tensor:
+    def losses(rows: Tensor, place: Tensor) -> Tensor:
         """Return the negative log densities of labels, ``(E, B)`` to ``(E, B)``."""
         nodes, of_nodes = theta[place, rows], log_weights[place, rows]
         z = flow.embeddings(x[rows]) if fixed is None else fixed[rows]
@@ -389,21 +341,29 @@ def finetune_flow(
         terms = torch.where(torch.isneginf(of_nodes), of_nodes, log_q + of_nodes)
         return math.log(count) - terms.logsumexp(dim=2)
 
-    split = [_with_density(losses, rows) for rows in zip(*splits, strict=True)]
+    split = [
+        _with_density(partial(losses, place=place), rows)
+        for rows in zip(*splits, strict=True)
+    ]
     train, held_out = (Padded.of(rows, weights) for rows in split)
 
-    def batches(epoch: int) -> Iterator[tuple[Padded]]:
+    def mean_loss(rows: Padded, place: Tensor) -> Tensor:
+        return rows.mean(losses(rows.index, place))
+
+    def batches(epoch: int) -> Iterator[tuple[Any, ...]]:
         if rehearsed is None:
-            yield from ((one,) for one in train.shuffled(training.training_batch_size))
+            for some in train.shuffled(training.training_batch_size):
+                yield some, place
             return
         for _ in range(STEPS_IN_EPOCH):
-            yield (train.drawn(PAIRS_IN_BATCH),)
+            pairs = train.drawn(PAIRS_IN_BATCH)
+            some = torch.randint(len(rehearsed[0]), pairs.index.shape)
+            yield pairs, place, some.to(x.device)
 
-    def loss(rows: Padded) -> Tensor:
-        found = rows.mean(losses(rows.index))
+    def loss(rows: Padded, place: Tensor, some: Tensor | None = None) -> Tensor:
+        found = mean_loss(rows, place)
         if rehearsed is None:
             return found
-        some = torch.randint(len(rehearsed[0]), rows.index.shape).to(x.device)
         theta_s, x_s = (one[some] for one in rehearsed)
         return 0.5 * found + 0.5 * flow.losses(theta_s, x_s).mean(dim=1)
 
@@ -412,9 +372,8 @@ def finetune_flow(
         batches,
         loss,
         training,
-        validation_loss=(
-            (lambda: held_out.mean(losses(held_out.index))) if len(held_out) else None
-        ),
+        validation_loss=mean_loss if len(held_out) else None,
+        held_out=(held_out, place),
         learning_rates=learning_rates,
         max_num_epochs=max_num_epochs,
         in_training_mode=False,
@@ -427,10 +386,10 @@ def finetune_flow(
 def _with_density(
     losses: Callable[[Tensor], Tensor], rows: Sequence[Tensor]
 ) -> list[Tensor]:
-    """Return the rows of each flow whose loss is finite, after a warning of the others.
+    """Return the rows of each flow whose loss is finite; warn of the others.
 
-    A single infinite loss would end the training. A label exactly on a bound of the
-    prior has one if the density is zero there.
+    A label exactly on a bound of the prior has an infinite loss if the density is zero
+    there, which would end the training.
     """
     padded = Padded.of(rows, None)
     if not len(padded):
@@ -477,6 +436,9 @@ class Padded:
     def __len__(self) -> int:
         return self.index.shape[1]
 
+    def __getitem__(self, members: Tensor) -> "Padded":
+        return Padded(self.index[members], self.share[members])
+
     def mean(self, values: Tensor) -> Tensor:
         """Return the weighted mean of each member, ``(E, m)`` to ``(E,)``."""
         share = self.share.to(values)
@@ -506,9 +468,7 @@ class Padded:
 def trainable_copy(embedding_net: nn.Module, embeddings: Tensor) -> nn.Module:
     """Copy a net so that all of it can be trained, in evaluation mode.
 
-    Args:
-        embedding_net: The net to copy.
-        embeddings: Any batch of its outputs, shape ``(n, l)``.
+    ``embeddings`` is any batch of its outputs, shape ``(n, l)``.
     """
     net = copy.deepcopy(embedding_net).requires_grad_()
     if not any(True for _ in net.parameters()):
@@ -519,20 +479,3 @@ def trainable_copy(embedding_net: nn.Module, embeddings: Tensor) -> nn.Module:
             affine.bias.zero_()
         net = nn.Sequential(net, affine)
     return net.eval()
-
-
-def _dtype_of(net: nn.Module) -> torch.dtype:
-    """Return the dtype of the parameters and buffers of a net."""
-    known = itertools.chain(net.parameters(), net.buffers())
-    dtypes = (values.dtype for values in known if values.is_floating_point())
-    return next(dtypes, torch.float32)
-
-
-def _embedded(name: str, x: Tensor, net: nn.Module) -> Tensor:
-    z = embed(net, x)
-    if (bad := ~torch.isfinite(z)).any():
-        raise InvalidInputError(
-            f"Expected `{name}` with finite embeddings; got NaN or Inf in "
-            f"{rows_with(bad)}."
-        )
-    return z

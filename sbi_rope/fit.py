@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from sbi_rope._progress import progress_bar
 from sbi_rope.data import MIN_PAIRS_FOR_HOLDOUT, too_few_pairs
+from sbi_rope.ensemble import resize
 from sbi_rope.errors import RoPEWarning, warn_user
 from sbi_rope.settings import Count, Level, Positive, Settings
 
@@ -34,6 +35,8 @@ LARGEST_LIMIT = 10**6
 # A course that made the loss worse is repeated from the better state with this share of
 # its rate, and not more often than so many times.
 LOWER, MAX_LOWERED = 0.3, 2
+# Share of a course in which its step size rises.
+WARM_UP = 0.1
 # Of Adam, as in torch.
 BETAS, EPSILON = (0.9, 0.999), 1e-8
 
@@ -51,9 +54,6 @@ class Training(Settings):
         max_num_epochs: Most passes over the training data; sbi's trainers make two at
             least.
         clip_max_norm: Largest norm of a gradient; None does not clip.
-
-    Raises:
-        InvalidInputError: If an argument is outside its range.
     """
 
     training_batch_size: Count = 200
@@ -94,36 +94,27 @@ class History:
         loss = self.validation_loss[self.best_epoch] if self.validation_loss else 0.0
         return math.inf if math.isnan(loss) else loss
 
-    def __repr__(self) -> str:
-        loss, what = self.validation_loss, "validation_loss"
-        if not loss:
-            loss, what = self.training_loss, "training_loss"
-        best = min(self.best_epoch, len(loss) - 1)
-        return (
-            f"History({what} {loss[0]:.3g} -> {loss[best]:.3g}, "
-            f"best_epoch={self.best_epoch}, learning_rate={self.learning_rate:g})"
-        )
-
 
 @dataclass(frozen=True)
 class Courses:
     """Trainings that follow each other, each from the better of two states.
 
-    In a course the step size falls to zero. A course after which the loss is higher is
-    not kept: the member goes on from the better state with a smaller step size.
+    In a course the step size falls to zero. A course after which the validation loss is
+    higher is not kept: the member goes on from the better state with a smaller step
+    size.
 
     Attributes:
-        compared: The loss of each member, ``(E,)``, on data that is always the same.
         min_gain: What a course has to gain for another to follow.
         min_fall: How far the training loss has to fall from the third to the last
             quarter of a course for another to follow.
         max_num: The largest number of courses.
+        growth: How many times as long as the one before a course is.
     """
 
-    compared: Callable[[], Tensor]
     min_gain: float
     min_fall: float = -math.inf
     max_num: int = 12
+    growth: int = 1
 
 
 def fit(
@@ -132,7 +123,8 @@ def fit(
     loss: Callable[..., Tensor],
     training: Training,
     *,
-    validation_loss: Callable[[], Tensor] | None = None,
+    validation_loss: Callable[..., Tensor] | None = None,
+    held_out: Sequence[Any] = (),
     courses: Courses | None = None,
     learning_rates: Sequence[float] | None = None,
     max_num_epochs: int | None = None,
@@ -141,7 +133,7 @@ def fit(
     label: str,
     show_progress_bars: bool,
 ) -> list[History]:
-    """Train networks in place with Adam; leave each at its best on what it holds out.
+    """Train networks in place with Adam; leave each at its best on its held-out data.
 
     The starting point competes, so that training never returns something worse than it
     started from on the held-out data. Without a hold-out the last state is kept. A
@@ -151,36 +143,42 @@ def fit(
     Args:
         network: What to train: a module, or E members whose parameters are stacked.
             Parameters that require no gradient are left alone, unless none does.
-        batches: Given the number of the epoch, the batches to pass over.
+        batches: Given the number of the epoch, the batches to pass over. Each part of
+            a batch for an ensemble has the rows of member e at ``part[e]``.
         loss: Of a batch, the mean loss of each member, ``(E,)``, or of the module.
+            Members that have stopped are not in the batch and in the network any more.
         training: Learning rate and so on; ``batches`` has the size of the batches.
         validation_loss: The loss over the held-out data, if there are any.
-        courses: Instead of these, how courses of so many epochs are compared.
+        held_out: The batch that ``validation_loss`` is called with.
+        courses: Whether ``max_num_epochs`` are a course that others may follow, after
+            which the validation loss is computed.
         learning_rates: One for each member; that of ``training`` if None.
         max_num_epochs: Instead of that of ``training``.
         in_training_mode: Whether dropout and batch statistics are active in training.
         decay: Whether the step size falls to zero, along a cosine over all epochs.
         label: What the progress bar and warnings call it.
         show_progress_bars: Whether to show the course of the loss.
-
-    Returns:
-        The losses of each member, and the epoch that was kept.
     """
     if not any(parameter.requires_grad for parameter in network.parameters()):
         network.requires_grad_()
     optimiser = _Adam(network, training.clip_max_norm)
-    state, E = [optimiser.values, *_buffers(network)], optimiser.num_members
+    buffers, E = _buffers(network), optimiser.num_members
     given = learning_rates or [training.learning_rate] * E
     rates = torch.tensor(given, dtype=torch.double)
-    length = max_num_epochs or training.max_num_epochs
-    last = length * courses.max_num if courses else length
-    scored, every = (courses.compared, length) if courses else (validation_loss, 1)
-    training_loss: list[Tensor] = []
-    scores: list[Tensor] = []
-    best = [value.clone() for value in state]
+    length, start = max_num_epochs or training.max_num_epochs, 0
+    growths = [courses.growth**k for k in range(courses.max_num)] if courses else [1]
+    last = length * sum(growths)
+    training_loss: list[list[float]] = [[] for _ in range(E)]
+    scores: list[list[float]] = [[] for _ in range(E)]
+    best = [value.clone() for value in (optimiser.values, *buffers)]
     best_loss = torch.full((E,), math.inf, dtype=torch.double)
     best_epoch, num_lowered = torch.zeros(2, E, dtype=torch.long)
-    going = torch.ones(E, dtype=torch.bool)
+    # Those that are still trained. The others leave the network, to save their time.
+    members, going, num_lost = torch.arange(E), torch.ones(E, dtype=torch.bool), 0
+
+    def of_members(batch: Sequence[Any]) -> Sequence[Any]:
+        return batch if len(members) == E else [of_all[members] for of_all in batch]
+
     progress = progress_bar(
         range(last + 1),
         show=show_progress_bars,
@@ -190,74 +188,91 @@ def fit(
     )
     network.eval()
     for epoch in progress:
-        if scored is not None and epoch % every == 0:
+        state = [optimiser.values, *buffers]
+        better = going & (validation_loss is None)
+        gain = torch.zeros(len(members), dtype=torch.double)
+        is_over = courses is None or epoch in (0, start + length)
+        if validation_loss is not None and is_over:
             with torch.no_grad():
-                scores.append(scored().detach().double().cpu().reshape(E))
-            gain = best_loss - scores[-1]
+                score = validation_loss(*of_members(held_out)).detach()
+            score = score.double().cpu().reshape(len(members))
+            gain = best_loss[members] - score
             better = going & (gain > 0)  # never for NaN
-            best_loss = scores[-1].where(better, best_loss)
-            best_epoch[better] = epoch
-            for kept, value in zip(best, state, strict=True):
-                kept[better] = value[better]
-            if courses is None:
-                going &= epoch - best_epoch < training.stop_after_epochs
-            elif epoch:
-                worse = going & ~better
-                for kept, value in zip(best, state, strict=True):
-                    value[worse] = kept[worse]
-                rates[worse] *= LOWER
-                num_lowered[worse] += 1
-                again = worse & (num_lowered <= MAX_LOWERED)
-                recent = torch.stack(training_loss[-length:])
-                quarter = max(1, length // 4)
-                fall = recent[-2 * quarter : -quarter].mean(0) - recent[-quarter:].mean(
-                    0
-                )
-                fall = fall.nan_to_num(torch.inf)  # of a single epoch
-                unsettled = (gain > courses.min_gain) & (fall > courses.min_fall)
-                going &= unsettled | again
-                optimiser.restart()
-        elif scored is None:
-            best_epoch[going] = epoch
-        if epoch == last or not going.any():
+            best_loss[members[better]] = score[better]
+            _append(scores, members, score)
+        best_epoch[members[better]] = epoch
+        for kept, value in zip(best, state, strict=True):
+            kept[members[better]] = value[better]
+        if epoch == last:
             break
-        part = epoch % length / length if decay or courses else 0.0
+        if validation_loss is not None and courses is None:
+            going &= epoch - best_epoch[members] < training.stop_after_epochs
+        elif courses and epoch and is_over:
+            worse = ~better
+            for kept, value in zip(best, state, strict=True):
+                value[worse] = kept[members[worse]]
+            rates[members[worse]] *= LOWER
+            num_lowered[members[worse]] += 1
+            again = worse & (num_lowered[members] <= MAX_LOWERED)
+            fall = torch.tensor([_fall(training_loss[e], length) for e in members])
+            going &= (gain > courses.min_gain) & (fall > courses.min_fall) | again
+            optimiser.restart()
+            start, length = epoch, length * courses.growth
+        if not going.any():
+            break
+        if not going.all():
+            optimiser.keep_only(going)
+            members, going = members[going], going[going]
+        part = (epoch - start) / length if decay or courses else 0.0
         factor = 0.5 * (1 + math.cos(math.pi * part))
-        of_batches = []
+        if courses:
+            factor *= min(1.0, (part + 1 / length) / WARM_UP)
+        of_batches, finite = [], going.clone()
         if in_training_mode:  # walking through the modules takes as long as a step
             network.train()
         with differentiable(network):
             for batch in batches(epoch):
-                value = loss(*batch).reshape(E)
-                going &= torch.isfinite(value.detach()).cpu()
-                optimiser.step(value, factor * rates * going)
+                value = loss(*of_members(batch)).reshape(len(members))
+                finite &= torch.isfinite(value.detach()).cpu()
+                optimiser.step(value, factor * rates[members] * finite)
                 of_batches.append(value.detach())
         if in_training_mode:
             network.eval()
-        training_loss.append(torch.stack(of_batches).double().mean(dim=0).cpu())
+        _append(training_loss, members, torch.stack(of_batches).double().mean(dim=0))
+        num_lost += int((going & ~finite).sum())
+        going &= finite
+        losses = scores if validation_loss is not None else training_loss
         progress.set_postfix(
-            loss=float((scores or training_loss)[-1].nanmean()), refresh=False
+            loss=sum(losses[e][-1] for e in members) / len(members), refresh=False
         )
     progress.close()
-    if training_loss and not (lost := torch.isfinite(training_loss[-1])).all():
+    if num_lost:
         warn_user(
-            f"{label}: the loss of {int((~lost).sum())} of {E} networks is not finite; "
-            "their best states before are kept. Use a smaller learning rate."
+            f"{label}: the loss of {num_lost} of {E} networks is not finite; their "
+            "best states before are kept. Use a smaller learning rate."
         )
-    if scored is not None:
-        for kept, value in zip(best, state, strict=True):
-            value.copy_(kept)
-    optimiser.finish()
+    optimiser.finish(best[0])
+    for buffer, kept in zip(buffers, best[1:], strict=True):
+        buffer.copy_(kept)
     network.requires_grad_(requires_grad=False)
     return [
         History(
-            [float(losses[e]) for losses in training_loss],
-            [] if courses else [float(losses[e]) for losses in scores],
-            int(best_epoch[e]),
-            given[e],
+            training_loss[e], [] if courses else scores[e], int(best_epoch[e]), given[e]
         )
         for e in range(E)
     ]
+
+
+def _append(losses: list[list[float]], members: Tensor, new: Tensor) -> None:
+    for e, value in zip(members.tolist(), new.tolist(), strict=True):
+        losses[e].append(value)
+
+
+def _fall(losses: Sequence[float], length: int) -> float:
+    """Return how far the mean loss fell from the third to the last quarter."""
+    quarter = max(1, length // 4)
+    third, fourth = losses[-2 * quarter : -quarter], losses[-quarter:]
+    return sum(third) / quarter - sum(fourth) / quarter
 
 
 def fit_on_pairs(
@@ -271,11 +286,7 @@ def fit_on_pairs(
     label: str,
     show_progress_bars: bool,
 ) -> History:
-    """Train an estimator on calibration pairs alone, in place.
-
-    The split has the rows to train on and those held out. Without the latter, training
-    stops early.
-    """
+    """Train an estimator on the pairs of a split that are not held out, in place."""
     train, held_out = split
 
     def batches(epoch: int) -> Iterator[tuple[Tensor]]:
@@ -308,11 +319,13 @@ class _Adam:
     """
 
     def __init__(self, network: nn.Module, clip_max_norm: float | None) -> None:
+        self.network = network
         self.parameters = [one for one in network.parameters() if one.requires_grad]
         self.clip_max_norm = clip_max_norm
         self.num_members = getattr(network, "num_members", 1)
+        self.sizes = [one.numel() // self.num_members for one in self.parameters]
         self.values = self._side_by_side(self.parameters).detach()
-        self._show(self.values)
+        self._show()
         self.restart()
 
     def restart(self) -> None:
@@ -321,10 +334,22 @@ class _Adam:
         self.second = torch.zeros_like(self.values)
         self.count = 0
 
-    def finish(self) -> None:
-        """Give each parameter memory of its own again."""
+    def keep_only(self, going: Tensor) -> None:
+        """Take the members out of the network that have stopped."""
+        self.first, self.second = self.first[going], self.second[going]
+        self._resize(self.values[going])
+
+    def finish(self, values: Tensor) -> None:
+        """Give all members these parameters, each with memory of its own."""
+        self._resize(values)
         for parameter in self.parameters:
             parameter.data = parameter.data.clone(memory_format=torch.contiguous_format)
+
+    def _resize(self, values: Tensor) -> None:
+        if len(values) != self.num_members:
+            resize(self.network, self.num_members, len(values))
+        self.values, self.num_members = values, len(values)
+        self._show()
 
     def step(self, losses: Tensor, rates: Tensor) -> None:
         """Lower the losses of all members, ``(E,)``, each with its step size."""
@@ -339,31 +364,28 @@ class _Adam:
                     for one, parameter in zip(gradients, self.parameters, strict=True)
                 ]
             )
-            self._update(gradient, rates.where(finite.cpu(), 0.0).to(gradient))
-
-    def _update(self, gradient: Tensor, rates: Tensor) -> None:
-        norm = gradient.norm(dim=1, keepdim=True)
-        if not torch.isfinite(norm).all():
-            norm = gradient.nan_to_num_(0.0, 0.0, 0.0).norm(dim=1, keepdim=True)
-        if self.clip_max_norm is not None:
-            gradient *= (self.clip_max_norm / (norm + 1e-6)).clamp(max=1.0)
-        self.count += 1
-        self.first.lerp_(gradient, 1 - BETAS[0])
-        self.second.mul_(BETAS[1]).addcmul_(gradient, gradient, value=1 - BETAS[1])
-        scale = self.second.sqrt().div_(math.sqrt(1 - BETAS[1] ** self.count))
-        size = rates / (1 - BETAS[0] ** self.count)
-        self.values -= self.first / scale.add_(EPSILON) * size[:, None]
+            norm = gradient.norm(dim=1, keepdim=True)
+            if not torch.isfinite(norm).all():
+                norm = gradient.nan_to_num_(0.0, 0.0, 0.0).norm(dim=1, keepdim=True)
+            if self.clip_max_norm is not None:
+                gradient *= (self.clip_max_norm / (norm + 1e-6)).clamp(max=1.0)
+            self.count += 1
+            self.first.lerp_(gradient, 1 - BETAS[0])
+            self.second.mul_(BETAS[1]).addcmul_(gradient, gradient, value=1 - BETAS[1])
+            scale = self.second.sqrt().div_(math.sqrt(1 - BETAS[1] ** self.count))
+            size = rates.where(finite.cpu(), 0.0).to(gradient)
+            size /= 1 - BETAS[0] ** self.count
+            self.values -= self.first / scale.add_(EPSILON) * size[:, None]
 
     def _side_by_side(self, tensors: Sequence[Tensor]) -> Tensor:
         return torch.cat([one.reshape(self.num_members, -1) for one in tensors], dim=1)
 
-    def _show(self, values: Tensor) -> None:
-        """Make the parameters views of these values."""
-        sizes = [one.numel() // self.num_members for one in self.parameters]
-        for parameter, part in zip(
-            self.parameters, values.split(sizes, 1), strict=True
-        ):
-            parameter.data = part.view(parameter.shape)
+    def _show(self) -> None:
+        """Make the parameters views of the values."""
+        parts = self.values.split(self.sizes, dim=1)
+        for parameter, part in zip(self.parameters, parts, strict=True):
+            shape = parameter.shape
+            parameter.data = part.view((-1, *shape[1:]) if shape else ())
 
 
 def _buffers(network: nn.Module) -> list[Tensor]:
@@ -394,10 +416,7 @@ def shuffled(rows: Tensor, size: int) -> Iterator[Tensor]:
 def epochs_on_pairs(
     theta_or_groups: Tensor, held_out: Tensor, max_num_epochs: int
 ) -> int:
-    """Return how many epochs to train on pairs for; few if none are held out.
-
-    Warns then, that nothing chooses the best net.
-    """
+    """Return how many epochs to train on pairs for; few, and warn, without hold-out."""
     if len(held_out):
         return max_num_epochs
     warn_user(

@@ -13,23 +13,26 @@ and the prior, so that no density is much larger than the mixture.
 
 import math
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.distributions import Chi2, MultivariateNormal
 
-from sbi_rope._bounds import bounds_of, moved_inside, off_bounds
+from sbi_rope._prior import (
+    bounds_of,
+    moved_inside,
+    off_bounds,
+    prior_log_prob,
+    prior_sample,
+)
 from sbi_rope._random import seeded
-from sbi_rope.data import Labels
-from sbi_rope.density.prior import prior_log_prob, prior_sample
+from sbi_rope.data import Labels, Nodes
 from sbi_rope.errors import InvalidInputError, warn_user
 from sbi_rope.settings import default_names
 from sbi_rope.tensors import as_batch, as_numbers, check_in_support, rows_with
 
 __all__ = [
-    "Nodes",
     "Reference",
     "draws_of",
     "given_groups",
@@ -159,8 +162,6 @@ def _given_covariance(
     std = variance.where(noisy, 1.0).sqrt()
     correlation = covariance.nan_to_num() / (std[:, :, None] * std[:, None, :])
     bad |= (correlation - correlation.mT).abs().amax(dim=(1, 2)) > ROUNDING
-    # Without noise there is no covariance either.
-    bad |= correlation.where(~noisy[:, :, None], 0.0).flatten(1).any(dim=1)
     # Noisy parameters may have no direction without noise, which has no density.
     regular = (correlation + correlation.mT) / 2 + torch.diag_embed((~noisy).double())
     bad |= torch.linalg.eigvalsh(regular)[:, 0] <= SINGULAR
@@ -227,11 +228,7 @@ def draws_of(labels: Labels, prior: Any) -> Tensor:
 
 
 def _shuffled(draws: Tensor) -> Tensor:
-    """Return draws in random order, all of them equally often, at least 100 in all.
-
-    Any part of them represents all of them then, also if they were sorted. With enough
-    of them simulations can tell what is noise.
-    """
+    """Return draws in random order, all of them equally often, at least 100 in all."""
     count = draws.shape[1]
     with seeded(0):
         rounds = [torch.randperm(count) for _ in range(-(-NUM_DRAWS // count))]
@@ -265,10 +262,11 @@ def _drawn(labels: Labels, prior: Any, *, first: int) -> Tensor:
     return nodes.theta.take_along_dim(chosen[..., None], 1)
 
 
-def _proposals(labels: Labels, prior: Any) -> tuple["Nodes", Tensor]:
+def _proposals(labels: Labels, prior: Any) -> tuple[Nodes, Tensor]:
     """Return proposals for labels, and their log densities given the label."""
-    wide = _prior_reference(labels, prior)
-    nodes = place_nodes(labels, [wide], prior, num_nodes=NUM_PROPOSALS)
+    nodes = place_nodes(
+        labels, [_prior_reference(labels, prior)], prior, num_nodes=NUM_PROPOSALS
+    )
     log_prior = prior_log_prob(prior, nodes.theta).double()
     return nodes, nodes.log_weights + log_prior
 
@@ -302,60 +300,6 @@ def reference_of(samples: Tensor) -> Reference:
     return Reference(mean, centred.mT @ centred / max(1, samples.shape[0] - 1))
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Nodes:
-    r"""Parameters and weights that turn a density of theta into one of the label.
-
-    .. math:: p(y_i \mid x_i) \approx \frac1S \sum_s u_{is}\, q(\theta_{is} \mid x_i)
-
-    Attributes:
-        theta: Shape ``(n, S, d)``, in the dtype of the labels. All are inside the
-            support of the prior, so that those with no weight do no harm to gradients.
-        log_weights: :math:`\log u`, minus infinity outside the support of the prior,
-            shape ``(n, S)``, float64.
-    """
-
-    theta: Tensor
-    log_weights: Tensor
-
-    @classmethod
-    def exact(cls, theta: Tensor) -> "Nodes":
-        """Return the nodes of exact labels ``(n, d)``: the labels themselves."""
-        log_weights = theta.new_zeros(len(theta), 1, dtype=torch.double)
-        return cls(theta=theta[:, None], log_weights=log_weights)
-
-    def __len__(self) -> int:
-        return len(self.theta)
-
-    def __getitem__(self, rows: Tensor) -> "Nodes":
-        return Nodes(theta=self.theta[rows], log_weights=self.log_weights[rows])
-
-    def log_mean(self, log_q: Tensor) -> Tensor:
-        r"""Return the log density of each label, ``(n,)`` or ``(n, K)``.
-
-        Args:
-            log_q: :math:`\log q(\theta_{is} \mid x_i)`, shape ``(n, S)`` or
-                ``(n, S, K)`` for K posteriors.
-        """
-        terms = self._terms(log_q)
-        return terms.logsumexp(dim=1) - math.log(terms.shape[1])
-
-    def standard_error(self, log_q: Tensor) -> Tensor:
-        """Return the Monte-Carlo error of :meth:`log_mean`, to first order."""
-        terms = self._terms(log_q)
-        largest = terms.amax(dim=1, keepdim=True)
-        ratio = (terms - largest.clamp_min(-1e300)).exp()
-        mean = ratio.mean(dim=1).clamp_min(1e-300)
-        return ratio.std(dim=1) / mean / terms.shape[1] ** 0.5
-
-    def _terms(self, log_q: Tensor) -> Tensor:
-        weights = self.log_weights if log_q.ndim == 2 else self.log_weights[..., None]
-        # Where the weight is zero, the density may be anything.
-        return torch.where(
-            torch.isneginf(weights), weights, log_q.to(weights) + weights
-        )
-
-
 def nodes_of(
     labels: Labels, references: Sequence[Reference], prior: Any, *, num_nodes: int
 ) -> Nodes:
@@ -364,12 +308,9 @@ def nodes_of(
     Of labels given as draws, these are the draws, weighted by
     :math:`1 / p(\theta)`, so that scores are relative to those of the prior.
 
-    Args:
-        labels: The labels.
-        references: Moments of the densities, at the observation of each label. The
-            prior is added, and takes the place of what is not finite.
-        prior: The prior of NPE.
-        num_nodes: The number of nodes of each label, at least.
+    Each label has at least ``num_nodes``. The ``references`` are moments of the
+    densities at the observation of each label. Those of the prior are added, and take
+    the place of what is not finite.
     """
     if labels.are_drawn:
         log_prior = prior_log_prob(prior, labels.draws).double()
@@ -421,13 +362,9 @@ def _prior_reference(labels: Labels, prior: Any) -> Reference:
 def place_nodes(
     labels: Labels, references: Sequence[Reference], prior: Any, *, num_nodes: int
 ) -> Nodes:
-    """Draw the nodes of labels that are measurements, from torch's random state.
+    """Draw the nodes of labels that are measurements, equally many of each reference.
 
-    Args:
-        labels: Labels that are not given as draws.
-        references: As in :func:`nodes_of`. Equally many nodes come from each.
-        prior: The prior; nodes outside its support get the weight zero.
-        num_nodes: The number of nodes of each label, at least.
+    Nodes outside the support of the prior get the weight zero.
     """
     n, d = labels.y.shape
     of_each = max(1, math.ceil(num_nodes / len(references)))

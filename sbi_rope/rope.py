@@ -3,25 +3,22 @@
 import copy
 import itertools
 from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._npe import TrainedNPE
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
-from sbi_rope._sbi import embed
-from sbi_rope._standardisation import (
-    Standardisation,
-    warn_of_far_entries,
-)
-from sbi_rope.batch import EmbeddedBatch, check_converged
-from sbi_rope.coupling import SinkhornCoupler
+from sbi_rope._sbi import TrainedNPE, embed
+from sbi_rope._standardisation import Standardisation, warn_of_far_entries
+from sbi_rope.coupling import Coupling, SinkhornCoupler
 from sbi_rope.data import Counts, Pairs
-from sbi_rope.density import MixturePosterior
-from sbi_rope.discrepancy.targets import tuning_targets
+from sbi_rope.density import Coupled, MixturePosterior
+from sbi_rope.discrepancy.correction import tuning_targets
 from sbi_rope.errors import (
+    CouplingError,
     InvalidInputError,
     NotReadyError,
     UnsupportedPosteriorError,
@@ -35,15 +32,63 @@ from sbi_rope.labels import (
     given_weights,
     on_bounds,
 )
-from sbi_rope.moments import moments, targets
 from sbi_rope.settings import Count, check
-from sbi_rope.simulate import Source, Stored, source_of
+from sbi_rope.simulate import Source, moments, source_of, targets
 from sbi_rope.tensors import as_numbers, check_same_length, column_names, rows_with
 
-__all__ = ["RoPE"]
+__all__ = ["EmbeddedBatch", "RoPE"]
 
 # The number of simulations to couple with if the batch has fewer observations.
 MIN_SIMULATIONS = 1000
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class EmbeddedBatch:
+    r"""The embeddings of real observations and of simulations.
+
+    :meth:`RoPE.embed <sbi_rope.RoPE.embed>` returns it, and it can be coupled.
+
+    Attributes:
+        x_o: The observations, shape ``(n_o, *event)``.
+        real: Their embeddings :math:`g(x_o)`, shape ``(n_o, l)``.
+        theta: The parameters of the simulations, shape ``(n_s, d)``.
+        simulated: The embeddings :math:`h(x_s)` of the simulations, shape ``(n_s, l)``.
+        npe: The NPE that the embeddings belong to.
+        embedding_net: g, or h if nothing was tuned.
+    """
+
+    x_o: Tensor
+    real: Tensor
+    theta: Tensor
+    simulated: Tensor
+    npe: TrainedNPE
+    embedding_net: nn.Module
+
+    def couple(self, coupler: SinkhornCoupler) -> Coupling:
+        """Couple the observations with the simulations."""
+        return coupler.couple(self.real, self.simulated)
+
+    def posterior(
+        self, coupling: Coupling, *, unseen: Literal["raise", "extend"] = "raise"
+    ) -> MixturePosterior:
+        """Return the mixture of simulated posteriors that a coupling gives.
+
+        ``unseen`` is that of :meth:`~sbi_rope.RoPE.build_posterior`.
+        """
+        # Each posterior has copies of its own of net and density. Moving one to another
+        # device then leaves the others where they are.
+        net = copy.deepcopy(self.embedding_net)
+        density = Coupled(
+            self.npe.density(), self.simulated, self.x_o, net, coupling, unseen=unseen
+        )
+        posterior = MixturePosterior(
+            density,
+            copy.deepcopy(self.npe.prior),
+            enable_transform=self.npe.enable_transform,
+        )
+        posterior.parameter_names = self.npe.parameter_names
+        posterior.x_names = self.npe.x_names
+        return posterior
 
 
 class RoPE:
@@ -95,10 +140,7 @@ class RoPE:
 
     Raises:
         UnsupportedPosteriorError: If the posterior has no embedding to work with, or
-            one that embeds a row of a batch differently among other rows, or a weight
-            of its networks is not finite.
-        InvalidInputError: If both or none of simulator and simulations are given, or
-            their shapes do not fit the posterior.
+            one that embeds a row of a batch differently among other rows.
         SimulationError: If the simulator raises or returns something unusable.
 
     Example:
@@ -200,8 +242,7 @@ class RoPE:
             Itself, so that calls can be chained.
 
         Raises:
-            InvalidInputError: If shapes, numbers of rows or devices do not fit, a value
-                is not finite, an exact theta is outside the prior's support, or no
+            InvalidInputError: If an exact theta is outside the prior's support, or no
                 parameters inside it fit a label. Nothing is added then.
             UnsupportedPosteriorError: If labels are not exact and some parameters are
                 discrete.
@@ -289,10 +330,6 @@ class RoPE:
 
         Returns:
             Itself, so that calls can be chained.
-
-        Raises:
-            NotReadyError: If no calibration pairs were appended.
-            SimulationError: If the simulator fails at the calibration parameters.
         """
         if not len(self._pairs):
             raise NotReadyError(
@@ -303,7 +340,20 @@ class RoPE:
         def drawn(count: int) -> Tensor:
             if pairs.are_exact:
                 return self.draw_targets(count, show_progress_bars=show)
-            return self._targets_of_labels(progress=show)
+            simulated = self._simulations(MIN_SIMULATIONS, progress=show)
+            return tuning_targets(
+                embed(self._npe.h, pairs.x),
+                moments(
+                    self._source,
+                    pairs,
+                    self.finetuner.simulations_per_target,
+                    self._embed_simulations,
+                    progress=show,
+                ),
+                Standardisation(self._embed_simulations(simulated).double()),
+                weights=pairs.weight,
+                groups=pairs.group,
+            )
 
         result = self.finetuner.finetune(
             self._npe.h,
@@ -340,23 +390,6 @@ class RoPE:
             progress=is_shown(show_progress_bars),
         )
 
-    def _targets_of_labels(self, *, progress: bool) -> Tensor:
-        """Return targets, ``(n_c, l)``, where some labels leave parameters open."""
-        simulated = self._simulations(MIN_SIMULATIONS, progress=progress)
-        return tuning_targets(
-            embed(self._npe.h, self._pairs.x),
-            moments(
-                self._source,
-                self._pairs,
-                self.finetuner.simulations_per_target,
-                self._embed_simulations,
-                progress=progress,
-            ),
-            Standardisation(self._embed_simulations(simulated).double()),
-            weights=self._pairs.weight,
-            groups=self._pairs.group,
-        )
-
     def _simulations(self, count: int, *, progress: bool) -> Tensor:
         """Return up to ``count`` simulations from the prior, always the same."""
         return self._source.from_prior(count, seed=0, progress=progress)[1]
@@ -371,10 +404,8 @@ class RoPE:
     ) -> EmbeddedBatch:
         r"""Return the embeddings of real observations and of simulations.
 
-        With the same ``num_simulations`` and ``seed``, :meth:`build_posterior` couples
-        with the same simulations.
-
-        The arguments are those of :meth:`build_posterior`.
+        The arguments are those of :meth:`build_posterior`, which with the same
+        ``num_simulations`` and ``seed`` couples with the same simulations.
 
         Returns:
             :math:`g(x_o)` (:math:`h(x_o)` without calibration pairs), parameters drawn
@@ -389,18 +420,12 @@ class RoPE:
         net = self._npe.h if self._g is None else self._g
         x_o = self._npe.as_x("x_o", x_o)
         real = self._npe.embed("x_o", x_o, net)
-        if num_simulations is not None:
-            check("num_simulations", num_simulations, Count)
+        check("num_simulations", num_simulations, Count | None)
         with seeded(seed):
             theta, simulated = self._source.from_prior(
                 num_simulations or max(len(x_o), MIN_SIMULATIONS),
                 self._embed_simulations,
                 progress=is_shown(show_progress_bars),
-            )
-        if isinstance(self._source, Stored) and len(theta) < (num_simulations or 0):
-            raise InvalidInputError(
-                f"Expected `num_simulations` of at most {len(theta)}, the number of "
-                f"stored simulations; got {num_simulations}."
             )
         return EmbeddedBatch(
             x_o=x_o,
@@ -431,8 +456,8 @@ class RoPE:
             x_o: The batch, shape ``(n_o, *event)``. Each posterior depends on the whole
                 batch. There is a warning if it has fewer than 20 observations.
             coupler: Settings for this batch; those of this object if None.
-            num_simulations: n_s; ``max(n_o, 1000)`` if None (or all stored
-                simulations, if there are fewer).
+            num_simulations: n_s; ``max(n_o, 1000)`` if None. Of stored simulations
+                there may be fewer.
             seed: Seed of the simulations, for torch, NumPy and Python; None uses their
                 states.
             unseen: What the posterior does with an x outside the batch: ``"raise"`` an
@@ -445,10 +470,7 @@ class RoPE:
 
         Raises:
             NotReadyError: If calibration pairs were appended after the last training.
-            InvalidInputError: If the net cannot read x_o, or there are fewer stored
-                simulations than asked for.
             CouplingError: If the coupling has not converged.
-            SimulationError: If the simulator fails.
         """
         coupler = self.coupler if coupler is None else coupler
         check("coupler", coupler, SinkhornCoupler)
@@ -461,8 +483,13 @@ class RoPE:
         )
         warn_of_far_entries("x_o", batch.x_o, self._npe.h)
         coupling = batch.couple(coupler)
-        if require_convergence:
-            check_converged(coupling, coupler)
+        if require_convergence and not coupling.converged:
+            raise CouplingError(
+                "The coupling has not converged: marginal error "
+                f"{coupling.marginal_error:.1e} after {coupling.num_iterations} "
+                f"iterations, tolerance {coupler.tolerance:.1e}. Use a larger gamma, "
+                "more max_iterations, or require_convergence=False."
+            )
         return batch.posterior(coupling, unseen=unseen)
 
     def tuned_posterior(self) -> Any:
@@ -470,13 +497,8 @@ class RoPE:
 
         It is the paper's ablation without transport ("tuning-only"), and an ordinary
         sbi posterior for any x.
-
-        Raises:
-            NotReadyError: If ``train()`` was not called.
         """
-        if self._g is None:
-            raise NotReadyError("No tuned embedding net yet. Call `train()` first.")
-        return self._npe.posterior(self._g)
+        return self._npe.posterior(self.tuned_embedding_net)
 
     def checked_observations(self, x_o: Tensor) -> Tensor:
         """Return a copy of a batch ``(n_o, *event)``, if it can be embedded."""
@@ -548,12 +570,10 @@ class RoPE:
     def num_simulator_calls(self) -> int:
         """How many rows of theta the simulator has simulated so far.
 
-        A few are simulated when RoPE is constructed, to find out how the simulator is
-        called. :meth:`train` simulates 100 for each label (and 2000 with rehearsal),
-        :meth:`build_posterior` ``max(n_o, 1000)`` for each batch, and
-        :func:`~sbi_rope.stack` 10,000 from the prior and 100 for each label. The
-        argument ``num_simulations`` of this class sets a number for all of these
-        together.
+        A few are simulated when RoPE is constructed. :meth:`train` simulates 100 for
+        each label (and 2000 with rehearsal), :meth:`build_posterior` ``max(n_o, 1000)``
+        for each batch, and :func:`~sbi_rope.stack` 10,000 from the prior and 100 for
+        each label.
         """
         return self._source.num_calls
 

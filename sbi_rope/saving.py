@@ -50,7 +50,8 @@ ROOMS = (
 )
 # Dataclasses of these rooms are results. Others call what they hold, or run programs.
 RESULTS = (
-    *("sbi_rope._two_sample.", "sbi_rope.baselines.", "sbi_rope.coupling."),
+    *("sbi_rope._statistics.", "sbi_rope.baselines.", "sbi_rope.coupling."),
+    "sbi_rope.data.Counts",
     *("sbi_rope.discrepancy.", "sbi_rope.metrics.", "sbi_rope.stacking."),
     "sbi_rope.tasks.hemodynamics.prior_table.",
 )
@@ -85,10 +86,6 @@ def save(posterior: Any, path: str | Path, *, overwrite: bool = False) -> None:
             ``VectorFieldPosterior`` of sbi, which several trainers return.
         path: The file. Its folder is made if there is none.
         overwrite: Whether to replace a file that exists.
-
-    Raises:
-        InvalidInputError: If it is no posterior.
-        FileExistsError: If the file exists.
 
     Example:
         >>> import tempfile, torch
@@ -129,7 +126,6 @@ def load(path: str | Path, *, trusted: Sequence[Any] = ()) -> Any:
         was saved.
 
     Raises:
-        DataNotFoundError: If there is no such file.
         FileFormatError: If it is not a file of :func:`save`, is damaged, was written by
             other versions of the packages, or needs a class that is not trusted.
     """

@@ -1,4 +1,7 @@
-"""Sources of simulations: a user's simulator, or pairs (theta, x) that were stored."""
+"""Sources of simulations, and what simulations at the labels of pairs are like.
+
+A source is a user's simulator, or pairs (theta, x) that were stored.
+"""
 
 import itertools
 import warnings
@@ -12,21 +15,26 @@ from scipy.stats import kstest
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_rope._prior import divisors
 from sbi_rope._progress import progress_bar
 from sbi_rope._random import seeded
-from sbi_rope._units import divisors
-from sbi_rope.errors import InvalidInputError, SimulationError, in_digits, warn_user
+from sbi_rope.data import Pairs
+from sbi_rope.errors import InvalidInputError, SimulationError, warn_user
 from sbi_rope.settings import Count, check
 from sbi_rope.tensors import as_batch, as_numbers, check_in_support
 
 __all__ = [
+    "Moments",
     "ParallelSimulator",
     "Simulated",
     "Source",
     "Stored",
     "all_finite",
+    "draws",
+    "moments",
     "parallel",
     "source_of",
+    "targets",
 ]
 
 Embed = Callable[[Tensor], Tensor]
@@ -51,6 +59,9 @@ NUM_AROUND = 50
 # Draws of the prior that stored parameters are compared with, and the p-value below
 # which they differ.
 NUM_FROM_PRIOR, NOT_FROM_PRIOR = 10_000, 1e-6
+# A quadratic surface has so many simulations for each of its coefficients, at least.
+# The ridge is relative to the number of simulations.
+SIMULATIONS_PER_COEFFICIENT, RIDGE = 3, 1e-4
 
 
 def all_finite(x: Tensor) -> Tensor:
@@ -98,9 +109,6 @@ def parallel(
         num_workers: The number of processes. With 1 everything is simulated in this
             one.
 
-    Raises:
-        InvalidInputError: If an argument has the wrong type or range.
-
     Example:
         >>> import numpy as np
         >>> def simulator(theta):  # NumPy, and one theta at a time
@@ -124,11 +132,9 @@ class _Way:
     like: Tensor
 
     def x_of(self, theta: Tensor) -> Tensor:
-        """Return x, in which dimensions of size one may be missing, as a tensor.
-
-        Theta and x are copied, because the simulator may change or use them again.
-        Arrays hold float64, as solvers of SciPy expect.
-        """
+        """Return x, in which dimensions of size one may be missing, as a tensor."""
+        # Copies, because the simulator may change theta or use x again. Arrays hold
+        # float64, as solvers of SciPy expect.
         if self.kind == "array":
             result = self.function(theta.to("cpu", torch.float64, copy=True).numpy())
         else:
@@ -150,7 +156,7 @@ class _Way:
         if self.batched:
             try:
                 return self.x_of(theta), num_calls, None
-            except Exception as raised:  # any error of the user's code
+            except Exception as raised:  # of any type
                 error, num_calls = raised, 2 * num_calls
         for one in theta.split(1) if self.batched else theta:
             try:
@@ -162,7 +168,7 @@ class _Way:
         return torch.stack(rows), num_calls, error
 
     def simulate_in_worker(self, theta: Tensor, seed: int) -> Result:
-        """Simulate with an error that can be sent to another process."""
+        """Simulate, and return an error that can be sent to another process."""
         with seeded(seed):
             x, num_calls, error = self.simulate(theta)
         named = error and SimulationError(f"{type(error).__name__}: {error}")
@@ -172,15 +178,8 @@ class _Way:
 class Simulated:
     """A user's simulator, called in the first way in which it returns the right shape.
 
-    Simulations that are not finite are left out, counted and warned of. What is random
-    follows a seed, or the generators of torch, NumPy and Python.
-
-    Args:
-        function: The simulator, batched or not, of tensors or NumPy arrays.
-        prior: The prior, from which parameters are drawn.
-        event_shape: Shape of one simulation.
-        like: A tensor with the dtype and device of parameters and simulations.
-        readable: Tells which simulations are of use.
+    Simulations that are not ``readable`` are left out, counted and warned of. Those
+    that are have the ``event_shape``, and the dtype and device of ``like``.
 
     Attributes:
         num_calls: How many rows were simulated so far.
@@ -220,10 +219,9 @@ class Simulated:
         seed: int | None = None,
         progress: bool = False,
     ) -> tuple[Tensor, Tensor]:
-        """Return parameters from the prior, and the embedding of a simulation of each.
+        """Return n parameters from the prior, and embeddings of their simulations.
 
-        There are n of them, without those that failed. With a seed they are simulated
-        once and kept, and as many as memory allows.
+        With a seed they are simulated once and kept, as many as memory allows.
         """
         if seed is None:
             return self.drawn(n, embed, progress=progress)
@@ -242,7 +240,10 @@ class Simulated:
         finished: list[Result] | None = None,
         progress: bool,
     ) -> tuple[Tensor, Tensor]:
-        """Simulate at n draws; parts that are finished are not simulated again."""
+        """Simulate at n draws; parts that are finished are not simulated again.
+
+        Other parts are added to those that are finished.
+        """
         theta = self._prior.sample(torch.Size((n,))).to(self._like)
         embedded, valid = self._embedded(
             theta, embed, "from the prior", progress=progress, finished=finished
@@ -253,9 +254,6 @@ class Simulated:
         """Simulate at parameters of n pairs, ``(n, S, d)`` to ``(n, S, l)``.
 
         Embeddings of simulations that failed are NaN.
-
-        Raises:
-            SimulationError: If all simulations of a pair failed.
         """
         embedded, valid = self._embedded(
             theta.flatten(0, 1), embed, "at calibration parameters", progress=progress
@@ -263,9 +261,11 @@ class Simulated:
         empty = ~valid.reshape(theta.shape[:2]).any(dim=1)
         if empty.any():
             # Row numbers would mislead, because these may be some of the pairs only.
+            first = theta[empty].mean(dim=1)[:5].tolist()
+            digits = [[float(f"{number:.4g}") for number in row] for row in first]
             raise SimulationError(
-                "All simulations at the calibration parameters "
-                f"{in_digits(theta[empty].mean(dim=1))} failed. Remove these pairs."
+                f"All simulations at the calibration parameters {digits} failed. "
+                "Remove these pairs."
             )
         embedded = embedded.where(valid[:, None], torch.nan)
         return embedded.reshape(*theta.shape[:2], -1)
@@ -317,10 +317,7 @@ class Simulated:
         progress: bool,
         finished: list[Result] | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Return embeddings ``(n, l)`` of simulations, and which of them are finite.
-
-        Parts that are ``finished`` are not simulated again, and others are added there.
-        """
+        """Return embeddings ``(n, l)`` of simulations, and which of them are finite."""
         embeddings, valid, error = [], [], None
         chunk = PARALLEL_CHUNK if self._num_workers else SINGLE_CHUNK
         parts = theta.split(BATCHED_CHUNK if self._way.batched else chunk)
@@ -386,12 +383,7 @@ class Simulated:
 
 
 class Stored:
-    """Stored pairs (theta, x), with theta from the prior, all of them finite.
-
-    Args:
-        theta: Shape ``(N, d)``.
-        x: Shape ``(N, *event)``.
-    """
+    """Stored pairs of theta ``(N, d)`` from the prior and x ``(N, *event)``."""
 
     def __init__(self, theta: Tensor, x: Tensor) -> None:
         self._pairs: tuple[Tensor, Tensor] | None = (theta, x)
@@ -499,10 +491,8 @@ class Stored:
 def _nearest(
     stored: Tensor, theta: Tensor, count: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the rows nearest to each theta, ``(n, count)``, and both standardised.
-
-    The mean is subtracted, because float32 cannot tell numbers far from zero apart.
-    """
+    """Return the rows nearest to each theta, ``(n, count)``, and both standardised."""
+    # float32 cannot tell numbers far from zero apart, hence the mean.
     mean, std = stored.mean(dim=0), divisors(stored.double().std(dim=0)).to(stored)
     stored, theta = (stored - mean) / std, (theta - mean) / std
     # Labels that are not exact have many parameters each, too many for one matrix.
@@ -526,10 +516,7 @@ def source_of(
     like: Tensor,
     readable: Readable = all_finite,
 ) -> Source:
-    """Return a simulator, called ``num_simulations`` times at most, or stored pairs.
-
-    The other arguments are those of :class:`Simulated`.
-    """
+    """Return a simulator, called ``num_simulations`` times at most, or stored pairs."""
     check("num_simulations", num_simulations, Count | None)
     if (simulator is None) == (simulations is None):
         raise InvalidInputError(
@@ -575,3 +562,156 @@ def source_of(
             "distributed like the prior, as whose draws they are used."
         )
     return stored
+
+
+# Targets and moments at the parameters of pairs ---------------------------------------
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Moments:
+    """Means and covariance of the embeddings of simulations at the parameters of pairs.
+
+    Attributes:
+        means: Means at R parameters that the label of each pair leaves possible, shape
+            ``(n, R, l)``, float64. R is 1 if all labels are exact.
+        covariance: That of simulations at one parameter, ``(n, l, l)``, float64.
+    """
+
+    means: Tensor
+    covariance: Tensor
+
+    @property
+    def mean(self) -> Tensor:
+        """The mean over the possible parameters, shape ``(n, l)``."""
+        return self.means.mean(dim=1)
+
+    def __getitem__(self, rows: Tensor) -> "Moments":
+        return Moments(means=self.means[rows], covariance=self.covariance[rows])
+
+    def columns(self, columns: slice) -> "Moments":
+        """Return the moments of some entries of the embeddings."""
+        return Moments(
+            means=self.means[..., columns],
+            covariance=self.covariance[:, columns, columns],
+        )
+
+
+def draws(
+    source: Source, pairs: Pairs, count: int, embed: Embed, *, progress: bool = False
+) -> tuple[Tensor, Tensor]:
+    """Simulate at the draws of each pair, ``count`` times at exact parameters.
+
+    Return parameters ``(n, S, d)`` and embeddings ``(n, S, l)``. A simulation that
+    failed is replaced by another one of the pair.
+    """
+    theta = pairs.theta
+    if theta.shape[1] == 1:
+        theta = theta.expand(-1, count, -1)
+    z = source.at(theta, embed, progress=progress)
+    failed = z.isnan().all(dim=2)
+    if not failed.any():
+        return theta, z
+    # The k-th that failed is replaced by the k-th that is there.
+    usable = failed.int().argsort(dim=1, stable=True)
+    place = (failed.cumsum(dim=1) - 1).clamp_min(0)
+    place = place % (~failed).sum(dim=1, keepdim=True)
+    own = torch.arange(failed.shape[1], device=z.device).expand(failed.shape)
+    chosen = own.where(~failed, usable.gather(1, place))[..., None]
+    return theta.take_along_dim(chosen, 1), z.take_along_dim(chosen, 1)
+
+
+def targets(
+    source: Source,
+    pairs: Pairs,
+    count: int,
+    embed: Embed,
+    *,
+    num_neighbors: int,
+    progress: bool = False,
+) -> Tensor:
+    r"""Return :math:`E[h(S(\theta)) \mid y_i]`, the mean of ``count`` simulations.
+
+    Its shape is ``(n, l)``. Over labels that are not exact it averages parameters, too.
+    Of stored simulations, those with the ``num_neighbors`` nearest parameters count.
+    """
+    if isinstance(source, Stored) and pairs.are_exact:
+        near = source.near(pairs.mean, num_neighbors, embed, progress=progress)
+        return near.mean(dim=1)
+    theta = pairs.theta[:, torch.arange(count) % pairs.theta.shape[1]]
+    return source.at(theta, embed, progress=progress).nanmean(dim=1)
+
+
+def moments(
+    source: Source, pairs: Pairs, count: int, embed: Embed, *, progress: bool = False
+) -> Moments:
+    r"""Return the moments of simulations at the parameters of each pair.
+
+    At exact parameters these are the moments of ``count`` simulations. Otherwise one
+    simulation is made at each draw that the label leaves possible, and a surface is
+    fitted to the simulations of each label, linear or, with enough draws, quadratic.
+    Its values at the draws are the possible means. The covariance is that of the
+    residuals.
+
+    A surface also fits the noise of the simulations. Its linear and its quadratic terms
+    are shrunk by how much of their size is noise, as James and Stein did, so that
+    labels that are nearly exact have a single possible mean.
+
+    References:
+        | Estimation with Quadratic Loss (James and Stein, 1961)
+        | https://projecteuclid.org/euclid.bsmsp/1200512173
+    """
+    theta, simulated = draws(source, pairs, count, embed, progress=progress)
+    simulated = simulated.double()
+    level = simulated.mean(dim=1, keepdim=True)
+    residual = simulated - level
+    freedom = simulated.new_full((len(theta),), theta.shape[1] - 1)
+    fits = []
+    for terms in [] if pairs.are_exact else _features(theta.double()):
+        fitted, used = _regressed(residual, terms)
+        residual = residual - fitted
+        freedom = freedom - used
+        fits.append((fitted, used))
+    covariance = residual.mT @ residual / freedom.clamp_min(1.0)[:, None, None]
+    noise = covariance.mean(dim=0).diagonal()
+    means = level
+    for fitted, used in fits:
+        means = means + _shrunk(fitted, used[:, None] * noise)
+    return Moments(means=means, covariance=covariance)
+
+
+def _features(theta: Tensor) -> list[Tensor]:
+    """Return linear and, with enough draws, quadratic terms of standardised draws.
+
+    All terms have mean zero, shape ``(n, R, p)``, and quadratic ones have no linear
+    part. Parameters that are known exactly have terms of zero.
+    """
+    centred = theta - theta.mean(dim=1, keepdim=True)
+    std = centred.square().mean(dim=1, keepdim=True).sqrt()
+    scale = theta.abs().amax(dim=1, keepdim=True).clamp_min(1e-30)
+    linear = torch.where(std > 1e-6 * scale, centred / std.clamp_min(1e-30), 0.0)
+    d = theta.shape[2]
+    num_terms = d + d * (d + 1) // 2
+    if num_terms * SIMULATIONS_PER_COEFFICIENT > theta.shape[1]:
+        return [linear]
+    first, second = torch.triu_indices(d, d).to(theta.device)
+    quadratic = linear[..., first] * linear[..., second]
+    quadratic = quadratic - quadratic.mean(dim=1, keepdim=True)
+    return [linear, quadratic - _regressed(quadratic, linear)[0]]
+
+
+def _regressed(y: Tensor, terms: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the part of y that is linear in some terms, and how many were fitted.
+
+    Shapes ``(n, R, l)`` and ``(n, R, p)`` to ``(n, R, l)`` and ``(n,)``.
+    """
+    ridge = RIDGE * terms.shape[1] * torch.eye(terms.shape[2]).to(terms)
+    normal = terms.mT @ terms
+    used = torch.linalg.solve(normal + ridge, normal).diagonal(dim1=1, dim2=2)
+    return terms @ torch.linalg.solve(normal + ridge, terms.mT @ y), used.sum(dim=1)
+
+
+def _shrunk(fitted: Tensor, noise: Tensor) -> Tensor:
+    """Shrink a fit ``(n, R, l)`` by the noise in its sum of squares, ``(n, l)``."""
+    squares = fitted.square().sum(dim=1)
+    shares = 1 - noise / squares.clamp_min(1e-300)
+    return fitted * shares.clamp_min(0.0)[:, None]

@@ -12,7 +12,6 @@ from torch import Tensor
 from sbi_rope.errors import InvalidInputError
 
 __all__ = [
-    "as_array",
     "as_batch",
     "as_numbers",
     "check_in_support",
@@ -88,24 +87,18 @@ def as_numbers(
         value = value.detach()
         return value if value.is_floating_point() else value.float()
     try:
-        array = as_array(value)
+        array = np.ma.asarray(value)  # NumPy alone would use what is under the mask
+        if np.ma.is_masked(array) and array.dtype.kind in "biuf":
+            array = np.ma.filled(array.astype(np.float64), np.nan)
         if array.dtype.kind not in "biuf":
             raise TypeError(f"its type is {array.dtype}")
         with np.errstate(over="ignore"):  # Inf is found as such
-            return torch.from_numpy(array.astype(np.float32)).to(device)
+            return torch.from_numpy(np.array(array, np.float32)).to(device)
     except (TypeError, ValueError, RuntimeError) as error:
         raise InvalidInputError(
             f"Expected `{name}` to be a tensor, an array, a table or a list of "
             f"numbers; got {type(value).__name__} ({error})."
         ) from error
-
-
-def as_array(value: Any) -> np.ndarray:
-    """Return ``value`` as an array in which masked numbers are NaN."""
-    array = np.ma.asarray(value)  # NumPy alone would use what is under the mask
-    if np.ma.is_masked(array) and array.dtype.kind in "biuf":
-        return np.ma.filled(array.astype(np.float64), np.nan)
-    return array.data
 
 
 def column_names(value: Any) -> tuple[str, ...] | None:

@@ -39,7 +39,7 @@ from sbi_rope.baselines import (
 )
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.tasks import Task, get_task
-from sbi_rope.trainers.data import Kind
+from sbi_rope.trainers.base import Kind
 from tests.conftest import SHARED_DATA
 
 VECTOR_TASKS = ("linear_gaussian", "light_tunnel_sensors")
@@ -54,18 +54,8 @@ CHAINS: dict[str, Any] = {
 FINETUNER = CalibrationFinetuner(learning_rate=3e-3, max_num_epochs=5)
 
 # Without a simulator: then they learn the same from a posterior trained beforehand.
-FLOWS: dict[str, Any] = {"npe_training": SHORT, "training": SHORT, "num_draws": 2}
-ALIGNED: dict[str, Any] = {
-    "npe_training": SHORT,
-    "training": SHORT,
-    "num_simulations": 50,
-}
-ERRORS: dict[str, Any] = {
-    "npe_training": SHORT,
-    "surrogate_training": SHORT,
-    "training": SHORT,
-    "num_draws": 8,
-}
+BRIEF: dict[str, Any] = {"npe_training": SHORT, "training": SHORT}
+ERRORS: dict[str, Any] = {**BRIEF, "surrogate_training": SHORT}
 CORRECTION: dict[str, Any] = {"npe_training": SHORT, "num_steps": 5}
 
 
@@ -102,43 +92,24 @@ METHODS: dict[str, Entry] = {
     ),
     "joint_npe": Entry(JointNPE, lambda task: {"training": SHORT}),
     "calibration_mlp": Entry(CalibrationMLP, lambda task: {"training": SHORT}),
-    "finetuned_npe": Entry(
-        FinetunedNPE, lambda task: {"npe_training": SHORT, "training": SHORT}
-    ),
+    "finetuned_npe": Entry(FinetunedNPE, lambda task: BRIEF),
     "finetuned_npe_averaged": Entry(
-        FinetunedNPE,
-        lambda task: {"npe_training": SHORT, "training": SHORT, "num_holdouts": 3},
+        FinetunedNPE, lambda task: {**BRIEF, "num_holdouts": 3}
     ),
     "discrepancy_embedding": Entry(DiscrepancyNPE, lambda task: CORRECTION),
     "discrepancy_input": Entry(
         DiscrepancyNPE, lambda task: {**CORRECTION, "space": "input"}
     ),
     "discrepancy_tuned": Entry(
-        DiscrepancyNPE,
-        lambda task: {
-            **CORRECTION,
-            "space": "tuned",
-            "num_folds": 2,
-            "finetuner": FINETUNER,
-        },
+        DiscrepancyNPE, lambda task: {**CORRECTION, "space": "tuned"}
     ),
-    "fmcpe": Entry(FMCPE, lambda task: FLOWS),
-    "frisbi": Entry(FRISBI, lambda task: ALIGNED),
-    "frisbi_distilled": Entry(
-        FRISBI, lambda task: {**ALIGNED, "distilled": True, "num_draws": 5}
-    ),
+    "fmcpe": Entry(FMCPE, lambda task: BRIEF),
+    "frisbi": Entry(FRISBI, lambda task: BRIEF),
+    "frisbi_distilled": Entry(FRISBI, lambda task: {**BRIEF, "distilled": True}),
     "npe_rs": Entry(NPERS, lambda task: {"training": SHORT}),
-    "nnpe": Entry(NNPE, lambda task: {"npe_training": SHORT, "training": SHORT}),
+    "nnpe": Entry(NNPE, lambda task: BRIEF),
     "hvae": Entry(
-        HVAE,
-        lambda task: {
-            "physics": swing,
-            "npe_training": SHORT,
-            "training": SHORT,
-            "width": 2,
-            "num_latents": 8,
-        },
-        ("pendulum",),
+        HVAE, lambda task: {**BRIEF, "physics": swing, "width": 2}, ("pendulum",)
     ),
     "rvnp": Entry(RVNP, lambda task: ERRORS),
     "rvnp_offset": Entry(RVNP, lambda task: {**ERRORS, "shift": True}),

@@ -208,7 +208,7 @@ class Gaussians(ConditionalDensityEstimator):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TableCoupling(Coupling):
-    """A coupling with weights chosen by hand, found by the number of the observation.
+    """A coupling with weights chosen by hand; the embedding of x_o is its number.
 
     Observations that are not among ``real`` get the rows of an ordinary coupling.
     """
@@ -217,24 +217,19 @@ class TableCoupling(Coupling):
 
     @property
     def weights(self) -> Tensor:
-        return self.table
+        return self.rows(self.real)
 
-    def rows(self, real: Tensor, *, distances: Tensor | None = None) -> Tensor:
-        rows = super().rows(real, distances=distances)
-        same = (real[:, None] == self.real).all(dim=-1)
-        known = same.any(dim=1)
-        rows[known] = self.table[same.int().argmax(dim=1)[known]]
+    def rows(self, real: Tensor) -> Tensor:
+        rows = super().rows(real)
+        known = (real[:, None] == self.real).all(dim=-1).any(dim=1)
+        rows[known] = self.table[real[known, 0].long()]
         return rows
-
-    def restricted_to(self, rows: Tensor) -> "TableCoupling":
-        return replace(super().restricted_to(rows), table=self.table[rows])
 
     def to(self, device: str | torch.device) -> "TableCoupling":
         return replace(super().to(device), table=self.table.to(device))
 
 
 def coupling_of(weights: Tensor, simulated: Tensor) -> TableCoupling:
-    """A coupling with weights chosen by hand; the embedding of x_o is its number."""
     numbers = torch.arange(len(weights), dtype=torch.double, device=weights.device)
     return TableCoupling(
         table=weights.double(),
@@ -285,8 +280,8 @@ def gaussian_posterior(
         nn.Linear(x_o[0].numel(), 2 * dim),
         coupling_of(weights, embeddings),
         unseen=unseen,
-        tail_mass=tail_mass,
     )
+    density.tail_mass = tail_mass
     return MixturePosterior(density, prior)
 
 
@@ -294,6 +289,12 @@ def rows_of(posterior: Any, x: Tensor) -> Tensor:
     """The weights of the simulations for some observations, (n, n_s)."""
     density = posterior.posterior_estimator
     return density.rows(density.embed(x))
+
+
+def error_of_mass(mass: Tensor, draws: int = 1024) -> Tensor:
+    """The relative standard error of a mass that is the share of so many draws."""
+    smoothed = (draws * mass + 0.5) / (draws + 1)
+    return (smoothed * (1 - smoothed) / draws).sqrt() / mass
 
 
 def standard_normal(dim: int) -> MultivariateNormal:

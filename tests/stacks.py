@@ -14,6 +14,7 @@ from sbi_rope import CalibrationFinetuner, RoPE, StackedPosterior
 from sbi_rope.density import Density, Prior
 from sbi_rope.discrepancy import DiscrepancyModel
 from sbi_rope.finetuning import FINETUNING
+from sbi_rope.fit import Training
 from sbi_rope.stacking import (
     Candidate,
     CrossValidation,
@@ -47,11 +48,11 @@ def quick() -> Iterator[None]:
         room + "candidates.FINETUNING": replace(FINETUNING, max_num_epochs=2),
         room + "candidates.REHEARSED": replace(REHEARSED, max_num_epochs=1),
         "sbi_rope.finetuning.STEPS_IN_EPOCH": 3,
-        "sbi_rope.discrepancy.correction.NUM_STEPS": dict.fromkeys(
-            ("embedding", "tuned", "input"), 4
+        "sbi_rope.discrepancy.correction.TRAINING": dict.fromkeys(
+            ("embedding", "tuned", "input"),
+            Training(training_batch_size=50, learning_rate=5e-3, max_num_epochs=4),
         ),
         "sbi_rope.discrepancy.correction.NUM_DRAWS": 50,
-        "sbi_rope.discrepancy.correction.BATCH_SIZE": 50,
         "sbi_rope.discrepancy.correction.NUM_COMPARED": 50,
         "sbi_rope.fit.MAX_LOWERED": 0,
     }

@@ -12,6 +12,7 @@ from tests.conftest import TEST_DATA
 __all__ = [
     "ROOTS",
     "SUBTLE",
+    "all_recorded",
     "as_many",
     "draw",
     "largest_z",
@@ -48,6 +49,14 @@ def draw(
 ) -> tuple[Tensor, Tensor]:
     get = task.get_calibration_set if part == "calibration" else task.get_test_set
     return get(n, seed=seed)  # type: ignore[arg-type]
+
+
+def all_recorded(task: Task, num_rows: int) -> tuple[Tensor, Tensor]:
+    """Return the pairs of both parts of a recording with so many rows."""
+    third = num_rows // 3
+    parts = (task.get_calibration_set(third), task.get_test_set(num_rows - third))
+    theta, x = zip(*parts, strict=True)
+    return torch.cat(theta), torch.cat(x)
 
 
 def rows_of(x: Tensor) -> list[bytes]:

@@ -16,12 +16,11 @@ PACKAGE = Path(sbi_rope.__file__).parent
 # The rooms by layer, the lowest first. A room imports from its own layer and from lower
 # ones. One that is new needs a place.
 LAYERS = [
-    """errors settings tensors _bounds _files _means _permutation _progress
-    _random _units data ensemble""",
-    """fit simulate moments labels coupling saving density finetuning sets metrics _npe
-    _sbi
-    _standardisation _two_sample""",
-    "rope discrepancy trainers batch tasks",
+    """errors settings tensors _files _prior _progress _random _statistics data
+    ensemble""",
+    """fit simulate labels coupling saving density finetuning sets metrics _sbi
+    _standardisation""",
+    "rope discrepancy trainers tasks",
     "stacking diagnosis baselines",
     "plots",
     "reports",

@@ -13,8 +13,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 # The most lines of all files of a kind in a folder, docstrings included.
 BUDGETS = {
-    "sbi_rope/*.py": 35_200,
-    "tests/*.py": 27_800,
+    "sbi_rope/*.py": 30_000,
+    "tests/*.py": 25_000,
     "benchmarks/*.py": 4_000,
     "docs/*.md": 4_000,
 }

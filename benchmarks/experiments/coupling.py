@@ -25,7 +25,7 @@ from torch import Tensor
 
 from benchmarks.experiments.common import Row, begin, show
 from sbi_rope import SinkhornCoupler
-from sbi_rope.coupling.kernel import marginal_error
+from sbi_rope.coupling.sinkhorn import marginal_error
 
 SETTINGS = [(0.5, 0.9), (0.5, 1.0), (0.05, 0.9), (0.05, 1.0)]
 OPTIONS = {

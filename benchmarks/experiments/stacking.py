@@ -74,7 +74,8 @@ def prepared(task: str, n: int, root: Path | None, cache: Path) -> dict[str, Any
     return {
         "posterior": case.npe,
         "pairs": case.calibration,
-        "simulator": None if case.simulator is None else case.task.get_simulator(),
+        # Each version of the package has a simulator of its own.
+        "task": {"variant": cell.variant or None, "root": root},
         "simulations": case.stored if case.simulator is None else None,
         "unit": float(case.task.prior_std.log().sum()),
     }
@@ -84,13 +85,17 @@ def measure(settings: dict[str, Any]) -> None:
     """Measure a stack with the package of a checkout and print it as JSON."""
     sys.path.insert(0, settings["root"])
     from sbi_rope import RoPE, stack
+    from sbi_rope.tasks import get_task
 
     warnings.simplefilter("ignore")
     torch.set_num_threads(settings["threads"])
     # This file was written by the process that started this one.
     case = torch.load(settings["case"], weights_only=False)
-    sources = {key: case[key] for key in ("simulator", "simulations")}
-    rope = RoPE(case["posterior"], **sources).append_calibration(*case["pairs"])
+    source: dict[str, Any] = {"simulations": case["simulations"]}
+    if case["simulations"] is None:
+        task = get_task(settings["task"], **case["task"])
+        source = {"simulator": task.get_simulator()}
+    rope = RoPE(case["posterior"], **source).append_calibration(*case["pairs"])
     start = time.process_time()
     posterior = stack(rope, seed=0, show_progress_bars=False)
     seconds = time.process_time() - start

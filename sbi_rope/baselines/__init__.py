@@ -1,4 +1,8 @@
-"""The methods RoPE is compared with, each used like an sbi trainer or posterior."""
+"""The methods RoPE is compared with, each used like an sbi trainer or posterior.
+
+When to prefer which, and where they differ from the original code, is on the page about
+:doc:`the methods </background/methods>`.
+"""
 
 from sbi_rope.baselines.calibration_mlp import CalibrationMLP
 from sbi_rope.baselines.error_model import SpikeAndSlab
@@ -7,13 +11,11 @@ from sbi_rope.baselines.frisbi import FRISBI
 from sbi_rope.baselines.hvae import HVAE
 from sbi_rope.baselines.joint_npe import JointNPE
 from sbi_rope.baselines.nnpe import NNPE
-from sbi_rope.baselines.npe import PlainNPE, ReferenceNPE
+from sbi_rope.baselines.npe import PlainNPE, PriorBaseline, ReferenceNPE
 from sbi_rope.baselines.npe_rs import NPERS
-from sbi_rope.baselines.ot_only import OTOnly
-from sbi_rope.baselines.prior import PriorBaseline
 from sbi_rope.baselines.rnpe import RNPE
+from sbi_rope.baselines.rope_parts import OTOnly, TuningOnly
 from sbi_rope.baselines.rvnp import RVNP
-from sbi_rope.baselines.tuning_only import TuningOnly
 from sbi_rope.density import PriorPosterior
 from sbi_rope.trainers import FinetunedNPE, Method, Training
 

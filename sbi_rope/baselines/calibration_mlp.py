@@ -13,7 +13,6 @@ from sbi_rope.baselines.networks import embedding_with_head
 from sbi_rope.data import split_pairs
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.fit import History, Training, fit_on_pairs
-from sbi_rope.settings import check
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.training import EstimatorBuilder, estimator_builder
 
@@ -59,11 +58,7 @@ class DiagonalGaussian(ConditionalDensityEstimator):
     highest: Tensor
 
     def __init__(
-        self,
-        net: nn.Module,
-        mean: Tensor,
-        std: Tensor,
-        condition_shape: torch.Size,
+        self, net: nn.Module, mean: Tensor, std: Tensor, condition_shape: torch.Size
     ) -> None:
         super().__init__(net, mean.shape, condition_shape)
         self.register_buffer("mean", mean)
@@ -77,9 +72,6 @@ class DiagonalGaussian(ConditionalDensityEstimator):
 
         An observation unlike those it was trained on can carry it out of the prior's
         support, where no draw would ever be accepted.
-
-        Args:
-            theta: Draws from the prior, shape ``(n, d)``.
         """
         self.lowest = theta.amin(dim=0).to(self.lowest)
         self.highest = theta.amax(dim=0).to(self.highest)
@@ -89,11 +81,7 @@ class DiagonalGaussian(ConditionalDensityEstimator):
         """Let no standard deviation fall below a tenth of the root mean square error.
 
         Far from what it was trained on, a network can be sure of something wrong
-        without bound, and one such observation then decides any mean of log densities.
-
-        Args:
-            theta: Parameters it was not trained on, shape ``(n, d)``.
-            x: Their observations, shape ``(n, *event)``.
+        without bound. The pairs, ``(n, d)`` and ``(n, *event)``, it has not seen.
         """
         error = (theta - self._moments(x)[0]) / self.std
         # As if two more pairs were off by a standard deviation of the prior: a few
@@ -150,10 +138,6 @@ class CalibrationMLP(Method):
     posterior is about Gaussian. Says what the labels are worth without a simulator: a
     method that uses one and does worse is not worth its simulations.
 
-    Where this differs from the paper: neither number of steps, batch size nor scaling
-    of the parameters is stated there, nor a bound on the standard deviations. Without
-    one, a single observation unlike the pairs can cost more than all others together.
-
     References:
         | Addressing Misspecification in Simulation-based Inference through Data-driven
           Calibration (Wehenkel et al., 2025), section 4, Baselines
@@ -168,8 +152,7 @@ class CalibrationMLP(Method):
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidInputError: If sbi knows no estimator of that name; in ``train``, if
-            there is one pair only.
+        InvalidInputError: In ``train``, if there is one pair only.
     """
 
     sees = frozenset({"calibration"})
@@ -182,10 +165,9 @@ class CalibrationMLP(Method):
         training: Training | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
-        check("training", training, Training | None)
         super().__init__(prior, device=device)
         self._build = estimator_builder(density_estimator)
-        self.training = DEFAULT_TRAINING if training is None else training
+        self.training = training or DEFAULT_TRAINING
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         theta, x = self._data.calibration

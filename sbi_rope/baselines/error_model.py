@@ -11,8 +11,10 @@ from torch import Tensor
 from sbi_rope._sbi import SliceSamplerVectorized
 from sbi_rope.settings import Positive, Settings, UnitInterval
 
-__all__ = ["ChainSettings", "SpikeAndSlab", "denoise", "split_r_hat"]
+__all__ = ["BOUND", "ChainSettings", "SpikeAndSlab", "denoise", "split_r_hat"]
 
+# Draws of noise farther out are put here, since networks see them: 8e-5 of all.
+BOUND = 1e3
 # Observations whose chains run side by side; more of them gain nothing.
 GROUP_SIZE = 50
 # Widest bracket of the slice sampler; it also ends the search where a density is flat.
@@ -40,25 +42,18 @@ class SpikeAndSlab(Settings):
         slab_scale: :math:`\lambda`, half the interquartile range of the Cauchy law of a
             misspecified one.
         slab_probability: :math:`\pi`, in [0, 1].
-        bound: Draws farther out are put here, since networks see them. The density
-            ignores it; 8e-5 of the default's draws are concerned.
-
-    Example:
-        >>> SpikeAndSlab().log_prob(torch.zeros(2)).exp().round(decimals=1)
-        tensor([20.6000, 20.6000])
     """
 
     spike_std: Positive = 0.01
     slab_scale: Positive = 0.25
     slab_probability: UnitInterval = 0.5
-    bound: Positive = 1e3
 
     def sample_like(self, x: Tensor) -> Tensor:
         """Draw noise of the shape, dtype and device of a tensor."""
         spike = self.spike_std * torch.randn_like(x)
         slab = torch.empty_like(x).cauchy_(sigma=self.slab_scale)
         is_slab = torch.rand_like(x) < self.slab_probability
-        return slab.where(is_slab, spike).clamp(-self.bound, self.bound)
+        return slab.where(is_slab, spike).clamp(-BOUND, BOUND)
 
     def log_prob(self, noise: Tensor) -> Tensor:
         """Return the log density of every entry of y - s, without the bound."""
@@ -72,19 +67,12 @@ class SpikeAndSlab(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class ChainSettings:
-    """How the denoising posterior is sampled.
-
-    Attributes:
-        num_draws: Draws kept of each observation.
-        num_chains: Chains of each observation.
-        warmup: Sweeps that each chain starts with and that are thrown away.
-        thin: Sweeps for every draw kept.
-    """
+    """How the denoising posterior of each observation is sampled."""
 
     num_draws: int
     num_chains: int
-    warmup: int
-    thin: int
+    warmup: int  # sweeps that each chain starts with and that are thrown away
+    thin: int  # sweeps for every draw kept
 
 
 def denoise(
@@ -189,13 +177,8 @@ def split_r_hat(draws: Tensor) -> Tensor:
         \hat R = \sqrt{\frac{n - 1}{n} + \frac{B}{n W}}
 
     with W the mean variance within half chains of n draws and B / n the variance of
-    their means.
-
-    Args:
-        draws: Shape ``(..., num_chains, num_draws, l)``, at least four draws.
-
-    Returns:
-        Shape ``(..., l)``; infinite if no chain moves and they differ.
+    their means. Draws are ``(..., num_chains, num_draws, l)``, and the result is
+    ``(..., l)``, infinite if no chain moves and they differ.
 
     References:
         | Bayesian Data Analysis (Gelman et al., 2013), section 11.4

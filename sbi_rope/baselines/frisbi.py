@@ -2,6 +2,7 @@ r"""FRISBI: a tuned embedding that is aligned with simulations while it is tuned
 
 import copy
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
@@ -15,10 +16,9 @@ from sbi_rope.density import Density, Flow, MixturePosterior, OverSimulations
 from sbi_rope.ensemble import Ensemble, embedded, log_density
 from sbi_rope.finetuning import trainable_copy
 from sbi_rope.fit import History, Training, epochs_on_pairs, fit, fit_on_pairs, shuffled
-from sbi_rope.moments import targets
-from sbi_rope.settings import Count, Positive, check
+from sbi_rope.settings import Positive, check
+from sbi_rope.simulate import targets
 from sbi_rope.trainers.base import Method
-from sbi_rope.trainers.starting_npe import StartingNPE
 from sbi_rope.trainers.training import EstimatorBuilder
 
 __all__ = ["FRISBI"]
@@ -38,8 +38,13 @@ DISTILLING = Training(
     stop_after_epochs=5,
     max_num_epochs=50,
 )
+# Simulations from the prior that observations are coupled with, at most those that are
+# stored, and simulations behind each target.
+NUM_SIMULATIONS, SIMULATIONS_PER_TARGET = 1000, 100
 # The stored simulations whose mean is a target, without a simulator.
 NUM_NEIGHBORS = 10
+# Draws of the mixture of each observation that a density is distilled from.
+NUM_DRAWS = 100
 
 
 class FRISBI(Method):
@@ -64,60 +69,22 @@ class FRISBI(Method):
     wherever observations are on top of simulations, whichever these are, so that it
     assumes that g starts near the right ones.
 
-    Where this differs from the original code:
-
-    - Gradients pass through both terms, and through :math:`\alpha`. There the second
-      term has none.
-    - g starts at h, and the best epoch on the held-out pairs is kept, h included.
-    - Simulations at the calibration parameters draw their nuisance parameters, which
-      the original takes from the labels.
-    - Targets are means over many simulations instead of single ones, which has the same
-      gradient on average and less noise.
-
     References:
         | Inductive Domain Transfer in Misspecified Simulation-Based Inference (Senouf
           et al., 2025)
         | https://arxiv.org/abs/2508.15593
 
     Args:
-        prior: A torch distribution over parameters of shape ``(d,)``.
-        density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns. An
-            embedding net inside it is copied, never trained in place.
+        prior, density_estimator, npe_training, device: See :class:`Method`.
         simulator: Maps parameters to simulations, batched or not. Without one, the
             appended simulations take its place.
         gamma: :math:`\gamma`, in units of the mean squared difference of embeddings.
-        num_simulations: Simulations from the prior that observations are coupled with,
-            beside the targets of the pairs; at most those that are stored.
-        simulations_per_target: Simulations behind each target.
         distilled: Whether the posterior is :math:`q_\phi`.
-        num_draws: Draws of the mixture of each observation that :math:`q_\phi` is
-            trained on.
-        npe_training: How NPE is trained; ``Training()`` if None.
         training: How g is trained, in batches of observations, each with all pairs; 100
             epochs in batches of 64 if None.
-        device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidInputError: If sbi knows no estimator of that name, or an argument is
-            outside its range.
         UnsupportedPosteriorError: In ``train``, if the estimator has no density.
-        SimulationError: In ``train``, if the simulator fails.
-
-    Example:
-        >>> from sbi.utils import BoxUniform
-        >>> prior = BoxUniform(torch.zeros(1), torch.ones(1))
-        >>> theta = prior.sample((200,))
-        >>> method = FRISBI(
-        ...     prior, "mdn", simulator=lambda theta: theta,
-        ...     npe_training=Training(max_num_epochs=1),
-        ...     training=Training(max_num_epochs=1),
-        ... )
-        >>> method = method.append_simulations(theta, theta)
-        >>> method = method.append_calibration(theta[:20], theta[:20] + 0.3)
-        >>> method = method.append_observations(theta[20:] + 0.3)
-        >>> posterior = method.train(seed=0, show_progress_bars=False).build_posterior()
-        >>> posterior.sample((5,), x=torch.ones(1), show_progress_bars=False).shape
-        torch.Size([5, 1])
     """
 
     sees = frozenset({"simulations", "calibration", "observations"})
@@ -131,28 +98,18 @@ class FRISBI(Method):
         *,
         simulator: Callable[[Any], Any] | None = None,
         gamma: float = 0.5,
-        num_simulations: int = 1000,
-        simulations_per_target: int = 100,
         distilled: bool = False,
-        num_draws: int = 100,
         npe_training: Training | None = None,
         training: Training | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
         check("gamma", gamma, Positive)
-        check("num_simulations", num_simulations, Count)
-        check("simulations_per_target", simulations_per_target, Count)
-        check("distilled", distilled, bool)
-        check("num_draws", num_draws, Count)
-        check("training", training, Training | None)
-        npe = StartingNPE(density_estimator, npe_training)
-        super().__init__(prior, npe=npe, simulator=simulator, device=device)
+        super().__init__(
+            prior, density_estimator, npe_training, simulator=simulator, device=device
+        )
         self.gamma = gamma
-        self.num_simulations = num_simulations
-        self.simulations_per_target = simulations_per_target
         self.distilled = distilled
-        self.num_draws = num_draws
-        self.training = DEFAULT_TRAINING if training is None else training
+        self.training = training or DEFAULT_TRAINING
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
@@ -165,7 +122,6 @@ class FRISBI(Method):
             density, g, torch.cat([simulated, targets]), event_shape, self.gamma
         )
         history = self._train(aligned, targets, show_progress_bars=show_progress_bars)
-        g.requires_grad_(requires_grad=False)
         found: Density = aligned.eval()
         if self.distilled:
             found = self._distilled(aligned, show_progress_bars=show_progress_bars)
@@ -177,16 +133,14 @@ class FRISBI(Method):
         """Return embeddings of simulations from the prior, and the targets of pairs."""
         source = self._source()
 
-        def embedding(x: Tensor) -> Tensor:
-            return embed(h, x)
-
+        embedding = partial(embed, h)
         _, simulated = source.from_prior(
-            self.num_simulations, embedding, progress=show_progress_bars
+            NUM_SIMULATIONS, embedding, progress=show_progress_bars
         )
         return simulated, targets(
             source,
             self._data.pairs,
-            self.simulations_per_target,
+            SIMULATIONS_PER_TARGET,
             embedding,
             num_neighbors=NUM_NEIGHBORS,
             progress=show_progress_bars,
@@ -207,13 +161,10 @@ class FRISBI(Method):
         def loss(some: Tensor) -> Tensor:
             return error(train) + aligned.transport_cost(x_o[some])
 
-        def batches(epoch: int) -> Any:
-            every = torch.arange(len(x_o), device=x_o.device)
-            return zip(shuffled(every, self.training.training_batch_size), strict=True)
-
+        every, size = torch.arange(len(x_o)), self.training.training_batch_size
         [history] = fit(
             aligned.g,
-            batches,
+            lambda epoch: zip(shuffled(every.to(x_o.device), size), strict=True),
             loss,
             self.training,
             validation_loss=(lambda: error(held_out)) if len(held_out) else None,
@@ -227,8 +178,8 @@ class FRISBI(Method):
     def _distilled(self, aligned: "Aligned", *, show_progress_bars: bool) -> Flow:
         """Return a density given g(x) that is trained on draws of the mixture."""
         x_o = self._data.observations
-        theta = aligned.sample(torch.Size((self.num_draws,)), x_o)
-        observation = torch.arange(len(x_o)).repeat(self.num_draws)
+        theta = aligned.sample(torch.Size((NUM_DRAWS,)), x_o)
+        observation = torch.arange(len(x_o)).repeat(NUM_DRAWS)
         density = copy.deepcopy(aligned.density).requires_grad_()
         fit_on_pairs(
             density,
@@ -241,7 +192,6 @@ class FRISBI(Method):
             label="Distilling",
             show_progress_bars=show_progress_bars,
         )
-        density.requires_grad_(requires_grad=False)
         return Flow(
             Ensemble([aligned.g], embedded, ()),
             Ensemble([density], log_density, ()),

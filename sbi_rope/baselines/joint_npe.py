@@ -11,7 +11,6 @@ from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope.data import split_pairs, too_few_pairs
 from sbi_rope.errors import warn_user
 from sbi_rope.fit import History, Training, fit
-from sbi_rope.settings import check
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.training import EstimatorBuilder, estimator_builder
 
@@ -32,13 +31,7 @@ class JointNPE(Method):
     that does best on it is kept; below five pairs the held-out data are simulations.
 
     Sees simulations and the calibration set. Assumes nothing about the misspecification
-    and so has to learn it from the pairs alone: to be preferred from a few hundred
-    pairs on.
-
-    Where this differs from the paper: it states both that the best model on the
-    training set is kept and that all methods are selected on a fifth of the calibration
-    set; the latter is done. It does not say whether a batch of 100 holds 50 or 100
-    simulations; here it holds 50.
+    and so has to learn it from the pairs alone, which takes hundreds of them.
 
     References:
         | Addressing Misspecification in Simulation-based Inference through Data-driven
@@ -46,26 +39,9 @@ class JointNPE(Method):
         | https://arxiv.org/abs/2405.08719
 
     Args:
-        prior: A torch distribution over parameters of shape ``(d,)``.
-        density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns. An
-            embedding net inside it is copied, never trained in place.
+        prior, density_estimator, device: See :class:`Method`.
         training: How it is trained; the held-out share is that of the calibration
             pairs. ``Training(validation_fraction=0.2)`` if None.
-        device: Where to train; data on other devices is moved there.
-
-    Raises:
-        InvalidInputError: If sbi knows no such estimator, or a setting is out of range.
-
-    Example:
-        >>> from sbi.utils import BoxUniform
-        >>> prior = BoxUniform(torch.zeros(1), torch.ones(1))
-        >>> theta, theta_cal = prior.sample((200,)), prior.sample((10,))
-        >>> method = JointNPE(prior, "mdn", training=Training(max_num_epochs=1))
-        >>> method = method.append_simulations(theta, theta)
-        >>> method = method.append_calibration(theta_cal, theta_cal + 0.3)
-        >>> posterior = method.train(show_progress_bars=False).build_posterior()
-        >>> posterior.sample((5,), x=torch.ones(1), show_progress_bars=False).shape
-        torch.Size([5, 1])
     """
 
     sees = frozenset({"simulations", "calibration"})
@@ -78,10 +54,9 @@ class JointNPE(Method):
         training: Training | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
-        check("training", training, Training | None)
         super().__init__(prior, device=device)
         self._build = estimator_builder(density_estimator)
-        self.training = DEFAULT_TRAINING if training is None else training
+        self.training = training or DEFAULT_TRAINING
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         theta, x = self._data.simulations

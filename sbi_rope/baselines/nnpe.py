@@ -6,11 +6,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from sbi_rope._sbi import (
-    embed,
-    estimator_of,
-    posterior_from,
-)
+from sbi_rope._sbi import embed, estimator_of, posterior_from
 from sbi_rope.baselines.error_model import SpikeAndSlab
 from sbi_rope.baselines.statistics import (
     NoiseOn,
@@ -21,7 +17,6 @@ from sbi_rope.baselines.statistics import (
 from sbi_rope.fit import History, Training
 from sbi_rope.settings import check
 from sbi_rope.trainers.base import Method
-from sbi_rope.trainers.starting_npe import StartingNPE
 from sbi_rope.trainers.training import EstimatorBuilder, train_on_simulations
 
 __all__ = ["NNPE"]
@@ -45,16 +40,7 @@ class NNPE(Method):
 
     Sees simulations, also when it starts from a trained NPE. Assumes that statistics
     err independently of each other, any of them, and by a few standard deviations
-    rather than by many. To be preferred without calibration data where a part of the
-    statistics is wrong: what remains of the others is then trusted. It is never as
-    sharp as NPE where the simulator is right.
-
-    Where this differs from the paper and the original code: the paper adds the errors
-    to statistics and does not say what is done with series and images; here it is the
-    embedding. The original code draws the noise once for all epochs. Draws of the
-    Cauchy law beyond 1000 standard deviations are put at 1000, and the network sees
-    statistics beyond three on a logarithmic scale, without which mixture density
-    networks diverge.
+    rather than by many. It is never as sharp as NPE where the simulator is right.
 
     References:
         | Robust Neural Posterior Estimation and Statistical Model Criticism
@@ -62,30 +48,13 @@ class NNPE(Method):
         | https://arxiv.org/abs/2210.06564
 
     Args:
-        prior: A torch distribution over parameters of shape ``(d,)``.
-        density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns. An
-            embedding net inside it is copied, never trained in place.
+        prior, density_estimator, npe_training, device: See :class:`Method`.
         noise_on: Where the noise goes: ``"embedding"`` or ``"input"``.
         error_model: The noise; ``SpikeAndSlab()`` if None.
-        npe_training: How NPE is trained; ``Training()`` if None.
         training: How training goes on with noise; ``Training()`` if None.
-        device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidInputError: If sbi knows no estimator of that name, or ``noise_on`` is
-            neither of the two.
         UnsupportedPosteriorError: In ``train``, if the estimator has no density.
-
-    Example:
-        >>> from sbi.utils import BoxUniform
-        >>> prior = BoxUniform(torch.zeros(1), torch.ones(1))
-        >>> theta = prior.sample((200,))
-        >>> once = Training(max_num_epochs=1)
-        >>> method = NNPE(prior, "mdn", npe_training=once, training=once)
-        >>> method = method.append_simulations(theta, theta)
-        >>> posterior = method.train(show_progress_bars=False).build_posterior()
-        >>> posterior.sample((5,), x=torch.ones(1), show_progress_bars=False).shape
-        torch.Size([5, 1])
     """
 
     sees = frozenset({"simulations"})
@@ -104,13 +73,10 @@ class NNPE(Method):
         device: str | torch.device = "cpu",
     ) -> None:
         check("noise_on", noise_on, Literal["embedding", "input"])
-        check("error_model", error_model, SpikeAndSlab | None)
-        check("training", training, Training | None)
-        npe = StartingNPE(density_estimator, npe_training)
-        super().__init__(prior, npe=npe, device=device)
+        super().__init__(prior, density_estimator, npe_training, device=device)
         self.noise_on: NoiseOn = noise_on
-        self.error_model = SpikeAndSlab() if error_model is None else error_model
-        self.training = Training() if training is None else training
+        self.error_model = error_model or SpikeAndSlab()
+        self.training = training or Training()
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)

@@ -1,4 +1,9 @@
-"""Neural posterior estimation, as it is, and where its simulator is right."""
+"""The prior, NPE as it is, and NPE where its simulator is right.
+
+The first and the last are baselines of Addressing Misspecification in Simulation-based
+Inference through Data-driven Calibration (Wehenkel et al., 2025), section 4,
+https://arxiv.org/abs/2405.08719.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,14 +12,30 @@ import torch
 from torch import Tensor
 
 from sbi_rope._random import seeded
-from sbi_rope.errors import NotReadyError
+from sbi_rope.density import PriorPosterior
 from sbi_rope.fit import History, Training
 from sbi_rope.simulate import Simulated
 from sbi_rope.trainers.base import Method
-from sbi_rope.trainers.starting_npe import StartingNPE
 from sbi_rope.trainers.training import EstimatorBuilder
 
-__all__ = ["PlainNPE", "ReferenceNPE"]
+__all__ = ["PlainNPE", "PriorBaseline", "ReferenceNPE"]
+
+
+class PriorBaseline(Method):
+    """The prior in the place of a posterior: a method that sees no data at all.
+
+    Assumes that the prior is right, then it is calibrated. Whatever has a lower log
+    posterior probability has learnt less than nothing.
+
+    Args:
+        prior: A torch distribution over parameters of shape ``(d,)``.
+        device: Where the prior lives.
+    """
+
+    sees = frozenset()
+
+    def _fit(self, *, show_progress_bars: bool) -> tuple[PriorPosterior, None]:
+        return PriorPosterior(self._prior), None
 
 
 class PlainNPE(Method):
@@ -24,10 +45,9 @@ class PlainNPE(Method):
         \min_q\; \mathbb{E}_{p(\theta)\, p(x_s \mid \theta)}
         \bigl[-\log q(\theta \mid h(x_s))\bigr]
 
-    A thin cover of ``sbi.inference.NPE``, so that it is used like the other baselines.
-
-    Sees simulations. Assumes that the simulator is right. The method to prefer if it
-    is: nothing else here is as sharp then, and none is as wrong if it is not.
+    A thin cover of ``sbi.inference.NPE``. It sees simulations, and assumes that the
+    simulator is right: nothing else here is as sharp then, and none is as wrong if it
+    is not.
 
     References:
         | Automatic Posterior Transformation for Likelihood-free Inference
@@ -36,13 +56,9 @@ class PlainNPE(Method):
 
     Args:
         prior: A torch distribution over parameters of shape ``(d,)``.
-        density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns. An
-            embedding net inside it is copied, never trained in place.
+        density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns.
         npe_training: How NPE is trained; ``Training()`` if None.
         device: Where to train; data on other devices is moved there.
-
-    Raises:
-        InvalidInputError: If sbi knows no such estimator, or a setting is out of range.
 
     Example:
         >>> from sbi.utils import BoxUniform
@@ -67,62 +83,23 @@ class PlainNPE(Method):
         npe_training: Training | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
-        npe = StartingNPE(density_estimator, npe_training)
-        super().__init__(prior, npe=npe, device=device)
+        super().__init__(prior, density_estimator, npe_training, device=device)
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History | None]:
         return self._trained_npe(show_progress_bars=show_progress_bars)
 
 
-class ReferenceNPE(Method):
+class ReferenceNPE(PlainNPE):
     """NPE on simulations in the place of real observations: the reference, "SBI".
 
     Not a method for real data, but what inference would give if the simulator were
     right: the posterior is that of :class:`PlainNPE`, and is scored on fresh
-    simulations of the test parameters, :meth:`simulated_test_set`.
-
-    Sees simulations. Training sees no labels; the test parameters are only simulated
-    from, after the training.
-
-    References:
-        | Addressing Misspecification in Simulation-based Inference through Data-driven
-          Calibration (Wehenkel et al., 2025), section 4, Baselines
-        | https://arxiv.org/abs/2405.08719
-
-    Args:
-        prior: A torch distribution over parameters of shape ``(d,)``.
-        density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns. An
-            embedding net inside it is copied, never trained in place.
-        npe_training: How NPE is trained; ``Training()`` if None.
-        device: Where to train; data on other devices is moved there.
-
-    Raises:
-        InvalidInputError: If sbi knows no such estimator, or a setting is out of range.
+    simulations of the test parameters, :meth:`simulated_test_set`. Training sees no
+    labels; the test parameters are only simulated from, after the training.
     """
 
-    sees = frozenset({"simulations"})
-    starts_from_npe = True
-
-    def __init__(
-        self,
-        prior: Any,
-        density_estimator: str | EstimatorBuilder = "nsf",
-        *,
-        npe_training: Training | None = None,
-        device: str | torch.device = "cpu",
-    ) -> None:
-        npe = StartingNPE(density_estimator, npe_training)
-        super().__init__(prior, npe=npe, device=device)
-
-    def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History | None]:
-        return self._trained_npe(show_progress_bars=show_progress_bars)
-
     def simulated_test_set(
-        self,
-        theta: Tensor,
-        simulator: Callable[[Any], Any],
-        *,
-        seed: int | None = None,
+        self, theta: Tensor, simulator: Callable[[Any], Any], *, seed: int | None = None
     ) -> tuple[Tensor, Tensor]:
         """Return the test parameters, each with one simulation.
 
@@ -134,19 +111,12 @@ class ReferenceNPE(Method):
 
         Returns:
             Parameters and simulations, without those that are not finite.
-
-        Raises:
-            SimulationError: If the simulator fails.
         """
         theta = self._data.read_theta(theta)
-        if self._data.event_shape is None:
-            raise NotReadyError(
-                "The shape of a simulation is not known yet. Call "
-                "`append_simulations(theta, x)` first."
-            )
+        event_shape = self._data.event_shape or torch.Size()
         with seeded(seed):
-            x = Simulated(
-                simulator, self._prior, event_shape=self._data.event_shape, like=theta
-            )(theta)
+            x = Simulated(simulator, self._prior, event_shape=event_shape, like=theta)(
+                theta
+            )
         valid = torch.isfinite(x).flatten(1).all(dim=1)
         return theta[valid], x[valid]

@@ -8,7 +8,7 @@ from torch import Tensor
 from sbi_rope._sbi import direct_posterior, embedding_of
 from sbi_rope.errors import warn_user
 from sbi_rope.fit import History, Training
-from sbi_rope.settings import Count, NotNegative, check
+from sbi_rope.settings import NotNegative, check
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.training import (
     EstimatorBuilder,
@@ -17,6 +17,10 @@ from sbi_rope.trainers.training import (
 )
 
 __all__ = ["NPERS", "squared_mmd"]
+
+# Simulations, and observations, behind the discrepancy of each step, if there are so
+# many.
+NUM_ROWS = 200
 
 
 def squared_mmd(simulated: Tensor, observed: Tensor) -> Tensor:
@@ -39,14 +43,6 @@ def squared_mmd(simulated: Tensor, observed: Tensor) -> Tensor:
     Args:
         simulated: Embeddings of simulations, shape ``(m, l)``.
         observed: Embeddings of observations, shape ``(n, l)``.
-
-    Returns:
-        The discrepancy, a scalar.
-
-    Example:
-        >>> embeddings = torch.tensor([[0.0], [1.0], [3.0]])
-        >>> squared_mmd(embeddings, embeddings)
-        tensor(0.)
     """
     within_simulated = _squared_distances(simulated, simulated)
     across = _squared_distances(simulated, observed)
@@ -77,14 +73,13 @@ class NPERS(Method):
         + \beta \, \mathrm{MMD}^2\bigl(\{h(x_s)\}, \{h(x_o)\}\bigr)
 
     with the discrepancy ``squared_mmd``. Each gradient step draws anew, without
-    replacement, some of all simulations and some of all observations for it, and
-    embeds them in evaluation mode: batch statistics are those of the simulations. When
+    replacement, 200 of all simulations and 200 of all observations for it, and embeds
+    them in evaluation mode: batch statistics are those of the simulations. When
     to stop and which network to keep is decided by the first term alone, on held-out
     simulations.
 
     Sees simulations and the observations to be inferred, no labels. Assumes that the
     prior is right, and that some statistics of x are informative and not misspecified.
-    To be preferred without any labels, for networks that can leave out what is wrong.
     Where every informative statistic is wrong, matching the distributions says nothing
     about which observation goes with which simulation, and the posterior is sharp
     around the wrong value. Whatever regularises also costs likelihood of simulations,
@@ -93,11 +88,6 @@ class NPERS(Method):
 
     An estimator without an embedding net that can be trained has nothing to
     regularise. The method is NPE then, and warns.
-
-    Where this differs from the original code: there one observation is a data set
-    whose embedding is the mean over its members, here it is a set of observations; the
-    prior is not widened after training; batches are of 200, not of 50. RoPE's authors
-    compare with all 2000 test observations at once.
 
     References:
         | Learning Robust Statistics for Simulation-based Inference under Model
@@ -109,30 +99,12 @@ class NPERS(Method):
         density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns, with an
             embedding net. The net is copied, never trained in place.
         regularisation: The weight :math:`\beta`; at 0 the method is NPE.
-        num_mmd_simulations: Simulations m behind the discrepancy of each step, at most
-            all of them.
-        num_mmd_observations: Observations n behind it, at most all of them.
         training: How it is trained; ``Training()`` if None.
         device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidInputError: If sbi knows no estimator of that name, or a number is
-            outside its range.
         UnsupportedPosteriorError: In ``train``, if the embedding cannot be separated
             from the density.
-
-    Example:
-        >>> from sbi.neural_nets import posterior_nn
-        >>> from sbi.utils import BoxUniform
-        >>> prior = BoxUniform(torch.zeros(1), torch.ones(1))
-        >>> theta, theta_o = prior.sample((200,)), prior.sample((50,))
-        >>> builder = posterior_nn("mdn", embedding_net=torch.nn.Linear(1, 2))
-        >>> method = NPERS(prior, builder, training=Training(max_num_epochs=1))
-        >>> method = method.append_simulations(theta, theta)
-        >>> method = method.append_observations(theta_o + 0.3)
-        >>> posterior = method.train(show_progress_bars=False).build_posterior()
-        >>> posterior.sample((5,), x=torch.ones(1), show_progress_bars=False).shape
-        torch.Size([5, 1])
     """
 
     sees = frozenset({"simulations", "observations"})
@@ -143,27 +115,17 @@ class NPERS(Method):
         density_estimator: str | EstimatorBuilder = "nsf",
         *,
         regularisation: float = 1.0,
-        num_mmd_simulations: int = 200,
-        num_mmd_observations: int = 200,
         training: Training | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
         check("regularisation", regularisation, NotNegative)
-        check("num_mmd_simulations", num_mmd_simulations, Count)
-        check("num_mmd_observations", num_mmd_observations, Count)
-        check("training", training, Training | None)
         super().__init__(prior, device=device)
         self._build = estimator_builder(density_estimator)
         self.regularisation = regularisation
-        self.num_mmd_simulations = num_mmd_simulations
-        self.num_mmd_observations = num_mmd_observations
-        self.training = Training() if training is None else training
+        self.training = training or Training()
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         theta, x = self._data.simulations
-
-        def penalty(estimator: Any) -> Tensor | None:
-            return self._penalty(estimator, x)
 
         estimator, history = train_on_simulations(
             self._prior,
@@ -172,7 +134,7 @@ class NPERS(Method):
             x,
             training=self.training,
             show_progress_bars=show_progress_bars,
-            penalty=penalty,
+            penalty=lambda estimator: self._penalty(estimator, x),
         )
         if self.regularisation and not _has_trainable_embedding(estimator):
             warn_user(
@@ -187,18 +149,16 @@ class NPERS(Method):
         if not self.regularisation or not _has_trainable_embedding(estimator):
             return None
         embedding = embedding_of(estimator)
-        simulations = _some(x, self.num_mmd_simulations)
-        observations = _some(self._data.observations, self.num_mmd_observations)
+        simulations, observations = (
+            rows[torch.randperm(len(rows))[:NUM_ROWS]]
+            for rows in (x, self._data.observations)
+        )
         # Batch normalisation would centre each of the two sets, and dropout is noise.
         embedding.eval()
         simulated = embedding(simulations).flatten(1)
         observed = embedding(observations).flatten(1)
         embedding.train()
         return self.regularisation * squared_mmd(simulated, observed)
-
-
-def _some(rows: Tensor, size: int) -> Tensor:
-    return rows[torch.randperm(len(rows))[:size]]
 
 
 def _has_trainable_embedding(estimator: Any) -> bool:

@@ -13,21 +13,19 @@ from sbi_rope._sbi import (
     estimator_of,
 )
 from sbi_rope._standardisation import Standardisation
-from sbi_rope.baselines.error_model import ChainSettings, SpikeAndSlab, denoise
+from sbi_rope.baselines.error_model import BOUND, ChainSettings, SpikeAndSlab, denoise
 from sbi_rope.baselines.statistics import (
     NoiseOn,
+    OverDraws,
     fit_marginal,
     split_at_statistics,
     standardisation_of_statistics,
 )
-from sbi_rope.density import Density, Flow
-from sbi_rope.ensemble import Ensemble, embedded, log_density
 from sbi_rope.errors import warn_user
 from sbi_rope.fit import History, Training
 from sbi_rope.settings import Count, Range, check
 from sbi_rope.tensors import as_batch
 from sbi_rope.trainers.base import Method
-from sbi_rope.trainers.starting_npe import StartingNPE
 from sbi_rope.trainers.training import EstimatorBuilder
 
 __all__ = ["RNPE", "Denoised"]
@@ -38,15 +36,14 @@ MAX_R_HAT = 1.1
 NUM_STARTS = 5000
 
 
-class Denoised(Flow):
+class Denoised(OverDraws):
     r"""A density that is averaged over the statistics that may be behind x.
 
     .. math::
         \tfrac1M \sum_m q(\theta \mid s_m), \qquad s_m \sim p(s \mid y)
 
     An observation is denoised when it is first asked for and known by its values from
-    then on, so that density and samples belong together. Its draws of s depend on those
-    it is denoised together with, through the random numbers alone.
+    then on, so that density and samples belong together.
 
     Args:
         density: :math:`q(\theta \mid s)`.
@@ -73,13 +70,7 @@ class Denoised(Flow):
         settings: ChainSettings,
         seed: int,
     ) -> None:
-        super().__init__(
-            Ensemble([net], embedded, ()),
-            Ensemble([density], log_density, ()),
-            torch.full((settings.num_draws,), 1 / settings.num_draws).double(),
-            input_shape=density.input_shape,
-            condition_shape=event_shape,
-        )
+        super().__init__(net, density, settings.num_draws, event_shape)
         self.marginal = marginal
         self.standardisation = Standardisation(statistics)
         self.register_buffer("starts", self.standardisation(statistics[:NUM_STARTS]))
@@ -91,8 +82,6 @@ class Denoised(Flow):
     def embed(self, x: Tensor) -> Tensor:
         """Return the draws of s of each observation, ``(n, num_denoised, l)``."""
         return torch.stack([draws for draws, _ in self._lookup(x)]).to(self.starts)
-
-    readable = Density.readable  # what is finite
 
     def r_hat(self, x: Tensor) -> Tensor:
         """Return the largest split-R-hat of each observation's chains, ``(n,)``."""
@@ -108,8 +97,7 @@ class Denoised(Flow):
         return [self._denoised[key] for key in keys]
 
     def _denoise(self, keys: list[bytes], x: Tensor) -> None:
-        bound = self.error_model.bound
-        y = self.standardisation(super().embed(x)[:, 0]).clamp(-bound, bound)
+        y = self.standardisation(super().embed(x)[:, 0]).clamp(-BOUND, BOUND)
         with seeded(self.seed):
             draws, r_hats = denoise(
                 y,
@@ -142,10 +130,8 @@ class RNPE(Method):
     in units of each statistic's standard deviation over the simulations. The density
     q(s) of simulated statistics is a neural spline flow. For every observation,
     statistics are drawn by sbi's slice sampler, with the choice between spike and slab
-    summed out, and kept with the posterior: the first call about an observation takes
-    half a second for eight statistics, later ones little. Chains that disagree
-    are warned of, and ``posterior.posterior_estimator.r_hat(x)`` tells
-    by how much.
+    summed out, and kept with the posterior. Chains that disagree are warned of, and
+    ``posterior.posterior_estimator.r_hat(x)`` tells by how much.
 
     Sees simulations. Assumes that statistics err independently of each other, any of
     them, and that simulated ones are not tied to each other: a sweep moves one at a
@@ -154,19 +140,13 @@ class RNPE(Method):
     with a few statistics, each with a meaning, and ``noise_on="input"``; elsewhere
     NNPE has no chains that could fail.
 
-    Where this differs from the original code: it samples the choices between spike and
-    slab too, for 100,000 steps of mixed Hamiltonian Monte Carlo an observation, and
-    its q(s) is a block autoregressive flow.
-
     References:
         | Robust Neural Posterior Estimation and Statistical Model Criticism
           (Ward et al., 2022), section 3
         | https://arxiv.org/abs/2210.06564
 
     Args:
-        prior: A torch distribution over parameters of shape ``(d,)``.
-        density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns. An
-            embedding net inside it is copied, never trained in place.
+        prior, density_estimator, npe_training, device: See :class:`Method`.
         noise_on: What the statistics are: the ``"embedding"`` of NPE, or the
             ``"input"``, whose shape must be ``(l,)`` then.
         error_model: The errors; ``SpikeAndSlab()`` if None.
@@ -174,13 +154,9 @@ class RNPE(Method):
         num_chains: Chains behind them, at least two.
         warmup: Sweeps over the statistics that each chain starts with.
         thin: Sweeps for every draw kept.
-        npe_training: How NPE is trained; ``Training()`` if None.
         training: How q(s) is trained; ``Training()`` if None.
-        device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidInputError: If sbi knows no estimator of that name, an option is outside
-            its range.
         UnsupportedPosteriorError: In ``train``, if the estimator has no density.
     """
 
@@ -204,21 +180,18 @@ class RNPE(Method):
         device: str | torch.device = "cpu",
     ) -> None:
         check("noise_on", noise_on, Literal["embedding", "input"])
-        check("error_model", error_model, SpikeAndSlab | None)
-        check("training", training, Training | None)
         check("num_chains", num_chains, Annotated[int, Range(2)])
         # Halves of chains need two draws for a variance.
         check("num_denoised", num_denoised, Annotated[int, Range(4 * num_chains)])
         check("warmup", warmup, Count)
         check("thin", thin, Count)
-        npe = StartingNPE(density_estimator, npe_training)
-        super().__init__(prior, npe=npe, device=device)
+        super().__init__(prior, density_estimator, npe_training, device=device)
         self.noise_on: NoiseOn = noise_on
-        self.error_model = SpikeAndSlab() if error_model is None else error_model
+        self.error_model = error_model or SpikeAndSlab()
         self.settings = ChainSettings(
             num_draws=num_denoised, num_chains=num_chains, warmup=warmup, thin=thin
         )
-        self.training = Training() if training is None else training
+        self.training = training or Training()
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)

@@ -1,6 +1,7 @@
 r"""The statistics that NNPE, RNPE and RVNP put errors on."""
 
 import copy
+from collections.abc import Callable
 from typing import Any, Literal
 
 import torch
@@ -18,13 +19,17 @@ from sbi_rope._sbi import (
 )
 from sbi_rope._standardisation import Standardisation
 from sbi_rope.data import split_pairs
+from sbi_rope.density import Density, Flow
+from sbi_rope.ensemble import Ensemble, embedded, log_density
 from sbi_rope.fit import History, Training, fit, shuffled
 from sbi_rope.tensors import as_batch
 
 __all__ = [
     "NoiseOn",
+    "OverDraws",
     "SoftClip",
     "fit_marginal",
+    "fit_with_jitter",
     "frozen_statistics",
     "split_at_statistics",
     "standardisation_of_statistics",
@@ -46,12 +51,7 @@ def split_at_statistics(
 ) -> tuple[nn.Module, ConditionalDensityEstimator]:
     r"""Return the map from x to statistics s and :math:`q(\theta \mid s)`.
 
-    Args:
-        estimator: A trained estimator, whose parameters both share.
-        noise_on: Whether s is the ``"embedding"`` h(x), or x itself, the ``"input"``.
-
-    Raises:
-        UnsupportedPosteriorError: If the estimator has no density.
+    Both share their parameters with the estimator; s is h(x), or x itself.
     """
     check_density(estimator)
     if noise_on == "input":
@@ -59,28 +59,50 @@ def split_at_statistics(
     return embedding_of(estimator), headless(estimator)
 
 
-def frozen_statistics(
-    posterior: Any,
-) -> tuple[nn.Module, ConditionalDensityEstimator]:
-    r"""Return h and :math:`q(\theta \mid h(x))` of NPE, as frozen copies.
-
-    Raises:
-        UnsupportedPosteriorError: If its estimator has no density.
-    """
-    estimator = copy.deepcopy(estimator_of(posterior)).eval()
+def frozen_statistics(npe: Any) -> tuple[nn.Module, ConditionalDensityEstimator]:
+    r"""Return h and :math:`q(\theta \mid h(x))` of NPE, as frozen copies."""
+    estimator = copy.deepcopy(estimator_of(npe)).eval()
     return split_at_statistics(
         estimator.requires_grad_(requires_grad=False), "embedding"
     )
 
 
-def standardisation_of_statistics(statistics: Tensor) -> Standardisation:
-    """Return the map from statistics to standard deviations of simulated ones.
+class OverDraws(Flow):
+    r"""NPE averaged over K embeddings :math:`s_k` that may be behind an observation.
+
+    .. math:: \tfrac1K \sum_k q(\theta \mid s_k)
+
+    A subclass returns these from ``embed``, ``(n, *event)`` to ``(n, K, l)``.
 
     Args:
-        statistics: Statistics of simulations, shape ``(n, l)``.
+        net: A network that the subclass embeds with.
+        density: :math:`q(\theta \mid s)`.
+        num_draws: K.
+        event_shape: Shape of one observation.
+    """
 
-    Raises:
-        InvalidInputError: If they are no vectors, or not finite.
+    def __init__(
+        self,
+        net: nn.Module,
+        density: ConditionalDensityEstimator,
+        num_draws: int,
+        event_shape: torch.Size,
+    ) -> None:
+        super().__init__(
+            Ensemble([net], embedded, ()),
+            Ensemble([density], log_density, ()),
+            torch.full((num_draws,), 1 / num_draws).double(),
+            input_shape=density.input_shape,
+            condition_shape=event_shape,
+        )
+
+    readable = Density.readable  # what is finite
+
+
+def standardisation_of_statistics(statistics: Tensor) -> Standardisation:
+    """Return the map from statistics to standard deviations of these, ``(n, l)``.
+
+    They are refused if they are no vectors, or not finite.
     """
     return Standardisation(
         as_batch("statistics of x", statistics, statistics.shape[-1:])
@@ -98,9 +120,6 @@ class SoftClip(nn.Module):
     It loses nothing and changes nothing where simulations are, but keeps networks from
     inputs that are hundreds of times larger than those. Statistics that are the same
     in all simulations stay at that value.
-
-    Args:
-        simulated: Statistics of simulations, shape ``(n, *)``.
     """
 
     mean: Tensor
@@ -124,14 +143,7 @@ class SoftClip(nn.Module):
 def with_clip(estimator: Any, clip: SoftClip, noise_on: NoiseOn) -> tuple[Any, Any]:
     r"""Return :math:`q(\theta \mid s)` and :math:`q(\theta \mid x)` that clip s.
 
-    Args:
-        estimator: A trained estimator, whose parameters both share.
-        clip: The clip of statistics.
-        noise_on: As in :func:`split_at_statistics`.
-
-    Returns:
-        The density given statistics, and the one given x. They are the same if x is
-        its own statistic.
+    Both share their parameters with the estimator, and are the same if s is x.
     """
     net, density = split_at_statistics(estimator, noise_on)
     density = with_embedding(density, nn.Sequential(clip, embedding_of(density)))
@@ -146,17 +158,9 @@ def fit_marginal(
     r"""Fit a neural spline flow :math:`q(s)` to standardised simulated statistics.
 
     It starts as a standard normal density and stays like it where there are no
-    simulations, which is where misspecified statistics are.
-
-    Args:
-        s: Shape ``(n, l)``.
-        jitter: Standard deviation of Gaussian noise on s, anew in every batch. Without
-            it statistics that depend on each other have no density.
-        training: Batch size, learning rate and so on.
-        show_progress_bars: Whether to show the course of the training.
-
-    Returns:
-        The flow, in evaluation mode, and its losses epoch by epoch.
+    simulations, which is where misspecified statistics are. The jitter is the standard
+    deviation of Gaussian noise on s, without which statistics that depend on each other
+    have no density.
     """
     flow = build_zuko_unconditional_flow(
         "NSF",
@@ -167,25 +171,50 @@ def fit_marginal(
     )
     _start_as_standard_normal(flow)
     flow = flow.to(s.device)
-    train, held_out = split_pairs(torch.arange(len(s)), training.validation_fraction)
-
-    def batches(step: int) -> Any:
-        for rows in shuffled(train, training.training_batch_size):
-            yield (s[rows],)
-
-    def loss(batch: Tensor) -> Tensor:
-        return flow.loss(batch + jitter * torch.randn_like(batch)).mean()
-
-    [history] = fit(
+    history = fit_with_jitter(
         flow,
-        batches,
-        loss,
-        training,
-        validation_loss=lambda: loss(s[held_out]),
+        lambda rows, noisy: flow.loss(noisy),
+        s,
+        torch.arange(len(s)),
+        jitter=jitter,
+        training=training,
         label="Density of the statistics",
         show_progress_bars=show_progress_bars,
     )
     return flow, history
+
+
+def fit_with_jitter(
+    density: nn.Module,
+    losses: Callable[[Tensor, Tensor], Tensor],
+    s: Tensor,
+    groups: Tensor,
+    *,
+    jitter: float,
+    training: Training,
+    label: str,
+    show_progress_bars: bool,
+) -> History:
+    """Train a density of statistics with Gaussian noise on them, anew in every batch.
+
+    The losses are those at some rows and their noisy statistics. Rows of a group are
+    held out together.
+    """
+    train, held_out = split_pairs(groups, training.validation_fraction)
+
+    def loss(rows: Tensor) -> Tensor:
+        return losses(rows, s[rows] + jitter * torch.randn_like(s[rows])).mean()
+
+    [history] = fit(
+        density,
+        lambda epoch: zip(shuffled(train, training.training_batch_size), strict=True),
+        loss,
+        training,
+        validation_loss=(lambda: loss(held_out)) if len(held_out) else None,
+        label=label,
+        show_progress_bars=show_progress_bars,
+    )
+    return history
 
 
 @torch.no_grad()

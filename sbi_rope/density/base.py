@@ -1,20 +1,21 @@
 r"""Densities :math:`q(\theta \mid x)` for any observation x."""
 
+import copy
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.distributions import Distribution
 
-from sbi_rope._progress import progress_bar
+from sbi_rope._prior import prior_log_prob, prior_sample
 from sbi_rope._random import seeded
-from sbi_rope._sbi import ConditionalDensityEstimator
-from sbi_rope.errors import warn_user
+from sbi_rope._sbi import ConditionalDensityEstimator, move_distribution_to_device
+from sbi_rope.errors import InvalidInputError, warn_user
 
-__all__ = ["Accept", "Density", "Mass", "batches", "num_fitting"]
+__all__ = ["Accept", "Density", "Given", "Prior", "batches", "num_fitting"]
 
 # sbi converts every x to this dtype, and its estimators work in no other.
 DTYPE = torch.float32
@@ -66,24 +67,6 @@ def without_nan(log_q: Tensor) -> Tensor:
         "there are none, train NPE longer, or with another density estimator."
     )
     return log_q.where(~undefined, -torch.inf)
-
-
-@dataclass(frozen=True)
-class Mass:
-    """The mass of a density inside the prior's support, for each observation.
-
-    Attributes:
-        mass: Shape ``(n,)``, float64.
-        variance: The variance of this estimate, shape ``(n,)``, float64.
-    """
-
-    mass: Tensor
-    variance: Tensor
-
-    @property
-    def standard_error(self) -> Tensor:
-        """The standard error of the mass, shape ``(n,)``, float64."""
-        return self.variance.sqrt()
 
 
 class Density(ConditionalDensityEstimator):
@@ -142,34 +125,23 @@ class Density(ConditionalDensityEstimator):
         *,
         share: float = 1.0,
         seed: int = 0,
-        show_progress_bars: bool = False,
-    ) -> Mass:
-        """Estimate the mass inside the prior's support, for B embedded observations.
+    ) -> Tensor:
+        """Estimate the mass inside the prior's support of B embedded observations.
 
-        The random numbers are the same in every call. Those of an observation depend on
-        its position in the batch.
+        The random numbers are the same in every call. In a mixture, a part needs draws
+        for its ``share`` only, and a ``seed`` of its own, so that errors average out.
 
-        Args:
-            z: What :meth:`embed` returned.
-            num_rows: B.
-            accept: Tells which parameters are inside.
-            share: The weight of this density in a mixture. A smaller one needs fewer
-                draws.
-            seed: Another one for each part of a mixture, so that their errors average
-                out.
-            show_progress_bars: Whether to show progress if it takes long.
+        Returns:
+            Shape ``(B,)``, float64.
         """
         count = math.ceil(NUM_DRAWS * share)
         every = torch.arange(num_rows, device=self.device)
         with seeded(seed):
             inside = [
                 accept(self.draw(z, some.repeat_interleave(count)))
-                for some in normalising(
-                    batches(every, share=count), show=show_progress_bars
-                )
+                for some in batches(every, share=count)
             ]
-        mass = torch.cat(inside).double().reshape(num_rows, count).mean(dim=1)
-        return Mass(mass, variance_of_share(mass, count))
+        return torch.cat(inside).double().reshape(num_rows, count).mean(dim=1)
 
     def log_prob(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
         r"""Return :math:`\log q(\theta \mid x)`.
@@ -179,7 +151,7 @@ class Density(ConditionalDensityEstimator):
                 all observations.
             condition: Observations, shape ``(B, *event)``. One observation serves all
                 rows of theta, and is embedded once.
-            **kwargs: Not used; they are in sbi's signature.
+            **kwargs: Not used.
 
         Returns:
             Shape ``(S, B)``.
@@ -210,16 +182,106 @@ class Density(ConditionalDensityEstimator):
         return -self.log_prob(input[None], condition)[0]
 
 
-def normalising(parts: Sequence[Any], *, show: bool) -> Any:
-    """Return parts of a work, whose progress is shown once it takes seconds."""
-    return progress_bar(parts, show=show, desc="Normalising", delay=5.0, leave=False)
+class Prior(Density):
+    r"""The prior :math:`p(\theta)`, whatever x is.
 
-
-def variance_of_share(share: Tensor, draws: int) -> Tensor:
-    """Return the variance of a share of draws.
-
-    Half a draw is added to those inside and to those outside, so that a share of zero
-    or one has an error, too.
+    Args:
+        prior: A torch distribution over parameters of shape ``(d,)``; it is copied.
+        condition_shape: Shape of one observation.
     """
-    smoothed = (draws * share + 0.5) / (draws + 1)
-    return smoothed * (1.0 - smoothed) / draws
+
+    placeholder: Tensor
+
+    def __init__(self, prior: Distribution, condition_shape: Sequence[int]) -> None:
+        super().__init__(prior.event_shape, condition_shape)
+        self.prior = copy.deepcopy(prior)
+        with seeded(0):
+            like = prior.sample(torch.Size((1,)))
+        # A distribution has no device. This tensor is on the device of its draws.
+        self.register_buffer("placeholder", torch.empty(0, device=like.device))
+
+    def embed(self, x: Tensor) -> Tensor:
+        """Return an empty embedding for each observation, ``(n, 0)``."""
+        return x.new_empty(len(x), 0)
+
+    def log_q(self, theta: Tensor, z: Tensor) -> Tensor:
+        """Return the log density at theta ``(S, B, d)``, shape ``(S, B)``, float64."""
+        return prior_log_prob(self.prior, theta).double()
+
+    def draw(self, z: Tensor, row: Tensor) -> Tensor:
+        """Draw once for each of n numbers of observations, ``(n, d)``."""
+        return prior_sample(self.prior, torch.Size((len(row),))).to(z)
+
+    def readable(self, x: Tensor) -> Tensor:
+        """Tell which observations have no infinite entry, and are not empty."""
+        x = x.flatten(1)
+        return ~torch.isinf(x).any(dim=1) & torch.isfinite(x).any(dim=1)
+
+    def mass(self, z: Tensor, num_rows: int, accept: Accept, **options: Any) -> Tensor:
+        """Estimate the mass inside the support of a prior once for all observations."""
+        return super().mass(z[:1], 1, accept, **options).expand(num_rows)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:  # noqa: FBT001, FBT002
+        # `to` calls this for each module, but a distribution is not a module.
+        moved = super()._apply(fn, recurse)
+        self.prior = move_distribution_to_device(self.prior, str(self.device))
+        return moved
+
+
+class Given(Density):
+    r"""A density that somebody else computes.
+
+    Args:
+        own: Has the methods ``log_prob(theta, x)``, shapes ``(S, B, d)`` and
+            ``(B, *event)`` to ``(S, B)``, and ``sample((n,), x)``, ``(n, B, d)``.
+        theta: Some parameters, shape ``(m, d)``, and
+        x: their observations, shape ``(m, *event)``, to try it on.
+    """
+
+    placeholder: Tensor
+
+    def __init__(self, own: Any, theta: Tensor, x: Tensor) -> None:
+        super().__init__(theta.shape[1:], x.shape[1:])
+        self.own = own
+        self.register_buffer("placeholder", theta.new_empty(0))
+        if not hasattr(own, "log_prob") or not hasattr(own, "sample"):
+            raise InvalidInputError(
+                "Expected a density with `log_prob(theta, x)` and `sample(shape, x)`; "
+                f"got {type(own).__name__}."
+            )
+        with torch.no_grad():
+            shapes = (
+                tuple(own.log_prob(theta[None], x).shape),
+                tuple(own.sample(torch.Size((3,)), x).shape),
+            )
+        expected = ((1, len(x)), (3, *theta.shape))
+        if shapes != expected:
+            raise InvalidInputError(
+                f"Expected log_prob(theta, x) of shape {expected[0]} and "
+                f"sample((3,), x) of shape {expected[1]} for {len(x)} observations; "
+                f"got {shapes[0]} and {shapes[1]}."
+            )
+
+    def embed(self, x: Tensor) -> Tensor:
+        """Return the observations themselves."""
+        return x
+
+    def log_q(self, theta: Tensor, z: Tensor) -> Tensor:
+        """Return the log density at theta ``(S, B, d)``, shape ``(S, B)``, float64."""
+        return self.own.log_prob(theta, z).double()
+
+    def draw(self, z: Tensor, row: Tensor) -> Tensor:
+        """Draw once for each of n numbers of observations, ``(n, d)``."""
+        rows, column = row.unique(return_inverse=True)
+        place = places(column)
+        draws = self.own.sample(torch.Size((int(place.max()) + 1,)), z[rows])
+        return draws[place, column]
+
+
+def places(numbers: Tensor) -> Tensor:
+    """Count for each of n numbers the equal ones before it, ``(n,)``."""
+    counts, order = numbers.bincount(), numbers.argsort(stable=True)
+    first = (counts.cumsum(0) - counts)[numbers[order]]
+    place = torch.empty_like(numbers)
+    place[order] = torch.arange(len(numbers), device=numbers.device) - first
+    return place

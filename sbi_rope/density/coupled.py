@@ -3,6 +3,7 @@
 import hashlib
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, Literal
 
 import torch
@@ -12,16 +13,12 @@ from sbi_rope._random import seeded
 from sbi_rope._sbi import ConditionalDensityEstimator, embed, readable
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope.coupling import Coupling
-from sbi_rope.coupling.cost import row_blocks
 from sbi_rope.density.base import (
     NUM_DRAWS,
     Accept,
     Density,
-    Mass,
     batches,
-    normalising,
     num_fitting,
-    variance_of_share,
     without_nan,
     without_nan_gradients,
 )
@@ -29,8 +26,6 @@ from sbi_rope.ensemble import drawn, log_density
 from sbi_rope.errors import InvalidInputError, warn_user
 
 __all__ = ["Coupled", "OverSimulations"]
-
-TAIL_MASS = 1e-3
 
 
 class OverSimulations(Density):
@@ -46,24 +41,24 @@ class OverSimulations(Density):
         density: :math:`q(\theta \mid s)`, an estimator conditioned on embeddings.
         simulated: :math:`s_j`, shape ``(n_s, l)``.
         condition_shape: Shape of one observation.
+
+    Attributes:
         tail_mass: t. The smallest weights of an observation, which sum to at most this,
             are left out of the density, which is then too small by at most t times the
-            largest density left out. 0 leaves out none.
+            largest density left out.
     """
 
     simulated: Tensor
+    tail_mass = 1e-3
 
     def __init__(
         self,
         density: ConditionalDensityEstimator,
         simulated: Tensor,
         condition_shape: Sequence[int],
-        *,
-        tail_mass: float = TAIL_MASS,
     ) -> None:
         super().__init__(density.input_shape, condition_shape)
         self.density = density
-        self.tail_mass = tail_mass
         self.register_buffer("simulated", simulated)
         self._mass_of_each: dict[str, Tensor] = {}
 
@@ -73,22 +68,15 @@ class OverSimulations(Density):
 
     def log_q(self, theta: Tensor, z: Tensor) -> Tensor:
         """Return the log density at theta ``(S, B, d)``, shape ``(S, B)``, float64."""
-        size = num_fitting(len(self.simulated))
-        blocks = zip(theta.split(size, dim=1), z.split(size), strict=True)
-        return torch.cat(
-            [self._log_q(points, self.rows(some)) for points, some in blocks], dim=1
-        )
-
-    def _log_q(self, theta: Tensor, weights: Tensor) -> Tensor:
-        row, column, log_weights = without_tail(weights, self.tail_mass)
-        return torch.cat(
-            [
-                _log_sum_exp(
-                    self._log_terms(some, row, column) + log_weights, row, len(weights)
-                )
-                for some in theta.split(num_fitting(len(row)))
-            ]
-        )
+        size, blocks = num_fitting(len(self.simulated)), []
+        for points, some in zip(theta.split(size, dim=1), z.split(size), strict=True):
+            row, column, log_weights = without_tail(self.rows(some), self.tail_mass)
+            log_q = []
+            for part in points.split(num_fitting(len(row))):
+                log_terms = self._log_terms(part, row, column) + log_weights
+                log_q.append(_log_sum_exp(log_terms, row, len(some)))
+            blocks.append(torch.cat(log_q))
+        return torch.cat(blocks, dim=1)
 
     def _log_terms(self, theta: Tensor, row: Tensor, column: Tensor) -> Tensor:
         """Evaluate K simulations at theta of their row, ``(S, b, d)`` to ``(S, K)``."""
@@ -116,39 +104,19 @@ class OverSimulations(Density):
         return torch.cat(theta)
 
     @torch.no_grad()
-    def mass(
-        self,
-        z: Tensor,
-        num_rows: int,
-        accept: Accept,
-        *,
-        show_progress_bars: bool = False,
-        **options: Any,
-    ) -> Mass:
+    def mass(self, z: Tensor, num_rows: int, accept: Accept, **options: Any) -> Tensor:
         r"""Return :math:`\sum_j a_j(x) Z_j`, with each :math:`Z_j` of 1024 draws."""
         if "mass" not in self._mass_of_each:
-            self._mass_of_each["mass"] = self._estimated(accept, show_progress_bars)
+            mass, shape = [], torch.Size((NUM_DRAWS,))
+            with seeded(0):
+                for some in batches(self.simulated, share=NUM_DRAWS):
+                    theta = self.density.sample(shape, condition=some)
+                    inside = accept(theta.reshape(-1, *self.input_shape))
+                    mass.append(inside.reshape(NUM_DRAWS, -1).double().mean(dim=0))
+            self._mass_of_each["mass"] = torch.cat(mass)
         of_each = self._mass_of_each["mass"]
-        variance = variance_of_share(of_each, NUM_DRAWS)
-        means, variances = [], []
-        for some in z.split(num_fitting(len(of_each))):
-            weights = self.rows(some).to(of_each)
-            means.append(weights @ of_each)
-            variances.append(weights.square() @ variance)
-        return Mass(torch.cat(means), torch.cat(variances))
-
-    def _estimated(self, accept: Accept, show_progress_bars: bool) -> Tensor:  # noqa: FBT001
-        """Return the mass of each simulation inside the support, ``(n_s,)``."""
-        mass = []
-        with seeded(0):
-            # Some densities take minutes here.
-            for some in normalising(
-                batches(self.simulated, share=NUM_DRAWS), show=show_progress_bars
-            ):
-                theta = self.density.sample(torch.Size((NUM_DRAWS,)), condition=some)
-                inside = accept(theta.reshape(-1, *self.input_shape))
-                mass.append(inside.reshape(NUM_DRAWS, -1).double().mean(dim=0))
-        return torch.cat(mass)
+        blocks = z.split(num_fitting(len(of_each)))
+        return torch.cat([self.rows(some).to(of_each) @ of_each for some in blocks])
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:  # noqa: FBT001, FBT002
         moved = super()._apply(fn, recurse)
@@ -179,7 +147,6 @@ class Coupled(OverSimulations):
         coupling: The coupling of :math:`g(x_o)` with the simulations.
         unseen: What to do with an x outside the batch: ``"raise"`` an error, or
             ``"extend"`` the coupling by a softmax row under the same potential.
-        tail_mass: t, as in :class:`OverSimulations`.
     """
 
     x_o: Tensor
@@ -193,9 +160,8 @@ class Coupled(OverSimulations):
         coupling: Coupling,
         *,
         unseen: Literal["raise", "extend"] = "raise",
-        tail_mass: float = TAIL_MASS,
     ) -> None:
-        super().__init__(density, simulated, x_o.shape[1:], tail_mass=tail_mass)
+        super().__init__(density, simulated, x_o.shape[1:])
         self.net = net
         self.coupling = coupling
         self.unseen: Literal["raise", "extend"] = unseen
@@ -210,11 +176,7 @@ class Coupled(OverSimulations):
         return [self]
 
     def embed(self, x: Tensor) -> Tensor:
-        """Embed observations, ``(n, *event)`` to ``(n, l)``.
-
-        Raises:
-            InvalidInputError: If an x is not in the batch and ``unseen="raise"``.
-        """
+        """Embed observations, ``(n, *event)`` to ``(n, l)``."""
         x = x.to(self.x_o)
         found = [self._index.get(key, -1) for key in _keys(x)]
         index = torch.tensor(found, dtype=torch.long, device=self.x_o.device)
@@ -250,25 +212,20 @@ class Coupled(OverSimulations):
 
     def rows(self, z: Tensor) -> Tensor:
         """Return the weights of the simulations, ``(b, n_s)``; rows sum to one."""
-        weights = z.new_empty(len(z), len(self.simulated))
-        # Blocks of this size stay in the cache.
-        for block in row_blocks(z, len(self.simulated)):
-            distances = self.coupling.distances(z[block])
-            weights[block] = self.coupling.rows(z[block], distances=distances)
-        return weights
+        return self.coupling.rows(z)
 
     def restricted_to(self, index: int) -> "Coupled":
         """Return the same density for one observation of the batch alone."""
-        row = torch.arange(len(self.x_o), device=self.x_o.device)[index][None]
+        row = torch.tensor([index], device=self.x_o.device)
         one = Coupled(
             self.density,
             self.simulated,
             self.x_o[row],
             self.net if self.unseen == "extend" else nn.Identity(),
-            self.coupling.restricted_to(row),
+            replace(self.coupling, real=self.coupling.real[row]),
             unseen=self.unseen,
-            tail_mass=self.tail_mass,
         )
+        one.tail_mass = self.tail_mass
         one._mass_of_each = self._mass_of_each
         return one
 

@@ -19,6 +19,7 @@ from sbi_rope._sbi import (
 from sbi_rope.density.base import (
     Density,
     batches,
+    places,
     without_nan,
     without_nan_gradients,
 )
@@ -76,14 +77,11 @@ class Flow(Density):
         *,
         nets: Sequence[nn.Module] | None = None,
     ) -> "Flow":
-        """Return the average of estimators of one architecture; they are copied.
+        """Return the average of copies of estimators of one architecture.
 
         Args:
             estimators: Estimators of sbi. The same one may appear several times.
             nets: Embedding nets in the place of their own.
-
-        Raises:
-            UnsupportedPosteriorError: If one has no embedding of x.
         """
         first = estimators[0]
         own = {id(one): embedding_of(one) for one in estimators}
@@ -132,22 +130,19 @@ class Flow(Density):
         """Return the average of copies of some of the flows."""
         some = torch.as_tensor(numbers)
         weights = self.weights[some]
-        return self._with(
-            self.nets[some] if len(self.nets) > 1 else copy.deepcopy(self.nets),
-            self.densities[some]
-            if len(self.densities) > 1
-            else copy.deepcopy(self.densities),
-            weights / weights.sum(),
+        nets, densities = (
+            one[some] if len(one) > 1 else copy.deepcopy(one)
+            for one in (self.nets, self.densities)
         )
+        return self._with(nets, densities, weights / weights.sum())
 
     def made_of(
         self, members: Sequence[tuple[int, int]], nets: Ensemble | None = None
     ) -> "Flow":
-        """Return the average of copies of some nets and densities, by their numbers.
+        """Return the average of copies of some nets and densities.
 
-        Args:
-            members: For each flow, the number of its net and of its density.
-            nets: Nets in the place of those of this flow.
+        Each flow is named by the number of its net and that of its density. The nets
+        may take the place of those of this flow.
         """
         of_nets, of_densities = zip(*members, strict=True)
         own = self.nets if nets is None else nets
@@ -169,11 +164,7 @@ class Flow(Density):
         )
 
     def estimator(self, like: ConditionalEstimator | None = None) -> Any:
-        """Return the first flow as an estimator of sbi.
-
-        Args:
-            like: The estimator that it was made of, to get one of the same class.
-        """
+        """Return the first flow as an estimator of sbi, of the class of ``like``."""
         density, net = self.densities.member(0), self.nets.member(0)
         if like is None:
             shape = self.condition_shape
@@ -185,15 +176,7 @@ class Flow(Density):
     # --- training ---
 
     def losses(self, theta: Tensor, x: Tensor) -> Tensor:
-        """Return the losses of each flow at its own pairs.
-
-        Args:
-            theta: Parameters, shape ``(E, B, d)``.
-            x: Observations, shape ``(E, B, *event)``.
-
-        Returns:
-            Shape ``(E, B)``.
-        """
+        """Return the losses ``(E, B)`` at theta ``(E, B, d)``, x ``(E, B, *event)``."""
         return self.losses_given(theta, self.embeddings(x))
 
     def embeddings(self, x: Tensor) -> Tensor:
@@ -256,35 +239,21 @@ class Flow(Density):
         of_net = member if z.shape[1] > 1 else torch.zeros_like(member)
         if len(self.densities) == 1:
             return self.densities.answer(drawn, z[row, of_net])
-        counts = member.bincount(minlength=self.num_members)
-        order = member.argsort(stable=True)
-        place = torch.arange(len(row), device=row.device)
-        place = place - (counts.cumsum(0) - counts)[member[order]]
-        padded = row.new_zeros(self.num_members, int(counts.max()))
-        padded[member[order], place] = order
+        place = places(member)
+        padded = row.new_zeros(self.num_members, int(place.max()) + 1)
+        padded[member, place] = torch.arange(len(row), device=row.device)
         theta = self.densities.answer(drawn, z[row, of_net][padded].flatten(0, 1))
-        theta = theta.reshape(*padded.shape, -1)[member[order], place]
-        return theta[order.argsort()]
+        return theta.reshape(*padded.shape, -1)[member, place]
 
     def readable(self, x: Tensor) -> Tensor:
         """Tell which observations all nets can read."""
-        return readable(_SideBySide(self.nets), x)
+        return readable(self, x)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return the embeddings by all nets, side by side, ``(B, E * l)``."""
+        return self.embed(x).flatten(1)
 
 
 def _are_equal(one: Ensemble, other: Ensemble) -> bool:
     pairs = zip(one.parameters(), other.parameters(), strict=True)
     return one is other or all(torch.equal(*pair) for pair in pairs)
-
-
-class _SideBySide(nn.Module):
-    """All nets of an ensemble, side by side, as one net."""
-
-    def __init__(self, nets: Ensemble) -> None:
-        super().__init__()
-        self.nets = nets
-
-    def forward(self, x: Tensor) -> Tensor:
-        count = len(self.nets)
-        rows = x.repeat(count, *[1] * (x.ndim - 1))
-        z = self.nets.answer(embedded, rows).unflatten(0, (count, -1))
-        return z.transpose(0, 1).flatten(1)

@@ -3,20 +3,21 @@
 import copy
 import math
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any
 
 import torch
 from sbi.utils import within_support
 from torch import Tensor, nn
 
 from sbi_rope._random import seeded
-from sbi_rope.density.base import Accept, Density, Mass
-from sbi_rope.density.given import density_of
+from sbi_rope._sbi import check_density, estimator_of
+from sbi_rope.density.base import Accept, Density
+from sbi_rope.density.flow import Flow
 from sbi_rope.density.posterior import MixturePosterior
 from sbi_rope.errors import InvalidInputError, shown
 from sbi_rope.settings import check
 
-__all__ = ["Mixture", "average"]
+__all__ = ["Mixture", "average", "density_of"]
 
 # Draws of the first prior, at which the others must have the same density.
 NUM_FROM_PRIOR = 100
@@ -29,11 +30,8 @@ class Mixture(Density):
 
     Args:
         parts: :math:`q_k`. The parts of a mixture among them become parts of this one.
-            Those that belong to a batch have to belong to the same one.
+            All have the same shapes of theta and x, and belong to the same batch.
         weights: :math:`w_k`, with a sum of one. A part of weight zero is left out.
-
-    Raises:
-        InvalidInputError: If shapes of theta or x, or batches, differ between parts.
     """
 
     weights: Tensor
@@ -57,7 +55,7 @@ class Mixture(Density):
             own = part.parts if isinstance(part, Mixture) else [part]
             pairs = zip(own, of_part, strict=True)
             flat += [(one, weight * w) for one, w in pairs if weight * w]
-        self._parts = nn.ModuleList(part for part, _ in flat)
+        self.parts: Any = nn.ModuleList(part for part, _ in flat)
         used = torch.tensor([w for _, w in flat], dtype=torch.double)
         self.register_buffer("weights", used.to(first.device))
         batches = [part.x_o for part in self.coupled]
@@ -65,11 +63,6 @@ class Mixture(Density):
             raise InvalidInputError(
                 "Expected the same `x_o` in all coupled parts; got different ones."
             )
-
-    @property
-    def parts(self) -> list[Density]:
-        """All parts with a weight above zero."""
-        return cast("list[Density]", list(self._parts))
 
     @property
     def coupled(self) -> list[Any]:
@@ -105,36 +98,30 @@ class Mixture(Density):
         return torch.stack([part.readable(x) for part in self.parts]).all(dim=0)
 
     def mass(
-        self,
-        z: list[Any],
-        num_rows: int,
-        accept: Accept,
-        *,
-        share: float = 1.0,
-        seed: int = 0,
-        show_progress_bars: bool = False,
-    ) -> Mass:
+        self, z: list[Any], num_rows: int, accept: Accept, **options: Any
+    ) -> Tensor:
         """Return the weighted sum of masses, each of its share of the draws."""
+        parts = zip(self.parts, self.weights.tolist(), z, strict=True)
         of_each = [
-            part.mass(
-                own,
-                num_rows,
-                accept,
-                share=share * weight,
-                seed=seed + k,
-                show_progress_bars=show_progress_bars,
-            )
-            for k, (part, weight, own) in enumerate(
-                zip(self.parts, self.weights.tolist(), z, strict=True)
-            )
+            part.mass(own, num_rows, accept, **(options | {"share": weight, "seed": k}))
+            for k, (part, weight, own) in enumerate(parts)
         ]
-        mass = torch.stack([one.mass for one in of_each], dim=1)
-        variance = torch.stack([one.variance for one in of_each], dim=1)
-        return Mass(mass @ self.weights, variance @ self.weights.square())
+        return torch.stack(of_each, dim=1) @ self.weights
 
     def restricted_to(self, index: int) -> "Mixture":
         """Return the same mixture for one observation of the batch alone."""
         return Mixture([part.restricted_to(index) for part in self.parts], self.weights)
+
+
+def density_of(posterior: Any, *, what: str = "a posterior") -> Density:
+    """Return a copy of the density of a posterior, of this package or of NPE.
+
+    Raises:
+        UnsupportedPosteriorError: If it has no density or no embedding of x.
+    """
+    if isinstance(posterior, MixturePosterior):
+        return copy.deepcopy(posterior.posterior_estimator)
+    return Flow.of([check_density(estimator_of(posterior), what=what)])
 
 
 def average(
@@ -146,9 +133,9 @@ def average(
         p(\theta \mid x) \propto \mathbf{1}[\theta \in \operatorname{supp} p]
         \sum_m w_m\, q_m(\theta \mid x)
 
-    An ensemble of NPEs is repaired in this way: every member is repaired by itself,
-    because each has an embedding net of its own. The average is normalised as a whole,
-    so that a member with much of its mass outside the prior counts for less.
+    An ensemble of NPEs is repaired in this way: every member by itself, because each
+    has an embedding net of its own. The average is normalised as a whole, so that a
+    member with much of its mass outside the prior counts for less.
 
     Args:
         posteriors: What ``stack``, ``RoPE.build_posterior`` or a trainer returns, or

@@ -2,43 +2,53 @@
 
 import copy
 import operator
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from sbi.utils import within_support
 from torch import Tensor
-from torch.distributions import Distribution, constraints
+from torch.distributions import Distribution
 
-from sbi_rope._bounds import moved_inside, support_of
-from sbi_rope._progress import is_shown
+from sbi_rope._prior import is_unbounded, moved_inside
+from sbi_rope._progress import is_shown, progress_bar
 from sbi_rope._random import seeded
 from sbi_rope._sbi import (
     BaseDirectPosterior,
     MixedDensity,
-    describe,
     move_distribution_to_device,
 )
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope.coupling import Coupling
-from sbi_rope.density.base import DTYPE, Density, Mass
+from sbi_rope.density.base import (
+    DTYPE,
+    MAX_ENTRIES,
+    Accept,
+    Density,
+    Prior,
+    num_fitting,
+)
 from sbi_rope.density.coupled import Coupled
-from sbi_rope.density.rejection import sample_inside
 from sbi_rope.errors import InvalidInputError, SamplingError
 from sbi_rope.saving import save
 from sbi_rope.sets.makes_sets import MakesSets
 from sbi_rope.settings import Count, Positive, check
 from sbi_rope.tensors import as_batch, as_numbers, rows_with
 
-__all__ = ["MixturePosterior", "is_unbounded"]
+__all__ = ["MixturePosterior", "PriorPosterior"]
 
-# Defaults of `map`.
-OF_MAP: dict[str, Any] = {
-    "num_iter": 100,
-    "num_init_samples": 100,
-    "num_to_optimize": 5,
-}
+# An observation is slow if, after MIN_PROPOSALS proposals, less than a share of
+# MIN_ACCEPTANCE of them lies inside the prior's support. Rejection sampling gives up on
+# slow observations if they would take more than MAX_PROPOSALS further proposals, which
+# are minutes. In a stack the prior often keeps a share just below MIN_ACCEPTANCE.
+MIN_PROPOSALS, MIN_ACCEPTANCE, MAX_PROPOSALS = 100_000, 1e-3, 10_000_000
+# Observations for which this many proposals were all rejected are counted together: if
+# a whole batch lies outside the support, MIN_PROPOSALS for all of it are enough.
+MIN_WITHOUT_ANY = 5_000
+# A flow takes about as long for this many draws as for a single one.
+SMALL_BATCH = 512
 
 
 class MixturePosterior(MakesSets, BaseDirectPosterior):
@@ -55,13 +65,12 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         \qquad Z_i = \sum_j \alpha_{ij} Z_j .
 
     It has all methods of sbi's :class:`DirectPosterior` and works with sbi's
-    diagnostics. That of RoPE belongs to a batch of observations: simulation-based
-    calibration, coverage and similar diagnostics only make sense for its ``x_o`` and
-    their true parameters. Others are amortised and answer any x.
+    diagnostics. That of RoPE belongs to a batch of observations: diagnostics such as
+    simulation-based calibration only make sense for its ``x_o`` and their true
+    parameters. Others are amortised and answer any x.
 
-    Apart from arguments and result it needs 100 MB, and what networks need for 16,384
-    pairs of a parameter and a component (131,072 on a GPU), which is 50 MB for sbi's
-    NSF. A matrix of size n_o x n_s is never held.
+    Apart from arguments and result it needs some 150 MB. A matrix of size n_o x n_s is
+    never held.
 
     References:
         | Addressing Misspecification in Simulation-based Inference through Data-driven
@@ -70,7 +79,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
 
     Args:
         density: q.
-        prior: The prior NPE was trained with.
+        prior: The prior that NPE was trained with.
         enable_transform: Whether ``map()`` searches in an unbounded space, as in sbi.
             For mixed discrete and continuous parameters it never does.
     """
@@ -78,7 +87,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
     # Whether an amortised posterior warns of entries that are far from simulations.
     warns = True
     # The observation that the mass was last estimated for, and this mass.
-    _latest: tuple[Tensor, Mass] | None = None
+    _latest: tuple[Tensor, Tensor] | None = None
 
     def __init__(
         self,
@@ -98,13 +107,10 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
                 enable_transform=enable_transform and not is_mixed,
             )
         self.posterior_estimator: Density = density
-        describe(self, self._words())
 
-    def _words(self) -> str:
-        if self.is_amortised:
-            return "It is a density of the parameters given any x."
-        count = len(self.couplings[0].simulated)
-        return f"It is a mixture over {count} simulations for each of {len(self)} x."
+    def __str__(self) -> str:
+        of = "any x" if self.is_amortised else f"each of {len(self)} x"
+        return f"{type(self).__name__} p(θ|x) of {of}"
 
     def __getstate__(self) -> dict[str, Any]:
         # Copies, files and posteriors of single observations do without it.
@@ -119,51 +125,35 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
 
     @property
     def x_o(self) -> Tensor:
-        """The batch of real observations, shape ``(n_o, *event)``.
-
-        Raises:
-            InvalidInputError: If the posterior is amortised; so do the other methods
-                and properties of the batch.
-        """
-        return self._of_batch("x_o")[0].x_o
-
-    @property
-    def couplings(self) -> tuple[Coupling, ...]:
-        """All couplings of the batch with simulations."""
-        return tuple(part.coupling for part in self._of_batch("couplings"))
+        """The batch of real observations, shape ``(n_o, *event)``."""
+        return self._coupled[0].x_o
 
     @property
     def coupling(self) -> Coupling:
-        """The coupling of the batch with the simulations, if there is a single one.
-
-        Raises:
-            InvalidInputError: If there are several.
-        """
-        coupled, *others = self._of_batch("coupling")
+        """The coupling of the batch with the simulations, if there is a single one."""
+        coupled, *others = self._coupled
         if others:
             raise InvalidInputError(
-                f"Expected a single coupling; got {1 + len(others)}. Use `couplings`."
+                f"Expected a single coupling; got {1 + len(others)} in an average."
             )
         return coupled.coupling
 
     @property
     def weights(self) -> Tensor:
-        """Weights of the simulations, shape ``(n_o, n_s)``; rows sum to one.
-
-        They are the weights within the coupled part, whatever the other parts weigh.
-        """
-        self._of_batch("weights")
+        """Weights of the simulations in the coupled part, shape ``(n_o, n_s)``."""
         return self.coupling.weights
 
-    def _of_batch(self, name: str) -> Sequence[Coupled]:
+    @property
+    def _coupled(self) -> Sequence[Coupled]:
         if not (coupled := self.posterior_estimator.coupled):
             raise InvalidInputError(
-                f"Expected a posterior of a batch for `{name}`; got an amortised one."
+                "Expected a posterior of a batch; got an amortised one, which has no "
+                "`x_o`, coupling or length."
             )
         return coupled
 
     def __len__(self) -> int:
-        return len(self._of_batch("len()")[0].x_o)
+        return len(self.x_o)
 
     def __bool__(self) -> bool:
         return True  # also an amortised one, which has no length
@@ -173,8 +163,8 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
 
         It does not know the other observations of the batch.
         """
-        self._of_batch("[i]")
-        density = self.posterior_estimator.restricted_to(operator.index(index))
+        index = range(len(self))[operator.index(index)]
+        density = self.posterior_estimator.restricted_to(index)
         view = copy.copy(self)
         view.posterior_estimator = density
         potential_fn: Any = copy.copy(self.potential_fn)
@@ -182,18 +172,14 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         potential_fn.set_x(None)  # another observation may have been asked for last
         view.potential_fn = potential_fn
         view.set_default_x(view.x_o)
-        describe(view, f"{self._words()} This is that of observation {index} alone.")
         return view
-
-    def __iter__(self) -> Iterator["MixturePosterior"]:
-        return (self[i] for i in range(len(self)))
 
     def to(self, device: str | torch.device) -> None:
         """Move the posterior, its coupling and its batch to a device.
 
         Posteriors of single observations (``posterior[i]``) have to be taken again.
         """
-        x, words, self._latest = self.default_x, self._purpose, None
+        x, self._latest = self.default_x, None
         prior = move_distribution_to_device(self.prior, device)
         density = self.posterior_estimator.to(device)
         with seeded(0):  # sbi draws from the prior to find out about it
@@ -204,33 +190,17 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
                 device=str(density.device),
                 enable_transform=self.enable_transform,
             )
-        describe(self, words)
         if x is not None:
             self._keep_default_x(x)
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
-        """Write this posterior to a file that :func:`sbi_rope.load` reads.
-
-        Args:
-            path: The file. Its folder is made if there is none.
-            overwrite: Whether to replace a file that exists.
-
-        Raises:
-            FileExistsError: If the file exists.
-        """
+        """Write this posterior to a file, as :func:`sbi_rope.save` does."""
         save(self, path, overwrite=overwrite)
 
     # --- arguments ---
 
     def set_default_x(self, x: Tensor) -> "MixturePosterior":
-        """Set the observation ``(*event)`` that methods take when they are given none.
-
-        Returns:
-            Itself, so that calls can be chained.
-
-        Raises:
-            InvalidInputError: If the shape does not fit, or a value is not finite.
-        """
+        """Set the observation ``(*event)`` of methods that are given none."""
         self._keep_default_x(self._warned_of(self._batch_of_x(x)))
         return self
 
@@ -309,7 +279,6 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         show_progress_bars: bool | None = None,  # noqa: FBT001
         reject_outside_prior: bool = True,  # noqa: FBT001, FBT002
         max_sampling_time: float | None = None,
-        return_partial_on_timeout: bool = False,  # noqa: FBT001, FBT002
     ) -> Tensor:
         r"""Draw from :math:`p(\theta \mid x_b)` of every observation of a batch.
 
@@ -323,52 +292,62 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             reject_outside_prior: Whether to draw from the density truncated to the
                 prior's support, or from the whole density.
             max_sampling_time: Seconds after which to give up; None for no limit.
-            return_partial_on_timeout: Must be False. Observations are drawn for one
-                after the other, so that some would have no draw.
 
         Returns:
             Shape ``(*sample_shape, B, d)``.
 
         Raises:
-            InvalidInputError: If an argument is outside its range, or an x is not in
-                the batch and ``unseen="raise"``.
+            InvalidInputError: If an x is not in the batch and ``unseen="raise"``.
             SamplingError: If hardly any mass lies inside the prior's support, or the
                 time is over.
         """
         check("max_sampling_time", max_sampling_time, Positive | None)
         check("max_sampling_batch_size", max_sampling_batch_size, Count | None)
-        if return_partial_on_timeout:
-            raise InvalidInputError(
-                "Expected `return_partial_on_timeout=False`: some observations would "
-                "have no draw."
-            )
         x = self._warned_of(self._batch_of_x(x))
         shape = torch.Size(sample_shape)
         density = self.posterior_estimator.eval()
-        theta = sample_inside(
-            density,
-            density.embed(x),
-            len(x),
-            shape.numel(),
-            accept=self._inside if reject_outside_prior else None,
-            batch_size=max_sampling_batch_size,
-            max_sampling_time=max_sampling_time,
-            show_progress_bars=is_shown(show_progress_bars),
-        )
-        return theta.reshape(*shape, *theta.shape[1:])
+        z = density.embed(x)
+        num_samples, num_rows = shape.numel(), len(x)
+        total, start = num_samples * num_rows, time.monotonic()
+
+        def draw(row: Tensor) -> Tensor:
+            if max_sampling_time and time.monotonic() > start + max_sampling_time:
+                raise SamplingError(
+                    "Sampling took longer than `max_sampling_time`: not all of "
+                    f"{total} draws were made."
+                )
+            parts = row.split(max_sampling_batch_size or len(row))
+            return torch.cat([density.draw(z, some) for some in parts])
+
+        if reject_outside_prior:
+            draw = _Rejection(draw, self._inside, num_rows, density.device)
+        theta = torch.empty(total, *density.input_shape, device=density.device)
+        with (
+            torch.no_grad(),
+            progress_bar(
+                show=is_shown(show_progress_bars), desc="Sampling", total=total
+            ) as bar,
+        ):
+            # Observation by observation, so that few of them are needed at a time.
+            for first in range(0, total, MAX_ENTRIES):
+                last = min(first + MAX_ENTRIES, total)
+                slot = torch.arange(first, last, device=density.device)
+                row, number = slot // num_samples, slot % num_samples
+                theta[number * num_rows + row] = draw(row)
+                bar.update(len(slot))
+        return theta.reshape(*shape, num_rows, *density.input_shape)
 
     def _inside(self, theta: Tensor) -> Tensor:
         return within_support(self.prior, theta).reshape(len(theta))
 
     # --- density ---
 
-    def log_prob(
+    def log_prob(  # type: ignore[override]
         self,
         theta: Tensor,
         x: Tensor | None = None,
         norm_posterior: bool = True,  # noqa: FBT001, FBT002
         track_gradients: bool = False,  # noqa: FBT001, FBT002
-        leakage_correction_params: dict | None = None,
     ) -> Tensor:
         r"""Return :math:`\log p(\theta \mid x)` of one observation.
 
@@ -377,24 +356,16 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             x: An observation, from the batch if there is one; the default x if None.
             norm_posterior: Whether to divide by the mass inside the prior's support.
             track_gradients: Whether gradients with respect to theta are needed.
-            leakage_correction_params: None, or ``{"show_progress_bars": True}`` to show
-                the progress of the normalisation if it takes more than five seconds.
 
         Returns:
             Shape ``(n,)``; minus infinity outside the prior's support.
 
         Raises:
-            InvalidInputError: If shapes do not fit, x is not finite, theta is NaN, or x
-                is not in the batch and ``unseen="raise"``.
+            InvalidInputError: If x is not in the batch and ``unseen="raise"``.
             SamplingError: If the density has no mass inside the prior's support.
         """
-        return self._log_prob(
-            self._parameters(theta)[:, None],
-            self._warned_of(self._one_x(x)),
-            norm_posterior,
-            track_gradients,
-            leakage_correction_params,
-        )[:, 0]
+        theta, x = self._parameters(theta)[:, None], self._warned_of(self._one_x(x))
+        return self._log_prob(theta, x, norm_posterior, track_gradients)[:, 0]
 
     def log_prob_batched(  # type: ignore[override]
         self, theta: Any, x: Any, *args: Any, **options: Any
@@ -421,7 +392,6 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         x: Tensor,
         norm_posterior: bool = True,  # noqa: FBT001, FBT002
         track_gradients: bool = False,  # noqa: FBT001, FBT002
-        leakage_correction_params: dict[str, Any] | None = None,
     ) -> Tensor:
         """Return the log density at theta ``(S, B, d)``; x is embedded once."""
         density = self.posterior_estimator.eval()
@@ -432,20 +402,9 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             safe = safe.reshape(theta.shape)
             log_prob = density.log_prob_given(safe, z, len(x))
         if norm_posterior:
-            options = leakage_correction_params or {}
-            log_prob = log_prob - self._normaliser(x, z, **options).log()
+            log_prob = log_prob - self._normaliser(x, z).log()
         inside = inside.reshape(theta.shape[:2])
         return log_prob.to(DTYPE).where(inside, -torch.inf)
-
-    def potential(
-        self,
-        theta: Tensor,
-        x: Tensor | None = None,
-        track_gradients: bool = False,  # noqa: FBT001, FBT002
-    ) -> Tensor:
-        r"""Return :math:`\log p(\theta \mid x)` without normalisation, ``(n,)``."""
-        theta = self._parameters(theta)
-        return super().potential(theta, self._one_x(x), track_gradients)
 
     def map(self, x: Tensor | None = None, **options: Any) -> Tensor:  # type: ignore[override]
         """Return the maximum of the density given the default x, as in sbi, ``(1, d)``.
@@ -454,13 +413,16 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         smaller than those of sbi, which would take many minutes: ``num_iter`` and
         ``num_init_samples`` are 100, and ``num_to_optimize`` is 5.
         """
+        own: dict[str, Any] = dict(
+            num_iter=100, num_init_samples=100, num_to_optimize=5
+        )
         with torch.enable_grad():  # the caller may have switched gradients off
-            return super().map(x=x, **(OF_MAP | options))
+            return super().map(x=x, **(own | options))
 
     # --- normalisation ---
 
-    def leakage(self, x: Tensor, *, show_progress_bars: bool = False) -> Mass:
-        """Return the mass of the density inside the prior's support, with its error.
+    def leakage_correction(self, x: Tensor) -> Tensor:  # type: ignore[override]
+        r"""Return the mass of the density inside the prior's support, ``(B,)``.
 
         It is estimated from 1024 draws with a seed of their own, so that ``log_prob``
         always returns the same numbers. For a mixture over simulations it is estimated
@@ -469,58 +431,134 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
 
         Args:
             x: Observations, shape ``(B, *event)``.
-            show_progress_bars: Whether to show progress if the estimate takes long.
-        """
-        x = self._batch_of_x(x)
-        z = self.posterior_estimator.embed(x)
-        return self._mass(x, z, show_progress_bars=show_progress_bars)
-
-    def leakage_correction(  # type: ignore[override]
-        self, x: Tensor, *, show_progress_bars: bool = False
-    ) -> Tensor:
-        r"""Return the masses alone, as sbi does, shape ``(B,)``.
 
         Raises:
-            SamplingError: If one of them is zero.
+            SamplingError: If one of the masses is zero.
         """
         x = self._batch_of_x(x)
-        z = self.posterior_estimator.embed(x)
-        return self._normaliser(x, z, show_progress_bars=show_progress_bars).to(DTYPE)
+        return self._normaliser(x, self.posterior_estimator.embed(x)).to(DTYPE)
 
-    def _normaliser(
-        self, x: Tensor, z: Any, *, show_progress_bars: bool = False, **unknown: Any
-    ) -> Tensor:
-        if unknown:
-            raise InvalidInputError(
-                "Expected no `leakage_correction_params` but `show_progress_bars`; got "
-                f"{sorted(unknown)}."
-            )
-        mass = self._mass(x, z, show_progress_bars=show_progress_bars).mass
+    def _normaliser(self, x: Tensor, z: Any) -> Tensor:
+        if is_unbounded(self.prior):
+            return torch.ones(len(x), dtype=torch.double, device=x.device)
+        if self._latest is not None and torch.equal(self._latest[0], x):
+            return self._latest[1]
+        mass = self.posterior_estimator.mass(z, len(x), self._inside)
         if not (mass > 0).all():
             rows = (mass <= 0).nonzero().flatten()
             raise SamplingError(
                 f"The densities of rows {rows[:5].tolist()} of `x` have no mass inside "
                 "the support of the prior. Leave them out, or train NPE longer."
             )
-        return mass
-
-    def _mass(self, x: Tensor, z: Any, *, show_progress_bars: bool) -> Mass:
-        if is_unbounded(self.prior):
-            ones = torch.ones(len(x), dtype=torch.double, device=x.device)
-            return Mass(ones, torch.zeros_like(ones))
-        if self._latest is not None and torch.equal(self._latest[0], x):
-            return self._latest[1]
-        mass = self.posterior_estimator.mass(
-            z, len(x), self._inside, show_progress_bars=show_progress_bars
-        )
         if len(x) == 1:
             self._latest = x.clone(), mass
         return mass
 
 
-def is_unbounded(prior: Distribution) -> bool:
-    """Tell whether a prior says that its support is the whole space."""
-    support = support_of(prior)
-    while isinstance(support, constraints.independent):
-        support = support.base_constraint
-    return support in (constraints.real, constraints.real_vector)
+class _Rejection:
+    """Proposes until a draw is accepted, and counts the proposals of each row."""
+
+    def __init__(
+        self,
+        propose: Callable[[Tensor], Tensor],
+        accept: Accept,
+        num_rows: int,
+        device: torch.device,
+    ) -> None:
+        self.propose, self.accept, self.num_rows = propose, accept, num_rows
+        self.proposed = torch.zeros(num_rows, dtype=torch.long, device=device)
+        self.inside = torch.zeros_like(self.proposed)
+
+    def __call__(self, row: Tensor) -> Tensor:
+        """Draw for each of n numbers of rows until a draw is accepted, ``(n, d)``."""
+        theta: Tensor | None = None
+        still_open = torch.ones_like(row, dtype=torch.bool)
+        rate = 1.0
+        while (open_slots := still_open.nonzero().flatten()).numel():
+            # At this rate most slots are filled. For the last few slots, more proposals
+            # take no longer than one.
+            count = len(open_slots)
+            wanted = max(int(1 / max(rate, MIN_ACCEPTANCE)), SMALL_BATCH // count)
+            repeats = max(1, min(wanted, num_fitting(count)))
+            proposals = open_slots.repeat_interleave(repeats)
+            rows = row[proposals]
+            draws = self.propose(rows)
+            accepted = self.accept(draws)
+            if theta is None:
+                theta = draws.new_empty(len(row), *draws.shape[1:])
+            # Of several proposals for a slot the first accepted one is kept.
+            chosen = accepted.nonzero().flatten()
+            filled = proposals[chosen]
+            first = filled != filled.roll(1)
+            first[:1] = True
+            theta[filled[first]] = draws[chosen[first]]
+            still_open[filled] = False
+            self.count(rows, accepted, row[still_open])
+            rate = float(accepted.double().mean())
+        assert theta is not None
+        return theta
+
+    def count(self, rows: Tensor, accepted: Tensor, missing: Tensor) -> None:
+        """Count proposals, and give up on rows that would take too many more."""
+        self.proposed += rows.bincount(minlength=self.num_rows)
+        self.inside += rows[accepted].bincount(minlength=self.num_rows)
+        num_missing = missing.bincount(minlength=self.num_rows)
+        share = self.inside / self.proposed.clamp_min(1)
+        slow = (num_missing > 0) & (self.proposed >= MIN_PROPOSALS)
+        slow &= share < MIN_ACCEPTANCE
+        # Infinite if nothing was accepted so far.
+        further = (num_missing[slow] / share[slow]).sum()
+        hopeless = slow & (further > MAX_PROPOSALS)
+        without_any = (self.proposed >= MIN_WITHOUT_ANY) & (self.inside == 0)
+        if int(self.proposed[without_any].sum()) >= MIN_PROPOSALS:
+            hopeless |= without_any
+        if hopeless.any():
+            numbers = hopeless.nonzero().flatten()[:5].tolist()
+            raise SamplingError(
+                f"Less than one in {int(1 / MIN_ACCEPTANCE)} draws lies inside the "
+                f"support of the prior for rows {numbers} of `x`. Leave these "
+                "observations out, train NPE longer, or pass "
+                "reject_outside_prior=False."
+            )
+
+
+class PriorPosterior(MixturePosterior):
+    r"""The prior :math:`p(\theta)`, in the form of an sbi posterior that ignores x.
+
+    It is calibrated whenever the prior is right. An estimate that has learnt something
+    from x has a higher log posterior probability. ``sample`` and ``log_prob`` need no
+    observation, and the batched methods take observations of any shape.
+
+    References:
+        | Addressing Misspecification in Simulation-based Inference through Data-driven
+        | Calibration (Wehenkel et al., 2025), section 4, Baselines
+        | https://arxiv.org/abs/2405.08719
+
+    Args:
+        prior: A torch distribution over parameters of shape ``(d,)``. It is copied.
+
+    Example:
+        >>> from sbi.utils import BoxUniform
+        >>> posterior = PriorPosterior(BoxUniform(torch.zeros(2), torch.ones(2)))
+        >>> posterior.sample_batched((5,), x=torch.zeros(3, 7)).shape
+        torch.Size([5, 3, 2])
+    """
+
+    def __init__(self, prior: Any) -> None:
+        if not isinstance(prior, Distribution) or len(prior.event_shape) != 1:
+            raise InvalidInputError(
+                "Expected `prior` to be a torch distribution over vectors; got "
+                f"{type(prior).__name__}. Use `sbi.utils.process_prior(prior)[0]`."
+            )
+        density = Prior(prior, (0,))
+        try:
+            super().__init__(density, density.prior)
+        except Exception:  # sbi raises all kinds if it cannot transform the prior
+            super().__init__(density, density.prior, enable_transform=False)
+
+    def _one_x(self, x: Any) -> Tensor:
+        return torch.empty(1, 0, device=self.posterior_estimator.device)
+
+    def _batch_of_x(self, x: Any) -> Tensor:
+        count = len(as_numbers("x", x))
+        return torch.empty(count, 0, device=self.posterior_estimator.device)

@@ -7,30 +7,35 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from sbi_rope._npe import TrainedNPE
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
-from sbi_rope._two_sample import compare_with_pairs
-from sbi_rope.coupling import SinkhornCoupler
+from sbi_rope._statistics import compare_with_pairs
 from sbi_rope.density import MixturePosterior
-from sbi_rope.diagnosis.also_in_pairs import also_in_pairs, implied_by_pairs
-from sbi_rope.diagnosis.far_entries import far_findings
-from sbi_rope.diagnosis.in_use import read_for, use_of
-from sbi_rope.diagnosis.labelled import labelled_finding
-from sbi_rope.diagnosis.misspecification import misspecification_findings
-from sbi_rope.diagnosis.prior_shift import PriorShift, prior_shift
-from sbi_rope.diagnosis.report import Diagnosis, Finding
+from sbi_rope.diagnosis.misspecification import (
+    far_findings,
+    labelled_findings,
+    misspecification_findings,
+    support_of,
+)
+from sbi_rope.diagnosis.parameters import (
+    FEWEST,
+    PriorShift,
+    also_in_pairs,
+    implied_by_pairs,
+    prior_shift,
+    spread_of,
+)
+from sbi_rope.diagnosis.report import Diagnosis, Finding, read_for
 from sbi_rope.diagnosis.residuals import (
     CrossFitted,
     cross_fit,
     residual_findings,
 )
 from sbi_rope.diagnosis.simulations import Simulations
-from sbi_rope.diagnosis.spread import FEWEST, spread_of
-from sbi_rope.diagnosis.support import support_of
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.rope import RoPE
 from sbi_rope.settings import Range, check, default_names, names_of
+from sbi_rope.stacking import StackedPosterior
 
 __all__ = ["diagnose"]
 
@@ -50,7 +55,6 @@ def diagnose(
     x_o: Tensor,
     *,
     num_simulations: int | None = None,
-    coupler: SinkhornCoupler | None = None,
     num_folds: int | None = 5,
     posterior: MixturePosterior | None = None,
     parameter_names: Sequence[str] | None = None,
@@ -87,8 +91,6 @@ def diagnose(
         x_o: The batch, shape ``(n_o, *event)``.
         num_simulations: n_s, at least 100. If None, ``max(n_o, 1000)``, or all stored
             simulations if there are fewer.
-        coupler: The coupler whose effective sample sizes are tested; that of ``rope``
-            if None.
         num_folds: The number of trainings for the residuals of 4, each of which takes
             as long as ``rope.train``. None leaves out 4, and the allowance for errors
             of g in both tests of 3.
@@ -112,13 +114,9 @@ def diagnose(
         :func:`sbi_rope.plots.implied_parameters`.
 
     Raises:
-        InvalidInputError: If x_o has the wrong shape or is not finite, an argument is
-            out of range, or there are fewer than 100 simulations.
-        CouplingError: If the embeddings cannot be coupled.
-        SimulationError: If the simulator fails.
+        InvalidInputError: If there are fewer than 100 simulations.
     """
     check("rope", rope, RoPE)
-    check("coupler", coupler, SinkhornCoupler | None)
     check("posterior", posterior, MixturePosterior | None)
     check("num_folds", num_folds, Folds | None)
     tuned = len(rope.pairs) > 0
@@ -140,7 +138,7 @@ def diagnose(
                 f"Expected at least {FEWEST_SIMULATIONS} simulations, to estimate the "
                 f"thresholds; got {len(batch.theta)}."
             )
-        coupling = batch.couple(coupler or rope.coupler)
+        coupling = batch.couple(rope.coupler)
         before = batch.npe.embed("x_o", batch.x_o, batch.npe.h)
         simulations = Simulations(
             theta=_moved(batch.theta), embedded=_moved(batch.simulated), tuned=tuned
@@ -155,8 +153,7 @@ def diagnose(
             rope, num_folds, show_progress_bars=is_shown(show_progress_bars)
         )
         shift = prior_shift(real, simulations, held_out=held_out)
-        findings += shift.findings(simulations, names)
-        notes += _shift_notes(shift, names)
+        findings += shift.findings(simulations, names, notes)
         residual = []
         if held_out is not None:
             residual = residual_findings(rope, held_out, simulations, notes)
@@ -167,7 +164,10 @@ def diagnose(
             notes.append(NO_STANDARDISATION)
         findings += far
         # It decides whether anything that was found on the pairs holds for the batch.
-        findings = _labelled_findings(rope, before, batch.npe, notes) + findings
+        if tuned:
+            of_pairs = batch.npe.embed("x", rope.pairs.x, batch.npe.h)
+            test = compare_with_pairs(of_pairs, rope.pairs.group.cpu(), before)
+            findings = labelled_findings(test, notes) + findings
         also = ()
         if tuned:
             pairs = implied_by_pairs(rope, batch.npe, simulations)
@@ -185,14 +185,17 @@ def diagnose(
         effective_sample_size=sizes,
         distance=support.distance,
         theta=simulations.theta,
-        implied=shift.implied,
-        unshifted=shift.unshifted,
+        implied=shift.batch.weights,
+        unshifted=shift.expected[0].weights,
         residuals=None if held_out is None else held_out.residuals,
         parameter_names=names,
         prior=prior,
         also_in_pairs=also,
     )
-    return diagnosis if posterior is None else read_for(diagnosis, use_of(posterior))
+    if posterior is None:
+        return diagnosis
+    is_stack = isinstance(posterior, StackedPosterior)
+    return read_for(diagnosis, posterior.report if is_stack else None)
 
 
 def _held_out(
@@ -244,37 +247,6 @@ def _spread_findings(
         return []
     spread = spread_of(shift, simulations.theta, theta_cal=theta)
     return spread.findings(names, tuned=simulations.tuned)
-
-
-def _shift_notes(shift: PriorShift, names: Sequence[str]) -> list[str]:
-    left_out = [name for k, name in enumerate(names) if not shift.is_testable(k)]
-    if not left_out:
-        return []
-    verb = "is" if len(left_out) == 1 else "are"
-    return [
-        f"Whether {', '.join(left_out)} {verb} shifted against the prior was not "
-        "tested: with so few observations or calibration pairs, even the largest "
-        "distance would be no sign of it."
-    ]
-
-
-def _labelled_findings(
-    rope: RoPE, batch: Tensor, npe: TrainedNPE, notes: list[str]
-) -> list[Finding]:
-    """Compare h(x_o) with h of the calibration pairs, if there are any."""
-    pairs = rope.pairs
-    if not len(pairs):
-        return []
-    embedded = npe.embed("x", pairs.x, npe.h)
-    test = compare_with_pairs(embedded, pairs.group.cpu(), batch)
-    if test is None:
-        notes.append(
-            "Whether the batch is like the calibration pairs was not tested, which "
-            "needs at least five observations and five pairs with different parameters "
-            "(or groups)."
-        )
-        return []
-    return [labelled_finding(test)]
 
 
 def _moved(values: Tensor) -> Tensor:

@@ -2,10 +2,13 @@
 
 import textwrap
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 from torch import Tensor
+
+from sbi_rope.discrepancy.parameters import is_improbable
+from sbi_rope.stacking import StackingReport
 
 __all__ = [
     "IN_BRIEF",
@@ -13,7 +16,7 @@ __all__ = [
     "UNLIKE_PAIRS",
     "Diagnosis",
     "Finding",
-    "PosteriorInUse",
+    "read_for",
     "whom_it_concerns",
     "why_expected",
 ]
@@ -39,24 +42,6 @@ HOW_TO_COUNT = (
     "`diagnose(rope, x_o, posterior=posterior)` counts only the alarms that concern "
     "the posterior that you use."
 )
-
-
-@dataclass(frozen=True, kw_only=True)
-class PosteriorInUse:
-    """What a diagnosis has to know of the posterior that is used.
-
-    Attributes:
-        name: What it is called: "this stack" or "this posterior".
-        has_couplings: Whether it may use the couplings of RoPE or its embedding net, so
-            that all findings concern it.
-        has_learned_parameters: Whether it is a stack that has learned from the pairs
-            how parameters are distributed, and the parameters of the pairs are not
-            distributed like the prior.
-    """
-
-    name: str
-    has_couplings: bool = True
-    has_learned_parameters: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,13 +82,8 @@ class Finding:
 
     def __str__(self) -> str:
         mark = "!" if self.alarming and not self.is_expected else "-"
-        whom = whom_it_concerns(self)
-        return "\n".join(
-            [
-                f"{mark} {self.name}: {self.number}",
-                _indented(f"{self.sentence} {whom} {self.reason}"),
-            ]
-        )
+        text = f"{self.sentence} {whom_it_concerns(self)} {self.reason}"
+        return f"{mark} {self.name}: {self.number}\n{_indented(text)}"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -132,7 +112,8 @@ class Diagnosis:
         prior: Draws of the prior, ``(n, d)``, for pictures.
         also_in_pairs: The names of findings in which the calibration pairs differ from
             the prior as the batch does, whether they are alarming or not.
-        posterior: What is known of the posterior in use, if one was given.
+        used: The kind of the posterior in use, if one was given. RoPE's couplings and
+            embedding net have no part in a stack.
     """
 
     findings: tuple[Finding, ...]
@@ -147,7 +128,7 @@ class Diagnosis:
     parameter_names: tuple[str, ...]
     prior: Tensor = field(repr=False)
     also_in_pairs: tuple[str, ...] = ()
-    posterior: PosteriorInUse | None = None
+    used: Literal["stack", "posterior"] | None = None
 
     @property
     def alarming(self) -> tuple[Finding, ...]:
@@ -185,15 +166,13 @@ class Diagnosis:
         return tuple(one for one in self.findings if self._concerns(one))
 
     def _concerns(self, finding: Finding) -> bool:
-        used = self.posterior
-        return used is None or used.has_couplings or finding.concerns != "RoPE"
+        return self.used != "stack" or finding.concerns != "RoPE"
 
     @property
     def verdict(self) -> str:
         """How many findings are alarming, in a sentence."""
-        count, whose = len(self.unexpected), ""
-        if self.posterior is not None:
-            whose = f" that concern {self.posterior.name}"
+        count = len(self.unexpected)
+        whose = f" that concern this {self.used}" if self.used else ""
         verdict = (
             f"{count or 'none'} of {len(self._own)} findings{whose} "
             f"{'is' if count < 2 else 'are'} alarming."
@@ -225,7 +204,7 @@ class Diagnosis:
                 f"{len(self.theta)} simulations: {self.verdict}{self._like_pairs}",
                 first="",
             ),
-            *_in_full(self.unexpected),
+            *map(str, self.unexpected),
         ]
         for why, found in _by_reason(self.expected).items():
             lines.append(_indented(f"as expected {why}:", first=""))
@@ -239,7 +218,7 @@ class Diagnosis:
             for one in self.others
         ]
         notes = list(self.notes)
-        if self.posterior is None and self.unexpected:
+        if self.used is None and self.unexpected:
             notes.append(HOW_TO_COUNT)
         lines += [_indented(note, first="* ") for note in notes]
         return "\n".join(lines)
@@ -249,7 +228,7 @@ class Diagnosis:
         if not self.quiet:
             return []
         lines = [f"  {one.name}: {one.number}" for one in self.quiet]
-        if self.posterior is not None:
+        if self.used is not None:
             return ["no alarm:", *lines]
         whose = [f" [{IN_BRIEF[one.concerns]}]" for one in self.quiet]
         return [
@@ -264,6 +243,33 @@ class Diagnosis:
             return ""
         value = f"p = {self[UNLIKE_PAIRS].value:.3g}"
         return f" No sign that the batch is unlike the calibration pairs ({value})."
+
+
+def read_for(diagnosis: Diagnosis, report: StackingReport | None) -> Diagnosis:
+    """Return a diagnosis as it is to be read by somebody who uses a posterior.
+
+    What the parameters of the batch have in common with those of the pairs is expected
+    of a stack that has learned where these are, unless the batch is unlike the pairs.
+
+    Args:
+        diagnosis: What was found.
+        report: The report of the stack that is used; None for another posterior, which
+            all findings concern.
+    """
+    is_like_pairs = UNLIKE_PAIRS in diagnosis and not diagnosis[UNLIKE_PAIRS].alarming
+    has_learned = (
+        report is not None
+        and report.learns_prior
+        and is_improbable(report.probability_of_prior)
+    )
+    findings = tuple(
+        replace(one, is_expected=one.alarming and is_like_pairs and has_learned)
+        if one.name in diagnosis.also_in_pairs
+        else one
+        for one in diagnosis.findings
+    )
+    used = "posterior" if report is None else "stack"
+    return replace(diagnosis, findings=findings, used=used)
 
 
 def whom_it_concerns(finding: Finding) -> str:
@@ -284,19 +290,6 @@ def _by_reason(findings: Iterable[Finding]) -> dict[str, list[Finding]]:
     for one in findings:
         reasons.setdefault(why_expected(one), []).append(one)
     return reasons
-
-
-def _in_full(findings: Iterable[Finding]) -> list[str]:
-    """Return the text of each finding; a reason that follows itself is left out."""
-    lines, given = [], ""
-    for one in findings:
-        text = str(one)
-        if one.reason == given:
-            head, _, _ = text.partition("\n")
-            text = f"{head}\n{_indented(one.sentence)}"
-        lines.append(text)
-        given = one.reason
-    return lines
 
 
 def _indented(text: str, *, first: str = "  ") -> str:

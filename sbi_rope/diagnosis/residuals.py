@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sbi_rope._permutation import permutation_test
+from sbi_rope._prior import divisors
 from sbi_rope._progress import progress_bar
 from sbi_rope._sbi import embed
-from sbi_rope._units import divisors
+from sbi_rope._statistics import permutation_test
 from sbi_rope.data import Counts, one_of_each_group
 from sbi_rope.diagnosis.report import Finding
 from sbi_rope.diagnosis.simulations import Simulations
@@ -17,10 +17,8 @@ from sbi_rope.rope import RoPE
 
 __all__ = [
     "CrossFitted",
-    "Dependence",
     "cross_fit",
     "dependence",
-    "num_features",
     "residual_finding",
     "residual_findings",
 ]
@@ -87,12 +85,6 @@ def cross_fit(rope: RoPE, *, num_folds: int, show_progress_bars: bool) -> CrossF
     training for each fold. Where labels are not exact, g is tuned to averages given the
     label alone, other than by :meth:`RoPE.train`, because residuals from averages that
     are also given x would be too small.
-
-    Args:
-        rope: RoPE with its calibration pairs; it is not changed.
-        num_folds: Number of folds, at most the number of groups, of which there are
-            two at least.
-        show_progress_bars: Whether to show how many folds are done.
     """
     pairs, h = rope.pairs, rope.embedding_net
     targets = rope.draw_targets(
@@ -130,10 +122,7 @@ def dependence(residuals: Tensor, theta: Tensor) -> Dependence:
     the squares of the parameters are left out. The standard error of b is at most about
     :math:`\sqrt{(s^2 + b^2 / 2) / n}`, its value if all residual variance has the
     direction of the bias.
-
-    Args:
-        residuals: Shape ``(n, l)``.
-        theta: Parameters, shape ``(n, d)``.
+    Shapes are ``(n, l)`` and ``(n, d)``.
     """
     count = num_features(*theta.shape)
     standard = (theta - theta.mean(dim=0)) / divisors(theta.std(dim=0))
@@ -153,14 +142,7 @@ def dependence(residuals: Tensor, theta: Tensor) -> Dependence:
 def residual_findings(
     rope: RoPE, held_out: CrossFitted, simulations: Simulations, notes: list[str]
 ) -> list[Finding]:
-    """Return a finding about calibration pairs, if they are enough for a test.
-
-    Args:
-        rope: RoPE with its calibration pairs.
-        held_out: The pairs, embedded by nets that were not trained on them.
-        simulations: What is known about simulations.
-        notes: Why there is no finding is appended to these.
-    """
+    """Return a finding about calibration pairs, or note why they are too few."""
     pairs = rope.pairs
     theta = pairs.mean.detach().cpu().double()
     residuals = held_out.residuals

@@ -1,4 +1,4 @@
-"""The simulations that a batch is compared with, and how tuning would move them."""
+"""The simulations that a batch is compared with, and the parameters they imply."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -6,9 +6,23 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from sbi_rope._units import divisors
+from sbi_rope._prior import divisors
+from sbi_rope.coupling import Coupling, SinkhornCoupler
 
-__all__ = ["Simulations", "nearest_distances"]
+__all__ = [
+    "Implied",
+    "Simulations",
+    "couple_by_itself",
+    "implied_by",
+    "nearest_distances",
+    "resampled",
+]
+
+# At tau = 0 each observation is coupled by itself, without trust in the prior. The
+# smaller gamma is, the less the implied distribution is blurred.
+COUPLER = SinkhornCoupler(gamma=0.1, tau=0.0, cost_scale="simulated")
+# Points at which distribution functions are compared.
+NUM_POINTS = 100
 
 # So many simulations give a covariance with errors of a few per cent.
 MAX_FOR_NOISE = 2000
@@ -67,32 +81,20 @@ class Simulations:
         if not self.tuned:
             return points
         mean = self.embedded.mean(dim=0)
-        return mean + (points - mean) @ self._averaging
-
-    @cached_property
-    def _averaging(self) -> Tensor:
-        centred = self.embedded - self.embedded.mean(dim=0)
+        centred = self.embedded - mean
         values, vectors = torch.linalg.eigh(centred.T @ centred / len(centred))
         kept = values > 1e-10 * values.max()
         root = vectors[:, kept] * values[kept].sqrt()
         inverse = vectors[:, kept] / values[kept].sqrt()
         share, basis = torch.linalg.eigh(inverse.T @ self.noise @ inverse)
         left = (1.0 - share).clamp(0.0, 1.0)
-        return inverse @ (basis * left) @ basis.T @ root.T
-
-    @cached_property
-    def nearest(self) -> Tensor:
-        """Distance from each simulation to its nearest neighbour, ``(n_s,)``."""
-        return nearest_distances(self.embedded, self.embedded, others=True)
+        return mean + (points - mean) @ (inverse @ (basis * left) @ basis.T @ root.T)
 
 
 def nearest_distances(points: Tensor, among: Tensor, *, others: bool = False) -> Tensor:
     """Return the distance from each point to the nearest of others, shape ``(n,)``.
 
-    Args:
-        points: Shape ``(n, l)``.
-        among: Shape ``(m, l)``.
-        others: Whether the two sets are the same, and no point is its own neighbour.
+    With ``others`` the two sets are the same, and no point is its own neighbour.
     """
     nearest = []
     for first in range(0, len(points), CHUNK):
@@ -102,3 +104,73 @@ def nearest_distances(points: Tensor, among: Tensor, *, others: bool = False) ->
             distance[own, first + own] = torch.inf
         nearest.append(distance.amin(dim=1))
     return torch.cat(nearest)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Implied:
+    """The parameters that the observations of a set imply.
+
+    Attributes:
+        weights: Mean weights of the simulations, which sum to one, ``(n_s,)``.
+        functions: The distribution functions of each observation, at points of each
+            parameter, ``(n, d, points)``.
+        means: The mean parameters of each observation, ``(n, d)``.
+    """
+
+    weights: Tensor
+    functions: Tensor
+    means: Tensor
+
+
+def couple_by_itself(simulations: Simulations) -> Coupling:
+    """Return a coupling whose rows depend on one observation only."""
+    # At tau = 0 the potential is zero for any batch, so that a few rows are enough.
+    return COUPLER.couple(simulations.embedded[:100], simulations.embedded)
+
+
+def implied_by(
+    coupling: Coupling,
+    real: Tensor,
+    simulations: Simulations,
+    *,
+    own: Tensor | None = None,
+) -> Implied:
+    r"""Return the parameters that embeddings imply.
+
+    Observation i gives simulation j the weight
+    :math:`\operatorname{softmax}_j(-C_{ij} / \gamma)`. For simulations that take the
+    place of observations, ``own`` are their numbers, and none is matched with itself.
+    """
+    theta = simulations.theta
+    order, last = theta.argsort(dim=0), len(theta) - 1
+    # The ranks at which distribution functions are compared.
+    where = torch.linspace(0, last, min(NUM_POINTS, len(theta))).round().long()
+    total = torch.zeros(len(theta), dtype=torch.float64)
+    functions, means = [], []
+    for first in range(0, len(real), CHUNK):
+        block = slice(first, first + CHUNK)
+        weights = coupling.rows(real[block])
+        if own is not None:
+            rows = torch.arange(len(weights))
+            weights[rows, own[block]] = 0.0
+            weights = weights / weights.sum(dim=1, keepdim=True).clamp_min(1e-300)
+        total += weights.sum(dim=0)
+        means.append(weights @ theta)
+        each = [weights[:, column].cumsum(dim=1)[:, where] for column in order.T]
+        functions.append(torch.stack(each, dim=1))
+    return Implied(
+        weights=total / len(real),
+        functions=torch.cat(functions),
+        means=torch.cat(means),
+    )
+
+
+def resampled(values: Tensor, size: int, *, num_draws: int) -> Tensor:
+    """Return means over ``size`` rows drawn with replacement, ``(num_draws, ...)``."""
+    count = len(values)
+    rows = torch.randint(count, (num_draws, size))
+    rows += count * torch.arange(num_draws).unsqueeze(1)
+    times = torch.bincount(rows.flatten(), minlength=num_draws * count)
+    draws = times.reshape(num_draws, count).to(values)
+    mean = draws @ values.reshape(count, -1) / size
+    return mean.reshape(num_draws, *values.shape[1:])

@@ -13,12 +13,12 @@ from sbi_rope._sbi import ConditionalEstimator, embedding_of
 from sbi_rope._standardisation import Standardisation
 from sbi_rope.data import Counts, groups_of
 from sbi_rope.density.flow import Flow
-from sbi_rope.discrepancy.model import DiscrepancyModel
+from sbi_rope.discrepancy.model import DiscrepancyModel, expected_means
 from sbi_rope.discrepancy.posterior import Discrepancy, DiscrepancyDraws
 from sbi_rope.discrepancy.regression import SMALLEST_NOISE
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.fit import Courses, History, Training, fit
-from sbi_rope.moments import Moments
+from sbi_rope.simulate import Moments
 
 __all__ = [
     "Correction",
@@ -27,6 +27,7 @@ __all__ = [
     "fit_discrepancy",
     "network_of",
     "surprise",
+    "tuning_targets",
 ]
 
 # What is corrected: h(x), x itself, or g(x) with nets g tuned on other pairs. In the
@@ -41,29 +42,30 @@ NUM_DRAWS, MAX_ENTRIES = 2000, 2**24
 SMALLEST_ERROR = {"embedding": 0.01, "tuned": 0.01, "input": 0.003}
 # More standard deviations than this refute that the simulator is right.
 LARGEST_SURPRISE = 5.0
-# Gradient steps of a course, and simulations in each. The density behind an embedding
-# net adapts within a hundred steps; a whole network takes longer.
-NUM_STEPS = {"embedding": 200, "tuned": 200, "input": 400}
-BATCH_SIZE = 160
+# Simulations in a step, and steps in a course. The density behind a net adapts
+# within a hundred steps; a whole network takes longer.
+BEHIND_NET = Training(training_batch_size=80, learning_rate=1e-2, max_num_epochs=250)
+TRAINING = {
+    "embedding": BEHIND_NET,
+    "tuned": BEHIND_NET,
+    "input": replace(BEHIND_NET, training_batch_size=160, max_num_epochs=400),
+}
 # Corrected simulations on which the loss before and after a course is compared.
 NUM_COMPARED = 1920
-LEARNING_RATES = {"embedding": 5e-3, "tuned": 5e-3, "input": 2e-3}
-# Another course follows if one has lowered the loss by so many nats. In a stack, where
-# many versions are trained, it also has to fall by more in the last quarter of one,
-# and there are fewer: one course is enough for most, but not for images. Chosen on
-# calibration data, see benchmarks/choices.md.
-UNTIL_SETTLED, STILL_FALLING, MAX_IN_A_STACK = 0.01, 0.15, 3
+# Courses follow each other until one gains less than 0.01 nats. In a stack, where many
+# versions are trained, a single course is enough for most, but not for images: only if
+# the loss still falls by so many nats in its last quarter, a longer one follows. Chosen
+# on calibration data, see benchmarks/choices.md.
+COURSES = Courses(min_gain=0.01)
+IN_A_STACK = Courses(min_gain=0.01, min_fall=0.3, max_num=2, growth=4)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Correction:
-    """Copies of NPE that were trained on corrected simulations.
+    """Copies of NPE that were trained on corrected simulations, and their losses.
 
-    Attributes:
-        flow: All copies.
-        constants: A layer that replaces entries without variation in simulations, to
-            put behind an embedding net of real observations. The flow contains it.
-        histories: The losses of the training of each copy.
+    ``constants`` is a layer that replaces entries without variation in simulations, to
+    put behind an embedding net of real observations.
     """
 
     flow: Flow
@@ -72,11 +74,7 @@ class Correction:
 
 
 def network_of(estimator: ConditionalEstimator, space: Space) -> nn.Module:
-    """Return the map from x to its representation that is corrected.
-
-    Raises:
-        InvalidInputError: If the input is to be corrected and is not a vector.
-    """
+    """Return the map from x to its representation that is corrected."""
     if space != "input":
         return embedding_of(estimator)
     if len(estimator.condition_shape) != 1:
@@ -103,16 +101,9 @@ def fit_discrepancy(
     many entries, a right simulator that fits badly can have more of it than all
     discrepancies, each of which has many coefficients to learn.
 
-    Args:
-        z: The representations of the real observations, shape ``(n, l)``.
-        moments: The moments of simulations at the parameters of the pairs.
-        standardisation: That of z over simulations from the prior.
-        model: The model of the discrepancy.
-        weights: How many pairs each pair counts as, shape ``(n,)``.
-        groups: A number for each pair, the same for recordings of one person.
-
-    Raises:
-        InvalidInputError: If nothing varies between simulations.
+    The representations z of the real observations have the shape ``(n, l)``, and
+    ``standardisation`` is that of z over simulations from the prior. Weights and groups
+    are those of :meth:`DiscrepancyModel.fit`.
     """
     varies = standardisation.varies
     if not varies.any():
@@ -124,12 +115,39 @@ def fit_discrepancy(
     covariances = moments.covariance[:, varies][:, :, varies] / std / std[:, None]
     z, means = standardisation(z.double()), standardisation(moments.means)
     covariance = covariances.mean(dim=0)
-    is_certain = model.probability_of_none in (0.0, 1.0)
-    if not is_certain:
-        found = surprise(z, means, covariances, weights=weights, groups=groups)
-        if found > LARGEST_SURPRISE:
-            model = replace(model, probability_of_none=0.0)
+    found = surprise(z, means, covariances, weights=weights, groups=groups)
+    if found > LARGEST_SURPRISE and model.probability_of_none < 1.0:
+        model = replace(model, probability_of_none=0.0)
     return model.fit(z, means, covariance, weights=weights, groups=groups)
+
+
+def tuning_targets(
+    z: Tensor,
+    moments: Moments,
+    standardisation: Standardisation,
+    *,
+    weights: Tensor | None = None,
+    groups: Tensor | None = None,
+    seed: int | None = None,
+) -> Tensor:
+    r"""Return the targets of the tuning, :math:`E[h(S(\theta_i)) \mid y_i, x_i]`.
+
+    A label y that leaves parameters open leaves open the target, too. Its average under
+    the prior would not do: a net that is tuned to it learns to forget what x says about
+    these parameters. The average is therefore also given x, under the discrepancy model
+    that is fitted to these pairs.
+
+    The arguments are those of :func:`fit_discrepancy`, and a seed of the averages. The
+    shape of the targets is that of z.
+    """
+    discrepancy = fit_discrepancy(
+        z, moments, standardisation, DiscrepancyModel(), weights=weights, groups=groups
+    )
+    with seeded(seed):
+        means = expected_means(
+            discrepancy, standardisation(z.double()), standardisation(moments.means)
+        )
+    return standardisation.undo(means).to(z)
 
 
 def surprise(
@@ -151,19 +169,12 @@ def surprise(
     the mean of all :math:`C_i`. In the worst case, pairs of a group have everything in
     common, so that each group counts as one pair, with the means of its T, E and V.
 
-    Args:
-        z: The representations of the real observations, shape ``(n, l)``.
-        means: :math:`m_i`, shape ``(n, l)``, or its possible values, ``(n, R, l)``, of
-            which the nearest counts.
-        covariances: :math:`C_i`, shape ``(n, l, l)``.
-        weights: :math:`w_i`, shape ``(n,)``; one if None.
-        groups: A number for each pair, shape ``(n,)``; None if all differ.
+    The means :math:`m_i` have the shape ``(n, R, l)``, and the nearest of R counts. The
+    covariances :math:`C_i` have the shape ``(n, l, l)``.
     """
     noise = SMALLEST_NOISE**2 * torch.eye(z.shape[1]).to(covariances)
     covariances = covariances + noise
-    residual = z.to(covariances).reshape(len(z), -1, z.shape[1]) - means.reshape(
-        len(z), -1, z.shape[1]
-    )
+    residual = z.to(covariances)[:, None] - means
     factor = torch.linalg.cholesky(covariances.mean(dim=0))
     white = torch.linalg.solve_triangular(factor, residual.mT, upper=False)
     found = white.square().sum(dim=1).amin(dim=1)
@@ -172,12 +183,10 @@ def surprise(
     expected = relative.diagonal(dim1=1, dim2=2).sum(dim=1)
     variance = 2 * (relative * relative.mT).sum(dim=(1, 2))
     w = torch.ones_like(found) if weights is None else weights.to(found)
-    excess = found - expected
-    if groups is not None:
-        numbers = groups_of(groups)
-        counts = Counts(w / numbers.bincount()[numbers].to(w), groups)
-        excess, w = counts.of_groups(excess)
-        variance, _ = counts.of_groups(variance)
+    numbers = groups_of(torch.arange(len(z)) if groups is None else groups)
+    counts = Counts(w / numbers.bincount()[numbers].to(w), numbers)
+    excess, w = counts.of_groups(found - expected)
+    variance, _ = counts.of_groups(variance)
     return float((w * excess).sum() / (w.square() * variance).sum().sqrt())
 
 
@@ -189,7 +198,6 @@ def correct_flow(
     space: Space,
     probabilities: Sequence[Tensor | None],
     num_steps: int | None = None,
-    learning_rate: float | None = None,
     in_a_stack: bool = False,
     show_progress_bars: bool = False,
 ) -> Correction:
@@ -202,27 +210,20 @@ def correct_flow(
 
     The optimum is the posterior with the discrepancy integrated out. Every step draws
     new rows, new corrections and new errors. A network of usual size does not overfit
-    them, so that no simulations are held out.
+    them, so that no simulations are held out. With ``space="tuned"`` the caller puts a
+    tuned net and the constants in the place of h.
 
     Args:
         estimator: The estimator of NPE; it is not changed.
         simulations: Parameters from the prior, shape ``(n_s, d)``, and the
             representation of a simulation of each, shape ``(n_s, l)``.
         discrepancies: The discrepancy of each copy, in standard deviations of these.
-        space: What is corrected. With ``"input"`` all of NPE is trained, otherwise the
-            density behind the embedding net alone.
-        probabilities: For each copy, the probabilities with which simulations are
-            drawn; None makes them equal.
+        space: With ``"input"`` all of NPE is trained, otherwise the density alone.
+        probabilities: Those with which each copy draws simulations; equal if None.
         num_steps: Gradient steps of a single course. If None, courses follow each
             other, whose length depends on the space.
-        learning_rate: Learning rate of Adam, which falls to zero in each course; it
-            depends on the space if None.
         in_a_stack: Whether to stop earlier, because many copies are trained.
         show_progress_bars: Whether to show the loss during training.
-
-    Returns:
-        The trained copies. With ``space="tuned"`` their embedding net is h. The caller
-        replaces h by a tuned net and the constants.
     """
     theta, z = simulations
     unit = Standardisation(z.double())
@@ -237,17 +238,14 @@ def correct_flow(
     losses = flow.losses if space == "input" else flow.losses_given
     size = max(1, min(NUM_DRAWS, MAX_ENTRIES // z.shape[1] ** 2 // count))
     draws = DiscrepancyDraws.joined(
-        [
-            one.sample(size, smallest_error=SMALLEST_ERROR[space])
-            for one in discrepancies
-        ]
+        one.sample(size, smallest_error=SMALLEST_ERROR[space]) for one in discrepancies
     )
     equal = torch.full((len(theta),), 1.0 / len(theta), dtype=torch.double)
     upper = torch.stack([equal if p is None else p.cpu() for p in probabilities])
     upper = upper.double().cumsum(dim=1)
 
     def batch(count: int) -> tuple[Tensor, Tensor]:
-        """Return theta and corrected z for each copy, ``(E, count, ...)``."""
+        """Draw theta and corrected z for each copy, ``(E, count, ...)``."""
         uniform = torch.rand(len(upper), count, dtype=torch.double) * upper[:, -1:]
         rows = torch.searchsorted(upper, uniform).clamp_max(len(theta) - 1)
         rows = rows.to(z.device)
@@ -260,27 +258,23 @@ def correct_flow(
     def mean_loss(theta: Tensor, z: Tensor) -> Tensor:
         return losses(theta, z).mean(dim=1)
 
-    compared = [batch(BATCH_SIZE) for _ in range(NUM_COMPARED // BATCH_SIZE)]
-
-    def compared_loss() -> Tensor:
+    def compared_loss(*held_out: Tensor) -> Tensor:
         with seeded(0):  # the loss of a vector field draws random times
-            return torch.stack([mean_loss(*some) for some in compared]).mean(dim=0)
+            parts = (one.split(training.training_batch_size, dim=1) for one in held_out)
+            of_each = [mean_loss(*some) for some in zip(*parts, strict=True)]
+        return torch.stack(of_each).mean(dim=0)
 
-    if num_steps:
-        courses = Courses(compared_loss, math.inf)
-    elif in_a_stack:
-        courses = Courses(compared_loss, UNTIL_SETTLED, STILL_FALLING, MAX_IN_A_STACK)
-    else:
-        courses = Courses(compared_loss, UNTIL_SETTLED)
+    training = TRAINING[space]
+    courses = Courses(math.inf) if num_steps else COURSES
     histories = fit(
         network,
-        lambda step: [batch(BATCH_SIZE)],
+        lambda step: [batch(training.training_batch_size)],
         mean_loss,
-        Training(
-            learning_rate=learning_rate or LEARNING_RATES[space],
-            max_num_epochs=num_steps or NUM_STEPS[space],
-        ),
-        courses=courses,
+        training,
+        max_num_epochs=num_steps,
+        validation_loss=compared_loss,
+        held_out=batch(NUM_COMPARED),
+        courses=IN_A_STACK if in_a_stack else courses,
         in_training_mode=False,
         label="Correcting NPE",
         show_progress_bars=show_progress_bars,
@@ -304,5 +298,5 @@ class SimulatedConstants(nn.Module):
         self.register_buffer("values", standardisation.mean)
 
     def forward(self, z: Tensor) -> Tensor:
-        """Return z with these entries replaced, in the same shape."""
+        """Return z with these entries replaced."""
         return z.where(self.varies, self.values.to(z))

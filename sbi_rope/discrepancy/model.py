@@ -1,7 +1,8 @@
 r"""A Bayesian linear model of how real observations differ from simulations."""
 
 import itertools
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,21 +11,36 @@ from torch import Tensor
 
 from sbi_rope._random import seeded
 from sbi_rope.data import groups_of
-from sbi_rope.discrepancy.conditional import Conditional
-from sbi_rope.discrepancy.correlation import GroupErrors, independent_pairs
-from sbi_rope.discrepancy.imputation import impute
 from sbi_rope.discrepancy.posterior import Discrepancy
-from sbi_rope.discrepancy.regression import SMALLEST_NOISE, Regressions
+from sbi_rope.discrepancy.regression import (
+    SMALLEST_NOISE,
+    Conditional,
+    GroupErrors,
+    Regressions,
+    independent_pairs,
+    log_density_of_right,
+)
 from sbi_rope.settings import Settings, UnitInterval
 from sbi_rope.tensors import as_batch
 
-__all__ = ["DiscrepancyModel"]
+__all__ = ["DiscrepancyModel", "expected_means"]
 
 # How many times as large the variance between the groups is as the one within them, and
 # their prior probabilities. Those below .2 matter for large groups only. Together they
 # are as probable as one of the others.
 VARIANCE_RATIOS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 PRIOR_OF_RATIOS = (1 / 30,) * 5 + (1 / 6,) * 5
+# Chains that are run side by side, which costs hardly more than one of them.
+NUM_CHAINS = 10
+# Imputations of a chain that are left out, because they depend on where it started, and
+# those that the posterior is averaged over. So many later imputations belong to each of
+# them. If labels are as noisy as the prior is wide, imputations that far apart are
+# nearly independent.
+NUM_WARM_UP, NUM_KEPT, APART = 100, 2, 30
+# Numbers in the largest tensor, unless one chain needs more.
+MAX_ENTRIES = 2**22
+# Draws of the discrepancy that an expected mean is averaged over.
+NUM_DRAWS = 40
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,10 +101,6 @@ class DiscrepancyModel(Settings):
             as much as this number of pairs.
         probability_of_none: The prior probability that the simulator is right.
 
-    Raises:
-        InvalidInputError: If one of the first three is no list, or the probability is
-            outside its range.
-
     Example:
         >>> z_s = torch.linspace(-1.0, 1.0, 20)[:, None]
         >>> noise = torch.tensor([[0.01]])
@@ -115,7 +127,7 @@ class DiscrepancyModel(Settings):
         groups: Tensor | None = None,
         seed: int = 0,
     ) -> Discrepancy:
-        r"""Return the posterior of the discrepancy given calibration pairs.
+        r"""Return the posterior of the discrepancy given calibration pairs, in float64.
 
         If parameters are not known exactly, ``mean`` holds the means at R parameters
         that are equally probable before the observation is seen. The parameters are
@@ -140,12 +152,6 @@ class DiscrepancyModel(Settings):
                 one person. None if all are independent. Do not divide the weights by
                 the number of recordings as well: a group counts as fewer pairs anyway.
             seed: Seed of the imputations.
-
-        Returns:
-            The posterior, in float64.
-
-        Raises:
-            InvalidInputError: If the shapes do not fit, or a value is not finite.
         """
         width = np.shape(z)[-1:]
         z = as_batch("z", z, width).double()
@@ -155,35 +161,23 @@ class DiscrepancyModel(Settings):
             mean = mean[:, 0]
         covariance = as_batch("covariance", covariance, width, rows=width[0]).to(z)
         noise = covariance + SMALLEST_NOISE**2 * torch.eye(z.shape[1]).to(z)
-        if weights is not None:
-            weights = as_batch("weights", weights, (), rows=len(z)).to(z)
+        weights = torch.ones(len(z)) if weights is None else weights
+        weights = as_batch("weights", weights, (), rows=len(z)).to(z)
         if groups is not None:
-            groups = as_batch("groups", groups, (), rows=len(z))
-            groups = groups_of(groups).to(z.device)
-            if len(groups.unique()) == len(groups):
-                groups = None
-
+            groups = groups_of(as_batch("groups", groups, (), rows=len(z)))
+            groups = None if len(groups.unique()) == len(z) else groups.to(z.device)
         # Whether the simulator is right is judged with each group as one pair. With a
         # correlation that is a little too low, a right simulator would be refuted.
         once = weights if groups is None else independent_pairs(groups, 1.0, weights)
 
-        def counts(mean: Tensor) -> Tensor | None:
+        def counts(mean: Tensor) -> Tensor:
             if groups is None:
                 return weights
             correlations = self._correlations_within(groups, z, mean)
             return independent_pairs(groups, correlations, weights)
 
-        def conditional(mean: Tensor, weights: Tensor | None) -> Conditional:
-            return Conditional.of(
-                z,
-                mean,
-                noise,
-                gain_precisions=self.gain_precisions,
-                settings=self._settings,
-                prior_of_none=self.probability_of_none,
-                weights=weights,
-                once=once,
-            )
+        def conditional(mean: Tensor, weights: Tensor) -> Conditional:
+            return self._conditional(z, mean, noise, weights, once)
 
         if mean.ndim == 2:
             [discrepancy] = conditional(mean[None], counts(mean[None])).posteriors()
@@ -191,24 +185,42 @@ class DiscrepancyModel(Settings):
         with seeded(seed):
             return impute(z, mean, conditional, counts)
 
-    def _correlations_within(self, groups: Tensor, z: Tensor, mean: Tensor) -> Tensor:
-        """Return the mean correlation of the errors of pairs of the same group.
+    def _conditional(
+        self, z: Tensor, mean: Tensor, noise: Tensor, weights: Tensor, once: Tensor
+    ) -> Conditional:
+        """Return the posteriors given B sets of means, shape ``(B, n, l)``.
 
-        Args:
-            groups: A number for each pair, shape ``(n,)``.
-            z: Representations of the real observations, shape ``(n, l)``.
-            mean: C sets of means, shape ``(C, n, l)``.
-
-        Returns:
-            Shape ``(C,)``.
+        ``once`` are the weights if each group counts as one pair, shape ``(n,)``.
         """
+        regressions = Regressions.of(z, mean, self.gain_precisions, weights)
+        log_evidence = judged = regressions.log_evidence(self._settings)
+        if once is not weights:
+            as_one_pair = Regressions.of(z, mean, self.gain_precisions, once)
+            judged = as_one_pair.log_evidence(self._settings)
+        average = judged.logsumexp(dim=(1, 2)) - math.log(judged[0].numel())
+        right = log_density_of_right(z - mean, noise, once)
+        prior = torch.logit(average.new_tensor(self.probability_of_none))
+        return Conditional(
+            regressions=regressions,
+            log_evidence=log_evidence,
+            settings=self._settings,
+            noise=noise,
+            average=average,
+            right=right,
+            probability_of_none=torch.sigmoid(right - average + prior),
+            num_pairs=len(z),
+        )
+
+    def _correlations_within(self, groups: Tensor, z: Tensor, mean: Tensor) -> Tensor:
+        """Return the mean correlation within groups, for each set of means."""
         ratios = torch.tensor(VARIANCE_RATIOS).to(z)
         correlations = ratios / (1 + ratios)
+        # Half of the precisions are enough to compare correlations.
+        precisions, ones = self.gain_precisions[::2], torch.ones(len(z)).to(z)
         evidence = []
         for correlation in correlations.tolist():
             errors = GroupErrors(groups=groups, correlation=correlation)
-            # Half of the precisions are enough to compare correlations.
-            some = Regressions.of(z, mean, self.gain_precisions[::2], errors=errors)
+            some = Regressions.of(z, mean, precisions, ones, errors=errors)
             evidence.append(some.log_evidence(self._settings).logsumexp(dim=(1, 2)))
         log_prior = torch.tensor(PRIOR_OF_RATIOS).to(z).log()
         return (torch.stack(evidence, dim=1) + log_prior).softmax(dim=1) @ correlations
@@ -216,3 +228,112 @@ class DiscrepancyModel(Settings):
     @property
     def _settings(self) -> list[tuple[float, float]]:
         return list(itertools.product(self.error_scales, self.degrees_of_freedom))
+
+
+def impute(
+    z: Tensor,
+    possible: Tensor,
+    conditional: Callable[[Tensor, Tensor], Conditional],
+    counts: Callable[[Tensor], Tensor],
+) -> Discrepancy:
+    r"""Average the posterior over imputed parameters, by Gibbs sampling.
+
+    Given a gain, an offset and an error, the possible means :math:`m_{ir}` of an
+    observation have the probabilities
+
+    .. math:: p_{ir} \propto \mathcal N(z_i; A m_{ir} + b, \Sigma).
+
+    One of them is drawn for each observation. Given these means the posterior of the
+    discrepancy has a closed form, of which the next gain, offset and error are drawn.
+    C chains of such draws are independent of each other.
+
+    The shape of ``possible`` is ``(n, R, l)``. ``conditional`` returns the posteriors
+    given C sets of means, ``(C, n, l)``, and how many pairs each of them counts as, and
+    ``counts`` returns the latter, ``(n,)`` or ``(C, n)``. It is asked at the start, and
+    again for the imputations that are kept. The two evidences, ``probability_of_none``
+    and ``num_independent`` of what is returned are averages over these.
+    """
+    mean = possible.mean(dim=1).expand(NUM_CHAINS, -1, -1)
+    weights = counts(mean)
+    given = conditional(mean, weights)
+    kept: list[Discrepancy] = []
+    for number in range(1, NUM_WARM_UP + NUM_KEPT * APART + 1):
+        mean = _imputed(z, possible, *given.draw())
+        if number == NUM_WARM_UP:
+            weights = counts(mean)
+        given = conditional(mean, weights)
+        if number > NUM_WARM_UP and (number - NUM_WARM_UP) % APART == 0:
+            kept.extend(given.posteriors())
+    shares = torch.cat([(1 - one.probability_of_none) * one.shares for one in kept])
+    total = shares.sum()
+    if not total > 0:  # the simulator is right in all of them
+        shares, total = torch.cat([one.shares for one in kept]), float(len(kept))
+    return Discrepancy(
+        terms=tuple(term for one in kept for term in one.terms),
+        shares=shares / total,
+        noise=given.noise,
+        probability_of_none=_mean([one.probability_of_none for one in kept]),
+        log_evidence=_mean([one.log_evidence for one in kept]),
+        log_evidence_of_none=_mean([one.log_evidence_of_none for one in kept]),
+        num_pairs=len(z),
+        num_independent=_mean([one.num_independent for one in kept]),
+    )
+
+
+def expected_means(discrepancy: Discrepancy, z: Tensor, possible: Tensor) -> Tensor:
+    r"""Return the means of observations that are expected given them.
+
+    This is :math:`\sum_r p_{ir}\, m_{ir}` with the probabilities of :func:`impute`,
+    averaged over the posterior of the discrepancy. Its shape is ``(n, l)``.
+    """
+    noise = discrepancy.noise
+    right = torch.eye(len(noise)).to(noise), noise.new_zeros(len(noise)), noise
+    drawn = []
+    for _ in range(NUM_DRAWS):
+        if float(torch.rand(())) < discrepancy.probability_of_none:
+            drawn.append(right)
+            continue
+        chosen = int(torch.multinomial(discrepancy.shares, 1))
+        drawn.append([one[0] for one in discrepancy.terms[chosen].sample(1)])
+    gain, offset, covariance = map(torch.stack, zip(*drawn, strict=True))
+    probabilities = _probabilities(z, possible, gain, offset, covariance).mean(dim=0)
+    return (probabilities[..., None] * possible).sum(dim=1)
+
+
+def _imputed(
+    z: Tensor, possible: Tensor, gain: Tensor, offset: Tensor, covariance: Tensor
+) -> Tensor:
+    """Draw one of the possible means of each observation, shape ``(C, n, l)``."""
+    probabilities = _probabilities(z, possible, gain, offset, covariance)
+    # Faster than torch.multinomial, which draws a number for each of the means.
+    bounds = probabilities.cumsum(dim=-1)
+    drawn = torch.rand(bounds.shape[:-1]).to(bounds) * bounds[..., -1]
+    chosen = torch.searchsorted(bounds, drawn[..., None], right=True)[..., 0]
+    return possible[torch.arange(len(z)), chosen.clamp_max(possible.shape[1] - 1)]
+
+
+def _probabilities(
+    z: Tensor, possible: Tensor, gain: Tensor, offset: Tensor, covariance: Tensor
+) -> Tensor:
+    """Return the probability of each possible mean given z, shape ``(C, n, R)``."""
+    # Observations and means are mapped to where their differences are standard normal.
+    identity = torch.eye(z.shape[1]).to(z).expand_as(covariance)
+    factor = torch.linalg.cholesky(covariance)
+    whiten = torch.linalg.solve_triangular(factor, identity, upper=False)
+    observed = (z - offset[:, None]) @ whiten.mT
+    flat = possible.flatten(0, 1)
+    chunk = max(1, MAX_ENTRIES // possible.numel())
+    parts = zip(observed.split(chunk), (whiten @ gain).split(chunk), strict=True)
+    distances = [
+        torch.cdist(
+            seen[:, :, None],
+            (flat @ to_seen.mT).unflatten(1, possible.shape[:2]),
+            compute_mode="donot_use_mm_for_euclid_dist",
+        )[:, :, 0]
+        for seen, to_seen in parts
+    ]
+    return torch.softmax(-torch.cat(distances).square() / 2, dim=-1)
+
+
+def _mean(values: list[float]) -> float:
+    return sum(values) / len(values)

@@ -2,8 +2,9 @@ r"""NPE trained on corrected simulations, as learned from calibration pairs."""
 
 import copy
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -28,25 +29,20 @@ from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.parameters import learn_parameters
 from sbi_rope.discrepancy.posterior import Discrepancy
 from sbi_rope.discrepancy.report import DiscrepancyReport, report_discrepancy
-from sbi_rope.discrepancy.summaries import Summaries
 from sbi_rope.ensemble import Ensemble
 from sbi_rope.errors import InvalidInputError, NotReadyError
-from sbi_rope.finetuning import TUNING, CalibrationFinetuner
+from sbi_rope.finetuning import TUNING
 from sbi_rope.fit import History, Training
-from sbi_rope.moments import Moments, moments
-from sbi_rope.settings import Count, Positive, Range, check
-from sbi_rope.simulate import Source
+from sbi_rope.settings import Count, Range, check
+from sbi_rope.simulate import Moments, Source, moments
 from sbi_rope.tensors import as_batch
 from sbi_rope.trainers.base import Method
-from sbi_rope.trainers.starting_npe import StartingNPE
 from sbi_rope.trainers.training import EstimatorBuilder
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 __all__ = ["DiscrepancyNPE"]
 
-Several = Annotated[int, Range(2)]
+# Simulations at the parameters of each pair, and copies g with ``space="tuned"``.
+SIMULATIONS_PER_PAIR, NUM_FOLDS = 100, 5
 
 
 class DiscrepancyNPE(Method):
@@ -60,14 +56,14 @@ class DiscrepancyNPE(Method):
     What is corrected depends on ``space``:
 
     - ``"embedding"``: the embedding h(x) of NPE. Only the density behind h is trained.
-    - ``"input"``: x itself, if it is a vector of a few summaries. All of NPE is
-      trained. This is better if h discards information that is needed when the
-      simulator is wrong.
-    - ``"tuned"``: copies g of h are tuned as RoPE tunes its own, each without one fold
-      of the pairs. The discrepancy is fitted to the remaining difference between g of
-      the pairs in that fold and h of simulations. The posterior averages over the
-      copies. This is for large nets that have never seen the effect which the simulator
-      lacks.
+    - ``"input"``: x itself, a vector of a few summaries, none of which is missing. All
+      of NPE is trained. This is better if h discards information that is needed when
+      the simulator is wrong.
+    - ``"tuned"``: five copies g of h are tuned as RoPE tunes its own, with rehearsal,
+      each without one fold of the pairs. The discrepancy is fitted to the remaining
+      difference between g of the pairs in that fold and h of simulations. The posterior
+      averages over the copies. This is for large nets that have never seen the effect
+      which the simulator lacks.
 
     It uses simulations and the calibration set, and assumes that one linear correction
     holds for all parameters. It works from a handful of pairs on;
@@ -90,24 +86,11 @@ class DiscrepancyNPE(Method):
             must then be drawn like the observations to be inferred.
         model: The model of the discrepancy; ``DiscrepancyModel()`` if None.
         num_simulations: Simulations from the prior to train on, if none were appended.
-        simulations_per_pair: Simulations at the parameters of each pair.
-        num_steps: Gradient steps. If None, NPE is trained in courses of 150 steps (400
+        num_steps: Gradient steps. If None, NPE is trained in courses of 200 steps (400
             with ``"input"``), until a course lowers the loss by less than 0.01, at most
             twelve.
-        learning_rate: Learning rate of Adam at the start of a course; 5e-3 if None
-            (2e-3 with ``"input"``).
-        num_folds: The number of copies g with ``space="tuned"``; at most one for each
-            pair.
-        finetuner: How the copies are tuned. If None, with rehearsal and a learning rate
-            of 3e-3. Their targets are the means of the simulations of each pair, so
-            that its settings of targets have no effect.
         npe_training: How NPE is trained; ``Training()`` if None.
         device: Where to train; data on other devices is moved there.
-
-    Raises:
-        InvalidInputError: If an argument is outside its range. In ``train``, if x is
-            not a vector, or has missing entries, with ``space="input"``.
-        SimulationError: In ``train``, if the simulator fails.
     """
 
     sees = frozenset({"simulations", "calibration"})
@@ -125,69 +108,28 @@ class DiscrepancyNPE(Method):
         learn_prior: bool = False,
         model: DiscrepancyModel | None = None,
         num_simulations: int = 20_000,
-        simulations_per_pair: int = 100,
         num_steps: int | None = None,
-        learning_rate: float | None = None,
-        num_folds: int = 5,
-        finetuner: CalibrationFinetuner | None = None,
         npe_training: Training | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
-        check("space", space, Literal["embedding", "input", "tuned"])
+        check("space", space, Space)
         check("learn_prior", learn_prior, bool)
         check("model", model, DiscrepancyModel | None)
-        check("num_simulations", num_simulations, Several)
-        check("simulations_per_pair", simulations_per_pair, Several)
+        check("num_simulations", num_simulations, Annotated[int, Range(2)])
         check("num_steps", num_steps, Count | None)
-        check("learning_rate", learning_rate, Positive | None)
-        check("num_folds", num_folds, Several)
-        check("finetuner", finetuner, CalibrationFinetuner | None)
-        npe = StartingNPE(density_estimator, npe_training)
-        super().__init__(prior, npe=npe, simulator=simulator, device=device)
+        super().__init__(
+            prior, density_estimator, npe_training, simulator=simulator, device=device
+        )
         self.space: Space = space
         self.learn_prior = learn_prior
         self.model = DiscrepancyModel() if model is None else model
         self.num_simulations = num_simulations
-        self.simulations_per_pair = simulations_per_pair
         self.num_steps = num_steps
-        self.learning_rate = learning_rate
-        self.num_folds = num_folds
-        self.finetuner = TUNING if finetuner is None else finetuner
         self._discrepancy: Discrepancy | None = None
-
-    @classmethod
-    def from_posterior(
-        cls,
-        posterior: Any,
-        *,
-        simulations: tuple[Tensor, Tensor] | None = None,
-        **options: Any,
-    ) -> "Self":
-        """Start from a trained NPE instead of training one.
-
-        Args:
-            posterior: What ``NPE(...).build_posterior()`` of sbi returns, or the
-                posterior of MNPE, FMPE or NPSE. It is copied and never changed.
-            simulations: Pairs (theta, x) to train on, with theta drawn from the prior.
-                They can replace ``simulator`` or be given together with it.
-            **options: Keyword arguments of the constructor, except ``device`` and those
-                of the training of NPE.
-
-        Raises:
-            UnsupportedPosteriorError: If the posterior is not a plain amortised one.
-        """
-        method = super().from_posterior(posterior, **options)
-        if simulations is not None:
-            method.append_simulations(*simulations)
-        return method
 
     @property
     def discrepancy(self) -> Discrepancy:
-        """The posterior of gain, offset and error after the last training.
-
-        Raises:
-            NotReadyError: If ``train()`` was not called since data was appended.
-        """
+        """The posterior of gain, offset and error after the last training."""
         if self._posterior is None or self._discrepancy is None:
             raise NotReadyError("No discrepancy fitted yet. Call `train()` first.")
         return self._discrepancy
@@ -213,20 +155,13 @@ class DiscrepancyNPE(Method):
                 spread of a set of trials. It may return a NumPy array. If None, the
                 summaries are the entries of x, which has to be a vector.
             x_names: Names of the summaries; numbered if None.
-            seed: Seed of the simulations; None uses the states of torch, NumPy and
-                Python.
+            seed: Seed of the simulations, as in ``train``.
             show_progress_bars: Whether to show the progress of slow simulations, and of
-                many summaries, as in ``train``. A summary takes about 0.03 seconds.
+                many summaries, as in ``train``.
 
         Returns:
             The gain, shift and error of each summary with 95 % intervals, in the units
             of x or of the summaries.
-
-        Raises:
-            NotReadyError: If there are fewer than two pairs, or no simulations.
-            InvalidInputError: If x is not a vector and no summaries are given, if these
-                have another shape or are not finite, or the names do not fit.
-            SimulationError: If the simulator fails.
         """
         self._check_data("calibration")
         if self._simulator is None:
@@ -238,61 +173,66 @@ class DiscrepancyNPE(Method):
                 "`summaries=`, a function from x to shape (n, k)."
             )
         show = is_shown(show_progress_bars)
-        net = nn.Identity() if summaries is None else Summaries(summaries)
+
+        def summarised(x: Tensor) -> Tensor:
+            if summaries is None:
+                return x
+            found = summaries(x.clone())  # which may work in place
+            width = np.shape(found)[-1:]
+            name = "summaries(x)"
+            found = as_batch(name, found, width, rows=len(x), finite=False)
+            return found.to(x.device)
+
         with seeded(seed):
             source = self._source()
             _, simulated = source.from_prior(
                 self.num_simulations, seed=0, progress=show
             )
-            x = as_batch("summaries of the pairs", embed(net, x))
-            simulated = as_batch("summaries of simulations", embed(net, simulated))
-            found = self._moments(source, net, show)
-        return report_discrepancy(
+            x = as_batch("summaries of the pairs", summarised(x))
+            simulated = as_batch("summaries of simulations", summarised(simulated))
+            found = self._moments(source, summarised, progress=show)
+        report = report_discrepancy(
             x,
             found,
             simulated,
             model=self.model,
             groups=self._data.pairs.group,
-            x_names=x_names,
             show_progress_bars=show,
         )
+        return report if x_names is None else report.renamed(x_names)
 
     def _moments(
-        self,
-        source: Source,
-        net: nn.Module,
-        show_progress_bars: bool,  # noqa: FBT001
+        self, source: Source, embed: Callable[[Tensor], Tensor], *, progress: bool
     ) -> Moments:
-        return moments(
-            source,
-            self._data.pairs,
-            self.simulations_per_pair,
-            lambda x: embed(net, x),
-            progress=show_progress_bars,
-        )
+        pairs = self._data.pairs
+        return moments(source, pairs, SIMULATIONS_PER_PAIR, embed, progress=progress)
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
         estimator = estimator_of(npe)
         if self.space == "tuned":
-            check_density(
-                estimator,
-                because="space='tuned' averages over nets",
-                instead="Choose space='embedding', or train NPE.",
-            )
+            check_density(estimator, because="space='tuned' averages over nets")
         pairs = self._data.pairs
         warn_of_far_entries("x", pairs.x, embedding_of(estimator))
         source = self._source()
         net = network_of(estimator, self.space)
-        found = self._moments(source, net, show_progress_bars)
-        theta_s, x_s = self._bank(source, show_progress_bars)
+        found = self._moments(
+            source, lambda x: embed(net, x), progress=show_progress_bars
+        )
+        if self._data.count("simulations"):
+            theta_s, x_s = self._data.simulations
+        else:
+            theta_s, x_s = source.from_prior(
+                self.num_simulations, seed=0, progress=show_progress_bars
+            )
         if self.space == "input":
             as_batch("x", pairs.x)
             as_batch("x of simulations", x_s)
         z, nets = embed(net, pairs.x), None
         if self.space == "tuned":
-            targets = found.mean.to(z)
-            nets, z = self._cross_fitted(net, targets, x_s, show_progress_bars)
+            nets, z = self._cross_fitted(
+                net, found.mean.to(z), x_s, show_progress_bars=show_progress_bars
+            )
         probabilities = None
         if self.learn_prior:
             probabilities = learn_parameters(pairs.mean, theta_s).probabilities
@@ -308,7 +248,6 @@ class DiscrepancyNPE(Method):
             space=self.space,
             probabilities=[probabilities],
             num_steps=self.num_steps,
-            learning_rate=self.learning_rate,
             show_progress_bars=show_progress_bars,
         )
         [history], flow = correction.histories, correction.flow
@@ -320,11 +259,7 @@ class DiscrepancyNPE(Method):
         return MixturePosterior(average, copy.deepcopy(self._prior)), history
 
     def _cross_fitted(
-        self,
-        h: nn.Module,
-        targets: Tensor,
-        simulations: Tensor,
-        show_progress_bars: bool,  # noqa: FBT001
+        self, h: nn.Module, targets: Tensor, x_s: Tensor, *, show_progress_bars: bool
     ) -> tuple[Ensemble, Tensor]:
         """Tune a copy of h without each fold of the pairs, and embed the fold with it.
 
@@ -338,31 +273,19 @@ class DiscrepancyNPE(Method):
                 f" all {len(pairs)} have the same. Use space='embedding'."
             )
         every = torch.arange(len(pairs)).to(pairs.group)
-        folds = pairs.folds(self.num_folds)
+        folds = pairs.folds(NUM_FOLDS)
         # The simulations may be sorted, and rehearsal takes the first ones.
-        order = torch.randperm(len(simulations)).to(simulations.device)
-        nets, _ = self.finetuner.tuned(
+        order = torch.randperm(len(x_s)).to(x_s.device)
+        nets, _ = TUNING.tuned(
             h,
             pairs.x,
             [targets] * len(folds),
             [every[~torch.isin(every, fold)] for fold in folds],
             groups=pairs.group,
-            draw_simulations=lambda count: simulations[order[:count]],
+            draw_simulations=lambda count: x_s[order[:count]],
             show_progress_bars=show_progress_bars,
         )
         z = torch.empty_like(targets)
         for number, fold in enumerate(folds):
             z[fold] = embed(nets.member(number), pairs.x[fold])
         return nets, z
-
-    def _bank(
-        self,
-        source: Source,
-        show_progress_bars: bool,  # noqa: FBT001
-    ) -> tuple[Tensor, Tensor]:
-        """Return simulations from the prior: the appended ones, or else new ones."""
-        if self._data.count("simulations"):
-            return self._data.simulations
-        return source.from_prior(
-            self.num_simulations, seed=0, progress=show_progress_bars
-        )

@@ -1,7 +1,6 @@
 r"""The distribution of parameters, learned from those of the calibration pairs."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,11 +43,6 @@ class ParameterDistribution:
     probabilities: Tensor
     probability_of_prior: float
 
-    @property
-    def effective_sample_size(self) -> float:
-        """The number of equally probable simulations with the same precision."""
-        return float(1.0 / self.probabilities.square().sum())
-
 
 def learn_parameters(
     theta_cal: Tensor, theta: Tensor, *, weights: Tensor | None = None
@@ -87,12 +81,6 @@ def learn_parameters(
         theta: Parameters of at least two simulations from the prior, shape ``(n, d)``.
         weights: How many draws from the distribution each pair counts as, shape
             ``(n_c,)``; one if None. The weights of equal parameters are added.
-
-    Returns:
-        The probabilities of the simulations.
-
-    Raises:
-        InvalidInputError: If the shapes do not fit, or a value is not finite.
     """
     theta = as_batch("theta", theta, np.shape(theta)[-1:])
     several = np.shape(theta_cal)[1:-1][:1]
@@ -105,7 +93,12 @@ def learn_parameters(
         uniform = theta.new_full((len(theta),), 1.0 / len(theta), dtype=torch.double)
         return ParameterDistribution(probabilities=uniform, probability_of_prior=0.5)
     sets = theta_cal.unbind(dim=1)[:NUM_SETS] if theta_cal.ndim == 3 else [theta_cal]
-    return _average([_learn(draws, theta, weights, is_continuous) for draws in sets])
+    parts = [_learn(draws, theta, weights, is_continuous) for draws in sets]
+    of_prior = [part.probability_of_prior for part in parts]
+    return ParameterDistribution(
+        probabilities=torch.stack([part.probabilities for part in parts]).mean(dim=0),
+        probability_of_prior=sum(of_prior) / len(of_prior),
+    )
 
 
 def _is_discrete(column: Tensor) -> bool:
@@ -120,20 +113,8 @@ def is_improbable(probability_of_prior: float | None) -> bool:
     return probability_of_prior is not None and probability_of_prior < IMPROBABLE
 
 
-def _average(parts: Sequence[ParameterDistribution]) -> ParameterDistribution:
-    probabilities = torch.stack([part.probabilities for part in parts])
-    of_prior = [part.probability_of_prior for part in parts]
-    return ParameterDistribution(
-        probabilities=probabilities.mean(dim=0),
-        probability_of_prior=sum(of_prior) / len(of_prior),
-    )
-
-
 def _learn(
-    theta_cal: Tensor,
-    theta: Tensor,
-    weights: Tensor | None,
-    is_continuous: list[bool],
+    theta_cal: Tensor, theta: Tensor, weights: Tensor | None, is_continuous: list[bool]
 ) -> ParameterDistribution:
     # People who differ in a discrete parameter only are different people.
     theta_cal, place = theta_cal.unique(dim=0, return_inverse=True)
@@ -165,12 +146,8 @@ def _learn(
 def normal_scores(theta: Tensor, reference: Tensor) -> Tensor:
     """Map each parameter to the normal quantile of its rank in a reference sample.
 
-    Args:
-        theta: Shape ``(m, d)``.
-        reference: Draws from the prior, shape ``(n, d)``.
-
-    Returns:
-        Shape ``(m, d)``, float64. Equal values get the middle of their ranks.
+    Parameters ``(m, d)`` and draws from the prior ``(n, d)`` to float64 ``(m, d)``.
+    Equal values get the middle of their ranks.
     """
     ordered = reference.double().T.contiguous().sort(dim=1).values
     values = theta.double().T.contiguous()

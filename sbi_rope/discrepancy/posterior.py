@@ -1,6 +1,6 @@
 """The posterior of gain, offset and error, and draws from it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import torch
@@ -99,9 +99,6 @@ class Discrepancy:
             smallest_error: Smallest standard deviation of the error, in standard
                 deviations of simulations.
             seed: Seed of the draws; None uses torch's state.
-
-        Returns:
-            The draws.
         """
         none = self.probability_of_none
         shares = torch.cat([(1 - none) * self.shares, self.shares.new_tensor([none])])
@@ -113,26 +110,23 @@ class Discrepancy:
                 for term, count in zip(self.terms, counts, strict=True)
                 if count
             ]
-        parts.append(self._no_correction(num_none))
-        gain, offset, factor = map(torch.cat, zip(*parts, strict=True))
-        return DiscrepancyDraws(gain=gain, offset=offset, error_factor=factor)
+        width = len(self.noise)
+        no_correction = DiscrepancyDraws(
+            gain=torch.eye(width).to(self.noise).expand(num_none, -1, -1),
+            offset=self.noise.new_zeros(num_none, width),
+            error_factor=self.noise.new_zeros(num_none, width, width),
+        )
+        return DiscrepancyDraws.joined([*parts, no_correction])
 
     def _corrections(
         self, term: Term, count: int, smallest_error: float
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    ) -> "DiscrepancyDraws":
         gain, offset, covariance = term.sample(count)
         error = covariance - gain @ self.noise @ gain.mT
         variance, directions = torch.linalg.eigh(error)
         std = variance.clamp_min(smallest_error**2).sqrt()
-        return gain, offset, directions * std[:, None, :]
-
-    def _no_correction(self, count: int) -> tuple[Tensor, Tensor, Tensor]:
-        width = len(self.noise)
-        return (
-            torch.eye(width).to(self.noise).expand(count, -1, -1),
-            self.noise.new_zeros(count, width),
-            self.noise.new_zeros(count, width, width),
-        )
+        factor = directions * std[:, None, :]
+        return DiscrepancyDraws(gain=gain, offset=offset, error_factor=factor)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -150,13 +144,11 @@ class DiscrepancyDraws:
     error_factor: Tensor
 
     @classmethod
-    def joined(cls, parts: "Sequence[DiscrepancyDraws]") -> "DiscrepancyDraws":
+    def joined(cls, parts: "Iterable[DiscrepancyDraws]") -> "DiscrepancyDraws":
         """Return all draws of several sets, one set after the other."""
-        return cls(
-            gain=torch.cat([part.gain for part in parts]),
-            offset=torch.cat([part.offset for part in parts]),
-            error_factor=torch.cat([part.error_factor for part in parts]),
-        )
+        all_of = ((one.gain, one.offset, one.error_factor) for one in parts)
+        gain, offset, factor = map(torch.cat, zip(*all_of, strict=True))
+        return cls(gain=gain, offset=offset, error_factor=factor)
 
     def __len__(self) -> int:
         return len(self.offset)
@@ -165,8 +157,7 @@ class DiscrepancyDraws:
         """Return simulations as they would be observed in reality.
 
         Each simulation is corrected by a draw that is chosen at random, and gets an
-        error of its own. Together they represent the whole posterior of the
-        discrepancy.
+        error of its own. Together they represent the whole posterior.
 
         Args:
             z_s: Simulations, shape ``(n, l)``.
@@ -174,9 +165,6 @@ class DiscrepancyDraws:
 
         Returns:
             Shape ``(n, l)``, float64.
-
-        Raises:
-            InvalidInputError: If the shape does not fit or a value is not finite.
         """
         z_s = as_batch("z_s", z_s, self.offset.shape[1:])
         if draw is None:
@@ -184,10 +172,10 @@ class DiscrepancyDraws:
         noise = torch.randn(z_s.shape, dtype=torch.double).to(z_s.device)
         # A matrix for each simulation needs a lot of memory if z has many entries.
         size = max(1, MAX_ENTRIES // z_s.shape[1] ** 2)
-        parts = zip(*(rows.split(size) for rows in (z_s, draw, noise)), strict=True)
-        return torch.cat([self._corrected(*part) for part in parts])
-
-    def _corrected(self, z_s: Tensor, draw: Tensor, noise: Tensor) -> Tensor:
-        moved = (self.gain[draw] @ z_s.double()[..., None])[..., 0]
-        error = (self.error_factor[draw] @ noise[..., None])[..., 0]
-        return moved + self.offset[draw] + error
+        corrected = []
+        parts = (rows.split(size) for rows in (z_s.double(), draw, noise))
+        for z, which, standard in zip(*parts, strict=True):
+            moved = (self.gain[which] @ z[..., None])[..., 0]
+            error = (self.error_factor[which] @ standard[..., None])[..., 0]
+            corrected.append(moved + self.offset[which] + error)
+        return torch.cat(corrected)

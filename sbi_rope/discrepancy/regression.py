@@ -1,4 +1,4 @@
-"""Regressions of real observations on simulated means, and their evidence."""
+r"""The posterior of the discrepancy, given the mean of simulations for each pair."""
 
 import math
 from collections.abc import Sequence
@@ -7,11 +7,18 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.distributions import MultivariateNormal
 
-from sbi_rope.discrepancy.correlation import GroupErrors
-from sbi_rope.discrepancy.posterior import Term
+from sbi_rope.discrepancy.posterior import Discrepancy, Term
 
-__all__ = ["SMALLEST_NOISE", "Regressions"]
+__all__ = [
+    "SMALLEST_NOISE",
+    "Conditional",
+    "GroupErrors",
+    "Regressions",
+    "independent_pairs",
+    "log_density_of_right",
+]
 
 # The prior precision of the offset is this share of the precision of the gain.
 OFFSET_PRECISION = 1 / 3
@@ -19,26 +26,80 @@ OFFSET_PRECISION = 1 / 3
 # some statistics have no noise at all. Its unit is the standard deviation of
 # simulations from the prior.
 SMALLEST_NOISE = 0.01
+# Settings of the hyper-parameters are left out if their evidence is less than this
+# share of the evidence of the best setting.
+NEGLIGIBLE = 1e-4
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class GroupErrors:
+    r"""Errors of calibration pairs that are correlated within groups.
+
+    The errors E of n pairs have the matrix normal distribution
+
+    .. math::
+        E \sim \mathcal{MN}(0, R, \Sigma), \qquad
+        R_{ij} = \begin{cases} 1 & \text{if } i = j, \\
+        \rho & \text{if } i \neq j \text{ are of the same group}, \\
+        0 & \text{otherwise}. \end{cases}
+
+    Attributes:
+        groups: Numbers of the groups from 0 on, shape ``(n,)``.
+        correlation: :math:`\rho`, at least 0 and less than 1.
+    """
+
+    groups: Tensor
+    correlation: float
+
+    def independent(self, values: Tensor) -> Tensor:
+        """Return :math:`R^{-1/2}` times values of the pairs, ``(*batch, n, k)``."""
+        *batch, _, width = values.shape
+        sizes = self.groups.bincount().to(values)[:, None]
+        sums = values.new_zeros(*batch, len(sizes), width)
+        sums = sums.index_add(-2, self.groups, values)
+        mean = (sums / sizes)[..., self.groups, :]
+        of_means = (1 + (sizes - 1) * self.correlation)[self.groups]
+        return mean / of_means.sqrt() + (values - mean) / (1 - self.correlation) ** 0.5
+
+    @property
+    def eigenvalues(self) -> Tensor:
+        """Those of R: of the mean of each group, and of differences within groups."""
+        sizes = self.groups.bincount().double()
+        of_means = 1 + (sizes - 1) * self.correlation
+        within = sizes.new_full((len(self.groups) - len(sizes),), 1 - self.correlation)
+        return torch.cat([of_means, within])
+
+
+def independent_pairs(
+    groups: Tensor, correlation: float | Tensor, weights: Tensor
+) -> Tensor:
+    r"""Return how many independent pairs each counts as (Kish), ``(*batch, n)``.
+
+    A pair among k of its group counts as :math:`1 / (1 + (k - 1) \rho)`. If the weights
+    of a group differ, k is its effective number of pairs: the squared sum of its
+    weights over the sum of their squares. Groups are numbered from 0 on.
+    """
+    w = weights.double()
+    number = groups.bincount(weights=w).square() / groups.bincount(weights=w.square())
+    correlation = torch.as_tensor(correlation).to(w)[..., None]
+    return w / (1 + (number[groups] - 1) * correlation)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Regressions:
     r"""Real observations regressed on simulated means, at K precisions of the gain.
 
-    There may be several means of each observation, such as imputed ones. Each set of
-    them has its own regressions, and ``*batch`` is the shape of the sets.
+    There are B sets of means, such as imputed ones. Each has its own regressions.
 
     Attributes:
-        coefficients: Means of :math:`(A, b)^\top`, shape ``(*batch, K, l + 1, l)``.
+        coefficients: Means of :math:`(A, b)^\top`, shape ``(B, K, l + 1, l)``.
         row_factor: Lower Cholesky factors of the covariances of their rows, shape
-            ``(*batch, K, l + 1, l + 1)``.
-        variances: Eigenvalues of the scatter matrices of the residuals, shape
-            ``(*batch, K, l)``.
-        directions: Their eigenvectors, shape ``(*batch, K, l, l)``.
+            ``(B, K, l + 1, l + 1)``.
+        variances: Eigenvalues of the scatter matrices of the residuals, ``(B, K, l)``.
+        directions: Their eigenvectors, shape ``(B, K, l, l)``.
         log_volume: The parts of the log evidences that come from the coefficients, and
-            from the correlation of the errors, shape ``(*batch, K)``.
-        num_pairs: The number of calibration pairs, or the sum of their weights, shape
-            ``batch``.
+            from the correlation of the errors, shape ``(B, K)``.
+        num_pairs: The sum of the weights of the pairs, shape ``(B,)``.
     """
 
     coefficients: Tensor
@@ -54,23 +115,16 @@ class Regressions:
         z: Tensor,
         mean: Tensor,
         gain_precisions: Sequence[float],
+        weights: Tensor,
         *,
-        weights: Tensor | None = None,
         errors: GroupErrors | None = None,
     ) -> "Regressions":
         """Return the conjugate posterior of the coefficients at each precision.
 
-        Either weights or the correlations of the errors are given, or none of them.
-
-        Args:
-            z: Representations of the real observations, shape ``(n, l)``.
-            mean: The means of simulations at their parameters, ``(*batch, n, l)``.
-            gain_precisions: K values of k.
-            weights: How many pairs each pair counts as, shape ``(n,)`` or
-                ``(*batch, n)``; one if None.
-            errors: Their correlations within groups; none if None.
+        Observations z have the shape ``(n, l)``, means ``(B, n, l)``, and weights
+        ``(n,)`` or ``(B, n)``. They are one if ``errors`` are correlated.
         """
-        *batch, n, width = mean.shape
+        width = mean.shape[2]
         identity = torch.eye(width).to(z)
         design = torch.cat([mean, torch.ones_like(mean[..., :1])], dim=-1)
         prior_mean = torch.cat([identity, torch.zeros_like(identity[:1])])
@@ -78,18 +132,16 @@ class Regressions:
         precision[:, -1] *= OFFSET_PRECISION
         # Relative to the prior mean, residuals are small, and so are rounding errors.
         residual = z - design @ prior_mean
-        num_pairs = z.new_tensor(n)
-        if weights is not None:
-            num_pairs = weights.sum(dim=-1)
-            residual = residual * weights.sqrt()[..., None]
-            design = design * weights.sqrt()[..., None]
-        num_pairs = num_pairs.expand(batch)
-        num_rounded, log_det_errors = num_pairs[..., None, None, None], 0.0
+        num_pairs = weights.sum(dim=-1).expand(len(mean))
+        residual = residual * weights.sqrt()[..., None]
+        design = design * weights.sqrt()[..., None]
+        num_rounded, log_det_errors = num_pairs[:, None, None, None], 0.0
         if errors is not None:
             residual, design = errors.independent(residual), errors.independent(design)
-            num_rounded, log_det_errors = errors.trace_of_inverse, errors.log_det
+            num_rounded = errors.eigenvalues.reciprocal().sum()
+            log_det_errors = errors.eigenvalues.log().sum()
         # From here on there is a dimension for the K precisions.
-        design, residual = design[..., None, :, :], residual[..., None, :, :]
+        design, residual = design[:, None], residual[:, None]
         factor = torch.linalg.cholesky(torch.diag_embed(precision) + design.mT @ design)
         shift = torch.cholesky_solve(design.mT @ residual, factor)
         # This is a sum of squares. The usual difference of two terms could be negative.
@@ -111,15 +163,12 @@ class Regressions:
         )
 
     def log_evidence(self, settings: Sequence[tuple[float, float]]) -> Tensor:
-        """Return the log density of the pairs for each precision and setting.
+        """Return the log density of the pairs at each precision and setting.
 
-        Args:
-            settings: S pairs of an error scale and its strength.
-
-        Returns:
-            Shape ``(*batch, K, S)``.
+        The settings are S pairs of an error scale and its strength, so that the shape
+        is ``(B, K, S)``.
         """
-        n, width = self.num_pairs[..., None, None], self.variances.shape[-1]
+        n, width = self.num_pairs[:, None, None], self.variances.shape[-1]
         error_scale, strength = self.variances.new_tensor(settings).unbind(dim=1)
         scale = strength * error_scale.square()
         degrees = strength + width + 1
@@ -133,14 +182,10 @@ class Regressions:
             - torch.special.multigammaln(degrees / 2, width)
         )
 
-    def at(self, where: tuple[Any, ...], error_scale: Any, strength: Any) -> Term:
-        """Return the posterior at one of the precisions, an error scale and strength.
+    def at(self, where: tuple[Any, Any], error_scale: Any, strength: Any) -> Term:
+        """Return the posterior at a set and precision, an error scale and a strength.
 
-        Args:
-            where: Index of the precision in ``(*batch, K)``. Indices are numbers, or
-                tensors of shape ``(m,)`` for m terms in one.
-            error_scale: The error scale, a number or of shape ``(m,)``.
-            strength: Its strength, likewise.
+        All arguments are numbers, or tensors of shape ``(m,)`` for m terms in one.
         """
         like = self.variances
         strength = torch.as_tensor(strength).to(like)
@@ -150,5 +195,80 @@ class Regressions:
             coefficients=self.coefficients[where],
             row_factor=self.row_factor[where],
             error_factor=self.directions[where] * scale[..., None, :].sqrt(),
-            degrees=strength + scale.shape[-1] + 1 + self.num_pairs[where[:-1]],
+            degrees=strength + scale.shape[-1] + 1 + self.num_pairs[where[0]],
         )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Conditional:
+    """The posterior of the discrepancy given each of B sets of means.
+
+    Attributes:
+        regressions: The posteriors at K precisions of the gain.
+        log_evidence: At these and S further settings, shape ``(B, K, S)``.
+        settings: The error scales and strengths, S of each.
+        noise: The covariance C of simulations at one parameter, shape ``(l, l)``.
+        average: Log density of the pairs under a discrepancy, with each group as one
+            pair, shape ``(B,)``.
+        right: The same if the simulator is right, shape ``(B,)``.
+        probability_of_none: That the simulator is right, shape ``(B,)``.
+        num_pairs: The number of calibration pairs.
+    """
+
+    regressions: Regressions
+    log_evidence: Tensor
+    settings: Sequence[tuple[float, float]]
+    noise: Tensor
+    average: Tensor
+    right: Tensor
+    probability_of_none: Tensor
+    num_pairs: int
+
+    def posteriors(self) -> list[Discrepancy]:
+        """Return the averages over the settings whose evidence is not negligible."""
+        return [self._posterior(*one) for one in enumerate(self.log_evidence)]
+
+    def _posterior(self, number: int, evidence: Tensor) -> Discrepancy:
+        kept = evidence > evidence.max() + math.log(NEGLIGIBLE)
+        return Discrepancy(
+            terms=tuple(
+                self.regressions.at((number, k), *self.settings[s])
+                for k, s in kept.nonzero().tolist()
+            ),
+            shares=torch.softmax(evidence[kept], dim=0),
+            noise=self.noise,
+            probability_of_none=float(self.probability_of_none[number]),
+            log_evidence=float(self.average[number]),
+            log_evidence_of_none=float(self.right[number]),
+            num_pairs=self.num_pairs,
+            num_independent=float(self.regressions.num_pairs[number]),
+        )
+
+    def draw(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Draw a gain, an offset and the covariance of observations at one parameter.
+
+        One of each is drawn from each of :meth:`posteriors`, without computing them,
+        and with the settings that they leave out. Their shapes are ``(B, l, l)``,
+        ``(B, l)`` and ``(B, l, l)``.
+        """
+        probabilities = torch.softmax(self.log_evidence.flatten(1), dim=1)
+        chosen = torch.multinomial(probabilities, 1)[:, 0]
+        k, s = chosen // len(self.settings), chosen % len(self.settings)
+        scale, strength = self.noise.new_tensor(self.settings)[s].unbind(dim=1)
+        which = torch.arange(len(chosen), device=chosen.device)
+        drawn = self.regressions.at((which, k), scale, strength).sample(1)
+        gain, offset, covariance = (values[0] for values in drawn)
+        none = torch.rand(len(chosen)).to(gain) < self.probability_of_none
+        identity = torch.eye(len(self.noise)).to(gain)
+        return (
+            torch.where(none[:, None, None], identity, gain),
+            offset.masked_fill(none[:, None], 0.0),
+            torch.where(none[:, None, None], self.noise, covariance),
+        )
+
+
+def log_density_of_right(residual: Tensor, noise: Tensor, weights: Tensor) -> Tensor:
+    """Return the log density of z - m, ``(B,)``, rounded as ``Regressions`` do."""
+    log_density = MultivariateNormal(torch.zeros_like(noise[0]), noise).log_prob
+    inexact = weights.sum() * SMALLEST_NOISE**2 * torch.linalg.inv(noise).trace()
+    return (weights * log_density(residual)).sum(dim=1) - inexact / 2

@@ -13,7 +13,7 @@ from sbi_rope._standardisation import Standardisation
 from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.posterior import Discrepancy
 from sbi_rope.errors import InvalidInputError
-from sbi_rope.moments import Moments
+from sbi_rope.simulate import Moments
 
 __all__ = [
     "DiscrepancyReport",
@@ -37,15 +37,9 @@ MIN_PAIRS_FOR_OUTLIERS = 10
 MANY_OUTLIERS = 0.05
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Interval:
-    """An estimate with its 95 % interval.
-
-    Attributes:
-        median: The estimate.
-        low: Lower end of the interval.
-        high: Upper end of the interval.
-    """
+    """The median of an estimate, with the ends of its 95 % interval."""
 
     median: float
     low: float
@@ -54,9 +48,8 @@ class Interval:
     @classmethod
     def of(cls, draws: Tensor) -> "Interval":
         """Return the quantiles of draws, shape ``(m,)``."""
-        levels = torch.tensor([0.025, 0.5, 0.975]).to(draws)
-        low, median, high = draws.quantile(levels).tolist()
-        return cls(median=median, low=low, high=high)
+        levels = torch.tensor([0.5, 0.025, 0.975]).to(draws)
+        return cls(*draws.quantile(levels).tolist())
 
     def __str__(self) -> str:
         return f"{self.median:.3g} [{self.low:.3g}, {self.high:.3g}]"
@@ -83,10 +76,9 @@ class SummaryDiscrepancy:
             summary, with one half before any pair is seen.
         outliers: Rows of calibration pairs that do not fit the others. In 99 of 100
             summaries without outliers no pair is so far away by chance.
-        std: The standard deviation of simulations from the prior, in the units of x;
-            one if it is not known.
+        std: The standard deviation of simulations from the prior, in the units of x.
         num_independent: How many independent pairs the calibration pairs count as here,
-            see :class:`~sbi_rope.discrepancy.DiscrepancyModel`; None if not known.
+            see :class:`~sbi_rope.discrepancy.DiscrepancyModel`.
     """
 
     name: str
@@ -95,9 +87,9 @@ class SummaryDiscrepancy:
     error: Interval
     size: Interval
     probability_of_none: float
+    std: float
+    num_independent: float
     outliers: tuple[int, ...] = ()
-    std: float = 1.0
-    num_independent: float | None = None
 
     @property
     def is_off(self) -> bool:
@@ -115,48 +107,31 @@ class DiscrepancyReport:
         summaries: The discrepancy of each summary, from the largest to the smallest.
             Summaries without a sign of discrepancy are last.
         num_pairs: The number of calibration pairs.
-        num_groups: The number of people or specimens that they are of; None if there
-            are as many as pairs.
+        num_groups: The number of people or specimens that they are of.
         constant: The names of summaries that are the same in all simulations. Nothing
             can be said about them.
     """
 
     summaries: tuple[SummaryDiscrepancy, ...]
     num_pairs: int
+    num_groups: int
     constant: tuple[str, ...] = ()
-    num_groups: int | None = None
 
     def __getitem__(self, name: str) -> SummaryDiscrepancy:
         return {summary.name: summary for summary in self.summaries}[name]
 
-    @property
-    def _in_groups(self) -> str:
-        return "" if self.num_groups is None else f" in {self.num_groups} groups"
-
     def renamed(self, names: Sequence[str]) -> "DiscrepancyReport":
-        """Return the same report with other names of the summaries.
-
-        Args:
-            names: A name for each entry of x, in the order of x.
-
-        Raises:
-            InvalidInputError: If they are not one for each entry of x, or the report
-                has names already.
-        """
+        """Return the report of numbered summaries with names, in the order of x."""
         of_entry = {f"x[{j}]": name for j, name in enumerate(names)}
         known = {*(summary.name for summary in self.summaries), *self.constant}
-        if known != set(of_entry):
+        if known != set(of_entry) or len(set(names)) < len(names):
             raise InvalidInputError(
-                f"Expected `names` of {sorted(known)}; got {list(names)}."
+                f"Expected `x_names` to be {len(known)} different names, of "
+                f"{sorted(known)}; got {list(names)}."
             )
-        return replace(
-            self,
-            summaries=tuple(
-                replace(summary, name=of_entry[summary.name])
-                for summary in self.summaries
-            ),
-            constant=tuple(of_entry[name] for name in self.constant),
-        )
+        summaries = tuple(replace(s, name=of_entry[s.name]) for s in self.summaries)
+        constant = tuple(of_entry[name] for name in self.constant)
+        return replace(self, summaries=summaries, constant=constant)
 
     def as_rows(self) -> list[dict[str, Any]]:
         """Return a row for each summary, in the order of ``summaries``."""
@@ -179,8 +154,10 @@ class DiscrepancyReport:
     def __str__(self) -> str:
         off = [summary for summary in self.summaries if summary.is_off]
         fine = [summary.name for summary in self.summaries if not summary.is_off]
+        grouped = self.num_groups < self.num_pairs
+        in_groups = f" in {self.num_groups} groups" if grouped else ""
         lines = [
-            f"What {self.num_pairs} calibration pairs{self._in_groups} say about the "
+            f"What {self.num_pairs} calibration pairs{in_groups} say about the "
             "simulator",
             "  observed = mean + shift + gain (simulated - mean) + error",
         ]
@@ -211,9 +188,9 @@ class DiscrepancyReport:
 
 def what_groups_count_as(report: DiscrepancyReport) -> str:
     """Say how many independent pairs those of a report count as; "" without groups."""
-    numbers = [s.num_independent for s in report.summaries if s.num_independent]
-    if report.num_groups is None or not numbers:
+    if report.num_groups == report.num_pairs:
         return ""
+    numbers = [summary.num_independent for summary in report.summaries]
     least, most = f"{min(numbers):.0f}", f"{max(numbers):.0f}"
     count = least if least == most else f"{least} to {most}"
     return (
@@ -256,8 +233,6 @@ def report_discrepancy(
     model: DiscrepancyModel,
     weights: Tensor | None = None,
     groups: Tensor | None = None,
-    x_names: Sequence[str] | None = None,
-    seed: int = 0,
     show_progress_bars: bool = False,
 ) -> DiscrepancyReport:
     """Fit the discrepancy of each summary separately.
@@ -265,33 +240,15 @@ def report_discrepancy(
     A joint gain of summaries that depend on each other, such as two sensors of one
     light, is ambiguous. The gain of a single summary is not, and can be checked.
 
-    Args:
-        x: Real observations of the calibration pairs, shape ``(n, l)``.
-        moments: The moments of simulations at their parameters.
-        simulated: Simulations from the prior, shape ``(n_s, l)``.
-        model: The model of the discrepancy.
-        weights: How many pairs each pair counts as, shape ``(n,)``; one if None.
-        groups: A number for each pair, the same for recordings of one person or
-            specimen, whose errors can have something in common; None if all differ.
-        x_names: Names of the summaries; numbered if None.
-        seed: Seed of the draws behind the intervals.
-        show_progress_bars: Whether to show the progress if there are many summaries.
-
-    Raises:
-        InvalidInputError: If there are not as many names as summaries.
+    Observations x have the shape ``(n, l)``, and simulations from the prior
+    ``(n_s, l)``. Weights and groups are those of :meth:`DiscrepancyModel.fit`.
     """
-    width = x.shape[1]
-    names = [f"x[{j}]" for j in range(width)] if x_names is None else list(x_names)
-    if len(names) != width or len(set(names)) != width:
-        raise InvalidInputError(
-            f"Expected `x_names` to be {width} different names; got {names}."
-        )
+    names = [f"x[{j}]" for j in range(x.shape[1])]
     standardisation = Standardisation(simulated.double())
     varies = standardisation.varies.tolist()
     summaries = []
-    numbers = range(width)
     for j in progress_bar(
-        numbers, show=show_progress_bars, desc="Summaries", delay=DELAY
+        range(len(names)), show=show_progress_bars, desc="Summaries", delay=DELAY
     ):
         if not varies[j]:
             continue
@@ -299,12 +256,8 @@ def report_discrepancy(
         z = ((x[:, j].double() - mean) / std)[:, None]
         m = ((moments.means[..., j] - mean) / std)[..., None]
         noise = moments.covariance[:, j, j].mean() / std.square()
-        discrepancy = model.fit(
-            z, m, noise.reshape(1, 1), weights=weights, groups=groups
-        )
-        summaries.append(
-            _summary(names[j], discrepancy, z, m, scale=float(std), seed=seed)
-        )
+        found = model.fit(z, m, noise.reshape(1, 1), weights=weights, groups=groups)
+        summaries.append(_summary(names[j], found, z, m, scale=float(std)))
     if not summaries:
         raise InvalidInputError(
             "Expected simulations that differ from each other; all summaries are "
@@ -315,40 +268,24 @@ def report_discrepancy(
             sorted(summaries, key=lambda s: (not s.is_off, -s.size.median))
         ),
         num_pairs=len(x),
-        num_groups=_num_groups(groups),
+        num_groups=len(x) if groups is None else len(groups.unique()),
         constant=tuple(n for n, v in zip(names, varies, strict=True) if not v),
     )
 
 
-def _num_groups(groups: Tensor | None) -> int | None:
-    if groups is None or (number := len(groups.unique())) == len(groups):
-        return None
-    return number
-
-
 def _summary(
-    name: str,
-    discrepancy: Discrepancy,
-    z: Tensor,
-    mean: Tensor,
-    *,
-    scale: float,
-    seed: int,
+    name: str, discrepancy: Discrepancy, z: Tensor, mean: Tensor, *, scale: float
 ) -> SummaryDiscrepancy:
-    """Return the discrepancy of one summary, with z ``(n, 1)`` and mean ``(n, R, 1)``.
-
-    Where labels are not exact there are no outliers: a residual may come from the
-    label.
-    """
+    """Return the discrepancy of a summary, with z ``(n, 1)`` and mean ``(n, R, 1)``."""
     # The intervals assume that there is a discrepancy. Its probability is reported too.
     draws = replace(discrepancy, probability_of_none=0.0).sample(
-        NUM_DRAWS, smallest_error=0.0, seed=seed
+        NUM_DRAWS, smallest_error=0.0, seed=0
     )
     gain, shift = draws.gain[:, 0, 0], draws.offset[:, 0]
     error = draws.error_factor[:, 0, 0].abs()
     size = ((gain - 1).square() + shift.square() + error.square()).sqrt()
     outliers: tuple[int, ...] = ()
-    if mean.shape[1] == 1:
+    if mean.shape[1] == 1:  # otherwise a residual may come from the label
         residual = (z - gain.median() * mean[:, 0] - shift.median())[:, 0]
         noise = float(gain.median().abs() * discrepancy.noise[0, 0].sqrt())
         outliers = _outliers(residual, noise)

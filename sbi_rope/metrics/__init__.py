@@ -1,13 +1,11 @@
 r"""Scores of a posterior on observations whose true parameters are known.
 
-Any sbi posterior can be scored that has ``sample_batched``, for scores of calibration,
-and ``log_prob_batched``, for scores of the density. The test set consists of ``theta``,
-shape ``(n, d)``, and ``x``, shape ``(n, *event_shape)``, both on the device of the
-posterior.
+:func:`evaluate` draws samples once and returns all scores of any sbi posterior that has
+``sample_batched`` and ``log_prob_batched``. The test set consists of ``theta``, shape
+``(n, d)``, and ``x``, shape ``(n, *event_shape)``, both on the device of the posterior.
 
-:func:`evaluate` draws the samples once and returns all scores. The other functions
-return one score each. All of them use the functions in
-``sbi_rope.metrics.calibration``, which take ranks and levels and need no posterior.
+The scores of calibration are also functions of ranks and levels, which need no
+posterior: ``acauc_of(central_levels(mid_ranks(samples, theta)))``.
 
 No score enters sbi's unbounded rejection loops: see ``sbi_rope.metrics.calls``.
 """
@@ -24,7 +22,6 @@ from sbi_rope.metrics.calibration import (
     mid_ranks,
 )
 from sbi_rope.metrics.calls import draw_samples
-from sbi_rope.metrics.coverage import acauc, coverage_curve, expected_coverage_error
 from sbi_rope.metrics.density import LPPScore, lpp
 from sbi_rope.metrics.evaluation import Evaluation, evaluate
 
@@ -35,15 +32,12 @@ __all__ = [
     "CoverageErrorScore",
     "Evaluation",
     "LPPScore",
-    "acauc",
     "acauc_of",
     "central_levels",
     "coverage_by_estimate",
-    "coverage_curve",
     "coverage_curve_of",
     "draw_samples",
     "evaluate",
-    "expected_coverage_error",
     "expected_coverage_error_of",
     "lpp",
     "mid_ranks",

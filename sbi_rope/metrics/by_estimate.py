@@ -15,9 +15,8 @@ import torch
 from scipy.stats import rankdata
 from torch import Tensor
 
-from sbi_rope._means import means_of_pairs
-from sbi_rope._permutation import permutation_test
 from sbi_rope._random import seeded
+from sbi_rope._statistics import means_of_pairs, permutation_test
 from sbi_rope.data import Counts
 from sbi_rope.metrics.calibration import (
     ROUNDING,
@@ -30,7 +29,6 @@ from sbi_rope.tensors import as_batch
 __all__ = [
     "CoverageByEstimate",
     "coverage_by_estimate",
-    "coverage_by_estimate_of_pairs",
     "estimates_and_ranks",
     "in_words",
 ]
@@ -95,9 +93,10 @@ class CoverageByEstimate:
 def coverage_by_estimate(
     ranks: Tensor,
     estimates: Tensor,
+    counts: Counts | None = None,
     *,
+    chosen: Tensor | None = None,
     level: float = 0.9,
-    allow_missing: bool = False,
 ) -> CoverageByEstimate:
     r"""Test whether the ranks of true parameters depend on the posterior means.
 
@@ -120,10 +119,13 @@ def coverage_by_estimate(
 
     Args:
         ranks: The ranks of the true parameters, from 0 to 1, shape ``(n, d)``, such as
-            those of :func:`mid_ranks`.
+            those of :func:`mid_ranks`; NaN where a parameter is not known.
         estimates: The posterior means, shape ``(n, d)``.
+        counts: How many pairs each counts as; one each if None.
+        chosen: The pairs that are tested, shape ``(n,)``: one of each group, if pairs
+            belong to groups. The mean over a group is no posterior mean, and would
+            depend on the ranks.
         level: The level of the intervals whose coverage is stated.
-        allow_missing: Whether ranks may be NaN, where the parameter is not known.
 
     Returns:
         The coverage in each third of the estimates, and the p-values. They are always
@@ -143,29 +145,8 @@ def coverage_by_estimate(
         (True,)
     """
     check("level", level, Level)
-    ranks = read_unit_interval("ranks", ranks, allow_missing=allow_missing)
+    ranks = read_unit_interval("ranks", ranks)
     estimates = as_batch("estimates", estimates, ranks.shape[1:], rows=len(ranks))
-    return coverage_by_estimate_of_pairs(ranks, estimates, level=level)
-
-
-def coverage_by_estimate_of_pairs(
-    ranks: Tensor,
-    estimates: Tensor,
-    counts: Counts | None = None,
-    *,
-    chosen: Tensor | None = None,
-    level: float = 0.9,
-) -> CoverageByEstimate:
-    """Return :func:`coverage_by_estimate` of pairs that are not all independent.
-
-    Args:
-        ranks: Checked ranks, NaN where they are not known, shape ``(n, d)``.
-        estimates: The posterior means, shape ``(n, d)``.
-        counts: How many pairs each counts as; None for one each.
-        chosen: The pairs that are tested, shape ``(n,)``: one of each group. The mean
-            over a group is no posterior mean, and would depend on the ranks.
-        level: The level of the intervals whose coverage is stated.
-    """
     ranks, estimates = ranks.detach().cpu().double(), estimates.detach().cpu().double()
     known = ~torch.isnan(ranks)
     tested = known if chosen is None else known & chosen.cpu()[:, None]

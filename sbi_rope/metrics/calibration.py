@@ -13,7 +13,7 @@ import torch
 from scipy.stats import t as student
 from torch import Tensor
 
-from sbi_rope._means import (
+from sbi_rope._statistics import (
     mean_and_error,
     mean_of_known,
     means_of_pairs,
@@ -29,12 +29,9 @@ __all__ = [
     "CoverageCurve",
     "CoverageErrorScore",
     "acauc_of",
-    "acauc_of_pairs",
     "central_levels",
     "count_ranks",
     "coverage_curve_of",
-    "coverage_curve_of_pairs",
-    "coverage_error_of_pairs",
     "expected_coverage_error_of",
     "mid_ranks",
     "random_ranks",
@@ -210,7 +207,9 @@ def central_levels(ranks: Tensor) -> Tensor:
     return (2.0 * _in_unit_interval("ranks", as_numbers("ranks", ranks)) - 1.0).abs()
 
 
-def acauc_of(levels: Tensor, *, allow_missing: bool = False) -> ACAUCScore:
+def acauc_of(
+    levels: Tensor, counts: Counts | None = None, *, confidence: float = 0.95
+) -> ACAUCScore:
     r"""Average the coverage error over all levels, parameters and observations.
 
     .. math:: \text{ACAUC} = \frac{1}{d n} \sum_{j=1}^{d} \sum_{i=1}^{n} \int_0^1
@@ -234,9 +233,11 @@ def acauc_of(levels: Tensor, *, allow_missing: bool = False) -> ACAUCScore:
         | https://arxiv.org/abs/2405.08719
 
     Args:
-        levels: The levels :math:`a^*` of the true parameters, shape ``(n, d)``.
-        allow_missing: Whether levels may be NaN, where the parameter is not known.
-            Means are then over the others.
+        levels: The levels :math:`a^*` of the true parameters, shape ``(n, d)``; NaN
+            where a parameter is not known. Means are over the others.
+        counts: How many pairs each counts as, and which are not independent; one each
+            if None.
+        confidence: The probability of the interval.
 
     Returns:
         The score with its standard error.
@@ -248,22 +249,7 @@ def acauc_of(levels: Tensor, *, allow_missing: bool = False) -> ACAUCScore:
         >>> acauc_of(torch.tensor([[0.5], [1.0]])).value
         0.25
     """
-    return acauc_of_pairs(
-        read_unit_interval("levels", levels, allow_missing=allow_missing)
-    )
-
-
-def acauc_of_pairs(
-    levels: Tensor, counts: Counts | None = None, *, confidence: float = 0.95
-) -> ACAUCScore:
-    """Return :func:`acauc_of` of pairs that count differently, or are not independent.
-
-    Args:
-        levels: Checked levels, NaN where they are not known, shape ``(n, d)``.
-        counts: How many pairs each counts as; None for one each.
-        confidence: The probability of the interval.
-    """
-    levels = levels.double()
+    levels = read_unit_interval("levels", levels).double()
     mean, error, n = _mean_over_pairs(mean_of_known(levels, dim=1), counts)
     width = float("nan")
     if n > 1:
@@ -277,7 +263,7 @@ def acauc_of_pairs(
     )
 
 
-def coverage_curve_of(levels: Tensor, *, allow_missing: bool = False) -> CoverageCurve:
+def coverage_curve_of(levels: Tensor, counts: Counts | None = None) -> CoverageCurve:
     r"""Count the true parameters inside the interval of each nominal level.
 
     .. math:: c_j(\alpha) = \frac{1}{n} \sum_{i=1}^{n} \mathbf{1}[a^*_{ij} \le \alpha]
@@ -286,27 +272,17 @@ def coverage_curve_of(levels: Tensor, *, allow_missing: bool = False) -> Coverag
     :math:`2 / (M + 1)`, so that the curve is exact to about :math:`1 / M`.
 
     Args:
-        levels: The levels :math:`a^*` of the true parameters, shape ``(n, d)``.
-        allow_missing: As in :func:`acauc_of`.
+        levels: As in :func:`acauc_of`.
+        counts: As in :func:`acauc_of`.
 
     Returns:
-        The curve at .01, .02, ..., .99.
+        The curve at .01, .02, ..., .99. Its number of observations is the effective
+        one, rounded down.
 
     Raises:
         InvalidInputError: If they have another shape, or a level is not in [0, 1].
     """
-    return coverage_curve_of_pairs(
-        read_unit_interval("levels", levels, allow_missing=allow_missing)
-    )
-
-
-def coverage_curve_of_pairs(
-    levels: Tensor, counts: Counts | None = None
-) -> CoverageCurve:
-    """Return :func:`coverage_curve_of`, with the arguments of :func:`acauc_of_pairs`.
-
-    The number of observations is the effective one, rounded down.
-    """
+    levels = read_unit_interval("levels", levels)
     nominal = _nominal_levels(levels)
     # One level at a time, so that no tensor is larger than `levels`.
     coverage, errors = [], []
@@ -323,7 +299,7 @@ def coverage_curve_of_pairs(
 
 
 def expected_coverage_error_of(
-    levels: Tensor, *, allow_missing: bool = False
+    levels: Tensor, counts: Counts | None = None
 ) -> CoverageErrorScore:
     r"""Average the distance between empirical coverage and nominal level.
 
@@ -341,8 +317,8 @@ def expected_coverage_error_of(
     The standard error is too large where the curve is close to the diagonal.
 
     Args:
-        levels: The levels :math:`a^*` of the true parameters, shape ``(n, d)``.
-        allow_missing: As in :func:`acauc_of`.
+        levels: As in :func:`acauc_of`.
+        counts: As in :func:`acauc_of`.
 
     Returns:
         The score with its standard error.
@@ -350,15 +326,7 @@ def expected_coverage_error_of(
     Raises:
         InvalidInputError: If they have another shape, or a level is not in [0, 1].
     """
-    return coverage_error_of_pairs(
-        read_unit_interval("levels", levels, allow_missing=allow_missing)
-    )
-
-
-def coverage_error_of_pairs(
-    levels: Tensor, counts: Counts | None = None
-) -> CoverageErrorScore:
-    """Return the expected coverage error, as :func:`acauc_of_pairs` does the ACAUC."""
+    levels = read_unit_interval("levels", levels)
     nominal = _nominal_levels(levels)
     distance = levels.new_zeros(levels.shape[1], dtype=torch.float64)
     influence = levels.new_zeros(levels.shape[0], dtype=torch.float64)
@@ -407,13 +375,11 @@ def _mean_over_pairs(
     return *mean_and_error(values, counts), counts.effective_number
 
 
-def read_unit_interval(name: str, values: Tensor, *, allow_missing: bool) -> Tensor:
-    """Return levels or ranks, shape ``(n, d)``, in 32 bits or more."""
+def read_unit_interval(name: str, values: Tensor) -> Tensor:
+    """Return levels or ranks, shape ``(n, d)``, NaN allowed, in 32 bits or more."""
     numbers = as_numbers(name, values)
     numbers = as_batch(name, numbers, numbers.shape[-1:], finite=False)
-    _in_unit_interval(
-        name, numbers[~torch.isnan(numbers)] if allow_missing else numbers
-    )
+    _in_unit_interval(name, numbers[~torch.isnan(numbers)])
     # In 16 bits, the nominal levels that they are compared with would be rounded too.
     return numbers if numbers.dtype == torch.double else numbers.float()
 

@@ -28,7 +28,6 @@ from sbi_rope.errors import (
     InvalidInputError,
     LogProbUnavailableError,
 )
-from sbi_rope.metrics.calibration import count_ranks, random_ranks
 from sbi_rope.settings import Count, Range, check
 from sbi_rope.tensors import as_batch, as_numbers, rows_with
 
@@ -36,8 +35,6 @@ __all__ = [
     "CHUNK_SIZE",
     "NumSamples",
     "draw_chunks",
-    "draw_joint_levels",
-    "draw_ranks",
     "draw_samples",
     "evaluate_log_probs",
     "is_normalised",
@@ -56,10 +53,6 @@ MAX_SAMPLES = 10**8
 MIN_SAMPLES = 20
 
 NumSamples = Annotated[int, Range(MIN_SAMPLES, MAX_SAMPLES)]
-
-# How many draws of each observation have their density evaluated in one call. It is
-# small because some flows embed x once for every draw.
-DRAWS_PER_CALL = 10
 
 # sbi warns of samples that are not rejected, and of whole chunks that are sampled at
 # once. Both are done here on purpose.
@@ -120,22 +113,6 @@ def evaluate_log_probs(
     return log_probs
 
 
-def draw_ranks(
-    posterior: Any,
-    theta: Tensor,
-    x: Tensor,
-    *,
-    num_samples: int,
-    chunk_size: int,
-    show: bool,
-) -> Tensor:
-    """Return the ranks of true parameters among samples, shape ``(n, d)``."""
-    chunks = draw_chunks(
-        posterior, theta, x, num_samples=num_samples, chunk_size=chunk_size, show=show
-    )
-    return torch.cat([random_ranks(samples, theta[rows]) for rows, samples in chunks])
-
-
 def draw_chunks(
     posterior: Any,
     theta: Tensor,
@@ -148,39 +125,6 @@ def draw_chunks(
     """Yield samples of some observations at a time, ``(num_samples, rows, d)``."""
     for rows in _chunks(theta.shape[0], chunk_size, "Drawing samples", show=show):
         yield rows, _draw(posterior, theta, x, rows, num_samples)
-
-
-def draw_joint_levels(
-    posterior: Any,
-    theta: Tensor,
-    x: Tensor,
-    *,
-    num_samples: int,
-    chunk_size: int,
-    show: bool,
-) -> Tensor:
-    """Return the levels of the smallest joint regions with theta, shape ``(n, 1)``.
-
-    The regions are those of highest posterior density (HPD).
-    """
-    _log_prob_of(posterior)
-    parts = []
-    chunks = draw_chunks(
-        posterior, theta, x, num_samples=num_samples, chunk_size=chunk_size, show=show
-    )
-    for rows, samples in chunks:
-        draws = torch.cat([theta[rows].unsqueeze(0).to(samples), samples])
-        densities = torch.cat(
-            [
-                _density(posterior, part, x[rows].clone())
-                for part in draws.split(DRAWS_PER_CALL)
-            ]
-        )
-        bad = torch.isnan(densities).any(dim=0)
-        _require_none(bad, "NaN log-probabilities", start=rows.start)
-        # The rank of -log p counts the draws whose density is higher than theta's.
-        parts.append(count_ranks(-densities[1:, :, None], -densities[0, :, None]))
-    return torch.cat(parts)
 
 
 def draw_samples(posterior: Any, x: Tensor, *, num_samples: int) -> Tensor:
@@ -266,26 +210,6 @@ def _draw(
     bad = torch.isnan(samples).any(dim=0).any(dim=-1)
     _require_none(bad, "NaN samples", start=rows.start)
     return samples
-
-
-def _density(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:
-    """Return the log density of draws, shape ``(num_draws, n)``.
-
-    It is the density of the distribution that the draws came from.
-    """
-    with torch.no_grad():
-        if _is_unbounded_direct(posterior):
-            # Draws that were not rejected can lie outside the prior, where `log_prob`
-            # is -Inf. A posterior with many such draws would look under-confident. The
-            # estimator gives the density that the draws really have.
-            return posterior.posterior_estimator.log_prob(theta, condition=x)
-        density = posterior.log_prob_batched(theta, x=x)
-    if density.shape != theta.shape[:2]:
-        raise InvalidInputError(
-            f"Expected `log_prob_batched` of shape {tuple(theta.shape[:2])}; got "
-            f"{tuple(density.shape)}."
-        )
-    return density
 
 
 def _is_unbounded(posterior: Any) -> bool:

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sbi_rope._means import standard_error_of_mean
+from sbi_rope._statistics import standard_error_of_mean
 from sbi_rope.metrics.calls import CHUNK_SIZE, evaluate_log_probs, read_test_set
 from sbi_rope.settings import Positive, check
 from sbi_rope.tensors import as_batch

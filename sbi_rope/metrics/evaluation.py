@@ -8,11 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sbi_rope._prior import std_of_prior
 from sbi_rope._random import seeded
-from sbi_rope._units import std_of_prior
 from sbi_rope.metrics.by_estimate import (
     CoverageByEstimate,
-    coverage_by_estimate_of_pairs,
+    coverage_by_estimate,
     estimates_and_ranks,
     in_words,
 )
@@ -231,7 +231,7 @@ def evaluate(
         acauc=acauc_of(levels),
         coverage=coverage_curve_of(levels),
         expected_coverage_error=expected_coverage_error_of(levels),
-        by_estimate=coverage_by_estimate_of_pairs(held_out, estimates),
+        by_estimate=coverage_by_estimate(held_out, estimates),
         parameter_names=getattr(posterior, "parameter_names", None),
         unit_z=unit_z,
         is_normalised=is_normalised(posterior),

@@ -31,12 +31,7 @@ def as_samples(
     theta: Tensor | None,
     parameter_names: Sequence[str] | None,
 ) -> tuple[dict[str, Tensor], Tensor | None, list[str]]:
-    """Return samples by method, the truth, and a name for each parameter.
-
-    Raises:
-        InvalidInputError: If the samples are no numbers of one width ``(n, d)``, or the
-            truth or the names do not fit.
-    """
+    """Return samples by method, the truth, and a name for each parameter."""
     width = np.shape(next(iter(samples.values())))[-1:]
     draws = {
         name: as_drawn(f"samples[{name!r}]", value, width)

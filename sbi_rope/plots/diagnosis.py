@@ -38,9 +38,6 @@ def implied_parameters(diagnosis: Diagnosis) -> "Figure":
 
     Returns:
         The figure, with one panel for each parameter.
-
-    Raises:
-        InvalidInputError: If the argument is no diagnosis.
     """
     check("diagnosis", diagnosis, Diagnosis)
     theta, names = diagnosis.theta, diagnosis.parameter_names

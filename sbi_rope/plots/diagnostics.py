@@ -49,14 +49,11 @@ def calibration_curves(curves: Mapping[str, CoverageCurve]) -> "Figure":
 
     Args:
         curves: Coverage curves by method name, from
-            :func:`sbi_rope.metrics.coverage_curve`. Their averages over parameters are
-            drawn.
+            :func:`sbi_rope.metrics.coverage_curve_of`. Their averages over
+            parameters are drawn.
 
     Returns:
         The figure.
-
-    Raises:
-        InvalidInputError: If one of them is no coverage curve.
     """
     for name, curve in curves.items():
         check(f"curves[{name!r}]", curve, CoverageCurve)
@@ -95,9 +92,6 @@ def ranks_by_estimate(
 
     Returns:
         The figure.
-
-    Raises:
-        InvalidInputError: If the argument is something else, or the names do not fit.
     """
     check("found", found, CoverageByEstimate)
     count = len(found.p_values)
@@ -147,9 +141,6 @@ def finetuning_history(history: History) -> "Figure":
 
     Returns:
         The figure.
-
-    Raises:
-        InvalidInputError: If the argument is no history.
     """
     check("history", history, History)
     training, validation = history.training_loss, history.validation_loss
@@ -195,9 +186,6 @@ def effective_sample_sizes(coupling: Coupling) -> "Figure":
 
     Returns:
         The figure, a histogram on a logarithmic axis.
-
-    Raises:
-        InvalidInputError: If the argument is no coupling.
     """
     check("coupling", coupling, Coupling)
     sizes = coupling.effective_sample_size.detach().cpu().double()

@@ -52,9 +52,6 @@ def real_and_simulated(
 
     Returns:
         The figure.
-
-    Raises:
-        InvalidInputError: If the shapes differ or are none of these.
     """
     x_o = as_drawn("x_o", x_o, np.shape(x_o)[1:])
     x_s = as_drawn("x_s", x_s, x_o.shape[1:], rows=len(x_o))

@@ -51,9 +51,6 @@ def pair_plot(
 
     Returns:
         The figure, with d rows and columns and the marginals on the diagonal.
-
-    Raises:
-        InvalidInputError: If the shapes differ, or a sample is not finite.
     """
     draws, truth, names = as_samples(samples, theta, parameter_names)
     dim = len(names)

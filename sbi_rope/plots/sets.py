@@ -62,9 +62,6 @@ def credible_set(
 
     Returns:
         The figure, with d rows and columns and the intervals on the diagonal.
-
-    Raises:
-        InvalidInputError: If the posterior is another one, or an argument does not fit.
     """
     check("posterior", posterior, MixturePosterior)
     options: dict[str, Any] = {"num_samples": NUM_SAMPLES, "seed": 0}

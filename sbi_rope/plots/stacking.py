@@ -55,9 +55,6 @@ def stacking_report(report: StackingReport) -> "Figure":
 
     Returns:
         The figure.
-
-    Raises:
-        InvalidInputError: If the argument is no report.
     """
     check("report", report, StackingReport)
     curve = report.learning_curve

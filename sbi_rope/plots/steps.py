@@ -110,9 +110,6 @@ def overview(
 
     Returns:
         The figure, with three panels.
-
-    Raises:
-        InvalidInputError: If shapes do not fit, or a value is not finite.
     """
     width = np.shape(simulated)[-1:]
     plane = _plane(

@@ -37,9 +37,6 @@ def discrepancy(report: DiscrepancyReport) -> "Figure":
 
     Returns:
         The figure.
-
-    Raises:
-        InvalidInputError: If the argument is no report.
     """
     check("report", report, DiscrepancyReport)
     shown = list(report.summaries[:MAX_SUMMARIES])

@@ -14,8 +14,8 @@ from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.discrepancy.report import what_groups_count_as, what_outliers_mean
 from sbi_rope.metrics import CoverageCurve
 from sbi_rope.metrics.calibration import (
-    acauc_of_pairs,
-    coverage_curve_of_pairs,
+    acauc_of,
+    coverage_curve_of,
 )
 from sbi_rope.plots import (
     calibration_curves,
@@ -59,10 +59,10 @@ def calibration_section(report: StackingReport, names: Sequence[str]) -> str:
     rows = [_row("all parameters", report.acauc.value, report.acauc.interval, curve)]
     curves = {"all parameters": curve}
     for k, name in enumerate(names):
-        score = acauc_of_pairs(levels[:, [k]], counts)
+        score = acauc_of(levels[:, [k]], counts)
         if score.verdict == "unknown":  # it was never measured
             continue
-        own = coverage_curve_of_pairs(levels[:, [k]], counts)
+        own = coverage_curve_of(levels[:, [k]], counts)
         if len(names) > 1:
             rows.append(_row(name, score.value, score.interval, own))
             curves[name] = own

@@ -6,7 +6,7 @@ from os import PathLike
 from pathlib import Path
 
 from sbi_rope.diagnosis import Diagnosis
-from sbi_rope.diagnosis.in_use import read_for, stack_in_use
+from sbi_rope.diagnosis.report import read_for
 from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.errors import InvalidInputError, shown
 from sbi_rope.plots._figures import new_figure
@@ -85,7 +85,7 @@ def write_stacking_report(
     discrepancy = _named(report.discrepancy, x_names)
     if diagnosis is not None:
         # The page is about this stack, whichever posterior the diagnosis was made for.
-        diagnosis = read_for(diagnosis, stack_in_use(report))
+        diagnosis = read_for(diagnosis, report)
     parts = [
         paragraph(_what_was_done(report)),
         verdict(verdict_of(report, diagnosis, names)),
@@ -266,22 +266,14 @@ def _weight_section(report: StackingReport) -> str:
 
 
 def _provenance_section(report: StackingReport) -> str:
-    scores, made = report.cross_validation, report.provenance
+    scores = report.cross_validation
     rows = [
         ("calibration pairs", str(len(scores))),
         *([("labels", scores.labels)] if scores.labels else []),
         ("folds", str(scores.num_folds)),
         ("candidates", str(len(scores.names))),
     ]
-    if made is not None:
-        seed = "none, so that a repetition differs" if made.seed is None else made.seed
-        rows += [
-            ("seed", str(seed)),
-            ("seconds", f"{made.seconds:.0f}"),
-            ("simulator calls", f"{made.num_simulator_calls:,}"),
-            ("finished", made.finished),
-            ("versions", ", ".join(f"{k} {v}" for k, v in made.versions.items())),
-        ]
+    rows += list(report.provenance.items())
     return section("How it was made", table(None, rows))
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from sbi_rope.diagnosis import Diagnosis
-from sbi_rope.diagnosis.labelled import UNLIKE_PAIRS
+from sbi_rope.diagnosis.report import UNLIKE_PAIRS
 from sbi_rope.metrics.calibration import FEWEST
 from sbi_rope.reports.page import number, percent
 from sbi_rope.stacking import StackingReport

@@ -6,15 +6,19 @@ from dataclasses import replace
 from functools import partial
 from typing import Annotated, Any
 
+import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_rope._random import seeded
-from sbi_rope._units import log_unit_of
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.sets.conformal import DIGITS
-from sbi_rope.sets.credible_set import CredibleSet, highest_density_set
-from sbi_rope.sets.intervals import CredibleIntervals, central_intervals
+from sbi_rope.sets.credible import (
+    CredibleIntervals,
+    CredibleSet,
+    central_intervals,
+    highest_density_set,
+)
 from sbi_rope.settings import Level, Range, check
 
 __all__ = ["MakesSets"]
@@ -68,10 +72,9 @@ class MakesSets(ABC):
             The set, which tells its volume and which parameters it contains.
 
         Raises:
-            InvalidInputError: If an argument is outside its range, or x is not in the
-                batch and ``unseen="raise"``. With ``guaranteed``, also if this is no
-                stack, or if it has too few pairs for the level.
-            SamplingError: If hardly any mass lies inside the prior's support.
+            InvalidInputError: If x is not in the batch and ``unseen="raise"``. With
+                ``guaranteed``, also if this is no stack, or if it has too few pairs for
+                the level.
         """
         _check(level, guaranteed=guaranteed, num_samples=num_samples, num_ends=1)
         with seeded(seed):
@@ -80,11 +83,7 @@ class MakesSets(ABC):
                 found = self._held_out_sets().credible_set(level, x, num_samples)
             else:
                 found = highest_density_set(
-                    self,
-                    x,
-                    level=level,
-                    num_samples=num_samples,
-                    log_unit=log_unit_of(self.prior),
+                    self, x, level=level, num_samples=num_samples
                 )
         return replace(found, parameter_names=self.parameter_names)
 
@@ -113,10 +112,6 @@ class MakesSets(ABC):
 
         Returns:
             The intervals, with ends of shape ``(d,)``.
-
-        Raises:
-            InvalidInputError: As in :meth:`credible_set`.
-            SamplingError: As in :meth:`credible_set`.
         """
         intervals = self.credible_intervals_batched(
             level,
@@ -139,18 +134,14 @@ class MakesSets(ABC):
         """Return an interval for each parameter given each observation of a batch.
 
         Args:
-            level: As in :meth:`credible_intervals`.
+            level: The probability of each interval.
             x: Observations, shape ``(B, *event)``.
-            guaranteed: As in :meth:`credible_intervals`.
+            guaranteed: As in :meth:`credible_set`.
             num_samples: As in :meth:`credible_intervals`.
-            seed: As in :meth:`credible_intervals`.
+            seed: As in :meth:`credible_set`.
 
         Returns:
             The intervals, with ends of shape ``(B, d)``.
-
-        Raises:
-            InvalidInputError: As in :meth:`credible_set`.
-            SamplingError: As in :meth:`credible_set`.
         """
         _check(level, guaranteed=guaranteed, num_samples=num_samples, num_ends=2)
         with seeded(seed):
@@ -158,8 +149,13 @@ class MakesSets(ABC):
             if guaranteed:
                 make = self._held_out_sets().credible_intervals
             blocks = self._batch_of_x(x).split(max(1, MAX_DRAWS // num_samples))
-            found = CredibleIntervals.joined([make(level, block) for block in blocks])
-        return replace(found, parameter_names=self.parameter_names)
+            parts = [make(level, block) for block in blocks]
+        return replace(
+            parts[0],
+            low=torch.cat([part.low for part in parts]),
+            high=torch.cat([part.high for part in parts]),
+            parameter_names=self.parameter_names,
+        )
 
     def _held_out_sets(self) -> Any:
         """Return what makes sets with a guarantee. Only a stack has it."""

@@ -15,12 +15,13 @@ from sbi_rope.stacking.cross_validation import (
     Difference,
     LearningCurve,
     SetScores,
+    StackingWeights,
+    stacking_weights,
 )
 from sbi_rope.stacking.data import StackData
 from sbi_rope.stacking.posterior import StackedPosterior
-from sbi_rope.stacking.report import Provenance, StackingReport
+from sbi_rope.stacking.report import StackingReport
 from sbi_rope.stacking.stack import stack
-from sbi_rope.stacking.weights import StackingWeights, stacking_weights
 
 __all__ = [
     "Candidate",
@@ -32,7 +33,6 @@ __all__ = [
     "LearningCurve",
     "NPECandidate",
     "PriorCandidate",
-    "Provenance",
     "RVNPCandidate",
     "SetScores",
     "StackData",

@@ -24,7 +24,7 @@ from sbi_rope.discrepancy.correction import (
 )
 from sbi_rope.ensemble import Ensemble
 from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError, warn_user
-from sbi_rope.finetuning import FINETUNING, TUNING, best_rates, finetune_flow
+from sbi_rope.finetuning import FINETUNING, TUNING, finetune_flow
 from sbi_rope.fit import without_warning_of_few_pairs
 from sbi_rope.rope import RoPE
 from sbi_rope.settings import Settings, check
@@ -321,16 +321,9 @@ def tuned(data: StackData, versions: Sequence[Tensor]) -> Tuned:
     return data.kept[key]
 
 
-# Learning rates of fine-tuning, by what was corrected in the net that it starts from.
-# Of several, each net takes the one that is best on the pairs that it holds out. With
-# "input" all parameters were trained already, and a smaller rate is enough. Chosen on
-# calibration data, see benchmarks/choices.md.
-LEARNING_RATES = {
-    None: (1e-3,),
-    "embedding": (1e-3,),
-    "tuned": (1e-3,),
-    "input": (3e-4,),
-}
+# How NPE is fine-tuned. Behind a corrected x all parameters were trained already, and a
+# smaller rate is enough. Chosen on calibration data, see benchmarks/choices.md.
+LEARNING_RATE, LEARNING_RATE_OF_INPUT = 1e-3, 3e-4
 # Training with rehearsal stops after so many epochs without improvement. No other
 # number was tried. What it gains on calibration data is in benchmarks/choices.md.
 REHEARSED = replace(FINETUNING, stop_after_epochs=10)
@@ -399,7 +392,6 @@ class FinetunedCandidate(Settings, Candidate):
             found = corrected(data, versions, self.space, learn_prior=True)
             start = found.flow
             behind = None if nets is None else nets.nets.then(found.constants)
-        rates = LEARNING_RATES[self.space]
         starts, jobs = [], []
         for version, rows in enumerate(versions):
             # Numbers of net and density. Versions may share either.
@@ -413,7 +405,7 @@ class FinetunedCandidate(Settings, Candidate):
             own = list(zip(members, data.holdouts(rows), strict=False))  # or none
             if self.rehearse:
                 own = own[version % max(1, len(own)) :][:1]
-            jobs += [(version, *job, nodes) for job in own for _ in rates]
+            jobs += [(version, *job, nodes) for job in own]
         if not jobs:
             return starts
         of_version, members, splits, labels = zip(*jobs, strict=True)
@@ -422,23 +414,26 @@ class FinetunedCandidate(Settings, Candidate):
         flow = start.made_of(members, behind)
         if only_densities:
             flow = start.behind_one_net([density for _, density in members])
-        histories = finetune_flow(
+        rate = LEARNING_RATE_OF_INPUT if self.space == "input" else LEARNING_RATE
+        finetune_flow(
             flow,
             labels,
             data.pairs.x,
             splits,
             training=REHEARSED if self.rehearse else FINETUNING,
-            learning_rates=list(rates) * (len(jobs) // len(rates)),
+            learning_rates=[rate] * len(jobs),
             weights=data.pairs.weight,
             rehearsed=data.simulations if self.rehearse else None,
             only_densities=only_densities,
             show_progress_bars=data.show,
         )
-        best = best_rates(histories, len(rates))
-        chosen = [[k for k in best if of_version[k] == v] for v in range(len(versions))]
+        trained = [
+            [k for k, of in enumerate(of_version) if of == version]
+            for version in range(len(versions))
+        ]
         return [
             flow[numbers] if numbers else one
-            for numbers, one in zip(chosen, starts, strict=True)
+            for numbers, one in zip(trained, starts, strict=True)
         ]
 
 

@@ -1,4 +1,4 @@
-"""Held-out scores of candidates and of their stack, and what follows from them."""
+"""The weights of candidates by their held-out scores, and what follows from these."""
 
 import math
 from collections.abc import Sequence
@@ -6,56 +6,188 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-import numpy as np
 import torch
-from scipy.stats import bootstrap, norm
-from scipy.stats import t as student
 from torch import Tensor
 
-from sbi_rope._means import counts_of, interval_of_mean, mean_and_error
+from sbi_rope._statistics import interval_of_mean, mean_and_error
 from sbi_rope.data import Counts
+from sbi_rope.errors import InvalidInputError, warn_user
 from sbi_rope.metrics import CoverageCurve
-from sbi_rope.metrics.calibration import coverage_curve_of_pairs
+from sbi_rope.metrics.calibration import coverage_curve_of
 from sbi_rope.sets.conformal import check_enough, rank_needed
-from sbi_rope.settings import Count, check, one_of
-from sbi_rope.stacking.weights import StackingWeights, stacking_weights
+from sbi_rope.settings import Count, NotNegative, Positive, check, one_of
+from sbi_rope.tensors import as_batch, as_numbers
 
 __all__ = [
     "CrossValidation",
     "Difference",
     "LearningCurve",
     "SetScores",
+    "StackingWeights",
     "fold_weights",
+    "stacking_weights",
 ]
 
-NUM_BOOTSTRAP = 2000
-# Means of resampled pairs are never outside the range of the pairs. With two, three and
-# four pairs it holds the true mean in 50, 75 and 87 % of the cases only.
-FEWEST_TO_RESAMPLE = 5
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StackingWeights:
+    """The weights of candidates, and a bound on how far they are from the best.
+
+    Attributes:
+        weights: On the simplex, shape ``(K,)``, float64.
+        score: The mean log score of the stack over the pairs that the weights were
+            fitted to. It is too high for new pairs.
+        gap: The objective, a sum over pairs, is at most this far below its maximum, in
+            nats.
+        num_iterations: The number of iterations of EM.
+        converged: Whether the gap is at most the tolerance.
+    """
+
+    weights: Tensor
+    score: float
+    gap: float
+    num_iterations: int
+    converged: bool
+
+
+def stacking_weights(
+    log_scores: Tensor,
+    *,
+    pair_weights: Tensor | None = None,
+    pseudo_count: float = 1.0,
+    tolerance: float = 1e-3,
+    max_iterations: int = 20_000,
+) -> StackingWeights:
+    r"""Return the weights whose mixture of candidates scores best on held-out pairs.
+
+    With the log score :math:`\ell_{ik}` of candidate k at pair i,
+
+    .. math::
+        \max_{w \in \Delta} \; \sum_{i=1}^{n} \log \sum_{k=1}^{K} w_k e^{\ell_{ik}}
+        + \frac{c}{K} \sum_{k=1}^{K} \log w_k ,
+
+    the mode under a Dirichlet prior with all parameters :math:`1 + c / K`. The prior
+    counts as c pairs at which all candidates share the responsibility equally. With few
+    pairs it prevents that a single candidate gets all the weight; with many pairs its
+    effect vanishes. The problem is concave, and for c > 0 the solution is unique. EM
+    starts from equal weights and repeats
+    :math:`w_k \leftarrow (\sum_i r_{ik} + c / K) / (n + c)` with the responsibilities
+    :math:`r_{ik} = w_k e^{\ell_{ik}} / \sum_m w_m e^{\ell_{im}}`.
+
+    References:
+        | Using Stacking to Average Bayesian Predictive Distributions (Yao et al., 2018)
+        | https://arxiv.org/abs/1704.02030
+
+    Args:
+        log_scores: :math:`\ell`, shape ``(n, K)``. Minus infinity is allowed, NaN and
+            plus infinity are not. A pair that has minus infinity for all candidates is
+            left out, with a warning.
+        pair_weights: How many pairs each pair counts as, shape ``(n,)``: a factor of
+            its term in the sum over i. One if None.
+        pseudo_count: c, at least 0.
+        tolerance: EM has converged when ``gap`` is at most this.
+        max_iterations: EM stops after so many iterations, converged or not.
+
+    Returns:
+        The weights.
+
+    Raises:
+        InvalidInputError: If a shape does not fit, a score is NaN or plus infinity, or
+            an argument is outside its range.
+
+    Example:
+        >>> log_scores = torch.tensor([[0.0, -9.0], [0.0, -9.0], [-9.0, 0.0]])
+        >>> stacking_weights(log_scores, pseudo_count=0.0).weights.round(decimals=3)
+        tensor([0.6670, 0.3330], dtype=torch.float64)
+    """
+    scores, of_pairs = _checked_scores(log_scores, pair_weights)
+    check("pseudo_count", pseudo_count, NotNegative)
+    check("tolerance", tolerance, Positive)
+    check("max_iterations", max_iterations, Count)
+    # Relative to the best candidate at each pair, so that exp does not over- or
+    # underflow.
+    density = (scores - scores.max(dim=1, keepdim=True).values).exp()
+    num_candidates = density.shape[1]
+    n = float(of_pairs.sum())
+    share = pseudo_count / num_candidates
+    weights = density.new_full((num_candidates,), 1.0 / num_candidates)
+    gap, iteration = math.inf, 0
+    for iteration in range(max_iterations + 1):
+        # The derivative of the objective by the weight of each candidate.
+        ratio = density / (density @ weights)[:, None]
+        gradient = (ratio * of_pairs[:, None]).sum(dim=0)
+        if share:
+            gradient = gradient + share / weights
+        # The objective is concave, so that it lies below its tangent everywhere.
+        gap = float(gradient.max()) - (n + pseudo_count)
+        if gap <= tolerance or iteration == max_iterations:
+            break
+        weights = weights * gradient
+        weights = weights / weights.sum()
+    mixed = torch.logsumexp(scores + weights.log(), dim=1)
+    return StackingWeights(
+        weights=weights,
+        score=float((of_pairs * mixed).sum() / of_pairs.sum()),  # NaN of none
+        gap=max(gap, 0.0),
+        num_iterations=iteration,
+        converged=gap <= tolerance,
+    )
+
+
+def _checked_scores(
+    log_scores: Tensor, pair_weights: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Return the scores and weights of the pairs that a candidate does not exclude."""
+    scores = as_numbers("log_scores", log_scores).double()
+    if scores.ndim != 2 or not scores.shape[1]:
+        raise InvalidInputError(
+            f"Expected `log_scores` of shape (n, K); got {tuple(scores.shape)}."
+        )
+    if bool((scores.isnan() | scores.isposinf()).any()):
+        raise InvalidInputError("Expected `log_scores` below infinity; got NaN or Inf.")
+    of_pairs = scores.new_ones(len(scores))
+    if pair_weights is not None:
+        of_pairs = as_batch("pair_weights", pair_weights, (), rows=len(scores))
+        if not bool((of_pairs > 0).all()):
+            raise InvalidInputError(
+                f"Expected positive `pair_weights`; got {float(of_pairs.min())}."
+            )
+    known = ~scores.isneginf().all(dim=1)
+    if not known.all():
+        warn_user(
+            f"{int((~known).sum())} of {len(scores)} held-out pairs have density zero "
+            "under every candidate and are left out of the weights. Add the prior as a "
+            "candidate."
+        )
+    return scores[known], of_pairs.to(scores)[known]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Difference:
-    """A mean difference of log scores, pair by pair, with its 95 % interval.
+    """A mean difference of log scores, pair by pair, and its 95 % interval.
+
+    The interval is that of Student's t, over groups if pairs belong to groups. It has
+    no ends if a difference is infinite.
 
     Attributes:
         mean: The mean over pairs.
         low: Lower end of the interval.
         high: Upper end.
-
-    The interval is a percentile interval of the bootstrap whose level is widened, as
-    the interval of Student's t is wider than that of a normal distribution. Otherwise
-    the true difference would be outside too often if there are few pairs. With fewer
-    than five pairs it is the interval of Student's t itself.
-
-    References:
-        | What Teachers Should Know about the Bootstrap (Hesterberg, 2015), section 4.4
-        | https://arxiv.org/abs/1411.5279
     """
 
     mean: float
     low: float
     high: float
+
+    @classmethod
+    def of(cls, difference: Tensor, counts: Counts | None) -> "Difference":
+        """Return the mean of the differences of all pairs, shape ``(n,)``."""
+        # Where both scores are minus infinity, neither candidate is better.
+        difference = difference.nan_to_num(nan=0.0, posinf=torch.inf, neginf=-torch.inf)
+        mean, low, high = interval_of_mean(difference, counts)
+        if torch.isinf(difference).any():
+            low, high = -math.inf, math.inf
+        return cls(mean=mean, low=low, high=high)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -135,11 +267,10 @@ class CrossValidation:
             shape ``(n,)``.
         set_scores: The scores that sets with a guarantee are made from; None if no
             label is exact.
-        pair_weights: How many pairs each pair counts as, shape ``(n,)``. Pairs of one
-            group share the weight of one. None if all count as one.
-        groups: A number for each pair, the same for pairs of one person or specimen,
-            shape ``(n,)``; None if all differ. Errors and intervals are those of means
-            of groups, because pairs of a group are not independent.
+        counts: How many pairs each pair counts as, and which belong to one group, such
+            as one person or specimen; None if all are independent and count as one.
+            Pairs of a group share the weight of one. Errors and intervals are those of
+            means of groups, because pairs of a group are not independent.
         score_errors: The Monte-Carlo errors of ``stack_scores``, if labels are not
             exact.
         labels: What is known of labels that are not exact, or weighted, in words.
@@ -159,8 +290,7 @@ class CrossValidation:
     estimates: Tensor = field(repr=False)
     ranks: Tensor = field(repr=False)
     log_unit: float | Tensor = float("nan")
-    pair_weights: Tensor | None = field(default=None, repr=False)
-    groups: Tensor | None = field(default=None, repr=False)
+    counts: Counts | None = field(default=None, repr=False)
     score_errors: Tensor | None = field(default=None, repr=False)
     labels: str = ""
     set_scores: SetScores | None = field(default=None, repr=False)
@@ -173,21 +303,23 @@ class CrossValidation:
         """The number of folds."""
         return int(self.fold.max()) + 1
 
+    @property
+    def groups(self) -> Tensor | None:
+        """The number of the group of each pair; None if all are independent."""
+        return None if self.counts is None else self.counts.groups
+
     @cached_property
     def weights(self) -> StackingWeights:
         """The weights of the candidates, fitted to all pairs."""
-        return stacking_weights(self.log_scores, pair_weights=self.pair_weights)
-
-    @property
-    def counts(self) -> Counts | None:
-        """How many pairs each counts as; None if all are independent and count one."""
-        return counts_of(self.pair_weights, self.groups)
+        weights = None if self.counts is None else self.counts.weights
+        return stacking_weights(self.log_scores, pair_weights=weights)
 
     @property
     def effective_number(self) -> float:
         """The number of independent pairs of equal weight with the same precision."""
-        counts = self.counts
-        return float(len(self)) if counts is None else counts.effective_number
+        if self.counts is None:
+            return float(len(self))
+        return self.counts.effective_number
 
     @property
     def monte_carlo_error(self) -> float:
@@ -195,8 +327,8 @@ class CrossValidation:
         if self.score_errors is None:
             return 0.0
         weights = torch.ones_like(self.score_errors)
-        if self.pair_weights is not None:
-            weights = self.pair_weights.to(weights)
+        if self.counts is not None:
+            weights = self.counts.weights.to(weights)
         return float((weights * self.score_errors).norm() / weights.sum())
 
     def in_units_of_prior(self, scores: Tensor) -> Tensor:
@@ -215,15 +347,13 @@ class CrossValidation:
         The scores of the candidates are not corrected either, so that the two can be
         compared.
         """
-        weights = fold_weights(
-            self.log_scores, self.fold, pair_weights=self.pair_weights
-        )
+        weights = fold_weights(self.log_scores, self.fold, self.counts)
         return torch.logsumexp(self.log_scores + weights[self.fold].log(), dim=1)
 
     @property
     def coverage(self) -> CoverageCurve:
         """Coverage of the stack's central intervals on held-out pairs."""
-        return coverage_curve_of_pairs(self.levels, self.counts)
+        return coverage_curve_of(self.levels, self.counts)
 
     def scores_of(self, name: str) -> Tensor:
         """Return the log scores of a candidate, or of "stack", shape ``(n,)``.
@@ -248,7 +378,7 @@ class CrossValidation:
         Raises:
             InvalidInputError: If there is no candidate of that name.
         """
-        return self._difference(self.scores_of(name) - self.scores_of(other))
+        return Difference.of(self.scores_of(name) - self.scores_of(other), self.counts)
 
     def gain_over_prior(self) -> Difference:
         """Return by how much the normalised stack scores higher than the prior.
@@ -259,36 +389,7 @@ class CrossValidation:
         Raises:
             InvalidInputError: If "prior" is not among the candidates.
         """
-        return self._difference(self.stack_scores - self.scores_of("prior"))
-
-    def _difference(self, difference: Tensor) -> Difference:
-        # Where both scores are minus infinity, neither candidate is better.
-        difference = difference.nan_to_num(nan=0.0, posinf=torch.inf, neginf=-torch.inf)
-        mean, low, high = interval_of_mean(difference, self.counts)
-        n = self.effective_number
-        if n < FEWEST_TO_RESAMPLE and math.isfinite(high - low):
-            return Difference(mean=mean, low=low, high=high)
-        data: tuple[Any, ...] = (difference.cpu().numpy(),)
-        statistic: Any = np.mean
-        if (counts := self.counts) is not None:
-            data = tuple(
-                values.cpu().numpy() for values in counts.of_groups(difference)
-            )
-            statistic = _weighted_mean
-        with np.errstate(invalid="ignore"):  # of infinite means
-            means = bootstrap(
-                data,
-                statistic,
-                n_resamples=NUM_BOOTSTRAP,
-                paired=len(data) > 1,
-                method="percentile",
-                rng=np.random.default_rng(0),
-            ).bootstrap_distribution
-        # SciPy's own interval interpolates between two means, of which one may be
-        # infinite. These quantiles are always one of the means.
-        tail = _expanded_tail(n)
-        low, high = np.quantile(means, [tail, 1 - tail], method="inverted_cdf")
-        return Difference(mean=mean, low=float(low), high=float(high))
+        return Difference.of(self.stack_scores - self.scores_of("prior"), self.counts)
 
     def as_rows(self) -> list[dict[str, Any]]:
         """Return a row for each candidate: name, family, weight, scores, errors.
@@ -312,39 +413,17 @@ class CrossValidation:
         return rows
 
 
-def _weighted_mean(values: Any, weights: Any, axis: int = -1) -> Any:
-    return (weights * values).sum(axis=axis) / weights.sum(axis=axis)
-
-
-def _expanded_tail(n: float) -> float:
-    """Return the tail of a percentile interval that is as wide as one of Student's t.
-
-    The bootstrap's standard error lacks the factor of n / (n - 1), and percentiles do
-    not know that it is an estimate.
-    """
-    n = max(n, 2.0)  # of weights of which one is far above the others
-    return float(norm.sf((n / (n - 1)) ** 0.5 * student.ppf(0.975, n - 1)))
-
-
-def fold_weights(
-    log_scores: Tensor,
-    fold: Tensor,
-    *,
-    pair_weights: Tensor | None = None,
-) -> Tensor:
+def fold_weights(log_scores: Tensor, fold: Tensor, counts: Counts | None) -> Tensor:
     """Return the weights fitted without each of the F folds, shape ``(F, K)``."""
-    numbers: Sequence[int] = range(int(fold.max()) + 1)
-    return torch.stack(
-        [
-            stacking_weights(
-                log_scores[fold != number],
-                pair_weights=(
-                    None if pair_weights is None else pair_weights[fold != number]
-                ),
-            ).weights.to(log_scores)
-            for number in numbers
-        ]
-    )
+    without = [fold != number for number in range(int(fold.max()) + 1)]
+    found = [
+        stacking_weights(
+            log_scores[rows],
+            pair_weights=None if counts is None else counts.weights[rows],
+        )
+        for rows in without
+    ]
+    return torch.stack([one.weights for one in found]).to(log_scores)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -355,15 +434,12 @@ class LearningCurve:
         num_pairs: The numbers of pairs that the candidates were trained on, ascending.
         pair_scores: The log score of the stack at each of n held-out pairs, for each
             number of pairs, with theta in its own units, shape ``(P, n)``.
-        pair_weights: How many pairs each held-out pair counts as, shape ``(n,)``; None
-            if all count as one.
-        groups: As in :class:`CrossValidation`.
+        counts: As in :class:`CrossValidation`.
     """
 
     num_pairs: tuple[int, ...]
     pair_scores: Tensor = field(repr=False)
-    pair_weights: Tensor | None = field(default=None, repr=False)
-    groups: Tensor | None = field(default=None, repr=False)
+    counts: Counts | None = field(default=None, repr=False)
 
     @classmethod
     def of(cls, parts: Sequence[CrossValidation]) -> "LearningCurve":
@@ -371,8 +447,7 @@ class LearningCurve:
         return cls(
             num_pairs=tuple(part.num_trained_on for part in parts),
             pair_scores=torch.stack([part.stack_scores.double() for part in parts]),
-            pair_weights=parts[0].pair_weights,
-            groups=parts[0].groups,
+            counts=parts[0].counts,
         )
 
     @property
@@ -423,19 +498,14 @@ class LearningCurve:
         last = self.num_pairs[-1]
         n = self.num_labels
         scale = 1 / last - n / (last * (n + num_more))
-        mean, low, high = interval_of_mean(scale * slopes, self._counts)
-        return Difference(mean=mean, low=low, high=high)
+        return Difference.of(scale * slopes, self.counts)
 
     @property
     def num_labels(self) -> int:
         """The number of pairs, or of their groups."""
-        if self.groups is None:
+        if self.counts is None or self.counts.groups is None:
             return self.pair_scores.shape[1]
-        return len(self.groups.unique())
-
-    @property
-    def _counts(self) -> Counts | None:
-        return counts_of(self.pair_weights, self.groups)
+        return len(self.counts.groups.unique())
 
     def _mean_and_error(self, values: Tensor) -> tuple[float, float]:
-        return mean_and_error(values, self._counts)
+        return mean_and_error(values, self.counts)

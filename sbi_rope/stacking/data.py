@@ -11,16 +11,16 @@ from torch import Tensor, nn
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed, estimator_of
 from sbi_rope._standardisation import Standardisation
+from sbi_rope.data import Nodes
 from sbi_rope.density.base import Density
-from sbi_rope.discrepancy.correction import Space
+from sbi_rope.discrepancy.correction import Space, tuning_targets
 from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.parameters import learn_parameters
 from sbi_rope.discrepancy.report import DiscrepancyReport, report_discrepancy
-from sbi_rope.discrepancy.targets import tuning_targets
 from sbi_rope.errors import NotReadyError
-from sbi_rope.labels import Nodes, nodes_of, reference_of
-from sbi_rope.moments import Moments, moments
+from sbi_rope.labels import nodes_of, reference_of
 from sbi_rope.rope import RoPE
+from sbi_rope.simulate import Moments, moments
 
 __all__ = ["StackData", "draw_seeds"]
 

@@ -1,17 +1,13 @@
 """The report of a stack: whether calibration helped, and how well it is calibrated."""
 
-import platform
-import time
 from collections.abc import Sequence
-from dataclasses import dataclass
-from datetime import datetime, timezone
-from importlib import import_module
+from dataclasses import dataclass, field
 from os import PathLike
 from typing import Any
 
 from torch import Tensor
 
-from sbi_rope._two_sample import TwoSampleTest
+from sbi_rope._statistics import TwoSampleTest
 from sbi_rope.data import groups_of, one_of_each_group
 from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.metrics import (
@@ -20,8 +16,8 @@ from sbi_rope.metrics import (
     CoverageCurve,
     CoverageErrorScore,
 )
-from sbi_rope.metrics.by_estimate import coverage_by_estimate_of_pairs
-from sbi_rope.metrics.calibration import acauc_of_pairs, coverage_error_of_pairs
+from sbi_rope.metrics.by_estimate import coverage_by_estimate
+from sbi_rope.metrics.calibration import acauc_of, expected_coverage_error_of
 from sbi_rope.sets.conformal import rank_needed
 from sbi_rope.settings import check
 from sbi_rope.stacking.cross_validation import (
@@ -32,64 +28,7 @@ from sbi_rope.stacking.cross_validation import (
 )
 from sbi_rope.stacking.words import LEVEL, REFERENCES, lines_of
 
-__all__ = ["Provenance", "StackingReport"]
-
-
-# Modules, which all know their version, and the names of their packages.
-PACKAGES = {
-    "sbi_rope": "sbi-rope",
-    "sbi": "sbi",
-    "torch": "torch",
-    "numpy": "numpy",
-    "scipy": "scipy",
-    "ot": "POT",
-}
-
-
-@dataclass(frozen=True, kw_only=True)
-class Provenance:
-    """How a stack was made.
-
-    Attributes:
-        seed: The seed that was given; None if the states of torch, NumPy and Python
-            were used.
-        seconds: How long it took.
-        num_simulator_calls: How many simulations the simulator made for it; 0 if all
-            were there already.
-        finished: When it was finished, in UTC, such as "2026-01-31 12:00 UTC".
-        versions: The versions of Python and of packages, by name.
-    """
-
-    seed: int | None
-    seconds: float
-    num_simulator_calls: int
-    finished: str
-    versions: dict[str, str]
-
-    @classmethod
-    def since(
-        cls, start: float, *, seed: int | None, num_simulator_calls: int
-    ) -> "Provenance":
-        """Return how a stack was made that is finished now.
-
-        Args:
-            start: What ``time.perf_counter()`` returned when it was begun.
-            seed: The seed that the user gave.
-            num_simulator_calls: How many simulations were made for it.
-        """
-        return cls(
-            seed=None if seed is None else int(seed),
-            seconds=time.perf_counter() - start,
-            num_simulator_calls=num_simulator_calls,
-            finished=datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
-            versions={
-                "Python": platform.python_version(),
-                **{
-                    package: str(import_module(module).__version__)
-                    for module, package in PACKAGES.items()
-                },
-            },
-        )
+__all__ = ["StackingReport"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -128,7 +67,8 @@ class StackingReport:
             it, or with fewer than five of either.
         discrepancy: What the pairs say about each entry of x. None if the stack has no
             discrepancy among its candidates, or x is not a short vector.
-        provenance: The seed, the seconds and the versions, if they are known.
+        provenance: How it was made, in words: the seed, the seconds, the simulator
+            calls, when it was finished, and the versions of packages.
         acauc_of_parameters: ACAUC of each parameter by itself. The intervals are so
             wide that those of d calibrated parameters all hold 0 in at least 95 % of
             the cases (Bonferroni).
@@ -157,7 +97,7 @@ class StackingReport:
     joint_sets: tuple[float, float] | None = None
     batch: TwoSampleTest | None = None
     discrepancy: DiscrepancyReport | None = None
-    provenance: Provenance | None = None
+    provenance: dict[str, str] = field(default_factory=dict, repr=False)
     probability_of_prior: float | None = None
     learns_prior: bool = True
     parameter_names: tuple[str, ...] | None = None
@@ -196,8 +136,8 @@ class StackingReport:
                 if name in scores.names
             },
             family_weights=_family_weights(scores),
-            acauc=acauc_of_pairs(levels, scores.counts),
-            coverage_error=coverage_error_of_pairs(levels, scores.counts),
+            acauc=acauc_of(levels, scores.counts),
+            coverage_error=expected_coverage_error_of(levels, scores.counts),
             share_inside=float(scores.coverage.average[round(100 * LEVEL) - 1]),
             joint_sets=_joint_sets(scores.set_scores),
             acauc_of_parameters=_acauc_of_parameters(scores),
@@ -270,8 +210,7 @@ def _acauc_of_parameters(scores: CrossValidation) -> tuple[ACAUCScore, ...]:
     columns = scores.levels.split(1, dim=1)
     confidence = 1 - 0.05 / len(columns)
     return tuple(
-        acauc_of_pairs(column, scores.counts, confidence=confidence)
-        for column in columns
+        acauc_of(column, scores.counts, confidence=confidence) for column in columns
     )
 
 
@@ -279,7 +218,7 @@ def _by_estimate(scores: CrossValidation) -> CoverageByEstimate:
     chosen = None
     if scores.groups is not None:
         chosen = one_of_each_group(groups_of(scores.groups), seed=0)
-    return coverage_by_estimate_of_pairs(
+    return coverage_by_estimate(
         scores.ranks, scores.estimates, scores.counts, chosen=chosen, level=LEVEL
     )
 

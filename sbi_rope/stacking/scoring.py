@@ -2,18 +2,19 @@
 
 import contextlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from sbi_rope._prior import log_units_of
 from sbi_rope._random import seeded
-from sbi_rope._units import log_units_of
-from sbi_rope.data import Labels, groups_of, one_of_each_group
+from sbi_rope.data import Counts, Labels, Nodes, groups_of, one_of_each_group
 from sbi_rope.density import Density, Mixture, MixturePosterior
 from sbi_rope.density.base import without_nan
 from sbi_rope.errors import SamplingError, warn_user
-from sbi_rope.labels import Nodes, nodes_of, reference_of
+from sbi_rope.labels import nodes_of, reference_of
 from sbi_rope.metrics.by_estimate import estimates_and_ranks
 from sbi_rope.metrics.calibration import central_levels, count_ranks, random_ranks
 from sbi_rope.metrics.calls import draw_chunks, draw_samples
@@ -25,9 +26,9 @@ from sbi_rope.stacking.cross_validation import (
     fold_weights,
 )
 from sbi_rope.stacking.data import StackData
-from sbi_rope.stacking.versions import fold_posterior
+from sbi_rope.stacking.posterior import fold_posterior
 
-__all__ = ["FoldScores", "LabelScores", "label_levels", "score_fold", "score_folds"]
+__all__ = ["score_folds"]
 
 # Samples at each held-out pair, from which the calibration of the stack is computed,
 # and for how many observations at a time they are drawn.
@@ -37,18 +38,11 @@ NUM_SAMPLES, MAX_OBSERVATIONS = 250, 500
 NUM_REFERENCES, NUM_NODES = 200, 512
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class FoldScores:
-    """Scores of a stack at held-out pairs.
+class FoldScores(NamedTuple):
+    """Scores of a stack at held-out pairs, as in ``CrossValidation``, ``SetScores``.
 
-    Attributes:
-        log_prob: The log density, normalised inside the prior's support, ``(n,)``.
-        levels: As in :class:`~sbi_rope.stacking.CrossValidation`, ``(n, d)``.
-        estimates: As in :class:`~sbi_rope.stacking.CrossValidation`, ``(n, d)``.
-        ranks: As in :class:`~sbi_rope.stacking.CrossValidation`, ``(n, d)``.
-        joint: As in :class:`SetScores`.
-        marginal: As in :class:`SetScores`.
-        errors: The Monte-Carlo errors of ``log_prob``, zero for exact labels, ``(n,)``.
+    ``log_prob`` is normalised inside the prior's support. Its Monte-Carlo ``errors``
+    are zero for exact labels.
     """
 
     log_prob: Tensor
@@ -60,32 +54,17 @@ class FoldScores:
     errors: Tensor
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class LabelScores:
-    """The densities of candidates at the nodes of the labels of one fold.
-
-    Attributes:
-        nodes: The nodes.
-        log_q: The log density of each candidate at the nodes, shape ``(n, S, K)``.
-    """
+    """The densities of K candidates at the nodes of labels, ``(n, S, K)``."""
 
     nodes: Nodes
     log_q: Tensor
 
-    @property
-    def of_candidates(self) -> Tensor:
-        """The log density of each label under each candidate, shape ``(n, K)``."""
-        return self.nodes.log_mean(self.log_q)
-
     def of_stack(self, weights: Tensor) -> tuple[Tensor, Tensor]:
         """Return the log density of each label under a mixture, and its error.
 
-        Args:
-            weights: The weights of the candidates, shape ``(K,)``.
-
-        Returns:
-            The log densities, not corrected for leakage, and their Monte-Carlo errors,
-            both of shape ``(n,)``.
+        They are not corrected for leakage. Both have the shape ``(n,)``.
         """
         log_q = (self.log_q + weights.to(self.log_q).log()).logsumexp(dim=2)
         return self.nodes.log_mean(log_q), self.nodes.standard_error(log_q)
@@ -112,16 +91,23 @@ def score_folds(
     of_folds = [[one[k] for one in fitted] for k in range(len(data.folds))]
     log_scores = weight.new_empty(len(data), len(fitted))
     fold = torch.empty_like(pairs.group)
-    of_labels = [_score_labels(data, of_one, k) for k, of_one in enumerate(of_folds)]
+    of_labels = [_at_labels(data, of_one, k) for k, of_one in enumerate(of_folds)]
     for k, rows in enumerate(data.folds):
-        fold[rows], log_scores[rows] = k, of_labels[k].of_candidates
-    weights = fold_weights(log_scores, fold, pair_weights=weight)
-    of_stack = _joined(
-        [
-            _score_fold(data, of_folds[k], weights[k], of_labels[k], k, seed=seed)
-            for k in range(len(data.folds))
-        ],
-        torch.cat(data.folds).argsort(),
+        fold[rows], log_scores[rows] = (
+            k,
+            of_labels[k].nodes.log_mean(of_labels[k].log_q),
+        )
+    counts = None
+    if bool((weight != 1).any()) or pairs.num_groups < len(pairs):
+        counts = Counts(weight, pairs.group if pairs.num_groups < len(pairs) else None)
+    weights = fold_weights(log_scores, fold, counts)
+    of_stacks = [
+        _score_fold(data, of_folds[k], weights[k], of_labels[k], k, seed=seed)
+        for k in range(len(data.folds))
+    ]
+    order = torch.cat(data.folds).argsort()
+    of_stack = FoldScores(
+        *(torch.cat(parts)[order] for parts in zip(*of_stacks, strict=True))
     )
     is_simple = pairs.are_exact and bool((pairs.weight == 1).all())
     scores = CrossValidation(
@@ -136,8 +122,7 @@ def score_folds(
         ranks=of_stack.ranks,
         set_scores=_set_scores(data, of_stack, weights, seed=seed),
         log_unit=_log_unit(data),
-        pair_weights=weight if bool((weight != 1).any()) else None,
-        groups=pairs.group if pairs.num_groups < len(pairs) else None,
+        counts=counts,
         score_errors=None if pairs.are_exact else of_stack.errors,
         labels="" if is_simple else str(pairs),
     )
@@ -161,34 +146,13 @@ def _score_fold(
 ) -> FoldScores:
     """Score the stack that has not seen a fold at the pairs of the fold."""
     rows = data.folds[number]
+    x, labels = data.pairs.x[rows], data.pairs.label[rows]
     posterior = fold_posterior(Mixture(densities, weights), data.prior)
-    if data.pairs.are_exact:
-        return score_fold(
-            posterior,
-            data.pairs.mean[rows],
-            data.pairs.x[rows],
-            num_samples=NUM_SAMPLES,
-            seed=seed,
-        )
-    return _score_labelled_fold(
-        posterior,
-        of_labels,
-        weights,
-        data.pairs.label[rows],
-        data.pairs.x[rows],
-        num_samples=NUM_SAMPLES,
-        seed=seed,
-    )
-
-
-def _joined(parts: Sequence[FoldScores], order: Tensor) -> FoldScores:
-    """Return the scores of all folds in the order of the pairs."""
-    return FoldScores(
-        **{
-            entry.name: torch.cat([getattr(one, entry.name) for one in parts])[order]
-            for entry in fields(FoldScores)
-        }
-    )
+    with _explained():
+        if data.pairs.are_exact:
+            return _score_exact(posterior, data.pairs.mean[rows], x, seed=seed)
+        scores = of_labels.of_stack(weights)
+        return _score_labels(posterior, scores, labels, x, seed=seed)
 
 
 def _set_scores(
@@ -225,26 +189,17 @@ def _log_unit(data: StackData) -> float | Tensor:
 
 
 @torch.no_grad()
-def score_fold(
-    posterior: MixturePosterior,
-    theta: Tensor,
-    x: Tensor,
-    *,
-    num_samples: int,
-    seed: int,
+def _score_exact(
+    posterior: MixturePosterior, theta: Tensor, x: Tensor, *, seed: int
 ) -> FoldScores:
-    """Score the posterior of a fold at the pairs of the fold.
-
-    Raises:
-        SamplingError: If the posterior has almost no mass inside the prior's support.
-    """
+    """Score the posterior of a fold at labels that are exact."""
     log_prob, levels, joint, marginal, by_estimate = [], [], [], [], []
-    with _explained(), seeded(seed):
+    with seeded(seed):
         chunks = draw_chunks(
             posterior,
             theta,
             x,
-            num_samples=num_samples,
+            num_samples=NUM_SAMPLES,
             chunk_size=MAX_OBSERVATIONS,
             show=False,
         )
@@ -284,10 +239,10 @@ def _explained() -> Iterator[None]:
 
 
 @torch.no_grad()
-def _score_labels(
+def _at_labels(
     data: StackData, densities: Sequence[Density], number: int
 ) -> LabelScores:
-    """Score all candidates on the labels of a fold that they were not trained on.
+    """Return the densities of all candidates at the labels of a fold.
 
     Nodes come from the samples of each candidate, so that none is scored at parameters
     that only others consider plausible.
@@ -305,83 +260,49 @@ def _score_labels(
             )
     theta = nodes.theta.movedim(1, 0)
     log_q = [without_nan(one.log_prob(theta, x)).double().T for one in densities]
-    return LabelScores(nodes=nodes, log_q=torch.stack(log_q, dim=2))
+    return LabelScores(nodes, torch.stack(log_q, dim=2))
 
 
 @torch.no_grad()
-def _score_labelled_fold(
+def _score_labels(
     posterior: MixturePosterior,
-    scores: LabelScores,
-    weights: Tensor,
+    scores: tuple[Tensor, Tensor],
     labels: Labels,
     x: Tensor,
     *,
-    num_samples: int,
     seed: int,
 ) -> FoldScores:
-    """Score the posterior of a fold at labels that are not exact.
+    """Score the posterior of a fold at labels that are not all exact.
 
-    Returns:
-        The scores. Those of sets are NaN where a label is not exact: a set that holds
-        a label need not hold the parameters.
-
-    Raises:
-        SamplingError: If the posterior has almost no mass inside the prior's support.
+    Draws of the posterior get the noise of a label, so that its levels are uniform if
+    the posterior is calibrated. They test it less the larger the noise is. Levels and
+    ranks are NaN for parameters that were not measured, and for labels given as draws.
+    Scores of sets are NaN where a label is not exact: a set that holds a label need not
+    hold the parameters.
     """
-    log_prob, errors = scores.of_stack(weights)
-    with _explained(), seeded(seed):
-        log_mass = posterior.leakage_correction(x).double().log()
-        levels, estimates, ranks = label_levels(
-            posterior, labels, x, num_samples=num_samples
-        )
+    log_prob, errors = scores
+    log_mass = posterior.leakage_correction(x).double().log()
+    std = labels.covariance.diagonal(dim1=1, dim2=2).sqrt()
+    with seeded(seed):
+        samples = draw_samples(posterior, x, num_samples=NUM_SAMPLES)
+        measured = samples + std.to(samples) * torch.randn_like(samples)
+    known = labels.is_measured & (not labels.are_drawn)
+    levels = central_levels(count_ranks(measured, labels.y)).to(labels.y)
+    estimates, ranks = estimates_and_ranks(measured, labels.y)
+    levels, ranks = (
+        one.to(labels.y).where(known, torch.nan) for one in (levels, ranks)
+    )
     marginal = torch.full_like(labels.y, torch.nan)
     joint = torch.full_like(log_prob, torch.nan)
     if (exact := labels.is_exact).any():
-        known = score_fold(
-            posterior, labels.y[exact], x[exact], num_samples=num_samples, seed=seed
-        )
-        joint[exact], marginal[exact] = known.joint, known.marginal.to(marginal)
+        at_exact = _score_exact(posterior, labels.y[exact], x[exact], seed=seed)
+        joint[exact], marginal[exact] = at_exact.joint, at_exact.marginal.to(marginal)
     return FoldScores(
         log_prob=log_prob - log_mass,
         levels=levels,
-        estimates=estimates,
+        estimates=estimates.to(labels.y),
         ranks=ranks,
         joint=joint,
         marginal=marginal,
         errors=errors,
-    )
-
-
-def label_levels(
-    posterior: MixturePosterior, labels: Labels, x: Tensor, *, num_samples: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    r"""Return the levels of the central intervals of labels that end at them.
-
-    For a noisy label this is the interval of the measurement, not of the parameter:
-    draws of the posterior get the noise of the label. The levels are uniform if the
-    posterior is calibrated, and their test of it is weaker the larger the noise is.
-
-    Args:
-        posterior: The posterior.
-        labels: The labels.
-        x: Their observations, shape ``(n, *event)``.
-        num_samples: The number of draws for each observation.
-
-    Returns:
-        The levels, the means of the posterior and the ranks of the labels, each of
-        shape ``(n, d)``. Levels and ranks are NaN for parameters that were not
-        measured, and for labels given as draws.
-    """
-    unknown = torch.full_like(labels.y, torch.nan)
-    if labels.are_drawn:
-        return unknown, unknown, unknown
-    samples = draw_samples(posterior, x, num_samples=num_samples)
-    std = labels.covariance.diagonal(dim1=1, dim2=2).sqrt().to(samples)
-    measured = samples + std * torch.randn_like(samples)
-    levels = central_levels(count_ranks(measured, labels.y)).to(labels.y)
-    estimates, ranks = estimates_and_ranks(measured, labels.y)
-    return (
-        levels.where(labels.is_measured, torch.nan),
-        estimates.to(labels.y),
-        ranks.to(labels.y).where(labels.is_measured, torch.nan),
     )

@@ -2,6 +2,8 @@
 
 import time
 from collections.abc import Sequence
+from datetime import datetime, timezone
+from importlib.metadata import version
 from typing import Annotated, Any
 
 import torch
@@ -11,7 +13,7 @@ from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import check_density, embed
 from sbi_rope._standardisation import warn_of_far_entries
-from sbi_rope._two_sample import TwoSampleTest, compare_with_pairs
+from sbi_rope._statistics import TwoSampleTest, compare_with_pairs
 from sbi_rope.density import Density
 from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.errors import warn_user
@@ -24,15 +26,16 @@ from sbi_rope.stacking.candidates import (
 )
 from sbi_rope.stacking.cross_validation import CrossValidation, LearningCurve
 from sbi_rope.stacking.data import NUM_FOLDS, StackData, draw_seeds
-from sbi_rope.stacking.posterior import StackedPosterior
-from sbi_rope.stacking.report import Provenance, StackingReport
+from sbi_rope.stacking.posterior import StackedPosterior, Versions
+from sbi_rope.stacking.report import StackingReport
 from sbi_rope.stacking.scoring import score_folds
-from sbi_rope.stacking.versions import Versions
 
 __all__ = ["stack"]
 
 # The learning curve trains on these shares of the folds, and on all folds but one.
 SMALLER = (0.25, 0.5)
+# The report says which versions of these made it.
+PACKAGES = "sbi-rope", "sbi", "torch", "numpy", "scipy", "POT"
 
 
 def stack(
@@ -149,9 +152,13 @@ def stack(
         probability_of_prior=data.probability_of_prior(),
         learns_prior=any(one.learns_prior for one in stacked),
         parameter_names=rope.parameter_names,
-        provenance=Provenance.since(
-            start, seed=seed, num_simulator_calls=rope.num_simulator_calls - calls
-        ),
+        provenance={
+            "seed": "none, so that a repetition differs" if seed is None else str(seed),
+            "seconds": f"{time.perf_counter() - start:.0f}",
+            "simulator calls": f"{rope.num_simulator_calls - calls:,}",
+            "finished": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
+            "versions": ", ".join(f"{name} {version(name)}" for name in PACKAGES),
+        },
     )
     posterior = StackedPosterior(
         [Versions.of(one) for one in fitted],

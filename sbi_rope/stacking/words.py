@@ -382,7 +382,7 @@ def gains_of(curve: LearningCurve) -> list[str]:
         more: curve.gain(more) for more in dict.fromkeys((FEW_MORE, curve.num_labels))
     }
     size = curve.pair_scores.shape[1] / curve.num_labels
-    kind = "labels" if curve.groups is None else f"groups of {size:.3g} pairs"
+    kind = "labels" if size == 1 else f"groups of {size:.3g} pairs"
     lines = [
         f"{more} more {kind} might add {gain.mean:.2f} nats a pair (95 % interval "
         f"{gain.low:.2f} to {gain.high:.2f})"
@@ -394,9 +394,9 @@ def gains_of(curve: LearningCurve) -> list[str]:
 
 def _what_it_took(report: "StackingReport") -> list[str]:
     made = report.provenance
-    if made is None:
+    if not made:
         return []
     return [
-        f"  made in {made.seconds:.0f} seconds with {made.num_simulator_calls:,} calls "
-        "of the simulator"
+        f"  made in {made['seconds']} seconds with {made['simulator calls']} calls of "
+        "the simulator"
     ]

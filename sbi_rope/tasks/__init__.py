@@ -1,7 +1,10 @@
 """Benchmarks of inference under a misspecified simulator.
 
 Each task is a prior, a simulator, an embedding network, and real observations with
-known parameters; see :class:`Task`.
+known parameters; see :class:`Task`. "The paper" is Addressing Misspecification in
+Simulation-based Inference through Data-driven Calibration (Wehenkel et al.,
+https://arxiv.org/abs/2405.08719). What is not as printed there is listed in
+``docs/background/paper.md``.
 """
 
 from pathlib import Path

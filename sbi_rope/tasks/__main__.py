@@ -6,7 +6,6 @@ them, with prior-predictive summaries; ``--plot FILE`` draws real beside simulat
 
 import argparse
 import dataclasses
-import os
 import sys
 import time
 from collections.abc import Sequence
@@ -18,7 +17,7 @@ from torch import Tensor
 from sbi_rope.errors import RoPEError
 from sbi_rope.tasks import Task, get_task, list_tasks
 
-__all__ = ["main"]
+__all__ = ["main", "print_table"]
 
 QUANTILES = (0.01, 0.25, 0.5, 0.75, 0.99)
 NUM_ROWS = 1000
@@ -63,8 +62,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _describe(task, theta, x_s, real)
             if args.plot and real:
                 _draw(task, *real, path=args.plot, seed=args.seed)
-    except BrokenPipeError:
-        raise
     except (RoPEError, ImportError, OSError) as error:
         print(f"{parser.prog}: {error}", file=sys.stderr)
         return 2
@@ -124,11 +121,11 @@ def _describe(
         name if unit == "1" else f"{name} [{unit}]": theta[:, k]
         for k, (name, unit) in enumerate(units.items())
     }
-    _print_table(f"prior ({n} draws)", columns)
-    _print_table(f"simulated x ({n} draws)", _summaries(task, x_s))
+    print_table(f"prior ({n} draws)", columns)
+    print_table(f"simulated x ({n} draws)", _summaries(task, x_s))
     if real:
         title = f"{_kind(task)} x ({n} test observations)"
-        _print_table(title, _summaries(task, real[1]))
+        print_table(title, _summaries(task, real[1]))
     else:
         files = ", ".join(map(str, task.required_files))
         print(f"No real x: {files} not found; give its folder as --root.\n")
@@ -164,7 +161,8 @@ def _summaries(task: Task, x: Tensor) -> dict[str, Tensor]:
     }
 
 
-def _print_table(title: str, columns: dict[str, Tensor]) -> None:
+def print_table(title: str, columns: dict[str, Tensor]) -> None:
+    """Print mean, standard deviation and quantiles of named numbers."""
     head = "".join(f"{f'q{100 * q:02.0f}':>11}" for q in QUANTILES)
     print(f"{title:<34}{'mean':>11}{'sd':>11}{head}")
     for name, values in columns.items():
@@ -193,10 +191,4 @@ def _draw(task: Task, theta: Tensor, x_o: Tensor, *, path: Path, seed: int) -> N
 
 
 if __name__ == "__main__":
-    try:
-        status = main()
-        sys.stdout.flush()
-    except BrokenPipeError:  # the reader, `head` for one, has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        status = 1
-    sys.exit(status)
+    sys.exit(main())

@@ -154,7 +154,7 @@ class Task(ABC):
     def get_simulator(self) -> Simulator:
         """Return the simulator, from theta ``(n, d)`` to x ``(n, *x_shape)``.
 
-        It draws from torch's global generator, on the device of theta.
+        It draws from torch's global generator.
         """
 
     @abstractmethod
@@ -240,8 +240,7 @@ class Task(ABC):
     def _take(self, n: int, *, seed: int, part: Part) -> tuple[Tensor, Tensor]:
         check("n", n, Count)
         check("seed", seed, Annotated[int, Range(0, MAX_SEED - 1)])
-        # Whatever torch's default device: every machine has the same sets. Integers of
-        # NumPy would overflow in the arithmetic of streams.
+        # Every machine has the same sets. Integers of NumPy would overflow in streams.
         with torch.device("cpu"):
             process = self._process_of(part)
             return process.take(

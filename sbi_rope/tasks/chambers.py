@@ -14,13 +14,14 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from sbi_rope.errors import DataNotFoundError, InvalidInputError
 from sbi_rope.tensors import as_batch
 
-__all__ = ["find_file", "find_images", "read_columns", "read_images", "read_table"]
+__all__ = ["find_file", "read_columns", "read_images", "read_table"]
 
 DATASETS_PAGE = "https://github.com/juangamella/causal-chamber/tree/main/datasets"
 
@@ -48,12 +49,24 @@ def find_file(file: Path, *, root: Path | None, download: bool = False) -> Path:
     return root / file
 
 
-def read_table(path: Path, columns: Sequence[str]) -> Any:
-    """Read columns of a CSV file as a pandas table.
+def read_columns(path: Path, columns: Sequence[str]) -> Tensor:
+    """Read columns of numbers of a CSV file with any number of rows.
+
+    Returns:
+        The values, shape ``(rows, len(columns))``, float64.
 
     Raises:
-        InvalidInputError: If columns are missing.
+        InvalidInputError: If columns are missing, there are no rows, or a value is not
+            a finite number.
     """
+    numbers = read_table(path, columns).apply(
+        _require("pandas").to_numeric, errors="coerce"
+    )
+    return as_batch(str(path), torch.tensor(numbers.to_numpy(dtype="float64")))
+
+
+def read_table(path: Path, columns: Sequence[str]) -> Any:
+    """Read columns of a CSV file as a pandas table."""
     # The first column is data, even if rows end with one comma too many.
     frame = _require("pandas").read_csv(path, index_col=False)
     missing = [column for column in columns if column not in frame.columns]
@@ -65,76 +78,20 @@ def read_table(path: Path, columns: Sequence[str]) -> Any:
     return frame[list(columns)]
 
 
-def read_columns(path: Path, columns: Sequence[str]) -> Tensor:
-    """Read columns of numbers of a CSV file.
-
-    Args:
-        path: The file. It may have any number of rows.
-        columns: Names of the columns to read.
-
-    Returns:
-        The values, shape ``(rows, len(columns))``, float64.
-
-    Raises:
-        InvalidInputError: If columns are missing, there are no rows, or a value is not
-            a finite number.
-    """
-    frame = read_table(path, columns)
-    numbers = frame.apply(_require("pandas").to_numeric, errors="coerce")
-    return as_batch(str(path), torch.tensor(numbers.to_numpy(dtype="float64")))
-
-
-def find_images(experiment: Path, size: int) -> Path:
-    """Return the folder with an experiment's images of one size.
-
-    Args:
-        experiment: Folder of the experiment, in which ``images_<size>`` lies.
-        size: Height and width of the images, in pixels.
-
-    Raises:
-        DataNotFoundError: If there is no such folder.
-    """
-    folder = experiment / f"images_{size}"
-    if not folder.is_dir():
-        found = sorted(path.name for path in experiment.glob("images_*"))
-        raise DataNotFoundError(
-            f"Expected the folder {folder} for `image_size={size}`; got {found}."
-        )
-    return folder
-
-
 def read_images(folder: Path, names: Sequence[str], size: int) -> Tensor:
-    """Read square RGB images with 8 bit a channel.
-
-    Args:
-        folder: Folder of the images.
-        names: File names, in any format that PIL reads.
-        size: Height and width that the images have, in pixels.
-
-    Returns:
-        The images, shape ``(len(names), 3, size, size)``, uint8.
+    """Read images of this size, as RGB, shape ``(len(names), 3, size, size)``, uint8.
 
     Raises:
         DataNotFoundError: If a file is not there.
-        InvalidInputError: If a file is no RGB image of this size.
     """
     pil = _require("PIL.Image")
-    images = torch.empty(
-        len(names), size, size, 3, dtype=torch.uint8, device=torch.device("cpu")
-    )
+    images = np.empty((len(names), size, size, 3), dtype=np.uint8)
     for i, name in enumerate(names):
-        path = folder / name
-        if not path.is_file():
-            raise DataNotFoundError(f"Expected the image {path}, which a table names.")
-        with pil.open(path) as image:
-            if image.size != (size, size) or image.mode != "RGB":
-                raise InvalidInputError(
-                    f"Expected {path} to have {size} x {size} pixels in mode RGB; got "
-                    f"{image.width} x {image.height} in mode {image.mode}."
-                )
-            content = torch.frombuffer(bytearray(image.tobytes()), dtype=torch.uint8)
-        images[i] = content.reshape(size, size, 3)
-    return images.permute(0, 3, 1, 2).contiguous()
+        if not (folder / name).is_file():
+            raise DataNotFoundError(f"Expected the recorded image {folder / name}.")
+        with pil.open(folder / name) as image:
+            images[i] = image.convert("RGB")
+    return torch.from_numpy(images).permute(0, 3, 1, 2).contiguous()
 
 
 def _download(dataset: str, root: Path) -> None:

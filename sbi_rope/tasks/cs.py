@@ -1,9 +1,7 @@
 r"""Task A: cells of a tissue in which tumours die from the inside."""
 
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 import torch
@@ -20,12 +18,8 @@ from sbi_rope.tensors import as_batch
 
 __all__ = ["CancerStroma", "CancerStromaSimulator"]
 
-Array = TypeVar("Array", np.ndarray, Tensor)
-
 STATISTICS = ("n_stromal", "n_cancer", "mean_distance", "max_distance")
 NUM_DISTANCES = 50  # the first stromal cells enter the two distances, others do not
-# Tissues that the batched path handles at once; 0.1 GB an array under the prior.
-CHUNK_SIZE = 256
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,9 +47,6 @@ class CancerStromaSimulator(Settings):
     Args:
         necrosis_probability: Probability of a parent to be necrotic.
         necrosis_radius: Radius without cells, as a fraction of :math:`r_j`.
-        batched: Whether to simulate tissues together on the device of ``theta``,
-            instead of one after the other in NumPy. Unless it is given, this is done
-            on other devices than the CPU only.
 
     Example:
         >>> theta = torch.tensor([[400.0, 5.0, 15.0], [1000.0, 10.0, 12.0]])
@@ -65,19 +56,10 @@ class CancerStromaSimulator(Settings):
 
     necrosis_probability: UnitInterval = 0.0
     necrosis_radius: UnitInterval = 0.8
-    batched: bool | None = None
 
     def __call__(self, theta: Tensor) -> Tensor:
         """Simulate ``theta`` of shape ``(n, 3)``, to shape ``(n, 4)``."""
         theta = as_batch("theta", theta, (3,), empty=True)
-        if not len(theta):
-            return theta.new_empty(0, len(STATISTICS))
-        off_cpu = theta.device.type != "cpu"
-        batched = off_cpu if self.batched is None else self.batched
-        simulate = self._simulate_chunks if batched else self._simulate_each
-        return simulate(theta.double()).to(theta)
-
-    def _simulate_each(self, theta: Tensor) -> Tensor:
         # NumPy's generator, in a state that torch's global generator decides.
         rng = np.random.default_rng(int(torch.randint(2**63 - 1, (), device="cpu")))
         x = np.empty((len(theta), len(STATISTICS)))
@@ -90,27 +72,7 @@ class CancerStromaSimulator(Settings):
                 necrotic=rng.random(num_parents) < self.necrosis_probability,
                 necrosis_radius=self.necrosis_radius,
             )
-        return torch.from_numpy(x)
-
-    def _simulate_chunks(self, theta: Tensor) -> Tensor:
-        num_cells = torch.poisson(theta[:, 0]).long()
-        num_parents = torch.poisson(theta[:, 1]).long() + 1
-        uniform = partial(torch.rand, dtype=theta.dtype, device=theta.device)
-        x = theta.new_empty(len(theta), len(STATISTICS))
-        # Tissues of similar size together, for little padding.
-        for rows in num_cells.argsort().split(CHUNK_SIZE):
-            most_parents = int(num_parents[rows].max())
-            rates = theta[rows, 2:].expand(-1, most_parents)
-            x[rows] = batched_statistics(
-                cells=uniform(len(rows), 2, max(1, int(num_cells[rows].max()))),
-                parents=uniform(len(rows), 2, most_parents),
-                num_cells=num_cells[rows],
-                num_parents=num_parents[rows],
-                num_daughters=torch.poisson(rates).long() + 1,
-                necrotic=uniform(*rates.shape) < self.necrosis_probability,
-                necrosis_radius=self.necrosis_radius,
-            )
-        return x
+        return torch.from_numpy(x).to(theta)
 
 
 def tissue_statistics(
@@ -123,12 +85,8 @@ def tissue_statistics(
 ) -> tuple[float, ...]:
     """Return the four statistics of one tissue.
 
-    Args:
-        cells: Positions of the N cells, shape ``(2, N)``.
-        parents: Positions of the P cancer parents, shape ``(2, P)``.
-        num_daughters: The number :math:`m_j` of each parent, shape ``(P,)``.
-        necrotic: Which parents are necrotic, shape ``(P,)``.
-        necrosis_radius: As in :class:`CancerStromaSimulator`.
+    Positions of cells and parents have shapes ``(2, N)`` and ``(2, P)``, numbers of
+    daughters and which parents are necrotic ``(P,)``.
     """
     undefined = (np.nan,) * len(STATISTICS)
     most = int(num_daughters.max())
@@ -148,48 +106,6 @@ def tissue_statistics(
     return stromal.size, cancer.size, distance.mean(), distance.max()
 
 
-def batched_statistics(
-    *,
-    cells: Tensor,
-    parents: Tensor,
-    num_cells: Tensor,
-    num_parents: Tensor,
-    num_daughters: Tensor,
-    necrotic: Tensor,
-    necrosis_radius: float,
-) -> Tensor:
-    """Return :func:`tissue_statistics` of many tissues, shape ``(n, 4)``.
-
-    The arguments have a leading dimension of tissues, and are padded beyond the true
-    numbers of cells and parents, each of shape ``(n,)``, to one cell at least.
-    """
-    device = cells.device
-    is_cell = torch.arange(cells.shape[2], device=device) < num_cells[:, None]
-    is_parent = torch.arange(parents.shape[2], device=device) < num_parents[:, None]
-    squared = _squared_distances(parents, cells)
-    squared.masked_fill_(~is_cell.unsqueeze(1), torch.inf)
-    most = min(int(num_daughters.max()), cells.shape[2] - 1)
-    nearest = squared.topk(most + 1, dim=2, largest=False).values
-    limit = nearest.gather(2, num_daughters.clamp(max=most).unsqueeze(2))
-    limit.masked_fill_(~is_parent.unsqueeze(2), -1.0)  # holds no cell
-    is_cancer = (squared <= limit).any(dim=1) & is_cell
-    inner = squared < necrosis_radius**2 * limit
-    cancer = is_cancer & ~(inner & necrotic.unsqueeze(2)).any(dim=1)
-    stromal = is_cell & ~is_cancer
-    first = (~stromal).byte().argsort(dim=1, stable=True)[:, :NUM_DISTANCES]
-    to_cancer = _squared_distances(
-        cells.gather(2, first.unsqueeze(1).expand(-1, 2, -1)), cells
-    ).masked_fill_(~cancer.unsqueeze(1), torch.inf)
-    distance = to_cancer.amin(dim=2).sqrt()
-    is_used = stromal.gather(1, first)
-    mean = distance.where(is_used, 0.0).sum(dim=1) / is_used.sum(dim=1)
-    maximum = distance.where(is_used, -torch.inf).amax(dim=1)
-    x = torch.stack([stromal.sum(dim=1), cancer.sum(dim=1), mean, maximum], dim=1)
-    # With too few cells for a parent, all are in its disc and none is stromal.
-    defined = stromal.any(dim=1) & cancer.any(dim=1)
-    return x.masked_fill(~defined.unsqueeze(1), torch.nan)
-
-
 class CancerStroma(Task):
     r"""Task A of the paper: rates of cells and tumours from counts and distances.
 
@@ -200,25 +116,12 @@ class CancerStroma(Task):
     necrotic, which halves the number of cancer cells; the number of stromal cells is
     untouched and the two distances hardly change.
 
-    Where the original code, which this follows, differs from the paper's description:
-    a parent owns one cell more than it has daughters :math:`m_j`; the number of
-    stromal cells comes first; only the first 50 of them enter the distances; and the
-    necrosis ("cancer cells that are too close to their generating parent") has
-    probability 0.75 and radius :math:`0.8 \, r_j`. Where this differs from the code:
-    tissues with an undefined statistic are dropped together with their parameters.
-
     References:
-        | Addressing Misspecification in Simulation-based Inference through
-          Data-driven Calibration (Wehenkel et al.), appendix on task A
-        | https://arxiv.org/abs/2405.08719
         | Robust Neural Posterior Estimation and Statistical Model Criticism
           (Ward et al., 2022), https://github.com/danielward27/rnpe
 
     Args:
-        variant: ``None`` or one of ``variants``.
-        root: Not used, the task is synthetic.
-        label_noise: Noise on the calibration labels, in standard deviations of the
-            prior. It is 0.2 unless given, and only for ``"noisy_labels"``.
+        variant, root, label_noise: See :class:`~sbi_rope.tasks.Task`.
         necrosis_probability: Probability of a real parent to be necrotic. At 0 the
             simulator is exact.
         necrosis_radius: Radius of the necrosis, as a fraction of the tumour's.
@@ -272,8 +175,8 @@ class CancerStroma(Task):
         return replace(self._simulated_process(), observe=self._real)
 
 
-def _squared_distances(a: Array, b: Array) -> Array:
-    """Return squared distances of points ``(..., 2, n)`` and ``(..., 2, m)``."""
-    x = a[..., 0, :, None] - b[..., 0, None, :]
-    y = a[..., 1, :, None] - b[..., 1, None, :]
+def _squared_distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return squared distances of points ``(2, n)`` and ``(2, m)``."""
+    x = a[0, :, None] - b[0]
+    y = a[1, :, None] - b[1]
     return x * x + y * y

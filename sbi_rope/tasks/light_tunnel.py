@@ -11,7 +11,6 @@ from sbi_rope.settings import check, one_of
 from sbi_rope.tasks.base import Task
 from sbi_rope.tasks.chambers import (
     find_file,
-    find_images,
     read_columns,
     read_images,
     read_table,
@@ -25,7 +24,7 @@ from sbi_rope.tasks.light_tunnel_models import (
     draw_crowded,
     malus,
 )
-from sbi_rope.tasks.light_tunnel_network import ImageEmbedding
+from sbi_rope.tasks.networks import ImageEmbedding
 from sbi_rope.tasks.settings import PaperSettings
 from sbi_rope.tasks.splits import DrawnPairs, Keep, Part, RecordedPairs, generator_of
 from sbi_rope.tasks.variants import COMMON_VARIANTS
@@ -68,37 +67,21 @@ class LightTunnel(Task):
     of 0.1 into a million. sbi lists the constant pixels in a long warning even so,
     unless the images are dequantised.
 
-    Besides the common variants, in ``"misspecified_prior"`` both sets come from the
-    experiment ``betab_ap_1.8_iso_500.0_ss_0.005``, whose colours and angles crowd in
-    the middle of their ranges; in ``"biased_calibration"`` the calibration set alone
-    does, as in the paper. In ``"flipped"`` the test images, but not those of the
-    calibration set, stand on their heads. In ``"synthetic"`` model F3 with noise
+    In ``"misspecified_prior"`` both sets come from the experiment
+    ``betab_ap_1.8_iso_500.0_ss_0.005``, in ``"biased_calibration"`` the calibration set
+    alone does, as in the paper. In ``"synthetic"`` model F3 with noise
     (``CameraSimulator``) stands in for the camera, so that no files are needed;
     ``stand_in=True`` does this in any other variant. The hexagon is nearly symmetric,
     so that flipping a stand-in only moves it by one row.
 
-    Where this differs from the paper: it names the experiment without ``uniform_``,
-    and does not say whether simulated images are cut off to 8 bit as they are in
-    causalchamber's model. They are here; without that, the three numbers in an image
-    would fix a curve of parameters exactly, and the density of no posterior would be
-    bounded. ``dequantise`` is a choice of ours, as is the light network.
-
     References:
-        | Addressing Misspecification in Simulation-based Inference through
-          Data-driven Calibration (Wehenkel et al.), appendix on task E
-        | https://arxiv.org/abs/2405.08719
-        | Causal chambers as a real-world physical testbed for AI methodology
-          (Gamella, Peters and Bühlmann, 2025)
-        | https://doi.org/10.1038/s42256-024-00964-x
         | https://github.com/juangamella/causal-chamber, data set ``lt_camera_v1``
           (CC BY 4.0)
 
     Args:
-        variant: ``None`` or one of ``variants``.
+        variant, label_noise: See :class:`~sbi_rope.tasks.Task`.
         root: Folder that holds ``lt_camera_v1/``. Only the two data sets need it, and
             they do not with a stand-in.
-        label_noise: Noise on the calibration labels, in standard deviations of the
-            prior. It is 0.2 unless given, and only for ``"noisy_labels"``.
         download: Whether to download the data set into ``root`` if it is not there.
         image_size: Height and width of the images in pixels, 64 or 100. Data sets
             from before version 1.4 have no images of size 64.
@@ -183,15 +166,6 @@ class LightTunnel(Task):
         """Return the paper's convolutional network or a light one, with 20 outputs."""
         return ImageEmbedding(image_size=self.image_size, light=light)
 
-    @property
-    def has_data(self) -> bool:
-        """Whether the tables are there, and the folders with images of this size."""
-        return super().has_data and all(
-            (self.root / table.parent / f"images_{self.image_size}").is_dir()
-            for table in self.required_files
-            if self.root is not None
-        )
-
     def _recorded_files(self) -> tuple[Path, ...]:
         if self.stand_in:
             return ()
@@ -210,18 +184,18 @@ class LightTunnel(Task):
         return self._drawn(part) if self.stand_in else self._recorded(part)
 
     def _drawn(self, part: Part) -> DrawnPairs:
-        prior = self.get_prior()
         camera = CameraSimulator(image_size=self.image_size, dequantise=self.dequantise)
         crowded = self._experiment(part) == BETA_BINOMIAL
+        process = self._simulated_process()
         return DrawnPairs(
-            draw_theta=draw_crowded if crowded else lambda n: prior.sample((n,)),  # type: ignore[arg-type]
+            draw_theta=draw_crowded if crowded else process.draw_theta,
             observe=lambda theta: self._oriented(camera(theta), part),
         )
 
     def _recorded(self, part: Part) -> RecordedPairs:
         table = _table(self._experiment(part))
         path = find_file(table, root=self.root, download=self.download)
-        folder = find_images(path.parent, self.image_size)
+        folder = path.parent / f"images_{self.image_size}"
         colour, angles = read_columns(path, INPUTS).split([3, 2], dim=1)
         theta = torch.cat([colour, malus(angles)], dim=1).float()
         check_in_support(f"theta of {table}", theta, self.get_prior())

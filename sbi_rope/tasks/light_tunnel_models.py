@@ -1,4 +1,12 @@
-r"""Two published models of the light tunnel's images, one with a camera's noise."""
+r"""Two published models of the light tunnel's images, one with a camera's noise.
+
+References:
+    | Causal chambers as a real-world physical testbed for AI methodology
+      (Gamella, Peters and Bühlmann, 2025), appendix on the image models
+    | https://doi.org/10.1038/s42256-024-00964-x
+    | https://github.com/juangamella/causal-chamber-package, ``models.model_f1`` and
+      ``models.model_f3`` (MIT licence)
+"""
 
 from dataclasses import dataclass
 
@@ -46,13 +54,6 @@ class HexagonSimulator(Settings):
     The model is deterministic, and an image has only three numbers for the four
     parameters, cut off to 8 bit; where all are below 1 it is black.
 
-    References:
-        | Causal chambers as a real-world physical testbed for AI methodology
-          (Gamella, Peters and Bühlmann, 2025), appendix on the image models
-        | https://doi.org/10.1038/s42256-024-00964-x
-        | https://github.com/juangamella/causal-chamber-package, ``models.model_f1``
-          (MIT licence)
-
     Args:
         image_size: Height and width of an image, in pixels.
         dequantise: Whether to add uniform noise within each 8-bit level, see
@@ -78,17 +79,6 @@ class HexagonSimulator(Settings):
             return as_brightness(_masked(levels, self.image_size), dequantise=True)
         return _masked(levels / MAX_LEVEL, self.image_size)
 
-    def image(self, theta: Tensor) -> Tensor:
-        """Return images that are not cut off to 8 bit, in [0, 1].
-
-        Args:
-            theta: Red, green, blue and alpha, shape ``(n, 4)``.
-
-        Returns:
-            Images, shape ``(n, 3, size, size)``, differentiable in ``theta``.
-        """
-        return _masked(theta[:, 3:] * theta[:, :3] / MAX_LEVEL, self.image_size)
-
 
 @dataclass(frozen=True, kw_only=True)
 class CameraSimulator(Settings):
@@ -102,13 +92,6 @@ class CameraSimulator(Settings):
         \odot ((T_p - T_c) \, \alpha + T_c) \right) M.
 
     The published model ends here. Noise and rounding are additions of ours.
-
-    References:
-        | Causal chambers as a real-world physical testbed for AI methodology
-          (Gamella, Peters and Bühlmann, 2025), appendix on the image models
-        | https://doi.org/10.1038/s42256-024-00964-x
-        | https://github.com/juangamella/causal-chamber-package, ``models.model_f3``
-          (MIT licence)
 
     Args:
         image_size: Height and width of an image, in pixels.
@@ -135,15 +118,7 @@ class CameraSimulator(Settings):
         return as_brightness(levels, dequantise=self.dequantise)
 
     def image(self, theta: Tensor) -> Tensor:
-        """Return images without noise, in [0, 1].
-
-        Args:
-            theta: Red, green, blue and alpha, shape ``(n, 4)``.
-
-        Returns:
-            Images, shape ``(n, 3, size, size)``, differentiable in ``theta`` where
-            they are not over-exposed.
-        """
+        """Return images ``(n, 3, size, size)`` in [0, 1] without noise."""
         colour, alpha = theta[:, :3] / MAX_LEVEL, theta[:, 3:]
         aligned, crossed = theta.new_tensor(ALIGNED), theta.new_tensor(CROSSED)
         response = theta.new_tensor(RESPONSE).T * theta.new_tensor(WHITE_BALANCE)
@@ -164,12 +139,7 @@ def hexagon_mask(image_size: int, *, like: Tensor | None = None) -> Tensor:
     the last one. In causalchamber's mask, which this one equals, rounding leaves
     pixels on the border outside.
 
-    Args:
-        image_size: Height and width of the image, in pixels.
-        like: A tensor with the dtype and device to return; float64 on the CPU if None.
-
-    Returns:
-        The mask, shape ``(image_size, image_size)``.
+    It has the dtype and device of a tensor, or is float64 on the CPU.
 
     Example:
         >>> hexagon_mask(100).sum()
@@ -193,11 +163,6 @@ def as_brightness(
     :math:`u \sim \mathcal{U}(0, 1)` for every pixel and channel, which gives images a
     density.
 
-    Args:
-        levels: Whole numbers from 0 to 255 in a floating-point dtype.
-        dequantise: Whether to spread each level over its interval.
-        generator: Source of the uniform numbers, torch's global one if None.
-
     Example:
         >>> as_brightness(torch.tensor([0.0, 51.0, 255.0]), dequantise=False)
         tensor([0.0000, 0.2000, 1.0000])
@@ -211,13 +176,9 @@ def as_brightness(
 
 
 def malus(angles: Tensor) -> Tensor:
-    r"""Return the share of light that two polarisers pass, :math:`\cos^2`.
+    r"""Return the share of light that passes, :math:`\cos^2`, shape ``(n, 1)``.
 
-    Args:
-        angles: Their angles in degrees, shape ``(n, 2)``.
-
-    Returns:
-        Shares, shape ``(n, 1)``.
+    The angles of the two polarisers are in degrees, shape ``(n, 2)``.
     """
     return torch.deg2rad(angles[:, :1] - angles[:, 1:]).cos() ** 2
 
@@ -226,17 +187,8 @@ def draw_crowded(n: int) -> Tensor:
     """Draw parameters by the protocol of the beta-binomial experiment.
 
     Colours are beta-binomial on 0 ... 255, and angles on the whole degrees from -180
-    to 180, all with both shapes 5.
-
-    Args:
-        n: Number of parameters.
-
-    Returns:
-        Red, green, blue and alpha, shape ``(n, 4)``, float32.
-
-    References:
-        https://github.com/juangamella/causal-chamber, ``betabinom.py`` among the
-        generators of ``lt_camera_v1``
+    to 180, all with both shapes 5 (``betabinom.py`` among the generators of
+    ``lt_camera_v1``).
     """
     five = torch.tensor(5.0, dtype=torch.float64)
 

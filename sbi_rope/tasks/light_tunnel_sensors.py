@@ -105,14 +105,7 @@ class LightTunnelSimulator(Settings):
         return torch.cat([light.clamp(min=0.0).log1p(), current], dim=1)
 
     def readings(self, theta: Tensor) -> Tensor:
-        """Return raw readings without noise, in the order of ``OUTPUTS``.
-
-        Args:
-            theta: Red, green, blue and the angle in degrees, shape ``(n, 4)``.
-
-        Returns:
-            Readings, shape ``(n, 7)``, differentiable in ``theta``.
-        """
+        """Return raw readings ``(n, 7)`` without noise, differentiable in ``theta``."""
         colour, angle = theta[:, :3], theta[:, 3:]
         response = theta.new_tensor(RESPONSE).T * theta.new_tensor(GAIN)
         aligned, crossed = theta.new_tensor(ALIGNED), theta.new_tensor(CROSSED)
@@ -151,29 +144,19 @@ class LightTunnelSensors(Task):
     calibration, the rest for tests.
 
     References:
-        | Causal chambers as a real-world physical testbed for AI methodology
-          (Gamella, Peters and Bühlmann, 2025)
-        | https://doi.org/10.1038/s42256-024-00964-x
         | https://github.com/juangamella/causal-chamber, data set
           ``lt_interventions_standard_v1`` (CC BY 4.0)
 
-    Three variants use other experiments of the data set. In ``"strong_colours"`` one
-    colour comes from 171 to 255, and the prior of the colours reaches to 255.5. In
-    ``"strong_angles"`` one polariser is turned away, to differences of 42 to 118
-    degrees, and the angle is uniform on [0, 120] in the prior; the light does not tell
-    an angle from its supplement, so that posteriors have two modes. In
-    ``"sensor_settings"`` the calibration set is the standard one, but the test set
+    Three variants use other experiments of the data set. In ``"strong_angles"`` the
+    light does not tell an angle from its supplement, so that posteriors have two modes.
+    In ``"sensor_settings"`` the calibration set is the standard one, but the test set
     pools seven experiments with another exposure time of one diode (``t_*``) or another
-    reference voltage of the current (``v_c``) that the simulator knows nothing of. The
-    reference voltages of the angle sensors, which are no part of an observation, change
-    nothing and are left out.
+    reference voltage of the current (``v_c``) that the simulator knows nothing of.
 
     Args:
-        variant: ``None`` or one of ``variants``.
+        variant, label_noise: See :class:`~sbi_rope.tasks.Task`.
         root: Folder that holds ``lt_interventions_standard_v1/``. Only the two data
             sets need it.
-        label_noise: Noise on the calibration labels, in standard deviations of the
-            prior. It is 0.2 unless given, and only for ``"noisy_labels"``.
         download: Whether to download the data set into ``root`` if it is not there.
         experiment: The recorded experiment that both sets come from,
             ``"uniform_reference"`` unless given; not for the variants that choose it

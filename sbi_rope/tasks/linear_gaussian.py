@@ -1,7 +1,7 @@
 r"""The linear-Gaussian task, whose posteriors are all known."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -106,10 +106,7 @@ class LinearGaussian(Task):
     distribution with 1.5 degrees of freedom, whose variance is infinite, times 0.3.
 
     Args:
-        variant: ``None`` or one of ``variants``.
-        root: Not used, the task is synthetic.
-        label_noise: Noise on the calibration labels, in standard deviations of the
-            prior. It is 0.2 unless given, and only for ``"noisy_labels"``.
+        variant, root, label_noise: See :class:`~sbi_rope.tasks.Task`.
         dim: Number of parameters and of entries of x, from 1 to 25.
         scale: Gain of the real process, not 0.
         shift: Offset of the real process. With a gain of 1 and an offset of 0 the
@@ -203,11 +200,7 @@ class LinearGaussian(Task):
         return self._real.posterior(x_o)
 
     def _real_process(self, part: Part) -> DrawnPairs:
-        prior = self.get_prior()
-        return DrawnPairs(
-            draw_theta=lambda n: prior.sample(torch.Size((n,))),
-            observe=self._observe,
-        )
+        return replace(self._simulated_process(), observe=self._observe)
 
     def _observe(self, theta: Tensor) -> Tensor:
         x = self._real(theta)

@@ -1,16 +1,24 @@
-r"""Embedding networks that several tasks share."""
+r"""The embedding networks of the tasks."""
 
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
-__all__ = ["SeriesEmbedding", "fully_connected", "light_series_embedding"]
+__all__ = [
+    "ImageEmbedding",
+    "SeriesEmbedding",
+    "fully_connected",
+    "light_series_embedding",
+]
 
 CHANNELS = (1, 16, 64, 128, 128, 128, 128, 128)
 STRIDES = (1, 2, 1, 2, 1, 2, 1)
 POOLS = ((3, 1), (3, 1), (3, 1))
 HEAD = (512, 128, 32)
+# Squares along each side of an image of which the light network takes means.
+NUM_MEANS = 10
+LAST_BIAS = 0.1
 
 
 class SeriesEmbedding(nn.Module):
@@ -20,12 +28,6 @@ class SeriesEmbedding(nn.Module):
     second, fourth and sixth, and four linear layers, all with ReLU in between. A dummy
     pass finds the number of features between the two halves, 2048 for a series of 200
     steps.
-
-    References:
-        | Addressing Misspecification in Simulation-based Inference through
-          Data-driven Calibration (Wehenkel et al.), appendices on tasks C and D,
-          algorithms of the 1D CNNs
-        | https://arxiv.org/abs/2405.08719
 
     Args:
         num_steps: Length of the series.
@@ -65,11 +67,7 @@ class SeriesEmbedding(nn.Module):
 
 
 def fully_connected(input_dim: int, widths: Sequence[int]) -> nn.Sequential:
-    """Return linear layers with ReLU between them, and none after the last.
-
-    Args:
-        input_dim: Number of inputs.
-        widths: Number of outputs of each layer, the last one being the network's.
+    """Return linear layers of these widths with ReLU between, none after the last.
 
     Example:
         >>> fully_connected(7, (64, 8))
@@ -90,10 +88,6 @@ def light_series_embedding(*, num_steps: int, output_dim: int) -> nn.Sequential:
 
     Three convolutions with kernel 5 and stride 2, to 32 channels, and two linear
     layers: about a thirtieth of the work of :class:`SeriesEmbedding` at 200 steps.
-
-    Args:
-        num_steps: Length of the series, at least 1.
-        output_dim: Number of statistics to return.
 
     Example:
         >>> net = light_series_embedding(num_steps=50, output_dim=10)
@@ -124,3 +118,69 @@ def _convolutions(padding: int, pools: Sequence[tuple[int, int]]) -> nn.Sequenti
             size, step = next(means)
             layers.append(nn.AvgPool1d(size, stride=step))
     return nn.Sequential(*layers, nn.Flatten())
+
+
+class ImageEmbedding(nn.Module):
+    r"""Two-dimensional convolutional network for square colour images.
+
+    Three convolutions with kernel 3 and stride 2 (a maximum over 3 x 3 pixels after
+    the second), two with kernel 1, and two linear layers, all with ReLU in between. A
+    dummy pass finds the number of features between the two halves: 27 for images of
+    100 x 100 pixels, 12 for 64 x 64.
+
+    The last convolution, whose three channels lead straight into a ReLU, starts with
+    biases of 0.1. As torch starts it, all three are 0 for every image in one network
+    out of ten, which then cannot learn.
+
+    Args:
+        image_size: Height and width of the images, in pixels.
+        output_dim: Number of statistics to return.
+        light: Whether to replace the convolutions by means over squares, about 10 by
+            10 of them, and three linear layers.
+
+    Example:
+        >>> ImageEmbedding(image_size=64)(torch.zeros(5, 3, 64, 64)).shape
+        torch.Size([5, 20])
+    """
+
+    def __init__(
+        self, *, image_size: int = 100, output_dim: int = 20, light: bool = False
+    ) -> None:
+        super().__init__()
+        means = nn.Sequential(nn.AvgPool2d(image_size // NUM_MEANS), nn.Flatten())
+        self.features = means if light else _image_convolutions()
+        with torch.no_grad():
+            image = torch.zeros(1, 3, image_size, image_size)
+            self.num_features = self.features(image).shape[1]
+        hidden = (64, 64) if light else (100,)
+        self.head = fully_connected(self.num_features, (*hidden, output_dim))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Embed images of shape ``(n, 3, size, size)`` as ``(n, output_dim)``."""
+        return self.head(self.features(x))
+
+
+class _LastConvolution(nn.Conv2d):
+    """A convolution whose biases start, and start again, above zero."""
+
+    def reset_parameters(self) -> None:
+        """Draw the weights and set the biases."""
+        super().reset_parameters()
+        nn.init.constant_(self.bias, LAST_BIAS)  # type: ignore[arg-type]
+
+
+def _image_convolutions() -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(3, 64, 3, stride=2),
+        nn.ReLU(),
+        nn.Conv2d(64, 128, 3, stride=2),
+        nn.ReLU(),
+        nn.MaxPool2d(3),
+        nn.Conv2d(128, 128, 3, stride=2),
+        nn.ReLU(),
+        nn.Conv2d(128, 64, 1),
+        nn.ReLU(),
+        _LastConvolution(64, 3, 1),
+        nn.ReLU(),
+        nn.Flatten(),
+    )

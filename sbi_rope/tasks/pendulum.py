@@ -55,15 +55,9 @@ class PendulumSimulator(Settings):
         return position + self.noise_std * torch.randn_like(position)
 
     def position(self, theta: Tensor, *, phase: Tensor, damping: Tensor) -> Tensor:
-        """Return the positions without noise, differentiable in all arguments.
+        """Return the positions ``(n, 200)`` without noise, differentiable.
 
-        Args:
-            theta: Frequencies and amplitudes, shape ``(n, 2)``.
-            phase: Phases at time 0, in radians, shape ``(n, 1)``.
-            damping: Damping rates, in 1/s, shape ``(n, 1)``.
-
-        Returns:
-            Positions, shape ``(n, 200)``.
+        Phases at time 0 are in radians, damping rates in 1/s, both ``(n, 1)``.
         """
         frequency, amplitude = theta[:, :1], theta[:, 1:]
         time = torch.linspace(
@@ -85,21 +79,8 @@ class Pendulum(Task):
     calibration set included, come from a mixture of the prior and
     :math:`\mathcal{U}[1, 2] \times \mathcal{U}[3, 6]`.
 
-    Where this differs from the paper: its equation reads :math:`e^{+\alpha t}`, which
-    would let a swing grow by up to :math:`e^{10}` and contradicts "the effect of
-    friction"; the sign is negative here. It gives neither the standard deviation of
-    the noise nor the tighter prior; 0.1 and the box above are choices of ours.
-
-    References:
-        | Addressing Misspecification in Simulation-based Inference through
-          Data-driven Calibration (Wehenkel et al.), appendix on task C
-        | https://arxiv.org/abs/2405.08719
-
     Args:
-        variant: ``None`` or one of ``variants``.
-        root: Not used, the task is synthetic.
-        label_noise: Noise on the calibration labels, in standard deviations of the
-            prior. It is 0.2 unless given, and only for ``"noisy_labels"``.
+        variant, root, label_noise: See :class:`~sbi_rope.tasks.Task`.
         misspecification_weight: Weight of the tighter distribution in the mixture, in
             [0, 1]. It is 0.5 unless given, and only for ``"misspecified_prior"``.
         noise_std: Standard deviation of the noise on simulated and real positions, in

@@ -15,11 +15,6 @@ class PaperSettings:
     simulations as there are test observations at ``gamma`` and ``tau``, RoPE* at
     ``tau_relaxed``; a fifth of every calibration set is held out.
 
-    References:
-        | Addressing Misspecification in Simulation-based Inference through
-          Data-driven Calibration (Wehenkel et al.), appendices on the tasks
-        | https://arxiv.org/abs/2405.08719
-
     Attributes:
         density_estimator: Name of the flow for sbi's ``posterior_nn``.
         conditioner: Widths of the hidden layers of the flow's conditioner.

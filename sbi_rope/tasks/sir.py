@@ -3,7 +3,6 @@ r"""Task B: an epidemic, of which the reports of a weekend come in part on Monda
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -11,10 +10,10 @@ from torch import Tensor, nn
 
 from sbi_rope.settings import Count, NotNegative, Settings, UnitInterval
 from sbi_rope.tasks.base import Task
+from sbi_rope.tasks.distributions import UniformTriangle
 from sbi_rope.tasks.networks import fully_connected
 from sbi_rope.tasks.settings import STATISTICS_SETTINGS
 from sbi_rope.tasks.splits import DrawnPairs, Part
-from sbi_rope.tasks.triangle import UniformTriangle
 from sbi_rope.tensors import as_batch
 
 __all__ = ["SIR", "SIRSimulator", "delay_weekend_reports", "summarise"]
@@ -33,7 +32,7 @@ INFECTED_AT_START = 0.001  # as a fraction of the population
 REVERSION = 0.05  # of the reproduction number to its mean, in 1/day
 # Day 0 is a Friday; 52 of each.
 SATURDAYS, SUNDAYS, MONDAYS = (slice(day, None, 7) for day in (1, 2, 3))
-CHUNK_SIZE = 1000  # series that are simulated together on a CPU, in its cache
+CHUNK_SIZE = 1000  # series that are simulated together, in the CPU's cache
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,36 +90,28 @@ class SIRSimulator(Settings):
         Returns:
             One number a day, shape ``(n, 365)``, float64.
         """
-        theta = theta.double()
-        size = CHUNK_SIZE if theta.device.type == "cpu" else max(1, len(theta))
-        return torch.cat([self._infections(chunk) for chunk in theta.split(size)])
+        chunks = theta.double().cpu().split(CHUNK_SIZE)
+        infected = torch.cat([self._infections(chunk) for chunk in chunks])
+        return infected.to(theta.device)
 
     def _infections(self, theta: Tensor) -> Tensor:
         shape = self.steps_per_day, len(theta)
         noise = (
-            torch.randn(shape, dtype=theta.dtype, device=theta.device)
+            torch.randn(shape, dtype=theta.dtype, device="cpu").numpy()
             for _ in range(NUM_DAYS - 1)
         )
-        if theta.device.type != "cpu":
-            days = integrate(theta.T, noise, volatility=self.volatility)
-            return torch.stack(list(days), dim=1)
-        # The same in NumPy, whose calls cost a fraction of torch's on small arrays.
-        noise = (normal.numpy() for normal in noise)
         days = integrate(theta.T.numpy(), noise, volatility=self.volatility)
         return torch.from_numpy(np.stack(list(days), axis=1))
 
 
-def integrate(theta: Any, noise: Iterable[Any], *, volatility: float) -> Iterator[Any]:
-    """Integrate the equations of :class:`SIRSimulator`, in NumPy or torch.
+def integrate(
+    theta: np.ndarray, noise: Iterable[np.ndarray], *, volatility: float
+) -> Iterator[np.ndarray]:
+    """Integrate the equations of :class:`SIRSimulator`.
 
-    Args:
-        theta: Infection and recovery rates, in 1/day, shape ``(2, n)``.
-        noise: Standard normal numbers of each day but the last, shape
-            ``(steps, n)``. Their number is that of the steps in a day.
-        volatility: As in :class:`SIRSimulator`.
-
-    Yields:
-        Numbers of infected people, shape ``(n,)``, for one day after the other.
+    NumPy's calls cost a fraction of torch's on arrays this small. From rates in 1/day,
+    shape ``(2, n)``, and standard normal numbers ``(steps, n)`` of each day but the
+    last, it yields the numbers of infected people ``(n,)`` on one day after the other.
     """
     infection, recovery = theta
     infected = INFECTED_AT_START + 0 * infection
@@ -203,24 +194,12 @@ class SIR(Task):
     This lowers the correlation of neighbouring days, by about three standard
     deviations, and leaves the other statistics almost as they are.
 
-    Where the original code, which this follows, differs from the paper's description:
-    the first five statistics are logarithms, and the "mean auto-correlation" is that
-    of one lag. Where this differs from that code: the equations are solved by
-    Euler-Maruyama steps of 0.1 days, and not by an adaptive solver whose tolerance
-    is ten times the fraction of people infected at the start.
-
     References:
-        | Addressing Misspecification in Simulation-based Inference through
-          Data-driven Calibration (Wehenkel et al.), appendix on task B
-        | https://arxiv.org/abs/2405.08719
         | Robust Neural Posterior Estimation and Statistical Model Criticism
           (Ward et al., 2022), https://github.com/danielward27/rnpe
 
     Args:
-        variant: ``None`` or one of ``variants``.
-        root: Not used, the task is synthetic.
-        label_noise: Noise on the calibration labels, in standard deviations of the
-            prior. It is 0.2 unless given, and only for ``"noisy_labels"``.
+        variant, root, label_noise: See :class:`~sbi_rope.tasks.Task`.
         reported_fraction: Fraction of a real weekend's infections that is reported on
             the day itself, in [0, 1]. At 1 the simulator is exact.
 

@@ -6,7 +6,6 @@ split once and for all.
 """
 
 import hashlib
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -36,8 +35,6 @@ MAX_SEED = 2**30
 BLOCK_SIZE = 100
 # Blocks without a single pair after which there is no hope for one.
 MAX_EMPTY_BLOCKS = 1000
-# Sets are drawn one after the other: all threads share torch's generator.
-LOCK = threading.RLock()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,18 +71,12 @@ class DrawnPairs:
     ) -> tuple[Tensor, Tensor]:
         """Return the first ``n`` pairs of the stream of one seed and part.
 
-        Args:
-            n: Number of pairs.
-            seed: Integer from 0 to ``MAX_SEED - 1``.
-            part: The part of the task's data that is drawn.
-            keep: Which parameters may stay. All may if it is not given.
-
         Raises:
             SimulationError: If the process gives no valid pair in many attempts.
         """
         thetas, xs = [], []
         found = dropped = empty = 0
-        with LOCK, torch.random.fork_rng(devices=[]), torch.device("cpu"):
+        with torch.random.fork_rng(devices=[]), torch.device("cpu"):
             # `torch.manual_seed` would reseed the accelerators as well.
             torch.default_generator.manual_seed(stream_of(seed, part))
             while found < n:
@@ -145,12 +136,6 @@ class RecordedPairs:
         self, n: int, *, seed: int, part: Part, keep: Keep | None = None
     ) -> tuple[Tensor, Tensor]:
         """Return ``n`` pairs of one part, which begin with those of a smaller ``n``.
-
-        Args:
-            n: Number of pairs.
-            seed: The seed by which rows are chosen.
-            part: The part to choose from.
-            keep: Which parameters may stay. All may if it is not given.
 
         Raises:
             InvalidInputError: If the part has fewer than ``n`` such rows.

@@ -52,8 +52,7 @@ def beta_shaped(quantiles: Tensor) -> Tensor:
     parameters are independent in the prior, Beta(3, 3) is the law of the quantiles
     that stay.
 
-    Args:
-        quantiles: Values of the prior's distribution functions, shape ``(n, d)``.
+    Quantiles are values of the prior's distribution functions, shape ``(n, d)``.
     """
     u = quantiles[:, :NUM_BIASED].double()
     return ((4 * u * (1 - u)) ** 2).prod(dim=1)
@@ -64,14 +63,8 @@ def with_label_noise(
 ) -> Tensor:
     """Add independent Gaussian noise, drawn anew where it leaves the prior's support.
 
-    Args:
-        theta: True parameters, shape ``(n, d)``.
-        std: Standard deviation of the noise on each parameter, shape ``(d,)``.
-        prior: The prior whose support the noisy parameters stay in.
-        seed: Seed of the set. The noise of a row depends on its position only.
-
-    Returns:
-        Noisy parameters, shape ``(n, d)``.
+    Parameters have shape ``(n, d)``, standard deviations ``(d,)``. The noise of a row
+    depends on the seed of the set and on its position only.
     """
     seeds = torch.Generator().manual_seed(stream_of(seed, "labels"))
     noisy = theta.clone()

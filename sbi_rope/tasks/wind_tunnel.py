@@ -1,5 +1,6 @@
 r"""Task F: the position of a hatch, from the pressure after an impulse of a fan."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -55,29 +56,14 @@ class WindTunnel(Task):
     deviation of 0.4.
     A stand-in shows that a method runs. Its scores say nothing about the real tunnel.
 
-    Where this differs from the paper: it calls the time of the impulse unknown to the
-    simulator, but gives no law; here it is shifted by :math:`\mathcal{U}(-0.3, 0.3)`
-    seconds. The ambient pressure is subtracted, as the paper does not say what the
-    curves are relative to. Its network needs at least 73 steps and curves have 50, so
-    that every convolution is padded by 2 here, which keeps the length. Simulated
-    samples are taken at the recorded times of one impulse, real ones at their own.
-
     References:
-        | Addressing Misspecification in Simulation-based Inference through
-          Data-driven Calibration (Wehenkel et al.), appendix on task F
-        | https://arxiv.org/abs/2405.08719
-        | Causal chambers as a real-world physical testbed for AI methodology
-          (Gamella, Peters and Bühlmann, 2025)
-        | https://doi.org/10.1038/s42256-024-00964-x
         | https://github.com/juangamella/causal-chamber, data set
           ``wt_intake_impulse_v1`` (CC BY 4.0)
 
     Args:
-        variant: ``None`` or one of ``variants``.
+        variant, label_noise: See :class:`~sbi_rope.tasks.Task`.
         root: Folder that holds ``wt_intake_impulse_v1/``. Only the two recorded sets
             need it.
-        label_noise: Noise on the calibration labels, in standard deviations of the
-            prior. It is 0.2 unless given, and only for ``"noisy_labels"``.
         download: Whether to download the data set into ``root`` if it is not there.
         stand_in: Whether to draw real observations from the stand-in instead of reading
             them; always so in the variant ``"synthetic"``. It goes with every variant,
@@ -153,11 +139,7 @@ class WindTunnel(Task):
         if not self.stand_in:
             theta, x = self._recorded()
             return RecordedPairs(theta=theta, read_x=x.__getitem__)
-        prior = self.get_prior()
-        return DrawnPairs(
-            draw_theta=lambda n: prior.sample(torch.Size((n,))),
-            observe=self._stand_in,
-        )
+        return replace(self._simulated_process(), observe=self._stand_in)
 
     def _recorded(self) -> tuple[Tensor, Tensor]:
         (file,) = self._recorded_files()

@@ -130,15 +130,10 @@ class WindTunnelSimulator(Settings):
         return (pressure + self.noise_std * noise).to(theta.dtype)
 
     def pressure(self, theta: Tensor, *, onset_shift: Tensor) -> Tensor:
-        """Return the pressure without noise, differentiable in ``theta``.
+        """Return the pressure ``(n, 50)`` in Pa without noise, differentiable.
 
-        Args:
-            theta: Positions of the hatch in degrees, shape ``(n, 1)``.
-            onset_shift: When the impulse begins after its usual time, in s, shape
-                ``(n,)``, float64; at most ``onset_jitter`` before or after.
-
-        Returns:
-            Pressures above ambient, in Pa, shape ``(n, 50)``, float64.
+        ``onset_shift`` is when the impulse begins after its usual time, in s, shape
+        ``(n,)``, float64; at most ``onset_jitter`` before or after.
         """
         ratio = CLOSED_RATIO + HATCH_EFFECT * theta.double() / MAX_HATCH
         scale = self.max_pressure * (1 - ratio.clamp(max=1.0))
@@ -160,20 +155,8 @@ def pressure_ratio(
 ) -> Tensor:
     r"""Return :math:`s = (\omega_{in}^2 - \omega_{out}^2) / \omega_{\max}^2`.
 
-    Args:
-        onset_shift: When the impulse begins after its usual time, in s, shape
-            ``(n,)``, float64.
-        inertia: Moment of inertia of both fans, in kg m^2.
-        exhaust_offset: Added to the speed of the fan at the back, in rad/s.
-
-    Returns:
-        The ratio at the 50 times, without unit, shape ``(n, 50)``, by Euler's method
-        without interpolation.
-
-    Example:
-        >>> s = pressure_ratio(torch.zeros(1, dtype=torch.float64))
-        >>> round(float(s.norm()), 3)
-        2.125
+    It is a number at each of the 50 times, shape ``(n, 50)``, by Euler's method for
+    shifts of the impulse in s, shape ``(n,)``, float64.
     """
     intake = _fan_speeds(onset_shift, loads=INTAKE_LOADS, inertia=inertia)
     exhaust = _fan_speeds(onset_shift[:1], loads=EXHAUST_LOADS, inertia=inertia)

@@ -3,27 +3,36 @@ r"""What all methods have in common: data goes in, a posterior of sbi comes out.
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.distributions import Distribution
 
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
-from sbi_rope._sbi import device_of, embedding_of, estimator_of
-from sbi_rope.errors import InvalidInputError, NotReadyError
-from sbi_rope.fit import History
+from sbi_rope._sbi import (
+    direct_posterior,
+    embedding_of,
+    estimator_of,
+    parameter_of,
+    posterior_from,
+    readable,
+)
+from sbi_rope.data import Pairs
+from sbi_rope.errors import InvalidInputError, NotReadyError, warn_user
+from sbi_rope.fit import History, Training
 from sbi_rope.settings import check
 from sbi_rope.simulate import Source, source_of
-from sbi_rope.trainers.data import Data, Kind
-from sbi_rope.trainers.starting_npe import StartingNPE
+from sbi_rope.tensors import as_batch, check_in_support, column_names, rows_with
+from sbi_rope.trainers.training import estimator_builder, train_on_simulations
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = ["Method"]
+__all__ = ["Kind", "Method"]
 
+Kind = Literal["simulations", "calibration", "observations"]
 # What data are called in messages, and the call that takes them.
 DATA: dict[Kind, tuple[str, str]] = {
     "simulations": ("simulations", "append_simulations(theta, x)"),
@@ -32,13 +41,108 @@ DATA: dict[Kind, tuple[str, str]] = {
 }
 
 
+class Data:
+    """Simulations, calibration pairs and observations with x of the same shape.
+
+    All are copied, in float32. Nothing is added of what does not fit. Tables whose
+    columns have the names of an earlier table are put into its order. Missing entries
+    (NaN) are accepted if the embedding net of a trained NPE can read them.
+    """
+
+    def __init__(self, prior: Distribution, device: torch.device) -> None:
+        self._prior = prior
+        self._device = device
+        self._tensors: dict[Kind, Any] = {}
+        self.event_shape: torch.Size | None = None
+        self.embedding_net: nn.Module = nn.Identity()
+        self.theta_names: tuple[str, ...] | None = None
+        self.x_names: tuple[str, ...] | None = None
+
+    @property
+    def simulations(self) -> tuple[Tensor, Tensor]:
+        """Theta ``(n, d)`` and simulated x ``(n, *event)``."""
+        return self._tensors["simulations"]
+
+    @property
+    def calibration(self) -> tuple[Tensor, Tensor]:
+        """Theta ``(n, d)`` and the real x ``(n, *event)`` recorded at them."""
+        return self._tensors["calibration"]
+
+    @property
+    def pairs(self) -> Pairs:
+        """The calibration pairs, whose labels are exact."""
+        return Pairs.exact(*self.calibration)
+
+    @property
+    def observations(self) -> Tensor:
+        """Real x without parameters, ``(n_o, *event)``."""
+        return self._tensors["observations"][0]
+
+    def count(self, kind: Kind) -> int:
+        """Return how many simulations, calibration pairs or observations there are."""
+        return len(self._tensors[kind][0]) if kind in self._tensors else 0
+
+    def append(self, kind: Kind, x: Any, theta: Any = None) -> None:
+        """Add data; simulations that cannot be read are dropped with a warning."""
+        new: tuple[Tensor, ...] = ()
+        name = "x_o" if kind == "observations" else "x"
+        if kind != "observations":
+            new = (self.read_theta(theta),)
+            check_in_support("theta", new[0], self._prior)
+        read = as_batch(
+            name,
+            x,
+            self.event_shape,
+            rows=len(new[0]) if new else None,
+            names=self.x_names,
+            finite=False,
+        )
+        if read.ndim < 2:
+            raise InvalidInputError(
+                f"Expected `{name}` of shape (n, *event); got {tuple(read.shape)}. For "
+                f"one number in each row pass `{name}[:, None]`."
+            )
+        new = (*new, self._copied(read))
+        valid = self.readable(new[-1])
+        if not valid.all():
+            if kind != "simulations" or not valid.any():
+                raise InvalidInputError(
+                    f"Expected `{name}` to be finite; got NaN or Inf in "
+                    f"{rows_with(~valid)}."
+                )
+            warn_user(
+                f"Dropped {int((~valid).sum())} of {len(valid)} simulations because "
+                "they contain NaN or Inf."
+            )
+            new = tuple(one[valid] for one in new)
+        old = self._tensors.get(kind, tuple(one[:0] for one in new))
+        self._tensors[kind] = tuple(map(torch.cat, zip(old, new, strict=True)))
+        self.event_shape = new[-1].shape[1:]
+        self.theta_names = self.theta_names or column_names(theta)
+        self.x_names = self.x_names or column_names(x)
+
+    def readable(self, x: Tensor) -> Tensor:
+        """Tell which x are finite, or can be read by the net in spite of NaN."""
+        return readable(self.embedding_net, x)
+
+    def read_theta(self, theta: Any) -> Tensor:
+        """Return a copy of parameters of a user, shape ``(n, d)``."""
+        shape = self._prior.event_shape
+        return self._copied(as_batch("theta", theta, shape, names=self.theta_names))
+
+    def _copied(self, tensor: Tensor) -> Tensor:
+        return tensor.to(self._device, torch.float32, copy=True)
+
+
 class Method(ABC):
     """A method of inference: construct, append data, ``train``, ``build_posterior``.
 
     What is passed in is copied or only read. Appending data after a training asks for
-    another one, which starts anew.
+    another one, which starts anew. ``train`` and what appends return the method, so
+    that calls can be chained.
 
-    A subclass says which data it ``sees`` and returns a posterior from ``_fit``.
+    A subclass says which data it ``sees`` and returns a posterior from ``_fit``. Data
+    that do not fit raise an ``InvalidInputError``, and nothing is added then.
 
     Attributes:
         sees: The kinds of data that can be appended.
@@ -52,12 +156,11 @@ class Method(ABC):
 
     Args:
         prior: A torch distribution over parameters of shape ``(d,)``.
-        npe: The NPE to start from, of a method that does.
+        density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns, of a
+            method that starts from NPE.
+        npe_training: How NPE is trained; ``Training()`` if None.
         simulator: Maps parameters to simulations, of a method that simulates.
         device: Where to train; data on other devices is moved there.
-
-    Raises:
-        InvalidInputError: If the prior is no torch distribution over vectors.
     """
 
     sees: ClassVar[frozenset[Kind]]
@@ -69,8 +172,9 @@ class Method(ABC):
     def __init__(
         self,
         prior: Any,
+        density_estimator: Any = None,
+        npe_training: Training | None = None,
         *,
-        npe: StartingNPE | None = None,
         simulator: Callable[[Any], Any] | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
@@ -85,18 +189,29 @@ class Method(ABC):
         if hasattr(self._prior, "to"):
             self._prior.to(self._device)  # type: ignore[attr-defined]
         self._data = Data(self._prior, self._device)
-        self._npe = npe
+        self._given_npe: Any = None
+        if self.starts_from_npe:
+            check("npe_training", npe_training, Training | None)
+            self._build = estimator_builder(density_estimator)
+            self._npe_training = npe_training or Training()
         self._simulator = simulator
         self._posterior: Any = None
         self._history: History | None = None
 
     @classmethod
-    def from_posterior(cls, posterior: Any, **options: Any) -> "Self":
+    def from_posterior(
+        cls,
+        posterior: Any,
+        *,
+        simulations: tuple[Tensor, Tensor] | None = None,
+        **options: Any,
+    ) -> "Self":
         """Start from a trained NPE instead of training one.
 
         Args:
             posterior: What ``NPE(...).build_posterior()`` of sbi returns. It is copied
                 and never changed.
+            simulations: Pairs (theta, x) to append, with theta drawn from the prior.
             **options: Keyword arguments of the constructor, except for ``device`` and
                 what concerns the training of NPE.
 
@@ -106,7 +221,6 @@ class Method(ABC):
 
         Raises:
             UnsupportedPosteriorError: If it is not a plain amortised posterior.
-            InvalidInputError: If the method does not start from NPE.
         """
         if not cls.starts_from_npe:
             raise InvalidInputError(
@@ -114,13 +228,14 @@ class Method(ABC):
                 f"`{cls.__name__}(prior)`."
             )
         estimator = estimator_of(posterior)
-        method = cls(posterior.prior, device=device_of(estimator), **options)
-        assert method._npe is not None
-        method._npe.replace_by(posterior)
+        method = cls(posterior.prior, device=parameter_of(estimator).device, **options)
+        method._given_npe = posterior_from(posterior, copy.deepcopy(estimator))
         method._data.event_shape = estimator.condition_shape
         method._data.theta_names = getattr(posterior, "parameter_names", None)
         method._data.x_names = getattr(posterior, "x_names", None)
         method._data.embedding_net = copy.deepcopy(embedding_of(estimator))
+        if simulations is not None:
+            method.append_simulations(*simulations)
         return method
 
     def append_simulations(self, theta: Tensor, x: Tensor) -> "Self":
@@ -132,15 +247,8 @@ class Method(ABC):
         Args:
             theta: Parameters drawn from the prior, shape ``(n, d)``.
             x: Their simulations, shape ``(n, *event)``.
-
-        Returns:
-            Itself, so that calls can be chained.
-
-        Raises:
-            InvalidInputError: If the method does not see simulations, shapes do not
-                fit, or a theta is outside the prior's support. Nothing is added then.
         """
-        return self._append("simulations", theta, x)
+        return self._append("simulations", x, theta)
 
     def append_calibration(self, theta: Tensor, x: Tensor) -> "Self":
         """Add real observations with known parameters; may be called repeatedly.
@@ -148,29 +256,14 @@ class Method(ABC):
         Args:
             theta: Parameters, shape ``(n, d)``, inside the prior's support.
             x: Real observations, shape ``(n, *event)``.
-
-        Returns:
-            Itself, so that calls can be chained.
-
-        Raises:
-            InvalidInputError: If the method does not see calibration pairs, shapes do
-                not fit, a value is not finite, or a theta is outside the prior's
-                support. Nothing is added then.
         """
-        return self._append("calibration", theta, x)
+        return self._append("calibration", x, theta)
 
     def append_observations(self, x_o: Tensor) -> "Self":
         """Add real observations without labels; may be called repeatedly.
 
         Args:
             x_o: Real observations, shape ``(n_o, *event)``.
-
-        Returns:
-            Itself, so that calls can be chained.
-
-        Raises:
-            InvalidInputError: If the method does not see observations, the shape does
-                not fit, or a value is not finite.
         """
         return self._append("observations", x_o)
 
@@ -184,9 +277,6 @@ class Method(ABC):
                 their states.
             show_progress_bars: Whether to show the course of the training. None does so
                 in a terminal or a notebook, but not in a file.
-
-        Returns:
-            Itself, so that calls can be chained.
 
         Raises:
             NotReadyError: If data that the method needs was not appended.
@@ -228,23 +318,24 @@ class Method(ABC):
         """Whether simulations must be appended, to train on or to look up."""
         looks_up = self.simulates and self._simulator is None
         used_anyway = looks_up or self.trains_on_statistics
-        return "simulations" in self.sees and (used_anyway or not self._has_npe)
-
-    @property
-    def _has_npe(self) -> bool:
-        """Whether it starts from an NPE that was trained beforehand."""
-        return self._npe is not None and self._npe.is_given
+        return "simulations" in self.sees and (used_anyway or self._given_npe is None)
 
     @abstractmethod
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History | None]:
-        """Return the trained posterior and how it came about."""
+        """Return the trained posterior and its losses."""
 
     def _trained_npe(self, *, show_progress_bars: bool) -> tuple[Any, History | None]:
-        """Return the posterior of the NPE to start from, and how that came about."""
-        assert self._npe is not None
-        return self._npe.posterior(
-            self._prior, self._data, show_progress_bars=show_progress_bars
+        """Return the posterior of NPE, and its losses if it is trained now."""
+        if self._given_npe is not None:
+            return self._given_npe, None
+        estimator, history = train_on_simulations(
+            self._prior,
+            self._build,
+            *self._data.simulations,
+            training=self._npe_training,
+            show_progress_bars=show_progress_bars,
         )
+        return direct_posterior(estimator, self._prior), history
 
     @property
     def _looked_up(self) -> tuple[Tensor, Tensor] | None:
@@ -253,13 +344,11 @@ class Method(ABC):
 
     def _source(self) -> Source:
         """Return the simulator, or the appended simulations where there is none."""
-        event_shape = self._data.event_shape
-        assert event_shape is not None
         return source_of(
             self._prior,
             simulator=self._simulator,
             simulations=self._looked_up,
-            event_shape=event_shape,
+            event_shape=self._data.event_shape or torch.Size(),
             like=torch.empty(0, *self._prior.event_shape, device=self._device),
             readable=self._data.readable,
         )
@@ -271,7 +360,7 @@ class Method(ABC):
                 f"Expected a method that sees {DATA[kind][0]}; {type(self).__name__} "
                 f"sees {'only ' + ' and '.join(seen) if seen else 'no data'}."
             )
-        getattr(self._data, f"append_{kind}")(*data)
+        self._data.append(kind, *data)
         self._posterior = self._history = None
         return self
 

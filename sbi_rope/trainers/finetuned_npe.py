@@ -6,21 +6,15 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from sbi_rope._sbi import (
-    check_density,
-    estimator_of,
-    posterior_from,
-)
+from sbi_rope._sbi import check_density, estimator_of, posterior_from
 from sbi_rope._standardisation import warn_of_far_entries
-from sbi_rope.data import MIN_PAIRS_FOR_HOLDOUT
+from sbi_rope.data import MIN_PAIRS_FOR_HOLDOUT, Nodes
 from sbi_rope.density import Flow, MixturePosterior
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.finetuning import FINETUNING, best_rates, finetune_flow
 from sbi_rope.fit import History, Training, epochs_on_pairs
-from sbi_rope.labels import Nodes
 from sbi_rope.settings import Count, check
 from sbi_rope.trainers.base import Method
-from sbi_rope.trainers.starting_npe import StartingNPE
 from sbi_rope.trainers.training import EstimatorBuilder
 
 if TYPE_CHECKING:
@@ -48,8 +42,6 @@ class FinetunedNPE(Method):
 
     Networks that few pairs have led astray are not astray in the same way, so that an
     average of five is better than each of them, and better calibrated.
-    It is a :class:`~sbi_rope.MixturePosterior`, which is divided by its mass
-    inside the prior's support, and says so with an error where there is none.
 
     Sees simulations and the calibration set. Assumes that what NPE has learnt is a good
     start. To be preferred from some 200 pairs on, where it is among the
@@ -78,8 +70,10 @@ class FinetunedNPE(Method):
             too few pairs to hold some out.
         device: Where to train; data on other devices is moved there.
 
+    Attributes:
+        histories: The losses of the last training, of each network.
+
     Raises:
-        InvalidInputError: If an argument is of the wrong kind.
         UnsupportedPosteriorError: In ``train``, if the estimator has no density.
     """
 
@@ -99,13 +93,12 @@ class FinetunedNPE(Method):
     ) -> None:
         check("num_holdouts", num_holdouts, Count)
         check("training", training, Training | None)
-        npe = StartingNPE(density_estimator, npe_training)
-        super().__init__(prior, npe=npe, device=device)
+        super().__init__(prior, density_estimator, npe_training, device=device)
         self.num_holdouts = num_holdouts
         self.training = FINETUNING if training is None else training
         self.learning_rates = learning_rates
         self._start: Flow | None = None
-        self._other_histories: tuple[History, ...] = ()
+        self.histories: tuple[History, ...] = ()
 
     @classmethod
     def from_posterior(cls, posterior: Any, **options: Any) -> "Self":
@@ -122,7 +115,6 @@ class FinetunedNPE(Method):
 
         Raises:
             UnsupportedPosteriorError: If it is none of these.
-            InvalidInputError: If ``num_holdouts`` is not the number of embedding nets.
         """
         flow = getattr(posterior, "posterior_estimator", None)
         if not isinstance(flow, Flow):
@@ -139,16 +131,6 @@ class FinetunedNPE(Method):
         method._data.theta_names = getattr(posterior, "parameter_names", None)
         method._data.x_names = getattr(posterior, "x_names", None)
         return method
-
-    @property
-    def history(self) -> History:
-        """The losses of the last training; of several networks, those of the first."""
-        return super().history
-
-    @property
-    def histories(self) -> tuple[History, ...]:
-        """The losses of the last training, of each network."""
-        return (self.history, *self._other_histories)
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
@@ -181,8 +163,8 @@ class FinetunedNPE(Method):
             show_progress_bars=show_progress_bars,
         )
         best = best_rates(histories, len(rates))
-        history, *others = (histories[k] for k in best)
-        self._other_histories = tuple(others)
+        self.histories = tuple(histories[k] for k in best)
+        history = self.histories[0]
         if self.num_holdouts == 1:
             return posterior_from(npe, flow[best].estimator(own)), history
         return MixturePosterior(flow[best], copy.deepcopy(self._prior)), history

@@ -11,9 +11,7 @@ import sbi_rope.baselines
 from sbi_rope._random import seeded
 from sbi_rope.baselines import Method, PlainNPE
 from sbi_rope.discrepancy import DiscrepancyNPE
-from sbi_rope.errors import (
-    InvalidInputError,
-)
+from sbi_rope.errors import InvalidInputError
 from tests import baselines
 from tests.baselines import (
     METHODS,
@@ -68,7 +66,6 @@ def test_every_method_is_held_to_this_contract() -> None:
 def test_every_method_takes_data_and_trains_as_their_common_base_does() -> None:
     shared = {f"append_{kind}" for kind in KINDS} | {"train", "build_posterior"}
     for kind in public_methods():
-        assert kind.__bases__ == (Method,)
         assert not shared & vars(kind).keys(), kind
 
 
@@ -80,17 +77,12 @@ def test_no_method_takes_labels_of_observations() -> None:
     assert options == ["self", "seed", "show_progress_bars"]
 
 
-@pytest.mark.parametrize("name", ["prior", "calibration_mlp", "joint_npe"])
-def test_data_that_a_method_does_not_see_are_refused(name: str) -> None:
-    sees = {
-        "prior": "no data",
-        "calibration_mlp": "only calibration pairs",
-        "joint_npe": "only simulations and calibration pairs",
-    }
-    method, data = make(name, first_task(name)), data_of(first_task(name))
-    for kind in set(KINDS) - method.sees:
-        with pytest.raises(InvalidInputError, match=f"sees {sees[name]}"):
-            append(method, kind, data)
+def test_data_that_a_method_does_not_see_are_refused() -> None:
+    for name, entry in METHODS.items():
+        method, data = make(name, first_task(name)), data_of(first_task(name))
+        for kind in set(KINDS) - entry.kind.sees:
+            with pytest.raises(InvalidInputError, match="Expected a method that sees"):
+                append(method, kind, data)
 
 
 # NPE trained beforehand.

@@ -3,7 +3,6 @@
 import copy
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 from unittest.mock import patch
 
@@ -13,12 +12,11 @@ from torch import Tensor
 
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed
-from sbi_rope.data import Pairs
+from sbi_rope.data import Nodes, Pairs
 from sbi_rope.density import Density, Flow
 from sbi_rope.ensemble import embedded
 from sbi_rope.finetuning import CalibrationFinetuner, finetune_flow
 from sbi_rope.fit import Training
-from sbi_rope.labels import Nodes
 from sbi_rope.stacking import (
     Candidate,
     DiscrepancyCandidate,
@@ -280,7 +278,7 @@ def test_pairs_and_simulations_count_half_each_with_rehearsal_and_pairs_by_weigh
 
     def spied(network: Any, batches: Any, loss: Any, *rest: Any, **options: Any) -> Any:
         losses.append(torch.stack([loss(*batch).detach() for batch in batches(0)]))
-        losses.append(options["validation_loss"]().detach())
+        losses.append(options["validation_loss"](*options["held_out"]).detach())
         return []
 
     monkeypatch.setattr(finetuning, "fit", spied)
@@ -354,29 +352,6 @@ def test_an_observation_is_embedded_once_whatever_its_label_leaves_possible() ->
     assert nodes.log_mean(log_q).isfinite().all()
 
 
-def test_of_several_learning_rates_the_best_on_the_hold_out_is_kept(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    data = data_of(rope_of(problem(12, seed=1)))
-    version = data.without(2)
-    training = replace(candidates.FINETUNING, max_num_epochs=15)
-    monkeypatch.setattr(candidates, "FINETUNING", training)
-
-    def held_out_losses(*rates: float) -> Tensor:
-        monkeypatch.setattr(candidates, "LEARNING_RATES", {None: rates})
-        [flow] = FinetunedCandidate().fit(data, [version])
-        assert isinstance(flow, Flow)
-        theta, x = data.pairs.mean, data.pairs.x
-        parts = [part for _, part in data.holdouts(version)]
-        scores = [flow[[k]].log_prob(theta[None], x)[0] for k in range(3)]
-        return -torch.stack([scores[k][part].mean() for k, part in enumerate(parts)])
-
-    slow, fast = held_out_losses(1e-4), held_out_losses(1e-2)
-    assert (slow - fast).abs().max() > 1e-3
-    for rates in ((1e-4, 1e-2), (1e-2, 1e-4)):
-        assert torch.allclose(held_out_losses(*rates), slow.minimum(fast), atol=1e-4)
-
-
 def test_a_version_is_corrected_by_the_discrepancy_of_its_rows() -> None:
     """Pairs of two kinds, each shifted in its own way."""
     theta, x = problem(16, seed=1)
@@ -406,7 +381,7 @@ def test_a_version_is_corrected_by_the_discrepancy_of_its_rows() -> None:
 def test_rvnp_learns_from_no_pair() -> None:
     candidate = RVNPCandidate(observed(60))
     with (
-        patch("sbi_rope.baselines.rvnp.method.DEFAULT_TRAINING", SHORT),
+        patch("sbi_rope.baselines.rvnp.DEFAULT_TRAINING", SHORT),
         patch("sbi_rope.stacking.candidates.MAX_OBSERVATIONS", 50),
     ):
         data = data_of(rope_of())

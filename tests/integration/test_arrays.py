@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import pytest
 import torch
@@ -10,7 +9,6 @@ from torch import Tensor
 
 from sbi_rope import RoPE, diagnose
 from sbi_rope.discrepancy import DiscrepancyNPE
-from sbi_rope.errors import InvalidInputError
 from sbi_rope.metrics import draw_samples, evaluate
 from sbi_rope.trainers import FinetunedNPE
 from sbi_rope.trainers.training import Training
@@ -91,31 +89,6 @@ def test_stored_simulations_and_trainers_take_arrays() -> None:
     assert method.build_posterior().sample((2,), x=PAIRS[1][0], **QUIET).shape == (2, 2)
 
 
-def test_the_array_of_a_user_is_not_changed_or_shared() -> None:
-    theta, x = (tensor.numpy().copy() for tensor in gaussian.labelled(20))
-    rope = RoPE(gaussian.posterior(), simulator=gaussian.simulator, finetuner=QUICK)
-    rope.append_calibration(theta, x)
-    x[:] = np.nan
-    assert rope.calibration[1].isfinite().all()
-
-
-def test_tables_are_those_of_tensors() -> None:
-    def simulator(theta: Tensor) -> pd.DataFrame:
-        return pd.DataFrame(gaussian.simulator(theta), columns=["blue", "red"])
-
-    theta, x = gaussian.labelled(12)
-    rope, expected = (
-        RoPE(gaussian.posterior(), simulator=function, finetuner=QUICK)
-        for function in (simulator, gaussian.simulator)
-    )
-    rope.append_calibration(pd.DataFrame(theta), pd.DataFrame(x))
-    expected.append_calibration(theta, x)
-    for ours, theirs in zip(rope.calibration, expected.calibration, strict=True):
-        assert torch.equal(ours, theirs)
-    found, wanted = (one.source.from_prior(20, seed=0)[1] for one in (rope, expected))
-    assert torch.equal(found, wanted)
-
-
 @pytest.mark.medium
 def test_a_table_is_put_in_the_order_of_the_first_one() -> None:
     def table(numbers: Tensor, names: str) -> Any:
@@ -148,17 +121,3 @@ def test_a_table_is_put_in_the_order_of_the_first_one() -> None:
         found_set = posterior.credible_set(0.5, x_second.iloc[0], seed=0)
         drawn = table(found_set.draws, "ab")[["b", "a"]]
         assert torch.equal(found_set.contains(drawn), found_set.inside)
-
-
-def test_what_an_array_masks_is_missing() -> None:
-    theta, x = map(array, PAIRS)
-    x_masked = np.ma.masked_array(x, mask=np.zeros_like(x))
-    x_masked[::3, 0] = np.ma.masked
-    x_masked.data[::3, 0] = -9.0
-    with pytest.raises(InvalidInputError, match="got NaN or Inf in 4 of 12"):
-        rope((theta, x_masked))
-    with pytest.raises(InvalidInputError, match="NaN"):
-        rope((theta, list(x_masked)))
-    theta_masked = np.ma.masked_array(theta, mask=x_masked.mask[:, :2])
-    known = rope((theta_masked, x)).pairs.label.is_measured
-    assert torch.equal(~known, torch.from_numpy(theta_masked.mask))

@@ -164,7 +164,6 @@ CALLS: dict[str, Call] = {
         stacked().credible_set(0.5, X_O[0], guaranteed=True, seed=0).contains(theta)
     ),
     "lpp": lambda theta=THETA, x=X: metrics.lpp(stacked(), theta, x),
-    "acauc": lambda theta=THETA, x=X: metrics.acauc(stacked(), theta, x),
     "evaluate": lambda theta=THETA, x=X: metrics.evaluate(stacked(), theta, x),
     "acauc_of": lambda levels=LEVELS: metrics.acauc_of(levels).value,
     "mid_ranks": lambda samples=SAMPLES, theta=THETA: metrics.mid_ranks(samples, theta),
@@ -217,6 +216,8 @@ MEANS: dict[str, Callable[[Any], bool]] = {
     # A parameter that was not measured is imputed.
     "RoPE.append_calibration(theta: NaN)": finite,
     "acauc_of(levels: width)": finite,
+    # A parameter that is not known.
+    "acauc_of(levels: NaN)": finite,
     # These have a rank.
     "mid_ranks(samples: Inf)": finite,
     "mid_ranks(theta: Inf)": finite,

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -11,7 +10,7 @@ from torch import Tensor
 from sbi_rope import RoPE, StackedPosterior, diagnose
 from sbi_rope.density import MixturePosterior
 from sbi_rope.diagnosis import Diagnosis
-from sbi_rope.diagnosis.in_use import read_for, stack_in_use
+from sbi_rope.diagnosis.report import read_for
 from tests import problems
 from tests.stacks import NPE, NUM_PAIRS, PRIOR, QUIET, Box, problem, rope_of, stacked
 
@@ -103,23 +102,6 @@ def test_nothing_alarms_about_a_stack_whose_batch_is_drawn_like_its_pairs(
     ]
 
 
-def test_the_verdict_for_the_stack_comes_first_and_what_does_not_concern_it_last(
-    of_stack: Diagnosis,
-) -> None:
-    text = " ".join(str(of_stack).split())
-    verdict = "none of 7 findings that concern this stack is alarming."
-    assert verdict in text
-    like = f"the batch is unlike the calibration pairs ({of_stack[UNLIKE].number[:5]}"
-    assert like in text[: text.index("as expected where the simulator is wrong:")]
-    first, _, last = text.partition("and not about this stack, which has no couplings:")
-    assert f"{AFTER}: " not in first
-    # An alarm about others is said to be one.
-    assert of_stack[AFTER].alarming
-    assert f"{AFTER}: {of_stack[AFTER].number}, alarming" in last
-    assert "\n! " not in str(of_stack)
-    assert "posterior=posterior" not in text
-
-
 def test_a_shift_that_the_pairs_do_not_show_is_an_alarm_about_the_stack(
     rope: RoPE, stack: StackedPosterior
 ) -> None:
@@ -132,9 +114,7 @@ def test_a_shift_that_the_pairs_do_not_show_is_an_alarm_about_the_stack(
         replace(one, alarming=one.name != UNLIKE and one.alarming)
         for one in diagnosis.findings
     )
-    used = diagnosis.posterior
-    assert used is not None
-    found = read_for(replace(diagnosis, findings=quiet), used)
+    found = read_for(replace(diagnosis, findings=quiet), stack.report)
     assert names(found.unexpected) >= SHIFTS
 
 
@@ -147,13 +127,11 @@ def test_a_shift_that_the_pairs_show_is_an_alarm_where_nothing_has_learned_it(
         replace(report, probability_of_prior=0.3),
         replace(report, probability_of_prior=None),
     ):
-        found = read_for(of_stack, stack_in_use(other))
+        found = read_for(of_stack, other)
         assert names(found.unexpected) == SHIFTS | NARROW
     # Nor is it expected where the comparison with the pairs is missing.
     others = tuple(one for one in of_stack.findings if one.name != UNLIKE)
-    used = of_stack.posterior
-    assert used is not None
-    found = read_for(replace(of_stack, findings=others), used)
+    found = read_for(replace(of_stack, findings=others), report)
     assert names(found.unexpected) == SHIFTS | NARROW
 
 
@@ -165,25 +143,3 @@ def test_all_findings_concern_posteriors_with_couplings(
     assert diagnosis.others == ()
     assert names(diagnosis.unexpected) == names(of_anyone.unexpected)
     assert "that concern this posterior are alarming" in diagnosis.verdict
-
-
-@pytest.mark.medium
-def test_the_page_of_a_stack_counts_its_alarms_whomever_the_diagnosis_was_for(
-    stack: StackedPosterior,
-    of_stack: Diagnosis,
-    of_anyone: Diagnosis,
-    tmp_path: Path,
-) -> None:
-    pytest.importorskip("matplotlib")
-
-    def page(diagnosis: Diagnosis) -> str:
-        path = tmp_path / "report.html"
-        stack.report.to_html(path, diagnosis=diagnosis)
-        return path.read_text(encoding="utf-8")
-
-    for diagnosis in (of_anyone, of_stack):
-        text = page(diagnosis)
-        assert "none of 7 findings that concern this stack is alarming" in text
-        assert "and not about this stack" in text
-        assert "It is as expected of this stack, which has learned" in text
-        assert 'class="finding alarm"' not in text

@@ -2,7 +2,6 @@
 
 import functools
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +15,7 @@ from torch.distributions import Normal
 
 from sbi_rope._random import seeded
 from sbi_rope.baselines import PlainNPE, Training
-from sbi_rope.discrepancy import Discrepancy, DiscrepancyDraws, DiscrepancyModel
+from sbi_rope.discrepancy import DiscrepancyDraws, DiscrepancyModel
 from sbi_rope.discrepancy.npe import DiscrepancyNPE
 from tests import gaussian
 
@@ -159,25 +158,6 @@ def test_with_many_pairs_it_becomes_the_posterior_of_a_known_discrepancy() -> No
     assert float(uncorrected.mean()) > 5
 
 
-def plug_in(
-    sample: Callable[..., DiscrepancyDraws],
-) -> Callable[..., DiscrepancyDraws]:
-    """Put the posterior mean in the place of all draws."""
-
-    def sample_mean(
-        self: Discrepancy, num_draws: int, **options: Any
-    ) -> DiscrepancyDraws:
-        draws = sample(self, num_draws, **options)
-        covariance = (draws.error_factor @ draws.error_factor.mT).mean(dim=0)
-        return DiscrepancyDraws(
-            gain=draws.gain.mean(dim=0, keepdim=True),
-            offset=draws.offset.mean(dim=0, keepdim=True),
-            error_factor=torch.linalg.cholesky(covariance)[None],
-        )
-
-    return sample_mean
-
-
 def coverage(num_pairs: int, *, repetitions: int) -> Tensor:
     """How often central 90 % intervals hold the parameter, at each repetition."""
     shares = []
@@ -204,16 +184,6 @@ def test_intervals_of_90_percent_hold_90_percent_of_the_parameters(
     error = float(shares.std()) / len(shares) ** 0.5
     assert error < 0.02
     assert abs(float(shares.mean()) - 0.9) < 3 * error + 0.005
-
-
-@pytest.mark.slow
-def test_a_discrepancy_that_is_plugged_in_is_over_confident(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(Discrepancy, "sample", plug_in(Discrepancy.sample))
-    shares = coverage(5, repetitions=60)
-    error = float(shares.std()) / len(shares) ** 0.5
-    assert float(shares.mean()) < 0.9 - 3 * error - 0.005
 
 
 @pytest.mark.slow

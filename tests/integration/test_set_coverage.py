@@ -72,7 +72,7 @@ def holds(n: int, mixing: Tensor) -> tuple[bool, bool, float]:
     for k in range(NUM_FOLDS):
         rows = (fold == k).nonzero().flatten()
         log_scores[rows] = log_normal(theta[rows, None], *predicted(models[k], x[rows]))
-    learnt = fold_weights(log_scores, fold)
+    learnt = fold_weights(log_scores, fold, None)
     held, plain = [], 0.0
     for weights in (learnt, torch.full_like(learnt, 1 / learnt.shape[1])):
         scores, at_new = theta.new_empty(n), theta.new_empty(NUM_FOLDS, 1)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from sbi_rope import RoPE, load, stack
-from sbi_rope._units import log_units_of
+from sbi_rope._prior import log_units_of
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.metrics import lpp
 from sbi_rope.stacking import CrossValidation

@@ -1,22 +1,20 @@
 """RVNP as a candidate of a stack, which learns from observations without labels."""
 
 import functools
-import pickle
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.distributions import Independent, Normal
 
-from sbi_rope import RoPE, StackedPosterior, load, save, stack
+from sbi_rope import RoPE, StackedPosterior, stack
 from sbi_rope._random import seeded
-from sbi_rope._sbi import embedding_of, estimator_of, posterior_from, with_embedding
+from sbi_rope._sbi import estimator_of
 from sbi_rope.baselines import RVNP, Training
-from sbi_rope.baselines.rvnp.likelihood import fit_surrogate
+from sbi_rope.baselines.rvnp import fit_surrogate
 from sbi_rope.errors import InvalidInputError, RoPEWarning
 from sbi_rope.stacking import RVNPCandidate, default_candidates
 from tests import gaussian, problems
@@ -45,7 +43,7 @@ def short(request: pytest.FixtureRequest) -> Iterator[None]:
     if request.node.get_closest_marker("slow"):
         yield
         return
-    room = "sbi_rope.baselines.rvnp.method."
+    room = "sbi_rope.baselines.rvnp."
 
     def quickly(*data: Tensor, training: Training, **options: Any) -> Any:
         return fit_surrogate(*data, training=SHORT, **options)
@@ -107,42 +105,6 @@ def test_the_labels_of_the_pairs_change_its_weight_only() -> None:
 
 
 @pytest.mark.medium
-def test_it_is_trained_once() -> None:
-    trained = []
-    train = RVNP.train
-
-    def counted(self: RVNP, **options: Any) -> RVNP:
-        trained.append(len(self._data.observations))
-        return train(self, **options)  # type: ignore[return-value]
-
-    with patch.object(RVNP, "train", counted):
-        stacked(
-            rope_of(),
-            candidates=with_rvnp(),
-            num_folds=4,
-            learning_curve=True,
-        )
-    assert trained == [NUM_OBSERVATIONS]
-
-
-@pytest.mark.medium
-@pytest.mark.parametrize("options", [{}, {"space": "input"}], ids=str)
-def test_the_stack_answers_observations_it_has_not_seen_and_can_be_kept(
-    options: dict[str, str], tmp_path: Path
-) -> None:
-    made, x = the_stack(**options), other_x()
-    assert made.report.family_weights["RVNP"] > 0
-    theta = made.sample_batched((3,), x, show_progress_bars=False)
-    expected = made.log_prob_batched(theta, x)
-    assert expected.isfinite().all()
-    save(made, tmp_path / "stack.pt")
-    again = load(tmp_path / "stack.pt")
-    copied = pickle.loads(pickle.dumps(made))
-    for other in (again, copied):
-        assert torch.equal(other.log_prob_batched(theta, x), expected)
-
-
-@pytest.mark.medium
 def test_a_batch_of_a_hundred_observations_brings_it_into_the_default_stack() -> None:
     rope, x_o = rope_of(), observed(100)
     plain = [candidate.name for candidate in default_candidates(rope)]
@@ -184,66 +146,6 @@ def test_what_would_take_hours_or_cannot_be_learned_is_left_out_with_a_warning()
     number = len(default_candidates(same))
     with pytest.warns(RoPEWarning, match="adds no candidate"):
         assert len(default_candidates(same, x_o)) == number
-
-
-def test_it_learns_from_a_part_of_many_observations() -> None:
-    learned = []
-    append = RVNP.append_observations
-
-    def kept(self: RVNP, x_o: Tensor) -> RVNP:
-        learned.append(x_o)
-        return append(self, x_o)  # type: ignore[return-value]
-
-    with (
-        patch.object(RVNP, "append_observations", kept),
-        patch("sbi_rope.stacking.candidates.MAX_OBSERVATIONS", 50),
-    ):
-        made = stacked(rope_of(), candidates=with_rvnp())
-    (part,) = learned
-    rows = (part[:, None] == observed(NUM_OBSERVATIONS)).all(dim=2)
-    assert len(part) == 50
-    assert rows.any(dim=1).all()
-    assert len(rows.int().argmax(dim=1).unique()) == 50
-    assert made.log_prob(torch.zeros(1, 2), x=other_x()[0]).isfinite()
-
-
-def test_missing_numbers_of_observations_put_the_errors_in_the_embedding() -> None:
-    npe = problems.npe_posterior()
-    net = nn.Sequential(problems.Filled(), *embedding_of(npe.posterior_estimator))
-    estimator = with_embedding(npe.posterior_estimator, net)
-    reads_missing = posterior_from(npe, estimator)
-    rope = RoPE(reads_missing, simulator=problems.simulate)
-    rope.append_calibration(*problem(NUM_PAIRS, seed=1))
-    x_o = observed(120)
-    assert default_candidates(rope, x_o)[-1].name == "RVNP (input)"
-    x_o[3, 1] = torch.nan
-    assert default_candidates(rope, x_o)[-1].name == "RVNP"
-    method = RVNP.from_posterior(reads_missing, noise_on="input")
-    theta = problems.box(2).sample((50,))
-    method.append_simulations(theta, problems.simulate(theta)).append_observations(x_o)
-    with pytest.raises(InvalidInputError, match=r"x_o` to be finite.*1 of 120"):
-        method.train(show_progress_bars=False)
-
-
-@pytest.mark.medium
-def test_errors_in_images_are_refused_before_anything_is_simulated() -> None:
-    calls = []
-
-    def simulator(theta: Tensor) -> Tensor:
-        calls.append(len(theta))
-        return problems.simulate_image(theta)
-
-    theta, _ = problem(NUM_PAIRS, seed=1)
-    images = problems.simulate_image(theta)
-    rope = RoPE(problems.npe_posterior("maf", "cnn"), simulator=simulator)
-    rope.append_calibration(theta, images)
-    calls.clear()
-    with pytest.raises(InvalidInputError, match="space='input'"):
-        stacked(rope, candidates=[NPE, RVNPCandidate(images, space="input")])
-    assert not calls
-    # The embedding of images is fine, for a stack and for what is asked in float64.
-    made = stacked(rope, candidates=[NPE, RVNPCandidate(images.double())])
-    assert "RVNP" in made.candidate_weights
 
 
 @pytest.mark.parametrize(

@@ -53,17 +53,10 @@ def test_a_slab_alone_has_the_quartiles_of_a_cauchy_law() -> None:
     assert torch.allclose(quartiles, expected, atol=0.01)
 
 
-def test_a_spike_alone_has_the_moments_of_a_gaussian() -> None:
-    noise = SpikeAndSlab(slab_probability=0.0).sample_like(torch.empty(100_000))
-    assert abs(float(noise.mean())) < 4 * 0.01 / len(noise) ** 0.5
-    assert float(noise.std()) == pytest.approx(0.01, rel=0.01)
-    assert float((noise / 0.01).pow(4).mean()) == pytest.approx(3.0, rel=0.05)
-
-
 def test_noise_never_exceeds_the_bound_and_reaches_it() -> None:
-    noise = SpikeAndSlab(bound=2.0).sample_like(torch.empty(10_000))
-    assert float(noise.max()) == 2.0
-    assert float(noise.min()) == -2.0
+    noise = SpikeAndSlab(slab_scale=100.0).sample_like(torch.empty(10_000))
+    assert float(noise.max()) == 1000.0
+    assert float(noise.min()) == -1000.0
 
 
 def test_the_density_is_the_mixture_of_both_laws() -> None:
@@ -167,13 +160,6 @@ def test_r_hat_is_the_textbook_ratio_of_variances() -> None:
             between = 5 * np.var([part.mean() for part in chains], ddof=1)
             expected = np.sqrt((4 / 5 * within + between / 5) / within)
             assert float(result[i, d]) == pytest.approx(expected)
-
-
-def test_r_hat_is_one_for_independent_draws_and_large_for_parted_chains() -> None:
-    draws = torch.randn(4, 1000, 1)
-    assert float(split_r_hat(draws)) == pytest.approx(1.0, abs=0.01)
-    parted = draws + torch.tensor([0.0, 0.0, 0.0, 3.0])[:, None, None]
-    assert float(split_r_hat(parted)) > 1.5
 
 
 def test_r_hat_sees_chains_that_drift_together() -> None:

@@ -8,12 +8,21 @@ from sbi.utils import BoxUniform
 from torch import Tensor, nn
 
 from sbi_rope.baselines import FMCPE, Training
-from sbi_rope.baselines.fmcpe.unbounded import Unbounded
-from sbi_rope.baselines.fmcpe.velocity import VelocityField, follow, follow_back
+from sbi_rope.baselines.flow_matching import (
+    Unbounded,
+    VelocityField,
+    follow,
+    follow_back,
+)
 from tests import gaussian, problems
 
 QUIET: dict[str, Any] = {"seed": 0, "show_progress_bars": False}
 DIM = 2
+
+
+@pytest.fixture(autouse=True)
+def _few_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sbi_rope.baselines.fmcpe.NUM_DRAWS", 10)
 
 
 def bent_field() -> VelocityField:
@@ -53,7 +62,7 @@ def test_the_divergence_is_the_change_of_volume_of_the_map() -> None:
 def trained(n: int, **options: Any) -> Any:
     torch.manual_seed(0)
     method = FMCPE.from_posterior(
-        gaussian.posterior(), simulator=gaussian.simulator, num_draws=20, **options
+        gaussian.posterior(), simulator=gaussian.simulator, **options
     )
     method.append_calibration(*gaussian.labelled(n))
     return method.train(**QUIET).build_posterior()
@@ -90,18 +99,23 @@ def test_with_many_pairs_it_comes_near_the_exact_posterior(
     assert found > float(exact) - 0.25
 
 
+def box_method(theta: Tensor, *, num_epochs: int = 40) -> Any:
+    """FMCPE in a box, tuned on pairs."""
+    method = FMCPE.from_posterior(
+        problems.npe_posterior("mdn", dim=1),
+        simulator=problems.simulate,
+        training=Training(
+            learning_rate=3e-3, max_num_epochs=num_epochs, stop_after_epochs=num_epochs
+        ),
+    )
+    return method.append_calibration(theta, problems.simulate(theta) + 0.3)
+
+
 @pytest.mark.slow
 def test_inside_a_box_the_density_has_mass_one_and_samples_follow_it() -> None:
     torch.manual_seed(0)
-    posterior = problems.npe_posterior("mdn", dim=1)
     theta = problems.box(1).sample((60,))
-    method = FMCPE.from_posterior(
-        posterior,
-        simulator=problems.simulate,
-        num_draws=10,
-        training=Training(learning_rate=3e-3, max_num_epochs=40, stop_after_epochs=40),
-    )
-    method.append_calibration(theta, problems.simulate(theta) + 0.3)
+    method = box_method(theta)
     repaired = method.train(**QUIET).build_posterior()
     x = problems.simulate(torch.tensor([[0.8]])) + 0.3
     edges = torch.linspace(-1, 1, 2001)
@@ -127,7 +141,6 @@ def test_what_npe_has_outside_the_prior_is_replaced_by_the_prior() -> None:
     method = FMCPE.from_posterior(
         npe,
         simulator=gaussian.simulator,
-        num_draws=5,
         training=Training(learning_rate=1e-12, max_num_epochs=1),
     )
     theta = prior.sample((20,))
@@ -137,21 +150,6 @@ def test_what_npe_has_outside_the_prior_is_replaced_by_the_prior() -> None:
     assert draws.std(dim=0).allclose(torch.tensor(1 / 3**0.5), atol=0.05)
     log_prob = posterior.log_prob(torch.zeros(1, DIM), x=far, norm_posterior=False)
     assert float(log_prob) == pytest.approx(float(prior.log_prob(torch.zeros(1, DIM))))
-
-
-def box_method(theta: Tensor, *, num_epochs: int = 40) -> Any:
-    """FMCPE in a box, tuned on pairs."""
-    method = FMCPE.from_posterior(
-        problems.npe_posterior("mdn", dim=1),
-        simulator=problems.simulate,
-        num_draws=10,
-        training=Training(
-            learning_rate=3e-3,
-            max_num_epochs=num_epochs,
-            stop_after_epochs=num_epochs,
-        ),
-    )
-    return method.append_calibration(theta, problems.simulate(theta) + 0.3)
 
 
 @pytest.mark.medium
@@ -202,7 +200,6 @@ def test_fields_see_observations_in_their_own_unit_however_far_they_are(
             npe,
             simulator=problems.simulate,
             space=space,  # type: ignore[arg-type]
-            num_draws=3,
             training=Training(max_num_epochs=1),
         )
         method.append_calibration(theta[:count], x[:count])
@@ -217,7 +214,3 @@ def test_fields_see_observations_in_their_own_unit_however_far_they_are(
                 continue
             assert torch.allclose(seen.mean(dim=0), torch.zeros(3), atol=1e-3)
             assert torch.allclose(seen.std(dim=0), torch.ones(3), atol=1e-3)
-
-
-def batch_norms(estimator: nn.Module) -> list[Any]:
-    return [one for one in estimator.modules() if isinstance(one, nn.BatchNorm1d)]

@@ -1,6 +1,5 @@
-"""The HVAE: bound, gradients, mixture and training."""
+"""The HVAE: bound, gradients, networks, mixture and training."""
 
-import copy
 import math
 from collections.abc import Iterator
 from typing import Any
@@ -11,23 +10,18 @@ from sbi.inference import NPE, DirectPosterior
 from sbi.neural_nets import posterior_nn
 from sbi.utils import BoxUniform
 from torch import Tensor, nn
-from torch.distributions import (
-    Dirichlet,
-    MultivariateNormal,
-)
+from torch.distributions import Dirichlet, MultivariateNormal
 
 from sbi_rope._sbi import headless
-from sbi_rope.baselines.hvae import HVAE
-from sbi_rope.baselines.hvae.embeddings import OverLatents
-from sbi_rope.baselines.hvae.model import (
-    FrozenNPE,
+from sbi_rope.baselines.hvae import HVAE, OverLatents
+from sbi_rope.baselines.hvae_model import (
+    ContinuedPrior,
     HybridVAE,
+    LatentEncoder,
+    reparametrised_sample,
 )
-from sbi_rope.baselines.hvae.prior import ContinuedPrior
-from sbi_rope.baselines.hvae.reparametrisation import reparametrised_sample
-from sbi_rope.errors import (
-    InvalidInputError,
-)
+from sbi_rope.baselines.networks import ConditionalUNet
+from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.pendulum import PendulumSimulator
 from sbi_rope.trainers.training import Training
 
@@ -91,28 +85,23 @@ class Shift(nn.Module):
         return mean, torch.full_like(mean, 2 * math.log(self.std))
 
 
-def linear_model(
-    *, shift: float = 0.0, noisy: bool = False, r2p_std: float = 0.1
-) -> HybridVAE:
+def linear_model(shift: float = 0.0) -> HybridVAE:
     return HybridVAE(
         Encoder(shift),
-        Shift(-1.0, r2p_std),
+        Shift(-1.0, 1.0),
         Shift(1.0, NOISE_STD),
-        npe=FrozenNPE(nn.Identity(), LinearFlow()),
+        npe=(nn.Identity(), LinearFlow()),
         physics=lambda theta: theta @ A.T,
         prior=ContinuedPrior(MultivariateNormal(torch.zeros(2), torch.eye(2))),
-        noisy=noisy,
     )
 
 
 def test_elbo_of_the_exact_posterior_is_the_evidence_for_every_draw() -> None:
     torch.manual_seed(0)
     x = EVIDENCE.sample((200,))
-    elbo = linear_model().elbo(x)
     # The KL term is in closed form, so that single draws scatter about it.
     model = linear_model()
     repeated = model.elbo(x.repeat(500, 1)).reshape(500, 200)
-    assert elbo.shape == (200,)
     error = repeated.mean(dim=0) - EVIDENCE.log_prob(x)
     standard_error = repeated.std(dim=0) / math.sqrt(500)
     assert (error.abs() < 5 * standard_error + 1e-4).all()
@@ -130,19 +119,6 @@ def test_elbo_of_a_shifted_encoder_is_lower_by_the_divergence() -> None:
     assert float(gap.mean()) == pytest.approx(1.5**2 / 2, abs=4 * standard_error)
 
 
-def test_elbo_with_drawn_simulations_is_lower_by_what_the_noise_costs() -> None:
-    torch.manual_seed(0)
-    x, std = EVIDENCE.sample((20_000,)), 0.3
-    elbo = linear_model(noisy=True, r2p_std=std).elbo(x).detach()
-    gap = EVIDENCE.log_prob(x) - elbo
-    # E KL(q(theta | s + noise) || q(theta | s)), two Gaussians of the same precision.
-    gain = torch.linalg.solve(PRECISION, A.T) / NOISE_STD**2
-    expected = 0.5 * std**2 * torch.trace(gain.T @ PRECISION @ gain)
-    standard_error = float(gap.std()) / math.sqrt(len(gap))
-    assert standard_error < 0.03
-    assert float(gap.mean()) == pytest.approx(float(expected), abs=4 * standard_error)
-
-
 def test_objective_adds_the_weighted_log_probability_of_the_pairs() -> None:
     x = EVIDENCE.sample((10,))
     pairs = torch.randn(4, 2), EVIDENCE.sample((4,))
@@ -150,10 +126,9 @@ def test_objective_adds_the_weighted_log_probability_of_the_pairs() -> None:
     torch.manual_seed(1)
     log_prob = model.calibration_log_prob(*pairs)
     elbo = model.elbo(x)
-    for weight in (0.0, 1.0, 3.0):
-        torch.manual_seed(1)
-        value = model.objective(x, *pairs, weight=weight)
-        torch.testing.assert_close(value, -elbo.mean() - weight * log_prob.mean())
+    torch.manual_seed(1)
+    value = model.objective(x, *pairs)
+    torch.testing.assert_close(value, -elbo.mean() - 4 * log_prob.mean())
 
 
 # --- draws with a gradient ---
@@ -177,7 +152,7 @@ def flow(name: str) -> Any:
 
 @pytest.mark.medium
 @pytest.mark.usefixtures("double")
-@pytest.mark.parametrize("name", ["maf", "nsf", "zuko_nsf", "zuko_unaf"])
+@pytest.mark.parametrize("name", ["maf", "zuko_unaf"])
 def test_gradient_of_a_draw_is_that_of_finite_differences_at_fixed_noise(
     name: str,
 ) -> None:
@@ -255,15 +230,9 @@ def test_physics_sees_parameters_inside_the_support_alone() -> None:
 # --- the posterior ---
 
 
-def mixture(num_latents: int = 7) -> OverLatents:
+def mixture() -> OverLatents:
     torch.manual_seed(0)
-    model = linear_model(shift=1.0, noisy=True, r2p_std=0.3)
-    return OverLatents(
-        model,
-        torch.randn(num_latents, 1),
-        torch.randn(num_latents, 4),
-        torch.Size((4,)),
-    )
+    return OverLatents(linear_model(shift=1.0), torch.randn(7, 1), torch.Size((4,)))
 
 
 def test_density_is_the_mean_over_all_draws_of_the_latent() -> None:
@@ -271,13 +240,10 @@ def test_density_is_the_mean_over_all_draws_of_the_latent() -> None:
     x, theta = EVIDENCE.sample((3,)), torch.randn(5, 3, 2)
     mean, log_variance = Encoder(1.0)(x)
     expected = torch.zeros(5, 3)
-    assert estimator.x_noise is not None
-    for epsilon, eta in zip(estimator.z_noise, estimator.x_noise, strict=True):
+    for epsilon in estimator.noise:
         z = mean + (0.5 * log_variance).exp() * epsilon
-        s = x - z @ B.T + 0.3 * eta
-        expected += LinearFlow().log_prob(theta, s).exp() / 7
+        expected += LinearFlow().log_prob(theta, x - z @ B.T).exp() / 7
     torch.testing.assert_close(estimator.log_prob(theta, x), expected.log())
-    torch.testing.assert_close(estimator.log_prob(theta[0], x), expected[:1].log())
     torch.testing.assert_close(estimator.loss(theta[0], x), -expected[0].log())
 
 
@@ -287,30 +253,101 @@ def test_density_does_not_depend_on_how_it_is_cut(
     estimator = mixture()
     x, theta = EVIDENCE.sample((11,)), torch.randn(5, 11, 2)
     expected = estimator.log_prob(theta, x)
-    for entries, pairs in ((4, 1), (8, 10), (56, 20), (100, 100)):
-        module = "sbi_rope.baselines.hvae.embeddings"
-        monkeypatch.setattr(f"{module}.MAX_ENTRIES", entries)
+    for entries, pairs in ((4, 1), (56, 20)):
+        monkeypatch.setattr("sbi_rope.baselines.hvae.MAX_ENTRIES", entries)
         monkeypatch.setattr("sbi_rope.density.base.CPU_BATCH", pairs)
         torch.testing.assert_close(estimator.log_prob(theta, x), expected)
         assert estimator.sample(torch.Size((3,)), x).shape == (3, 11, 2)
 
 
-def test_samples_have_the_moments_and_the_mean_log_density_of_the_density() -> None:
-    estimator = mixture()
-    x = EVIDENCE.sample((2,))
-    torch.manual_seed(1)
-    samples = estimator.sample(torch.Size((20_000,)), x)
-    axis = torch.linspace(-6, 6, 241)
-    grid = torch.cartesian_prod(axis, axis)
-    log_density = estimator.log_prob(grid[:, None].expand(-1, 2, -1), x)
-    weights = log_density.exp() * (axis[1] - axis[0]) ** 2
-    mean = weights.T @ grid
-    torch.testing.assert_close(samples.mean(dim=0), mean, atol=0.02, rtol=0)
-    second = weights.T @ grid**2
-    torch.testing.assert_close((samples**2).mean(dim=0), second, atol=0.05, rtol=0)
-    entropy = -(weights * log_density).sum(dim=0)
-    estimate = -estimator.log_prob(samples, x).mean(dim=0)
-    torch.testing.assert_close(estimate, entropy, atol=0.03, rtol=0)
+# --- the networks ---
+
+
+def unet(
+    event: tuple[int, ...], latent_dim: int, *, mean: float = 0.0, std: float = 1.0
+) -> ConditionalUNet:
+    channels = event[0] if len(event) == 3 else 1
+    moments = {
+        "mean": torch.full((channels,), mean),
+        "std": torch.full((channels,), std),
+    }
+    return ConditionalUNet(event, latent_dim, width=4, **moments)
+
+
+def trained_like(net: nn.Module) -> nn.Module:
+    """Give every parameter a value, also those that start at zero."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        for parameter in net.parameters():
+            if not parameter.any():
+                nn.init.normal_(parameter, std=0.3)
+    return net.eval()
+
+
+def test_every_latent_reaches_nearly_every_entry_of_both_outputs() -> None:
+    for event in [(50,), (3, 20, 33)]:
+        for output in [0, 1]:
+            torch.manual_seed(0)
+            net = trained_like(unet(event, 5)).double()
+            x, z = torch.randn(1, *event).double(), torch.randn(1, 5).double()
+            before = net(x, z)[output]
+            for k in range(5):
+                moved = z + torch.eye(5)[k]
+                # Some ReLUs are shut.
+                assert (net(x, moved)[output] != before).double().mean() > 0.95
+
+
+def test_several_latents_of_one_x_are_the_same_as_one_at_a_time() -> None:
+    torch.manual_seed(0)
+    net = trained_like(unet((50,), 5))
+    x, z = torch.randn(3, 50), torch.randn(3 * 4, 5)
+    together = net(x, z)
+    for i in range(12):
+        alone = net(x[i // 4 : i // 4 + 1], z[i : i + 1])
+        torch.testing.assert_close(together[0][i], alone[0][0])
+        torch.testing.assert_close(together[1][i], alone[1][0])
+
+
+def test_the_net_starts_as_the_identity_at_the_variance_of_the_data() -> None:
+    std = torch.tensor([2.0, 3.0])
+    net = ConditionalUNet((2, 20, 20), 5, width=4, mean=torch.ones(2), std=std)
+    x = torch.randn(3, 2, 20, 20)
+    mean, log_variance = net(x, torch.randn(3, 5))
+    torch.testing.assert_close(mean, x)
+    torch.testing.assert_close(log_variance[0, :, 0, 0], 2 * std.log())
+
+
+def test_outputs_follow_the_units_of_the_data() -> None:
+    nets = []
+    for mean, std in ((0.0, 1.0), (5.0, 10.0)):
+        torch.manual_seed(0)
+        nets.append(trained_like(unet((40,), 2, mean=mean, std=std)))
+    x, z = torch.randn(3, 40), torch.randn(3, 2)
+    mean, log_variance = nets[0](x, z)
+    scaled_mean, scaled_log_variance = nets[1](5.0 + 10.0 * x, z)
+    torch.testing.assert_close(scaled_mean, 5.0 + 10.0 * mean)
+    expected = log_variance + 2 * torch.tensor(10.0).log()
+    torch.testing.assert_close(scaled_log_variance, expected)
+
+
+@pytest.mark.parametrize(
+    "embedding", [nn.Flatten(), nn.Sequential(nn.Flatten(), nn.Linear(48, 7))]
+)
+def test_encoder_is_trainable_and_leaves_the_embedding_net_alone(
+    embedding: nn.Module,
+) -> None:
+    embedding.requires_grad_(False)
+    before = [p.clone() for p in embedding.parameters()]
+    x = torch.randn(6, 3, 16)
+    encoder = LatentEncoder(embedding, 5, x)
+    mean, log_variance = encoder(x)
+    assert mean.shape == log_variance.shape == (6, 5)
+    optimizer = torch.optim.Adam(encoder.parameters(), lr=0.1)
+    (mean.square().sum() + log_variance.sum()).backward()
+    assert all(p.grad is not None and p.grad.any() for p in encoder.parameters())
+    optimizer.step()
+    for old, new in zip(before, embedding.parameters(), strict=True):
+        torch.testing.assert_close(old, new, rtol=0, atol=0)
 
 
 # --- the method ---
@@ -360,13 +397,7 @@ def npe() -> DirectPosterior:
 
 
 def small(npe: Any, **options: Any) -> HVAE:
-    options = {
-        "physics": physics,
-        "width": 2,
-        "num_latents": 4,
-        "training": SMALL,
-        **options,
-    }
+    options = {"physics": physics, "width": 2, "training": SMALL, **options}
     return HVAE.from_posterior(npe, **options)
 
 
@@ -398,21 +429,13 @@ def test_training_improves_on_npe_for_held_out_real_data(npe: Any) -> None:
     assert history.kept_validation_loss < history.validation_loss[0]
 
 
-@pytest.fixture(scope="module")
-def posterior(npe: Any) -> Any:
-    return trained(npe).build_posterior()
-
-
 @pytest.mark.medium
 @pytest.mark.filterwarnings("ignore:Only 3 calibration")
-def test_npe_is_left_as_it_was_and_is_not_trained_inside_either(npe: Any) -> None:
-    before = copy.deepcopy(npe.posterior_estimator.state_dict())
+def test_npe_is_not_trained_inside(npe: Any) -> None:
     # Chosen by the bound, which improves within an epoch.
     method = trained(npe, num_pairs=3)
     assert method.history.best_epoch > 0
     estimator = method.build_posterior().posterior_estimator
-    for name, value in npe.posterior_estimator.state_dict().items():
-        torch.testing.assert_close(value, before[name], rtol=0, atol=0)
     inside = headless(npe.posterior_estimator).state_dict()
     for name, value in estimator.densities.member(0).state_dict().items():
         torch.testing.assert_close(value, inside[name], rtol=0, atol=0)
@@ -422,26 +445,6 @@ def test_npe_is_left_as_it_was_and_is_not_trained_inside_either(npe: Any) -> Non
         strict=True,
     ):
         torch.testing.assert_close(own, given, rtol=0, atol=0)
-
-
-@pytest.mark.medium
-@pytest.mark.parametrize("name", ["zuko_unaf", "zuko_nsf"])
-def test_training_runs_on_flows_of_zuko(name: str) -> None:
-    method = HVAE(
-        PRIOR,
-        posterior_nn(name, embedding_net=embedding_net(), num_transforms=1),
-        physics=physics,
-        npe_training=Training(max_num_epochs=1),
-        training=SMALL,
-        width=2,
-        num_latents=4,
-    )
-    theta = PRIOR.sample((50,))
-    method.append_simulations(theta, PendulumSimulator()(theta))
-    method.append_calibration(*real(10, seed=1))
-    method.append_observations(real(20, seed=2)[1])
-    posterior = method.train(seed=0, show_progress_bars=False).build_posterior()
-    assert torch.isfinite(scores(posterior, *real(5, seed=3))).all()
 
 
 @pytest.mark.medium
@@ -462,7 +465,6 @@ def test_images_are_supported() -> None:
         npe_training=Training(max_num_epochs=1),
         training=SMALL,
         width=2,
-        num_latents=4,
     )
     theta = prior.sample((60,))
     noise = 0.1 * torch.randn(60, 3, 20, 17)

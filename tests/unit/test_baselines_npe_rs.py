@@ -228,19 +228,17 @@ class Recorder(nn.Module):
 
 
 @pytest.mark.medium
-def test_each_step_draws_anew_from_all_simulations_and_observations() -> None:
+def test_each_step_draws_anew_from_all_simulations_and_observations(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("sbi_rope.baselines.npe_rs.NUM_ROWS", 30)
     Recorder.seen.clear()
     training = Training(training_batch_size=10, max_num_epochs=10)
-    trained(
-        embedding_net=Recorder(),
-        training=training,
-        num_mmd_simulations=30,
-        num_mmd_observations=40,
-    )
+    trained(embedding_net=Recorder(), training=training)
     num_steps = 10 * 9
     assert len(Recorder.seen) == 2 * num_steps
-    for seen, size, total in [(0, 30, 100), (1, 40, 200)]:
+    for seen, total in [(0, 100), (1, 200)]:
         steps = Recorder.seen[seen::2]
-        assert all(len(step.unique(dim=0)) == len(step) == size for step in steps)
+        assert all(len(step.unique(dim=0)) == len(step) == 30 for step in steps)
         assert len(torch.cat(steps).unique(dim=0)) == total
         assert not torch.equal(steps[0], steps[1])

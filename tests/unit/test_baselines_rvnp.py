@@ -11,12 +11,7 @@ from torch.distributions import Independent, MultivariateNormal, Normal
 
 from sbi_rope._sbi import estimator_of, gaussians_of
 from sbi_rope.baselines import RVNP, Training
-from sbi_rope.baselines.rvnp.bound import Bound
-from sbi_rope.baselines.rvnp.likelihood import (
-    ErrorModel,
-    fit_surrogate,
-    log_likelihood,
-)
+from sbi_rope.baselines.rvnp import Bound, ErrorModel, fit_surrogate, log_likelihood
 from sbi_rope.errors import InvalidInputError
 from tests import gaussian
 from tests.baselines import flat_net
@@ -115,27 +110,6 @@ def test_the_bound_is_the_evidence_and_its_weights_the_posterior_with_many_draws
             assert found.item() == pytest.approx(expected.item(), abs=0.03)
 
 
-@pytest.mark.parametrize("shift", [True, False])
-@pytest.mark.parametrize("depends_on_theta", [True, False])
-def test_errors_have_the_parts_that_are_asked_for(
-    shift: bool, depends_on_theta: bool
-) -> None:
-    theta, _ = simulations()
-    errors = ErrorModel(theta, 2, shift=shift, depends_on_theta=depends_on_theta)
-    optimizer = torch.optim.Adam(errors.parameters(), lr=0.1)
-    for _ in range(5):
-        optimizer.zero_grad()
-        mean, _, covariance = errors(theta[:50])
-        law = MultivariateNormal(mean, covariance)
-        (-law.log_prob(theta[:50].sin() + 1)).mean().backward()
-        optimizer.step()
-    mean, of_mean, covariance = errors(theta[:50])
-    assert bool(mean.any()) is shift
-    assert bool(of_mean.any()) is (shift and depends_on_theta)
-    assert bool(covariance.std(dim=0).amax() > 1e-4) is depends_on_theta
-    assert covariance[:, 0, 1].all()
-
-
 # Without labels.
 
 
@@ -194,28 +168,6 @@ def test_with_a_right_simulator_it_stays_near_npe() -> None:
 def test_without_an_offset_in_the_errors_it_does_not_undo_one() -> None:
     found, exact = scores(trained(OFFSET, 0.0, shift=False), OFFSET, 0.0)
     assert found < exact - 0.4
-
-
-@pytest.mark.medium
-def test_a_strong_penalty_leaves_no_offset_that_varies() -> None:
-    theta, _ = simulations()
-    y = theta[:500] + 2 * theta[:500].sign()
-    sizes = []
-    for shrinkage in (0.0, 100.0):
-        torch.manual_seed(0)
-        errors = ErrorModel(theta, 2, shift=True, depends_on_theta=True)
-        q: Any = estimator_of(gaussian.posterior())
-        bound = Bound(q, errors, surrogate(), gaussian.prior(), 16)
-        method = RVNP.from_posterior(
-            gaussian.posterior(),
-            shift=True,
-            shrinkage=shrinkage,
-            training=Training(learning_rate=1e-2, max_num_epochs=15),
-        )
-        method._train(bound, y, y, show_progress_bars=False)
-        sizes.append(float(errors(theta)[1].square().sum(dim=1).mean()))
-    assert sizes[0] > 0.1
-    assert sizes[1] < 0.1 * sizes[0]
 
 
 # What is refused.

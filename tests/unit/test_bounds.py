@@ -4,8 +4,7 @@ import torch
 from sbi.utils import BoxUniform, MultipleIndependent
 from torch.distributions import Beta, Categorical, Gamma, Uniform
 
-from sbi_rope._bounds import bounds_of, off_bounds
-from sbi_rope.density.prior import prior_log_prob
+from sbi_rope._prior import bounds_of, off_bounds, prior_log_prob
 
 ONE = torch.ones(1)
 

@@ -14,7 +14,6 @@ from sbi_rope.data import Counts
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.metrics import CoverageByEstimate, coverage_by_estimate, evaluate
 from sbi_rope.metrics.by_estimate import (
-    coverage_by_estimate_of_pairs,
     estimates_and_ranks,
     in_words,
 )
@@ -140,13 +139,12 @@ def test_parameters_that_are_not_known_are_left_out() -> None:
     alone = coverage_by_estimate(ranks[::2], mean[::2])
     gaps = ranks.clone()
     gaps[1::2] = torch.nan
-    found = coverage_by_estimate(gaps, mean, allow_missing=True)
+    found = coverage_by_estimate(gaps, mean)
     assert found.p_values == alone.p_values
     assert torch.equal(found.shares, alone.shares)
     beside = coverage_by_estimate(
         torch.cat([ranks, torch.full_like(ranks, torch.nan)], dim=1),
         torch.cat([mean, mean], dim=1),
-        allow_missing=True,
     )
     assert beside.num_tested == 1
     assert beside.depends == (True, False)
@@ -172,7 +170,7 @@ def test_only_one_pair_of_a_group_is_tested_and_groups_count_once() -> None:
     theta, mean = estimated()
     ranks = ranks_in(theta, mean, gaussian.POSTERIOR_STD)
     rows = torch.arange(300)
-    found = coverage_by_estimate_of_pairs(
+    found = coverage_by_estimate(
         torch.cat([ranks, ranks]),
         torch.cat([mean, mean]),
         Counts(torch.full((600,), 0.5), torch.cat([rows, rows])),

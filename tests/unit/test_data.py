@@ -14,9 +14,9 @@ from sbi_rope.data import (
     one_of_each_group,
     split_groups,
     split_pairs,
-    too_few_pairs,
 )
-from sbi_rope.errors import InvalidInputError
+from sbi_rope.errors import RoPEWarning
+from sbi_rope.fit import EPOCHS_WITHOUT_HOLDOUT, epochs_on_pairs
 
 NAN = math.nan
 
@@ -49,19 +49,6 @@ def test_groups_of_labels_that_are_equal() -> None:
     assert labels.is_exact.tolist() == [False, True, False, True]
     drawn = Labels(y=y, covariance=labels.covariance, draws=torch.randn(4, 3, 2))
     assert not drawn.is_exact.any()
-    with pytest.raises(InvalidInputError, match="as many draws"):
-        _ = labels + drawn
-
-
-def test_rows_of_pairs_keep_all_that_belongs_to_them() -> None:
-    pairs, rows = pairs_of(torch.randn(10, 2)), torch.tensor([7, 2])
-    some = pairs[rows]
-    assert len(some) == 2
-    assert some.are_exact
-    assert torch.equal(some.mean, pairs.mean[rows])
-    assert torch.equal(some.x, pairs.x[rows])
-    assert torch.equal(some.label.y, some.theta[:, 0])
-    assert some.group.tolist() == [7, 2]
 
 
 @pytest.mark.parametrize(
@@ -104,10 +91,11 @@ def test_of_few_groups_none_is_held_out() -> None:
     theta = torch.randn(MIN_PAIRS_FOR_HOLDOUT - 1, 2).repeat(10, 1)
     train, held_out = pairs_of(theta).split(0.2)
     assert (len(train), len(held_out)) == (40, 0)
-    assert too_few_pairs(theta) == (
-        "Only 4 different parameters (or groups) among 40 calibration pairs"
-    )
-    assert too_few_pairs(theta[:4]) == "Only 4 calibration pair(s)"
+    match = r"Only 4 different parameters \(or groups\) among 40 calibration pairs"
+    with pytest.warns(RoPEWarning, match=match):
+        assert epochs_on_pairs(theta, held_out, 80) == EPOCHS_WITHOUT_HOLDOUT
+    with pytest.warns(RoPEWarning, match=r"Only 4 calibration pair\(s\)"):
+        assert epochs_on_pairs(theta[:4], held_out, 30) == 30
 
 
 def test_folds_keep_groups_whole_and_have_rows_alike() -> None:

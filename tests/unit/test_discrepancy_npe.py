@@ -1,19 +1,16 @@
 """NPE on corrected simulations as a method: what it takes, returns and refuses."""
 
-import copy
-import random
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 
-import numpy as np
 import pytest
 import torch
 from sbi.inference import DirectPosterior, VectorFieldPosterior
 from sbi.neural_nets import posterior_nn
 from torch import Tensor, nn
 
-from sbi_rope import CalibrationFinetuner
 from sbi_rope._sbi import embedding_of, estimator_of
 from sbi_rope._standardisation import Standardisation
 from sbi_rope.baselines import Training
@@ -25,7 +22,7 @@ from sbi_rope.errors import (
     NotReadyError,
     UnsupportedPosteriorError,
 )
-from sbi_rope.moments import Moments
+from sbi_rope.simulate import Moments
 from tests import problems
 
 pytestmark = [
@@ -38,12 +35,7 @@ pytestmark = [
 
 SPACES = ["embedding", "input", "tuned"]
 SHORT = Training(training_batch_size=50, max_num_epochs=2)
-SMALL: dict[str, Any] = {
-    "num_simulations": 300,
-    "num_steps": 4,
-    "num_folds": 2,
-    "finetuner": CalibrationFinetuner(max_num_epochs=3, rehearsal=1.0),
-}
+SMALL: dict[str, Any] = {"num_simulations": 300, "num_steps": 4}
 QUIET: dict[str, Any] = {"seed": 0, "show_progress_bars": False}
 
 
@@ -61,7 +53,7 @@ def method(posterior: Any = None, **options: Any) -> DiscrepancyNPE:
     """One that starts from a trained NPE and has a simulator unless given others."""
     posterior = problems.npe_posterior() if posterior is None else posterior
     if "simulations" not in options:
-        options = {"simulator": problems.simulate, **options}
+        options = {"simulator": problems.simulate} | options
     return DiscrepancyNPE.from_posterior(posterior, **SMALL | options)
 
 
@@ -147,43 +139,6 @@ def test_mixed_parameters_keep_their_categories() -> None:
         assert set(samples[:, 3].tolist()) <= {0.0, 1.0}, space
 
 
-def states() -> tuple[Any, ...]:
-    return torch.get_rng_state().tolist(), np.random.get_state()[1].tolist(), random.getstate()  # noqa: E501, NPY002  # fmt: skip
-
-
-@pytest.mark.medium
-def test_the_same_seed_gives_the_same_posterior_and_keeps_the_random_state() -> None:
-    pairs = labelled()
-    for space in SPACES:
-        densities = []
-        for seed in (0, 0, 1):
-            made = method(space=space, learn_prior=True).append_calibration(*pairs)
-            before = states()
-            made.train(seed=seed, show_progress_bars=False)
-            assert states() == before, space
-            densities.append(log_probs(made.build_posterior()))
-            torch.rand(1)
-        assert torch.equal(densities[0], densities[1]), space
-        assert not torch.equal(densities[0], densities[2]), space
-
-
-def test_nothing_that_is_passed_in_is_changed() -> None:
-    posterior = problems.npe_posterior()
-    pairs, bank = labelled(), simulations()
-    net = posterior.posterior_estimator
-    state = copy.deepcopy(net.state_dict())
-    modes = [m.training for m in net.modules()]
-    flags = [p.requires_grad for p in net.parameters()]
-    copies = [tensor.clone() for tensor in (*pairs, *bank)]
-    for space in SPACES:
-        made = method(simulations=bank, space=space).append_calibration(*pairs)
-        made.train(**QUIET)
-        assert all(map(torch.equal, (*pairs, *bank), copies)), space
-        assert all(torch.equal(v, state[k]) for k, v in net.state_dict().items())
-        assert [m.training for m in net.modules()] == modes, space
-        assert [p.requires_grad for p in net.parameters()] == flags, space
-
-
 def test_correcting_an_embedding_leaves_its_net_and_correcting_x_does_not() -> None:
     x = labelled(5)[1]
     before = estimator_of(problems.npe_posterior())
@@ -195,17 +150,11 @@ def test_correcting_an_embedding_leaves_its_net_and_correcting_x_does_not() -> N
 
 @pytest.mark.medium
 def test_discrepancy_and_history_are_those_of_the_last_training() -> None:
-    made = method()
-    with pytest.raises(NotReadyError, match=r"Call `train\(\)` first"):
-        _ = made.discrepancy
-    with pytest.raises(NotReadyError):
-        _ = made.history
-    made.append_calibration(*labelled()).train(**QUIET)
+    made = method().append_calibration(*labelled()).train(**QUIET)
     assert made.discrepancy.num_pairs == 12
     made.append_calibration(*labelled(3))
-    for ask in (lambda: made.discrepancy, made.build_posterior):
-        with pytest.raises(NotReadyError, match=r"Call `train\(\)` first"):
-            ask()
+    with pytest.raises(NotReadyError, match=r"Call `train\(\)` first"):
+        _ = made.discrepancy
     assert made.train(**QUIET).discrepancy.num_pairs == 15
     again = method(num_steps=45).append_calibration(*labelled()).train(**QUIET)
     assert len(again.history.training_loss) >= 45
@@ -220,8 +169,7 @@ def test_learned_parameters_move_the_posterior_to_those_of_the_pairs() -> None:
     for learn_prior in (False, True):
         made = method(
             learn_prior=learn_prior,
-            num_steps=300,
-            learning_rate=2e-2,
+            num_steps=1000,
             num_simulations=2000,
         )
         made.append_calibration(theta, x).train(**QUIET)
@@ -317,16 +265,6 @@ def test_only_simulations_with_a_probability_are_drawn(
     )
 
 
-def test_training_asks_for_the_data_that_it_lacks() -> None:
-    with pytest.raises(NotReadyError, match="append_calibration"):
-        method().train(**QUIET)
-    with pytest.raises(NotReadyError, match="at least 2 calibration pairs; got 1"):
-        method().append_calibration(*labelled(1)).train(**QUIET)
-    without = DiscrepancyNPE.from_posterior(problems.npe_posterior(), **SMALL)
-    with pytest.raises(NotReadyError, match="append_simulations"):
-        without.append_calibration(*labelled()).train(**QUIET)
-
-
 def test_pairs_that_cannot_be_corrected_are_refused() -> None:
     theta, x = labelled()
     with pytest.raises(InvalidInputError, match="all 12 have the same"):
@@ -339,19 +277,6 @@ def test_pairs_that_cannot_be_corrected_are_refused() -> None:
     images.append_calibration(theta, problems.simulate_image(theta))
     with pytest.raises(InvalidInputError, match="Use space='embedding'"):
         images.train(**QUIET)
-
-
-def test_tables_are_put_into_the_order_of_the_first_one() -> None:
-    pandas = pytest.importorskip("pandas")
-    theta, x = labelled()
-    tables = (
-        pandas.DataFrame(theta.numpy(), columns=["a", "b"]),
-        pandas.DataFrame(x.numpy(), columns=["u", "v", "w"]),
-    )
-    made = method().append_calibration(*tables)
-    made.append_calibration(tables[0][["b", "a"]], tables[1][["w", "u", "v"]])
-    for found, given in zip(made._data.calibration, (theta, x), strict=True):
-        assert torch.equal(found, given.repeat(2, 1))
 
 
 class Remembering(nn.Module):
@@ -367,7 +292,7 @@ class Remembering(nn.Module):
 
 
 def test_pairs_are_embedded_by_a_net_that_was_tuned_on_all_others() -> None:
-    made = method(space="tuned", num_folds=3).append_calibration(*labelled())
+    made = method(space="tuned").append_calibration(*labelled())
     seen: list[Tensor] = []
 
     def tuned(h: Any, x: Tensor, targets: Any, sets: Any, **options: Any) -> Any:
@@ -375,22 +300,9 @@ def test_pairs_are_embedded_by_a_net_that_was_tuned_on_all_others() -> None:
         nets = [Remembering(x[rows]) for rows in sets]
         return SimpleNamespace(member=nets.__getitem__), []
 
-    made.finetuner = SimpleNamespace(tuned=tuned)  # type: ignore[assignment]
-    _, z = made._cross_fitted(nn.Identity(), torch.ones(12, 1), simulations()[1], False)
-    assert (z == 0).all()
-    assert [len(rows) for rows in seen] == [8, 8, 8]
-
-
-def test_appended_simulations_are_trained_on_in_place_of_new_ones() -> None:
-    made = method()
-    assert not made.needs_simulations
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            "sbi_rope.discrepancy.npe.correct_flow",
-            lambda estimator, simulations, *rest, **options: pytest.fail(
-                f"trained on {len(simulations[0])}"
-            ),
+    with patch("sbi_rope.discrepancy.npe.TUNING", SimpleNamespace(tuned=tuned)):
+        _, z = made._cross_fitted(
+            nn.Identity(), torch.ones(12, 1), simulations()[1], show_progress_bars=False
         )
-        made.append_simulations(*simulations(77)).append_calibration(*labelled())
-        with pytest.raises(pytest.fail.Exception, match="trained on 77"):
-            made.train(**QUIET)
+    assert (z == 0).all()
+    assert [len(rows) for rows in seen] == [9, 9, 10, 10, 10]

@@ -10,9 +10,8 @@ from scipy import stats
 from torch import Tensor
 from torch.distributions import Gamma
 
-from sbi_rope.discrepancy import learn_parameters
+from sbi_rope.discrepancy import ParameterDistribution, learn_parameters
 from sbi_rope.discrepancy.parameters import STRENGTHS, _fit, normal_scores
-from sbi_rope.tasks import Task, get_task
 
 CORRELATION = torch.tensor([[1.0, 0.6], [0.6, 1.0]]).double()
 
@@ -78,6 +77,11 @@ def single(n: int) -> Tensor:
     return 100.0 + 1e-3 * torch.randn(n, 1)
 
 
+def num_effective(learned: ParameterDistribution) -> float:
+    """How many equally probable simulations are as precise."""
+    return float(1 / learned.probabilities.square().sum())
+
+
 Prior = Callable[[int], Tensor]
 PRIORS: tuple[Prior, ...] = (box, skewed, discrete, single)
 
@@ -95,7 +99,7 @@ def test_pairs_from_the_prior_hardly_change_it() -> None:
                 assert float(one.probabilities.sum()) == pytest.approx(1.0)
                 assert (one.probabilities >= 0).all()
             probability = torch.tensor([one.probability_of_prior for one in learned])
-            size = torch.tensor([one.effective_sample_size for one in learned])
+            size = torch.tensor([num_effective(one) for one in learned])
             case = (prior.__name__, n)
             assert float(probability.median()) > (0.75 if n == 100 else 0.45), case
             assert float(size.median()) > 0.9 * 5000, case
@@ -122,27 +126,10 @@ def test_shifted_pairs_give_more_density_to_parameters_like_theirs() -> None:
                 )
                 if n == 50:
                     assert learned.probability_of_prior < 1e-3, prior.__name__
-                    assert learned.effective_sample_size < 0.6 * 20_000, prior.__name__
+                    assert num_effective(learned) < 0.6 * 20_000, prior.__name__
             # Who knows the region gains 1.2 nats.
             case = (prior.__name__, n)
             assert least < sum(gains) / 4 < math.log(1 / 0.3), case
-
-
-@pytest.mark.slow
-def test_fifty_pairs_from_the_middle_of_the_prior_are_recognised() -> None:
-    biased = get_task("linear_gaussian", variant="biased_calibration")
-    usual = get_task("linear_gaussian")
-    theta = usual.get_prior().sample((5000,))
-
-    def improbable(task: Task, n: int, *, below: float = 0.05) -> int:
-        pairs = (task.get_calibration_set(n, seed=seed)[0] for seed in range(30))
-        found = [learn_parameters(one, theta).probability_of_prior for one in pairs]
-        return sum(probability < below for probability in found)
-
-    assert improbable(biased, 50, below=1e-3) == 30
-    # Ten pairs are often too few to tell.
-    assert 2 <= improbable(biased, 10) <= 15
-    assert improbable(usual, 10) + improbable(usual, 50) <= 1
 
 
 def test_weighted_simulations_have_the_mean_and_spread_of_the_pairs() -> None:
@@ -152,11 +139,6 @@ def test_weighted_simulations_have_the_mean_and_spread_of_the_pairs() -> None:
     std = (learned.probabilities[:, None] * (theta - mean).square()).sum().sqrt()
     assert float(mean) == pytest.approx(1.0, abs=0.1)
     assert float(std) == pytest.approx(0.5, abs=0.1)
-    equal = torch.full((4,), 0.25)
-    halves = torch.tensor([0.5, 0.5, 0.0, 0.0])
-    for weights, expected in [(equal, 4.0), (halves, 2.0)]:
-        one = type(learned)(probabilities=weights, probability_of_prior=0.0)
-        assert one.effective_sample_size == pytest.approx(expected)
 
 
 def test_discrete_parameters_are_left_out() -> None:
@@ -182,7 +164,7 @@ def test_discrete_parameters_are_left_out() -> None:
     assert weighted.probability_of_prior < 1e-6
     of_counts = learn_parameters(pairs[:, 1:], theta[:, 1:])
     assert of_counts.probability_of_prior == 0.5
-    assert of_counts.effective_sample_size == pytest.approx(n)
+    assert num_effective(of_counts) == pytest.approx(n)
 
 
 def test_labels_that_are_rounded_to_the_bounds_are_draws_from_the_prior() -> None:

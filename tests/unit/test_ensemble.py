@@ -79,6 +79,8 @@ NETS: dict[str, tuple[Callable[[], nn.Module], tuple[int, ...]]] = {
     ),
     "trials": (problems.TrialsNet, (4, 2)),
     "transposed": (Transposed, (5, 2)),
+    "series": (lambda: SeriesEmbedding(num_steps=80, output_dim=4), (80,)),
+    "light": (lambda: light_series_embedding(num_steps=40, output_dim=4), (40,)),
 }
 FAMILIES = problems.FAMILIES
 
@@ -177,56 +179,6 @@ def test_draws_of_each_member_are_those_of_its_density(family: str) -> None:
         error = (of_member.var(dim=0) + expected.var(dim=0)).div(400).sqrt()
         difference = (of_member.mean(dim=0) - expected.mean(dim=0)).abs()
         assert (difference < 4.5 * error + 1e-6).all()
-
-
-@pytest.mark.parametrize(
-    ("make", "shape"),
-    [
-        pytest.param(lambda: SeriesEmbedding(num_steps=80), (80,), id="series"),
-        pytest.param(
-            lambda: light_series_embedding(num_steps=40, output_dim=4),
-            (40,),
-            id="light",
-        ),
-    ],
-)
-def test_our_own_nets_embed_at_once_as_alone(
-    make: Callable[[], nn.Module], shape: tuple[int, ...]
-) -> None:
-    each = members(make())
-    x = torch.randn(NUM_MEMBERS, 7, *shape)
-    ensemble = Ensemble(each, embedded, (x[0],))
-    found = ensemble.answer(embedded, x.flatten(0, 1)).unflatten(0, (NUM_MEMBERS, 7))
-    for of_member, rows, net in zip(found, x, each, strict=True):
-        assert torch.allclose(of_member, net(rows), atol=1e-4)
-
-
-def test_a_member_whose_loss_is_nan_does_not_touch_the_others() -> None:
-    estimator = estimator_behind("linear")
-    theta, x = pairs_for(estimator)
-    training = Training(learning_rate=1e-2, max_num_epochs=3)
-    flows = []
-    for number in (math_nan := float("nan"), 0.0):
-        torch.manual_seed(0)
-        flow = Flow.of(members(estimator))
-        before = flow.nets.member(1)(x[1])
-        spoiled = torch.tensor([0.0, number, 0.0])
-
-        def loss(
-            theta: Tensor, x: Tensor, flow: Flow = flow, spoiled: Tensor = spoiled
-        ) -> Tensor:
-            return flow.losses(theta, x).mean(dim=1) + spoiled
-
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            fit(flow, lambda _: [(theta, x)], loss, training, **ALONE)
-        flows.append(flow)
-        if number is math_nan:
-            assert torch.equal(flow.nets.member(1)(x[1]), before)
-    for number in (0, 2):
-        spoiled, clean = (flow.nets.member(number)(x[0]) for flow in flows)
-        assert torch.equal(spoiled, clean)
-        assert not torch.equal(clean, flows[0].nets.member(1)(x[0]))
 
 
 @pytest.mark.parametrize("name", ["linear", "transposed", "conv"])

@@ -1,8 +1,6 @@
 """Entries of x that are far from simulations, or the same in all of them."""
 
 import warnings
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 import torch
@@ -11,14 +9,12 @@ from sbi.neural_nets import posterior_nn
 from sbi.utils.sbiutils import Standardize
 from torch import Tensor, nn
 
-from sbi_rope import CalibrationFinetuner, RoPE, diagnose, stack
-from sbi_rope._standardisation import FAR, deviations
+from sbi_rope import CalibrationFinetuner, RoPE, diagnose
+from sbi_rope._standardisation import deviations
 from sbi_rope.baselines import CalibrationMLP, FinetunedNPE, Training
 from sbi_rope.density import average
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import RoPEWarning
-from sbi_rope.stacking import default_candidates
-from sbi_rope.tasks import get_task
 from tests import problems
 
 QUIET = {"show_progress_bars": False}
@@ -98,48 +94,9 @@ def test_an_amortised_posterior_warns_of_an_observation_in_another_unit() -> Non
         posterior.log_prob_batched(THETA[:3], other, norm_posterior=False)
     with pytest.warns(RoPEWarning, match="Check the units"):
         posterior.set_default_x(other[0])
-    with pytest.warns(RoPEWarning, match="Check the units"):
-        posterior.sample((1,), reject_outside_prior=False, **QUIET)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         posterior.sample_batched((1,), x, **QUIET)
-    # A call warns once, whatever it does inside.
-    calls: tuple[Callable[[], Tensor], ...] = (
-        lambda: posterior.sample((1,), reject_outside_prior=False, **QUIET),
-        lambda: posterior.log_prob(THETA[:1], norm_posterior=False),
-    )
-    for call in calls:
-        with warnings.catch_warnings(record=True) as found:
-            warnings.simplefilter("always")
-            call()
-        assert len([one for one in found if one.category is RoPEWarning]) == 1
-
-
-def test_a_coupling_that_is_extended_warns_of_an_observation_in_another_unit() -> None:
-    rope = RoPE(npe_of("independent"), simulator=simulator)
-    posterior = rope.build_posterior(
-        simulator(THETA), unseen="extend", require_convergence=False, **QUIET
-    )
-    x = simulator(THETA[:2])
-    with pytest.warns(RoPEWarning, match="Check the units"):
-        posterior.sample_batched((1,), 1000.0 * x, **QUIET)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", message="Extended the coupling")
-        posterior.sample_batched((1,), x, **QUIET)
-
-
-@pytest.mark.medium
-def test_a_stack_does_not_warn_of_its_pairs_again() -> None:
-    rope = RoPE(npe_of("independent"), simulator=simulator)
-    with pytest.warns(RoPEWarning, match="entries of `x`"):
-        rope.append_calibration(THETA_CAL, real(THETA_CAL))
-    candidates = [c for c in default_candidates() if c.name in ("prior", "NPE")]
-    with warnings.catch_warnings():
-        warnings.filterwarnings("error", message=".*deviations away from simulations")
-        posterior = stack(rope, candidates=candidates, seed=0, **QUIET)
-    with pytest.warns(RoPEWarning, match="deviations away from simulations"):
-        posterior.sample_batched((1,), real(THETA[:2]), **QUIET)
 
 
 def test_npe_that_standardises_all_entries_alike_gives_no_warning() -> None:
@@ -185,23 +142,3 @@ def test_the_posterior_of_such_a_network_has_mass_inside_the_prior_for_any_x() -
     far = torch.tensor([[1e4, -1e4], [-1e4, -1e4]])
     samples = posterior.sample_batched((200,), x=far, **QUIET)
     assert (samples.abs() <= 1).all()
-
-
-@pytest.mark.medium
-def test_no_measurement_of_a_task_is_at_half_the_distance_of_a_warning() -> None:
-    for name in ("cs", "hemodynamics", "linear_gaussian", "pendulum", "sir"):
-        task = get_task(name)
-        _, simulated = task.get_simulations(200)
-        _, measured = task.get_calibration_set(30)
-        std, mean = torch.std_mean(simulated, dim=0)
-        assert ((measured - mean).abs() < FAR / 2 * std).all(), name
-
-
-def test_no_measurement_of_the_sensors_is_that_far(
-    chamber_root: Path,
-) -> None:
-    task = get_task("light_tunnel_sensors", root=chamber_root)
-    _, simulated = task.get_simulations(500)
-    _, measured = task.get_calibration_set(200)
-    std, mean = torch.std_mean(simulated, dim=0)
-    assert ((measured - mean).abs() < FAR / 2 * std).all()

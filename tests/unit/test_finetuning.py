@@ -125,78 +125,32 @@ def test_a_net_without_parameters_gets_an_affine_map_that_starts_as_identity() -
     assert (tuned(x) - (1.3 * x - 0.2)).norm(dim=1).mean() < 0.02
 
 
-def test_few_pairs_are_not_held_out_and_get_few_steps() -> None:
-    for n in (1, 4):
-        x = torch.randn(n, 2)
-        with pytest.warns(RoPEWarning, match="at least 5 pairs"):
-            _, training, validation, best = finetune(linear(), x, x)
-        assert validation == []
-        assert best == EPOCHS_WITHOUT_HOLDOUT
-        assert training[-1] < training[0]
-
-
 def test_the_targets_of_held_out_pairs_stay_the_same_with_resampling() -> None:
     x, net = torch.randn(20, 2), linear()
-    draws = iter([net(x).detach()] + [1e3 * torch.randn(20, 2) for _ in range(30)])
+    draws = iter([net(x).detach()] + [1e3 * torch.randn(20, 2) for _ in range(4)])
     result = CalibrationFinetuner(
         learning_rate=1e-9, max_num_epochs=5, resample_targets=True
     ).finetune(net, x, lambda count: next(draws), seed=0, show_progress_bars=False)
     assert max(result.history.validation_loss) < 1e-4
     assert min(result.history.training_loss[1:]) > 10
+    assert next(draws, None) is None  # one for each step
 
 
 def test_without_a_hold_out_an_affine_map_gets_the_largest_rate() -> None:
     x = torch.randn(4, 2)
     rates = {}
     for net in (linear(), nn.Identity()):
-        with pytest.warns(RoPEWarning):
+        with pytest.warns(RoPEWarning, match="at least 5 pairs"):
             result = CalibrationFinetuner().finetune(
                 net, x, lambda count: 2 * x, seed=0, show_progress_bars=False
             )
+        assert result.history.best_epoch == EPOCHS_WITHOUT_HOLDOUT
         rates[type(net)] = result.history.learning_rate
     assert rates == {nn.Linear: 1e-4, nn.Identity: 1e-3}
 
 
-def test_targets_are_drawn_once_or_before_every_step() -> None:
-    x, calls = torch.randn(10, 2), []
-
-    def draw(count: int) -> Tensor:
-        calls.append(count)
-        return torch.randn(10, 2)
-
-    settings = {"max_num_epochs": 7, "simulations_per_target": 3, "learning_rate": 1e-3}
-    CalibrationFinetuner(**settings).finetune(  # type: ignore[arg-type]
-        linear(), x, draw, show_progress_bars=False
-    )
-    assert calls == [3]
-    CalibrationFinetuner(**settings, resample_targets=True).finetune(  # type: ignore[arg-type]
-        linear(), x, draw, show_progress_bars=False
-    )
-    assert calls == [3] * 8  # none after the last step
-
-
-def test_the_net_is_finite_after_steps_that_are_too_large() -> None:
-    for n in (3, 20):
-        x, targets = torch.randn(n, 2), torch.randn(n, 2)
-        with pytest.warns(RoPEWarning, match="is not finite"):
-            g, *_ = finetune(linear(), x, targets, learning_rate=1e30)
-        assert torch.isfinite(g(x)).all(), n
-
-
-def test_the_same_seed_gives_the_same_net_and_leaves_the_callers_state() -> None:
-    x, targets, net = torch.randn(30, 2), torch.randn(30, 2), linear()
-    state = torch.get_rng_state()
-    first, *_ = finetune(net, x, targets, max_num_epochs=20)
-    assert torch.equal(torch.get_rng_state(), state)
-    second, *_ = finetune(net, x, targets, max_num_epochs=20)
-    assert torch.equal(first(x), second(x))
-
-
 def test_targets_have_the_shape_of_the_embeddings_in_every_step() -> None:
     x = torch.randn(10, 2)
-    for targets in (x[:9], x[:1], x[:, :1], x[:, :, None]):
-        with pytest.raises(InvalidInputError, match=r"shape \(10, 2\)"):
-            finetune(linear(), x, targets)
     later = iter([x, x[:, :1]])
     with pytest.raises(InvalidInputError, match=r"shape \(10, 2\)"):
         CalibrationFinetuner(max_num_epochs=3, resample_targets=True).finetune(
@@ -251,25 +205,6 @@ def test_the_loss_of_rehearsal_is_the_weighted_distance_from_the_embeddings_by_h
     two = rehearsed(net, x, x + 3, simulations, **options, max_num_epochs=2)
     found = two.history.training_loss[1]
     assert found == pytest.approx(float(distance + 0.7 * kept), rel=1e-5)
-
-
-def test_the_validation_loss_does_not_contain_rehearsal() -> None:
-    x, simulations = torch.randn(10, 2), torch.randn(50, 2)
-    result = rehearsed(
-        linear(),
-        x,
-        x + 3,
-        simulations,
-        rehearsal=0.3,
-        max_num_epochs=20,
-        learning_rate=0.03,
-    )
-    with seeded(0):
-        held_out = torch.randperm(10)[:2]
-    distance = (result.embedding_net(x) - x - 3).norm(dim=1)[held_out].mean()
-    assert result.history.best_epoch > 5
-    best = result.history.validation_loss[result.history.best_epoch]
-    assert float(distance) == pytest.approx(best, rel=1e-6)
 
 
 def test_rehearsal_needs_finite_simulations() -> None:

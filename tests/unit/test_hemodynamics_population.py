@@ -89,25 +89,13 @@ def test_weisslers_formula_explains_half_of_the_variance_of_the_ejection_time(
 
 @pytest.mark.medium
 def test_the_ejection_leaves_room_in_the_beat() -> None:
-    for prior in ("population", "independent"):
-        subjects = _draw("simulator", 1500, prior=prior)
-        time = np.array([s.ejection_time for s in subjects])
-        period = np.array([s.period for s in subjects])
-        peak = np.array([s.peak_flow_time for s in subjects])
-        assert (time <= 0.55 * 1000 * period).all()
-        assert (peak <= 0.45 * time).all()
-        assert min(s.regurgitant_volume for s in subjects) >= 0.0
-
-
-@pytest.mark.medium
-def test_independent_parameters_follow_the_laws_asked_for() -> None:
-    subjects = _draw("simulator", prior="independent")
-    volume = np.array([s.stroke_volume for s in subjects])
+    subjects = _draw("simulator", 1500)
     time = np.array([s.ejection_time for s in subjects])
-    law = truncnorm(-2.0, 2.0)
-    assert kstest((volume - 65) / 15, law.cdf).pvalue > 1e-3
-    assert kstest((time - 282) / (282 * 24.43 / 295.29), law.cdf).pvalue > 1e-3
-    assert abs(np.corrcoef(volume, time)[0, 1]) < 4 / N**0.5
+    period = np.array([s.period for s in subjects])
+    peak = np.array([s.peak_flow_time for s in subjects])
+    assert (time <= 0.55 * 1000 * period).all()
+    assert (peak <= 0.45 * time).all()
+    assert min(s.regurgitant_volume for s in subjects) >= 0.0
 
 
 @pytest.mark.medium

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from sbi.utils import within_support
-from scipy.integrate import quad
 from scipy.stats import kstest, norm
 from torch import Tensor
 from torch.autograd.functional import jacobian
@@ -16,28 +15,12 @@ from sbi_rope.tasks.hemodynamics import population_tables as tables
 from sbi_rope.tasks.hemodynamics.population import Population, ejection_time_slopes
 from sbi_rope.tasks.hemodynamics.prior import PopulationPrior, _linear_quantile
 
-KINDS = ("population", "independent")
 N = 8000
 
 
-@pytest.fixture(params=KINDS)
-def kind(request: pytest.FixtureRequest) -> str:
-    return request.param
-
-
 @pytest.fixture
-def prior(kind: str) -> PopulationPrior:
-    return PopulationPrior(Population(prior=kind))  # type: ignore[arg-type]
-
-
-@pytest.fixture(scope="module")
-def people() -> dict[str, Tensor]:
-    def draw(kind: str) -> Tensor:
-        population = Population(prior=kind)  # type: ignore[arg-type]
-        hearts = [population.draw("simulator", 5, i) for i in range(N)]
-        return torch.tensor([(s.stroke_volume, s.ejection_time) for s in hearts])
-
-    return {kind: draw(kind) for kind in KINDS}
+def prior() -> PopulationPrior:
+    return PopulationPrior()
 
 
 def _grid(prior: PopulationPrior, points: int = 801) -> tuple[Tensor, float]:
@@ -50,10 +33,9 @@ def _grid(prior: PopulationPrior, points: int = 801) -> tuple[Tensor, float]:
 
 
 @pytest.mark.slow
-def test_people_follow_the_density_and_its_moments(
-    prior: PopulationPrior, kind: str, people: dict[str, Tensor]
-) -> None:
-    theta = people[kind]
+def test_people_follow_the_density_and_its_moments(prior: PopulationPrior) -> None:
+    hearts = [Population().draw("simulator", 5, i) for i in range(N)]
+    theta = torch.tensor([(s.stroke_volume, s.ejection_time) for s in hearts])
     assert prior.support.check(theta).all()
     assert prior.log_prob(theta).isfinite().all()
     for probabilities in prior.marginal_cdf(theta).T:
@@ -146,17 +128,6 @@ def test_the_density_integrates_to_the_marginal_cdf_and_to_one(
     assert prior.marginal_cdf(far).tolist() == [[0.0, 0.0], [1.0, 1.0]]
 
 
-def test_independent_density_is_a_product() -> None:
-    prior = PopulationPrior(Population(prior="independent"))
-    whole = norm.cdf(2) - norm.cdf(-2)
-    sd = tables.EJECTION_TIME[1]
-    expected = norm.pdf(72, 65, 15) * norm.pdf(270, 282, sd) / whole**2
-    found = float(prior.log_prob(torch.tensor([72.0, 270.0])).exp())
-    assert found == pytest.approx(expected, rel=1e-3)
-    total = quad(lambda t: norm.pdf(t, 282, sd), 282 - 2 * sd, 282 + 2 * sd)[0]
-    assert total == pytest.approx(whole)
-
-
 def test_the_prior_has_no_density_outside_of_its_support(
     prior: PopulationPrior,
 ) -> None:
@@ -185,16 +156,11 @@ def test_bijection_has_the_log_determinant_of_its_jacobian(
     assert transform.inv(far).isfinite().all()
 
 
-def test_prior_can_be_copied_expanded_and_moved(prior: PopulationPrior) -> None:
+def test_prior_can_be_copied_and_moved(prior: PopulationPrior) -> None:
     copied = pickle.loads(pickle.dumps(prior))
     draws = copied.sample((5,))
     torch.testing.assert_close(copied.log_prob(draws), prior.log_prob(draws))
     assert pickle.loads(pickle.dumps(prior.support)).check(draws).all()
-    expanded = prior.expand((3,))
-    assert (expanded.batch_shape, expanded.event_shape) == ((3,), (2,))
-    assert expanded.sample((4,)).shape == (4, 3, 2)
-    assert expanded.mean.shape == expanded.variance.shape == (3, 2)
-    assert expanded.log_prob(draws[:3]).shape == (3,)
     copied.to("meta")
     assert copied.mean.device.type == "meta"
-    assert PopulationPrior(Population()).mean.device.type == "cpu"
+    assert PopulationPrior().mean.device.type == "cpu"

@@ -11,51 +11,16 @@ import pytest
 from sbi_rope.errors import SimulationError
 from sbi_rope.tasks import hemodynamics
 from sbi_rope.tasks.hemodynamics import waveforms
-from sbi_rope.tasks.hemodynamics.linear import linear_pressure
-from sbi_rope.tasks.hemodynamics.network import Network, Outlets
+from sbi_rope.tasks.hemodynamics.network import Network
 from sbi_rope.tasks.hemodynamics.solver import Flow, solve
 from sbi_rope.tasks.hemodynamics.subject import Physics
-from sbi_rope.tasks.hemodynamics.validation import BASELINE
+from tests.blood_flow import BASELINE, REST, linear_pressure, make_network
 
 pytest.importorskip("numba")
 
-REST = 1e4  # Pa
 PERIOD = 0.8  # s
+SPEED = np.sqrt(2 / 3 * 6e4 / 1060)  # of waves in the tubes below, m/s
 HALF_SINE = np.maximum(np.sin(np.linspace(0, 2 * np.pi, 400, endpoint=False)), 0)
-
-
-def make_network(
-    nodes: list[tuple[int, int]],
-    *,
-    length: list[float],
-    radius: list[tuple[float, float]],
-    outlets: list[int],
-    viscosity: float = 0.0,
-    friction: float = 0.0,
-    resistance: tuple[float, float] = (1e8, 1e9),
-    outflow_pressure: float = REST,
-) -> Network:
-    num = len(nodes)
-    return Network(
-        inlet_node=np.array([node[0] for node in nodes]),
-        outlet_node=np.array([node[1] for node in nodes]),
-        length=np.array(length),
-        inlet_radius=np.array([pair[0] for pair in radius]),
-        outlet_radius=np.array([pair[1] for pair in radius]),
-        stiffness=np.array([[0.0] * num, [0.0] * num, [6e4] * num]),
-        wall_viscosity=np.array([[viscosity] * num, [0.0] * num]),
-        reference_pressure=np.full(num, REST),
-        friction=np.full(num, friction),
-        density=1060.0,
-        source_node=0,
-        outlets=Outlets(
-            segment=np.array(outlets),
-            proximal_resistance=np.full(len(outlets), resistance[0]),
-            distal_resistance=np.full(len(outlets), resistance[1]),
-            compliance=np.full(len(outlets), 1e-9),
-            pressure=outflow_pressure,
-        ),
-    )
 
 
 def run(network: Network, inflow: np.ndarray, **changes: Any) -> Flow:
@@ -204,8 +169,31 @@ def test_a_wave_travels_at_the_velocity_of_the_tube_law() -> None:
         convection=0.0,
     )
     first, second = flow.previous.argmax(axis=1) / flow.previous.shape[1] * PERIOD
-    speed = float(tube.wave_speed(0, np.array(0.01)))
-    assert second - first == pytest.approx(1.0 / speed, rel=5e-3)
+    assert second - first == pytest.approx(1.0 / SPEED, rel=5e-3)
+
+
+def test_a_bifurcation_reflects_waves_as_its_admittances_predict() -> None:
+    radius = np.array([0.01, 0.006, 0.005])
+    tubes = make_network(
+        [(0, 1), (1, 2), (1, 3)],
+        length=[2.0] * 3,
+        radius=[(r, r) for r in radius],
+        outlets=[1, 2],
+    )
+    # It passes the middle of the first tube before and after it is reflected.
+    pulse = np.zeros(400)
+    pulse[:25] = np.sin(np.linspace(0, np.pi, 25)) ** 2
+    flow = run(tubes, 1e-7 * pulse, num_cycles=2, convection=0.0, cell_length=0.005)
+    wave = flow.previous[0] - REST
+    time = np.arange(len(wave)) / len(wave) * PERIOD
+    turn = 2.0 / SPEED + 0.025
+    incident, reflected = wave[time < turn], wave[time >= turn]
+    measured = reflected[np.abs(reflected).argmax()] / incident.max()
+    admittance = radius**2
+    branches = admittance[1:].sum()
+    exact = (admittance[0] - branches) / (admittance[0] + branches)
+    assert exact > 0.2
+    assert measured == pytest.approx(exact, abs=0.01)
 
 
 @pytest.mark.parametrize(

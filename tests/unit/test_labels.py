@@ -10,17 +10,20 @@ import pytest
 import torch
 from sbi.inference import DirectPosterior
 from sbi.utils import BoxUniform
+from scipy.stats import kstest
 from torch import Tensor
 from torch.distributions import MultivariateNormal, Normal
 
 from sbi_rope import CalibrationFinetuner, RoPE
 from sbi_rope.data import Labels, Pairs
 from sbi_rope.discrepancy import DiscrepancyModel, learn_parameters
-from sbi_rope.discrepancy.imputation import expected_means
+from sbi_rope.discrepancy.model import expected_means
 from sbi_rope.errors import InvalidInputError, RoPEWarning
 from sbi_rope.labels import draws_of, nodes_of, reference_of
 from sbi_rope.metrics import acauc_of, coverage_curve_of, expected_coverage_error_of
-from sbi_rope.moments import moments
+from sbi_rope.simulate import moments
+from sbi_rope.stacking import stacking_weights
+from sbi_rope.stacking.scoring import _score_labels
 from tests import gaussian
 
 NAN = math.nan
@@ -114,7 +117,7 @@ def test_the_density_of_a_label_is_that_of_the_posterior_with_its_noise() -> Non
     assert float(error[3]) == 0.0  # of an exact label there is nothing to estimate
 
 
-@pytest.mark.parametrize("smallest", [1e-3, 1e-5, 1e-7])
+@pytest.mark.parametrize("smallest", [1e-3, 1e-7])
 def test_parameters_may_be_known_with_very_different_precision(smallest: float) -> None:
     y = torch.tensor([[0.3, -0.2]])
     q = MultivariateNormal(torch.zeros(2).double(), 0.3 * torch.eye(2).double() + 0.1)
@@ -136,10 +139,12 @@ def log_evidence(y: float, std: float) -> float:
 
 @pytest.mark.parametrize(
     ("y", "std", "dim", "num_nodes", "error"),
-    [(0.9, 0.15, 1, 20_000, 0.03)]
-    + [(y, 0.15, 1, 64, 0.6) for y in (0.9, 1.2, 1.5, 2.0)]
-    # The prior's reference is far outside of the box in most parameters.
-    + [(1.3, 0.3, 6, 32, 1.0)],
+    [
+        (0.9, 0.15, 1, 20_000, 0.03),
+        (2.0, 0.15, 1, 64, 0.6),
+        # The prior's reference is far outside of the box in most parameters.
+        (1.3, 0.3, 6, 32, 1.0),
+    ],
 )
 def test_the_density_of_a_label_is_that_of_quadrature_inside_the_support(
     y: float, std: float, dim: int, num_nodes: int, error: float
@@ -157,6 +162,19 @@ def test_the_density_of_draws_is_relative_to_that_of_the_prior() -> None:
     given = Labels(y=draws.mean(dim=1), covariance=COVARIANCE, draws=draws)
     score = nodes_of(given, [], PRIOR, num_nodes=7).log_mean(PRIOR.log_prob(draws))
     assert torch.allclose(score, torch.zeros(4).double(), atol=1e-6)
+
+
+def test_levels_of_noisy_labels_are_uniform_if_the_posterior_is_right() -> None:
+    torch.manual_seed(0)
+    theta = gaussian.prior().sample((400,))
+    noise = torch.tensor([0.0, 0.8])
+    labels = measured(theta + noise * torch.randn_like(theta), 0.0, 0.8)
+    posterior: Any = gaussian.posterior()
+    x = gaussian.simulator(theta)
+    unscored = (torch.zeros(len(x)), torch.zeros(len(x)))
+    found = _score_labels(posterior, unscored, labels, x, seed=0)
+    for uniform in (*found.levels.T, *found.ranks.T):
+        assert kstest(uniform.numpy(), "uniform").pvalue > 0.01
 
 
 # Learning -----------------------------------------------------------------------------
@@ -239,6 +257,11 @@ def test_a_weight_of_two_counts_as_two_pairs() -> None:
     b = DiscrepancyModel().fit(z[twice], m[twice], noise)
     assert math.isclose(a.log_evidence, b.log_evidence, rel_tol=1e-9)
     assert math.isclose(a.log_evidence_of_none, b.log_evidence_of_none, rel_tol=1e-9)
+    log_scores = torch.randn(6, 3)
+    one = stacking_weights(log_scores, pair_weights=weights)
+    other = stacking_weights(log_scores[twice])
+    assert torch.allclose(one.weights, other.weights, atol=1e-6)
+    assert math.isclose(one.score, other.score, rel_tol=1e-6)
 
 
 def test_the_distribution_of_parameters_is_learned_from_draws_and_weights() -> None:
@@ -274,13 +297,18 @@ def test_expected_means_are_those_of_the_normal_posterior() -> None:
     assert torch.allclose(found, expected, atol=0.05)
 
 
-@pytest.mark.medium
-def test_tuning_on_partial_labels_keeps_what_x_says_about_missing_parameters() -> None:
+def half_measured(count: int) -> tuple[Tensor, Tensor]:
+    """Return pairs of which each has one parameter."""
     torch.manual_seed(0)
-    theta = gaussian.prior().sample((600,))
-    x = gaussian.real_process(theta)
+    theta, x = gaussian.labelled(count)
     theta[::2, 0] = NAN
     theta[1::2, 1] = NAN
+    return theta, x
+
+
+@pytest.mark.medium
+def test_tuning_on_partial_labels_keeps_what_x_says_about_missing_parameters() -> None:
+    theta, x = half_measured(600)
     finetuner = CalibrationFinetuner(learning_rate=1e-2, max_num_epochs=300)
     conductor = rope(finetuner=finetuner).append_calibration(theta, x)
     conductor.train(seed=0, show_progress_bars=False)
@@ -293,28 +321,16 @@ def test_tuning_on_partial_labels_keeps_what_x_says_about_missing_parameters() -
     assert torch.allclose(torch.stack(moved) - level, expected, atol=0.15 * slope)
 
 
-def test_targets_of_noisy_labels_are_means_of_as_many_simulations_as_asked_for() -> (
-    None
-):
-    conductor = rope().append_calibration(*gaussian.labelled(3), theta_std=0.3)
-    before = conductor.num_simulator_calls
-    conductor.draw_targets(simulations_per_target=250, show_progress_bars=False)
-    assert conductor.num_simulator_calls == before + 750
-
-
 def test_levels_that_are_not_known_are_left_out() -> None:
     levels = torch.tensor([[0.2, NAN], [0.6, 0.9], [NAN, NAN], [1.0, 0.1]])
-    score = acauc_of(levels, allow_missing=True)
+    score = acauc_of(levels)
     assert math.isclose(score.value, (0.2 + 0.75 + 0.55) / 3 - 0.5, abs_tol=1e-6)
     expected = torch.tensor([0.1, 0.0]).double()
     assert torch.allclose(score.per_parameter, expected, atol=1e-6)
-    curve = coverage_curve_of(levels, allow_missing=True)
+    curve = coverage_curve_of(levels)
     half = torch.tensor([1 / 3, 0.5]).double()
     assert torch.allclose(curve.per_parameter[:, 49], half)
-    assert 0 < expected_coverage_error_of(levels, allow_missing=True).value < 0.5
-    for score_of in (acauc_of, coverage_curve_of, expected_coverage_error_of):
-        with pytest.raises(InvalidInputError, match="nan"):
-            score_of(levels)
+    assert 0 < expected_coverage_error_of(levels).value < 0.5
 
 
 # What users pass ----------------------------------------------------------------------
@@ -348,22 +364,16 @@ def test_exact_and_noisy_labels_may_be_appended_one_after_the_other() -> None:
         conductor.append_calibration(theta[:, None].repeat(1, 3, 1), x)
 
 
-STD = torch.tensor([0.1, 0.1])
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"theta_std": -0.1}, "not negative"),
         ({"theta_std": torch.ones(3)}, r"\(2,\) or \(10, 2\)"),
-        ({"theta_std": STD, "theta_cov": torch.eye(2)}, "got both"),
-        ({"theta_std": torch.tensor([0.1, NAN])}, "finite and not negative"),
+        ({"theta_std": 0.1, "theta_cov": torch.eye(2)}, "got both"),
         ({"theta_cov": torch.eye(3)}, r"\(2, 2\) or \(10, 2, 2\)"),
-        ({"theta_cov": -torch.eye(2)}, "positive definite"),
         ({"theta_cov": torch.tensor([[1.0, 0.5], [0.0, 1.0]])}, "positive definite"),
         ({"theta_cov": torch.ones(2, 2)}, "positive definite"),
         ({"weights": torch.zeros(10)}, "positive"),
-        ({"weights": torch.ones(9)}, "`weights` of shape"),
         ({"groups": [1, 2]}, "each of 10 pairs; got 2"),
     ],
 )
@@ -381,8 +391,6 @@ def test_a_covariance_may_have_parameters_of_very_different_units() -> None:
     covariance = torch.tensor([[1e-6, 1e-2], [1e-2, 1e8]])
     label = rope().append_calibration(theta, x, theta_cov=covariance).pairs.label
     assert torch.equal(label.covariance[0].float(), covariance)
-    covariance = torch.tensor([[0.0, 0.0], [0.0, 1e14]])
-    assert len(rope().append_calibration(theta, x, theta_cov=covariance).pairs) == 10
 
 
 def test_draws_of_labels_are_checked() -> None:
@@ -393,8 +401,6 @@ def test_draws_of_labels_are_checked() -> None:
     assert str(pairs) == "4 labels, each given as 20 draws"
     with pytest.raises(InvalidInputError, match="draws of all parameters"):
         rope().append_calibration(draws, x, theta_std=0.1)
-    with pytest.raises(InvalidInputError, match="draws of all parameters"):
-        rope().append_calibration(draws.where(draws > 0, NAN), x)
 
 
 def test_a_label_that_fits_no_parameters_of_the_prior_is_named() -> None:
@@ -408,12 +414,12 @@ def test_a_label_that_fits_no_parameters_of_the_prior_is_named() -> None:
 
 def test_groups_are_numbers_or_names_of_all_pairs() -> None:
     theta, x = gaussian.labelled(4)
-    numbers = [7, 7, 2, 3]
-    array = np.array(numbers)
     table = pd.DataFrame({"specimen": ["a", "a", "b", "c"]})
-    of_table = rope().append_calibration(theta, x, groups=table["specimen"])
-    assert of_table.pairs.group.tolist() == [0, 0, 1, 2]
-    for groups in (numbers, array, list(array), torch.tensor(numbers), iter(numbers)):
+    for groups in (
+        table["specimen"],
+        np.array([7, 7, 2, 3]),
+        torch.tensor([7, 7, 2, 3]),
+    ):
         named = rope().append_calibration(theta, x, groups=groups)
         assert named.pairs.group.tolist() == [0, 0, 1, 2]
     named = named.append_calibration(theta, x, groups=["mouse", 2, "rat", "mouse"])
@@ -421,10 +427,6 @@ def test_groups_are_numbers_or_names_of_all_pairs() -> None:
     with pytest.raises(InvalidInputError, match="or of none"):
         named.append_calibration(theta, x)
     assert len(named.pairs) == 8
-    with pytest.raises(InvalidInputError, match="or of none"):
-        rope().append_calibration(theta, x).append_calibration(theta, x, groups=numbers)
-    with pytest.raises(InvalidInputError, match="each of 4 pairs; got 1"):
-        rope().append_calibration(theta, x, groups=table)  # type: ignore[arg-type]
 
 
 def test_weights_that_were_normalised_are_warned_of() -> None:

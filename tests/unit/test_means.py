@@ -5,14 +5,9 @@ import math
 import pytest
 import torch
 
-from sbi_rope._means import interval_of_mean, mean_and_error
+from sbi_rope._statistics import interval_of_mean, mean_and_error
 from sbi_rope.data import Counts
 from sbi_rope.metrics import acauc_of, coverage_curve_of, expected_coverage_error_of
-from sbi_rope.metrics.calibration import (
-    acauc_of_pairs,
-    coverage_curve_of_pairs,
-    coverage_error_of_pairs,
-)
 from sbi_rope.stacking import CrossValidation, LearningCurve
 
 torch.manual_seed(0)
@@ -48,19 +43,19 @@ def test_an_interval_holds_the_mean_as_often_if_one_pair_counts_as_all_others() 
 
 def test_repeated_pairs_give_the_calibration_of_single_ones() -> None:
     levels = LEVELS.repeat_interleave(4, dim=0)
-    once, found = acauc_of(LEVELS), acauc_of_pairs(levels, REPEATED)
+    once, found = acauc_of(LEVELS), acauc_of(levels, REPEATED)
     assert found.value == pytest.approx(once.value)
     assert found.interval == pytest.approx(once.interval)
     torch.testing.assert_close(found.per_parameter, once.per_parameter)
     curve, of_pairs = (
         coverage_curve_of(LEVELS),
-        coverage_curve_of_pairs(levels, REPEATED),
+        coverage_curve_of(levels, REPEATED),
     )
     torch.testing.assert_close(of_pairs.per_parameter, curve.per_parameter)
     torch.testing.assert_close(of_pairs.standard_error, curve.standard_error)
     assert of_pairs.num_observations == 12
     error = expected_coverage_error_of(LEVELS)
-    of_pairs = coverage_error_of_pairs(levels, REPEATED)
+    of_pairs = expected_coverage_error_of(levels, REPEATED)
     assert of_pairs.value == pytest.approx(error.value)
     assert of_pairs.standard_error == pytest.approx(error.standard_error)
 
@@ -70,16 +65,16 @@ def test_a_weight_counts_as_so_many_pairs() -> None:
     levels[2, 0] = math.nan  # a parameter that was not measured
     counts = Counts(TIMES.double())
     several = levels.repeat_interleave(TIMES, dim=0)
-    found = acauc_of_pairs(levels, counts)
-    expected = acauc_of(several, allow_missing=True)
+    found = acauc_of(levels, counts)
+    expected = acauc_of(several)
     assert found.value == pytest.approx(expected.value)
     torch.testing.assert_close(found.per_parameter, expected.per_parameter)
     torch.testing.assert_close(
-        coverage_curve_of_pairs(levels, counts).per_parameter,
-        coverage_curve_of(several, allow_missing=True).per_parameter,
+        coverage_curve_of(levels, counts).per_parameter,
+        coverage_curve_of(several).per_parameter,
     )
-    assert coverage_error_of_pairs(levels, counts).value == pytest.approx(
-        expected_coverage_error_of(several, allow_missing=True).value
+    assert expected_coverage_error_of(levels, counts).value == pytest.approx(
+        expected_coverage_error_of(several).value
     )
 
 
@@ -101,8 +96,9 @@ def test_recordings_with_the_same_parameters_do_not_make_a_report_more_certain()
             levels=LEVELS.repeat_interleave(times, dim=0),
             estimates=torch.zeros(12 * times, LEVELS.shape[1]),
             ranks=LEVELS.repeat_interleave(times, dim=0),
-            pair_weights=torch.full((12 * times,), 1 / times) if times > 1 else None,
-            groups=groups if times > 1 else None,
+            counts=Counts(torch.full((12 * times,), 1 / times), groups)
+            if times > 1
+            else None,
         )
 
     once, often = scores(1), scores(4)

@@ -5,7 +5,6 @@ import math
 import signal
 import warnings
 from collections.abc import Iterator
-from functools import partial
 from typing import Any
 
 import pytest
@@ -24,7 +23,7 @@ from sbi_rope.errors import InvalidInputError, LogProbUnavailableError
 from tests import gaussian
 from tests.refusals import assert_refused
 
-KINDS: tuple[Any, ...] = ("central", "hpd", "rank")
+KINDS = "central", "rank"
 NORMAL = Normal(torch.tensor(0.0, dtype=torch.float64), 1.0)
 
 
@@ -55,6 +54,12 @@ class NoDensity(GaussianPosterior):
     """A posterior that can only be sampled."""
 
     log_prob_batched = property()  # type: ignore[assignment]
+
+
+def acauc(posterior: Any, theta: Tensor, x: Tensor, kind: str, **options: Any) -> Any:
+    """Return the ACAUC of central intervals, or that of ranks, the printed one."""
+    found = metrics.evaluate(posterior, theta, x, **options)
+    return found.acauc if kind == "central" else metrics.acauc_of(found.ranks)
 
 
 def gaussian_pairs(n: int, d: int = 1) -> tuple[Tensor, Tensor]:
@@ -150,7 +155,6 @@ def test_ranks_and_levels_outside_the_unit_interval_are_refused() -> None:
     for score in (*LEVEL_SCORES, metrics.central_levels):
         assert_refused(r"\[0, 1\]", score, TRUTH + 7)
         assert_refused(r"\[0, 1\]", score, TRUTH - 1)
-        assert_refused(r"\[0, 1\]", score, TRUTH * torch.nan)
     for score in LEVEL_SCORES:
         assert_refused("shape", score, TRUTH[:, :0])
 
@@ -198,10 +202,10 @@ def test_coverage_error_of_calibrated_levels_has_its_expected_value(
     levels = torch.rand(40, 400, 4)
     for number, of_parameter in zip(measured, levels.unbind(dim=2), strict=True):
         of_parameter[:, number:] = math.nan
-    errors = [metrics.expected_coverage_error_of(e, allow_missing=True) for e in levels]
+    errors = [metrics.expected_coverage_error_of(e) for e in levels]
     mean = sum(error.value for error in errors) / 40
     assert mean == pytest.approx(errors[0].if_calibrated, rel=0.1)
-    curve = metrics.coverage_curve_of(levels[0], allow_missing=True)
+    curve = metrics.coverage_curve_of(levels[0])
     # The number that is as good for each parameter on average.
     parts = [number**-0.5 for number in measured if number]
     assert curve.num_observations == int((sum(parts) / len(parts)) ** -2 + 1e-9)
@@ -261,28 +265,20 @@ def test_acauc_of_a_factor_near_one_is_its_logarithm_divided_by_pi(
 def test_acauc_of_gaussian_posteriors_has_its_exact_and_its_published_value() -> None:
     theta, x = gaussian_pairs(1500)
     for bias, scale, *published in (
-        (0.0, 1.0, 0.0015, 0.0013, -0.0001),  # calibrated
-        (0.0, 0.3, 0.3127, 0.3135, -0.001),  # over-confident
-        (0.0, 0.01, 0.492, 0.493, 0.0),
-        (0.0, 3.0, -0.298, -0.299, 0.001),  # under-confident
-        (0.0, 100.0, -0.474, -0.494, 0.0),
-        (2.0, 1.0, 0.356, 0.357, -0.422),  # too high
-        (-2.0, 1.0, 0.354, 0.355, 0.421),  # too low
-        (50.0, 0.1, 0.499, 0.5, -0.5),
-        (-50.0, 0.1, 0.499, 0.5, 0.5),
+        (0.0, 1.0, 0.0015, -0.0001),  # calibrated
+        (0.0, 0.3, 0.3127, -0.001),  # over-confident
+        (0.0, 0.01, 0.492, 0.0),
+        (0.0, 3.0, -0.298, 0.001),  # under-confident
+        (0.0, 100.0, -0.474, 0.0),
+        (2.0, 1.0, 0.356, -0.422),  # too high
+        (-2.0, 1.0, 0.354, 0.421),  # too low
+        (50.0, 0.1, 0.499, -0.5),
+        (-50.0, 0.1, 0.499, 0.5),
     ):
         posterior = GaussianPosterior(bias, scale)
         for kind, table in zip(KINDS, published, strict=True):
             # All observations at a time, which takes a quarter of the time.
-            score = metrics.acauc(
-                posterior,
-                theta,
-                x,
-                kind=kind,
-                num_samples=1000,
-                num_observations=1500,
-                chunk_size=1500,
-            )
+            score = acauc(posterior, theta, x, kind, chunk_size=1500)
             exact = expected_acauc(bias, scale, kind, num_samples=1000)
             case = f"{kind} at bias {bias} and scale {scale}: {score.value}"
             # 0.001: finitely many samples; 0.002: the error of the published value.
@@ -293,9 +289,9 @@ def test_acauc_of_gaussian_posteriors_has_its_exact_and_its_published_value() ->
 def test_calibrated_posteriors_have_an_acauc_of_zero() -> None:
     theta, x = gaussian_pairs(2000, d=3)
     for kind in KINDS:
-        score = metrics.acauc(GaussianPosterior(), theta, x, kind=kind)
+        score = acauc(GaussianPosterior(), theta, x, kind)
         assert abs(score.value) < 4 * score.standard_error, kind
-        assert score.per_parameter.shape == ((1,) if kind == "hpd" else (3,))
+        assert score.per_parameter.shape == (3,)
 
 
 def test_skewed_but_exact_posteriors_have_an_acauc_of_zero() -> None:
@@ -312,35 +308,21 @@ def test_skewed_but_exact_posteriors_have_an_acauc_of_zero() -> None:
     x = torch.randn(1500, 1)
     theta = x + GammaPosterior.law.sample((1500,))
     for kind in KINDS:
-        score = metrics.acauc(GammaPosterior(), theta, x, kind=kind, num_samples=300)
+        score = acauc(GammaPosterior(), theta, x, kind, num_samples=300)
         assert abs(score.value) < 4 * score.standard_error, kind
-
-
-def test_joint_regions_depend_on_correlation_and_central_intervals_do_not() -> None:
-    common = torch.randn(2000, 1)
-    score = metrics.acauc(
-        GaussianPosterior(), common.expand(-1, 2), torch.zeros(2000, 2), kind="hpd"
-    )
-    central = metrics.acauc(
-        GaussianPosterior(), common.expand(-1, 2), torch.zeros(2000, 2)
-    )
-    # |theta|^2 = 2 z^2 instead of chi^2 with two degrees: E exp(-z^2) = 1/sqrt(3).
-    expected = 0.5 - 3**-0.5
-    assert abs(central.value) < 4 * central.standard_error
-    assert abs(score.value - expected) < 4 * score.standard_error
 
 
 def test_coverage_of_gaussian_posteriors_follows_its_formula() -> None:
     theta, x = gaussian_pairs(2000, d=2)
-    curve = metrics.coverage_curve(GaussianPosterior(scale=0.5), theta, x)
+    found = metrics.evaluate(GaussianPosterior(scale=0.5), theta, x)
+    curve, error = found.coverage, found.expected_coverage_error
     expected = 2 * NORMAL.cdf(0.5 * NORMAL.icdf((1 + curve.levels) / 2)) - 1
     assert curve.per_parameter.shape == (2, 99)
     assert ((curve.average - expected).abs() < 5 * curve.standard_error + 0.002).all()
-    error = metrics.expected_coverage_error(GaussianPosterior(scale=0.5), theta, x)
     distance = float((curve.levels - expected).mean())
     assert abs(error.value - distance) < 4 * error.standard_error + 0.001
-    calibrated = metrics.expected_coverage_error(GaussianPosterior(), theta, x)
-    assert calibrated.value < 4 * 0.313 / 2000**0.5
+    calibrated = metrics.evaluate(GaussianPosterior(), theta, x)
+    assert calibrated.expected_coverage_error.value < 4 * 0.313 / 2000**0.5
 
 
 # Log-probabilities --------------------------------------------------------------------
@@ -390,22 +372,16 @@ def test_log_probs_of_minus_infinity_stay_in_the_mean_and_are_counted() -> None:
 def test_evaluation_agrees_with_the_single_scores() -> None:
     theta, x = gaussian_pairs(80, d=2)
     posterior, std = GaussianPosterior(0.3, 0.7), torch.tensor([2.0, 5.0])
-    options = {"num_samples": 100, "seed": 3}
-    result = metrics.evaluate(posterior, theta, x, theta_std=std, **options)
+    result = metrics.evaluate(posterior, theta, x, theta_std=std, num_samples=100)
+    levels = metrics.central_levels(result.ranks)
     assert result.as_row() == {
         "lpp": metrics.lpp(posterior, theta, x).mean,
         "lpp_z": metrics.lpp(posterior, theta, x, theta_std=std).mean,
         "lpp_median": metrics.lpp(posterior, theta, x).median,
         "neg_inf_fraction": 0.0,
-        "acauc": metrics.acauc(posterior, theta, x, **options).value,
-        "expected_coverage_error": metrics.expected_coverage_error(
-            posterior, theta, x, **options
-        ).value,
+        "acauc": metrics.acauc_of(levels).value,
+        "expected_coverage_error": metrics.expected_coverage_error_of(levels).value,
     }
-    bias = metrics.acauc(posterior, theta, x, kind="rank", **options)
-    assert metrics.acauc_of(result.ranks).value == bias.value
-    curve = metrics.coverage_curve(posterior, theta, x, **options)
-    assert torch.equal(result.coverage.per_parameter, curve.per_parameter)
 
 
 def test_a_seed_fixes_the_samples_and_leaves_the_global_random_state_alone() -> None:
@@ -461,19 +437,6 @@ def test_a_printed_evaluation_is_a_dozen_lines_that_name_their_units() -> None:
     assert "outside the prior" not in str(without)
 
 
-def test_joint_acauc_uses_at_most_200_observations_from_the_whole_test_set() -> None:
-    posterior = GaussianPosterior()
-    theta, x = gaussian_pairs(1000)
-    theta[990:] = 1e3  # level 1, seen only if the last rows are sampled
-    score = metrics.acauc(posterior, theta, x, kind="hpd", num_samples=20, seed=0)
-    assert sum(posterior.batch_sizes[::4]) == 200
-    assert float(score.per_parameter) == score.value
-    theta, x = gaussian_pairs(1000)
-    theta[[0, -1]] = 1e3
-    two = metrics.acauc(posterior, theta, x, kind="hpd", num_observations=2)
-    assert two.value == pytest.approx(0.5, abs=0.01)
-
-
 # Posteriors of sbi --------------------------------------------------------------------
 
 
@@ -507,11 +470,9 @@ def test_calibration_does_not_hang_where_no_sample_is_accepted(
     for posterior in (npe, EnsemblePosterior([npe, npe])):
         with at_most(10), warnings.catch_warnings():
             warnings.simplefilter("error")
-            score = metrics.acauc(posterior, theta, x, num_samples=100)
-        assert score.value > 0.4, posterior
-    with at_most(10):
-        joint = metrics.acauc(npe, theta, x, kind="hpd", num_samples=50)
-    assert joint.value > 0.4
+            samples = metrics.draw_samples(posterior, x, num_samples=100)
+        levels = metrics.central_levels(metrics.mid_ranks(samples, theta))
+        assert metrics.acauc_of(levels).value > 0.4, posterior
 
 
 def test_samples_are_drawn_where_the_rejection_of_sbi_would_not_end() -> None:
@@ -568,8 +529,6 @@ def test_a_posterior_with_bounded_rejection_is_called_as_it_is(
     result = metrics.evaluate(posterior, theta, x, num_samples=20)
     assert result.lpp.mean == 0.0
     assert "    corrected for mass outside the prior" in str(result)
-    score = metrics.acauc(posterior, theta, x, kind="hpd", num_samples=20)
-    assert score.value == 0.0
 
 
 # Errors -------------------------------------------------------------------------------
@@ -593,25 +552,14 @@ def test_an_evaluation_says_what_is_wrong_with_parameters_and_their_units() -> N
         assert_refused(match, metrics.evaluate, AnyWidth(), **good | change)
 
 
-SCORES_OF_POSTERIORS = (
-    metrics.lpp,
-    metrics.acauc,
-    partial(metrics.acauc, kind="hpd"),
-    metrics.coverage_curve,
-    metrics.expected_coverage_error,
-    metrics.evaluate,
-    lambda posterior, _, x: metrics.draw_samples(posterior, x, num_samples=5),
-)
-
-
 def test_a_posterior_without_density_can_still_be_scored_by_its_calibration() -> None:
     theta, x = gaussian_pairs(30)
     for score in (metrics.lpp, metrics.evaluate):
         with pytest.raises(LogProbUnavailableError, match="NoDensity"):
             score(NoDensity(), theta, x)
-    with pytest.raises(LogProbUnavailableError):
-        metrics.acauc(NoDensity(), theta, x, kind="hpd")
-    assert metrics.acauc(NoDensity(), theta, x).standard_error > 0
+    samples = metrics.draw_samples(NoDensity(), x, num_samples=20)
+    levels = metrics.central_levels(metrics.mid_ranks(samples, theta))
+    assert metrics.acauc_of(levels).standard_error > 0
 
 
 def test_nan_and_infinite_log_probs_raise_and_say_where() -> None:
@@ -632,7 +580,7 @@ def test_nan_samples_raise_and_say_where() -> None:
 
     x = torch.arange(12.0).unsqueeze(1)
     with pytest.raises(InvalidInputError, match=r"NaN samples.*first: \[7\]"):
-        metrics.coverage_curve(Broken(), x, x, chunk_size=5)
+        metrics.evaluate(Broken(), x, x, chunk_size=5)
 
 
 def test_acauc_standard_error_does_not_count_copies_of_a_parameter() -> None:

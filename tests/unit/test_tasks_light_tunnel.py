@@ -24,7 +24,8 @@ from sbi_rope.tasks.light_tunnel_models import (
     hexagon_mask,
     malus,
 )
-from sbi_rope.tasks.light_tunnel_network import ImageEmbedding
+from sbi_rope.tasks.networks import ImageEmbedding
+from tests.tasks import all_recorded
 
 SIZE = 64
 WriteData = Callable[..., Path]
@@ -54,14 +55,11 @@ def write_data(tmp_path: Path) -> WriteData:
         experiment: str = UNIFORM,
         size: int = SIZE,
         offset: int = 0,
-        drop: tuple[str, ...] = (),
-        **changes: object,
     ) -> Path:
         folder = tmp_path / DATASET / experiment
         images = folder / f"images_{size}"
         images.mkdir(parents=True)
         columns = ["timestamp", *INPUTS, "image_file"]
-        columns = [column for column in columns if column not in drop]
         lines = [",".join(columns)]
         for i in range(offset, offset + num_rows):
             row = {
@@ -73,7 +71,6 @@ def write_data(tmp_path: Path) -> WriteData:
                 "pol_2": 2.5 * i,
                 "image_file": f"img_{i}.png",
             }
-            row |= changes if i == 1 else {}
             lines.append(",".join(str(row[column]) for column in columns))
             content = pixels_of(i, size).permute(1, 2, 0).contiguous().numpy()
             image = image_module.frombytes("RGB", (size, size), content.tobytes())
@@ -82,13 +79,6 @@ def write_data(tmp_path: Path) -> WriteData:
         return tmp_path
 
     return write
-
-
-def all_recorded(task: LightTunnel, num_rows: int = 12) -> tuple[Tensor, Tensor]:
-    third = num_rows // 3
-    parts = (task.get_calibration_set(third), task.get_test_set(num_rows - third))
-    theta, x = zip(*parts, strict=True)
-    return torch.cat(theta), torch.cat(x)
 
 
 # The models --------------------------------------------------------------------------
@@ -162,28 +152,6 @@ def test_stand_in_without_noise_is_model_f3_of_causalchamber() -> None:
         torch.testing.assert_close(image, torch.as_tensor(expected).permute(2, 0, 1))
 
 
-def test_image_without_truncation_is_within_a_level_of_the_simulation() -> None:
-    theta = LightTunnel().get_prior().sample((100,))
-    simulator = HexagonSimulator()
-    image = simulator.image(theta)
-    rest = 255 * (image - simulator(theta))
-    assert rest.min() >= -1e-4
-    assert 0.9 < rest.max() < 1.0
-    assert image.min() >= 0.0
-    assert image.max() <= 1.0
-
-
-def test_image_has_the_gradients_of_the_product() -> None:
-    theta = torch.tensor([[200.0, 100.0, 50.0, 0.25]], dtype=torch.float64)
-    theta.requires_grad_()
-    image = HexagonSimulator(image_size=10).image
-    assert torch.autograd.gradcheck(image, theta)
-    (gradient,) = torch.autograd.grad(image(theta)[0, 1].sum(), theta)
-    pixels = float(hexagon_mask(10).sum())
-    expected = pixels / 255 * torch.tensor([[0.0, 0.25, 0.0, 100.0]])
-    torch.testing.assert_close(gradient, expected.double())
-
-
 def test_dequantised_simulations_are_uniform_within_their_levels() -> None:
     theta = torch.tensor([[200.0, 101.0, 255.0, 1.0]]).expand(20, -1)
     plain = 255 * HexagonSimulator(image_size=SIZE)(theta)
@@ -252,18 +220,6 @@ def test_crowded_parameters_are_beta_binomial() -> None:
     assert theta.dtype == torch.float32
 
 
-def test_paper_settings_are_those_of_the_appendix() -> None:
-    settings = LightTunnel.paper_settings
-    assert settings is not None
-    assert settings.conditioner == (500,) * 3
-    assert settings.integrand == (150,) * 4
-    assert (settings.learning_rate, settings.batch_size) == (5e-4, 100)
-    assert settings.num_validation == 10_000
-    assert settings.finetuning_learning_rate == 1e-4
-    assert settings.finetuning_steps == 2000
-    assert (settings.joint_epochs, settings.joint_epoch_size) == (50, 1000)
-
-
 # The networks ------------------------------------------------------------------------
 
 
@@ -288,12 +244,6 @@ def test_layers_of_the_network_are_those_of_the_paper() -> None:
         (128, 64, 1, 1, 1),
         (64, 3, 1, 1, 1),
     ]
-    once = [nn.Conv2d, nn.ReLU]
-    expected = [*once, *once, nn.MaxPool2d, *once, *once, *once, nn.Flatten]
-    assert len(net.features) == len(expected)
-    for layer, kind in zip(net.features, expected, strict=True):
-        assert isinstance(layer, kind)
-    assert net.features[4].kernel_size == 3
     linear = [
         (m.in_features, m.out_features)
         for m in net.modules()
@@ -328,7 +278,7 @@ def test_the_light_network_starts_from_means_over_squares() -> None:
 
 def test_rows_of_a_file_become_parameters_and_images(write_data: WriteData) -> None:
     task = LightTunnel(root=write_data(), image_size=SIZE)
-    theta, x = all_recorded(task)
+    theta, x = all_recorded(task, 12)
     assert sorted(theta[:, 0].tolist()) == list(range(12))
     i = theta[:, 0]
     alpha = torch.deg2rad(10 + 2.5 * i).cos() ** 2
@@ -365,13 +315,6 @@ def test_dequantised_images_get_the_same_noise_whenever_they_are_read(
     other = task.get_test_set(6, seed=1)
     row = int((other[0][:, 0] == theta[0, 0]).nonzero()[0])
     assert torch.equal(other[1][row], x[0])
-
-
-def test_a_size_that_is_missing_is_no_data(write_data: WriteData) -> None:
-    task = LightTunnel(root=write_data(), image_size=100)
-    assert not task.has_data
-    with pytest.raises(DataNotFoundError, match=r"images_100.*images_64"):
-        task.get_test_set(1)
 
 
 def test_the_flipped_variant_turns_test_images_only(write_data: WriteData) -> None:

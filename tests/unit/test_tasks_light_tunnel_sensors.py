@@ -19,6 +19,7 @@ from sbi_rope.tasks.light_tunnel_sensors import (
     LightTunnelSensors,
     LightTunnelSimulator,
 )
+from tests.tasks import all_recorded
 
 WriteTable = Callable[..., Path]
 
@@ -29,12 +30,9 @@ def write_table(tmp_path: Path) -> WriteTable:
 
     def write(
         num_rows: int = 9,
-        *,
-        experiment: str = "uniform_reference",
-        drop: tuple[str, ...] = (),
         **changes: object,
     ) -> Path:
-        columns = [c for c in ("timestamp", *INPUTS, *OUTPUTS) if c not in drop]
+        columns = ["timestamp", *INPUTS, *OUTPUTS]
         lines = [",".join(columns)]
         for i in range(num_rows):
             row = dict.fromkeys(columns, 100 + i) | {
@@ -48,7 +46,7 @@ def write_table(tmp_path: Path) -> WriteTable:
             lines.append(",".join(str(row[column]) for column in columns))
         folder = tmp_path / DATASET
         folder.mkdir(exist_ok=True)
-        (folder / f"{experiment}.csv").write_text("\n".join(lines) + "\n")
+        (folder / "uniform_reference.csv").write_text("\n".join(lines) + "\n")
         return tmp_path
 
     return write
@@ -128,7 +126,7 @@ def test_prior_log_density_is_analytic() -> None:
 def test_the_law_overpredicts_the_light_by_the_known_ratios(
     chamber_extract: Path,
 ) -> None:
-    theta, x = all_recorded(LightTunnelSensors(root=chamber_extract), num_rows=450)
+    theta, x = all_recorded(LightTunnelSensors(root=chamber_extract), 450)
     assert len(theta) == 450
     measured = x[:, :6].expm1().mean(dim=0)
     ratios = LightTunnelSimulator().readings(theta)[:, :6].mean(dim=0) / measured
@@ -137,7 +135,7 @@ def test_the_law_overpredicts_the_light_by_the_known_ratios(
 
 
 def test_all_6000_recorded_parameters_follow_the_prior(chamber_root: Path) -> None:
-    theta, _ = all_recorded(LightTunnelSensors(root=chamber_root))
+    theta, _ = all_recorded(LightTunnelSensors(root=chamber_root), 6000)
     # Distribution functions of the prior, which are uniform where it is right.
     colour = (theta[:, :3] + 0.5) / 86
     angle = UniformDistance(torch.tensor([40.0])).cdf(theta[:, 3:])
@@ -172,7 +170,7 @@ def test_a_recorded_row_becomes_the_parameters_and_the_observation(
     chamber_extract: Path,
 ) -> None:
     # The first row of the file: its colours, angles and readings as published.
-    theta, x = all_recorded(LightTunnelSensors(root=chamber_extract), num_rows=450)
+    theta, x = all_recorded(LightTunnelSensors(root=chamber_extract), 450)
     first = [72.0, 18.0, 60.0, 5.962499618530273 + 2.0250000953674316]
     (row,) = (theta == torch.tensor(first)).all(dim=1).nonzero().flatten().tolist()
     readings = torch.tensor([14377.0, 3598.0, 1767.0, 465.0, 567.0, 159.0])
@@ -184,7 +182,7 @@ def test_the_readings_come_in_the_order_of_the_simulator(
     write_table: WriteTable,
 ) -> None:
     changes = {name: 10**i for i, name in enumerate(OUTPUTS)}
-    theta, x = all_recorded(LightTunnelSensors(root=write_table(**changes)), num_rows=9)
+    theta, x = all_recorded(LightTunnelSensors(root=write_table(**changes)), 9)
     row = x[theta[:, 0] == 1][0]
     torch.testing.assert_close(row[:6].expm1(), 10.0 ** torch.arange(6))
     assert row[6] == 1e6
@@ -194,7 +192,7 @@ def test_a_recording_of_any_number_of_rows_is_data(write_table: WriteTable) -> N
     cycle = torch.arange(4000) % 41
     task = LightTunnelSensors(root=write_table(4000))
     assert task.num_recorded("calibration") == 1333
-    theta, x = all_recorded(task, num_rows=4000)
+    theta, x = all_recorded(task, 4000)
     assert torch.equal(theta[:, 0].sort().values, cycle.sort().values.float())
     assert torch.isfinite(x).all()
     assert len(LightTunnelSensors(root=write_table(3)).get_test_set(2)[0]) == 2
@@ -269,12 +267,3 @@ def test_variants_with_experiments_of_their_own_take_no_other() -> None:
     for variant in OWN_EXPERIMENTS:
         with pytest.raises(InvalidInputError, match="`experiment`"):
             LightTunnelSensors(variant=variant, experiment="uniform_l_11_mid")
-
-
-def all_recorded(
-    task: LightTunnelSensors, *, num_rows: int = 6000
-) -> tuple[Tensor, Tensor]:
-    third = num_rows // 3
-    parts = (task.get_calibration_set(third), task.get_test_set(num_rows - third))
-    theta, x = zip(*parts, strict=True)
-    return torch.cat(theta), torch.cat(x)

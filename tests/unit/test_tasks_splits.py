@@ -1,7 +1,5 @@
 """Pairs that share no observation."""
 
-from concurrent.futures import ThreadPoolExecutor
-
 import pytest
 import torch
 from torch import Tensor
@@ -94,15 +92,6 @@ def test_a_process_without_valid_pairs_is_stopped_with_an_error() -> None:
     )
     with pytest.raises(SimulationError, match="0 of 3 pairs"):
         pairs.take(3, seed=0, part="test")
-
-
-def test_sets_drawn_in_several_threads_are_those_of_one_thread() -> None:
-    expected, _ = drawn().take(2000, seed=0, part="test")
-    with ThreadPoolExecutor(4) as threads:
-        sets = threads.map(
-            lambda _: drawn().take(2000, seed=0, part="test")[0], range(8)
-        )
-    assert all(torch.equal(theta, expected) for theta in sets)
 
 
 # Recorded pairs ----------------------------------------------------------------------

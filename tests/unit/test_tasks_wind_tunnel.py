@@ -18,6 +18,7 @@ from sbi_rope.tasks.wind_tunnel_model import (
     WindTunnelSimulator,
     pressure_ratio,
 )
+from tests.tasks import all_recorded
 
 # The published columns around those that are read.
 HEADER = (
@@ -69,7 +70,6 @@ def write_impulses(tmp_path: Path) -> WriteImpulses:
         hatches: tuple[float, ...] = (0.0, 12.5, 45.0),
         *,
         pressures: Tensor | None = None,
-        experiment: str = EXPERIMENT,
         edit: Callable[[list[str]], list[str]] = list,
     ) -> Path:
         if pressures is None:
@@ -84,7 +84,7 @@ def write_impulses(tmp_path: Path) -> WriteImpulses:
                 )
         folder = tmp_path / DATASET
         folder.mkdir(exist_ok=True)
-        path = folder / f"{experiment}.csv"
+        path = folder / f"{EXPERIMENT}.csv"
         path.write_text("\n".join(edit([HEADER, *rows])) + "\n")
         return tmp_path
 
@@ -288,16 +288,6 @@ def test_files_are_needed_unless_there_is_a_stand_in_or_nothing_to_read() -> Non
     assert WindTunnel(variant="well_specified").required_files == ()
 
 
-def test_the_stand_in_has_other_fans_and_correlated_noise() -> None:
-    stand_in = WindTunnel(variant="synthetic")._stand_in
-    assert stand_in == WindTunnelSimulator(
-        noise_correlation=0.6,
-        max_pressure=0.95 * 74.82473949999999,
-        inertia=(1 + 0.1) * (0.5 * 0.059**2 * 0.02),
-        exhaust_offset=5.0,
-    )
-
-
 @pytest.mark.slow
 def test_to_the_simulator_the_stand_in_looks_like_a_hatch_that_is_open_wider() -> None:
     theta, x = WindTunnel(variant="synthetic", onset_jitter=0.0).get_test_set(2000)
@@ -334,13 +324,3 @@ def test_impulses_that_a_recording_cuts_are_left_out(
     task = WindTunnel(root=write_impulses((50.0, 1.0, 2.0)))
     with pytest.raises(InvalidInputError, match="support of the prior"):
         task.get_test_set(1)
-
-
-# From a file to a repaired posterior -------------------------------------------------
-
-
-def all_recorded(task: WindTunnel, num: int) -> tuple[Tensor, Tensor]:
-    third = num // 3
-    parts = (task.get_calibration_set(third), task.get_test_set(num - third))
-    theta, x = zip(*parts, strict=True)
-    return torch.cat(theta), torch.cat(x)

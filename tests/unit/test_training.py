@@ -3,7 +3,6 @@
 import copy
 import dataclasses
 import inspect
-import math
 import os
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from sbi.inference import NPE
 from sbi.neural_nets import posterior_nn
 from torch import Tensor, nn
 
-from sbi_rope._sbi.trainer import SimulationTrainer
+from sbi_rope._sbi import SimulationTrainer
 from sbi_rope.baselines import Training
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.fit import History
@@ -32,33 +31,10 @@ pytestmark = [
 ]
 
 
-class TestTraining:
-    def test_values_outside_their_range_are_refused(self) -> None:
-        for field, value in [
-            ("training_batch_size", 0),
-            ("training_batch_size", 1.5),
-            ("learning_rate", 0.0),
-            ("learning_rate", math.inf),
-            ("validation_fraction", 0.0),
-            ("validation_fraction", 1.0),
-            ("stop_after_epochs", 0),
-            ("max_num_epochs", 0),
-            ("clip_max_norm", 0.0),
-            ("clip_max_norm", "5"),
-        ]:
-            with pytest.raises(InvalidInputError, match=f"`{field}`"):
-                Training(**{field: value})
-
-    def test_the_ends_of_the_ranges_are_taken(self) -> None:
-        training = Training(
-            training_batch_size=1, validation_fraction=0.5, clip_max_norm=None
-        )
-        assert training.clip_max_norm is None
-
-    def test_its_fields_are_arguments_of_sbis_train(self) -> None:
-        known = inspect.signature(NPE.train).parameters
-        for field in dataclasses.fields(Training):
-            assert known[field.name].default == field.default
+def test_the_settings_of_a_training_are_arguments_of_sbis_train() -> None:
+    known = inspect.signature(NPE.train).parameters
+    for field in dataclasses.fields(Training):
+        assert known[field.name].default == field.default
 
 
 def small(net: nn.Module | None = None) -> Any:
@@ -87,34 +63,6 @@ class TestEstimatorBuilder:
         after = norm.state_dict()
         assert all(torch.equal(before[key], after[key]) for key in before)
         assert norm.training
-
-    def test_a_name_is_that_of_sbi(self) -> None:
-        for name in ["mdn", "maf", "nsf"]:
-            theta, x = torch.randn(20, 2), torch.randn(20, 3)
-            torch.manual_seed(1)
-            ours = estimator_builder(name)(theta, x)
-            torch.manual_seed(1)
-            theirs = posterior_nn(name)(theta, x)
-            assert type(ours) is type(theirs)
-            state = theirs.state_dict()
-            assert all(torch.equal(v, state[k]) for k, v in ours.state_dict().items())
-
-    def test_checking_a_name_leaves_no_trace(self) -> None:
-        before = torch.get_rng_state()
-        estimator_builder("maf")
-        assert torch.equal(torch.get_rng_state(), before)
-
-    def test_an_unknown_name_is_refused(self) -> None:
-        for name in ["", "fancy", "MAF", "mnpe"]:
-            with pytest.raises(
-                InvalidInputError, match=f"`density_estimator`.*{name!r}"
-            ):
-                estimator_builder(name)
-
-    def test_what_cannot_build_is_refused(self) -> None:
-        for value in [None, 3, ("maf",)]:
-            with pytest.raises(InvalidInputError, match="`density_estimator`"):
-                estimator_builder(value)
 
 
 def pairs(n: int) -> tuple[Tensor, Tensor]:
@@ -154,15 +102,8 @@ class TestTrainWithSBI:
         assert history.kept_validation_loss == min(history.validation_loss)
         assert history.validation_loss[history.best_epoch] < history.validation_loss[0]
         assert history.learning_rate == 0.05
+        assert len(history.training_loss) <= 40
         assert not estimator.training
-
-    def test_the_options_reach_sbi(self) -> None:
-        _, history = with_sbi(max_num_epochs=3)
-        assert len(history.training_loss) == 3
-        _, stopped = with_sbi(
-            stop_after_epochs=1, max_num_epochs=200, learning_rate=0.3
-        )
-        assert len(stopped.training_loss) < 100
 
     def test_too_few_simulations_are_refused(self) -> None:
         with_sbi(MIN_SIMULATIONS, max_num_epochs=1)
@@ -179,16 +120,6 @@ def split_of(make_trainer: Any, theta: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class TestSimulationTrainer:
-    def test_recordings_of_a_person_are_held_out_together(self) -> None:
-        people = box(2).sample((12,))
-        theta = people.repeat(6, 1)
-        train, held_out = split_of(SimulationTrainer, theta)
-        assert sorted(torch.cat([train, held_out]).tolist()) == list(range(72))
-        assert not set(train.remainder(12).tolist()) & set(
-            held_out.remainder(12).tolist()
-        )
-        assert 72 * 0.2 <= len(held_out) < 72 * 0.2 + 6
-
     def test_without_recordings_of_the_same_it_is_the_split_of_sbi(self) -> None:
         theta = box(2).sample((50,))
         for ours, sbis in zip(
@@ -196,9 +127,9 @@ class TestSimulationTrainer:
         ):
             assert torch.equal(ours, sbis)
 
-    def test_a_few_people_are_held_out_together_in_smaller_batches(self) -> None:
-        """Fewer than a batch of 20 are left to train on, or hardly any held out."""
-        for sizes in [(1, 19), (6, 7, 12), (2, 2, 30)]:
+    def test_recordings_of_a_person_are_held_out_together(self) -> None:
+        """Where fewer than a batch of 20 are left, or hardly any held out, too."""
+        for sizes in [(1, 19), (6, 7, 12), (2, 2, 30), (6,) * 12]:
             people = box(2).sample((len(sizes),))
             theta = people.repeat_interleave(torch.tensor(sizes), dim=0)
             for seed in range(6):

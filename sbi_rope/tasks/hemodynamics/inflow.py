@@ -1,14 +1,4 @@
-r"""Flow out of the heart, from the timing and the volumes of a beat.
-
-References:
-    | Modeling arterial pulse waves in healthy aging: a database for in silico
-      evaluation of hemodynamics and pulse wave indexes (Charlton et al., 2019)
-    | https://doi.org/10.1152/ajpheart.00218.2019
-    | https://github.com/peterhcharlton/pwdb, commit 5a0d4727 (MIT licence)
-    | One-dimensional haemodynamic modeling and wave dynamics in the entire adult
-      circulation (Mynard and Smolich, 2015)
-    | https://doi.org/10.1007/s10439-015-1313-8
-"""
+r"""Flow out of the heart, from the timing and the volumes of a beat."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -21,8 +11,9 @@ from sbi_rope.tasks.hemodynamics.subject import Subject
 __all__ = ["aortic_inflow"]
 
 # Flow through the aortic valve in arbitrary units, every 3 ms from its opening on: the
-# waveform of Mynard and Smolich as published with pwdb, which has a value every ms. A
-# cubic spline through these reproduces the others to 0.2 % of the peak.
+# waveform of Mynard and Smolich (2015, https://doi.org/10.1007/s10439-015-1313-8) as
+# published with pwdb (see arteries.py), which has a value every ms. A cubic spline
+# through these reproduces the others to 0.2 % of the peak.
 TEMPLATE_STEP = 3.0  # ms
 TEMPLATE = (
     *(0.0, 4.6, 30.1, 77.9, 127.9, 172.0, 211.9, 249.4, 284.8, 317.1, 345.6, 370.1),
@@ -54,13 +45,9 @@ def aortic_inflow(subject: Subject, num_samples: int) -> np.ndarray:
     regurgitant volume. Should a beat be too short for the reverse flow to end in it,
     the reverse flow is shortened.
 
-    Args:
-        subject: The person.
-        num_samples: Number of samples in a beat.
-
     Returns:
-        Flow in ml/s, shape ``(num_samples,)``, float64, at equally spaced times from
-        the opening of the valve, the end of the beat excluded.
+        Flow in ml/s, shape ``(num_samples,)``, at equally spaced times from the opening
+        of the valve, the end of the beat excluded.
     """
     template = _template()
     time = 1000.0 * subject.period * np.arange(num_samples) / num_samples

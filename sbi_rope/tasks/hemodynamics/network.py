@@ -103,11 +103,6 @@ class Network:
         constant, slope = self.wall_viscosity[:, segment]
         return constant + slope / (2 * radius)
 
-    def wave_speed(self, segment: int, radius: np.ndarray) -> np.ndarray:
-        """Return the velocity of waves at the reference pressure, in m/s."""
-        stiffness = _stiffness(radius, *self.stiffness[:, segment])
-        return np.sqrt(2 / 3 * stiffness / (self.density * radius))
-
 
 def build_network(subject: Subject, physics: Physics) -> Network:
     r"""Return the arteries of a subject.
@@ -163,11 +158,8 @@ def carotid_femoral_velocity(
     with the wave velocity :math:`c_i` at the mean radius of a segment. Paths end in
     the middle of their last segment.
 
-    Args:
-        length: Lengths of the 116 segments, in m.
-        inlet_radius: Radii at the reference pressure, in m.
-        outlet_radius: Radii at the other end, in m.
-        k3: Stiffness of the walls, in kg s^-2 m^-1.
+    Lengths and radii, of both ends of the 116 segments, are in m, the stiffness
+    :math:`k_3` in kg s^-2 m^-1.
     """
     distance, time = np.zeros(2), np.zeros(2)
     for i, path in enumerate(PATHS):
@@ -176,11 +168,16 @@ def carotid_femoral_velocity(
         share[-1], middle[-1] = 0.5, 0.25
         inlet, outlet = inlet_radius[segment], outlet_radius[segment]
         radius = inlet + middle * (outlet - inlet)
-        stiffness = _stiffness(radius, arteries.WALL_K1, arteries.WALL_K2, k3)
-        speed = np.sqrt(2 / 3 * stiffness / (arteries.DENSITY * radius))
+        speed = wave_speed(radius, k3)
         distance[i] = (share * length[segment]).sum()
         time[i] = (share * length[segment] / speed).sum()
     return float((distance[1] - distance[0]) / (time[1] - time[0]))
+
+
+def wave_speed(radius: np.ndarray, k3: float) -> np.ndarray:
+    """Return the velocity of waves at the reference pressure, in m/s."""
+    stiffness = _stiffness(radius, arteries.WALL_K1, arteries.WALL_K2, k3)
+    return np.sqrt(2 / 3 * stiffness / (arteries.DENSITY * radius))
 
 
 def _stiffness(radius: np.ndarray, k1: float, k2: float, k3: float) -> np.ndarray:
@@ -231,9 +228,7 @@ def _outlets(outlet_radius: np.ndarray, k3: float, subject: Subject) -> Outlets:
         compliance.append(bed_compliance * ML / MMHG * share)
     segment = np.concatenate(segment)
     radius = outlet_radius[segment]
-    stiffness = _stiffness(radius, arteries.WALL_K1, arteries.WALL_K2, k3)
-    speed = np.sqrt(2 / 3 * stiffness / (arteries.DENSITY * radius))
-    impedance = arteries.DENSITY * speed / (np.pi * radius**2)
+    impedance = arteries.DENSITY * wave_speed(radius, k3) / (np.pi * radius**2)
     total = np.concatenate(resistance) + impedance
     output = subject.stroke_volume * ML / subject.period
     drop = (subject.mean_pressure - subject.outflow_pressure) * MMHG

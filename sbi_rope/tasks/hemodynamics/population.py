@@ -39,7 +39,6 @@ NUISANCES = (
 TRUNCATION = 2.0  # standard deviations at which every normal law is cut
 TRUNCATED_SD = 0.8796256610342398  # of a standard normal law cut there
 QUANTILE_90 = 1.2815515655446004  # of a standard normal law
-INDEPENDENT_SV = (65.0, 15.0)  # ml
 EXPLAINED = 0.7  # correlation of ejection time and its prediction by Weissler
 MAX_PEAK_SHARE = 0.45  # of the ejection
 MEAN_HEIGHT = 1.70  # m
@@ -78,20 +77,11 @@ class Population(Settings):
     with independent standard normal :math:`\varepsilon_i`, and the proximal aorta
     grows with age besides, with an individual factor of 13.4 %.
 
-    References:
-        | Modeling arterial pulse waves in healthy aging: a database for in silico
-          evaluation of hemodynamics and pulse wave indexes (Charlton et al., 2019)
-        | https://doi.org/10.1152/ajpheart.00218.2019
-
     Args:
         height_sd: Standard deviation :math:`\sigma_h` of the height in m.
         segment_sd: Scatter :math:`s` of the logarithm of each segment's length.
         proximal_aorta: Whether the proximal aorta varies by itself in the real
             process. Without it and with both scatters 0, the simulator is exact.
-        prior: ``"population"``, as above, or ``"independent"``: stroke volume
-            :math:`\mathcal{N}(65, 15^2)` and ejection time
-            :math:`\mathcal{N}(282, 23.3^2)`, cut at two standard deviations, whatever
-            the age and the heart rate.
 
     Example:
         >>> person = Population().draw("simulator", seed=0, index=0)
@@ -103,20 +93,15 @@ class Population(Settings):
     height_sd: Annotated[float, Range(0, 0.4)] = 0.10
     segment_sd: Annotated[float, Range(0, 0.5)] = 0.15
     proximal_aorta: bool = True
-    prior: Literal["population", "independent"] = "population"
 
     def draw(self, process: Process, seed: int, index: int) -> Subject:
-        """Return one person, always the same for the same arguments.
+        """Return one person of a cohort, always the same for the same arguments.
 
-        Args:
-            process: ``"simulator"`` or ``"real"``.
-            seed: Number of the cohort.
-            index: Number of the person in the cohort. Persons are independent of each
-                other, within and between processes.
+        Persons are independent of each other, within and between cohorts and processes.
         """
         entropy = [seed, PROCESSES.index(process), index]
         rng = np.random.default_rng(np.random.SeedSequence(entropy))
-        age, stroke_volume, heart_rate, ejection_time = self._draw_heart(rng)
+        age, stroke_volume, heart_rate, ejection_time = _draw_heart(rng)
         return Subject(
             age=age,
             heart_rate=heart_rate,
@@ -134,22 +119,6 @@ class Population(Settings):
             length_factors=self._draw_lengths(rng, process, age),
         )
 
-    def _draw_heart(self, rng: np.random.Generator) -> tuple[float, ...]:
-        """Return age, stroke volume in ml, heart rate in 1/min, ejection time in ms."""
-        age = float(rng.uniform(*tables.AGES))
-        rate_mean = float(tables.heart_rate_mean(age))
-        heart_rate = truncated_normal(rng, rate_mean, tables.HEART_RATE_SD)
-        if self.prior == "independent":
-            stroke_volume = truncated_normal(rng, *INDEPENDENT_SV)
-            time = truncated_normal(rng, *tables.EJECTION_TIME)
-            return age, stroke_volume, heart_rate, time
-        mean, sd = tables.stroke_volume_law(age)
-        stroke_volume = truncated_normal(rng, float(mean), float(sd))
-        time, slope, noise_sd = ejection_time_slopes()
-        predicted = time + slope * tables.weissler_time(stroke_volume, heart_rate)
-        ejection_time = truncated_normal(rng, float(predicted), noise_sd)
-        return age, stroke_volume, heart_rate, ejection_time
-
     def _draw_lengths(
         self, rng: np.random.Generator, process: Process, age: float
     ) -> tuple[float, ...]:
@@ -162,6 +131,19 @@ class Population(Settings):
         if self.proximal_aorta:
             factors[list(PROXIMAL_AORTA)] *= growth * tables.aorta_growth(age)
         return tuple(factors.tolist())
+
+
+def _draw_heart(rng: np.random.Generator) -> tuple[float, ...]:
+    """Return age, stroke volume in ml, heart rate in 1/min, ejection time in ms."""
+    age = float(rng.uniform(*tables.AGES))
+    rate_mean = float(tables.heart_rate_mean(age))
+    heart_rate = truncated_normal(rng, rate_mean, tables.HEART_RATE_SD)
+    mean, sd = tables.stroke_volume_law(age)
+    stroke_volume = truncated_normal(rng, float(mean), float(sd))
+    time, slope, noise_sd = ejection_time_slopes()
+    predicted = time + slope * tables.weissler_time(stroke_volume, heart_rate)
+    ejection_time = truncated_normal(rng, float(predicted), noise_sd)
+    return age, stroke_volume, heart_rate, ejection_time
 
 
 def _draw_arteries(rng: np.random.Generator, age: float) -> dict[str, float]:
@@ -204,9 +186,8 @@ def truncated_normal(
 def ejection_time_slopes() -> tuple[float, float, float]:
     """Return how the ejection time follows from Weissler's prediction.
 
-    Returns:
-        Its intercept in ms, its slope, and the standard deviation in ms of what the
-        prediction leaves open, before it is cut.
+    That is by its intercept in ms, its slope, and the standard deviation in ms of what
+    the prediction leaves open, before it is cut.
     """
     low, high = tables.AGES
     nodes, weights = np.polynomial.legendre.leggauss(200)

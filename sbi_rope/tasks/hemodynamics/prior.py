@@ -1,6 +1,5 @@
 r"""The law of stroke volume and ejection time over the population, as a density."""
 
-from copy import copy
 from typing import Any
 
 import torch
@@ -9,7 +8,6 @@ from torch.distributions import Distribution, biject_to, constraints
 from torch.distributions.transforms import IndependentTransform, Transform
 from torch.nn.functional import logsigmoid
 
-from sbi_rope.tasks.hemodynamics.population import Population
 from sbi_rope.tasks.hemodynamics.prior_table import Band, prior_table
 
 __all__ = ["PopulationPrior"]
@@ -30,17 +28,11 @@ class PopulationPrior(Distribution):
         \; \mathrm{d} f \, \mathrm{d} a .
 
     The support is a parallelogram, bounded in :math:`V` and in :math:`t_e` minus what
-    it is expected to be given :math:`V`; a rectangle if both are independent. On it,
-    the density is calculated once on a grid, in closed form over the heart rate and by
-    quadrature over age. In between it is bilinear in the coordinates of the
-    parallelogram, and scaled so that its integral is one; draws have exactly this
-    density. As the cut laws go to zero at some edges, it is zero in slivers there,
-    that have no draws.
-
-    Args:
-        population: The population; by default the one with default settings. Of its
-            settings, only ``prior`` matters.
-        validate_args: As in torch.
+    it is expected to be given :math:`V`. On it, the density is calculated once on a
+    grid, in closed form over the heart rate and by quadrature over age. In between it
+    is bilinear in the coordinates of the parallelogram, and scaled so that its
+    integral is one; draws have exactly this density. As the cut laws go to zero at
+    some edges, it is zero in slivers there, that have no draws.
 
     Example:
         >>> prior = PopulationPrior()
@@ -50,13 +42,10 @@ class PopulationPrior(Distribution):
         tensor([-7.35...,    -inf])
     """
 
-    def __init__(
-        self,
-        population: Population | None = None,
-        *,
-        validate_args: bool | None = None,
-    ) -> None:
-        table = prior_table((population or Population()).prior)
+    arg_constraints: dict = {}  # type: ignore[override]  # noqa: RUF012
+
+    def __init__(self) -> None:
+        table = prior_table()
         self._band = table.band
         self._density = torch.from_numpy(table.density.copy())
         self._marginal_grid = torch.from_numpy(table.marginal_grid.copy())
@@ -64,14 +53,7 @@ class PopulationPrior(Distribution):
         self._moments = torch.tensor(
             [table.mean, table.variance], dtype=torch.float32, device="cpu"
         )
-        super().__init__(
-            batch_shape=Size(), event_shape=Size((2,)), validate_args=validate_args
-        )
-
-    @property
-    def arg_constraints(self) -> dict[str, constraints.Constraint]:
-        """There are none."""
-        return {}
+        super().__init__(event_shape=Size((2,)), validate_args=False)
 
     @property
     def support(self) -> constraints.Constraint:
@@ -80,13 +62,13 @@ class PopulationPrior(Distribution):
 
     @property
     def mean(self) -> Tensor:
-        """The means in ml and ms, shape ``(*batch, 2)``."""
-        return self._moments[0].expand(self._extended_shape())
+        """The means in ml and ms, shape ``(2,)``."""
+        return self._moments[0]
 
     @property
     def variance(self) -> Tensor:
-        """The variances in ml^2 and ms^2, shape ``(*batch, 2)``."""
-        return self._moments[1].expand(self._extended_shape())
+        """The variances in ml^2 and ms^2, shape ``(2,)``."""
+        return self._moments[1]
 
     def sample(self, sample_shape: Any = Size()) -> Tensor:  # noqa: B008
         """Draw a cell of the grid, and then a place in it by inversion."""
@@ -115,8 +97,6 @@ class PopulationPrior(Distribution):
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Return the log density, minus infinity outside of the support."""
-        if self._validate_args:
-            self._validate_sample(value)
         shares = self._band.shares(value)
         inside = ((shares >= 0) & (shares <= 1)).all(dim=-1)
         shares = shares.clamp(0.0, 1.0)
@@ -149,14 +129,6 @@ class PopulationPrior(Distribution):
         i = place.long().clamp(max=steps - 1)
         cdf = self._marginal_cdf
         return torch.lerp(cdf.gather(1, i), cdf.gather(1, i + 1), place - i).T.to(theta)
-
-    def expand(
-        self, batch_shape: Any, _instance: Distribution | None = None
-    ) -> "PopulationPrior":
-        """Return this distribution with a larger batch shape."""
-        expanded = copy(self)
-        expanded._batch_shape = Size(batch_shape)
-        return expanded
 
     def to(self, device: str | torch.device) -> None:
         """Move to a device in place, as sbi expects of a prior."""

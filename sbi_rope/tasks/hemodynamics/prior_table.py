@@ -10,7 +10,6 @@ from torch import Tensor
 
 from sbi_rope.tasks.hemodynamics import population_tables as tables
 from sbi_rope.tasks.hemodynamics.population import (
-    INDEPENDENT_SV,
     TRUNCATION,
     ejection_time_slopes,
 )
@@ -90,22 +89,21 @@ class PriorTable:
     marginal_cdf: np.ndarray
 
 
-@lru_cache(maxsize=2)
-def prior_table(prior: str) -> PriorTable:
-    """Return the table of a population's law, made once."""
-    band = _band_of_population() if prior == "population" else _box()
-    density_of = _population_density if prior == "population" else _independent_density
+@lru_cache(maxsize=1)
+def prior_table() -> PriorTable:
+    """Return the table of the population's law, made once."""
+    band = _band()
     across, along = (np.linspace(0.0, 1.0, points) for points in GRID)
     volume = band.volumes[0] + (band.volumes[1] - band.volumes[0]) * across
     start = band.intercept + band.slope * volume
-    density = density_of(volume, start[:, None] + band.width * along)
+    density = _density(volume, start[:, None] + band.width * along)
     density = density / _integral(density)
     grid, cdf = _marginals(band, density)
     mean, variance = _moments(band, density)
     return PriorTable(band, density, mean, variance, grid, cdf)
 
 
-def _band_of_population() -> Band:
+def _band() -> Band:
     age = np.array(tables.AGES)
     mean, sd = tables.stroke_volume_law(age)  # linear in age
     low, high = (mean - TRUNCATION * sd).min(), (mean + TRUNCATION * sd).max()
@@ -124,22 +122,7 @@ def _band_of_population() -> Band:
     )
 
 
-def _box() -> Band:
-    (volume, volume_sd), (time, time_sd) = INDEPENDENT_SV, tables.EJECTION_TIME
-    return Band(
-        volumes=(volume - TRUNCATION * volume_sd, volume + TRUNCATION * volume_sd),
-        intercept=time - TRUNCATION * time_sd,
-        slope=0.0,
-        width=2 * TRUNCATION * time_sd,
-    )
-
-
-def _independent_density(volume: np.ndarray, time: np.ndarray) -> np.ndarray:
-    (v_mean, v_sd), (t_mean, t_sd) = INDEPENDENT_SV, tables.EJECTION_TIME
-    return _normal((volume[:, None] - v_mean) / v_sd) * _normal((time - t_mean) / t_sd)
-
-
-def _population_density(volume: np.ndarray, time: np.ndarray) -> np.ndarray:
+def _density(volume: np.ndarray, time: np.ndarray) -> np.ndarray:
     """Return the density up to a factor, (volumes, times), by Gauss-Legendre in age."""
     nodes, weights = np.polynomial.legendre.leggauss(NUM_AGES)
     first, last = _ages_with(volume)

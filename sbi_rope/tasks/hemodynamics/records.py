@@ -74,15 +74,9 @@ class Recorder(Settings):
 
 
 def play(beat: Tensor, period: Tensor, *, start: Tensor) -> Tensor:
-    """Repeat beats for eight seconds.
+    """Repeat beats ``(n, m)`` for eight seconds at 125 Hz, to shape ``(n, 1000)``.
 
-    Args:
-        beat: Pressures over one period, end excluded, shape ``(n, m)``.
-        period: Lengths of the beats in s, shape ``(n,)``.
-        start: Where in the beat to begin, as a share of the period, shape ``(n,)``.
-
-    Returns:
-        Pressures at 125 Hz, shape ``(n, 1000)``, interpolated linearly.
+    Periods are in s, and starts shares of the period, both of shape ``(n,)``.
     """
     num_phases = beat.shape[1]
     # float64: eight seconds are many periods, whose whole number is taken away.

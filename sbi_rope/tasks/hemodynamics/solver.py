@@ -37,10 +37,6 @@ class Flow:
         """Return the pressures at phases from 0 to 1, shape ``(r, len(phase))``."""
         return _interpolate(self.pressure, phase)
 
-    def before(self, phase: np.ndarray) -> np.ndarray:
-        """Return the same of the beat before."""
-        return _interpolate(self.previous, phase)
-
 
 def _interpolate(waves: np.ndarray, phase: np.ndarray) -> np.ndarray:
     own = np.arange(waves.shape[1]) / waves.shape[1]
@@ -74,8 +70,7 @@ def solve(
 
     Args:
         network: The arteries.
-        inflow: Flow into the source node, equally spaced over a beat, linear in
-            between, in m^3 s^-1.
+        inflow: Flow into the source node, equally spaced over a beat, in m^3 s^-1.
         period: Length of a beat, in s.
         sites: Segment, counted from 0, and position along it from 0 to 1.
         start_pressure: Pressure everywhere at the start, in Pa.
@@ -85,11 +80,7 @@ def solve(
         num_cycles: Beats, of which the last two are kept.
         convection: Momentum correction :math:`\alpha`.
 
-    Returns:
-        The last beat.
-
     Raises:
-        ImportError: If numba is not installed.
         SimulationError: If the solution is not finite.
 
     References:
@@ -131,8 +122,6 @@ def _import_kernels() -> Any:
     try:
         from sbi_rope.tasks.hemodynamics import kernels
     except ImportError as error:
-        if error.name is None or error.name.split(".")[0] != "numba":
-            raise
         raise ImportError(
             "Simulating blood flow needs numba. Install it with "
             '`pip install "sbi-rope[hemodynamics]"`.'

@@ -1,19 +1,15 @@
 r"""Task D: stroke volume and ejection time, from the pulse at the wrist."""
 
 from dataclasses import dataclass
-from functools import partial
-from importlib.resources import files
 from pathlib import Path
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
 from sbi_rope.errors import InvalidInputError
-from sbi_rope.settings import check
 from sbi_rope.tasks.base import Task
 from sbi_rope.tasks.hemodynamics.dataset import BeatSet, load
-from sbi_rope.tasks.hemodynamics.population import Population, Process
+from sbi_rope.tasks.hemodynamics.population import Process
 from sbi_rope.tasks.hemodynamics.prior import PopulationPrior
 from sbi_rope.tasks.hemodynamics.records import NUM_STEPS, Normalisation, Recorder
 from sbi_rope.tasks.networks import SeriesEmbedding, light_series_embedding
@@ -23,7 +19,7 @@ from sbi_rope.tensors import as_batch, check_in_support
 
 __all__ = ["Hemodynamics", "NearestBeatSimulator"]
 
-SHIPPED = "sbi_rope.tasks.hemodynamics.data"
+SHIPPED = Path(__file__).parent / "data"
 CHUNK_SIZE = 1000  # parameters that are looked up together
 
 
@@ -101,30 +97,12 @@ class Hemodynamics(Task):
     The solver, its validation and the data sets are described in
     ``docs/background/hemodynamics.md``.
 
-    Where this differs from the paper: its simulator, prior, noise and normalisation
-    are unpublished. Ours follow a published population and geometry; noise and
-    scatter are choices with a switch. Its network needs half of the samples: it takes
-    every second one here.
-
-    References:
-        | Addressing Misspecification in Simulation-based Inference through
-          Data-driven Calibration (Wehenkel et al.), appendix on task D
-        | https://arxiv.org/abs/2405.08719
-        | Modeling arterial pulse waves in healthy aging: a database for in silico
-          evaluation of hemodynamics and pulse wave indexes (Charlton et al., 2019)
-        | https://doi.org/10.1152/ajpheart.00218.2019
-
     Args:
-        variant: ``None`` or one of ``variants``.
-        root: Not used. Data sets are given by ``simulations`` and ``observations``.
-        label_noise: Noise on the calibration labels, in standard deviations of the
-            prior. It is 0.2 unless given, and only for ``"noisy_labels"``.
+        variant, root, label_noise: See :class:`~sbi_rope.tasks.Task`.
         simulations: File of simulated people. It is the small one of the package
             unless given.
         observations: File of real people. It is the small one of the package unless
             given.
-        prior: The law of the parameters that both files were made with, see
-            ``Population``. Those of the package have ``"population"``.
         noise_std: Standard deviation of the noise, after normalisation.
         normalisation: ``"per_record"``, to mean 0 and standard deviation 1, or
             ``"global"``, which keeps the level and the height of the pulse.
@@ -162,20 +140,17 @@ class Hemodynamics(Task):
         label_noise: float | None = None,
         simulations: str | Path | None = None,
         observations: str | Path | None = None,
-        prior: Literal["population", "independent"] = "population",
         noise_std: float = 0.05,
         normalisation: Normalisation = "per_record",
     ) -> None:
         super().__init__(variant=variant, root=root, label_noise=label_noise)
-        check("prior", prior, Literal["population", "independent"])
-        self.prior: Literal["population", "independent"] = prior
         self.simulations = simulations
         self.observations = observations
         self.recorder = Recorder(noise_std=noise_std, normalisation=normalisation)
 
     def get_prior(self) -> PopulationPrior:
         """Return the law of both parameters in the population."""
-        return PopulationPrior(Population(prior=self.prior))
+        return PopulationPrior()
 
     def prior_quantiles(self, theta: Tensor) -> Tensor:
         """Return the distribution functions of both parameters, ``(n, 2)``."""
@@ -226,20 +201,26 @@ class Hemodynamics(Task):
         chosen = slice(first, None, step)
         beat, period = people.beat[chosen], people.period[chosen]
         cohort = f"{people.settings['process']} {people.settings['seed']}"
-        keys = [f"recording {cohort} {i}" for i in people.index[chosen].tolist()]
-        read_x = partial(_record_once, self.recorder, beat, period, keys)
+        index = people.index[chosen].tolist()
+
+        def read_x(rows: list[int]) -> Tensor:
+            records = [
+                self.recorder(
+                    beat[row : row + 1],
+                    period[row : row + 1],
+                    # Each person is recorded once, whenever that is.
+                    generator=generator_of(f"recording {cohort} {index[row]}"),
+                )
+                for row in rows
+            ]
+            return torch.cat(records)
+
         return RecordedPairs(theta=people.theta[chosen], read_x=read_x)
 
     def _load(self, path: str | Path | None, process: Process) -> BeatSet:
         if path is None:
-            path = str(files(SHIPPED) / f"{process}.npz")
+            path = SHIPPED / f"{process}.npz"
         people = load(path, process=process)
-        made_with = people.settings["population"]["prior"]
-        if made_with != self.prior:
-            raise InvalidInputError(
-                f"Expected people of the prior {self.prior!r} in {path}; got those of "
-                f"{made_with!r}. Pass `prior={made_with!r}`."
-            )
         check_in_support(f"theta of {path}", people.theta, self.get_prior())
         return people
 
@@ -257,22 +238,3 @@ class _Rounds:
             self.left = torch.cat([self.left, self.theta[order]])
         drawn, self.left = self.left[:n], self.left[n:]
         return drawn
-
-
-def _record_once(
-    recorder: Recorder,
-    beat: Tensor,
-    period: Tensor,
-    keys: list[str],
-    rows: list[int],
-) -> Tensor:
-    """Return the one recording of each chosen person."""
-    records = [
-        recorder(
-            beat[row : row + 1],
-            period[row : row + 1],
-            generator=generator_of(keys[row]),
-        )
-        for row in rows
-    ]
-    return torch.cat(records)

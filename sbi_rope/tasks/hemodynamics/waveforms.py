@@ -33,21 +33,12 @@ def simulate_beat(subject: Subject, physics: Physics = Physics()) -> Beat:  # no
 
     A run that fails is tried again with the smaller ``physics.fallback_courant``.
 
-    Args:
-        subject: The person.
-        physics: How finely, and which walls.
-
-    Returns:
-        Pressures over the beat, which begins with the opening of the aortic valve.
+    The beat begins with the opening of the aortic valve.
 
     Raises:
         ImportError: If numba is not installed.
         SimulationError: If the subject is impossible, or the solution is not finite
             or not periodic for the smaller Courant number either.
-
-    Example:
-        >>> simulate_beat(subject).pressure["radial"].shape  # doctest: +SKIP
-        (256,)
     """
     network = build_network(subject, physics)
     reason = ""

@@ -1,0 +1,764 @@
+"""Where this package touches the inside of sbi, and nowhere else.
+
+sbi keeps the embedding h (its standardising layer followed by the user's network) as
+one submodule of an estimator, under a name that depends on the family. Everything here
+finds that submodule by identity with the public property ``embedding_net``, so that it
+holds for every family; the mixed estimator of MNPE, which has no such property, is the
+exception.
+"""
+
+import copy
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+import torch
+from sbi.inference import NPE, DirectPosterior, VectorFieldPosterior
+from sbi.inference.posteriors.base_posterior import NeuralPosterior
+from sbi.inference.posteriors.filtered_direct_posterior import FilteredDirectPosterior
+from sbi.inference.posteriors.npe_a_posterior import NPE_A_Posterior
+from sbi.inference.potentials.base_potential import BasePotential
+from sbi.neural_nets.estimators.base import (
+    ConditionalDensityEstimator,
+    ConditionalEstimator,
+    ConditionalVectorFieldEstimator,
+    UnconditionalDensityEstimator,
+)
+from sbi.neural_nets.estimators.mixed_density_estimator import MixedDensityEstimator
+from sbi.neural_nets.estimators.mixture_density_estimator import (
+    MixtureDensityEstimator,
+)
+from sbi.neural_nets.estimators.tabpfn_flow import TabPFNFlow
+from sbi.neural_nets.net_builders.flow import build_zuko_unconditional_flow
+from sbi.samplers.mcmc import SliceSamplerVectorized
+from sbi.utils.sbiutils import ImproperEmpirical, Standardize
+from sbi.utils.user_input_checks_utils import move_distribution_to_device
+from torch import Tensor, nn
+from torch.distributions import Distribution
+from torch.utils.data import DataLoader, SubsetRandomSampler
+
+from sbi_rope._progress import progress_bar
+from sbi_rope._random import seeded
+from sbi_rope.data import groups_to_hold_out
+from sbi_rope.errors import (
+    InvalidInputError,
+    LogProbUnavailableError,
+    UnsupportedPosteriorError,
+)
+from sbi_rope.settings import names_of
+from sbi_rope.tensors import as_batch, rows_with
+
+__all__ = [
+    "BaseDirectPosterior",
+    "BasePotential",
+    "ConditionalDensityEstimator",
+    "ConditionalEstimator",
+    "MixedDensity",
+    "NeuralPosterior",
+    "SimulationTrainer",
+    "SliceSamplerVectorized",
+    "TrainedNPE",
+    "UnconditionalDensityEstimator",
+    "VectorFieldDensity",
+    "build_zuko_unconditional_flow",
+    "check_density",
+    "direct_posterior",
+    "embed",
+    "embedding_of",
+    "estimator_of",
+    "gaussians_of",
+    "headless",
+    "is_bounded",
+    "move_distribution_to_device",
+    "parameter_of",
+    "posterior_from",
+    "readable",
+    "squared_mmd",
+    "standardisation_of",
+    "with_embedding",
+]
+
+# A row may differ by this share of the largest embedding when it is alone. Rounding
+# depends on the size of a batch, and is largest for convolutions on a GPU.
+ROUNDING = 0.01
+# What sbi adds to the precision of each Gaussian that it mixes.
+SMALLEST_PRECISION = 1e-4
+
+
+# --- an estimator, split into h and q ---
+
+
+def embedding_of(estimator: ConditionalEstimator) -> nn.Module:
+    r"""Return :math:`h`, the embedding of x, of a trained estimator.
+
+    It includes sbi's standardising layer. Without a user-given network it is that
+    layer alone; with ``z_score_x="none"`` as well it is the identity.
+    """
+    if isinstance(estimator, TabPFNFlow):
+        raise UnsupportedPosteriorError(
+            "Expected an estimator whose embedding of x was trained; got TabPFNFlow "
+            "(NPE-PFN)."
+        )
+    if isinstance(estimator, MixedDensityEstimator):
+        # Its two halves see x through one net. Tuning a net that only one of them uses
+        # would leave the other with the embedding of the simulations.
+        embedding = estimator.condition_embedding
+        if estimator.discrete_net.net.embedding_net is not embedding:
+            raise UnsupportedPosteriorError(
+                "Expected a MixedDensityEstimator whose two parts share one embedding "
+                "net; got two. Use `posterior_nn('mnpe', embedding_net=...)`."
+            )
+        return embedding
+    embedding = getattr(estimator, "embedding_net", None)
+    if not isinstance(embedding, nn.Module) or not _paths_to(estimator, embedding):
+        raise UnsupportedPosteriorError(
+            "Expected an estimator of sbi's posterior_nn with an embedding net; got "
+            f"{type(estimator).__name__}."
+        )
+    return embedding
+
+
+def headless(estimator: ConditionalEstimator) -> Any:
+    r"""Return :math:`q(\theta \mid h)`: the estimator without its embedding.
+
+    The parameters are shared with ``estimator``, which is left as it was.
+    """
+    embedding = embedding_of(estimator)
+    blank = parameter_of(estimator).new_zeros(1, *estimator.condition_shape)
+    embedded_shape = embed(embedding, blank).shape[1:]
+    if len(embedded_shape) != 1:
+        raise UnsupportedPosteriorError(
+            "Expected the embedding net to return one vector per observation, shape "
+            f"(n, l); got {('n', *embedded_shape)}."
+        )
+    clone = with_embedding(estimator, nn.Identity(), condition_shape=embedded_shape)
+    return MixedDensity(clone) if isinstance(clone, MixedDensityEstimator) else clone
+
+
+def with_embedding(
+    estimator: ConditionalEstimator,
+    embedding: nn.Module,
+    *,
+    condition_shape: Sequence[int] | None = None,
+) -> Any:
+    r"""Return the estimator with another embedding in the place of :math:`h`.
+
+    The other parameters are shared with ``estimator``, which is left as it was.
+
+    The ``condition_shape`` is that of what the new embedding embeds; as before if None.
+    """
+    clone: nn.Module = estimator
+    paths = _paths_to(estimator, embedding_of(estimator))
+    for path in paths:
+        clone = _replace(clone, path.split("."), embedding)
+    if condition_shape is None:
+        return clone
+    for path in paths:
+        names = path.split(".")
+        for depth in range(len(names)):
+            module = clone.get_submodule(".".join(names[:depth]))
+            if isinstance(module, ConditionalEstimator):
+                module._condition_shape = torch.Size(condition_shape)
+    return clone
+
+
+def embed(net: nn.Module, x: Tensor, *, batch_size: int = 1000) -> Tensor:
+    """Apply an embedding net without gradients, in batches: ``(n, *)`` to ``(n, l)``.
+
+    The net runs in evaluation mode: no dropout, and batch normalisation with its
+    trained statistics, so that the result does not depend on the batch.
+    """
+    modes = {module: module.training for module in net.modules()}
+    net.eval()
+    try:
+        with torch.no_grad():
+            # A net may change its argument, as activations in place do.
+            return torch.cat([net(part.clone()) for part in x.split(batch_size)])
+    finally:
+        for module, training in modes.items():
+            module.training = training
+
+
+def standardisation_of(embedding_net: nn.Module) -> tuple[Tensor, Tensor] | None:
+    """Return the mean and standard deviation by which sbi standardises x.
+
+    Each has the shape of one observation or none. None if there is no such layer.
+    """
+    layers = (part for part in embedding_net.modules() if isinstance(part, Standardize))
+    layer: Any = next(layers, None)
+    return None if layer is None else (layer._mean, layer._std)
+
+
+def parameter_of(module: nn.Module) -> Tensor:
+    """Return a parameter of a module, which has its dtype and device."""
+    return next(p for p in module.parameters() if p.is_floating_point())
+
+
+def _paths_to(root: nn.Module, target: nn.Module) -> list[str]:
+    named = root.named_modules(remove_duplicate=False)
+    return [name for name, module in named if module is target and name]
+
+
+def _replace(root: nn.Module, path: list[str], new: nn.Module) -> nn.Module:
+    # Only the modules along the path are copied, and those without their tensors.
+    clone = copy.copy(root)
+    clone._modules = dict(root._modules)
+    child = root._modules[path[0]]
+    if len(path) > 1:
+        assert child is not None
+        new = _replace(child, path[1:], new)
+    clone._modules[path[0]] = new
+    return clone
+
+
+def readable(net: nn.Module, x: Tensor) -> Tensor:
+    """Tell which observations an embedding net can read, ``(n, *event)`` to ``(n,)``.
+
+    It can read what is finite. Where some entries are missing (NaN), it depends on the
+    net: sbi's ``PermutationInvariantEmbedding`` leaves out trials that are missing, and
+    most other nets return NaN. Nothing can be read from Inf, or if all is missing.
+    """
+    rows = x.flatten(1)
+    finite, missing = torch.isfinite(rows), torch.isnan(rows)
+    can_read = finite.all(dim=1)
+    partial = finite.any(dim=1) & missing.any(dim=1) & (finite | missing).all(dim=1)
+    if partial.any():
+        try:
+            embedded = embed(net, x[partial])
+        except Exception:  # nets refuse NaN with errors of any kind
+            return can_read
+        can_read[partial] = torch.isfinite(embedded).flatten(1).all(dim=1)
+        some = x[partial & can_read][:2]
+        full = some.nan_to_num(0.0)
+        sparse = full.clone()
+        if x.ndim > 2:
+            sparse[:, 1:] = torch.nan
+        # sbi 0.27 takes the number of trials from another row if trials have several
+        # columns. Sets with some, no and most trials missing stand side by side here.
+        check_rows_apart(net, torch.stack([some, full, sparse], dim=1).flatten(0, 1))
+    return can_read
+
+
+def check_rows_apart(net: nn.Module, x: Tensor) -> None:
+    """Raise if the embedding of a row is another one alone than among other rows."""
+    try:
+        with seeded(0):
+            together, again = embed(net, x), embed(net, x)
+            alone = torch.cat([embed(net, row) for row in x.split(1)])
+    except Exception:  # the net may take no such numbers
+        return
+    usable = torch.isfinite(together) & torch.isfinite(alone)
+    if not usable.any() or not torch.equal(together[usable], again[usable]):
+        return  # a net with noise of its own
+    margin = ROUNDING * together[usable].abs().max()
+    if bool(((together - alone).abs()[usable] > margin).any()):
+        missing = " with missing entries (NaN)" if x.isnan().any() else ""
+        raise UnsupportedPosteriorError(
+            f"Expected an embedding net that reads each observation{missing} by "
+            "itself; got another embedding of a row alone than in a batch."
+        )
+
+
+# --- estimators in the shape of densities that can be mixed ---
+
+
+class MixedDensity(ConditionalDensityEstimator):
+    """The mixed estimator of MNPE, as a density over all of the prior's support.
+
+    Where sbi's own has no density it is zero: at a category that was not trained on,
+    which sbi gives the mass of the next larger one or refuses, and with
+    ``log_transform_x`` at zero and below, where sbi returns NaN.
+    """
+
+    def __init__(self, estimator: MixedDensityEstimator) -> None:
+        super().__init__(estimator, estimator.input_shape, estimator.condition_shape)
+        self.mixed = estimator
+
+    @property
+    def embedding_net(self) -> nn.Module:
+        """The embedding net of both parts."""
+        return self.mixed.condition_embedding
+
+    def log_prob(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
+        """Return the log of density times mass, ``(S, B)``."""
+        categories = self.mixed.discrete_net.net.categorical_values_per_var
+        continuous = input[..., : -len(categories)]
+        # Detached, so that gradient ascent does not move between categories.
+        discrete = input[..., -len(categories) :].detach()
+        trained = torch.stack(
+            [
+                torch.isin(column, values.to(column))
+                for column, values in zip(discrete.unbind(-1), categories, strict=True)
+            ],
+            dim=-1,
+        )
+        inside = torch.ones_like(continuous, dtype=torch.bool)
+        if self.mixed.log_transform_input:
+            inside = continuous > 0
+        # Anything that can be evaluated stands in for what cannot.
+        some = torch.stack([values[0] for values in categories]).to(discrete)
+        valid = torch.cat(
+            [continuous.where(inside, 1.0), discrete.where(trained, some)], dim=-1
+        )
+        log_prob = self.mixed.log_prob(valid, condition)
+        possible = trained.all(dim=-1) & inside.all(dim=-1)
+        return log_prob.where(possible, -torch.inf)
+
+    def sample(
+        self, sample_shape: torch.Size, condition: Tensor, **kwargs: Any
+    ) -> Tensor:
+        """Draw the discrete parameters, then the continuous ones given these."""
+        return self.mixed.sample(sample_shape, condition, **kwargs)
+
+    def loss(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
+        """Return the negative log-probability, shape ``(B,)``."""
+        return -self.log_prob(input[None], condition)[0]
+
+
+class VectorFieldDensity(ConditionalDensityEstimator):
+    """A vector field (FMPE, NPSE) in the shape of a density that can only be sampled.
+
+    Its density would need one ODE solve per component and parameter, so ``log_prob``
+    raises instead of starting hours of work.
+    """
+
+    def __init__(
+        self,
+        estimator: ConditionalVectorFieldEstimator,
+        prior: Distribution,
+        sample_with: Literal["ode", "sde"],
+    ) -> None:
+        super().__init__(estimator, estimator.input_shape, estimator.condition_shape)
+        self.vector_field = estimator
+        self.prior = prior
+        self.sample_with: Literal["ode", "sde"] = sample_with
+
+    def sample(
+        self, sample_shape: torch.Size, condition: Tensor, **kwargs: Any
+    ) -> Tensor:
+        """Solve the ODE or SDE for every condition; no prior support is enforced."""
+        with seeded(0):  # sbi draws from the prior to look at it
+            posterior = VectorFieldPosterior(
+                self.vector_field,
+                self.prior,
+                device=condition.device,
+                sample_with=self.sample_with,
+            )
+        with warnings.catch_warnings():
+            # Draws outside the prior are rejected by the mixture; the batch is ours.
+            warnings.simplefilter("ignore")
+            return posterior.sample_batched(
+                sample_shape,
+                condition,
+                show_progress_bars=False,
+                reject_outside_prior=False,
+            )
+
+    def log_prob(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
+        """Raise: the density of a vector field is not evaluated."""
+        raise LogProbUnavailableError(
+            "log_prob is not available for posteriors of FMPE and NPSE: every mixture "
+            "component would need its own ODE solve. Use samples, or train NPE."
+        )
+
+    def loss(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
+        """Return the loss of the vector field."""
+        return self.vector_field.loss(input, condition, **kwargs)
+
+
+def gaussians_of(
+    estimator: MixtureDensityEstimator, condition: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the Gaussians that a mixture density network mixes.
+
+    Given conditions ``(n, k)``, these are the logarithms of their weights up to a
+    constant, ``(n, c)``, their means, ``(n, c, l)``, and covariances, ``(n, c, l, l)``,
+    all in float64. The network was built with ``z_score_x="none"``, so that they have
+    the units of what it is a density of.
+    """
+    mixture = estimator.get_uncorrected_mog(condition)
+    assert not estimator.has_input_transform
+    factors = mixture.precision_factors
+    assert factors is not None
+    # In float32 a narrow covariance would not be positive definite after rounding.
+    factors = factors.double()
+    identity = torch.eye(factors.shape[-1]).to(factors)
+    precision = factors.mT @ factors + SMALLEST_PRECISION * identity
+    covariances = torch.cholesky_inverse(torch.linalg.cholesky(precision))
+    return mixture.logits.double(), mixture.means.double(), covariances
+
+
+# --- posteriors ---
+
+
+def estimator_of(posterior: Any) -> ConditionalEstimator:
+    """Return the trained estimator inside an sbi posterior, if it can be split."""
+    prior = getattr(posterior, "prior", None)
+    if isinstance(prior, ImproperEmpirical):
+        raise UnsupportedPosteriorError(
+            "Expected a posterior that knows its prior; got none. Use "
+            "`npe.build_posterior(prior=prior)`."
+        )
+    # One that leaves out parameters whose simulations fail is no hindrance.
+    accepts = getattr(getattr(prior, "_accept_reject_fn", None), "__qualname__", "")
+    if accepts.startswith("get_density_thresholder."):
+        raise UnsupportedPosteriorError(
+            "Expected a posterior trained on the whole prior; got a prior truncated "
+            "around one observation (TSNPE)."
+        )
+    if isinstance(posterior, VectorFieldPosterior):
+        estimator: Any = posterior.vector_field_estimator
+    else:
+        estimator = getattr(posterior, "posterior_estimator", None)
+        if (
+            not isinstance(posterior, DirectPosterior)
+            or isinstance(posterior, FilteredDirectPosterior | NPE_A_Posterior)
+            or hasattr(estimator, "log_q")  # a density of this package
+        ):
+            raise UnsupportedPosteriorError(
+                "Expected `posterior` to be what `NPE(...).build_posterior()` returns, "
+                "or the posterior of MNPE, FMPE or NPSE; got "
+                f"{type(posterior).__name__}."
+            )
+    for name, weights in estimator.named_parameters():
+        if not torch.isfinite(weights).all():
+            raise UnsupportedPosteriorError(
+                f"Expected an NPE with finite weights; got NaN or Inf in `{name}`, so "
+                "that its training has failed."
+            )
+    return estimator
+
+
+def check_density(
+    estimator: Any, *, what: str = "an estimator", because: str = ""
+) -> ConditionalDensityEstimator:
+    """Return an estimator if it has a density; say what needs one otherwise."""
+    if not isinstance(estimator, ConditionalDensityEstimator):
+        clause = f", because {because}" if because else ""
+        raise UnsupportedPosteriorError(
+            f"Expected {what} with a density, such as that of NPE{clause}; got "
+            f"{type(estimator).__name__}. Train NPE instead of FMPE or NPSE."
+        )
+    return estimator
+
+
+def is_bounded(posterior: DirectPosterior) -> bool:
+    """Tell whether a posterior normalises by other means than sbi's own rejection.
+
+    That goes on until enough draws are inside the prior, which may be for ever.
+    """
+    # NPE_A_Posterior of sbi has a method of its own, but of the same kind.
+    return type(posterior).leakage_correction.__module__.split(".")[0] != "sbi"
+
+
+def posterior_from(
+    posterior: Any, estimator: Any
+) -> DirectPosterior | VectorFieldPosterior:
+    """Return an sbi posterior of the same kind as ``posterior`` around an estimator."""
+    if isinstance(estimator, ConditionalDensityEstimator):
+        return direct_posterior(
+            estimator, posterior.prior, enable_transform=posterior.enable_transform
+        )
+    with seeded(0):  # sbi draws from the prior to look at it
+        return VectorFieldPosterior(
+            estimator,
+            copy.deepcopy(posterior.prior),
+            device=parameter_of(estimator).device,
+            enable_transform=posterior.enable_transform,
+            sample_with=posterior.sample_with,
+        )
+
+
+def direct_posterior(
+    estimator: ConditionalDensityEstimator,
+    prior: Distribution,
+    *,
+    enable_transform: bool = True,
+) -> DirectPosterior:
+    """Return an sbi posterior around an estimator and a copy of the prior."""
+    with seeded(0):  # sbi draws from the prior to look at it
+        return DirectPosterior(
+            estimator,
+            copy.deepcopy(prior),
+            device=parameter_of(estimator).device,
+            enable_transform=enable_transform,
+        )
+
+
+class BaseDirectPosterior(DirectPosterior):
+    """sbi's DirectPosterior, for our own posteriors to derive from.
+
+    ``map()`` shows the progress of its draws only if it was asked to, and never returns
+    less than the best of its starting points. Shallow copies share no state. What
+    checks an observation is :meth:`_one_x`: sbi itself refuses any NaN, which some
+    embedding nets can read.
+    """
+
+    def _one_x(self, x: Any) -> Tensor:
+        """Return a checked observation; the default x if it is None."""
+        return super()._x_else_default_x(x)
+
+    def _x_else_default_x(self, x: Any) -> Tensor:
+        return self._one_x(x)
+
+    def _keep_default_x(self, x: Tensor) -> None:
+        """Set the default x to a copy of an observation that was checked."""
+        self._x, self._map = x.clone().to(self._device), None
+
+    def __getstate__(self) -> dict[str, Any]:
+        # sbi hands out its own __dict__, which a shallow copy would then share.
+        return dict(self.__dict__)
+
+    def _calculate_map(  # type: ignore[override]
+        self,
+        *,
+        init_method: str | Tensor = "posterior",
+        num_init_samples: int,
+        show_progress_bars: bool,
+        **options: Any,
+    ) -> Tensor:
+        # sbi shows the progress of these draws whatever it was told.
+        if isinstance(init_method, str) and init_method == "posterior":
+            init_method = self.sample(
+                (num_init_samples,), show_progress_bars=show_progress_bars
+            )
+        found = super()._calculate_map(
+            init_method=init_method,
+            num_init_samples=num_init_samples,
+            show_progress_bars=show_progress_bars,
+            **options,
+        )
+        if not isinstance(init_method, Tensor):
+            return found
+        # Where no step improves on the best start, sbi transforms that start a second
+        # time and returns another point.
+        heights = self.potential_fn(init_method)
+        start = init_method[heights.argmax()].reshape(1, -1)
+        improved = self.potential_fn(found.reshape(1, -1)) >= heights.max()
+        return found.reshape(1, -1) if bool(improved) else start
+
+
+class TrainedNPE:
+    r"""A copy of a trained estimator :math:`q(\theta \mid h(x))`, in its two parts.
+
+    Estimator and prior are copied, and all that is returned is a copy again.
+
+    Attributes:
+        estimator: The copy of the estimator, in evaluation mode.
+        prior: The copy of the prior.
+        h: The embedding net of the copy, with sbi's standardising layer.
+        like: An empty tensor of shape ``(0, d)`` with the dtype and device of the
+            estimator.
+        parameter_names: The names of the parameters; None if there are none.
+        x_names: The names of the columns of tables of x; None if they are not known.
+    """
+
+    def __init__(self, posterior: Any, parameter_names: Any = None) -> None:
+        estimator = copy.deepcopy(estimator_of(posterior)).eval()
+        self.estimator = estimator.requires_grad_(requires_grad=False)
+        self.h = embedding_of(estimator)
+        self._q = headless(estimator)
+        self._posterior: Any = posterior_from(posterior, estimator)
+        self.prior = copy.deepcopy(posterior.prior)
+        self.like = parameter_of(estimator).new_empty(0, *estimator.input_shape)
+        self.parameter_names: tuple[str, ...] | None = None
+        if parameter_names is not None:
+            self.parameter_names = names_of(parameter_names, self.like.shape[1])
+        self.x_names: tuple[str, ...] | None = None
+        generator = torch.Generator().manual_seed(0)
+        x = torch.randn(4, *self.event_shape, generator=generator).to(self.like)
+        mean, std = standardisation_of(self.h) or (0.0, 1.0)
+        check_rows_apart(self.h, mean + std * x)
+
+    @property
+    def event_shape(self) -> torch.Size:
+        """The shape of one observation."""
+        return self.estimator.condition_shape
+
+    @property
+    def is_mixed(self) -> bool:
+        """Whether some parameters are discrete."""
+        return isinstance(self._q, MixedDensity)
+
+    @property
+    def enable_transform(self) -> bool:
+        """Whether sbi's ``map`` searches in an unbounded space."""
+        return self._posterior.enable_transform
+
+    def posterior(self, embedding_net: nn.Module | None = None) -> Any:
+        """Return a copy of the sbi posterior, with another net in the place of h."""
+        estimator = self.estimator
+        if embedding_net is not None:
+            estimator = with_embedding(estimator, embedding_net)
+        return posterior_from(self._posterior, copy.deepcopy(estimator))
+
+    def density(self) -> ConditionalDensityEstimator:
+        r"""Return a copy of :math:`q(\theta \mid s)`, given an embedding s."""
+        density = self._q
+        if not isinstance(density, ConditionalDensityEstimator):
+            sample_with = self._posterior.sample_with
+            density = VectorFieldDensity(density, self.prior, sample_with)
+        return copy.deepcopy(density)
+
+    def embed(self, name: str, x: Tensor, embedding_net: nn.Module) -> Tensor:
+        """Return the finite embeddings of a user's observations, shape ``(n, l)``."""
+        embedded = embed(embedding_net, x)
+        bad = ~torch.isfinite(torch.linalg.vector_norm(embedded, dim=1))
+        if bad.any():
+            raise InvalidInputError(
+                f"Expected `{name}` with finite embeddings; got NaN, Inf or too large "
+                f"numbers in {rows_with(bad)}."
+            )
+        return embedded
+
+    def as_x(self, name: str, x: Any) -> Tensor:
+        """Return a copy of a user's observations, if h can read them."""
+        x = as_batch(
+            name,
+            x,
+            self.event_shape,
+            device=self.like.device,
+            names=self.x_names,
+            finite=False,
+        ).to(self.like.dtype, copy=True)
+        if not (can_read := self.readable(x)).all():
+            raise InvalidInputError(
+                f"Expected `{name}` that the embedding net of NPE can read; got NaN or "
+                f"Inf in {rows_with(~can_read)}."
+            )
+        return x
+
+    def readable(self, x: Tensor) -> Tensor:
+        """Tell which observations h can read, ``(n,)``; some nets can read NaN."""
+        return readable(self.h, x)
+
+
+# --- training ---
+
+
+class SimulationTrainer(NPE):
+    """sbi's NPE, which holds simulations of the same parameters out together.
+
+    Where a few stored people are recorded many times, a network can learn them by
+    heart; only people it has not met say when to stop. Recordings of a single person
+    are split one by one.
+
+    It shows a progress bar on stderr, or nothing. sbi prints to stdout, a line for each
+    epoch in a log file, and prints that it has converged even if it was asked to be
+    quiet.
+
+    Args:
+        change_x: Applied to the x of every batch before its loss is taken.
+        penalty: Of the estimator, a term that is added to the loss of every training
+            batch; None adds nothing.
+        **options: Those of NPE.
+    """
+
+    def __init__(
+        self,
+        *,
+        change_x: Callable[[Tensor], Tensor] | None = None,
+        penalty: Callable[[Any], Tensor | None] | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__(tracker=_NoTracker(), **options)
+        self._change_x = change_x
+        self._penalty = penalty
+        self._bar: Any = None
+
+    def get_dataloaders(
+        self,
+        starting_round: int = 0,
+        training_batch_size: int = 200,
+        validation_fraction: float = 0.1,
+        resume_training: bool = False,  # noqa: FBT001, FBT002
+        dataloader_kwargs: dict[str, Any] | None = None,
+    ) -> tuple[Any, Any]:
+        """Return what to train on and what is held out, batch by batch."""
+        theta = self.get_simulations(starting_round)[0]
+        split = None if resume_training else _split_by(theta, validation_fraction)
+        if split is not None:
+            # sbi takes the rows of a training it resumes as they are.
+            self.train_indices, self.val_indices = split
+            resume_training = True
+            # sbi makes no smaller batch of what is left over.
+            training_batch_size = min(training_batch_size, len(split[0]))
+        train, held_out = super().get_dataloaders(
+            starting_round,
+            training_batch_size,
+            validation_fraction,
+            resume_training,
+            dataloader_kwargs,
+        )
+        if split is not None and not len(held_out):
+            rows = self.val_indices
+            held_out = DataLoader(
+                held_out.dataset,
+                batch_size=len(rows),
+                sampler=SubsetRandomSampler(rows.tolist()),
+            )
+        return train, held_out
+
+    def _maybe_show_progress(self, show: bool, epoch: int) -> None:  # type: ignore[override]  # noqa: FBT001
+        if self._bar is None:
+            self._bar = progress_bar(show=show, desc="Training NPE", unit=" epochs")
+        self._bar.update()
+
+    def _report_convergence_at_end(self, epoch: int, max_num_epochs: int) -> None:
+        self._bar.close()
+        if epoch > max_num_epochs:  # sbi warns of that, and prints otherwise
+            super()._report_convergence_at_end(epoch, max_num_epochs)
+
+    def _loss(self, theta: Tensor, x: Tensor, *args: Any, **kwargs: Any) -> Tensor:
+        if self._change_x is not None:
+            x = self._change_x(x)
+        loss = super()._loss(theta, x, *args, **kwargs)
+        assert self._neural_net is not None
+        if self._penalty is None or not self._neural_net.training:
+            return loss
+        penalty = self._penalty(self._neural_net)
+        return loss if penalty is None else loss + penalty
+
+
+def _split_by(
+    theta: Tensor, validation_fraction: float
+) -> tuple[Tensor, Tensor] | None:
+    """Split rows by their parameters; None if no two rows share theirs, or all do."""
+    groups, of_row = theta.unique(dim=0, return_inverse=True)
+    if len(groups) in (1, len(theta)):
+        return None
+    num_held_out = len(theta) - int((1 - validation_fraction) * len(theta))
+    order = torch.randperm(len(groups), device=theta.device)
+    sizes = torch.bincount(of_row)[order]
+    rows = sizes.cumsum(0)
+    # As many groups as it takes to fill what sbi makes room for.
+    num_groups = int((rows < num_held_out).sum()) + 1
+    held_out_groups = order[:num_groups]
+    if rows[num_groups - 1] > len(theta) / 2:  # the last of them is a large one
+        chosen = groups_to_hold_out(num_held_out, sizes.tolist())
+        held_out_groups = order[chosen]
+    held_out = torch.isin(of_row, held_out_groups)
+    return (~held_out).nonzero()[:, 0], held_out.nonzero()[:, 0]
+
+
+class _NoTracker:
+    """Keeps sbi from writing a folder of logs next to the user's work."""
+
+    log_dir = None
+
+    def flush(self, *args: Any, **kwargs: Any) -> None:
+        """Do nothing."""
+
+    log_metric = log_metrics = log_params = add_figure = flush
+
+
+def squared_mmd(a: Tensor, b: Tensor) -> float:
+    """Return the squared MMD of two sets, ``(n, l)`` and ``(m, l)``.
+
+    The kernel is Gaussian. Its width is the median distance between the sets.
+    """
+    # It is imported here because it needs packages that nothing else here needs. sbi's
+    # `calc_misspecification_mmd` would compute one more MMD, for its p-value.
+    from sbi.diagnostics.misspecification import compute_rbf_mmd_median_heuristic
+
+    return float(compute_rbf_mmd_median_heuristic(a, b))

@@ -1,0 +1,236 @@
+"""Weighted means over calibration pairs with their errors, and permutation tests."""
+
+from dataclasses import dataclass
+
+import torch
+from scipy.stats import t as student
+from torch import Tensor
+
+from sbi_rope._random import seeded
+from sbi_rope.data import Counts, one_of_each_group
+
+__all__ = [
+    "LEVEL",
+    "PermutationTest",
+    "TwoSampleTest",
+    "compare_with_pairs",
+    "interval_of_mean",
+    "mean_and_error",
+    "mean_of_known",
+    "means_of_pairs",
+    "permutation_test",
+    "standard_error_of_mean",
+]
+
+NUM_PERMUTATIONS = 1000
+# So many are made at a time, which takes memory for as many copies of the outcomes.
+AT_A_TIME = 100
+# Two sets differ clearly if the p-value is below this.
+LEVEL = 0.01
+NUM_DIVISIONS = 999
+# With fewer rows in one of the sets, no difference could be significant. The cost
+# grows with the square of the number of rows.
+FEWEST, MOST = 5, 1000
+# What is further from the median, in standard deviations of a normal distribution that
+# has the same quartiles, counts as being this far away.
+FARTHEST = 10.0
+
+
+# Means --------------------------------------------------------------------------------
+
+
+def standard_error_of_mean(values: Tensor) -> float:
+    """Return that of a vector: NaN for a single value, infinite if a value is."""
+    if values.numel() < 2:
+        return float("nan")
+    if torch.isinf(values).any():
+        return float("inf")
+    return float(values.double().std() / values.numel() ** 0.5)
+
+
+def mean_and_error(values: Tensor, counts: Counts | None) -> tuple[float, float]:
+    """Return the mean of a number for each pair, ``(n,)``, and its standard error.
+
+    Counts of None are one for each pair. The error is infinite if a value is.
+    """
+    if counts is None:
+        return float(values.mean()), standard_error_of_mean(values)
+    values, weights = counts.of_groups(values)
+    n = len(values)
+    mean = (weights * values).sum() / weights.sum()
+    if torch.isinf(values).any():
+        return float(mean), float("inf")
+    square = (weights * (values - mean)).square().sum() / weights.sum().square()
+    return float(mean), float((square * n / max(1, n - 1)).sqrt())
+
+
+def interval_of_mean(
+    values: Tensor, counts: Counts | None
+) -> tuple[float, float, float]:
+    """Return a mean over pairs and the ends of its 95 % interval of Student's t.
+
+    Example:
+        >>> mean, low, high = interval_of_mean(torch.tensor([1.0, 2.0, 3.0]), None)
+        >>> print(f"{mean:.2f}, from {low:.2f} to {high:.2f}")
+        2.00, from -0.48 to 4.48
+    """
+    mean, error = mean_and_error(values, counts)
+    n = float(len(values))
+    if counts is not None:
+        # A few that count as much as all others tell as little as so few alone. Their
+        # variance is estimated by these few, too.
+        count, n = len(counts.of_groups(values)[0]), max(2.0, counts.effective_number)
+        error *= (n / (n - 1) * max(1, count - 1) / count) ** 0.5
+    half = float(student.ppf(0.975, max(1.0, n - 1))) * error
+    return mean, mean - half, mean + half
+
+
+def means_of_pairs(values: Tensor, counts: Counts | None) -> Tensor:
+    """Return the mean over pairs of those that are not NaN, ``(n, d)`` to ``(d,)``."""
+    if counts is None:
+        return mean_of_known(values, dim=0)
+    weights = counts.weights.to(values)[:, None] * ~torch.isnan(values)
+    return (weights * values.nan_to_num()).sum(dim=0) / weights.sum(dim=0)
+
+
+def mean_of_known(values: Tensor, dim: int) -> Tensor:
+    """Return the mean of those that are not NaN; NaN if there are none."""
+    return values.nanmean(dim=dim) if values.isnan().any() else values.mean(dim=dim)
+
+
+# Whether numbers depend on others -----------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class PermutationTest:
+    """What a linear regression explains, and how often permutations explain as much.
+
+    Attributes:
+        p_value: The share of permutations that explain as much, the data themselves
+            included.
+        explained: The sum of squares that the regression explains.
+        num_features: The number of features that are linearly independent.
+    """
+
+    p_value: float
+    explained: float
+    num_features: int
+
+
+def permutation_test(outcomes: Tensor, features: Tensor) -> PermutationTest:
+    """Test whether rows of outcomes depend linearly on rows of features.
+
+    The statistic is the sum of squares that a linear regression with an intercept
+    explains. If the rows of the outcomes ``(n, l)`` are exchangeable given the features
+    ``(n, p)``, the p-value is below any level at most as often as the level says.
+    """
+    features = features - features.mean(dim=0)
+    vectors, values, _ = torch.linalg.svd(features, full_matrices=False)
+    basis = vectors[:, values > 1e-9 * values.max()]
+    centred = outcomes - outcomes.mean(dim=0)
+    explained = float((basis.T @ centred).square().sum())
+    permuted = []
+    for _ in range(NUM_PERMUTATIONS // AT_A_TIME):
+        rows = torch.stack([torch.randperm(len(centred)) for _ in range(AT_A_TIME)])
+        permuted.append((basis.T @ centred[rows]).square().sum(dim=(1, 2)))
+    # A permutation that is equal up to rounding counts.
+    reached = int((torch.cat(permuted) >= explained * (1 - 1e-12)).sum())
+    return PermutationTest(
+        p_value=(1 + reached) / (1 + NUM_PERMUTATIONS),
+        explained=explained,
+        num_features=basis.shape[1],
+    )
+
+
+# Whether two sets come from one distribution ------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class TwoSampleTest:
+    """The outcome of a permutation test of two sets.
+
+    Attributes:
+        p_value: The share of random divisions of all rows into two sets whose energy
+            distance is at least that of the two sets.
+        spread: How far apart the rows of the second set are on average, as a multiple
+            of the same distance in the first set.
+    """
+
+    p_value: float
+    spread: float
+
+    @property
+    def is_different(self) -> bool:
+        """Whether the two sets differ clearly, with a p-value below 0.01."""
+        return self.p_value < LEVEL
+
+
+@torch.no_grad()
+def compare_with_pairs(
+    labelled: Tensor, groups: Tensor, batch: Tensor
+) -> TwoSampleTest | None:
+    r"""Test whether a batch is like the observations of calibration pairs.
+
+    The statistic is the energy distance
+    :math:`2\,E\|X - Y\| - E\|X - X'\| - E\|Y - Y'\|`, which is zero only if the two
+    distributions are the same. It sees other means and other spreads alike. Each column
+    is divided by its standard deviation in both sets together. Entries that are far
+    from all others are moved closer first. Otherwise a single one could hide that the
+    sets differ. Among two sets of one distribution, one in a hundred has a p-value
+    below 0.01, whatever the distribution.
+
+    References:
+        | Testing for Equal Distributions in High Dimension (Szekely and Rizzo, 2004)
+
+    Args:
+        labelled: The embeddings of the pairs, shape ``(n, l)``; the first set. Pairs of
+            one group resemble each other, so that one of them is used. At most 1000
+            random rows are used.
+        groups: The group of each pair, shape ``(n,)``.
+        batch: The embeddings of the batch, shape ``(m, l)``; at most 1000, too.
+
+    Returns:
+        The outcome, which is always the same for the same sets. None if one of the sets
+        has fewer than five rows.
+    """
+    first = labelled[one_of_each_group(groups, seed=0).to(labelled.device)]
+    if min(len(first), len(batch)) < FEWEST:
+        return None
+    with seeded(0):
+        sets = [
+            values.detach().cpu().double()[torch.randperm(len(values))[:MOST]]
+            for values in (first, batch)
+        ]
+        rows, n = _closer(torch.cat(sets)), len(sets[0])
+        # Of two equal embeddings, only rounding would be left to compare.
+        std = rows.std(dim=0)
+        varies = std > 1e-9 * rows.abs().amax(dim=0).clamp_min(1e-30)
+        rows = (rows - rows.mean(dim=0))[:, varies] / std[varies]
+        distances = torch.cdist(rows, rows)
+        member = torch.zeros(NUM_DIVISIONS + 1, len(rows), dtype=torch.double)
+        member[0, :n] = 1.0
+        for i in range(1, NUM_DIVISIONS + 1):
+            member[i, torch.randperm(len(rows))[:n]] = 1.0
+    # Mean distances within the first set, across, and within the second.
+    rest, m = 1.0 - member, len(rows) - n
+    of_first = member @ distances
+    of_second = distances.sum(dim=1) - of_first
+    within = (of_first * member).sum(dim=1) / n**2
+    across = (of_first * rest).sum(dim=1) / (n * m)
+    other = (of_second * rest).sum(dim=1) / m**2
+    energy = 2 * across - within - other
+    # A division that is equal up to rounding counts, and so does the one at hand.
+    reached = energy >= energy[0] - 1e-9 * across[0]
+    return TwoSampleTest(
+        p_value=float(reached.double().mean()),
+        # Of rows that are all equal it is NaN.
+        spread=float((other[0] * m / (m - 1)) / (within[0] * n / (n - 1))),
+    )
+
+
+def _closer(rows: Tensor) -> Tensor:
+    """Move entries that are far from the median of their column closer to it."""
+    low, median, high = rows.quantile(rows.new_tensor([0.25, 0.5, 0.75]), dim=0)
+    reach = FARTHEST * (high - low) / 1.349
+    reach = reach.where(reach > 0, torch.inf)  # most entries of the column are equal
+    return rows.clamp(median - reach, median + reach)

@@ -1,1 +1,0 @@
-"""The small data sets that come with the package."""
