@@ -1,145 +1,177 @@
-"""What a prior says of its parameters: their bounds, their units and their density."""
+"""A prior with one set of shapes: its density, its bounds and its units."""
 
+import copy
+from functools import cached_property
 from typing import Any
 
 import torch
-from sbi.utils import within_support
 from torch import Tensor
-from torch.distributions import constraints
+from torch.distributions import Distribution, constraints
 
 from sbi_rope._random import seeded
+from sbi_rope.errors import InvalidInputError, shown
 
-__all__ = [
-    "bounds_of",
-    "box_of",
-    "divisors",
-    "is_unbounded",
-    "log_unit_of",
-    "log_units_of",
-    "moved_inside",
-    "off_bounds",
-    "prior_log_prob",
-    "prior_sample",
-    "std_of_prior",
-]
+__all__ = ["PriorDistribution", "divisors"]
 
-# So many draws of the prior are moved apart to see whether its support is a box.
-NUM_DRAWS = 256
-# Draws from which a standard deviation is estimated that the prior does not state.
-NUM_FOR_STD = 10_000
+# Draws from which moments are estimated that a prior does not state, and those that are
+# moved apart to see whether it has bounds.
+NUM_FOR_MOMENTS, NUM_DRAWS, FAR_APART = 10_000, 256, 5.0
 
 
-def prior_sample(prior: Any, sample_shape: torch.Size) -> Tensor:
-    """Draw from a prior over parameters of shape ``(d,)``, ``(*sample_shape, d)``."""
-    # sbi's MultipleIndependent takes sample shapes with one dimension only.
-    theta = prior.sample(torch.Size((sample_shape.numel(),)))
-    return theta.reshape(*sample_shape, *theta.shape[1:])
+class PriorDistribution(Distribution):
+    r"""A copy of a prior over parameters of shape ``(d,)``, in float32.
 
+    Priors that sbi trains with differ in their shapes, dtypes and in what they do
+    outside their support. This one does not. Its log density is minus infinity outside
+    the support, and on a bound that just inside. Where a density is flat, its gradient
+    is zero.
 
-def prior_log_prob(prior: Any, theta: Tensor) -> Tensor:
-    r"""Return the log density at theta ``(*batch, d)``, shape ``(*batch)``.
-
-    It is :math:`-\infty` outside the support, and on a bound that just inside. There
-    are gradients even where the density is flat; they are zero there.
+    Args:
+        prior: A torch distribution, or what sbi's ``process_prior`` returns.
     """
-    shape = theta.shape[:-1]
-    # sbi's MultipleIndependent takes theta with at most two dimensions.
-    theta = theta.reshape(-1, theta.shape[-1])
-    theta = theta if theta.is_floating_point() else theta.float()
-    safe, inside = moved_inside(prior, theta)
-    log_prob = prior.log_prob(off_bounds(prior, safe)) + 0.0 * safe.sum(dim=-1)
-    return log_prob.where(inside, -torch.inf).reshape(shape)
 
+    def __init__(self, prior: Any) -> None:
+        own = prior._own if isinstance(prior, PriorDistribution) else prior
+        self._own = copy.deepcopy(own)
+        draws = None
+        if hasattr(own, "sample"):
+            with seeded(0):
+                draws = self._own.sample(torch.Size((1,)))
+        if not isinstance(draws, Tensor) or draws.ndim != 2:
+            raise InvalidInputError(
+                "Expected `prior` to be a torch distribution over vectors; got "
+                f"{shown(own)}. Use `sbi.utils.process_prior(prior)[0]`."
+            )
+        # It takes the place of parameters outside the support.
+        self._some = draws
+        super().__init__(event_shape=draws.shape[1:], validate_args=False)
 
-def moved_inside(prior: Any, theta: Tensor) -> tuple[Tensor, Tensor]:
-    """Return parameters ``(n, d)``, those outside the support replaced by one inside.
+    def __repr__(self) -> str:
+        return repr(self._own)
 
-    Outside, torch's distributions raise an error, and networks may return anything,
-    NaN and gradients of NaN included. What was computed there is to be overwritten.
+    @property
+    def arg_constraints(self) -> dict[str, Any]:
+        """There are none."""
+        return {}
 
-    Returns:
-        The parameters, and which of them were inside, ``(n,)``.
-    """
-    inside = within_support(prior, theta).reshape(len(theta))
-    with seeded(0):
-        filler = prior.sample(torch.Size((1,))).to(theta)
-    return torch.where(inside[:, None], theta, filler), inside
+    def to(self, device: Any) -> None:
+        """Move the prior to a device."""
+        from sbi_rope._sbi import move_distribution_to_device
 
+        self._own = move_distribution_to_device(self._own, device)
+        self._some = self._some.to(device)
 
-# --- bounds ---
+    # --- draws and density ---
 
+    def sample(self, sample_shape: Any = ()) -> Tensor:
+        """Draw parameters, shape ``(*sample_shape, d)``."""
+        # sbi's MultipleIndependent takes sample shapes with one dimension only.
+        shape = torch.Size(sample_shape)
+        theta = self._own.sample(torch.Size((shape.numel(),)))
+        return theta.float().reshape(*shape, *self.event_shape)
 
-def bounds_of(prior: Any, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the ends of the prior's support, infinite where they are not known.
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Return the log density at theta ``(*batch, d)``, shape ``(*batch)``."""
+        theta = value if value.is_floating_point() else value.float()
+        flat = theta.reshape(-1, *self.event_shape)
+        low, high = self.bounds(flat)
+        moved = self.off_bounds(flat).to(self._some.dtype)
+        inside = ((flat >= low) & (flat <= high)).all(dim=1)
+        if (support := self._support) is not None:
+            inside = inside & support.check(moved).reshape(len(flat), -1).all(dim=1)
+        # Outside, torch's distributions raise an error, or return NaN.
+        safe = moved.where(inside[:, None], self._some)
+        log_prob = self._own.log_prob(safe).reshape(len(flat), -1).sum(dim=1)
+        log_prob = log_prob.to(flat) + 0.0 * flat.where(inside[:, None], 0.0).sum(dim=1)
+        usable = inside & torch.isfinite(log_prob)
+        return log_prob.where(usable, -torch.inf).reshape(theta.shape[:-1])
 
-    They get the shape ``(*batch, d)``, dtype and device of ``like``.
-    """
-    return _bounds(_support_of(prior), like)
+    def inside(self, theta: Tensor) -> Tensor:
+        """Tell which parameters ``(n, d)`` have a finite log density, ``(n,)``."""
+        return torch.isfinite(self.log_prob(theta))
 
+    def moved_inside(self, theta: Tensor) -> tuple[Tensor, Tensor]:
+        """Return parameters ``(n, d)``, those outside replaced, and which were inside.
 
-def box_of(prior: Any) -> tuple[Tensor, Tensor] | None:
-    """Return the bounds of a prior, float64; None if its support is no whole box."""
-    with seeded(0):
-        theta = prior.sample((NUM_DRAWS,)).double()
-    # In a box, any parameters between the bounds are inside.
-    apart = off_bounds(prior, 2.0 * theta - theta.mean(dim=0))
-    inside = within_support(prior, apart).all()
-    return bounds_of(prior, theta[0]) if bool(inside) else None
+        Outside, networks may return anything, NaN and gradients of NaN included. What
+        was computed there is to be overwritten.
+        """
+        inside = self.inside(theta)
+        return theta.where(inside[:, None], self._some.to(theta)), inside
 
+    # --- bounds ---
 
-def off_bounds(prior: Any, theta: Tensor) -> Tensor:
-    """Return parameters ``(n, d)``, those on a bound moved to the next number inside.
+    @property
+    def support(self) -> Any:
+        """The support that the prior states, as sbi expects it."""
+        return self._own.support
 
-    Many densities are zero or infinite on a bound. Discrete parameters stay.
-    """
-    low, high = bounds_of(prior, theta)
-    inside = theta.clamp(low.nextafter(high), high.nextafter(low))
-    return theta.where(_is_discrete(_support_of(prior), theta), inside)
+    @cached_property
+    def is_unbounded(self) -> bool:
+        """Whether the support is the whole space."""
+        if _base_of(self._support) not in (constraints.real, constraints.real_vector):
+            return False
+        with seeded(0):
+            draws = self.sample((NUM_DRAWS,))
+        # sbi says so of every prior that states no bounds.
+        apart = draws + FAR_APART * (draws - draws.mean(dim=0))
+        return bool(self.inside(apart).all())
 
+    @property
+    def _support(self) -> Any:
+        try:
+            return self._own.support
+        except (NotImplementedError, AttributeError):  # it states none
+            return None
 
-def is_unbounded(prior: Any) -> bool:
-    """Tell whether a prior says that its support is the whole space."""
-    return _support_of(prior) in (constraints.real, constraints.real_vector)
+    def bounds(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the ends of the support, infinite where they are not known.
 
+        They get the shape ``(*batch, d)``, dtype and device of ``like``.
+        """
+        return _bounds(self._support, like)
 
-def _support_of(prior: Any) -> Any:
-    """Return the support that a prior states, a constraint of torch; None if none."""
-    try:
-        support = getattr(prior, "support", None)
-    except NotImplementedError:  # torch raises it if a distribution states no support
-        return None
-    while isinstance(support, constraints.independent):
-        support = support.base_constraint
-    return support
+    def off_bounds(self, theta: Tensor) -> Tensor:
+        """Return theta ``(n, d)``, those on a bound moved to the next number inside.
 
+        Many densities are zero or infinite on a bound. Discrete parameters stay.
+        """
+        low, high = self.bounds(theta)
+        inside = theta.clamp(low.nextafter(high), high.nextafter(low))
+        return theta.where(_is_discrete(self._support, theta), inside)
 
-def _is_discrete(support: Any, like: Tensor) -> Tensor:
-    if isinstance(support, constraints.cat):
-        columns = like.split(support.lengths, dim=-1)
-        parts = [_is_discrete(*one) for one in zip(support.cseq, columns, strict=True)]
-        return torch.cat(parts, dim=-1)
-    return torch.full_like(
-        like, bool(getattr(support, "is_discrete", False)), dtype=torch.bool
-    )
+    # --- units ---
 
+    @property
+    def mean(self) -> Tensor:
+        """The mean of each parameter, ``(d,)``; estimated if it is not stated."""
+        return self._moment("mean")
 
-def _bounds(support: Any, like: Tensor) -> tuple[Tensor, Tensor]:
-    while isinstance(support, constraints.independent):
-        support = support.base_constraint
-    if isinstance(support, constraints.cat):  # of sbi's MultipleIndependent
-        columns = like.split(support.lengths, dim=-1)
-        ends = [_bounds(*one) for one in zip(support.cseq, columns, strict=True)]
-        low, high = (torch.cat(some, dim=-1) for some in zip(*ends, strict=True))
-        return low, high
-    unknown = (0.0, 1.0) if support is constraints.boolean else (-torch.inf, torch.inf)
-    low, high = (
-        torch.as_tensor(getattr(support, name, end)).to(like).expand_as(like)
-        for name, end in zip(("lower_bound", "upper_bound"), unknown, strict=True)
-    )
-    return low, high
+    @property
+    def variance(self) -> Tensor:
+        """The variance of each parameter, ``(d,)``; estimated if it is not stated."""
+        return self._moment("variance")
 
+    def _moment(self, name: str) -> Tensor:
+        try:
+            found = getattr(self._own, name)
+        except Exception:  # priors of users and of sbi raise all kinds
+            with seeded(0):
+                draws = self.sample((NUM_FOR_MOMENTS,))
+            found = draws.mean(dim=0) if name == "mean" else draws.var(dim=0)
+        found = torch.as_tensor(found).detach().to(self._some.device, torch.float32)
+        return found.expand(1, *self.event_shape)[0]
 
-# --- units ---
+    def log_units(self) -> Tensor:
+        r"""Return :math:`\log s_j`, with s the standard deviations, ``(d,)``.
+
+        The density of :math:`z_j = \theta_j / s_j` is
+        :math:`p(z \mid x) = p(\theta \mid x) \prod_j s_j`, so that a log score with
+        theta in standard deviations of the prior is higher by their sum. It is NaN
+        where the prior has no finite standard deviation.
+        """
+        std = self.stddev.double()
+        return std.log().where((std > 0) & torch.isfinite(std), torch.nan)
 
 
 def divisors(std: Tensor) -> Tensor:
@@ -151,28 +183,32 @@ def divisors(std: Tensor) -> Tensor:
     return std.where(std > 0, 1.0)
 
 
-def log_unit_of(prior: Any) -> float:
-    """Return the sum of :func:`log_units_of`; NaN if one of them is unknown."""
-    return float(log_units_of(prior).sum())
+def _base_of(support: Any) -> Any:
+    while isinstance(support, constraints.independent):
+        support = support.base_constraint
+    return support
 
 
-def log_units_of(prior: Any) -> Tensor:
-    r"""Return :math:`\log s_j`, with s the standard deviations of the prior, ``(d,)``.
-
-    The density of :math:`z_j = \theta_j / s_j` is
-    :math:`p(z \mid x) = p(\theta \mid x) \prod_j s_j`, so that a log score with theta
-    in standard deviations of the prior is higher by their sum. It is NaN where the
-    prior has no finite standard deviation.
-    """
-    std = std_of_prior(prior)
-    return std.log().where((std > 0) & torch.isfinite(std), torch.nan)
+def _is_discrete(support: Any, like: Tensor) -> Tensor:
+    support = _base_of(support)
+    if isinstance(support, constraints.cat):  # of sbi's MultipleIndependent
+        columns = like.split(support.lengths, dim=-1)
+        parts = [_is_discrete(*one) for one in zip(support.cseq, columns, strict=True)]
+        return torch.cat(parts, dim=-1)
+    is_discrete = bool(getattr(support, "is_discrete", False))
+    return torch.full_like(like, is_discrete, dtype=torch.bool)
 
 
-def std_of_prior(prior: Any) -> Tensor:
-    """Return the standard deviations of a prior, ``(d,)``; estimated if not stated."""
-    try:
-        std = prior.stddev
-    except Exception:  # priors of users and of sbi raise all kinds
-        with seeded(0):
-            std = prior.sample(torch.Size((NUM_FOR_STD,))).std(dim=0)
-    return torch.as_tensor(std).detach().double()
+def _bounds(support: Any, like: Tensor) -> tuple[Tensor, Tensor]:
+    support = _base_of(support)
+    if isinstance(support, constraints.cat):
+        columns = like.split(support.lengths, dim=-1)
+        ends = [_bounds(*one) for one in zip(support.cseq, columns, strict=True)]
+        low, high = (torch.cat(some, dim=-1) for some in zip(*ends, strict=True))
+        return low, high
+    unknown = (0.0, 1.0) if support is constraints.boolean else (-torch.inf, torch.inf)
+    low, high = (
+        torch.as_tensor(getattr(support, name, end)).to(like).expand_as(like)
+        for name, end in zip(("lower_bound", "upper_bound"), unknown, strict=True)
+    )
+    return low, high

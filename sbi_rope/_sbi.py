@@ -37,6 +37,7 @@ from torch import Tensor, nn
 from torch.distributions import Distribution
 from torch.utils.data import DataLoader, SubsetRandomSampler
 
+from sbi_rope._prior import PriorDistribution
 from sbi_rope._progress import progress_bar
 from sbi_rope._random import seeded
 from sbi_rope.data import groups_to_hold_out
@@ -69,6 +70,7 @@ __all__ = [
     "gaussians_of",
     "headless",
     "is_bounded",
+    "leave_out_constants",
     "move_distribution_to_device",
     "parameter_of",
     "posterior_from",
@@ -81,6 +83,9 @@ __all__ = [
 # A row may differ by this share of the largest embedding when it is alone. Rounding
 # depends on the size of a batch, and is largest for convolutions on a GPU.
 ROUNDING = 0.01
+# An entry does not vary if its standard deviation is less than this share of its mean,
+# or what sbi divides it by then.
+CONSTANT, SMALLEST_STD = 1e-6, 1e-7
 # What sbi adds to the precision of each Gaussian that it mixes.
 SMALLEST_PRECISION = 1e-4
 
@@ -187,6 +192,20 @@ def standardisation_of(embedding_net: nn.Module) -> tuple[Tensor, Tensor] | None
     layers = (part for part in embedding_net.modules() if isinstance(part, Standardize))
     layer: Any = next(layers, None)
     return None if layer is None else (layer._mean, layer._std)
+
+
+@torch.no_grad()
+def leave_out_constants(embedding_net: nn.Module) -> None:
+    """Make a net ignore the entries of x that were the same in all of its training.
+
+    sbi divides an entry that does not vary by 1e-7. In an observation where it does
+    vary, it would then be much larger than all other entries. The standardising layer
+    of the net is changed, so that such an entry always has the value it was trained on.
+    """
+    if (mean_and_std := standardisation_of(embedding_net)) is not None:
+        mean, std = mean_and_std
+        is_constant = std <= (CONSTANT * mean.abs()).clamp_min(SMALLEST_STD)
+        std.masked_fill_(is_constant, torch.inf)
 
 
 def parameter_of(module: nn.Module) -> Tensor:
@@ -545,7 +564,7 @@ class TrainedNPE:
 
     Attributes:
         estimator: The copy of the estimator, in evaluation mode.
-        prior: The copy of the prior.
+        prior: The copy of the prior, with one set of shapes.
         h: The embedding net of the copy, with sbi's standardising layer.
         like: An empty tensor of shape ``(0, d)`` with the dtype and device of the
             estimator.
@@ -559,7 +578,7 @@ class TrainedNPE:
         self.h = embedding_of(estimator)
         self._q = headless(estimator)
         self._posterior: Any = posterior_from(posterior, estimator)
-        self.prior = copy.deepcopy(posterior.prior)
+        self.prior = PriorDistribution(posterior.prior)
         self.like = parameter_of(estimator).new_empty(0, *estimator.input_shape)
         self.parameter_names: tuple[str, ...] | None = None
         if parameter_names is not None:
@@ -569,6 +588,7 @@ class TrainedNPE:
         x = torch.randn(4, *self.event_shape, generator=generator).to(self.like)
         mean, std = standardisation_of(self.h) or (0.0, 1.0)
         check_rows_apart(self.h, mean + std * x)
+        leave_out_constants(self.h)
 
     @property
     def event_shape(self) -> torch.Size:

@@ -11,7 +11,6 @@ __all__ = [
     "ROUNDING",
     "Standardisation",
     "deviations",
-    "leave_out_constants",
     "warn_of_far_entries",
 ]
 
@@ -39,32 +38,21 @@ def deviations(embedding_net: nn.Module, x: Tensor) -> Tensor | None:
     return ((x - mean) / std).abs().nan_to_num(nan=0.0, posinf=torch.inf)
 
 
-@torch.no_grad()
-def leave_out_constants(embedding_net: nn.Module, x: Tensor) -> None:
-    """Make a net ignore the entries that are the same in all calibration pairs.
-
-    sbi divides an entry that does not vary by 1e-7. In an observation where it does
-    vary, it would then be much larger than all other entries. The standardising layer
-    of the net, whose mean and standard deviation are those of x, is changed.
-    """
-    mean_and_std = standardisation_of(embedding_net)
-    if mean_and_std is None or mean_and_std[1].shape != x.shape[1:]:
-        return  # x is not standardised, or all entries have one standard deviation
-    constant = x.std(dim=0) <= ROUNDING * x.abs().amax(dim=0)
-    if not constant.any():
-        return
-    mean_and_std[1].masked_fill_(constant, torch.inf)
-    entries = constant.flatten().nonzero().flatten().tolist()
-    warn_user(
-        f"Left out {len(entries)} of the {constant.numel()} entries of the calibration "
-        f"`x` (first: {entries[:5]}), which are the same in all pairs."
-    )
-
-
 def warn_of_far_entries(name: str, x: Tensor, embedding_net: nn.Module) -> None:
     """Warn of entries of ``x`` that are far from all simulations NPE was trained on."""
     far = deviations(embedding_net, x)
-    if far is not None and (far > FAR).any():
+    if far is None:
+        return
+    mean, std = standardisation_of(embedding_net) or (x, x)
+    ignored = torch.isinf(std) & ((x - mean).abs() > 1e-4 * mean.abs())
+    if ignored.any():
+        entries = ignored.any(dim=0).flatten().nonzero().flatten()
+        warn_user(
+            f"{len(entries)} of the {far[0].numel()} entries of `{name}` (first: "
+            f"{entries[:5].tolist()}) never vary in simulations, or by less than 1e-7, "
+            "and are ignored."
+        )
+    if (far > FAR).any():
         entries = (far > FAR).any(dim=0).flatten().nonzero().flatten()
         warn_user(
             f"{len(entries)} of the {far[0].numel()} entries of `{name}` (first: "

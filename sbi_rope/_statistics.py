@@ -1,11 +1,14 @@
 """Weighted means over calibration pairs with their errors, and permutation tests."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from scipy.stats import t as student
 from torch import Tensor
 
+from sbi_rope._prior import divisors
 from sbi_rope._random import seeded
 from sbi_rope.data import Counts, one_of_each_group
 
@@ -27,10 +30,14 @@ NUM_PERMUTATIONS = 1000
 AT_A_TIME = 100
 # Two sets differ clearly if the p-value is below this.
 LEVEL = 0.01
+# Above this there is no sign that they do.
+NO_SIGN = 0.05
 NUM_DIVISIONS = 999
 # With fewer rows in one of the sets, no difference could be significant. The cost
 # grows with the square of the number of rows.
-FEWEST, MOST = 5, 1000
+FEWEST, MOST = 5, 500
+# Draws that an estimate of NPE is the mean of.
+NUM_FOR_ESTIMATE = 20
 # What is further from the median, in standard deviations of a normal distribution that
 # has the same quartiles, counts as being this far away.
 FARTHEST = 10.0
@@ -150,44 +157,72 @@ class TwoSampleTest:
     """The outcome of a permutation test of two sets.
 
     Attributes:
-        p_value: The share of random divisions of all rows into two sets whose energy
-            distance is at least that of the two sets.
-        spread: How far apart the rows of the second set are on average, as a multiple
-            of the same distance in the first set.
+        p_value: The share of random divisions of all rows into two sets that differ at
+            least as much as the two sets, in the embeddings or in an estimate.
+        spread: How far apart the embeddings of the second set are on average, as a
+            multiple of the same distance in the first set.
+        p_values: The same share for each parameter alone, with the divisions that
+            differ as much in any respect, ``(d,)``.
+        spreads: The standard deviation of the estimates of each parameter in the second
+            set, as a multiple of that in the first, ``(d,)``.
     """
 
     p_value: float
     spread: float
+    p_values: tuple[float, ...] = ()
+    spreads: tuple[float, ...] = ()
 
     @property
     def is_different(self) -> bool:
         """Whether the two sets differ clearly, with a p-value below 0.01."""
         return self.p_value < LEVEL
 
+    def alike(self, names: Sequence[str]) -> tuple[str, ...]:
+        """Return the names of parameters that show no sign of a difference."""
+        both = zip(names, self.p_values, strict=True)
+        return tuple(name for name, p_value in both if p_value > NO_SIGN)
+
+    def parameters(self, names: Sequence[str]) -> list[str]:
+        """Say which parameters differ by themselves, and how."""
+        ratios = zip(names, self.p_values, self.spreads, strict=True)
+        return [
+            f"{name} ({spread:.2g} times the spread of the pairs)"
+            for name, p_value, spread in ratios
+            if p_value < LEVEL
+        ]
+
 
 @torch.no_grad()
 def compare_with_pairs(
-    labelled: Tensor, groups: Tensor, batch: Tensor
+    labelled: Tensor,
+    groups: Tensor,
+    batch: Tensor,
+    density: Any = None,
 ) -> TwoSampleTest | None:
     r"""Test whether a batch is like the observations of calibration pairs.
 
     The statistic is the energy distance
     :math:`2\,E\|X - Y\| - E\|X - X'\| - E\|Y - Y'\|`, which is zero only if the two
-    distributions are the same. It sees other means and other spreads alike. Each column
-    is divided by its standard deviation in both sets together. Entries that are far
-    from all others are moved closer first. Otherwise a single one could hide that the
-    sets differ. Among two sets of one distribution, one in a hundred has a p-value
-    below 0.01, whatever the distribution.
+    distributions are the same. It is computed of the embeddings, and of the estimates
+    of each parameter alone, which show a narrower or a shifted range of one of them.
+    Each of these distances is divided by its mean over random divisions of all rows,
+    and the largest counts. Among two sets of one distribution, one in a hundred has a
+    p-value below 0.01, whatever the distribution.
+
+    Each column is divided by its standard deviation in both sets together. Entries that
+    are far from all others are moved closer first. Otherwise a single one could hide
+    that the sets differ.
 
     References:
         | Testing for Equal Distributions in High Dimension (Szekely and Rizzo, 2004)
 
     Args:
         labelled: The embeddings of the pairs, shape ``(n, l)``; the first set. Pairs of
-            one group resemble each other, so that one of them is used. At most 1000
+            one group resemble each other, so that one of them is used. At most 500
             random rows are used.
         groups: The group of each pair, shape ``(n,)``.
-        batch: The embeddings of the batch, shape ``(m, l)``; at most 1000, too.
+        batch: The embeddings of the batch, shape ``(m, l)``; at most 500, too.
+        density: :math:`q(\theta \mid h)` of NPE, whose estimates are compared as well.
 
     Returns:
         The outcome, which is always the same for the same sets. None if one of the sets
@@ -197,35 +232,61 @@ def compare_with_pairs(
     if min(len(first), len(batch)) < FEWEST:
         return None
     with seeded(0):
-        sets = [
-            values.detach().cpu().double()[torch.randperm(len(values))[:MOST]]
-            for values in (first, batch)
-        ]
-        rows, n = _closer(torch.cat(sets)), len(sets[0])
-        # Of two equal embeddings, only rounding would be left to compare.
-        std = rows.std(dim=0)
-        varies = std > 1e-9 * rows.abs().amax(dim=0).clamp_min(1e-30)
-        rows = (rows - rows.mean(dim=0))[:, varies] / std[varies]
-        distances = torch.cdist(rows, rows)
-        member = torch.zeros(NUM_DIVISIONS + 1, len(rows), dtype=torch.double)
+        first, second = (
+            some[torch.randperm(len(some))[:MOST]] for some in (first, batch)
+        )
+        rows, n, m = torch.cat([first, second]), len(first), len(second)
+        member = torch.zeros(NUM_DIVISIONS + 1, n + m, dtype=torch.double)
         member[0, :n] = 1.0
         for i in range(1, NUM_DIVISIONS + 1):
-            member[i, torch.randperm(len(rows))[:n]] = 1.0
-    # Mean distances within the first set, across, and within the second.
+            member[i, torch.randperm(n + m)[:n]] = 1.0
+        estimates = rows[:, :0]
+        if density is not None:
+            draws = torch.Size((NUM_FOR_ESTIMATE,))
+            estimates = density.sample(draws, condition=rows).mean(dim=0)
+    estimates = estimates.cpu().double()
+    compared = [rows.cpu().double(), *estimates.T[..., None]]
+    found = [_energies(_closer(columns), member) for columns in compared]
+    # The energy distances of each division, and how much larger than usual they are.
+    energies = torch.stack([energy for energy, _ in found], dim=1)
+    excess = energies / divisors(energies.mean(dim=0))
+    largest = excess.amax(dim=1)
+    # A division that is equal up to rounding counts, and so does the one at hand.
+    reached = largest[:, None] >= excess[0] - 1e-9
+    each = reached.double().mean(dim=0).tolist()
+    of_sets = [column.split([n, m]) for column in estimates.T]
+    return TwoSampleTest(
+        p_value=min(each),
+        spread=found[0][1],
+        p_values=tuple(each[1:]),
+        spreads=tuple(float(b.std() / divisors(a.std())) for a, b in of_sets),
+    )
+
+
+def _energies(rows: Tensor, member: Tensor) -> tuple[Tensor, float]:
+    """Return the energy distance of each division, and the spread of the second set.
+
+    The spread is that in the first division, as a multiple of the first set's.
+
+    Rows have the shape ``(n + m, l)``. In ``member``, the first set of each division
+    has ones, ``(divisions, n + m)``.
+    """
+    # Of two equal rows, only rounding would be left to compare.
+    std = rows.std(dim=0)
+    varies = std > 1e-9 * rows.abs().amax(dim=0).clamp_min(1e-30)
+    rows = (rows - rows.mean(dim=0))[:, varies] / std[varies]
+    distances = torch.cdist(rows, rows)
+    n = int(member[0].sum())
     rest, m = 1.0 - member, len(rows) - n
+    # Mean distances within the first set, across, and within the second.
     of_first = member @ distances
     of_second = distances.sum(dim=1) - of_first
     within = (of_first * member).sum(dim=1) / n**2
     across = (of_first * rest).sum(dim=1) / (n * m)
     other = (of_second * rest).sum(dim=1) / m**2
-    energy = 2 * across - within - other
-    # A division that is equal up to rounding counts, and so does the one at hand.
-    reached = energy >= energy[0] - 1e-9 * across[0]
-    return TwoSampleTest(
-        p_value=float(reached.double().mean()),
-        # Of rows that are all equal it is NaN.
-        spread=float((other[0] * m / (m - 1)) / (within[0] * n / (n - 1))),
-    )
+    # Of rows that are all equal the ratio is NaN.
+    spread = (other[0] * m / (m - 1)) / (within[0] * n / (n - 1))
+    return 2 * across - within - other, float(spread)
 
 
 def _closer(rows: Tensor) -> Tensor:

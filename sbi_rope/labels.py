@@ -19,13 +19,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Chi2, MultivariateNormal
 
-from sbi_rope._prior import (
-    bounds_of,
-    moved_inside,
-    off_bounds,
-    prior_log_prob,
-    prior_sample,
-)
+from sbi_rope._prior import PriorDistribution
 from sbi_rope._random import seeded
 from sbi_rope.data import Labels, Nodes
 from sbi_rope.errors import InvalidInputError, warn_user
@@ -72,7 +66,7 @@ def given_labels(
     theta_std: Any,
     theta_cov: Any,
     like: Tensor,
-    prior: Any,
+    prior: PriorDistribution,
     names: Sequence[str] | None,
 ) -> Labels:
     """Return labels from the arguments of :meth:`RoPE.append_calibration`.
@@ -183,7 +177,9 @@ def _expanded(name: str, value: Tensor, *shapes: tuple[int, ...]) -> Tensor:
     return value.double().expand(shapes[-1])
 
 
-def on_bounds(labels: Labels, prior: Any, names: Sequence[str] | None) -> list[str]:
+def on_bounds(
+    labels: Labels, prior: PriorDistribution, names: Sequence[str] | None
+) -> list[str]:
     """Say of which parameters many exact labels are on a bound of the prior.
 
     A posterior with a density does not expect any such label.
@@ -191,7 +187,7 @@ def on_bounds(labels: Labels, prior: Any, names: Sequence[str] | None) -> list[s
     if labels.are_drawn:
         return []
     exact = labels.is_measured & ~labels.is_noisy
-    on_bound = exact & (labels.y != off_bounds(prior, labels.y))
+    on_bound = exact & (labels.y != prior.off_bounds(labels.y))
     counts, numbers = on_bound.sum(dim=0), exact.sum(dim=0)
     many = (counts > 1) & (counts > MANY_ON_BOUNDS * numbers)
     names = names or default_names(len(many))
@@ -204,7 +200,7 @@ def on_bounds(labels: Labels, prior: Any, names: Sequence[str] | None) -> list[s
 # Draws of parameters ------------------------------------------------------------------
 
 
-def draws_of(labels: Labels, prior: Any) -> Tensor:
+def draws_of(labels: Labels, prior: PriorDistribution) -> Tensor:
     r"""Draw from :math:`p(\theta \mid y) \propto p(\theta)\, p(y \mid \theta)`.
 
     The draws of a label do not depend on the values of other labels.
@@ -235,12 +231,12 @@ def _shuffled(draws: Tensor) -> Tensor:
     return draws[:, torch.cat(rounds).to(draws.device)]
 
 
-def _drawn(labels: Labels, prior: Any, *, first: int) -> Tensor:
+def _drawn(labels: Labels, prior: PriorDistribution, *, first: int) -> Tensor:
     """Draw parameters of labels, the first of which is the row ``first``."""
     nodes, log_posterior = _proposals(labels, prior)
     # Labels that miss the support by many standard deviations fit nothing, either.
     y = labels.y.double()
-    low, high = bounds_of(prior, y[0])
+    low, high = prior.bounds(y[0])
     std = labels.covariance.diagonal(dim1=1, dim2=2).sqrt()
     missed = torch.maximum(low - y, y - high) > LARGEST_MISS * std
     lost = torch.isneginf(log_posterior).all(dim=1)
@@ -262,12 +258,12 @@ def _drawn(labels: Labels, prior: Any, *, first: int) -> Tensor:
     return nodes.theta.take_along_dim(chosen[..., None], 1)
 
 
-def _proposals(labels: Labels, prior: Any) -> tuple[Nodes, Tensor]:
+def _proposals(labels: Labels, prior: PriorDistribution) -> tuple[Nodes, Tensor]:
     """Return proposals for labels, and their log densities given the label."""
     nodes = place_nodes(
         labels, [_prior_reference(labels, prior)], prior, num_nodes=NUM_PROPOSALS
     )
-    log_prior = prior_log_prob(prior, nodes.theta).double()
+    log_prior = prior.log_prob(nodes.theta).double()
     return nodes, nodes.log_weights + log_prior
 
 
@@ -301,7 +297,11 @@ def reference_of(samples: Tensor) -> Reference:
 
 
 def nodes_of(
-    labels: Labels, references: Sequence[Reference], prior: Any, *, num_nodes: int
+    labels: Labels,
+    references: Sequence[Reference],
+    prior: PriorDistribution,
+    *,
+    num_nodes: int,
 ) -> Nodes:
     r"""Return the nodes at which the densities of labels are computed.
 
@@ -313,7 +313,7 @@ def nodes_of(
     the place of what is not finite.
     """
     if labels.are_drawn:
-        log_prior = prior_log_prob(prior, labels.draws).double()
+        log_prior = prior.log_prob(labels.draws).double()
         return Nodes(theta=labels.draws, log_weights=-log_prior)
     wide = _prior_reference(labels, prior)
     usable = []
@@ -333,7 +333,7 @@ def nodes_of(
     return nodes
 
 
-def _nodes_inside(labels: Labels, prior: Any, count: int) -> Nodes:
+def _nodes_inside(labels: Labels, prior: PriorDistribution, count: int) -> Nodes:
     r"""Return nodes drawn from :math:`p(\theta \mid y)`, which is inside the support.
 
     Their weights are :math:`p(y) / p(\theta)`, zero for labels that no parameters fit.
@@ -350,17 +350,21 @@ def _nodes_inside(labels: Labels, prior: Any, count: int) -> Nodes:
     return Nodes(theta=theta, log_weights=log_weights)
 
 
-def _prior_reference(labels: Labels, prior: Any) -> Reference:
+def _prior_reference(labels: Labels, prior: PriorDistribution) -> Reference:
     """Return the moments of the prior, the same for each label."""
     with seeded(0):
-        samples = prior_sample(prior, torch.Size((NUM_PRIOR_DRAWS,))).to(labels.y)
+        samples = prior.sample((NUM_PRIOR_DRAWS,)).to(labels.y)
     mean, covariance = reference_of(samples[:, None])
     n = len(labels)
     return Reference(mean.expand(n, -1), covariance.expand(n, -1, -1))
 
 
 def place_nodes(
-    labels: Labels, references: Sequence[Reference], prior: Any, *, num_nodes: int
+    labels: Labels,
+    references: Sequence[Reference],
+    prior: PriorDistribution,
+    *,
+    num_nodes: int,
 ) -> Nodes:
     """Draw the nodes of labels that are measurements, equally many of each reference.
 
@@ -371,7 +375,7 @@ def place_nodes(
     total = of_each * len(references)
     theta = labels.y.double()[:, None].expand(n, total, d).clone()
     log_weights = labels.covariance.new_zeros(n, total)
-    low, high = bounds_of(prior, log_weights.new_zeros(d))
+    low, high = prior.bounds(log_weights.new_zeros(d))
     pattern = torch.cat(
         [~labels.is_measured | labels.is_noisy, labels.is_measured], dim=1
     )
@@ -398,7 +402,7 @@ def place_nodes(
             likelihood = MultivariateNormal(at, scale_tril=noise, validate_args=False)
             y = some.y.double()[:, None, noisy]
             log_weights[rows] += likelihood.log_prob(y)
-    theta, inside = moved_inside(prior, theta.to(labels.y).reshape(-1, d))
+    theta, inside = prior.moved_inside(theta.to(labels.y).reshape(-1, d))
     return Nodes(
         theta=theta.reshape(n, total, d),
         log_weights=log_weights.where(inside.reshape(n, total), -torch.inf),

@@ -83,7 +83,7 @@ class EmbeddedBatch:
         )
         posterior = MixturePosterior(
             density,
-            copy.deepcopy(self.npe.prior),
+            self.npe.prior,
             enable_transform=self.npe.enable_transform,
         )
         posterior.parameter_names = self.npe.parameter_names

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from sbi.utils import within_support
 from torch import Tensor
 
+from sbi_rope._prior import PriorDistribution
 from sbi_rope.errors import InvalidInputError
 
 __all__ = [
@@ -116,8 +116,8 @@ def check_in_support(
     if rows is None:
         rows = torch.ones(len(theta), dtype=torch.bool, device=theta.device)
     outside = torch.zeros_like(rows)
-    if rows.any():  # sbi cannot check an empty batch
-        outside[rows] = ~within_support(prior, theta[rows])
+    if rows.any():
+        outside[rows] = ~PriorDistribution(prior).inside(theta[rows])
     if outside.any():
         raise InvalidInputError(
             f"Expected `{name}` inside the support of the prior; got "

@@ -7,8 +7,12 @@ import torch
 from torch import Tensor, nn
 
 from sbi_rope._random import seeded
-from sbi_rope._sbi import ConditionalDensityEstimator, direct_posterior, embedding_of
-from sbi_rope._standardisation import leave_out_constants
+from sbi_rope._sbi import (
+    ConditionalDensityEstimator,
+    direct_posterior,
+    embedding_of,
+    leave_out_constants,
+)
 from sbi_rope.baselines.networks import embedding_with_head
 from sbi_rope.data import split_pairs
 from sbi_rope.errors import InvalidInputError
@@ -196,18 +200,10 @@ class CalibrationMLP(Method):
     def _gaussian(self, theta: Tensor, x: Tensor) -> DiagonalGaussian:
         theta, x = theta.cpu(), x.cpu()
         embedding = embedding_of(self._build(theta, x))
-        leave_out_constants(embedding, x)
+        leave_out_constants(embedding)
         net = embedding_with_head(embedding, 2 * theta.shape[1], x)
-        mean, std = self._prior_moments()
+        mean, std = self._prior.mean.cpu(), self._prior.stddev.cpu()
         return DiagonalGaussian(net, mean, std, x.shape[1:])
-
-    def _prior_moments(self) -> tuple[Tensor, Tensor]:
-        try:
-            mean, std = self._prior.mean, self._prior.variance.sqrt()
-        except NotImplementedError:
-            draws = self._prior_draws()
-            mean, std = draws.mean(dim=0), draws.std(dim=0)
-        return mean.float().cpu(), std.float().cpu()
 
     def _prior_draws(self) -> Tensor:
         with seeded(0):

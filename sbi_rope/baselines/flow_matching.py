@@ -1,6 +1,5 @@
 """Velocity fields that carry one distribution to another, and their units."""
 
-import copy
 from collections.abc import Callable
 from typing import Any
 
@@ -9,7 +8,7 @@ from sbi.utils import mcmc_transform
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
-from sbi_rope._prior import bounds_of, moved_inside
+from sbi_rope._prior import PriorDistribution
 from sbi_rope._random import seeded
 from sbi_rope._standardisation import ROUNDING
 
@@ -179,11 +178,11 @@ class Unbounded(nn.Module):
 
     def __init__(self, prior: Distribution) -> None:
         super().__init__()
-        self.prior = copy.deepcopy(prior)
+        self.prior = PriorDistribution(prior)
         with seeded(0):
-            draws = self.prior.sample(torch.Size((NUM_DRAWS,))).float()
+            draws = self.prior.sample((NUM_DRAWS,))
         self._set_transform(draws.device)
-        low, high = bounds_of(self.prior, draws[0])
+        low, high = self.prior.bounds(draws[0])
         # Where only one bound is known, the range is that of a uniform distribution
         # with the same standard deviation.
         margin = MARGIN * 12**0.5 * draws.std(dim=0)
@@ -192,8 +191,7 @@ class Unbounded(nn.Module):
         self.unit = Standardise(self._transform(self._off_bounds(draws)))
 
     def _set_transform(self, device: torch.device) -> None:
-        if hasattr(self.prior, "to"):
-            self.prior.to(device)  # type: ignore[attr-defined]
+        self.prior.to(device)
         with seeded(0):  # sbi draws from the prior to look at it
             self._transform: Any = mcmc_transform(self.prior, device=str(device))
 
@@ -221,7 +219,7 @@ class Unbounded(nn.Module):
 
     def replaced(self, theta: Tensor) -> Tensor:
         """Replace parameters outside the prior's support by draws of the prior."""
-        prior = self.prior.sample(torch.Size((len(theta),))).to(theta)
+        prior = self.prior.sample((len(theta),)).to(theta)
         return torch.where(self.contains(theta)[:, None], theta, prior)
 
     def transformed_inside(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -232,7 +230,7 @@ class Unbounded(nn.Module):
             transform multiplies by, ``(n,)``, and which rows are inside. The others
             have zeros.
         """
-        safe, inside = moved_inside(self.prior, theta)
+        safe, inside = self.prior.moved_inside(theta)
         u = self.transformed(safe)
         log_scale = self.log_scale(u)
         inside = inside & torch.isfinite(u).all(dim=1) & torch.isfinite(log_scale)

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
-from sbi_rope._prior import is_unbounded
 from sbi_rope._random import seeded
 from sbi_rope._sbi import ConditionalDensityEstimator, direct_posterior, embed
 from sbi_rope._standardisation import warn_of_far_entries
@@ -360,10 +359,10 @@ class PushedForward(ConditionalDensityEstimator):
         prior = self.unbounded.prior
         z, num_rows = self.base.embed(condition), len(condition)
         log_q = self.base.log_prob_given(start, z, num_rows).to(start)
-        if is_unbounded(prior):
+        if prior.is_unbounded:
             return log_q
         outside = 1 - self.base.mass(z, num_rows, self.unbounded.contains)
-        replaced = prior.log_prob(start.flatten(0, 1)).reshape(start.shape[:2])
+        replaced = prior.log_prob(start)
         return torch.logaddexp(log_q, outside.clamp_min(0).log().to(start) + replaced)
 
     @torch.no_grad()

@@ -125,7 +125,7 @@ class FRISBI(Method):
         found: Density = aligned.eval()
         if self.distilled:
             found = self._distilled(aligned, show_progress_bars=show_progress_bars)
-        return MixturePosterior(found, copy.deepcopy(self._prior)), history
+        return MixturePosterior(found, self._prior), history
 
     def _simulated(
         self, h: nn.Module, *, show_progress_bars: bool

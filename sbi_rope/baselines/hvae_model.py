@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
-from sbi_rope._prior import box_of
+from sbi_rope._prior import PriorDistribution
 from sbi_rope._random import seeded
 from sbi_rope.baselines.networks import bounded, embedding_with_head
 from sbi_rope.errors import InvalidInputError
@@ -145,17 +145,19 @@ class ContinuedPrior:
     """
 
     def __init__(self, prior: Distribution) -> None:
-        self._prior = prior
+        self._prior = PriorDistribution(prior)
         with seeded(0):
-            std = prior.sample(torch.Size((NUM_DRAWS,))).std(dim=0).float()
-        box = box_of(prior)
-        if box is None:
+            draws = self._prior.sample((NUM_DRAWS,))
+        std = draws.std(dim=0)
+        # In a box, any parameters between the bounds are inside.
+        apart = self._prior.off_bounds(2.0 * draws - draws.mean(dim=0))
+        if not self._prior.inside(apart).all():
             raise InvalidInputError(
                 f"Expected a prior whose support is a box; got {type(prior).__name__}."
             )
         self.std = std
-        self.low = box[0].to(std) + MARGIN * std
-        self.high = box[1].to(std) - MARGIN * std
+        low, high = self._prior.bounds(std)
+        self.low, self.high = low + MARGIN * std, high - MARGIN * std
 
     def nearest(self, theta: Tensor) -> Tensor:
         """Return the nearest points in the box, ``(n, d)``."""

@@ -14,7 +14,6 @@ from torch.distributions import (
     MultivariateNormal,
 )
 
-from sbi_rope._prior import prior_log_prob, prior_sample
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed, estimator_of, gaussians_of, posterior_from
 from sbi_rope._standardisation import Standardisation
@@ -240,7 +239,7 @@ class Bound(nn.Module):
         """Return the terms at statistics ``(n, *)``, which are y if standardised."""
         theta = self._draws(statistics)
         log_q = self.q.log_prob(theta, statistics).double()
-        log_prior = prior_log_prob(self.prior, theta).double()
+        log_prior = self.prior.log_prob(theta).double()
         log_lik, of_mean = log_likelihood(
             self.surrogate, self.errors, y.repeat(len(theta), 1), theta.flatten(0, 1)
         )
@@ -262,7 +261,7 @@ class Bound(nn.Module):
         """Return draws of r for each observation, ``(K, n, d)``."""
         of_q = self.q.sample(torch.Size((self.num_of_q,)), statistics)
         shape = torch.Size((self.num_of_prior, len(statistics)))
-        return torch.cat([of_q, prior_sample(self.prior, shape).to(of_q)])
+        return torch.cat([of_q, self.prior.sample(shape).to(of_q)])
 
 
 class ErrorModel(nn.Module):

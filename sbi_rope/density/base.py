@@ -1,6 +1,5 @@
 r"""Densities :math:`q(\theta \mid x)` for any observation x."""
 
-import copy
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -10,9 +9,9 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
-from sbi_rope._prior import prior_log_prob, prior_sample
+from sbi_rope._prior import PriorDistribution
 from sbi_rope._random import seeded
-from sbi_rope._sbi import ConditionalDensityEstimator, move_distribution_to_device
+from sbi_rope._sbi import ConditionalDensityEstimator
 from sbi_rope.errors import InvalidInputError, warn_user
 
 __all__ = ["Accept", "Density", "Given", "Prior", "batches", "num_fitting"]
@@ -186,19 +185,18 @@ class Prior(Density):
     r"""The prior :math:`p(\theta)`, whatever x is.
 
     Args:
-        prior: A torch distribution over parameters of shape ``(d,)``; it is copied.
+        prior: A distribution over parameters of shape ``(d,)``; it is copied.
         condition_shape: Shape of one observation.
     """
 
     placeholder: Tensor
 
     def __init__(self, prior: Distribution, condition_shape: Sequence[int]) -> None:
+        prior = PriorDistribution(prior)
         super().__init__(prior.event_shape, condition_shape)
-        self.prior = copy.deepcopy(prior)
-        with seeded(0):
-            like = prior.sample(torch.Size((1,)))
+        self.prior = prior
         # A distribution has no device. This tensor is on the device of its draws.
-        self.register_buffer("placeholder", torch.empty(0, device=like.device))
+        self.register_buffer("placeholder", torch.empty(0, device=prior.mean.device))
 
     def embed(self, x: Tensor) -> Tensor:
         """Return an empty embedding for each observation, ``(n, 0)``."""
@@ -206,11 +204,11 @@ class Prior(Density):
 
     def log_q(self, theta: Tensor, z: Tensor) -> Tensor:
         """Return the log density at theta ``(S, B, d)``, shape ``(S, B)``, float64."""
-        return prior_log_prob(self.prior, theta).double()
+        return self.prior.log_prob(theta).double()
 
     def draw(self, z: Tensor, row: Tensor) -> Tensor:
         """Draw once for each of n numbers of observations, ``(n, d)``."""
-        return prior_sample(self.prior, torch.Size((len(row),))).to(z)
+        return self.prior.sample((len(row),)).to(z)
 
     def readable(self, x: Tensor) -> Tensor:
         """Tell which observations have no infinite entry, and are not empty."""
@@ -224,7 +222,7 @@ class Prior(Density):
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:  # noqa: FBT001, FBT002
         # `to` calls this for each module, but a distribution is not a module.
         moved = super()._apply(fn, recurse)
-        self.prior = move_distribution_to_device(self.prior, str(self.device))
+        self.prior.to(self.device)
         return moved
 
 

@@ -9,12 +9,10 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._random import seeded
 from sbi_rope._sbi import ConditionalDensityEstimator, embed, readable
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope.coupling import Coupling
 from sbi_rope.density.base import (
-    NUM_DRAWS,
     Accept,
     Density,
     batches,
@@ -34,8 +32,7 @@ class OverSimulations(Density):
     .. math:: \sum_j a_j(x)\, q(\theta \mid s_j)
 
     A subclass defines :meth:`Density.embed` and :meth:`rows`. A matrix of the weights
-    of many observations is never held. The mass of each simulation inside the prior's
-    support is estimated once and kept, so that a density belongs to one prior.
+    of many observations is never held.
 
     Args:
         density: :math:`q(\theta \mid s)`, an estimator conditioned on embeddings.
@@ -60,7 +57,6 @@ class OverSimulations(Density):
         super().__init__(density.input_shape, condition_shape)
         self.density = density
         self.register_buffer("simulated", simulated)
-        self._mass_of_each: dict[str, Tensor] = {}
 
     @abstractmethod
     def rows(self, z: Tensor) -> Tensor:
@@ -103,27 +99,11 @@ class OverSimulations(Density):
         theta = [drawn(self.density, self.simulated[some]) for some in batches(column)]
         return torch.cat(theta)
 
-    @torch.no_grad()
     def mass(self, z: Tensor, num_rows: int, accept: Accept, **options: Any) -> Tensor:
-        r"""Return :math:`\sum_j a_j(x) Z_j`, with each :math:`Z_j` of 1024 draws."""
-        if "mass" not in self._mass_of_each:
-            mass, shape = [], torch.Size((NUM_DRAWS,))
-            with seeded(0):
-                for some in batches(self.simulated, share=NUM_DRAWS):
-                    theta = self.density.sample(shape, condition=some)
-                    inside = accept(theta.reshape(-1, *self.input_shape))
-                    mass.append(inside.reshape(NUM_DRAWS, -1).double().mean(dim=0))
-            self._mass_of_each["mass"] = torch.cat(mass)
-        of_each = self._mass_of_each["mass"]
-        blocks = z.split(num_fitting(len(of_each)))
-        return torch.cat([self.rows(some).to(of_each) @ of_each for some in blocks])
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:  # noqa: FBT001, FBT002
-        moved = super()._apply(fn, recurse)
-        # Another dictionary: densities of single observations share the old one.
-        masses = self._mass_of_each.items()
-        self._mass_of_each = {k: mass.to(self.device) for k, mass in masses}
-        return moved
+        """Estimate masses row by row, so that they are the same in any batch."""
+        estimate = super().mass
+        rows = [estimate(one, 1, accept, **options) for one in z.split(1)]
+        return torch.cat(rows)
 
 
 class Coupled(OverSimulations):
@@ -226,7 +206,6 @@ class Coupled(OverSimulations):
             unseen=self.unseen,
         )
         one.tail_mass = self.tail_mass
-        one._mass_of_each = self._mass_of_each
         return one
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:  # noqa: FBT001, FBT002

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from sbi.utils import within_support
 from torch import Tensor, nn
 
+from sbi_rope._prior import PriorDistribution
 from sbi_rope._random import seeded
 from sbi_rope._sbi import check_density, estimator_of
 from sbi_rope.density.base import Accept, Density
@@ -181,20 +181,17 @@ def average(
                 f"{shown(weights)}."
             )
     mixture = Mixture([density_of(posterior) for posterior in posteriors], shares)
-    first = posteriors[0]
+    first, *others = (PriorDistribution(one.prior) for one in posteriors)
     with seeded(0):
-        theta = first.prior.sample(torch.Size((NUM_FROM_PRIOR,)))
-    for number, prior in enumerate(one.prior for one in posteriors):
-        # Outside its support a prior of torch has no density, but an error.
-        if not bool(within_support(prior, theta).all()) or not torch.allclose(
-            prior.log_prob(theta), first.prior.log_prob(theta), atol=1e-3
-        ):
+        theta = first.sample((NUM_FROM_PRIOR,))
+    for number, prior in enumerate(others, start=1):
+        if not torch.allclose(prior.log_prob(theta), first.log_prob(theta), atol=1e-3):
             raise InvalidInputError(
                 "Expected `posteriors` with the same prior; got another one in "
                 f"posteriors[{number}]."
             )
     averaged = MixturePosterior(
-        mixture, copy.deepcopy(first.prior), enable_transform=first.enable_transform
+        mixture, first, enable_transform=posteriors[0].enable_transform
     )
     for names in ("parameter_names", "x_names"):
         own, *others = (getattr(one, names, None) for one in posteriors)

@@ -8,17 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from sbi.utils import within_support
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_rope._prior import is_unbounded, moved_inside
+from sbi_rope._prior import PriorDistribution
 from sbi_rope._progress import is_shown, progress_bar
 from sbi_rope._random import seeded
 from sbi_rope._sbi import (
     BaseDirectPosterior,
     MixedDensity,
-    move_distribution_to_device,
 )
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope.coupling import Coupling
@@ -84,9 +82,10 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             For mixed discrete and continuous parameters it never does.
     """
 
+    prior: PriorDistribution
     # Whether an amortised posterior warns of entries that are far from simulations.
     warns = True
-    # The observation that the mass was last estimated for, and this mass.
+    # The observations that the mass was last estimated for, and this mass.
     _latest: tuple[Tensor, Tensor] | None = None
 
     def __init__(
@@ -102,7 +101,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         with seeded(0):  # sbi draws from the prior to find out about it
             super().__init__(
                 density,
-                prior,
+                PriorDistribution(prior),
                 device=density.device,
                 enable_transform=enable_transform and not is_mixed,
             )
@@ -180,13 +179,13 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         Posteriors of single observations (``posterior[i]``) have to be taken again.
         """
         x, self._latest = self.default_x, None
-        prior = move_distribution_to_device(self.prior, device)
+        self.prior.to(device)
         density = self.posterior_estimator.to(device)
         with seeded(0):  # sbi draws from the prior to find out about it
             BaseDirectPosterior.__init__(
                 self,
                 density,
-                prior,
+                self.prior,
                 device=str(density.device),
                 enable_transform=self.enable_transform,
             )
@@ -320,7 +319,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             return torch.cat([density.draw(z, some) for some in parts])
 
         if reject_outside_prior:
-            draw = _Rejection(draw, self._inside, num_rows, density.device)
+            draw = _Rejection(draw, self.prior.inside, num_rows, density.device)
         theta = torch.empty(total, *density.input_shape, device=density.device)
         with (
             torch.no_grad(),
@@ -336,9 +335,6 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
                 theta[number * num_rows + row] = draw(row)
                 bar.update(len(slot))
         return theta.reshape(*shape, num_rows, *density.input_shape)
-
-    def _inside(self, theta: Tensor) -> Tensor:
-        return within_support(self.prior, theta).reshape(len(theta))
 
     # --- density ---
 
@@ -396,7 +392,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         """Return the log density at theta ``(S, B, d)``; x is embedded once."""
         density = self.posterior_estimator.eval()
         # Networks may be NaN outside.
-        safe, inside = moved_inside(self.prior, theta.flatten(0, 1))
+        safe, inside = self.prior.moved_inside(theta.flatten(0, 1))
         z = density.embed(x)
         with torch.set_grad_enabled(track_gradients):
             safe = safe.reshape(theta.shape)
@@ -425,9 +421,8 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         r"""Return the mass of the density inside the prior's support, ``(B,)``.
 
         It is estimated from 1024 draws with a seed of their own, so that ``log_prob``
-        always returns the same numbers. For a mixture over simulations it is estimated
-        for each of these once, and kept. Otherwise it is estimated for each x, and kept
-        until another one is asked for.
+        always returns the same numbers. It is kept until other observations are asked
+        for.
 
         Args:
             x: Observations, shape ``(B, *event)``.
@@ -439,19 +434,18 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         return self._normaliser(x, self.posterior_estimator.embed(x)).to(DTYPE)
 
     def _normaliser(self, x: Tensor, z: Any) -> Tensor:
-        if is_unbounded(self.prior):
+        if self.prior.is_unbounded:
             return torch.ones(len(x), dtype=torch.double, device=x.device)
         if self._latest is not None and torch.equal(self._latest[0], x):
             return self._latest[1]
-        mass = self.posterior_estimator.mass(z, len(x), self._inside)
+        mass = self.posterior_estimator.mass(z, len(x), self.prior.inside)
         if not (mass > 0).all():
             rows = (mass <= 0).nonzero().flatten()
             raise SamplingError(
                 f"The densities of rows {rows[:5].tolist()} of `x` have no mass inside "
                 "the support of the prior. Leave them out, or train NPE longer."
             )
-        if len(x) == 1:
-            self._latest = x.clone(), mass
+        self._latest = x.clone(), mass
         return mass
 
 
@@ -545,11 +539,6 @@ class PriorPosterior(MixturePosterior):
     """
 
     def __init__(self, prior: Any) -> None:
-        if not isinstance(prior, Distribution) or len(prior.event_shape) != 1:
-            raise InvalidInputError(
-                "Expected `prior` to be a torch distribution over vectors; got "
-                f"{type(prior).__name__}. Use `sbi.utils.process_prior(prior)[0]`."
-            )
         density = Prior(prior, (0,))
         try:
             super().__init__(density, density.prior)

@@ -18,14 +18,9 @@ from sbi_rope.diagnosis.misspecification import (
     support_of,
 )
 from sbi_rope.diagnosis.parameters import (
-    FEWEST,
-    PriorShift,
-    also_in_pairs,
-    implied_by_pairs,
     prior_shift,
-    spread_of,
 )
-from sbi_rope.diagnosis.report import Diagnosis, Finding, read_for
+from sbi_rope.diagnosis.report import Diagnosis, read_for
 from sbi_rope.diagnosis.residuals import (
     CrossFitted,
     cross_fit,
@@ -69,21 +64,20 @@ def diagnose(
        behind each posterior?
     3. Do the parameters of the batch follow the prior? The parameters of the
        simulations, weighted by the coupling at tau = 0, are compared with the prior.
-       A test of their spread finds a batch that holds a narrower range.
     4. Do the residuals :math:`g(x) - E[h(S(\theta))]` of calibration pairs depend on
        :math:`\theta`? They are computed on pairs that g was not trained on.
     5. Is an entry of x many standard deviations away from simulations? This is tested
        if NPE standardises x.
     6. Is the batch like the observations of the calibration pairs? This is an energy
-       test of :math:`h(x_o)` against h of the pairs. The held-out scores of a stack,
-       and what they say about calibration, hold for observations like those of the
-       pairs.
+       test of :math:`h(x_o)`, and of NPE's estimate of each parameter, against those of
+       the pairs. The held-out scores of a stack, and what they say about calibration,
+       hold for observations like those of the pairs.
 
     Without calibration pairs g is h, and the second test of 1 and all of 4 and 6 are
-    left out. One batch of simulations in a hundred exceeds the thresholds of 1, each of
-    the two tests of 3 and the distances in 2. One batch in a hundred that is drawn like
-    the pairs has a p-value below the threshold of 6, which is 0.01. The thresholds of
-    effective sample sizes are rules of thumb about the setting of the coupler.
+    left out. One batch of simulations in a hundred exceeds the thresholds of 1, of 3
+    and of the distances in 2. One batch in a hundred that is drawn like the pairs has a
+    p-value below the threshold of 6, which is 0.01. The thresholds of effective sample
+    sizes are rules of thumb about the setting of the coupler.
 
     Args:
         rope: A RoPE, which is not changed. If calibration pairs were appended but not
@@ -93,12 +87,12 @@ def diagnose(
             simulations if there are fewer.
         num_folds: The number of trainings for the residuals of 4, each of which takes
             as long as ``rope.train``. None leaves out 4, and the allowance for errors
-            of g in both tests of 3.
+            of g in 3.
         posterior: The posterior that you use, such as that of :func:`sbi_rope.stack`,
             made with the same pairs. Alarms are then counted for it, and what concerns
             other posteriors only comes last. A shift against the prior is no alarm, but
-            expected, if the posterior is a stack that has learned it from the pairs,
-            the pairs show it as well, and 6 shows no sign of a difference. None counts
+            expected, if the posterior is a stack that has learned from the pairs how
+            parameters are distributed, and 6 shows no sign of a difference. None counts
             all alarms.
         parameter_names: One name for each parameter. If None, those of ``rope``, or
             "theta_1" and so on.
@@ -157,21 +151,23 @@ def diagnose(
         residual = []
         if held_out is not None:
             residual = residual_findings(rope, held_out, simulations, notes)
-        findings += _spread_findings(rope, shift, simulations, names, notes)
         findings += residual
         far = far_findings(batch.npe.h, batch.x_o)
         if not far:
             notes.append(NO_STANDARDISATION)
         findings += far
         # It decides whether anything that was found on the pairs holds for the batch.
+        also: tuple[str, ...] = ()
         if tuned:
             of_pairs = batch.npe.embed("x", rope.pairs.x, batch.npe.h)
-            test = compare_with_pairs(of_pairs, rope.pairs.group.cpu(), before)
-            findings = labelled_findings(test, notes) + findings
-        also = ()
-        if tuned:
-            pairs = implied_by_pairs(rope, batch.npe, simulations)
-            also = also_in_pairs(shift, pairs, names)
+            test = compare_with_pairs(
+                of_pairs,
+                rope.pairs.group.cpu(),
+                before,
+                batch.npe.density(),
+            )
+            findings = labelled_findings(test, names, notes) + findings
+            also = () if test is None else test.alike(names)
         prior = _moved(batch.npe.prior.sample(torch.Size((NUM_DRAWN,))))
     if not coupling.converged:
         notes.append(
@@ -190,7 +186,7 @@ def diagnose(
         residuals=None if held_out is None else held_out.residuals,
         parameter_names=names,
         prior=prior,
-        also_in_pairs=also,
+        like_pairs=also,
     )
     if posterior is None:
         return diagnosis
@@ -211,8 +207,7 @@ def _held_out(
     elif num_folds is None:
         note = (
             "Residuals of calibration pairs were left out, as asked. Errors of the "
-            "tuned embedding net can therefore look like a prior shift, or like a "
-            "batch that is narrower than the prior."
+            "tuned embedding net can therefore look like a prior shift."
         )
     elif rope.pairs.num_groups < 2:
         note = (
@@ -224,29 +219,6 @@ def _held_out(
             rope, num_folds=num_folds, show_progress_bars=show_progress_bars
         ), []
     return None, [note]
-
-
-def _spread_findings(
-    rope: RoPE,
-    shift: PriorShift,
-    simulations: Simulations,
-    names: Sequence[str],
-    notes: list[str],
-) -> list[Finding]:
-    # The means of labels that are not exact are narrower than their parameters.
-    theta = _moved(rope.pairs.theta[:, 0])
-    counts = [len(shift.batch.means)]
-    if shift.held_out is not None:
-        counts.append(len(shift.held_out.of_people(theta)))
-    if min(counts) < FEWEST:
-        notes.append(
-            "Whether the batch has a narrower range of parameters than the prior was "
-            f"not tested, which needs at least {FEWEST} observations and {FEWEST} "
-            "calibration pairs with different parameters (or groups)."
-        )
-        return []
-    spread = spread_of(shift, simulations.theta, theta_cal=theta)
-    return spread.findings(names, tuned=simulations.tuned)
 
 
 def _moved(values: Tensor) -> Tensor:

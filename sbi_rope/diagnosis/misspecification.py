@@ -1,5 +1,6 @@
 """Test whether a batch is unlike simulations or pairs, and has simulations near it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -154,7 +155,9 @@ def _ratio(test: MMDTest) -> str:
     return f"{ratio:.0f} times" if ratio >= 10 else f"{ratio:.1f} times"
 
 
-def labelled_findings(test: TwoSampleTest | None, notes: list[str]) -> list[Finding]:
+def labelled_findings(
+    test: TwoSampleTest | None, names: Sequence[str], notes: list[str]
+) -> list[Finding]:
     """Say whether the batch is like the pairs, or note why this was not tested."""
     if test is None:
         notes.append(
@@ -168,11 +171,14 @@ def labelled_findings(test: TwoSampleTest | None, notes: list[str]) -> list[Find
         "pairs"
     )
     if test.is_different:
+        found = test.parameters(names)
+        where = f", and its parameters differ in {', '.join(found)}" if found else ""
         sentence = (
-            f"As NPE sees it, the batch differs from the calibration pairs: {size}. "
-            "The weights of a stack, its scores and its calibration were found on the "
-            "pairs, and need not hold for this batch. The same is true of what sets "
-            "with a guarantee promise. Label some observations like those of the batch."
+            f"As NPE sees it, the batch differs from the calibration pairs: {size}"
+            f"{where}. The weights of a stack, its scores and its calibration were "
+            "found on the pairs, and need not hold for this batch. The same is true of "
+            "what sets with a guarantee promise. Label some observations like those of "
+            "the batch."
         )
     else:
         sentence = (
@@ -217,9 +223,8 @@ def far_findings(embedding_net: nn.Module, x_o: Tensor) -> list[Finding]:
             ),
             reason=(
                 "Alarming above the threshold, which is far beyond any error of a "
-                "simulator. Above it, the units may differ, or the entry may not vary "
-                "in simulations, and the answer of NPE is arbitrary. Then leave the "
-                "entry out, or train NPE with z_score_x='structured'."
+                "simulator. Above it, the units may differ, and the answer of NPE is "
+                "arbitrary. Entries that never vary in simulations are ignored."
             ),
         )
     ]
@@ -301,15 +306,20 @@ def support_of(real: Tensor, simulations: Simulations) -> Support:
     """Compare distances to simulations with those of simulations to one another.
 
     The distance of a simulation to itself is left out, so that a simulation that takes
-    the place of an observation is flagged with the stated probability.
+    the place of an observation is flagged with the stated probability. A tuned g
+    averages over the simulator's noise, and may put observations between simulations,
+    such as between the categories of an entry. The limit allows for that.
     """
-    nearest = nearest_distances(simulations.embedded, simulations.embedded, others=True)
+    embedded = simulations.embedded
+    nearest = nearest_distances(embedded, embedded, others=True)
     # A new value exceeds the (k+1)-th largest of n with probability (k + 1) / (n + 1).
     k = int(FLAGGED_SHARE * len(nearest))
     unit = float(nearest.median())
     if unit == 0.0:  # most simulations are the same as another, as with discrete data
         unit = float(nearest.mean()) or 1.0
-    limit = float(nearest.sort(descending=True).values[k])
+    averaged = nearest_distances(simulations.averaged, embedded, others=True)
+    ends = torch.stack([nearest, averaged]).sort(dim=1, descending=True).values
+    limit = float(ends[:, k].max())
     smallest = torch.finfo(torch.float64).tiny
     return Support(
         distance=nearest_distances(real, simulations.embedded) / unit,

@@ -110,8 +110,8 @@ class Diagnosis:
             trained on other pairs, ``(n_c, l)``; None if they were left out.
         parameter_names: One name for each parameter.
         prior: Draws of the prior, ``(n, d)``, for pictures.
-        also_in_pairs: The names of findings in which the calibration pairs differ from
-            the prior as the batch does, whether they are alarming or not.
+        like_pairs: The names of parameters of which NPE's estimates show no sign that
+            the batch differs from the calibration pairs.
         used: The kind of the posterior in use, if one was given. RoPE's couplings and
             embedding net have no part in a stack.
     """
@@ -127,7 +127,7 @@ class Diagnosis:
     residuals: Tensor | None = field(repr=False)
     parameter_names: tuple[str, ...]
     prior: Tensor = field(repr=False)
-    also_in_pairs: tuple[str, ...] = ()
+    like_pairs: tuple[str, ...] = ()
     used: Literal["stack", "posterior"] | None = None
 
     @property
@@ -264,7 +264,7 @@ def read_for(diagnosis: Diagnosis, report: StackingReport | None) -> Diagnosis:
     )
     findings = tuple(
         replace(one, is_expected=one.alarming and is_like_pairs and has_learned)
-        if one.name in diagnosis.also_in_pairs
+        if one.name.partition(": ")[2] in diagnosis.like_pairs
         else one
         for one in diagnosis.findings
     )

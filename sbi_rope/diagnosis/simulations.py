@@ -114,12 +114,10 @@ class Implied:
         weights: Mean weights of the simulations, which sum to one, ``(n_s,)``.
         functions: The distribution functions of each observation, at points of each
             parameter, ``(n, d, points)``.
-        means: The mean parameters of each observation, ``(n, d)``.
     """
 
     weights: Tensor
     functions: Tensor
-    means: Tensor
 
 
 def couple_by_itself(simulations: Simulations) -> Coupling:
@@ -146,7 +144,7 @@ def implied_by(
     # The ranks at which distribution functions are compared.
     where = torch.linspace(0, last, min(NUM_POINTS, len(theta))).round().long()
     total = torch.zeros(len(theta), dtype=torch.float64)
-    functions, means = [], []
+    functions = []
     for first in range(0, len(real), CHUNK):
         block = slice(first, first + CHUNK)
         weights = coupling.rows(real[block])
@@ -155,14 +153,9 @@ def implied_by(
             weights[rows, own[block]] = 0.0
             weights = weights / weights.sum(dim=1, keepdim=True).clamp_min(1e-300)
         total += weights.sum(dim=0)
-        means.append(weights @ theta)
         each = [weights[:, column].cumsum(dim=1)[:, where] for column in order.T]
         functions.append(torch.stack(each, dim=1))
-    return Implied(
-        weights=total / len(real),
-        functions=torch.cat(functions),
-        means=torch.cat(means),
-    )
+    return Implied(weights=total / len(real), functions=torch.cat(functions))
 
 
 def resampled(values: Tensor, size: int, *, num_draws: int) -> Tensor:

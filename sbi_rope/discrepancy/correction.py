@@ -37,6 +37,10 @@ Space = Literal["embedding", "input", "tuned"]
 # The number of draws of the discrepancy for a training, and the limit on the entries of
 # all draws together. Embeddings of a hundred dimensions get fewer draws.
 NUM_DRAWS, MAX_ENTRIES = 2000, 2**24
+# Where this limits the draws, each of them serves so many simulations of a step.
+BLOCK = 40
+# A discrepancy of more entries takes minutes and many GB of memory.
+MOST_ENTRIES = 500
 # Smallest standard deviation of the error, in standard deviations of simulations. It is
 # smaller for x, which can be known more precisely than an embedding.
 SMALLEST_ERROR = {"embedding": 0.01, "tuned": 0.01, "input": 0.003}
@@ -54,10 +58,12 @@ TRAINING = {
 NUM_COMPARED = 1920
 # Courses follow each other until one gains less than 0.01 nats. In a stack, where many
 # versions are trained, a single course is enough for most, but not for images: only if
-# the loss still falls by so many nats in its last quarter, a longer one follows. Chosen
-# on calibration data, see benchmarks/choices.md.
+# the loss still falls by so many nats in its last quarter, a longer one follows.
+# Without an embedding net it adds nothing. Chosen on calibration data, see
+# benchmarks/choices.md.
 COURSES = Courses(min_gain=0.01)
 IN_A_STACK = Courses(min_gain=0.01, min_fall=0.3, max_num=2, growth=4)
+IN_A_STACK_WITHOUT_NET = replace(IN_A_STACK, max_num=1)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -75,8 +81,15 @@ class Correction:
 
 def network_of(estimator: ConditionalEstimator, space: Space) -> nn.Module:
     """Return the map from x to its representation that is corrected."""
+    net = embedding_of(estimator)
+    width = estimator.condition_shape.numel()
+    if width > MOST_ENTRIES and (space == "input" or not _has_parameters(net)):
+        raise InvalidInputError(
+            f"Expected x of at most {MOST_ENTRIES} entries, or an NPE with an "
+            f"embedding net; got {width}. Train NPE with an embedding net."
+        )
     if space != "input":
-        return embedding_of(estimator)
+        return net
     if len(estimator.condition_shape) != 1:
         raise InvalidInputError(
             "Expected observations of shape (n, l) with space='input'; got those of "
@@ -237,6 +250,7 @@ def correct_flow(
     network = flow if space == "input" else flow.densities
     losses = flow.losses if space == "input" else flow.losses_given
     size = max(1, min(NUM_DRAWS, MAX_ENTRIES // z.shape[1] ** 2 // count))
+    block = 1 if size == NUM_DRAWS else BLOCK
     draws = DiscrepancyDraws.joined(
         one.sample(size, smallest_error=SMALLEST_ERROR[space]) for one in discrepancies
     )
@@ -249,7 +263,7 @@ def correct_flow(
         uniform = torch.rand(len(upper), count, dtype=torch.double) * upper[:, -1:]
         rows = torch.searchsorted(upper, uniform).clamp_max(len(theta) - 1)
         rows = rows.to(z.device)
-        draw = torch.randint(size, rows.shape)
+        draw = torch.randint(size, (len(rows), count // block))
         draw = (draw + size * torch.arange(len(rows))[:, None]).to(z.device)
         corrected = draws.correct(z[rows.flatten()], draw.flatten())
         corrected = unit.undo(corrected.unflatten(0, rows.shape))
@@ -266,6 +280,9 @@ def correct_flow(
 
     training = TRAINING[space]
     courses = Courses(math.inf) if num_steps else COURSES
+    if in_a_stack:
+        with_net = _has_parameters(embedding_of(estimator))
+        courses = IN_A_STACK if with_net else IN_A_STACK_WITHOUT_NET
     histories = fit(
         network,
         lambda step: [batch(training.training_batch_size)],
@@ -274,12 +291,16 @@ def correct_flow(
         max_num_epochs=num_steps,
         validation_loss=compared_loss,
         held_out=batch(NUM_COMPARED),
-        courses=IN_A_STACK if in_a_stack else courses,
+        courses=courses,
         in_training_mode=False,
         label="Correcting NPE",
         show_progress_bars=show_progress_bars,
     )
     return Correction(flow=flow, constants=constants, histories=histories)
+
+
+def _has_parameters(net: nn.Module) -> bool:
+    return any(True for _ in net.parameters())
 
 
 class SimulatedConstants(nn.Module):

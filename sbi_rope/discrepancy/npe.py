@@ -1,6 +1,5 @@
 r"""NPE trained on corrected simulations, as learned from calibration pairs."""
 
-import copy
 from collections.abc import Callable, Sequence
 from typing import Annotated, Any
 
@@ -256,7 +255,7 @@ class DiscrepancyNPE(Method):
         # An entry that is constant in h can vary in g.
         members = [(number, 0) for number in range(len(nets))]
         average = flow.made_of(members, nets.then(correction.constants))
-        return MixturePosterior(average, copy.deepcopy(self._prior)), history
+        return MixturePosterior(average, self._prior), history
 
     def _cross_fitted(
         self, h: nn.Module, targets: Tensor, x_s: Tensor, *, show_progress_bars: bool

@@ -161,7 +161,8 @@ class DiscrepancyDraws:
 
         Args:
             z_s: Simulations, shape ``(n, l)``.
-            draw: The number of the draw for each, shape ``(n,)``; random if None.
+            draw: The number of the draw for each, shape ``(n,)``, or for each of m
+                blocks of ``n / m`` simulations, ``(m,)``; random if None.
 
         Returns:
             Shape ``(n, l)``, float64.
@@ -169,13 +170,13 @@ class DiscrepancyDraws:
         z_s = as_batch("z_s", z_s, self.offset.shape[1:])
         if draw is None:
             draw = torch.randint(len(self), (len(z_s),)).to(z_s.device)
-        noise = torch.randn(z_s.shape, dtype=torch.double).to(z_s.device)
-        # A matrix for each simulation needs a lot of memory if z has many entries.
+        blocks = z_s.double().reshape(len(draw), -1, z_s.shape[1])
+        noise = torch.randn(z_s.shape, dtype=torch.double).to(blocks)
+        # A matrix for each draw needs a lot of memory if z has many entries.
         size = max(1, MAX_ENTRIES // z_s.shape[1] ** 2)
         corrected = []
-        parts = (rows.split(size) for rows in (z_s.double(), draw, noise))
+        parts = (rows.split(size) for rows in (blocks, draw, noise.reshape_as(blocks)))
         for z, which, standard in zip(*parts, strict=True):
-            moved = (self.gain[which] @ z[..., None])[..., 0]
-            error = (self.error_factor[which] @ standard[..., None])[..., 0]
-            corrected.append(moved + self.offset[which] + error)
-        return torch.cat(corrected)
+            moved = self.offset[which][:, None] + z @ self.gain[which].mT
+            corrected.append(moved + standard @ self.error_factor[which].mT)
+        return torch.cat(corrected).reshape_as(z_s)

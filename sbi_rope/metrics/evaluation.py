@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sbi_rope._prior import std_of_prior
+from sbi_rope._prior import PriorDistribution
 from sbi_rope._random import seeded
 from sbi_rope.metrics.by_estimate import (
     CoverageByEstimate,
@@ -241,6 +241,8 @@ def evaluate(
 def _std_of_prior(posterior: Any, theta: Tensor) -> Tensor | None:
     """Return the standard deviations of a posterior's prior, if they can be known."""
     try:
-        return read_units(std_of_prior(posterior.prior).cpu(), theta.shape[1])
+        return read_units(
+            PriorDistribution(posterior.prior).stddev.double().cpu(), theta.shape[1]
+        )
     except Exception:  # posteriors of users, which need not have a prior to sample
         return None

@@ -16,6 +16,7 @@ from sbi_rope.stacking.words import (
     compared,
     coverage_by_estimate,
     depends_on_estimate,
+    is_comparable,
     not_the_prior,
     parameters_off,
 )
@@ -27,15 +28,14 @@ def verdict_of(
     report: StackingReport, diagnosis: Diagnosis | None, names: Sequence[str]
 ) -> list[tuple[str, bool]]:
     """Return the sentences of the verdict, and whether each is alarming."""
-    lines = [
-        (
-            f"The stack is {compared(gain, name)}: {number(gain.mean, sign=True)} nats "
-            f"a measurement, 95 % interval {number(gain.low, sign=True)} to "
-            f"{number(gain.high, sign=True)}.",
-            gain.high < 0,
-        )
-        for name, gain in report.gains.items()
-    ]
+    lines = []
+    for name, gain in report.gains.items():
+        line = f"The stack is {compared(gain, name)}"
+        if is_comparable(gain):
+            line += f": {number(gain.mean, sign=True)} nats a measurement, 95 % "
+            line += f"interval {number(gain.low, sign=True)} to "
+            line += number(gain.high, sign=True)
+        lines.append((f"{line}.", gain.high < 0))
     lines.append(_calibrated(report))
     lines += [(f"{line}.", True) for line in parameters_off(report, names)]
     if depends_on_estimate(report):

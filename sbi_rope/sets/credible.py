@@ -7,7 +7,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sbi_rope._prior import log_unit_of
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.sets.conformal import DIGITS, Guarantee
 from sbi_rope.settings import default_names
@@ -153,7 +152,7 @@ def highest_density_set(
         draws,
         log_prob,
         level=level,
-        log_unit=log_unit_of(posterior.prior),
+        log_unit=float(posterior.prior.log_units().sum()),
     )
 
 

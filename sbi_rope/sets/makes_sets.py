@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 import torch
 from torch import Tensor
-from torch.distributions import Distribution
 
+from sbi_rope._prior import PriorDistribution
 from sbi_rope._random import seeded
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.sets.conformal import DIGITS
@@ -34,7 +34,7 @@ class MakesSets(ABC):
     ``_held_out_sets`` for it.
     """
 
-    prior: Distribution
+    prior: PriorDistribution
     # One name for each parameter, where they have names.
     parameter_names: tuple[str, ...] | None = None
     # The names of the columns of tables of x, which are put in this order.

@@ -203,9 +203,8 @@ class DiscrepancyCandidate(Settings, Candidate):
         return self.space == "embedding" or _tunes(data)
 
     def check(self, data: StackData) -> None:
-        """Raise for images, series and missing entries with ``space="input"``."""
-        if self.space == "input":
-            _check_input(data)
+        """Raise if x is too long, or for ``space="input"`` no vector without NaN."""
+        _check_space(data, self.space)
 
     def fit(self, data: StackData, versions: Sequence[Tensor]) -> list[Density]:
         """Train NPE on corrected simulations."""
@@ -220,10 +219,12 @@ class DiscrepancyCandidate(Settings, Candidate):
         ]
 
 
-def _check_input(data: StackData) -> None:
-    network_of(data.estimator, "input")  # raises unless x is a vector
-    as_batch("x", data.pairs.x)
-    as_batch("x of simulations", data.simulations[1])
+def _check_space(data: StackData, space: Space | None) -> None:
+    if space is not None:
+        network_of(data.estimator, space)  # raises if it cannot be corrected
+    if space == "input":
+        as_batch("x", data.pairs.x)
+        as_batch("x of simulations", data.simulations[1])
 
 
 def _tunes(data: StackData) -> bool:
@@ -379,9 +380,8 @@ class FinetunedCandidate(Settings, Candidate):
         return self.space is None or DiscrepancyCandidate(space=self.space).suits(data)
 
     def check(self, data: StackData) -> None:
-        """Raise for images, series and missing entries with ``space="input"``."""
-        if self.space == "input":
-            _check_input(data)
+        """Raise if x is too long, or for ``space="input"`` no vector without NaN."""
+        _check_space(data, self.space)
 
     def fit(self, data: StackData, versions: Sequence[Tensor]) -> list[Density]:
         """Train one net without each part of the pairs of each version."""
@@ -496,7 +496,7 @@ class RVNPCandidate(Candidate):
         """Raise for observations of another shape, and those that are not finite."""
         x_o = data.rope.checked_observations(self.x_o)
         if self.space == "input":
-            _check_input(data)
+            _check_space(data, "input")
             as_batch("x_o", x_o)
 
     def fit(self, data: StackData, versions: Sequence[Tensor]) -> list[Density]:
@@ -603,9 +603,9 @@ def chosen_candidates(
             missing that one of them corrects.
         UnsupportedPosteriorError: If one that is given cannot be used.
     """
+    check("candidates", candidates, Sequence | None)
     if candidates is None:
-        return suitable_candidates(data, x_o)
-    check("candidates", candidates, Sequence)
+        candidates = suitable_candidates(data, x_o)
     chosen = tuple(
         one if isinstance(one, Candidate) else GivenCandidate(one) for one in candidates
     )

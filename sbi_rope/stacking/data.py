@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from sbi_rope._prior import PriorDistribution
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed, estimator_of
 from sbi_rope._standardisation import Standardisation
@@ -70,7 +71,7 @@ class StackData:
         self.rope, self.show = rope, show_progress_bars
         self.npe = rope.npe
         self.estimator = estimator_of(self.npe)
-        self.prior, self.source = self.npe.prior, rope.source
+        self.prior, self.source = PriorDistribution(self.npe.prior), rope.source
         self.pairs = rope.pairs
         self.model = DiscrepancyModel()
         if (count := self.pairs.num_groups) < 2:

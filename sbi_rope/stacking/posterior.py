@@ -1,6 +1,5 @@
 """The stack of candidates as an sbi posterior, and its sets with a guarantee."""
 
-import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,7 +8,6 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_rope._prior import bounds_of, log_unit_of, prior_log_prob, prior_sample
 from sbi_rope._sbi import MixedDensity
 from sbi_rope.density import Density, Flow, Mixture, MixturePosterior
 from sbi_rope.errors import InvalidInputError
@@ -139,7 +137,7 @@ class StackedPosterior(MixturePosterior):
         weights = report.cross_validation.weights.weights
         super().__init__(
             mixture_of(versions, weights),
-            copy.deepcopy(prior),
+            prior,
             enable_transform=enable_transform,
         )
         self.versions = list(versions)
@@ -260,7 +258,7 @@ class HeldOutSets:
             theta,
             log_density,
             level=level,
-            log_unit=log_unit_of(self._posterior.prior),
+            log_unit=float(self._posterior.prior.log_units().sum()),
             guarantee=guarantee,
         )
 
@@ -283,7 +281,7 @@ class HeldOutSets:
             low.append(ends[0].permute(2, 0, 1))
             high.append(ends[1].permute(2, 0, 1))
         ends = interval_of(torch.cat(low), torch.cat(high), level=level)
-        least, most = bounds_of(self._posterior.prior, ends[0])
+        least, most = self._posterior.prior.bounds(ends[0])
         return CredibleIntervals(
             low=ends[0].clamp(least, most).to(x),
             high=ends[1].clamp(least, most).to(x),
@@ -335,7 +333,7 @@ class HeldOutSets:
         mean = draws.mean(dim=0)
         theta = torch.cat(
             [
-                prior_sample(prior, torch.Size((count,))).to(draws),
+                prior.sample((count,)).to(draws),
                 *(_stretched(draws, mean, by=stretch) for stretch in stretches),
             ]
         )
@@ -345,7 +343,7 @@ class HeldOutSets:
         scales = torch.tensor(stretches).to(log_prob).log() * theta.shape[1]
         terms = torch.cat(
             [
-                prior_log_prob(prior, theta).to(log_prob)[None],
+                prior.log_prob(theta).to(log_prob)[None],
                 log_prob.reshape(len(stretches), -1) - scales[:, None],
             ]
         )

@@ -8,7 +8,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from sbi_rope._prior import log_units_of
 from sbi_rope._random import seeded
 from sbi_rope.data import Counts, Labels, Nodes, groups_of, one_of_each_group
 from sbi_rope.density import Density, Mixture, MixturePosterior
@@ -182,7 +181,7 @@ def _log_unit(data: StackData) -> float | Tensor:
     labels = data.pairs.label
     if labels.are_drawn:
         return 0.0  # these scores are relative to the prior
-    units = log_units_of(data.prior)
+    units = data.prior.log_units()
     if labels.are_exact:
         return float(units.sum())
     return labels.is_measured.to(units) @ units

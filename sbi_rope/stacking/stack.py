@@ -11,14 +11,14 @@ from torch import Tensor
 
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
-from sbi_rope._sbi import check_density, embed
+from sbi_rope._sbi import check_density, embed, headless
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._statistics import TwoSampleTest, compare_with_pairs
 from sbi_rope.density import Density
 from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.errors import warn_user
 from sbi_rope.rope import RoPE
-from sbi_rope.settings import Range, check
+from sbi_rope.settings import Range, check, default_names
 from sbi_rope.stacking.candidates import (
     Candidate,
     as_densities,
@@ -194,12 +194,17 @@ def _compare_batch(data: StackData, x_o: Tensor) -> TwoSampleTest | None:
     """
     net = data.embedding_net
     test = compare_with_pairs(
-        embed(net, data.pairs.x), data.pairs.group.cpu(), embed(net, x_o)
+        embed(net, data.pairs.x),
+        data.pairs.group.cpu(),
+        embed(net, x_o),
+        headless(data.estimator),
     )
     if test is not None and test.is_different:
+        names = data.rope.parameter_names or default_names(data.pairs.theta.shape[-1])
+        where = ", ".join(test.parameters(names)) or "no parameter alone"
         warn_user(
             f"`x_o` differs from the observations of the calibration pairs (p = "
-            f"{test.p_value:.3f}), so that the report need not hold for it. Look at "
-            "`diagnose(rope, x_o)`."
+            f"{test.p_value:.3f}; {where}), so that the report need not hold for it. "
+            "Look at `diagnose(rope, x_o)`."
         )
     return test

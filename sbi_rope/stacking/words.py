@@ -31,6 +31,7 @@ __all__ = [
     "depends_on_estimate",
     "differs",
     "gains_of",
+    "is_comparable",
     "lines_of",
     "not_the_prior",
     "parameters_off",
@@ -50,6 +51,8 @@ ALL = 0.995
 FEW_MORE = 10
 # A difference of less than this, in nats a pair, is called slight: 10 % of the density.
 SLIGHT = 0.1
+# Where a density is this many nats lower, its network is far from anything it has seen.
+INCOMPARABLE = 1e6
 
 # The candidates that a stack is compared with, and how the text calls them.
 REFERENCES = {"prior": "the prior", "NPE": "NPE as it was"}
@@ -95,10 +98,17 @@ IN_WORDS = {
 
 def compared(gain: Difference, name: str) -> str:
     """Say how the stack compares with a reference, no more than the interval shows."""
+    if not is_comparable(gain):
+        return f"not comparable with {REFERENCES[name]}, whose density is arbitrary"
     if gain.low <= 0 <= gain.high:
         return f"not shown to differ from {REFERENCES[name]}"
     slightly = "slightly " if abs(gain.mean) < SLIGHT else ""
     return f"{slightly}{'better' if gain.low > 0 else 'worse'} than {REFERENCES[name]}"
+
+
+def is_comparable(gain: Difference) -> bool:
+    """Tell whether a reference was asked about what it has seen the like of."""
+    return abs(gain.mean) < INCOMPARABLE
 
 
 def differs(report: "StackingReport") -> bool:
@@ -175,11 +185,14 @@ def are_relative(report: "StackingReport") -> bool:
 
 
 def _gains(report: "StackingReport") -> list[str]:
-    return [
-        f"  {compared(gain, name)}: {gain.mean:+.2f} nats a pair in any unit, "
-        f"95 % interval {gain.low:+.2f} to {gain.high:+.2f}"
-        for name, gain in report.gains.items()
-    ]
+    lines = []
+    for name, gain in report.gains.items():
+        line = f"  {compared(gain, name)}"
+        if is_comparable(gain):
+            line += f": {gain.mean:+.2f} nats a pair in any unit, "
+            line += f"95 % interval {gain.low:+.2f} to {gain.high:+.2f}"
+        lines.append(line)
+    return lines
 
 
 def _weights(report: "StackingReport") -> list[str]:

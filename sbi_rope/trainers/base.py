@@ -9,14 +9,16 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
+from sbi_rope._prior import PriorDistribution
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import (
+    TrainedNPE,
     direct_posterior,
     embedding_of,
     estimator_of,
+    leave_out_constants,
     parameter_of,
-    posterior_from,
     readable,
 )
 from sbi_rope.data import Pairs
@@ -178,16 +180,9 @@ class Method(ABC):
         simulator: Callable[[Any], Any] | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
-        check("prior", prior, Distribution)
-        if len(prior.event_shape) != 1:
-            raise InvalidInputError(
-                "Expected `prior` over vectors, with event shape (d,); got event shape "
-                f"{tuple(prior.event_shape)}."
-            )
-        self._prior: Distribution = copy.deepcopy(prior)
+        self._prior = PriorDistribution(prior)
         self._device = torch.empty(0, device=device).device  # with its number
-        if hasattr(self._prior, "to"):
-            self._prior.to(self._device)  # type: ignore[attr-defined]
+        self._prior.to(self._device)
         self._data = Data(self._prior, self._device)
         self._given_npe: Any = None
         if self.starts_from_npe:
@@ -229,7 +224,7 @@ class Method(ABC):
             )
         estimator = estimator_of(posterior)
         method = cls(posterior.prior, device=parameter_of(estimator).device, **options)
-        method._given_npe = posterior_from(posterior, copy.deepcopy(estimator))
+        method._given_npe = TrainedNPE(posterior).posterior()
         method._data.event_shape = estimator.condition_shape
         method._data.theta_names = getattr(posterior, "parameter_names", None)
         method._data.x_names = getattr(posterior, "x_names", None)
@@ -335,6 +330,7 @@ class Method(ABC):
             training=self._npe_training,
             show_progress_bars=show_progress_bars,
         )
+        leave_out_constants(embedding_of(estimator))
         return direct_posterior(estimator, self._prior), history
 
     @property

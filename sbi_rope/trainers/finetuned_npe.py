@@ -167,7 +167,7 @@ class FinetunedNPE(Method):
         history = self.histories[0]
         if self.num_holdouts == 1:
             return posterior_from(npe, flow[best].estimator(own)), history
-        return MixturePosterior(flow[best], copy.deepcopy(self._prior)), history
+        return MixturePosterior(flow[best], self._prior), history
 
     def _splits(self) -> list[tuple[Tensor, Tensor]]:
         """Return the rows to train on and those held out, for each network."""

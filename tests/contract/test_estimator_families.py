@@ -302,7 +302,7 @@ def test_densities_of_the_family_integrate_to_one_inside_the_prior(
 ) -> None:
     # The mass inside the prior is estimated from draws. Usually there are 1024, which
     # is an error of up to 0.03 here.
-    monkeypatch.setattr("sbi_rope.density.coupled.NUM_DRAWS", 8192)
+    monkeypatch.setattr("sbi_rope.density.base.NUM_DRAWS", 8192)
     posterior = repaired(family, dim=1).posterior[0]
     edges = torch.linspace(-1, 1, 101)
     theta = (edges[1:] + edges[:-1])[:, None] / 2

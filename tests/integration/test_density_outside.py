@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.distributions import Gamma, Independent
 
 from sbi_rope import RoPE
+from sbi_rope._prior import PriorDistribution
 from sbi_rope.baselines import FinetunedNPE
 from sbi_rope.errors import RoPEWarning
 from sbi_rope.finetuning import FINETUNING
@@ -131,10 +132,12 @@ def test_what_labels_leave_possible_is_inside_the_support() -> None:
         theta_std=0.5,
         theta_cov=None,
         like=theta[:0],
-        prior=PRIOR,
+        prior=PriorDistribution(PRIOR),
         names=None,
     )
     draws = 0.1 + torch.randn(50, 24, 2)
-    nodes = place_nodes(of_labels, [reference_of(draws)], PRIOR, num_nodes=40)
+    nodes = place_nodes(
+        of_labels, [reference_of(draws)], PriorDistribution(PRIOR), num_nodes=40
+    )
     assert torch.isneginf(nodes.log_weights).any()
     assert within_support(PRIOR, nodes.theta.reshape(-1, 2)).all()

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from sbi_rope import RoPE, load, stack
-from sbi_rope._prior import log_units_of
+from sbi_rope._prior import PriorDistribution
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.metrics import lpp
 from sbi_rope.stacking import CrossValidation
@@ -51,8 +51,9 @@ def test_a_stack_is_scored_on_what_was_measured(tmp_path: Any) -> None:
     assert 0 < scores.monte_carlo_error < 0.2
     # In standard deviations of the prior, each parameter that was measured counts.
     unit = (
-        log_units_of(rope.npe.prior)[1]
-        + (~torch.isnan(PARTIAL[:, 0])).double() * (log_units_of(rope.npe.prior)[0])
+        PriorDistribution(rope.npe.prior).log_units()[1]
+        + (~torch.isnan(PARTIAL[:, 0])).double()
+        * PriorDistribution(rope.npe.prior).log_units()[0]
     )
     in_units = scores.stack_scores + unit
     score, error = posterior.report.score_z

@@ -1,6 +1,7 @@
 """Entries of x that are far from simulations, or the same in all of them."""
 
 import warnings
+from dataclasses import replace
 
 import pytest
 import torch
@@ -9,13 +10,16 @@ from sbi.neural_nets import posterior_nn
 from sbi.utils.sbiutils import Standardize
 from torch import Tensor, nn
 
-from sbi_rope import CalibrationFinetuner, RoPE, diagnose
+from sbi_rope import CalibrationFinetuner, RoPE, diagnose, stack
 from sbi_rope._standardisation import deviations
 from sbi_rope.baselines import CalibrationMLP, FinetunedNPE, Training
 from sbi_rope.density import average
 from sbi_rope.discrepancy import DiscrepancyNPE
-from sbi_rope.errors import RoPEWarning
+from sbi_rope.errors import InvalidInputError, RoPEWarning
+from sbi_rope.stacking.cross_validation import Difference
+from sbi_rope.stacking.words import compared, is_comparable
 from tests import problems
+from tests.stacks import DEFAULTS, quick
 
 QUIET = {"show_progress_bars": False}
 PRIOR = problems.box(2)
@@ -60,30 +64,64 @@ def test_distances_from_simulations_count_below_as_above() -> None:
     assert torch.allclose(far, torch.tensor([[0.0, 1000.0]]))
 
 
+IGNORED = r"1 of the 3 entries of `{}` \(first: \[2\]\) never vary in simulations"
+
+
 @pytest.mark.medium
-def test_an_entry_that_varies_only_in_reality_is_named_and_diagnosed() -> None:
-    what = r"1 of the 3 entries of `{}` \(first: \[2\]\) are up to .e\+05 standard"
+def test_an_entry_that_varies_only_in_reality_is_named_and_ignored() -> None:
     for net in (False, True):
         rope = RoPE(
             npe_of("independent", net=net),
             simulator=simulator,
             finetuner=CalibrationFinetuner(max_num_epochs=1),
         )
-        with pytest.warns(RoPEWarning, match=what.format("x")):
+        with pytest.warns(RoPEWarning, match=IGNORED.format("x")):
             rope.append_calibration(THETA_CAL, real(THETA_CAL))
     rope.train(seed=0, **QUIET)
-    with pytest.warns(RoPEWarning, match=what.format("x_o")):
-        rope.build_posterior(real(THETA), require_convergence=False, **QUIET)
+    with pytest.warns(RoPEWarning, match=IGNORED.format("x_o")):
+        rope.build_posterior(real(THETA), **QUIET)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        diagnosis, usual = (
+        with quick():
+            stacked = stack(rope, **DEFAULTS)
+        looks = [
             diagnose(rope, x, num_simulations=100, num_folds=None, seed=0, **QUIET)
-            for x in (real(THETA), simulator(THETA))
-        )
-    finding = diagnosis["entries far from simulations"]
-    assert finding.alarming
-    assert "Entry 2 of observation" in finding.sentence
-    assert not usual["entries far from simulations"].alarming
+            for x in (real(THETA), 1000.0 * simulator(THETA))
+        ]
+        x = real(THETA[:5])
+        found = [
+            [
+                posterior.log_prob_batched(THETA[:5], other, norm_posterior=False)
+                for other in (x, x + torch.tensor([0.0, 0.0, 1e6]))
+            ]
+            for posterior in (rope.npe, stacked)
+        ]
+    usual, in_another_unit = (one["entries far from simulations"] for one in looks)
+    assert not usual.alarming
+    assert in_another_unit.alarming
+    assert "Entry 2 of" not in in_another_unit.sentence
+    for before, after in found:
+        assert torch.isfinite(before).all()
+        assert torch.equal(before, after)
+
+
+def test_a_gain_over_an_arbitrary_density_is_not_comparable() -> None:
+    far = Difference(mean=5e17, low=-1e18, high=2e18)
+    assert compared(far, "NPE").startswith("not comparable with NPE as it was")
+    assert is_comparable(replace(far, mean=1e3))
+
+
+def test_x_that_is_too_long_without_a_net_is_refused_before_training() -> None:
+    x = torch.randn(60, 501)
+    npe = NPE(PRIOR, posterior_nn("mdn", hidden_features=5), **QUIET)
+    npe.append_simulations(THETA, x).train(max_num_epochs=1)
+    rope = RoPE(npe.build_posterior(), simulations=(THETA, x))
+    rope.append_calibration(THETA_CAL, x[::2])
+    method = DiscrepancyNPE.from_posterior(rope.npe, simulations=(THETA, x))
+    method.append_calibration(THETA_CAL, x[::2])
+    for train in (lambda: stack(rope, **DEFAULTS), lambda: method.train(**QUIET)):
+        with pytest.raises(InvalidInputError, match="Train NPE with an embedding net"):
+            train()
 
 
 def test_an_amortised_posterior_warns_of_an_observation_in_another_unit() -> None:
@@ -122,8 +160,7 @@ def test_other_methods_that_start_from_npe_warn_too() -> None:
 def test_a_network_of_real_observations_ignores_their_constant_entries() -> None:
     method = CalibrationMLP(PRIOR, training=Training(max_num_epochs=50))
     method.append_calibration(THETA_CAL, simulator(THETA_CAL))
-    with pytest.warns(RoPEWarning, match=r"1 of the 3 entries.*first: \[2\].*same"):
-        method.train(seed=0, **QUIET)
+    method.train(seed=0, **QUIET)
     posterior = method.build_posterior()
     x = simulator(THETA)
     changed = x + torch.tensor([0.0, 0.0, 100.0])

@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.distributions import MultivariateNormal, Normal
 
 from sbi_rope import CalibrationFinetuner, RoPE
+from sbi_rope._prior import PriorDistribution
 from sbi_rope.data import Labels, Pairs
 from sbi_rope.discrepancy import DiscrepancyModel, learn_parameters
 from sbi_rope.discrepancy.model import expected_means
@@ -27,9 +28,8 @@ from sbi_rope.stacking.scoring import _score_labels
 from tests import gaussian
 
 NAN = math.nan
-PRIOR = MultivariateNormal(
-    torch.zeros(3), torch.tensor([[1.0, 0.5, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, 2.0]])
-)
+OF_PRIOR = torch.tensor([[1.0, 0.5, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, 2.0]])
+PRIOR = PriorDistribution(MultivariateNormal(torch.zeros(3), OF_PRIOR))
 Y = torch.tensor([[0.5, -0.3, 1.0], [NAN, 0.4, -1.0], [0.2, NAN, NAN], [0.1, 0, 0]])
 COVARIANCE = torch.zeros(4, 3, 3, dtype=torch.double)
 COVARIANCE[0] = torch.tensor([[0.3, 0.1, 0.0], [0.1, 0.2, 0.0], [0.0, 0.0, 0.5]])
@@ -38,8 +38,8 @@ COVARIANCE[1, 1, 1] = 0.2
 LABELS = Labels(y=Y, covariance=COVARIANCE, draws=Y.new_empty(4, 0, 3))
 
 
-def box(dim: int, low: float = -1.0) -> BoxUniform:
-    return BoxUniform(low * torch.ones(dim), torch.ones(dim))
+def box(dim: int, low: float = -1.0) -> PriorDistribution:
+    return PriorDistribution(BoxUniform(low * torch.ones(dim), torch.ones(dim)))
 
 
 def measured(y: Tensor, *std: float) -> Labels:
@@ -58,7 +58,7 @@ def rope(dim: int = 2, **options: Any) -> RoPE:
 def test_draws_of_parameters_follow_the_prior_given_the_label() -> None:
     found = draws_of(LABELS, PRIOR).double()
     assert found.shape == (4, 100, 3)
-    prior = PRIOR.covariance_matrix.double()
+    prior = OF_PRIOR.double()
     for i in range(4):
         known = LABELS.is_measured[i].nonzero().flatten()
         select = torch.eye(3, dtype=torch.double)[known]
@@ -186,7 +186,7 @@ def line(theta: Tensor) -> Tensor:
 
 def pairs_of(labels: Labels, prior: Any) -> Pairs:
     exact = Pairs.exact(labels.y, labels.y)
-    theta = draws_of(labels, prior)
+    theta = draws_of(labels, PriorDistribution(prior))
     return Pairs(
         theta=theta, x=exact.x, group=exact.group, weight=exact.weight, label=labels
     )

@@ -105,7 +105,7 @@ def test_sbc_accepts_the_prior() -> None:
 
 
 def test_a_prior_that_is_no_distribution_is_refused() -> None:
-    over_numbers = torch.distributions.Uniform(torch.zeros(2), torch.ones(2))
+    over_numbers = torch.distributions.Uniform(0.0, 1.0)
     for prior in ([box()], over_numbers):
         with pytest.raises(InvalidInputError, match="process_prior"):
             PriorPosterior(prior)
