@@ -68,6 +68,7 @@ __all__ = [
     "embedding_of",
     "estimator_of",
     "gaussians_of",
+    "has_parameters",
     "headless",
     "is_bounded",
     "leave_out_constants",
@@ -206,6 +207,11 @@ def leave_out_constants(embedding_net: nn.Module) -> None:
         mean, std = mean_and_std
         is_constant = std <= (CONSTANT * mean.abs()).clamp_min(SMALLEST_STD)
         std.masked_fill_(is_constant, torch.inf)
+
+
+def has_parameters(net: nn.Module) -> bool:
+    """Tell whether a net can learn, and lose information about x."""
+    return any(True for _ in net.parameters())
 
 
 def parameter_of(module: nn.Module) -> Tensor:

@@ -244,7 +244,8 @@ def compare_with_pairs(
         if density is not None:
             draws = torch.Size((NUM_FOR_ESTIMATE,))
             estimates = density.sample(draws, condition=rows).mean(dim=0)
-    estimates = estimates.cpu().double()
+    # Far from all simulations, a network may return anything.
+    estimates = estimates.cpu().double().nan_to_num()
     compared = [rows.cpu().double(), *estimates.T[..., None]]
     found = [_energies(_closer(columns), member) for columns in compared]
     # The energy distances of each division, and how much larger than usual they are.
@@ -264,12 +265,11 @@ def compare_with_pairs(
 
 
 def _energies(rows: Tensor, member: Tensor) -> tuple[Tensor, float]:
-    """Return the energy distance of each division, and the spread of the second set.
+    """Return the energy distance of each division of rows ``(n + m, l)``.
 
-    The spread is that in the first division, as a multiple of the first set's.
-
-    Rows have the shape ``(n + m, l)``. In ``member``, the first set of each division
-    has ones, ``(divisions, n + m)``.
+    In ``member``, ``(divisions, n + m)``, the first set of each division has ones. The
+    second value is the spread of the second set in the first division, as a multiple
+    of that of the first set.
     """
     # Of two equal rows, only rounding would be left to compare.
     std = rows.std(dim=0)

@@ -12,6 +12,7 @@ from sbi_rope._random import seeded
 from sbi_rope._sbi import (
     ConditionalEstimator,
     embedding_of,
+    has_parameters,
     headless,
     readable,
     with_embedding,
@@ -59,7 +60,7 @@ class Flow(Density):
         condition_shape: Sequence[int],
     ) -> None:
         super().__init__(input_shape, condition_shape)
-        if len(nets) > 1 and not any(True for _ in nets.parameters()):
+        if len(nets) > 1 and not has_parameters(nets):
             nets = nets[[0]]  # without parameters, all are the same
         self.nets, self.densities = nets, densities
         if weights is None:

@@ -157,7 +157,7 @@ def diagnose(
             notes.append(NO_STANDARDISATION)
         findings += far
         # It decides whether anything that was found on the pairs holds for the batch.
-        also: tuple[str, ...] = ()
+        alike: tuple[str, ...] = ()
         if tuned:
             of_pairs = batch.npe.embed("x", rope.pairs.x, batch.npe.h)
             test = compare_with_pairs(
@@ -167,7 +167,7 @@ def diagnose(
                 batch.npe.density(),
             )
             findings = labelled_findings(test, names, notes) + findings
-            also = () if test is None else test.alike(names)
+            alike = () if test is None else test.alike(names)
         prior = _moved(batch.npe.prior.sample(torch.Size((NUM_DRAWN,))))
     if not coupling.converged:
         notes.append(
@@ -186,7 +186,7 @@ def diagnose(
         residuals=None if held_out is None else held_out.residuals,
         parameter_names=names,
         prior=prior,
-        like_pairs=also,
+        like_pairs=alike,
     )
     if posterior is None:
         return diagnosis

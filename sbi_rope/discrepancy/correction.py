@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from sbi_rope._random import seeded
-from sbi_rope._sbi import ConditionalEstimator, embedding_of
+from sbi_rope._sbi import ConditionalEstimator, embedding_of, has_parameters
 from sbi_rope._standardisation import Standardisation
 from sbi_rope.data import Counts, groups_of
 from sbi_rope.density.flow import Flow
@@ -83,7 +83,7 @@ def network_of(estimator: ConditionalEstimator, space: Space) -> nn.Module:
     """Return the map from x to its representation that is corrected."""
     net = embedding_of(estimator)
     width = estimator.condition_shape.numel()
-    if width > MOST_ENTRIES and (space == "input" or not _has_parameters(net)):
+    if width > MOST_ENTRIES and (space == "input" or not has_parameters(net)):
         raise InvalidInputError(
             f"Expected x of at most {MOST_ENTRIES} entries, or an NPE with an "
             f"embedding net; got {width}. Train NPE with an embedding net."
@@ -281,8 +281,8 @@ def correct_flow(
     training = TRAINING[space]
     courses = Courses(math.inf) if num_steps else COURSES
     if in_a_stack:
-        with_net = _has_parameters(embedding_of(estimator))
-        courses = IN_A_STACK if with_net else IN_A_STACK_WITHOUT_NET
+        longer = has_parameters(embedding_of(estimator))
+        courses = IN_A_STACK if longer else IN_A_STACK_WITHOUT_NET
     histories = fit(
         network,
         lambda step: [batch(training.training_batch_size)],
@@ -297,10 +297,6 @@ def correct_flow(
         show_progress_bars=show_progress_bars,
     )
     return Correction(flow=flow, constants=constants, histories=histories)
-
-
-def _has_parameters(net: nn.Module) -> bool:
-    return any(True for _ in net.parameters())
 
 
 class SimulatedConstants(nn.Module):

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from sbi_rope._prior import PriorDistribution
 from sbi_rope._random import seeded
-from sbi_rope._sbi import embed, estimator_of
+from sbi_rope._sbi import embed, estimator_of, has_parameters
 from sbi_rope._standardisation import Standardisation
 from sbi_rope.data import Nodes
 from sbi_rope.density.base import Density
@@ -209,8 +209,7 @@ class StackData:
 
         Without a net to lose information, errors in x are those in h(x).
         """
-        has_net = any(True for _ in self.embedding_net.parameters())
-        return has_net and self.compares_entries
+        return has_parameters(self.embedding_net) and self.compares_entries
 
     # --- labels ---
 

@@ -43,9 +43,9 @@ class Slicing:
         return torch.rand(*sample_shape, 2)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        inside = ((value[:, :1] > 0) & (value[:, 1:2] < 1))[:, 0]
-        inside = inside & (value[:, 0] < 1) & (value[:, 1] > 0)
-        return torch.zeros(len(value)).where(inside, -torch.inf)
+        first, second = value[:, :1], value[:, 1:2]
+        inside = (first > 0) & (first < 1) & (second > 0) & (second < 1)
+        return torch.zeros(len(value)).where(inside[:, 0], -torch.inf)
 
 
 class OfArrays:
