@@ -14,7 +14,11 @@ from sbi_rope._standardisation import Standardisation
 from sbi_rope.data import Counts, groups_of
 from sbi_rope.density.flow import Flow
 from sbi_rope.discrepancy.model import DiscrepancyModel, expected_means
-from sbi_rope.discrepancy.posterior import Discrepancy, DiscrepancyDraws
+from sbi_rope.discrepancy.posterior import (
+    Discrepancy,
+    DiscrepancyDraws,
+    noise_scale,
+)
 from sbi_rope.discrepancy.regression import SMALLEST_NOISE
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.fit import Courses, History, Training, fit
@@ -41,8 +45,9 @@ NUM_DRAWS, MAX_ENTRIES = 2000, 2**24
 BLOCK = 40
 # A discrepancy of more entries takes minutes and many GB of memory.
 MOST_ENTRIES = 500
-# Smallest standard deviation of the error, in standard deviations of simulations. It is
-# smaller for x, which can be known more precisely than an embedding.
+# Smallest standard deviation of the error of the entry with most noise, in standard
+# deviations of simulations. It is smaller for x, which can be known more precisely than
+# an embedding.
 SMALLEST_ERROR = {"embedding": 0.01, "tuned": 0.01, "input": 0.003}
 # More standard deviations than this refute that the simulator is right.
 LARGEST_SURPRISE = 5.0
@@ -185,8 +190,8 @@ def surprise(
     The means :math:`m_i` have the shape ``(n, R, l)``, and the nearest of R counts. The
     covariances :math:`C_i` have the shape ``(n, l, l)``.
     """
-    noise = SMALLEST_NOISE**2 * torch.eye(z.shape[1]).to(covariances)
-    covariances = covariances + noise
+    rounded = SMALLEST_NOISE * noise_scale(covariances.mean(dim=0))
+    covariances = covariances + rounded.square().diag()
     residual = z.to(covariances)[:, None] - means
     factor = torch.linalg.cholesky(covariances.mean(dim=0))
     white = torch.linalg.solve_triangular(factor, residual.mT, upper=False)

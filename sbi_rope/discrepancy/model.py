@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sbi_rope._random import seeded
 from sbi_rope.data import groups_of
-from sbi_rope.discrepancy.posterior import Discrepancy
+from sbi_rope.discrepancy.posterior import Discrepancy, noise_scale
 from sbi_rope.discrepancy.regression import (
     SMALLEST_NOISE,
     Conditional,
@@ -60,13 +60,17 @@ class DiscrepancyModel(Settings):
     The prior is conjugate, and its centre is a simulator that is right,
 
     .. math::
-        \Sigma \sim \mathrm{IW}\bigl((\nu - l - 1)\, s^2 I, \nu\bigr), \qquad
+        \Sigma \sim \mathrm{IW}\bigl((\nu - l - 1)\, s^2 V, \nu\bigr), \qquad
         (A, b) \mid \Sigma \sim \mathcal{MN}\bigl((I, 0), K^{-1}, \Sigma\bigr), \quad
-        K = \operatorname{diag}(k, \ldots, k, k / 3),
+        K = \operatorname{diag}(k + 4 l C_{11}, \ldots, k + 4 l C_{ll}, k / 3),
 
     so that the posterior has the same form and the evidence has a closed form. The
-    hyper-parameters k, s and :math:`\nu` are averaged over a grid, weighted by their
-    evidence, so that there is nothing to choose.
+    shape V is I, or :math:`D^2` with the noise of simulations in each entry, relative
+    to the largest: an entry that is measured more precisely than others may have a
+    smaller error, too. The noise in K keeps what is uncertain about A from adding more
+    than a quarter of :math:`\Sigma` to the noise. V and the hyper-parameters k, s and
+    :math:`\nu` are averaged over a grid, weighted by their evidence, so that there is
+    nothing to choose.
 
     Recordings of one person or specimen can have errors in common. If these have the
     correlation :math:`\rho`, a group of k pairs counts as
@@ -160,7 +164,8 @@ class DiscrepancyModel(Settings):
         if possible == (1,):
             mean = mean[:, 0]
         covariance = as_batch("covariance", covariance, width, rows=width[0]).to(z)
-        noise = covariance + SMALLEST_NOISE**2 * torch.eye(z.shape[1]).to(z)
+        smallest = SMALLEST_NOISE * noise_scale(covariance)
+        noise = covariance + smallest.square().diag()
         weights = torch.ones(len(z)) if weights is None else weights
         weights = as_batch("weights", weights, (), rows=len(z)).to(z)
         if groups is not None:
@@ -173,7 +178,7 @@ class DiscrepancyModel(Settings):
         def counts(mean: Tensor) -> Tensor:
             if groups is None:
                 return weights
-            correlations = self._correlations_within(groups, z, mean)
+            correlations = self._correlations_within(groups, z, mean, noise)
             return independent_pairs(groups, correlations, weights)
 
         def conditional(mean: Tensor, weights: Tensor) -> Conditional:
@@ -192,10 +197,11 @@ class DiscrepancyModel(Settings):
 
         ``once`` are the weights if each group counts as one pair, shape ``(n,)``.
         """
-        regressions = Regressions.of(z, mean, self.gain_precisions, weights)
+        precisions = self.gain_precisions
+        regressions = Regressions.of(z, mean, precisions, weights, noise)
         log_evidence = judged = regressions.log_evidence(self._settings)
         if once is not weights:
-            as_one_pair = Regressions.of(z, mean, self.gain_precisions, once)
+            as_one_pair = Regressions.of(z, mean, precisions, once, noise)
             judged = as_one_pair.log_evidence(self._settings)
         average = judged.logsumexp(dim=(1, 2)) - math.log(judged[0].numel())
         right = log_density_of_right(z - mean, noise, once)
@@ -211,7 +217,9 @@ class DiscrepancyModel(Settings):
             num_pairs=len(z),
         )
 
-    def _correlations_within(self, groups: Tensor, z: Tensor, mean: Tensor) -> Tensor:
+    def _correlations_within(
+        self, groups: Tensor, z: Tensor, mean: Tensor, noise: Tensor
+    ) -> Tensor:
         """Return the mean correlation within groups, for each set of means."""
         ratios = torch.tensor(VARIANCE_RATIOS).to(z)
         correlations = ratios / (1 + ratios)
@@ -220,7 +228,7 @@ class DiscrepancyModel(Settings):
         evidence = []
         for correlation in correlations.tolist():
             errors = GroupErrors(groups=groups, correlation=correlation)
-            some = Regressions.of(z, mean, precisions, ones, errors=errors)
+            some = Regressions.of(z, mean, precisions, ones, noise, errors=errors)
             evidence.append(some.log_evidence(self._settings).logsumexp(dim=(1, 2)))
         log_prior = torch.tensor(PRIOR_OF_RATIOS).to(z).log()
         return (torch.stack(evidence, dim=1) + log_prior).softmax(dim=1) @ correlations

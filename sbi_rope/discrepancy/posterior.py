@@ -10,10 +10,24 @@ from torch.distributions import Chi2
 from sbi_rope._random import seeded
 from sbi_rope.tensors import as_batch
 
-__all__ = ["Discrepancy", "DiscrepancyDraws", "Term"]
+__all__ = ["Discrepancy", "DiscrepancyDraws", "Term", "noise_scale"]
 
 # Entries of the matrices that simulations are corrected by at a time.
 MAX_ENTRIES = 2**22
+# The smallest noise of an entry, relative to the largest, that is told apart from none.
+SMALLEST_SCALE = 0.01
+
+
+def noise_scale(covariance: Tensor) -> Tensor:
+    """Return the diagonal of D: the noise of each entry, relative to the largest.
+
+    The covariance is that of simulations at one parameter, ``(l, l)``. D is one if
+    there is no noise at all.
+    """
+    std = covariance.diagonal().clamp_min(0.0).sqrt()
+    if not std.max() > 0:
+        return torch.ones_like(std)
+    return (std / std.max()).clamp_min(SMALLEST_SCALE)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -91,13 +105,14 @@ class Discrepancy:
 
         A share ``probability_of_none`` of the draws has gain one, offset zero and no
         error. In the other draws the error is :math:`\Sigma` without the simulator's
-        own noise, :math:`\Sigma' = \Sigma - A C A^\top`. Its eigenvalues are at least
-        ``smallest_error`` squared.
+        own noise, :math:`\Sigma' = \Sigma - A C A^\top`. The eigenvalues of
+        :math:`D^{-1} \Sigma' D^{-1}` are at least ``smallest_error`` squared, with the
+        noise D of :class:`DiscrepancyModel`.
 
         Args:
             num_draws: Number of draws.
-            smallest_error: Smallest standard deviation of the error, in standard
-                deviations of simulations.
+            smallest_error: Smallest standard deviation of the error of the entry with
+                most noise, in standard deviations of simulations.
             seed: Seed of the draws; None uses torch's state.
         """
         none = self.probability_of_none
@@ -122,10 +137,11 @@ class Discrepancy:
         self, term: Term, count: int, smallest_error: float
     ) -> "DiscrepancyDraws":
         gain, offset, covariance = term.sample(count)
+        scale = noise_scale(self.noise)
         error = covariance - gain @ self.noise @ gain.mT
-        variance, directions = torch.linalg.eigh(error)
+        variance, directions = torch.linalg.eigh(error / scale / scale[:, None])
         std = variance.clamp_min(smallest_error**2).sqrt()
-        factor = directions * std[:, None, :]
+        factor = scale[:, None] * directions * std[:, None, :]
         return DiscrepancyDraws(gain=gain, offset=offset, error_factor=factor)
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
-from sbi_rope.discrepancy.posterior import Discrepancy, Term
+from sbi_rope.discrepancy.posterior import Discrepancy, Term, noise_scale
 
 __all__ = [
     "SMALLEST_NOISE",
@@ -22,9 +22,15 @@ __all__ = [
 
 # The prior precision of the offset is this share of the precision of the gain.
 OFFSET_PRECISION = 1 / 3
-# This standard deviation is added to the noise of simulations at one parameter, because
-# some statistics have no noise at all. Its unit is the standard deviation of
-# simulations from the prior.
+# The prior precision of the gain is at least this times the noise C of each entry and
+# the number of entries. What is uncertain about the gain then adds a quarter of the
+# error to the noise, at most and on average. Without this, the noise of imprecise
+# entries leaks into a precise one, along directions in which the means of the pairs do
+# not vary.
+LEAST_PRECISION = 4.0
+# This standard deviation, times D, is added to the noise of simulations at one
+# parameter, because some statistics have no noise at all. Its unit is the standard
+# deviation of simulations from the prior.
 SMALLEST_NOISE = 0.01
 # Settings of the hyper-parameters are left out if their evidence is less than this
 # share of the evidence of the best setting.
@@ -87,23 +93,27 @@ def independent_pairs(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Regressions:
-    r"""Real observations regressed on simulated means, at K precisions of the gain.
+    r"""Real observations regressed on simulated means, at K forms of the prior.
 
+    A form is a precision of the gain, and a shape of the error: the identity or D.
     There are B sets of means, such as imputed ones. Each has its own regressions.
 
     Attributes:
         coefficients: Means of :math:`(A, b)^\top`, shape ``(B, K, l + 1, l)``.
         row_factor: Lower Cholesky factors of the covariances of their rows, shape
             ``(B, K, l + 1, l + 1)``.
-        variances: Eigenvalues of the scatter matrices of the residuals, ``(B, K, l)``.
+        shapes: The diagonals of the shapes, ``(K, l)``.
+        variances: Eigenvalues of the scatter matrices of the residuals, which are
+            divided by the shape, ``(B, K, l)``.
         directions: Their eigenvectors, shape ``(B, K, l, l)``.
-        log_volume: The parts of the log evidences that come from the coefficients, and
-            from the correlation of the errors, shape ``(B, K)``.
+        log_volume: The parts of the log evidences that come from the coefficients, from
+            the shape, and from the correlation of the errors, shape ``(B, K)``.
         num_pairs: The sum of the weights of the pairs, shape ``(B,)``.
     """
 
     coefficients: Tensor
     row_factor: Tensor
+    shapes: Tensor
     variances: Tensor
     directions: Tensor
     log_volume: Tensor
@@ -116,13 +126,15 @@ class Regressions:
         mean: Tensor,
         gain_precisions: Sequence[float],
         weights: Tensor,
+        noise: Tensor,
         *,
         errors: GroupErrors | None = None,
     ) -> "Regressions":
-        """Return the conjugate posterior of the coefficients at each precision.
+        """Return the conjugate posterior of the coefficients at each form.
 
         Observations z have the shape ``(n, l)``, means ``(B, n, l)``, and weights
-        ``(n,)`` or ``(B, n)``. They are one if ``errors`` are correlated.
+        ``(n,)`` or ``(B, n)``. They are one if ``errors`` are correlated. ``noise`` is
+        C, the covariance of simulations at one parameter.
         """
         width = mean.shape[2]
         identity = torch.eye(width).to(z)
@@ -130,6 +142,7 @@ class Regressions:
         prior_mean = torch.cat([identity, torch.zeros_like(identity[:1])])
         precision = z.new_tensor(gain_precisions)[:, None].repeat(1, width + 1)
         precision[:, -1] *= OFFSET_PRECISION
+        precision[:, :-1] += LEAST_PRECISION * width * noise.diagonal()
         # Relative to the prior mean, residuals are small, and so are rounding errors.
         residual = z - design @ prior_mean
         num_pairs = weights.sum(dim=-1).expand(len(mean))
@@ -149,21 +162,30 @@ class Regressions:
         scatter = left_over.mT @ left_over + shift.mT @ (precision[..., None] * shift)
         # No z is known more precisely than SMALLEST_NOISE, even if pairs agree exactly.
         # Pairs are rounded one by one, whatever the errors of a group have in common.
-        scatter = scatter + num_rounded * SMALLEST_NOISE**2 * identity
-        variances, directions = torch.linalg.eigh(scatter)
+        scale = noise_scale(noise)
+        scatter = scatter + num_rounded * (SMALLEST_NOISE * scale).square().diag()
         log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(dim=-1)
-        log_prior = precision.log().sum(dim=1)
+        log_volume = width / 2 * (precision.log().sum(1) - log_det - log_det_errors)
+        # From here on both shapes follow each other in the dimension of the precisions.
+        shapes = torch.stack([torch.ones_like(scale), scale]).unique(dim=0)
+        several, count = len(shapes), len(precision)
+        log_volume = log_volume.repeat(1, several)
+        shapes = shapes.repeat_interleave(count, dim=0)
+        scatter = scatter.repeat(1, several, 1, 1) / shapes[:, None] / shapes[..., None]
+        variances, directions = torch.linalg.eigh(scatter)
+        row_factor = torch.linalg.cholesky(torch.cholesky_inverse(factor))
         return cls(
-            coefficients=prior_mean + shift,
-            row_factor=torch.linalg.cholesky(torch.cholesky_inverse(factor)),
+            coefficients=(prior_mean + shift).repeat(1, several, 1, 1),
+            row_factor=row_factor.repeat(1, several, 1, 1),
+            shapes=shapes,
             variances=variances.clamp_min(0.0),
             directions=directions,
-            log_volume=width / 2 * (log_prior - log_det - log_det_errors),
+            log_volume=log_volume - num_pairs[:, None] * shapes.log().sum(dim=1),
             num_pairs=num_pairs,
         )
 
     def log_evidence(self, settings: Sequence[tuple[float, float]]) -> Tensor:
-        """Return the log density of the pairs at each precision and setting.
+        """Return the log density of the pairs at each form and setting.
 
         The settings are S pairs of an error scale and its strength, so that the shape
         is ``(B, K, S)``.
@@ -183,7 +205,7 @@ class Regressions:
         )
 
     def at(self, where: tuple[Any, Any], error_scale: Any, strength: Any) -> Term:
-        """Return the posterior at a set and precision, an error scale and a strength.
+        """Return the posterior at a set and form, an error scale and a strength.
 
         All arguments are numbers, or tensors of shape ``(m,)`` for m terms in one.
         """
@@ -194,7 +216,9 @@ class Regressions:
         return Term(
             coefficients=self.coefficients[where],
             row_factor=self.row_factor[where],
-            error_factor=self.directions[where] * scale[..., None, :].sqrt(),
+            error_factor=self.shapes[where[1]][..., None]
+            * self.directions[where]
+            * scale[..., None, :].sqrt(),
             degrees=strength + scale.shape[-1] + 1 + self.num_pairs[where[0]],
         )
 
@@ -204,7 +228,7 @@ class Conditional:
     """The posterior of the discrepancy given each of B sets of means.
 
     Attributes:
-        regressions: The posteriors at K precisions of the gain.
+        regressions: The posteriors at K forms of the prior.
         log_evidence: At these and S further settings, shape ``(B, K, S)``.
         settings: The error scales and strengths, S of each.
         noise: The covariance C of simulations at one parameter, shape ``(l, l)``.
@@ -270,5 +294,6 @@ class Conditional:
 def log_density_of_right(residual: Tensor, noise: Tensor, weights: Tensor) -> Tensor:
     """Return the log density of z - m, ``(B,)``, rounded as ``Regressions`` do."""
     log_density = MultivariateNormal(torch.zeros_like(noise[0]), noise).log_prob
-    inexact = weights.sum() * SMALLEST_NOISE**2 * torch.linalg.inv(noise).trace()
+    rounded = (SMALLEST_NOISE * noise_scale(noise)).square()
+    inexact = weights.sum() * (rounded * torch.linalg.inv(noise).diagonal()).sum()
     return (weights * log_density(residual)).sum(dim=1) - inexact / 2

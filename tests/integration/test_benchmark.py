@@ -286,6 +286,6 @@ def test_what_is_fine_tuned_is_a_discrepancy_of_x_itself_where_it_is_short(
     assert method.space == "input"
     method.append_calibration(*case.calibration)
     method.train(seed=0, show_progress_bars=False)
-    assert len(method.build_posterior().posterior_estimator.parts) == 2
+    assert method.build_posterior().posterior_estimator.num_members == 2
     # The corrected NPE is the start: the discrepancy was fitted, too.
     assert method.discrepancy.num_pairs == 10

@@ -1,6 +1,7 @@
 """The posterior of gain, offset and error, against integrals and simulations."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -17,6 +18,7 @@ from sbi_rope.discrepancy.regression import (
     Regressions,
     independent_pairs,
 )
+from sbi_rope.metrics.calibration import acauc_of
 
 # Settings of the hyper-parameters k, s and the strength of the error's prior.
 SETTINGS = [(0.5, 0.2, 1.0), (3.0, 0.6, 4.0), (30.0, 0.1, 20.0)]
@@ -45,8 +47,16 @@ def no_noise(width: int) -> Tensor:
     return torch.zeros(width, width)
 
 
+def without_rounding(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in ("model", "regression"):
+        monkeypatch.setattr(f"sbi_rope.discrepancy.{module}.SMALLEST_NOISE", 0.0)
+
+
 def updated(
-    z: Tensor, mean: Tensor, setting: tuple[float, ...]
+    z: Tensor,
+    mean: Tensor,
+    setting: tuple[float, ...],
+    shape: Sequence[float] | None = None,
 ) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
     """The posterior by one pair after the other, each predicted by a Student t density.
 
@@ -57,7 +67,8 @@ def updated(
     width = z.shape[1]
     precision = np.diag([k] * width + [k / 3])
     coefficients = np.vstack([np.eye(width), np.zeros((1, width))])
-    scale, degrees = strength * s**2 * np.eye(width), strength + width + 1
+    scale = strength * s**2 * np.diag(np.square(shape or [1.0] * width))
+    degrees = strength + width + 1
     total = 0.0
     for y, m in zip(z.numpy(), mean.numpy(), strict=True):
         x = np.append(m, 1.0)
@@ -78,11 +89,11 @@ def updated(
 def test_evidence_and_draws_are_those_of_one_update_after_the_other(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("sbi_rope.discrepancy.regression.SMALLEST_NOISE", 0.0)
+    without_rounding(monkeypatch)
     for width in (1, 2, 4):
         z, mean = pairs(9, width)
         for setting in SETTINGS:
-            discrepancy = at(*setting).fit(z, mean, 1e-9 * torch.eye(width))
+            discrepancy = at(*setting).fit(z, mean, 1e-12 * torch.eye(width))
             evidence, coefficients, rows, sigma = updated(z, mean, setting)
             assert discrepancy.log_evidence == pytest.approx(evidence, abs=1e-8)
             draws = discrepancy.sample(DRAWS, smallest_error=0.0, seed=0)
@@ -97,11 +108,59 @@ def test_evidence_and_draws_are_those_of_one_update_after_the_other(
             ), setting
 
 
+def test_the_shape_of_the_error_is_averaged_over_by_evidence(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    without_rounding(monkeypatch)
+    z, mean = pairs(9, 2)
+    noise, (k, s, strength) = 1e-10 * torch.tensor([1.0, 0.25]), SETTINGS[0]
+    discrepancy = at(k, s, strength).fit(z, mean, noise.diag())
+    of_shapes = [
+        updated(z, mean, (k, s, strength), shape) for shape in ([1.0, 0.5], [1.0, 1.0])
+    ]
+    evidence = torch.tensor([one[0] for one in of_shapes]).double()
+    average = float(evidence.logsumexp(0)) - math.log(2)
+    assert discrepancy.log_evidence == pytest.approx(average, abs=1e-6)
+    assert torch.allclose(discrepancy.shares, evidence.softmax(0), atol=1e-6)
+    for term, (_, _, _, sigma) in zip(discrepancy.terms, of_shapes, strict=True):
+        scale = term.error_factor @ term.error_factor.mT
+        found = scale / (float(term.degrees) - 3)
+        assert found.numpy() == pytest.approx(sigma, abs=1e-6)
+
+
+def test_a_precise_entry_beside_imprecise_ones_is_not_blurred() -> None:
+    """Its noise is 1/200 of its range, that of the others a quarter; no network."""
+    std = torch.tensor([1 / 200, 0.25, 0.25, 0.25]).double()
+
+    def observed(theta: Tensor) -> Tensor:
+        return 0.9 * theta + 0.1 + 1.4 * std * torch.randn(len(theta), 4)
+
+    levels = []
+    for _ in range(4):
+        theta, new = torch.randn(50, 1).double(), torch.randn(500, 1).double()
+        mean, noise = theta.expand(-1, 4), std.square().diag()
+        draws = DiscrepancyModel().fit(observed(theta), mean, noise).sample(300)
+        # Given a draw, the posterior of theta is normal, and its weight is known.
+        covariance = draws.error_factor @ draws.error_factor.mT
+        covariance = covariance + draws.gain @ noise @ draws.gain.mT
+        slope = draws.gain.sum(dim=2)
+        inverse = torch.linalg.inv(covariance + slope[:, :, None] * slope[:, None])
+        rest = (observed(new)[:, None] - draws.offset)[..., None]
+        distance = (rest.mT @ inverse @ rest)[..., 0, 0] + inverse.logdet().neg()
+        weight = torch.softmax(-distance / 2, dim=1)
+        shrunk = (slope[:, None] @ inverse)[:, 0]
+        std_of_theta = (1 - (shrunk * slope).sum(dim=1)).sqrt()
+        z = (new - (shrunk * rest[..., 0]).sum(dim=2)) / std_of_theta
+        cdf = (weight * torch.special.ndtr(z)).sum(dim=1)
+        levels.append((2 * cdf - 1).abs()[:, None])
+    found = acauc_of(torch.cat(levels), None)
+    assert abs(found.value) <= 0.06, found
+
+
 def test_the_evidence_of_a_simulator_that_is_right_is_a_normal_density(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    for module in ("model", "regression"):
-        monkeypatch.setattr(f"sbi_rope.discrepancy.{module}.SMALLEST_NOISE", 0.0)
+    without_rounding(monkeypatch)
     z, mean = pairs(6, 2)
     noise = torch.tensor([[0.5, 0.2], [0.2, 0.3]]).double()
     model = replace(at(*SETTINGS[0]), probability_of_none=0.2)
@@ -137,7 +196,7 @@ def test_the_evidence_of_correlated_errors_is_a_matrix_t_density(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """With the coefficients and the covariance integrated out by hand."""
-    monkeypatch.setattr("sbi_rope.discrepancy.regression.SMALLEST_NOISE", 0.0)
+    without_rounding(monkeypatch)
     groups = torch.tensor([0, 1, 0, 2, 1, 0, 3])
     n, width, rho = len(groups), 2, 0.6
     z, mean = pairs(n, width)
@@ -158,7 +217,8 @@ def test_the_evidence_of_correlated_errors_is_a_matrix_t_density(
         )
         errors = GroupErrors(groups=groups, correlation=rho)
         ones = torch.ones(n).double()
-        regression = Regressions.of(z, mean[None], [k], ones, errors=errors)
+        noise = no_noise(width).double()
+        regression = Regressions.of(z, mean[None], [k], ones, noise, errors=errors)
         found = regression.log_evidence([(s, strength)])
         assert float(found) == pytest.approx(float(expected), abs=1e-4)
 
@@ -342,11 +402,12 @@ def test_some_draws_correct_nothing() -> None:
 def test_the_noise_that_the_simulator_has_made_is_taken_off_times_the_gain() -> None:
     z, mean = pairs(30, 2, error=1.0)
 
+    model = replace(GRID, probability_of_none=0.0)
+    fitted = model.fit(z, mean, no_noise(2))
+
     def total(noise: Tensor) -> Tensor:
-        discrepancy = GRID.fit(z, mean, noise)
-        draws = replace(discrepancy, probability_of_none=0.0).sample(
-            100, smallest_error=0.0, seed=0
-        )
+        discrepancy = replace(fitted, noise=noise.double())
+        draws = discrepancy.sample(100, smallest_error=0.0, seed=0)
         assert (draws.gain - torch.eye(2)).abs().mean() > 0.1
         error = draws.error_factor @ draws.error_factor.mT
         return error + draws.gain @ discrepancy.noise @ draws.gain.mT

@@ -121,7 +121,7 @@ def test_vector_fields_are_corrected_and_can_be_sampled() -> None:
             samples.append(one.sample((5,), x=x, show_progress_bars=False))
         assert samples[0].shape == (5, 2)
         assert not torch.equal(*samples)
-        with pytest.raises(UnsupportedPosteriorError, match="space='embedding'"):
+        with pytest.raises(UnsupportedPosteriorError, match="space='tuned'"):
             trained(posterior, space="tuned")
 
 
