@@ -3,13 +3,15 @@
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 from torch import Tensor
 
 from sbi_rope.tasks import Task, get_task
-from tests.conftest import TEST_DATA
+from tests.conftest import SHARED_DATA, TEST_DATA
 
 __all__ = [
+    "MEASURED",
     "ROOTS",
     "SUBTLE",
     "all_recorded",
@@ -19,10 +21,15 @@ __all__ = [
     "make",
     "rows_of",
     "same_rows",
+    "skip_without_data",
 ]
 
+# Their parameters were measured, and none was set. The repository has no data of them.
+MEASURED = ("near_infrared", "ocean_colour")
 # Folders with the recorded data of tasks; the other tasks are drawn here.
-ROOTS: dict[str, Path] = {"light_tunnel_sensors": TEST_DATA / "causal_chamber"}
+ROOTS: dict[str, Path] = {
+    "light_tunnel_sensors": TEST_DATA / "causal_chamber",
+} | dict.fromkeys(MEASURED, SHARED_DATA / "real")
 # Small images are quick to write, read and compare.
 # Without 8-bit levels, no two of them are equal. Recorded sets have their own tests.
 OPTIONS: dict[str, dict[str, Any]] = {
@@ -38,8 +45,14 @@ def make(name: str, **options: Any) -> Task:
     return get_task(name, root=ROOTS.get(name), **OPTIONS.get(name, {}), **options)
 
 
+def skip_without_data(task: Task) -> None:
+    if task.name in MEASURED and not task.has_data:
+        pytest.skip(f"the data of {task.name} are not on this machine")
+
+
 def as_many(n: int, task: Task, part: str, *, seed: int = 0) -> int:
     """Return ``n``, or the number of recorded pairs where there are fewer."""
+    skip_without_data(task)
     recorded = task.num_recorded(part, seed=seed)  # type: ignore[arg-type]
     return n if recorded is None else min(n, recorded)
 
@@ -47,6 +60,7 @@ def as_many(n: int, task: Task, part: str, *, seed: int = 0) -> int:
 def draw(
     task: Task, part: str, n: object, *, seed: object = 0
 ) -> tuple[Tensor, Tensor]:
+    skip_without_data(task)
     get = task.get_calibration_set if part == "calibration" else task.get_test_set
     return get(n, seed=seed)  # type: ignore[arg-type]
 

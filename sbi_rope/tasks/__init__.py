@@ -17,6 +17,8 @@ from sbi_rope.tasks.hemodynamics.task import Hemodynamics
 from sbi_rope.tasks.light_tunnel import LightTunnel
 from sbi_rope.tasks.light_tunnel_sensors import LightTunnelSensors
 from sbi_rope.tasks.linear_gaussian import LinearGaussian
+from sbi_rope.tasks.near_infrared import NearInfrared
+from sbi_rope.tasks.ocean_colour import OceanColour
 from sbi_rope.tasks.pendulum import Pendulum
 from sbi_rope.tasks.sir import SIR
 from sbi_rope.tasks.wind_tunnel import WindTunnel
@@ -29,6 +31,8 @@ TASKS: dict[str, type[Task]] = {
     "light_tunnel": LightTunnel,
     "light_tunnel_sensors": LightTunnelSensors,
     "linear_gaussian": LinearGaussian,
+    "near_infrared": NearInfrared,
+    "ocean_colour": OceanColour,
     "pendulum": Pendulum,
     "sir": SIR,
     "wind_tunnel": WindTunnel,

@@ -11,6 +11,7 @@ from torch.distributions import Distribution
 
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.settings import Count, Range, UnitInterval, check, one_of
+from sbi_rope.tasks.chambers import where
 from sbi_rope.tasks.settings import PaperSettings
 from sbi_rope.tasks.splits import MAX_SEED, DrawnPairs, Keep, Part, RecordedPairs
 from sbi_rope.tasks.variants import (
@@ -140,7 +141,7 @@ class Task(ABC):
         files = self.required_files
         if not files:
             return True
-        return self.root is not None and all((self.root / f).is_file() for f in files)
+        return all(where(file, self.root) is not None for file in files)
 
     @abstractmethod
     def get_prior(self) -> Distribution:

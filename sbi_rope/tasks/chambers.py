@@ -1,4 +1,4 @@
-r"""Readers of the recorded experiments of the causal chambers.
+r"""Readers of recorded data: tables, and the experiments of the causal chambers.
 
 References:
     | Causal chambers as a real-world physical testbed for AI methodology
@@ -21,32 +21,59 @@ from torch import Tensor
 from sbi_rope.errors import DataNotFoundError, InvalidInputError
 from sbi_rope.tensors import as_batch
 
-__all__ = ["find_file", "read_columns", "read_images", "read_table"]
+__all__ = [
+    "find_file",
+    "numbers_of",
+    "read_columns",
+    "read_images",
+    "read_table",
+    "where",
+]
 
 DATASETS_PAGE = "https://github.com/juangamella/causal-chamber/tree/main/datasets"
 
 
-def find_file(file: Path, *, root: Path | None, download: bool = False) -> Path:
+def where(file: Path, root: Path | None) -> Path | None:
+    """Return the place of a file below ``root`` or one of its folders, if it is there.
+
+    One folder can hold the data of all tasks.
+    """
+    if root is None:
+        return None
+    return next(
+        (p for p in (root / file, *root.glob(f"*/{file}")) if p.is_file()), None
+    )
+
+
+def find_file(
+    file: Path, *, root: Path | None, source: str = "", download: bool = False
+) -> Path:
     """Return the full path of a recorded file.
 
     Args:
-        file: The file's path below ``root``, beginning with the name of the data set:
+        file: The file's path below ``root``, or below a folder in it, beginning with
+            the name of the data set:
             ``lt_interventions_standard_v1/uniform_reference.csv``.
         root: Folder that holds the data sets.
+        source: Where the data come from, if not from the causal chambers.
         download: Whether to download the data set into ``root`` if it is not there.
 
     Raises:
         DataNotFoundError: If the file is not there.
     """
     dataset = file.parts[0]
-    if root is not None and download and not (root / dataset).exists():
+    found = where(file, root)
+    if root is not None and download and not found and not (root / dataset).exists():
         _download(dataset, root)
-    if root is None or not (root / file).is_file():
+        found = where(file, root)
+    if found is None:
+        get = f"Get it from {source}."
+        if not source:
+            get = f"Pass `download=True`, or get it from {DATASETS_PAGE}/{dataset}."
         raise DataNotFoundError(
-            f"Expected the recorded file {file} in the folder `root`; got {root}. Pass "
-            f"`download=True`, or get it from {DATASETS_PAGE}/{dataset}."
+            f"Expected the recorded file {file} in the folder `root`; got {root}. {get}"
         )
-    return root / file
+    return found
 
 
 def read_columns(path: Path, columns: Sequence[str]) -> Tensor:
@@ -59,10 +86,13 @@ def read_columns(path: Path, columns: Sequence[str]) -> Tensor:
         InvalidInputError: If columns are missing, there are no rows, or a value is not
             a finite number.
     """
-    numbers = read_table(path, columns).apply(
-        _require("pandas").to_numeric, errors="coerce"
-    )
-    return as_batch(str(path), torch.tensor(numbers.to_numpy(dtype="float64")))
+    return numbers_of(read_table(path, columns), str(path))
+
+
+def numbers_of(table: Any, name: str) -> Tensor:
+    """Return a pandas table of finite numbers as float64; raise for any other."""
+    numbers = table.apply(_require("pandas").to_numeric, errors="coerce")
+    return as_batch(name, torch.tensor(numbers.to_numpy(dtype="float64")))
 
 
 def read_table(path: Path, columns: Sequence[str]) -> Any:

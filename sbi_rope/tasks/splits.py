@@ -6,7 +6,7 @@ split once and for all.
 """
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -121,6 +121,8 @@ class RecordedPairs:
     Args:
         theta: Parameters of all rows, shape ``(rows, d)``.
         read_x: Returns the observations of chosen rows, in their order.
+        groups: What rows have in common that must be in the same part, one entry a row.
+        share: The share of the rows for calibration, a third unless given.
 
     Example:
         >>> theta = torch.arange(6.0).reshape(6, 1)
@@ -131,6 +133,8 @@ class RecordedPairs:
 
     theta: Tensor
     read_x: Callable[[list[int]], Tensor]
+    groups: Sequence[Hashable] | None = None
+    share: float = 1 / 3
 
     def take(
         self, n: int, *, seed: int, part: Part, keep: Keep | None = None
@@ -167,8 +171,16 @@ class RecordedPairs:
     def rows_of(self, part: Part) -> list[int]:
         """Return the numbers of all rows of a part, whatever the seed."""
         order = _shuffled(range(len(self.theta)), key="split")
-        third = len(order) // 3
-        return order[:third] if part == "calibration" else order[third:]
+        groups: dict[Hashable, list[int]] = {}
+        for row in order:
+            group = row if self.groups is None else self.groups[row]
+            groups.setdefault(group, []).append(row)
+        calibration: list[int] = []
+        test: list[int] = []
+        wanted = int(self.share * len(order) + 1e-9)
+        for rows in groups.values():
+            (calibration if len(calibration) < wanted else test).extend(rows)
+        return calibration if part == "calibration" else test
 
 
 def stream_of(seed: int, use: Part | Literal["labels"]) -> int:

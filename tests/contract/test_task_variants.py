@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from sbi_rope.tasks import TASKS
-from tests.tasks import as_many, draw, make
+from tests.tasks import MEASURED, as_many, draw, make
 
 EVERY_TASK = pytest.mark.parametrize("name", sorted(TASKS))
 
@@ -31,9 +31,10 @@ def test_biased_calibration_parameters_crowd_in_the_middle(name: str) -> None:
         spread.append(task.prior_quantiles(theta)[:, :3].std(dim=0))
         margin.append(0.5 / n**0.5)
     # Standard deviations of Beta(3, 3) and of the uniform law, and a margin of three
-    # standard errors or more.
+    # standard errors or more. Parameters of the sea or of meat never follow a prior.
     assert (spread[0] < 0.189 + margin[0]).all()
-    assert (spread[1] > 0.289 - margin[1]).all()
+    if name not in MEASURED:
+        assert (spread[1] > 0.289 - margin[1]).all()
 
 
 @pytest.mark.medium
@@ -51,7 +52,7 @@ def test_noisy_labels_belong_to_the_observations_of_the_standard_task(
         assert torch.equal(x, same_x)
         scaled[noise] = (noisy_theta - theta) / clean.prior_std
         assert (scaled[noise] != 0).all()
-    sets = (task.get_test_set(50) for task in (clean, noisy))
+    sets = (task.get_test_set(40) for task in (clean, noisy))
     assert all(torch.equal(a, b) for a, b in zip(*sets, strict=True))
     # The default is 0.2, and less where the support of the prior cuts the noise.
     assert scaled[None].std(dim=0).max() < 0.2 * (1 + 2.2 / n**0.5)

@@ -9,6 +9,7 @@ from sbi.neural_nets import posterior_nn
 
 from sbi_rope import CalibrationFinetuner, RoPE, SinkhornCoupler
 from sbi_rope.tasks import TASKS, Task, get_task
+from tests.tasks import ROOTS, skip_without_data
 
 OPTIONS = {"light_tunnel": {"image_size": 64}}
 
@@ -19,10 +20,9 @@ def task(request: pytest.FixtureRequest) -> Task:
     options = OPTIONS.get(name, {})
     if "synthetic" in TASKS[name].variants:
         return get_task(name, variant="synthetic", **options)
-    if get_task(name).required_files:
-        root = request.getfixturevalue("chamber_extract")
-        return get_task(name, root=root, **options)
-    return get_task(name, **options)
+    made = get_task(name, root=ROOTS.get(name), **options)
+    skip_without_data(made)
+    return made
 
 
 @pytest.mark.medium
